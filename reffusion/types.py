@@ -1,0 +1,189 @@
+"""The data that moves between the parts of the method: frozen, without inheritance, without IO.
+
+Axes, units and names are those of CONVENTIONS.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole view. Pixel (column i, row j) covers [i, i+1) x [j, j+1); its centre is (i+0.5, j+0.5).
+
+    Attributes:
+        name: the view's name, unique in the scene, without a file ending.
+        width, height: image size in pixels.
+        fx, fy, cx, cy: focal lengths and principal point in pixels.
+        world_to_camera: [4, 4] float64 rigid transform; the camera looks along +z, x right, y down.
+    """
+
+    name: str
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    world_to_camera: np.ndarray
+
+    @cached_property
+    def intrinsics(self) -> np.ndarray:
+        """[3, 3] float64."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @cached_property
+    def center(self) -> np.ndarray:
+        """[3] float64, the optical centre in the world."""
+        rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
+        return -rotation.T @ translation
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same view sampled at another size."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
+        )
+
+    def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
+        """The window of this view whose upper left pixel is (left, top); it may reach outside the image."""
+        return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """x_normalised = scale * (x_scene - offset). No rotation, so spherical harmonics pass unchanged.
+
+    Attributes:
+        scale: float64, positive.
+        offset: [3] float64.
+    """
+
+    scale: float
+    offset: np.ndarray
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        """[..., 3] in the scene's own frame -> normalised frame, in float64."""
+        return (np.asarray(points, np.float64) - self.offset) * self.scale
+
+    def invert(self, points: np.ndarray) -> np.ndarray:
+        """[..., 3] in the normalised frame -> the scene's own frame, in float64."""
+        return np.asarray(points, np.float64) / self.scale + self.offset
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What the `poses` stage leaves behind: pinhole cameras and sparse points in the normalised frame.
+
+    Attributes:
+        cameras: view name -> Camera, sorted by name.
+        train, test: names of the training and test views.
+        clean: names of the training views in which the object is absent (their masked pixels may supervise).
+        points: [P, 3] float64 sparse points.
+        point_colors: [P, 3] uint8.
+        similarity: from the scene's own frame to this one.
+    """
+
+    cameras: dict[str, Camera]
+    train: tuple[str, ...]
+    test: tuple[str, ...]
+    clean: frozenset[str]
+    points: np.ndarray
+    point_colors: np.ndarray
+    similarity: Similarity
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """N anisotropic 3D Gaussians, parametrised as in 3DGS.
+
+    Attributes:
+        means: [N, 3], normalised frame.
+        quaternions: [N, 4], wxyz, any length (a zero quaternion is the identity).
+        log_scales: [N, 3], natural logarithm of the standard deviations.
+        opacity_logits: [N].
+        sh: [N, K, 3] spherical harmonics, K = (degree + 1)^2 in {1, 4, 9, 16}; colour = 0.5 + sum_k Y_k sh_k,
+            clamped from below at 0.
+    """
+
+    means: Tensor
+    quaternions: Tensor
+    log_scales: Tensor
+    opacity_logits: Tensor
+    sh: Tensor
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def sh_degree(self) -> int:
+        return int(round(self.sh.shape[1] ** 0.5)) - 1
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
+        """`function` applied to each parameter, e.g. `g.map(lambda p: p[keep])`."""
+        return Gaussians(*(function(getattr(self, name)) for name in PARAMETERS))
+
+    def zipped(self, other: Gaussians, function: Callable[[Tensor, Tensor], Tensor]) -> Gaussians:
+        """`function` applied to each pair of parameters, e.g. concatenation."""
+        return Gaussians(*(function(getattr(self, name), getattr(other, name)) for name in PARAMETERS))
+
+
+PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
+
+
+class Rendering(NamedTuple):
+    """What `splat.render` returns; every tensor is differentiable in the Gaussians unless said otherwise.
+
+    Attributes:
+        color: [H, W, 3], background included.
+        depth: [H, W] expected camera-z divided by alpha; 0 where alpha is 0.
+        alpha: [H, W] in [0, 1).
+        features: [H, W, C] blended features (not divided by alpha), or None.
+        radii: [N] int32, pixel radius of the footprint, 0 where culled. Not differentiable.
+    """
+
+    color: Tensor
+    depth: Tensor
+    alpha: Tensor
+    features: Tensor | None
+    radii: Tensor
+
+
+@dataclass(frozen=True)
+class MaskSet:
+    """The pixel classes of one view, bool [H, W] each.
+
+    Attributes:
+        raw: the given 2D mask (all False where none was given).
+        consistent: C, rendered back from the labelled Gaussians; it must not supervise.
+        never_seen: N, inside C, explained by no remaining Gaussian.
+        invent: I, the pixels to be made up: N, or the region the scene asks to fill.
+    """
+
+    raw: np.ndarray
+    consistent: np.ndarray
+    never_seen: np.ndarray
+    invent: np.ndarray
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A view completed in 2D.
+
+    Attributes:
+        camera: the view.
+        image: [H, W, 3] uint8.
+        mask: [H, W] bool, the pixels the reference stands for (the view's invent mask).
+    """
+
+    camera: Camera
+    image: np.ndarray
+    mask: np.ndarray
