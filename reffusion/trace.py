@@ -104,7 +104,7 @@ def log_spaced(iteration: int, last: int, per_octave: int = 2) -> bool:
         return True
     from math import floor, log2
 
-    step = lambda i: floor(log2(i) * per_octave)  # noqa: E731
+    step = lambda i: floor(log2(i) * per_octave)
     return iteration > 0 and step(iteration) != step(max(iteration - 1, 0.5))
 
 

@@ -11,7 +11,6 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from torch import Tensor
 
 
@@ -125,7 +124,7 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
-        return int(round(self.sh.shape[1] ** 0.5)) - 1
+        return round(self.sh.shape[1] ** 0.5) - 1
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
         """`function` applied to each parameter, e.g. `g.map(lambda p: p[keep])`."""

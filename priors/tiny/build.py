@@ -1,0 +1,162 @@
+"""The parts of the embedded prior before training: ordinary diffusers and transformers objects.
+
+The VAE works at full resolution (factor 1) and is exact by construction, not trained: see `linear_vae`.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import torch
+from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
+from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer
+
+NATIVE = 64  # px
+WORDS = ("a", "photo", "of", "sks", "cropped", ",")
+TEXT_LENGTH = 24
+# Opponent colours of (r, g, b) in [-1, 1], scaled to deviation about 1 over the training images, so that one noise
+# schedule serves light and colour alike; the fourth latent is the light's Laplacian: fine texture, made loud.
+LIGHT, WARM, GREEN, DETAIL = 1.9, 5.0, 9.0, 4.0
+
+
+def linear_vae() -> AutoencoderKL:
+    """An AutoencoderKL of factor 1 and four latent channels that is a linear map up to 1e-4 of the picture.
+
+    Group norm and SiLU stand between the first and the last convolution; both are made harmless: every signal x
+    travels as the pair (x, -x), since silu(x) - silu(-x) = x exactly, and one pair of large constants (c, -c) fixes
+    the group's mean at 0 and its deviation at c (2 / channels)^(1/2). Residual branches end in zeros.
+    """
+    constant, channels = 400.0, 10
+    vae = AutoencoderKL(
+        down_block_types=("DownEncoderBlock2D",),
+        up_block_types=("UpDecoderBlock2D",),
+        block_out_channels=(channels,),
+        layers_per_block=1,
+        latent_channels=4,
+        norm_num_groups=1,
+        sample_size=NATIVE,
+        scaling_factor=1.0,
+        force_upcast=False,
+        use_quant_conv=False,
+        use_post_quant_conv=False,
+        mid_block_add_attention=False,
+    )
+    light = torch.tensor([1, 1, 1]) / 3
+    colours = torch.stack(
+        [LIGHT * light, WARM * torch.tensor([0.5, 0, -0.5]), GREEN * torch.tensor([-0.25, 0.5, -0.25])]
+    )
+    kernel = torch.zeros(4, 3, 3, 3)
+    kernel[:3, :, 1, 1] = colours
+    laplacian = torch.tensor([[0.0, -1, 0], [-1, 4, -1], [0, -1, 0]])
+    kernel[3] = DETAIL * light[:, None, None] * laplacian
+    back = torch.zeros(3, 4, 3, 3)
+    back[:, :3, 1, 1] = torch.linalg.inv(colours)
+    gain = constant * (2 / channels) ** 0.5  # what the group norm divides by
+    with torch.no_grad():
+        for module in vae.modules():
+            if type(module).__name__ == "ResnetBlock2D":
+                module.conv2.weight.zero_()
+                module.conv2.bias.zero_()
+        _carry(vae.encoder.conv_in, kernel, constant)
+        _gather(vae.encoder.conv_out, gain)
+        vae.encoder.conv_out.bias[4:] = -30.0  # log variance of the posterior: none
+        identity = torch.zeros(4, 4, 3, 3)
+        identity[:, :, 1, 1] = torch.eye(4)
+        _carry(vae.decoder.conv_in, identity, constant)
+        _gather(vae.decoder.conv_out, gain, back)
+    return vae.requires_grad_(False)
+
+
+def _carry(conv: torch.nn.Conv2d, kernel: torch.Tensor, constant: float) -> None:
+    """Write x = kernel * input as (x, -x) into channels 0-7 and (c, -c) into 8-9."""
+    conv.weight.zero_()
+    conv.bias.zero_()
+    conv.weight[0:4], conv.weight[4:8] = kernel, -kernel
+    conv.bias[8], conv.bias[9] = constant, -constant
+
+
+def _gather(conv: torch.nn.Conv2d, gain: float, kernel: torch.Tensor | None = None) -> None:
+    """Read the pairs back: kernel * (silu(x / gain) - silu(-x / gain)) * gain."""
+    conv.weight.zero_()
+    conv.bias.zero_()
+    if kernel is None:
+        kernel = torch.zeros(4, 4, 3, 3)
+        kernel[:, :, 1, 1] = torch.eye(4)
+    conv.weight[: kernel.shape[0], 0:4], conv.weight[: kernel.shape[0], 4:8] = kernel * gain, -kernel * gain
+
+
+def tokenizer(folder: Path) -> CLIPTokenizer:
+    """A CLIP tokenizer of bytes and the prompts' own words; its two files go to `folder`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    letters = _byte_letters()
+    vocabulary, merges = [*letters, *(c + "</w>" for c in letters)], []
+    for word in WORDS:
+        parts = [*word[:-1], word[-1] + "</w>"]
+        while len(parts) > 1:
+            joined = parts[0] + parts[1]
+            if f"{parts[0]} {parts[1]}" not in merges:
+                merges.append(f"{parts[0]} {parts[1]}")
+            if joined not in vocabulary:
+                vocabulary.append(joined)
+            parts = [joined, *parts[2:]]
+    vocabulary += ["<|startoftext|>", "<|endoftext|>"]
+    (folder / "vocab.json").write_text(json.dumps({token: i for i, token in enumerate(vocabulary)}))
+    (folder / "merges.txt").write_text("#version: 0.2\n" + "\n".join(merges) + "\n")
+    return CLIPTokenizer.from_pretrained(folder, model_max_length=TEXT_LENGTH)
+
+
+def _byte_letters() -> list[str]:
+    """The printable letter that byte-level BPE writes for each byte."""
+    printable = [*range(ord("!"), ord("~") + 1), *range(0xA1, 0xAD), *range(0xAE, 0x100)]
+    others = [b for b in range(256) if b not in printable]
+    letters = {b: chr(b) for b in printable} | {b: chr(256 + i) for i, b in enumerate(others)}
+    return [letters[b] for b in range(256)]
+
+
+def text_encoder(tokens: CLIPTokenizer) -> CLIPTextModel:
+    return CLIPTextModel(
+        CLIPTextConfig(
+            vocab_size=len(tokens),
+            hidden_size=64,
+            intermediate_size=128,
+            projection_dim=64,
+            num_hidden_layers=2,
+            num_attention_heads=2,
+            max_position_embeddings=TEXT_LENGTH,
+            bos_token_id=tokens.bos_token_id,
+            eos_token_id=tokens.eos_token_id,
+            pad_token_id=tokens.pad_token_id,
+        )
+    )
+
+
+def unet(channels: tuple[int, ...] = (32, 64, 96), layers: int = 1) -> UNet2DConditionModel:
+    """Mostly convolutional; attention (to the text and within the view) at the coarsest level only."""
+    levels = len(channels)
+    return UNet2DConditionModel(
+        sample_size=NATIVE,
+        in_channels=9,
+        out_channels=4,
+        down_block_types=("DownBlock2D",) * (levels - 1) + ("CrossAttnDownBlock2D",),
+        up_block_types=("CrossAttnUpBlock2D",) + ("UpBlock2D",) * (levels - 1),
+        block_out_channels=channels,
+        layers_per_block=layers,
+        cross_attention_dim=64,
+        attention_head_dim=4,
+        norm_num_groups=8,
+        use_linear_projection=True,
+    )
+
+
+def scheduler() -> DDIMScheduler:
+    return DDIMScheduler(
+        beta_start=0.00085,
+        beta_end=0.012,
+        beta_schedule="scaled_linear",
+        prediction_type="v_prediction",
+        clip_sample=False,
+        set_alpha_to_one=True,
+        steps_offset=1,
+        timestep_spacing="trailing",
+    )

@@ -1,0 +1,182 @@
+"""Train the embedded prior: `python priors/tiny/train.py --steps 20000` (or `make prior`).
+
+Resumable and seeded: step k draws its images, masks, noise and timesteps from (seed, k) alone, so an interrupted run
+continues as the unbroken one would. The folder this file stands in receives an ordinary diffusers inpainting pipeline
+in half precision, averaged over the last steps (EMA).
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import sys
+import time
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+sys.path[:0] = [str(HERE.parent.parent), str(HERE)]
+
+import build  # noqa: E402
+import images  # noqa: E402
+import numpy as np  # noqa: E402
+import torch  # noqa: E402
+from diffusers import StableDiffusionInpaintPipeline  # noqa: E402
+from torch import Tensor, nn  # noqa: E402
+
+from reffusion.trace import generator, load_checkpoint, save_checkpoint, seed_for  # noqa: E402
+
+POOL = 2000  # images held in memory; step k replaces the oldest
+SMALL, LARGE = (
+    (32, 24),
+    (64, 8),
+)  # (crop side in px, batch): small crops three steps of four, whole native ones the fourth
+PEAK_RATE, WARMUP, EMA = 1e-3, 200, 0.999
+OUTSIDE = 0.2  # weight of the loss on pixels the network is given anyway
+
+
+class Pool:
+    """The last POOL training images; `advance` adds image number `index`."""
+
+    def __init__(self, seed: int, step: int):
+        self.seed, self.items, self.captions = seed, [None] * POOL, [""] * POOL
+        for index in range(step, step + POOL):
+            self.advance(index)
+
+    def advance(self, index: int) -> None:
+        self.items[index % POOL], self.captions[index % POOL] = images.image(self.seed, index)
+
+    def batch(self, rng: np.random.Generator, side: int, count: int) -> tuple[Tensor, Tensor, list[str]]:
+        """Crops [B, 3, side, side] in [-1, 1], masks [B, 1, side, side] (1 = repaint), captions."""
+        crops, masks, captions = [], [], []
+        for index in rng.integers(0, POOL, count):
+            picture = self.items[index]
+            if side == build.NATIVE and rng.random() < 0.5:  # the whole view at native size
+                crop = picture.reshape(side, 2, side, 2, 3).mean((1, 3))
+            else:
+                top, left = rng.integers(0, images.SIZE - side + 1, 2)
+                crop = picture[top : top + side, left : left + side]
+            crops.append(crop[:, ::-1] if rng.random() < 0.5 else crop)
+            masks.append(images.mask(rng, side))
+            captions.append(self.captions[index] if rng.random() < 0.5 else "")
+        pixels = torch.from_numpy(np.stack(crops).astype(np.float32) / 127.5 - 1).permute(0, 3, 1, 2)
+        return pixels, torch.from_numpy(np.stack(masks)[:, None].astype(np.float32)), captions
+
+
+class Model(nn.Module):
+    """What is trained: UNet and text encoder; the VAE is exact by construction."""
+
+    def __init__(self, seed: int):
+        super().__init__()
+        torch.manual_seed(seed)
+        self.tokens = build.tokenizer(HERE / "tokenizer")
+        self.unet, self.text = build.unet(), build.text_encoder(self.tokens)
+
+    def forward(self, noisy: Tensor, t: Tensor, condition: Tensor, captions: list[str]) -> Tensor:
+        ids = self.tokens(captions, padding="max_length", truncation=True, return_tensors="pt").input_ids
+        words = self.text(ids.to(noisy.device)).last_hidden_state
+        return self.unet(torch.cat([noisy, condition], 1), t, words).sample
+
+
+def loss(
+    model: Model, vae: nn.Module, alphas: Tensor, batch: tuple[Tensor, Tensor, list[str]], random: torch.Generator
+):
+    """Mean squared error of v = sqrt(a) eps - sqrt(1 - a) z, hole pixels at weight 1, given ones at OUTSIDE."""
+    pixels, masks, captions = batch
+    with torch.no_grad():
+        clean = vae.encode(pixels).latent_dist.mean
+        given = vae.encode(pixels * (masks < 0.5)).latent_dist.mean
+    t = torch.randint(0, len(alphas), (len(pixels),), generator=random)
+    noise = torch.randn(clean.shape, generator=random)
+    a = alphas[t].view(-1, 1, 1, 1)
+    noisy, target = a.sqrt() * clean + (1 - a).sqrt() * noise, a.sqrt() * noise - (1 - a).sqrt() * clean
+    predicted = model(noisy, t, torch.cat([masks, given], 1), captions)
+    weight = OUTSIDE + (1 - OUTSIDE) * masks
+    return (weight * (predicted - target) ** 2).sum() / (weight.sum() * clean.shape[1])
+
+
+def rate(step: int, steps: int) -> float:
+    """Warm-up, constant, and a cosine over the last fifth."""
+    ending = max((step - 0.8 * steps) / (0.2 * steps), 0.0)
+    return PEAK_RATE * min((step + 1) / WARMUP, 1.0) * (0.5 + 0.5 * math.cos(math.pi * min(ending, 1.0))) + 1e-6
+
+
+def validation(model: Model, vae: nn.Module, alphas: Tensor, seed: int) -> float:
+    """The loss on fixed held-out images, masks, noise and timesteps."""
+    rng = np.random.default_rng(seed_for(seed, "validation"))
+    pool = Pool.__new__(Pool)
+    drawn = [images.image(seed, k, held_out=True) for k in range(32)]
+    pool.items, pool.captions = ([d[i] for d in drawn] * (POOL // 32 + 1) for i in (0, 1))
+    with torch.no_grad():
+        return float(loss(model, vae, alphas, pool.batch(rng, build.NATIVE, 32), generator(seed, "validation noise")))
+
+
+def export(model: Model, average: dict[str, Tensor]) -> None:
+    """Write the diffusers folder with the averaged weights in half precision."""
+    final = Model(0)
+    final.load_state_dict(average)
+    pipeline = StableDiffusionInpaintPipeline(
+        vae=build.linear_vae(),
+        text_encoder=final.text,
+        tokenizer=final.tokens,
+        unet=final.unet,
+        scheduler=build.scheduler(),
+        safety_checker=None,
+        feature_extractor=None,
+        requires_safety_checker=False,
+    )
+    pipeline.to(dtype=torch.float16).save_pretrained(HERE)
+    (HERE / "tokenizer" / "tokenizer.json").unlink(missing_ok=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--steps", type=int, default=20000, help="training steps in all")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--work", type=Path, default=HERE.parent.parent / "runs" / "prior", help="checkpoint and log")
+    parser.add_argument("--export-every", type=int, default=500, help="steps between exports of the folder")
+    parser.add_argument("--threads", type=int, default=os.cpu_count())
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    options.work.mkdir(parents=True, exist_ok=True)
+
+    model, vae = Model(options.seed), build.linear_vae()
+    alphas = build.scheduler().alphas_cumprod
+    optimiser = torch.optim.AdamW(model.parameters(), lr=PEAK_RATE, weight_decay=0.01, betas=(0.9, 0.99))
+    average, start = {k: v.clone() for k, v in model.state_dict().items()}, 0
+    if (state := load_checkpoint(options.work)) is not None:
+        model.load_state_dict(state["model"])
+        optimiser.load_state_dict(state["optimiser"])
+        average, start = state["average"], state["step"]
+    pool, began = Pool(options.seed, start), time.time()
+    for step in range(start, options.steps):
+        rng = np.random.default_rng(seed_for(options.seed, "batch", step))
+        side, count = LARGE if step % 4 == 3 else SMALL
+        for group in optimiser.param_groups:
+            group["lr"] = rate(step, options.steps)
+        error = loss(model, vae, alphas, pool.batch(rng, side, count), generator(options.seed, "noise", step))
+        if not torch.isfinite(error):
+            raise FloatingPointError(f"training loss is {error.item()} at step {step}")
+        optimiser.zero_grad(set_to_none=True)
+        error.backward()
+        nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+        optimiser.step()
+        keep = min(EMA, (step + 1) / (step + 10))
+        with torch.no_grad():
+            for name, value in model.state_dict().items():
+                average[name].lerp_(value, 1 - keep) if value.is_floating_point() else average[name].copy_(value)
+        pool.advance(step + POOL)
+        if step % 100 == 99 or step == options.steps - 1:
+            live = {k: v.clone() for k, v in model.state_dict().items()}
+            model.load_state_dict(average)
+            held = validation(model, vae, alphas, options.seed)
+            model.load_state_dict(live)
+            print(f"{step + 1} loss {error.item():.4f} held-out {held:.4f} {time.time() - began:.0f} s", flush=True)
+            state = {"model": live, "optimiser": optimiser.state_dict(), "average": average, "step": step + 1}
+            save_checkpoint(options.work, state)
+        if step % options.export_every == options.export_every - 1 or step == options.steps - 1:
+            export(model, average)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,153 @@
+"""The prior: exact VAE, conversions between eps, v and z_0, sampling, and LoRA files that diffusers reads."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from reffusion import prior as P
+from reffusion.trace import generator
+
+TINY = Path(__file__).resolve().parent.parent / "priors" / "tiny"
+
+
+@pytest.fixture
+def tiny():
+    return P.load_prior(TINY)
+
+
+def pictures(count=2, side=32, seed=0):
+    return torch.rand(count, 3, side, side, generator=generator(seed, "pictures")) * 2 - 1
+
+
+def half_masks(count=2, side=32):
+    masks = torch.zeros(count, 1, side, side)
+    masks[:, :, :, side // 2 :] = 1
+    return masks
+
+
+def test_sizes_are_read_from_the_folder(tiny):
+    assert (tiny.factor, tiny.native_size, tiny.prediction_type) == (1, 64, "v_prediction")
+
+
+def test_vae_round_trip_is_exact(tiny):
+    images = pictures(2, 48)
+    assert (P.decode(tiny, P.encode(tiny, images)) - images).abs().max() < 3e-3
+
+
+def test_encoding_is_linear(tiny):
+    a, b = pictures(1, 24, 1), pictures(1, 24, 2)
+    middle = P.encode(tiny, (a + b) / 2)
+    assert torch.allclose(middle, (P.encode(tiny, a) + P.encode(tiny, b)) / 2, atol=3e-3)
+
+
+@pytest.mark.parametrize("kind", ["epsilon", "v_prediction"])
+def test_predictions_reproduce_the_noisy_latents(tiny, kind):
+    from dataclasses import replace
+
+    prior = replace(tiny, prediction_type=kind)
+    t, noise = torch.tensor([0, 999]), torch.randn(2, 4, 32, 32, generator=generator(0))
+    clean = P.encode(prior, pictures())
+    noisy = P.add_noise(prior, clean, noise, t)
+    text, condition = P.embed_text(prior, ["A photo of sks", ""]), P.conditioning(prior, pictures(), half_masks())
+    eps, x0 = P.predict(prior, noisy, t, condition, text)
+    assert torch.allclose(P.add_noise(prior, x0, eps, t), noisy, atol=1e-4)
+    target = P.training_target(prior, clean, noise, t)
+    a = P.abar(prior, t)
+    recovered = (
+        (noisy - (1 - a).sqrt() * target) / a.sqrt()
+        if kind == "epsilon"
+        else a.sqrt() * noisy - (1 - a).sqrt() * target
+    )
+    assert torch.allclose(recovered, clean, atol=2e-4)
+
+
+def test_conditioning_hides_what_lies_under_the_mask(tiny):
+    images, masks = pictures(), half_masks()
+    other = torch.where(masks > 0, torch.ones(()), images)
+    assert torch.equal(P.conditioning(tiny, images, masks), P.conditioning(tiny, other, masks))
+    images.requires_grad_(True)
+    assert not P.conditioning(tiny, images, masks).requires_grad
+
+
+def test_sampling_repeats_with_its_seed_and_is_finite(tiny):
+    text = P.embed_text(tiny, ["A photo of sks"] * 2)
+    run = lambda seed: P.sample(tiny, pictures(), half_masks(), text, 3, generator(seed))
+    first, again, other = run(0), run(0), run(1)
+    assert torch.equal(first, again) and not torch.equal(first, other)
+    assert torch.isfinite(first).all() and first.abs().max() <= 1
+
+
+def test_guidance_zero_is_the_conditional_prediction(tiny):
+    text, empty = P.embed_text(tiny, ["A photo of sks"]), P.embed_text(tiny, [""])
+    noisy, t = torch.randn(1, 4, 16, 16, generator=generator(3)), torch.tensor([500])
+    condition = P.conditioning(tiny, pictures(1, 16), half_masks(1, 16))
+    plain, _ = P.predict(tiny, noisy, t, condition, text)
+    without, _ = P.predict(tiny, noisy, t, condition, empty)
+    guided, _ = P.guided(tiny, noisy, t, condition, text, empty, 2.0)
+    assert torch.allclose(guided, 3 * plain - 2 * without, atol=1e-5)
+    with pytest.raises(ValueError, match="empty prompt"):
+        P.guided(tiny, noisy, t, condition, text, None, 1.0)
+
+
+@pytest.mark.parametrize("layers", ["attention", "attention+conv"])
+def test_saved_lora_gives_the_trained_epsilon_in_a_fresh_diffusers_pipeline(tiny, tmp_path, layers):
+    found = P.add_lora(tiny, rank=4, alpha=12.0, dropout=0.1, layers=layers, seed=0)
+    noise = generator(0, "lora")
+    for parameter in found["unet"] + found["text"]:
+        parameter.data += 0.05 * torch.randn(parameter.shape, generator=noise)
+    noisy, t = torch.randn(1, 4, 16, 16, generator=noise), torch.tensor([400])
+    condition = P.conditioning(tiny, pictures(1, 16), half_masks(1, 16))
+    trained = P.raw_prediction(tiny, noisy, t, condition, P.embed_text(tiny, ["A photo of sks"]))
+    P.save_lora(tiny, tmp_path)
+
+    from diffusers import StableDiffusionInpaintPipeline
+
+    pipe = StableDiffusionInpaintPipeline.from_pretrained(TINY, safety_checker=None, torch_dtype=torch.float32)
+    plain = P.load_prior(TINY)
+    base = P.raw_prediction(plain, noisy, t, condition, P.embed_text(plain, ["A photo of sks"]))
+    assert (trained - base).abs().max() > 1e-3
+    pipe.load_lora_weights(tmp_path)
+    fresh = P.make_prior(pipe.unet, pipe.vae, pipe.text_encoder, pipe.tokenizer, pipe.scheduler)
+    loaded = P.raw_prediction(fresh, noisy, t, condition, P.embed_text(fresh, ["A photo of sks"]))
+    assert (loaded - trained).abs().max() < 1e-5
+
+    merged = P.load_lora(plain, tmp_path)
+    again = P.raw_prediction(merged, noisy, t, condition, P.embed_text(merged, ["A photo of sks"]))
+    assert (again - trained).abs().max() < 2e-5
+
+
+def test_lora_state_round_trip(tiny):
+    found = P.add_lora(tiny, 2, 4.0, 0.0, "attention", 0)
+    state = P.lora_state(tiny)
+    for parameter in found["unet"] + found["text"]:
+        parameter.data += 1
+    P.load_lora_state(tiny, state)
+    assert all(torch.equal(a, b) for a, b in zip(state.values(), P.lora_state(tiny).values(), strict=True))
+
+
+def test_the_stock_pipeline_inpaints():
+    from diffusers import StableDiffusionInpaintPipeline
+    from PIL import Image
+
+    pipe = StableDiffusionInpaintPipeline.from_pretrained(TINY, safety_checker=None, torch_dtype=torch.float32)
+    pipe.set_progress_bar_config(disable=True)
+    image, mask = Image.new("RGB", (64, 64), (90, 120, 60)), Image.new("L", (64, 64), 255)
+    result = pipe("A photo of sks", image=image, mask_image=mask, height=64, width=64, num_inference_steps=2)
+    assert result.images[0].size == (64, 64)
+
+
+def test_clear_errors(tmp_path):
+    with pytest.raises(ValueError, match="no such folder"):
+        P.load_prior(tmp_path / "absent")
+    (tmp_path / "unet").mkdir()
+    with pytest.raises(ValueError, match="lacks vae"):
+        P.load_prior(tmp_path)
+    copy = tmp_path / "copy"
+    shutil.copytree(TINY, copy)
+    config = copy / "scheduler" / "scheduler_config.json"
+    config.write_text(json.dumps(json.loads(config.read_text()) | {"prediction_type": "sample"}))
+    with pytest.raises(ValueError, match="prediction_type"):
+        P.load_prior(copy)
