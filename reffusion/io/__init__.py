@@ -1,0 +1,48 @@
+"""Every file format the project reads or writes, as `load_*` and `save_*` pairs.
+
+Importing this package costs numpy and pillow only: torch comes in with the functions that return tensors.
+"""
+
+from .arrays import load_json, load_labels, save_json, save_labels
+from .images import image_size, load_exr, load_image, load_mask, save_exr, save_image, save_mask
+from .ply import load_ply, load_points, save_ply, save_points
+from .scene import (
+    load_given_references,
+    load_mask_sets,
+    load_raw_masks,
+    load_references,
+    load_scene,
+    load_test_masks,
+    load_views,
+    save_mask_sets,
+    save_references,
+    save_scene,
+)
+
+__all__ = [
+    "image_size",
+    "load_exr",
+    "load_given_references",
+    "load_image",
+    "load_json",
+    "load_labels",
+    "load_mask",
+    "load_mask_sets",
+    "load_ply",
+    "load_points",
+    "load_raw_masks",
+    "load_references",
+    "load_scene",
+    "load_test_masks",
+    "load_views",
+    "save_exr",
+    "save_image",
+    "save_json",
+    "save_labels",
+    "save_mask",
+    "save_mask_sets",
+    "save_ply",
+    "save_points",
+    "save_references",
+    "save_scene",
+]

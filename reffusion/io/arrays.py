@@ -1,0 +1,49 @@
+"""JSON and label arrays."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+def save_json(path: Path, value: Any) -> None:
+    """Write `value` indented, creating the folder. Floats keep every digit; NaN and infinity raise ValueError."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(value, indent=2, allow_nan=False) + "\n")
+
+
+def load_json(path: Path) -> Any:
+    """The value in a JSON file; ValueError naming the file where it is absent or not JSON."""
+    try:
+        return json.loads(Path(path).read_text())
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such file") from None
+    except ValueError as error:
+        raise ValueError(f"{path}: not valid JSON ({error})") from error
+
+
+def save_labels(path: Path, labels: Tensor | np.ndarray) -> None:
+    """Write bool [N] (True = masked Gaussian) as `.npy`."""
+    array = np.asarray(labels)
+    if array.dtype != np.bool_ or array.ndim != 1:
+        raise ValueError(f"{path}: labels must be bool [N], got {array.dtype} {list(array.shape)}")
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "wb") as file:
+        np.save(file, array)
+
+
+def load_labels(path: Path) -> Tensor:
+    """bool [N] on the CPU, True = masked Gaussian."""
+    import torch
+
+    array = np.load(path, allow_pickle=False)
+    if array.dtype != np.bool_ or array.ndim != 1:
+        raise ValueError(f"{path}: labels must be bool [N], got {array.dtype} {list(array.shape)}")
+    return torch.from_numpy(array)

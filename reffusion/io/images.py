@@ -1,0 +1,139 @@
+"""Pictures, masks and depth maps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageOps, UnidentifiedImageError
+
+
+def image_size(path: Path, upright: bool = False) -> tuple[int, int]:
+    """(width, height) in pixels, from the file's header alone. `upright` as in `load_image`."""
+    try:
+        with Image.open(path) as image:
+            width, height = image.size
+            turned = upright and image.getexif().get(0x0112, 1) >= 5
+            return (height, width) if turned else (width, height)
+    except (OSError, UnidentifiedImageError) as error:
+        raise ValueError(f"{path}: not a readable image ({error})") from error
+
+
+def load_image(path: Path, upright: bool = False) -> np.ndarray:
+    """Read an 8-bit picture as uint8 [H, W, 3], sRGB.
+
+    Grey becomes RGB and an alpha channel is dropped. The camera's orientation tag is ignored, because poses
+    that come with photographs refer to the stored pixels; `upright=True` obeys it.
+
+    Raises:
+        ValueError: naming the file, where it is absent, cut off, or not an 8-bit picture.
+    """
+    try:
+        with Image.open(path) as image:
+            if image.mode[0] in "IF":
+                raise ValueError(f"{path}: {image.mode} pixels; save it as an 8-bit picture")
+            if upright:
+                image = ImageOps.exif_transpose(image)
+            return np.array(image.convert("RGB"))
+    except (OSError, UnidentifiedImageError) as error:
+        raise ValueError(f"{path}: not a readable image ({error})") from error
+
+
+def save_image(path: Path, array: np.ndarray) -> None:
+    """Write [H, W, 3] (or [H, W]) as 8-bit, creating the folder. Floats are in [0, 1] and are clipped and rounded.
+
+    Raises:
+        ValueError: where values are not finite, or the shape or type is none of these.
+    """
+    array = np.asarray(array)
+    if np.issubdtype(array.dtype, np.floating):
+        if not np.isfinite(array).all():
+            raise ValueError(f"{path}: the picture holds values that are not finite")
+        array = np.round(np.clip(array, 0.0, 1.0) * 255.0).astype(np.uint8)
+    if array.dtype != np.uint8 or not (array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3)):
+        raise ValueError(f"{path}: a picture is uint8 or float [H, W, 3], got {array.dtype} {list(array.shape)}")
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    # The fastest setting of the lossless coder: a third larger, four times quicker to write.
+    Image.fromarray(np.ascontiguousarray(array)).save(path, **({"compress_level": 1} if _is_png(path) else {}))
+
+
+def _is_png(path: Path) -> bool:
+    return Path(path).suffix.lower() == ".png"
+
+
+def load_mask(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
+    """Read a mask as bool [H, W], True = masked.
+
+    Understood are files of {0, 1}, of {0, 255} (cut at 128, so lossy and soft edges do no harm), one-bit files
+    and palettes (any entry but the first). Of colours the brightest channel counts; alpha is ignored.
+
+    Args:
+        size: (height, width) to resize to, nearest neighbour; None keeps the file's.
+
+    Raises:
+        ValueError: naming the file, where it is unreadable or its values are neither {0, 1} nor {0, 255}.
+    """
+    try:
+        with Image.open(path) as image:
+            mode = image.mode
+            array = np.array(image)
+    except (OSError, UnidentifiedImageError) as error:
+        raise ValueError(f"{path}: not a readable mask ({error})") from error
+    if array.ndim == 3:
+        array = array[..., : 3 if array.shape[2] >= 3 else 1].max(axis=2)
+    if mode == "P" or array.dtype == np.bool_ or array.max() <= 1:
+        mask = array > 0
+    elif array.max() >= 128:
+        mask = array >= (32768 if array.max() > 255 else 128)
+    else:
+        raise ValueError(
+            f"{path}: its values reach {array.max()}, neither 0/1 nor 0/255; write 255 where the object is, 0 elsewhere"
+        )
+    return mask if size is None else resize_nearest(mask, size)
+
+
+def resize_nearest(array: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """[H, W, ...] -> [*size, ...]: each new pixel takes the old one its centre falls into."""
+    rows, columns = (
+        np.minimum(((np.arange(new) + 0.5) * old / new).astype(int), old - 1)
+        for new, old in zip(size, array.shape[:2], strict=True)
+    )
+    return array[rows[:, None], columns[None, :]]
+
+
+def save_mask(path: Path, mask: np.ndarray) -> None:
+    """Write bool [H, W] as 0/255."""
+    mask = np.asarray(mask)
+    if mask.dtype != np.bool_ or mask.ndim != 2:
+        raise ValueError(f"{path}: a mask is bool [H, W], got {mask.dtype} {list(mask.shape)}")
+    save_image(path, mask.astype(np.uint8) * 255)
+
+
+def save_exr(path: Path, depth: np.ndarray) -> None:
+    """Write float32 [H, W] (depths: camera z) losslessly to one channel `Z` of an OpenEXR file."""
+    import OpenImageIO as oiio
+
+    depth = np.ascontiguousarray(depth, np.float32)
+    if depth.ndim != 2:
+        raise ValueError(f"{path}: one channel [H, W] expected, got {list(depth.shape)}")
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    spec = oiio.ImageSpec(depth.shape[1], depth.shape[0], 1, oiio.FLOAT)
+    spec.channelnames = ("Z",)
+    spec.attribute("compression", "zip")
+    file = oiio.ImageOutput.create(str(path))
+    if file is None or not file.open(str(path), spec) or not file.write_image(depth[..., None]) or not file.close():
+        raise ValueError(f"{path}: cannot be written ({file.geterror() if file else oiio.geterror()})")
+
+
+def load_exr(path: Path) -> np.ndarray:
+    """float32 [H, W], the first channel of an OpenEXR file."""
+    import OpenImageIO as oiio
+
+    file = oiio.ImageInput.open(str(path))
+    if file is None:
+        raise ValueError(f"{path}: not a readable EXR file ({oiio.geterror()})")
+    pixels = file.read_image(oiio.FLOAT)
+    file.close()
+    if pixels is None:
+        raise ValueError(f"{path}: cut off ({file.geterror()})")
+    return np.ascontiguousarray(pixels.reshape(pixels.shape[0], pixels.shape[1], -1)[..., 0])

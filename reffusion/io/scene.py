@@ -1,0 +1,130 @@
+"""The artifacts of the stages: scenes, views, masks and references.
+
+Layout of the folder `poses` leaves behind: images/<view>.png, masks/<view>.png, test_masks/<view>.png,
+references/<view>.png, sparse/0/*.bin, transform.json, views.json.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .arrays import load_json, save_json
+from .colmap import ModelCamera, ModelImage, load_cameras, load_images, load_model_points, save_model
+from .images import load_image, load_mask, save_image, save_mask
+
+if TYPE_CHECKING:
+    from reffusion.types import MaskSet, Reference, Scene
+
+PIXEL_CLASSES = ("raw", "consistent", "never_seen", "invent")
+
+
+def save_scene(poses_dir: Path, scene: Scene) -> None:
+    """Write sparse/0/*.bin (PINHOLE, normalised frame), transform.json and views.json; no pictures."""
+    poses_dir = Path(poses_dir)
+    cameras, images = {}, {}
+    for identity, camera in enumerate(scene.cameras.values(), start=1):
+        params = (camera.fx, camera.fy, camera.cx, camera.cy)
+        cameras[identity] = ModelCamera("PINHOLE", camera.width, camera.height, params)
+        images[identity] = ModelImage(f"{camera.name}.png", identity, camera.world_to_camera)
+    save_model(poses_dir / "sparse" / "0", cameras, images, scene.points, scene.point_colors)
+    similarity = {"scale": float(scene.similarity.scale), "offset": [float(v) for v in scene.similarity.offset]}
+    save_json(poses_dir / "transform.json", similarity)
+    views = {"train": list(scene.train), "test": list(scene.test), "clean": sorted(scene.clean)}
+    save_json(poses_dir / "views.json", views)
+
+
+def load_scene(poses_dir: Path) -> Scene:
+    """The scene that `poses` wrote, in the normalised frame. ValueError naming the file where one is wrong."""
+    from reffusion.types import Camera, Scene, Similarity
+
+    poses_dir = Path(poses_dir)
+    model = poses_dir / "sparse" / "0"
+    for path in (model / f"{stem}.bin" for stem in ("cameras", "images", "points3D")):
+        if not path.is_file():
+            raise ValueError(f"{path}: missing; {poses_dir} is no finished `poses` folder")
+    intrinsics, cameras = load_cameras(model / "cameras.bin"), {}
+    for image in load_images(model / "images.bin").values():
+        name, shared = image.name.rsplit(".", 1)[0], intrinsics[image.camera_id]
+        if shared.model != "PINHOLE":
+            raise ValueError(f"{model / 'cameras.bin'}: {shared.model}; `poses` writes PINHOLE cameras only")
+        cameras[name] = Camera(name, shared.width, shared.height, *shared.params, image.world_to_camera)
+    points = load_model_points(model / "points3D.bin")
+    views, similarity = load_json(poses_dir / "views.json"), load_json(poses_dir / "transform.json")
+    return Scene(
+        cameras={name: cameras[name] for name in sorted(cameras)},
+        train=tuple(views["train"]),
+        test=tuple(views["test"]),
+        clean=frozenset(views["clean"]),
+        points=points.positions,
+        point_colors=points.colors,
+        similarity=Similarity(similarity["scale"], np.array(similarity["offset"], np.float64)),
+    )
+
+
+def load_views(poses_dir: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
+    """View name -> uint8 [H, W, 3]."""
+    return {name: load_image(Path(poses_dir) / "images" / f"{name}.png") for name in names}
+
+
+def load_raw_masks(poses_dir: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
+    """View name -> bool [H, W], True = the object; only the views that have a mask."""
+    paths = {name: Path(poses_dir) / "masks" / f"{name}.png" for name in names}
+    return {name: load_mask(path) for name, path in paths.items() if path.is_file()}
+
+
+def load_test_masks(poses_dir: Path) -> dict[str, np.ndarray]:
+    """Test view name -> bool [H, W], True = where the object would be seen; empty where the scene has none."""
+    return {path.stem: load_mask(path) for path in sorted((Path(poses_dir) / "test_masks").glob("*.png"))}
+
+
+def load_given_references(poses_dir: Path) -> dict[str, np.ndarray]:
+    """View name -> uint8 [H, W, 3]: the completed views that the scene brings; empty where it brings none."""
+    return {path.stem: load_image(path) for path in sorted((Path(poses_dir) / "references").glob("*.png"))}
+
+
+def save_mask_sets(masks_dir: Path, sets: Mapping[str, MaskSet]) -> None:
+    """Write raw/, consistent/, never_seen/ and invent/<view>.png."""
+    for name, mask_set in sets.items():
+        for kind in PIXEL_CLASSES:
+            save_mask(Path(masks_dir) / kind / f"{name}.png", getattr(mask_set, kind))
+
+
+def load_mask_sets(masks_dir: Path, names: Iterable[str]) -> dict[str, MaskSet]:
+    """View name -> the pixel classes that `masks` wrote."""
+    from reffusion.types import MaskSet
+
+    load = lambda kind, name: load_mask(Path(masks_dir) / kind / f"{name}.png")
+    return {name: MaskSet(*(load(kind, name) for kind in PIXEL_CLASSES)) for name in names}
+
+
+def save_references(reference_dir: Path, references: Sequence[Reference]) -> None:
+    """Write references/<view>.png and masks/<view>.png."""
+    for reference in references:
+        name = f"{reference.camera.name}.png"
+        save_image(Path(reference_dir) / "references" / name, reference.image)
+        save_mask(Path(reference_dir) / "masks" / name, reference.mask)
+
+
+def load_references(reference_dir: Path, scene: Scene) -> list[Reference]:
+    """The references and their masks, sorted by view name.
+
+    Raises:
+        ValueError: naming the file, where a reference belongs to no view, has another size than its view, or
+            has no mask.
+    """
+    from reffusion.types import Reference
+
+    found = []
+    for path in sorted((Path(reference_dir) / "references").glob("*.png")):
+        camera = scene.cameras.get(path.stem)
+        if camera is None:
+            raise ValueError(f"{path}: the scene has no view '{path.stem}'")
+        image, mask = load_image(path), load_mask(Path(reference_dir) / "masks" / path.name)
+        if image.shape[:2] != (camera.height, camera.width) or mask.shape != image.shape[:2]:
+            raise ValueError(f"{path}: it and its mask must have their view's size {camera.width}x{camera.height}")
+        found.append(Reference(camera, image, mask))
+    return found
