@@ -1,0 +1,313 @@
+"""Metrics against their definitions, written out again here, and at the edges: one pixel, constant, identical."""
+
+import hashlib
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from reffusion import lpips, metrics
+from reffusion.metrics import Box, mask_box
+
+
+def pair(height, width, seed=0, noise=0.1):
+    rng = np.random.default_rng(seed)
+    truth = rng.random((height, width, 3))
+    return np.clip(truth + noise * rng.standard_normal(truth.shape), 0, 1), truth
+
+
+# --- box
+
+
+def test_box_grows_by_a_tenth_of_its_extent_on_each_side():
+    mask = np.zeros((100, 200), bool)
+    mask[40:60, 50:80] = True  # 20 rows, 30 columns
+    assert mask_box(mask, 0.1) == Box(47, 38, 83, 62)
+    assert mask_box(mask, 0.0) == Box(50, 40, 80, 60)
+
+
+def test_box_is_rounded_outwards_and_clipped_at_the_border():
+    mask = np.zeros((30, 30), bool)
+    mask[0:5, 27:30] = True
+    assert mask_box(mask, 0.1) == Box(26, 0, 30, 6)
+    assert mask_box(np.ones((7, 9), bool), 5.0) == Box(0, 0, 9, 7)
+
+
+def test_an_empty_mask_has_no_box_and_one_pixel_has_one():
+    assert mask_box(np.zeros((4, 5), bool)) is None
+    mask = np.zeros((4, 5), bool)
+    mask[2, 3] = True
+    assert mask_box(mask, 0.0) == Box(3, 2, 4, 3)
+    assert mask_box(np.ones((1, 1), bool), 0.1) == Box(0, 0, 1, 1)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(0, 1))
+def test_box_holds_the_mask_and_lies_in_the_image(seed, dilation):
+    rng = np.random.default_rng(seed)
+    mask = rng.random((int(rng.integers(1, 20)), int(rng.integers(1, 20)))) < 0.2
+    box = mask_box(mask, dilation)
+    if box is None:
+        assert not mask.any()
+    else:
+        assert box.crop(mask).sum() == mask.sum()
+        assert 0 <= box.left < box.right <= mask.shape[1] and 0 <= box.top < box.bottom <= mask.shape[0]
+
+
+# --- PSNR
+
+
+def test_psnr_of_a_known_error():
+    truth = np.full((5, 7, 3), 0.5)
+    assert metrics.psnr(truth + 0.1, truth) == pytest.approx(20.0)
+    assert metrics.psnr(np.full((1, 1, 3), 1, np.uint8), np.zeros((1, 1, 3), np.uint8)) == pytest.approx(48.1308, 1e-5)
+    assert metrics.psnr(truth, truth) == math.inf
+
+
+def test_a_mean_counts_an_identical_view_as_the_cap_and_skips_what_is_missing():
+    assert metrics.mean([math.inf, 20.0, None]) == 60.0
+    assert metrics.mean([0.25, 0.75]) == 0.5
+    assert metrics.mean([None, None]) is None and metrics.mean([]) is None
+
+
+# --- SSIM
+
+
+def ssim_by_definition(x, y):
+    """Wang et al.: a window of 11 px at every place where it fits, one channel after another."""
+    line = np.exp(-0.5 * ((np.arange(11) - 5) / 1.5) ** 2)
+    weight = np.outer(line, line) / line.sum() ** 2
+    values = []
+    for channel in range(3):
+        for i in range(x.shape[0] - 10):
+            for j in range(x.shape[1] - 10):
+                a, b = (z[i : i + 11, j : j + 11, channel] for z in (x, y))
+                ma, mb = (weight * a).sum(), (weight * b).sum()
+                va, vb = (weight * (a - ma) ** 2).sum(), (weight * (b - mb) ** 2).sum()
+                cov = (weight * (a - ma) * (b - mb)).sum()
+                c1, c2 = 0.01**2, 0.03**2
+                values.append((2 * ma * mb + c1) * (2 * cov + c2) / ((ma**2 + mb**2 + c1) * (va + vb + c2)))
+    return np.mean(values)
+
+
+def test_ssim_equals_its_definition_over_the_valid_region():
+    image, truth = pair(17, 14)
+    assert metrics.ssim(image, truth) == pytest.approx(ssim_by_definition(image, truth), abs=1e-10)
+
+
+def test_ssim_edges():
+    image, truth = pair(11, 11)
+    assert metrics.ssim(image, truth) == pytest.approx(ssim_by_definition(image, truth), abs=1e-10)
+    assert metrics.ssim(truth, truth) == pytest.approx(1.0)
+    black, white = np.zeros((12, 12, 3)), np.ones((12, 12, 3))
+    assert metrics.ssim(black, white) == pytest.approx(1e-4 / (1 + 1e-4))
+    with pytest.raises(ValueError, match="11 px"):
+        metrics.ssim(image[:10], truth[:10])
+
+
+# --- FLIP
+
+
+def test_flip_is_zero_for_identical_one_for_the_worst_and_grows_between():
+    image, truth = pair(32, 32, noise=0.02)
+    worse, _ = pair(32, 32, noise=0.3)
+    assert metrics.flip(truth, truth) == 0.0
+    assert 0 < metrics.flip(image, truth) < metrics.flip(worse, truth) < 1
+    black, white = np.zeros((40, 40, 3)), np.ones((40, 40, 3))
+    assert 0.9 < metrics.flip(white, black) <= 1.0
+
+
+def test_flip_of_one_pixel_and_of_a_view_into_a_larger_array():
+    black, white = np.zeros((1, 1, 3), np.uint8), np.full((1, 1, 3), 255, np.uint8)
+    assert metrics.flip(black, black) == 0.0 < metrics.flip(white, black)
+    image, truth = pair(40, 40)
+    window = Box(5, 7, 30, 22)
+    copies = window.crop(image).copy(), window.crop(truth).copy()
+    assert metrics.flip(window.crop(image), window.crop(truth)) == metrics.flip(*copies)
+
+
+# --- what every metric refuses
+
+
+@pytest.mark.parametrize("metric", [metrics.psnr, metrics.ssim, metrics.flip])
+def test_bad_images_are_refused(metric):
+    image, truth = pair(16, 16)
+    for wrong, message in [
+        (image[:, :15], "one size"),
+        (image[..., :1], "one size"),
+        (np.full_like(image, np.nan), r"\[0, 1\]"),
+        (image * 255, r"\[0, 1\]"),
+        ((image * 255).astype(np.int32), "uint8 or float"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            metric(wrong, truth)
+    with pytest.raises(ValueError, match="at least one pixel"):
+        metric(image[:0], truth[:0])
+
+
+def test_bytes_and_floats_score_alike():
+    image, truth = ((255 * x).round().astype(np.uint8) for x in pair(20, 20))
+    for metric in (metrics.psnr, metrics.ssim, metrics.flip):
+        assert metric(image, truth) == pytest.approx(metric(image / 255, truth / 255), rel=1e-6)
+
+
+# --- LPIPS
+
+
+def random_states(net, seed=0):
+    """A backbone with torchvision's keys and linear weights with the published ones', random."""
+    generator = torch.Generator().manual_seed(seed)
+    shapes = {
+        "alex": {0: (64, 3, 11), 3: (192, 64, 5), 6: (384, 192, 3), 8: (256, 384, 3), 10: (256, 256, 3)},
+        "vgg": dict(
+            zip(
+                (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28),
+                [
+                    *[(64, 3, 3), (64, 64, 3), (128, 64, 3), (128, 128, 3), (256, 128, 3)],
+                    *[(256, 256, 3), (256, 256, 3), (512, 256, 3)],
+                    *[(512, 512, 3)] * 5,
+                ],
+                strict=True,
+            )
+        ),
+    }[net]
+    backbone = {"classifier.1.weight": torch.zeros(2, 2)}
+    for index, (out, into, kernel) in shapes.items():
+        spread = (2 / (into * kernel**2)) ** 0.5
+        backbone[f"features.{index}.weight"] = spread * torch.randn(out, into, kernel, kernel, generator=generator)
+        backbone[f"features.{index}.bias"] = 0.1 * torch.randn(out, generator=generator)
+    widths = {"alex": (64, 192, 384, 256, 256), "vgg": (64, 128, 256, 512, 512)}[net]
+    linear = {f"lin{i}.model.1.weight": torch.rand(1, c, 1, 1, generator=generator) for i, c in enumerate(widths)}
+    return backbone, linear
+
+
+def lpips_by_definition(net, backbone, linear, images):
+    """The formula, layer by layer with functional calls, in float64; images [H, W, 3] in [0, 1]."""
+    F = torch.nn.functional
+    steps = {
+        "alex": [(0, 4, 2), "tap", 3, (3, 1, 2), "tap", 3, (6, 1, 1), "tap", (8, 1, 1), "tap", (10, 1, 1), "tap"],
+        "vgg": [
+            *[(0, 1, 1), (2, 1, 1), "tap", 2, (5, 1, 1), (7, 1, 1), "tap", 2],
+            *[(10, 1, 1), (12, 1, 1), (14, 1, 1), "tap", 2, (17, 1, 1), (19, 1, 1), (21, 1, 1), "tap", 2],
+            *[(24, 1, 1), (26, 1, 1), (28, 1, 1), "tap"],
+        ],
+    }[net]
+    taps = []
+    for image in images:
+        x = torch.from_numpy(image).double()
+        x = (2 * x - 1 - torch.tensor([-0.030, -0.088, -0.188])) / torch.tensor([0.458, 0.448, 0.450])
+        x, found = x.permute(2, 0, 1)[None], []
+        for step in steps:
+            if step == "tap":
+                found.append(x[0] / torch.linalg.vector_norm(x[0], dim=0))
+            elif isinstance(step, int):
+                x = F.max_pool2d(x, step, 2)
+            else:
+                index, stride, padding = step
+                weight, bias = (backbone[f"features.{index}.{key}"].double() for key in ("weight", "bias"))
+                x = F.relu(F.conv2d(x, weight, bias, stride, padding))
+        taps.append(found)
+    total = 0.0
+    for i, (a, b) in enumerate(zip(*taps, strict=True)):
+        weight = linear[f"lin{i}.model.1.weight"].double().flatten()
+        total += torch.einsum("c,chw->hw", weight, (a - b) ** 2).mean().item()
+    return total
+
+
+@pytest.mark.parametrize("net", ["alex", "vgg"])
+def test_lpips_equals_its_formula_with_random_weights(net):
+    states = random_states(net)
+    model = lpips.from_states(net, *states)
+    image, truth = pair(45, 38)
+    value = metrics.lpips(image, truth, model)
+    assert value == pytest.approx(lpips_by_definition(net, *states, (image, truth)), rel=1e-4)
+    assert value > 0 and metrics.lpips(truth, truth, model) == 0.0
+    constant = np.full((40, 40, 3), 0.5)
+    assert metrics.lpips(constant, constant, model) == 0.0
+
+
+@pytest.mark.parametrize("net", ["alex", "vgg"])
+def test_lpips_takes_the_smallest_size_and_refuses_smaller(net):
+    model = lpips.from_states(net, *random_states(net))
+    size = lpips.SMALLEST[net]
+    image, truth = pair(size, size)
+    assert np.isfinite(metrics.lpips(image, truth, model))
+    with pytest.raises(ValueError, match=rf"at least {size} px a side; the image is {size}x{size - 1} px"):
+        metrics.lpips(image[1:], truth[1:], model)
+
+
+def test_lpips_weights_of_another_shape_are_refused_by_name():
+    backbone, linear = random_states("alex")
+    with pytest.raises(ValueError, match=r"no `features.3.bias`"):
+        lpips.from_states("alex", {k: v for k, v in backbone.items() if k != "features.3.bias"}, linear)
+    with pytest.raises(ValueError, match=r"lin1.model.1.weight` has shape \(1, 128, 1, 1\)"):
+        lpips.from_states("alex", backbone, random_states("vgg")[1])
+
+
+@pytest.fixture
+def no_caches(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    return tmp_path
+
+
+def test_lpips_without_weights_says_why(no_caches):
+    model, reason = lpips.load("vgg")
+    assert model is None and "no backbone" in reason and "vgg16-*.pth" in reason
+    model, reason = lpips.load("alex", no_caches / "given")
+    assert model is None and "given" in reason
+
+
+def test_lpips_weights_are_found_in_the_caches_and_checked(no_caches):
+    backbone, linear = random_states("alex")
+    hub, own = no_caches / "torch" / "hub" / "checkpoints", no_caches / "cache" / "reffusion" / "lpips"
+    hub.mkdir(parents=True)
+    own.mkdir(parents=True)
+    torch.save(backbone, hub / "raw.pth")
+    digest = hashlib.sha256((hub / "raw.pth").read_bytes()).hexdigest()
+    path = (hub / "raw.pth").rename(hub / f"alexnet-owt-{digest[:8]}.pth")
+    assert "no linear weights" in lpips.load("alex")[1]
+    torch.save(linear, own / "alex.pth")
+    model, reason = lpips.load("alex")
+    image, truth = pair(40, 40)
+    assert reason is None
+    assert metrics.lpips(image, truth, model) == metrics.lpips(
+        image, truth, lpips.from_states("alex", backbone, linear)
+    )
+    assert model.files[path.name] == digest[:16]
+
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+    with pytest.raises(ValueError, match="not the file its name says"):
+        lpips.load("alex")
+    path.unlink()
+    torch.save({"features.0.weight": torch.zeros(1)}, hub / "alexnet-own.pth")
+    with pytest.raises(ValueError, match=r"alexnet-own.pth.*cannot be used"):
+        lpips.load("alex")
+
+
+# --- a view's row
+
+
+def test_score_view_leaves_out_what_is_too_small():
+    image, truth = pair(40, 50)
+    models = {"vgg": lpips.from_states("vgg", *random_states("vgg"))}
+    row = metrics.score_view(image, truth, Box(3, 4, 13, 34), models)  # 10 px wide
+    assert tuple(row) == metrics.COLUMNS
+    assert row["psnr_box"] == metrics.psnr(image[4:34, 3:13], truth[4:34, 3:13])
+    assert row["ssim_box"] is None and row["lpips_vgg_box"] is None and row["lpips_alex_box"] is None
+    assert row["ssim_full"] == metrics.ssim(image, truth)
+    row = metrics.score_view(image, truth, None, models)
+    assert row["psnr_box"] is None and row["flip_box"] is None and row["psnr_full"] is not None
+
+
+def test_side_by_side_draws_the_box_and_leaves_the_pictures_alone():
+    first, second = (np.full((6, 8, 3), v, np.uint8) for v in (10, 200))
+    strip = metrics.side_by_side([first, second], Box(2, 1, 6, 5))
+    assert strip.shape == (6, 20, 3) and (strip[:, 8:12] == 255).all()
+    assert (strip[1, 2] == (255, 220, 0)).all() and (strip[4, 17] == (255, 220, 0)).all()
+    assert (strip[2, 3] == 10).all() and (strip[0, 0] == 10).all() and (strip[2, 15] == 200).all()
+    assert (first == 10).all()
+    assert metrics.side_by_side([np.zeros((1, 1, 3), np.uint8)], Box(0, 0, 1, 1)).shape == (1, 1, 3)
