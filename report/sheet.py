@@ -1,0 +1,111 @@
+"""A contact sheet of a finished scene: a row a view; with the object, ground truth, initialization, result.
+
+python -m report.sheet runs/demo --views 3 --out docs/images/demo.png
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from reffusion import io
+
+GAP = 6  # px between pictures
+TITLES = {
+    "renders_fit": "with the object",
+    "truth": "ground truth",
+    "renders_initialize": "initialization",
+    "renders": "ours",
+}
+
+
+def make(scene_dir: Path, out: Path, *, views: list[str] | int = 3, scale: int | None = None) -> Path:
+    """Write the sheet of runs/<scene> to `out` and give back its path.
+
+    Args:
+        views: names, or how many to take, spread evenly.
+        scale: whole factor by which pixels are repeated; None enlarges to about 480 px of width.
+
+    Raises:
+        ValueError: where the scene is not evaluated yet, or a named view is not among its renders.
+    """
+    evaluate = scene_dir / "evaluate"
+    there = sorted(path.stem for path in (evaluate / "renders").glob("*.png"))
+    if not there:
+        raise ValueError(f"{evaluate / 'renders'}: no pictures; run `make scene={scene_dir.name} evaluate` first")
+    names = evenly(there, views) if isinstance(views, int) else views
+    if unknown := [name for name in names if name not in there]:
+        raise ValueError(f"{evaluate / 'renders'} has no {', '.join(unknown)}; it has {there[0]} ... {there[-1]}")
+    test = io.load_json(scene_dir / "poses" / "views.json")["test"]
+    rows = [pictures_of(scene_dir, name, name in test) for name in names]
+    columns = [key for key in TITLES if any(key in row for row in rows)]
+    width = max(picture.shape[1] for row in rows for picture in row.values())
+    scale = scale or max(1, round(480 / width))
+    cells = [[enlarged(row.get(key), scale) for key in columns] for row in rows]
+    io.save_image(out, framed(cells, [TITLES[key] for key in columns], names))
+    return out
+
+
+def evenly(names: list[str], count: int) -> list[str]:
+    """`count` of them, spread evenly, the first and last a little inside."""
+    places = (np.arange(min(count, len(names))) + 0.5) * len(names) / min(count, len(names))
+    return [names[int(place)] for place in places]
+
+
+def pictures_of(scene_dir: Path, name: str, scored: bool) -> dict[str, np.ndarray]:
+    """Column -> uint8 [H, W, 3], of what is there; a training photo shows the object and is no ground truth."""
+    paths = {key: scene_dir / "evaluate" / key / f"{name}.png" for key in TITLES if key != "truth"}
+    if scored:
+        paths["truth"] = scene_dir / "poses" / "images" / f"{name}.png"
+    return {key: io.load_image(path) for key, path in paths.items() if path.exists()}
+
+
+def enlarged(picture: np.ndarray | None, scale: int) -> np.ndarray | None:
+    """Each pixel repeated `scale` times, so that nothing is blurred."""
+    return None if picture is None else picture.repeat(scale, 0).repeat(scale, 1)
+
+
+def framed(cells: list[list[np.ndarray | None]], titles: list[str], names: list[str]) -> np.ndarray:
+    """uint8 [H, W, 3]: the cells on white, titles above, the view's name on its first picture."""
+    heights = [max(cell.shape[0] for cell in row if cell is not None) for row in cells]
+    width = max(cell.shape[1] for row in cells for cell in row if cell is not None)
+    size = max(12, width // 20)
+    font, small = ImageFont.load_default(size), ImageFont.load_default(max(10, size * 2 // 3))
+    head = 2 * size
+    canvas = Image.new("RGB", (len(titles) * (width + GAP) + GAP, head + sum(heights) + GAP * len(heights)), "white")
+    draw = ImageDraw.Draw(canvas)
+    for column, title in enumerate(titles):
+        draw.text((GAP + column * (width + GAP) + width // 2, head // 2), title, "black", font, anchor="mm")
+    top = head
+    for row, height, name in zip(cells, heights, names, strict=True):
+        for column, cell in enumerate(row):
+            if cell is not None:
+                canvas.paste(Image.fromarray(cell), (GAP + column * (width + GAP), top))
+        place = (GAP + 4, top + height - 4)
+        draw.rectangle(draw.textbbox(place, name, small, anchor="ls"), "black")
+        draw.text(place, name, "white", small, anchor="ls")
+        top += height + GAP
+    return np.asarray(canvas)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="report.sheet", description=__doc__.split("\n")[0])
+    parser.add_argument("scene", type=Path, help="runs/<scene>")
+    parser.add_argument("--views", nargs="+", default=["3"], help="how many views, or their names")
+    parser.add_argument("--scale", type=int, help="whole factor of enlargement (default: to about 480 px)")
+    parser.add_argument("--out", type=Path, help="default: runs/<scene>/sheet.png")
+    arguments = parser.parse_args()
+    views = arguments.views
+    if len(views) == 1 and views[0].isdigit() and not (arguments.scene / f"evaluate/renders/{views[0]}.png").exists():
+        views = int(views[0])
+    try:
+        print(make(arguments.scene, arguments.out or arguments.scene / "sheet.png", views=views, scale=arguments.scale))
+    except ValueError as error:
+        raise SystemExit(f"error: {error}") from None
+
+
+if __name__ == "__main__":
+    main()

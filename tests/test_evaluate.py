@@ -1,0 +1,190 @@
+"""`evaluate` on folders written to disk: what it leaves behind must be recomputable from its own pictures."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from reffusion import io, metrics, trace
+from reffusion.types import Camera, Gaussians, MaskSet, Scene, Similarity
+from report import sheet
+from stages import evaluate
+
+SIMILARITY = Similarity(0.02, np.array([500_000.0, -3.0, 40.0]))
+WIDTH, HEIGHT = 48, 36
+
+
+def camera(name, shift):
+    pose = np.eye(4)
+    pose[0, 3] = shift
+    return Camera(name, WIDTH, HEIGHT, 40.0, 40.0, WIDTH / 2, HEIGHT / 2, pose)
+
+
+def blobs(count, seed=0):
+    generator = trace.generator(seed, "blobs")
+    draw = lambda *shape: torch.rand(*shape, generator=generator)
+    means = torch.cat([draw(count, 2) * 1.6 - 0.8, 1.5 + draw(count, 1)], 1)
+    return Gaussians(means, draw(count, 4) - 0.5, draw(count, 3) - 3.2, 3 * draw(count), draw(count, 4, 3) - 0.5)
+
+
+@pytest.fixture
+def folders(tmp_path):
+    """Folders of the stages before: views 0-2 test (2 without a mask of its own), 3-7 training."""
+    names = [f"view{i}" for i in range(8)]
+    cameras = {name: camera(name, 0.1 * i - 0.3) for i, name in enumerate(names)}
+    scene = Scene(
+        cameras,
+        tuple(names[3:]),
+        tuple(names[:3]),
+        frozenset(),
+        np.zeros((1, 3)),
+        np.zeros((1, 3), np.uint8),
+        SIMILARITY,
+    )
+    made = {name: tmp_path / name for name in ("poses", "fit", "masks", "reference", "initialize", "distill")}
+    rng = np.random.default_rng(0)
+    io.save_scene(made["poses"], scene)
+    for name in names:
+        io.save_image(made["poses"] / "images" / f"{name}.png", rng.random((HEIGHT, WIDTH, 3)))
+    mask, empty = np.zeros((HEIGHT, WIDTH), bool), np.zeros((HEIGHT, WIDTH), bool)
+    mask[10:30, 5:35] = True
+    io.save_mask(made["poses"] / "test_masks" / "view0.png", mask)
+    io.save_mask(made["poses"] / "test_masks" / "view1.png", empty)
+    other = np.zeros_like(mask)
+    other[4:24, 20:48] = True
+    io.save_mask_sets(made["masks"], {name: MaskSet(empty, other, empty, empty) for name in names})
+    for stage, count in (("fit", 60), ("initialize", 40), ("distill", 50)):
+        io.save_ply(made[stage] / "gaussians.ply", blobs(count))
+    for stage, seconds in (("fit", 12.5), ("distill", 3.0)):
+        io.save_json(made[stage] / "receipt.json", {"seconds": seconds})
+    return made
+
+
+def run(out, folders, **params):
+    out.mkdir()
+    evaluate.run(evaluate.Params(**params), out, **folders)
+    return json.loads((out / "metrics.json").read_text())
+
+
+@pytest.fixture(autouse=True)
+def no_weights(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+
+
+def test_scores_are_those_of_the_saved_pictures(tmp_path, folders):
+    out = tmp_path / "out"
+    summary = run(out, folders)
+    boxes = {"view0": metrics.Box(2, 8, 38, 32), "view1": None, "view2": metrics.Box(17, 2, 48, 26)}
+    for kind, renders in (("mean", "renders"), ("initialize", "renders_initialize")):
+        rows = [
+            metrics.score_view(
+                io.load_image(out / renders / f"{name}.png"),
+                io.load_image(folders["poses"] / "images" / f"{name}.png"),
+                box,
+            )
+            for name, box in boxes.items()
+        ]
+        for column in metrics.COLUMNS:
+            assert summary[kind][column] == metrics.mean([row[column] for row in rows]), (kind, column)
+    assert summary["mean"]["psnr_box"] != summary["initialize"]["psnr_box"]
+    assert summary["views"]["psnr_box"] == 2 and summary["views"]["psnr_full"] == 3
+    assert summary["mean"]["lpips_vgg_box"] is None and "vgg16-*.pth" in summary["lpips_unavailable"]
+    assert summary["seconds"] == {"fit": 12.5, "distill": 3.0}
+    assert summary["gaussians"] == {"fit": 60, "initialize": 40, "distill": 50}
+    assert summary["rendered"] == "3 test views" and summary["protocol"]["resolution"] == ["48x36"]
+
+    table = list(csv.DictReader((out / "per_view.csv").read_text().splitlines()))
+    assert [row["view"] for row in table] == ["view0", "view1", "view2"]
+    assert table[0]["left"] == "2" and table[1]["left"] == "" and table[1]["psnr_box"] == ""
+    box_scores = [float(row["psnr_box"]) for row in table if row["psnr_box"]]
+    assert np.mean(box_scores) == pytest.approx(summary["mean"]["psnr_box"])
+    assert io.load_image(out / "side_by_side" / "view0.png").shape == (HEIGHT, 3 * WIDTH + 8, 3)
+
+
+def test_the_scene_is_exported_in_its_own_frame(tmp_path, folders):
+    out = tmp_path / "out"
+    run(out, folders)
+    exported, result = io.load_ply(out / "scene.ply"), io.load_ply(folders["distill"] / "gaussians.ply")
+    back = SIMILARITY.apply(exported.means.double().numpy())
+    # 500 km away a float of the scene's own frame is worth 0.03 units, 6e-4 of the normalised frame.
+    assert np.abs(back - result.means.double().numpy()).max() < 1e-3
+    sizes = exported.log_scales - result.log_scales
+    assert torch.allclose(sizes, torch.full_like(sizes, -np.log(0.02)), atol=1e-5)
+
+
+def test_an_identical_view_is_infinite_in_the_table_and_capped_in_the_mean(tmp_path, folders):
+    first = tmp_path / "first"
+    run(first, folders)
+    for view in ("view0", "view1", "view2"):
+        picture = io.load_image(first / "renders" / f"{view}.png")
+        io.save_image(folders["poses"] / "images" / f"{view}.png", picture)
+    summary = run(tmp_path / "again", folders)
+    assert summary["mean"]["psnr_full"] == summary["mean"]["psnr_box"] == metrics.PSNR_CAP
+    assert summary["mean"]["flip_full"] == 0.0 and summary["mean"]["ssim_box"] == pytest.approx(1.0)
+    assert "inf" in (tmp_path / "again" / "per_view.csv").read_text()
+
+
+def test_without_distill_the_initialization_is_the_result(tmp_path, folders):
+    out = tmp_path / "out"
+    summary = run(out, folders | {"distill": None, "reference": None})
+    assert summary["result"] == "initialize" and summary["mean"] == summary["initialize"]
+    assert (out / "renders" / "view0.png").read_bytes() == (out / "renders_initialize" / "view0.png").read_bytes()
+
+
+def test_nothing_removed_scores_the_fit_on_the_full_image(tmp_path, folders):
+    for path in (folders["poses"] / "test_masks").iterdir():
+        path.unlink()
+    summary = run(tmp_path / "out", {"poses": folders["poses"], "fit": folders["fit"]})
+    assert summary["result"] == "fit" and summary["mean"]["psnr_box"] is None
+    assert summary["mean"]["psnr_full"] > 0 and set(summary["initialize"].values()) == {None}
+
+
+def test_without_test_views_the_training_cameras_are_rendered_and_not_scored(tmp_path, folders):
+    scene = io.load_scene(folders["poses"])
+    every = tuple(scene.cameras)
+    untested = Scene(scene.cameras, every, (), scene.clean, scene.points, scene.point_colors, scene.similarity)
+    io.save_scene(folders["poses"], untested)
+    out = tmp_path / "out"
+    summary = run(out, folders)
+    assert summary["rendered"] == "8 training views"
+    assert set(summary["mean"].values()) == {None} and set(summary["views"].values()) == {0}
+    assert sorted(path.stem for path in (out / "renders").iterdir()) == list(every)
+    assert io.load_image(out / "side_by_side" / "view0.png").shape[1] == 2 * WIDTH + 4
+    assert len((out / "per_view.csv").read_text().splitlines()) == 9
+
+
+def test_of_many_training_views_every_eighth():
+    names = tuple(f"v{i:03d}" for i in range(70))
+    scene = Scene({}, names, (), frozenset(), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), SIMILARITY)
+    assert evaluate.views_of(scene) == (names[::8], "training, every 8th")
+
+
+def test_a_test_view_without_picture_is_rendered_and_one_of_another_size_refused(tmp_path, folders):
+    picture = folders["poses"] / "images" / "view1.png"
+    picture.unlink()
+    summary = run(tmp_path / "out", folders)
+    assert summary["views"]["psnr_full"] == 2 and (tmp_path / "out" / "renders" / "view1.png").exists()
+    io.save_image(picture, np.zeros((HEIGHT, WIDTH + 1, 3)))
+    with pytest.raises(ValueError, match=r"view1.png: 49x36 px, its camera 48x36"):
+        run(tmp_path / "again", folders)
+
+
+def test_the_contact_sheet_shows_each_picture_enlarged_without_blur(tmp_path, folders):
+    scene_dir = tmp_path
+    run(scene_dir / "evaluate", folders)
+    path = sheet.make(scene_dir, tmp_path / "sheet.png", views=["view0", "view2"], scale=3)
+    picture = io.load_image(path)
+    ours = np.kron(io.load_image(scene_dir / "evaluate" / "renders" / "view2.png"), np.ones((3, 3, 1), np.uint8))
+    bottom, right = (size - sheet.GAP for size in picture.shape[:2])
+    assert (picture[bottom - 3 * HEIGHT : bottom, right - 3 * WIDTH : right] == ours).all()
+
+
+def test_the_sheet_names_what_is_missing(tmp_path, folders):
+    with pytest.raises(ValueError, match="no pictures; run `make scene=nowhere evaluate` first"):
+        sheet.make(tmp_path / "nowhere", tmp_path / "sheet.png")
+    run(tmp_path / "evaluate", folders)
+    with pytest.raises(ValueError, match=r"has no view9; it has view0 ... view2"):
+        sheet.make(tmp_path, tmp_path / "sheet.png", views=["view0", "view9"])
