@@ -1,0 +1,90 @@
+# One run: make scene=demo all        What it would do: make scene=demo plan        Everything else: make help
+
+# Given on the command line; set here so that a variable of the environment is not taken for one of them.
+scene :=
+profile :=
+variant :=
+set :=
+trust :=
+runs :=
+data := data
+seed :=
+name :=
+
+PYTHON ?= python3
+VENV ?= .venv
+PY := $(VENV)/bin/python
+STAGES := poses fit masks reference personalize initialize distill evaluate
+
+options = $(if $(profile),--profile '$(profile)') $(if $(variant),--variant '$(variant)') \
+	$(if $(set),--set '$(set)') $(if $(trust),--trust) $(if $(runs),--runs '$(runs)')
+
+.PHONY: help setup all $(STAGES) plan clean batch demo test lint
+.DELETE_ON_ERROR:
+
+help:
+	@echo 'make scene=demo all            the whole job; a second call finds everything cached'
+	@echo 'make scene=X STAGE             one stage and what it needs: $(STAGES)'
+	@echo 'make scene=X plan              what would run, and why'
+	@echo 'make scene=X clean             remove what was computed for it'
+	@echo 'make data=FOLDER batch         every scene of a folder, and one table'
+	@echo 'make demo [seed=N]             make the demo scene, or another: data/demo-N'
+	@echo 'make setup | test | lint       .venv; the tests; ruff'
+	@echo 'scene=  a name under data/, or the path of any folder'
+	@echo 'profile=auto|laptop|paper  variant=NAME  set="fit.iterations=500 distill.seed=3"  runs=FOLDER'
+	@echo 'trust=1  keep results of older code'
+
+# ---------------------------------------------------------------------------------------------------- environment
+
+setup: $(VENV)/.ready
+
+$(VENV)/.ready: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo 'error: $(PYTHON) is not Python 3.11 or later; name one: make PYTHON=python3.12 setup' >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(PY) -m pip install --quiet --constraint constraints.txt --editable .
+	@touch $@
+
+$(VENV)/.ready-dev: $(VENV)/.ready
+	$(PY) -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+# --------------------------------------------------------------------------------------------------------- scenes
+
+# The demo scenes are made by the project: `demo`, `demo-photos` (no poses), `demo-<seed>`.
+made = $(filter demo demo-%,$(scene))
+
+demo: setup
+	$(PY) data/generate.py --out data/$(or $(name),demo$(if $(seed),-$(seed))) --seed $(or $(seed),0)
+	@touch data/$(or $(name),demo$(if $(seed),-$(seed)))/.generated
+
+data/%/.generated: | $(VENV)/.ready
+	$(PY) data/generate.py --out data/$* \
+		$(if $(filter demo-photos,$*),--kind photos,--seed $(or $(patsubst demo-%,%,$(filter demo-%,$*)),0))
+	@touch $@
+
+# ----------------------------------------------------------------------------------------------------------- jobs
+
+.PHONY: named ready
+named:
+	@test -n '$(scene)' || { echo 'error: which scene? For example: make scene=demo $(MAKECMDGOALS)' >&2; exit 1; }
+
+ready: named setup $(made:%=data/%/.generated)
+
+all $(STAGES): ready
+	@$(PY) -m runner run $@ --scene '$(scene)' $(options)
+
+plan: ready
+	@$(PY) -m runner plan --scene '$(scene)' $(options)
+
+clean: named setup
+	@$(PY) -m runner clean --scene '$(scene)' $(options)
+
+batch: setup
+	@$(PY) -m runner batch --data '$(data)' $(options)
+
+test: $(VENV)/.ready-dev
+	$(PY) -m pytest
+
+lint: $(VENV)/.ready-dev
+	$(PY) -m ruff check .

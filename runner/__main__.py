@@ -1,0 +1,60 @@
+"""python -m runner plan|run|batch|clean --scene NAME: what the Makefile calls."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from pathlib import Path
+
+from runner.child import INTERRUPTED
+from runner.execute import Failed, batch, clean, run_scene, show_results
+from runner.pipeline import Refused
+from runner.plan import Request, plan, prepare, table
+
+
+def main() -> int:
+    arguments = _parser().parse_args()
+    root = arguments.root.resolve()
+    runs = (arguments.runs or root / "runs").resolve()
+    request = Request(
+        root, runs, arguments.scene, arguments.profile, arguments.variant, arguments.trust, arguments.set
+    )
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # told to end: as Ctrl-C
+    try:
+        if arguments.command == "plan":
+            job = prepare(request)
+            print(table(job, plan(job, job.pipeline.closure(arguments.stage))))
+        elif arguments.command == "run":
+            job = run_scene(request, arguments.stage)
+            show_results(job)
+        elif arguments.command == "batch":
+            return 1 if batch(request, arguments.data) else 0
+        else:
+            clean(request)
+    except (Refused, Failed) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("\nstopped; the same command goes on from here", file=sys.stderr)
+        return INTERRUPTED
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="runner", description=__doc__)
+    parser.add_argument("command", choices=["plan", "run", "batch", "clean"])
+    parser.add_argument("stage", nargs="?", default="all", help="run this stage and what it needs; `all` (default)")
+    parser.add_argument("--scene", default="", help="a name under data/, or a path")
+    parser.add_argument("--data", type=Path, default=Path("data"), help="batch: the folder of scenes")
+    parser.add_argument("--profile", help="auto, laptop or paper")
+    parser.add_argument("--variant", help="a variant of pipeline.yaml")
+    parser.add_argument("--trust", action="store_true", help="accept artifacts made by older code")
+    parser.add_argument("--set", default="", help="stage.parameter=value ...")
+    parser.add_argument("--root", type=Path, default=Path(__file__).parent.parent, help="where pipeline.yaml is")
+    parser.add_argument("--runs", type=Path, help="where artifacts go; root/runs")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

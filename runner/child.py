@@ -1,0 +1,123 @@
+"""The process in which stages are imported: `describe` reads their parameters, `run` does a stage's work."""
+
+from __future__ import annotations
+
+import faulthandler
+import importlib
+import inspect
+import json
+import os
+import resource
+import signal
+import sys
+import threading
+import time
+import traceback
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+INTERRUPTED = 130
+
+
+def describe() -> None:
+    """Standard input: {stage: {"params": asked for, "takes": names of needs, "needs": their paths (for a preview)}};
+    standard output: `_describe` of each.
+
+    Costs the import of pydantic and of the stage modules, which import nothing heavy at their top.
+    """
+    question = json.load(sys.stdin)
+    answer_to, sys.stdout = sys.stdout, sys.stderr  # whatever a module prints must not mix with the answer
+    json.dump({name: _describe(name, **asked) for name, asked in question.items()}, answer_to)
+
+
+def _describe(
+    name: str, params: dict[str, Any], takes: list[str], needs: dict[str, str | None] | None = None
+) -> dict[str, Any]:
+    """All parameters and the names of those that name weights; or errors in them; or why the stage is "broken"."""
+    try:
+        stage = importlib.import_module(f"stages.{name}")
+        inspect.signature(stage.run).bind(None, None, **dict.fromkeys(takes))
+    except Exception as error:
+        return {"broken": f"stages/{name}.py: {_one_line(error)}"}
+    fields = stage.Params.model_fields
+    marked = {field: info.json_schema_extra for field, info in fields.items()}
+    answer: dict[str, Any] = {
+        "params": {}, "errors": [], "known": list(fields), "notes": [], "refusal": None, "broken": None,
+        "weights": [field for field, extra in marked.items() if isinstance(extra, dict) and extra.get("weights")],
+    }  # fmt: skip
+    try:
+        resolved = stage.Params(**params)
+    except ValidationError as error:
+        answer["errors"] = [_error(e) for e in error.errors()]
+        return answer
+    answer["params"] = resolved.model_dump(mode="json")
+    if needs is not None and hasattr(stage, "preview"):
+        try:
+            answer["notes"] = list(stage.preview(resolved, **{n: p and Path(p) for n, p in needs.items()}))
+        except ValueError as error:
+            answer["refusal"] = _one_line(error)
+    return answer
+
+
+def _error(error: Any) -> dict[str, Any]:
+    where = [str(part) for part in error["loc"]] or ["?"]
+    return {
+        "param": where[0],
+        "where": ".".join(where),
+        "unknown": error["type"] == "extra_forbidden" and len(where) == 1,
+        "value": repr(error["input"]),
+        "message": error["msg"].removeprefix("Value error, "),
+    }
+
+
+def _one_line(error: BaseException) -> str:
+    text = " ".join(str(error).split())
+    return text if isinstance(error, ValueError) and text else f"{type(error).__name__}: {text}"
+
+
+def run() -> int:
+    """Do one stage. Standard input: one line of JSON, then nothing until the runner is gone.
+
+    The line: {"stage", "params", "out", "needs": {need: path or null}, "log", "result", "lock"}. Writes to `result`
+    {"seconds", "peak_memory_mb"} or {"error": one line}, and to `log` the full traceback.
+    """
+    job = json.loads(sys.stdin.readline())
+    os.set_inheritable(job["lock"], False)  # held open until this process ends: no second runner before that
+    threading.Thread(target=_end_with_runner, args=(sys.stdin.fileno(),), daemon=True).start()
+    began, code = time.perf_counter(), 0
+    with open(job["log"], "w") as log:
+        faulthandler.enable(log)
+        log.write(f"{time.strftime('%F %T')} {job['stage']} {json.dumps(job['params'])}\n")
+        try:
+            stage = importlib.import_module(f"stages.{job['stage']}")
+            needs = {name: path and Path(path) for name, path in job["needs"].items()}
+            stage.run(stage.Params(**job["params"]), Path(job["out"]), **needs)
+            result = {"seconds": round(time.perf_counter() - began, 2), "peak_memory_mb": _peak_memory_mb()}
+        except KeyboardInterrupt:
+            return INTERRUPTED
+        except Exception as error:
+            log.write(traceback.format_exc())
+            result, code = {"error": _one_line(error)}, 1
+        log.write(f"{time.strftime('%F %T')} {json.dumps(result)}\n")
+        faulthandler.disable()
+    Path(job["result"]).write_text(json.dumps(result))
+    return code
+
+
+def _end_with_runner(fd: int) -> None:
+    """A runner that is killed must not leave a stage working on in a folder that the next runner takes over."""
+    while os.read(fd, 4096):
+        pass
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _peak_memory_mb() -> int:
+    unit = 1 if sys.platform == "darwin" else 1024  # bytes there, kilobytes elsewhere
+    largest = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return round(largest * unit / 2**20)
+
+
+if __name__ == "__main__":
+    sys.exit(describe() if sys.argv[1] == "describe" else run())

@@ -1,0 +1,266 @@
+"""`pipeline.yaml` and `scene.yaml`: their models, and the parameters that follow from them."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+
+SCENE = "scene"  # the need that stands for the scene's own folder
+AUTO = "auto"
+
+Overrides = dict[str, dict[str, Any]]  # stage -> parameter -> value
+
+
+class Refused(Exception):
+    """What the user can put right, told in one line before any work."""
+
+
+class Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Condition(Strict):
+    """A reason to leave a stage out, read from an earlier stage's artifact.
+
+    Either `fact: <stage>.<name>` of its facts.json is `equals`, or the folder `empty: <stage>/<folder>` holds no file.
+    Ignored where the scene brings the key `unless`.
+    """
+
+    because: str
+    fact: str | None = None
+    equals: Any = None
+    empty: str | None = None
+    unless: str | None = None
+
+    @model_validator(mode="after")
+    def _one_question(self) -> Condition:
+        if (self.fact is None) == (self.empty is None):
+            raise ValueError("a condition has either `fact` or `empty`")
+        return self
+
+    @property
+    def stage(self) -> str:
+        """The stage that must be done before this can be told."""
+        return re.split(r"[./]", self.fact or self.empty or "")[0]
+
+
+class Provided(Strict):
+    """The scene's own file stands for the stage: where scene.yaml has the key `by`, `artifact` is used in its place."""
+
+    by: str
+    artifact: str
+
+
+class Stage(Strict):
+    """needs: earlier stages, or `scene`. optional: needs that may be left out, and then arrive as None."""
+
+    needs: tuple[str, ...]
+    optional: tuple[str, ...] = ()
+    provided: Provided | None = None
+    left_out: tuple[Condition, ...] = ()
+    params: dict[str, Any] = {}
+
+    @property
+    def takes(self) -> tuple[str, ...]:
+        """All that run() is handed."""
+        return (*self.needs, *self.optional)
+
+
+class Pipeline(Strict):
+    """The stages in order; parameters by profile and by variant; the keys of scene.yaml and the stage they go to."""
+
+    stages: dict[str, Stage]
+    scene_keys: dict[str, tuple[str, ...]]
+    profiles: dict[str, Overrides]
+    variants: dict[str, Overrides] = {}
+
+    @model_validator(mode="after")
+    def _names_are_known(self) -> Pipeline:
+        earlier = [SCENE]
+        for name, stage in self.stages.items():
+            named = [*stage.takes, *(c.stage for c in stage.left_out)]
+            named += [stage.provided.artifact] if stage.provided else []
+            for need in named:
+                if need not in earlier:
+                    raise ValueError(f"stage {name} names {need!r}, which is not a stage before it")
+            earlier.append(name)
+        for label, layer in [("scene_keys", self.scene_keys), *self.profiles.items(), *self.variants.items()]:
+            for stage in layer:
+                if stage not in self.stages:
+                    raise ValueError(f"{label} names {unknown('stage', stage, self.stages)}")
+        return self
+
+    def closure(self, target: str) -> list[str]:
+        """`target` and all it needs, in order; every stage for `all`."""
+        if target == "all":
+            return list(self.stages)
+        if target not in self.stages:
+            raise Refused(f"pipeline.yaml: {unknown('stage', target, ['all', *self.stages])}")
+        wanted = {target}
+        for name in reversed(self.stages):
+            if name in wanted:
+                stage = self.stages[name]
+                wanted |= {*stage.takes, *(c.stage for c in stage.left_out)}
+        return [name for name in self.stages if name in wanted]
+
+
+def unknown(kind: str, name: object, known: Any) -> str:
+    """"unknown stage 'fitt'; did you mean 'fit'?", or what there is."""
+    known = [str(k) for k in known]
+    near = difflib.get_close_matches(str(name), known, n=1)
+    return f"unknown {kind} {name!r}; " + (f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}")
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise Refused(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
+    if content is None:
+        return {}
+    if not isinstance(content, dict):
+        raise Refused(f"{path}: expected `key: value` lines, found a {type(content).__name__}")
+    return content
+
+
+def _first_error(error: ValidationError) -> str:
+    first = error.errors()[0]
+    where = ".".join(str(part) for part in first["loc"])
+    return f"{where}: {first['msg']}" if where else first["msg"].removeprefix("Value error, ")
+
+
+def load_pipeline(root: Path) -> Pipeline:
+    """Raises Refused where pipeline.yaml is missing, ill-formed, or names a stage that is not there."""
+    path = root / "pipeline.yaml"
+    if not path.is_file():
+        raise Refused(f"{path}: no such file; the runner's --root is the folder that holds it")
+    try:
+        return Pipeline.model_validate(_read_yaml(path))
+    except ValidationError as error:
+        raise Refused(f"{path}: {_first_error(error)}") from None
+
+
+@dataclass(frozen=True)
+class SceneFile:
+    """What a scene's optional scene.yaml says.
+
+    Attributes:
+        path: the file, present or not.
+        profile: its `profile`, or None.
+        brings: the keys, with values, that describe the scene.
+        stages: parameters of stages.
+    """
+
+    path: Path
+    profile: str | None
+    brings: dict[str, Any]
+    stages: Overrides
+
+
+def load_scene_file(folder: Path, pipeline: Pipeline) -> SceneFile:
+    path = folder / "scene.yaml"
+    content = _read_yaml(path) if path.is_file() else {}
+    keys = [key for names in pipeline.scene_keys.values() for key in names]
+    for key in content:
+        if key not in (*keys, "profile", "stages"):
+            raise Refused(f"{path}: {unknown('key', key, [*keys, 'profile', 'stages'])}")
+    stages = content.get("stages") or {}
+    if not isinstance(stages, dict) or not all(isinstance(v, dict) for v in stages.values()):
+        raise Refused(f"{path}: stages: expected {{stage: {{parameter: value}}}}")
+    for stage in stages:
+        if stage not in pipeline.stages:
+            raise Refused(f"{path}: stages: {unknown('stage', stage, pipeline.stages)}")
+    brings = {key: value for key, value in content.items() if key in keys and value is not None}
+    return SceneFile(path, content.get("profile"), brings, stages)
+
+
+def parse_set(text: str, pipeline: Pipeline) -> Overrides:
+    """`fit.iterations=500 distill.seed=3`; the values are read as YAML."""
+    overrides: Overrides = {}
+    for word in shlex.split(text):
+        match = re.fullmatch(r"(\w+)\.(\w+)=(.*)", word, flags=re.DOTALL)
+        if not match:
+            raise Refused(f"set: {word!r} is not of the form stage.parameter=value")
+        stage, name, value = match.groups()
+        if stage not in pipeline.stages:
+            raise Refused(f"set: {unknown('stage', stage, pipeline.stages)}")
+        try:
+            overrides.setdefault(stage, {})[name] = yaml.safe_load(value)
+        except yaml.YAMLError:
+            raise Refused(f"set: the value of {stage}.{name} is not valid YAML: {value!r}") from None
+    return overrides
+
+
+@dataclass(frozen=True)
+class Layers:
+    """Parameters as they were asked for, and who asked: stage -> parameter -> (value, file)."""
+
+    values: Overrides
+    origin: dict[str, dict[str, str]]
+
+
+def layered(pipeline: Pipeline, scene: SceneFile, profile: str, variant: str | None, asked: Overrides) -> Layers:
+    """Later layers win: stage defaults in pipeline.yaml, profile, scene.yaml, variant, `set=`."""
+    brought = {stage: {k: scene.brings[k] for k in keys if k in scene.brings}
+               for stage, keys in pipeline.scene_keys.items()}
+    layers = [
+        ("pipeline.yaml", {name: stage.params for name, stage in pipeline.stages.items()}),
+        (f"pipeline.yaml: profile {profile}", pipeline.profiles[profile]),
+        (str(scene.path), brought),
+        (f"{scene.path}: stages", scene.stages),
+        (f"pipeline.yaml: variant {variant}", pipeline.variants.get(variant or "", {})),
+        ("set", asked),
+    ]
+    values: Overrides = {name: {} for name in pipeline.stages}
+    origin: dict[str, dict[str, str]] = {name: {} for name in pipeline.stages}
+    for label, layer in layers:
+        for stage, params in layer.items():
+            values[stage].update(params)
+            origin[stage].update(dict.fromkeys(params, label))
+    return Layers(values, origin)
+
+
+def find_scene(text: str, root: Path) -> Path:
+    """The folder meant by `scene=`: a name under data/, or a path."""
+    for folder in (root / "data" / text, Path(text).expanduser()):
+        if text and folder.is_dir():
+            folder = folder.resolve()
+            if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.\-+]*", folder.name):
+                raise Refused(f"{folder}: a scene is called by its folder's name; use letters, digits and _ . - + only")
+            return folder
+    known = sorted(p.name for p in (root / "data").glob("[!._]*/")) if (root / "data").is_dir() else []
+    raise Refused(
+        f"unknown scene {text!r}: there is no folder data/{text}, nor one at that path; "
+        f"known: {', '.join(known) or 'none'} (`make demo` makes one)"
+    )
+
+
+def choose_profile(asked: str | None, scene: SceneFile, pinned: list[Path], pipeline: Pipeline) -> str:
+    """The profile asked for, else scene.yaml's, else the one this scene was run with, else by the machine."""
+    origin = "profile" if asked else f"{scene.path}: profile"
+    profile = asked or scene.profile or AUTO
+    if profile == AUTO:
+        for path in pinned:
+            if path.is_file():
+                origin, profile = str(path), path.read_text().strip()
+                break
+        else:
+            origin, profile = "profile", "paper" if has_cuda() else "laptop"
+    if profile not in pipeline.profiles:
+        raise Refused(f"{origin}: {unknown('profile', profile, [AUTO, *pipeline.profiles])}")
+    return profile
+
+
+def has_cuda() -> bool:
+    """Is there an NVIDIA driver, and is a device visible? Asked of the system, so that torch need not be imported."""
+    if os.environ.get("CUDA_VISIBLE_DEVICES", "unset") in ("", "-1"):
+        return False
+    return any(Path(p).exists() for p in ("/proc/driver/nvidia/version", "/dev/nvidia0", "/usr/lib/wsl/lib/libcuda.so"))

@@ -1,0 +1,476 @@
+"""The runner on a toy pipeline: what reruns and why, kills, locks, refusals, variants, batches."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from runner import execute
+from runner.execute import Failed, run_scene
+from runner.keys import fingerprint
+from runner.pipeline import Refused
+from runner.plan import Request, plan, prepare, table
+
+REPO = Path(__file__).resolve().parent.parent
+
+FILES = {
+    "pipeline.yaml": """
+scene_keys: {poses: [shift, gaussians]}
+stages:
+  poses: {needs: [scene]}
+  fit: {needs: [poses], provided: {by: gaussians, artifact: poses}}
+  masks:
+    needs: [poses, fit]
+    left_out: [{empty: poses/masks, because: the scene has no masks}]
+  distill:
+    needs: [fit, masks]
+    left_out: [{fact: masks.invent, equals: 0, because: nothing to invent}]
+  evaluate: {needs: [poses, fit], optional: [masks, distill]}
+profiles: {laptop: {fit: {rate: 2}}, paper: {}}
+variants: {strong: {distill: {gain: 5}}, same: {}}
+""",
+    "stages/__init__.py": "",
+    "stages/poses.py": '''
+from pathlib import Path
+from pydantic import BaseModel, ConfigDict
+
+class Params(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    shift: int = 0
+    gaussians: str | None = None
+
+def preview(params, scene):
+    if not (scene / "number.txt").exists():
+        raise ValueError(f"{scene}: no number.txt; write one")
+    return ["reads one number"]
+
+def run(params: Params, out: Path, *, scene: Path) -> None:
+    if (scene / "broken").exists():
+        raise ValueError(f"{scene}: it is\\nbroken")
+    number = abs(int((scene / "number.txt").read_text())) + params.shift
+    (out / "number.txt").write_text(str(number))
+    if params.gaussians:
+        (out / "gaussians.ply").write_text((scene / params.gaussians).read_text())
+    if not (scene / "unmasked").exists():
+        (out / "masks").mkdir(exist_ok=True)
+        (out / "masks" / "a.png").write_text("m")
+''',
+    "stages/fit.py": '''
+import time
+from pathlib import Path
+from pydantic import BaseModel, ConfigDict, Field
+
+class Params(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    iterations: int = Field(3, ge=1, description="steps")
+    rate: int = 1
+    pause: float = 0.0  # seconds a step
+
+def run(params: Params, out: Path, *, poses: Path) -> None:
+    from reffusion.optimize import step
+    checkpoint = out / "checkpoint.pt"
+    number, start = map(int, checkpoint.read_text().split()) if checkpoint.exists() else (0, 0)
+    for index in range(start, params.iterations):
+        number = step(number, params.rate)
+        partial = out / "checkpoint.pt.writing"
+        partial.write_text(f"{number} {index + 1}")
+        partial.replace(checkpoint)
+        time.sleep(params.pause)
+    (out / "gaussians.ply").write_text(str(number + int((poses / "number.txt").read_text())))
+    (out / "trace.jsonl").write_text(str(start))
+    checkpoint.unlink()
+''',
+    "stages/masks.py": '''
+import json
+from pathlib import Path
+from pydantic import BaseModel, ConfigDict
+
+class Params(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    threshold: int = 100
+
+def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
+    invent = int(int((fit / "gaussians.ply").read_text()) < params.threshold)
+    (out / "facts.json").write_text(json.dumps({"invent": invent}))
+''',
+    "stages/distill.py": '''
+from pathlib import Path
+from pydantic import BaseModel, ConfigDict, Field
+
+class Params(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    gain: int = 1
+    prior: str = Field("weights", json_schema_extra={"weights": True})
+
+def run(params: Params, out: Path, *, fit: Path, masks: Path) -> None:
+    (out / "gaussians.ply").write_text(str(int((fit / "gaussians.ply").read_text()) * params.gain))
+''',
+    "stages/evaluate.py": '''
+import json
+from pathlib import Path
+from pydantic import BaseModel, ConfigDict
+
+class Params(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+def run(params, out: Path, *, poses: Path, fit: Path, masks: Path | None, distill: Path | None) -> None:
+    result = int(((distill or fit) / "gaussians.ply").read_text())
+    metrics = {"mean": {"psnr_box": float(result), "lpips_vgg_box": None}}
+    (out / "metrics.json").write_text(json.dumps(metrics))
+''',
+    "reffusion/__init__.py": '"""The package."""',
+    "reffusion/optimize.py": '''
+"""Steps."""
+
+def step(number, rate):
+    """One step."""
+    from .numbers import plus
+    return plus(number, rate)  # forwards
+''',
+    "reffusion/numbers.py": "def plus(a, b):\n    return a + b\n",
+    "reffusion/unused.py": "x = 1\n",
+    "weights/model.bin": "w",
+    "data/toy/number.txt": "4",
+}
+WORDS = ["poses", "fit", "masks", "distill", "evaluate"]
+
+
+def write(root: Path, files: dict[str, str]) -> None:
+    for name, text in files.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text)
+
+
+def request(root: Path, scene: str = "toy", **options) -> Request:
+    return Request(root, root / "runs", scene, **{"profile": "laptop", **options})
+
+
+def words(root: Path, **options) -> dict[str, str]:
+    """Stage -> "word reason" as planned."""
+    job = prepare(request(root, **options))
+    return {s: f"{d.word} {d.reason}".strip() for s, d in plan(job, job.pipeline.closure("all")).items()}
+
+
+def ran(capsys, root: Path, **options) -> list[str]:
+    """The stages that ran, in order."""
+    capsys.readouterr()
+    run_scene(request(root, **options), "all")
+    return [line.split(":")[0] for line in capsys.readouterr().out.splitlines() if ": done in" in line]
+
+
+def result(root: Path, home: str = "toy") -> float:
+    return json.loads((root / "runs" / home / "evaluate/metrics.json").read_text())["mean"]["psnr_box"]
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("finished")
+    write(root, FILES)
+    run_scene(request(root), "all")
+    return root
+
+
+@pytest.fixture
+def root(finished: Path, tmp_path: Path) -> Path:
+    """A toy project in which everything is done."""
+    shutil.copytree(finished, tmp_path / "project")
+    return tmp_path / "project"
+
+
+@pytest.fixture
+def fresh(tmp_path: Path) -> Path:
+    write(tmp_path / "project", FILES)
+    return tmp_path / "project"
+
+
+def start(root: Path, *arguments: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "runner", "run", "all", "--root", str(root), "--profile", "laptop", *arguments]
+    environment = {**os.environ, "PYTHONPATH": str(REPO)}
+    return subprocess.Popen(
+        command, cwd=root, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+
+
+def wait_for(found) -> None:
+    for _ in range(600):
+        if found():
+            return
+        time.sleep(0.05)
+    raise AssertionError("waited 30 s in vain")
+
+
+# ------------------------------------------------------------------------------------------------------ what reruns
+
+
+def test_first_run_and_receipts(root):
+    assert result(root) == 10.0  # 3 steps of 2, and the scene's 4
+    receipt = json.loads((root / "runs/toy/fit/receipt.json").read_text())
+    assert receipt["params"] == {"iterations": 3, "rate": 2, "pause": 0.0}
+    assert receipt["profile"] == "laptop" and receipt["peak_memory_mb"] > 0 and receipt["versions"]["python"]
+    assert list(receipt["code"]) == [
+        "reffusion/__init__.py", "reffusion/numbers.py", "reffusion/optimize.py", "stages/fit.py"
+    ]  # fmt: skip
+    assert not list((root / "runs/toy").glob(".partial*")) and not list((root / "runs/toy").glob(".old*"))
+    assert (root / "runs/toy/profile").read_text() == "laptop\n"
+
+
+def test_fresh_plan(fresh):
+    said = words(fresh)
+    assert said["poses"] == said["fit"] == "run no artifact yet"
+    assert said["masks"].startswith("undecided left out if the scene has no masks")
+    assert said["distill"].startswith("undecided") and said["evaluate"].startswith("run")
+    job = prepare(request(fresh))
+    assert "reads one number" in table(job, plan(job, ["poses"]))
+    assert not (fresh / "runs").exists() or not (fresh / "runs/toy").exists()  # plan leaves nothing but hashes
+
+
+def test_a_second_call_runs_nothing(root, capsys):
+    assert ran(capsys, root) == []
+    assert set(words(root).values()) == {"cached"}
+
+
+def test_parameter_reruns_its_stage_and_what_depends_on_it(root, capsys):
+    said = words(root, set="fit.iterations=5")
+    assert said["poses"] == "cached" and said["fit"] == "run param iterations 3 -> 5"
+    assert said["masks"].startswith("stale waits for fit") and said["evaluate"].startswith("stale")
+    assert ran(capsys, root, set="fit.iterations=5") == ["fit", "masks", "distill", "evaluate"]
+    assert result(root) == 14.0
+
+
+def test_identical_output_stops_a_rerun(root, capsys):
+    """`masks` comes out the same, so `distill` and `evaluate` stay."""
+    assert ran(capsys, root, set="masks.threshold=99") == ["masks"]
+    (root / "data/toy/number.txt").write_text("-4")
+    assert words(root, set="masks.threshold=99")["poses"] == "run need scene changed"
+    assert ran(capsys, root, set="masks.threshold=99") == ["poses"]
+
+
+def test_code_edits(root, capsys):
+    optimize = root / "reffusion/optimize.py"
+    edit(optimize, "# forwards", "# onwards")
+    edit(optimize, "One step.", "A step.")
+    edit(root / "stages/fit.py", 'description="steps"', 'description="how many"')
+    edit(root / "reffusion/unused.py", "1", "2")
+    assert ran(capsys, root) == []
+    edit(root / "reffusion/numbers.py", "a + b", "a + b + 1")
+    assert words(root)["fit"] == "run code of reffusion/numbers.py changed"
+    trusted = words(root, trust=True)
+    assert trusted["fit"] == "cached trusted although code of reffusion/numbers.py changed"
+    assert trusted["evaluate"] == "cached"
+    assert words(root, trust=True, set="fit.rate=3")["fit"].startswith("run param rate 2 -> 3")
+    assert ran(capsys, root) == ["fit", "masks", "distill", "evaluate"]
+
+
+def test_fingerprint():
+    same = ["def f(a):\n    return a", 'def f(a):\n    "Doc."\n    # why\n    return a', "def f( a ):\n\n  return (a)"]
+    assert len({fingerprint(text) for text in same}) == 1
+    assert fingerprint("def f(a):\n    return a or 1") != fingerprint(same[0])
+    assert fingerprint("x = '''a'''") != fingerprint("x = '''b'''")
+
+
+def test_weights_profile_and_hand_edits(root, capsys):
+    (root / "weights/model.bin").write_text("v")
+    assert words(root)["distill"] == "run weights prior changed"
+    assert words(root, profile="paper")["poses"] == "run profile laptop -> paper"
+    assert words(root, profile=None) == words(root)  # pinned by the first run
+    (root / "weights/model.bin").write_text("w")
+    (root / "runs/toy/fit/gaussians.ply").write_text("11")
+    assert words(root)["fit"] == "cached its files were changed by hand since"
+    assert ran(capsys, root) == ["masks", "distill", "evaluate"]
+    assert result(root) == 11.0
+
+
+def test_left_out_and_provided(root, capsys):
+    assert ran(capsys, root, set="masks.threshold=1") == ["masks", "evaluate"]
+    assert words(root, set="masks.threshold=1")["distill"] == "skip nothing to invent"
+    write(root, {"data/toy/scene.yaml": "shift: 1\ngaussians: mine.ply\n", "data/toy/mine.ply": "50"})
+    assert words(root)["fit"] == "provided the scene brings `gaussians`"
+    ran(capsys, root)
+    assert result(root) == 50.0
+    write(root, {"data/toy/unmasked": ""})
+    ran(capsys, root)
+    said = words(root)
+    assert said["masks"] == "skip the scene has no masks" and said["distill"].startswith("skip")
+
+
+def test_scene_yaml_stages_rerun_only_their_stage(root, capsys):
+    write(root, {"data/toy/scene.yaml": "profile: laptop\nstages: {distill: {gain: 3}}\n"})
+    assert ran(capsys, root) == ["distill", "evaluate"]
+    assert ran(capsys, root, set="distill.gain=4") == ["distill", "evaluate"]
+    assert result(root) == 40.0
+
+
+def test_files_outside_the_scene_count(root, capsys):
+    write(root, {"data/toy/scene.yaml": "gaussians: ../../mine.ply\n", "mine.ply": "50"})
+    ran(capsys, root)
+    write(root, {"mine.ply": "60"})
+    assert ran(capsys, root) == ["poses", "masks", "distill", "evaluate"]
+    assert result(root) == 60.0
+
+
+def test_variants_share_what_they_do_not_change(root, capsys):
+    assert ran(capsys, root, variant="strong") == ["distill", "evaluate"]
+    assert sorted(p.name for p in (root / "runs/toy@strong").iterdir() if p.is_dir()) == ["distill", "evaluate"]
+    assert result(root, "toy@strong") == 50.0 and result(root) == 10.0
+    assert set(words(root, variant="same").values()) == {"cached shared with toy"}
+    execute.show_results(run_scene(request(root, variant="same"), "all"))
+    assert "runs/toy/evaluate/metrics.json" in capsys.readouterr().out
+
+
+# ----------------------------------------------------------------------------------------------- kills, locks, swaps
+
+
+def kill_in_fit(root: Path, steps: int, send: int) -> tuple[int, str]:
+    """Start a long fit, signal the runner once a few steps are done; exit code and output."""
+    process = start(root, "--scene", "toy", "--set", f"fit.pause=0.1 fit.iterations={steps}")
+    wait_for(lambda: any((p / "checkpoint.pt").exists() for p in (root / "runs/toy").glob(".partial-fit-*")))
+    process.send_signal(send)
+    output, _ = process.communicate(timeout=30)
+    return process.returncode, output
+
+
+def test_a_killed_run_leaves_the_old_artifact_and_resumes(root, capsys):
+    options = {"set": "fit.pause=0.1 fit.iterations=8"}
+    code, _ = kill_in_fit(root, 8, signal.SIGKILL)
+    assert code == -signal.SIGKILL
+    assert (root / "runs/toy/fit/gaussians.ply").read_text() == "10"
+    assert words(root, **options)["fit"].endswith("goes on where it stopped")
+    assert ran(capsys, root, **options) == ["fit", "masks", "distill", "evaluate"]
+    assert int((root / "runs/toy/fit/trace.jsonl").read_text()) > 0  # the step it went on from
+    assert result(root) == 20.0
+    assert not list((root / "runs/toy").glob(".partial*"))
+
+
+def test_ctrl_c(root):
+    code, output = kill_in_fit(root, 1000, signal.SIGINT)
+    assert code == 130 and "the same command goes on from here" in output and "Traceback" not in output
+    assert not list((root / "runs/toy").glob(".partial-fit-*/receipt.json"))
+
+
+def test_two_runners_on_one_scene(root):
+    first = start(root, "--scene", "toy", "--set", "fit.pause=0.2 fit.iterations=8")
+    wait_for(lambda: list((root / "runs/toy").glob(".partial-fit-*")))
+    with pytest.raises(Refused, match=f"toy is in use by process {first.pid}"):
+        execute.clean(request(root))
+    second = start(root, "--scene", "toy", "--set", "fit.pause=0.2 fit.iterations=8")
+    output, _ = second.communicate(timeout=60)
+    assert first.wait(timeout=60) == 0 and second.returncode == 0
+    assert f"in use by process {first.pid}: waiting" in output and "done in" not in output
+
+
+@pytest.mark.parametrize("moment", ["after the old is moved", "after the new is moved", "while the old is deleted"])
+def test_killed_in_the_swap(root, capsys, moment):
+    """The next run finds one whole artifact at every moment, and does not repeat finished work."""
+    ran(capsys, root, set="fit.iterations=5")
+    home = root / "runs/toy"
+    shutil.copytree(root / "runs/toy/fit", home / "new")
+    ran(capsys, root)
+    if moment == "after the old is moved":
+        (home / "fit").rename(home / ".old-fit")
+        key = json.loads((home / "new/receipt.json").read_text())["key"]
+        (home / "new").rename(home / f".partial-fit-{key}")
+    else:
+        (home / "fit").rename(home / ".old-fit")
+        (home / "new").rename(home / "fit")
+        if moment == "while the old is deleted":
+            (home / ".old-fit/receipt.json").unlink()
+    assert ran(capsys, root, set="fit.iterations=5") == ["masks", "distill", "evaluate"][:: 1 if result(root) else 1]
+    assert result(root) == 14.0
+    assert not list(home.glob(".old*"))
+
+
+def test_a_failing_stage_keeps_the_rest(root, capsys):
+    write(root, {"data/toy/broken": ""})
+    with pytest.raises(Failed, match=r"poses: .*toy: it is broken \(all of it in .*poses.log\)$"):
+        run_scene(request(root), "all")
+    assert "Traceback" in (root / "runs/toy/poses.log").read_text()
+    assert result(root) == 10.0
+    (root / "data/toy/broken").unlink()
+    assert ran(capsys, root) == []
+
+
+# ---------------------------------------------------------------------------------------------------------- refusals
+
+REFUSALS = {
+    "unknown scene": ({}, {"scene": "toi"}, r"unknown scene 'toi'.*data/toi.*known: toy"),
+    "unknown stage": ({}, {"set": "fitt.rate=1"}, r"set: unknown stage 'fitt'; did you mean 'fit'"),
+    "unknown parameter": ({}, {"set": "fit.rat=1"}, r"set: stage fit: unknown parameter 'rat'; did you mean 'rate'"),
+    "ill-typed": ({}, {"set": "fit.rate=fast"}, r"set: fit.rate = 'fast': .*integer"),
+    "out of range": ({}, {"set": "fit.iterations=0"}, r"set: fit.iterations = 0: .*greater than or equal to 1"),
+    "no equals sign": ({}, {"set": "fit.rate"}, r"'fit.rate' is not of the form stage.parameter=value"),
+    "variant": ({}, {"variant": "x"}, r"pipeline.yaml: unknown variant 'x'; known: strong, same"),
+    "profile": ({}, {"profile": "laptp"}, r"unknown profile 'laptp'; did you mean 'laptop'"),
+    "scene.yaml key": ({"data/toy/scene.yaml": "shft: 1"}, {}, r"toy/scene.yaml: unknown key 'shft'; .*'shift'"),
+    "scene.yaml value": ({"data/toy/scene.yaml": "shift: a"}, {}, r"toy/scene.yaml: poses.shift = 'a'"),
+    "scene.yaml stage": ({"data/toy/scene.yaml": "stages: {fi: {}}"}, {}, r"scene.yaml: stages: unknown stage 'fi'"),
+    "scene.yaml syntax": ({"data/toy/scene.yaml": "a: [1"}, {}, r"toy/scene.yaml: not valid YAML"),
+    "scene.yaml list": ({"data/toy/scene.yaml": "- 1"}, {}, r"scene.yaml: expected `key: value`"),
+    "weights": ({}, {"set": "distill.prior=./none"}, r"distill.prior: no weights at .*none; name a folder, or an id"),
+    "missing input": ({"data/void/x": ""}, {"scene": "void"}, r"poses: .*void: no number.txt; write one"),
+    "pipeline": ({"pipeline.yaml": "stages: {a: {needs: [b]}}"}, {}, r"pipeline.yaml: "),
+    "pipeline need": (
+        {"pipeline.yaml": "scene_keys: {}\nprofiles: {}\nstages: {a: {needs: [b]}}"}, {},
+        r"pipeline.yaml: stage a names 'b', which is not a stage before it"),
+    "no stage file": (
+        {"pipeline.yaml": "scene_keys: {}\nprofiles: {laptop: {}}\nstages: {lost: {needs: [scene]}}"}, {},
+        r"stages/lost.py: no such file"),
+    "broken stage": ({"stages/fit.py": "import nowhere"}, {}, r"stages/fit.py: ModuleNotFoundError"),
+    "broken library": ({"reffusion/numbers.py": "def"}, {}, r"numbers.py:1: not valid Python"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSALS)
+def test_refused_in_one_line_before_any_work(fresh, case):
+    files, options, message = REFUSALS[case]
+    write(fresh, files)
+    with pytest.raises(Refused, match=message) as caught:
+        run_scene(request(fresh, **{"scene": "toy", **options}), "all")
+    assert "\n" not in str(caught.value)
+    assert not list((fresh / "runs").glob("*/*/receipt.json"))
+
+
+def test_two_folders_of_one_name(root, tmp_path):
+    write(tmp_path, {"elsewhere/toy/number.txt": "4"})
+    with pytest.raises(Refused, match=r"two scenes are called 'toy': .*data/toy.*elsewhere/toy"):
+        prepare(request(root, scene=str(tmp_path / "elsewhere/toy")))
+    shutil.rmtree(root / "data/toy")  # moved, not doubled
+    assert set(words(root, scene=str(tmp_path / "elsewhere/toy")).values()) == {"cached"}
+
+
+def test_clean(root):
+    run_scene(request(root, variant="strong"), "all")
+    execute.clean(request(root, variant="strong"))
+    assert (root / "runs/toy").exists() and not (root / "runs/toy@strong").exists()
+    shutil.rmtree(root / "data/toy")
+    execute.clean(request(root))
+    assert not (root / "runs/toy").exists()
+
+
+# ------------------------------------------------------------------------------------------------------------- batch
+
+
+def test_batch_goes_on_after_a_failed_scene(root, capsys):
+    write(root, {"data/bad/number.txt": "1", "data/bad/broken": "", "data/wide/number.txt": "6"})
+    assert execute.batch(request(root, scene=""), root / "data") == 1
+    output = capsys.readouterr().out
+    assert "failed: bad: poses: " in output and "2 of 3 scenes done" in output
+    lines = (root / "runs/results.csv").read_text().split()
+    assert lines[0] == "scene,state,psnr_box,lpips_vgg_box"
+    rows = {line.split(",")[0]: line.split(",")[1:] for line in lines[1:]}
+    assert rows["toy"] == ["done", "10.0000", ""] and rows["wide"] == ["done", "12.0000", ""]
+    assert rows["bad"] == ["failed", "", ""]
+    assert (root / "runs/results.md").read_text().splitlines()[-1] == "| mean of 2 |  | 11.0000 |  |"
