@@ -1,0 +1,24 @@
+"""The constants of the splatting model, shared by its implementations (docs/splatting.md)."""
+
+NEAR = 0.01  # camera z below which a Gaussian is left out, in units of the normalised frame
+LOW_PASS = 0.3  # px^2 added to the diagonal of the 2D covariance
+MIN_ALPHA = 1.0 / 255.0  # fainter contributions are skipped
+MAX_ALPHA = 0.99  # stronger ones are cut; their gradient is then zero
+MIN_TRANSMITTANCE = 1e-4  # the Gaussian that would go below is not blended, and the pixel is finished
+JACOBIAN_MARGIN = 0.3  # x/z is clamped at the image border + this share of half the image, in the Jacobian only
+MAX_PIXELS = 1e7  # Gaussians whose 2D mean lies farther than this from the image are left out
+MAX_VARIANCE = 1e30  # px^2: those with a larger 2D variance are left out, too
+
+# Real spherical harmonics in the order and with the signs of 3DGS.
+SH0 = 0.28209479177387814
+SH1 = 0.4886025119029199
+SH2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
+SH3 = (
+    -0.5900435899266435,
+    2.890611442640554,
+    -0.4570457994644658,
+    0.3731763325901154,
+    -0.4570457994644658,
+    1.445305721320277,
+    -0.5900435899266435,
+)
