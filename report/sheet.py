@@ -32,15 +32,15 @@ def make(scene_dir: Path, out: Path, *, views: list[str] | int = 3, scale: int |
     Raises:
         ValueError: where the scene is not evaluated yet, or a named view is not among its renders.
     """
-    evaluate = scene_dir / "evaluate"
+    evaluate, poses = (stage_folder(scene_dir, stage) for stage in ("evaluate", "poses"))
     there = sorted(path.stem for path in (evaluate / "renders").glob("*.png"))
     if not there:
         raise ValueError(f"{evaluate / 'renders'}: no pictures; run `make scene={scene_dir.name} evaluate` first")
     names = evenly(there, views) if isinstance(views, int) else views
     if unknown := [name for name in names if name not in there]:
         raise ValueError(f"{evaluate / 'renders'} has no {', '.join(unknown)}; it has {there[0]} ... {there[-1]}")
-    test = io.load_json(scene_dir / "poses" / "views.json")["test"]
-    rows = [pictures_of(scene_dir, name, name in test) for name in names]
+    test = io.load_json(poses / "views.json")["test"]
+    rows = [pictures_of(evaluate, poses if name in test else None, name) for name in names]
     columns = [key for key in TITLES if any(key in row for row in rows)]
     width = max(picture.shape[1] for row in rows for picture in row.values())
     scale = scale or max(1, round(480 / width))
@@ -55,11 +55,17 @@ def evenly(names: list[str], count: int) -> list[str]:
     return [names[int(place)] for place in places]
 
 
-def pictures_of(scene_dir: Path, name: str, scored: bool) -> dict[str, np.ndarray]:
-    """Column -> uint8 [H, W, 3], of what is there; a training photo shows the object and is no ground truth."""
-    paths = {key: scene_dir / "evaluate" / key / f"{name}.png" for key in TITLES if key != "truth"}
-    if scored:
-        paths["truth"] = scene_dir / "poses" / "images" / f"{name}.png"
+def stage_folder(scene_dir: Path, stage: str) -> Path:
+    """runs/<scene>/<stage>; of a variant, runs/<scene>@<variant>, the scene's own where the variant shares it."""
+    own = scene_dir / stage
+    return own if own.exists() else scene_dir.with_name(scene_dir.name.split("@")[0]) / stage
+
+
+def pictures_of(evaluate: Path, poses: Path | None, name: str) -> dict[str, np.ndarray]:
+    """Column -> uint8 [H, W, 3], of what is there. No `poses` for a training photo: it shows the object."""
+    paths = {key: evaluate / key / f"{name}.png" for key in TITLES}
+    if poses:
+        paths["truth"] = poses / "images" / f"{name}.png"
     return {key: io.load_image(path) for key, path in paths.items() if path.exists()}
 
 
@@ -98,9 +104,7 @@ def main() -> None:
     parser.add_argument("--scale", type=int, help="whole factor of enlargement (default: to about 480 px)")
     parser.add_argument("--out", type=Path, help="default: runs/<scene>/sheet.png")
     arguments = parser.parse_args()
-    views = arguments.views
-    if len(views) == 1 and views[0].isdigit() and not (arguments.scene / f"evaluate/renders/{views[0]}.png").exists():
-        views = int(views[0])
+    views = arguments.views if len(arguments.views) > 1 or not arguments.views[0].isdigit() else int(arguments.views[0])
     try:
         print(make(arguments.scene, arguments.out or arguments.scene / "sheet.png", views=views, scale=arguments.scale))
     except ValueError as error:

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -29,8 +30,7 @@ def blobs(count, seed=0):
     return Gaussians(means, draw(count, 4) - 0.5, draw(count, 3) - 3.2, 3 * draw(count), draw(count, 4, 3) - 0.5)
 
 
-@pytest.fixture
-def folders(tmp_path):
+def write_stages(home):
     """Folders of the stages before: views 0-2 test (2 without a mask of its own), 3-7 training."""
     names = [f"view{i}" for i in range(8)]
     cameras = {name: camera(name, 0.1 * i - 0.3) for i, name in enumerate(names)}
@@ -43,7 +43,7 @@ def folders(tmp_path):
         np.zeros((1, 3), np.uint8),
         SIMILARITY,
     )
-    made = {name: tmp_path / name for name in ("poses", "fit", "masks", "reference", "initialize", "distill")}
+    made = {name: home / name for name in ("poses", "fit", "masks", "reference", "initialize", "distill")}
     rng = np.random.default_rng(0)
     io.save_scene(made["poses"], scene)
     for name in names:
@@ -68,21 +68,31 @@ def run(out, folders, **params):
     return json.loads((out / "metrics.json").read_text())
 
 
-@pytest.fixture(autouse=True)
-def no_weights(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+@pytest.fixture
+def folders(tmp_path):
+    return write_stages(tmp_path)
 
 
-def test_scores_are_those_of_the_saved_pictures(tmp_path, folders):
-    out = tmp_path / "out"
-    summary = run(out, folders)
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    """A scene's folder with every stage done, not to be changed; as on a machine without LPIPS weights."""
+    home = tmp_path_factory.mktemp("scene")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(home / "nothing"))
+        patch.setenv("TORCH_HOME", str(home / "nothing"))
+        run(home / "evaluate", write_stages(home))
+    return home
+
+
+def test_scores_are_those_of_the_saved_pictures(done):
+    out = done / "evaluate"
+    summary = io.load_json(out / "metrics.json")
     boxes = {"view0": metrics.Box(2, 8, 38, 32), "view1": None, "view2": metrics.Box(17, 2, 48, 26)}
     for kind, renders in (("mean", "renders"), ("initialize", "renders_initialize")):
         rows = [
             metrics.score_view(
                 io.load_image(out / renders / f"{name}.png"),
-                io.load_image(folders["poses"] / "images" / f"{name}.png"),
+                io.load_image(done / "poses" / "images" / f"{name}.png"),
                 box,
             )
             for name, box in boxes.items()
@@ -104,10 +114,8 @@ def test_scores_are_those_of_the_saved_pictures(tmp_path, folders):
     assert io.load_image(out / "side_by_side" / "view0.png").shape == (HEIGHT, 3 * WIDTH + 8, 3)
 
 
-def test_the_scene_is_exported_in_its_own_frame(tmp_path, folders):
-    out = tmp_path / "out"
-    run(out, folders)
-    exported, result = io.load_ply(out / "scene.ply"), io.load_ply(folders["distill"] / "gaussians.ply")
+def test_the_scene_is_exported_in_its_own_frame(done):
+    exported, result = io.load_ply(done / "evaluate" / "scene.ply"), io.load_ply(done / "distill" / "gaussians.ply")
     back = SIMILARITY.apply(exported.means.double().numpy())
     # 500 km away a float of the scene's own frame is worth 0.03 units, 6e-4 of the normalised frame.
     assert np.abs(back - result.means.double().numpy()).max() < 1e-3
@@ -115,11 +123,9 @@ def test_the_scene_is_exported_in_its_own_frame(tmp_path, folders):
     assert torch.allclose(sizes, torch.full_like(sizes, -np.log(0.02)), atol=1e-5)
 
 
-def test_an_identical_view_is_infinite_in_the_table_and_capped_in_the_mean(tmp_path, folders):
-    first = tmp_path / "first"
-    run(first, folders)
+def test_an_identical_view_is_infinite_in_the_table_and_capped_in_the_mean(done, tmp_path, folders):
     for view in ("view0", "view1", "view2"):
-        picture = io.load_image(first / "renders" / f"{view}.png")
+        picture = io.load_image(done / "evaluate" / "renders" / f"{view}.png")
         io.save_image(folders["poses"] / "images" / f"{view}.png", picture)
     summary = run(tmp_path / "again", folders)
     assert summary["mean"]["psnr_full"] == summary["mean"]["psnr_box"] == metrics.PSNR_CAP
@@ -172,19 +178,23 @@ def test_a_test_view_without_picture_is_rendered_and_one_of_another_size_refused
         run(tmp_path / "again", folders)
 
 
-def test_the_contact_sheet_shows_each_picture_enlarged_without_blur(tmp_path, folders):
-    scene_dir = tmp_path
-    run(scene_dir / "evaluate", folders)
-    path = sheet.make(scene_dir, tmp_path / "sheet.png", views=["view0", "view2"], scale=3)
+def test_the_contact_sheet_shows_each_picture_enlarged_without_blur(done, tmp_path):
+    path = sheet.make(done, tmp_path / "sheet.png", views=["view0", "view2"], scale=3)
     picture = io.load_image(path)
-    ours = np.kron(io.load_image(scene_dir / "evaluate" / "renders" / "view2.png"), np.ones((3, 3, 1), np.uint8))
+    ours = np.kron(io.load_image(done / "evaluate" / "renders" / "view2.png"), np.ones((3, 3, 1), np.uint8))
     bottom, right = (size - sheet.GAP for size in picture.shape[:2])
     assert (picture[bottom - 3 * HEIGHT : bottom, right - 3 * WIDTH : right] == ours).all()
 
 
-def test_the_sheet_names_what_is_missing(tmp_path, folders):
+def test_the_contact_sheet_of_a_variant_takes_shared_stages_from_the_scene(done, tmp_path):
+    shutil.copytree(done / "evaluate", tmp_path / "scene@variant" / "evaluate")
+    shutil.copytree(done / "poses", tmp_path / "scene" / "poses")
+    path = sheet.make(tmp_path / "scene@variant", tmp_path / "variant.png")
+    assert path.read_bytes() == sheet.make(done, tmp_path / "own.png").read_bytes()
+
+
+def test_the_sheet_names_what_is_missing(done, tmp_path):
     with pytest.raises(ValueError, match="no pictures; run `make scene=nowhere evaluate` first"):
         sheet.make(tmp_path / "nowhere", tmp_path / "sheet.png")
-    run(tmp_path / "evaluate", folders)
     with pytest.raises(ValueError, match=r"has no view9; it has view0 ... view2"):
-        sheet.make(tmp_path, tmp_path / "sheet.png", views=["view0", "view9"])
+        sheet.make(done, tmp_path / "sheet.png", views=["view0", "view9"])
