@@ -1,0 +1,321 @@
+"""3DGS optimisation of a whole scene from its training views: what `fit` runs, and any baseline that masks pixels."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from reffusion import trace
+from reffusion.densify import densify, prune
+from reffusion.optimize import GaussianOptimizer, Rates, reconstruction_loss
+from reffusion.splat import render
+from reffusion.types import PARAMETERS, Camera, Gaussians
+
+CHECKPOINT_SECONDS = 10.0
+FEWEST_POINTS = 100
+SCATTERED_POINTS = 10_000
+SH_0 = 0.28209479177387814  # the constant spherical harmonic
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How long and how finely to fit. Lengths in units of the normalised frame; moments as parts of the run in [0, 1].
+
+    Attributes:
+        iterations: optimisation steps, one view each.
+        seed: of the order of the views, random backgrounds and splits.
+        sh_degree: highest degree of the spherical harmonics, 0-3.
+        sh_every: part of the run after which one more degree joins in (3DGS: 1000 of 30000 steps).
+        random_background: a new colour each step, so that nothing stays transparent to show a black background.
+        coarse_until: part of the run that sees the views at half their size.
+        densify_from, densify_until: parts of the run between which Gaussians are added.
+        densify_every: steps between two densifications.
+        slope: mean screen-space gradient from which on a Gaussian is cloned or split, see `densify`.
+        split_above: standard deviation from which on a Gaussian is split, not cloned.
+        budget: most Gaussians.
+        least_opacity: fainter Gaussians are pruned.
+        largest: Gaussians of a larger standard deviation are pruned.
+        reset_every: part of the run after which opacities are capped at 0.01, while densifying; 0: never.
+        rates: Adam's step sizes.
+    """
+
+    iterations: int = 30_000
+    seed: int = 0
+    sh_degree: int = 3
+    sh_every: float = 1 / 30
+    random_background: bool = False
+    coarse_until: float = 0.0
+    densify_from: float = 1 / 60
+    densify_until: float = 0.5
+    densify_every: int = 100
+    slope: float = 2e-4
+    split_above: float = 0.01
+    budget: int = 1_000_000
+    least_opacity: float = 0.005
+    largest: float = 0.5
+    reset_every: float = 0.1
+    rates: Rates = field(default_factory=Rates)
+
+
+def fit(
+    cameras: Sequence[Camera],
+    images: Mapping[str, np.ndarray],
+    initial: Gaussians,
+    settings: Settings,
+    *,
+    folder: Path,
+    weights: Mapping[str, np.ndarray] | None = None,
+    held_out: Sequence[Camera] = (),
+    impl: str = "auto",
+) -> Gaussians:
+    """Optimise `initial` until its renders look like the views; resumes from `folder`'s checkpoint, bit for bit.
+
+    Args:
+        cameras: the views to fit, at least one.
+        images: view name -> uint8 [H, W, 3], for `cameras` and `held_out`.
+        initial: the Gaussians to start from; the work is done on their device.
+        folder: gets trace.jsonl (loss, psnr of the steps since the last line, gaussians, and psnr_held_out, during
+            whose measurement the clock stands) and checkpoints.
+        weights: view name -> [H, W], how much each pixel counts; pixels of weight 0, and they alone, influence nothing.
+            A view without an entry counts as a whole.
+        held_out: views that are only measured.
+        impl: `splat.render`'s.
+
+    Raises:
+        ValueError: no view, or an image or mask of another size than its camera; before any work.
+        FloatingPointError: a loss, gradient or parameter became infinite or NaN; names the step and the view.
+    """
+    weights = weights or {}
+    if not cameras:
+        raise ValueError("a fit needs at least one view")
+    _check_sizes(cameras, images, weights)
+    _check_sizes(held_out, images, {})
+    optimizer, start = GaussianOptimizer(initial, rates=settings.rates), 0
+    recent = {"loss": 0.0, "error": 0.0, "steps": 0}
+    state, seconds = trace.load_checkpoint(folder), 0.0
+    if state is not None:
+        optimizer.load_state_dict(state["optimizer"])
+        start, seconds, recent = state["iteration"], state["seconds"], state["recent"]
+    log = trace.Trace(folder, seconds, start + 1)  # a line is numbered by the steps done
+    saved_at = time.monotonic()
+
+    for i in trace.progress(settings.iterations, "fit", start):
+        camera = cameras[_view(i, len(cameras), settings.seed)]
+        half = i < settings.coarse_until * settings.iterations
+        camera, target, counts = _sample(camera, images[camera.name], weights.get(camera.name), half)
+        target, counts = _move(target, optimizer), _move(counts, optimizer)
+        loss, error = _step(optimizer, camera, target, counts, settings, i, impl)
+        recent = {"loss": recent["loss"] + loss, "error": recent["error"] + error, "steps": recent["steps"] + 1}
+        done = i + 1
+        _adapt(optimizer, settings, done)
+        if trace.log_spaced(done, settings.iterations):
+            _check_finite(optimizer.gaussians, f"step {i}, view '{camera.name}'")
+            with log.paused():
+                line = _summary(recent, optimizer, held_out, images, settings, done, impl)
+            log.log(done, **line)
+            recent = {"loss": 0.0, "error": 0.0, "steps": 0}
+        if time.monotonic() - saved_at > CHECKPOINT_SECONDS and done < settings.iterations:
+            _check_finite(optimizer.gaussians, f"step {i}, view '{camera.name}'")
+            state = {"optimizer": optimizer.state_dict(), "iteration": done, "recent": recent, "seconds": log.seconds}
+            trace.save_checkpoint(folder, state)
+            saved_at = time.monotonic()
+    return optimizer.gaussians.map(Tensor.detach)
+
+
+def initial_gaussians(
+    points: np.ndarray, colors: np.ndarray, sh_degree: int, budget: int, generator: torch.Generator
+) -> Gaussians:
+    """3DGS's start: a round Gaussian of opacity 0.1 at each point, as large as the way to its 3 nearest neighbours.
+
+    Args:
+        points: [P, 3] in the normalised frame, P >= 4.
+        colors: [P, 3] uint8.
+        budget: no more Gaussians than this; a random subset of the points then.
+        generator: of that subset.
+    """
+    if len(points) > budget:
+        kept = torch.randperm(len(points), generator=generator)[:budget].numpy()
+        points, colors = points[kept], colors[kept]
+    distance = cKDTree(points).query(points, k=4)[0][:, 1:]
+    spread = np.sqrt((distance**2).mean(1)).clip(min=1e-4)
+    count = len(points)
+    sh = torch.zeros(count, (sh_degree + 1) ** 2, 3)
+    sh[:, 0] = (torch.from_numpy(colors.astype(np.float32)) / 255 - 0.5) / SH_0
+    return Gaussians(
+        means=torch.from_numpy(points.astype(np.float32)),
+        quaternions=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        log_scales=torch.from_numpy(np.log(spread).astype(np.float32))[:, None].repeat(1, 3),
+        opacity_logits=torch.full((count,), math.log(0.1 / 0.9)),
+        sh=sh,
+    )
+
+
+def starting_points(
+    points: np.ndarray,
+    colors: np.ndarray,
+    cameras: Sequence[Camera],
+    images: Mapping[str, np.ndarray],
+    generator: torch.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The sparse points, or scattered ones where there are fewer than FEWEST_POINTS: what the scene can start from."""
+    if len(points) >= FEWEST_POINTS:
+        return points, colors
+    return scattered_points(cameras, images, SCATTERED_POINTS, generator)
+
+
+def scattered_points(
+    cameras: Sequence[Camera], images: Mapping[str, np.ndarray], count: int, generator: torch.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where no sparse points are known: points on the rays of random pixels, in those pixels' colours.
+
+    Returns:
+        [count, 3] float64 points, at camera depths log-uniform in [0.3, 5] (the normalised frame puts the scene at
+        about 1), and [count, 3] uint8 colours.
+    """
+    draws = torch.rand(count, 4, generator=generator, dtype=torch.float64).numpy()
+    points, colors = np.empty((count, 3)), np.empty((count, 3), np.uint8)
+    for k, (which, u, v, d) in enumerate(draws):
+        camera = cameras[int(which * len(cameras))]
+        x, y, depth = u * camera.width, v * camera.height, 0.3 * (5 / 0.3) ** d
+        seen = np.array([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0]) * depth
+        points[k] = camera.world_to_camera[:3, :3].T @ (seen - camera.world_to_camera[:3, 3])
+        colors[k] = images[camera.name][int(y), int(x)]
+    return points, colors
+
+
+def _view(iteration: int, count: int, seed: int) -> int:
+    """Every view once an epoch, in an order of the epoch's own."""
+    order = torch.randperm(count, generator=trace.generator(seed, "views", iteration // count))
+    return int(order[iteration % count])
+
+
+def _sample(
+    camera: Camera, image: np.ndarray, weights: np.ndarray | None, half: bool
+) -> tuple[Camera, Tensor, Tensor | None]:
+    """The view as the step sees it: camera, image in [0, 1], weights; at half the size if `half`.
+
+    A half-size pixel that covers a pixel of weight 0 has weight 0, lest that pixel come in through the average.
+    """
+    weights = None if weights is None else np.asarray(weights, np.float32)
+    if half:
+        size = ((camera.width + 1) // 2, (camera.height + 1) // 2)
+        image, camera = cv2.resize(image, size, interpolation=cv2.INTER_AREA), camera.resized(*size)
+        if weights is not None:
+            touched = cv2.resize((weights == 0).astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0
+            weights = np.where(touched, 0, cv2.resize(weights, size, interpolation=cv2.INTER_AREA))
+    target = torch.from_numpy(image).float() / 255
+    return camera, target, None if weights is None else torch.from_numpy(weights)
+
+
+def _move(tensor: Tensor | None, optimizer: GaussianOptimizer) -> Tensor | None:
+    return None if tensor is None else tensor.to(optimizer.masked.device, non_blocking=True)
+
+
+def _step(
+    optimizer: GaussianOptimizer,
+    camera: Camera,
+    target: Tensor,
+    counts: Tensor | None,
+    settings: Settings,
+    i: int,
+    impl: str,
+) -> tuple[float, float]:
+    """Render, compare, move; returns the loss and the mean squared error over the pixels that count."""
+    where = f"step {i}, view '{camera.name}'"
+    probe = torch.zeros(len(optimizer.gaussians), 2, device=target.device, requires_grad=True)
+    background = None
+    if settings.random_background:
+        background = torch.rand(3, generator=trace.generator(settings.seed, "background", i)).to(target.device)
+    degree = _degree(settings, i)
+    rendering = render(optimizer.gaussians, camera, background=background, impl=impl, sh_degree=degree, probe=probe)
+    loss = reconstruction_loss(rendering.color, target, counts)
+    value = float(loss.detach())
+    if not math.isfinite(value):
+        raise FloatingPointError(f"fit, {where}: the reconstruction loss is {value}")
+    loss.backward()
+    optimizer.observe(probe.grad, rendering.radii, camera.width, camera.height)
+    try:
+        optimizer.step(i / settings.iterations, visible=rendering.radii > 0)
+    except FloatingPointError as error:
+        raise FloatingPointError(f"fit, {where}, reconstruction: {error}") from None
+    return value, _squared_error(rendering.color.detach(), target, counts)
+
+
+def _squared_error(image: Tensor, target: Tensor, counts: Tensor | None) -> float:
+    squared = (image - target).square()
+    if counts is None:
+        return float(squared.mean())
+    inside = counts > 0
+    return float(squared[inside].mean()) if inside.any() else 0.0
+
+
+def _degree(settings: Settings, i: int) -> int:
+    if settings.sh_every == 0:
+        return settings.sh_degree
+    return min(settings.sh_degree, int(i / (settings.sh_every * settings.iterations)))
+
+
+def _adapt(optimizer: GaussianOptimizer, settings: Settings, done: int) -> None:
+    """Add, prune and fade Gaussians where the schedule says so after `done` steps."""
+    progress = done / settings.iterations
+    if not settings.densify_from <= progress < settings.densify_until:
+        return
+    if done % settings.densify_every == 0:
+        noise = trace.generator(settings.seed, "densify", done)
+        densify(optimizer, settings.slope, settings.split_above, settings.budget, noise)
+        prune(optimizer, settings.least_opacity, settings.largest)
+    period = round(settings.reset_every * settings.iterations)
+    if period and done % period == 0:
+        optimizer.cap_opacity(0.01)
+
+
+def _summary(
+    recent: Mapping[str, float],
+    optimizer: GaussianOptimizer,
+    held_out: Sequence[Camera],
+    images: Mapping[str, np.ndarray],
+    settings: Settings,
+    done: int,
+    impl: str,
+) -> dict[str, Any]:
+    steps = max(recent["steps"], 1)
+    line = {
+        "loss": recent["loss"] / steps,
+        "psnr": -10 * math.log10(max(recent["error"] / steps, 1e-10)),
+        "gaussians": len(optimizer.gaussians),
+    }
+    if not held_out:
+        return line
+    degree, gaussians = _degree(settings, done), optimizer.gaussians.map(Tensor.detach)
+    psnr = []
+    for camera in held_out:
+        image = render(gaussians, camera, impl=impl, sh_degree=degree).color.clamp(0, 1)
+        error = _squared_error(image, _move(_sample(camera, images[camera.name], None, False)[1], optimizer), None)
+        psnr.append(-10 * math.log10(max(error, 1e-10)))
+    return line | {"psnr_held_out": sum(psnr) / len(psnr)}
+
+
+def _check_sizes(cameras: Sequence[Camera], images: Mapping[str, np.ndarray], weights: Mapping[str, np.ndarray]):
+    for camera in cameras:
+        for kind, array in (("image", images.get(camera.name)), ("mask", weights.get(camera.name))):
+            if array is None and kind == "image":
+                raise ValueError(f"view '{camera.name}': no image was given")
+            if array is not None and array.shape[:2] != (camera.height, camera.width):
+                size = f"{array.shape[1]}x{array.shape[0]}"
+                raise ValueError(f"view '{camera.name}': {kind} is {size}, camera is {camera.width}x{camera.height}")
+
+
+def _check_finite(gaussians: Gaussians, where: str) -> None:
+    for name in PARAMETERS:
+        if not torch.isfinite(getattr(gaussians, name).detach()).all():
+            raise FloatingPointError(f"fit, {where}: the Gaussians' {name} are not finite")

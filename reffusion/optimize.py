@@ -1,0 +1,263 @@
+"""The reconstruction loss, the paper's confinement, and Adam over a set of Gaussians whose number changes.
+
+Shared by `fit` and `distill`. Everything here takes tensors and plain numbers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor
+
+from reffusion.ssim import dssim
+from reffusion.types import PARAMETERS, Gaussians
+
+
+def reconstruction_loss(image: Tensor, target: Tensor, weights: Tensor | None = None, share: float = 0.2) -> Tensor:
+    """(1 - share) L1 + share D-SSIM, 3DGS's photometric loss with share 0.2 (D-SSIM = 1 - SSIM).
+
+    Args:
+        image, target: [H, W, C] in [0, 1]; the gradient reaches `image` only.
+        weights: [H, W], bool or in [0, 1]: how much a pixel counts; None: all alike. A pixel of weight 0 influences
+            neither the value nor any other pixel's gradient, and its own gradient is exactly 0 (see `reffusion.ssim`).
+            PAPER leaves open: what a masked loss is divided by. All pixels of the image, so that a pixel pulls
+            equally hard in every view; a view masked as a whole gives 0.
+    """
+    return (1 - share) * _l1(image, target.detach(), weights) + share * dssim(image, target, weights)
+
+
+def _l1(image: Tensor, target: Tensor, weights: Tensor | None) -> Tensor:
+    difference = (image - target).abs()
+    if weights is None:
+        return difference.mean()
+    weights = weights.to(image.dtype)[..., None]
+    return torch.where(weights > 0, weights * difference, 0.0).mean()
+
+
+def confine(gaussians: Gaussians, select: Tensor) -> Gaussians:
+    """The same Gaussians, but a gradient reaches only the rows where `select` [N] bool is True: elsewhere exactly 0."""
+
+    def confined(parameter: Tensor) -> Tensor:
+        return torch.where(select.view(-1, *[1] * (parameter.ndim - 1)), parameter, parameter.detach())
+
+    return gaussians.map(confined)
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Adam's step sizes: 3DGS's values, for the normalised frame, in which cameras stand about 1 from the scene.
+
+    Attributes:
+        means: for positions at the start, in units of the frame; it falls exponentially to `means_last`.
+        means_last: for positions at the end.
+        quaternions, log_scales, opacity_logits: of the like-named parameters.
+        sh_dc: for the constant spherical harmonic.
+        sh_rest: for the others.
+    """
+
+    means: float = 1.6e-4
+    means_last: float = 1.6e-6
+    quaternions: float = 1e-3
+    log_scales: float = 5e-3
+    opacity_logits: float = 0.05
+    sh_dc: float = 2.5e-3
+    sh_rest: float = 2.5e-3 / 20
+
+    def at(self, progress: float, gaussians: Gaussians) -> dict[str, Tensor]:
+        """Step size per parameter and column, at `progress` in [0, 1] of the run."""
+        constant = lambda value, count: torch.full((count,), value)
+        sh = constant(self.sh_rest, gaussians.sh.shape[1] * 3)
+        sh[:3] = self.sh_dc
+        return {
+            "means": constant(self.means ** (1 - progress) * self.means_last**progress, 3),
+            "quaternions": constant(self.quaternions, 4),
+            "log_scales": constant(self.log_scales, 3),
+            "opacity_logits": constant(self.opacity_logits, 1),
+            "sh": sh,
+        }
+
+
+class GaussianOptimizer:
+    """Adam over Gaussians that can be added, removed and relabelled.
+
+    Each Gaussian counts its own steps, so one born late starts Adam afresh, bias correction included. In a
+    step only the Gaussians said to be visible move: moments of the others wait (as in Taming 3DGS), for a Gaussian that
+    no pixel sees has no gradient to average.
+
+    Attributes:
+        gaussians: the parameters, leaves that require a gradient. A new object after each change of number.
+        masked: [N] bool, the Gaussians' labels; they follow through `select` and `append`.
+        slope_sum, slope_count: [N], what `observe` has gathered since `forget_slopes`; they follow likewise.
+    """
+
+    _COUNTERS = ("masked", "_steps", "slope_sum", "slope_count")
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        masked: Tensor | None = None,
+        rates: Rates | None = None,
+        betas: tuple[float, float] = (0.9, 0.999),
+        epsilon: float = 1e-15,
+    ):
+        self.rates, self.betas, self.epsilon = rates or Rates(), betas, epsilon
+        self.masked = torch.zeros(len(gaussians), dtype=torch.bool) if masked is None else masked.clone()
+        self.masked = self.masked.to(gaussians.means.device)
+        self.gaussians = gaussians.map(_leaf)
+        self._first = gaussians.map(_zeros)
+        self._second = gaussians.map(_zeros)
+        self._steps = torch.zeros(len(gaussians), dtype=torch.int32, device=self.masked.device)
+        self.forget_slopes()
+
+    def observe(self, probe_gradient: Tensor, radii: Tensor, width: int, height: int) -> None:
+        """Gather one view's screen-space gradients, by which `densify` chooses.
+
+        3DGS measures in normalised device coordinates, where the image spans [-1, 1]: one unit is half the image. A
+        gradient by pixels therefore counts `width / 2` and `height / 2` times, and since the loss is a mean over
+        pixels the result depends neither on the image's size nor on the scene's.
+
+        Args:
+            probe_gradient: [N, 2], d loss / d (2D mean in pixels), as `splat.render`'s probe receives it.
+            radii: [N], 0 where the Gaussian was not drawn.
+            width, height: of the rendered image, in pixels.
+        """
+        seen = radii > 0
+        slope = probe_gradient * probe_gradient.new_tensor([width / 2, height / 2])
+        self.slope_sum += torch.where(seen, slope.norm(dim=1), 0.0)
+        self.slope_count += seen
+
+    def forget_slopes(self) -> None:
+        self.slope_sum = torch.zeros_like(self._steps, dtype=torch.float32)
+        self.slope_count = torch.zeros_like(self._steps)
+
+    def step(self, progress: float, visible: Tensor | None = None) -> None:
+        """One Adam step along the gradients gathered since the last, which are then forgotten.
+
+        Args:
+            progress: in [0, 1], the part of the run that is done; it sets the step size of the means.
+            visible: [N] bool, the Gaussians to move, e.g. `rendering.radii > 0`; None moves all.
+
+        Raises:
+            FloatingPointError: a gradient is not finite; says of which parameter. Nothing has been changed then.
+        """
+        gradients = {name: getattr(self.gaussians, name).grad for name in PARAMETERS}
+        for name, gradient in gradients.items():
+            # A sum is finite only if every term is, and costs no array of flags.
+            if gradient is not None and not torch.isfinite(gradient.sum()):
+                raise FloatingPointError(f"the gradient of the Gaussians' {name} is not finite")
+        if visible is None:
+            visible = torch.ones_like(self.masked)
+        rates = self.rates.at(progress, self.gaussians)
+        self._steps += visible
+        with torch.no_grad():
+            for name, gradient in gradients.items():
+                if gradient is None:
+                    continue
+                rows = [_rows(getattr(g, name)) for g in (self.gaussians, self._first, self._second)]
+                update = _adam_cpu if gradient.device.type == "cpu" else _adam
+                update(*rows, _rows(gradient), self._steps, visible, rates[name], *self.betas, self.epsilon)
+        self.forget_gradients()
+
+    def forget_gradients(self) -> None:
+        for name in PARAMETERS:
+            getattr(self.gaussians, name).grad = None
+
+    def select(self, keep: Tensor) -> None:
+        """Keep the rows that `keep` ([N] bool, or indices [M]) names; labels and moments with them."""
+        self._replace(lambda p: p[keep])
+        for name in self._COUNTERS:
+            setattr(self, name, getattr(self, name)[keep])
+
+    def append(self, gaussians: Gaussians, masked: Tensor) -> None:
+        """Add Gaussians after the present ones, with labels `masked` [M] bool and empty moments."""
+        self.gaussians = self.gaussians.zipped(gaussians, lambda a, b: _leaf(torch.cat([a, b])))
+        empty = gaussians.map(_zeros)
+        self._first = self._first.zipped(empty, lambda a, b: torch.cat([a, b]))
+        self._second = self._second.zipped(empty, lambda a, b: torch.cat([a, b]))
+        for name in self._COUNTERS:
+            old = getattr(self, name)
+            setattr(self, name, torch.cat([old, masked if name == "masked" else old.new_zeros(len(gaussians))]))
+
+    def cap_opacity(self, limit: float) -> None:
+        """3DGS's opacity reset: no Gaussian is more opaque than `limit` in (0, 1); what is needed grows back.
+
+        Adam's moments of the opacity are emptied: they tell of a slope that is no longer there.
+        """
+        with torch.no_grad():
+            self.gaussians.opacity_logits.clamp_(max=float(np.log(limit / (1 - limit))))
+            self._first.opacity_logits.zero_()
+            self._second.opacity_logits.zero_()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Tensors from which `load_state_dict` continues bit for bit."""
+        parts = {"parameters": self.gaussians, "first": self._first, "second": self._second}
+        state: dict[str, Any] = {
+            part: {name: getattr(g, name).detach().clone() for name in PARAMETERS} for part, g in parts.items()
+        }
+        return state | {name: getattr(self, name).clone() for name in self._COUNTERS}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a `state_dict`, of any number of Gaussians."""
+        self.gaussians = Gaussians(**state["parameters"]).map(_leaf)
+        self._first = Gaussians(**state["first"]).map(torch.clone)
+        self._second = Gaussians(**state["second"]).map(torch.clone)
+        for name in self._COUNTERS:
+            setattr(self, name, state[name].clone())
+
+    def _replace(self, function) -> None:
+        self.gaussians = self.gaussians.map(lambda p: _leaf(function(p)))
+        self._first, self._second = self._first.map(function), self._second.map(function)
+
+
+def _leaf(parameter: Tensor) -> Tensor:
+    return parameter.detach().clone().contiguous().requires_grad_()
+
+
+def _zeros(parameter: Tensor) -> Tensor:
+    return torch.zeros_like(parameter, requires_grad=False, memory_format=torch.contiguous_format)
+
+
+def _rows(parameter: Tensor) -> Tensor:
+    return parameter.detach().contiguous().view(parameter.shape[0], -1)
+
+
+def _adam(parameter, first, second, gradient, steps, visible, rates, beta1, beta2, epsilon) -> None:
+    """One Adam step in place on rows [N, D]; `steps` [N] counts this one already, `rates` [D]."""
+    rows = visible.nonzero()[:, 0]
+    g, t = gradient[rows], steps[rows, None].to(gradient.dtype)
+    m = first[rows].lerp_(g, 1 - beta1)
+    v = second[rows].mul_(beta2).addcmul_(g, g, value=1 - beta2)
+    first[rows], second[rows] = m, v
+    rate = rates.to(g) / (1 - beta1**t)
+    parameter[rows] -= rate * m / ((v / (1 - beta2**t)).sqrt() + epsilon)
+
+
+def _adam_cpu(parameter, first, second, gradient, steps, visible, rates, beta1, beta2, epsilon) -> None:
+    """`_adam` in one pass over memory, for float32."""
+    arrays = (t.numpy() for t in (parameter, first, second, gradient, steps, visible, rates))
+    _adam_kernel(*arrays, beta1, beta2, np.float32(epsilon))
+
+
+@numba.njit(fastmath={"contract", "reassoc", "nsz", "arcp"}, cache=True, nogil=True, parallel=True)
+def _adam_kernel(parameter, first, second, gradient, steps, visible, rates, beta1, beta2, epsilon):
+    count, width = parameter.shape
+    keep1, keep2 = np.float32(beta1), np.float32(beta2)
+    new1, new2 = np.float32(1 - beta1), np.float32(1 - beta2)
+    least = np.float32(1e-30)  # below it a first moment would soon be denormal, on which processors are slow
+    for i in numba.prange(count):
+        if not visible[i]:
+            continue
+        t = float(steps[i])
+        unbias1 = np.float32(1 / (1 - beta1**t))
+        unbias2 = np.float32(1 / (1 - beta2**t))
+        p, m, v, g = parameter[i], first[i], second[i], gradient[i]
+        for j in range(width):
+            a = keep1 * m[j] + new1 * g[j]
+            a = np.float32(0) if abs(a) < least else a
+            b = keep2 * v[j] + new2 * g[j] * g[j]
+            m[j], v[j] = a, b
+            p[j] -= rates[j] * unbias1 * a / (np.sqrt(b * unbias2) + epsilon)

@@ -1,0 +1,78 @@
+"""fit: the scene as it was photographed, object included, in Gaussians; a scene's own .ply is taken over."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class Params(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    iterations: int = Field(30_000, ge=1, description="optimisation steps, one view each (3DGS: 30000)")
+    seed: int = Field(0, description="of the order of views, backgrounds and splits")
+    sh_degree: int = Field(3, ge=0, le=3, description="highest degree of the spherical harmonics")
+    sh_every: float = Field(1 / 30, ge=0, le=1, description="part of the run after which one more degree joins")
+    random_background: bool = Field(False, description="a new background colour each step, instead of black")
+    coarse_until: float = Field(0.0, ge=0, le=1, description="part of the run that sees views at half their size")
+    densify_from: float = Field(1 / 60, ge=0, le=1, description="part of the run before the first densification")
+    densify_until: float = Field(0.5, ge=0, le=1, description="part of the run after which no Gaussian is added")
+    densify_every: int = Field(100, ge=1, description="steps from one densification to the next")
+    slope: float = Field(2e-4, gt=0, description="screen-space gradient that clones or splits; images span [-1, 1]")
+    split_above: float = Field(
+        0.01, gt=0, description="a larger standard deviation splits, a smaller clones; 1 = view distance"
+    )
+    budget: int = Field(1_000_000, ge=4, description="most Gaussians")
+    least_opacity: float = Field(0.005, ge=0, lt=1, description="fainter Gaussians are pruned")
+    largest: float = Field(
+        0.5, gt=0, description="Gaussians of a larger standard deviation are pruned; 1 = view distance"
+    )
+    reset_every: float = Field(0.1, ge=0, le=1, description="part of the run between opacity resets; 0 = none")
+    means_rate: float = Field(1.6e-4, gt=0, description="first step size of positions; the last is a hundredth of it")
+    opacity_rate: float = Field(0.05, gt=0, description="step size of opacity logits")
+    holdout: int = Field(0, ge=0, description="every so manieth training view is only measured; 0 = none")
+    device: Literal["cpu", "cuda"] = Field("cpu", description="where to compute")
+
+
+def preview(params: Params, *, poses: Path) -> list[str]:
+    given = poses is not None and (poses / "gaussians.ply").exists()
+    return ["takes over the scene's gaussians.ply: no optimisation"] if given else []
+
+
+def run(params: Params, out: Path, *, poses: Path) -> None:
+    from reffusion import io, trace
+    from reffusion.fit import fit, initial_gaussians, starting_points
+
+    if (poses / "gaussians.ply").exists():
+        io.save_ply(out / "gaussians.ply", io.load_ply(poses / "gaussians.ply"))
+        return
+    scene = io.load_scene(poses)
+    held_out = scene.train[params.holdout // 2 :: params.holdout] if params.holdout else ()
+    cameras = [scene.cameras[name] for name in scene.train if name not in held_out]
+    images = io.load_views(poses, scene.train)
+    noise = trace.generator(params.seed, "start")
+    points, colors = starting_points(scene.points, scene.point_colors, cameras, images, noise)
+    start = initial_gaussians(points, colors, params.sh_degree, params.budget, noise)
+    gaussians = fit(
+        cameras,
+        images,
+        start.map(lambda p: p.to(params.device)),
+        settings(params),
+        folder=out,
+        held_out=[scene.cameras[name] for name in held_out],
+    )
+    io.save_ply(out / "gaussians.ply", gaussians.map(lambda p: p.cpu()))
+    trace.clear_checkpoint(out)
+
+
+def settings(params: Params):
+    from dataclasses import fields
+
+    from reffusion.fit import Settings
+    from reffusion.optimize import Rates
+
+    shared = {f.name: getattr(params, f.name) for f in fields(Settings) if f.name != "rates"}
+    rates = Rates(means=params.means_rate, means_last=params.means_rate / 100, opacity_logits=params.opacity_rate)
+    return Settings(**shared, rates=rates)

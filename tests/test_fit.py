@@ -1,0 +1,240 @@
+"""The fit of a whole scene: it learns, resumes, ignores masked pixels, and fails by name."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from reffusion import fit as fitting
+from reffusion import io, trace
+from reffusion.fit import Settings, fit, initial_gaussians, scattered_points
+from reffusion.optimize import Rates
+from reffusion.splat import render
+from reffusion.types import PARAMETERS, Camera, Gaussians, Scene, Similarity
+
+WIDTH, HEIGHT = 22, 16
+SETTINGS = Settings(
+    iterations=24, sh_degree=1, sh_every=0.25, densify_from=0.2, densify_until=0.8, densify_every=6, slope=1e-4,
+    budget=120, coarse_until=0.2, reset_every=0.5, random_background=True, rates=Rates(means=2e-3, means_last=2e-4),
+)  # fmt: skip
+
+
+def ring_of_cameras(count: int = 5, scale: float = 1.0, offset=(0.0, 0.0, 0.0)) -> list[Camera]:
+    """Views of the origin from distance 1, in a frame where a point p of the normalised one is p / scale + offset."""
+    cameras = []
+    for k in range(count):
+        angle = 0.8 * (k / (count - 1) - 0.5)
+        rotation = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+        pose = np.eye(4)
+        pose[:3, :3] = rotation
+        center = rotation.T @ np.array([0, 0, -1.0]) / scale + np.asarray(offset)
+        pose[:3, 3] = -rotation @ center
+        cameras.append(Camera(f"view{k}", WIDTH, HEIGHT, WIDTH, WIDTH, WIDTH / 2, HEIGHT / 2, pose))
+    return cameras
+
+
+def normalised(camera: Camera, similarity: Similarity) -> Camera:
+    pose = camera.world_to_camera.copy()
+    pose[:3, 3] = -pose[:3, :3] @ similarity.apply(camera.center)
+    return replace(camera, world_to_camera=pose)
+
+
+def truth() -> Gaussians:
+    draw = lambda *shape: torch.randn(*shape, generator=generator)
+    generator = trace.generator(5, "truth")
+    return Gaussians(draw(40, 3) * 0.2, draw(40, 4), -2.5 + 0.3 * draw(40, 3), 2 + draw(40), draw(40, 1, 3))
+
+
+def photos(cameras) -> dict[str, np.ndarray]:
+    pictures = {c.name: render(truth(), c, impl="reference").color.clamp(0, 1) for c in cameras}
+    return {name: (picture * 255).round().byte().numpy() for name, picture in pictures.items()}
+
+
+def start(points=None, degree: int = 1) -> Gaussians:
+    points = truth().means.numpy().astype(np.float64) if points is None else points
+    colors = np.full((len(points), 3), 128, np.uint8)
+    return initial_gaussians(points, colors, degree, 1000, trace.generator(0))
+
+
+def run(folder, cameras=None, initial=None, settings=SETTINGS, **given) -> Gaussians:
+    folder.mkdir(exist_ok=True)
+    cameras = cameras or ring_of_cameras()
+    return fit(cameras, photos(ring_of_cameras()), initial or start(), settings, folder=folder, **given)
+
+
+def test_it_learns_and_says_so(tmp_path):
+    held = ring_of_cameras()[2:3]
+    cameras = [c for c in ring_of_cameras() if c.name != held[0].name]
+    settings = replace(SETTINGS, iterations=120, reset_every=0, random_background=False)
+    fitted = run(tmp_path, cameras, settings=settings, held_out=held)
+    lines = [json.loads(line) for line in (tmp_path / "trace.jsonl").read_text().splitlines()]
+    assert lines[-1]["iteration"] == 120 and lines[-1]["gaussians"] == len(fitted)
+    assert lines[-1]["psnr_held_out"] > lines[0]["psnr_held_out"] + 2
+    assert lines[-1]["psnr"] > lines[0]["psnr"] + 2
+    assert 40 < len(fitted) <= 120, "densification made more, the budget bounded it"
+    seconds = [line["seconds"] for line in lines]
+    assert seconds == sorted(seconds)
+
+
+class Killed(Exception):
+    pass
+
+
+def test_a_resumed_fit_is_the_unbroken_one_bit_for_bit(tmp_path, monkeypatch):
+    unbroken = run(tmp_path / "unbroken")
+    monkeypatch.setattr(fitting, "CHECKPOINT_SECONDS", 0.0)
+    adapt, folder = fitting._adapt, tmp_path / "resumed"
+    for moment in (3, 4, 13, 18):  # before the first checkpoint of a run, twice in a row, around densifications
+
+        def killing(optimizer, settings, done, moment=moment):
+            adapt(optimizer, settings, done)
+            if done == moment:
+                raise Killed
+
+        monkeypatch.setattr(fitting, "_adapt", killing)
+        with pytest.raises(Killed):
+            run(folder)
+        assert trace.load_checkpoint(folder)["iteration"] == moment - 1
+    monkeypatch.setattr(fitting, "_adapt", adapt)
+    resumed = run(folder)
+    for name in PARAMETERS:
+        assert torch.equal(getattr(unbroken, name), getattr(resumed, name)), name
+    broken, whole = (trace.read_trace(tmp_path / k / "trace.jsonl") for k in ("resumed", "unbroken"))
+    drop = lambda lines: [{k: v for k, v in line.items() if k != "seconds"} for line in lines]
+    assert drop(broken) == drop(whole)
+
+
+def test_seeds_matter_and_repeat(tmp_path):
+    first, again = run(tmp_path / "a"), run(tmp_path / "b")
+    other = run(tmp_path / "c", settings=replace(SETTINGS, seed=1))
+    assert torch.equal(first.means, again.means)
+    assert len(other) != len(first) or not torch.equal(first.means, other.means)
+
+
+def test_masked_pixels_do_not_matter_to_the_fit(tmp_path):
+    cameras, pictures = ring_of_cameras(), photos(ring_of_cameras())
+    weights = {c.name: np.ones((HEIGHT, WIDTH), bool) for c in cameras[1:]}
+    for mask in weights.values():
+        mask[3:10, 5:12] = False
+    spoilt = {name: p.copy() for name, p in pictures.items()}
+    for name, mask in weights.items():
+        spoilt[name][~mask] = 255
+    fitted = []
+    for k, images in enumerate((pictures, spoilt)):
+        (tmp_path / str(k)).mkdir()
+        fitted.append(fit(cameras, images, start(), SETTINGS, folder=tmp_path / str(k), weights=weights))
+    assert torch.equal(fitted[0].means, fitted[1].means) and torch.equal(fitted[0].sh, fitted[1].sh)
+
+
+def test_a_scene_a_thousand_times_larger_and_far_away_fits_alike(tmp_path):
+    """Cameras and points in metres of a national grid, through their similarity, give the fit of the unit scene."""
+    scale, offset = 1e-3, np.array([4.5e5, -3.2e4, 120.0])
+    far = Similarity(scale, offset)
+    cameras = [normalised(c, far) for c in ring_of_cameras(scale=scale, offset=offset)]
+    points = truth().means.numpy().astype(np.float64)
+    plain = run(tmp_path / "plain")
+    moved = run(tmp_path / "far", cameras, start(far.apply(far.invert(points))))
+    assert len(plain) == len(moved)
+    for camera in ring_of_cameras():
+        a, b = (render(g, camera, impl="reference").color for g in (plain, moved))
+        assert (a - b).abs().max() < 0.01
+
+
+@pytest.mark.parametrize("broken", ["picture", "parameter"])
+def test_what_is_not_finite_stops_and_is_named(tmp_path, monkeypatch, broken):
+    initial = start()
+    if broken == "parameter":
+        initial.sh[3, 0, 0] = float("nan")
+        with pytest.raises(FloatingPointError, match=r"step 0, view 'view\d'"):
+            run(tmp_path, initial=initial)
+        return
+
+    def burst(image, target, weights=None, share=0.2):
+        return image.sum() * float("inf")
+
+    monkeypatch.setattr(fitting, "reconstruction_loss", burst)
+    with pytest.raises(FloatingPointError, match=r"step 0, view 'view\d': the reconstruction loss"):
+        run(tmp_path)
+
+
+def test_wrong_input_is_refused_before_any_work(tmp_path):
+    cameras, pictures = ring_of_cameras(), photos(ring_of_cameras())
+    with pytest.raises(ValueError, match="view 'view1': image is 10x16, camera is 22x16"):
+        fit(cameras, pictures | {"view1": pictures["view1"][:, :10]}, start(), SETTINGS, folder=tmp_path)
+    with pytest.raises(ValueError, match="view 'view2': mask"):
+        weights = {"view2": np.ones((3, 3), bool)}
+        fit(cameras, pictures, start(), SETTINGS, folder=tmp_path, weights=weights)
+    with pytest.raises(ValueError, match="'view0': no image"):
+        fit(cameras, {}, start(), SETTINGS, folder=tmp_path)
+    with pytest.raises(ValueError, match="at least one view"):
+        fit([], {}, start(), SETTINGS, folder=tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_start_has_the_points_colours_and_spacing():
+    grid = np.stack(np.meshgrid(*[np.arange(4) * 0.1] * 3), -1).reshape(-1, 3)
+    colors = np.tile(np.array([[10, 128, 250]], np.uint8), (64, 1))
+    gaussians = initial_gaussians(grid, colors, 2, 1000, trace.generator(0))
+    assert torch.allclose(gaussians.log_scales.exp(), torch.tensor(0.1), rtol=1e-5)
+    assert torch.allclose(0.5 + 0.28209479 * gaussians.sh[:, 0], torch.tensor([10, 128, 250]) / 255, atol=1e-6)
+    assert torch.allclose(gaussians.opacity_logits.sigmoid(), torch.tensor(0.1))
+    assert gaussians.sh.shape == (64, 9, 3) and torch.all(gaussians.sh[:, 1:] == 0)
+    assert len(initial_gaussians(grid, colors, 0, 20, trace.generator(0))) == 20
+    coincident = initial_gaussians(np.zeros((5, 3)), colors[:5], 0, 9, trace.generator(0))
+    assert torch.isfinite(coincident.log_scales).all()
+
+
+def test_scattered_points_are_seen_where_they_were_drawn():
+    from reffusion.geometry import project
+
+    cameras = ring_of_cameras()
+    images = {c.name: np.full((HEIGHT, WIDTH, 3), 40 * k, np.uint8) for k, c in enumerate(cameras)}
+    points, colors = scattered_points(cameras, images, 200, trace.generator(0))
+    for k, camera in enumerate(cameras):
+        uv, depth = project(points[colors[:, 0] == 40 * k], camera)
+        assert len(uv) and np.all((depth >= 0.3) & (depth <= 5.0))
+        assert np.all((uv >= 0) & (uv <= [WIDTH, HEIGHT]))
+
+
+def write_scene(folder) -> None:
+    cameras, pictures = ring_of_cameras(), photos(ring_of_cameras())
+    names = [c.name for c in cameras]
+    points = np.repeat(truth().means.numpy().astype(np.float64), 3, 0)
+    points += np.random.default_rng(0).normal(0, 0.01, points.shape)
+    scene = Scene(
+        cameras={c.name: c for c in cameras}, train=tuple(names[1:]), test=(names[0],), clean=frozenset(),
+        points=points, point_colors=np.full((len(points), 3), 128, np.uint8),
+        similarity=Similarity(1.0, np.zeros(3)),
+    )  # fmt: skip
+    io.save_scene(folder, scene)
+    for name in scene.train:  # the test view has no picture here: reading it would fail
+        io.save_image(folder / "images" / f"{name}.png", pictures[name])
+
+
+def test_the_stage_writes_its_artifact_and_never_reads_test_views(tmp_path):
+    from stages import fit as stage
+
+    poses, out = tmp_path / "poses", tmp_path / "out"
+    write_scene(poses)
+    out.mkdir()
+    params = stage.Params(iterations=10, budget=150, sh_degree=1, holdout=4)
+    stage.run(params, out, poses=poses)
+    fitted = io.load_ply(out / "gaussians.ply")
+    assert 0 < len(fitted) <= 150 and fitted.sh_degree == 1
+    assert "psnr_held_out" in trace.read_trace(out / "trace.jsonl")[-1]
+    assert trace.load_checkpoint(out) is None
+    assert stage.preview(params, poses=poses) == []
+
+
+def test_the_stage_takes_over_a_scene_of_gaussians(tmp_path):
+    from stages import fit as stage
+
+    poses, out = tmp_path / "poses", tmp_path / "out"
+    write_scene(poses)
+    out.mkdir()
+    io.save_ply(poses / "gaussians.ply", truth())
+    stage.run(stage.Params(), out, poses=poses)
+    assert torch.equal(io.load_ply(out / "gaussians.ply").means, truth().means)
+    assert "no optimisation" in stage.preview(stage.Params(), poses=poses)[0]

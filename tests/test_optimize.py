@@ -1,0 +1,327 @@
+"""The reconstruction loss, confinement, Adam over a changing set of Gaussians, densification."""
+
+import numpy as np
+import pytest
+import torch
+
+from reffusion import trace
+from reffusion.densify import SHRINK, densify, prune, rotate, split
+from reffusion.optimize import GaussianOptimizer, Rates, _adam, confine, reconstruction_loss
+from reffusion.splat import render
+from reffusion.ssim import dssim, dssim_torch
+from reffusion.types import PARAMETERS, Camera, Gaussians
+
+
+def random_gaussians(count: int, degree: int = 1, seed: int = 0, scale: float = 0.05) -> Gaussians:
+    draw = lambda *shape: torch.randn(*shape, generator=generator)
+    generator = trace.generator(seed, "test")
+    return Gaussians(
+        means=draw(count, 3) * 0.2,
+        quaternions=draw(count, 4),
+        log_scales=np.log(scale) + 0.3 * draw(count, 3),
+        opacity_logits=draw(count),
+        sh=draw(count, (degree + 1) ** 2, 3) * 0.3,
+    )
+
+
+def camera(width: int = 24, height: int = 18) -> Camera:
+    pose = np.eye(4)
+    pose[2, 3] = 1.0
+    return Camera("view", width, height, width * 1.0, width * 1.0, width / 2, height / 2, pose)
+
+
+def pictures(height: int = 23, width: int = 31, channels: int = 3):
+    generator = trace.generator(1, "pictures")
+    image = torch.rand(height, width, channels, generator=generator)
+    target = (image + 0.2 * torch.randn(image.shape, generator=generator)).clamp(0, 1)
+    return image, target, torch.rand(height, width, generator=generator) > 0.4
+
+
+# ---------------------------------------------------------------------------------------------- loss
+
+
+def test_ssim_is_the_formula_of_wang_et_al():
+    """scikit-image's value, for pictures that differ in the middle only, so that no window meets a border."""
+    from skimage.metrics import structural_similarity
+
+    image, target, _ = pictures(40, 44)
+    differs = torch.zeros(40, 44, 1, dtype=torch.bool)
+    differs[10:-10, 10:-10] = True
+    target = torch.where(differs, target, image)
+    _, similarity = structural_similarity(
+        image.double().numpy(), target.double().numpy(), channel_axis=2, data_range=1.0, gaussian_weights=True,
+        sigma=1.5, use_sample_covariance=False, full=True,
+    )  # fmt: skip
+    assert abs(dssim(image, target).item() - (1 - similarity.mean())) < 1e-6
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize("kind", ["all", "mask", "soft"])
+def test_kernel_agrees_with_plain_torch_in_float64(channels, kind):
+    image, target, mask = pictures(channels=channels)
+    weights = {"all": None, "mask": mask, "soft": mask * torch.rand(mask.shape)}[kind]
+    fast, exact = image.clone().requires_grad_(), image.double().requires_grad_()
+    value = dssim(fast, target, weights)
+    oracle = dssim_torch(exact, target.double(), None if weights is None else weights.double())
+    (3 * value).backward()
+    (3 * oracle).backward()
+    assert abs(value.item() - oracle.item()) < 1e-6
+    assert (fast.grad - exact.grad).abs().max() < 1e-5 * exact.grad.abs().max()
+
+
+def test_loss_gradient_by_finite_differences():
+    image, target, mask = pictures(7, 6, 1)
+    for weights in (None, mask, mask.double() * 0.7):
+        loss = lambda x, w=weights: reconstruction_loss(x, target.double(), w)
+        assert torch.autograd.gradcheck(loss, image.double().requires_grad_())
+
+
+@pytest.mark.parametrize("junk", [0.0, 1.0, 1e30, float("nan"), float("inf")])
+def test_masked_pixels_have_no_influence_at_all(junk):
+    image, target, mask = pictures()
+    clean, dirty = image.clone(), image.clone()
+    dirty[~mask] = junk
+    values, gradients = [], []
+    for picture, truth in ((clean, target), (dirty, torch.where(mask[..., None], target, junk))):
+        leaf = picture.requires_grad_()
+        loss = reconstruction_loss(leaf, truth, mask)
+        loss.backward()
+        values.append(loss.item())
+        gradients.append(leaf.grad)
+    assert values[0] == values[1]
+    assert torch.equal(gradients[0], gradients[1])
+    assert torch.all(gradients[0][~mask] == 0)
+    assert gradients[0][mask].abs().sum() > 0
+
+
+def test_wholly_masked_and_perfect_views_give_zero():
+    image, target, mask = pictures()
+    leaf = image.clone().requires_grad_()
+    loss = reconstruction_loss(leaf, target, torch.zeros_like(mask))
+    loss.backward()
+    assert loss.item() == 0 and torch.all(leaf.grad == 0)
+    assert abs(reconstruction_loss(target, target).item()) < 1e-6
+
+
+def test_large_images_in_one_value():
+    """1 - SSIM of anti-correlated checkers: known without any code."""
+    rows = torch.arange(40)[:, None] + torch.arange(40)[None]
+    checker = (rows % 2).float()[..., None]
+    assert 1.9 < dssim(checker, 1 - checker).item() <= 2.0
+
+
+# ---------------------------------------------------------------------------------------------- confine
+
+
+def test_confined_rows_receive_exactly_nothing():
+    leaves = random_gaussians(30).map(lambda p: p.requires_grad_())
+    select = torch.arange(30) % 3 == 0
+    rendering = render(confine(leaves, select), camera(), impl="reference")
+    (rendering.color.square().sum() + rendering.depth.sum() + rendering.alpha.sum()).backward()
+    for name in PARAMETERS:
+        gradient = getattr(leaves, name).grad
+        assert torch.all(gradient[~select] == 0), name
+        if name != "quaternions":
+            assert gradient[select].abs().sum() > 0, name
+
+
+def test_confine_stops_even_nan():
+    leaves = random_gaussians(4).map(lambda p: p.requires_grad_())
+    select = torch.tensor([True, False, True, False])
+    (confine(leaves, select).means * torch.tensor([[1.0], [float("nan")], [1.0], [float("inf")]])).sum().backward()
+    assert torch.equal(leaves.means.grad, torch.tensor([[1.0], [0.0], [1.0], [0.0]]).expand(4, 3))
+
+
+def test_confine_leaves_the_picture_alone():
+    gaussians = random_gaussians(20)
+    seen = render(gaussians, camera(), impl="reference").color
+    confined = confine(gaussians, torch.zeros(20, dtype=torch.bool))
+    assert torch.equal(render(confined, camera(), impl="reference").color, seen)
+
+
+# ---------------------------------------------------------------------------------------------- Adam
+
+
+def pretend_gradients(optimizer: GaussianOptimizer, step: int) -> None:
+    for name in PARAMETERS:
+        parameter = getattr(optimizer.gaussians, name)
+        parameter.grad = torch.randn(parameter.shape, generator=trace.generator(step, name))
+
+
+def test_adam_is_torch_adam_where_all_are_visible():
+    start, rates, steps = random_gaussians(17, degree=2), Rates(), 12
+    ours = GaussianOptimizer(start, rates=rates)
+    theirs = {name: getattr(start, name).clone().requires_grad_() for name in PARAMETERS}
+    dc, rest = start.sh[:, :1].clone().requires_grad_(), start.sh[:, 1:].clone().requires_grad_()
+    groups = [{"params": [theirs[name]], "lr": getattr(rates, name)} for name in PARAMETERS[:-1]]
+    groups += [{"params": [dc], "lr": rates.sh_dc}, {"params": [rest], "lr": rates.sh_rest}]
+    reference = torch.optim.Adam(groups, eps=1e-15)
+    for i in range(steps):
+        pretend_gradients(ours, i)
+        for name in PARAMETERS[:-1]:
+            theirs[name].grad = getattr(ours.gaussians, name).grad.clone()
+        dc.grad, rest.grad = ours.gaussians.sh.grad[:, :1].clone(), ours.gaussians.sh.grad[:, 1:].clone()
+        reference.param_groups[0]["lr"] = rates.means * (rates.means_last / rates.means) ** (i / steps)
+        reference.step()
+        ours.step(i / steps)
+    theirs["sh"] = torch.cat([dc, rest], 1)
+    for name in PARAMETERS:
+        moved = (theirs[name] - getattr(start, name)).abs().max()
+        assert (getattr(ours.gaussians, name) - theirs[name]).abs().max() < 1e-4 * moved, name
+
+
+def test_plain_and_compiled_adam_agree():
+    generator = trace.generator(3, "adam")
+    rows = [torch.randn(50, 6, generator=generator) for _ in range(4)]
+    rows[2] = rows[2].abs()
+    steps, visible = torch.randint(1, 9, (50,), generator=generator, dtype=torch.int32), rows[0][:, 0] > 0
+    rates = torch.rand(6, generator=generator)
+    plain, compiled = [r.double() for r in rows], [r.clone() for r in rows]
+    _adam(*plain, steps, visible, rates, 0.9, 0.999, 1e-15)
+    from reffusion.optimize import _adam_cpu
+
+    _adam_cpu(*compiled, steps, visible, rates, 0.9, 0.999, 1e-15)
+    for a, b in zip(plain, compiled, strict=True):
+        assert torch.allclose(a.float(), b, rtol=1e-5, atol=1e-6)
+
+
+def test_unseen_gaussians_stay_and_late_ones_start_afresh():
+    optimizer = GaussianOptimizer(random_gaussians(6))
+    visible = torch.tensor([True, True, True, False, False, False])
+    before = optimizer.gaussians.map(lambda p: p.detach().clone())
+    for i in range(5):
+        pretend_gradients(optimizer, i)
+        optimizer.step(0.0, visible)
+    assert torch.equal(optimizer.gaussians.means[3:], before.means[3:])
+    assert not torch.equal(optimizer.gaussians.means[:3], before.means[:3])
+    pretend_gradients(optimizer, 9)
+    sign = optimizer.gaussians.means.grad.sign()
+    optimizer.step(0.0)
+    # Adam's first step is the step size along the gradient's sign, whenever it is taken.
+    first = optimizer.gaussians.means[3:] - before.means[3:]
+    assert torch.allclose(first, -Rates().means * sign[3:], rtol=1e-2)
+
+
+def test_a_gradient_that_is_not_finite_is_named_and_changes_nothing():
+    optimizer = GaussianOptimizer(random_gaussians(5))
+    pretend_gradients(optimizer, 0)
+    optimizer.gaussians.opacity_logits.grad[2] = float("nan")
+    before = optimizer.state_dict()
+    with pytest.raises(FloatingPointError, match="opacity_logits"):
+        optimizer.step(0.0)
+    after = optimizer.state_dict()
+    assert all(torch.equal(before["parameters"][n], after["parameters"][n]) for n in PARAMETERS)
+
+
+def test_state_continues_bit_for_bit():
+    unbroken = GaussianOptimizer(random_gaussians(9), masked=torch.arange(9) % 2 == 0)
+    for i in range(3):
+        pretend_gradients(unbroken, i)
+        unbroken.step(i / 6)
+    resumed = GaussianOptimizer(random_gaussians(2))
+    resumed.load_state_dict(unbroken.state_dict())
+    for optimizer in (unbroken, resumed):
+        for i in range(3, 6):
+            pretend_gradients(optimizer, i)
+            optimizer.step(i / 6, torch.arange(9) < 7)
+    for name in PARAMETERS:
+        assert torch.equal(getattr(unbroken.gaussians, name), getattr(resumed.gaussians, name))
+    assert torch.equal(unbroken.masked, resumed.masked)
+
+
+# ---------------------------------------------------------------------------------------------- densification
+
+
+def observed(gaussians: Gaussians, slopes: list[float], masked=None) -> GaussianOptimizer:
+    optimizer = GaussianOptimizer(gaussians, masked)
+    optimizer.slope_sum = torch.tensor(slopes) * 4
+    optimizer.slope_count = torch.full((len(slopes),), 4, dtype=torch.int32)
+    return optimizer
+
+
+def test_labels_and_moments_follow_through_clone_split_and_prune():
+    start = random_gaussians(5, scale=0.005)
+    start.log_scales[3:] += 3.0  # 3 and 4 are large: to be split
+    masked = torch.tensor([True, False, True, True, False])
+    optimizer = observed(start, [9e-4, 0.0, 0.0, 9e-4, 0.0], masked)
+    pretend_gradients(optimizer, 0)
+    optimizer.step(0.0)
+    kept = optimizer.state_dict()
+    grown = densify(optimizer, 2e-4, 0.02, 100, trace.generator(0, "split"))
+    # order now: 0 1 2 4, clone of 0, two children of 3
+    assert grown == 2 and len(optimizer.gaussians) == 7
+    assert optimizer.masked.tolist() == [True, False, True, False, True, True, True]
+    old = torch.tensor([0, 1, 2, 4])
+    after = optimizer.state_dict()
+    for part in ("parameters", "first", "second"):
+        for name in PARAMETERS:
+            assert torch.equal(after[part][name][:4], kept[part][name][old]), (part, name)
+    for name in PARAMETERS:
+        assert torch.equal(after["parameters"][name][4], kept["parameters"][name][0])
+        assert torch.all(after["first"][name][4:] == 0) and torch.all(after["second"][name][4:] == 0)
+    assert after["_steps"].tolist() == [1, 1, 1, 1, 0, 0, 0]
+    assert torch.allclose(
+        after["parameters"]["log_scales"][5], kept["parameters"]["log_scales"][3] - float(np.log(SHRINK))
+    )
+
+    with torch.no_grad():
+        optimizer.gaussians.opacity_logits[[0, 3, 5]] = -9.0
+        optimizer.gaussians.opacity_logits[[1, 2, 4, 6]] = 1.0
+    assert prune(optimizer, 0.005, 10.0) == 3
+    assert optimizer.masked.tolist() == [False, True, True, True]
+    assert torch.equal(optimizer.state_dict()["first"]["means"][:2], kept["first"]["means"][[1, 2]])
+    assert len(optimizer.slope_sum) == len(optimizer.slope_count) == 4
+
+
+def test_the_budget_takes_the_steepest():
+    optimizer = observed(random_gaussians(4, scale=0.001), [3e-4, 9e-4, 1e-4, 5e-4])
+    assert densify(optimizer, 2e-4, 0.01, 6, trace.generator(0)) == 2
+    assert torch.equal(optimizer.gaussians.means[4:], optimizer.gaussians.means[[1, 3]])
+    optimizer.slope_sum += 1
+    optimizer.slope_count += 1
+    assert densify(optimizer, 2e-4, 0.01, 6, trace.generator(0)) == 0
+
+
+def test_split_keeps_the_picture_roughly():
+    parent = random_gaussians(12, seed=4, scale=0.1)
+    parent.opacity_logits[:] = 0.0
+    children = split(parent, trace.generator(0, "split"))
+    before = render(parent, camera(48, 36), impl="reference")
+    after = render(children, camera(48, 36), impl="reference")
+    error = (before.color - after.color).square().mean()
+    assert error < 0.25 * before.color.square().mean()
+    assert abs(after.alpha.mean() / before.alpha.mean() - 1) < 0.25
+
+
+def test_split_draws_from_the_gaussian_itself():
+    """Children of one anisotropic Gaussian have its covariance about its mean."""
+    one = random_gaussians(1, seed=2)
+    one.log_scales[0] = torch.log(torch.tensor([0.5, 0.1, 0.02]))
+    many = one.map(lambda p: p.repeat(4000, *[1] * (p.ndim - 1)))
+    offsets = split(many, trace.generator(1)).means - one.means
+    basis = rotate(one.quaternions.expand(3, 4), torch.eye(3)).T
+    truth = basis @ torch.diag(torch.tensor([0.5, 0.1, 0.02]) ** 2) @ basis.T
+    assert (torch.cov(offsets.T) - truth).abs().max() < 0.05 * truth.abs().max()
+    assert torch.equal(rotate(torch.zeros(1, 4), torch.ones(1, 3)), torch.ones(1, 3))
+
+
+def test_slopes_do_not_depend_on_the_image_size():
+    """The same blurred picture at twice the size pulls at the same Gaussians equally hard."""
+    slopes = []
+    for width in (32, 64):
+        optimizer = GaussianOptimizer(random_gaussians(15, seed=7, scale=0.15))
+        probe = torch.zeros(15, 2, requires_grad=True)
+        seen = render(optimizer.gaussians, camera(width, width * 3 // 4), impl="reference", probe=probe)
+        (seen.color - 0.3).square().mean().backward()
+        optimizer.observe(probe.grad, seen.radii, width, width * 3 // 4)
+        slopes.append(optimizer.slope_sum)
+    assert torch.allclose(slopes[0], slopes[1], rtol=0.05, atol=0.02 * float(slopes[0].max()))
+
+
+def test_capped_opacities_start_over():
+    optimizer = GaussianOptimizer(random_gaussians(8))
+    pretend_gradients(optimizer, 0)
+    optimizer.step(0.0)
+    optimizer.cap_opacity(0.01)
+    assert optimizer.gaussians.opacity_logits.sigmoid().max() < 0.01 + 1e-6
+    assert torch.all(optimizer.state_dict()["first"]["opacity_logits"] == 0)
