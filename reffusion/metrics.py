@@ -114,7 +114,8 @@ def flip(image: np.ndarray, truth: np.ndarray) -> float:
 
     image, truth = (np.ascontiguousarray(x, np.float32) for x in _pair(image, truth))
     settings = {"ppd": PIXELS_PER_DEGREE}
-    return float(flip_evaluator.evaluate(truth, image, "LDR", applyMagma=False, parameters=settings)[1])
+    errors = flip_evaluator.evaluate(truth, image, "LDR", applyMagma=False, computeMeanError=False, parameters=settings)
+    return float(errors[0].mean(dtype=np.float64))
 
 
 def lpips(image: np.ndarray, truth: np.ndarray, model: Lpips) -> float:
