@@ -1,8 +1,8 @@
 """The tiny runner: it knows files, hashes and YAML, and nothing of 3D.
 
-    pipeline.py   pipeline.yaml and scene.yaml: models, layers of parameters, clear refusals
-    keys.py       what an artifact depends on, as hashes: contents of folders, code, parameters
-    plan.py       one word and a reason for each stage, from what lies on the disk
-    execute.py    locks, fresh processes, folders renamed into place, receipts, batches
-    child.py      the other side: the process in which stages are imported
+- pipeline.py: pipeline.yaml and scene.yaml: models, layers of parameters, clear refusals.
+- keys.py: what an artifact depends on, as hashes: contents of folders, code, parameters.
+- plan.py: one word and a reason for each stage, from what lies on the disk.
+- execute.py: locks, fresh processes, folders renamed into place, receipts, batches.
+- child.py: the other side: the process in which stages are imported.
 """

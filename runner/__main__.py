@@ -17,9 +17,7 @@ def main() -> int:
     arguments = _parser().parse_args()
     root = arguments.root.resolve()
     runs = (arguments.runs or root / "runs").resolve()
-    request = Request(
-        root, runs, arguments.scene, arguments.profile, arguments.variant, arguments.trust, arguments.set
-    )
+    request = Request(root, runs, arguments.scene, arguments.profile, arguments.variant, arguments.trust, arguments.set)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # told to end: as Ctrl-C
     try:
         if arguments.command == "plan":

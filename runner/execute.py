@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import fcntl
+import functools
 import importlib.metadata
 import json
 import os
@@ -191,6 +192,7 @@ def _receipt(
     }
 
 
+@functools.cache
 def _installed() -> dict[str, str]:
     found = {}
     for name in PACKAGES:
@@ -242,8 +244,11 @@ def refuse_missing(job: Job, planned: dict[str, Decision]) -> None:
 def clean(request: Request) -> None:
     """Remove what was computed for a scene with its variants, or for one variant. Works for a scene that is gone."""
     name = Path(request.scene).name
-    names = [f"{name}@{request.variant}"] if request.variant else [
-        name, *sorted(p.name for p in request.runs.glob(f"{name}@*"))]
+    names = (
+        [f"{name}@{request.variant}"]
+        if request.variant
+        else [name, *sorted(p.name for p in request.runs.glob(f"{name}@*"))]
+    )
     with ExitStack() as held:
         for each in names:
             held.enter_context(locked(request.runs, each, wait=False))

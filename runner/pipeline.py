@@ -113,7 +113,7 @@ class Pipeline(Strict):
 
 
 def unknown(kind: str, name: object, known: Any) -> str:
-    """"unknown stage 'fitt'; did you mean 'fit'?", or what there is."""
+    """Words for a name that is not known: the one that was meant, or all there are."""
     known = [str(k) for k in known]
     near = difflib.get_close_matches(str(name), known, n=1)
     return f"unknown {kind} {name!r}; " + (f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}")
@@ -209,8 +209,9 @@ class Layers:
 
 def layered(pipeline: Pipeline, scene: SceneFile, profile: str, variant: str | None, asked: Overrides) -> Layers:
     """Later layers win: stage defaults in pipeline.yaml, profile, scene.yaml, variant, `set=`."""
-    brought = {stage: {k: scene.brings[k] for k in keys if k in scene.brings}
-               for stage, keys in pipeline.scene_keys.items()}
+    brought = {
+        stage: {k: scene.brings[k] for k in keys if k in scene.brings} for stage, keys in pipeline.scene_keys.items()
+    }
     layers = [
         ("pipeline.yaml", {name: stage.params for name, stage in pipeline.stages.items()}),
         (f"pipeline.yaml: profile {profile}", pipeline.profiles[profile]),

@@ -236,6 +236,7 @@ def decide(job: Job, stage: str, earlier: dict[str, Decision]) -> Decision:
             unknown_yet.append(f"waits for {need}")
     if lost := _missing_weights(job, stage):
         return Decision("missing", lost)
+    code = code_of(job.root, stage, job.hashes)
     if unknown_yet:
         return Decision("undecided", unknown_yet[0], _there(job, stage))
     moving = [need for need, decision in needs.items() if not decision.settled]
@@ -243,7 +244,7 @@ def decide(job: Job, stage: str, earlier: dict[str, Decision]) -> Decision:
         path = _there(job, stage)
         reason = f"waits for {', '.join(moving)}; kept if the new content is the same" if path else "no artifact yet"
         return Decision("stale" if path else "run", reason, path)
-    return _compare(job, stage, _inputs(job, stage, {need: d.path for need, d in needs.items()}))
+    return _compare(job, stage, _inputs(job, stage, {need: d.path for need, d in needs.items()}, code))
 
 
 def _holds(job: Job, condition: Condition, source: Decision) -> bool | None:
@@ -283,7 +284,7 @@ def _missing_weights(job: Job, stage: str) -> str | None:
     return None
 
 
-def _inputs(job: Job, stage: str, needs: dict[str, Path | None]) -> Inputs:
+def _inputs(job: Job, stage: str, needs: dict[str, Path | None], code: dict[str, str]) -> Inputs:
     hashes = {need: path and job.hashes.folder(path) for need, path in needs.items()}
     if SCENE in job.pipeline.stages[stage].takes:
         hashes[SCENE] = job.hashes.folder(job.folder, leave_out=("scene.yaml",))
@@ -294,7 +295,7 @@ def _inputs(job: Job, stage: str, needs: dict[str, Path | None]) -> Inputs:
         if name := job.params[stage][param]:
             folder = _weights_folder(job, name)
             weights[param] = job.hashes.folder(folder) if folder else name
-    return Inputs(job.params[stage], job.profile, hashes, weights, code_of(job.root, stage, job.hashes))
+    return Inputs(job.params[stage], job.profile, hashes, weights, code)
 
 
 def _compare(job: Job, stage: str, inputs: Inputs) -> Decision:

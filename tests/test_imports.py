@@ -1,0 +1,111 @@
+"""Who may import whom, who may open files: the rules of README's tree, read from the sources."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+OWN = {"reffusion", "stages", "runner", "report"}
+# A heavy or special dependency enters in one module.
+ONE_DOOR = {
+    "pycolmap": "reffusion/sfm.py",
+    "diffusers": "reffusion/prior.py",
+    "peft": "reffusion/prior.py",
+    "transformers": "reffusion/prior.py",
+}
+OPENERS = {"open", "read_text", "write_text", "read_bytes", "write_bytes", "imread", "imwrite", "imsave", "savez"}
+MAY_OPEN = ("reffusion/io/", "reffusion/trace.py")
+OWN_FILES = ("reffusion/prior.py", "reffusion/lpips.py", "reffusion/sfm.py")  # weights and databases
+PURE = ("geometry", "splat/", "sds", "ssim", "densify", "discriminator", "types")  # tensors and plain numbers only
+
+
+def sources(*folders: str) -> list[Path]:
+    return sorted(path for folder in folders for path in (ROOT / folder).rglob("*.py"))
+
+
+def imports(path: Path, top_only: bool = False) -> set[str]:
+    """Dotted names a file imports, relative ones made absolute; TYPE_CHECKING blocks left out."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    package = path.relative_to(ROOT).parts[:-1]
+    found = set()
+    for node in _nodes(tree, top_only):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else ()
+            module = ".".join((*base, *filter(None, [node.module])))
+            found |= {f"{module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def _nodes(tree: ast.AST, top_only: bool) -> Iterator[ast.AST]:
+    for child in ast.iter_child_nodes(tree):
+        if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
+            continue
+        if top_only and isinstance(child, ast.FunctionDef):
+            continue
+        yield child
+        yield from _nodes(child, top_only)
+
+
+def outsiders(path: Path, allowed: set[str], top_only: bool = False) -> set[str]:
+    """Top-level packages that `path` imports, other than the standard library and `allowed`."""
+    return {name.split(".")[0] for name in imports(path, top_only)} - allowed - set(sys.stdlib_module_names)
+
+
+def named(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+@pytest.mark.parametrize("path", sources("runner"), ids=named)
+def test_runner_knows_nothing_of_3d(path):
+    assert outsiders(path, {"runner", "pydantic", "yaml"}) == set()
+
+
+@pytest.mark.parametrize("path", sources("stages"), ids=named)
+def test_stages_import_the_library_only(path):
+    assert outsiders(path, {"reffusion", "numpy", "torch", "pydantic"}) == set()
+    assert "argparse" not in imports(path)
+
+
+@pytest.mark.parametrize("path", sources("stages"), ids=named)
+def test_importing_a_stage_is_light(path):
+    """So that `plan` answers at once: numpy, torch and the library are imported inside functions."""
+    assert outsiders(path, {"pydantic"}, top_only=True) == set()
+
+
+@pytest.mark.parametrize("path", sources("reffusion"), ids=named)
+def test_library(path):
+    names = {name.split(".")[0] for name in imports(path)}
+    assert not names & {"stages", "runner", "report", "yaml", "argparse"}
+    for package, door in ONE_DOOR.items():
+        assert package not in names or named(path) == door, f"only {door} imports {package}"
+
+
+@pytest.mark.parametrize("path", sources("report"), ids=named)
+def test_report_reads_through_io(path):
+    own = {name for name in imports(path) if name.split(".")[0] in OWN - {"report"}}
+    assert all(name.startswith("reffusion.io") for name in own), own
+
+
+@pytest.mark.parametrize("path", sources("reffusion"), ids=named)
+def test_files_are_opened_in_io_and_trace(path):
+    if named(path).startswith((*MAY_OPEN, *OWN_FILES)):
+        return
+    calls = [n.func for n in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(n, ast.Call)]
+    opened = {f.attr if isinstance(f, ast.Attribute) else getattr(f, "id", "") for f in calls} & OPENERS
+    opened |= {text for f in calls if (text := ast.unparse(f)) in
+               ("np.load", "np.save", "numpy.load", "torch.load", "torch.save", "json.load", "json.dump")}  # fmt: skip
+    assert opened == set()
+
+
+@pytest.mark.parametrize("path", sources("reffusion"), ids=named)
+def test_pure_modules_take_no_paths_and_no_params(path):
+    inside = named(path).removeprefix("reffusion/")
+    if inside.startswith(PURE):
+        assert not {name.split(".")[0] for name in imports(path)} & {"pathlib", "pydantic", "os", "io"}
