@@ -5,7 +5,9 @@ Importing this package costs numpy and pillow only: torch comes in with the func
 
 from .arrays import load_json, load_labels, save_json, save_labels
 from .images import image_size, load_exr, load_image, load_mask, save_exr, save_image, save_mask
+from .layouts import LAYOUTS, Capture, Poses, load_capture
 from .ply import load_ply, load_points, save_ply, save_points
+from .roles import Roles, load_roles
 from .scene import (
     load_given_references,
     load_mask_sets,
@@ -18,9 +20,17 @@ from .scene import (
     save_references,
     save_scene,
 )
+from .undistorted import check_masks, load_at, save_undistorted
 
 __all__ = [
+    "LAYOUTS",
+    "Capture",
+    "Poses",
+    "Roles",
+    "check_masks",
     "image_size",
+    "load_at",
+    "load_capture",
     "load_exr",
     "load_given_references",
     "load_image",
@@ -32,6 +42,7 @@ __all__ = [
     "load_points",
     "load_raw_masks",
     "load_references",
+    "load_roles",
     "load_scene",
     "load_test_masks",
     "load_views",
@@ -45,4 +56,5 @@ __all__ = [
     "save_points",
     "save_references",
     "save_scene",
+    "save_undistorted",
 ]

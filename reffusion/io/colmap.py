@@ -179,35 +179,41 @@ POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", 
 
 def load_model_points(path: Path) -> ModelPoints:
     """The points of points3D.bin or points3D.txt, with the images that see each."""
-    read = _points_binary if path.suffix == ".bin" else _points_text
-    positions, colors, tracks = read(path)
-    positions = np.array(positions, np.float64).reshape(-1, 3)
-    if not np.isfinite(positions).all():
+    points = _points_binary(path) if path.suffix == ".bin" else _points_text(path)
+    if not np.isfinite(points.positions).all():
         raise ValueError(f"{path}: points that are not finite")
-    lengths = [len(t) for t in tracks]
-    return ModelPoints(
-        positions,
-        np.array(colors, np.uint8).reshape(-1, 3),
-        np.repeat(np.arange(len(tracks)), lengths),
-        np.concatenate([np.zeros(0, np.int64), *tracks]).astype(np.int64),
-    )
+    return points
 
 
-def _points_binary(path: Path) -> tuple[list, list, list]:
-    file, positions, colors, tracks = _Bytes(path), [], [], []
-    for _ in range(file.read("Q")[0]):
-        record = file.array(POINT, 1)[0]
-        positions.append(record["xyz"])
-        colors.append(record["rgb"])
-        tracks.append(file.array("<u4", 2 * int(record["track"]))[::2])
-    return positions, colors, tracks
+def _points_binary(path: Path) -> ModelPoints:
+    file = _Bytes(path)
+    count = file.read("Q")[0]
+    # Records follow each other at distances that their track lengths tell: first the places, then all at once.
+    starts, at, track_at = np.empty(count, np.int64), file.at, POINT.itemsize - 8
+    for k in range(count):
+        starts[k] = at
+        at += POINT.itemsize + 8 * int.from_bytes(file.data[at + track_at : at + POINT.itemsize], "little")
+        if at > len(file.data):
+            raise ValueError(f"{path}: cut off at byte {len(file.data)}")
+    data = np.frombuffer(file.data, np.uint8)
+    records = data[starts[:, None] + np.arange(POINT.itemsize)].reshape(-1).view(POINT)
+    lengths = records["track"].astype(np.int64)
+    rows = np.repeat(np.arange(count), lengths)
+    place = np.arange(len(rows)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+    track_bytes = starts[rows] + POINT.itemsize + 8 * place
+    images = data[track_bytes[:, None] + np.arange(4)].reshape(-1).view("<u4").astype(np.int64)
+    return ModelPoints(records["xyz"].astype(np.float64), records["rgb"].copy(), rows, images)
 
 
-def _points_text(path: Path) -> tuple[list, list, list]:
+def _points_text(path: Path) -> ModelPoints:
     rows = [line.split() for line in filter(None, _lines(path))]
-    positions = [[float(v) for v in row[1:4]] for row in rows]
-    colors = [[int(v) for v in row[4:7]] for row in rows]
-    return positions, colors, [np.array(row[8::2], np.int64) for row in rows]
+    tracks = [np.array(row[8::2], np.int64) for row in rows]
+    return ModelPoints(
+        np.array([[float(v) for v in row[1:4]] for row in rows]).reshape(-1, 3),
+        np.array([[int(v) for v in row[4:7]] for row in rows], np.uint8).reshape(-1, 3),
+        np.repeat(np.arange(len(rows)), [len(track) for track in tracks]),
+        np.concatenate([np.zeros(0, np.int64), *tracks]),
+    )
 
 
 def pose_matrix(quaternion: np.ndarray, translation: np.ndarray) -> np.ndarray:

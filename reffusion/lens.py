@@ -1,0 +1,221 @@
+"""Lenses: distortion models, and the pinhole view that replaces a distorted one.
+
+Directions are [..., 2] camera x/z and y/z (x right, y down); pixels as in CONVENTIONS.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+PINHOLE_ENOUGH = 0.05  # px: a lens that moves no border pixel further counts as a pinhole
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Intrinsics with distortion.
+
+    With r the length of the direction (x, y), or for a fisheye r = atan of it, the direction is multiplied by
+
+        (1 + radial[0] r^2 + radial[1] r^4 + ...) / (1 + denominator[0] r^2 + denominator[1] r^4 + ...)
+
+    (for a fisheye also by r over its length); then Brown's tangential terms p1, p2 are added (not to a fisheye).
+
+    Attributes:
+        width, height: image size in pixels.
+        fx, fy, cx, cy: focal lengths and principal point in pixels.
+        radial, denominator: polynomial coefficients, lowest power first, any number.
+        tangential: p1, p2 as in OpenCV.
+        fisheye: equidistant projection instead of perspective.
+        model: COLMAP's name of the model, for messages.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    radial: tuple[float, ...] = ()
+    denominator: tuple[float, ...] = ()
+    tangential: tuple[float, float] = (0.0, 0.0)
+    fisheye: bool = False
+    model: str = "PINHOLE"
+
+    def resized(self, width: int, height: int) -> Lens:
+        """The same lens before a picture of another size; distortion acts on directions and stays."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
+        )
+
+    @property
+    def pinhole(self) -> Lens:
+        """The same intrinsics without distortion."""
+        return Lens(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
+
+    def coefficients(self) -> str:
+        """For messages: `SIMPLE_RADIAL k1=0.0124`."""
+        names = [(f"k{i}", k) for i, k in enumerate((*self.radial, *self.denominator), start=1)]
+        names += [("p1", self.tangential[0]), ("p2", self.tangential[1])]
+        return " ".join([self.model, *(f"{name}={value:.4g}" for name, value in names if value)])
+
+
+def from_colmap(model: str, width: int, height: int, params: tuple[float, ...]) -> Lens:
+    """The lens of a COLMAP camera; ValueError naming the model where it is none of those understood."""
+    if model not in _COLMAP:
+        raise ValueError(f"camera model {model} is not understood; convert it to one of {', '.join(_COLMAP)}")
+    single_focal, fisheye, names = _COLMAP[model]
+    head = (params[0], *params[:3]) if single_focal else params[:4]
+    k = dict(zip(names, params[3 if single_focal else 4 :], strict=True))
+    return Lens(
+        width,
+        height,
+        *head,
+        radial=tuple(k[n] for n in ("k1", "k2", "k3", "k4") if n in k and (fisheye or n != "k4")),
+        denominator=tuple(k[n] for n in ("k4", "k5", "k6") if n in k and not fisheye),
+        tangential=(k.get("p1", 0.0), k.get("p2", 0.0)),
+        fisheye=fisheye,
+        model=model,
+    )
+
+
+# One focal length for both axes?, fisheye?, what follows the principal point.
+_COLMAP = {
+    "SIMPLE_PINHOLE": (True, False, ()),
+    "PINHOLE": (False, False, ()),
+    "SIMPLE_RADIAL": (True, False, ("k1",)),
+    "RADIAL": (True, False, ("k1", "k2")),
+    "OPENCV": (False, False, ("k1", "k2", "p1", "p2")),
+    "FULL_OPENCV": (False, False, ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
+    "SIMPLE_RADIAL_FISHEYE": (True, True, ("k1",)),
+    "RADIAL_FISHEYE": (True, True, ("k1", "k2")),
+    "OPENCV_FISHEYE": (False, True, ("k1", "k2", "k3", "k4")),
+}
+
+
+def distort(directions: np.ndarray, lens: Lens) -> np.ndarray:
+    """True directions [..., 2] -> where the lens shows them, [..., 2], float64."""
+    xy = np.asarray(directions, np.float64)
+    length = np.linalg.norm(xy, axis=-1, keepdims=True)
+    angle = np.arctan(length) if lens.fisheye else length
+    square = angle * angle
+    factor = _polynomial(lens.radial, square) / _polynomial(lens.denominator, square)
+    if lens.fisheye:
+        # atan(l) / l, 1 at the centre
+        return xy * factor * np.divide(angle, length, out=np.ones_like(length), where=length > 1e-12)
+    (p1, p2), x, y = lens.tangential, xy[..., :1], xy[..., 1:]
+    tangential = np.concatenate(
+        [2 * p1 * x * y + p2 * (square + 2 * x * x), p1 * (square + 2 * y * y) + 2 * p2 * x * y], axis=-1
+    )
+    return xy * factor + tangential
+
+
+def _polynomial(coefficients: tuple[float, ...], square: np.ndarray) -> np.ndarray:
+    value = np.zeros_like(square)
+    for k in reversed(coefficients):
+        value = (value + k) * square
+    return 1.0 + value
+
+
+def undistort(shown: np.ndarray, lens: Lens) -> np.ndarray:
+    """Inverse of `distort`, by Newton's method; NaN where it does not converge (outside what the lens can show)."""
+    shown = np.asarray(shown, np.float64)
+    xy, step = shown.copy(), 1e-6
+    if lens.fisheye:
+        radius = np.linalg.norm(shown, axis=-1, keepdims=True)
+        xy = shown * np.tan(np.minimum(radius, 1.5)) / np.maximum(radius, 1e-12)
+    with np.errstate(all="ignore"):
+        for _ in range(30):
+            right, below = np.array([step, 0.0]), np.array([0.0, step])
+            by_x = (distort(xy + right, lens) - distort(xy - right, lens)) / (2 * step)
+            by_y = (distort(xy + below, lens) - distort(xy - below, lens)) / (2 * step)
+            error = distort(xy, lens) - shown
+            determinant = by_x[..., 0] * by_y[..., 1] - by_x[..., 1] * by_y[..., 0]
+            dx = (error[..., 0] * by_y[..., 1] - error[..., 1] * by_y[..., 0]) / determinant
+            dy = (by_x[..., 0] * error[..., 1] - by_x[..., 1] * error[..., 0]) / determinant
+            xy = xy - np.stack([dx, dy], axis=-1)
+        lost = (np.abs(distort(xy, lens) - shown).max(axis=-1) > 1e-8) | ~(determinant > 0)
+    return np.where(lost[..., None], np.nan, xy)
+
+
+def to_pixels(directions: np.ndarray, lens: Lens) -> np.ndarray:
+    """True directions [..., 2] -> pixels [..., 2] of the distorted picture."""
+    return distort(directions, lens) * (lens.fx, lens.fy) + (lens.cx, lens.cy)
+
+
+def to_directions(pixels: np.ndarray, lens: Lens) -> np.ndarray:
+    """Pixels [..., 2] of the distorted picture -> true directions [..., 2]; NaN outside what the lens can show."""
+    return undistort((np.asarray(pixels, np.float64) - (lens.cx, lens.cy)) / (lens.fx, lens.fy), lens)
+
+
+def _border(lens: Lens) -> tuple[np.ndarray, ...]:
+    """Left, top, right and bottom edge of the picture, [65, 2] pixels each."""
+    along = np.linspace(0.0, 1.0, 65)
+    across, down = along * lens.width, along * lens.height
+    left, right = np.zeros_like(along), np.full_like(along, lens.width)
+    top, bottom = np.zeros_like(along), np.full_like(along, lens.height)
+    pairs = ((left, down), (across, top), (right, down), (across, bottom))
+    return tuple(np.stack(pair, axis=1) for pair in pairs)
+
+
+def largest_shift(lens: Lens) -> float:
+    """Pixels by which the lens moves the border pixel that it moves furthest; 0 for a pinhole, inf off its range."""
+    border = np.concatenate(_border(lens))
+    seen = to_directions(border, lens)
+    if not np.isfinite(seen).all():
+        return float("inf")
+    return float(np.linalg.norm(seen * (lens.fx, lens.fy) + (lens.cx, lens.cy) - border, axis=1).max())
+
+
+def without_distortion(lens: Lens) -> Lens:
+    """The pinhole that an undistorted picture of the same size gets.
+
+    Its window is the largest that lies wholly inside the distorted picture, so that no black border remains; both
+    axes are zoomed alike, so pixels keep their shape. A lens that moves nothing by `PINHOLE_ENOUGH` px only loses
+    its coefficients.
+
+    Raises:
+        ValueError: where the distortion folds over, or a fisheye reaches 85 degrees, inside the picture.
+    """
+    shift = largest_shift(lens)
+    if shift <= PINHOLE_ENOUGH:
+        return lens.pinhole
+    edges = [to_directions(edge, lens) for edge in _border(lens)]
+    if not np.isfinite(shift) or np.linalg.norm(np.concatenate(edges), axis=1).max() > np.tan(np.radians(85.0)):
+        raise ValueError(
+            f"the lens {lens.coefficients()} cannot be undone inside its {lens.width}x{lens.height} px picture; "
+            "check its coefficients, or crop the pictures"
+        )
+    left, top, right, bottom = edges
+    low = np.array([left[:, 0].max(), top[:, 1].max()])
+    high = np.array([right[:, 0].min(), bottom[:, 1].min()])
+    size, focal = np.array([lens.width, lens.height]), np.array([lens.fx, lens.fy])
+    fx, fy = focal * (size / (focal * (high - low))).max()
+    cx, cy = size / 2 - (fx, fy) * (low + high) / 2
+    return Lens(lens.width, lens.height, float(fx), float(fy), float(cx), float(cy))
+
+
+def sampling_map(lens: Lens, pinhole: Lens) -> np.ndarray:
+    """[H, W, 2] float64: for each pixel of the pinhole's picture, the pixel coordinates to read in the lens's."""
+    columns, rows = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
+    directions = np.stack([(columns - pinhole.cx) / pinhole.fx, (rows - pinhole.cy) / pinhole.fy], axis=-1)
+    return to_pixels(directions, lens)
+
+
+def undistort_image(image: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """uint8 [h, w, 3] read at `where` [H, W, 2] (`sampling_map`) by Lanczos interpolation."""
+    import cv2
+
+    at = (where - 0.5).astype(np.float32)  # OpenCV counts from the centre of the first pixel
+    return cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
+
+
+def undistort_mask(mask: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """bool [h, w] read at `where` [H, W, 2]: linear, then cut at one half."""
+    import cv2
+
+    at = (where - 0.5).astype(np.float32)
+    soft = cv2.remap(mask.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return soft >= 0.5

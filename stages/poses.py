@@ -1,0 +1,141 @@
+"""poses: pictures without distortion, cameras and sparse points in the normalised frame, masks, the split."""
+
+from __future__ import annotations
+
+import shutil
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+if TYPE_CHECKING:
+    from reffusion.io import Capture, Roles
+
+STRICT = ConfigDict(extra="forbid", frozen=True)
+
+
+class GivenReference(BaseModel):
+    model_config = STRICT
+
+    view: str = Field(description="name of the view it completes")
+    image: str = Field(description="picture, relative to the scene, in its view's proportions")
+    undistorted: bool = Field(False, description="painted over `poses`' own undistorted image, not over the photo")
+
+
+class Region(BaseModel):
+    model_config = STRICT
+
+    center: tuple[float, float, float] = Field(description="of a box along the axes, in the scene's own frame")
+    size: tuple[float, float, float] = Field(description="side lengths in the scene's own units")
+
+
+class Params(BaseModel):
+    model_config = STRICT
+
+    layout: Literal["llff", "colmap", "transforms", "photos"] | None = Field(None, description="None: recognised")
+    images: str | None = Field(None, description="folder of pictures, relative to the scene; None: the usual ones")
+    masks: str | None = Field(None, description='folder of masks; "none": the scene has none; None: the usual ones')
+    test_masks: str | None = Field(None, description="folder of masks of test views, by name or in their order")
+    train: list[str] | str | None = Field(None, description='view names, or "every N"; None: all that are not test')
+    test: list[str] | str | None = Field(None, description='view names, or "every N"; None: those of the test masks')
+    clean: list[str] = Field([], description="training views in which the object is absent")
+    reference: GivenReference | list[GivenReference] | None = Field(None, description="completed views of the scene's")
+    gaussians: str | None = Field(None, description=".ply the scene brings in its own frame, 3DGS layout")
+    region: Region | None = Field(None, description="3D box that holds the object, or is to be filled")
+    longest: int = Field(1600, ge=16, description="larger image side in px; smaller pictures stay as they are")
+    least_points: int = Field(500, ge=0, description="with fewer sparse points, random ones are added to them")
+    random_points: int = Field(10_000, ge=1, description="how many")
+    seed: int = 0
+
+    @property
+    def references(self) -> list[GivenReference]:
+        given = self.reference
+        return [] if given is None else given if isinstance(given, list) else [given]
+
+
+def preview(params: Params, scene: Path) -> list[str]:
+    """What the stage will do, from headers alone. ValueError where it would refuse."""
+    from reffusion import lens
+
+    capture, roles = _read(params, scene)
+    notes = [f"{len(roles.train)} training and {len(roles.test)} test views, {len(roles.masks)} masks"]
+    if capture.poses is None:
+        notes.append(f"SfM: {len(capture.pictures)} photos bring no poses")
+    else:
+        notes.append(f"SfM left out: {capture.brought_by.relative_to(scene)} brings poses")
+        shifts = {each: lens.largest_shift(each) for each in set(capture.poses.lenses.values())}
+        worst = max(shifts, key=shifts.__getitem__)
+        moved = f"{worst.coefficients()} moves the border by up to {shifts[worst]:.1f} px"
+        pinhole = shifts[worst] <= lens.PINHOLE_ENOUGH
+        notes.append("undistortion left out: the lens is a pinhole" if pinhole else f"undistortion: {moved}")
+    return [*notes, *capture.warnings, *roles.warnings]
+
+
+def run(params: Params, out: Path, *, scene: Path) -> None:
+    from reffusion import frame, io, trace
+
+    capture, roles = _read(params, scene)
+    for warning in (*capture.warnings, *roles.warnings):
+        warnings.warn(warning, stacklevel=1)
+    io.check_masks(roles.masks)
+    if capture.poses is None:
+        capture = _place(params, out, capture)
+        roles = roles.among(set(capture.pictures))
+    views = sorted({*roles.train, *roles.test})
+    pinholes = {}
+    for k in trace.progress(len(views), "poses"):
+        pinholes[views[k]] = io.save_undistorted(out, views[k], capture, roles, params.longest)
+    shutil.rmtree(out / "sfm", ignore_errors=True)
+    normalised = frame.normalised(capture.poses, pinholes, roles.train, roles.test, roles.clean)
+    if len(normalised.points) < params.least_points or len(normalised.points) == 0:
+        ranges = frame.ranges_of(capture.poses, pinholes) * normalised.similarity.scale
+        draws = trace.generator(params.seed, "poses", "random points")
+        normalised = frame.filled_up(
+            normalised, ranges, params.random_points, draws, lambda v: io.load_views(out, [v])[v]
+        )
+    io.save_scene(out, normalised)
+    similarity = normalised.similarity
+    if params.gaussians is not None:
+        io.save_ply(out / "gaussians.ply", io.load_ply(scene / params.gaussians, similarity))
+    if params.region is not None:
+        center = similarity.apply(params.region.center).tolist()
+        size = [side * similarity.scale for side in params.region.size]
+        io.save_json(out / "region.json", {"center": center, "size": size})
+
+
+def _place(params: Params, out: Path, capture: Capture) -> Capture:
+    """The capture with poses by structure from motion, its pictures upright and at their final size."""
+    from reffusion import io, sfm
+
+    work = out / "sfm"
+    prepared = {name: work / "images" / f"{name}.png" for name in capture.pictures}
+    for name, path in prepared.items():
+        io.save_image(path, io.load_at(capture.pictures[name], params.longest, upright=True))
+    poses = sfm.solve(prepared, capture.pictures, work / "colmap", params.seed)
+    lost = sorted(set(prepared) - set(poses.lenses))
+    if lost:
+        warnings.warn(f"{len(lost)} views were not placed and are left out: {', '.join(lost)}", stacklevel=1)
+    return replace(capture, pictures={name: prepared[name] for name in poses.lenses}, poses=poses)
+
+
+def _read(params: Params, scene: Path) -> tuple[Capture, Roles]:
+    """The capture and its views' roles, checked before any work."""
+    from reffusion import io
+
+    capture = io.load_capture(scene, params.layout, params.images)
+    roles = io.load_roles(
+        scene,
+        capture,
+        masks=params.masks,
+        test_masks=params.test_masks,
+        train=params.train,
+        test=params.test,
+        clean=params.clean,
+        references=[(given.view, given.image, given.undistorted) for given in params.references],
+        region=params.region is not None,
+    )
+    if params.gaussians is not None and not (scene / params.gaussians).is_file():
+        raise ValueError(f"{scene / params.gaussians}: no such file; correct `gaussians` in scene.yaml")
+    return capture, roles
