@@ -8,17 +8,18 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
 
+from reffusion.splat.compiled import kernel, share
 from reffusion.splat.conventions import MIN_ALPHA
-from reffusion.splat.projection import DEPTH, LEVEL, MEAN_X, MEAN_Y, PARALLEL, SERIAL, SLANT, WHITEN_X, WHITEN_Y
+from reffusion.splat.projection import CHUNKS, DEPTH, LEVEL, MEAN_X, MEAN_Y, SLANT, WHITEN_X, WHITEN_Y
+from reffusion.splat.vectors import take_ticket
 
 TILE_WIDTH = 16
 TILE_HEIGHT = 32
 CUT = np.float32(math.log2(MIN_ALPHA))  # log2(alpha) below which a pixel is skipped
 
 
-@njit(**SERIAL)
+@kernel
 def depth_order(radii, footprints):
     """[M] indices of the Gaussians with a radius, front to back, equal depths by index (radix sort, stable)."""
     count = radii.shape[0]
@@ -54,7 +55,7 @@ def depth_order(radii, footprints):
     return order
 
 
-@njit(**SERIAL)
+@kernel
 def _ellipse(footprint):
     """The alpha >= 1/255 ellipse of a footprint, a little enlarged against rounding.
 
@@ -74,7 +75,7 @@ def _ellipse(footprint):
     return half_width, half_height, tilt, column, np.float32(1.0) / (level * xx), slant * half_height
 
 
-@njit(**SERIAL)
+@kernel
 def _column_rows(footprint, ellipse, left, width, height):
     """First and one past the last pixel row of the image that the ellipse can touch in a tile column."""
     half_width, half_height, tilt, column, inverse, peak = ellipse
@@ -94,7 +95,7 @@ def _column_rows(footprint, ellipse, left, width, height):
     return int(begin), int(max(end, begin))
 
 
-@njit(**SERIAL)
+@kernel
 def _columns(footprint, half_width, tiles_x):
     """First and one past the last tile column that the ellipse can touch."""
     first = max(footprint[MEAN_X] - half_width - np.float32(0.5), np.float32(0.0))
@@ -104,13 +105,12 @@ def _columns(footprint, half_width, tiles_x):
     return int(first) // TILE_WIDTH, int(last) // TILE_WIDTH + 1
 
 
-@njit(**PARALLEL)
-def bin_footprints(footprints, width, height, chunks):
+def bin_footprints(footprints, width, height):
     """Tile lists, front to back.
 
     Args:
         footprints: [M, FOOTPRINT] front to back.
-        chunks: how many parts to work on at once; the result does not depend on it.
+        width, height: the image's size in pixels.
 
     Returns:
         starts: [tiles + 1] int64, where each tile's list begins; tiles in reading order.
@@ -119,44 +119,41 @@ def bin_footprints(footprints, width, height, chunks):
         slots: [I] int64, place of this footprint-tile pair when pairs are ordered by footprint.
         first_slots: [M + 1] int64, where each footprint's pairs begin in that order.
     """
-    count = footprints.shape[0]
-    tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
-    tiles = tiles_x * ((height + TILE_HEIGHT - 1) // TILE_HEIGHT)
-    places = np.zeros((chunks, tiles), np.int64)
-    first_slots = np.zeros(count + 1, np.int64)
-    for chunk in prange(chunks):
-        begin, end = chunk * count // chunks, (chunk + 1) * count // chunks
-        _count_pairs(begin, end, footprints, width, height, places[chunk], first_slots)
+    tiles = -(-width // TILE_WIDTH) * -(-height // TILE_HEIGHT)
+    places = np.zeros((CHUNKS, tiles), np.int64)
+    first_slots = np.zeros(len(footprints) + 1, np.int64)
+    share(_count_pairs, footprints, width, height, places, first_slots)
     total = _counts_to_places(first_slots, places)
-    starts = np.empty(tiles + 1, np.int64)
-    starts[:tiles] = places[0]
-    starts[tiles] = total
+    starts = np.append(places[0], total)
     members, rows, slots = np.empty(total, np.int32), np.empty(total, np.int32), np.empty(total, np.int64)
-    for chunk in prange(chunks):
-        begin, end = chunk * count // chunks, (chunk + 1) * count // chunks
-        _fill_lists(begin, end, footprints, width, height, places[chunk], first_slots, members, rows, slots)
+    share(_fill_lists, footprints, width, height, places, first_slots, members, rows, slots)
     return starts, members, rows, slots, first_slots
 
 
-@njit(**SERIAL)
-def _count_pairs(begin, end, footprints, width, height, counts, first_slots):
+@kernel
+def _count_pairs(tickets, footprints, width, height, places, first_slots):
     """Count pairs by tile and by footprint."""
     tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
-    for m in range(begin, end):
-        footprint = footprints[m]
-        ellipse = _ellipse(footprint)
-        first, last = _columns(footprint, ellipse[0], tiles_x)
-        pairs = 0
-        for column in range(first, last):
-            top, bottom = _column_rows(footprint, ellipse, column * TILE_WIDTH, width, height)
-            if top < bottom:
-                for tile_row in range(top // TILE_HEIGHT, (bottom - 1) // TILE_HEIGHT + 1):
-                    counts[tile_row * tiles_x + column] += 1
-                    pairs += 1
-        first_slots[m + 1] = pairs
+    while True:
+        ticket = take_ticket(tickets)
+        if ticket >= CHUNKS:
+            return
+        counts = places[ticket]
+        for m in range(ticket * len(footprints) // CHUNKS, (ticket + 1) * len(footprints) // CHUNKS):
+            footprint = footprints[m]
+            ellipse = _ellipse(footprint)
+            first, last = _columns(footprint, ellipse[0], tiles_x)
+            pairs = 0
+            for column in range(first, last):
+                top, bottom = _column_rows(footprint, ellipse, column * TILE_WIDTH, width, height)
+                if top < bottom:
+                    for tile_row in range(top // TILE_HEIGHT, (bottom - 1) // TILE_HEIGHT + 1):
+                        counts[tile_row * tiles_x + column] += 1
+                        pairs += 1
+            first_slots[m + 1] = pairs
 
 
-@njit(**SERIAL)
+@kernel
 def _counts_to_places(first_slots, places):
     """Running sums in place: by footprint, and by tile then chunk. Returns the number of pairs."""
     for m in range(first_slots.shape[0] - 1):
@@ -170,23 +167,28 @@ def _counts_to_places(first_slots, places):
     return total
 
 
-@njit(**SERIAL)
-def _fill_lists(begin, end, footprints, width, height, places, first_slots, members, rows, slots):
+@kernel
+def _fill_lists(tickets, footprints, width, height, all_places, first_slots, members, rows, slots):
     """Write the pairs to their places."""
     tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
-    for m in range(begin, end):
-        footprint = footprints[m]
-        ellipse = _ellipse(footprint)
-        first, last = _columns(footprint, ellipse[0], tiles_x)
-        slot = first_slots[m]
-        for column in range(first, last):
-            top, bottom = _column_rows(footprint, ellipse, column * TILE_WIDTH, width, height)
-            if top < bottom:
-                for tile_row in range(top // TILE_HEIGHT, (bottom - 1) // TILE_HEIGHT + 1):
-                    tile, tile_top = tile_row * tiles_x + column, tile_row * TILE_HEIGHT
-                    at = places[tile]
-                    places[tile] = at + 1
-                    members[at] = m
-                    rows[at] = max(top - tile_top, 0) + 256 * min(bottom - tile_top, TILE_HEIGHT)
-                    slots[at] = slot
-                    slot += 1
+    while True:
+        ticket = take_ticket(tickets)
+        if ticket >= CHUNKS:
+            return
+        places = all_places[ticket]
+        for m in range(ticket * len(footprints) // CHUNKS, (ticket + 1) * len(footprints) // CHUNKS):
+            footprint = footprints[m]
+            ellipse = _ellipse(footprint)
+            first, last = _columns(footprint, ellipse[0], tiles_x)
+            slot = first_slots[m]
+            for column in range(first, last):
+                top, bottom = _column_rows(footprint, ellipse, column * TILE_WIDTH, width, height)
+                if top < bottom:
+                    for tile_row in range(top // TILE_HEIGHT, (bottom - 1) // TILE_HEIGHT + 1):
+                        tile, tile_top = tile_row * tiles_x + column, tile_row * TILE_HEIGHT
+                        at = places[tile]
+                        places[tile] = at + 1
+                        members[at] = m
+                        rows[at] = max(top - tile_top, 0) + 256 * min(bottom - tile_top, TILE_HEIGHT)
+                        slots[at] = slot
+                        slot += 1

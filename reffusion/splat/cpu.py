@@ -4,42 +4,46 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 
 from reffusion.splat import backward, binning, forward, projection
+from reffusion.splat.compiled import share
 from reffusion.types import Camera, Gaussians, Rendering
 
 
-class Bins(NamedTuple):
-    """Sorted footprints and tile lists of one view; arrays as described in `binning.bin_footprints`."""
+class View(NamedTuple):
+    """The Gaussians that reach one view.
+
+    Attributes:
+        order: [M] int32 their indices, front to back.
+        footprints: [M, FOOTPRINT] float32, see `projection`.
+        bins: starts, members, rows, slots of the tile lists, see `binning.bin_footprints`.
+        first_slots: [M + 1] int64.
+        radii: [N] int32.
+    """
 
     order: np.ndarray
     footprints: np.ndarray
-    starts: np.ndarray
-    members: np.ndarray
-    rows: np.ndarray
-    slots: np.ndarray
+    bins: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     first_slots: np.ndarray
+    radii: np.ndarray
 
 
 def render(
     gaussians: Gaussians, camera: Camera, features: Tensor | None, background: Tensor, degree: int, probe: Tensor | None
 ) -> Rendering:
     """See `reffusion.splat.render`."""
-    blended = background.new_empty(len(gaussians), 0) if features is None else features
-    nudge = background.new_empty(0, 2) if probe is None else probe
     color, depth, alpha, blended, radii = _Splat.apply(
         gaussians.means,
         gaussians.quaternions,
         gaussians.log_scales,
         gaussians.opacity_logits,
         gaussians.sh,
-        blended,
+        background.new_empty(len(gaussians), 0) if features is None else features,
         background,
-        nudge,
+        background.new_empty(0, 2) if probe is None else probe,
         camera,
         degree,
     )
@@ -48,11 +52,11 @@ def render(
 
 def accumulate(gaussians: Gaussians, camera: Camera, values: Tensor, count: bool) -> Tensor:
     """See `reffusion.splat.accumulate`."""
-    arrays = [_array(getattr(gaussians, name)) for name in ("means", "quaternions", "log_scales", "opacity_logits")]
-    bins, _ = _bin(*arrays, _array(gaussians.sh[:, :1]), np.empty((0, 2), np.float32), camera, 0)
-    records = backward.gather_values(*bins[1:6], _array(values), count)
+    parameters = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.opacity_logits)
+    view = _view([_array(p) for p in (*parameters, gaussians.sh)], np.empty((0, 2), np.float32), camera, 0)
+    records = backward.gather_values(view.footprints, view.bins, _array(values), count)
     gathered = np.zeros((len(gaussians), values.shape[-1]), np.float32)
-    gathered[bins.order] = backward.add_records(records, bins.first_slots)
+    gathered[view.order] = backward.add_records(records, view.first_slots, values.shape[-1])
     return torch.from_numpy(gathered)
 
 
@@ -60,15 +64,17 @@ def _array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().contiguous().numpy()
 
 
-def _bin(means, quaternions, log_scales, opacity_logits, sh, probe, camera, degree) -> tuple[Bins, np.ndarray]:
-    """Project, sort and bin; returns the bins and radii [N]."""
-    footprints, radii = projection.project(
-        means, quaternions, log_scales, opacity_logits, probe, projection.view_numbers(camera)
-    )
-    order = binning.depth_order(radii, footprints)
-    footprints = projection.gather_footprints(footprints, order, means, sh, degree, camera.center)
-    lists = binning.bin_footprints(footprints, camera.width, camera.height, numba.get_num_threads())
-    return Bins(order, footprints, *lists), radii
+def _view(parameters: list[np.ndarray], probe: np.ndarray, camera: Camera, degree: int) -> View:
+    """Project, sort and bin; `parameters` in the order of `types.PARAMETERS`."""
+    *geometry, sh = parameters
+    means = geometry[0]
+    every, radii = np.empty((len(means), projection.FOOTPRINT), np.float32), np.zeros(len(means), np.int32)
+    share(projection.project, *geometry, probe, projection.view_numbers(camera), every, radii)
+    order = binning.depth_order(radii, every)
+    footprints = np.empty((len(order), projection.FOOTPRINT), np.float32)
+    share(projection.gather_footprints, every, order, means, sh, degree, camera.center, footprints)
+    *bins, first_slots = binning.bin_footprints(footprints, camera.width, camera.height)
+    return View(order, footprints, tuple(bins), first_slots, radii)
 
 
 class _Splat(torch.autograd.Function):
@@ -77,62 +83,53 @@ class _Splat(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means, quaternions, log_scales, opacity_logits, sh, features, background, probe, camera, degree):
         parameters = [_array(t) for t in (means, quaternions, log_scales, opacity_logits, sh)]
-        bins, radii = _bin(*parameters, _array(probe), camera, degree)
-        color, depth, blended, transmittance, used = forward.blend(
-            bins.footprints,
-            _array(features)[bins.order],
+        view = _view(parameters, _array(probe), camera, degree)
+        color, depth, alpha, blended, transmittance, used = forward.blend(
+            view.footprints,
+            _array(features)[view.order],
             _array(background),
-            bins.starts,
-            bins.members,
-            bins.rows,
+            *view.bins[:3],
             camera.width,
             camera.height,
         )
-        outputs = [torch.from_numpy(array) for array in (color, depth, np.float32(1) - transmittance, blended, radii)]
-        ctx.mark_non_differentiable(outputs[4])
+        color, depth, alpha, blended, radii = map(torch.from_numpy, (color, depth, alpha, blended, view.radii))
+        ctx.mark_non_differentiable(radii)
         if any(ctx.needs_input_grad):
-            ctx.save_for_backward(
-                means, quaternions, log_scales, opacity_logits, sh, features, *outputs[:2], outputs[3]
-            )
-            ctx.rest = bins, transmittance, used, camera, degree
-        return tuple(outputs)
+            inputs = (means, quaternions, log_scales, opacity_logits, sh, features)
+            ctx.save_for_backward(*inputs, color, depth, blended)
+            ctx.rest = view, transmittance, used, camera, degree
+        return color, depth, alpha, blended, radii
 
     @staticmethod
     def backward(ctx, grad_color, grad_depth, grad_alpha, grad_blended, _):
-        *inputs, color, depth, blended = (_array(t) for t in ctx.saved_tensors)
-        means, quaternions, log_scales, opacity_logits, sh, features = inputs
-        bins, transmittance, used, camera, degree = ctx.rest
-        grads = [_array(g) for g in (grad_color, grad_depth, grad_alpha, grad_blended)]
-        upstream, remainder = backward.upstream_of_blending(
-            color, depth, blended, transmittance, *grads, features.shape[1]
-        )
+        *parameters, features, color, depth, blended = (_array(t) for t in ctx.saved_tensors)
+        *geometry, sh = parameters
+        means = geometry[0]
+        view, transmittance, used, camera, degree = ctx.rest
+        gradients = [_array(g) for g in (grad_color, grad_depth, grad_alpha, grad_blended)]
         records = backward.blend_backward(
-            bins.footprints,
-            features[bins.order],
-            bins.starts,
-            bins.members,
-            bins.rows,
-            bins.slots,
+            view.footprints,
+            features[view.order],
+            view.bins,
             used,
-            upstream,
-            remainder,
+            (color, depth, blended),
             transmittance,
+            gradients,
         )
-        sums = backward.add_records(records, bins.first_slots)
-        g_means, g_quaternions, g_scales, g_opacities, g_probe = projection.project_backward(
-            sums,
-            bins.order,
-            means,
-            quaternions,
-            log_scales,
-            opacity_logits,
-            projection.view_numbers(camera),
-            ctx.needs_input_grad[7],
+        sums = backward.add_records(records, view.first_slots, projection.GRAD_FEATURES + features.shape[1])
+
+        to_parameters = [np.zeros_like(array) for array in parameters]
+        *to_geometry, to_sh = to_parameters
+        to_probe = np.zeros((len(means) if ctx.needs_input_grad[7] else 0, 2), np.float32)
+        numbers = projection.view_numbers(camera)
+        share(projection.project_backward, sums, view.order, *geometry, numbers, *to_geometry, to_probe)
+        share(
+            projection.colors_backward,
+            *(sums, view.order, view.footprints, means, sh, degree, camera.center, to_geometry[0], to_sh),
         )
-        g_sh = projection.colors_backward(sums, bins.order, bins.footprints, means, sh, degree, camera.center, g_means)
-        g_features = np.zeros(features.shape, np.float32)
-        g_features[bins.order] = sums[:, projection.GRAD_FEATURES :]
-        g_background = (transmittance[..., None] * grads[0]).sum((0, 1)) if ctx.needs_input_grad[6] else None
-        arrays = (g_means, g_quaternions, g_scales, g_opacities, g_sh, g_features, g_background, g_probe)
+        to_features = np.zeros_like(features)
+        to_features[view.order] = sums[:, projection.GRAD_FEATURES :]
+        to_background = np.einsum("hw,hwc->c", transmittance, gradients[0])
+        arrays = (*to_parameters, to_features, to_background, to_probe)
         needed = zip(arrays, ctx.needs_input_grad, strict=False)
         return (*(torch.from_numpy(array) if need else None for array, need in needed), None, None)

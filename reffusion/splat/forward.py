@@ -1,34 +1,31 @@
-"""Blending tile by tile, front to back."""
+"""Blending tile by tile, front to back, sixteen pixels of a row at a time."""
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
-from numba import njit, prange
 
 from reffusion.splat.binning import CUT, TILE_HEIGHT, TILE_WIDTH
+from reffusion.splat.compiled import kernel, share
 from reffusion.splat.conventions import MAX_ALPHA, MIN_TRANSMITTANCE
-from reffusion.splat.projection import (
-    BLUE,
-    DEPTH,
-    GREEN,
-    LEVEL,
-    MEAN_X,
-    MEAN_Y,
-    PARALLEL,
-    RED,
-    SERIAL,
-    SLANT,
-    WHITEN_X,
-    WHITEN_Y,
+from reffusion.splat.projection import BLUE, DEPTH, GREEN, LEVEL, MEAN_X, MEAN_Y, RED, SLANT, WHITEN_X, WHITEN_Y
+from reffusion.splat.vectors import (
+    exp2,
+    fma,
+    fnma,
+    load,
+    minimum,
+    negative,
+    ramp,
+    select,
+    some,
+    splat,
+    store,
+    take_ticket,
 )
 
-_MAX_ALPHA = np.float32(MAX_ALPHA)
-_MIN_TRANSMITTANCE = np.float32(MIN_TRANSMITTANCE)
+_SUMS = 5  # vectors of a row before its features: transmittance, red, green, blue, depth
 
 
-@njit(**PARALLEL)
 def blend(footprints, features, background, starts, members, rows, width, height):
     """Blend every tile's list.
 
@@ -36,76 +33,134 @@ def blend(footprints, features, background, starts, members, rows, width, height
         footprints: [M, FOOTPRINT]; features: [M, C]; background: [3]; starts, members, rows: see `bin_footprints`.
 
     Returns:
-        color [H, W, 3], depth [H, W], features [H, W, C], transmittance [H, W], all float32, and used [tiles] int64:
-        how many of a tile's list were looked at before all its pixels were finished.
+        color [H, W, 3], depth [H, W], alpha [H, W], features [H, W, C], transmittance [H, W], all float32, and used
+        [tiles] int64: how many of a tile's list were looked at before all its pixels were finished.
     """
-    channels = features.shape[1]
     color = np.empty((height, width, 3), np.float32)
-    depth = np.empty((height, width), np.float32)
-    blended = np.empty((height, width, channels), np.float32)
+    depth, alpha = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+    blended = np.empty((height, width, features.shape[1]), np.float32)
     transmittance = np.empty((height, width), np.float32)
-    used = np.zeros(starts.shape[0] - 1, np.int64)
-    for tile in prange(starts.shape[0] - 1):
-        _blend_tile(
-            tile, footprints, features, background, starts, members, rows, color, depth, blended, transmittance, used
-        )
-    return color, depth, blended, transmittance, used
+    used = np.empty(len(starts) - 1, np.int64)
+    outputs = color, depth, alpha, blended, transmittance, used
+    share(_blend, footprints, features, background, starts, members, rows, *outputs)
+    return outputs
 
 
-@njit(**SERIAL)
-def _blend_tile(
-    tile, footprints, features, background, starts, members, rows, color, depth, blended, transmittance, used
+@kernel
+def aligned(vectors):
+    """Room for so many vectors, on a cache line's border."""
+    room = np.empty((vectors + 1) * 16, np.float32)
+    first = (-room.ctypes.data // 4) % 16
+    return room[first : first + vectors * 16]
+
+
+@kernel
+def open_tile(state, stride, rows, columns):
+    """Set the transmittances, first of each row's `stride` floats: 1, or -1 (finished) outside the image."""
+    for row in range(TILE_HEIGHT):
+        limit = np.float32(columns if row < rows else 0)
+        store(state, row * stride, select(ramp() < splat(limit), splat(1.0), splat(-1.0)))
+
+
+@kernel
+def finished(state, stride):
+    """Whether no pixel of the tile takes anything more."""
+    for row in range(TILE_HEIGHT):
+        if some(load(state, row * stride) > splat(0.0)):
+            return False
+    return True
+
+
+@kernel
+def _blend(
+    tickets,
+    footprints,
+    features,
+    background,
+    starts,
+    members,
+    rows,
+    color,
+    depth,
+    alpha,
+    blended,
+    transmittance,
+    used,
 ):
-    f = np.float32
-    height, width = depth.shape
+    channels = features.shape[1]
+    stride = (_SUMS + channels) * TILE_WIDTH
+    state = aligned(TILE_HEIGHT * (_SUMS + channels))
+    while True:
+        tile = take_ticket(tickets)
+        if tile >= used.shape[0]:
+            return
+        used[tile] = _blend_tile(tile, footprints, features, starts, members, rows, depth.shape, state, stride)
+        _write_tile(tile, state, stride, background, color, depth, alpha, blended, transmittance)
+
+
+@kernel
+def _blend_tile(tile, footprints, features, starts, members, rows, size, state, stride):
+    """Blend one tile into `state`; returns how much of its list was used."""
+    height, width = size
     channels = features.shape[1]
     tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
     left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
-    tile_rows, tile_columns = min(TILE_HEIGHT, height - top), min(TILE_WIDTH, width - left)
-    # per row: transmittance (negative once finished), red, green, blue, depth, features
-    state = np.zeros((TILE_HEIGHT, 5 + channels, TILE_WIDTH), np.float32)
-    state[:, 0, :] = f(-1.0)
-    state[:tile_rows, 0, :tile_columns] = f(1.0)
-    at = starts[tile]
-    while at < starts[tile + 1]:
-        if (at - starts[tile]) % 32 == 31 and state[:, 0, :].max() <= 0:
-            break
-        splat = footprints[members[at]]
+    state[:] = np.float32(0.0)
+    open_tile(state, stride, min(TILE_HEIGHT, height - top), min(TILE_WIDTH, width - left))
+    zero, cut = splat(0.0), splat(CUT)
+    strongest, least = splat(MAX_ALPHA), splat(MIN_TRANSMITTANCE)
+    columns = ramp() + splat(np.float32(left) + np.float32(0.5))
+    for at in range(starts[tile], starts[tile + 1]):
+        if (at - starts[tile]) % 32 == 31 and finished(state, stride):
+            return at - starts[tile]
+        footprint = footprints[members[at]]
         extra = features[members[at]]
+        whiten_x, whiten_y, level = splat(footprint[WHITEN_X]), splat(footprint[WHITEN_Y]), splat(footprint[LEVEL])
+        lean = whiten_x * splat(footprint[SLANT])
+        across = whiten_x * (columns - splat(footprint[MEAN_X]))
+        red, green, blue = splat(footprint[RED]), splat(footprint[GREEN]), splat(footprint[BLUE])
+        far = splat(footprint[DEPTH])
+        above = np.float32(top) + np.float32(0.5) - footprint[MEAN_Y]
         for row in range(rows[at] & 255, rows[at] >> 8):
-            dy = f(top + row) + f(0.5) - splat[MEAN_Y]
-            v = splat[WHITEN_Y] * dy
-            level = splat[LEVEL] - v * v
-            middle = splat[MEAN_X] + splat[SLANT] * dy
-            for lane in range(TILE_WIDTH):
-                before = state[row, 0, lane]
-                u = splat[WHITEN_X] * (f(left + lane) + f(0.5) - middle)
-                power = level - u * u
-                if before <= 0 or power < CUT:
-                    continue
-                alpha = min(f(math.exp2(power)), _MAX_ALPHA)
-                after = before * (f(1.0) - alpha)
-                if after < _MIN_TRANSMITTANCE:
-                    state[row, 0, lane] = -before
-                    continue
-                weight = before * alpha
-                state[row, 0, lane] = after
-                state[row, 1, lane] += weight * splat[RED]
-                state[row, 2, lane] += weight * splat[GREEN]
-                state[row, 3, lane] += weight * splat[BLUE]
-                state[row, 4, lane] += weight * splat[DEPTH]
-                for c in range(channels):
-                    state[row, 5 + c, lane] += weight * extra[c]
-        at += 1
-    used[tile] = at - starts[tile]
-    for row in range(tile_rows):
-        for lane in range(tile_columns):
-            y, x = top + row, left + lane
-            behind = abs(state[row, 0, lane])
-            transmittance[y, x] = behind
-            color[y, x, 0] = state[row, 1, lane] + behind * background[0]
-            color[y, x, 1] = state[row, 2, lane] + behind * background[1]
-            color[y, x, 2] = state[row, 3, lane] + behind * background[2]
-            depth[y, x] = state[row, 4, lane] / (f(1.0) - behind) if behind < 1 else f(0.0)
+            place = row * stride
+            before = load(state, place)
+            dy = splat(above + np.float32(row))
+            u, v = fnma(lean, dy, across), whiten_y * dy
+            power = fnma(u, u, fnma(v, v, level))
+            seen = (power >= cut) & (before > zero)
+            if not some(seen):
+                continue
+            opacity = minimum(exp2(power), strongest)
+            after = fnma(before, opacity, before)
+            kept = seen & (after >= least)
+            weight = select(kept, before * opacity, zero)
+            store(state, place, select(seen, select(kept, after, negative(before)), before))
+            store(state, place + 16, fma(weight, red, load(state, place + 16)))
+            store(state, place + 32, fma(weight, green, load(state, place + 32)))
+            store(state, place + 48, fma(weight, blue, load(state, place + 48)))
+            store(state, place + 64, fma(weight, far, load(state, place + 64)))
             for c in range(channels):
-                blended[y, x, c] = state[row, 5 + c, lane]
+                place_c = place + 16 * (_SUMS + c)
+                store(state, place_c, fma(weight, splat(extra[c]), load(state, place_c)))
+    return starts[tile + 1] - starts[tile]
+
+
+@kernel
+def _write_tile(tile, state, stride, background, color, depth, alpha, blended, transmittance):
+    """Put a blended tile into the images."""
+    height, width = depth.shape
+    tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
+    left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
+    one = np.float32(1.0)
+    for row in range(min(TILE_HEIGHT, height - top)):
+        y = top + row
+        for lane in range(min(TILE_WIDTH, width - left)):
+            x, place = left + lane, row * stride + lane
+            behind = abs(state[place])
+            transmittance[y, x] = behind
+            alpha[y, x] = one - behind
+            for c in range(3):
+                color[y, x, c] = state[place + 16 * (1 + c)] + behind * background[c]
+            depth[y, x] = state[place + 64] / max(one - behind, np.float32(1e-30))
+            for c in range(blended.shape[2]):
+                blended[y, x, c] = state[place + 16 * (_SUMS + c)]

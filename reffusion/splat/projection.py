@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
 
+from reffusion.splat.compiled import kernel
 from reffusion.splat.conventions import (
     JACOBIAN_MARGIN,
     LOW_PASS,
@@ -23,6 +23,7 @@ from reffusion.splat.conventions import (
     SH2,
     SH3,
 )
+from reffusion.splat.vectors import take_ticket
 from reffusion.types import Camera
 
 # Columns of a footprint: 2D mean; slant xy/yy; the whitening factors along x and y, scaled so that
@@ -34,10 +35,7 @@ FOOTPRINT = 16  # columns, of which the last six are unused: one cache line each
 # then the gradients of camera z, colour and features.
 SUM_G, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, GRAD_DEPTH, GRAD_RED, GRAD_GREEN, GRAD_BLUE, GRAD_FEATURES = range(11)
 
-# Serial pieces of work hold the loops; thin parallel functions share them out in CHUNKS parts of fixed borders.
-SERIAL = {"cache": True, "nogil": True, "error_model": "numpy"}
-PARALLEL = {"cache": True, "nogil": True, "parallel": True}
-CHUNKS = 32
+CHUNKS = 32  # pieces that the Gaussians are shared out in; fixed, so that nothing depends on the number of threads
 
 _LOG2_E = 1.4426950408889634
 _HALF_LOG2_E = math.sqrt(0.5 * _LOG2_E)
@@ -62,7 +60,16 @@ def view_numbers(camera: Camera) -> np.ndarray:
     )
 
 
-@njit(**SERIAL)
+@kernel
+def next_part(tickets, count):
+    """Borders of the next of CHUNKS parts of range(count), or (-1, -1) when all are drawn."""
+    ticket = take_ticket(tickets)
+    if ticket >= CHUNKS:
+        return -1, -1
+    return ticket * count // CHUNKS, (ticket + 1) * count // CHUNKS
+
+
+@kernel
 def _rotation(q):
     """Rotation matrix of a quaternion wxyz of any length (zero: identity), row by row, and 1 / length."""
     w, x, y, z = np.float64(q[0]), np.float64(q[1]), np.float64(q[2]), np.float64(q[3])
@@ -81,7 +88,7 @@ def _rotation(q):
     )
 
 
-@njit(**SERIAL)
+@kernel
 def _to_camera(view, mean):
     """Camera coordinates of a mean."""
     a, b, c = np.float64(mean[0]), np.float64(mean[1]), np.float64(mean[2])
@@ -92,7 +99,7 @@ def _to_camera(view, mean):
     )
 
 
-@njit(**SERIAL)
+@kernel
 def _projector(view, x, y, z):
     """The two rows of Jacobian x rotation [2, 3], and the clamped slopes x/z and y/z."""
     inverse = 1.0 / z
@@ -107,77 +114,70 @@ def _projector(view, x, y, z):
     )
 
 
-@njit(**PARALLEL)
-def project(means, quaternions, log_scales, opacity_logits, probe, view):
+@kernel
+def project(tickets, means, quaternions, log_scales, opacity_logits, probe, view, footprints, radii):
     """Footprints of all Gaussians.
 
     Args:
         probe: [N, 2] added to the 2D means, or [0, 2].
-
-    Returns:
-        footprints [N, FOOTPRINT] float32 (colour not yet set), radii [N] int32 (0 = left out).
+        view: see `view_numbers`.
+        footprints: [N, FOOTPRINT] float32, written up to the depth for Gaussians that reach the image.
+        radii: [N] int32 zeros, written for the same Gaussians.
     """
-    count = means.shape[0]
-    footprints = np.empty((count, FOOTPRINT), np.float32)
-    radii = np.zeros(count, np.int32)
-    for chunk in prange(CHUNKS):
-        begin, end = chunk * count // CHUNKS, (chunk + 1) * count // CHUNKS
-        _project(begin, end, means, quaternions, log_scales, opacity_logits, probe, view, footprints, radii)
-    return footprints, radii
+    while True:
+        begin, end = next_part(tickets, means.shape[0])
+        if begin < 0:
+            return
+        for i in range(begin, end):
+            x, y, z = _to_camera(view, means[i])
+            if not z >= NEAR:
+                continue
+            _, r0, r1, r2 = _rotation(quaternions[i])
+            p0, p1, _, _ = _projector(view, x, y, z)
+            s0 = math.exp(np.float64(log_scales[i, 0]))
+            s1 = math.exp(np.float64(log_scales[i, 1]))
+            s2 = math.exp(np.float64(log_scales[i, 2]))
+            # root [2, 3]: the covariance is root rootᵀ + low-pass
+            a0 = (p0[0] * r0[0] + p0[1] * r1[0] + p0[2] * r2[0]) * s0
+            a1 = (p0[0] * r0[1] + p0[1] * r1[1] + p0[2] * r2[1]) * s1
+            a2 = (p0[0] * r0[2] + p0[1] * r1[2] + p0[2] * r2[2]) * s2
+            b0 = (p1[0] * r0[0] + p1[1] * r1[0] + p1[2] * r2[0]) * s0
+            b1 = (p1[0] * r0[1] + p1[1] * r1[1] + p1[2] * r2[1]) * s1
+            b2 = (p1[0] * r0[2] + p1[1] * r1[2] + p1[2] * r2[2]) * s2
+            xx = a0 * a0 + a1 * a1 + a2 * a2
+            xy = a0 * b0 + a1 * b1 + a2 * b2
+            yy = b0 * b0 + b1 * b1 + b2 * b2
+            # Cauchy-Binet: the sum of the squared 2x2 minors has no cancellation where xx yy - xy^2 loses everything
+            m0, m1, m2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+            determinant = m0 * m0 + m1 * m1 + m2 * m2 + LOW_PASS * (xx + yy) + LOW_PASS * LOW_PASS
+            xx += LOW_PASS
+            yy += LOW_PASS
+            mean_x = view[12] * x / z + view[14]
+            mean_y = view[13] * y / z + view[15]
+            if probe.shape[0] > 0:
+                mean_x += probe[i, 0]
+                mean_y += probe[i, 1]
+            opacity = 1.0 / (1.0 + math.exp(-np.float64(opacity_logits[i])))
+            near_enough = abs(mean_x) < MAX_PIXELS and abs(mean_y) < MAX_PIXELS
+            if not (opacity >= MIN_ALPHA and near_enough and xx < MAX_VARIANCE and yy < MAX_VARIANCE):
+                continue
+            cut = math.sqrt(2.0 * math.log(opacity / MIN_ALPHA))
+            reach_x, reach_y = math.ceil(cut * math.sqrt(xx)), math.ceil(cut * math.sqrt(yy))
+            inside_x = mean_x + reach_x > 0 and mean_x - reach_x < view[20]
+            inside_y = mean_y + reach_y > 0 and mean_y - reach_y < view[21]
+            if not (inside_x and inside_y):
+                continue
+            radii[i] = np.int32(min(max(reach_x, reach_y, 1.0), 1073741824.0))
+            footprints[i, MEAN_X] = mean_x
+            footprints[i, MEAN_Y] = mean_y
+            footprints[i, SLANT] = xy / yy
+            footprints[i, WHITEN_X] = _HALF_LOG2_E * math.sqrt(yy / determinant)
+            footprints[i, WHITEN_Y] = _HALF_LOG2_E / math.sqrt(yy)
+            footprints[i, LEVEL] = math.log(opacity) * _LOG2_E
+            footprints[i, DEPTH] = z
 
 
-@njit(**SERIAL)
-def _project(begin, end, means, quaternions, log_scales, opacity_logits, probe, view, footprints, radii):
-    for i in range(begin, end):
-        x, y, z = _to_camera(view, means[i])
-        if not z >= NEAR:
-            continue
-        _, r0, r1, r2 = _rotation(quaternions[i])
-        p0, p1, _, _ = _projector(view, x, y, z)
-        s0 = math.exp(np.float64(log_scales[i, 0]))
-        s1 = math.exp(np.float64(log_scales[i, 1]))
-        s2 = math.exp(np.float64(log_scales[i, 2]))
-        # root [2, 3]: the covariance is root rootᵀ + low-pass
-        a0 = (p0[0] * r0[0] + p0[1] * r1[0] + p0[2] * r2[0]) * s0
-        a1 = (p0[0] * r0[1] + p0[1] * r1[1] + p0[2] * r2[1]) * s1
-        a2 = (p0[0] * r0[2] + p0[1] * r1[2] + p0[2] * r2[2]) * s2
-        b0 = (p1[0] * r0[0] + p1[1] * r1[0] + p1[2] * r2[0]) * s0
-        b1 = (p1[0] * r0[1] + p1[1] * r1[1] + p1[2] * r2[1]) * s1
-        b2 = (p1[0] * r0[2] + p1[1] * r1[2] + p1[2] * r2[2]) * s2
-        xx = a0 * a0 + a1 * a1 + a2 * a2
-        xy = a0 * b0 + a1 * b1 + a2 * b2
-        yy = b0 * b0 + b1 * b1 + b2 * b2
-        # Cauchy-Binet: the sum of the squared 2x2 minors has no cancellation where xx yy - xy^2 loses everything
-        m0, m1, m2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
-        determinant = m0 * m0 + m1 * m1 + m2 * m2 + LOW_PASS * (xx + yy) + LOW_PASS * LOW_PASS
-        xx += LOW_PASS
-        yy += LOW_PASS
-        mean_x = view[12] * x / z + view[14]
-        mean_y = view[13] * y / z + view[15]
-        if probe.shape[0] > 0:
-            mean_x += probe[i, 0]
-            mean_y += probe[i, 1]
-        opacity = 1.0 / (1.0 + math.exp(-np.float64(opacity_logits[i])))
-        near_enough = abs(mean_x) < MAX_PIXELS and abs(mean_y) < MAX_PIXELS
-        if not (opacity >= MIN_ALPHA and near_enough and xx < MAX_VARIANCE and yy < MAX_VARIANCE):
-            continue
-        cut = math.sqrt(2.0 * math.log(opacity / MIN_ALPHA))
-        reach_x, reach_y = math.ceil(cut * math.sqrt(xx)), math.ceil(cut * math.sqrt(yy))
-        inside_x = mean_x + reach_x > 0 and mean_x - reach_x < view[20]
-        inside_y = mean_y + reach_y > 0 and mean_y - reach_y < view[21]
-        if not (inside_x and inside_y):
-            continue
-        radii[i] = np.int32(min(max(reach_x, reach_y, 1.0), 1073741824.0))
-        footprints[i, MEAN_X] = mean_x
-        footprints[i, MEAN_Y] = mean_y
-        footprints[i, SLANT] = xy / yy
-        footprints[i, WHITEN_X] = _HALF_LOG2_E * math.sqrt(yy / determinant)
-        footprints[i, WHITEN_Y] = _HALF_LOG2_E / math.sqrt(yy)
-        footprints[i, LEVEL] = math.log(opacity) * _LOG2_E
-        footprints[i, DEPTH] = z
-
-
-@njit(**SERIAL)
+@kernel
 def _basis(degree, x, y, z):
     """The 16 spherical harmonics of 3DGS in a unit direction, zero above `degree`."""
     f = np.float32
@@ -205,7 +205,7 @@ def _basis(degree, x, y, z):
     )
 
 
-@njit(**SERIAL)
+@kernel
 def _direction(mean, center):
     """Unit vector from the camera centre to a mean, and 1 / distance."""
     x = np.float64(mean[0]) - center[0]
@@ -215,89 +215,41 @@ def _direction(mean, center):
     return np.float32(x * inverse), np.float32(y * inverse), np.float32(z * inverse), np.float32(inverse)
 
 
-@njit(**PARALLEL)
-def gather_footprints(footprints, order, means, sh, degree, center):
+@kernel
+def gather_footprints(tickets, footprints, order, means, sh, degree, center, sorted_footprints):
     """Footprints front to back, with their colours.
 
     Args:
         order: [M] Gaussian indices, front to back.
-
-    Returns:
-        [M, FOOTPRINT] float32.
+        sorted_footprints: [M, FOOTPRINT] float32, written.
     """
-    count = order.shape[0]
-    sorted_footprints = np.empty((count, FOOTPRINT), np.float32)
-    for chunk in prange(CHUNKS):
-        begin, end = chunk * count // CHUNKS, (chunk + 1) * count // CHUNKS
-        _gather_footprints(begin, end, footprints, order, means, sh, degree, center, sorted_footprints)
-    return sorted_footprints
-
-
-@njit(**SERIAL)
-def _gather_footprints(begin, end, footprints, order, means, sh, degree, center, sorted_footprints):
     terms = (degree + 1) * (degree + 1)
-    for rank in range(begin, end):
-        i = order[rank]
-        x, y, z, _ = _direction(means[i], center)
-        basis = _basis(degree, x, y, z)
-        red = green = blue = np.float32(0.5)
-        for k in range(terms):
-            red += basis[k] * sh[i, k, 0]
-            green += basis[k] * sh[i, k, 1]
-            blue += basis[k] * sh[i, k, 2]
-        target = sorted_footprints[rank]
-        for k in range(RED):
-            target[k] = footprints[i, k]
-        target[RED] = max(red, np.float32(0.0))
-        target[GREEN] = max(green, np.float32(0.0))
-        target[BLUE] = max(blue, np.float32(0.0))
-        for k in range(BLUE + 1, FOOTPRINT):
-            target[k] = np.float32(0.0)
+    while True:
+        begin, end = next_part(tickets, order.shape[0])
+        if begin < 0:
+            return
+        for rank in range(begin, end):
+            i = order[rank]
+            x, y, z, _ = _direction(means[i], center)
+            basis = _basis(degree, x, y, z)
+            red = green = blue = np.float32(0.5)
+            for k in range(terms):
+                red += basis[k] * sh[i, k, 0]
+                green += basis[k] * sh[i, k, 1]
+                blue += basis[k] * sh[i, k, 2]
+            target = sorted_footprints[rank]
+            for k in range(RED):
+                target[k] = footprints[i, k]
+            target[RED] = max(red, np.float32(0.0))
+            target[GREEN] = max(green, np.float32(0.0))
+            target[BLUE] = max(blue, np.float32(0.0))
+            for k in range(BLUE + 1, FOOTPRINT):
+                target[k] = np.float32(0.0)
 
 
-@njit(**PARALLEL)
-def project_backward(sums, order, means, quaternions, log_scales, opacity_logits, view, want_probe):
-    """From the sums of each footprint to the gradients of means, quaternions, log-scales, opacity logits and probe.
-
-    Args:
-        sums: [M, >= GRAD_FEATURES] per footprint, columns as above.
-        order: [M] Gaussian indices.
-
-    Returns:
-        Gradients of all N Gaussians, zero for those not in `order`; the probe's is [0, 2] unless wanted.
-    """
-    count = means.shape[0]
-    grad_means = np.zeros((count, 3), np.float32)
-    grad_quaternions = np.zeros((count, 4), np.float32)
-    grad_scales = np.zeros((count, 3), np.float32)
-    grad_opacities = np.zeros(count, np.float32)
-    grad_probe = np.zeros((count if want_probe else 0, 2), np.float32)
-    visible = order.shape[0]
-    for chunk in prange(CHUNKS):
-        begin, end = chunk * visible // CHUNKS, (chunk + 1) * visible // CHUNKS
-        _project_backward(
-            begin,
-            end,
-            sums,
-            order,
-            means,
-            quaternions,
-            log_scales,
-            opacity_logits,
-            view,
-            grad_means,
-            grad_quaternions,
-            grad_scales,
-            grad_opacities,
-            grad_probe,
-        )
-    return grad_means, grad_quaternions, grad_scales, grad_opacities, grad_probe
-
-
-@njit(**SERIAL)
-def _project_backward(
-    begin,
-    end,
+@kernel
+def project_backward(
+    tickets,
     sums,
     order,
     means,
@@ -311,159 +263,165 @@ def _project_backward(
     grad_opacities,
     grad_probe,
 ):
+    """From the sums of each footprint to the gradients of means, quaternions, log-scales, opacity logits and probe.
+
+    Args:
+        sums: [M, >= GRAD_FEATURES] per footprint, columns as above.
+        order: [M] Gaussian indices.
+        grad_means, grad_quaternions, grad_scales, grad_opacities, grad_probe: float32 zeros, written for the Gaussians
+            in `order`; grad_probe may be [0, 2].
+    """
     unscale = math.sqrt(2.0 / _LOG2_E)  # the record's u and v are scaled by sqrt(log2(e) / 2)
     want_probe = grad_probe.shape[0] > 0
-    for rank in range(begin, end):
-        i = order[rank]
-        record = sums[rank]
-        x, y, z = _to_camera(view, means[i])
-        (qw, qx, qy, qz, q_inverse), r0, r1, r2 = _rotation(quaternions[i])
-        p0, p1, _, _ = _projector(view, x, y, z)
-        s0 = math.exp(np.float64(log_scales[i, 0]))
-        s1 = math.exp(np.float64(log_scales[i, 1]))
-        s2 = math.exp(np.float64(log_scales[i, 2]))
-        e00 = p0[0] * r0[0] + p0[1] * r1[0] + p0[2] * r2[0]
-        e01 = p0[0] * r0[1] + p0[1] * r1[1] + p0[2] * r2[1]
-        e02 = p0[0] * r0[2] + p0[1] * r1[2] + p0[2] * r2[2]
-        e10 = p1[0] * r0[0] + p1[1] * r1[0] + p1[2] * r2[0]
-        e11 = p1[0] * r0[1] + p1[1] * r1[1] + p1[2] * r2[1]
-        e12 = p1[0] * r0[2] + p1[1] * r1[2] + p1[2] * r2[2]
-        a0, a1, a2 = e00 * s0, e01 * s1, e02 * s2
-        b0, b1, b2 = e10 * s0, e11 * s1, e12 * s2
-        xx = a0 * a0 + a1 * a1 + a2 * a2
-        xy = a0 * b0 + a1 * b1 + a2 * b2
-        yy = b0 * b0 + b1 * b1 + b2 * b2
-        m0, m1, m2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
-        determinant = m0 * m0 + m1 * m1 + m2 * m2 + LOW_PASS * (xx + yy) + LOW_PASS * LOW_PASS
-        yy += LOW_PASS
-        slant = xy / yy
-        lx, ly = math.sqrt(yy / determinant), 1.0 / math.sqrt(yy)
+    while True:
+        begin, end = next_part(tickets, order.shape[0])
+        if begin < 0:
+            return
+        for rank in range(begin, end):
+            i = order[rank]
+            record = sums[rank]
+            x, y, z = _to_camera(view, means[i])
+            (qw, qx, qy, qz, q_inverse), r0, r1, r2 = _rotation(quaternions[i])
+            p0, p1, _, _ = _projector(view, x, y, z)
+            s0 = math.exp(np.float64(log_scales[i, 0]))
+            s1 = math.exp(np.float64(log_scales[i, 1]))
+            s2 = math.exp(np.float64(log_scales[i, 2]))
+            e00 = p0[0] * r0[0] + p0[1] * r1[0] + p0[2] * r2[0]
+            e01 = p0[0] * r0[1] + p0[1] * r1[1] + p0[2] * r2[1]
+            e02 = p0[0] * r0[2] + p0[1] * r1[2] + p0[2] * r2[2]
+            e10 = p1[0] * r0[0] + p1[1] * r1[0] + p1[2] * r2[0]
+            e11 = p1[0] * r0[1] + p1[1] * r1[1] + p1[2] * r2[1]
+            e12 = p1[0] * r0[2] + p1[1] * r1[2] + p1[2] * r2[2]
+            a0, a1, a2 = e00 * s0, e01 * s1, e02 * s2
+            b0, b1, b2 = e10 * s0, e11 * s1, e12 * s2
+            xx = a0 * a0 + a1 * a1 + a2 * a2
+            xy = a0 * b0 + a1 * b1 + a2 * b2
+            yy = b0 * b0 + b1 * b1 + b2 * b2
+            m0, m1, m2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+            determinant = m0 * m0 + m1 * m1 + m2 * m2 + LOW_PASS * (xx + yy) + LOW_PASS * LOW_PASS
+            yy += LOW_PASS
+            slant = xy / yy
+            lx, ly = math.sqrt(yy / determinant), 1.0 / math.sqrt(yy)
 
-        # 2D mean: u = lx (dx - slant dy), v = ly dy, ln alpha = ln opacity - (u^2 + v^2) / 2
-        sum_u, sum_v = unscale * record[SUM_U], unscale * record[SUM_V]
-        g_mean_x = lx * sum_u
-        g_mean_y = ly * sum_v - slant * g_mean_x
-        if want_probe:
-            grad_probe[i, 0] = g_mean_x
-            grad_probe[i, 1] = g_mean_y
+            # 2D mean: u = lx (dx - slant dy), v = ly dy, ln alpha = ln opacity - (u^2 + v^2) / 2
+            sum_u, sum_v = unscale * record[SUM_U], unscale * record[SUM_V]
+            g_mean_x = lx * sum_u
+            g_mean_y = ly * sum_v - slant * g_mean_x
+            if want_probe:
+                grad_probe[i, 0] = g_mean_x
+                grad_probe[i, 1] = g_mean_y
 
-        # root: dLoss/d(root) = L M Lᵀ root, with L the whitening factor and M the second moments of (u, v)
-        uu = unscale * unscale * record[SUM_UU]
-        uv = unscale * unscale * record[SUM_UV]
-        vv = unscale * unscale * record[SUM_VV]
-        w0, w1, w2 = lx * (a0 - slant * b0), lx * (a1 - slant * b1), lx * (a2 - slant * b2)
-        h0, h1, h2 = ly * b0, ly * b1, ly * b2
-        ga0, ga1, ga2 = lx * (uu * w0 + uv * h0), lx * (uu * w1 + uv * h1), lx * (uu * w2 + uv * h2)
-        gb0 = ly * (uv * w0 + vv * h0) - slant * ga0
-        gb1 = ly * (uv * w1 + vv * h1) - slant * ga1
-        gb2 = ly * (uv * w2 + vv * h2) - slant * ga2
-        grad_scales[i, 0] = ga0 * a0 + gb0 * b0
-        grad_scales[i, 1] = ga1 * a1 + gb1 * b1
-        grad_scales[i, 2] = ga2 * a2 + gb2 * b2
-        ga0, ga1, ga2, gb0, gb1, gb2 = ga0 * s0, ga1 * s1, ga2 * s2, gb0 * s0, gb1 * s1, gb2 * s2
+            # root: dLoss/d(root) = L M Lᵀ root, with L the whitening factor and M the second moments of (u, v)
+            uu = unscale * unscale * record[SUM_UU]
+            uv = unscale * unscale * record[SUM_UV]
+            vv = unscale * unscale * record[SUM_VV]
+            w0, w1, w2 = lx * (a0 - slant * b0), lx * (a1 - slant * b1), lx * (a2 - slant * b2)
+            h0, h1, h2 = ly * b0, ly * b1, ly * b2
+            ga0, ga1, ga2 = lx * (uu * w0 + uv * h0), lx * (uu * w1 + uv * h1), lx * (uu * w2 + uv * h2)
+            gb0 = ly * (uv * w0 + vv * h0) - slant * ga0
+            gb1 = ly * (uv * w1 + vv * h1) - slant * ga1
+            gb2 = ly * (uv * w2 + vv * h2) - slant * ga2
+            grad_scales[i, 0] = ga0 * a0 + gb0 * b0
+            grad_scales[i, 1] = ga1 * a1 + gb1 * b1
+            grad_scales[i, 2] = ga2 * a2 + gb2 * b2
+            ga0, ga1, ga2, gb0, gb1, gb2 = ga0 * s0, ga1 * s1, ga2 * s2, gb0 * s0, gb1 * s1, gb2 * s2
 
-        # rotation, then quaternion (tangential to the unit sphere, divided by the length; zero stays zero)
-        g00, g01, g02 = p0[0] * ga0 + p1[0] * gb0, p0[0] * ga1 + p1[0] * gb1, p0[0] * ga2 + p1[0] * gb2
-        g10, g11, g12 = p0[1] * ga0 + p1[1] * gb0, p0[1] * ga1 + p1[1] * gb1, p0[1] * ga2 + p1[1] * gb2
-        g20, g21, g22 = p0[2] * ga0 + p1[2] * gb0, p0[2] * ga1 + p1[2] * gb1, p0[2] * ga2 + p1[2] * gb2
-        gw = 2.0 * (qx * (g21 - g12) + qy * (g02 - g20) + qz * (g10 - g01))
-        gx = 2.0 * (qw * (g21 - g12) + qy * (g01 + g10) + qz * (g02 + g20)) - 4.0 * qx * (g11 + g22)
-        gy = 2.0 * (qw * (g02 - g20) + qx * (g01 + g10) + qz * (g12 + g21)) - 4.0 * qy * (g00 + g22)
-        gz = 2.0 * (qw * (g10 - g01) + qx * (g02 + g20) + qy * (g12 + g21)) - 4.0 * qz * (g00 + g11)
-        radial = gw * qw + gx * qx + gy * qy + gz * qz
-        grad_quaternions[i, 0] = (gw - radial * qw) * q_inverse
-        grad_quaternions[i, 1] = (gx - radial * qx) * q_inverse
-        grad_quaternions[i, 2] = (gy - radial * qy) * q_inverse
-        grad_quaternions[i, 3] = (gz - radial * qz) * q_inverse
+            # rotation, then quaternion (tangential to the unit sphere, divided by the length; zero stays zero)
+            g00, g01, g02 = p0[0] * ga0 + p1[0] * gb0, p0[0] * ga1 + p1[0] * gb1, p0[0] * ga2 + p1[0] * gb2
+            g10, g11, g12 = p0[1] * ga0 + p1[1] * gb0, p0[1] * ga1 + p1[1] * gb1, p0[1] * ga2 + p1[1] * gb2
+            g20, g21, g22 = p0[2] * ga0 + p1[2] * gb0, p0[2] * ga1 + p1[2] * gb1, p0[2] * ga2 + p1[2] * gb2
+            gw = 2.0 * (qx * (g21 - g12) + qy * (g02 - g20) + qz * (g10 - g01))
+            gx = 2.0 * (qw * (g21 - g12) + qy * (g01 + g10) + qz * (g02 + g20)) - 4.0 * qx * (g11 + g22)
+            gy = 2.0 * (qw * (g02 - g20) + qx * (g01 + g10) + qz * (g12 + g21)) - 4.0 * qy * (g00 + g22)
+            gz = 2.0 * (qw * (g10 - g01) + qx * (g02 + g20) + qy * (g12 + g21)) - 4.0 * qz * (g00 + g11)
+            radial = gw * qw + gx * qx + gy * qy + gz * qz
+            grad_quaternions[i, 0] = (gw - radial * qw) * q_inverse
+            grad_quaternions[i, 1] = (gx - radial * qx) * q_inverse
+            grad_quaternions[i, 2] = (gy - radial * qy) * q_inverse
+            grad_quaternions[i, 3] = (gz - radial * qz) * q_inverse
 
-        # projector rows fx/z (R0 - slope_x R2) and fy/z (R1 - slope_y R2), then camera coordinates
-        gp00 = ga0 * r0[0] + ga1 * r0[1] + ga2 * r0[2]
-        gp01 = ga0 * r1[0] + ga1 * r1[1] + ga2 * r1[2]
-        gp02 = ga0 * r2[0] + ga1 * r2[1] + ga2 * r2[2]
-        gp10 = gb0 * r0[0] + gb1 * r0[1] + gb2 * r0[2]
-        gp11 = gb0 * r1[0] + gb1 * r1[1] + gb2 * r1[2]
-        gp12 = gb0 * r2[0] + gb1 * r2[1] + gb2 * r2[2]
-        z_inverse = 1.0 / z
-        fx, fy = view[12] * z_inverse, view[13] * z_inverse
-        g_slope_x = -fx * (gp00 * view[6] + gp01 * view[7] + gp02 * view[8])
-        g_slope_y = -fy * (gp10 * view[6] + gp11 * view[7] + gp12 * view[8])
-        free_x = view[16] <= x * z_inverse <= view[17]
-        free_y = view[18] <= y * z_inverse <= view[19]
-        g_x = fx * g_mean_x + (g_slope_x * z_inverse if free_x else 0.0)
-        g_y = fy * g_mean_y + (g_slope_y * z_inverse if free_y else 0.0)
-        g_z = -z_inverse * (x * g_x + y * g_y) + record[GRAD_DEPTH]
-        g_z -= z_inverse * (gp00 * p0[0] + gp01 * p0[1] + gp02 * p0[2] + gp10 * p1[0] + gp11 * p1[1] + gp12 * p1[2])
-        grad_means[i, 0] = view[0] * g_x + view[3] * g_y + view[6] * g_z
-        grad_means[i, 1] = view[1] * g_x + view[4] * g_y + view[7] * g_z
-        grad_means[i, 2] = view[2] * g_x + view[5] * g_y + view[8] * g_z
+            # projector rows fx/z (R0 - slope_x R2) and fy/z (R1 - slope_y R2), then camera coordinates
+            gp00 = ga0 * r0[0] + ga1 * r0[1] + ga2 * r0[2]
+            gp01 = ga0 * r1[0] + ga1 * r1[1] + ga2 * r1[2]
+            gp02 = ga0 * r2[0] + ga1 * r2[1] + ga2 * r2[2]
+            gp10 = gb0 * r0[0] + gb1 * r0[1] + gb2 * r0[2]
+            gp11 = gb0 * r1[0] + gb1 * r1[1] + gb2 * r1[2]
+            gp12 = gb0 * r2[0] + gb1 * r2[1] + gb2 * r2[2]
+            z_inverse = 1.0 / z
+            fx, fy = view[12] * z_inverse, view[13] * z_inverse
+            g_slope_x = -fx * (gp00 * view[6] + gp01 * view[7] + gp02 * view[8])
+            g_slope_y = -fy * (gp10 * view[6] + gp11 * view[7] + gp12 * view[8])
+            free_x = view[16] <= x * z_inverse <= view[17]
+            free_y = view[18] <= y * z_inverse <= view[19]
+            g_x = fx * g_mean_x + (g_slope_x * z_inverse if free_x else 0.0)
+            g_y = fy * g_mean_y + (g_slope_y * z_inverse if free_y else 0.0)
+            g_z = -z_inverse * (x * g_x + y * g_y) + record[GRAD_DEPTH]
+            g_z -= z_inverse * (gp00 * p0[0] + gp01 * p0[1] + gp02 * p0[2] + gp10 * p1[0] + gp11 * p1[1] + gp12 * p1[2])
+            grad_means[i, 0] = view[0] * g_x + view[3] * g_y + view[6] * g_z
+            grad_means[i, 1] = view[1] * g_x + view[4] * g_y + view[7] * g_z
+            grad_means[i, 2] = view[2] * g_x + view[5] * g_y + view[8] * g_z
 
-        grad_opacities[i] = record[SUM_G] / (1.0 + math.exp(np.float64(opacity_logits[i])))
-
-
-@njit(**PARALLEL)
-def colors_backward(sums, order, footprints, means, sh, degree, center, grad_means):
-    """Gradients of the spherical harmonics [N, K, 3], and through the viewing direction added to `grad_means`."""
-    grad_sh = np.zeros(sh.shape, np.float32)
-    count = order.shape[0]
-    for chunk in prange(CHUNKS):
-        begin, end = chunk * count // CHUNKS, (chunk + 1) * count // CHUNKS
-        _colors_backward(begin, end, sums, order, footprints, means, sh, degree, center, grad_means, grad_sh)
-    return grad_sh
+            grad_opacities[i] = record[SUM_G] / (1.0 + math.exp(np.float64(opacity_logits[i])))
 
 
-@njit(**SERIAL)
-def _colors_backward(begin, end, sums, order, footprints, means, sh, degree, center, grad_means, grad_sh):
+@kernel
+def colors_backward(tickets, sums, order, footprints, means, sh, degree, center, grad_means, grad_sh):
+    """Gradients of the spherical harmonics (zeros, written); through the viewing direction, added to `grad_means`."""
     f = np.float32
     terms = (degree + 1) * (degree + 1)
-    for rank in range(begin, end):
-        i = order[rank]
-        red = sums[rank, GRAD_RED] if footprints[rank, RED] > 0 else f(0.0)
-        green = sums[rank, GRAD_GREEN] if footprints[rank, GREEN] > 0 else f(0.0)
-        blue = sums[rank, GRAD_BLUE] if footprints[rank, BLUE] > 0 else f(0.0)
-        x, y, z, inverse = _direction(means[i], center)
-        basis = _basis(degree, x, y, z)
-        for k in range(terms):
-            grad_sh[i, k, 0] = basis[k] * red
-            grad_sh[i, k, 1] = basis[k] * green
-            grad_sh[i, k, 2] = basis[k] * blue
-        if degree == 0:
-            continue
-        gx = gy = gz = f(0.0)
-        c = sh[i]
-        # along[k]: the upstream colour gradient dotted with the k-th coefficient
-        along1 = c[1, 0] * red + c[1, 1] * green + c[1, 2] * blue
-        along2 = c[2, 0] * red + c[2, 1] * green + c[2, 2] * blue
-        along3 = c[3, 0] * red + c[3, 1] * green + c[3, 2] * blue
-        gx -= f(SH1) * along3
-        gy -= f(SH1) * along1
-        gz += f(SH1) * along2
-        if degree >= 2:
-            along4 = (c[4, 0] * red + c[4, 1] * green + c[4, 2] * blue) * f(SH2[0])
-            along5 = (c[5, 0] * red + c[5, 1] * green + c[5, 2] * blue) * f(SH2[1])
-            along6 = (c[6, 0] * red + c[6, 1] * green + c[6, 2] * blue) * f(SH2[2])
-            along7 = (c[7, 0] * red + c[7, 1] * green + c[7, 2] * blue) * f(SH2[3])
-            along8 = (c[8, 0] * red + c[8, 1] * green + c[8, 2] * blue) * f(SH2[4])
-            gx += along4 * y - f(2.0) * along6 * x + along7 * z + f(2.0) * along8 * x
-            gy += along4 * x + along5 * z - f(2.0) * along6 * y - f(2.0) * along8 * y
-            gz += along5 * y + f(4.0) * along6 * z + along7 * x
-        if degree >= 3:
-            xx, yy, zz = x * x, y * y, z * z
-            along9 = (c[9, 0] * red + c[9, 1] * green + c[9, 2] * blue) * f(SH3[0])
-            along10 = (c[10, 0] * red + c[10, 1] * green + c[10, 2] * blue) * f(SH3[1])
-            along11 = (c[11, 0] * red + c[11, 1] * green + c[11, 2] * blue) * f(SH3[2])
-            along12 = (c[12, 0] * red + c[12, 1] * green + c[12, 2] * blue) * f(SH3[3])
-            along13 = (c[13, 0] * red + c[13, 1] * green + c[13, 2] * blue) * f(SH3[4])
-            along14 = (c[14, 0] * red + c[14, 1] * green + c[14, 2] * blue) * f(SH3[5])
-            along15 = (c[15, 0] * red + c[15, 1] * green + c[15, 2] * blue) * f(SH3[6])
-            gx += f(6.0) * along9 * x * y + along10 * y * z - f(2.0) * along11 * x * y - f(6.0) * along12 * x * z
-            gx += along13 * (f(4.0) * zz - f(3.0) * xx - yy) + f(2.0) * along14 * x * z
-            gx += f(3.0) * along15 * (xx - yy)
-            gy += f(3.0) * along9 * (xx - yy) + along10 * x * z + along11 * (f(4.0) * zz - xx - f(3.0) * yy)
-            gy -= f(6.0) * along12 * y * z + f(2.0) * along13 * x * y + f(2.0) * along14 * y * z
-            gy -= f(6.0) * along15 * x * y
-            gz += along10 * x * y + f(8.0) * along11 * y * z + f(3.0) * along12 * (f(2.0) * zz - xx - yy)
-            gz += f(8.0) * along13 * x * z + along14 * (xx - yy)
-        radial = gx * x + gy * y + gz * z
-        grad_means[i, 0] += (gx - radial * x) * inverse
-        grad_means[i, 1] += (gy - radial * y) * inverse
-        grad_means[i, 2] += (gz - radial * z) * inverse
+    while True:
+        begin, end = next_part(tickets, order.shape[0])
+        if begin < 0:
+            return
+        for rank in range(begin, end):
+            i = order[rank]
+            red = sums[rank, GRAD_RED] if footprints[rank, RED] > 0 else f(0.0)
+            green = sums[rank, GRAD_GREEN] if footprints[rank, GREEN] > 0 else f(0.0)
+            blue = sums[rank, GRAD_BLUE] if footprints[rank, BLUE] > 0 else f(0.0)
+            x, y, z, inverse = _direction(means[i], center)
+            basis = _basis(degree, x, y, z)
+            for k in range(terms):
+                grad_sh[i, k, 0] = basis[k] * red
+                grad_sh[i, k, 1] = basis[k] * green
+                grad_sh[i, k, 2] = basis[k] * blue
+            if degree == 0:
+                continue
+            gx = gy = gz = f(0.0)
+            c = sh[i]
+            # along[k]: the upstream colour gradient dotted with the k-th coefficient
+            along1 = c[1, 0] * red + c[1, 1] * green + c[1, 2] * blue
+            along2 = c[2, 0] * red + c[2, 1] * green + c[2, 2] * blue
+            along3 = c[3, 0] * red + c[3, 1] * green + c[3, 2] * blue
+            gx -= f(SH1) * along3
+            gy -= f(SH1) * along1
+            gz += f(SH1) * along2
+            if degree >= 2:
+                along4 = (c[4, 0] * red + c[4, 1] * green + c[4, 2] * blue) * f(SH2[0])
+                along5 = (c[5, 0] * red + c[5, 1] * green + c[5, 2] * blue) * f(SH2[1])
+                along6 = (c[6, 0] * red + c[6, 1] * green + c[6, 2] * blue) * f(SH2[2])
+                along7 = (c[7, 0] * red + c[7, 1] * green + c[7, 2] * blue) * f(SH2[3])
+                along8 = (c[8, 0] * red + c[8, 1] * green + c[8, 2] * blue) * f(SH2[4])
+                gx += along4 * y - f(2.0) * along6 * x + along7 * z + f(2.0) * along8 * x
+                gy += along4 * x + along5 * z - f(2.0) * along6 * y - f(2.0) * along8 * y
+                gz += along5 * y + f(4.0) * along6 * z + along7 * x
+            if degree >= 3:
+                xx, yy, zz = x * x, y * y, z * z
+                along9 = (c[9, 0] * red + c[9, 1] * green + c[9, 2] * blue) * f(SH3[0])
+                along10 = (c[10, 0] * red + c[10, 1] * green + c[10, 2] * blue) * f(SH3[1])
+                along11 = (c[11, 0] * red + c[11, 1] * green + c[11, 2] * blue) * f(SH3[2])
+                along12 = (c[12, 0] * red + c[12, 1] * green + c[12, 2] * blue) * f(SH3[3])
+                along13 = (c[13, 0] * red + c[13, 1] * green + c[13, 2] * blue) * f(SH3[4])
+                along14 = (c[14, 0] * red + c[14, 1] * green + c[14, 2] * blue) * f(SH3[5])
+                along15 = (c[15, 0] * red + c[15, 1] * green + c[15, 2] * blue) * f(SH3[6])
+                gx += f(6.0) * along9 * x * y + along10 * y * z - f(2.0) * along11 * x * y - f(6.0) * along12 * x * z
+                gx += along13 * (f(4.0) * zz - f(3.0) * xx - yy) + f(2.0) * along14 * x * z
+                gx += f(3.0) * along15 * (xx - yy)
+                gy += f(3.0) * along9 * (xx - yy) + along10 * x * z + along11 * (f(4.0) * zz - xx - f(3.0) * yy)
+                gy -= f(6.0) * along12 * y * z + f(2.0) * along13 * x * y + f(2.0) * along14 * y * z
+                gy -= f(6.0) * along15 * x * y
+                gz += along10 * x * y + f(8.0) * along11 * y * z + f(3.0) * along12 * (f(2.0) * zz - xx - yy)
+                gz += f(8.0) * along13 * x * z + along14 * (xx - yy)
+            radial = gx * x + gy * y + gz * z
+            grad_means[i, 0] += (gx - radial * x) * inverse
+            grad_means[i, 1] += (gy - radial * y) * inverse
+            grad_means[i, 2] += (gz - radial * z) * inverse

@@ -1,0 +1,68 @@
+"""How kernels are compiled, kept, and shared out among threads."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+import shutil
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numba
+import numpy as np
+import torch
+
+_CACHE = "splat-"  # folders of machine code in __pycache__, one per state of these sources
+
+
+@functools.cache
+def _cache_folder() -> Path:
+    """Machine code is kept by the content of all files here: numba itself looks only at the one file of a function,
+    and would go on using a constant or a callee that has changed elsewhere."""
+    sources = sorted(Path(__file__).parent.glob("*.py"))
+    digest = hashlib.blake2b(b"".join(path.read_bytes() for path in sources), digest_size=8).hexdigest()
+    return Path(__file__).parent / "__pycache__" / (_CACHE + digest)
+
+
+def kernel(function: Callable) -> Callable:
+    """Compile `function` at its first call, without the interpreter's lock; later processes load it from disk."""
+    folder, before = _cache_folder(), numba.config.CACHE_DIR
+    try:
+        if not folder.exists():
+            for old in folder.parent.glob(_CACHE + "*"):
+                shutil.rmtree(old, ignore_errors=True)
+            folder.mkdir(parents=True, exist_ok=True)
+        numba.config.CACHE_DIR = str(folder)
+    except OSError:
+        pass  # an installation that cannot be written to: numba falls back to the user's cache folder
+    try:
+        return numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    finally:
+        numba.config.CACHE_DIR = before
+
+
+def threads() -> int:
+    """How many threads kernels use: torch's number, so one setting (or OMP_NUM_THREADS) rules both."""
+    return torch.get_num_threads()
+
+
+def share(function: Callable, *arguments) -> None:
+    """Call `function(tickets, *arguments)` on every thread at once; they draw tickets until the work is gone.
+
+    `tickets` is an int64 counter to draw from with `vectors.take_ticket`. What a piece of work writes must depend on
+    its number only, so that results are the same for any number of threads.
+    """
+    tickets = np.zeros(1, np.int64)
+    helpers = threads() - 1
+    pending = [_pool(os.getpid(), helpers).submit(function, tickets, *arguments) for _ in range(helpers)]
+    function(tickets, *arguments)
+    for future in pending:
+        future.result()
+
+
+@functools.lru_cache(maxsize=1)
+def _pool(process: int, helpers: int) -> ThreadPoolExecutor:
+    """Waiting threads; a forked process makes its own."""
+    return ThreadPoolExecutor(helpers, thread_name_prefix="splat")
