@@ -58,6 +58,8 @@ def _describe(
             answer["notes"] = list(stage.preview(resolved, **{n: p and Path(p) for n, p in needs.items()}))
         except ValueError as error:
             answer["refusal"] = _one_line(error)
+        except Exception as error:
+            answer["notes"] = [f"(its preview failed: {_one_line(error)})"]
     return answer
 
 

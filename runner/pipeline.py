@@ -28,28 +28,36 @@ class Strict(BaseModel):
 
 
 class Condition(Strict):
-    """A reason to leave a stage out, read from an earlier stage's artifact.
+    """A reason to leave a stage out: one question, whose answer is yes.
 
-    Either `fact: <stage>.<name>` of its facts.json is `equals`, or the folder `empty: <stage>/<folder>` holds no file.
+    `fact: <stage>.<name>`, of an earlier stage's facts.json, is `equals`; or so is `param: <stage>.<name>`, a parameter
+    of any stage; or the folder `empty: <stage>/<folder>` of an earlier artifact holds no file.
     Ignored where the scene brings the key `unless`.
     """
 
     because: str
     fact: str | None = None
+    param: str | None = None
     equals: Any = None
     empty: str | None = None
     unless: str | None = None
 
     @model_validator(mode="after")
     def _one_question(self) -> Condition:
-        if (self.fact is None) == (self.empty is None):
-            raise ValueError("a condition has either `fact` or `empty`")
+        if [self.fact, self.param, self.empty].count(None) != 2:
+            raise ValueError("a condition has one of `fact`, `param`, `empty`")
         return self
 
     @property
-    def stage(self) -> str:
-        """The stage that must be done before this can be told."""
-        return re.split(r"[./]", self.fact or self.empty or "")[0]
+    def names(self) -> tuple[str, str]:
+        """The stage the question is about, and the name of the fact, parameter or folder."""
+        stage, name = re.split(r"[./]", self.fact or self.param or self.empty or "", maxsplit=1)
+        return stage, name
+
+    @property
+    def waits_for(self) -> tuple[str, ...]:
+        """The stage that must be done before there is an answer, if any."""
+        return () if self.param else self.names[:1]
 
 
 class Provided(Strict):
@@ -86,7 +94,7 @@ class Pipeline(Strict):
     def _names_are_known(self) -> Pipeline:
         earlier = [SCENE]
         for name, stage in self.stages.items():
-            named = [*stage.takes, *(c.stage for c in stage.left_out)]
+            named = [*stage.takes, *(need for c in stage.left_out for need in c.waits_for)]
             named += [stage.provided.artifact] if stage.provided else []
             for need in named:
                 if need not in earlier:
@@ -108,7 +116,7 @@ class Pipeline(Strict):
         for name in reversed(self.stages):
             if name in wanted:
                 stage = self.stages[name]
-                wanted |= {*stage.takes, *(c.stage for c in stage.left_out)}
+                wanted |= {*stage.takes, *(need for c in stage.left_out for need in c.waits_for)}
         return [name for name in self.stages if name in wanted]
 
 

@@ -224,10 +224,10 @@ def decide(job: Job, stage: str, earlier: dict[str, Decision]) -> Decision:
         return Decision("provided", f"the scene brings `{spec.provided.by}`", source.path, source.settled)
     unknown_yet = []
     for condition in spec.left_out:
-        if holds := _holds(job, condition, earlier[condition.stage]):
+        if holds := _holds(job, condition, earlier):
             return Decision("skip", condition.because, settled=True)
         if holds is None:
-            unknown_yet.append(f"left out if {condition.because}: known after {condition.stage}")
+            unknown_yet.append(f"left out if {condition.because}: known after {condition.names[0]}")
     needs = {need: earlier[need] for need in spec.takes if need != SCENE}
     for need in (need for need in spec.needs if need != SCENE):
         if needs[need].word == "skip":
@@ -247,19 +247,24 @@ def decide(job: Job, stage: str, earlier: dict[str, Decision]) -> Decision:
     return _compare(job, stage, _inputs(job, stage, {need: d.path for need, d in needs.items()}, code))
 
 
-def _holds(job: Job, condition: Condition, source: Decision) -> bool | None:
+def _holds(job: Job, condition: Condition, earlier: dict[str, Decision]) -> bool | None:
     """Is the condition true? None: not known yet."""
-    if (condition.unless and condition.unless in job.brings) or source.word == "skip":
+    stage, name = condition.names
+    if condition.unless and condition.unless in job.brings:
+        return False
+    if condition.param:
+        if name not in job.params.get(stage, {}):
+            raise Refused(f"{job.root / 'pipeline.yaml'}: a condition asks for {condition.param}, which is not there")
+        return job.params[stage][name] == condition.equals
+    source = earlier[stage]
+    if source.word == "skip":
         return False
     if not source.settled or source.path is None:
         return None
     if condition.empty:
-        return not any(files_below(source.path / condition.empty.partition("/")[2]))
-    assert condition.fact
-    name = condition.fact.partition(".")[2]
+        return not any(files_below(source.path / name))
     try:
-        facts = json.loads((source.path / "facts.json").read_text())
-        return facts[name] == condition.equals
+        return json.loads((source.path / "facts.json").read_text())[name] == condition.equals
     except (OSError, ValueError, KeyError):
         raise Refused(f"{source.path / 'facts.json'}: has no {name!r}, which pipeline.yaml asks for") from None
 

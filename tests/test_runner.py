@@ -32,7 +32,9 @@ stages:
     left_out: [{empty: poses/masks, because: the scene has no masks}]
   distill:
     needs: [fit, masks]
-    left_out: [{fact: masks.invent, equals: 0, because: nothing to invent}]
+    left_out:
+      - {fact: masks.invent, equals: 0, because: nothing to invent}
+      - {param: distill.gain, equals: 0, because: no gain}
   evaluate: {needs: [poses, fit], optional: [masks, distill]}
 profiles: {laptop: {fit: {rate: 2}}, paper: {}}
 variants: {strong: {distill: {gain: 5}}, same: {}}
@@ -297,6 +299,7 @@ def test_weights_profile_and_hand_edits(root, capsys):
 def test_left_out_and_provided(root, capsys):
     assert ran(capsys, root, set="masks.threshold=1") == ["masks", "evaluate"]
     assert words(root, set="masks.threshold=1")["distill"] == "skip nothing to invent"
+    assert words(root, set="distill.gain=0")["distill"] == "skip no gain"
     write(root, {"data/toy/scene.yaml": "shift: 1\ngaussians: mine.ply\n", "data/toy/mine.ply": "50"})
     assert words(root)["fit"] == "provided the scene brings `gaussians`"
     ran(capsys, root)
