@@ -1,0 +1,339 @@
+"""Personalization (RefFusion section 4.1): the prior learns the reference, as a whole and in crops, by LoRA.
+
+A sample is an image, a mask to repaint and a prompt; the loss is the prior's own denoising loss over the whole image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import cos, isfinite, pi
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from reffusion import prior as diffusion
+from reffusion import trace
+from reffusion.sds import enlarged, two_scale_masks, two_scales, window_around
+from reffusion.trace import generator as seeded
+
+PROMPTS = ("A photo of sks", "A photo of sks, cropped", "")
+GLOBAL, LOCAL, EMPTY = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A training picture.
+
+    Attributes:
+        image: [3, H, W] float32 in [-1, 1], no side shorter than the prior's native size.
+        region: [H, W] bool; of a reference the pixels it stands for, of a scene's view those that must not be used.
+    """
+
+    image: Tensor
+    region: Tensor
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How a training sample is drawn. Shares are probabilities.
+
+    PAPER leaves open all of these figures. Rectangles (count, side, inversion) and the share of empty prompts are
+    RealFill's; half of the samples are local.
+
+    Attributes:
+        local_share: of the reference's samples, those that are native-size crops around its mask.
+        scene_share: of all samples, crops of the scene's own views that touch none of their masked pixels (paper: 0).
+        empty_share: samples whose prompt is replaced by the empty one, so that guidance stays meaningful.
+        border: largest share of height or width that a global sample loses at each side.
+        rectangles: smallest and largest number of rectangles in a mask.
+        side: shortest and longest side of a rectangle, in sides of the sample.
+        inverted_share: masks that repaint everything but their rectangles.
+    """
+
+    local_share: float = 0.5
+    scene_share: float = 0.0
+    empty_share: float = 0.1
+    border: float = 0.1
+    rectangles: tuple[int, int] = (1, 29)
+    side: tuple[float, float] = (0.03, 0.25)
+    inverted_share: float = 0.5
+
+
+class Samples(NamedTuple):
+    """images [B, 3, n, n] in [-1, 1]; masks [B, 1, n, n], 1 = repaint; prompts [B] long, indices into PROMPTS."""
+
+    images: Tensor
+    masks: Tensor
+    prompts: Tensor
+
+
+def picture(image: Tensor, region: Tensor, size: int) -> Picture:
+    """A `Picture` from a uint8 [H, W, 3] image and a bool [H, W] region, enlarged where shorter than `size` pixels."""
+    floats = enlarged(image.permute(2, 0, 1).to(torch.float32) / 127.5 - 1, size)
+    return Picture(floats, enlarged(region.to(torch.float32)[None], size)[0] > 1e-4)
+
+
+def _uniform(low: float, high: float, generator: torch.Generator) -> float:
+    return low + (high - low) * float(torch.rand((), generator=generator))
+
+
+def rectangle_mask(size: int, sampling: Sampling, generator: torch.Generator) -> Tensor:
+    """[1, size, size] float, 1 = repaint: a union of random rectangles, or everything but them."""
+    fewest, most = sampling.rectangles
+    mask = torch.zeros(1, size, size)
+    for _ in range(int(torch.randint(fewest, most + 1, (), generator=generator))):
+        height, width = (max(1, round(_uniform(*sampling.side, generator) * size)) for _ in range(2))
+        top, left = (int(torch.randint(size - extent + 1, (), generator=generator)) for extent in (height, width))
+        mask[:, top : top + height, left : left + width] = 1
+    return 1 - mask if _uniform(0, 1, generator) < sampling.inverted_share else mask
+
+
+def without_border(image: Tensor, border: float, generator: torch.Generator) -> Tensor:
+    """[3, H, W] -> the image less a thin strip, drawn for each of its four sides."""
+    height, width = image.shape[-2:]
+    top, bottom = (int(_uniform(0, border, generator) * height) for _ in range(2))
+    left, right = (int(_uniform(0, border, generator) * width) for _ in range(2))
+    return image[:, top : height - bottom, left : width - right]
+
+
+def clear_windows(region: Tensor, size: int) -> Tensor:
+    """[K, 2] long, the (top, left) of every size x size window of a [H, W] bool region that holds no True pixel."""
+    counts = torch.zeros(region.shape[0] + 1, region.shape[1] + 1, dtype=torch.int64)
+    counts[1:, 1:] = region.to(torch.int64).cumsum(0).cumsum(1)
+    inside = counts[size:, size:] - counts[:-size, size:] - counts[size:, :-size] + counts[:-size, :-size]
+    return torch.nonzero(inside == 0)
+
+
+def draw_samples(
+    references: Sequence[Picture],
+    views: Sequence[Picture],
+    native: int,
+    size: int,
+    count: int,
+    sampling: Sampling,
+    generator: torch.Generator,
+) -> Samples:
+    """`count` training samples of side `size`. All the randomness comes from `generator`.
+
+    Args:
+        references: what is to be learned; every pixel of them may be used.
+        views: the scene's own views for `sampling.scene_share`; pixels in their region are never used.
+        native: the side that distillation reduces a whole view to. A global sample is reduced to it as well, and,
+            where `size` is smaller, a window of it is taken, so that the model learns it in the scale it will see.
+    Raises:
+        ValueError: scene crops are asked for and no view has a window free of masked pixels.
+    """
+    clear = [clear_windows(view.region, size) for view in views] if sampling.scene_share > 0 else []
+    usable = [index for index, windows in enumerate(clear) if len(windows)]
+    if sampling.scene_share > 0 and not usable:
+        raise ValueError(f"no training view has a {size} px window free of masked pixels; set scene_crops to 0")
+    images, masks, prompts = [], [], []
+    for _ in range(count):
+        if _uniform(0, 1, generator) < sampling.scene_share:
+            index = usable[int(torch.randint(len(usable), (), generator=generator))]
+            windows = clear[index]
+            top, left = windows[int(torch.randint(len(windows), (), generator=generator))].tolist()
+            image, prompt = views[index].image[:, top : top + size, left : left + size], LOCAL
+        else:
+            source = references[int(torch.randint(len(references), (), generator=generator))]
+            if _uniform(0, 1, generator) < sampling.local_share:
+                top, left = window_around(source.region, size, generator)
+                image, prompt = source.image[:, top : top + size, left : left + size], LOCAL
+            else:
+                whole = two_scales(without_border(source.image, sampling.border, generator), [], native)[0]
+                top, left = torch.randint(native - size + 1, (2,), generator=generator).tolist()
+                image, prompt = whole[:, top : top + size, left : left + size], GLOBAL
+        images.append(image)
+        masks.append(rectangle_mask(size, sampling, generator))
+        prompts.append(EMPTY if _uniform(0, 1, generator) < sampling.empty_share else prompt)
+    return Samples(torch.stack(images), torch.stack(masks), torch.tensor(prompts))
+
+
+def latent_shape(prior: diffusion.Prior, size: int) -> tuple[int, int, int]:
+    """(C, h, w) of the latents of a size x size image."""
+    side = size // prior.factor
+    return prior.vae.config.latent_channels, side, side
+
+
+def denoising_error(
+    prior: diffusion.Prior, samples: Samples, timesteps: Tensor, noise: Tensor
+) -> tuple[Tensor, Tensor]:
+    """([B], [B]): mean squared error of the prior's own target over the whole image, and of the clean latent.
+
+    The target is what the network was trained to predict: eps, or v = a eps - s z. PAPER leaves open: the target
+    (its prior predicts eps) and whether the loss covers the whole image or the mask; as in RealFill it covers all.
+
+    Args:
+        timesteps: [B] long.
+        noise: [B, C, h, w] standard normal, shaped as the latents.
+    """
+    images, masks = samples.images.to(prior.device), samples.masks.to(prior.device)
+    timesteps, noise = timesteps.to(prior.device), noise.to(prior.device)
+    with torch.no_grad():
+        latents = diffusion.encode(prior, images)
+        condition = diffusion.conditioning(prior, images, masks)
+        noisy = diffusion.add_noise(prior, latents, noise, timesteps)
+        target = diffusion.training_target(prior, latents, noise, timesteps)
+    text = diffusion.embed_text(prior, list(PROMPTS))[samples.prompts.to(prior.device)]
+    output = diffusion.raw_prediction(prior, noisy, timesteps, condition, text)
+    error = (output - target).square().mean((1, 2, 3))
+    # z_t is given, so both targets are linear in the clean latent: an error of 1 in it is one of a/s in eps, 1/s in v.
+    alpha_bar = diffusion.abar(prior, timesteps).flatten()
+    odds = alpha_bar if prior.prediction_type == "epsilon" else 1.0
+    return error, (1 - alpha_bar) * error / odds
+
+
+def held_out_samples(references: Sequence[Picture], size: int, seed: int) -> Samples:
+    """The reference's own hole, which no training mask shows: the whole view and two crops. Same for equal seeds."""
+    draw = seeded(seed, "personalize", "held out")
+    first = references[0]
+    windows = [window_around(first.region, size, draw) for _ in range(2)]
+    masks = two_scale_masks(first.region, windows, size)
+    return Samples(two_scales(first.image, windows, size), masks, torch.tensor([GLOBAL, LOCAL, LOCAL]))
+
+
+@torch.no_grad()
+def held_out_error(prior: diffusion.Prior, samples: Samples, seed: int) -> dict[str, float]:
+    """{"target_mse", "clean_latent_mse"} at four fixed timesteps with fixed noise: comparable through the training."""
+    diffusion.set_dropout(prior, False)
+    errors = []
+    for level in (0.15, 0.4, 0.65, 0.9):
+        timesteps = torch.full((len(samples.prompts),), round(level * (prior.timesteps - 1)))
+        draw = seeded(seed, "personalize", "held out", level)
+        noise = torch.randn(len(samples.prompts), *latent_shape(prior, samples.images.shape[-1]), generator=draw)
+        errors.append(torch.stack(denoising_error(prior, samples, timesteps, noise)))
+    target, clean = torch.stack(errors).mean((0, 2)).tolist()
+    return {"target_mse": target, "clean_latent_mse": clean}
+
+
+def learning_rate_factor(step: int, steps: int, warm_up: int, schedule: str) -> float:
+    """What the base learning rate is multiplied with: a linear warm-up, then constant or half a cosine down to 0.
+
+    PAPER leaves open: the schedule (default constant, without warm-up).
+    """
+    if step < warm_up:
+        return (step + 1) / warm_up
+    if schedule == "constant":
+        return 1.0
+    return 0.5 * (1 + cos(pi * (step - warm_up) / max(steps - warm_up, 1)))
+
+
+@dataclass(frozen=True)
+class Training:
+    """How LoRA is trained: AdamW, a learning rate each for UNet and text encoder.
+
+    Attributes:
+        steps: optimiser steps, each on `accumulate` batches of `batch` samples.
+        lr_unet, lr_text: learning rates. weight_decay: AdamW's. clip: largest norm of the gradient.
+        warm_up, schedule: see `learning_rate_factor`.
+        size: side of a sample in pixels, at most the prior's native size.
+        seed: of samples, timesteps, noise and dropout.
+        checkpoint_seconds: seconds of work between checkpoints.
+    """
+
+    steps: int
+    lr_unet: float
+    lr_text: float
+    batch: int
+    accumulate: int
+    weight_decay: float
+    clip: float
+    warm_up: int
+    schedule: str
+    size: int
+    seed: int
+    checkpoint_seconds: float
+
+
+def personalize(
+    prior: diffusion.Prior,
+    lora: dict[str, list[torch.nn.Parameter]],
+    references: Sequence[Picture],
+    views: Sequence[Picture],
+    sampling: Sampling,
+    training: Training,
+    folder: Path,
+) -> None:
+    """Train the prior's LoRA in place; resumes from `folder`'s checkpoint, bit for bit on the CPU.
+
+    Args:
+        lora: what `prior.add_lora` returned.
+        references, views: see `draw_samples`.
+        folder: gets trace.jsonl (`held_out_error`, measured with the clock stopped) and checkpoints.
+    Raises:
+        ValueError: samples larger than the prior's native size, or no scene crop to be had.
+        FloatingPointError: a loss or gradient is not finite; names the step.
+    """
+    if not 0 < training.size <= prior.native_size or training.size % prior.factor:
+        raise ValueError(
+            f"samples of {training.size} px: the size must be a multiple of {prior.factor} "
+            f"up to the prior's native {prior.native_size} px"
+        )
+    rates = {"unet": training.lr_unet, "text": training.lr_text}
+    groups = [{"params": lora[part], "lr": rate} for part, rate in rates.items()]
+    optimizer = torch.optim.AdamW(groups, weight_decay=training.weight_decay)
+    state, start, seconds = trace.load_checkpoint(folder), 0, 0.0
+    if state is not None:
+        diffusion.load_lora_state(prior, state["lora"])
+        optimizer.load_state_dict(state["optimizer"])
+        start, seconds = state["step"], state["seconds"]
+    log, saved = trace.Trace(folder, seconds, start), seconds
+    held_out = held_out_samples(references, prior.native_size, training.seed)
+
+    for step in trace.progress(training.steps, "personalize", start):
+        if trace.log_spaced(step, training.steps):
+            with log.paused():
+                errors = held_out_error(prior, held_out, training.seed)
+            log.log(step, **errors)
+        factor = learning_rate_factor(step, training.steps, training.warm_up, training.schedule)
+        for group, rate in zip(optimizer.param_groups, rates.values(), strict=True):
+            group["lr"] = rate * factor
+        train_step(prior, optimizer, references, views, sampling, training, step)
+        if log.seconds - saved > training.checkpoint_seconds:
+            saved = log.seconds
+            weights = diffusion.lora_state(prior)
+            done = {"lora": weights, "optimizer": optimizer.state_dict(), "step": step + 1, "seconds": saved}
+            trace.save_checkpoint(folder, done)
+    with log.paused():
+        errors = held_out_error(prior, held_out, training.seed)
+    log.log(training.steps, **errors)
+    diffusion.set_dropout(prior, False)
+
+
+def train_step(
+    prior: diffusion.Prior,
+    optimizer: torch.optim.Optimizer,
+    references: Sequence[Picture],
+    views: Sequence[Picture],
+    sampling: Sampling,
+    training: Training,
+    step: int,
+) -> float:
+    """One optimiser step; the mean loss. Its draws depend on `step`, not on what was drawn before.
+
+    Raises:
+        FloatingPointError: naming the step; the weights are as before it.
+    """
+    diffusion.set_dropout(prior, True)
+    optimizer.zero_grad(set_to_none=True)
+    total = 0.0
+    for part in range(training.accumulate):
+        draw = seeded(training.seed, "personalize", step, part)
+        samples = draw_samples(references, views, prior.native_size, training.size, training.batch, sampling, draw)
+        timesteps = torch.randint(prior.timesteps, (training.batch,), generator=draw)
+        noise = torch.randn(training.batch, *latent_shape(prior, training.size), generator=draw)
+        # LoRA's dropout takes no generator of its own: seed the global one from the step's.
+        torch.manual_seed(int(torch.randint(2**62, (), generator=draw)))
+        loss = denoising_error(prior, samples, timesteps, noise)[0].mean() / training.accumulate
+        loss.backward()
+        total += loss.item()
+    trained = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    norm = float(torch.nn.utils.clip_grad_norm_(trained, training.clip))
+    if not (isfinite(norm) and isfinite(total)):
+        where = f"personalization, step {step}"
+        raise FloatingPointError(f"{where}: loss {total}, gradient norm {norm}; lower the learning rates")
+    optimizer.step()
+    return total

@@ -1,0 +1,103 @@
+"""personalize: the prior learns the reference by LoRA (RefFusion section 4.1)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class Params(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    prior: str = Field(
+        "sd2-community/stable-diffusion-2-inpainting",
+        description="inpainting prior: a diffusers folder, or the name of one on the hub",
+        json_schema_extra={"weights": True},
+    )
+    steps: int = Field(2000, ge=1, description="optimiser steps")
+    lr_unet: float = Field(2e-4, gt=0, description="AdamW learning rate of the UNet's LoRA")
+    lr_text: float = Field(4e-5, gt=0, description="AdamW learning rate of the text encoder's LoRA")
+    rank: int = Field(8, ge=1, description="LoRA rank")
+    alpha: float = Field(16, gt=0, description="LoRA alpha; a weight changes by alpha / rank * B A")
+    dropout: float = Field(0.1, ge=0, lt=1, description="LoRA dropout")
+    layers: Literal["attention", "attention+conv"] = Field("attention", description="what carries LoRA in the UNet")
+    # PAPER leaves open: batch, accumulation, weight decay, clipping, schedule. RealFill's batch 16, decay 1e-2, clip 1.
+    batch: int = Field(16, ge=1, description="samples in a batch")
+    accumulate: int = Field(1, ge=1, description="batches in an optimiser step")
+    weight_decay: float = Field(1e-2, ge=0, description="AdamW's")
+    clip: float = Field(1.0, gt=0, description="largest norm of the gradient")
+    warm_up: int = Field(0, ge=0, description="steps of linear warm-up")
+    schedule: Literal["constant", "cosine"] = Field("constant", description="learning rate after the warm-up")
+    # PAPER leaves open: how samples are drawn (reffusion.personalize.Sampling says where the figures come from).
+    local_share: float = Field(0.5, ge=0, le=1, description="share of the reference's samples that are local crops")
+    scene_crops: float = Field(0.0, ge=0, lt=1, description="share of samples from unmasked crops of the scene's views")
+    empty_share: float = Field(0.1, ge=0, lt=1, description="share of samples with the empty prompt")
+    border: float = Field(0.1, ge=0, lt=0.5, description="largest strip cropped off each side, in sides")
+    rectangles: tuple[int, int] = Field((1, 29), description="fewest and most rectangles of a mask")
+    side: tuple[float, float] = Field((0.03, 0.25), description="shortest and longest side of one, in sides")
+    inverted_share: float = Field(0.5, ge=0, le=1, description="share of masks that repaint all but the rectangles")
+    size: int = Field(0, ge=0, description="side of a sample in pixels; 0: the prior's native size (paper)")
+    seed: int = 0
+    device: Literal["cpu", "cuda"] = "cpu"
+    dtype: Literal["float32", "bfloat16", "float16"] = Field("float32", description="of the frozen weights")
+    checkpoint_seconds: float = Field(10.0, gt=0, description="seconds of work between checkpoints")
+
+
+def run(params: Params, out: Path, *, poses: Path, masks: Path, reference: Path) -> None:
+    import torch
+
+    from reffusion import io, trace
+    from reffusion import personalize as P
+    from reffusion import prior as diffusion
+
+    scene = io.load_scene(poses)
+    sampling = P.Sampling(
+        params.local_share,
+        params.scene_crops,
+        params.empty_share,
+        params.border,
+        params.rectangles,
+        params.side,
+        params.inverted_share,
+    )
+    prior = diffusion.load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
+    references = [
+        P.picture(torch.from_numpy(r.image), torch.from_numpy(r.mask), prior.native_size)
+        for r in io.load_references(reference, scene)
+    ]
+    views = scene_views(scene, poses, masks, prior.native_size) if params.scene_crops > 0 else []
+
+    training = P.Training(
+        steps=params.steps,
+        lr_unet=params.lr_unet,
+        lr_text=params.lr_text,
+        batch=params.batch,
+        accumulate=params.accumulate,
+        weight_decay=params.weight_decay,
+        clip=params.clip,
+        warm_up=params.warm_up,
+        schedule=params.schedule,
+        size=params.size or prior.native_size,
+        seed=params.seed,
+        checkpoint_seconds=params.checkpoint_seconds,
+    )
+    lora = diffusion.add_lora(prior, params.rank, params.alpha, params.dropout, params.layers, params.seed)
+    P.personalize(prior, lora, references, views, sampling, training, out)
+    diffusion.save_lora(prior, out)
+    trace.clear_checkpoint(out)
+
+
+def scene_views(scene, poses: Path, masks: Path, size: int) -> list:
+    """The training views as pictures whose consistent mask must not be used (nothing of it in a clean view)."""
+    import torch
+
+    from reffusion import io
+    from reffusion import personalize as P
+
+    photos, sets = io.load_views(poses, scene.train), io.load_mask_sets(masks, scene.train)
+    return [
+        P.picture(torch.from_numpy(photos[n]), torch.from_numpy(sets[n].consistent & (n not in scene.clean)), size)
+        for n in scene.train
+    ]

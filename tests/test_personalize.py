@@ -1,0 +1,162 @@
+"""Personalization: which pixels a sample may show, what the loss measures, that training learns, resumes and stops."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from small_prior import small_prior
+
+from reffusion import personalize as P
+from reffusion import prior as diffusion
+from reffusion.trace import generator, load_checkpoint, read_trace
+
+NATIVE, SIZE = 16, 12
+TRAINING = P.Training(
+    steps=4, lr_unet=1e-3, lr_text=1e-4, batch=2, accumulate=1, weight_decay=1e-2, clip=1.0, warm_up=0,
+    schedule="constant", size=SIZE, seed=0, checkpoint_seconds=1e9,
+)  # fmt: skip
+
+
+@pytest.fixture
+def tiny():
+    return small_prior()
+
+
+def striped(height=70, width=90):
+    """A reference of diagonal stripes, its hole in the middle."""
+    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    image = torch.stack([128 + 100 * torch.sin((rows + k * columns) / 4) for k in (1, 2, 3)], 2)
+    hole = torch.zeros(height, width, dtype=torch.bool)
+    hole[20:50, 30:60] = True
+    return P.picture(image.to(torch.uint8), hole, NATIVE)
+
+
+def test_pictures_are_enlarged_until_a_crop_fits():
+    small = P.picture(torch.zeros(30, 50, 3, dtype=torch.uint8), torch.ones(30, 50, dtype=torch.bool), 64)
+    assert small.image.shape == (3, 64, 107) and small.region.shape == (64, 107) and small.region.all()
+    assert float(small.image.min()) == -1
+
+
+def test_rectangle_masks_repaint_something_and_keep_within_their_sides():
+    once = P.Sampling(rectangles=(1, 1), side=(0.25, 0.5), inverted_share=0.0)
+    for seed in range(50):
+        mask = P.rectangle_mask(64, once, generator(seed))[0]
+        rows, columns = mask.any(1).sum(), mask.any(0).sum()
+        assert set(mask.unique().tolist()) == {0.0, 1.0} and mask.sum() == rows * columns
+        assert 16 <= rows <= 32 and 16 <= columns <= 32
+    inverted = [float(P.rectangle_mask(64, P.Sampling(), generator(seed)).mean()) for seed in range(200)]
+    assert min(inverted) < 0.1 and max(inverted) > 0.9 and 0.4 < sum(inverted) / 200 < 0.6
+
+
+def test_global_samples_lose_a_thin_border_only():
+    image = torch.zeros(3, 100, 200)
+    for seed in range(20):
+        height, width = P.without_border(image, 0.1, generator(seed)).shape[1:]
+        assert 80 <= height <= 100 and 160 <= width <= 200
+
+
+def test_clear_windows_are_all_windows_without_masked_pixels():
+    region = torch.rand(20, 23, generator=generator(1)) > 0.97
+    clear = {tuple(w) for w in P.clear_windows(region, 6).tolist()}
+    for top in range(15):
+        for left in range(18):
+            assert ((top, left) in clear) == (not region[top : top + 6, left : left + 6].any())
+
+
+def test_scene_crops_never_show_a_masked_pixel():
+    view = striped()
+    poisoned = torch.where(view.region, float("nan"), view.image)
+    sampling = P.Sampling(scene_share=1.0, empty_share=0.0)
+    samples = P.draw_samples([view], [P.Picture(poisoned, view.region)], NATIVE, 16, 40, sampling, generator(2))
+    assert torch.isfinite(samples.images).all() and (samples.prompts == P.LOCAL).all()
+    full = P.Picture(poisoned, torch.ones_like(view.region))
+    with pytest.raises(ValueError, match="scene_crops"):
+        P.draw_samples([view], [full], NATIVE, 16, 4, sampling, generator(2))
+
+
+def test_local_samples_show_the_hole_in_full_resolution_and_prompts_follow():
+    view = striped()
+    local = P.draw_samples([view], [], NATIVE, SIZE, 10, P.Sampling(local_share=1.0, empty_share=0.0), generator(3))
+    windows = view.image.unfold(1, SIZE, 1).unfold(2, SIZE, 1).permute(1, 2, 0, 3, 4).flatten(0, 1)
+    for image in local.images:
+        assert (windows == image).all((1, 2, 3)).any(), "not a crop of the reference"
+    whole = P.draw_samples([view], [], NATIVE, NATIVE, 10, P.Sampling(local_share=0.0, empty_share=0.0), generator(3))
+    assert (local.prompts == P.LOCAL).all() and (whole.prompts == P.GLOBAL).all()
+    mixed = P.draw_samples([view], [], NATIVE, SIZE, 300, P.Sampling(empty_share=0.2), generator(3)).prompts
+    shares = torch.bincount(mixed, minlength=3) / 300
+    torch.testing.assert_close(shares, torch.tensor([0.4, 0.4, 0.2]), atol=0.09, rtol=0)
+
+
+@pytest.mark.parametrize("kind", ["epsilon", "v_prediction"])
+def test_loss_is_the_priors_own_and_its_clean_latent_error_is_predicts(tiny, kind):
+    prior, draw = replace(tiny, prediction_type=kind), generator(4)
+    samples = P.draw_samples([striped()], [], NATIVE, SIZE, 3, P.Sampling(), draw)
+    t, noise = torch.tensor([10, 500, 950]), torch.randn(3, 4, SIZE, SIZE, generator=draw)
+    with torch.no_grad():
+        error, clean = P.denoising_error(prior, samples, t, noise)
+        latents = diffusion.encode(prior, samples.images)
+        noisy = diffusion.add_noise(prior, latents, noise, t)
+        condition = diffusion.conditioning(prior, samples.images, samples.masks)
+        text = diffusion.embed_text(prior, [P.PROMPTS[p] for p in samples.prompts])
+        eps, x0 = diffusion.predict(prior, noisy, t, condition, text)
+    torch.testing.assert_close(clean, (x0 - latents).square().mean((1, 2, 3)), rtol=1e-3, atol=1e-5)
+    if kind == "epsilon":
+        torch.testing.assert_close(error, (eps - noise).square().mean((1, 2, 3)))
+
+
+def test_learning_rate_warms_up_and_falls():
+    factor = lambda step, schedule: P.learning_rate_factor(step, 100, 10, schedule)
+    assert factor(0, "cosine") == 0.1 and factor(9, "constant") == 1 and factor(99, "constant") == 1
+    assert factor(10, "cosine") == 1 and factor(99, "cosine") < 0.001
+    assert P.learning_rate_factor(0, 100, 0, "constant") == 1
+
+
+def test_training_learns_the_reference_and_logs_it(tiny, tmp_path):
+    lora = diffusion.add_lora(tiny, 8, 16, 0.1, "attention+conv", 0)
+    training = replace(TRAINING, steps=60, batch=4, lr_unet=4e-3)
+    P.personalize(tiny, lora, [striped()], [], P.Sampling(), training, tmp_path)
+    records = read_trace(tmp_path / "trace.jsonl")
+    assert [records[0]["iteration"], records[-1]["iteration"]] == [0, 60]
+    assert records[-1]["target_mse"] < 0.9 * records[0]["target_mse"]
+    assert records[-1]["clean_latent_mse"] < records[0]["clean_latent_mse"]
+    assert not tiny.unet.training
+
+
+def test_interrupted_training_resumes_to_the_same_weights(tmp_path, monkeypatch):
+    def trained(folder):
+        prior = small_prior()
+        lora = diffusion.add_lora(prior, 4, 8, 0.1, "attention", 0)
+        training = replace(TRAINING, accumulate=2, schedule="cosine", warm_up=2, checkpoint_seconds=1e-9)
+        P.personalize(prior, lora, [striped()], [], P.Sampling(), training, folder)
+        return diffusion.lora_state(prior)
+
+    (tmp_path / "whole").mkdir()
+    (tmp_path / "broken").mkdir()
+    whole = trained(tmp_path / "whole")
+    real = P.train_step
+
+    def interrupted(*arguments):
+        if arguments[-1] == 2:
+            raise KeyboardInterrupt
+        return real(*arguments)
+
+    monkeypatch.setattr(P, "train_step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        trained(tmp_path / "broken")
+    assert load_checkpoint(tmp_path / "broken")["step"] == 2
+    monkeypatch.setattr(P, "train_step", real)
+    torch.manual_seed(12345)
+    resumed = trained(tmp_path / "broken")
+    assert all((resumed[name] == weight).all() for name, weight in whole.items())
+    errors = lambda f: [[r["iteration"], r["target_mse"]] for r in read_trace(tmp_path / f / "trace.jsonl")]
+    assert errors("whole") == errors("broken")
+
+
+def test_a_number_that_is_none_stops_the_training_and_names_the_step(tiny, tmp_path):
+    lora = diffusion.add_lora(tiny, 4, 8, 0.0, "attention", 0)
+    broken = replace(striped(), image=torch.full((3, 70, 90), float("nan")))
+    with pytest.raises(FloatingPointError, match="step 0"):
+        P.personalize(tiny, lora, [broken], [], P.Sampling(), TRAINING, tmp_path)
+    assert all(torch.isfinite(w).all() for w in diffusion.lora_state(tiny).values())
+    with pytest.raises(ValueError, match="native 16 px"):
+        P.personalize(tiny, lora, [striped()], [], P.Sampling(), replace(TRAINING, size=128), tmp_path)

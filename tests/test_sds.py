@@ -1,0 +1,164 @@
+"""Score distillation against a distribution whose score is known, and the two scales it looks at."""
+
+import pytest
+import torch
+
+from reffusion.sds import (
+    draw_timesteps,
+    enlarged,
+    sds_gradient,
+    sds_loss,
+    two_scale_masks,
+    two_scales,
+    window_around,
+)
+from reffusion.trace import generator
+
+ABAR = torch.cos(torch.linspace(0.05, 1.5, 100, dtype=torch.float64)) ** 2
+MEAN, VARIANCE = 0.7, 0.25
+
+
+def ideal(noisy, t):
+    """What a perfect denoiser answers when clean data are independent normal numbers: the posterior means."""
+    a, s = ABAR[t].sqrt().view(-1, 1, 1, 1), (1 - ABAR[t]).sqrt().view(-1, 1, 1, 1)
+    eps = s * (noisy - a * MEAN) / (a**2 * VARIANCE + s**2)
+    return eps, (noisy - s * eps) / a
+
+
+def expected(latent, t, weighting):
+    """E over noise of w(t) (eps_theta - eps), by hand."""
+    a2 = ABAR[t]
+    mean = (1 - a2).sqrt() * a2.sqrt() * (latent - MEAN) / (a2 * VARIANCE + 1 - a2)
+    return mean * {"one": 1.0, "sigma2": 1 - a2, "x0": ((1 - a2) / a2).sqrt()}[weighting]
+
+
+@pytest.mark.parametrize("weighting", ["x0", "sigma2", "one"])
+def test_mean_gradient_converges_to_the_closed_form_as_one_over_root_n(weighting):
+    latent, t, counts = torch.tensor(2.0, dtype=torch.float64), 60, (100, 1_000, 10_000)
+    errors = []
+    for count in counts:
+        noise = torch.randn(40, count, 1, 1, 1, generator=generator(0, weighting, count), dtype=torch.float64)
+        means = [
+            sds_gradient(latent.expand_as(n), ideal, torch.full((count,), t), n, ABAR, weighting=weighting).mean()
+            for n in noise
+        ]
+        errors.append((torch.stack(means) - expected(latent, t, weighting)).square().mean().sqrt())
+    rates = [float((errors[i] / errors[i + 1]).log10() / 1.0) for i in range(2)]
+    assert all(0.35 < rate < 0.65 for rate in rates), rates
+    assert errors[-1] < 0.05 * expected(latent, t, weighting).abs()
+
+
+def test_descent_along_the_gradient_ends_at_the_mean_of_the_data():
+    latent = torch.full((1, 4, 8, 8), -3.0, dtype=torch.float64, requires_grad=True)
+    optimizer = torch.optim.Adam([latent], lr=0.05)
+    for step in range(400):
+        draw = generator(1, step)
+        noise = torch.randn(latent.shape, generator=draw, dtype=torch.float64)
+        gradient = sds_gradient(latent, ideal, draw_timesteps(1, 100, 0.02, 0.98, draw), noise, ABAR, weighting="x0")
+        optimizer.zero_grad()
+        sds_loss(latent, gradient).backward()
+        optimizer.step()
+    assert abs(float(latent.detach().mean()) - MEAN) < 0.05
+
+
+def test_weightings_differ_by_a_function_of_the_timestep_only():
+    t, draw = torch.tensor([1, 40, 98]), generator(2)
+    latents = torch.randn(3, 4, 5, 5, generator=draw, dtype=torch.float64)
+    noise = torch.randn(3, 4, 5, 5, generator=draw, dtype=torch.float64)
+    one, x0, sigma2 = (
+        sds_gradient(latents, ideal, t, noise, ABAR, weighting=w) for w in ("one", "x0", "sigma2")
+    )
+    a2 = ABAR[t].view(-1, 1, 1, 1)
+    torch.testing.assert_close(x0, ((1 - a2) / a2).sqrt() * one)
+    torch.testing.assert_close(sigma2, (1 - a2) * one)
+    with pytest.raises(ValueError, match="weighting"):
+        sds_gradient(latents, ideal, t, noise, ABAR, weighting="w")
+
+
+def test_unit_rms_is_per_sample_and_over_the_hole():
+    t, draw = torch.tensor([5, 90]), generator(3)
+    latents, noise = torch.randn(2, 2, 4, 6, 6, generator=draw, dtype=torch.float64)
+    mask = torch.zeros(2, 1, 6, 6, dtype=torch.float64)
+    mask[:, :, 2:5] = 1
+    gradient = sds_gradient(latents, ideal, t, noise, ABAR, unit_rms=True, mask=mask)
+    assert (gradient[:, :, :2] == 0).all() and (gradient[:, :, 5:] == 0).all()
+    torch.testing.assert_close(gradient[:, :, 2:5].square().mean((1, 2, 3)), torch.ones(2, dtype=torch.float64))
+    blank = sds_gradient(latents, ideal, t, noise, ABAR, unit_rms=True, mask=torch.zeros_like(mask))
+    assert (blank == 0).all()
+
+
+@pytest.mark.parametrize("patches", [0, 1, 2])
+def test_loss_hands_on_the_gradient_global_plus_mean_of_patches(patches):
+    latents = torch.randn(1 + patches, 4, 3, 3, generator=generator(4), requires_grad=True)
+    gradient = torch.randn(latents.shape, generator=generator(5))
+    sds_loss(latents, gradient, "sum").backward()
+    share = torch.tensor([1.0] + [1 / max(patches, 1)] * patches).view(-1, 1, 1, 1)
+    torch.testing.assert_close(latents.grad, share * gradient)
+    latents.grad = None
+    sds_loss(latents, gradient, "mean").backward()
+    torch.testing.assert_close(latents.grad, share * gradient / 36)
+
+
+def test_two_scales_cuts_patches_exactly_and_keeps_the_mean_of_the_view():
+    image = torch.rand(3, 40, 60, generator=generator(6), dtype=torch.float64)
+    scales = two_scales(image, [(0, 0), (24, 44)], 16)
+    assert scales.shape == (3, 3, 16, 16)
+    assert (scales[1] == image[:, :16, :16]).all() and (scales[2] == image[:, 24:, 44:]).all()
+    assert (scales[0].mean((1, 2)) - image.mean((1, 2))).abs().max() < 0.01
+
+
+def test_two_scales_gradient_reaches_every_pixel_and_matches_differences():
+    image = torch.rand(1, 20, 24, generator=generator(7), dtype=torch.float64, requires_grad=True)
+    weights = torch.randn(2, 1, 8, 8, generator=generator(8), dtype=torch.float64)
+    value = lambda x: (two_scales(x, [(3, 5)], 8) * weights).sum()
+    (gradient,) = torch.autograd.grad(value(image), image)
+    assert (gradient != 0).float().mean() > 0.95
+    for row, column in ((0, 0), (5, 9), (19, 23)):
+        step = torch.zeros_like(image)
+        step[0, row, column] = 1e-6
+        numeric = (value(image + step) - value(image - step)) / 2e-6
+        torch.testing.assert_close(gradient[0, row, column], numeric.detach(), rtol=1e-6, atol=1e-9)
+
+
+def test_a_reduced_mask_covers_every_masked_pixel():
+    for seed in range(10):
+        draw = generator(9, seed)
+        mask = torch.rand(50, 70, generator=draw) > 0.98
+        hidden = torch.rand(1, 50, 70, generator=draw)
+        other = torch.where(mask, torch.rand(1, 50, 70, generator=draw), hidden)
+        small = two_scale_masks(mask, [(7, 9)], 16)
+        # Where nothing is repainted, the masked pixels' values must make no difference.
+        keep = small == 0
+        difference = (two_scales(hidden, [(7, 9)], 16) - two_scales(other, [(7, 9)], 16)).abs()
+        assert difference[keep].max() < 1e-4 and (small[1, 0].bool() == mask[7:23, 9:25]).all()
+
+
+def test_windows_show_the_mask_and_stay_inside():
+    mask = torch.zeros(30, 50, dtype=torch.bool)
+    mask[2, 1] = mask[29, 49] = mask[15, 20] = True
+    seen = {(2, 1): 0, (29, 49): 0, (15, 20): 0}
+    for seed in range(60):
+        top, left = window_around(mask, 12, generator(10, seed))
+        assert 0 <= top <= 18 and 0 <= left <= 38
+        inside = mask[top : top + 12, left : left + 12]
+        assert inside.any()
+        for row, column in seen:
+            seen[row, column] += top <= row < top + 12 and left <= column < left + 12
+    assert min(seen.values()) > 8, "one part of the mask is hardly ever drawn"
+    with pytest.raises(ValueError, match="empty mask"):
+        window_around(torch.zeros(30, 50, dtype=torch.bool), 12, generator(0))
+    with pytest.raises(ValueError, match="does not fit"):
+        window_around(mask, 31, generator(0))
+
+
+def test_small_views_are_enlarged_until_a_window_fits():
+    assert enlarged(torch.rand(3, 24, 40), 16).shape == (3, 24, 40)
+    assert enlarged(torch.rand(3, 24, 40), 48).shape == (3, 48, 80)
+    assert min(enlarged(torch.rand(3, 33, 47), 64).shape[1:]) == 64
+
+
+def test_timesteps_reach_both_ends_of_their_range():
+    drawn = draw_timesteps(5000, 1000, 0.02, 0.98, generator(11))
+    assert (int(drawn.min()), int(drawn.max())) == (20, 979)
+    with pytest.raises(ValueError, match="range"):
+        draw_timesteps(1, 1000, 0.5, 0.4, generator(0))
