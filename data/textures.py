@@ -1,0 +1,375 @@
+"""Procedural textures: square, tileable (or fitted to one face), [N, N, 3] float32 sRGB in [0, 1], N a power of two.
+
+Each maker takes a numpy random generator and N; `baked` turns a dictionary of them into what `raycast` samples.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from raycast import Textures
+
+
+def noise(rng, size, rows, columns):
+    """Smooth tileable noise [N, N] with rows x columns random nodes, about -1..1."""
+    nodes = np.pad(rng.random((rows, columns), dtype=np.float32) * 2 - 1, 2, mode="wrap")
+    high, wide = size // rows, size // columns
+    big = cv2.resize(nodes, (nodes.shape[1] * wide, nodes.shape[0] * high), interpolation=cv2.INTER_CUBIC)
+    return big[2 * high : 2 * high + size, 2 * wide : 2 * wide + size]
+
+
+def fbm(rng, size, rows, columns, octaves=5, gain=0.55):
+    """Noise at several scales, each twice as fine; zero mean, unit deviation."""
+    total, weight = np.zeros((size, size), np.float32), 1.0
+    rows, columns = min(rows, size // 2), min(columns, size // 2)
+    for _ in range(octaves):
+        if max(rows, columns) > size // 2:
+            break
+        total += weight * noise(rng, size, rows, columns)
+        rows, columns, weight = 2 * rows, 2 * columns, weight * gain
+    return (total - total.mean()) / total.std()
+
+
+def grid(size):
+    """(x, y) of the pixel centres in tiles, [N, N] each."""
+    line = (np.arange(size, dtype=np.float32) + 0.5) / size
+    return np.meshgrid(line, line)
+
+
+def step(edge0, edge1, x):
+    t = np.clip((x - edge0) / (edge1 - edge0), 0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def ramp(t, *colors):
+    """Colours [N, N, 3] along a palette, t in [0, 1]."""
+    palette = np.asarray(colors, np.float32) / 255
+    return np.stack([np.interp(t, np.linspace(0, 1, len(palette)), palette[:, c]) for c in range(3)], -1)
+
+
+def blend(a, b, t):
+    return a + (b - a) * t[..., None]
+
+
+def shifted(image, x, y):
+    """A tileable picture [N, N] read at (x, y) in tiles."""
+    size = np.float32(image.shape[0])
+    return cv2.remap(
+        image,
+        (x % 1).astype(np.float32) * size - 0.5,
+        (y % 1).astype(np.float32) * size - 0.5,
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_WRAP,
+    )
+
+
+WOODS = (
+    ((96, 58, 32), (150, 98, 56), (196, 146, 94)),  # oak
+    ((70, 42, 30), (112, 70, 48), (158, 108, 76)),  # walnut
+    ((132, 108, 84), (176, 152, 122), (212, 192, 162)),  # limed
+    ((110, 62, 38), (168, 96, 56), (206, 140, 88)),  # cherry
+)
+
+
+def wood_planks(rng, size, rows=24, pieces=3, palette=None):
+    """Floor boards along x: each with its own tone, grain and rings, a dark joint between them."""
+    palette = WOODS[rng.integers(len(WOODS))] if palette is None else palette
+    x, y = grid(size)
+    row = np.floor(y * rows).astype(int)
+    across = y * rows - row
+    along = (x + rng.random(rows)[row]) % 1 * pieces
+    piece = np.floor(along).astype(int)
+    along -= piece
+    tone, dx, dy = (rng.random((rows, pieces)).astype(np.float32)[row, piece] for _ in range(3))
+    warp = shifted(noise(rng, size, 4, 4), x + dx, y + dy)
+    grain = shifted(fbm(rng, size, min(128, size // 4), 4, 4), x * 2 + dx, y + dy)
+    fine = shifted(fbm(rng, size, size // 4, 16, 2), x + dy, y + dx)
+    rings = np.sin(6.28 * ((across - 0.5 + 0.5 * dx) * (2 + 3 * dy) + 1.1 * warp + 0.25 * grain))
+    color = ramp(0.5 + 0.55 * (tone - 0.5) + 0.15 * grain + 0.09 * rings + 0.05 * fine, *palette)
+    edge = np.minimum(np.minimum(across, 1 - across), np.minimum(along, 1 - along) * (rows / pieces))
+    return color * (0.35 + 0.65 * step(0.008, 0.045, edge))[..., None]
+
+
+def herringbone(rng, size, cells=8):
+    """Blocks of two by one laid at right angles, grain along each."""
+    palette = WOODS[rng.integers(len(WOODS))]
+    x, y = grid(size)
+    a, b = x * cells * 2, y * cells * 2
+    i, j = np.floor(a).astype(int), np.floor(b).astype(int)
+    phase = (i - j) % 4  # the block lies along x for phases 0, 1 and along y for 2, 3
+    flat = phase < 2
+    left = np.where(flat, i - phase, i)
+    top = np.where(flat, j, j - (3 - phase))
+    fx, fy = a - left, b - top
+    along, across = np.where(flat, fx, fy) / 2, np.where(flat, fy, fx)
+    tone, dx, dy = (rng.random((2 * cells, 2 * cells)).astype(np.float32) for _ in range(3))
+    tone, dx, dy = (t[top % (2 * cells), left % (2 * cells)] for t in (tone, dx, dy))
+    streaks = fbm(rng, size, min(128, size // 4), 8, 4)
+    grain = shifted(streaks, along * 0.3 + dx, across * 0.12 + dy)
+    color = ramp(0.5 + 0.5 * (tone - 0.5) + 0.1 * (flat - 0.5) + 0.16 * grain, *palette)
+    edge = np.minimum(np.minimum(across, 1 - across), 2 * np.minimum(along, 1 - along))
+    return color * (0.35 + 0.65 * step(0.01, 0.06, edge))[..., None]
+
+
+STONES = (
+    ((150, 140, 126), (186, 176, 160), (214, 206, 192), (120, 112, 104)),
+    ((128, 78, 58), (172, 108, 78), (198, 138, 104), (150, 140, 126)),
+    ((92, 100, 108), (128, 138, 146), (166, 174, 180), (196, 192, 184)),
+)
+
+
+def stone_tiles(rng, size, cells=8):
+    """Veined tiles with light grout."""
+    *palette, grout = STONES[rng.integers(len(STONES))]
+    x, y = grid(size)
+    i, j = np.floor(x * cells).astype(int), np.floor(y * cells).astype(int)
+    fx, fy = x * cells - i, y * cells - j
+    tone, dx, dy = (rng.random((cells, cells)).astype(np.float32)[j, i] for _ in range(3))
+    cloud = shifted(fbm(rng, size, 8, 8, 6), x + dx, y + dy)
+    vein = np.exp(-((shifted(fbm(rng, size, 4, 4, 6), x + dy, y + dx) / 0.09) ** 2))
+    color = ramp(0.5 + 0.5 * (tone - 0.5) + 0.17 * cloud - 0.3 * vein, *palette)
+    edge = np.minimum(np.minimum(fx, 1 - fx), np.minimum(fy, 1 - fy))
+    joint = np.asarray(grout, np.float32) / 255 * (0.9 + 0.05 * fbm(rng, size, 64, 64, 3))[..., None]
+    color *= (0.8 + 0.2 * step(0.02, 0.07, edge))[..., None]
+    return blend(joint, color, step(0.014, 0.03, edge))
+
+
+BRICKS = (
+    ((112, 48, 36), (156, 76, 56), (188, 112, 84), (188, 178, 164)),
+    ((196, 188, 176), (218, 210, 198), (236, 230, 220), (160, 152, 142)),
+    ((92, 84, 80), (128, 116, 108), (160, 146, 134), (196, 190, 180)),
+    ((150, 98, 62), (186, 132, 88), (212, 168, 122), (206, 196, 180)),
+)
+
+
+def bricks(rng, size, rows=24, columns=8):
+    """Running bond, rounded edges lit from above left."""
+    *palette, mortar = BRICKS[rng.integers(len(BRICKS))]
+    x, y = grid(size)
+    wobble = 0.012 * fbm(rng, size, 16, 16, 3)
+    row = np.floor(y * rows).astype(int)
+    fy = y * rows - row
+    a = x * columns + 0.5 * (row % 2)
+    column = np.floor(a).astype(int) % columns
+    fx = a - np.floor(a)
+    tone, dx, dy = (rng.random((rows, columns)).astype(np.float32)[row, column] for _ in range(3))
+    rough = shifted(fbm(rng, size, 32, 32, 5), x + dx, y + dy)
+    color = ramp(0.5 + 0.75 * (tone - 0.5) + 0.13 * rough + 0.06 * fbm(rng, size, 4, 4, 3), *palette)
+    aspect = rows / columns
+    edge = np.minimum(np.minimum(fy, 1 - fy), aspect * np.minimum(fx, 1 - fx)) + wobble
+    body = step(0.07, 0.16, edge)
+    height = body * (1 + 0.12 * rough)
+    slope = np.roll(height, 2, 0) - np.roll(height, -2, 0) + 0.6 * (np.roll(height, 2, 1) - np.roll(height, -2, 1))
+    joint = np.asarray(mortar, np.float32) / 255 * (0.82 + 0.07 * fbm(rng, size, 128, 128, 2))[..., None]
+    return blend(joint, color, body) * (1 - 0.22 * np.clip(slope, -1, 1))[..., None]
+
+
+PAPERS = (
+    ((38, 84, 92), (214, 196, 152), (70, 122, 126)),
+    ((226, 214, 190), (150, 92, 72), (196, 170, 134)),
+    ((52, 62, 98), (206, 186, 170), (90, 104, 146)),
+    ((200, 208, 190), (84, 110, 86), (226, 222, 200)),
+    ((150, 70, 66), (236, 212, 176), (178, 104, 92)),
+)
+
+
+def wallpaper(rng, size, repeats=4):
+    """Rosettes and leaves in a half drop, over fine stripes."""
+    ground, figure, second = (np.asarray(c, np.float32) / 255 for c in PAPERS[rng.integers(len(PAPERS))])
+    x, y = grid(size)
+    petals, turns = int(rng.integers(5, 9)), rng.random() * 6.28
+    color = np.broadcast_to(ground, (size, size, 3)).copy()
+    stripe = 0.5 + 0.5 * np.cos(6.2832 * x * repeats * 6)
+    color = blend(color, second, 0.35 * step(0.55, 0.8, stripe))
+    for shift in (0.0, 0.5):
+        a = (x * repeats + shift) % 1 - 0.5
+        b = (y * repeats + shift) % 1 - 0.5
+        radius, angle = np.hypot(a, b), np.arctan2(b, a)
+        flower = 0.17 + 0.055 * np.cos(petals * angle + turns)
+        color = blend(color, figure, step(0.012, -0.012, radius - flower))
+        color = blend(color, second, step(0.010, -0.010, np.abs(radius - 0.095) - 0.018))
+        color = blend(color, ground, step(0.010, -0.010, radius - 0.045))
+        for side in (-1, 1):
+            leaf = np.hypot((a - side * 0.27 * np.cos(b * 5)) * 2.6, b - 0.02)
+            rib = step(0.0, 0.02, np.abs(a - side * 0.27))
+            color = blend(color, figure, 0.85 * rib * step(0.015, -0.015, leaf - 0.15))
+    paper = 1 + 0.035 * fbm(rng, size, 32, 32, 5) + 0.03 * fbm(rng, size, 4, 4, 3)
+    return color * paper[..., None]
+
+
+def plaster(rng, size, color=(214, 208, 198)):
+    """A painted wall: clouds, trowel marks, grain."""
+    rough = 0.022 * fbm(rng, size, 4, 4, 4) + 0.02 * fbm(rng, size, 64, 16, 4) + 0.018 * fbm(rng, size, 128, 128, 2)
+    return np.asarray(color, np.float32) / 255 * (1 + rough)[..., None]
+
+
+def rug(rng, size):
+    """A woven carpet with a border and diamonds, fitted to its face."""
+    hues = [np.asarray(c, np.float32) / 255 for c in ((142, 44, 40), (28, 52, 84), (220, 196, 150), (194, 128, 60))]
+    rng.shuffle(hues)
+    x, y = grid(size)
+    a, b = (x * 6) % 1 - 0.5, (y * 4) % 1 - 0.5
+    diamond = np.abs(a) + np.abs(b)
+    color = np.broadcast_to(hues[0], (size, size, 3)).copy()
+    for level, hue in ((0.44, 1), (0.36, 2), (0.28, 0), (0.2, 3), (0.1, 1)):
+        color = blend(color, hues[hue], step(0.01, -0.01, diamond - level))
+    edge = np.minimum(np.minimum(x, 1 - x) * 1.5, np.minimum(y, 1 - y))
+    zigzag = np.abs(((x + y * 0.667) * 24) % 1 - 0.5) * 2
+    border = blend(np.broadcast_to(hues[1], color.shape), hues[2], step(0.45, 0.55, zigzag))
+    color = blend(border, color, step(0.098, 0.102, edge))
+    for level, hue in ((0.1, 3), (0.022, 0)):
+        color = blend(color, hues[hue], step(0.012, 0.008, np.abs(edge - level)))
+    weave = 1 + 0.08 * np.sin(x * 6.2832 * 96) * np.sin(y * 6.2832 * 64) + 0.05 * fbm(rng, size, 64, 64, 3)
+    return color * weave[..., None]
+
+
+def books(rng, size):
+    """A row of spines, fitted to its face."""
+    color = np.full((size, size, 3), 0.05, np.float32)
+    x = 0
+    while x < size:
+        width = int(size * rng.uniform(0.03, 0.075))
+        top = int(size * rng.uniform(0.02, 0.28))
+        hue = np.asarray(
+            cv2.cvtColor(
+                np.float32([[[rng.uniform(0, 360), rng.uniform(0.25, 0.75), rng.uniform(0.3, 0.85)]]]),
+                cv2.COLOR_HSV2RGB,
+            )[0, 0]
+        )
+        end = min(x + width, size)
+        shade = 0.45 + 0.55 * np.sin(np.linspace(0.25, 2.9, end - x))[:, None]
+        color[top:, x:end] = hue * shade
+        for band in rng.uniform(0.1, 0.9, rng.integers(2, 5)):
+            row = int(top + band * (size - top))
+            light = np.float32([0.86, 0.78, 0.55]) if hue.mean() < 0.55 else hue * 0.4
+            color[row : row + max(size // 60, 2), x:end] = light * shade
+        x = end + max(size // 200, 1)
+    return np.clip(color * (1 + 0.06 * fbm(rng, size, 64, 64, 3))[..., None], 0, 1)
+
+
+def picture(rng, size):
+    """A framed landscape, fitted to its face: sky, sun, ranges of hills."""
+    x, y = grid(size)
+    hue = rng.uniform(0, 60)
+    sky = ramp(y, (60 + hue, 110, 170), (236, 190 - hue, 140), (250, 220, 170))
+    sun = np.hypot((x - rng.uniform(0.25, 0.75)), y - rng.uniform(0.25, 0.45))
+    color = blend(sky, np.float32([1.0, 0.93, 0.75]), step(0.085, 0.075, sun))
+    for k in range(5):
+        ridge = 0.42 + 0.1 * k + (0.09 - 0.01 * k) * fbm(rng, size, 4, 4, 5)[size // 3][None, :]
+        far = np.asarray([60 + hue - 12 * k, 112 - 14 * k, 120 - 20 * k], np.float32) / 255
+        textured = far * (1 + 0.1 * fbm(rng, size, 32, 32, 4))[..., None]
+        color = blend(color, textured, step(-0.004, 0.004, y - ridge))
+    edge = np.minimum(np.minimum(x, 1 - x), np.minimum(y, 1 - y))
+    color = blend(np.broadcast_to(np.float32([0.93, 0.91, 0.86]), color.shape), color, step(0.158, 0.162, edge))
+    frame = np.float32([0.24, 0.15, 0.09]) * (1 + 0.2 * fbm(rng, size, 64, 8, 3))[..., None]
+    frame = frame * (0.7 + 0.6 * np.sin(np.clip(edge / 0.06, 0, 1) * 3.14))[..., None]
+    return blend(frame, color, step(0.058, 0.062, edge))
+
+
+def leaves(rng, size):
+    """Overlapping leaves, light at the rim of each cell."""
+    color = ramp(np.full((size, size), 0.05), (16, 34, 16), (90, 150, 60))
+    for k in range(420):
+        u, v, angle, length = rng.integers(size), rng.integers(size), rng.random() * 6.28, rng.uniform(0.05, 0.09)
+        reach = np.arange(-int(length * size), int(length * size) + 1)
+        rows, columns = np.ix_((v + reach) % size, (u + reach) % size)
+        b, a = np.meshgrid(reach / size, reach / size, indexing="ij")
+        p, q = a * np.cos(angle) + b * np.sin(angle), b * np.cos(angle) - a * np.sin(angle)
+        inside = step(0.004, -0.004, np.abs(q) - 0.42 * (length - np.abs(p)) * (1 - (p / length) ** 2))
+        rib = 1 - 0.35 * step(0.004, 0.0, np.abs(q))
+        tone = (0.25 + 0.75 * k / 420) * (0.75 + 1.25 * q / length) * rib * rng.uniform(0.8, 1.15)
+        leaf = np.multiply.outer(tone, np.array([70, 138, 52]) / 255)
+        color[rows, columns] = blend(color[rows, columns], leaf, inside)
+    return np.clip(color, 0, 1)
+
+
+def wicker(rng, size, cells=16):
+    """A basket's over-and-under weave."""
+    x, y = grid(size)
+    a, b = x * cells, y * cells
+    over = (np.floor(a) + np.floor(b)) % 2 > 0
+    fa, fb = a % 1 - 0.5, b % 1 - 0.5
+    along, across = np.where(over, fa, fb), np.where(over, fb, fa)
+    shade = np.sqrt(np.clip(1 - (across * 1.9) ** 2, 0.05, 1)) * np.cos(along * 2.4)
+    straw = 0.5 + 0.3 * fbm(rng, size, 128, 128, 3) * 0.4
+    return ramp(straw, (140, 96, 52), (196, 150, 92), (226, 190, 132)) * (0.3 + 0.7 * shade)[..., None]
+
+
+def painted_front(rng, size, color=(30, 120, 120)):
+    """A cabinet's front, fitted to its face: two doors with sunk panels and brass knobs, a drawer above each."""
+    x, y = grid(size)
+    base = np.asarray(color, np.float32) / 255 * (1 + 0.05 * fbm(rng, size, 16, 128, 4))[..., None]
+    light = np.ones((size, size), np.float32)
+    knob = np.zeros((size, size), np.float32)
+    for x0, x1 in ((0.03, 0.49), (0.51, 0.97)):
+        for y0, y1 in ((0.05, 0.27), (0.31, 0.94)):
+            d = np.minimum(np.minimum(x - x0, x1 - x), np.minimum(y - y0, y1 - y))
+            light *= 1 - 0.6 * step(0.008, 0.003, np.abs(d))  # the gap around the door
+            sunk = step(0.0, 0.012, d - 0.055)
+            light *= 1 - 0.12 * sunk
+            rim = step(0.009, 0.0, np.abs(d - 0.06))
+            upper = ((y - y0) < (y1 - y)) & (np.abs(y - y0 - 0.06) < 0.02)
+            light *= 1 + rim * np.where(upper, -0.4, 0.22)
+            cx, cy = ((x0 + x1) / 2, (y0 + y1) / 2) if y1 < 0.3 else ((0.45 if x0 < 0.3 else 0.55), 0.5)
+            radius = np.hypot(x - cx, y - cy)
+            light *= 1 - 0.35 * step(0.035, 0.0, np.hypot(x - cx, y - cy - 0.012))
+            knob = np.maximum(knob, step(0.021, 0.017, radius))
+    brass = ramp(np.clip(0.5 + 0.4 * fbm(rng, size, 8, 8, 2), 0, 1), (120, 84, 30), (226, 184, 92), (250, 230, 170))
+    return blend(base * light[..., None], brass, knob)
+
+
+def painted(rng, size, color=(30, 120, 120)):
+    """Brushed paint."""
+    return (
+        np.asarray(color, np.float32)
+        / 255
+        * (1 + 0.05 * fbm(rng, size, 16, 128, 4) + 0.03 * fbm(rng, size, 4, 4, 3))[..., None]
+    )
+
+
+def ball(rng, size, first=(214, 66, 48), second=(240, 226, 196)):
+    """Beach-ball wedges about a tilted axis, for a sphere's longitude and latitude."""
+    x, y = grid(size)
+    longitude, latitude = x * 6.2832, y * 3.1416
+    p = np.stack([np.sin(latitude) * np.cos(longitude), np.cos(latitude), np.sin(latitude) * np.sin(longitude)], -1)
+    axis = rng.normal(size=3) * (1, 0.6, 1)
+    q, _ = np.linalg.qr(np.stack([axis, (0, 1, 0), (1, 0, 0.3)], 1))
+    p = p @ q
+    wedge = np.sin(4 * np.arctan2(p[..., 2], p[..., 1]))
+    # An edge's width in wedge values grows towards the poles; dividing by the radius keeps it even.
+    soft = 0.05 / np.maximum(np.hypot(p[..., 1], p[..., 2]), 0.1)
+    one, two = (np.asarray(c, np.float32) / 255 for c in (first, second))
+    color = blend(np.broadcast_to(one, (size, size, 3)), two, step(-1, 1, wedge / soft))
+    return blend(color, np.float32([0.95, 0.78, 0.25]), step(0.955, 0.965, np.abs(p[..., 0])))
+
+
+def glazed(rng, size, color=(40, 70, 130), bands=(236, 230, 214)):
+    """Pottery: a wash with rings, fitted to its face."""
+    x, y = grid(size)
+    wash = np.asarray(color, np.float32) / 255 * (1 + 0.1 * fbm(rng, size, 4, 4, 5))[..., None]
+    ring = np.zeros_like(x)
+    for center, width in zip(rng.uniform(0.12, 0.88, 4), rng.uniform(0.01, 0.045, 4), strict=True):
+        wave = center + 0.015 * np.sin(x * 6.2832 * 9)
+        ring = np.maximum(ring, step(width + 0.008, width, np.abs(y - wave)))
+    return blend(wash, np.asarray(bands, np.float32) / 255, ring)
+
+
+def baked(pictures: dict[str, np.ndarray]) -> tuple[Textures, dict[str, int]]:
+    """Mip levels of each picture, made in linear light; and each name's index."""
+    linear = (np.arange(256) / 255.0) ** 2.2
+    levels = max(int(np.log2(p.shape[0])) for p in pictures.values()) + 1
+    texels, start, side, mean, total = [], [], [], [], 0
+    for p in pictures.values():
+        level = np.clip(p, 0, 1).astype(np.float32) ** 2.2
+        starts = []
+        side.append(p.shape[0])
+        mean.append(level.mean((0, 1)))
+        for _ in range(levels):
+            starts.append(total)
+            texels.append(np.round(level ** (1 / 2.2) * 255).astype(np.uint8).reshape(-1, 3))
+            total += len(texels[-1])
+            if level.shape[0] > 1:
+                level = 0.25 * (level[::2, ::2] + level[1::2, ::2] + level[::2, 1::2] + level[1::2, 1::2])
+        start.append(starts)
+    arrays = Textures(np.concatenate(texels), np.array(start), np.array(side), np.array(mean, np.float64), linear)
+    return arrays, {name: k for k, name in enumerate(pictures)}
