@@ -153,13 +153,15 @@ class GaussianOptimizer:
             visible = torch.ones_like(self.masked)
         rates = self.rates.at(progress, self.gaussians)
         self._steps += visible
+        # Bias correction, per row; a row that never moved has t = 0 and is skipped.
+        unbias = [1 / (1 - beta ** self._steps.clamp(min=1).double()).float() for beta in self.betas]
         with torch.no_grad():
             for name, gradient in gradients.items():
                 if gradient is None:
                     continue
                 rows = [_rows(getattr(g, name)) for g in (self.gaussians, self._first, self._second)]
                 update = _adam_cpu if gradient.device.type == "cpu" else _adam
-                update(*rows, _rows(gradient), self._steps, visible, rates[name], *self.betas, self.epsilon)
+                update(*rows, _rows(gradient), *unbias, visible, rates[name], *self.betas, self.epsilon)
         self.forget_gradients()
 
     def forget_gradients(self) -> None:
@@ -225,39 +227,35 @@ def _rows(parameter: Tensor) -> Tensor:
     return parameter.detach().contiguous().view(parameter.shape[0], -1)
 
 
-def _adam(parameter, first, second, gradient, steps, visible, rates, beta1, beta2, epsilon) -> None:
-    """One Adam step in place on rows [N, D]; `steps` [N] counts this one already, `rates` [D]."""
+def _adam(parameter, first, second, gradient, unbias1, unbias2, visible, rates, beta1, beta2, epsilon) -> None:
+    """One Adam step in place on the visible rows of [N, D]; `unbias` [N] is 1 / (1 - beta^t), `rates` [D]."""
     rows = visible.nonzero()[:, 0]
-    g, t = gradient[rows], steps[rows, None].to(gradient.dtype)
+    g = gradient[rows]
     m = first[rows].lerp_(g, 1 - beta1)
     v = second[rows].mul_(beta2).addcmul_(g, g, value=1 - beta2)
     first[rows], second[rows] = m, v
-    rate = rates.to(g) / (1 - beta1**t)
-    parameter[rows] -= rate * m / ((v / (1 - beta2**t)).sqrt() + epsilon)
+    denominator = (v * unbias2[rows, None]).sqrt() + epsilon
+    parameter[rows] -= rates.to(g) * unbias1[rows, None] * m / denominator
 
 
-def _adam_cpu(parameter, first, second, gradient, steps, visible, rates, beta1, beta2, epsilon) -> None:
+def _adam_cpu(parameter, first, second, gradient, unbias1, unbias2, visible, rates, beta1, beta2, epsilon) -> None:
     """`_adam` in one pass over memory, for float32."""
-    arrays = (t.numpy() for t in (parameter, first, second, gradient, steps, visible, rates))
-    _adam_kernel(*arrays, beta1, beta2, np.float32(epsilon))
+    arrays = (t.numpy() for t in (parameter, first, second, gradient, unbias1, unbias2, visible, rates))
+    _adam_kernel(*arrays, np.float32(beta1), np.float32(beta2), np.float32(epsilon))
 
 
 @numba.njit(fastmath={"contract", "reassoc", "nsz", "arcp"}, cache=True, nogil=True, parallel=True)
-def _adam_kernel(parameter, first, second, gradient, steps, visible, rates, beta1, beta2, epsilon):
+def _adam_kernel(parameter, first, second, gradient, unbias1, unbias2, visible, rates, beta1, beta2, epsilon):
     count, width = parameter.shape
-    keep1, keep2 = np.float32(beta1), np.float32(beta2)
-    new1, new2 = np.float32(1 - beta1), np.float32(1 - beta2)
+    new1, new2 = np.float32(1) - beta1, np.float32(1) - beta2
     least = np.float32(1e-30)  # below it a first moment would soon be denormal, on which processors are slow
     for i in numba.prange(count):
         if not visible[i]:
             continue
-        t = float(steps[i])
-        unbias1 = np.float32(1 / (1 - beta1**t))
-        unbias2 = np.float32(1 / (1 - beta2**t))
-        p, m, v, g = parameter[i], first[i], second[i], gradient[i]
         for j in range(width):
-            a = keep1 * m[j] + new1 * g[j]
+            g = gradient[i, j]
+            a = beta1 * first[i, j] + new1 * g
             a = np.float32(0) if abs(a) < least else a
-            b = keep2 * v[j] + new2 * g[j] * g[j]
-            m[j], v[j] = a, b
-            p[j] -= rates[j] * unbias1 * a / (np.sqrt(b * unbias2) + epsilon)
+            b = beta2 * second[i, j] + new2 * g * g
+            first[i, j], second[i, j] = a, b
+            parameter[i, j] -= rates[j] * unbias1[i] * a / (np.sqrt(b * unbias2[i]) + epsilon)
