@@ -52,7 +52,7 @@ def blend_backward(footprints, features, bins, used, images, transmittance, grad
     Args:
         footprints: [M, FOOTPRINT]; features: [M, C].
         bins: starts, members, rows, slots, see `bin_footprints`.
-        images: color [H, W, 3], depth [H, W], features [H, W, C] as `blend` returned them.
+        images: color [H, W, 3], depth [H, W], alpha [H, W], features [H, W, C] as `blend` returned them.
         used, transmittance: from `blend`.
         gradients: dLoss/d(color, depth, alpha, features), shaped like them.
 
@@ -77,6 +77,7 @@ def _blend_backward(
     used,
     color,
     depth,
+    alpha,
     blended,
     transmittance,
     grad_color,
@@ -100,6 +101,7 @@ def _blend_backward(
             stride,
             color,
             depth,
+            alpha,
             blended,
             transmittance,
             grad_color,
@@ -114,7 +116,7 @@ def _blend_backward(
 
 @kernel
 def _load_tile(
-    tile, state, stride, color, depth, blended, transmittance, grad_color, grad_depth, grad_alpha, grad_blended
+    tile, state, stride, color, depth, alpha, blended, transmittance, grad_color, grad_depth, grad_alpha, grad_blended
 ):
     """Upstream gradients of the blended sums, and the remainder: upstream dotted with all that was blended.
 
@@ -131,8 +133,7 @@ def _load_tile(
         for lane in range(min(TILE_WIDTH, width - left)):
             x, place = left + lane, row * stride + lane
             behind = transmittance[y, x]
-            covered = np.float32(1.0) - behind
-            g_depth = grad_depth[y, x] / covered if covered > 0 else np.float32(0.0)
+            g_depth = grad_depth[y, x] / alpha[y, x] if alpha[y, x] > 0 else np.float32(0.0)
             g_alpha = grad_alpha[y, x] - g_depth * depth[y, x]
             remainder = grad_depth[y, x] * depth[y, x] - behind * g_alpha
             for c in range(3):

@@ -96,13 +96,14 @@ class _Splat(torch.autograd.Function):
         ctx.mark_non_differentiable(radii)
         if any(ctx.needs_input_grad):
             inputs = (means, quaternions, log_scales, opacity_logits, sh, features)
-            ctx.save_for_backward(*inputs, color, depth, blended)
+            ctx.save_for_backward(*inputs, color, depth, alpha, blended)
             ctx.rest = view, transmittance, used, camera, degree
         return color, depth, alpha, blended, radii
 
     @staticmethod
     def backward(ctx, grad_color, grad_depth, grad_alpha, grad_blended, _):
-        *parameters, features, color, depth, blended = (_array(t) for t in ctx.saved_tensors)
+        saved = [_array(t) for t in ctx.saved_tensors]
+        parameters, features, images = saved[:5], saved[5], saved[6:]
         *geometry, sh = parameters
         means = geometry[0]
         view, transmittance, used, camera, degree = ctx.rest
@@ -112,7 +113,7 @@ class _Splat(torch.autograd.Function):
             features[view.order],
             view.bins,
             used,
-            (color, depth, blended),
+            images,
             transmittance,
             gradients,
         )

@@ -23,7 +23,7 @@ from reffusion.splat.vectors import (
     take_ticket,
 )
 
-_SUMS = 5  # vectors of a row before its features: transmittance, red, green, blue, depth
+_SUMS = 6  # vectors of a row before its features: transmittance, red, green, blue, depth, alpha
 
 
 def blend(footprints, features, background, starts, members, rows, width, height):
@@ -139,6 +139,7 @@ def _blend_tile(tile, footprints, features, starts, members, rows, size, state, 
             store(state, place + 32, fma(weight, green, load(state, place + 32)))
             store(state, place + 48, fma(weight, blue, load(state, place + 48)))
             store(state, place + 64, fma(weight, far, load(state, place + 64)))
+            store(state, place + 80, load(state, place + 80) + weight)
             for c in range(channels):
                 place_c = place + 16 * (_SUMS + c)
                 store(state, place_c, fma(weight, splat(extra[c]), load(state, place_c)))
@@ -151,16 +152,15 @@ def _write_tile(tile, state, stride, background, color, depth, alpha, blended, t
     height, width = depth.shape
     tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
     left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
-    one = np.float32(1.0)
     for row in range(min(TILE_HEIGHT, height - top)):
         y = top + row
         for lane in range(min(TILE_WIDTH, width - left)):
             x, place = left + lane, row * stride + lane
-            behind = abs(state[place])
+            behind, covered = abs(state[place]), state[place + 80]
             transmittance[y, x] = behind
-            alpha[y, x] = one - behind
+            alpha[y, x] = covered  # not 1 - behind, which has few digits where it is faint
             for c in range(3):
                 color[y, x, c] = state[place + 16 * (1 + c)] + behind * background[c]
-            depth[y, x] = state[place + 64] / max(one - behind, np.float32(1e-30))
+            depth[y, x] = state[place + 64] / max(covered, np.float32(1e-30))
             for c in range(blended.shape[2]):
                 blended[y, x, c] = state[place + 16 * (_SUMS + c)]

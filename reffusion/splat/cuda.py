@@ -1,0 +1,148 @@
+"""Splatting on a CUDA GPU by gsplat 1.5, with the conventions of the other implementations.
+
+gsplat's `rasterization` in its parts, because the probe is added to the 2D means between two of them. What differs
+from `reference` and cannot be set: alpha is clamped at 0.999 instead of 0.99, the transmittance stop is <= 1e-4 instead
+of <, and the conic is inverted from a float32 determinant (long needles lose digits).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from reffusion.splat.conventions import LOW_PASS, NEAR
+from reffusion.types import Camera, Gaussians, Rendering
+
+_TILE = 16
+
+
+class _Footprints(NamedTuple):
+    """One view's footprints as gsplat passes them on, with a leading dimension of one view."""
+
+    means: Tensor  # [1, N, 2]
+    radii: Tensor  # [1, N, 2] int32
+    depths: Tensor  # [1, N]
+    conics: Tensor  # [1, N, 3]
+    opacities: Tensor  # [1, N]
+    tiles: tuple[Tensor, Tensor]  # where each tile's list begins, and the lists
+
+
+def require_gpu(means: Tensor) -> None:
+    """Raise ValueError unless there are a GPU, gsplat and tensors on that GPU."""
+    if not torch.cuda.is_available():
+        raise ValueError("impl='cuda' needs a CUDA GPU and there is none here; take impl='cpu' or 'auto'")
+    if not means.is_cuda or means.dtype != torch.float32:
+        raise ValueError(f"impl='cuda' needs float32 tensors on the GPU, not {means.dtype} on {means.device}")
+    try:
+        import gsplat  # noqa: F401
+    except ImportError as error:
+        raise ValueError("impl='cuda' needs gsplat: pip install 'reffusion[gpu]'") from error
+
+
+def render(
+    gaussians: Gaussians, camera: Camera, features: Tensor | None, background: Tensor, degree: int, probe: Tensor | None
+) -> Rendering:
+    """See `reffusion.splat.render`."""
+    if len(gaussians) == 0:
+        return _empty(camera, features, background)
+    import gsplat
+
+    footprints = _project(gaussians, camera)
+    means = footprints.means if probe is None else footprints.means + probe
+    center = torch.as_tensor(camera.center, dtype=means.dtype, device=means.device)
+    visible = (footprints.radii > 0).all(-1)[0]
+    colors = gsplat.spherical_harmonics(degree, gaussians.means - center, gaussians.sh, masks=visible)
+    colors = torch.clamp_min(colors + 0.5, 0)
+    columns = [colors, footprints.depths[0, :, None]] + ([] if features is None else [features])
+    behind_all = torch.cat((background, background.new_zeros(sum(c.shape[1] for c in columns) - 3)))
+    image, alpha = gsplat.rasterize_to_pixels(
+        means,
+        footprints.conics,
+        torch.cat(columns, 1)[None],
+        footprints.opacities,
+        camera.width,
+        camera.height,
+        _TILE,
+        *footprints.tiles,
+        backgrounds=behind_all[None],
+    )
+    image, alpha = image[0], alpha[0, ..., 0]
+    drawn = alpha > 0
+    return Rendering(
+        color=image[..., :3],
+        depth=torch.where(drawn, image[..., 3], 0) / torch.where(drawn, alpha, 1),
+        alpha=alpha,
+        features=None if features is None else image[..., 4:],
+        radii=(footprints.radii[0].amax(1) * visible).to(torch.int32),
+    )
+
+
+def accumulate(gaussians: Gaussians, camera: Camera, values: Tensor, count: bool) -> Tensor:
+    """See `reffusion.splat.accumulate`. Weighted sums are the gradient of blended features."""
+    size = len(gaussians), values.shape[-1]
+    if 0 in size:
+        return values.new_zeros(size)
+    if not count:
+        with torch.enable_grad():
+            features = values.new_zeros(size).requires_grad_()
+            blended = render(gaussians, camera, features, values.new_zeros(3), 0, None).features
+            return torch.autograd.grad(blended, features, values)[0]
+    import gsplat
+
+    footprints = _project(gaussians, camera)
+    members, pixels, _ = gsplat.rasterize_to_indices_in_range(
+        0,
+        2**30,
+        values.new_ones(1, camera.height, camera.width),
+        footprints.means,
+        footprints.conics,
+        footprints.opacities,
+        camera.width,
+        camera.height,
+        _TILE,
+        *footprints.tiles,
+    )
+    return values.new_zeros(size).index_add(0, members.long(), values.reshape(-1, size[1])[pixels.long()])
+
+
+def _project(gaussians: Gaussians, camera: Camera) -> _Footprints:
+    import gsplat
+
+    like = gaussians.means
+    pose = torch.as_tensor(camera.world_to_camera, dtype=like.dtype, device=like.device)
+    intrinsics = torch.as_tensor(camera.intrinsics, dtype=like.dtype, device=like.device)
+    # gsplat divides by the length: the zero quaternion has to become the identity here
+    zero = (gaussians.quaternions == 0).all(1, keepdim=True)
+    quaternions = torch.where(zero, like.new_tensor([1.0, 0.0, 0.0, 0.0]), gaussians.quaternions)
+    opacities = torch.sigmoid(gaussians.opacity_logits)
+    radii, means, depths, conics, _ = gsplat.fully_fused_projection(
+        like,
+        None,
+        quaternions,
+        gaussians.log_scales.exp(),
+        pose[None],
+        intrinsics[None],
+        camera.width,
+        camera.height,
+        eps2d=LOW_PASS,
+        near_plane=NEAR,
+        opacities=opacities,
+    )
+    across, down = -(-camera.width // _TILE), -(-camera.height // _TILE)
+    with torch.no_grad():
+        _, pairs, lists = gsplat.isect_tiles(means, radii, depths, _TILE, across, down, n_images=1)
+        starts = gsplat.isect_offset_encode(pairs, 1, across, down)
+    return _Footprints(means, radii, depths, conics, opacities[None], (starts.reshape(1, down, across), lists))
+
+
+def _empty(camera: Camera, features: Tensor | None, background: Tensor) -> Rendering:
+    zeros = background.new_zeros(camera.height, camera.width)
+    return Rendering(
+        color=zeros[..., None] + background,
+        depth=zeros,
+        alpha=zeros,
+        features=None if features is None else zeros[..., None] * features.sum(0),
+        radii=torch.zeros(0, dtype=torch.int32, device=background.device),
+    )

@@ -1,0 +1,353 @@
+"""Splatting: the compiled kernel against the float64 reference, the reference against finite differences."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from reffusion import splat
+from reffusion.splat import reference
+from reffusion.types import PARAMETERS, Camera, Gaussians
+
+BLOCKS = (*PARAMETERS, "features", "background", "probe")
+IMAGES = ("color", "depth", "alpha", "features")
+
+
+def camera(width: int, height: int, distance: float = 3.0) -> Camera:
+    """A view of the origin, a little turned and off-centre so that no symmetry hides an error."""
+    turn = 0.3
+    pose = np.eye(4)
+    pose[:3, :3] = [[math.cos(turn), 0, math.sin(turn)], [0, 1, 0], [-math.sin(turn), 0, math.cos(turn)]]
+    pose[:3, 3] = 0.05, -0.02, distance
+    return Camera("test", width, height, 1.2 * width, 1.25 * width, width / 2 + 0.7, height / 2 - 0.3, pose)
+
+
+def cloud(count: int, log_scale: float, seed: int = 0, degree: int = 3, spread: float = 1.0) -> Gaussians:
+    """Random Gaussians around the origin, colours in and out of range, some opacities saturated."""
+    generator = torch.Generator().manual_seed(seed)
+    normal = lambda *shape: torch.randn(*shape, generator=generator)
+    higher = 0.15 * normal(count, (degree + 1) ** 2 - 1, 3)
+    return Gaussians(
+        means=spread * normal(count, 3) * 0.6,
+        quaternions=normal(count, 4) * 2,
+        log_scales=log_scale + 0.6 * normal(count, 3),
+        opacity_logits=2 * normal(count),
+        sh=torch.cat((normal(count, 1, 3), higher), 1),
+    )
+
+
+def differentiate(gaussians, view, impl, dtype, channels=3, sh_degree=None):
+    """Rendering, and the gradients of a fixed random linear function of everything rendered."""
+    generator = torch.Generator().manual_seed(1)
+    random = lambda *shape: torch.randn(*shape, generator=generator).to(dtype)
+    leaf = lambda tensor: tensor.detach().to(dtype).clone().requires_grad_()
+    gaussians = gaussians.map(leaf)
+    features, background = leaf(random(len(gaussians), channels)), leaf(torch.tensor([0.2, 0.3, 0.4]))
+    probe = leaf(torch.zeros(len(gaussians), 2))
+    drawn = splat.render(
+        gaussians,
+        view,
+        features=features,
+        background=background,
+        impl=impl,
+        sh_degree=sh_degree,
+        probe=probe,
+    )
+    loss = sum((getattr(drawn, name) * random(*getattr(drawn, name).shape)).sum() for name in IMAGES)
+    leaves = (*(getattr(gaussians, name) for name in PARAMETERS), features, background, probe)
+    return drawn, dict(zip(BLOCKS, torch.autograd.grad(loss, leaves), strict=True))
+
+
+def assert_close(actual, expected, relative, floor, what):
+    error = (actual.double() - expected.double()).norm().item()
+    assert error <= relative * expected.double().norm().item() + floor, (what, error, expected.norm().item())
+
+
+def assert_same(gaussians, view, relative=2e-5, **options):
+    """The compiled kernel equals the reference in float64, values and gradients, up to `relative` in L2."""
+    fast, fast_gradients = differentiate(gaussians, view, "cpu", torch.float32, **options)
+    exact, exact_gradients = differentiate(gaussians, view, "reference", torch.float64, **options)
+    assert torch.equal(fast.radii, exact.radii)
+    for name in IMAGES:
+        assert_close(getattr(fast, name), getattr(exact, name), relative, 1e-6, name)
+    for name in BLOCKS:
+        assert_close(fast_gradients[name], exact_gradients[name], relative, 1e-5, name)
+    return exact
+
+
+@pytest.mark.parametrize(
+    ("count", "log_scale", "size", "options"),
+    [
+        (300, -3.2, (61, 47), {}),
+        (300, -2.0, (64, 64), {"channels": 0}),
+        (600, -4.5, (50, 70), {"channels": 1, "sh_degree": 1}),
+        (80, -3.0, (7, 5), {"channels": 9, "sh_degree": 2}),
+        (20, -1.0, (1, 1), {"sh_degree": 0}),
+    ],
+)
+def test_equals_reference(count, log_scale, size, options):
+    exact = assert_same(cloud(count, log_scale), camera(*size), **options)
+    assert exact.alpha.mean() > 0.1
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_stored_degrees(degree):
+    assert_same(cloud(50, -2.5, degree=degree), camera(33, 20))
+
+
+def test_inside_the_cloud():
+    """Gaussians behind, around and right before the camera; the Jacobian's clamp is active for some."""
+    exact = assert_same(cloud(400, -2.5, seed=3, spread=2.0), camera(48, 40, distance=0.1), relative=1e-4)
+    assert (exact.radii == 0).any() and (exact.radii > 100).any()
+
+
+def test_cropped_view():
+    view = camera(64, 48)
+    whole = splat.render(cloud(100, -3.0), view).color
+    part = splat.render(cloud(100, -3.0), view.cropped(17, 9, 32, 24)).color
+    assert_close(part, whole[9:33, 17:49], 1e-2, 0, "crop")  # the Jacobian's clamp depends on the window
+    assert_same(cloud(100, -3.0), view.cropped(17, 9, 32, 24))
+
+
+@pytest.mark.parametrize("footprint", [30.0, 300.0, 3000.0])
+def test_needles(footprint):
+    """Needles 1000:1, of so many pixels, at all angles."""
+    gaussians = cloud(40, 0.0, seed=5, spread=0.5)
+    length = math.log(footprint * 3.0 / (1.2 * 64))
+    gaussians = replace(gaussians, log_scales=torch.tensor([length, length - math.log(1000), length - 7]).repeat(40, 1))
+    assert_same(gaussians, camera(64, 64), relative=1e-3)
+
+
+def test_reference_against_finite_differences():
+    """Every parameter along random directions, in float64; the random scene has no pixel close to a threshold."""
+    gaussians, view = cloud(12, -1.2, seed=2).map(torch.Tensor.double), camera(9, 8)
+    _, gradients = differentiate(gaussians, view, "reference", torch.float64)
+    generator = torch.Generator().manual_seed(1)
+    random = lambda *shape: torch.randn(*shape, generator=generator).double()
+    features, weights = random(12, 3), [random(8, 9, 3), random(8, 9), random(8, 9), random(8, 9, 3)]
+
+    def loss(changed: dict[str, torch.Tensor]) -> float:
+        drawn = splat.render(
+            replace(gaussians, **{k: v for k, v in changed.items() if k in PARAMETERS}),
+            view,
+            features=changed.get("features", features),
+            background=changed.get("background", torch.tensor([0.2, 0.3, 0.4]).double()),
+            probe=changed.get("probe"),
+            impl="reference",
+        )
+        return sum((getattr(drawn, n) * w).sum().item() for n, w in zip(IMAGES, weights, strict=True))
+
+    base = {name: getattr(gaussians, name) for name in PARAMETERS} | {"features": features}
+    base |= {"background": torch.tensor([0.2, 0.3, 0.4]).double(), "probe": torch.zeros(12, 2).double()}
+    for name in BLOCKS:
+        direction, step = torch.randn(base[name].shape, generator=generator).double(), 1e-6
+        slope = (loss({name: base[name] + step * direction}) - loss({name: base[name] - step * direction})) / (2 * step)
+        assert slope == pytest.approx((gradients[name] * direction).sum().item(), rel=1e-5, abs=1e-6), name
+
+
+def test_probe_is_the_gradient_of_the_2d_mean():
+    """Shifting the principal point shifts every 2D mean: the probe's gradients add up to that."""
+    gaussians, view = cloud(60, -2.5), camera(30, 30)
+    _, gradients = differentiate(gaussians, view, "cpu", torch.float32)
+    generator = torch.Generator().manual_seed(1)
+    random = lambda *shape: torch.randn(*shape, generator=generator).double()
+    features = random(60, 3)
+    weights = [random(30, 30, 3), random(30, 30), random(30, 30), random(30, 30, 3)]
+
+    def loss(shift: float) -> float:
+        probe = torch.tensor([[shift, 0.0]]).double().repeat(60, 1)
+        drawn = splat.render(
+            gaussians.map(torch.Tensor.double),
+            view,
+            features=features,
+            background=torch.tensor([0.2, 0.3, 0.4]).double(),
+            probe=probe,
+            impl="reference",
+        )
+        return sum((getattr(drawn, n) * w).sum().item() for n, w in zip(IMAGES, weights, strict=True))
+
+    slope = (loss(1e-6) - loss(-1e-6)) / 2e-6
+    assert gradients["probe"][:, 0].sum().item() == pytest.approx(slope, rel=1e-3)
+
+
+def test_same_bits_for_any_number_of_threads():
+    gaussians, view, before = cloud(3000, -3.5), camera(150, 131), torch.get_num_threads()
+    values, results = torch.rand(131, 150, 2), []
+    try:
+        for threads in (1, 2, 5):
+            torch.set_num_threads(threads)
+            drawn, gradients = differentiate(gaussians, view, "cpu", torch.float32)
+            results.append([*drawn, *gradients.values(), splat.accumulate(gaussians, view, values)])
+    finally:
+        torch.set_num_threads(before)
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+def test_equal_depths_are_drawn_by_index():
+    """Forty opaque Gaussians in the same place, the first one red, the others green."""
+    gaussians = replace(cloud(40, -1.0), means=torch.zeros(40, 3), opacity_logits=torch.full((40,), 9.0))
+    gaussians.sh[:] = 0.0
+    gaussians.sh[:, 0] = torch.tensor([-2.0, 2.0, -2.0])
+    gaussians.sh[0, 0] = torch.tensor([2.0, -2.0, -2.0])
+    for impl in ("cpu", "reference"):
+        red, green, blue = splat.render(gaussians, camera(20, 20), impl=impl).color[10, 10]
+        assert red > 0.8 and green < 0.2 and blue < 0.2
+
+
+def test_zero_quaternion_is_the_identity():
+    gaussians = cloud(30, -2.0)
+    zero = replace(gaussians, quaternions=torch.zeros(30, 4))
+    identity = replace(gaussians, quaternions=torch.tensor([1.0, 0, 0, 0]).repeat(30, 1))
+    for impl in ("cpu", "reference"):
+        drawn = [splat.render(g, camera(20, 20), impl=impl).color for g in (zero, identity)]
+        assert torch.equal(*drawn)
+    assert_same(zero, camera(20, 20))
+
+
+def test_order_and_length_of_quaternions_do_not_matter_to_values():
+    gaussians = cloud(30, -2.0)
+    longer = replace(gaussians, quaternions=gaussians.quaternions * 1e-18)
+    drawn = [splat.render(g, camera(20, 20)).color for g in (gaussians, longer)]
+    assert_close(*drawn, 1e-5, 0, "quaternion length")
+
+
+def extremes() -> Gaussians:
+    """Behind the camera, at its centre, far aside, gigantic, vanishing, transparent, opaque."""
+    center = torch.tensor(camera(20, 20).center, dtype=torch.float32)
+    gaussians = cloud(10, -1.0)
+    for array, row, value in (
+        (gaussians.means, 0, center * 1.5),
+        (gaussians.means, 1, center),
+        (gaussians.means, 2, torch.tensor([1e30, 0.0, 0.0])),
+        (gaussians.means, 3, torch.tensor([1e5, -1e5, 0.0])),
+        (gaussians.log_scales, 4, 1e4),
+        (gaussians.log_scales, 5, 20.7),
+        (gaussians.log_scales, 6, -1e4),
+        (gaussians.log_scales, 7, torch.tensor([80.0, -80.0, 0.0])),
+        (gaussians.opacity_logits, 8, -1e4),
+        (gaussians.opacity_logits, 9, 1e4),
+    ):
+        array[row] = value
+    return gaussians
+
+
+def test_extremes_stay_finite():
+    drawn, gradients = differentiate(extremes(), camera(20, 20), "cpu", torch.float32)
+    for name in IMAGES:
+        assert torch.isfinite(getattr(drawn, name)).all(), name
+    for name, gradient in gradients.items():
+        assert torch.isfinite(gradient).all(), name
+    assert drawn.radii[[0, 1, 2, 4, 8]].tolist() == [0] * 5
+    assert drawn.radii[9] > 0
+
+
+@pytest.mark.parametrize("impl", ["cpu", "reference"])
+def test_nothing_to_draw(impl):
+    """No Gaussians, or all behind the camera: the background, zeros, and zero gradients."""
+    view, background = camera(5, 3), torch.tensor([0.1, 0.2, 0.3])
+    behind = replace(cloud(4, -2.0), means=torch.tensor(view.center * 2, dtype=torch.float32).repeat(4, 1))
+    for gaussians in (behind, cloud(0, -2.0)):
+        features = torch.ones(len(gaussians), 2, requires_grad=True)
+        drawn = splat.render(gaussians, view, features=features, background=background, impl=impl)
+        assert torch.equal(drawn.color, background.expand(3, 5, 3))
+        assert not drawn.depth.any() and not drawn.alpha.any() and not drawn.radii.any()
+        assert drawn.features.shape == (3, 5, 2) and not drawn.features.any()
+        (drawn.features.sum() + drawn.depth.sum()).backward()
+        assert features.grad is None or not features.grad.any()
+        assert not splat.accumulate(gaussians, view, torch.ones(3, 5, 1), impl=impl).any()
+
+
+def test_a_finished_pixel_stays_finished():
+    """Opaque sheets: transmittance never falls under 1e-4 and what lies behind changes nothing."""
+    view, count = camera(16, 16), 60
+    gaussians = replace(cloud(count, 0.0), opacity_logits=torch.full((count,), 3.0))
+    assert splat.render(gaussians, view).alpha.max() <= 1 - 1e-4 + 1e-6
+    assert_same(gaussians, view)
+
+
+def test_deep_faint_stack():
+    """Two thousand layers of alpha about 1/150 at every pixel."""
+    view, gaussians = camera(18, 12), cloud(2000, 2.0, seed=4)
+    depths = torch.linspace(2.0, 4.0, 2000)[torch.randperm(2000, generator=torch.Generator().manual_seed(0))]
+    forward = torch.tensor(view.world_to_camera[2, :3], dtype=torch.float32)
+    means = torch.tensor(view.center, dtype=torch.float32) + depths[:, None] * forward
+    gaussians = replace(gaussians, means=means, opacity_logits=torch.full((2000,), math.log(1 / 149)))
+    assert_same(gaussians, view, relative=5e-5)
+
+
+def test_accumulate_is_the_gradient_of_features():
+    gaussians, view, values = cloud(200, -2.5), camera(45, 40), torch.rand(40, 45, 2)
+    features = torch.zeros(200, 2, requires_grad=True)
+    splat.render(gaussians, view, features=features).features.backward(values)
+    gathered = splat.accumulate(gaussians, view, values)
+    assert_close(gathered, features.grad, 1e-6, 1e-6, "accumulate")
+    for count in (False, True):
+        exact = splat.accumulate(
+            gaussians.map(torch.Tensor.double), view, values.double(), impl="reference", count=count
+        )
+        assert_close(splat.accumulate(gaussians, view, values, count=count), exact, 2e-6, 0, count)
+
+
+def test_counts_are_whole_numbers_of_blended_pixels():
+    gaussians, view = cloud(50, -2.0), camera(45, 40)
+    counts = splat.accumulate(gaussians, view, torch.ones(40, 45, 1), count=True)[:, 0]
+    assert torch.equal(counts, counts.round()) and counts.max() > 20
+    projected, _ = reference.project(gaussians.map(torch.Tensor.double), view, None)
+    assert set(torch.nonzero(counts)[:, 0].tolist()) <= set(projected.order.tolist())
+
+
+def test_rendering_without_gradients_keeps_nothing():
+    drawn = splat.render(cloud(10, -2.0), camera(9, 9))
+    assert not drawn.color.requires_grad and drawn.color.grad_fn is None
+
+
+def test_background_and_alpha_agree():
+    gaussians, view = cloud(40, -2.5), camera(25, 25)
+    black, white = (splat.render(gaussians, view, background=torch.full((3,), b)) for b in (0.0, 1.0))
+    assert_close(white.color - black.color, (1 - black.alpha)[..., None].expand(-1, -1, 3), 1e-6, 0, "background")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"features": torch.ones(3, 2)}, "features has shape"),
+        ({"background": torch.ones(4)}, "background has shape"),
+        ({"probe": torch.ones(10, 2).double()}, "probe is torch.float64"),
+        ({"sh_degree": 4}, "sh_degree 4 is outside 0..3"),
+        ({"impl": "metal"}, "none of auto, reference, cpu, cuda"),
+        ({"impl": "cuda"}, "impl='cuda' needs"),
+    ],
+)
+def test_bad_input_is_named(change, message):
+    with pytest.raises(ValueError, match=message):
+        splat.render(cloud(10, -2.0), camera(4, 4), **change)
+
+
+def test_bad_gaussians_are_named():
+    gaussians = cloud(10, -2.0)
+    with pytest.raises(ValueError, match="sh is"):
+        splat.render(replace(gaussians, sh=torch.zeros(10, 7, 3)), camera(4, 4))
+    with pytest.raises(ValueError, match="log_scales has shape"):
+        splat.render(replace(gaussians, log_scales=torch.zeros(9, 3)), camera(4, 4))
+    with pytest.raises(ValueError, match="takes float32"):
+        splat.render(gaussians.map(torch.Tensor.double), camera(4, 4), impl="cpu")
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
+def test_cuda_equals_reference():
+    gaussians = replace(cloud(300, -3.2), opacity_logits=torch.linspace(-5, 4, 300))  # alpha stays under 0.99
+    view, cuda = camera(61, 47), cloud(300, -3.2)
+    cuda = replace(gaussians).map(torch.Tensor.cuda)
+    exact = splat.render(gaussians.map(torch.Tensor.double), view, impl="reference")
+    drawn = splat.render(cuda, view)
+    for name in ("color", "depth", "alpha"):
+        assert_close(getattr(drawn, name).cpu(), getattr(exact, name), 1e-4, 0, name)
+    for count in (False, True):
+        values = torch.rand(47, 61, 2)
+        gathered = splat.accumulate(cuda, view, values.cuda(), count=count)
+        assert_close(gathered.cpu(), splat.accumulate(gaussians, view, values, count=count), 1e-3, 0, count)
