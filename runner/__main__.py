@@ -25,7 +25,7 @@ def main() -> int:
             print(table(job, plan(job, job.pipeline.closure(arguments.stage))))
         elif arguments.command == "run":
             job = run_scene(request, arguments.stage)
-            show_results(job)
+            show_results(job, job.pipeline.closure(arguments.stage)[-1])
         elif arguments.command == "batch":
             return 1 if batch(request, arguments.data) else 0
         else:

@@ -34,6 +34,7 @@ from runner.plan import (
     plan,
     prepare,
     receipt,
+    shown,
     source_of,
     table,
 )
@@ -168,7 +169,7 @@ def _in_child(job: Job, stage: str, partial: Path, earlier: dict[str, Decision],
         return answer
     how = f"ended by signal {-code} ({signal.Signals(-code).name})" if code < 0 else f"ended with code {code}"
     hint = "; out of memory?" if code == -signal.SIGKILL else ""
-    raise Failed(f"{stage}: {answer.get('error', how + hint)} (all of it in {log})")
+    raise Failed(f"{stage}: {answer.get('error', how + hint)} (all of it in {shown(log)})")
 
 
 def _receipt(
@@ -255,26 +256,36 @@ def clean(request: Request) -> None:
         for each in names:
             if (request.runs / each).exists():
                 shutil.rmtree(request.runs / each)
-                say(f"removed {request.runs / each}")
+                say(f"removed {shown(request.runs / each)}")
 
 
 # -------------------------------------------------------------------------------------------------------- results
 
 
-def mean_metrics(job: Job) -> dict[str, float | None]:
-    """`mean` of evaluate/metrics.json; empty where there is none."""
-    path = job.home / "evaluate" / "metrics.json"
-    path = path if path.is_file() else job.base / "evaluate" / "metrics.json"
-    return json.loads(path.read_text()).get("mean", {}) if path.is_file() else {}
+def _made(job: Job, stage: str) -> Path | None:
+    """The stage's artifact: the variant's own, or the one it shares."""
+    return next((home / stage for home in (job.home, job.base) if receipt(home / stage)), None)
 
 
-def show_results(job: Job) -> None:
-    """Where the results are, and the mean metrics."""
-    folder = next((h / "evaluate" for h in (job.home, job.base) if receipt(h / "evaluate")), None)
+def _metrics(job: Job) -> dict[str, dict[str, float | None]]:
+    folder = _made(job, "evaluate")
+    return json.loads((folder / "metrics.json").read_text()) if folder else {}
+
+
+def show_results(job: Job, stage: str) -> None:
+    """Where the results are; after `evaluate` the mean metrics too, those of the initialization beside them."""
+    folder = _made(job, stage)
+    if stage == "evaluate":
+        metrics = _metrics(job)
+        for name, value in metrics.get("mean", {}).items():
+            before = _number(metrics.get("initialize", {}).get(name))
+            say(
+                f"  {name:<16} {_number(value) or 'not available':<14}"
+                + (f" initialization {before}" if before else "")
+            )
     if folder:
-        for name, value in mean_metrics(job).items():
-            say(f"  {name:<18} {_number(value) or 'not available'}")
-        say(f"results: {', '.join(str(folder / p.name) for p in sorted(folder.iterdir()) if p.name != RECEIPT)}")
+        names = (p.name + ("/" if p.is_dir() else "") for p in sorted(folder.iterdir()) if p.name != RECEIPT)
+        say(f"results in {shown(folder)}/: {', '.join(names)}")
 
 
 def _number(value: Any) -> str:
@@ -290,7 +301,7 @@ def batch(request: Request, folder: Path) -> int:
     failed: dict[str, str] = {}
     for scene in scenes:
         try:
-            rows[scene.name] = mean_metrics(run_scene(replace(request, scene=str(scene)), "all"))
+            rows[scene.name] = _metrics(run_scene(replace(request, scene=str(scene)), "all")).get("mean", {})
         except (Refused, Failed) as error:
             failed[scene.name] = str(error)
             print(f"error: {error}", file=sys.stderr, flush=True)
@@ -298,7 +309,7 @@ def batch(request: Request, folder: Path) -> int:
     _write_table(request.runs / f"results{suffix}", rows, failed)
     for name, reason in failed.items():
         say(f"failed: {name}: {reason}")
-    say(f"{len(rows)} of {len(scenes)} scenes done; table: {request.runs / f'results{suffix}'}.csv and .md")
+    say(f"{len(rows)} of {len(scenes)} scenes done; table: {shown(request.runs)}/results{suffix}.csv and .md")
     return len(failed)
 
 

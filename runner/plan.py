@@ -368,8 +368,13 @@ def table(job: Job, decisions: dict[str, Decision]) -> str:
 
 
 def expected_seconds(job: Job, stage: str) -> float | None:
-    """What the stage last took on this machine with this profile: for this scene, else for any."""
-    found = [receipt(path.parent) for path in job.runs.glob(f"*/{stage}/{RECEIPT}")]
-    here = [r for r in found if r and r["machine"] == MACHINE and r["profile"] == job.profile]
-    own = [r for r in here if r["scene"] == job.name]
-    return max(own or here, key=lambda r: r["date"])["seconds"] if here else None
+    """What the stage last took for this scene, or a variant of it, on this machine with this profile."""
+    places = [job.runs / job.name, *job.runs.glob(f"{job.name}@*")]
+    found = [r for place in places if (r := receipt(place / stage))]
+    here = [r for r in found if r["machine"] == MACHINE and r["profile"] == job.profile]
+    return max(here, key=lambda r: r["date"])["seconds"] if here else None
+
+
+def shown(path: Path) -> str:
+    """A path as people type it: from the current folder where it lies below."""
+    return os.path.relpath(path) if path.is_relative_to(Path.cwd()) else str(path)
