@@ -28,7 +28,7 @@ from reffusion.sds import (
     window_around,
 )
 from reffusion.splat import render
-from reffusion.types import Camera, Gaussians, Rendering
+from reffusion.types import PARAMETERS, Camera, Gaussians, Rendering
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,10 @@ def sds_term(
 def gradient_norms(gaussians: Gaussians, masked: Tensor) -> Tensor:
     """[M]: for each masked Gaussian the norm of the gradient gathered so far, over all of its parameters."""
     total = torch.zeros(int(masked.sum()), device=masked.device)
-    gaussians.map(lambda p: total.add_(p.grad[masked].flatten(1).square().sum(1)) if p.grad is not None else None)
+    for name in PARAMETERS:
+        gradient = getattr(gaussians, name).grad
+        if gradient is not None:
+            total += gradient[masked].reshape(len(total), -1).square().sum(1)
     return total.sqrt()
 
 

@@ -1,0 +1,383 @@
+"""Distillation: confinement to the bit, the region, resume, guards; the reference by hand and by the prior."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from small_prior import save_small_prior, small_prior
+
+from reffusion import distill as D
+from reffusion import inpaint, io
+from reffusion.confinement import (
+    Distillation,
+    Sight,
+    reconstruction_term,
+    reference_term,
+    region_of,
+    sds_term,
+    strays,
+)
+from reffusion.optimize import Rates
+from reffusion.personalize import PROMPTS
+from reffusion.prior import embed_text
+from reffusion.splat import render
+from reffusion.trace import generator, load_checkpoint, read_trace
+from reffusion.types import PARAMETERS, Camera, Gaussians, MaskSet, Scene, Similarity
+
+WIDTH, HEIGHT = 36, 28
+SDS = Distillation(weighting="x0", unit_rms=True, guidance=0.0)
+
+
+def camera(name="a", shift=0.0):
+    pose = np.eye(4)
+    pose[:3, 3] = shift, 0.0, 1.0
+    return Camera(name, WIDTH, HEIGHT, 30.0, 30.0, WIDTH / 2, HEIGHT / 2, pose)
+
+
+def wall(count=150, seed=0):
+    """Gaussians on a wall before the camera; those of its middle are masked."""
+    draw = generator(seed, "wall")
+    means = torch.rand(count, 3, generator=draw) * torch.tensor([1.2, 0.9, 0.1]) - torch.tensor([0.6, 0.45, 0.0])
+    sh = torch.zeros(count, 4, 3)
+    sh[:, 0] = torch.randn(count, 3, generator=draw)
+    sh[:, 1:] = 0.1 * torch.randn(count, 3, 3, generator=draw)
+    gaussians = Gaussians(
+        means,
+        torch.randn(count, 4, generator=draw),
+        torch.full((count, 3), -3.2) + 0.2 * torch.randn(count, 3, generator=draw),
+        torch.randn(count, generator=draw) + 1,
+        sh,
+    )
+    return gaussians, (means[:, 0].abs() < 0.25) & (means[:, 1].abs() < 0.2)
+
+
+def hole():
+    mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    mask[8:20, 11:25] = True
+    return mask
+
+
+def sight(name="a", shift=0.0, clean=False):
+    photo = torch.rand(HEIGHT, WIDTH, 3, generator=generator(3, name))
+    supervises = torch.ones_like(hole()) if clean else ~hole()
+    return Sight(camera(name, shift), photo, supervises, hole() & (not clean), clean)
+
+
+@pytest.fixture(scope="module")
+def prior():
+    return small_prior()
+
+
+@pytest.fixture(scope="module")
+def text(prior):
+    with torch.no_grad():
+        return embed_text(prior, list(PROMPTS))
+
+
+def leaves(gaussians):
+    return gaussians.map(lambda p: p.clone().requires_grad_())
+
+
+def reached(gaussians):
+    """[N] bool: has any gradient at all."""
+    columns = [getattr(gaussians, name).grad.flatten(1).ne(0).any(1) for name in PARAMETERS if name != "opacity_logits"]
+    return torch.stack([*columns, gaussians.opacity_logits.grad != 0]).any(0)
+
+
+def gradients_of(term, gaussians, masked, prior, text, view=None):
+    gaussians, view = leaves(gaussians), view or sight()
+    if term == "sds":
+        loss, rendering = sds_term(gaussians, masked, view, prior, text, SDS, generator(1))
+    elif term == "reference":
+        loss, rendering = reference_term(gaussians, masked, view.camera, view.photo, hole())
+    else:
+        loss, rendering = reconstruction_term(gaussians, masked, view)
+    loss.backward()
+    return gaussians, rendering.radii > 0
+
+
+@pytest.mark.parametrize("term", ["sds", "reference", "reconstruction"])
+def test_forbidden_gradients_are_exactly_zero(term, prior, text):
+    gaussians, masked = wall()
+    allowed = ~masked if term == "reconstruction" else masked
+    gaussians, drawn = gradients_of(term, gaussians, masked, prior, text)
+    got = reached(gaussians)
+    assert not got[~allowed].any(), "a forbidden Gaussian has a gradient"
+    assert (got & allowed).sum() > 0.5 * (drawn & allowed).sum(), "hardly any allowed Gaussian has a gradient"
+    for name in PARAMETERS:
+        assert getattr(gaussians, name).grad[allowed].ne(0).any(), name
+
+
+def test_a_clean_view_reconstructs_all_gaussians(prior, text):
+    gaussians, masked = wall()
+    gaussians, drawn = gradients_of("reconstruction", gaussians, masked, prior, text, sight(clean=True))
+    assert reached(gaussians)[masked & drawn].float().mean() > 0.5
+
+
+@pytest.mark.parametrize("term", ["sds", "reconstruction"])
+def test_the_photo_where_it_is_not_trusted_changes_nothing(term, prior, text):
+    gaussians, masked = wall()
+    view = sight()
+    poisoned = replace(view, photo=torch.where(view.supervises[..., None], view.photo, float("nan")))
+    a, _ = gradients_of(term, gaussians, masked, prior, text, view)
+    b, _ = gradients_of(term, gaussians, masked, prior, text, poisoned)
+    for name in PARAMETERS:
+        assert (getattr(a, name).grad == getattr(b, name).grad).all(), name
+
+
+def test_densification_probe_of_unmasked_gaussians_stays_zero(prior, text):
+    gaussians, masked = wall()
+    probe = torch.zeros(len(gaussians), 2, requires_grad=True)
+    sds_term(leaves(gaussians), masked, sight(), prior, text, SDS, generator(1), probe)[0].backward()
+    assert (probe.grad[~masked] == 0).all() and (probe.grad[masked] != 0).any()
+
+
+def test_sds_without_patches_and_with_guidance(prior, text):
+    gaussians, masked = wall()
+    for settings in (replace(SDS, patches=0), replace(SDS, guidance=2.0), replace(SDS, hole_only=True)):
+        moved = leaves(gaussians)
+        sds_term(moved, masked, sight(), prior, text, settings, generator(1))[0].backward()
+        assert torch.isfinite(moved.means.grad).all() and moved.means.grad[masked].ne(0).any()
+
+
+def test_region_changers_are_found_and_no_one_else():
+    gaussians, masked = wall(600)
+    region = region_of(gaussians.means, masked)
+    assert not strays(region, gaussians.means, masked).any(), "an initialization has no strays"
+    moved = gaussians.means.clone()
+    a, b = torch.nonzero(masked)[0, 0], torch.nonzero(~masked)[0, 0]
+    moved[a] = torch.tensor([0.55, 0.4, 0.05])  # a masked one far out on the wall
+    middle = ((gaussians.means[:, :2].norm(dim=1)) + 10 * ~masked).argmin()
+    moved[b] = gaussians.means[middle]  # an unmasked one in the middle of the invented part
+    assert set(torch.nonzero(strays(region, moved, masked))[:, 0].tolist()) == {int(a), int(b)}
+    slightly = gaussians.means + region.voxel * 0.9
+    assert not strays(region, slightly, masked)[masked].any(), "there is room to move in"
+    assert strays(region, torch.full_like(moved, 1e6), masked).tolist() == masked.tolist()
+    single = region_of(gaussians.means[:1], torch.tensor([True]))
+    assert not strays(single, gaussians.means[:1], torch.tensor([True])).any()
+
+
+SETTINGS = D.Settings(
+    iterations=6, sds_weight=1e-3, sds=SDS, reference_weight=0.5, densify_every=2, densify_until=1.0, region_every=2,
+    checkpoint_seconds=1e-9,
+)  # fmt: skip
+
+
+def run(folder, prior, text, settings=SETTINGS, sights=None, gaussians=None):
+    folder.mkdir(exist_ok=True)
+    start, masked = wall()
+    views = sights or [sight("a"), sight("b", 0.1), sight("c", -0.1, clean=True)]
+    holes = [(camera(), sight().photo, hole())]
+    return D.distill(gaussians or start, masked, views, holes, prior, text, settings, folder)
+
+
+def test_interrupted_distillation_resumes_to_the_same_gaussians(prior, text, tmp_path, monkeypatch):
+    whole, labels = run(tmp_path / "whole", prior, text)
+    assert labels.sum() > wall()[1].sum(), "densification added no masked Gaussian"
+    real = D._step
+
+    def interrupted(optimizer, step, *others):
+        if step == 3:
+            raise KeyboardInterrupt
+        return real(optimizer, step, *others)
+
+    monkeypatch.setattr(D, "_step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "broken", prior, text)
+    assert load_checkpoint(tmp_path / "broken")["step"] == 3
+    monkeypatch.setattr(D, "_step", real)
+    resumed, resumed_labels = run(tmp_path / "broken", prior, text)
+    assert (labels == resumed_labels).all()
+    for name in PARAMETERS:
+        assert (getattr(whole, name) == getattr(resumed, name)).all(), name
+    lines = [
+        [{k: v for k, v in r.items() if k != "seconds"} for r in read_trace(tmp_path / f / "trace.jsonl")]
+        for f in ("whole", "broken")
+    ]
+    assert lines[0] == lines[1] and lines[0][-1]["iteration"] == 6
+    assert lines[0][-1]["sds_gradient_max"] >= lines[0][-1]["sds_gradient_mean"] > 0
+
+
+def test_each_set_of_gaussians_moves_by_its_own_terms_only(prior, text, tmp_path):
+    start, masked = wall()
+    plain = replace(SETTINGS, densify_every=0, reference_weight=0.0, region_every=100)
+    views = [sight("a"), sight("b", 0.1)]
+    one, labels = run(tmp_path / "sds", prior, text, replace(plain, reconstruction_every=0), views)
+    assert (labels == masked).all() and (one.means[~masked] == start.means[~masked]).all()
+    assert (one.sh[masked] != start.sh[masked]).any()
+    two, _ = run(tmp_path / "reconstruction", None, None, replace(plain, sds_weight=0.0), views)
+    assert (two.means[masked] == start.means[masked]).all() and (two.sh[~masked] != start.sh[~masked]).any()
+
+
+def test_the_reference_term_draws_the_reference(prior, text, tmp_path):
+    start, masked = wall()
+    settings = D.Settings(40, sds_weight=0.0, reference_weight=1.0, reconstruction_every=0, checkpoint_seconds=1e9)
+    target, _ = wall()
+    with torch.no_grad():
+        image = render(replace(target, sh=target.sh + 0.5), camera()).color.clamp(0, 1)
+    settings = replace(settings, rates=Rates(sh_dc=0.03))
+    ended, _ = D.distill(start, masked, [sight()], [(camera(), image, hole())], None, None, settings, tmp_path)
+    records = read_trace(tmp_path / "trace.jsonl")
+    assert records[-1]["reference_psnr"] > records[0]["reference_psnr"] + 1
+    assert len(ended) == len(start)
+
+
+def test_early_stopping_ends_before_the_last_step(prior, text, tmp_path):
+    settings = replace(SETTINGS, iterations=60, reference_weight=0.0, densify_every=0, stop_drop=0.3)
+    settings = replace(settings, rates=Rates(sh_dc=0.3))
+    with torch.no_grad():
+        image = render(wall()[0], camera()).color.clamp(0, 1)  # the start agrees perfectly
+    D.distill(*wall(), [sight()], [(camera(), image, hole())], prior, text, settings, tmp_path)
+    assert read_trace(tmp_path / "trace.jsonl")[-1]["iteration"] < 30
+
+
+def test_a_number_that_is_none_names_step_term_and_view(prior, text, tmp_path):
+    broken = replace(prior, alphas_cumprod=torch.full_like(prior.alphas_cumprod, float("nan")))
+    with pytest.raises(FloatingPointError, match=r"step 0, SDS, view 'a'"):
+        run(tmp_path / "x", broken, text, sights=[sight()])
+    bad = replace(sight(), photo=torch.full((HEIGHT, WIDTH, 3), float("nan")))
+    with pytest.raises(FloatingPointError, match=r"step 0, reconstruction, view 'a'"):
+        run(tmp_path / "y", None, None, replace(SETTINGS, sds_weight=0.0, reference_weight=0.0), [bad])
+    with pytest.raises(ValueError, match="prior"):
+        run(tmp_path / "z", None, None)
+
+
+# ------------------------------------------------------------------------------------------ the reference
+
+
+def test_painting_keeps_known_pixels_and_a_candidates_picture_is_its_seeds(prior):
+    image = torch.rand(3, HEIGHT, WIDTH, generator=generator(5)) * 2 - 1
+    options = {"prompt": "", "steps": 2, "start": 0.6, "guidance": 0.0}
+    pair = inpaint.paint(prior, image, hole(), seeds=[0, 1], **options)
+    assert pair.shape == (2, 3, HEIGHT, WIDTH) and torch.isfinite(pair).all()
+    assert (pair[:, :, ~hole()] == image[:, ~hole()]).all()
+    assert (pair[0] != pair[1]).any()
+    assert (inpaint.paint(prior, image, hole(), seeds=[1], **options)[0] == pair[1]).all()
+    other = torch.where(hole(), torch.rand(HEIGHT, WIDTH, generator=generator(6)), image)
+    assert (inpaint.paint(prior, other, hole(), seeds=[1], **options)[0] == pair[1])[:, hole()].all()
+
+
+def test_painting_works_on_views_smaller_and_larger_than_the_prior(prior):
+    for height, width in ((10, 13), (16, 16), (36, 34)):
+        mask = torch.zeros(height, width, dtype=torch.bool)
+        mask[-14:-3, 2:9] = True
+        painted = inpaint.paint(
+            prior, torch.zeros(3, height, width), mask, prompt="", seeds=[0], steps=1, start=0.5, guidance=1.0
+        )
+        assert painted.shape == (1, 3, height, width) and (painted[:, :, ~mask] == 0).all()
+
+
+@pytest.mark.parametrize("shape", [(16, 16), (40, 64), (75, 33)])
+def test_windows_cover_any_hole(shape):
+    for seed in range(20):
+        mask = torch.rand(*shape, generator=generator(7, seed)) > (0.2, 0.99)[seed % 2]
+        covered = torch.zeros_like(mask)
+        for top, left in inpaint.windows_over(mask, 16):
+            assert 0 <= top <= shape[0] - 16 and 0 <= left <= shape[1] - 16
+            covered[top : top + 16, left : left + 16] = True
+        assert (covered | ~mask).all()
+
+
+def test_levels_double_up_to_the_view():
+    assert inpaint.level_sizes(240, 320, 64) == [(128, 171), (240, 320)]
+    assert inpaint.level_sizes(1200, 1600, 512) == [(1024, 1365), (1200, 1600)]
+    assert inpaint.level_sizes(400, 300, 512) == [(683, 512)]
+
+
+def test_the_seam_prefers_the_candidate_that_continues_its_surroundings():
+    ramp = torch.linspace(-1, 1, WIDTH).expand(3, HEIGHT, WIDTH)
+    wrong = torch.where(hole(), torch.tensor(0.9), ramp)
+    assert int(inpaint.seam(torch.stack([wrong, ramp, wrong]), hole()).argmin()) == 1
+
+
+# ------------------------------------------------------------------------------------------ the stages
+
+
+@pytest.fixture
+def folders(tmp_path):
+    """The artifacts of a miniature scene: poses, fit, masks, initialize, and a prior."""
+    gaussians, masked = wall()
+    cameras = {name: camera(name, shift) for name, shift in (("a", 0.0), ("b", 0.1), ("t", 0.05))}
+    here = Similarity(1.0, np.zeros(3))
+    scene = Scene(cameras, ("a", "b"), ("t",), frozenset(), np.zeros((4, 3)), np.zeros((4, 3), np.uint8), here)
+    names = ("poses", "fit", "masks", "initialize", "reference", "personalize", "distill")
+    paths = {name: tmp_path / name for name in names}
+    for path in paths.values():
+        path.mkdir()
+    io.save_scene(paths["poses"], scene)
+    for name, view in cameras.items():
+        io.save_image(paths["poses"] / "images" / f"{name}.png", render(gaussians, view).color.clamp(0, 1).numpy())
+    pixels = hole().numpy()
+    io.save_mask_sets(paths["masks"], {name: MaskSet(pixels, pixels, pixels, pixels) for name in cameras})
+    io.save_json(paths["masks"] / "facts.json", {"best_reference": "b"})
+    io.save_labels(paths["masks"] / "labels.npy", masked)
+    io.save_labels(paths["initialize"] / "labels.npy", masked)
+    for stage in ("fit", "initialize"):
+        io.save_ply(paths[stage] / "gaussians.ply", gaussians)
+    save_small_prior(tmp_path / "prior")
+    return paths | {"prior": str(tmp_path / "prior")}
+
+
+def pick(folders, *names):
+    return {name: folders[name] for name in names}
+
+
+def test_stages_chain_through_files_with_the_scenes_own_reference(folders):
+    from stages import distill, personalize, reference
+
+    given = io.load_image(folders["poses"] / "images" / "a.png")
+    io.save_image(folders["poses"] / "references" / "a.png", given)
+    params = reference.Params(prior="nowhere/at-all")
+    assert "a" in reference.preview(params, poses=folders["poses"])[0]
+    reference.run(params, folders["reference"], **pick(folders, "poses", "fit", "masks"))
+    assert (io.load_image(folders["reference"] / "references" / "a.png") == given).all()
+    assert (io.load_mask(folders["reference"] / "masks" / "a.png") == hole().numpy()).all()
+
+    learning = personalize.Params(prior=folders["prior"], steps=2, batch=2, scene_crops=0.3, size=8)
+    personalize.run(learning, folders["personalize"], **pick(folders, "poses", "masks", "reference"))
+    assert (folders["personalize"] / "pytorch_lora_weights.safetensors").exists()
+
+    needs = pick(folders, "poses", "masks", "reference", "personalize", "initialize")
+    distill.run(distill.Params(prior=folders["prior"], iterations=2), folders["distill"], **needs)
+    result = io.load_ply(folders["distill"] / "gaussians.ply")
+    labels = io.load_labels(folders["distill"] / "labels.npy")
+    assert len(result) == len(labels) and labels.any()
+    for stage in ("personalize", "distill"):
+        assert read_trace(folders[stage] / "trace.jsonl") and not (folders[stage] / "checkpoint.pt").exists()
+
+
+def test_reference_inpaints_the_best_view_and_keeps_all_else(folders):
+    from stages import reference
+
+    params = reference.Params(prior=folders["prior"], candidates=2, steps=2)
+    reference.run(params, folders["reference"], **pick(folders, "poses", "fit", "masks"))
+    (found,) = io.load_references(folders["reference"], io.load_scene(folders["poses"]))
+    photo = io.load_image(folders["poses"] / "images" / "b.png")
+    assert found.camera.name == "b" and (found.image[~found.mask] == photo[~found.mask]).all()
+    assert io.load_image(folders["reference"] / "candidates.png").shape == (HEIGHT, 2 * WIDTH, 3)
+    record = json.loads((folders["reference"] / "candidates.json").read_text())
+    assert record["chosen"] == int(np.argmin(record["seams"]))
+    with pytest.raises(ValueError, match="choose"):
+        third = params.model_copy(update={"choose": 2})
+        reference.run(third, folders["reference"], **pick(folders, "poses", "fit", "masks"))
+
+
+def test_a_reference_that_does_not_fit_is_refused_by_name(folders):
+    from stages import reference
+
+    run_it = lambda: reference.run(reference.Params(), folders["reference"], **pick(folders, "poses", "fit", "masks"))
+    folder = folders["poses"] / "references"
+    io.save_image(folder / "zebra.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    with pytest.raises(ValueError, match=r"zebra\.png"):
+        run_it()
+    (folder / "zebra.png").unlink()
+    io.save_image(folder / "a.png", np.zeros((HEIGHT + 1, WIDTH, 3), np.uint8))
+    with pytest.raises(ValueError, match="resize"):
+        run_it()
+    io.save_image(folder / "a.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    empty = np.zeros((HEIGHT, WIDTH), bool)
+    io.save_mask_sets(folders["masks"], {"a": MaskSet(empty, empty, empty, empty)})
+    with pytest.raises(ValueError, match="other views"):
+        run_it()
