@@ -24,8 +24,8 @@ def main() -> int:
             job = prepare(request)
             print(table(job, plan(job, job.pipeline.closure(arguments.stage))))
         elif arguments.command == "run":
-            job = run_scene(request, arguments.stage)
-            show_results(job, job.pipeline.closure(arguments.stage)[-1])
+            stage, folder = list(run_scene(request, arguments.stage).items())[-1]
+            show_results(stage, folder)
         elif arguments.command == "batch":
             return 1 if batch(request, arguments.data) else 0
         else:

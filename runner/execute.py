@@ -33,7 +33,6 @@ from runner.plan import (
     partial_folder,
     plan,
     prepare,
-    receipt,
     shown,
     source_of,
     table,
@@ -207,8 +206,11 @@ def _installed() -> dict[str, str]:
 # ------------------------------------------------------------------------------------------------------- one scene
 
 
-def run_scene(request: Request, target: str) -> Job:
-    """Bring `target` and what it needs up to date. Raises Refused before any work, Failed where a stage fails."""
+def run_scene(request: Request, target: str) -> dict[str, Path | None]:
+    """Bring `target` and what it needs up to date; stage -> its artifact's folder, None where it is left out.
+
+    Raises Refused before any work, Failed where a stage fails.
+    """
     job = prepare(request)
     stages = job.pipeline.closure(target)
     with ExitStack() as held:
@@ -233,7 +235,7 @@ def run_scene(request: Request, target: str) -> Job:
                         say(table(job, {later: planned[later] for later in stages[position + 1 :]}))
                     refuse_missing(job, planned)
         job.hashes.save()
-    return job
+    return {stage: decision.path for stage, decision in done.items()}
 
 
 def refuse_missing(job: Job, planned: dict[str, Decision]) -> None:
@@ -262,30 +264,24 @@ def clean(request: Request) -> None:
 # -------------------------------------------------------------------------------------------------------- results
 
 
-def _made(job: Job, stage: str) -> Path | None:
-    """The stage's artifact: the variant's own, or the one it shares."""
-    return next((home / stage for home in (job.home, job.base) if receipt(home / stage)), None)
+def _mean(evaluate: Path | None, of: str = "mean") -> dict[str, float | None]:
+    return json.loads((evaluate / "metrics.json").read_text()).get(of, {}) if evaluate else {}
 
 
-def _metrics(job: Job) -> dict[str, dict[str, float | None]]:
-    folder = _made(job, "evaluate")
-    return json.loads((folder / "metrics.json").read_text()) if folder else {}
-
-
-def show_results(job: Job, stage: str) -> None:
+def show_results(stage: str, folder: Path | None) -> None:
     """Where the results are; after `evaluate` the mean metrics too, those of the initialization beside them."""
-    folder = _made(job, stage)
+    if folder is None:
+        return
     if stage == "evaluate":
-        metrics = _metrics(job)
-        for name, value in metrics.get("mean", {}).items():
-            before = _number(metrics.get("initialize", {}).get(name))
+        initial = _mean(folder, "initialize")
+        for name, value in _mean(folder).items():
+            before = _number(initial.get(name))
             say(
                 f"  {name:<16} {_number(value) or 'not available':<14}"
                 + (f" initialization {before}" if before else "")
             )
-    if folder:
-        names = (p.name + ("/" if p.is_dir() else "") for p in sorted(folder.iterdir()) if p.name != RECEIPT)
-        say(f"results in {shown(folder)}/: {', '.join(names)}")
+    names = (p.name + ("/" if p.is_dir() else "") for p in sorted(folder.iterdir()) if p.name != RECEIPT)
+    say(f"results in {shown(folder)}/: {', '.join(names)}")
 
 
 def _number(value: Any) -> str:
@@ -301,7 +297,7 @@ def batch(request: Request, folder: Path) -> int:
     failed: dict[str, str] = {}
     for scene in scenes:
         try:
-            rows[scene.name] = _metrics(run_scene(replace(request, scene=str(scene)), "all")).get("mean", {})
+            rows[scene.name] = _mean(run_scene(replace(request, scene=str(scene)), "all").get("evaluate"))
         except (Refused, Failed) as error:
             failed[scene.name] = str(error)
             print(f"error: {error}", file=sys.stderr, flush=True)
