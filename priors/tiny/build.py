@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import torch
 from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
@@ -86,9 +87,8 @@ def _gather(conv: torch.nn.Conv2d, gain: float, kernel: torch.Tensor | None = No
     conv.weight[: kernel.shape[0], 0:4], conv.weight[: kernel.shape[0], 4:8] = kernel * gain, -kernel * gain
 
 
-def tokenizer(folder: Path) -> CLIPTokenizer:
-    """A CLIP tokenizer of bytes and the prompts' own words; its two files go to `folder`."""
-    folder.mkdir(parents=True, exist_ok=True)
+def tokenizer() -> CLIPTokenizer:
+    """A CLIP tokenizer of bytes and the prompts' own words."""
     letters = _byte_letters()
     vocabulary, merges = [*letters, *(c + "</w>" for c in letters)], []
     for word in WORDS:
@@ -101,9 +101,11 @@ def tokenizer(folder: Path) -> CLIPTokenizer:
                 vocabulary.append(joined)
             parts = [joined, *parts[2:]]
     vocabulary += ["<|startoftext|>", "<|endoftext|>"]
-    (folder / "vocab.json").write_text(json.dumps({token: i for i, token in enumerate(vocabulary)}))
-    (folder / "merges.txt").write_text("#version: 0.2\n" + "\n".join(merges) + "\n")
-    return CLIPTokenizer.from_pretrained(folder, model_max_length=TEXT_LENGTH)
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "vocab.json").write_text(json.dumps({token: i for i, token in enumerate(vocabulary)}))
+        (folder / "merges.txt").write_text("#version: 0.2\n" + "\n".join(merges) + "\n")
+        return CLIPTokenizer.from_pretrained(folder, model_max_length=TEXT_LENGTH)
 
 
 def _byte_letters() -> list[str]:

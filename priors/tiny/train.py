@@ -36,20 +36,23 @@ OUTSIDE = 0.2  # weight of the loss on pixels the network is given anyway
 
 
 class Pool:
-    """The last POOL training images; `advance` adds image number `index`."""
+    """The last `size` images of a seed; `advance` puts image number `index` in the place of the oldest."""
 
-    def __init__(self, seed: int, step: int):
-        self.seed, self.items, self.captions = seed, [None] * POOL, [""] * POOL
-        for index in range(step, step + POOL):
+    def __init__(self, seed: int, step: int, size: int = POOL, held_out: bool = False):
+        self.seed, self.held_out = seed, held_out
+        self.items: list[np.ndarray | None] = [None] * size
+        self.captions = [""] * size
+        for index in range(step, step + size):
             self.advance(index)
 
     def advance(self, index: int) -> None:
-        self.items[index % POOL], self.captions[index % POOL] = images.image(self.seed, index)
+        slot = index % len(self.items)
+        self.items[slot], self.captions[slot] = images.image(self.seed, index, self.held_out)
 
     def batch(self, rng: np.random.Generator, side: int, count: int) -> tuple[Tensor, Tensor, list[str]]:
         """Crops [B, 3, side, side] in [-1, 1], masks [B, 1, side, side] (1 = repaint), captions."""
         crops, masks, captions = [], [], []
-        for index in rng.integers(0, POOL, count):
+        for index in rng.integers(0, len(self.items), count):
             picture = self.items[index]
             if side == build.NATIVE and rng.random() < 0.5:  # the whole view at native size
                 crop = picture.reshape(side, 2, side, 2, 3).mean((1, 3))
@@ -69,7 +72,7 @@ class Model(nn.Module):
     def __init__(self, seed: int):
         super().__init__()
         torch.manual_seed(seed)
-        self.tokens = build.tokenizer(HERE / "tokenizer")
+        self.tokens = build.tokenizer()
         self.unet, self.text = build.unet(), build.text_encoder(self.tokens)
 
     def forward(self, noisy: Tensor, t: Tensor, condition: Tensor, captions: list[str]) -> Tensor:
@@ -101,17 +104,41 @@ def rate(step: int, steps: int) -> float:
     return PEAK_RATE * min((step + 1) / WARMUP, 1.0) * (0.5 + 0.5 * math.cos(math.pi * min(ending, 1.0))) + 1e-6
 
 
-def validation(model: Model, vae: nn.Module, alphas: Tensor, seed: int) -> float:
-    """The loss on fixed held-out images, masks, noise and timesteps."""
-    rng = np.random.default_rng(seed_for(seed, "validation"))
-    pool = Pool.__new__(Pool)
-    drawn = [images.image(seed, k, held_out=True) for k in range(32)]
-    pool.items, pool.captions = ([d[i] for d in drawn] * (POOL // 32 + 1) for i in (0, 1))
+def validation(model: Model, vae: nn.Module, alphas: Tensor, pool: Pool) -> float:
+    """The loss on fixed held-out crops, masks, noise and timesteps."""
+    rng = np.random.default_rng(seed_for(pool.seed, "validation"))
     with torch.no_grad():
-        return float(loss(model, vae, alphas, pool.batch(rng, build.NATIVE, 32), generator(seed, "validation noise")))
+        batch = pool.batch(rng, build.NATIVE, 32)
+        return float(loss(model, vae, alphas, batch, generator(pool.seed, "validation noise")))
 
 
-def export(model: Model, average: dict[str, Tensor]) -> None:
+def step_once(
+    model: Model, vae: nn.Module, alphas: Tensor, optimiser: torch.optim.Optimizer, pool: Pool, step: int, steps: int
+) -> float:
+    """Training step number `step` of `steps`; returns its loss."""
+    rng = np.random.default_rng(seed_for(pool.seed, "batch", step))
+    side, count = LARGE if step % 4 == 3 else SMALL
+    for group in optimiser.param_groups:
+        group["lr"] = rate(step, steps)
+    error = loss(model, vae, alphas, pool.batch(rng, side, count), generator(pool.seed, "noise", step))
+    if not torch.isfinite(error):
+        raise FloatingPointError(f"training loss is {error.item()} at step {step}")
+    optimiser.zero_grad(set_to_none=True)
+    error.backward()
+    nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+    optimiser.step()
+    return error.item()
+
+
+@torch.no_grad()
+def follow(average: dict[str, Tensor], model: Model, step: int) -> None:
+    """Move the running average of the weights towards the model's; short at first, EMA later."""
+    keep = min(EMA, (step + 1) / (step + 10))
+    for name, value in model.state_dict().items():
+        average[name].lerp_(value, 1 - keep) if value.is_floating_point() else average[name].copy_(value)
+
+
+def export(average: dict[str, Tensor], folder: Path = HERE) -> None:
     """Write the diffusers folder with the averaged weights in half precision."""
     final = Model(0)
     final.load_state_dict(average)
@@ -125,8 +152,7 @@ def export(model: Model, average: dict[str, Tensor]) -> None:
         feature_extractor=None,
         requires_safety_checker=False,
     )
-    pipeline.to(dtype=torch.float16).save_pretrained(HERE)
-    (HERE / "tokenizer" / "tokenizer.json").unlink(missing_ok=True)
+    pipeline.to(dtype=torch.float16).save_pretrained(folder)
 
 
 def main() -> None:
@@ -141,6 +167,7 @@ def main() -> None:
     options.work.mkdir(parents=True, exist_ok=True)
 
     model, vae = Model(options.seed), build.linear_vae()
+    averaged = Model(options.seed)
     alphas = build.scheduler().alphas_cumprod
     optimiser = torch.optim.AdamW(model.parameters(), lr=PEAK_RATE, weight_decay=0.01, betas=(0.9, 0.99))
     average, start = {k: v.clone() for k, v in model.state_dict().items()}, 0
@@ -148,34 +175,20 @@ def main() -> None:
         model.load_state_dict(state["model"])
         optimiser.load_state_dict(state["optimiser"])
         average, start = state["average"], state["step"]
-    pool, began = Pool(options.seed, start), time.time()
+    pool, held_out, began = Pool(options.seed, start), Pool(options.seed, 0, 32, held_out=True), time.time()
     for step in range(start, options.steps):
-        rng = np.random.default_rng(seed_for(options.seed, "batch", step))
-        side, count = LARGE if step % 4 == 3 else SMALL
-        for group in optimiser.param_groups:
-            group["lr"] = rate(step, options.steps)
-        error = loss(model, vae, alphas, pool.batch(rng, side, count), generator(options.seed, "noise", step))
-        if not torch.isfinite(error):
-            raise FloatingPointError(f"training loss is {error.item()} at step {step}")
-        optimiser.zero_grad(set_to_none=True)
-        error.backward()
-        nn.utils.clip_grad_norm_(model.parameters(), 1.0)
-        optimiser.step()
-        keep = min(EMA, (step + 1) / (step + 10))
-        with torch.no_grad():
-            for name, value in model.state_dict().items():
-                average[name].lerp_(value, 1 - keep) if value.is_floating_point() else average[name].copy_(value)
+        error = step_once(model, vae, alphas, optimiser, pool, step, options.steps)
+        follow(average, model, step)
         pool.advance(step + POOL)
-        if step % 100 == 99 or step == options.steps - 1:
-            live = {k: v.clone() for k, v in model.state_dict().items()}
-            model.load_state_dict(average)
-            held = validation(model, vae, alphas, options.seed)
-            model.load_state_dict(live)
-            print(f"{step + 1} loss {error.item():.4f} held-out {held:.4f} {time.time() - began:.0f} s", flush=True)
-            state = {"model": live, "optimiser": optimiser.state_dict(), "average": average, "step": step + 1}
+        done = step + 1
+        if done % 100 == 0 or done == options.steps:
+            averaged.load_state_dict(average)
+            held = validation(averaged, vae, alphas, held_out)
+            print(f"{done} loss {error:.4f} held-out {held:.4f} {time.time() - began:.0f} s", flush=True)
+            state = {"model": model.state_dict(), "optimiser": optimiser.state_dict(), "average": average, "step": done}
             save_checkpoint(options.work, state)
-        if step % options.export_every == options.export_every - 1 or step == options.steps - 1:
-            export(model, average)
+        if done % options.export_every == 0 or done == options.steps:
+            export(average)
 
 
 if __name__ == "__main__":
