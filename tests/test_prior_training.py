@@ -1,4 +1,4 @@
-"""The training of the embedded prior: pictures and steps that depend on the seed alone, an exact code, exact resumes."""
+"""Training the embedded prior: pictures and steps depend on the seed alone; the code is exact, resumes are too."""
 
 import sys
 from pathlib import Path
