@@ -21,7 +21,11 @@ CUT = np.float32(math.log2(MIN_ALPHA))  # log2(alpha) below which a pixel is ski
 
 @kernel
 def depth_order(radii, footprints):
-    """[M] indices of the Gaussians with a radius, front to back, equal depths by index (radix sort, stable)."""
+    """Sort the Gaussians that have a radius by depth, equal depths by index (radix sort, stable).
+
+    Returns:
+        order [M] int32, their indices front to back, and ranks [N] int32, the place of each in it (-1 without radius).
+    """
     count = radii.shape[0]
     visible = 0
     for i in range(count):
@@ -52,7 +56,10 @@ def depth_order(radii, footprints):
             other_order[place] = order[k]
         keys, other_keys = other_keys, keys
         order, other_order = other_order, order
-    return order
+    ranks = np.full(count, -1, np.int32)
+    for rank in range(visible):
+        ranks[order[rank]] = rank
+    return order, ranks
 
 
 @kernel

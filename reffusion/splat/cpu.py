@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reffusion.splat import backward, binning, forward, projection
+from reffusion.splat import backward, binning, forward, harmonics, projection
 from reffusion.splat.compiled import share
 from reffusion.types import Camera, Gaussians, Rendering
 
@@ -18,6 +18,7 @@ class View(NamedTuple):
 
     Attributes:
         order: [M] int32 their indices, front to back.
+        ranks: [N] int32, the place of each Gaussian in `order`, or -1.
         footprints: [M, FOOTPRINT] float32, see `projection`.
         bins: starts, members, rows, slots of the tile lists, see `binning.bin_footprints`.
         first_slots: [M + 1] int64.
@@ -25,6 +26,7 @@ class View(NamedTuple):
     """
 
     order: np.ndarray
+    ranks: np.ndarray
     footprints: np.ndarray
     bins: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     first_slots: np.ndarray
@@ -70,11 +72,11 @@ def _view(parameters: list[np.ndarray], probe: np.ndarray, camera: Camera, degre
     means = geometry[0]
     every, radii = np.empty((len(means), projection.FOOTPRINT), np.float32), np.zeros(len(means), np.int32)
     share(projection.project, *geometry, probe, projection.view_numbers(camera), every, radii)
-    order = binning.depth_order(radii, every)
+    order, ranks = binning.depth_order(radii, every)
     footprints = np.empty((len(order), projection.FOOTPRINT), np.float32)
-    share(projection.gather_footprints, every, order, means, sh, degree, camera.center, footprints)
+    share(harmonics.paint, every, ranks, means, sh, degree, camera.center, footprints)
     *bins, first_slots = binning.bin_footprints(footprints, camera.width, camera.height)
-    return View(order, footprints, tuple(bins), first_slots, radii)
+    return View(order, ranks, footprints, tuple(bins), first_slots, radii)
 
 
 class _Splat(torch.autograd.Function):
@@ -123,14 +125,14 @@ class _Splat(torch.autograd.Function):
         *to_geometry, to_sh = to_parameters
         to_probe = np.zeros((len(means) if ctx.needs_input_grad[7] else 0, 2), np.float32)
         numbers = projection.view_numbers(camera)
-        share(projection.project_backward, sums, view.order, *geometry, numbers, *to_geometry, to_probe)
+        share(projection.project_backward, sums, view.ranks, *geometry, numbers, *to_geometry, to_probe)
         share(
-            projection.colors_backward,
-            *(sums, view.order, view.footprints, means, sh, degree, camera.center, to_geometry[0], to_sh),
+            harmonics.paint_backward,
+            *(sums, view.ranks, view.footprints, means, sh, degree, camera.center, to_geometry[0], to_sh),
         )
         to_features = np.zeros_like(features)
         to_features[view.order] = sums[:, projection.GRAD_FEATURES :]
-        to_background = np.einsum("hw,hwc->c", transmittance, gradients[0])
+        to_background = np.einsum("hw,hwc->c", transmittance, gradients[0]) if ctx.needs_input_grad[6] else None
         arrays = (*to_parameters, to_features, to_background, to_probe)
         needed = zip(arrays, ctx.needs_input_grad, strict=False)
         return (*(torch.from_numpy(array) if need else None for array, need in needed), None, None)

@@ -18,10 +18,6 @@ from reffusion.splat.conventions import (
     MAX_VARIANCE,
     MIN_ALPHA,
     NEAR,
-    SH0,
-    SH1,
-    SH2,
-    SH3,
 )
 from reffusion.splat.vectors import take_ticket
 from reffusion.types import Camera
@@ -178,80 +174,10 @@ def project(tickets, means, quaternions, log_scales, opacity_logits, probe, view
 
 
 @kernel
-def _basis(degree, x, y, z):
-    """The 16 spherical harmonics of 3DGS in a unit direction, zero above `degree`."""
-    f = np.float32
-    zero = f(0.0)
-    on1, on2, on3 = f(degree >= 1), f(degree >= 2), f(degree >= 3)
-    xx, yy, zz = x * x, y * y, z * z
-    return (
-        f(SH0),
-        on1 * f(-SH1) * y,
-        on1 * f(SH1) * z,
-        on1 * f(-SH1) * x,
-        on2 * f(SH2[0]) * x * y,
-        on2 * f(SH2[1]) * y * z,
-        on2 * f(SH2[2]) * (f(2.0) * zz - xx - yy),
-        on2 * f(SH2[3]) * x * z,
-        on2 * f(SH2[4]) * (xx - yy),
-        on3 * f(SH3[0]) * y * (f(3.0) * xx - yy),
-        on3 * f(SH3[1]) * x * y * z,
-        on3 * f(SH3[2]) * y * (f(4.0) * zz - xx - yy),
-        on3 * f(SH3[3]) * z * (f(2.0) * zz - f(3.0) * xx - f(3.0) * yy),
-        on3 * f(SH3[4]) * x * (f(4.0) * zz - xx - yy),
-        on3 * f(SH3[5]) * z * (xx - yy),
-        on3 * f(SH3[6]) * x * (xx - f(3.0) * yy),
-        zero,
-    )
-
-
-@kernel
-def _direction(mean, center):
-    """Unit vector from the camera centre to a mean, and 1 / distance."""
-    x = np.float64(mean[0]) - center[0]
-    y = np.float64(mean[1]) - center[1]
-    z = np.float64(mean[2]) - center[2]
-    inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
-    return np.float32(x * inverse), np.float32(y * inverse), np.float32(z * inverse), np.float32(inverse)
-
-
-@kernel
-def gather_footprints(tickets, footprints, order, means, sh, degree, center, sorted_footprints):
-    """Footprints front to back, with their colours.
-
-    Args:
-        order: [M] Gaussian indices, front to back.
-        sorted_footprints: [M, FOOTPRINT] float32, written.
-    """
-    terms = (degree + 1) * (degree + 1)
-    while True:
-        begin, end = next_part(tickets, order.shape[0])
-        if begin < 0:
-            return
-        for rank in range(begin, end):
-            i = order[rank]
-            x, y, z, _ = _direction(means[i], center)
-            basis = _basis(degree, x, y, z)
-            red = green = blue = np.float32(0.5)
-            for k in range(terms):
-                red += basis[k] * sh[i, k, 0]
-                green += basis[k] * sh[i, k, 1]
-                blue += basis[k] * sh[i, k, 2]
-            target = sorted_footprints[rank]
-            for k in range(RED):
-                target[k] = footprints[i, k]
-            target[RED] = max(red, np.float32(0.0))
-            target[GREEN] = max(green, np.float32(0.0))
-            target[BLUE] = max(blue, np.float32(0.0))
-            for k in range(BLUE + 1, FOOTPRINT):
-                target[k] = np.float32(0.0)
-
-
-@kernel
 def project_backward(
     tickets,
     sums,
-    order,
+    ranks,
     means,
     quaternions,
     log_scales,
@@ -267,19 +193,20 @@ def project_backward(
 
     Args:
         sums: [M, >= GRAD_FEATURES] per footprint, columns as above.
-        order: [M] Gaussian indices.
+        ranks: [N] int32, each Gaussian's row in `sums`, or -1.
         grad_means, grad_quaternions, grad_scales, grad_opacities, grad_probe: float32 zeros, written for the Gaussians
-            in `order`; grad_probe may be [0, 2].
+            with a rank; grad_probe may be [0, 2].
     """
     unscale = math.sqrt(2.0 / _LOG2_E)  # the record's u and v are scaled by sqrt(log2(e) / 2)
     want_probe = grad_probe.shape[0] > 0
     while True:
-        begin, end = next_part(tickets, order.shape[0])
+        begin, end = next_part(tickets, means.shape[0])
         if begin < 0:
             return
-        for rank in range(begin, end):
-            i = order[rank]
-            record = sums[rank]
+        for i in range(begin, end):
+            if ranks[i] < 0:
+                continue
+            record = sums[ranks[i]]
             x, y, z = _to_camera(view, means[i])
             (qw, qx, qy, qz, q_inverse), r0, r1, r2 = _rotation(quaternions[i])
             p0, p1, _, _ = _projector(view, x, y, z)
@@ -362,66 +289,3 @@ def project_backward(
             grad_means[i, 2] = view[2] * g_x + view[5] * g_y + view[8] * g_z
 
             grad_opacities[i] = record[SUM_G] / (1.0 + math.exp(np.float64(opacity_logits[i])))
-
-
-@kernel
-def colors_backward(tickets, sums, order, footprints, means, sh, degree, center, grad_means, grad_sh):
-    """Gradients of the spherical harmonics (zeros, written); through the viewing direction, added to `grad_means`."""
-    f = np.float32
-    terms = (degree + 1) * (degree + 1)
-    while True:
-        begin, end = next_part(tickets, order.shape[0])
-        if begin < 0:
-            return
-        for rank in range(begin, end):
-            i = order[rank]
-            red = sums[rank, GRAD_RED] if footprints[rank, RED] > 0 else f(0.0)
-            green = sums[rank, GRAD_GREEN] if footprints[rank, GREEN] > 0 else f(0.0)
-            blue = sums[rank, GRAD_BLUE] if footprints[rank, BLUE] > 0 else f(0.0)
-            x, y, z, inverse = _direction(means[i], center)
-            basis = _basis(degree, x, y, z)
-            for k in range(terms):
-                grad_sh[i, k, 0] = basis[k] * red
-                grad_sh[i, k, 1] = basis[k] * green
-                grad_sh[i, k, 2] = basis[k] * blue
-            if degree == 0:
-                continue
-            gx = gy = gz = f(0.0)
-            c = sh[i]
-            # along[k]: the upstream colour gradient dotted with the k-th coefficient
-            along1 = c[1, 0] * red + c[1, 1] * green + c[1, 2] * blue
-            along2 = c[2, 0] * red + c[2, 1] * green + c[2, 2] * blue
-            along3 = c[3, 0] * red + c[3, 1] * green + c[3, 2] * blue
-            gx -= f(SH1) * along3
-            gy -= f(SH1) * along1
-            gz += f(SH1) * along2
-            if degree >= 2:
-                along4 = (c[4, 0] * red + c[4, 1] * green + c[4, 2] * blue) * f(SH2[0])
-                along5 = (c[5, 0] * red + c[5, 1] * green + c[5, 2] * blue) * f(SH2[1])
-                along6 = (c[6, 0] * red + c[6, 1] * green + c[6, 2] * blue) * f(SH2[2])
-                along7 = (c[7, 0] * red + c[7, 1] * green + c[7, 2] * blue) * f(SH2[3])
-                along8 = (c[8, 0] * red + c[8, 1] * green + c[8, 2] * blue) * f(SH2[4])
-                gx += along4 * y - f(2.0) * along6 * x + along7 * z + f(2.0) * along8 * x
-                gy += along4 * x + along5 * z - f(2.0) * along6 * y - f(2.0) * along8 * y
-                gz += along5 * y + f(4.0) * along6 * z + along7 * x
-            if degree >= 3:
-                xx, yy, zz = x * x, y * y, z * z
-                along9 = (c[9, 0] * red + c[9, 1] * green + c[9, 2] * blue) * f(SH3[0])
-                along10 = (c[10, 0] * red + c[10, 1] * green + c[10, 2] * blue) * f(SH3[1])
-                along11 = (c[11, 0] * red + c[11, 1] * green + c[11, 2] * blue) * f(SH3[2])
-                along12 = (c[12, 0] * red + c[12, 1] * green + c[12, 2] * blue) * f(SH3[3])
-                along13 = (c[13, 0] * red + c[13, 1] * green + c[13, 2] * blue) * f(SH3[4])
-                along14 = (c[14, 0] * red + c[14, 1] * green + c[14, 2] * blue) * f(SH3[5])
-                along15 = (c[15, 0] * red + c[15, 1] * green + c[15, 2] * blue) * f(SH3[6])
-                gx += f(6.0) * along9 * x * y + along10 * y * z - f(2.0) * along11 * x * y - f(6.0) * along12 * x * z
-                gx += along13 * (f(4.0) * zz - f(3.0) * xx - yy) + f(2.0) * along14 * x * z
-                gx += f(3.0) * along15 * (xx - yy)
-                gy += f(3.0) * along9 * (xx - yy) + along10 * x * z + along11 * (f(4.0) * zz - xx - f(3.0) * yy)
-                gy -= f(6.0) * along12 * y * z + f(2.0) * along13 * x * y + f(2.0) * along14 * y * z
-                gy -= f(6.0) * along15 * x * y
-                gz += along10 * x * y + f(8.0) * along11 * y * z + f(3.0) * along12 * (f(2.0) * zz - xx - yy)
-                gz += f(8.0) * along13 * x * z + along14 * (xx - yy)
-            radial = gx * x + gy * y + gz * z
-            grad_means[i, 0] += (gx - radial * x) * inverse
-            grad_means[i, 1] += (gy - radial * y) * inverse
-            grad_means[i, 2] += (gz - radial * z) * inverse

@@ -96,6 +96,19 @@ def splat(typing, value):
 
 
 @intrinsic
+def pack(typing, values):
+    """Sixteen float32 of a tuple, one to a lane."""
+
+    def emit(context, builder, sig, args):
+        packed = ir.Constant(_FLOATS, ir.Undefined)
+        for i in range(LANES):
+            packed = builder.insert_element(packed, builder.extract_value(args[0], i), ir.Constant(ir.IntType(32), i))
+        return packed
+
+    return lanes(values), emit
+
+
+@intrinsic
 def ramp(typing):
     """0, 1, ... 15."""
 
@@ -246,6 +259,63 @@ def totals(typing, vectors):
         return rows[0]
 
     return lanes(vectors), emit
+
+
+_TRIPLE = types.UniTuple(lanes, 3)
+
+
+def _place_of(source: int) -> ir.Constant:
+    return ir.Constant(ir.IntType(32), source)
+
+
+@intrinsic
+def thrice(typing, x):
+    """Three vectors that hold each lane three times in a row: 0 0 0 1 1 1 ... 15 15 15."""
+
+    def emit(context, builder, sig, args):
+        parts = [
+            builder.shuffle_vector(args[0], args[0], ir.Constant(_INTS, [(16 * q + i) // 3 for i in range(LANES)]))
+            for q in range(3)
+        ]
+        return context.make_tuple(builder, _TRIPLE, parts)
+
+    return _TRIPLE(x), emit
+
+
+@intrinsic
+def striped(typing, red, green, blue):
+    """Three vectors red green blue red green blue ..., 48 lanes in all."""
+
+    def emit(context, builder, sig, args):
+        colors = ir.Constant(_FLOATS, ir.Undefined)
+        for c in range(3):
+            colors = builder.insert_element(
+                colors, context.cast(builder, args[c], sig.args[c], types.float32), _place_of(c)
+            )
+        parts = [
+            builder.shuffle_vector(colors, colors, ir.Constant(_INTS, [(16 * q + i) % 3 for i in range(LANES)]))
+            for q in range(3)
+        ]
+        return context.make_tuple(builder, _TRIPLE, parts)
+
+    return _TRIPLE(red, green, blue), emit
+
+
+@intrinsic
+def triple_sums(typing, x, y, z):
+    """Of 48 lanes x y z, the sums of each three in a row."""
+
+    def emit(context, builder, sig, args):
+        value = None
+        for offset in range(3):
+            wanted = [3 * lane + offset for lane in range(LANES)]
+            low = builder.shuffle_vector(args[0], args[1], ir.Constant(_INTS, [min(w, 31) for w in wanted]))
+            mixed = [lane if w < 32 else LANES + w - 32 for lane, w in enumerate(wanted)]
+            part = builder.shuffle_vector(low, args[2], ir.Constant(_INTS, mixed))
+            value = part if value is None else builder.fadd(value, part)
+        return value
+
+    return lanes(x, y, z), emit
 
 
 @intrinsic
