@@ -22,8 +22,6 @@ from reffusion.splat import render
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
 CHECKPOINT_SECONDS = 10.0
-FEWEST_POINTS = 100
-SCATTERED_POINTS = 10_000
 SH_0 = 0.28209479177387814  # the constant spherical harmonic
 
 
@@ -36,7 +34,9 @@ class Settings:
         seed: of the order of the views, random backgrounds and splits.
         sh_degree: highest degree of the spherical harmonics, 0-3.
         sh_every: part of the run after which one more degree joins in (3DGS: 1000 of 30000 steps).
-        random_background: a new colour each step, so that nothing stays transparent to show a black background.
+        random_background: a new colour each step instead of black.
+            PAPER leaves open: 3DGS takes black by default. Dark texture is then drawn by leaving holes, which the
+            stages after this one would read as places that no Gaussian explains.
         coarse_until: part of the run that sees the views at half their size.
         densify_from, densify_until: parts of the run between which Gaussians are added.
         densify_every: steps between two densifications.
@@ -53,7 +53,7 @@ class Settings:
     seed: int = 0
     sh_degree: int = 3
     sh_every: float = 1 / 30
-    random_background: bool = False
+    random_background: bool = True
     coarse_until: float = 0.0
     densify_from: float = 1 / 60
     densify_until: float = 0.5
@@ -142,7 +142,12 @@ def initial_gaussians(
         colors: [P, 3] uint8.
         budget: no more Gaussians than this; a random subset of the points then.
         generator: of that subset.
+
+    Raises:
+        ValueError: fewer than 4 points.
     """
+    if len(points) < 4:
+        raise ValueError(f"a fit starts from sparse points, at least 4; the scene has {len(points)}")
     if len(points) > budget:
         kept = torch.randperm(len(points), generator=generator)[:budget].numpy()
         points, colors = points[kept], colors[kept]
@@ -158,39 +163,6 @@ def initial_gaussians(
         opacity_logits=torch.full((count,), math.log(0.1 / 0.9)),
         sh=sh,
     )
-
-
-def starting_points(
-    points: np.ndarray,
-    colors: np.ndarray,
-    cameras: Sequence[Camera],
-    images: Mapping[str, np.ndarray],
-    generator: torch.Generator,
-) -> tuple[np.ndarray, np.ndarray]:
-    """The sparse points, or scattered ones where there are fewer than FEWEST_POINTS: what the scene can start from."""
-    if len(points) >= FEWEST_POINTS:
-        return points, colors
-    return scattered_points(cameras, images, SCATTERED_POINTS, generator)
-
-
-def scattered_points(
-    cameras: Sequence[Camera], images: Mapping[str, np.ndarray], count: int, generator: torch.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Where no sparse points are known: points on the rays of random pixels, in those pixels' colours.
-
-    Returns:
-        [count, 3] float64 points, at camera depths log-uniform in [0.3, 5] (the normalised frame puts the scene at
-        about 1), and [count, 3] uint8 colours.
-    """
-    draws = torch.rand(count, 4, generator=generator, dtype=torch.float64).numpy()
-    points, colors = np.empty((count, 3)), np.empty((count, 3), np.uint8)
-    for k, (which, u, v, d) in enumerate(draws):
-        camera = cameras[int(which * len(cameras))]
-        x, y, depth = u * camera.width, v * camera.height, 0.3 * (5 / 0.3) ** d
-        seen = np.array([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0]) * depth
-        points[k] = camera.world_to_camera[:3, :3].T @ (seen - camera.world_to_camera[:3, 3])
-        colors[k] = images[camera.name][int(y), int(x)]
-    return points, colors
 
 
 def _view(iteration: int, count: int, seed: int) -> int:

@@ -15,7 +15,7 @@ class Params(BaseModel):
     seed: int = Field(0, description="of the order of views, backgrounds and splits")
     sh_degree: int = Field(3, ge=0, le=3, description="highest degree of the spherical harmonics")
     sh_every: float = Field(1 / 30, ge=0, le=1, description="part of the run after which one more degree joins")
-    random_background: bool = Field(False, description="a new background colour each step, instead of black")
+    random_background: bool = Field(True, description="a new background colour each step, instead of black")
     coarse_until: float = Field(0.0, ge=0, le=1, description="part of the run that sees views at half their size")
     densify_from: float = Field(1 / 60, ge=0, le=1, description="part of the run before the first densification")
     densify_until: float = Field(0.5, ge=0, le=1, description="part of the run after which no Gaussian is added")
@@ -43,7 +43,7 @@ def preview(params: Params, *, poses: Path) -> list[str]:
 
 def run(params: Params, out: Path, *, poses: Path) -> None:
     from reffusion import io, trace
-    from reffusion.fit import fit, initial_gaussians, starting_points
+    from reffusion.fit import fit, initial_gaussians
 
     if (poses / "gaussians.ply").exists():
         io.save_ply(out / "gaussians.ply", io.load_ply(poses / "gaussians.ply"))
@@ -53,8 +53,7 @@ def run(params: Params, out: Path, *, poses: Path) -> None:
     cameras = [scene.cameras[name] for name in scene.train if name not in held_out]
     images = io.load_views(poses, scene.train)
     noise = trace.generator(params.seed, "start")
-    points, colors = starting_points(scene.points, scene.point_colors, cameras, images, noise)
-    start = initial_gaussians(points, colors, params.sh_degree, params.budget, noise)
+    start = initial_gaussians(scene.points, scene.point_colors, params.sh_degree, params.budget, noise)
     gaussians = fit(
         cameras,
         images,

@@ -9,7 +9,7 @@ import torch
 
 from reffusion import fit as fitting
 from reffusion import io, trace
-from reffusion.fit import Settings, fit, initial_gaussians, scattered_points
+from reffusion.fit import Settings, fit, initial_gaussians
 from reffusion.optimize import Rates
 from reffusion.splat import render
 from reffusion.types import PARAMETERS, Camera, Gaussians, Scene, Similarity
@@ -182,20 +182,10 @@ def test_the_start_has_the_points_colours_and_spacing():
     assert torch.allclose(gaussians.opacity_logits.sigmoid(), torch.tensor(0.1))
     assert gaussians.sh.shape == (64, 9, 3) and torch.all(gaussians.sh[:, 1:] == 0)
     assert len(initial_gaussians(grid, colors, 0, 20, trace.generator(0))) == 20
+    with pytest.raises(ValueError, match="at least 4; the scene has 3"):
+        initial_gaussians(grid[:3], colors[:3], 0, 9, trace.generator(0))
     coincident = initial_gaussians(np.zeros((5, 3)), colors[:5], 0, 9, trace.generator(0))
     assert torch.isfinite(coincident.log_scales).all()
-
-
-def test_scattered_points_are_seen_where_they_were_drawn():
-    from reffusion.geometry import project
-
-    cameras = ring_of_cameras()
-    images = {c.name: np.full((HEIGHT, WIDTH, 3), 40 * k, np.uint8) for k, c in enumerate(cameras)}
-    points, colors = scattered_points(cameras, images, 200, trace.generator(0))
-    for k, camera in enumerate(cameras):
-        uv, depth = project(points[colors[:, 0] == 40 * k], camera)
-        assert len(uv) and np.all((depth >= 0.3) & (depth <= 5.0))
-        assert np.all((uv >= 0) & (uv <= [WIDTH, HEIGHT]))
 
 
 def write_scene(folder) -> None:
