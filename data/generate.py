@@ -5,7 +5,7 @@ A furnished room is ray-cast with and without one object. Kinds:
   mini    the same, 3 + 8 views of 64 x 48 px, for tests
   wide    demo with cameras +-50 degrees around the object
   360     demo with cameras all around an object that lies on the floor
-  photos  28 larger photographs and masks without poses, for structure from motion
+  photos  26 larger photographs and masks without poses, for structure from motion
 
 Poses are written in a scene frame of arbitrary scale, rotation and origin, as SfM leaves it. As in SPIn-NeRF the
 COLMAP model and poses_bounds.npy are those of the full resolution, 4 times `images_4`; the model names `<view>.jpg`.
@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import struct
 import zlib
 from dataclasses import dataclass, replace
@@ -58,7 +59,7 @@ KINDS = {
     "mini": Kind(width=64, height=48, train=8, test=3, texture=256, node=0.1, points=400),
     "wide": Kind(spread=50.0),
     "360": Kind(spread=180.0),
-    "photos": Kind(width=640, height=480, train=28, test=0, photos=True, texture=2048, node=0.025),
+    "photos": Kind(width=480, height=360, train=26, test=0, photos=True, texture=2048, node=0.025),
 }
 FULL = 4  # full resolution over that of images_4
 LEAST_NEVER_SEEN = 0.4
@@ -178,18 +179,19 @@ def paint_textures(seed: int, size: int) -> dict[str, np.ndarray]:
         "wood": (paint.wood_planks, small, {"rows": 8, "pieces": 1, "palette": paint.WOODS[draw.integers(4)]}),
         "rug": (paint.rug, size, {}),
         "books": (paint.books, small, {}),
-        "books2": (paint.books, small, {}),
+        "books2": (paint.books, small, {"thick": 3.0}),
         "picture": (paint.picture, small, {}),
         "picture2": (paint.picture, small, {}),
         "leaves": (paint.leaves, small, {}),
         "wicker": (paint.wicker, small, {}),
         "pot": (paint.glazed, small, {"color": (170, 92, 60), "bands": (222, 176, 138)}),
         "vase": (paint.glazed, small, {"color": (44, 78, 128)}),
-        "stone": (paint.stone_tiles, small, {"cells": 1}),
+        "crate": (paint.wood_planks, small, {"rows": 4, "pieces": 1, "palette": paint.WOODS[draw.integers(4)]}),
         "globe": (paint.ball, small, {"first": (64, 104, 92), "second": (224, 212, 180)}),
         "front": (paint.painted_front, small, {"color": hues[first][0]}),
         "paint": (paint.painted, small, {"color": hues[first][0]}),
         "ball": (paint.ball, small, {"first": hues[second][0], "second": hues[second][1]}),
+        "quilt": (paint.quilt, small, {"first": hues[first][0], "second": hues[second][1]}),
         "jar": (paint.glazed, small, {"color": hues[first][1], "bands": hues[second][0]}),
         "white": (paint.plaster, small, {"color": (236, 234, 228)}),
     }
@@ -238,13 +240,12 @@ def cabinet(f: Furniture, draw, x: float, z: float, wide: float, high: float, de
                removable=True)  # fmt: skip
 
 
-def chest(f: Furniture, draw, x: float, z: float) -> None:
-    """The object of 360: a low slab on the floor with a ball and a jar on it, so that it hides the floor below."""
+def daybed(f: Furniture, draw, x: float, z: float) -> None:
+    """The object of 360: a low daybed with a ball and a jar on it; all around, only the floor below is hidden."""
     wide, deep, high = draw.uniform(1.1, 1.3), draw.uniform(0.8, 0.95), draw.uniform(0.14, 0.18)
     yaw = draw.uniform(-20, 20)
-    f.box(x, 0, z, (wide, high, deep), Material("paint", 1.3), yaw=yaw, removable=True)
-    f.box(x, high, z, (wide + 0.04, 0.025, deep + 0.04), Material("front"), yaw=yaw, top=Material("ball", 0.5),
-          removable=True)  # fmt: skip
+    f.box(x, 0.008, z, (wide, high - 0.008, deep), Material("paint", 1.3), yaw=yaw, removable=True)
+    f.box(x, high, z, (wide + 0.04, 0.025, deep + 0.04), WOOD, yaw=yaw, top=Material("quilt"), removable=True)
     f.sphere(x + 0.2, high + 0.025, z - 0.1, 0.11, Material("ball"), removable=True)
     f.cylinder(x - 0.25, high + 0.025, z + 0.1, 0.08, 0.13, Material("jar"), removable=True)
 
@@ -277,18 +278,19 @@ def furnish(seed: int, kind: Kind) -> tuple[Furniture, np.ndarray]:
           yaw=draw.uniform(-6, 6))  # fmt: skip
     f.cylinder(-side * draw.uniform(0.85, 0.95), 0, draw.uniform(0.75, 0.85), 0.15, 0.24, Material("wicker", 0.5),
                Material("wicker", 0.5, (0.25, 0.2, 0.15)))  # fmt: skip
-    f.box(side * draw.uniform(0.82, 0.92), 0, draw.uniform(0.72, 0.85), (0.26, 0.2, 0.2), Material("stone", 0.5),
+    f.box(side * draw.uniform(0.82, 0.92), 0, draw.uniform(0.72, 0.85), (0.26, 0.2, 0.2), Material("crate"),
           yaw=draw.uniform(10, 60))  # fmt: skip
     return f, np.array([0.0, 0.5, 0.1])
 
 
 def _round_room(f: Furniture, draw, planks: Material, wall: Material, plain: Material) -> np.ndarray:
     f.room((0, 1.35, 3.2), (3.2, 1.35, 3.2), plain, wall, WHITE, planks, wall, wall)
-    chest(f, draw, 0.0, 3.2)
+    f.box(0.1, 0, 3.15, (2.3, 0.008, 1.6), Material("rug"), top=Material("rug"), yaw=draw.uniform(-30, 30))
+    daybed(f, draw, 0.0, 3.2)
     for x, z, wide, deep in ((0, 0.008, 6.4, 0.016), (0, 6.392, 6.4, 0.016), (-3.192, 3.2, 0.016, 6.4),
                              (3.192, 3.2, 0.016, 6.4)):  # fmt: skip
         f.box(x, 0, z, (wide, 0.1, deep), WHITE)
-    for x, z in ((-2.75, 0.45), (2.75, 5.95)):
+    for x, z in ((-2.75, 0.45), (2.75, 5.95), (2.7, 0.5), (-2.7, 5.9)):
         plant(f, draw, x, z, draw.uniform(1.4, 1.7))
     for x, z, yaw in ((0.4, 0.2, 0), (-0.5, 6.2, 180), (-3.0, 3.6, 90), (3.0, 2.8, -90)):
         shelf(f, draw, x, z, draw.uniform(1.0, 1.3), yaw)
@@ -296,16 +298,16 @@ def _round_room(f: Furniture, draw, planks: Material, wall: Material, plain: Mat
     f.box(-1.7, 1.0, 0.012, (0.6, 0.8, 0.024), WOOD, Material("picture2"))
     f.box(-3.188, 1.1, 1.8, (0.024, 0.7, 0.9), Material("picture2"))
     f.box(3.188, 1.1, 4.4, (0.024, 0.7, 0.9), Material("picture"))
-    for k, name in enumerate(("stone", "wicker", "globe", "vase")):
+    for k, name in enumerate(("crate", "wicker", "globe", "vase")):
         a = np.radians(90 * k + draw.uniform(20, 70))
-        x, z = 1.15 * np.cos(a), 3.2 + 1.15 * np.sin(a)
-        if name == "stone":
-            f.box(x, 0, z, (0.24, 0.18, 0.2), Material(name, 0.5), yaw=draw.uniform(0, 90))
+        x, z = 1.25 * np.cos(a), 3.2 + 1.25 * np.sin(a)
+        if name == "crate":
+            f.box(x, 0, z, (0.24, 0.18, 0.2), Material(name), yaw=draw.uniform(0, 90))
         elif name == "globe":
             f.sphere(x, 0, z, 0.11, Material(name))
         else:
             f.cylinder(x, 0, z, 0.1, 0.16, Material(name))
-    return np.array([0.0, 0.1, 3.2])
+    return np.array([0.0, 0.3, 3.2])
 
 
 def bake(furniture: Furniture, seed: int, kind: Kind) -> World:
@@ -337,8 +339,8 @@ def path(seed: int, kind: Kind, target: np.ndarray, count: int, label: str) -> n
     around = kind.spread >= 180
     if around:
         azimuth = 360 * (2 * s + draw.random())
-        height = 1.45 + 0.2 * np.sin(6.28 * 3 * s + phase[1]) + np.where(s < 0.5, 0.2, -0.15)
-        radius = 2.15 + 0.1 * np.sin(6.28 * 5 * s + phase[2])
+        height = 1.15 + 0.12 * np.sin(6.28 * 3 * s + phase[1]) + np.where(s < 0.5, 0.2, -0.1)
+        radius = 2.25 + 0.1 * np.sin(6.28 * 5 * s + phase[2])
     else:
         # Few views walk one arc and back; many go to and fro, so that heights and sides mix.
         azimuth = reach * kind.spread * np.sin(6.28 * 2.5 * s + phase[0])
@@ -450,6 +452,8 @@ def sparse_points(seed: int, kind: Kind, world: World, cameras: np.ndarray, phot
         colors.append(photo[row, column])
     positions, colors = np.concatenate(positions), np.concatenate(colors)
     tracks = raycast.observations(world.solids, cameras, kind.width, kind.height, positions) * FULL
+    # A feature is matched in some of the views that show it only.
+    tracks[draw.random(tracks.shape[:2]) > max(0.2, 4 / len(cameras))] = np.nan
     good = np.flatnonzero(np.isfinite(tracks[..., 0]).sum(1) >= 3)
     good = np.sort(draw.permutation(good)[: kind.points])
     tracks = tracks[good] + draw.normal(0, 0.4, (len(good), len(cameras), 2))
@@ -529,11 +533,23 @@ def write_truth_cameras(path: Path, kind: Kind, names: list[str], cameras: np.nd
 
 
 def generate(out: Path, seed: int, kind: Kind) -> dict:
-    """Write the scene into `out` and return its facts.
+    """Write the scene to `out`, all of it or nothing, and return its facts.
 
     Raises:
-        ValueError: where less than 40% of the masks hides background that no training view saw.
+        ValueError: where `out` holds something that this script did not write; where less than 40% of the masks
+            hides background that no training view saw.
     """
+    if out.exists() and any(out.iterdir()) and not (out / "truth/facts.json").exists():
+        raise ValueError(f"{out} holds files that data/generate.py did not write; name another folder, or empty it")
+    partial = out.with_name(out.name + ".writing")
+    shutil.rmtree(partial, ignore_errors=True)
+    facts = _write_scene(partial, seed, kind)
+    shutil.rmtree(out, ignore_errors=True)
+    partial.rename(out)
+    return facts
+
+
+def _write_scene(out: Path, seed: int, kind: Kind) -> dict:
     furniture, target = furnish(seed, kind)
     world = bake(furniture, seed, kind)
     train, test = (path(seed, kind, target, n, label) for n, label in ((kind.train, "train"), (kind.test, "test")))

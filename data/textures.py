@@ -90,25 +90,22 @@ def wood_planks(rng, size, rows=24, pieces=3, palette=None):
     return color * (0.35 + 0.65 * step(0.008, 0.045, edge))[..., None]
 
 
-def herringbone(rng, size, cells=8):
-    """Blocks of two by one laid at right angles, grain along each."""
+def herringbone(rng, size, cells=32, long=4):
+    """Narrow blocks, `long` times as long as wide, laid at right angles in steps, grain along each."""
     palette = WOODS[rng.integers(len(WOODS))]
     x, y = grid(size)
-    a, b = x * cells * 2, y * cells * 2
+    a, b = x * cells, y * cells
     i, j = np.floor(a).astype(int), np.floor(b).astype(int)
-    phase = (i - j) % 4  # the block lies along x for phases 0, 1 and along y for 2, 3
-    flat = phase < 2
+    phase = (i - j) % (2 * long)  # counts along a block lying in x, then down one lying in y
+    flat = phase < long
     left = np.where(flat, i - phase, i)
-    top = np.where(flat, j, j - (3 - phase))
-    fx, fy = a - left, b - top
-    along, across = np.where(flat, fx, fy) / 2, np.where(flat, fy, fx)
-    tone, dx, dy = (rng.random((2 * cells, 2 * cells)).astype(np.float32) for _ in range(3))
-    tone, dx, dy = (t[top % (2 * cells), left % (2 * cells)] for t in (tone, dx, dy))
-    streaks = fbm(rng, size, min(128, size // 4), 8, 4)
-    grain = shifted(streaks, along * 0.3 + dx, across * 0.12 + dy)
-    color = ramp(0.5 + 0.5 * (tone - 0.5) + 0.1 * (flat - 0.5) + 0.16 * grain, *palette)
-    edge = np.minimum(np.minimum(across, 1 - across), 2 * np.minimum(along, 1 - along))
-    return color * (0.35 + 0.65 * step(0.01, 0.06, edge))[..., None]
+    top = np.where(flat, j, j - (2 * long - 1 - phase))
+    along, across = np.where(flat, a - left, b - top) / long, np.where(flat, b - top, a - left)
+    tone, dx, dy = (rng.random((cells, cells)).astype(np.float32)[top % cells, left % cells] for _ in range(3))
+    grain = shifted(fbm(rng, size, min(128, size // 4), 8, 4), along * 0.25 + dx, across * 0.06 + dy)
+    color = ramp(0.5 + 0.5 * (tone - 0.5) + 0.12 * (flat - 0.5) + 0.16 * grain, *palette)
+    edge = np.minimum(np.minimum(across, 1 - across), long * np.minimum(along, 1 - along))
+    return color * (0.35 + 0.65 * step(0.01, 0.07, edge))[..., None]
 
 
 STONES = (
@@ -174,25 +171,29 @@ PAPERS = (
 
 
 def wallpaper(rng, size, repeats=4):
-    """Rosettes and leaves in a half drop, over fine stripes."""
+    """Flowers in a half drop, each in a pointed frame with leaves, over fine stripes."""
     ground, figure, second = (np.asarray(c, np.float32) / 255 for c in PAPERS[rng.integers(len(PAPERS))])
     x, y = grid(size)
-    petals, turns = int(rng.integers(5, 9)), rng.random() * 6.28
-    color = np.broadcast_to(ground, (size, size, 3)).copy()
+    petals, turns = int(rng.integers(5, 8)), rng.random() * 6.28
     stripe = 0.5 + 0.5 * np.cos(6.2832 * x * repeats * 6)
-    color = blend(color, second, 0.35 * step(0.55, 0.8, stripe))
+    color = blend(np.broadcast_to(ground, (size, size, 3)), second, 0.25 * step(0.55, 0.8, stripe))
+    u = x * repeats
+    # Two families of waves, half a period apart, that touch: the frames.
+    swing = 0.235 * np.cos(6.2832 * y * repeats)
+    for sign in (-1, 1):
+        off = np.abs((u + sign * swing + 0.25 * (1 + sign)) % 1 - 0.5)
+        color = blend(color, second, step(0.022, 0.012, np.abs(off - 0.02)))
     for shift in (0.0, 0.5):
-        a = (x * repeats + shift) % 1 - 0.5
-        b = (y * repeats + shift) % 1 - 0.5
+        a, b = (u + shift) % 1 - 0.5, (y * repeats + shift) % 1 - 0.5
         radius, angle = np.hypot(a, b), np.arctan2(b, a)
-        flower = 0.17 + 0.055 * np.cos(petals * angle + turns)
-        color = blend(color, figure, step(0.012, -0.012, radius - flower))
-        color = blend(color, second, step(0.010, -0.010, np.abs(radius - 0.095) - 0.018))
-        color = blend(color, ground, step(0.010, -0.010, radius - 0.045))
-        for side in (-1, 1):
-            leaf = np.hypot((a - side * 0.27 * np.cos(b * 5)) * 2.6, b - 0.02)
-            rib = step(0.0, 0.02, np.abs(a - side * 0.27))
-            color = blend(color, figure, 0.85 * rib * step(0.015, -0.015, leaf - 0.15))
+        for tilt in (0.6, np.pi - 0.6):
+            p, q = a * np.cos(tilt) + b * np.sin(tilt), b * np.cos(tilt) - a * np.sin(tilt)
+            leaf = np.abs(q) - 0.35 * (0.3 - np.abs(p)) * np.sqrt(np.abs(p) / 0.3)
+            color = blend(color, second, step(0.006, -0.006, leaf) * step(0.0, 0.006, np.abs(q) + 0.004))
+        flower = 0.16 + 0.045 * np.cos(petals * angle + turns)
+        color = blend(color, figure, step(0.010, -0.010, radius - flower))
+        color = blend(color, ground, step(0.008, -0.008, np.abs(radius - 0.075) - 0.007))
+        color = blend(color, second, step(0.008, -0.008, radius - 0.045))
     paper = 1 + 0.035 * fbm(rng, size, 32, 32, 5) + 0.03 * fbm(rng, size, 4, 4, 3)
     return color * paper[..., None]
 
@@ -205,7 +206,7 @@ def plaster(rng, size, color=(214, 208, 198)):
 
 def rug(rng, size):
     """A woven carpet with a border and diamonds, fitted to its face."""
-    hues = [np.asarray(c, np.float32) / 255 for c in ((142, 44, 40), (28, 52, 84), (220, 196, 150), (194, 128, 60))]
+    hues = [np.asarray(c, np.float32) / 255 for c in ((116, 34, 42), (28, 52, 84), (220, 196, 150), (194, 128, 60))]
     rng.shuffle(hues)
     x, y = grid(size)
     a, b = (x * 6) % 1 - 0.5, (y * 4) % 1 - 0.5
@@ -223,16 +224,26 @@ def rug(rng, size):
     return color * weave[..., None]
 
 
-def books(rng, size):
-    """A row of spines, fitted to its face."""
+def books(rng, size, thick=1.0):
+    """A row of spines, fitted to its face; `thick` makes them fewer."""
     color = np.full((size, size, 3), 0.05, np.float32)
     x = 0
     while x < size:
-        width = int(size * rng.uniform(0.03, 0.075))
+        width = int(size * thick * rng.uniform(0.03, 0.075))
         top = int(size * rng.uniform(0.02, 0.28))
         hue = np.asarray(
             cv2.cvtColor(
-                np.float32([[[rng.uniform(0, 360), rng.uniform(0.25, 0.75), rng.uniform(0.3, 0.85)]]]),
+                np.float32(
+                    [
+                        [
+                            [
+                                (rng.normal(20, 45) + rng.choice((0, 0, 180))) % 360,
+                                rng.uniform(0.15, 0.6),
+                                rng.uniform(0.25, 0.8),
+                            ]
+                        ]
+                    ]
+                ),
                 cv2.COLOR_HSV2RGB,
             )[0, 0]
         )
@@ -275,7 +286,7 @@ def leaves(rng, size):
         rows, columns = np.ix_((v + reach) % size, (u + reach) % size)
         b, a = np.meshgrid(reach / size, reach / size, indexing="ij")
         p, q = a * np.cos(angle) + b * np.sin(angle), b * np.cos(angle) - a * np.sin(angle)
-        inside = step(0.004, -0.004, np.abs(q) - 0.42 * (length - np.abs(p)) * (1 - (p / length) ** 2))
+        inside = step(0.004, -0.004, np.abs(q) - 0.34 * length * (1 - (p / length) ** 2))
         rib = 1 - 0.35 * step(0.004, 0.0, np.abs(q))
         tone = (0.25 + 0.75 * k / 420) * (0.75 + 1.25 * q / length) * rib * rng.uniform(0.8, 1.15)
         leaf = np.multiply.outer(tone, np.array([70, 138, 52]) / 255)
@@ -341,6 +352,23 @@ def ball(rng, size, first=(214, 66, 48), second=(240, 226, 196)):
     one, two = (np.asarray(c, np.float32) / 255 for c in (first, second))
     color = blend(np.broadcast_to(one, (size, size, 3)), two, step(-1, 1, wedge / soft))
     return blend(color, np.float32([0.95, 0.78, 0.25]), step(0.955, 0.965, np.abs(p[..., 0])))
+
+
+def quilt(rng, size, first=(214, 66, 48), second=(240, 226, 196), cells=8):
+    """Patchwork of triangles in two hues and their shades, stitched along the seams."""
+    x, y = grid(size)
+    i, j = np.floor(x * cells).astype(int), np.floor(y * cells).astype(int)
+    fx, fy = x * cells - i, y * cells - j
+    flip = rng.integers(0, 2, (cells, cells))[j, i] > 0
+    upper = np.where(flip, fx > fy, fx + fy > 1)
+    shade = rng.uniform(0.75, 1.1, (cells, cells, 2)).astype(np.float32)[j, i, upper.astype(int)]
+    one, two = (np.asarray(c, np.float32) / 255 for c in (first, second))
+    color = np.where(upper[..., None], one, two) * shade[..., None]
+    seam = np.minimum(
+        np.minimum(np.minimum(fx, 1 - fx), np.minimum(fy, 1 - fy)), np.abs(np.where(flip, fx - fy, fx + fy - 1))
+    )
+    puffed = 0.72 + 0.28 * step(0.0, 0.16, seam)
+    return color * (puffed * (1 + 0.06 * fbm(rng, size, 128, 128, 3)))[..., None]
 
 
 def glazed(rng, size, color=(40, 70, 130), bands=(236, 230, 214)):

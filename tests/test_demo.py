@@ -1,0 +1,207 @@
+"""The generator of synthetic scenes: layout, poses, lens, and above all its truth."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from reffusion import io
+from reffusion.io import colmap
+
+DATA = Path(__file__).parents[1] / "data"
+
+
+@pytest.fixture(scope="module")
+def generate():
+    sys.path.insert(0, str(DATA))
+    try:
+        import generate
+
+        yield generate
+    finally:
+        sys.path.remove(str(DATA))
+
+
+@pytest.fixture(scope="module")
+def mini(generate, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("demo") / "mini"
+    generate.generate(folder, 0, generate.KINDS["mini"])
+    return folder
+
+
+def stems(folder: Path) -> list[str]:
+    return sorted(path.stem for path in folder.glob("*.png"))
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def through_lens(truth: dict, view: str, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Image points [P, 2] and camera z of scene points, from truth/cameras.json alone."""
+    pose = np.array(truth["world_to_camera"][view])
+    x, y, z = (points @ pose[:3, :3].T + pose[:3, 3]).T
+    x, y = x / z, y / z
+    bend = truth["f"] * (1 + truth["k1"] * (x * x + y * y))
+    return np.stack([bend * x + truth["cx"], bend * y + truth["cy"]], 1), z
+
+
+def test_same_seed_same_bytes_and_old_files_go(generate, mini, tmp_path):
+    again = tmp_path / "again"
+    generate.generate(again, 1, generate.KINDS["mini"])
+    other = files(again)
+    (again / "images_4" / "stale.png").write_bytes(b"")
+    generate.generate(again, 0, generate.KINDS["mini"])
+    assert files(again) == files(mini)
+    name = "images_4/IMG_2005.png"
+    assert other[name] != files(mini)[name]
+
+
+def test_foreign_files_are_never_overwritten(generate, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(ValueError, match="did not write"):
+        generate.generate(tmp_path, 0, generate.KINDS["mini"])
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+def test_layout_is_spin_nerfs(generate, mini):
+    kind = generate.KINDS["mini"]
+    names = stems(mini / "images_4")
+    train = names[kind.test :]
+    assert len(names) == kind.test + kind.train
+    assert stems(mini / "images_4/label") == train
+    assert stems(mini / "images_4/test_label") == [f"out_{k:05d}" for k in range(kind.test)]
+    label = io.load_image(mini / f"images_4/label/{train[0]}.png")
+    assert label.shape[:2] == (kind.height, kind.width)
+    assert set(np.unique(label)) == {0, 1}
+    scene = yaml.safe_load((mini / "scene.yaml").read_text())
+    assert set(scene) == {"reference"}
+    assert scene["reference"]["view"] in train
+    assert io.load_image(mini / scene["reference"]["image"]).shape == (kind.height, kind.width, 3)
+    assert [
+        p["test"] + p["train"] for p in ({"test": k.test, "train": k.train} for k in (generate.KINDS["demo"],))
+    ] == [100]
+
+
+def test_poses_bounds_model_and_truth_agree(mini, generate):
+    kind = generate.KINDS["mini"]
+    truth = json.loads((mini / "truth/cameras.json").read_text())
+    llff = np.load(mini / "poses_bounds.npy")
+    model = {Path(image.name).stem: image for image in colmap.load_images(mini / "sparse/0/images.bin").values()}
+    names = stems(mini / "images_4")
+    assert llff.shape == (len(names), 17)
+    assert sorted(model) == names
+    for row, name in zip(llff, names, strict=True):
+        pose = np.array(truth["world_to_camera"][name])
+        down, right, back, center, size = row[:15].reshape(3, 5).T
+        np.testing.assert_allclose(pose[:3, :3], np.stack([right, down, -back]), atol=1e-12)
+        np.testing.assert_allclose(-pose[:3, :3].T @ pose[:3, 3], center, atol=1e-12)
+        np.testing.assert_allclose(size, [4 * kind.height, 4 * kind.width, 4 * truth["f"]])
+        np.testing.assert_allclose(model[name].world_to_camera, pose, atol=1e-12)
+    (camera,) = colmap.load_cameras(mini / "sparse/0/cameras.bin").values()
+    assert (camera.width, camera.height) == (4 * kind.width, 4 * kind.height)
+    points = colmap.load_model_points(mini / "sparse/0/points3D.bin").positions
+    depths = np.concatenate([through_lens(truth, name, points)[1] for name in names])
+    assert llff[:, 15].min() > 0
+    assert llff[:, 16].max() <= depths.max()
+
+
+def test_sparse_points_lie_on_what_the_training_views_show(mini):
+    """Half a pixel away colours agree far better than six pixels away: poses, lens and tracks are one system."""
+    truth = json.loads((mini / "truth/cameras.json").read_text())
+    model = colmap.load_model_points(mini / "sparse/0/points3D.bin")
+    errors = {0: [], 6: []}
+    for name in stems(mini / "images_4/label"):
+        image = io.load_image(mini / f"images_4/{name}.png").astype(float)
+        uv, _ = through_lens(truth, name, model.positions)
+        for shift, found in errors.items():
+            column, row = np.floor(uv + (shift, 0)).astype(int).T
+            inside = (column >= 0) & (row >= 0) & (column < image.shape[1]) & (row < image.shape[0])
+            found.append(np.abs(image[row[inside], column[inside]] - model.colors[inside]).mean(1))
+    near, far = (np.median(np.concatenate(found)) for found in errors.values())
+    assert near < 0.6 * far
+
+
+def test_only_masked_pixels_change_when_the_object_goes(generate, mini):
+    view = yaml.safe_load((mini / "scene.yaml").read_text())["reference"]["view"]
+    photo, reference = io.load_image(mini / f"images_4/{view}.png"), io.load_image(mini / "reference.png")
+    mask = io.load_mask(mini / f"images_4/label/{view}.png")
+    assert np.array_equal(photo[~mask], reference[~mask])
+    assert (photo[mask] != reference[mask]).any(1).mean() > 0.9
+
+
+def test_test_views_are_without_the_object(generate, mini):
+    """Rendering with the object changes the test views inside their masks and nowhere else."""
+    kind = generate.KINDS["mini"]
+    furniture, target = generate.furnish(0, kind)
+    world = generate.bake(furniture, 0, kind)
+    train, test = (
+        generate.path(0, kind, target, n, label) for n, label in ((kind.train, "train"), (kind.test, "test"))
+    )
+    middle = np.argmin(np.linalg.norm(train[:, 13:] - train[:, 13:].mean(0), axis=1))
+    world = generate.exposed(world, train[middle], kind)
+    for k, name in enumerate(stems(mini / "images_4")[: kind.test]):
+        photo = io.load_image(mini / f"images_4/{name}.png")
+        mask = io.load_mask(mini / f"images_4/test_label/out_{k:05d}.png")
+        with_object, _ = generate.shoot(world, test[k], kind, True)
+        assert np.array_equal(photo[~mask], with_object[~mask])
+        assert (photo[mask] != with_object[mask]).any(1).mean() > 0.9
+
+
+def test_never_seen_pixels_are_never_seen(generate, mini):
+    """Checked with another projection: every training view hides such a pixel's background, or a mask covers it."""
+    import raycast
+
+    kind = generate.KINDS["mini"]
+    truth = json.loads((mini / "truth/cameras.json").read_text())
+    furniture, target = generate.furnish(0, kind)
+    world, frame = generate.bake(furniture, 0, kind), generate.scene_frame(0)
+    cameras = generate.path(0, kind, target, kind.test, "test")
+    training = {name: io.load_mask(mini / f"images_4/label/{name}.png") for name in stems(mini / "images_4/label")}
+    for k, name in enumerate(stems(mini / "images_4")[: kind.test]):
+        mask = io.load_mask(mini / f"images_4/test_label/out_{k:05d}.png")
+        never = io.load_mask(mini / f"truth/never_seen/{name}.png")
+        assert not (never & ~mask).any()
+        points, _ = raycast.surface_points(world.solids, cameras[k], generate.pixel_centers(mask), False)
+        back, _ = through_lens(truth, name, frame.points(points))
+        np.testing.assert_allclose(back, generate.pixel_centers(mask), atol=1e-6)
+        shown = np.zeros(len(points), bool)
+        for view, covered in training.items():
+            uv, _ = through_lens(truth, view, frame.points(points))
+            column, row = np.floor(uv).astype(int).T
+            inside = (column >= 0) & (row >= 0) & (column < kind.width) & (row < kind.height)
+            shown[inside] |= ~covered[row[inside], column[inside]]
+        assert shown[~never[mask]].all()
+        # The few left over are behind furniture that stays.
+        assert shown[never[mask]].mean() < 0.1
+
+
+@pytest.mark.parametrize("name", ["demo", "wide", "360"])
+def test_two_fifths_of_the_mask_are_never_seen(generate, tmp_path, name):
+    kind = replace(
+        generate.KINDS[name], width=48, height=36, samples=1, train=20, test=6, texture=256, node=0.4, points=60
+    )
+    for seed in (0, 11):
+        facts = generate.generate(tmp_path / f"{name}{seed}", seed, kind)
+        assert min(facts["never_seen_share"].values()) >= 0.4
+        assert 0.06 < facts["mask_share"]["train"] < 0.25
+
+
+def test_too_small_a_share_is_an_error_and_writes_nothing(generate, tmp_path, monkeypatch):
+    monkeypatch.setattr(generate, "LEAST_NEVER_SEEN", 0.99)
+    with pytest.raises(ValueError, match="never seen"):
+        generate.generate(tmp_path / "scene", 0, generate.KINDS["mini"])
+    assert not (tmp_path / "scene").exists()
+
+
+def test_photos_bring_no_poses(generate, tmp_path):
+    kind = replace(generate.KINDS["photos"], width=48, height=36, train=4, texture=256, node=0.4)
+    generate.generate(tmp_path / "photos", 7, kind)
+    assert stems(tmp_path / "photos/images") == stems(tmp_path / "photos/masks")
+    assert sorted(p.name for p in (tmp_path / "photos").iterdir()) == ["images", "masks", "truth"]
