@@ -93,7 +93,9 @@ def _complete_region(disparity, confidence, guide, domain, stiffness, edge, most
     bend = _bending(domain, guide, edge)
     data = np.where(known, confidence, 0.0)[domain]
     system = sparse.diags(data) + stiffness * bend.T @ bend
-    solution = splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(
+    solution = splu(
+        system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+    ).solve(
         data * rest[domain] / unit
     )
     filled = plane.copy()

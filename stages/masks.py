@@ -1,0 +1,102 @@
+"""masks: votes label the object's Gaussians; rendered back they give every view's consistent, never-seen and
+invent mask."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class Params(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    vote: Literal["weight", "count"] = Field(
+        "weight", description="what a contribution counts: its blending weight, or 1 (the paper's word is 'count')"
+    )
+    tau: float = Field(1.0, gt=0, description="masked from this ratio of masked to unmasked contributions (paper: 1)")
+    tau_rendered: float = Field(0.3, gt=0, lt=1, description="C is where the rendered label exceeds it (paper: 0.3)")
+    observed: float = Field(
+        1.0, gt=0, description="unmasked blending weight, summed over pixels and views, of a fully observed Gaussian"
+    )
+    explained: float = Field(0.5, gt=0, lt=1, description="blended observation from which a pixel is explained")
+    witnesses: int = Field(1, ge=0, description="training views that must show a pixel's background; 0 = not asked")
+    tolerance: float = Field(0.02, gt=0, description="relative depth by which a visible point may lie too far")
+    speck: float = Field(0.01, ge=0, description="islands of a mask below this diameter go, / image width")
+    gap: float = Field(0.02, ge=0, description="holes in a mask below this diameter close, / image width")
+    unknowns: int = Field(5000, ge=100, description="pixels in the completion of depth behind the object, a view")
+    invent: Literal["auto", "never_seen", "region"] = Field(
+        "auto", description="what is made up; auto = the scene's 3D region where it names one, else never-seen pixels"
+    )
+
+
+def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
+    import numpy as np
+    import torch
+
+    from reffusion import io, masks, trace
+    from reffusion.types import MaskSet
+
+    scene, gaussians = io.load_scene(poses), io.load_ply(fit / "gaussians.ply")
+    train = [scene.cameras[name] for name in scene.train]
+    region = io.load_json(poses / "region.json") if (poses / "region.json").exists() else None
+    raw = io.load_raw_masks(poses, scene.train)
+    empty = {name: np.zeros((camera.height, camera.width), bool) for name, camera in scene.cameras.items()}
+    ballots = raw | {name: empty[name] for name in scene.clean}
+    if params.invent == "region" and region is None:
+        raise ValueError(f"masks.invent is 'region', but {poses / 'region.json'} is missing: set region in scene.yaml")
+
+    # Observation outside the masks is measured by weight, whatever the votes count.
+    seen = masks.cast_votes(gaussians, train, ballots or empty, mode="weight")
+    if raw:
+        votes = seen if params.vote == "weight" else masks.cast_votes(gaussians, train, ballots, mode=params.vote)
+        labels = masks.label_gaussians(votes, params.tau)
+        voteless = (votes.masked + votes.unmasked) == 0
+        labels |= voteless & masks.hidden_inside(gaussians, train, ballots)
+    elif region is not None:
+        labels = masks.inside_box(gaussians, region["center"], region["size"])
+    else:
+        raise ValueError(f"{poses}: neither masks nor a region say what is to be changed: add masks, or a region")
+
+    clean = lambda mask: masks.tidy(mask, params.speck * mask.shape[1], params.gap * mask.shape[1])
+    consistent, shown = {}, {}
+    for name, camera in scene.cameras.items():
+        share, shown[name] = masks.label_view(gaussians, labels, camera)
+        consistent[name] = clean(share > params.tau_rendered)
+    hidden = consistent | {name: empty[name] for name in scene.clean}
+    remaining, observed = gaussians.map(lambda p: p[~labels]), masks.evidence(seen, params.observed)[~labels]
+
+    sets, names = {}, list(scene.cameras)
+    fill_region = params.invent == "region" or (params.invent == "auto" and region is not None)
+    for k in trace.progress(len(names), "masks"):
+        name, camera = names[k], scene.cameras[names[k]]
+        surface = masks.remaining_surface(
+            remaining, observed, camera, consistent[name], enough=params.explained, most_unknowns=params.unknowns
+        )
+        unseen = consistent[name] & (surface.explained < params.explained)
+        unseen |= consistent[name] & (
+            masks.seen_elsewhere(
+                surface.disparity, consistent[name], camera, train, hidden, shown, tolerance=params.tolerance
+            )
+            < params.witnesses
+        )
+        unseen = clean(unseen) & hidden[name]
+        invent = masks.box_silhouette(**region, camera=camera, disparity=surface.disparity) if fill_region else unseen
+        sets[name] = MaskSet(raw.get(name, empty[name]), consistent[name], unseen, invent)
+
+    io.save_labels(out / "labels.npy", labels.cpu())
+    io.save_mask_sets(out, sets)
+    invents = {name: each.invent for name, each in sets.items()}
+    count = lambda kind, chosen: int(sum(np.count_nonzero(getattr(sets[name], kind)) for name in chosen))
+    facts = {
+        "masked_gaussians": int(torch.count_nonzero(labels)),
+        "gaussians": len(gaussians),
+        "voting_views": len(ballots),
+        "invent_pixels": count("invent", scene.train),
+        "consistent_pixels": count("consistent", scene.train),
+        "never_seen_share": count("never_seen", scene.train) / max(count("consistent", scene.train), 1),
+        "invent_views": [name for name in scene.train if invents[name].any()],
+        "best_reference": masks.best_view(invents, scene.train),
+    }
+    io.save_json(out / "facts.json", facts)
