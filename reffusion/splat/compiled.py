@@ -59,7 +59,8 @@ def share(function: Callable, *arguments) -> None:
     pending = [_pool(os.getpid(), helpers).submit(function, tickets, *arguments) for _ in range(helpers)]
     function(tickets, *arguments)
     for future in pending:
-        future.result()
+        if not future.cancel():  # a helper that never woke up has nothing left to do
+            future.result()
 
 
 @functools.lru_cache(maxsize=1)

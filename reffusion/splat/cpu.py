@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from reffusion.splat import backward, binning, forward, harmonics, projection
 from reffusion.splat.compiled import share
@@ -103,6 +104,7 @@ class _Splat(torch.autograd.Function):
         return color, depth, alpha, blended, radii
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, grad_color, grad_depth, grad_alpha, grad_blended, _):
         saved = [_array(t) for t in ctx.saved_tensors]
         parameters, features, images = saved[:5], saved[5], saved[6:]
