@@ -87,7 +87,7 @@ def _extract(pycolmap, database: Path, folder: Path, pictures: Mapping[str, Path
         image_names=sorted(path.name for path in pictures.values()),
         camera_mode=mode,
         reader_options=pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL"),
-        extraction_options=pycolmap.FeatureExtractionOptions(use_gpu=False),
+        extraction_options=pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=1),
         device=pycolmap.Device.cpu,
     )
     if not given:

@@ -1,0 +1,157 @@
+"""Structure from motion: on a small drawn room always; on photographs with REFFUSION_SLOW=1 (minutes)."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reffusion import io, sfm
+from stages import poses
+
+ROOT = Path(__file__).parents[1]
+CAPTURES = ROOT.parent / "shared" / "data"
+slow = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="takes minutes; set REFFUSION_SLOW=1")
+
+
+def noise(generator: np.random.Generator, size: int = 256) -> np.ndarray:
+    """[size, size, 3] speckle at several scales, in [0, 255]."""
+    total = np.zeros((size, size, 3))
+    for cell in (2, 4, 8, 16, 32):
+        coarse = generator.random((size // cell, size // cell, 3))
+        total += np.kron(coarse, np.ones((cell, cell, 1))) * cell**0.5
+    return 255 * (total - total.min()) / np.ptp(total)
+
+
+def draw_corner(pose: np.ndarray, textures: np.ndarray, size=(200, 150), focal=170.0) -> np.ndarray:
+    """The corner of a room, planes x = 2, y = 1.5, z = 3, ray-cast; uint8 [H, W, 3]."""
+    columns, rows = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
+    rays = np.stack([(columns - size[0] / 2) / focal, (rows - size[1] / 2) / focal, np.ones_like(rows)], -1)
+    rays, center = rays @ pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]
+    with np.errstate(divide="ignore"):
+        times = (np.array([2.0, 1.5, 3.0]) - center) / rays
+    times = np.where(times > 0, times, np.inf)
+    plane = times.argmin(-1)
+    hit = center + rays * times.min(-1)[..., None]
+    flat = np.stack([hit[..., 1], hit[..., 0], hit[..., 0]], -1), np.stack([hit[..., 2], hit[..., 2], hit[..., 1]], -1)
+    u, v = (np.take_along_axis(axis, plane[..., None], -1)[..., 0] * 40 for axis in flat)
+    texels = textures.shape[1]
+    return textures[plane, v.astype(int) % texels, u.astype(int) % texels].astype(np.uint8)
+
+
+def walk(count: int) -> dict[str, np.ndarray]:
+    """Views that face the corner, up and down by turns: centres on a line would leave the alignment free to turn."""
+    result = {}
+    for k in range(count):
+        t = k / (count - 1) - 0.5
+        center, forward = np.array([1.6 * t, 0.3 * (-1) ** k, -1.0 + 0.8 * t * t]), np.array([0.35 - 0.4 * t, 0.2, 1.0])
+        forward /= np.linalg.norm(forward)
+        right = np.cross([0.0, 1.0, 0.0], forward)
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+        pose[:3, 3] = -pose[:3, :3] @ center
+        result[f"p{k}"] = pose
+    return result
+
+
+def errors_after_alignment(scene, truth: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation errors in degrees and centre errors over the extent of the true centres, of the common views."""
+    names = [name for name in truth if name in scene.cameras]
+    rotations = np.stack([truth[n][:3, :3] for n in names])
+    centers = np.stack([-truth[n][:3, :3].T @ truth[n][:3, 3] for n in names])
+    found = np.stack([scene.cameras[n].center for n in names])
+    turned = np.stack([scene.cameras[n].world_to_camera[:3, :3] for n in names])
+    a, b = centers - centers.mean(0), found - found.mean(0)
+    u, stretch, v = np.linalg.svd(a.T @ b)
+    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
+    turn = u @ sign @ v
+    aligned = (stretch * np.diag(sign)).sum() / (b**2).sum() * b @ turn.T
+    traces = np.einsum("nij,njk,nik->n", rotations, np.broadcast_to(turn, rotations.shape), turned)
+    degrees = np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1)))
+    extent = np.linalg.norm(centers[:, None] - centers[None], axis=-1).max()
+    return degrees, np.linalg.norm(aligned - a, axis=1) / extent
+
+
+def assert_accepted(scene, truth: dict[str, np.ndarray]) -> None:
+    degrees, shifts = errors_after_alignment(scene, truth)
+    assert degrees.max() < 0.5 and np.median(shifts) < 0.01 and shifts.max() < 0.02
+
+
+def run(folder: Path, out: Path, **params):
+    out.mkdir()
+    poses.run(poses.Params(**params), out, scene=folder)
+    return io.load_scene(out)
+
+
+def test_a_walk_past_a_corner(tmp_path):
+    """All views that belong to it are placed; the one that does not is named and left out, and so is its mask."""
+    generator, truth = np.random.default_rng(0), walk(6)
+    textures = np.stack([noise(generator) for _ in range(3)])
+    folder = tmp_path / "s"
+    for name, pose in truth.items():
+        io.save_image(folder / f"{name}.png", draw_corner(pose, textures))
+    io.save_image(folder / "stray.png", noise(generator)[:150, :200].astype(np.uint8))
+    for name in (*truth, "stray"):
+        io.save_mask(folder / "masks" / f"{name}.png", np.eye(150, 200, dtype=bool))
+    with pytest.warns(UserWarning, match="1 views were not placed and are left out: stray"):
+        scene = run(folder, tmp_path / "out")
+    assert sorted(scene.cameras) == sorted(truth) == list(scene.train)
+    assert_accepted(scene, truth)
+    assert len(scene.points) > 300 and "stray" not in io.load_raw_masks(tmp_path / "out", ["stray"])
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
+        "images", "masks", "sparse", "transform.json", "views.json",
+    ]  # fmt: skip
+
+
+def test_views_that_do_not_belong_together_are_named(tmp_path):
+    for name in ("a", "b", "c"):
+        io.save_image(tmp_path / "s" / "images" / f"{name}.jpg", np.full((60, 80, 3), 90, np.uint8))
+    with pytest.raises(ValueError, match=r"placed 0 of 3 views.*not a, b, c\. Take more photos"):
+        run(tmp_path / "s", tmp_path / "out", masks="none")
+
+
+def test_focal_length_from_exif(tmp_path):
+    from PIL import Image
+
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 28  # focal length in 35 mm film
+    Image.new("RGB", (360, 240)).save(tmp_path / "with.jpg", exif=exif)
+    Image.new("RGB", (360, 240)).save(tmp_path / "without.jpg")
+    assert sfm.focal_of(tmp_path / "with.jpg") == pytest.approx(28 / 36, rel=0.02)
+    assert sfm.focal_of(tmp_path / "without.jpg") is None
+
+
+@slow
+def test_demo_photos(tmp_path):
+    """Every view of the generator's photographs, against its truth."""
+    made = [sys.executable, str(ROOT / "data" / "generate.py"), "--out", str(tmp_path / "s"), "--kind", "photos"]
+    subprocess.run(made, check=True)
+    record = json.loads((tmp_path / "s" / "truth" / "cameras.json").read_text())
+    truth = {name: np.array(pose) for name, pose in record["world_to_camera"].items()}
+    scene = run(tmp_path / "s", tmp_path / "out")
+    assert sorted(scene.cameras) == sorted(truth)
+    assert_accepted(scene, truth)
+
+
+@slow
+def test_bear(tmp_path):
+    """A dozen neighbouring photographs against the poses they came with (which are COLMAP's own, from 96)."""
+    if not (CAPTURES / "bear").is_dir():
+        pytest.skip("the capture bear is not in ../shared/data")
+    brought = io.load_capture(CAPTURES / "bear")
+    names = sorted(brought.pictures)[:24:2]
+    (tmp_path / "s" / "images").mkdir(parents=True)
+    for name in names:
+        shutil.copy(brought.pictures[name], tmp_path / "s" / "images")
+    scene = run(tmp_path / "s", tmp_path / "out", masks="none")
+    truth = {name: brought.poses.world_to_camera[name] for name in names}
+    assert sorted(scene.cameras) == names
+    degrees, shifts = errors_after_alignment(scene, truth)
+    assert degrees.max() < 1.0 and np.median(shifts) < 0.02
