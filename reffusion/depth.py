@@ -22,6 +22,7 @@ def complete(
     stiffness: float = 100.0,
     edge: float = 0.1,
     most_unknowns: int = 60_000,
+    keep: bool = True,
 ) -> np.ndarray:
     """Fill the pixels of zero confidence by second-order, edge-aware completion in disparity.
 
@@ -40,9 +41,10 @@ def complete(
         stiffness: weight of bending against the data, px^4; about 3 px are averaged at 100.
         edge: guide step (in [0, 1]) at which the weight of a second difference has fallen to 1/e.
         most_unknowns: above so many pixels a coarser grid is solved, and its correction interpolated.
+        keep: known pixels keep their values; else those of the ring take the minimiser's, which is smooth at the rim.
 
     Returns:
-        [H, W] float64: the input where confidence > 0, the completion elsewhere.
+        [H, W] float64: the completion where confidence is 0, elsewhere the input (see `keep`).
 
     Raises:
         ValueError: fewer than 3 known pixels next to some hole, or these on one line (no plane is fixed);
@@ -63,7 +65,7 @@ def complete(
             disparity[window], confidence[window], None if gray is None else gray[window], domain,
             stiffness, edge, most_unknowns,
         )  # fmt: skip
-        inside = domain & hole[window]
+        inside = domain & hole[window] if keep else domain
         completed[window][inside] = part[inside]
     return completed
 

@@ -1,0 +1,83 @@
+"""initialize: masked Gaussians out; the references' pixels, on completed depth, in as new masked Gaussians."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class Params(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    overlap: float = Field(0.006, ge=0, description="how far new Gaussians reach beyond the hole, / image width")
+    explained: float = Field(0.5, gt=0, lt=1, description="alpha from which remaining Gaussians' depth is known")
+    margin: float = Field(0.01, ge=0, description="known depth nearer to the hole than this is left out, / image width")
+    ring: float = Field(0.08, gt=0, description="surroundings whose depth is continued, / image width")
+    stiffness: float = Field(100.0, gt=0, description="bending against data in the completion, px^4")
+    edge: float = Field(0.1, gt=0, description="step of the reference's colour that lets depth bend, colours in [0, 1]")
+    unknowns: int = Field(60_000, ge=100, description="pixels in the completion; more are solved on a coarser grid")
+    solver_smoothness: float = Field(128.0, gt=0, description="bilateral solver: lambda")
+    solver_spatial: float = Field(8.0, gt=0, description="bilateral solver: cell size, px")
+    solver_luma: float = Field(8.0, gt=0, description="bilateral solver: cell size, levels of 255")
+    solver_chroma: float = Field(8.0, gt=0, description="bilateral solver: cell size, levels of 255")
+    spread: float = Field(0.4, gt=0, description="standard deviation of new Gaussians, pixels of the reference")
+    thickness: float = Field(0.1, gt=0, description="their deviation along the normal over that within the surface")
+    grazing: float = Field(0.15, gt=0, le=1, description="least cosine to the view at which they are stretched")
+    opacity: float = Field(0.95, gt=0, lt=1, description="their opacity")
+    color_steps: int = Field(5, ge=0, description="corrections of their colours until the reference is reproduced")
+
+
+def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, reference: Path | None) -> None:
+    import torch
+
+    from reffusion import initialize, io
+
+    gaussians, labels = io.load_ply(fit / "gaussians.ply"), io.load_labels(masks / "labels.npy")
+    if len(labels) != len(gaussians):
+        raise ValueError(f"{masks}: {len(labels)} labels for {len(gaussians)} Gaussians of {fit}: run masks again")
+    gaussians = gaussians.map(lambda p: p[~labels])
+    new = torch.zeros(len(gaussians), dtype=torch.bool)
+    scene = io.load_scene(poses)
+    references = io.load_references(reference, scene) if reference else []
+    best = io.load_json(masks / "facts.json")["best_reference"]
+    for each in sorted(references, key=lambda r: (r.camera.name != best, -int(r.mask.sum()))):
+        gaussians, new = filled(params, out, gaussians, new, each)
+    io.save_ply(out / "gaussians.ply", gaussians)
+    io.save_labels(out / "labels.npy", new)
+    sets = io.load_mask_sets(masks, scene.train)
+    asked = covered = 0
+    for name, each in sets.items():
+        asked += int(each.invent.sum())
+        covered += int((initialize.share_of(gaussians, new, scene.cameras[name]) > 0.5)[each.invent].sum())
+    facts = {"new_gaussians": int(new.sum()), "removed_gaussians": int(labels.sum())}
+    facts["uncovered_share"] = 1 - covered / asked if asked else 0.0
+    io.save_json(out / "facts.json", facts)
+    if references and facts["uncovered_share"] > 0.05:
+        print(f"{facts['uncovered_share']:.0%} of the invent masks is covered by no reference: add another view's")
+
+
+def filled(params: Params, out: Path, gaussians, new, reference):
+    """The Gaussians with those of one reference, on what is still empty in its mask, and the labels."""
+    import torch
+
+    from reffusion import geometry, initialize, io
+
+    camera = reference.camera
+    behind = initialize.depth_behind(
+        gaussians.map(lambda p: p[~new]), reference, reference.mask,
+        explained=params.explained, margin=params.margin, ring=params.ring, stiffness=params.stiffness,
+        edge=params.edge, most_unknowns=params.unknowns, smoothness=params.solver_smoothness,
+        sigma_spatial=params.solver_spatial, sigma_luma=params.solver_luma, sigma_chroma=params.solver_chroma,
+    )  # fmt: skip
+    io.save_exr(out / "depth" / f"{camera.name}.exr", behind.astype("float32"))
+    empty = reference.mask & (initialize.share_of(gaussians, new, camera) < 0.5)
+    pixels = initialize.grown(empty, params.overlap)
+    added = geometry.surface_gaussians(
+        reference.image, behind, pixels, camera, sh_count=gaussians.sh.shape[1], spread=params.spread,
+        thickness=params.thickness, grazing=params.grazing, opacity=params.opacity,
+    )  # fmt: skip
+    together = gaussians.zipped(added, lambda a, b: torch.cat([a, b]))
+    fresh = torch.cat([torch.zeros_like(new), torch.ones(len(added), dtype=torch.bool)])
+    together = initialize.match_colors(together, fresh, reference.image, pixels, camera, params.color_steps)
+    return together, torch.cat([new, fresh[len(new) :]])
