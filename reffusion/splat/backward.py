@@ -13,8 +13,10 @@ from reffusion.splat.compiled import kernel, share
 from reffusion.splat.conventions import MAX_ALPHA, MIN_TRANSMITTANCE
 from reffusion.splat.forward import aligned, finished, open_tile
 from reffusion.splat.projection import (
+    AHEAD,
     BLUE,
     DEPTH,
+    FOOTPRINT,
     GRAD_FEATURES,
     GREEN,
     LEVEL,
@@ -33,6 +35,7 @@ from reffusion.splat.vectors import (
     load,
     minimum,
     negative,
+    prefetch,
     ramp,
     select,
     some,
@@ -156,9 +159,12 @@ def _tile_backward(tile, footprints, features, starts, members, rows, slots, use
     zero, one, cut = splat(0.0), splat(1.0), splat(CUT)
     strongest, least = splat(MAX_ALPHA), splat(MIN_TRANSMITTANCE)
     columns = ramp() + splat(np.float32(left) + np.float32(0.5))
+    flat_footprints, last = footprints.reshape(-1), members.shape[0] - 1
     for at in range(starts[tile] + used[tile], starts[tile + 1]):
         records[slots[at] * columns_of_record : (slots[at] + 1) * columns_of_record] = np.float32(0.0)
     for at in range(starts[tile], starts[tile] + used[tile]):
+        prefetch(flat_footprints, members[min(at + AHEAD, last)] * FOOTPRINT)
+        prefetch(records, slots[min(at + AHEAD, last)] * columns_of_record)
         footprint = footprints[members[at]]
         extra = features[members[at]]
         whiten_x, whiten_y, level = splat(footprint[WHITEN_X]), splat(footprint[WHITEN_Y]), splat(footprint[LEVEL])

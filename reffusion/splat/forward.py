@@ -7,7 +7,20 @@ import numpy as np
 from reffusion.splat.binning import CUT, TILE_HEIGHT, TILE_WIDTH
 from reffusion.splat.compiled import kernel, share
 from reffusion.splat.conventions import MAX_ALPHA, MIN_TRANSMITTANCE
-from reffusion.splat.projection import BLUE, DEPTH, GREEN, LEVEL, MEAN_X, MEAN_Y, RED, SLANT, WHITEN_X, WHITEN_Y
+from reffusion.splat.projection import (
+    AHEAD,
+    BLUE,
+    DEPTH,
+    FOOTPRINT,
+    GREEN,
+    LEVEL,
+    MEAN_X,
+    MEAN_Y,
+    RED,
+    SLANT,
+    WHITEN_X,
+    WHITEN_Y,
+)
 from reffusion.splat.vectors import (
     exp2,
     fma,
@@ -15,6 +28,7 @@ from reffusion.splat.vectors import (
     load,
     minimum,
     negative,
+    prefetch,
     ramp,
     select,
     some,
@@ -110,9 +124,11 @@ def _blend_tile(tile, footprints, features, starts, members, rows, size, state, 
     zero, cut = splat(0.0), splat(CUT)
     strongest, least = splat(MAX_ALPHA), splat(MIN_TRANSMITTANCE)
     columns = ramp() + splat(np.float32(left) + np.float32(0.5))
+    flat_footprints, last = footprints.reshape(-1), members.shape[0] - 1
     for at in range(starts[tile], starts[tile + 1]):
         if (at - starts[tile]) % 32 == 31 and finished(state, stride):
             return at - starts[tile]
+        prefetch(flat_footprints, members[min(at + AHEAD, last)] * FOOTPRINT)
         footprint = footprints[members[at]]
         extra = features[members[at]]
         whiten_x, whiten_y, level = splat(footprint[WHITEN_X]), splat(footprint[WHITEN_Y]), splat(footprint[LEVEL])

@@ -8,8 +8,8 @@ import numpy as np
 
 from reffusion.splat.compiled import kernel
 from reffusion.splat.conventions import SH0, SH1, SH2, SH3
-from reffusion.splat.projection import BLUE, FOOTPRINT, GRAD_BLUE, GRAD_GREEN, GRAD_RED, GREEN, RED, next_part
-from reffusion.splat.vectors import fma, load, pack, store, striped, thrice, total, triple_sums
+from reffusion.splat.projection import AHEAD, BLUE, FOOTPRINT, GRAD_BLUE, GRAD_GREEN, GRAD_RED, GREEN, RED, next_part
+from reffusion.splat.vectors import fma, load, pack, prefetch, store, striped, thrice, total, triple_sums
 
 _F = np.float32
 
@@ -102,6 +102,7 @@ def paint(tickets, footprints, ranks, means, sh, degree, center, painted):
         if begin < 0:
             return
         for i in range(begin, end):
+            prefetch(flat_painted, ranks[min(i + AHEAD, end - 1)] * FOOTPRINT)
             if ranks[i] < 0:
                 continue
             x, y, z, _ = _direction(means[i], center)
@@ -129,12 +130,15 @@ def paint_backward(tickets, sums, ranks, footprints, means, sh, degree, center, 
     padded, padded_grad, along = np.zeros(48, np.float32), np.zeros(48, np.float32), np.zeros(16, np.float32)
     width = 3 * sh.shape[1]
     flat_sh, flat_grad = sh.reshape(-1), grad_sh.reshape(-1)
+    flat_sums, flat_footprints = sums.reshape(-1), footprints.reshape(-1)
     while True:
         begin, end = next_part(tickets, means.shape[0])
         if begin < 0:
             return
         for i in range(begin, end):
-            rank = ranks[i]
+            soon, rank = ranks[min(i + AHEAD, end - 1)], ranks[i]
+            prefetch(flat_sums, soon * sums.shape[1])
+            prefetch(flat_footprints, soon * FOOTPRINT)
             if rank < 0:
                 continue
             red = sums[rank, GRAD_RED] if footprints[rank, RED] > 0 else _F(0.0)

@@ -19,7 +19,7 @@ from reffusion.splat.conventions import (
     MIN_ALPHA,
     NEAR,
 )
-from reffusion.splat.vectors import take_ticket
+from reffusion.splat.vectors import prefetch, take_ticket
 from reffusion.types import Camera
 
 # Columns of a footprint: 2D mean; slant xy/yy; the whitening factors along x and y, scaled so that
@@ -32,6 +32,7 @@ FOOTPRINT = 16  # columns, of which the last six are unused: one cache line each
 SUM_G, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, GRAD_DEPTH, GRAD_RED, GRAD_GREEN, GRAD_BLUE, GRAD_FEATURES = range(11)
 
 CHUNKS = 32  # pieces that the Gaussians are shared out in; fixed, so that nothing depends on the number of threads
+AHEAD = 8  # steps between asking for a row of another order (`vectors.prefetch`) and using it
 
 _LOG2_E = 1.4426950408889634
 _HALF_LOG2_E = math.sqrt(0.5 * _LOG2_E)
@@ -198,12 +199,13 @@ def project_backward(
             with a rank; grad_probe may be [0, 2].
     """
     unscale = math.sqrt(2.0 / _LOG2_E)  # the record's u and v are scaled by sqrt(log2(e) / 2)
-    want_probe = grad_probe.shape[0] > 0
+    want_probe, flat_sums = grad_probe.shape[0] > 0, sums.reshape(-1)
     while True:
         begin, end = next_part(tickets, means.shape[0])
         if begin < 0:
             return
         for i in range(begin, end):
+            prefetch(flat_sums, ranks[min(i + AHEAD, end - 1)] * sums.shape[1])
             if ranks[i] < 0:
                 continue
             record = sums[ranks[i]]

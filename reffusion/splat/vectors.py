@@ -147,6 +147,22 @@ def store(typing, array, place, value):
 
 
 @intrinsic
+def prefetch(typing, array, place):
+    """Ask for the cache line of an element that will be needed soon (any place will do, it is only a hint)."""
+
+    def emit(context, builder, sig, args):
+        pointer = builder.bitcast(_pointer(context, builder, sig, args), ir.IntType(8).as_pointer())
+        number = ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [pointer.type, number, number, number])
+        name = "llvm.prefetch.p0i8"
+        function = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
+        builder.call(function, [pointer, number(0), number(3), number(1)])
+        return context.get_dummy_value()
+
+    return types.void(array, place), emit
+
+
+@intrinsic
 def fma(typing, x, y, z):
     """x y + z, rounded once."""
 
