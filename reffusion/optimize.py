@@ -13,8 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from reffusion.splat.compiled import share
+from reffusion.splat.vectors import take_ticket
 from reffusion.ssim import dssim
 from reffusion.types import PARAMETERS, Gaussians
+
+_CHUNK = 512  # rows that a thread takes at once
 
 
 def reconstruction_loss(image: Tensor, target: Tensor, weights: Tensor | None = None, share: float = 0.2) -> Tensor:
@@ -241,21 +245,25 @@ def _adam(parameter, first, second, gradient, unbias1, unbias2, visible, rates, 
 def _adam_cpu(parameter, first, second, gradient, unbias1, unbias2, visible, rates, beta1, beta2, epsilon) -> None:
     """`_adam` in one pass over memory, for float32."""
     arrays = (t.numpy() for t in (parameter, first, second, gradient, unbias1, unbias2, visible, rates))
-    _adam_kernel(*arrays, np.float32(beta1), np.float32(beta2), np.float32(epsilon))
+    share(_adam_kernel, *arrays, np.float32(beta1), np.float32(beta2), np.float32(epsilon))
 
 
-@numba.njit(fastmath={"contract", "reassoc", "nsz", "arcp"}, cache=True, nogil=True, parallel=True)
-def _adam_kernel(parameter, first, second, gradient, unbias1, unbias2, visible, rates, beta1, beta2, epsilon):
+@numba.njit(fastmath={"contract", "reassoc", "nsz", "arcp"}, error_model="numpy", cache=True, nogil=True)
+def _adam_kernel(tickets, parameter, first, second, gradient, unbias1, unbias2, visible, rates, beta1, beta2, epsilon):
     count, width = parameter.shape
     new1, new2 = np.float32(1) - beta1, np.float32(1) - beta2
     least = np.float32(1e-30)  # below it a first moment would soon be denormal, on which processors are slow
-    for i in numba.prange(count):
-        if not visible[i]:
-            continue
-        for j in range(width):
-            g = gradient[i, j]
-            a = beta1 * first[i, j] + new1 * g
-            a = np.float32(0) if abs(a) < least else a
-            b = beta2 * second[i, j] + new2 * g * g
-            first[i, j], second[i, j] = a, b
-            parameter[i, j] -= rates[j] * unbias1[i] * a / (np.sqrt(b * unbias2[i]) + epsilon)
+    while True:
+        start = take_ticket(tickets) * _CHUNK
+        if start >= count:
+            return
+        for i in range(start, min(start + _CHUNK, count)):
+            if not visible[i]:
+                continue
+            for j in range(width):
+                g = gradient[i, j]
+                a = beta1 * first[i, j] + new1 * g
+                a = np.float32(0) if abs(a) < least else a
+                b = beta2 * second[i, j] + new2 * g * g
+                first[i, j], second[i, j] = a, b
+                parameter[i, j] -= rates[j] * unbias1[i] * a / (np.sqrt(b * unbias2[i]) + epsilon)

@@ -18,6 +18,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from reffusion.splat.compiled import share
+from reffusion.splat.vectors import take_ticket
+
 RADIUS, SIGMA = 5, 1.5
 C1, C2 = 0.01**2, 0.03**2
 
@@ -76,15 +79,24 @@ class _FastDssim(torch.autograd.Function):
         per_pixel = np.ones((height, width), np.float32) if weights is None else weights.contiguous().numpy()
         norm = _unmasked_norm(height, width) if weights is None else _norm(per_pixel)
         weight_rows, norm_rows = np.repeat(per_pixel, channels, 1), np.repeat(norm, channels, 1)
-        sums, partials = _forward(flat(image), flat(target), weight_rows, norm_rows, channels)
+        images = flat(image), flat(target), weight_rows
+        fields, partials, sums = _padded(4, images[0]), _padded(3, images[0]), np.empty(height)
+        share(_filter_products, *images, channels, fields)
+        share(_compare, fields, weight_rows, norm_rows, channels, sums, partials)
         if ctx.needs_input_grad[0]:
-            gradient = _backward(partials, flat(image), flat(target), weight_rows, channels)
+            gradient = np.empty_like(images[0])
+            share(_gather_gradient, partials, *images, gradient)
             ctx.gradient = torch.from_numpy(gradient).view(height, width, channels)
         return image.new_tensor(float(sums.sum()) / image.numel())
 
     @staticmethod
     def backward(ctx, upstream: Tensor):
         return ctx.gradient * (upstream / ctx.gradient.numel()), None, None
+
+
+def _padded(count: int, image: np.ndarray) -> np.ndarray:
+    """`count` fields like `image`, with 5 rows of zeros above and below."""
+    return np.zeros((count, image.shape[0] + 2 * RADIUS, image.shape[1]), np.float32)
 
 
 def _norm(weights: np.ndarray) -> np.ndarray:
@@ -100,10 +112,10 @@ def _unmasked_norm(height: int, width: int) -> np.ndarray:
 
 # The kernels hold an image as H rows of W * C numbers, so that each inner loop runs along memory. Rows of a field are
 # filtered along the row first, then columns; both are symmetric, so each is its own adjoint (borders count as 0).
+# Threads share out rows.
 _K0, _K1, _K2, _K3, _K4, _K5 = (np.float32(k) for k in _window()[RADIUS:])
-_FAST = {"contract", "reassoc", "nsz", "arcp"}  # NaN and infinity stay what they are: `fit` looks for them
-_jit = numba.njit(fastmath=_FAST, cache=True, nogil=True)
-_parallel = numba.njit(fastmath=_FAST, cache=True, nogil=True, parallel=True)
+# Rounding may vary, but NaN and infinity stay what they are: `fit` looks for them.
+_jit = numba.njit(fastmath={"contract", "reassoc", "nsz", "arcp"}, error_model="numpy", cache=True, nogil=True)
 
 
 @_jit
@@ -154,17 +166,17 @@ def _filtered(field, channels):
     return out
 
 
-@_parallel
-def _forward(x, y, weights, norm, channels):
-    """Row sums of weights * (1 - SSIM) [H] float64, and its partials by the windowed fields, [3, H + 10, W * C]."""
+@_jit
+def _filter_products(tickets, x, y, weights, channels, fields):
+    """fields [4, H + 10, W * C] = weights * (x, y, x^2 + y^2, x y), filtered along each row."""
     height, n = x.shape
-    fields = np.zeros((4, height + 2 * RADIUS, n), np.float32)
-    partials = np.zeros((3, height + 2 * RADIUS, n), np.float32)
-    sums = np.zeros(height, np.float64)
     lead = RADIUS * channels
-    for i in numba.prange(height):
-        padded = np.zeros((4, n + 2 * lead), np.float32)
-        p0, p1, p2, p3 = padded[0, lead:], padded[1, lead:], padded[2, lead:], padded[3, lead:]
+    padded = np.zeros((4, n + 2 * lead), np.float32)
+    p0, p1, p2, p3 = padded[0, lead:], padded[1, lead:], padded[2, lead:], padded[3, lead:]
+    while True:
+        i = take_ticket(tickets)
+        if i >= height:
+            return
         xi, yi, wi = x[i], y[i], weights[i]
         for j in range(n):
             a, b, w = xi[j], yi[j], wi[j]
@@ -174,14 +186,27 @@ def _forward(x, y, weights, norm, channels):
             p3[j] = w * a * b
         for f in range(4):
             _along_row(padded[f], fields[f, i + RADIUS], n, channels)
-    for i in numba.prange(height):
-        column = np.empty((4, n), np.float32)
+
+
+@_jit
+def _compare(tickets, fields, weights, norm, channels, sums, partials):
+    """Sum of weights * (1 - SSIM) of each row, and its partials by the windowed fields, filtered along the row.
+
+    Writes sums [H] float64 and partials [3, H + 10, W * C]: by the means of x, of x^2 + y^2 and of x y.
+    """
+    height, n = weights.shape
+    lead = RADIUS * channels
+    column, padded = np.empty((4, n), np.float32), np.zeros((3, n + 2 * lead), np.float32)
+    m0, m1, m2, m3 = column[0], column[1], column[2], column[3]
+    d0, d1, d2 = padded[0, lead:], padded[1, lead:], padded[2, lead:]
+    c1, c2, one, two = np.float32(C1), np.float32(C2), np.float32(1), np.float32(2)
+    while True:
+        i = take_ticket(tickets)
+        if i >= height:
+            return
         for f in range(4):
             _down_column(fields[f], i, column[f], n)
-        m0, m1, m2, m3, wi, ni = column[0], column[1], column[2], column[3], weights[i], norm[i]
-        row = np.empty((3, n), np.float32)
-        d0, d1, d2 = row[0], row[1], row[2]
-        c1, c2, one, two = np.float32(C1), np.float32(C2), np.float32(1), np.float32(2)
+        wi, ni = weights[i], norm[i]
         total = np.float32(0)
         for j in range(n):
             inverse = one / ni[j]
@@ -189,36 +214,33 @@ def _forward(x, y, weights, norm, channels):
             squares, product = m2[j] * inverse, m3[j] * inverse
             light = two * mx * my + c1
             structure = two * (product - mx * my) + c2
-            light_scale = mx * mx + my * my
-            contrast = squares - light_scale + c2
-            light_scale += c1
-            over = one / (light_scale * contrast)
+            brightness = mx * mx + my * my
+            contrast = squares - brightness + c2
+            brightness += c1
+            over = one / (brightness * contrast)
             similarity = light * structure * over
             total += wi[j] * (one - similarity)
-            share = -wi[j] * inverse
-            to_mean = two * over * (my * (structure - light) + mx * similarity * (light_scale - contrast))
-            d0[j] = share * to_mean
-            d1[j] = share * (-similarity * light_scale * over)
-            d2[j] = share * (two * light * over)
+            part = -wi[j] * inverse
+            d0[j] = part * two * over * (my * (structure - light) + mx * similarity * (brightness - contrast))
+            d1[j] = part * -similarity * brightness * over
+            d2[j] = part * two * light * over
         sums[i] = total
-        padded = np.zeros(n + 2 * lead, np.float32)
         for f in range(3):
-            padded[lead : lead + n] = row[f]
-            _along_row(padded, partials[f, i + RADIUS], n, channels)
-    return sums, partials
+            _along_row(padded[f], partials[f, i + RADIUS], n, channels)
 
 
-@_parallel
-def _backward(partials, x, y, weights, channels):
-    """d(sum of weights * (1 - SSIM)) / dx, [H, W * C]."""
+@_jit
+def _gather_gradient(tickets, partials, x, y, weights, gradient):
+    """gradient [H, W * C] = d(sum of weights * (1 - SSIM)) / dx."""
     height, n = x.shape
-    gradient = np.empty((height, n), np.float32)
-    two = np.float32(2)
-    for i in numba.prange(height):
-        column = np.empty((3, n), np.float32)
+    column, two = np.empty((3, n), np.float32), np.float32(2)
+    c0, c1, c2 = column[0], column[1], column[2]
+    while True:
+        i = take_ticket(tickets)
+        if i >= height:
+            return
         for f in range(3):
             _down_column(partials[f], i, column[f], n)
-        c0, c1, c2, xi, yi, wi, out = column[0], column[1], column[2], x[i], y[i], weights[i], gradient[i]
+        xi, yi, wi, out = x[i], y[i], weights[i], gradient[i]
         for j in range(n):
             out[j] = wi[j] * (c0[j] + two * xi[j] * c1[j] + yi[j] * c2[j])
-    return gradient
