@@ -6,11 +6,15 @@ second differences continues floors and walls exactly.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+import torch
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import cg, splu
 
 CREASE_FLOOR = 1e-4  # weight left to a second difference across the strongest guide edge: keeps the system regular
+LEAST_SAMPLES = 12  # four for each coefficient of a plane
 
 
 def complete(
@@ -200,6 +204,100 @@ def _unit_range(guide: np.ndarray) -> np.ndarray:
 
 def _dilate(mask: np.ndarray, pixels: float) -> np.ndarray:
     return ndimage.distance_transform_edt(~mask) <= pixels if mask.any() else mask
+
+
+@dataclass(frozen=True)
+class PlanarModel:
+    """Disparity as maxima and minima of planes: rooms are concave (the nearer plane shows), boxes convex.
+
+    Attributes:
+        disparity: [H, W] float64, everywhere.
+        explained: share of the surroundings within the tolerance, in [0, 1].
+        planes: how many planes take part.
+    """
+
+    disparity: np.ndarray
+    explained: float
+    planes: int
+
+
+def planar_model(
+    pixels: np.ndarray,
+    disparity: np.ndarray,
+    shape: tuple[int, int],
+    draws: torch.Generator,
+    *,
+    tolerance: float = 0.01,
+    gain: float = 0.03,
+    trials: int = 500,
+    most_planes: int = 6,
+) -> PlanarModel:
+    """The planes that surround a hole, continued until they meet.
+
+    Planes are found one after another among the samples (three drawn, the best supported plane fitted to its own, these
+    set aside). Starting with the best supported one, each of the others joins as maximum or as minimum with the model
+    so far, if that explains more of the samples. So the plane of something that stands before the wall does not cut
+    through the hole: as a maximum it would hide the wall beside it.
+
+    PAPER leaves open: the completion. This is the hypothesis for rooms; the smooth one is `complete`.
+
+    Args:
+        pixels: [S, 2] image points of the samples around the hole, (x, y) in pixels.
+        disparity: [S], positive.
+        shape: (H, W) of the model wanted.
+        draws: a CPU generator.
+        tolerance: relative disparity within which a sample is explained.
+        gain: least growth of the explained share for which a plane joins.
+        trials: draws of three samples for each plane.
+        most_planes: candidates.
+
+    Raises:
+        ValueError: fewer than 12 samples, or all on one line.
+    """
+    scaled = np.column_stack([pixels / shape[1], np.ones(len(pixels))])
+    if len(pixels) < LEAST_SAMPLES or np.linalg.matrix_rank(scaled, tol=1e-6) < 3:
+        raise ValueError(f"{len(pixels)} samples around the hole fix no plane: {LEAST_SAMPLES} off one line are needed")
+    planes = _planes_in(scaled, disparity, draws, tolerance, trials, most_planes)
+    candidates = [scaled @ plane for plane in planes]
+    fits = lambda values: np.mean(np.abs(values - disparity) < tolerance * disparity)
+    start = max(range(len(planes)), key=lambda k: fits(candidates[k]))
+    at_samples, whole, used = candidates[start], _plane_values(planes[start], shape), 1
+    while True:
+        ways = [(join, k) for k in range(len(planes)) for join in (np.maximum, np.minimum)]
+        join, k = max(ways, key=lambda way: fits(way[0](at_samples, candidates[way[1]])))
+        joined = join(at_samples, candidates[k])
+        if fits(joined) < fits(at_samples) + gain:
+            return PlanarModel(whole, float(fits(at_samples)), used)
+        at_samples, whole, used = joined, join(whole, _plane_values(planes[k], shape)), used + 1
+
+
+def _plane_values(plane: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """[H, W] at pixel centres."""
+    return evaluate_plane(plane + (0, 0, (plane[0] + plane[1]) * 0.5 / shape[1]), shape)
+
+
+def _planes_in(points, values, draws, tolerance, trials, most_planes) -> list[np.ndarray]:
+    """Coefficients [3] of planes, values ~ points [S, 3] @ plane, each fitted to its own samples; at least one."""
+    near = tolerance * values
+    free, planes = np.ones(len(values), bool), []
+    while free.sum() >= max(LEAST_SAMPLES, 0.03 * len(values)) and len(planes) < most_planes:
+        index = np.flatnonzero(free)
+        picks = index[torch.randint(len(index), (trials, 3), generator=draws).numpy()]
+        regular = np.abs(np.linalg.det(points[picks])) > 1e-4  # a triangle of about 1% of the width a side
+        if not regular.any():
+            break
+        trial = np.linalg.solve(points[picks[regular]], values[picks[regular]][..., None])[..., 0]
+        sample = index[:: max(1, len(index) // 4000)]
+        support = (np.abs(trial @ points[sample].T - values[sample]) < near[sample]).sum(1)
+        plane = trial[support.argmax()]
+        for _ in range(5):
+            inliers = free & (np.abs(points @ plane - values) < near)
+            if inliers.sum() < 3:
+                break
+            plane = np.linalg.lstsq(points[inliers], values[inliers], rcond=None)[0]
+        free &= np.abs(points @ plane - values) >= near
+        planes.append(plane)
+    return planes or [np.linalg.lstsq(points, values, rcond=None)[0]]
 
 
 def bilateral_solve(

@@ -2,68 +2,119 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from scipy import ndimage
 
 from reffusion import depth as completion
-from reffusion import geometry, splat
+from reffusion import geometry, splat, trace
 from reffusion.types import Camera, Gaussians, Reference
+
+ENOUGH_POINTS = 50  # fewer sparse points around the hole, and the rendered depth is asked instead
+BEHIND = 1.03  # relative depth from which a sparse point is hidden by what is rendered
+
+
+@dataclass(frozen=True)
+class Completion:
+    """How depth is continued behind the object; the fields are stages/initialize.py's parameters.
+
+    PAPER leaves open: the depth model. Without one the surroundings are continued, by two hypotheses: planes that meet
+    (rooms), taken where they explain the surroundings, else the smooth completion.
+
+    Attributes:
+        explained: alpha from which the rendered depth is known.
+        margin: known pixels nearer to the hole are left out, / image width: their depth is half the object's.
+        ring: surroundings that are continued, / image width.
+        planar_share: share of the surroundings that planes must explain to be taken; above 1 they never are.
+        planar_tolerance: relative disparity within which they do.
+        stiffness, edge, unknowns: see `depth.complete`.
+        solver_smoothness, solver_spatial, solver_luma, solver_chroma: see `depth.bilateral_solve`.
+        seed: of the draws that find planes.
+    """
+
+    explained: float
+    margin: float
+    ring: float
+    planar_share: float
+    planar_tolerance: float
+    stiffness: float
+    edge: float
+    unknowns: int
+    solver_smoothness: float
+    solver_spatial: float
+    solver_luma: float
+    solver_chroma: float
+    seed: int
 
 
 @torch.no_grad()
 def depth_behind(
-    remaining: Gaussians,
-    reference: Reference,
-    hole: np.ndarray,
-    *,
-    explained: float = 0.5,
-    margin: float = 0.01,
-    ring: float = 0.08,
-    stiffness: float = 100.0,
-    edge: float = 0.1,
-    most_unknowns: int = 60_000,
-    smoothness: float = 128.0,
-    sigma_spatial: float = 8.0,
-    sigma_luma: float = 8.0,
-    sigma_chroma: float = 8.0,
-) -> np.ndarray:
-    """Depth [H, W] float64 of the scene without the object, completed in `hole` along the reference's picture.
+    remaining: Gaussians, reference: Reference, hidden: np.ndarray, points: np.ndarray, how: Completion
+) -> tuple[np.ndarray, str]:
+    """Depth [H, W] float64 of the scene without the object, made up on the reference's mask, and how in words.
 
-    The completion's misfit on known pixels is then spread by the bilateral solver, so that the new surface meets the
-    remaining one at the rim. PAPER leaves open: the depth model; without one the surroundings are continued, and no
-    alignment is due.
+    Planes are found among the sparse points where there are enough (they are unbiased, while the expected depth of
+    splats lies too near wherever haze hangs before a plain surface), else among the rendered depths.
 
     Args:
         remaining: the Gaussians left.
-        reference: gives the view and the guide.
-        hole: bool [H, W], pixels whose depth is made up.
-        explained: alpha from which the rendered depth is known.
-        margin: known pixels nearer to the hole are left out, fraction of the width: their depth is half the object's.
-        ring, stiffness, edge, most_unknowns: see `depth.complete`.
-        smoothness, sigma_spatial, sigma_luma, sigma_chroma: see `depth.bilateral_solve`.
+        reference: gives the view, the hole (its mask) and the guide.
+        hidden: bool [H, W], C of that view: where the object stood.
+        points: [P, 3] sparse points of the scene.
+        how: parameters.
 
     Raises:
         ValueError: naming the view, where too little is known around the hole.
     """
-    drawn = splat.render(remaining, reference.camera, sh_degree=0)
+    camera, hole = reference.camera, reference.mask
+    drawn = splat.render(remaining, camera, sh_degree=0)
     depth, alpha = drawn.depth.double().cpu().numpy(), drawn.alpha.cpu().numpy()
-    known = (alpha > explained) & (depth > 0) & ~grown(hole, margin)
+    known = (alpha > how.explained) & (depth > 0) & ~grown(hole, how.margin)
     disparity = np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0)
+    around = grown(hidden | hole, how.ring) & ~(hidden | hole)
     try:
-        fitted = completion.complete(
-            disparity, known, reference.image, ring=ring, stiffness=stiffness, edge=edge,
-            most_unknowns=most_unknowns, keep=False,
-        )  # fmt: skip
-        solved = completion.refine(
-            fitted, disparity, known.astype(np.float64), reference.image, smoothness=smoothness,
-            sigma_spatial=sigma_spatial, sigma_luma=sigma_luma, sigma_chroma=sigma_chroma,
-        )  # fmt: skip
+        pixels, values = visible_points(points, camera, around, disparity)
+        source = "sparse points"
+        if len(values) < ENOUGH_POINTS:
+            rows, columns = np.nonzero(around & known)
+            pixels, values, source = np.stack([columns, rows], 1) + 0.5, disparity[rows, columns], "rendered depth"
+        draws = trace.generator(how.seed, "planes", camera.name)
+        planar = completion.planar_model(pixels, values, hole.shape, draws, tolerance=how.planar_tolerance)
+        said = f"{planar.planes} planes explain {planar.explained:.0%} of {len(values)} {source}"
+        if planar.explained >= how.planar_share:
+            solved = planar.disparity
+        else:
+            solved, said = _continued(disparity, known, reference.image, how), f"{said}: continued smoothly instead"
     except ValueError as error:
-        raise ValueError(f"reference {reference.camera.name}: {error}") from error
-    # Beyond infinity there is nothing: the farthest known surface stands in.
-    result = 1.0 / np.maximum(solved, 0.5 * disparity[known].min())
-    return np.where(known, depth, result)
+        raise ValueError(f"reference {camera.name}: {error}") from error
+    # Beyond infinity there is nothing: twice the farthest known depth stands in.
+    made_up = 1.0 / np.maximum(solved, 0.5 * disparity[known].min())
+    return np.where(known, depth, made_up), said
+
+
+def visible_points(
+    points: np.ndarray, camera: Camera, pixels: np.ndarray, disparity: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Image points [S, 2] and disparities [S] of the points that fall on `pixels`, not behind what is rendered."""
+    uv, z = geometry.project(points, camera)
+    chosen, inside = geometry.sample_nearest(pixels, uv)
+    shown, _ = geometry.sample_nearest(disparity, uv)
+    seen = chosen & inside & (z > 0) & (z * shown < BEHIND)
+    return uv[seen], 1.0 / z[seen]
+
+
+def _continued(disparity: np.ndarray, known: np.ndarray, guide: np.ndarray, how: Completion) -> np.ndarray:
+    """The smooth completion; its misfit on known pixels is spread by the bilateral solver, so that rims meet."""
+    fitted = completion.complete(
+        disparity, known, guide, ring=how.ring, stiffness=how.stiffness, edge=how.edge,
+        most_unknowns=how.unknowns, keep=False,
+    )  # fmt: skip
+    return completion.refine(
+        fitted, disparity, known.astype(np.float64), guide, smoothness=how.solver_smoothness,
+        sigma_spatial=how.solver_spatial, sigma_luma=how.solver_luma, sigma_chroma=how.solver_chroma,
+    )  # fmt: skip
 
 
 def grown(mask: np.ndarray, fraction: float) -> np.ndarray:

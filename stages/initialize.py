@@ -14,13 +14,16 @@ class Params(BaseModel):
     explained: float = Field(0.5, gt=0, lt=1, description="alpha from which remaining Gaussians' depth is known")
     margin: float = Field(0.01, ge=0, description="known depth nearer to the hole than this is left out, / image width")
     ring: float = Field(0.08, gt=0, description="surroundings whose depth is continued, / image width")
-    stiffness: float = Field(100.0, gt=0, description="bending against data in the completion, px^4")
+    planar_share: float = Field(0.7, ge=0, description="planes are taken if they explain this share of the ring")
+    planar_tolerance: float = Field(0.01, gt=0, description="relative disparity within which a plane explains")
+    stiffness: float = Field(100.0, gt=0, description="bending against data in the smooth completion, px^4")
     edge: float = Field(0.1, gt=0, description="step of the reference's colour that lets depth bend, colours in [0, 1]")
     unknowns: int = Field(60_000, ge=100, description="pixels in the completion; more are solved on a coarser grid")
     solver_smoothness: float = Field(128.0, gt=0, description="bilateral solver: lambda")
     solver_spatial: float = Field(8.0, gt=0, description="bilateral solver: cell size, px")
     solver_luma: float = Field(8.0, gt=0, description="bilateral solver: cell size, levels of 255")
     solver_chroma: float = Field(8.0, gt=0, description="bilateral solver: cell size, levels of 255")
+    seed: int = Field(0, description="of the draws that find planes")
     spread: float = Field(0.4, gt=0, description="standard deviation of new Gaussians, pixels of the reference")
     thickness: float = Field(0.1, gt=0, description="their deviation along the normal over that within the surface")
     grazing: float = Field(0.15, gt=0, le=1, description="least cosine to the view at which they are stretched")
@@ -40,14 +43,15 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
     new = torch.zeros(len(gaussians), dtype=torch.bool)
     scene = io.load_scene(poses)
     references = io.load_references(reference, scene) if reference else []
+    sets = io.load_mask_sets(masks, scene.cameras)
     best = io.load_json(masks / "facts.json")["best_reference"]
     for each in sorted(references, key=lambda r: (r.camera.name != best, -int(r.mask.sum()))):
-        gaussians, new = filled(params, out, gaussians, new, each)
+        gaussians, new = filled(params, out, gaussians, new, each, sets[each.camera.name].consistent, scene.points)
     io.save_ply(out / "gaussians.ply", gaussians)
     io.save_labels(out / "labels.npy", new)
-    sets = io.load_mask_sets(masks, scene.train)
     asked = covered = 0
-    for name, each in sets.items():
+    for name in scene.train:
+        each = sets[name]
         asked += int(each.invent.sum())
         covered += int((initialize.share_of(gaussians, new, scene.cameras[name]) > 0.5)[each.invent].sum())
     facts = {"new_gaussians": int(new.sum()), "removed_gaussians": int(labels.sum())}
@@ -57,19 +61,18 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
         print(f"{facts['uncovered_share']:.0%} of the invent masks is covered by no reference: add another view's")
 
 
-def filled(params: Params, out: Path, gaussians, new, reference):
+def filled(params: Params, out: Path, gaussians, new, reference, hidden, points):
     """The Gaussians with those of one reference, on what is still empty in its mask, and the labels."""
+    from dataclasses import fields
+
     import torch
 
     from reffusion import geometry, initialize, io
 
     camera = reference.camera
-    behind = initialize.depth_behind(
-        gaussians.map(lambda p: p[~new]), reference, reference.mask,
-        explained=params.explained, margin=params.margin, ring=params.ring, stiffness=params.stiffness,
-        edge=params.edge, most_unknowns=params.unknowns, smoothness=params.solver_smoothness,
-        sigma_spatial=params.solver_spatial, sigma_luma=params.solver_luma, sigma_chroma=params.solver_chroma,
-    )  # fmt: skip
+    how = initialize.Completion(**{f.name: getattr(params, f.name) for f in fields(initialize.Completion)})
+    behind, said = initialize.depth_behind(gaussians.map(lambda p: p[~new]), reference, hidden, points, how)
+    print(f"depth of reference {camera.name}: {said}")
     io.save_exr(out / "depth" / f"{camera.name}.exr", behind.astype("float32"))
     empty = reference.mask & (initialize.share_of(gaussians, new, camera) < 0.5)
     pixels = initialize.grown(empty, params.overlap)
