@@ -45,7 +45,7 @@ class Params(BaseModel):
     gaussians: str | None = Field(None, description=".ply the scene brings in its own frame, 3DGS layout")
     region: Region | None = Field(None, description="3D box that holds the object, or is to be filled")
     longest: int = Field(1600, ge=16, description="larger image side in px; smaller pictures stay as they are")
-    least_points: int = Field(500, ge=0, description="with fewer sparse points, random ones are added to them")
+    least_points: int = Field(100, ge=0, description="with fewer sparse points, random ones are added to them")
     random_points: int = Field(10_000, ge=1, description="how many")
     seed: int = 0
 

@@ -104,6 +104,9 @@ def test_a_walk_past_a_corner(tmp_path):
         scene = run(folder, tmp_path / "out")
     assert sorted(scene.cameras) == sorted(truth) == list(scene.train)
     assert_accepted(scene, truth)
+    again = sfm.solve(*2 * [{n: folder / f"{n}.png" for n in truth}], tmp_path / "work", seed=0)
+    once_more = sfm.solve(*2 * [{n: folder / f"{n}.png" for n in truth}], tmp_path / "work", seed=0)
+    assert all(np.array_equal(again.world_to_camera[n], once_more.world_to_camera[n]) for n in truth)
     assert len(scene.points) > 300 and "stray" not in io.load_raw_masks(tmp_path / "out", ["stray"])
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
         "images", "masks", "sparse", "transform.json", "views.json",
