@@ -17,7 +17,7 @@ SHRINK = 1.6  # 3DGS: the two children of a split are 0.8 * 2 times smaller
 
 
 def densify(
-    optimizer: GaussianOptimizer, slope: float, split_above: float, budget: int, generator: torch.Generator
+    optimizer: GaussianOptimizer, slope: float, split_above: float | Tensor, budget: int, generator: torch.Generator
 ) -> int:
     """Clone the small and split the large Gaussians whose mean observed gradient is at least `slope`.
 
@@ -26,7 +26,8 @@ def densify(
 
     Args:
         slope: in units of normalised device coordinates (see `GaussianOptimizer.observe`); 3DGS: 2e-4.
-        split_above: the largest standard deviation from which on a Gaussian is split, not cloned; 3DGS: 0.01.
+        split_above: the largest standard deviation above which a Gaussian is split, not cloned; one for all or [N].
+            3DGS: 0.01.
         budget: no more Gaussians than this; if there are more candidates, those of the steepest slope are taken.
         generator: of the split's noise.
 
@@ -50,6 +51,11 @@ def densify(
     return room
 
 
+def viewing_distance(means: Tensor, centers: Tensor) -> Tensor:
+    """[N] distance of each mean [N, 3] to the nearest camera centre [V, 3]: what sizes are to be measured by."""
+    return torch.cdist(means.detach(), centers.to(means)).amin(dim=1)
+
+
 def split(gaussians: Gaussians, generator: torch.Generator) -> Gaussians:
     """Two smaller Gaussians for each one, at places drawn from it: [M] -> [2 M], all first children before the second.
 
@@ -70,8 +76,8 @@ def rotate(quaternions: Tensor, vectors: Tensor) -> Tensor:
     return vectors + w * across + torch.linalg.cross(axis, across)
 
 
-def prune(optimizer: GaussianOptimizer, least_opacity: float, largest: float) -> int:
-    """Remove the Gaussians fainter than `least_opacity` or with a standard deviation above `largest`.
+def prune(optimizer: GaussianOptimizer, least_opacity: float, largest: float | Tensor) -> int:
+    """Remove the Gaussians fainter than `least_opacity` or with a standard deviation above `largest` (or its row).
 
     PAPER leaves open: 3DGS also removes what covers more than 20 pixels of a view; that is a size in pixels, takes
     whole walls with it in small images, and is left out here.

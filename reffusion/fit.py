@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from reffusion import trace
-from reffusion.densify import densify, prune
+from reffusion.densify import densify, prune, viewing_distance
 from reffusion.optimize import GaussianOptimizer, Rates, reconstruction_loss
 from reffusion.splat import render
 from reffusion.types import PARAMETERS, Camera, Gaussians
@@ -27,7 +27,10 @@ SH_0 = 0.28209479177387814  # the constant spherical harmonic
 
 @dataclass(frozen=True)
 class Settings:
-    """How long and how finely to fit. Lengths in units of the normalised frame; moments as parts of the run in [0, 1].
+    """How long and how finely to fit. Moments are parts of the run in [0, 1].
+
+    PAPER leaves open: 3DGS measures Gaussians by the extent of the cameras, and so, in a street, prunes what is far
+    away and large. Here sizes are standard deviations divided by the distance to the nearest camera.
 
     Attributes:
         iterations: optimisation steps, one view each.
@@ -41,10 +44,11 @@ class Settings:
         densify_from, densify_until: parts of the run between which Gaussians are added.
         densify_every: steps between two densifications.
         slope: mean screen-space gradient from which on a Gaussian is cloned or split, see `densify`.
-        split_above: standard deviation from which on a Gaussian is split, not cloned.
-        budget: most Gaussians.
+        split_above: size from which on a Gaussian is split, not cloned.
+        budget: most Gaussians, reached at `densify_until`: the number allowed grows evenly from that of the start, so
+            that some are left for where late views still pull.
         least_opacity: fainter Gaussians are pruned.
-        largest: Gaussians of a larger standard deviation are pruned.
+        largest: Gaussians of a larger size are pruned.
         reset_every: part of the run after which opacities are capped at 0.01, while densifying; 0: never.
         rates: Adam's step sizes.
     """
@@ -107,6 +111,7 @@ def fit(
         optimizer.load_state_dict(state["optimizer"])
         start, seconds, recent = state["iteration"], state["seconds"], state["recent"]
     log = trace.Trace(folder, seconds, start + 1)  # a line is numbered by the steps done
+    centers = torch.tensor(np.stack([camera.center for camera in cameras]), dtype=torch.float32)
     saved_at = time.monotonic()
 
     for i in trace.progress(settings.iterations, "fit", start):
@@ -117,7 +122,7 @@ def fit(
         loss, error = _step(optimizer, camera, target, counts, settings, i, impl)
         recent = {"loss": recent["loss"] + loss, "error": recent["error"] + error, "steps": recent["steps"] + 1}
         done = i + 1
-        _adapt(optimizer, settings, done)
+        _adapt(optimizer, centers, len(initial), settings, done)
         if trace.log_spaced(done, settings.iterations):
             _check_finite(optimizer.gaussians, f"step {i}, view '{camera.name}'")
             with log.paused():
@@ -237,18 +242,27 @@ def _degree(settings: Settings, i: int) -> int:
     return min(settings.sh_degree, int(i / (settings.sh_every * settings.iterations)))
 
 
-def _adapt(optimizer: GaussianOptimizer, settings: Settings, done: int) -> None:
+def _adapt(optimizer: GaussianOptimizer, centers: Tensor, started_with: int, settings: Settings, done: int) -> None:
     """Add, prune and fade Gaussians where the schedule says so after `done` steps."""
     progress = done / settings.iterations
     if not settings.densify_from <= progress < settings.densify_until:
         return
     if done % settings.densify_every == 0:
         noise = trace.generator(settings.seed, "densify", done)
-        densify(optimizer, settings.slope, settings.split_above, settings.budget, noise)
-        prune(optimizer, settings.least_opacity, settings.largest)
+        away = viewing_distance(optimizer.gaussians.means, centers)
+        densify(optimizer, settings.slope, settings.split_above * away, _allowed(started_with, settings, done), noise)
+        away = viewing_distance(optimizer.gaussians.means, centers)
+        prune(optimizer, settings.least_opacity, settings.largest * away)
     period = round(settings.reset_every * settings.iterations)
     if period and done % period == 0:
         optimizer.cap_opacity(0.01)
+
+
+def _allowed(started_with: int, settings: Settings, done: int) -> int:
+    """The number of Gaussians after `done` steps may be this."""
+    first, last = settings.densify_from * settings.iterations, settings.densify_until * settings.iterations
+    passed = (done + settings.densify_every - first) / (last - first)
+    return round(started_with + (settings.budget - started_with) * min(1.0, passed))
 
 
 def _summary(

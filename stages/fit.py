@@ -21,14 +21,10 @@ class Params(BaseModel):
     densify_until: float = Field(0.5, ge=0, le=1, description="part of the run after which no Gaussian is added")
     densify_every: int = Field(100, ge=1, description="steps from one densification to the next")
     slope: float = Field(2e-4, gt=0, description="screen-space gradient that clones or splits; images span [-1, 1]")
-    split_above: float = Field(
-        0.01, gt=0, description="a larger standard deviation splits, a smaller clones; 1 = view distance"
-    )
+    split_above: float = Field(0.01, gt=0, description="a larger size splits, a smaller clones; deviation / distance")
     budget: int = Field(1_000_000, ge=4, description="most Gaussians")
     least_opacity: float = Field(0.005, ge=0, lt=1, description="fainter Gaussians are pruned")
-    largest: float = Field(
-        0.5, gt=0, description="Gaussians of a larger standard deviation are pruned; 1 = view distance"
-    )
+    largest: float = Field(0.5, gt=0, description="Gaussians of a larger size are pruned; deviation / distance")
     reset_every: float = Field(0.1, ge=0, le=1, description="part of the run between opacity resets; 0 = none")
     means_rate: float = Field(1.6e-4, gt=0, description="first step size of positions; the last is a hundredth of it")
     opacity_rate: float = Field(0.05, gt=0, description="step size of opacity logits")

@@ -88,8 +88,8 @@ def test_a_resumed_fit_is_the_unbroken_one_bit_for_bit(tmp_path, monkeypatch):
     adapt, folder = fitting._adapt, tmp_path / "resumed"
     for moment in (3, 4, 13, 18):  # before the first checkpoint of a run, twice in a row, around densifications
 
-        def killing(optimizer, settings, done, moment=moment):
-            adapt(optimizer, settings, done)
+        def killing(optimizer, centers, started_with, settings, done, moment=moment):
+            adapt(optimizer, centers, started_with, settings, done)
             if done == moment:
                 raise Killed
 
