@@ -38,13 +38,13 @@ help:
 
 setup: $(VENV)/.ready
 
-$(VENV)/.created:
+# Only where there is none: an environment that exists is never emptied.
+$(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo 'error: $(PYTHON) is not Python 3.11 or later; name one: make PYTHON=python3.12 setup' >&2; exit 1; }
-	$(PYTHON) -m venv --clear $(VENV)
-	@touch $@
+	$(PYTHON) -m venv $(VENV) || { rm -f $@; exit 1; }
 
-$(VENV)/.ready: pyproject.toml constraints.txt | $(VENV)/.created
+$(VENV)/.ready: pyproject.toml constraints.txt | $(VENV)/bin/python
 	$(PY) -m pip install --quiet --no-compile --constraint constraints.txt --editable .
 	@touch $@
 
