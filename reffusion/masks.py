@@ -71,6 +71,22 @@ def label_gaussians(votes: Votes, tau: float = 1.0) -> Tensor:
     return votes.masked > tau * votes.unmasked
 
 
+def leaking(
+    remaining: Gaussians, cameras: Sequence[Camera], never_seen: Mapping[str, np.ndarray], tau: float = 1.0
+) -> Tensor:
+    """bool [M]: haze, the Gaussians that with the object gone show mostly in never-seen pixels.
+
+    The fit had no say in what they show there: footprints that reached far into or behind the object while it hid
+    them. The same ratio that labels the object decides, counted without the object.
+
+    Args:
+        remaining: M Gaussians, the masked ones gone.
+        never_seen: view name -> bool [H, W].
+        tau: ratio of contributions in never-seen pixels to those in all others.
+    """
+    return label_gaussians(cast_votes(remaining, cameras, never_seen, mode="weight"), tau)
+
+
 def hidden_inside(
     gaussians: Gaussians, cameras: Sequence[Camera], masks: Mapping[str, np.ndarray], share: float = 0.5
 ) -> Tensor:

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 class Params(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    leak: float = Field(1.0, gt=0, description="weight in never-seen over other pixels from which Gaussians are haze")
     overlap: float = Field(0.006, ge=0, description="how far new Gaussians reach beyond the hole, / image width")
     explained: float = Field(0.5, gt=0, lt=1, description="alpha from which remaining Gaussians' depth is known")
     margin: float = Field(0.01, ge=0, description="known depth nearer to the hole than this is left out, / image width")
@@ -34,7 +35,7 @@ class Params(BaseModel):
 def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, reference: Path | None) -> None:
     import torch
 
-    from reffusion import initialize, io
+    from reffusion import initialize, io, masks as voting
 
     gaussians, labels = io.load_ply(fit / "gaussians.ply"), io.load_labels(masks / "labels.npy")
     if len(labels) != len(gaussians):
@@ -44,6 +45,9 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
     scene = io.load_scene(poses)
     references = io.load_references(reference, scene) if reference else []
     sets = io.load_mask_sets(masks, scene.cameras)
+    train = [scene.cameras[name] for name in scene.train]
+    haze = voting.leaking(gaussians, train, {c.name: sets[c.name].never_seen for c in train}, params.leak)
+    gaussians, new = gaussians.map(lambda p: p[~haze]), new[~haze]
     best = io.load_json(masks / "facts.json")["best_reference"]
     for each in sorted(references, key=lambda r: (r.camera.name != best, -int(r.mask.sum()))):
         gaussians, new = filled(params, out, gaussians, new, each, sets[each.camera.name].consistent, scene.points)
@@ -54,7 +58,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
         each = sets[name]
         asked += int(each.invent.sum())
         covered += int((initialize.share_of(gaussians, new, scene.cameras[name]) > 0.5)[each.invent].sum())
-    facts = {"new_gaussians": int(new.sum()), "removed_gaussians": int(labels.sum())}
+    facts = {"new_gaussians": int(new.sum()), "removed_gaussians": int(labels.sum()), "haze": int(haze.sum())}
     facts["uncovered_share"] = 1 - covered / asked if asked else 0.0
     io.save_json(out / "facts.json", facts)
     if references and facts["uncovered_share"] > 0.05:

@@ -20,6 +20,9 @@ class Params(BaseModel):
     observed: float = Field(
         1.0, gt=0, description="unmasked blending weight, summed over pixels and views, of a fully observed Gaussian"
     )
+    buried: float = Field(
+        0.1, ge=0, description="blending weight in all views up to which a Gaussian votes by where it stands"
+    )
     explained: float = Field(0.5, gt=0, lt=1, description="blended observation from which a pixel is explained")
     witnesses: int = Field(1, ge=0, description="training views that must show a pixel's background; 0 = not asked")
     tolerance: float = Field(0.02, gt=0, description="relative depth by which a visible point may lie too far")
@@ -52,8 +55,9 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
     if raw:
         votes = seen if params.vote == "weight" else masks.cast_votes(gaussians, train, ballots, mode=params.vote)
         labels = masks.label_gaussians(votes, params.tau)
-        voteless = (votes.masked + votes.unmasked) == 0
-        labels |= voteless & masks.hidden_inside(gaussians, train, ballots)
+        # What hardly any view sees (buried in the object, or in the wall behind it) votes by where it stands.
+        unseen = seen.masked + seen.unmasked <= params.buried
+        labels |= unseen & masks.hidden_inside(gaussians, train, ballots)
     elif region is not None:
         labels = masks.inside_box(gaussians, region["center"], region["size"])
     else:
