@@ -15,7 +15,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -149,8 +149,9 @@ def _in_child(job: Job, stage: str, partial: Path, earlier: dict[str, Decision],
     process = child(job.root, "run", pass_fds=(lock,), process_group=0)
     assert process.stdin
     try:
-        process.stdin.write(json.dumps(task) + "\n")
-        process.stdin.flush()  # and left open: the child ends when this process does
+        with suppress(BrokenPipeError):  # a child that is gone already has its code below
+            process.stdin.write(json.dumps(task) + "\n")
+            process.stdin.flush()  # and left open: the child ends when this process does
         code = process.wait()
     except KeyboardInterrupt:
         process.send_signal(signal.SIGINT)
@@ -161,7 +162,8 @@ def _in_child(job: Job, stage: str, partial: Path, earlier: dict[str, Decision],
             process.wait()
         raise
     finally:
-        process.stdin.close()
+        with suppress(BrokenPipeError):
+            process.stdin.close()
     answer = json.loads(result.read_text()) if result.exists() else {}
     result.unlink(missing_ok=True)
     if code == 0:
