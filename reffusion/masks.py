@@ -11,7 +11,6 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from reffusion import depth as completion
 from reffusion import geometry, splat
 from reffusion.types import Camera, Gaussians
 
@@ -134,53 +133,20 @@ def _small_parts(mask: np.ndarray, diameter: float) -> np.ndarray:
     return small[parts]
 
 
-@dataclass(frozen=True)
-class Surface:
-    """What one view shows of the scene without the object.
-
-    Attributes:
-        disparity: [H, W] float64, 1 / camera z of the remaining Gaussians, completed where they explain nothing.
-        explained: [H, W] in [0, 1]: blended evidence, see `evidence`.
-    """
-
-    disparity: np.ndarray
-    explained: np.ndarray
-
-
 def evidence(votes: Votes, enough: float) -> Tensor:
     """[N] in [0, 1]: how far a Gaussian was observed outside the masks, 1 from `enough` (in the unit of the votes)."""
     return (votes.unmasked / enough).clamp(0, 1)
 
 
 @torch.no_grad()
-def remaining_surface(
-    remaining: Gaussians,
-    observed: Tensor,
-    camera: Camera,
-    consistent: np.ndarray,
-    *,
-    enough: float = 0.5,
-    most_unknowns: int = 5000,
-) -> Surface:
-    """Depth and evidence of the remaining Gaussians in one view, the depth completed inside C where they fail.
+def remaining_view(remaining: Gaussians, observed: Tensor, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """What one view shows with the object gone: (disparity [H, W], 0 where nothing is; explained [H, W] in [0, 1)).
 
-    Args:
-        remaining: M Gaussians, the masked ones gone.
-        observed: [M] their evidence.
-        camera: the view.
-        consistent: bool [H, W], its C.
-        enough: blended evidence from which a pixel of C is explained.
-        most_unknowns: see `depth.complete`.
+    `explained` is the evidence of the M remaining Gaussians, `observed` [M], blended like a colour: tails and haze that
+    no photograph showed do not explain a pixel, however opaque.
     """
     drawn = splat.render(remaining, camera, features=observed[:, None].to(remaining.means.dtype), sh_degree=0)
-    alpha, explained = drawn.alpha.cpu().numpy(), drawn.features[..., 0].cpu().numpy()
-    disparity = _inverse(drawn.depth)
-    known = (alpha > 0.5) & (disparity > 0) & (~consistent | (explained > enough))
-    try:
-        disparity = completion.complete(disparity, known, most_unknowns=most_unknowns)
-    except ValueError:  # a mask over nearly the whole view leaves nothing to continue: what is rendered stays
-        pass
-    return Surface(disparity, explained)
+    return _inverse(drawn.depth), drawn.features[..., 0].cpu().numpy()
 
 
 def seen_elsewhere(

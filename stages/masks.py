@@ -28,7 +28,6 @@ class Params(BaseModel):
     tolerance: float = Field(0.02, gt=0, description="relative depth by which a visible point may lie too far")
     speck: float = Field(0.01, ge=0, description="islands of a mask below this diameter go, / image width")
     gap: float = Field(0.02, ge=0, description="holes in a mask below this diameter close, / image width")
-    unknowns: int = Field(5000, ge=100, description="pixels in the completion of depth behind the object, a view")
     invent: Literal["auto", "never_seen", "region"] = Field(
         "auto", description="what is made up; auto = the scene's 3D region where it names one, else never-seen pixels"
     )
@@ -75,18 +74,12 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
     fill_region = params.invent == "region" or (params.invent == "auto" and region is not None)
     for k in trace.progress(len(names), "masks"):
         name, camera = names[k], scene.cameras[names[k]]
-        surface = masks.remaining_surface(
-            remaining, observed, camera, consistent[name], enough=params.explained, most_unknowns=params.unknowns
-        )
-        unseen = consistent[name] & (surface.explained < params.explained)
-        unseen |= consistent[name] & (
-            masks.seen_elsewhere(
-                surface.disparity, consistent[name], camera, train, hidden, shown, tolerance=params.tolerance
-            )
-            < params.witnesses
-        )
+        disparity, explained = masks.remaining_view(remaining, observed, camera)
+        asked = consistent[name] & (explained > params.explained)
+        seen_by = masks.seen_elsewhere(disparity, asked, camera, train, hidden, shown, tolerance=params.tolerance)
+        unseen = consistent[name] & ~(asked & (seen_by >= params.witnesses))
         unseen = clean(unseen) & hidden[name]
-        invent = masks.box_silhouette(**region, camera=camera, disparity=surface.disparity) if fill_region else unseen
+        invent = masks.box_silhouette(**region, camera=camera, disparity=disparity) if fill_region else unseen
         sets[name] = MaskSet(raw.get(name, empty[name]), consistent[name], unseen, invent)
 
     io.save_labels(out / "labels.npy", labels.cpu())
