@@ -273,7 +273,8 @@ def planar_model(
 
 def _plane_values(plane: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """[H, W] at pixel centres."""
-    return evaluate_plane(plane + (0, 0, (plane[0] + plane[1]) * 0.5 / shape[1]), shape)
+    a, b, c = plane
+    return evaluate_plane(np.array([a, b, c + 0.5 * (a + b) / shape[1]]), shape)
 
 
 def _planes_in(points, values, draws, tolerance, trials, most_planes) -> list[np.ndarray]:
@@ -290,11 +291,14 @@ def _planes_in(points, values, draws, tolerance, trials, most_planes) -> list[np
         sample = index[:: max(1, len(index) // 4000)]
         support = (np.abs(trial @ points[sample].T - values[sample]) < near[sample]).sum(1)
         plane = trial[support.argmax()]
-        for _ in range(5):
-            inliers = free & (np.abs(points @ plane - values) < near)
+        inliers = free & (np.abs(points @ plane - values) < near)
+        for _ in range(10):
             if inliers.sum() < 3:
                 break
             plane = np.linalg.lstsq(points[inliers], values[inliers], rcond=None)[0]
+            misfit = np.abs(points @ plane - values)
+            # Beside a crease the other plane's samples are near, too: they stand out from the plane's own noise.
+            inliers = free & (misfit < np.minimum(near, 4.0 * np.median(misfit[inliers])))
         free &= np.abs(points @ plane - values) >= near
         planes.append(plane)
     return planes or [np.linalg.lstsq(points, values, rcond=None)[0]]

@@ -51,16 +51,22 @@ class Completion:
 
 @torch.no_grad()
 def depth_behind(
-    remaining: Gaussians, reference: Reference, hidden: np.ndarray, points: np.ndarray, how: Completion
+    remaining: Gaussians,
+    reference: Reference,
+    hole: np.ndarray,
+    hidden: np.ndarray,
+    points: np.ndarray,
+    how: Completion,
 ) -> tuple[np.ndarray, str]:
-    """Depth [H, W] float64 of the scene without the object, made up on the reference's mask, and how in words.
+    """Depth [H, W] float64 of the scene without the object, made up in the hole, and how in words.
 
     Planes are found among the sparse points where there are enough (they are unbiased, while the expected depth of
     splats lies too near wherever haze hangs before a plain surface), else among the rendered depths.
 
     Args:
         remaining: the Gaussians left.
-        reference: gives the view, the hole (its mask) and the guide.
+        reference: gives the view and the guide.
+        hole: bool [H, W], the pixels to be filled.
         hidden: bool [H, W], C of that view: where the object stood.
         points: [P, 3] sparse points of the scene.
         how: parameters.
@@ -68,7 +74,7 @@ def depth_behind(
     Raises:
         ValueError: naming the view, where too little is known around the hole.
     """
-    camera, hole = reference.camera, reference.mask
+    camera = reference.camera
     drawn = splat.render(remaining, camera, sh_degree=0)
     depth, alpha = drawn.depth.double().cpu().numpy(), drawn.alpha.cpu().numpy()
     known = (alpha > how.explained) & (depth > 0) & ~grown(hole, how.margin)
@@ -122,6 +128,18 @@ def grown(mask: np.ndarray, fraction: float) -> np.ndarray:
     if not mask.any():
         return mask
     return ndimage.distance_transform_edt(~mask) <= fraction * mask.shape[1]
+
+
+@torch.no_grad()
+def to_fill(
+    gaussians: Gaussians, new: torch.Tensor, reference: Reference, hidden: np.ndarray, covered: float
+) -> np.ndarray:
+    """bool [H, W]: what the reference has to fill: of its mask, what no earlier reference filled; of C (`hidden`, bool
+    [H, W]) also what the Gaussians cover by less than `covered`, e.g. where haze was taken away.
+    """
+    drawn = splat.render(gaussians, reference.camera, features=new[:, None].to(gaussians.means.dtype), sh_degree=0)
+    thin, filled = drawn.alpha.cpu().numpy() < covered, drawn.features[..., 0].cpu().numpy() > 0.5
+    return (reference.mask & ~filled) | (hidden & thin)
 
 
 @torch.no_grad()

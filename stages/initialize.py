@@ -12,6 +12,7 @@ class Params(BaseModel):
 
     leak: float = Field(1.0, gt=0, description="weight in never-seen over other pixels from which Gaussians are haze")
     overlap: float = Field(0.006, ge=0, description="how far new Gaussians reach beyond the hole, / image width")
+    covered: float = Field(0.9, gt=0, le=1, description="alpha below which the reference also fills pixels of C")
     explained: float = Field(0.5, gt=0, lt=1, description="alpha from which remaining Gaussians' depth is known")
     margin: float = Field(0.01, ge=0, description="known depth nearer to the hole than this is left out, / image width")
     ring: float = Field(0.08, gt=0, description="surroundings whose depth is continued, / image width")
@@ -35,7 +36,8 @@ class Params(BaseModel):
 def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, reference: Path | None) -> None:
     import torch
 
-    from reffusion import initialize, io, masks as voting
+    from reffusion import initialize, io
+    from reffusion import masks as voting
 
     gaussians, labels = io.load_ply(fit / "gaussians.ply"), io.load_labels(masks / "labels.npy")
     if len(labels) != len(gaussians):
@@ -74,12 +76,12 @@ def filled(params: Params, out: Path, gaussians, new, reference, hidden, points)
     from reffusion import geometry, initialize, io
 
     camera = reference.camera
+    hole = initialize.to_fill(gaussians, new, reference, hidden, params.covered)
     how = initialize.Completion(**{f.name: getattr(params, f.name) for f in fields(initialize.Completion)})
-    behind, said = initialize.depth_behind(gaussians.map(lambda p: p[~new]), reference, hidden, points, how)
+    behind, said = initialize.depth_behind(gaussians.map(lambda p: p[~new]), reference, hole, hidden, points, how)
     print(f"depth of reference {camera.name}: {said}")
     io.save_exr(out / "depth" / f"{camera.name}.exr", behind.astype("float32"))
-    empty = reference.mask & (initialize.share_of(gaussians, new, camera) < 0.5)
-    pixels = initialize.grown(empty, params.overlap)
+    pixels = initialize.grown(hole, params.overlap)
     added = geometry.surface_gaussians(
         reference.image, behind, pixels, camera, sh_count=gaussians.sh.shape[1], spread=params.spread,
         thickness=params.thickness, grazing=params.grazing, opacity=params.opacity,

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from reffusion import depth
+from reffusion.trace import generator
 
 ROWS, COLUMNS = np.mgrid[:48, :64].astype(float)
 PLANE = 0.4 + 0.003 * COLUMNS - 0.002 * ROWS
@@ -102,3 +103,37 @@ def test_refine_keeps_an_estimate_without_misfit_and_spreads_a_constant_one():
     np.testing.assert_allclose(depth.refine(PLANE, hidden(PLANE, INNER), ~INNER, guide), PLANE, rtol=1e-12)
     shifted = depth.refine(PLANE - 0.1, hidden(PLANE, INNER), (~INNER).astype(float), guide)
     np.testing.assert_allclose(shifted, PLANE, rtol=1e-9)
+
+
+def samples(disparity, keep):
+    rows, columns = np.nonzero(keep)
+    return np.stack([columns, rows], 1) + 0.5, disparity[rows, columns]
+
+
+def test_planes_of_a_room_meet_in_their_crease():
+    disparity, _ = corner()
+    pixels, values = samples(disparity, ~INNER)
+    model = depth.planar_model(pixels, values, disparity.shape, generator(0))
+    np.testing.assert_allclose(model.disparity, disparity, rtol=1e-9)
+    assert model.planes == 2 and model.explained == 1.0
+
+
+def test_a_convex_edge_is_continued_too():
+    disparity = np.minimum(0.4 + 0.01 * COLUMNS, 1.2 - 0.012 * COLUMNS)
+    model = depth.planar_model(*samples(disparity, ~INNER), disparity.shape, generator(0))
+    np.testing.assert_allclose(model.disparity, disparity, rtol=1e-9)
+
+
+def test_a_plane_before_the_wall_does_not_cut_through_the_hole():
+    disparity = np.where(COLUMNS > 50, PLANE + 0.3, PLANE) + 1e-4 * np.random.default_rng(0).normal(size=PLANE.shape)
+    model = depth.planar_model(*samples(disparity, ~INNER), disparity.shape, generator(0))
+    np.testing.assert_allclose(model.disparity[INNER], PLANE[INNER], rtol=1e-3)
+    assert model.explained < 0.9
+
+
+def test_too_few_samples_fix_no_plane():
+    with pytest.raises(ValueError, match="fix no plane"):
+        depth.planar_model(np.arange(22.0).reshape(11, 2), np.ones(11), (48, 64), generator(0))
+    line = np.stack([np.arange(30.0), 2 * np.arange(30.0)], 1)
+    with pytest.raises(ValueError, match="fix no plane"):
+        depth.planar_model(line, np.ones(30), (48, 64), generator(0))

@@ -1,0 +1,100 @@
+"""A wall of Gaussians with a square of other Gaussians before it, seen by cameras side by side: truth by hand."""
+
+import numpy as np
+import torch
+
+from reffusion import geometry, io
+from reffusion.types import Camera, Scene, Similarity
+
+WALL, HALF, RIM = 2.0, 0.17, 0.015  # depth of the wall; half the side of the square, and its soft rim; scene units
+WIDTH, HEIGHT, FOCAL = 96, 72, 90.0
+
+
+def camera(name: str, x: float, y: float = 0.0, z: float = 0.0) -> Camera:
+    pose = np.eye(4)
+    pose[:3, 3] = -x, -y, -z
+    return Camera(name, WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, pose)
+
+
+CAMERAS = {c.name: c for c in [*(camera(f"a{k}", x) for k, x in enumerate((-0.3, -0.15, 0.0, 0.15, 0.3))),
+                               camera("t0", 0.07), camera("t1", -0.2, 0.05)]}  # fmt: skip
+TRAIN, TEST = ("a0", "a1", "a2", "a3", "a4"), ("t0", "t1")
+
+
+def texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Colour of the wall at (x, y), [..., 3] in [0, 1]."""
+    return np.stack([0.5 + 0.3 * np.sin(9 * x), 0.5 + 0.3 * np.cos(8 * y), 0.5 + 0.2 * np.sin(6 * (x + y))], -1)
+
+
+def plane(depth: float, half_x: float, half_y: float, color):
+    """Gaussians of a fronto-parallel rectangle: one for each pixel of a camera that sees just it."""
+    wide, high = (max(2, round(2 * half * FOCAL / depth * 1.3)) for half in (half_x, half_y))
+    fx, fy = wide * depth / 2 / half_x, high * depth / 2 / half_y
+    view = Camera("sheet", wide, high, fx, fy, wide / 2, high / 2, np.eye(4))
+    points = geometry.unproject(np.full((high, wide), depth), view)
+    picture = color(points[..., 0], points[..., 1])
+    return geometry.surface_gaussians(
+        picture, np.full((high, wide), depth), np.ones((high, wide), bool), view, sh_count=1, spread=0.6, opacity=0.98
+    )
+
+
+def gaussians(square_at: float):
+    """(Gaussians, labels True for the square at depth `square_at`). What every view misses of the wall is left out."""
+    wall = plane(WALL, 2.0, 1.4, texture)
+    seen = torch.from_numpy(~hidden_everywhere(wall.means.numpy(), square_at))
+    square = plane(square_at, HALF, HALF, lambda x, y: np.broadcast_to((0.9, 0.1, 0.1), (*x.shape, 3)))
+    labels = torch.cat([torch.zeros(int(seen.sum()), dtype=torch.bool), torch.ones(len(square), dtype=torch.bool)])
+    return wall.map(lambda p: p[seen]).zipped(square, lambda a, b: torch.cat([a, b])), labels
+
+
+def behind_square(points: np.ndarray, view: Camera, square_at: float) -> np.ndarray:
+    """Does the square hide these wall points [..., 3] from the view?"""
+    at = view.center + (points - view.center) * (square_at - view.center[2]) / (points[..., 2:] - view.center[2])
+    return (np.abs(at[..., :2]) <= HALF + RIM).all(-1)
+
+
+def hidden_everywhere(points: np.ndarray, square_at: float) -> np.ndarray:
+    return np.all([behind_square(points, CAMERAS[name], square_at) for name in TRAIN], 0)
+
+
+def wall_points(view: Camera) -> np.ndarray:
+    return geometry.unproject(np.full((HEIGHT, WIDTH), WALL - view.center[2]), view)
+
+
+def true_mask(view: Camera, square_at: float) -> np.ndarray:
+    return behind_square(wall_points(view), view, square_at)
+
+
+def true_never_seen(view: Camera, square_at: float) -> np.ndarray:
+    return true_mask(view, square_at) & hidden_everywhere(wall_points(view), square_at)
+
+
+def photo(view: Camera) -> np.ndarray:
+    """uint8 [H, W, 3], the wall without the square."""
+    points = wall_points(view)
+    return (255 * texture(points[..., 0], points[..., 1])).round().astype(np.uint8)
+
+
+def write(folder, square_at: float, masks=None, clean=()):
+    """`poses` and `fit` folders of the scene; masks: view name -> bool, default the true ones of all training views."""
+    poses, fit = folder / "poses", folder / "fit"
+    masks = {name: true_mask(CAMERAS[name], square_at) for name in TRAIN} if masks is None else masks
+    points = np.stack([*(a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 25), np.linspace(-0.7, 0.7, 19))),
+                       np.full(475, WALL)], -1)  # fmt: skip
+    points = points[~hidden_everywhere(points, square_at)]
+    scene = Scene(dict(CAMERAS), TRAIN, TEST, frozenset(clean), points, np.zeros((len(points), 3), np.uint8),
+                  Similarity(1.0, np.zeros(3)))  # fmt: skip
+    io.save_scene(poses, scene)
+    for name, view in CAMERAS.items():
+        io.save_image(poses / "images" / f"{name}.png", photo(view))
+    for name, mask in masks.items():
+        io.save_mask(poses / "masks" / f"{name}.png", mask)
+    fit.mkdir(parents=True, exist_ok=True)
+    everything, labels = gaussians(square_at)
+    io.save_ply(fit / "gaussians.ply", everything)
+    return poses, fit, labels
+
+
+def iou(a: np.ndarray, b: np.ndarray) -> float:
+    union = (a | b).sum()
+    return float((a & b).sum() / union) if union else 1.0

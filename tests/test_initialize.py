@@ -1,0 +1,163 @@
+"""New Gaussians lie on the hidden surface, show the reference, and leave no holes."""
+
+import numpy as np
+import pytest
+import small_scene as small
+import torch
+
+from reffusion import geometry, io, splat
+from reffusion import initialize as rules
+from reffusion.types import Camera, Reference
+from stages import initialize, masks
+
+NEAR = 1.7
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene")
+    poses, fit, _ = small.write(folder, NEAR)
+    (folder / "masks").mkdir()
+    masks.run(masks.Params(), folder / "masks", poses=poses, fit=fit)
+    return {"poses": poses, "fit": fit, "masks": folder / "masks"}
+
+
+def references(scene, folder, *names):
+    sets = io.load_mask_sets(scene["masks"], names)
+    io.save_references(
+        folder, [Reference(small.CAMERAS[n], small.photo(small.CAMERAS[n]), sets[n].invent) for n in names]
+    )
+    return folder
+
+
+@pytest.mark.parametrize("how", [{}, {"planar_share": 2.0}], ids=["planes", "smooth"])
+def test_the_hidden_wall_is_rebuilt_where_it_was(scene, tmp_path, how):
+    initialize.run(initialize.Params(**how), tmp_path, **scene, reference=references(scene, tmp_path / "r", "a2"))
+    gaussians, new = io.load_ply(tmp_path / "gaussians.ply"), io.load_labels(tmp_path / "labels.npy")
+    before, removed = io.load_ply(scene["fit"] / "gaussians.ply"), io.load_labels(scene["masks"] / "labels.npy")
+    haze = io.load_json(tmp_path / "facts.json")["haze"]
+    assert len(gaussians) == len(new) and int((~new).sum()) == len(before) - int(removed.sum()) - haze
+    assert (gaussians.means[new][:, 2] - small.WALL).abs().max() < 0.03
+    depth = io.load_exr(tmp_path / "depth" / "a2.exr")
+    assert np.abs(depth - small.WALL).max() < 0.04
+    for name in small.TEST:
+        view = small.CAMERAS[name]
+        drawn = splat.render(gaussians, view)
+        inner = small.true_mask(view, NEAR)
+        error = np.abs(drawn.color.numpy() - small.photo(view) / 255)[inner]
+        assert error.mean() < 0.03 and drawn.alpha.numpy()[inner].min() > 0.85
+    assert io.load_json(tmp_path / "facts.json")["uncovered_share"] < 0.15
+
+
+def test_without_references_it_only_removes(scene, tmp_path):
+    initialize.run(initialize.Params(), tmp_path, **scene, reference=None)
+    labels = io.load_labels(scene["masks"] / "labels.npy")
+    before, after = io.load_ply(scene["fit"] / "gaussians.ply"), io.load_ply(tmp_path / "gaussians.ply")
+    haze = io.load_json(tmp_path / "facts.json")["haze"]
+    assert len(after) == len(before) - int(labels.sum()) - haze and haze < 0.01 * len(before)
+    assert not io.load_labels(tmp_path / "labels.npy").any()
+
+
+def test_a_second_reference_fills_only_what_the_first_left(scene, tmp_path):
+    counts = []
+    for names in (("a2",), ("a2", "a4")):
+        out = tmp_path / "".join(names)
+        out.mkdir()
+        initialize.run(initialize.Params(), out, **scene, reference=references(scene, out / "r", *names))
+        counts.append(int(io.load_labels(out / "labels.npy").sum()))
+    assert counts[0] <= counts[1] < 1.5 * counts[0]
+
+
+def test_labels_of_another_fit_are_refused(scene, tmp_path):
+    wrong = tmp_path / "masks"
+    wrong.mkdir()
+    io.save_labels(wrong / "labels.npy", np.zeros(3, bool))
+    with pytest.raises(ValueError, match="3 labels for"):
+        initialize.run(initialize.Params(), tmp_path, **(scene | {"masks": wrong}), reference=None)
+
+
+def slanted(degrees: float):
+    """Disparity of a plane through (0, 0, 2), turned about the vertical, and the view that sees it."""
+    view = small.camera("v", 0.0)
+    rays = geometry.pixel_rays(view)
+    normal = np.array([np.sin(np.radians(degrees)), 0.0, -np.cos(np.radians(degrees))])
+    return rays @ normal / (normal[2] * 2.0), view, normal
+
+
+@pytest.mark.parametrize("degrees", [0.0, 40.0, -60.0])
+def test_normals_of_a_plane_are_exact(degrees):
+    disparity, view, normal = slanted(degrees)
+    found = geometry.surface_normals(1 / disparity, view)
+    np.testing.assert_allclose(found, np.broadcast_to(normal, found.shape), atol=1e-9)
+
+
+def test_normals_beside_a_crease_belong_to_their_own_plane():
+    left, view, _ = slanted(30.0)
+    right = slanted(-30.0)[0]
+    normals = geometry.surface_normals(1 / np.maximum(left, right), view)
+    sides = np.sort(normals[36, :, 0])
+    assert (np.abs(np.abs(sides) - 0.5) < 1e-9).all()
+
+
+@pytest.mark.parametrize("degrees", [0.0, 40.0])
+@pytest.mark.parametrize("closer", [1.0, 1.5])
+@pytest.mark.parametrize("turn", [0.0, 65.0])
+def test_the_new_surface_shows_no_holes_nearer_by_or_from_the_side(degrees, closer, turn):
+    disparity, view, _ = slanted(degrees)
+    whole = np.ones(disparity.shape, bool)
+    params = initialize.Params()
+    surface = geometry.surface_gaussians(
+        np.zeros((*disparity.shape, 3), np.uint8), 1 / disparity, whole, view, sh_count=4, spread=params.spread,
+        thickness=params.thickness, grazing=params.grazing, opacity=params.opacity,
+    )  # fmt: skip
+    a = np.radians(turn)
+    pose = np.eye(4)
+    pose[:3, :3] = [[np.cos(a), 0, -np.sin(a)], [0, 1, 0], [np.sin(a), 0, np.cos(a)]]
+    pose[:3, 3] = np.array([0, 0, 2 / closer]) - pose[:3, :3] @ (0, 0, 2.0)
+    other = Camera("w", 16, 16, small.FOCAL, small.FOCAL, 8, 8, pose)
+    assert splat.render(surface, other).alpha.min() > 0.8
+
+
+def test_bad_depth_is_refused():
+    view = small.camera("v", 0.0)
+    depth = np.ones((small.HEIGHT, small.WIDTH))
+    depth[3, 3] = np.nan
+    with pytest.raises(ValueError, match="not positive and finite"):
+        geometry.surface_gaussians(np.zeros((*depth.shape, 3)), depth, np.ones(depth.shape, bool), view, sh_count=1)
+    none = geometry.surface_gaussians(np.zeros((*depth.shape, 3)), depth, np.zeros(depth.shape, bool), view, sh_count=4)
+    assert len(none) == 0 and none.sh.shape == (0, 4, 3)
+
+
+def test_what_haze_left_open_is_filled_too(scene, tmp_path):
+    """The rim of the hole that the mask leaves to the remaining Gaussians, with these taken away."""
+    view = small.CAMERAS["a2"]
+    sets = io.load_mask_sets(scene["masks"], ["a2"])["a2"]
+    gaussians, labels = io.load_ply(scene["fit"] / "gaussians.ply"), io.load_labels(scene["masks"] / "labels.npy")
+    remaining = gaussians.map(lambda p: p[~labels])
+    reference = Reference(view, small.photo(view), np.zeros_like(sets.invent))
+    asked = rules.to_fill(remaining, torch.zeros(len(remaining), dtype=torch.bool), reference, sets.consistent, 0.9)
+    assert (asked & sets.never_seen).sum() > 0.9 * small.true_never_seen(view, NEAR).sum()
+    assert not (asked & ~sets.consistent).any()
+
+
+def test_sparse_points_count_where_they_are_visible():
+    view = small.camera("v", 0.0)
+    points = np.array([[0, 0, 2.0], [0, 0, 3.0], [0.9, 0, 2.0], [5, 0, 2.0], [0, 0, -2.0]])
+    wall, left = np.full((small.HEIGHT, small.WIDTH), 0.5), np.zeros((small.HEIGHT, small.WIDTH), bool)
+    left[:, :60] = True
+    pixels, values = rules.visible_points(points, view, left, wall)
+    np.testing.assert_allclose(pixels, [[small.WIDTH / 2, small.HEIGHT / 2]])
+    assert values.tolist() == [0.5]
+
+
+def test_the_reference_is_reproduced_by_matched_colors():
+    view = small.camera("v", 0.0)
+    picture, depth = small.photo(view), np.full((small.HEIGHT, small.WIDTH), small.WALL)
+    everything = np.ones(depth.shape, bool)
+    new = geometry.surface_gaussians(picture, depth, everything, view, sh_count=1, spread=0.4)
+    labels = torch.ones(len(new), dtype=torch.bool)
+    error = lambda g: np.abs(splat.render(g, view).color.numpy() - picture / 255)[4:-4, 4:-4].mean()
+    matched = rules.match_colors(new, labels, picture, everything, view, 5)
+    assert error(matched) < 0.5 * error(new)
+    kept = rules.match_colors(new, ~labels, picture, everything, view, 5)
+    assert torch.equal(kept.sh, new.sh)

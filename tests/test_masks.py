@@ -1,0 +1,191 @@
+"""Votes, labels and pixel classes on a scene whose truth is known by hand."""
+
+import numpy as np
+import pytest
+import small_scene as small
+import torch
+
+from reffusion import io, masks
+from reffusion.types import Gaussians
+from stages.masks import Params, run
+
+NEAR, FAR = 1.7, 0.8  # a square close to the wall hides part of it from all views; a distant one next to nothing
+
+
+def classify(tmp_path, square_at, params=None, **scene):
+    poses, fit, labels = small.write(tmp_path, square_at, **scene)
+    out = tmp_path / "masks"
+    out.mkdir()
+    run(params or Params(), out, poses=poses, fit=fit)
+    found = io.load_labels(out / "labels.npy")
+    return io.load_mask_sets(out, small.CAMERAS), io.load_json(out / "facts.json"), found, labels
+
+
+def ball(z, opacity=0.9, scale=0.1):
+    return Gaussians(
+        torch.tensor([[0.0, 0.0, z]]), torch.zeros(1, 4), torch.full((1, 3), float(np.log(scale))),
+        torch.full((1,), float(np.log(opacity / (1 - opacity)))), torch.zeros(1, 1, 3),
+    )  # fmt: skip
+
+
+def test_a_vote_is_the_blending_weight_inside_and_outside_the_mask():
+    view, front, back = small.camera("v", 0.0), ball(1.0), ball(1.5)
+    both = front.zipped(back, lambda a, b: torch.cat([a, b]))
+    left = np.zeros((small.HEIGHT, small.WIDTH), bool)
+    left[:, : small.WIDTH // 2] = True
+    votes = masks.cast_votes(both, [view], {"v": left}, mode="weight")
+    np.testing.assert_allclose(votes.masked, votes.unmasked, rtol=1e-4)  # symmetric about the middle
+    alone = masks.cast_votes(front, [view], {"v": left}, mode="weight")
+    np.testing.assert_allclose(votes.masked[0], alone.masked[0], rtol=1e-5)  # nothing stands before the front one
+    assert votes.masked[1] < masks.cast_votes(back, [view], {"v": left}, mode="weight").masked[0]
+    counts = masks.cast_votes(both, [view], {"v": left}, mode="count")
+    assert counts.masked[1] == round(float(counts.masked[1])) and counts.masked[1] > votes.masked[1]
+
+
+@pytest.mark.parametrize("tau", [0.5, 1.0, 2.0])
+def test_the_label_needs_a_ratio_above_tau(tau):
+    votes = masks.Votes(torch.tensor([tau * 3, tau * 3 + 1e-3, 0.0, 1.0, 0.0]), torch.tensor([3.0, 3.0, 0.0, 0.0, 1.0]))
+    assert masks.label_gaussians(votes, tau).tolist() == [False, True, False, True, False]
+
+
+def test_views_without_a_mask_do_not_vote_and_empty_masks_do():
+    views = [small.camera("v", 0.0), small.camera("w", 0.0)]
+    full, empty = np.ones((small.HEIGHT, small.WIDTH), bool), np.zeros((small.HEIGHT, small.WIDTH), bool)
+    alone = masks.cast_votes(ball(1.0), views, {"v": full})
+    assert masks.label_gaussians(alone).all() and alone.unmasked == 0
+    both = masks.cast_votes(ball(1.0), views, {"v": full, "w": empty})
+    assert both.masked == both.unmasked > 0 and not masks.label_gaussians(both).any()  # a tie is no majority
+
+
+def test_wrong_masks_are_refused():
+    with pytest.raises(ValueError, match="none of the training views has a mask"):
+        masks.cast_votes(ball(1.0), [small.camera("v", 0.0)], {"other": np.ones((small.HEIGHT, small.WIDTH), bool)})
+    with pytest.raises(ValueError, match="mask of view v"):
+        masks.cast_votes(ball(1.0), [small.camera("v", 0.0)], {"v": np.ones((4, 4), bool)})
+
+
+def test_gaussians_that_nobody_sees_go_with_what_surrounds_them():
+    views = [small.camera("v", -0.2), small.camera("w", 0.2)]
+    ballots = {view.name: small.true_mask(view, 1.0) for view in views}
+    aside = ball(1.0).map(lambda p: p.clone())
+    aside.means[0, 0] = 0.5
+    nowhere = ball(-1.0)
+    assert [bool(masks.hidden_inside(g, views, ballots)) for g in (ball(1.0), aside, nowhere)] == [True, False, False]
+
+
+def test_tidy_removes_specks_and_closes_gaps():
+    mask = np.zeros((40, 40), bool)
+    mask[5:25, 5:25] = True
+    whole = mask.copy()
+    mask[10, 10] = False
+    mask[35, 35] = True
+    assert (masks.tidy(mask, 3, 3) == whole).all()
+    assert (masks.tidy(mask, 0, 0) == mask).all()
+    mask[12:20, 12:20] = False
+    assert not masks.tidy(mask, 3, 3)[15, 15]
+
+
+def test_consistent_and_never_seen_masks_match_the_truth(tmp_path):
+    sets, facts, found, labels = classify(tmp_path, NEAR)
+    assert (found == labels).float().mean() > 0.99
+    for name, view in small.CAMERAS.items():
+        assert small.iou(sets[name].consistent, small.true_mask(view, NEAR)) > 0.9
+        assert small.iou(sets[name].never_seen, small.true_never_seen(view, NEAR)) > 0.75
+        assert not (sets[name].never_seen & ~sets[name].consistent).any()
+        assert (sets[name].invent == sets[name].never_seen).all()
+    assert facts["best_reference"] in small.TRAIN and facts["invent_views"] == list(small.TRAIN)
+    assert facts["masked_gaussians"] == int(found.sum())
+    assert facts["invent_pixels"] == sum(int(sets[name].invent.sum()) for name in small.TRAIN)
+
+
+def test_what_other_views_saw_is_not_invented(tmp_path):
+    sets, facts, _, _ = classify(tmp_path, FAR)
+    assert all(small.iou(sets[n].consistent, small.true_mask(v, FAR)) > 0.9 for n, v in small.CAMERAS.items())
+    # Some is: a band of half a footprint, whose Gaussians the masks' rim outvotes.
+    assert facts["never_seen_share"] < 0.1
+
+
+def test_a_missing_and_a_contradicting_mask_are_outvoted(tmp_path):
+    given = {name: small.true_mask(small.CAMERAS[name], NEAR) for name in small.TRAIN[1:]}
+    given["a3"] = np.zeros_like(given["a3"])
+    sets, facts, _, _ = classify(tmp_path, NEAR, masks=given)
+    assert facts["voting_views"] == 4
+    assert small.iou(sets["a0"].consistent, small.true_mask(small.CAMERAS["a0"], NEAR)) > 0.9
+    assert not sets["a0"].raw.any()
+
+
+def test_a_clean_view_shows_what_the_object_hid(tmp_path):
+    given = {name: small.true_mask(small.CAMERAS[name], NEAR) for name in small.TRAIN if name != "a2"}
+    sets, facts, _, _ = classify(tmp_path, NEAR, masks=given, clean=("a2",))
+    assert facts["voting_views"] == 5
+    assert not sets["a2"].never_seen.any()
+    hidden = classify(tmp_path / "b", NEAR)[1] if (tmp_path / "b").mkdir() is None else None
+    assert facts["invent_pixels"] <= hidden["invent_pixels"]
+
+
+@pytest.mark.parametrize("value", [False, True])
+def test_empty_and_full_masks_are_handled(tmp_path, value):
+    given = np.full((small.HEIGHT, small.WIDTH), value)
+    sets, facts, found, _ = classify(tmp_path, NEAR, masks=dict.fromkeys(small.TRAIN, given))
+    assert bool(found.any()) == value
+    assert all(each.consistent.mean() == (1.0 if value else 0.0) for each in sets.values())
+    assert (facts["best_reference"] is None) == (not value)
+
+
+def test_a_region_alone_marks_and_fills(tmp_path):
+    poses, fit, labels = small.write(tmp_path, NEAR, masks={})
+    with pytest.raises(ValueError, match="neither masks nor a region"):
+        run(Params(), tmp_path, poses=poses, fit=fit)
+    with pytest.raises(ValueError, match=r"region\.json is missing"):
+        run(Params(invent="region"), tmp_path, poses=poses, fit=fit)
+    io.save_json(poses / "region.json", {"center": [0, 0, NEAR], "size": [0.5, 0.5, 0.1]})
+    run(Params(), tmp_path, poses=poses, fit=fit)
+    sets = io.load_mask_sets(tmp_path, small.CAMERAS)
+    assert (io.load_labels(tmp_path / "labels.npy") == labels).all()
+    rows, columns = np.nonzero(sets["a2"].invent)
+    half = 0.25 / (NEAR - 0.05) * small.FOCAL
+    assert all(abs((side.max() - side.min() + 1) / 2 - half) <= 1 for side in (rows, columns))
+
+
+def test_a_box_behind_the_surface_has_no_silhouette():
+    view = small.camera("v", 0.0)
+    wall = np.full((small.HEIGHT, small.WIDTH), 1 / small.WALL)
+    visible = masks.box_silhouette([0, 0, 1.5], [0.2] * 3, view, wall)
+    assert visible[36, 48] and not visible[2, 2]
+    assert not masks.box_silhouette([0, 0, 1.5], [0.2] * 3, view, np.full(wall.shape, 1 / 1.2)).any()
+    assert not masks.box_silhouette([0, 0, -1.5], [0.2] * 3, view, wall).any()
+
+
+def test_the_best_view_has_the_largest_mask_clear_of_the_border():
+    blank = np.zeros((20, 30), bool)
+    small_one, large, cut = blank.copy(), blank.copy(), blank.copy()
+    small_one[5:8, 5:8] = large[5:12, 5:12] = cut[:15, :15] = True
+    assert masks.best_view({"s": small_one, "l": large, "c": cut}, ["c", "s", "l"]) == "l"
+    assert masks.best_view({"s": blank, "c": cut}, ["s", "c"]) == "c"
+    assert masks.best_view({"s": blank}, ["s"]) is None
+
+
+def test_haze_shows_mostly_where_nobody_saw():
+    view, blob = small.camera("v", 0.0), ball(1.0)
+    inside = small.true_mask(view, 1.0)
+    aside = blob.map(lambda p: p.clone())
+    aside.means[0, 0] = 0.4
+    both = blob.zipped(aside, lambda a, b: torch.cat([a, b]))
+    assert masks.leaking(both, [view], {"v": inside}).tolist() == [True, False]
+
+
+def test_evidence_is_what_was_observed_outside_the_masks():
+    votes = masks.Votes(torch.tensor([9.0, 0.0, 0.0]), torch.tensor([0.0, 0.5, 7.0]))
+    assert masks.evidence(votes, 1.0).tolist() == [0.0, 0.5, 1.0]
+
+
+def test_a_point_is_seen_in_front_of_what_a_view_shows_and_outside_its_mask():
+    view, other = small.camera("v", 0.0), small.camera("w", 0.1)
+    shape = (small.HEIGHT, small.WIDTH)
+    wall, pixels, none = np.full(shape, 1 / small.WALL), np.ones(shape, bool), np.zeros(shape, bool)
+    count = lambda hidden, shown: masks.seen_elsewhere(wall, pixels, view, [other], {"w": hidden}, {"w": shown})
+    inside = count(none, wall)
+    assert inside[:, 8:].all() and not inside[:, :4].any()  # beyond the frame of the other view
+    assert not count(pixels, wall).any()
+    assert not count(none, np.full(shape, 1 / 1.5)).any()  # something stands before it there
+    assert count(none, np.full(shape, 0.0))[:, 8:].all()  # nothing there at all: it is not hidden
