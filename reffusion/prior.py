@@ -326,13 +326,12 @@ def set_dropout(prior: Prior, active: bool) -> None:
 
 def save_lora(prior: Prior, folder: Path) -> None:
     """Write `pytorch_lora_weights.safetensors` as diffusers' `load_lora_weights` reads it, rank and alpha included."""
-    from diffusers import StableDiffusionInpaintPipeline
     from peft import get_peft_model_state_dict
 
-    StableDiffusionInpaintPipeline.save_lora_weights(
+    _pipeline_class().save_lora_weights(
         folder,
-        unet_lora_layers=get_peft_model_state_dict(prior.unet),
-        text_encoder_lora_layers=get_peft_model_state_dict(prior.text_encoder),
+        unet_lora_layers=get_peft_model_state_dict(prior.unet, save_embedding_layers=False),
+        text_encoder_lora_layers=get_peft_model_state_dict(prior.text_encoder, save_embedding_layers=False),
         weight_name=LORA_FILE,
         unet_lora_adapter_metadata=_adapter_facts(prior.unet),
         text_encoder_lora_adapter_metadata=_adapter_facts(prior.text_encoder),
@@ -361,9 +360,7 @@ def load_lora(prior: Prior, folder: Path) -> Prior:
 
 def pipeline(prior: Prior) -> Any:
     """diffusers' own inpainting pipeline over the same parts."""
-    from diffusers import StableDiffusionInpaintPipeline
-
-    return StableDiffusionInpaintPipeline(
+    return _pipeline_class()(
         vae=prior.vae,
         text_encoder=prior.text_encoder,
         tokenizer=prior.tokenizer,
@@ -373,3 +370,15 @@ def pipeline(prior: Prior) -> Any:
         feature_extractor=None,
         requires_safety_checker=False,
     )
+
+
+def _pipeline_class() -> Any:
+    """StableDiffusionInpaintPipeline, imported without the advice to install torchvision, which nothing here needs."""
+    from transformers.utils import logging as transformers_logging
+
+    level = transformers_logging.get_verbosity()
+    transformers_logging.set_verbosity_error()
+    from diffusers import StableDiffusionInpaintPipeline
+
+    transformers_logging.set_verbosity(level)
+    return StableDiffusionInpaintPipeline
