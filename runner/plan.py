@@ -242,8 +242,13 @@ def decide(job: Job, stage: str, earlier: dict[str, Decision]) -> Decision:
     moving = [need for need, decision in needs.items() if not decision.settled]
     if moving:
         path = _there(job, stage)
-        reason = f"waits for {', '.join(moving)}; kept if the new content is the same" if path else "no artifact yet"
-        return Decision("stale" if path else "run", reason, path)
+        found = path and receipt(path)
+        if not found:
+            return Decision("run", "no artifact yet")
+        as_then = Inputs(job.params[stage], job.profile, found["needs"], found["weights"], code)
+        if known := [] if job.trust else changes(found, as_then):
+            return Decision("run", _listed(known), path)
+        return Decision("stale", f"waits for {', '.join(moving)}; kept if the new content is the same", path)
     return _compare(job, stage, _inputs(job, stage, {need: d.path for need, d in needs.items()}, code))
 
 
@@ -350,7 +355,7 @@ def plan(job: Job, stages: list[str], done: dict[str, Decision] | None = None) -
             asked[stage] = {"params": job.params[stage], "takes": spec.takes, "needs": paths}
     for stage, answer in (_ask(job.root, asked) if asked else {}).items():
         decisions[stage] = replace(decisions[stage], notes=tuple(answer["notes"]))
-        if answer["refusal"] and decisions[stage].word == "run":
+        if answer["refusal"] and decisions[stage].inputs:  # its needs are what they will be
             decisions[stage] = replace(decisions[stage], word="missing", reason=answer["refusal"])
     job.hashes.save()
     return {stage: decisions[stage] for stage in stages}

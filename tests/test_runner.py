@@ -249,6 +249,7 @@ def test_parameter_reruns_its_stage_and_what_depends_on_it(root, capsys):
     said = words(root, set="fit.iterations=5")
     assert said["poses"] == "cached" and said["fit"] == "run param iterations 3 -> 5"
     assert said["masks"].startswith("stale waits for fit") and said["evaluate"].startswith("stale")
+    assert words(root, set="fit.iterations=5 masks.threshold=99")["masks"] == "run param threshold 100 -> 99"
     assert ran(capsys, root, set="fit.iterations=5") == ["fit", "masks", "distill", "evaluate"]
     assert result(root) == 14.0
 
