@@ -10,6 +10,7 @@ runs :=
 data := data
 seed :=
 name :=
+steps :=
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -19,7 +20,7 @@ STAGES := poses fit masks reference personalize initialize distill evaluate
 options = $(if $(profile),--profile '$(profile)') $(if $(variant),--variant '$(variant)') \
 	$(if $(set),--set '$(set)') $(if $(trust),--trust) $(if $(runs),--runs '$(runs)')
 
-.PHONY: help setup all $(STAGES) plan clean batch demo test lint
+.PHONY: help setup all $(STAGES) plan clean batch demo prior test lint
 .DELETE_ON_ERROR:
 
 help:
@@ -29,6 +30,7 @@ help:
 	@echo 'make scene=X clean             remove what was computed for it'
 	@echo 'make data=FOLDER batch         every scene of a folder, and one table'
 	@echo 'make demo [seed=N]             make the demo scene, or another: data/demo-N'
+	@echo 'make prior [steps=N]           train the embedded prior further (hours)'
 	@echo 'make setup | test | lint       .venv; the tests; ruff'
 	@echo 'scene=  a name under data/, or the path of any folder'
 	@echo 'profile=auto|laptop|paper  variant=NAME  set="fit.iterations=500 distill.seed=3"  runs=FOLDER'
@@ -85,6 +87,9 @@ clean: named setup
 
 batch: setup
 	@$(PY) -m runner batch --data '$(data)' $(options)
+
+prior: setup
+	$(PY) priors/tiny/train.py $(if $(steps),--steps '$(steps)')
 
 test: $(VENV)/.ready-dev
 	$(PY) -m pytest

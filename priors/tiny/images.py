@@ -18,7 +18,7 @@ from reffusion.trace import seed_for
 
 SIZE = 128  # px, side of one training image; crops are taken from it
 SUPERSAMPLE = 2
-PHOTOS = ("astronaut", "chelsea", "coffee", "rocket", "brick", "grass", "gravel", "camera", "coins", "moon")
+PHOTOS = ("astronaut", "chelsea", "coffee", "rocket", "brick", "grass", "gravel", "camera", "coins")
 HELD_OUT_PHOTOS = ("chelsea", "gravel")
 
 Field = np.ndarray  # [H, W] float32
