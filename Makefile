@@ -12,13 +12,15 @@ seed :=
 name :=
 steps :=
 
+export set # its value may hold quotes: recipes read it from the environment
+
 PYTHON ?= python3
 VENV ?= .venv
 PY := $(VENV)/bin/python
 STAGES := poses fit masks reference personalize initialize distill evaluate
 
 options = $(if $(profile),--profile '$(profile)') $(if $(variant),--variant '$(variant)') \
-	$(if $(set),--set '$(set)') $(if $(trust),--trust) $(if $(runs),--runs '$(runs)')
+	$(if $(set),--set "$$set") $(if $(trust),--trust) $(if $(runs),--runs '$(runs)')
 
 .PHONY: help setup all $(STAGES) plan clean batch demo prior test lint
 .DELETE_ON_ERROR:
