@@ -12,7 +12,7 @@ seed :=
 name :=
 steps :=
 
-export set # its value may hold quotes: recipes read it from the environment
+export set # its value may hold quotes, so recipes read it from the environment
 
 PYTHON ?= python3
 VENV ?= .venv
