@@ -72,12 +72,13 @@ def fit_unmasked(run: Run, scene: Scene, out: Path) -> Gaussians:
     masks = io.load_raw_masks(run.poses, scene.train)
     keep = ~mostly_inside(scene.points, cameras, masks)
     noise = trace.generator(params.seed, "start")
-    start = initial_gaussians(scene.points[keep], scene.point_colors[keep], params.sh_degree, params.budget, noise)
+    chosen = fit_stage.settings(params, cameras)
+    start = initial_gaussians(scene.points[keep], scene.point_colors[keep], params.sh_degree, chosen.budget, noise)
     result = fit(
         cameras,
         io.load_views(run.poses, scene.train),
         start.map(lambda p: p.to(params.device)),
-        fit_stage.settings(params),
+        chosen,
         folder=out,
         weights={name: (~mask).astype(np.float32) for name, mask in masks.items()},
     ).map(lambda p: p.cpu())

@@ -46,7 +46,7 @@ class Settings:
         budget: most Gaussians.
         least_opacity: fainter ones are pruned when others are added.
         region_every: steps between prunings of Gaussians that changed region.
-        stop_drop: stop when the reference's PSNR falls so many dB under its best; 0: never.
+        stop_drop: stop when the reference's PSNR falls so many dB under its best, and give the best; 0: never.
         rates: Adam's step sizes.
         checkpoint_seconds: seconds of work between checkpoints.
     """
@@ -101,10 +101,10 @@ def distill(
     if distilled and (prior is None or text is None):
         raise ValueError("distillation with sds_weight > 0 needs a prior and its prompts' embeddings")
     state = trace.load_checkpoint(folder)
-    start, seconds, best = 0, 0.0, -float("inf")
+    start, seconds, best, best_psnr = 0, 0.0, None, -float("inf")
     if state is not None:
         optimizer.load_state_dict(state["optimizer"])
-        start, seconds, best = state["step"], state["seconds"], state["best"]
+        start, seconds, best, best_psnr = (state[k] for k in ("step", "seconds", "best", "best_psnr"))
     log, saved = trace.Trace(folder, seconds, start + 1), seconds  # a line is numbered by the steps done
 
     for step in trace.progress(settings.iterations, "distill", start):
@@ -114,21 +114,26 @@ def distill(
             _densify(optimizer, settings, done)
         if region is not None and (done % settings.region_every == 0 or done == settings.iterations):
             optimizer.select(~strays(region, optimizer.gaussians.means.detach(), optimizer.masked))
-        stop = False
         if trace.log_spaced(done, settings.iterations, per_octave=4):
             with log.paused():
                 psnr = reference_psnr(optimizer.gaussians, holes)
             counts = {"gaussians": len(optimizer.masked), "masked_gaussians": int(optimizer.masked.sum())}
             log.log(done, reference_psnr=psnr, **line, **counts)
-            best = max(best, psnr)
-            stop = 0 < settings.stop_drop < best - psnr
-        if log.seconds - saved > settings.checkpoint_seconds and not stop:
+            if settings.stop_drop > 0 and psnr > best_psnr:
+                best, best_psnr = _copy(optimizer), psnr
+            if 0 < settings.stop_drop < best_psnr - psnr:
+                return Gaussians(**{name: best[name] for name in PARAMETERS}), best["masked"]
+        if log.seconds - saved > settings.checkpoint_seconds:
             saved = log.seconds
-            state = {"optimizer": optimizer.state_dict(), "step": done, "seconds": saved, "best": best}
-            trace.save_checkpoint(folder, state)
-        if stop:
-            break
+            state = {"optimizer": optimizer.state_dict(), "step": done, "seconds": saved}
+            trace.save_checkpoint(folder, state | {"best": best, "best_psnr": best_psnr})
     return optimizer.gaussians.map(Tensor.detach), optimizer.masked
+
+
+def _copy(optimizer: GaussianOptimizer) -> dict[str, Tensor]:
+    """The Gaussians' parameters and labels as they are now."""
+    tensors = {name: getattr(optimizer.gaussians, name) for name in PARAMETERS} | {"masked": optimizer.masked}
+    return {name: tensor.detach().clone() for name, tensor in tensors.items()}
 
 
 def _step(

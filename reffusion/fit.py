@@ -21,7 +21,6 @@ from reffusion.optimize import GaussianOptimizer, Rates, reconstruction_loss
 from reffusion.splat import render
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
-CHECKPOINT_SECONDS = 10.0
 SH_0 = 0.28209479177387814  # the constant spherical harmonic
 
 
@@ -51,6 +50,7 @@ class Settings:
         largest: Gaussians of a larger size are pruned.
         reset_every: part of the run after which opacities are capped at 0.01, while densifying; 0: never.
         rates: Adam's step sizes.
+        checkpoint_seconds: seconds of work between checkpoints.
     """
 
     iterations: int = 30_000
@@ -69,6 +69,7 @@ class Settings:
     largest: float = 0.5
     reset_every: float = 0.1
     rates: Rates = field(default_factory=Rates)
+    checkpoint_seconds: float = 10.0
 
 
 def fit(
@@ -129,7 +130,7 @@ def fit(
                 line = _summary(recent, optimizer, held_out, images, settings, done, impl)
             log.log(done, **line)
             recent = {"loss": 0.0, "error": 0.0, "steps": 0}
-        if time.monotonic() - saved_at > CHECKPOINT_SECONDS and done < settings.iterations:
+        if time.monotonic() - saved_at > settings.checkpoint_seconds and done < settings.iterations:
             _check_finite(optimizer.gaussians, f"step {i}, view '{camera.name}'")
             state = {"optimizer": optimizer.state_dict(), "iteration": done, "recent": recent, "seconds": log.seconds}
             trace.save_checkpoint(folder, state)

@@ -107,9 +107,22 @@ def clear_windows(region: Tensor, size: int) -> Tensor:
     return torch.nonzero(inside == 0)
 
 
+class Clear(NamedTuple):
+    """image [3, H, W]; windows [K, 2] long, (top, left) of its windows without a masked pixel, K > 0."""
+
+    image: Tensor
+    windows: Tensor
+
+
+def clear_views(views: Sequence[Picture], size: int) -> list[Clear]:
+    """The views that have a size x size window free of their region, with all such windows."""
+    found = (Clear(view.image, clear_windows(view.region, size)) for view in views)
+    return [view for view in found if len(view.windows)]
+
+
 def draw_samples(
     references: Sequence[Picture],
-    views: Sequence[Picture],
+    views: Sequence[Clear],
     native: int,
     size: int,
     count: int,
@@ -120,23 +133,16 @@ def draw_samples(
 
     Args:
         references: what is to be learned; every pixel of them may be used.
-        views: the scene's own views for `sampling.scene_share`; pixels in their region are never used.
+        views: the scene's own views for `sampling.scene_share`, their windows of side `size`; none: no such samples.
         native: the side that distillation reduces a whole view to. A global sample is reduced to it as well, and,
             where `size` is smaller, a window of it is taken, so that the model learns it in the scale it will see.
-    Raises:
-        ValueError: scene crops are asked for and no view has a window free of masked pixels.
     """
-    clear = [clear_windows(view.region, size) for view in views] if sampling.scene_share > 0 else []
-    usable = [index for index, windows in enumerate(clear) if len(windows)]
-    if sampling.scene_share > 0 and not usable:
-        raise ValueError(f"no training view has a {size} px window free of masked pixels; set scene_crops to 0")
     images, masks, prompts = [], [], []
     for _ in range(count):
-        if _uniform(0, 1, generator) < sampling.scene_share:
-            index = usable[int(torch.randint(len(usable), (), generator=generator))]
-            windows = clear[index]
-            top, left = windows[int(torch.randint(len(windows), (), generator=generator))].tolist()
-            image, prompt = views[index].image[:, top : top + size, left : left + size], LOCAL
+        if views and _uniform(0, 1, generator) < sampling.scene_share:
+            view = views[int(torch.randint(len(views), (), generator=generator))]
+            top, left = view.windows[int(torch.randint(len(view.windows), (), generator=generator))].tolist()
+            image, prompt = view.image[:, top : top + size, left : left + size], LOCAL
         else:
             source = references[int(torch.randint(len(references), (), generator=generator))]
             if _uniform(0, 1, generator) < sampling.local_share:
@@ -252,7 +258,7 @@ def personalize(
     prior: diffusion.Prior,
     lora: dict[str, list[torch.nn.Parameter]],
     references: Sequence[Picture],
-    views: Sequence[Picture],
+    views: Sequence[Clear],
     sampling: Sampling,
     training: Training,
     folder: Path,
@@ -264,7 +270,7 @@ def personalize(
         references, views: see `draw_samples`.
         folder: gets trace.jsonl (`held_out_error`, measured with the clock stopped) and checkpoints.
     Raises:
-        ValueError: samples larger than the prior's native size, or no scene crop to be had.
+        ValueError: samples larger than the prior's native size.
         FloatingPointError: a loss or gradient is not finite; names the step.
     """
     if not 0 < training.size <= prior.native_size or training.size % prior.factor:
@@ -307,7 +313,7 @@ def train_step(
     prior: diffusion.Prior,
     optimizer: torch.optim.Optimizer,
     references: Sequence[Picture],
-    views: Sequence[Picture],
+    views: Sequence[Clear],
     sampling: Sampling,
     training: Training,
     step: int,

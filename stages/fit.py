@@ -23,11 +23,13 @@ class Params(BaseModel):
     slope: float = Field(2e-4, gt=0, description="screen-space gradient that clones or splits; images span [-1, 1]")
     split_above: float = Field(0.01, gt=0, description="a larger size splits, a smaller clones; deviation / distance")
     budget: int = Field(1_000_000, ge=4, description="most Gaussians")
+    per_pixel: float = Field(0.0, ge=0, description="most Gaussians for each pixel of a view; 0: `budget` alone")
     least_opacity: float = Field(0.005, ge=0, lt=1, description="fainter Gaussians are pruned")
     largest: float = Field(0.5, gt=0, description="Gaussians of a larger size are pruned; deviation / distance")
     reset_every: float = Field(0.1, ge=0, le=1, description="part of the run between opacity resets; 0 = none")
     means_rate: float = Field(1.6e-4, gt=0, description="first step size of positions; the last is a hundredth of it")
     opacity_rate: float = Field(0.05, gt=0, description="step size of opacity logits")
+    checkpoint_seconds: float = Field(10.0, gt=0, description="seconds of work between checkpoints")
     holdout: int = Field(0, ge=0, description="every so manieth training view is only measured; 0 = none")
     device: Literal["cpu", "cuda"] = Field("cpu", description="where to compute")
 
@@ -49,12 +51,13 @@ def run(params: Params, out: Path, *, poses: Path) -> None:
     cameras = [scene.cameras[name] for name in scene.train if name not in held_out]
     images = io.load_views(poses, scene.train)
     noise = trace.generator(params.seed, "start")
-    start = initial_gaussians(scene.points, scene.point_colors, params.sh_degree, params.budget, noise)
+    chosen = settings(params, cameras)
+    start = initial_gaussians(scene.points, scene.point_colors, params.sh_degree, chosen.budget, noise)
     gaussians = fit(
         cameras,
         images,
         start.map(lambda p: p.to(params.device)),
-        settings(params),
+        chosen,
         folder=out,
         held_out=[scene.cameras[name] for name in held_out],
     )
@@ -62,12 +65,15 @@ def run(params: Params, out: Path, *, poses: Path) -> None:
     trace.clear_checkpoint(out)
 
 
-def settings(params: Params):
+def settings(params: Params, cameras: list):
+    """The fit's settings for these views: a larger picture has room for more Gaussians."""
     from dataclasses import fields
 
     from reffusion.fit import Settings
     from reffusion.optimize import Rates
 
-    shared = {f.name: getattr(params, f.name) for f in fields(Settings) if f.name != "rates"}
+    shared = {f.name: getattr(params, f.name) for f in fields(Settings) if f.name not in ("rates", "budget")}
+    pixels = sum(camera.width * camera.height for camera in cameras) / len(cameras)
+    most = max(4, round(params.per_pixel * pixels)) if params.per_pixel else params.budget
     rates = Rates(means=params.means_rate, means_last=params.means_rate / 100, opacity_logits=params.opacity_rate)
-    return Settings(**shared, rates=rates)
+    return Settings(**shared, budget=min(params.budget, most), rates=rates)

@@ -67,8 +67,6 @@ def run(params: Params, out: Path, *, poses: Path, masks: Path, reference: Path)
         P.picture(torch.from_numpy(r.image), torch.from_numpy(r.mask), prior.native_size)
         for r in io.load_references(reference, scene)
     ]
-    views = scene_views(scene, poses, masks, prior.native_size) if params.scene_crops > 0 else []
-
     training = P.Training(
         steps=params.steps,
         lr_unet=params.lr_unet,
@@ -83,6 +81,13 @@ def run(params: Params, out: Path, *, poses: Path, masks: Path, reference: Path)
         seed=params.seed,
         checkpoint_seconds=params.checkpoint_seconds,
     )
+    views = []
+    if params.scene_crops > 0:
+        views = P.clear_views(scene_views(scene, poses, masks, prior.native_size), training.size)
+        if not views:
+            print(
+                f"note: no view has {training.size} px window free of masks: reference alone", flush=True
+            )
     lora = diffusion.add_lora(prior, params.rank, params.alpha, params.dropout, params.layers, params.seed)
     P.personalize(prior, lora, references, views, sampling, training, out)
     diffusion.save_lora(prior, out)

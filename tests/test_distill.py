@@ -224,13 +224,17 @@ def test_the_reference_term_draws_the_reference(prior, text, tmp_path):
     assert len(ended) == len(start)
 
 
-def test_early_stopping_ends_before_the_last_step(prior, text, tmp_path):
+def test_early_stopping_ends_before_the_last_step_and_gives_the_best(prior, text, tmp_path):
     settings = replace(SETTINGS, iterations=60, reference_weight=0.0, densify_every=0, stop_drop=0.3)
     settings = replace(settings, rates=Rates(sh_dc=0.3))
     with torch.no_grad():
         image = render(wall()[0], camera()).color.clamp(0, 1)  # the start agrees perfectly
-    D.distill(*wall(), [sight()], [(camera(), image, hole())], prior, text, settings, tmp_path)
-    assert read_trace(tmp_path / "trace.jsonl")[-1]["iteration"] < 30
+    holes = [(camera(), image, hole())]
+    gaussians, masked = D.distill(*wall(), [sight()], holes, prior, text, settings, tmp_path)
+    lines = read_trace(tmp_path / "trace.jsonl")
+    best = max(line["reference_psnr"] for line in lines)
+    assert lines[-1]["iteration"] < 30 and lines[-1]["reference_psnr"] < best - 0.3
+    assert D.reference_psnr(gaussians, holes) == pytest.approx(best) and len(masked) == len(gaussians)
 
 
 def test_a_number_that_is_none_names_step_term_and_view(prior, text, tmp_path):

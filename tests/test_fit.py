@@ -84,7 +84,6 @@ class Killed(Exception):
 
 def test_a_resumed_fit_is_the_unbroken_one_bit_for_bit(tmp_path, monkeypatch):
     unbroken = run(tmp_path / "unbroken")
-    monkeypatch.setattr(fitting, "CHECKPOINT_SECONDS", 0.0)
     adapt, folder = fitting._adapt, tmp_path / "resumed"
     for moment in (3, 4, 13, 18):  # before the first checkpoint of a run, twice in a row, around densifications
 
@@ -95,7 +94,7 @@ def test_a_resumed_fit_is_the_unbroken_one_bit_for_bit(tmp_path, monkeypatch):
 
         monkeypatch.setattr(fitting, "_adapt", killing)
         with pytest.raises(Killed):
-            run(folder)
+            run(folder, settings=replace(SETTINGS, checkpoint_seconds=0.0))
         assert trace.load_checkpoint(folder)["iteration"] == moment - 1
     monkeypatch.setattr(fitting, "_adapt", adapt)
     resumed = run(folder)
@@ -216,6 +215,19 @@ def test_the_stage_writes_its_artifact_and_never_reads_test_views(tmp_path):
     assert "psnr_held_out" in trace.read_trace(out / "trace.jsonl")[-1]
     assert trace.load_checkpoint(out) is None
     assert stage.preview(params, poses=poses) == []
+
+
+def test_larger_pictures_have_room_for_more_gaussians():
+    from stages import fit as stage
+
+    cameras = ring_of_cameras()
+    pixels = cameras[0].width * cameras[0].height
+    budget = lambda cameras, **params: stage.settings(stage.Params(**params), cameras).budget
+    assert budget(cameras, per_pixel=0.25) == round(0.25 * pixels)
+    doubled = [camera.resized(2 * camera.width, 2 * camera.height) for camera in cameras]
+    assert budget(doubled, per_pixel=0.25) == pixels
+    assert budget(doubled, per_pixel=0.25, budget=100) == 100
+    assert budget(cameras, budget=1234) == 1234
 
 
 def test_the_stage_takes_over_a_scene_of_gaussians(tmp_path):

@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parent.parent
 KILLS = int(os.environ.get("RESUME_KILLS", "5"))
 STAGES = ("fit", "masks", "reference", "personalize", "initialize", "distill", "evaluate")
 SMALL = (
-    "fit.iterations=120 personalize.steps=16 personalize.batch=2 personalize.scene_crops=0 "
+    "fit.iterations=120 fit.checkpoint_seconds=0.2 personalize.steps=16 personalize.batch=2 personalize.scene_crops=0 "
     "personalize.checkpoint_seconds=0.2 distill.iterations=40 distill.checkpoint_seconds=0.2"
 )
 
