@@ -22,6 +22,7 @@ from runner.pipeline import (
     Refused,
     choose_profile,
     find_scene,
+    has_cuda,
     layered,
     load_pipeline,
     load_scene_file,
@@ -328,6 +329,15 @@ def _compare(job: Job, stage: str, inputs: Inputs) -> Decision:
     return Decision("run", why + begun, places[0] if receipts else None, False, inputs)
 
 
+def _on_this_machine(job: Job, stage: str, decision: Decision) -> Decision:
+    """The decision, or `missing` for work on a GPU where there is none; what is cached holds on any machine."""
+    at_work = decision.word in ("run", "stale", "undecided")
+    if at_work and job.params[stage].get("device") == "cuda" and not has_cuda():
+        cure = f'profile=laptop, or set="{stage}.device=cpu"'
+        return Decision("missing", f"{stage}.device is cuda, and this machine has no CUDA driver: {cure}")
+    return decision
+
+
 def partial_folder(job: Job, stage: str, key: str) -> Path:
     return job.home / f".partial-{stage}-{key}"
 
@@ -345,7 +355,7 @@ def plan(job: Job, stages: list[str], done: dict[str, Decision] | None = None) -
     decisions = dict(done or {})
     for stage in stages:
         if stage not in decisions:
-            decisions[stage] = decide(job, stage, decisions)
+            decisions[stage] = _on_this_machine(job, stage, decide(job, stage, decisions))
     asked = {}
     for stage in stages:
         spec = job.pipeline.stages[stage]

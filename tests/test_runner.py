@@ -75,6 +75,7 @@ class Params(BaseModel):
     iterations: int = Field(3, ge=1, description="steps")
     rate: int = 1
     pause: float = 0.0  # seconds a step
+    device: str = "cpu"
 
 def run(params: Params, out: Path, *, poses: Path) -> None:
     from reffusion.optimize import step
@@ -221,7 +222,7 @@ def wait_for(found) -> None:
 def test_first_run_and_receipts(root):
     assert result(root) == 10.0  # 3 steps of 2, and the scene's 4
     receipt = json.loads((root / "runs/toy/fit/receipt.json").read_text())
-    assert receipt["params"] == {"iterations": 3, "rate": 2, "pause": 0.0}
+    assert receipt["params"] == {"iterations": 3, "rate": 2, "pause": 0.0, "device": "cpu"}
     assert receipt["profile"] == "laptop" and receipt["peak_memory_mb"] > 0 and receipt["versions"]["python"]
     assert list(receipt["code"]) == [
         "reffusion/__init__.py", "reffusion/numbers.py", "reffusion/optimize.py", "stages/fit.py"
@@ -424,6 +425,7 @@ REFUSALS = {
     "scene.yaml syntax": ({"data/toy/scene.yaml": "a: [1"}, {}, r"toy/scene.yaml: not valid YAML"),
     "scene.yaml list": ({"data/toy/scene.yaml": "- 1"}, {}, r"scene.yaml: expected `key: value`"),
     "weights": ({}, {"set": "distill.prior=./none"}, r"distill.prior: no weights at .*none; name a folder, or an id"),
+    "no GPU": ({}, {"set": "fit.device=cuda"}, r"fit: fit.device is cuda, .*no CUDA driver: profile=laptop"),
     "missing input": ({"data/void/x": ""}, {"scene": "void"}, r"poses: .*void: no number.txt; write one"),
     "pipeline": ({"pipeline.yaml": "stages: {a: {needs: [b]}}"}, {}, r"pipeline.yaml: "),
     "pipeline need": (
@@ -445,6 +447,14 @@ def test_refused_in_one_line_before_any_work(fresh, case):
         run_scene(request(fresh, **{"scene": "toy", **options}), "all")
     assert "\n" not in str(caught.value)
     assert not list((fresh / "runs").glob("*/*/receipt.json"))
+
+
+def test_a_cache_made_on_a_gpu_holds_without_one(root, monkeypatch):
+    monkeypatch.setattr("runner.plan.has_cuda", lambda: True)
+    run_scene(request(root, set="fit.device=cuda"), "fit")
+    monkeypatch.setattr("runner.plan.has_cuda", lambda: False)
+    assert words(root, set="fit.device=cuda")["fit"].startswith("cached")
+    assert words(root, set="fit.device=cuda fit.rate=9")["fit"].startswith("missing")
 
 
 def test_two_folders_of_one_name(root, tmp_path):

@@ -1,0 +1,124 @@
+"""Consistent and never-seen masks against ray-cast truth: `python benchmarks/masks.py --scene data/demo`.
+
+Runs the `masks` stage, with the parameters of the scene's own run and on its own fit, twice: on the exact masks, and on
+masks each dilated, eroded or shifted at random by up to 2 % of the image's width, a tenth of them missing. Prints the
+mean and the worst intersection over union over all training views, missing masks included. The scene must be one of
+the generator's: only there is the truth known.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from reffusion import io, lens, trace
+from reffusion.types import Camera, Scene
+from stages import masks as masks_stage
+
+ASKED = {"exact": {"consistent": 0.95, "never_seen": 0.85}, "perturbed": {"consistent": 0.90, "never_seen": 0.85}}
+LARGEST, MISSING = 0.02, 0.1  # of the image's width; share of the views
+
+
+def true_never_seen(scene_folder: Path, cameras: list[Camera]) -> dict[str, np.ndarray]:
+    """View name -> bool [H, W], the generator's never-seen pixels, read through its lens as `poses` reads pictures."""
+    truth = io.load_json(scene_folder / "truth/cameras.json")
+    size = (truth["width"], truth["height"])
+    photo = lens.Lens(*size, truth["f"], truth["f"], truth["cx"], truth["cy"], radial=(truth["k1"],))
+    shown = {}
+    for camera in cameras:
+        pinhole = lens.Lens(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        mask = io.load_mask(scene_folder / f"truth/never_seen/{camera.name}.png", size[::-1])
+        shown[camera.name] = lens.undistort_mask(mask, lens.sampling_map(photo, pinhole))
+    return shown
+
+
+def perturbed(mask: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """bool [H, W] dilated, eroded or shifted, each as likely, by a distance drawn up to LARGEST."""
+    distance = random.uniform(0, LARGEST * mask.shape[1])
+    way = random.choice(["dilate", "erode", "shift"])
+    if way == "shift":
+        angle = random.uniform(0, 2 * np.pi)
+        move = np.float32([[1, 0, distance * np.cos(angle)], [0, 1, distance * np.sin(angle)]])
+        return cv2.warpAffine(mask.astype(np.float32), move, mask.shape[::-1]) > 0.5
+    # Distances to the mask's nearest pixel (or, for the erosion, to the nearest one outside it).
+    away = cv2.distanceTransform((~mask if way == "dilate" else mask).astype(np.uint8), cv2.DIST_L2, 5)
+    return away <= distance if way == "dilate" else away > distance
+
+
+def with_masks(poses: Path, given: dict[str, np.ndarray], folder: Path) -> Path:
+    """A copy of the `poses` artifact that has these masks and no others."""
+    shutil.rmtree(folder, ignore_errors=True)
+    shutil.copytree(poses, folder, ignore=shutil.ignore_patterns("masks", "images"))
+    for name, mask in given.items():
+        io.save_mask(folder / "masks" / f"{name}.png", mask)
+    return folder
+
+
+def iou(found: np.ndarray, truth: np.ndarray) -> float:
+    union = np.count_nonzero(found | truth)
+    return np.count_nonzero(found & truth) / union if union else 1.0
+
+
+def scores(made: Path, scene: Scene, truth: dict[str, dict[str, np.ndarray]]) -> dict[str, dict[str, float]]:
+    """Kind of mask -> mean and worst IoU over the training views."""
+    sets = io.load_mask_sets(made, scene.train)
+    values = {kind: [iou(getattr(sets[n], kind), truth[kind][n]) for n in scene.train] for kind in truth}
+    return {kind: {"mean": float(np.mean(v)), "worst": float(np.min(v))} for kind, v in values.items()}
+
+
+def measure(scene_folder: Path, run: Path, out: Path, seed: int) -> dict[str, dict[str, dict[str, float]]]:
+    """Kind of input -> kind of mask -> mean and worst IoU; the masks made are kept in `out`."""
+    scene = io.load_scene(run / "poses")
+    exact = io.load_raw_masks(run / "poses", scene.train)
+    cameras = [scene.cameras[name] for name in scene.train]
+    truth = {"consistent": exact, "never_seen": true_never_seen(scene_folder, cameras)}
+    random = np.random.default_rng(trace.seed_for(seed, "perturbed masks"))
+    kept = random.permutation(len(scene.train))[round(MISSING * len(scene.train)) :]
+    noisy = {scene.train[k]: perturbed(exact[scene.train[k]], random) for k in sorted(kept)}
+    params = masks_stage.Params(**io.load_json(run / "masks/receipt.json")["params"])
+    results = {}
+    for kind, given in (("exact", exact), ("perturbed", noisy)):
+        made = out / kind
+        shutil.rmtree(made, ignore_errors=True)
+        made.mkdir(parents=True)
+        masks_stage.run(params, made, poses=with_masks(run / "poses", given, out / f"poses-{kind}"), fit=run / "fit")
+        results[kind] = scores(made, scene, truth)
+    results["perturbed"]["input"] = {"mean": float(np.mean([iou(noisy[n], exact[n]) for n in noisy]))}
+    return results
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", type=Path, required=True, help="a scene's folder made by data/generate.py")
+    parser.add_argument("--run", type=Path, help="default: runs/<scene's name>")
+    parser.add_argument("--out", type=Path, help="default: runs/masks/<scene's name>")
+    parser.add_argument("--seed", type=int, default=0, help="of the perturbations")
+    parser.add_argument("--check", action="store_true", help="exit with 1 where the aim is missed")
+    given = parser.parse_args()
+    name = given.scene.resolve().name
+    run, out = given.run or Path("runs") / name, given.out or Path("runs/masks") / name
+    for path in (given.scene / "truth/cameras.json", run / "masks/receipt.json"):
+        if not path.exists():
+            raise ValueError(f"{path} is missing: make a scene of the generator's, and run `make scene=... masks`")
+    results = measure(given.scene, run, out, given.seed)
+    (out / "masks.json").write_text(json.dumps(results, indent=1))
+    missed = 0
+    for kind, asked in ASKED.items():
+        for mask, least in asked.items():
+            found = results[kind][mask]
+            missed += found["mean"] < least
+            print(f"{kind:9} {mask:10} IoU {found['mean']:.3f}, worst {found['worst']:.3f} (asked: {least})")
+    print(f"the perturbed masks themselves: {results['perturbed']['input']['mean']:.3f}")
+    return int(given.check and missed > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
