@@ -203,9 +203,13 @@ def fresh(tmp_path: Path) -> Path:
 def start(root: Path, *arguments: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "runner", "run", "fit", "--root", str(root), "--profile", "laptop", *arguments]
     environment = {**os.environ, "PYTHONPATH": str(REPO)}
-    return subprocess.Popen(
-        command, cwd=root, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    # A shell starts background jobs, and so their children, with Ctrl-C ignored: as from a terminal, it is not.
+    return subprocess.Popen(command, cwd=root, env=environment, preexec_fn=heed_ctrl_c, **pipes)
+
+
+def heed_ctrl_c() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def wait_for(found) -> None:
