@@ -15,12 +15,13 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from reffusion import trace
+from reffusion import mcmc, trace
 from reffusion.densify import densify, prune, viewing_distance
 from reffusion.optimize import GaussianOptimizer, Rates, reconstruction_loss
 from reffusion.splat import render
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
+GROWTH = 1.05  # mcmc: the number grows by at most a twentieth at a time
 SH_0 = 0.28209479177387814  # the constant spherical harmonic
 
 
@@ -40,6 +41,10 @@ class Settings:
             PAPER leaves open: 3DGS takes black by default. Dark texture is then drawn by leaving holes, which the
             stages after this one would read as places that no Gaussian explains.
         coarse_until: part of the run that sees the views at half their size.
+        densify_by: `slopes`, 3DGS's way; `mcmc`, see `reffusion.mcmc`, in which `slope`, `split_above`, `largest` and
+            `reset_every` mean nothing.
+        opacity_weight, scale_weight: of the mean opacity and standard deviation in the loss; they make room for
+            relocation (mcmc: 0.01 each, 3DGS: 0).
         densify_from, densify_until: parts of the run between which Gaussians are added.
         densify_every: steps between two densifications.
         slope: mean screen-space gradient from which on a Gaussian is cloned or split, see `densify`.
@@ -59,6 +64,9 @@ class Settings:
     sh_every: float = 1 / 30
     random_background: bool = True
     coarse_until: float = 0.0
+    densify_by: str = "slopes"
+    opacity_weight: float = 0.0
+    scale_weight: float = 0.0
     densify_from: float = 1 / 60
     densify_until: float = 0.5
     densify_every: int = 100
@@ -220,13 +228,25 @@ def _step(
     value = float(loss.detach())
     if not math.isfinite(value):
         raise FloatingPointError(f"fit, {where}: the reconstruction loss is {value}")
-    loss.backward()
+    (loss + _thrift(optimizer.gaussians, settings)).backward()
     optimizer.observe(probe.grad, rendering.radii, camera.width, camera.height)
     try:
         optimizer.step(i / settings.iterations, visible=rendering.radii > 0)
     except FloatingPointError as error:
         raise FloatingPointError(f"fit, {where}, reconstruction: {error}") from None
+    if settings.densify_by == "mcmc":
+        mcmc.explore(optimizer, i / settings.iterations, trace.generator(settings.seed, "explore", i))
     return value, _squared_error(rendering.color.detach(), target, counts)
+
+
+def _thrift(gaussians: Gaussians, settings: Settings) -> Tensor | float:
+    """The price of opacity and size."""
+    price = 0.0
+    if settings.opacity_weight:
+        price = price + settings.opacity_weight * gaussians.opacity_logits.sigmoid().mean()
+    if settings.scale_weight:
+        price = price + settings.scale_weight * gaussians.log_scales.exp().mean()
+    return price
 
 
 def _squared_error(image: Tensor, target: Tensor, counts: Tensor | None) -> float:
@@ -248,8 +268,15 @@ def _adapt(optimizer: GaussianOptimizer, centers: Tensor, started_with: int, set
     progress = done / settings.iterations
     if not settings.densify_from <= progress < settings.densify_until:
         return
-    if done % settings.densify_every == 0:
-        noise = trace.generator(settings.seed, "densify", done)
+    noise, due = trace.generator(settings.seed, "densify", done), done % settings.densify_every == 0
+    if settings.densify_by == "mcmc":
+        if due:
+            mcmc.relocate(optimizer, settings.least_opacity, noise)
+            allowed = min(_allowed(started_with, settings, done), round(GROWTH * len(optimizer.gaussians)))
+            mcmc.grow(optimizer, allowed - len(optimizer.gaussians), settings.least_opacity, noise)
+            optimizer.forget_slopes()
+        return
+    if due:
         away = viewing_distance(optimizer.gaussians.means, centers)
         densify(optimizer, settings.slope, settings.split_above * away, _allowed(started_with, settings, done), noise)
         away = viewing_distance(optimizer.gaussians.means, centers)
