@@ -54,6 +54,7 @@ class Settings:
         least_opacity: fainter Gaussians are pruned.
         largest: Gaussians of a larger size are pruned.
         reset_every: part of the run after which opacities are capped at 0.01, while densifying; 0: never.
+        by_distance: step sizes of the means are multiplied by the distance to the step's camera (3DGS: no).
         rates: Adam's step sizes.
         checkpoint_seconds: seconds of work between checkpoints.
     """
@@ -76,6 +77,7 @@ class Settings:
     least_opacity: float = 0.005
     largest: float = 0.5
     reset_every: float = 0.1
+    by_distance: bool = False
     rates: Rates = field(default_factory=Rates)
     checkpoint_seconds: float = 10.0
 
@@ -231,12 +233,21 @@ def _step(
     (loss + _thrift(optimizer.gaussians, settings)).backward()
     optimizer.observe(probe.grad, rendering.radii, camera.width, camera.height)
     try:
-        optimizer.step(i / settings.iterations, visible=rendering.radii > 0)
+        optimizer.step(i / settings.iterations, visible=rendering.radii > 0, reach=_reach(optimizer, camera, settings))
     except FloatingPointError as error:
         raise FloatingPointError(f"fit, {where}, reconstruction: {error}") from None
     if settings.densify_by == "mcmc":
         mcmc.explore(optimizer, i / settings.iterations, trace.generator(settings.seed, "explore", i))
     return value, _squared_error(rendering.color.detach(), target, counts)
+
+
+def _reach(optimizer: GaussianOptimizer, camera: Camera, settings: Settings) -> Tensor | None:
+    """[N] each Gaussian's distance to the camera: what is ten times as far must step ten times as wide to be seen
+    to move."""
+    if not settings.by_distance:
+        return None
+    means = optimizer.gaussians.means.detach()
+    return (means - torch.as_tensor(camera.center, dtype=means.dtype, device=means.device)).norm(dim=1)
 
 
 def _thrift(gaussians: Gaussians, settings: Settings) -> Tensor | float:

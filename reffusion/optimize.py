@@ -138,12 +138,13 @@ class GaussianOptimizer:
         self.slope_sum = torch.zeros_like(self._steps, dtype=torch.float32)
         self.slope_count = torch.zeros_like(self._steps)
 
-    def step(self, progress: float, visible: Tensor | None = None) -> None:
+    def step(self, progress: float, visible: Tensor | None = None, reach: Tensor | None = None) -> None:
         """One Adam step along the gradients gathered since the last, which are then forgotten.
 
         Args:
             progress: in [0, 1], the part of the run that is done; it sets the step size of the means.
             visible: [N] bool, the Gaussians to move, e.g. `rendering.radii > 0`; None moves all.
+            reach: [N] factor on the step size of the means, e.g. each one's distance to the camera; None: 1.
 
         Raises:
             FloatingPointError: a gradient is not finite; says of which parameter. Nothing has been changed then.
@@ -156,6 +157,8 @@ class GaussianOptimizer:
         if visible is None:
             visible = torch.ones_like(self.masked)
         rates = self.rates.at(progress, self.gaussians)
+        alike = torch.ones_like(self._steps, dtype=torch.float32)
+        reach = alike if reach is None else reach.detach().float().contiguous()
         self._steps += visible
         # Bias correction, per row; a row that never moved has t = 0 and is skipped.
         unbias = [1 / (1 - beta ** self._steps.clamp(min=1).double()).float() for beta in self.betas]
@@ -165,7 +168,8 @@ class GaussianOptimizer:
                     continue
                 rows = [_rows(getattr(g, name)) for g in (self.gaussians, self._first, self._second)]
                 update = _adam_cpu if gradient.device.type == "cpu" else _adam
-                update(*rows, _rows(gradient), *unbias, visible, rates[name], *self.betas, self.epsilon)
+                steps = reach if name == "means" else alike
+                update(*rows, _rows(gradient), *unbias, steps, visible, rates[name], *self.betas, self.epsilon)
         self.forget_gradients()
 
     def forget_gradients(self) -> None:
@@ -238,25 +242,30 @@ def _rows(parameter: Tensor) -> Tensor:
     return parameter.detach().contiguous().view(parameter.shape[0], -1)
 
 
-def _adam(parameter, first, second, gradient, unbias1, unbias2, visible, rates, beta1, beta2, epsilon) -> None:
-    """One Adam step in place on the visible rows of [N, D]; `unbias` [N] is 1 / (1 - beta^t), `rates` [D]."""
+def _adam(parameter, first, second, gradient, unbias1, unbias2, reach, visible, rates, beta1, beta2, epsilon) -> None:
+    """One Adam step in place on the visible rows of [N, D]; `unbias` [N] is 1 / (1 - beta^t), step sizes are
+    `rates` [D] times `reach` [N]."""
     rows = visible.nonzero()[:, 0]
     g = gradient[rows]
     m = first[rows].lerp_(g, 1 - beta1)
     v = second[rows].mul_(beta2).addcmul_(g, g, value=1 - beta2)
     first[rows], second[rows] = m, v
     denominator = (v * unbias2[rows, None]).sqrt() + epsilon
-    parameter[rows] -= rates.to(g) * unbias1[rows, None] * m / denominator
+    parameter[rows] -= rates.to(g) * (reach * unbias1)[rows, None] * m / denominator
 
 
-def _adam_cpu(parameter, first, second, gradient, unbias1, unbias2, visible, rates, beta1, beta2, epsilon) -> None:
+def _adam_cpu(
+    parameter, first, second, gradient, unbias1, unbias2, reach, visible, rates, beta1, beta2, epsilon
+) -> None:
     """`_adam` in one pass over memory, for float32."""
-    arrays = (t.numpy() for t in (parameter, first, second, gradient, unbias1, unbias2, visible, rates))
+    arrays = (t.numpy() for t in (parameter, first, second, gradient, unbias1, unbias2, reach, visible, rates))
     share(_adam_kernel, *arrays, np.float32(beta1), np.float32(beta2), np.float32(epsilon))
 
 
 @numba.njit(fastmath={"contract", "reassoc", "nsz", "arcp"}, error_model="numpy", cache=True, nogil=True)
-def _adam_kernel(tickets, parameter, first, second, gradient, unbias1, unbias2, visible, rates, beta1, beta2, epsilon):
+def _adam_kernel(
+    tickets, parameter, first, second, gradient, unbias1, unbias2, reach, visible, rates, beta1, beta2, epsilon
+):
     count, width = parameter.shape
     new1, new2 = np.float32(1) - beta1, np.float32(1) - beta2
     least = np.float32(1e-30)  # below it a first moment would soon be denormal, on which processors are slow
@@ -273,4 +282,4 @@ def _adam_kernel(tickets, parameter, first, second, gradient, unbias1, unbias2, 
                 a = np.float32(0) if abs(a) < least else a
                 b = beta2 * second[i, j] + new2 * g * g
                 first[i, j], second[i, j] = a, b
-                parameter[i, j] -= rates[j] * unbias1[i] * a / (np.sqrt(b * unbias2[i]) + epsilon)
+                parameter[i, j] -= reach[i] * rates[j] * unbias1[i] * a / (np.sqrt(b * unbias2[i]) + epsilon)

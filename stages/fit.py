@@ -31,6 +31,7 @@ class Params(BaseModel):
     largest: float = Field(0.5, gt=0, description="Gaussians of a larger size are pruned; deviation / distance")
     reset_every: float = Field(0.1, ge=0, le=1, description="part of the run between opacity resets; 0 = none")
     means_rate: float = Field(1.6e-4, gt=0, description="first step size of positions; the last is a hundredth of it")
+    by_distance: bool = Field(False, description="multiply it by each Gaussian's distance to the camera (3DGS: no)")
     opacity_rate: float = Field(0.05, gt=0, description="step size of opacity logits")
     checkpoint_seconds: float = Field(10.0, gt=0, description="seconds of work between checkpoints")
     holdout: int = Field(0, ge=0, description="every so manieth training view is only measured; 0 = none")
