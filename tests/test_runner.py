@@ -15,9 +15,10 @@ import pytest
 
 from runner import execute
 from runner.execute import Failed, run_scene
+from runner.job import Request, prepare
 from runner.keys import fingerprint
 from runner.pipeline import Refused
-from runner.plan import Request, plan, prepare, table
+from runner.plan import plan, table
 
 REPO = Path(__file__).resolve().parent.parent
 
