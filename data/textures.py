@@ -1,67 +1,13 @@
 """Procedural textures: square, tileable (or fitted to one face), [N, N, 3] float32 sRGB in [0, 1], N a power of two.
 
-Each maker takes a numpy random generator and N; `baked` turns a dictionary of them into what `raycast` samples.
+Each maker takes a numpy random generator and N.
 """
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
-from raycast import Textures
-
-
-def noise(rng, size, rows, columns):
-    """Smooth tileable noise [N, N] with rows x columns random nodes, about -1..1."""
-    nodes = np.pad(rng.random((rows, columns), dtype=np.float32) * 2 - 1, 2, mode="wrap")
-    high, wide = size // rows, size // columns
-    big = cv2.resize(nodes, (nodes.shape[1] * wide, nodes.shape[0] * high), interpolation=cv2.INTER_CUBIC)
-    return big[2 * high : 2 * high + size, 2 * wide : 2 * wide + size]
-
-
-def fbm(rng, size, rows, columns, octaves=5, gain=0.55):
-    """Noise at several scales, each twice as fine; zero mean, unit deviation."""
-    total, weight = np.zeros((size, size), np.float32), 1.0
-    rows, columns = min(rows, size // 2), min(columns, size // 2)
-    for _ in range(octaves):
-        if max(rows, columns) > size // 2:
-            break
-        total += weight * noise(rng, size, rows, columns)
-        rows, columns, weight = 2 * rows, 2 * columns, weight * gain
-    return (total - total.mean()) / total.std()
-
-
-def grid(size):
-    """(x, y) of the pixel centres in tiles, [N, N] each."""
-    line = (np.arange(size, dtype=np.float32) + 0.5) / size
-    return np.meshgrid(line, line)
-
-
-def step(edge0, edge1, x):
-    t = np.clip((x - edge0) / (edge1 - edge0), 0, 1)
-    return t * t * (3 - 2 * t)
-
-
-def ramp(t, *colors):
-    """Colours [N, N, 3] along a palette, t in [0, 1]."""
-    palette = np.asarray(colors, np.float32) / 255
-    return np.stack([np.interp(t, np.linspace(0, 1, len(palette)), palette[:, c]) for c in range(3)], -1)
-
-
-def blend(a, b, t):
-    return a + (b - a) * t[..., None]
-
-
-def shifted(image, x, y):
-    """A tileable picture [N, N] read at (x, y) in tiles."""
-    size = np.float32(image.shape[0])
-    return cv2.remap(
-        image,
-        (x % 1).astype(np.float32) * size - 0.5,
-        (y % 1).astype(np.float32) * size - 0.5,
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_WRAP,
-    )
-
+from patterns import blend, cell, fbm, grid, noise, ramp, rim, shifted, srgb, step, varied
 
 WOODS = (
     ((96, 58, 32), (150, 98, 56), (196, 146, 94)),  # oak
@@ -75,18 +21,15 @@ def wood_planks(rng, size, rows=24, pieces=3, palette=None):
     """Floor boards along x: each with its own tone, grain and rings, a dark joint between them."""
     palette = WOODS[rng.integers(len(WOODS))] if palette is None else palette
     x, y = grid(size)
-    row = np.floor(y * rows).astype(int)
-    across = y * rows - row
-    along = (x + rng.random(rows)[row]) % 1 * pieces
-    piece = np.floor(along).astype(int)
-    along -= piece
-    tone, dx, dy = (rng.random((rows, pieces)).astype(np.float32)[row, piece] for _ in range(3))
+    row, across = cell(y * rows)
+    piece, along = cell((x + rng.random(rows)[row]) % 1 * pieces)
+    tone, dx, dy = varied(rng, rows, pieces, row, piece)
     warp = shifted(noise(rng, size, 4, 4), x + dx, y + dy)
     grain = shifted(fbm(rng, size, min(128, size // 4), 4, 4), x * 2 + dx, y + dy)
     fine = shifted(fbm(rng, size, size // 4, 16, 2), x + dy, y + dx)
     rings = np.sin(6.28 * ((across - 0.5 + 0.5 * dx) * (2 + 3 * dy) + 1.1 * warp + 0.25 * grain))
     color = ramp(0.5 + 0.55 * (tone - 0.5) + 0.15 * grain + 0.09 * rings + 0.05 * fine, *palette)
-    edge = np.minimum(np.minimum(across, 1 - across), np.minimum(along, 1 - along) * (rows / pieces))
+    edge = np.minimum(rim(across), rim(along) * (rows / pieces))
     return color * (0.35 + 0.65 * step(0.008, 0.045, edge))[..., None]
 
 
@@ -101,10 +44,10 @@ def herringbone(rng, size, cells=32, long=4):
     left = np.where(flat, i - phase, i)
     top = np.where(flat, j, j - (2 * long - 1 - phase))
     along, across = np.where(flat, a - left, b - top) / long, np.where(flat, b - top, a - left)
-    tone, dx, dy = (rng.random((cells, cells)).astype(np.float32)[top % cells, left % cells] for _ in range(3))
+    tone, dx, dy = varied(rng, cells, cells, top % cells, left % cells)
     grain = shifted(fbm(rng, size, min(128, size // 4), 8, 4), along * 0.25 + dx, across * 0.06 + dy)
     color = ramp(0.5 + 0.5 * (tone - 0.5) + 0.12 * (flat - 0.5) + 0.16 * grain, *palette)
-    edge = np.minimum(np.minimum(across, 1 - across), long * np.minimum(along, 1 - along))
+    edge = np.minimum(rim(across), long * rim(along))
     return color * (0.35 + 0.65 * step(0.01, 0.07, edge))[..., None]
 
 
@@ -119,14 +62,13 @@ def stone_tiles(rng, size, cells=8):
     """Veined tiles with light grout."""
     *palette, grout = STONES[rng.integers(len(STONES))]
     x, y = grid(size)
-    i, j = np.floor(x * cells).astype(int), np.floor(y * cells).astype(int)
-    fx, fy = x * cells - i, y * cells - j
-    tone, dx, dy = (rng.random((cells, cells)).astype(np.float32)[j, i] for _ in range(3))
+    (i, fx), (j, fy) = cell(x * cells), cell(y * cells)
+    tone, dx, dy = varied(rng, cells, cells, j, i)
     cloud = shifted(fbm(rng, size, 8, 8, 6), x + dx, y + dy)
     vein = np.exp(-((shifted(fbm(rng, size, 4, 4, 6), x + dy, y + dx) / 0.09) ** 2))
     color = ramp(0.5 + 0.5 * (tone - 0.5) + 0.17 * cloud - 0.3 * vein, *palette)
-    edge = np.minimum(np.minimum(fx, 1 - fx), np.minimum(fy, 1 - fy))
-    joint = np.asarray(grout, np.float32) / 255 * (0.9 + 0.05 * fbm(rng, size, 64, 64, 3))[..., None]
+    edge = np.minimum(rim(fx), rim(fy))
+    joint = srgb(grout) * (0.9 + 0.05 * fbm(rng, size, 64, 64, 3))[..., None]
     color *= (0.8 + 0.2 * step(0.02, 0.07, edge))[..., None]
     return blend(joint, color, step(0.014, 0.03, edge))
 
@@ -144,20 +86,17 @@ def bricks(rng, size, rows=24, columns=8):
     *palette, mortar = BRICKS[rng.integers(len(BRICKS))]
     x, y = grid(size)
     wobble = 0.012 * fbm(rng, size, 16, 16, 3)
-    row = np.floor(y * rows).astype(int)
-    fy = y * rows - row
-    a = x * columns + 0.5 * (row % 2)
-    column = np.floor(a).astype(int) % columns
-    fx = a - np.floor(a)
-    tone, dx, dy = (rng.random((rows, columns)).astype(np.float32)[row, column] for _ in range(3))
+    row, fy = cell(y * rows)
+    column, fx = cell(x * columns + 0.5 * (row % 2))
+    tone, dx, dy = varied(rng, rows, columns, row, column % columns)
     rough = shifted(fbm(rng, size, 32, 32, 5), x + dx, y + dy)
     color = ramp(0.5 + 0.75 * (tone - 0.5) + 0.13 * rough + 0.06 * fbm(rng, size, 4, 4, 3), *palette)
     aspect = rows / columns
-    edge = np.minimum(np.minimum(fy, 1 - fy), aspect * np.minimum(fx, 1 - fx)) + wobble
+    edge = np.minimum(rim(fy), aspect * rim(fx)) + wobble
     body = step(0.07, 0.16, edge)
     height = body * (1 + 0.12 * rough)
     slope = np.roll(height, 2, 0) - np.roll(height, -2, 0) + 0.6 * (np.roll(height, 2, 1) - np.roll(height, -2, 1))
-    joint = np.asarray(mortar, np.float32) / 255 * (0.82 + 0.07 * fbm(rng, size, 128, 128, 2))[..., None]
+    joint = srgb(mortar) * (0.82 + 0.07 * fbm(rng, size, 128, 128, 2))[..., None]
     return blend(joint, color, body) * (1 - 0.22 * np.clip(slope, -1, 1))[..., None]
 
 
@@ -172,7 +111,7 @@ PAPERS = (
 
 def wallpaper(rng, size, repeats=4):
     """Flowers in a half drop, each in a pointed frame with leaves, over fine stripes."""
-    ground, figure, second = (np.asarray(c, np.float32) / 255 for c in PAPERS[rng.integers(len(PAPERS))])
+    ground, figure, second = (srgb(c) for c in PAPERS[rng.integers(len(PAPERS))])
     x, y = grid(size)
     petals, turns = int(rng.integers(5, 8)), rng.random() * 6.28
     stripe = 0.5 + 0.5 * np.cos(6.2832 * x * repeats * 6)
@@ -201,12 +140,12 @@ def wallpaper(rng, size, repeats=4):
 def plaster(rng, size, color=(214, 208, 198)):
     """A painted wall: clouds, trowel marks, grain."""
     rough = 0.022 * fbm(rng, size, 4, 4, 4) + 0.02 * fbm(rng, size, 64, 16, 4) + 0.018 * fbm(rng, size, 128, 128, 2)
-    return np.asarray(color, np.float32) / 255 * (1 + rough)[..., None]
+    return srgb(color) * (1 + rough)[..., None]
 
 
 def rug(rng, size):
     """A woven carpet with a border and diamonds, fitted to its face."""
-    hues = [np.asarray(c, np.float32) / 255 for c in ((116, 34, 42), (28, 52, 84), (220, 196, 150), (194, 128, 60))]
+    hues = [srgb(c) for c in ((116, 34, 42), (28, 52, 84), (220, 196, 150), (194, 128, 60))]
     rng.shuffle(hues)
     x, y = grid(size)
     a, b = (x * 6) % 1 - 0.5, (y * 4) % 1 - 0.5
@@ -214,7 +153,7 @@ def rug(rng, size):
     color = np.broadcast_to(hues[0], (size, size, 3)).copy()
     for level, hue in ((0.44, 1), (0.36, 2), (0.28, 0), (0.2, 3), (0.1, 1)):
         color = blend(color, hues[hue], step(0.01, -0.01, diamond - level))
-    edge = np.minimum(np.minimum(x, 1 - x) * 1.5, np.minimum(y, 1 - y))
+    edge = np.minimum(rim(x) * 1.5, rim(y))
     zigzag = np.abs(((x + y * 0.667) * 24) % 1 - 0.5) * 2
     border = blend(np.broadcast_to(hues[1], color.shape), hues[2], step(0.45, 0.55, zigzag))
     color = blend(border, color, step(0.098, 0.102, edge))
@@ -231,22 +170,8 @@ def books(rng, size, thick=1.0):
     while x < size:
         width = int(size * thick * rng.uniform(0.03, 0.075))
         top = int(size * rng.uniform(0.02, 0.28))
-        hue = np.asarray(
-            cv2.cvtColor(
-                np.float32(
-                    [
-                        [
-                            [
-                                (rng.normal(20, 45) + rng.choice((0, 0, 180))) % 360,
-                                rng.uniform(0.15, 0.6),
-                                rng.uniform(0.25, 0.8),
-                            ]
-                        ]
-                    ]
-                ),
-                cv2.COLOR_HSV2RGB,
-            )[0, 0]
-        )
+        hsv = (rng.normal(20, 45) + rng.choice((0, 0, 180))) % 360, rng.uniform(0.15, 0.6), rng.uniform(0.25, 0.8)
+        hue = cv2.cvtColor(np.float32([[hsv]]), cv2.COLOR_HSV2RGB)[0, 0]
         end = min(x + width, size)
         shade = 0.45 + 0.55 * np.sin(np.linspace(0.25, 2.9, end - x))[:, None]
         color[top:, x:end] = hue * shade
@@ -267,10 +192,10 @@ def picture(rng, size):
     color = blend(sky, np.float32([1.0, 0.93, 0.75]), step(0.085, 0.075, sun))
     for k in range(5):
         ridge = 0.42 + 0.1 * k + (0.09 - 0.01 * k) * fbm(rng, size, 4, 4, 5)[size // 3][None, :]
-        far = np.asarray([60 + hue - 12 * k, 112 - 14 * k, 120 - 20 * k], np.float32) / 255
+        far = srgb((60 + hue - 12 * k, 112 - 14 * k, 120 - 20 * k))
         textured = far * (1 + 0.1 * fbm(rng, size, 32, 32, 4))[..., None]
         color = blend(color, textured, step(-0.004, 0.004, y - ridge))
-    edge = np.minimum(np.minimum(x, 1 - x), np.minimum(y, 1 - y))
+    edge = np.minimum(rim(x), rim(y))
     color = blend(np.broadcast_to(np.float32([0.93, 0.91, 0.86]), color.shape), color, step(0.158, 0.162, edge))
     frame = np.float32([0.24, 0.15, 0.09]) * (1 + 0.2 * fbm(rng, size, 64, 8, 3))[..., None]
     frame = frame * (0.7 + 0.6 * np.sin(np.clip(edge / 0.06, 0, 1) * 3.14))[..., None]
@@ -309,7 +234,7 @@ def wicker(rng, size, cells=16):
 def painted_front(rng, size, color=(30, 120, 120)):
     """A cabinet's front, fitted to its face: two doors with sunk panels and brass knobs, a drawer above each."""
     x, y = grid(size)
-    base = np.asarray(color, np.float32) / 255 * (1 + 0.05 * fbm(rng, size, 16, 128, 4))[..., None]
+    base = srgb(color) * (1 + 0.05 * fbm(rng, size, 16, 128, 4))[..., None]
     light = np.ones((size, size), np.float32)
     knob = np.zeros((size, size), np.float32)
     for x0, x1 in ((0.03, 0.49), (0.51, 0.97)):
@@ -331,11 +256,8 @@ def painted_front(rng, size, color=(30, 120, 120)):
 
 def painted(rng, size, color=(30, 120, 120)):
     """Brushed paint."""
-    return (
-        np.asarray(color, np.float32)
-        / 255
-        * (1 + 0.05 * fbm(rng, size, 16, 128, 4) + 0.03 * fbm(rng, size, 4, 4, 3))[..., None]
-    )
+    relief = 1 + 0.05 * fbm(rng, size, 16, 128, 4) + 0.03 * fbm(rng, size, 4, 4, 3)
+    return srgb(color) * relief[..., None]
 
 
 def ball(rng, size, first=(214, 66, 48), second=(240, 226, 196)):
@@ -349,7 +271,7 @@ def ball(rng, size, first=(214, 66, 48), second=(240, 226, 196)):
     wedge = np.sin(4 * np.arctan2(p[..., 2], p[..., 1]))
     # An edge's width in wedge values grows towards the poles; dividing by the radius keeps it even.
     soft = 0.05 / np.maximum(np.hypot(p[..., 1], p[..., 2]), 0.1)
-    one, two = (np.asarray(c, np.float32) / 255 for c in (first, second))
+    one, two = (srgb(c) for c in (first, second))
     color = blend(np.broadcast_to(one, (size, size, 3)), two, step(-1, 1, wedge / soft))
     return blend(color, np.float32([0.95, 0.78, 0.25]), step(0.955, 0.965, np.abs(p[..., 0])))
 
@@ -357,16 +279,14 @@ def ball(rng, size, first=(214, 66, 48), second=(240, 226, 196)):
 def quilt(rng, size, first=(214, 66, 48), second=(240, 226, 196), cells=8):
     """Patchwork of triangles in two hues and their shades, stitched along the seams."""
     x, y = grid(size)
-    i, j = np.floor(x * cells).astype(int), np.floor(y * cells).astype(int)
-    fx, fy = x * cells - i, y * cells - j
+    (i, fx), (j, fy) = cell(x * cells), cell(y * cells)
     flip = rng.integers(0, 2, (cells, cells))[j, i] > 0
     upper = np.where(flip, fx > fy, fx + fy > 1)
     shade = rng.uniform(0.75, 1.1, (cells, cells, 2)).astype(np.float32)[j, i, upper.astype(int)]
-    one, two = (np.asarray(c, np.float32) / 255 for c in (first, second))
+    one, two = (srgb(c) for c in (first, second))
     color = np.where(upper[..., None], one, two) * shade[..., None]
-    seam = np.minimum(
-        np.minimum(np.minimum(fx, 1 - fx), np.minimum(fy, 1 - fy)), np.abs(np.where(flip, fx - fy, fx + fy - 1))
-    )
+    diagonal = np.abs(np.where(flip, fx - fy, fx + fy - 1))
+    seam = np.minimum(np.minimum(rim(fx), rim(fy)), diagonal)
     puffed = 0.72 + 0.28 * step(0.0, 0.16, seam)
     return color * (puffed * (1 + 0.06 * fbm(rng, size, 128, 128, 3)))[..., None]
 
@@ -374,30 +294,9 @@ def quilt(rng, size, first=(214, 66, 48), second=(240, 226, 196), cells=8):
 def glazed(rng, size, color=(40, 70, 130), bands=(236, 230, 214)):
     """Pottery: a wash with rings, fitted to its face."""
     x, y = grid(size)
-    wash = np.asarray(color, np.float32) / 255 * (1 + 0.1 * fbm(rng, size, 4, 4, 5))[..., None]
+    wash = srgb(color) * (1 + 0.1 * fbm(rng, size, 4, 4, 5))[..., None]
     ring = np.zeros_like(x)
     for center, width in zip(rng.uniform(0.12, 0.88, 4), rng.uniform(0.01, 0.045, 4), strict=True):
         wave = center + 0.015 * np.sin(x * 6.2832 * 9)
         ring = np.maximum(ring, step(width + 0.008, width, np.abs(y - wave)))
-    return blend(wash, np.asarray(bands, np.float32) / 255, ring)
-
-
-def baked(pictures: dict[str, np.ndarray]) -> tuple[Textures, dict[str, int]]:
-    """Mip levels of each picture, made in linear light; and each name's index."""
-    linear = (np.arange(256) / 255.0) ** 2.2
-    levels = max(int(np.log2(p.shape[0])) for p in pictures.values()) + 1
-    texels, start, side, mean, total = [], [], [], [], 0
-    for p in pictures.values():
-        level = np.clip(p, 0, 1).astype(np.float32) ** 2.2
-        starts = []
-        side.append(p.shape[0])
-        mean.append(level.mean((0, 1)))
-        for _ in range(levels):
-            starts.append(total)
-            texels.append(np.round(level ** (1 / 2.2) * 255).astype(np.uint8).reshape(-1, 3))
-            total += len(texels[-1])
-            if level.shape[0] > 1:
-                level = 0.25 * (level[::2, ::2] + level[1::2, ::2] + level[::2, 1::2] + level[1::2, 1::2])
-        start.append(starts)
-    arrays = Textures(np.concatenate(texels), np.array(start), np.array(side), np.array(mean, np.float64), linear)
-    return arrays, {name: k for k, name in enumerate(pictures)}
+    return blend(wash, srgb(bands), ring)

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from reffusion import depth as completion
-from reffusion import geometry, splat, trace
+from reffusion import bilateral, geometry, planes, splat, trace
+from reffusion.depth import Plate, complete
 from reffusion.types import Camera, Gaussians, Reference
 
 ENOUGH_POINTS = 50  # fewer sparse points around the hole, and the rendered depth is asked instead
@@ -29,8 +29,8 @@ class Completion:
         ring: surroundings that are continued, / image width.
         planar_share: share of the surroundings that planes must explain to be taken; above 1 they never are.
         planar_tolerance: relative disparity within which they do.
-        stiffness, edge, unknowns: see `depth.complete`.
-        solver_smoothness, solver_spatial, solver_luma, solver_chroma: see `depth.bilateral_solve`.
+        stiffness, edge, unknowns: see `depth.Plate`.
+        solver_smoothness, solver_spatial, solver_luma, solver_chroma: see `bilateral.Solver`.
         seed: of the draws that find planes.
     """
 
@@ -87,7 +87,7 @@ def depth_behind(
             rows, columns = np.nonzero(around & known)
             pixels, values, source = np.stack([columns, rows], 1) + 0.5, disparity[rows, columns], "rendered depth"
         draws = trace.generator(how.seed, "planes", camera.name)
-        planar = completion.planar_model(pixels, values, hole.shape, draws, tolerance=how.planar_tolerance)
+        planar = planes.planar_model(pixels, values, hole.shape, draws, tolerance=how.planar_tolerance)
         said = f"{planar.planes} planes explain {planar.explained:.0%} of {len(values)} {source}"
         if planar.explained >= how.planar_share:
             solved = planar.disparity
@@ -113,14 +113,10 @@ def visible_points(
 
 def _continued(disparity: np.ndarray, known: np.ndarray, guide: np.ndarray, how: Completion) -> np.ndarray:
     """The smooth completion; its misfit on known pixels is spread by the bilateral solver, so that rims meet."""
-    fitted = completion.complete(
-        disparity, known, guide, ring=how.ring, stiffness=how.stiffness, edge=how.edge,
-        most_unknowns=how.unknowns, keep=False,
-    )  # fmt: skip
-    return completion.refine(
-        fitted, disparity, known.astype(np.float64), guide, smoothness=how.solver_smoothness,
-        sigma_spatial=how.solver_spatial, sigma_luma=how.solver_luma, sigma_chroma=how.solver_chroma,
-    )  # fmt: skip
+    plate = Plate(how.ring, how.stiffness, how.edge, how.unknowns)
+    solver = bilateral.Solver(how.solver_smoothness, how.solver_spatial, how.solver_luma, how.solver_chroma)
+    fitted = complete(disparity, known, guide, plate, keep=False)
+    return bilateral.refine(fitted, disparity, known.astype(np.float64), guide, solver)
 
 
 def grown(mask: np.ndarray, fraction: float) -> np.ndarray:

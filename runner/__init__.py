@@ -2,6 +2,7 @@
 
 - pipeline.py: pipeline.yaml and scene.yaml: models, layers of parameters, clear refusals.
 - keys.py: what an artifact depends on, as hashes: contents of folders, code, parameters.
+- job.py: a request with everything about it resolved and checked.
 - plan.py: one word and a reason for each stage, from what lies on the disk.
 - execute.py: locks, fresh processes, folders renamed into place, receipts, batches.
 - child.py: the other side: the process in which stages are imported.

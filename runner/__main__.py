@@ -10,8 +10,9 @@ from pathlib import Path
 
 from runner.child import INTERRUPTED
 from runner.execute import Failed, batch, clean, run_scene, show_results
+from runner.job import Request, prepare
 from runner.pipeline import Refused
-from runner.plan import Request, plan, prepare, table
+from runner.plan import plan, table
 
 
 def main() -> int:

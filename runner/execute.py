@@ -20,23 +20,9 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from runner.job import Job, Request, child, prepare, source_of
 from runner.pipeline import SCENE, Refused
-from runner.plan import (
-    MACHINE,
-    RECEIPT,
-    Decision,
-    Job,
-    Request,
-    child,
-    decide,
-    expected_seconds,
-    partial_folder,
-    plan,
-    prepare,
-    shown,
-    source_of,
-    table,
-)
+from runner.plan import MACHINE, RECEIPT, Decision, decide, expected_seconds, partial_folder, plan, table
 
 PACKAGES = ("reffusion", "numpy", "torch", "numba", "diffusers", "transformers", "peft", "pycolmap", "gsplat")
 GRACE = 20.0  # seconds an interrupted stage has to end by itself
@@ -327,3 +313,8 @@ def _write_table(stem: Path, rows: dict[str, dict[str, float | None]], failed: d
         csv.writer(file).writerows([header, *lines])
     text = [" | ".join(cells) for cells in (header, ["---"] * len(header), *lines)]
     Path(f"{stem}.md").write_text("".join(f"| {line} |\n" for line in text))
+
+
+def shown(path: Path) -> str:
+    """A path as people type it: from the current folder where it lies below."""
+    return os.path.relpath(path) if path.is_relative_to(Path.cwd()) else str(path)

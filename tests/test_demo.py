@@ -137,39 +137,42 @@ def test_only_masked_pixels_change_when_the_object_goes(generate, mini):
 
 def test_test_views_are_without_the_object(generate, mini):
     """Rendering with the object changes the test views inside their masks and nowhere else."""
+    import photographs
+
     kind = generate.KINDS["mini"]
     furniture, target = generate.furnish(0, kind)
     world = generate.bake(furniture, 0, kind)
     train, test = (
-        generate.path(0, kind, target, n, label) for n, label in ((kind.train, "train"), (kind.test, "test"))
+        photographs.path(0, kind, target, n, label) for n, label in ((kind.train, "train"), (kind.test, "test"))
     )
     middle = np.argmin(np.linalg.norm(train[:, 13:] - train[:, 13:].mean(0), axis=1))
-    world = generate.exposed(world, train[middle], kind)
+    world = photographs.exposed(world, train[middle], kind)
     for k, name in enumerate(stems(mini / "images_4")[: kind.test]):
         photo = io.load_image(mini / f"images_4/{name}.png")
         mask = io.load_mask(mini / f"images_4/test_label/out_{k:05d}.png")
-        with_object, _ = generate.shoot(world, test[k], kind, True)
+        with_object, _ = photographs.shoot(world, test[k], kind, True)
         assert np.array_equal(photo[~mask], with_object[~mask])
         assert (photo[mask] != with_object[mask]).any(1).mean() > 0.9
 
 
 def test_never_seen_pixels_are_never_seen(generate, mini):
     """Checked with another projection: every training view hides such a pixel's background, or a mask covers it."""
+    import photographs
     import raycast
 
     kind = generate.KINDS["mini"]
     truth = json.loads((mini / "truth/cameras.json").read_text())
     furniture, target = generate.furnish(0, kind)
     world, frame = generate.bake(furniture, 0, kind), generate.scene_frame(0)
-    cameras = generate.path(0, kind, target, kind.test, "test")
+    cameras = photographs.path(0, kind, target, kind.test, "test")
     training = {name: io.load_mask(mini / f"images_4/label/{name}.png") for name in stems(mini / "images_4/label")}
     for k, name in enumerate(stems(mini / "images_4")[: kind.test]):
         mask = io.load_mask(mini / f"images_4/test_label/out_{k:05d}.png")
         never = io.load_mask(mini / f"truth/never_seen/{name}.png")
         assert not (never & ~mask).any()
-        points, _ = raycast.surface_points(world.solids, cameras[k], generate.pixel_centers(mask), False)
+        points, _ = raycast.surface_points(world.solids, cameras[k], photographs.pixel_centers(mask), False)
         back, _ = through_lens(truth, name, frame.points(points))
-        np.testing.assert_allclose(back, generate.pixel_centers(mask), atol=1e-6)
+        np.testing.assert_allclose(back, photographs.pixel_centers(mask), atol=1e-6)
         shown = np.zeros(len(points), bool)
         for view, covered in training.items():
             uv, _ = through_lens(truth, view, frame.points(points))

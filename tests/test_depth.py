@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from reffusion import depth
+from reffusion import bilateral, depth, planes
+from reffusion.depth import Plate
 from reffusion.trace import generator
 
 ROWS, COLUMNS = np.mgrid[:48, :64].astype(float)
@@ -48,15 +49,17 @@ def test_two_holes_do_not_disturb_each_other():
     left, right = (COLUMNS < 20) & INNER.T[:48, :48].any(), COLUMNS > 60
     hole = left & (COLUMNS > 6) & (ROWS > 10) & (ROWS < 30) | right
     disparity = np.where(COLUMNS > 40, 1.0 + 0.01 * ROWS, PLANE)
-    np.testing.assert_allclose(depth.complete(hidden(disparity, hole), ~hole, ring=0.04), disparity, rtol=1e-10)
+    np.testing.assert_allclose(
+        depth.complete(hidden(disparity, hole), ~hole, plate=Plate(ring=0.04)), disparity, rtol=1e-10
+    )
 
 
 def test_the_coarse_path_agrees_with_the_fine_one():
     disparity = PLANE + 0.01 * np.sin(COLUMNS / 15) * np.cos(ROWS / 20)
     fine = depth.complete(disparity, ~INNER)
-    coarse = depth.complete(disparity, ~INNER, most_unknowns=400)
+    coarse = depth.complete(disparity, ~INNER, plate=Plate(most_unknowns=400))
     assert np.abs(fine - coarse).max() < 3e-4
-    np.testing.assert_allclose(depth.complete(PLANE, ~INNER, most_unknowns=400), PLANE, rtol=1e-12)
+    np.testing.assert_allclose(depth.complete(PLANE, ~INNER, plate=Plate(most_unknowns=400)), PLANE, rtol=1e-12)
 
 
 def test_nothing_to_complete_is_a_copy():
@@ -81,27 +84,27 @@ def test_bad_arrays_are_refused():
     with pytest.raises(ValueError, match="not negative"):
         depth.complete(PLANE, -1.0 * INNER)
     with pytest.raises(ValueError, match="no pixel of positive confidence"):
-        depth.bilateral_solve(PLANE, np.zeros(PLANE.shape), np.zeros((48, 64, 3), np.uint8))
+        bilateral.solve(PLANE, np.zeros(PLANE.shape), np.zeros((48, 64, 3), np.uint8))
 
 
 def test_the_solver_smooths_within_edges_and_not_across():
     step = np.where(COLUMNS < 32, 0.2, 0.8)
     guide = np.repeat(np.where(COLUMNS < 32, 90, 180)[..., None], 3, -1).astype(np.uint8)
     noisy = step + 0.05 * np.random.default_rng(0).normal(size=step.shape)
-    solved = depth.bilateral_solve(noisy, np.where(INNER, 0.0, 1.0), guide)
+    solved = bilateral.solve(noisy, np.where(INNER, 0.0, 1.0), guide)
     assert np.abs(solved - step).max() < 0.02
 
 
 def test_the_solver_keeps_constants_and_fills_unreached_cells_with_the_mean():
     guide = np.random.default_rng(0).integers(0, 255, (48, 64, 3)).astype(np.uint8)
     constant = np.full(PLANE.shape, 3.25)
-    np.testing.assert_allclose(depth.bilateral_solve(constant, (~INNER).astype(float), guide), 3.25, rtol=1e-12)
+    np.testing.assert_allclose(bilateral.solve(constant, (~INNER).astype(float), guide), 3.25, rtol=1e-12)
 
 
 def test_refine_keeps_an_estimate_without_misfit_and_spreads_a_constant_one():
     guide = np.repeat((COLUMNS * 2)[..., None], 3, -1).astype(np.uint8)
-    np.testing.assert_allclose(depth.refine(PLANE, hidden(PLANE, INNER), ~INNER, guide), PLANE, rtol=1e-12)
-    shifted = depth.refine(PLANE - 0.1, hidden(PLANE, INNER), (~INNER).astype(float), guide)
+    np.testing.assert_allclose(bilateral.refine(PLANE, hidden(PLANE, INNER), ~INNER, guide), PLANE, rtol=1e-12)
+    shifted = bilateral.refine(PLANE - 0.1, hidden(PLANE, INNER), (~INNER).astype(float), guide)
     np.testing.assert_allclose(shifted, PLANE, rtol=1e-9)
 
 
@@ -113,27 +116,27 @@ def samples(disparity, keep):
 def test_planes_of_a_room_meet_in_their_crease():
     disparity, _ = corner()
     pixels, values = samples(disparity, ~INNER)
-    model = depth.planar_model(pixels, values, disparity.shape, generator(0))
+    model = planes.planar_model(pixels, values, disparity.shape, generator(0))
     np.testing.assert_allclose(model.disparity, disparity, rtol=1e-9)
     assert model.planes == 2 and model.explained == 1.0
 
 
 def test_a_convex_edge_is_continued_too():
     disparity = np.minimum(0.4 + 0.01 * COLUMNS, 1.2 - 0.012 * COLUMNS)
-    model = depth.planar_model(*samples(disparity, ~INNER), disparity.shape, generator(0))
+    model = planes.planar_model(*samples(disparity, ~INNER), disparity.shape, generator(0))
     np.testing.assert_allclose(model.disparity, disparity, rtol=1e-9)
 
 
 def test_a_plane_before_the_wall_does_not_cut_through_the_hole():
     disparity = np.where(COLUMNS > 50, PLANE + 0.3, PLANE) + 1e-4 * np.random.default_rng(0).normal(size=PLANE.shape)
-    model = depth.planar_model(*samples(disparity, ~INNER), disparity.shape, generator(0))
+    model = planes.planar_model(*samples(disparity, ~INNER), disparity.shape, generator(0))
     np.testing.assert_allclose(model.disparity[INNER], PLANE[INNER], rtol=1e-3)
     assert model.explained < 0.9
 
 
 def test_too_few_samples_fix_no_plane():
     with pytest.raises(ValueError, match="fix no plane"):
-        depth.planar_model(np.arange(22.0).reshape(11, 2), np.ones(11), (48, 64), generator(0))
+        planes.planar_model(np.arange(22.0).reshape(11, 2), np.ones(11), (48, 64), generator(0))
     line = np.stack([np.arange(30.0), 2 * np.arange(30.0)], 1)
     with pytest.raises(ValueError, match="fix no plane"):
-        depth.planar_model(line, np.ones(30), (48, 64), generator(0))
+        planes.planar_model(line, np.ones(30), (48, 64), generator(0))

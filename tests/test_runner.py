@@ -15,9 +15,10 @@ import pytest
 
 from runner import execute
 from runner.execute import Failed, run_scene
+from runner.job import Request, prepare
 from runner.keys import fingerprint
 from runner.pipeline import Refused
-from runner.plan import Request, plan, prepare, table
+from runner.plan import plan, table
 
 REPO = Path(__file__).resolve().parent.parent
 
@@ -373,10 +374,13 @@ def test_ctrl_c(root):
 def test_two_runners_on_one_scene(root):
     first = start(root, "--scene", "toy", "--set", "fit.pause=0.2 fit.iterations=8")
     wait_for(lambda: list((root / "runs/toy").glob(".partial-fit-*")))
+    first.send_signal(signal.SIGSTOP)  # until the second has had to wait
     with pytest.raises(Refused, match=f"toy is in use by process {first.pid}"):
         execute.clean(request(root))
     second = start(root, "--scene", "toy", "--set", "fit.pause=0.2 fit.iterations=8")
-    output, _ = second.communicate(timeout=60)
+    output = second.stdout.readline()
+    first.send_signal(signal.SIGCONT)
+    output += second.communicate(timeout=60)[0]
     assert first.wait(timeout=60) == 0 and second.returncode == 0
     assert f"in use by process {first.pid}: waiting" in output and "done in" not in output
 

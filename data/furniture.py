@@ -1,0 +1,146 @@
+"""Furniture: solids with materials on their faces, put together to pieces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from solids import BOX, CYLINDER, ROOM, SPHERE, Faces, Solids
+
+
+@dataclass(frozen=True)
+class Material:
+    """A texture on a face: metres a tile (0: fitted to the face), factor on its colour, turned by 90 degrees."""
+
+    texture: str
+    tile: float = 0.0
+    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    turned: bool = False
+
+
+class Furniture:
+    """Solids and their materials while the room is being furnished."""
+
+    def __init__(self) -> None:
+        self.solids: list[tuple] = []
+        self.materials: list[Material] = []
+
+    def _add(self, kind, center, half, yaw, materials, removable):
+        turn = (np.cos(np.radians(yaw)), np.sin(np.radians(yaw)))
+        self.solids.append((kind, center, half, turn, len(self.materials), removable))
+        self.materials += materials
+
+    def room(self, center, half, right, left, ceiling, floor, front, back):
+        self._add(ROOM, center, half, 0.0, [right, left, ceiling, floor, front, back], False)
+
+    def box(self, x, bottom, z, size, sides, front=None, top=None, yaw=0.0, removable=False):
+        """An upright box of size (wide, high, deep) that stands on `bottom`; `front` faces +z before the yaw."""
+        half = np.array(size) / 2
+        faces = [sides, sides, top or sides, sides, front or sides, sides]
+        self._add(BOX, (x, bottom + half[1], z), half, yaw, faces, removable)
+
+    def sphere(self, x, bottom, z, radius, material, yaw=0.0, removable=False):
+        self._add(SPHERE, (x, bottom + radius, z), (radius,) * 3, yaw, [material], removable)
+
+    def cylinder(self, x, bottom, z, radius, high, side, top=None, removable=False):
+        half = (radius, high / 2, radius)
+        self._add(CYLINDER, (x, bottom + high / 2, z), half, 0.0, [side, top or side, side], removable)
+
+    def arrays(self, index: dict[str, int], node: float) -> tuple[Solids, Faces]:
+        """Everything as the arrays that kernels read; `index`: texture name -> number, `node`: metres."""
+        return self._solid_arrays(), self._face_arrays(index, node)
+
+    def _solid_arrays(self) -> Solids:
+        kind, center, half, turn, first, removable = zip(*self.solids, strict=True)
+        return Solids(
+            np.array(kind, np.int32), np.array(center, float), np.array(half, float),
+            np.array(turn, float), np.array(first, np.int32), np.array(removable, bool),
+            np.array([_reach(k, h) for k, h in zip(kind, half, strict=True)]),
+        )  # fmt: skip
+
+    def _face_arrays(self, index: dict[str, int], node: float) -> Faces:
+        sizes = np.array([size for solid in self.solids for size in _face_sizes(solid[0], solid[2])])
+        spacing = np.full((len(sizes), 1), node)
+        spacing[[2, 4]] *= 4  # ceiling and front wall: hardly ever in a picture
+        nodes = np.clip(np.ceil(sizes / spacing).astype(int) + 1, 5, 256)
+        start = np.cumsum([0, *nodes.prod(1)])[:-1]
+        mapping = np.zeros((len(sizes), 4))
+        for face, (size, material) in enumerate(zip(sizes, self.materials, strict=True)):
+            if material.tile:
+                # No two faces show the same stretch.
+                mapping[face] = 1 / material.tile, 1 / material.tile, face * 0.377 % 1, face * 0.619 % 1
+            else:
+                mapping[face, :2] = 1 / (size[::-1] if material.turned else size)
+        return Faces(
+            np.array([index[m.texture] for m in self.materials]), mapping,
+            np.array([m.turned for m in self.materials]), np.array([m.tint for m in self.materials], float),
+            sizes, np.column_stack([start, nodes]).astype(np.int64),
+        )  # fmt: skip
+
+
+def _reach(kind: int, half) -> float:
+    """Radius of the bounding sphere."""
+    if kind == SPHERE:
+        return half[0]
+    return np.hypot(half[0], half[1]) if kind == CYLINDER else np.linalg.norm(half)
+
+
+def _face_sizes(kind: int, half) -> list[tuple[float, float]]:
+    a, b, c = (2 * h for h in half)
+    if kind == SPHERE:
+        return [(np.pi * a, np.pi * a / 2)]
+    if kind == CYLINDER:
+        return [(np.pi * a, b), (a, a), (a, a)]
+    return [(c, b), (c, b), (a, c), (a, c), (a, b), (a, b)]
+
+
+WHITE = Material("white", 2.0)
+WOOD = Material("wood", 0.9)
+
+
+def plant(f: Furniture, draw, x: float, z: float, high: float) -> None:
+    f.cylinder(x, 0, z, 0.17, 0.3, Material("pot"), Material("wicker", 0.6, (0.3, 0.22, 0.16)))
+    f.cylinder(x, 0.3, z, 0.025, high - 0.6, WOOD)
+    for k in range(7):
+        a = 2.4 * k + draw.random()
+        r = draw.uniform(0.13, 0.2)
+        y = high - 0.85 + 0.09 * k
+        f.sphere(x + 0.15 * np.cos(a), y, z + 0.15 * np.sin(a), r, Material("leaves", 0.5), 40 * k)
+
+
+def shelf(f: Furniture, draw, x: float, z: float, wide: float, yaw: float = 0.0) -> None:
+    """A low bookshelf with things on it; its back towards -z before the yaw."""
+    c, s = np.cos(np.radians(yaw)), np.sin(np.radians(yaw))
+    f.box(x, 0, z, (wide, 0.44, 0.3), WOOD, Material("books"), yaw=yaw)
+    f.box(x, 0.44, z, (wide + 0.06, 0.03, 0.34), WOOD, yaw=yaw)
+    for offset, thing in zip((-0.3, 0.02, 0.3), draw.permutation(3), strict=True):
+        px, pz = x + c * offset * wide, z - s * offset * wide
+        if thing == 0:
+            f.cylinder(px, 0.47, pz, 0.075, 0.26, Material("vase"))
+        elif thing == 1:
+            f.sphere(px, 0.47, pz, 0.11, Material("globe"), 70.0)
+        else:
+            f.box(px, 0.47, pz, (0.2, 0.2, 0.16), Material("books2"), yaw=yaw + 8, top=WHITE)
+
+
+def cabinet(f: Furniture, draw, x: float, z: float, wide: float, high: float, deep: float) -> None:
+    """The object of demo: a cabinet against the wall, a ball and a jar on it. z is its back."""
+    body = Material("paint", 1.3)
+    f.box(x, 0, z + deep / 2, (wide, high, deep), body, Material("front"), removable=True)
+    f.box(x, high, z + deep / 2, (wide + 0.04, 0.025, deep + 0.02), WOOD, removable=True)
+    side = draw.choice((-1, 1))
+    radius = min(draw.uniform(0.12, 0.16), deep * 0.48)
+    top = high + 0.025
+    f.sphere(x + side * wide * 0.26, top, z + deep / 2, radius, Material("ball"), draw.uniform(0, 360), removable=True)
+    f.cylinder(x - side * wide * 0.2, top, z + deep / 2, min(0.1, deep / 3), draw.uniform(0.16, 0.26), Material("jar"),
+               removable=True)  # fmt: skip
+
+
+def daybed(f: Furniture, draw, x: float, z: float) -> None:
+    """The object of 360: a low daybed with a ball and a jar on it; all around, only the floor below is hidden."""
+    wide, deep, high = draw.uniform(1.1, 1.3), draw.uniform(0.8, 0.95), draw.uniform(0.14, 0.18)
+    yaw = draw.uniform(-20, 20)
+    f.box(x, 0.008, z, (wide, high - 0.008, deep), Material("paint", 1.3), yaw=yaw, removable=True)
+    f.box(x, high, z, (wide + 0.04, 0.025, deep + 0.04), WOOD, yaw=yaw, top=Material("quilt"), removable=True)
+    f.sphere(x + 0.2, high + 0.025, z - 0.1, 0.11, Material("ball"), removable=True)
+    f.cylinder(x - 0.25, high + 0.025, z + 0.1, 0.08, 0.13, Material("jar"), removable=True)

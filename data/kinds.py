@@ -1,0 +1,54 @@
+"""The kinds of synthetic scenes, and where their randomness comes from."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+
+FULL = 4  # full resolution over that of images_4
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What differs between kinds.
+
+    Attributes:
+        width, height: pixels of the written images; samples: rays a side of a pixel.
+        train, test: numbers of views; photos: write photographs and masks only.
+        spread: degrees the cameras reach to either side of the object; from 180 on they circle it.
+        texture: pixels a side of the largest textures; node: metres between nodes of the light map.
+        bend: SIMPLE_RADIAL's k1 at its largest; points: sparse points wanted.
+    """
+
+    width: int = 320
+    height: int = 240
+    samples: int = 3
+    train: int = 60
+    test: int = 40
+    photos: bool = False
+    spread: float = 22.0
+    texture: int = 1024
+    node: float = 0.03
+    bend: float = 0.045
+    points: int = 3000
+
+    @property
+    def around(self) -> bool:
+        """Whether the cameras circle the object."""
+        return self.spread >= 180
+
+
+KINDS = {
+    "demo": Kind(),
+    "mini": Kind(width=64, height=48, train=8, test=3, texture=256, node=0.1, points=400),
+    "wide": Kind(spread=50.0),
+    "360": Kind(spread=180.0),
+    "photos": Kind(width=480, height=360, train=26, test=0, photos=True, texture=2048, node=0.025),
+}
+
+
+def randomness(seed: int, label: str) -> np.random.Generator:
+    """A generator of its own for each part, so that changing one part leaves the others as they were."""
+    return np.random.default_rng([seed, zlib.crc32(label.encode())])

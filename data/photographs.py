@@ -1,0 +1,138 @@
+"""The photographer: a walk with a camera, exposure, and which of what a mask covers no photograph shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import raycast
+from kinds import Kind, randomness
+from world import World
+
+
+@dataclass(frozen=True)
+class Session:
+    """V photographs, those of test views first and without the object.
+
+    Attributes:
+        names: of the views; cameras: [V, 16]; test: how many are test views.
+        photos: [V, H, W, 3] uint8; masks: bool [V, H, W], pixels that the object touches or would touch.
+        hidden: bool [V, H, W], never-seen pixels of the masks.
+        middle: the view from the middle of the training views' walk; completed: it without the object.
+    """
+
+    names: list[str]
+    cameras: np.ndarray
+    test: int
+    photos: np.ndarray
+    masks: np.ndarray
+    hidden: np.ndarray
+    middle: int
+    completed: np.ndarray
+
+
+def photographed(seed: int, kind: Kind, world: World, target: np.ndarray) -> Session:
+    """All photographs of a scene, at one exposure."""
+    train, test = (path(seed, kind, target, n, label) for n, label in ((kind.train, "train"), (kind.test, "test")))
+    cameras = np.concatenate([test, train])
+    names = [f"IMG_{k + 2000:04d}" for k in range(len(cameras))]
+    middle = kind.test + int(np.argmin(np.linalg.norm(train[:, 13:] - train[:, 13:].mean(0), axis=1)))
+    world = exposed(world, cameras[middle], kind)
+    shots = [shoot(world, camera, kind, k >= kind.test) for k, camera in enumerate(cameras)]
+    photos, masks = (np.stack(pictures) for pictures in zip(*shots, strict=True))
+    in_training = train, masks[kind.test :]
+    hidden = [never_seen(world, camera, mask, *in_training) for camera, mask in zip(cameras, masks, strict=True)]
+    completed, _ = shoot(world, cameras[middle], kind, False)
+    return Session(names, cameras, kind.test, photos, masks, np.stack(hidden), middle, completed)
+
+
+def path(seed: int, kind: Kind, target: np.ndarray, count: int, label: str) -> np.ndarray:
+    """Cameras [count, 16] of a walk around the target with an unsteady hand; `label` names the walk."""
+    draw = randomness(seed, f"path {label}")
+    azimuth, height, radius = _walk(kind, count, 1.0 if label == "train" else 0.88, draw)
+    angle = np.radians(azimuth + draw.normal(0, 0.6, count))
+    center = target + np.stack([radius * np.sin(angle), height - target[1], radius * np.cos(angle)], 1)
+    center += draw.normal(0, 0.015, (count, 3))
+    aim = target + draw.normal(0, 0.04, (count, 3))
+    roll = np.radians(draw.normal(0, 1.2, count))
+    focal = kind.width * (0.82 if kind.around else 0.85)
+    bend = kind.bend * randomness(seed, "lens").uniform(0.7, 1.0)
+    cameras = np.empty((count, 16))
+    for k in range(count):
+        turn = _looking(aim[k] - center[k], roll[k])
+        cameras[k] = focal, kind.width / 2, kind.height / 2, bend, *turn.ravel(), *center[k]
+    return cameras
+
+
+def _walk(kind: Kind, count: int, reach: float, draw: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Azimuth [count] in degrees, height and horizontal distance from the target in metres."""
+    s = (np.arange(count) + 0.5) / max(count, 1)
+    phase = draw.random(4) * 6.28
+    if kind.around:
+        azimuth = 360 * (2 * s + draw.random())
+        height = 1.15 + 0.12 * np.sin(6.28 * 3 * s + phase[1]) + np.where(s < 0.5, 0.2, -0.1)
+        return azimuth, height, 2.25 + 0.1 * np.sin(6.28 * 5 * s + phase[2])
+    # Few views walk one arc and back; many go to and fro, so that heights and sides mix.
+    azimuth = reach * kind.spread * np.sin(6.28 * 2.5 * s + phase[0])
+    height = 1.22 + 0.2 * np.sin(6.28 * 1.5 * s + phase[1])
+    return azimuth, height, 2.45 + 0.08 * np.sin(6.28 * 4 * s + phase[2])
+
+
+def _looking(along: np.ndarray, roll: float) -> np.ndarray:
+    """[3, 3] camera-to-room rotation that looks along a direction, turned about it by `roll`."""
+    forward = along / np.linalg.norm(along)
+    right = np.cross(forward, (0, 1, 0))
+    right /= np.linalg.norm(right)
+    down = np.cross(forward, right)
+    c, s = np.cos(roll), np.sin(roll)
+    return np.stack([c * right + s * down, c * down - s * right, forward], 1)
+
+
+def develop(color: np.ndarray, exposure: float) -> np.ndarray:
+    """Linear radiance -> sRGB bytes, with a shoulder instead of clipped highlights."""
+    tone = 1 - np.exp(-exposure * color)
+    return np.round(255 * tone ** (1 / 2.2)).astype(np.uint8)
+
+
+def shoot(world: World, camera: np.ndarray, kind: Kind, with_object: bool) -> tuple[np.ndarray, np.ndarray]:
+    """(photograph uint8 [H, W, 3], pixels that the object touches, in it or not: bool [H, W])."""
+    color, mask = _radiance(world, camera, kind, with_object, kind.samples)
+    return develop(color, world.exposure), mask
+
+
+def _radiance(world: World, camera, kind: Kind, with_object: bool, samples: int) -> tuple[np.ndarray, np.ndarray]:
+    return raycast.render(
+        world.solids, world.faces, world.textures, world.light, camera, kind.width, kind.height, with_object, samples
+    )
+
+
+def exposed(world: World, camera: np.ndarray, kind: Kind) -> World:
+    """The world with the exposure that puts this view's mean, object left out, at a comfortable grey."""
+    color, _ = _radiance(world, camera, kind, False, 1)
+    low, high = 0.01, 1000.0
+    for _ in range(40):
+        middle = np.sqrt(low * high)
+        low, high = (middle, high) if develop(color, middle).mean() < 128 else (low, middle)
+    return replace(world, exposure=float(middle))
+
+
+def pixel_centers(mask: np.ndarray) -> np.ndarray:
+    """[P, 2] image points of a mask's pixels."""
+    return np.argwhere(mask)[:, ::-1] + 0.5
+
+
+def never_seen(world: World, camera, mask, train_cameras, train_masks) -> np.ndarray:
+    """Bool [H, W]: pixels of the mask whose background no training view shows outside its own mask."""
+    points, _ = raycast.surface_points(world.solids, camera, pixel_centers(mask), False)
+    result = np.zeros(mask.shape, bool)
+    result[mask] = raycast.never_seen(world.solids, train_cameras, train_masks, points)
+    return result
+
+
+def corner_shift(camera: np.ndarray) -> float:
+    """Pixels by which the lens moves the image's corners."""
+    radius = np.hypot(camera[1], camera[2]) / camera[0]
+    undone = radius
+    for _ in range(8):
+        undone -= (undone + camera[3] * undone**3 - radius) / (1 + 3 * camera[3] * undone**2)
+    return camera[0] * (radius - undone)

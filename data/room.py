@@ -1,0 +1,79 @@
+"""How the room is furnished: a corner with a cabinet, or a room all around a daybed."""
+
+from __future__ import annotations
+
+import numpy as np
+from furniture import WHITE, WOOD, Furniture, Material, cabinet, daybed, plant, shelf
+from kinds import Kind, randomness
+
+WALL = Material("wall", 1.8)
+PLAIN = Material("side", 2.6)
+RUG = Material("rug")
+
+
+def furnish(seed: int, kind: Kind) -> tuple[Furniture, np.ndarray]:
+    """The room and what stands in it; the point the cameras look at."""
+    f, draw = Furniture(), randomness(seed, "layout")
+    planks = Material("floor", 3.0, turned=bool(draw.integers(2)))
+    if kind.around:
+        return f, _round_room(f, draw, planks)
+    side = draw.choice((-1, 1))  # where the corner is
+    # The corner stands clear of the outermost camera.
+    corner = 1.45 + max(0.0, 2.6 * np.sin(np.radians(kind.spread)) - 0.97)
+    _corner(f, draw, planks, side, corner)
+    flat = kind.spread > 30
+    cabinet(f, draw, 0.0, 0.026 if flat else draw.uniform(0.06, 0.14), draw.uniform(0.98, 1.12), draw.uniform(0.6, 0.7),
+            draw.uniform(0.19, 0.22) if flat else draw.uniform(0.4, 0.46))  # fmt: skip
+    plant(f, draw, side * (corner - 0.42), 0.36, draw.uniform(1.35, 1.6))
+    shelf(f, draw, -side * draw.uniform(1.08, 1.2), 0.2, draw.uniform(0.7, 0.8))
+    _pictures_and_clutter(f, draw, side)
+    return f, np.array([0.0, 0.5, 0.1])
+
+
+def _corner(f: Furniture, draw, planks: Material, side: int, corner: float) -> None:
+    """The room with its skirting; the near side wall is `corner` metres from the middle."""
+    left, right = (-corner, 4.0) if side < 0 else (-4.0, corner)
+    middle = (left + right) / 2
+    f.room((middle, 1.35, 3.2), ((right - left) / 2, 1.35, 3.2), PLAIN, PLAIN, WHITE, planks, PLAIN, WALL)
+    skirt = WHITE if draw.random() < 0.6 else WOOD
+    f.box(middle, 0, 0.008, (right - left, 0.1, 0.016), skirt)
+    f.box(side * (corner - 0.008), 0, 3.2, (0.016, 0.1, 6.4), skirt)
+
+
+def _pictures_and_clutter(f: Furniture, draw, side: int) -> None:
+    x, y = -side * draw.uniform(0.95, 1.1), draw.uniform(0.95, 1.05)
+    f.box(x, y, 0.012, (0.52, 0.4, 0.024), WOOD, Material("picture"))
+    x, y = side * draw.uniform(0.5, 0.75), draw.uniform(1.1, 1.2)
+    f.box(x, y, 0.012, (0.4, 0.5, 0.024), WOOD, Material("picture2"))
+    f.box(draw.uniform(-0.15, 0.15), 0, draw.uniform(1.3, 1.4), (1.5, 0.008, 1.1), RUG, yaw=draw.uniform(-6, 6))
+    f.cylinder(-side * draw.uniform(0.85, 0.95), 0, draw.uniform(0.75, 0.85), 0.15, 0.24, Material("wicker", 0.5),
+               Material("wicker", 0.5, (0.25, 0.2, 0.15)))  # fmt: skip
+    f.box(side * draw.uniform(0.82, 0.92), 0, draw.uniform(0.72, 0.85), (0.26, 0.2, 0.2), Material("crate"),
+          yaw=draw.uniform(10, 60))  # fmt: skip
+
+
+def _round_room(f: Furniture, draw, planks: Material) -> np.ndarray:
+    f.room((0, 1.35, 3.2), (3.2, 1.35, 3.2), PLAIN, WALL, WHITE, planks, WALL, WALL)
+    f.box(0.1, 0, 3.15, (2.3, 0.008, 1.6), RUG, yaw=draw.uniform(-30, 30))
+    daybed(f, draw, 0.0, 3.2)
+    for x, z, wide, deep in ((0, 0.008, 6.4, 0.016), (0, 6.392, 6.4, 0.016), (-3.192, 3.2, 0.016, 6.4),
+                             (3.192, 3.2, 0.016, 6.4)):  # fmt: skip
+        f.box(x, 0, z, (wide, 0.1, deep), WHITE)
+    for x, z in ((-2.75, 0.45), (2.75, 5.95), (2.7, 0.5), (-2.7, 5.9)):
+        plant(f, draw, x, z, draw.uniform(1.4, 1.7))
+    for x, z, yaw in ((0.4, 0.2, 0), (-0.5, 6.2, 180), (-3.0, 3.6, 90), (3.0, 2.8, -90)):
+        shelf(f, draw, x, z, draw.uniform(1.0, 1.3), yaw)
+    f.box(1.6, 1.1, 0.012, (0.8, 0.6, 0.024), WOOD, Material("picture"))
+    f.box(-1.7, 1.0, 0.012, (0.6, 0.8, 0.024), WOOD, Material("picture2"))
+    f.box(-3.188, 1.1, 1.8, (0.024, 0.7, 0.9), Material("picture2"))
+    f.box(3.188, 1.1, 4.4, (0.024, 0.7, 0.9), Material("picture"))
+    for k, name in enumerate(("crate", "wicker", "globe", "vase")):
+        a = np.radians(90 * k + draw.uniform(20, 70))
+        x, z = 1.25 * np.cos(a), 3.2 + 1.25 * np.sin(a)
+        if name == "crate":
+            f.box(x, 0, z, (0.24, 0.18, 0.2), Material(name), yaw=draw.uniform(0, 90))
+        elif name == "globe":
+            f.sphere(x, 0, z, 0.11, Material(name))
+        else:
+            f.cylinder(x, 0, z, 0.1, 0.16, Material(name))
+    return np.array([0.0, 0.3, 3.2])

@@ -1,0 +1,175 @@
+"""A request with everything about it resolved and checked: scene, profile, variant, parameters of all stages."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from runner.keys import Hashes
+from runner.pipeline import (
+    Layers,
+    Overrides,
+    Pipeline,
+    Refused,
+    choose_profile,
+    find_scene,
+    layered,
+    load_pipeline,
+    load_scene_file,
+    parse_set,
+    unknown,
+)
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the command line asks for. Texts are as given; None where not given."""
+
+    root: Path
+    runs: Path
+    scene: str
+    profile: str | None = None
+    variant: str | None = None
+    trust: bool = False
+    set: str = ""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One scene with everything about it resolved and checked.
+
+    Attributes:
+        home: runs/<scene>, or runs/<scene>@<variant>.
+        base: runs/<scene>.
+        brings: the keys of scene.yaml that have values.
+        params: stage -> every parameter.
+        broken: stages without parameters here, because their file is missing or is no stage -> what is wrong.
+        weights: stage -> names of the parameters that name weights.
+        outside: files or folders named by the scene's parameters that lie outside its folder.
+    """
+
+    root: Path
+    runs: Path
+    folder: Path
+    name: str
+    home: Path
+    base: Path
+    pipeline: Pipeline
+    profile: str
+    trust: bool
+    brings: frozenset[str]
+    params: Overrides
+    broken: dict[str, str]
+    weights: dict[str, tuple[str, ...]]
+    outside: tuple[Path, ...]
+    hashes: Hashes
+
+    @property
+    def label(self) -> str:
+        return self.home.name
+
+
+def prepare(request: Request) -> Job:
+    """Read and check everything a request names. Raises Refused with one line that says what would fix it."""
+    root, runs = request.root, request.runs
+    pipeline = load_pipeline(root)
+    folder = find_scene(request.scene, root)
+    scene = load_scene_file(folder, pipeline)
+    if request.variant and request.variant not in pipeline.variants:
+        raise Refused(f"{root / 'pipeline.yaml'}: {unknown('variant', request.variant, pipeline.variants)}")
+    base = runs / folder.name
+    home = runs / (f"{folder.name}@{request.variant}" if request.variant else folder.name)
+    _one_folder_a_name(base, folder, root)
+    profile = choose_profile(request.profile, scene, [home / "profile", base / "profile"], pipeline)
+    layers = layered(pipeline, scene, profile, request.variant, parse_set(request.set, pipeline))
+    described, broken = _described(root, pipeline, layers)
+    params = {name: answer["params"] for name, answer in described.items()}
+    scene_params = [params[stage] for stage in pipeline.scene_keys if stage in params]
+    return Job(
+        root=root,
+        runs=runs,
+        folder=folder,
+        name=folder.name,
+        home=home,
+        base=base,
+        pipeline=pipeline,
+        profile=profile,
+        trust=request.trust,
+        brings=frozenset(scene.brings),
+        params=params,
+        broken=broken,
+        weights={name: tuple(answer["weights"]) for name, answer in described.items()},
+        outside=tuple(_outside(scene_params, folder)),
+        hashes=Hashes(runs / ".hashes.json"),
+    )
+
+
+def source_of(folder: Path, root: Path) -> str:
+    """How runs/<scene>/source names a scene's folder: from the root where it lies inside."""
+    return folder.relative_to(root).as_posix() if folder.is_relative_to(root) else str(folder)
+
+
+def _one_folder_a_name(base: Path, folder: Path, root: Path) -> None:
+    record = base / "source"
+    if record.is_file():
+        before = root / record.read_text().strip()
+        if before != folder and before.is_dir():
+            raise Refused(
+                f"two scenes are called {folder.name!r}: {base} was made from {before}, and {folder} is asked for; "
+                f"rename one folder, or make room with `make scene={before} clean`"
+            )
+
+
+def _outside(value: Any, folder: Path) -> Iterator[Path]:
+    """Files and folders named anywhere in `value`, relative to the scene, that the scene's folder does not hold."""
+    if isinstance(value, dict | list):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from _outside(part, folder)
+    elif isinstance(value, str) and value and "\0" not in value and len(value) < 1024:
+        path = (folder / value).resolve()
+        if ("/" in value or os.sep in value) and not path.is_relative_to(folder) and path.exists():
+            yield path
+
+
+def child(root: Path, *arguments: str, **options: Any) -> subprocess.Popen[str]:
+    """A fresh process that may import stages: `python -m runner.child <arguments>` with `root` first on its path."""
+    here = Path(__file__).resolve().parent.parent
+    path = os.pathsep.join(filter(None, [str(root), str(here), os.environ.get("PYTHONPATH", "")]))
+    command = [sys.executable, "-m", "runner.child", *arguments]
+    return subprocess.Popen(
+        command, cwd=root, env={**os.environ, "PYTHONPATH": path}, stdin=subprocess.PIPE, text=True, **options
+    )
+
+
+def ask(root: Path, question: dict[str, Any]) -> dict[str, Any]:
+    """What stages say of themselves: see `runner.child.describe`."""
+    process = child(root, "describe", stdout=subprocess.PIPE)
+    answer, _ = process.communicate(json.dumps(question))
+    if process.returncode:
+        raise Refused("the stages could not be asked for their parameters (see above)")
+    return json.loads(answer)
+
+
+def _described(root: Path, pipeline: Pipeline, layers: Layers) -> tuple[dict[str, Any], dict[str, str]]:
+    """stage -> {"params": all parameters, "weights": names}, and broken stages; refuses the first wrong parameter."""
+    broken = {name: f"stages/{name}.py: no such file, and pipeline.yaml names it" for name in pipeline.stages}
+    here = [name for name in pipeline.stages if (root / "stages" / f"{name}.py").is_file()]
+    questions = {name: {"params": layers.values[name], "takes": pipeline.stages[name].takes} for name in here}
+    described = {}
+    for stage, answer in ask(root, questions).items():
+        if answer["broken"]:
+            broken[stage] = answer["broken"]
+            continue
+        for error in answer["errors"]:
+            name, origin = error["param"], layers.origin[stage].get(error["param"], "pipeline.yaml")
+            if error["unknown"]:
+                raise Refused(f"{origin}: stage {stage}: {unknown('parameter', name, answer['known'])}")
+            raise Refused(f"{origin}: {stage}.{error['where']} = {error['value']}: {error['message']}")
+        described[stage] = answer
+    return described, {name: why for name, why in broken.items() if name not in described}

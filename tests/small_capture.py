@@ -1,0 +1,145 @@
+"""A small capture with known truth, written in any layout, and `poses` run on it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from reffusion import io, lens
+from reffusion.io import colmap
+from stages import poses
+
+WIDTH, HEIGHT = 96, 72
+FISHEYE = ("OPENCV_FISHEYE", (60.0, 61.0, 48.5, 35.0, 0.02, -0.01, 0.002, 0.001))
+OPENCV = ("OPENCV", (90.0, 91.0, 47.0, 36.5, 0.06, -0.08, -0.001, 0.002))
+RADIAL = ("SIMPLE_RADIAL", (90.0, 48.0, 36.0, 0.05))
+PINHOLE = ("SIMPLE_PINHOLE", (90.0, 48.0, 36.0))
+
+
+@dataclass(frozen=True)
+class Truth:
+    """A made-up capture in its own frame: view name -> [4, 4], points, the lens at the size of the pictures."""
+
+    world_to_camera: dict[str, np.ndarray]
+    points: np.ndarray
+    model: tuple[str, tuple[float, ...]]
+
+    @property
+    def lens(self) -> lens.Lens:
+        return lens.from_colmap(self.model[0], WIDTH, HEIGHT, self.model[1])
+
+
+def some_truth(model=PINHOLE, views=6, scale=1.0, offset=(0.0, 0.0, 0.0)) -> Truth:
+    """Cameras on an arc, 4 away from a cloud of points around the offset."""
+    generator, cameras, offset = np.random.default_rng(3), {}, np.array(offset)
+    for k in range(views):
+        angle = np.radians(-25 + 50 * k / (views - 1))
+        center = 4 * np.array([np.sin(angle), 0.15 * generator.normal(), -np.cos(angle)])
+        forward = -center / np.linalg.norm(center)
+        right = np.cross([0.0, 1.0, 0.1 * generator.normal()], forward)
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+        pose[:3, 3] = -pose[:3, :3] @ (scale * center + offset)
+        cameras[f"v{k:02d}"] = pose
+    return Truth(cameras, generator.uniform(-0.9, 0.9, (60, 3)) * scale + offset, model)
+
+
+def write_pictures(folder: Path, names, size=(WIDTH, HEIGHT), ending=".png") -> None:
+    for k, name in enumerate(names):
+        io.save_image(folder / f"{name}{ending}", np.full((size[1], size[0], 3), 40 + k, np.uint8))
+
+
+def write_masks(folder: Path, names, size=(WIDTH, HEIGHT), value=255) -> None:
+    mask = np.zeros((size[1], size[0]), np.uint8)
+    mask[size[1] // 4 : size[1] // 2, size[0] // 4 : size[0] // 2] = value
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        Image.fromarray(mask).save(folder / f"{name}.png")
+
+
+def write_model(folder: Path, truth: Truth, text=False, factor=1, ending=".jpg") -> None:
+    """A COLMAP model for pictures `factor` times larger than those written."""
+    at = truth.lens.resized(WIDTH * factor, HEIGHT * factor)
+    single = truth.model[0].startswith(("SIMPLE", "RADIAL"))
+    head = (at.fx, at.cx, at.cy) if single else (at.fx, at.fy, at.cx, at.cy)
+    params = (*head, *truth.model[1][len(head) :])
+    cameras = {1: colmap.ModelCamera(truth.model[0], at.width, at.height, params)}
+    images = {
+        k: colmap.ModelImage(name + ending, 1, pose)
+        for k, (name, pose) in enumerate(sorted(truth.world_to_camera.items(), reverse=True), start=7)
+    }
+    colors = np.full((len(truth.points), 3), 99, np.uint8)
+    colmap.save_model(folder, cameras, images, truth.points, colors)
+    if text:
+        import pycolmap
+
+        pycolmap.Reconstruction(folder).write_text(folder)
+        for path in folder.glob("*.bin"):
+            path.unlink()
+
+
+def write_transforms(folder: Path, truth: Truth, per_frame=False, **changes) -> None:
+    at, flip = truth.lens, np.diag([1.0, -1.0, -1.0, 1.0])
+    values = {"w": WIDTH, "h": HEIGHT, "fl_x": at.fx, "fl_y": at.fy, "cx": at.cx, "cy": at.cy}
+    values |= {f"k{i}": k for i, k in enumerate(at.radial, start=1)} | dict(
+        zip(("p1", "p2"), at.tangential, strict=True)
+    )
+    values["camera_model"] = truth.model[0]
+    frames = [
+        {"file_path": f"images/{name}.png", "transform_matrix": (np.linalg.inv(pose) @ flip).tolist()}
+        for name, pose in sorted(truth.world_to_camera.items(), reverse=True)
+    ]
+    record = {"frames": [f | values for f in frames]} if per_frame else {**values, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(record | changes))
+
+
+def write_poses_bounds(folder: Path, truth: Truth, factor=4) -> None:
+    rows = []
+    for pose in (truth.world_to_camera[name] for name in sorted(truth.world_to_camera)):
+        right, down, forward = pose[:3, :3]
+        size = np.array([HEIGHT * factor, WIDTH * factor, truth.lens.fx * factor])
+        matrix = np.stack([down, right, -forward, -pose[:3, :3].T @ pose[:3, 3], size], axis=1)
+        z = truth.points @ forward + pose[2, 3]
+        rows.append([*matrix.ravel(), z.min(), z.max()])
+    np.save(folder / "poses_bounds.npy", np.array(rows))
+
+
+def prepare(folder: Path, layout: str, truth: Truth) -> Path:
+    """Pictures, masks and poses in one of the layouts."""
+    images = folder / ("images_4" if layout.startswith("llff") else "images")
+    write_pictures(images, truth.world_to_camera)
+    write_masks(images / "label" if layout.startswith("llff") else folder / "masks", truth.world_to_camera)
+    if layout.startswith("llff"):
+        write_poses_bounds(folder, truth)
+    if layout in ("llff+bin", "llff+txt", "colmap", "colmap txt"):
+        write_model(folder / "sparse" / "0", truth, layout.endswith("txt"), 4 if layout.startswith("llff") else 1)
+    if layout.startswith("transforms"):
+        write_transforms(folder, truth, layout.endswith("each"))
+    return folder
+
+
+def run(folder: Path, **params):
+    out = folder.parent / (folder.name + "_out")
+    out.mkdir(exist_ok=True)
+    poses.run(poses.Params(**params), out, scene=folder)
+    return io.load_scene(out), out
+
+
+def reprojection_error(scene, truth: Truth) -> float:
+    """Pixels between where a point is in the photograph and where the undistorted picture reads it from."""
+    worst = 0.0
+    for name, pose in truth.world_to_camera.items():
+        at = truth.points @ pose[:3, :3].T + pose[:3, 3]
+        shown = lens.to_pixels(at[:, :2] / at[:, 2:], truth.lens)
+        camera = scene.cameras[name]
+        ours = scene.similarity.apply(truth.points) @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        uv = (ours[:, :2] / ours[:, 2:] * (camera.fx, camera.fy)) + (camera.cx, camera.cy)
+        back = (uv - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+        worst = max(worst, float(np.abs(lens.to_pixels(back, truth.lens) - shown).max()))
+        assert (camera.width, camera.height) == (WIDTH, HEIGHT)
+    return worst

@@ -1,0 +1,122 @@
+"""Captures that `poses` refuses: each time with the file and the remedy, and before any work."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_capture import HEIGHT, WIDTH, prepare, run, some_truth, write_masks, write_pictures
+
+
+def edit_transforms(change):
+    def edit(folder: Path) -> None:
+        record = json.loads((folder / "transforms.json").read_text())
+        change(record)
+        (folder / "transforms.json").write_text(json.dumps(record))
+
+    return edit
+
+
+def nan_pose(record):
+    record["frames"][2]["transform_matrix"][0][3] = float("nan")
+
+
+def mirrored_pose(record):
+    record["frames"][2]["transform_matrix"][0][:3] = [-v for v in record["frames"][2]["transform_matrix"][0][:3]]
+
+
+def same_stem(folder: Path) -> None:
+    write_pictures(folder / "other", ["v00"])
+    edit_transforms(lambda r: r["frames"][0].update(file_path="other/v00.png"))(folder)
+
+
+def drop_views(folder: Path) -> None:
+    for k in range(2, 6):
+        (folder / "images" / f"v{k:02d}.png").unlink()
+        (folder / "masks" / f"v{k:02d}.png").unlink()
+
+
+def drop_masks(folder: Path) -> None:
+    for path in (folder / "masks").iterdir():
+        path.unlink()
+
+
+def drop_poses(folder: Path) -> None:
+    (folder / "transforms.json").unlink()
+    write_pictures(folder / "images", ["v03"], (HEIGHT, HEIGHT))
+
+
+REFUSALS = [
+    ("mask for no picture", lambda f: write_masks(f / "masks", ["zz"]), {}, r"zz\.png.*no picture"),
+    ("no mask at all", drop_masks, {}, "no mask at all.*masks: none"),
+    ("named masks missing", None, {"masks": "nowhere"}, "nowhere.*correct `masks`"),
+    ("empty masks", lambda f: write_masks(f / "masks", [f"v{k:02d}" for k in range(6)], value=0), {}, "are empty"),
+    ("mask of other proportions", lambda f: write_masks(f / "masks", ["v01"], (HEIGHT, WIDTH)), {}, r"v01\.png.*72x96"),
+    ("two training views", drop_views, {}, "2 training views.*at least 3"),
+    ("all views are test views", None, {"test": "every 1"}, "0 training views.*at least 3"),
+    ("mixed sizes, no intrinsics", drop_poses, {}, "2 sizes and no intrinsics"),
+    ("unreadable picture", lambda f: (f / "images" / "v01.png").write_text("x"), {}, r"v01\.png.*readable image"),
+    ("NaN pose", edit_transforms(nan_pose), {}, r"transforms\.json.*'v03' is not finite"),
+    ("mirrored pose", edit_transforms(mirrored_pose), {}, "'v03' is no rotation"),
+    ("two views of a name", same_stem, {}, "view name 'v00' is also"),
+    ("no intrinsics", edit_transforms(lambda r: r.pop("fl_x")), {}, "neither fl_x nor camera_angle_x"),
+    ("unknown camera model", edit_transforms(lambda r: r.update(camera_model="X")), {}, "camera_model X"),
+    ("other proportions than the camera", edit_transforms(lambda r: r.update(w=50)), {}, "other proportions"),
+    ("unknown test view", None, {"test": ["w01"]}, r"test: there is no view 'w01'.*v01"),
+    ("unknown train view", None, {"train": ["v00", "v01", "q"]}, "train: there is no view 'q'"),
+    ("unknown clean view", None, {"clean": ["q"]}, "clean: there is no view 'q'"),
+    ("clean view that is a test view", None, {"clean": ["v00"], "test": ["v00"]}, "v00 is no training view"),
+    ("both train and test", None, {"train": ["v00", "v01", "v02"], "test": ["v02"]}, "v02 in both"),
+    ("split that is neither", None, {"test": "some"}, "'some' is neither"),
+    ("unknown reference view", None, {"reference": {"view": "q", "image": "ref.png"}}, "reference: there is no view"),
+    ("missing reference", None, {"reference": {"view": "v01", "image": "no.png"}}, r"no\.png: no such file"),
+    ("reference of other proportions", None, {"reference": {"view": "v01", "image": "tall.png"}}, r"tall\.png: 72x96"),
+    ("missing images folder", None, {"images": "nowhere"}, "nowhere: no such folder"),
+    ("missing gaussians", None, {"gaussians": "no.ply"}, r"no\.ply: no such file"),
+    ("layout that is not there", None, {"layout": "colmap"}, "no COLMAP model"),
+]
+
+
+@pytest.mark.parametrize(("change", "params", "message"), [r[1:] for r in REFUSALS], ids=[r[0] for r in REFUSALS])
+def test_refusals_name_file_and_remedy(tmp_path, change, params, message):
+    folder = prepare(tmp_path / "s", "transforms", some_truth())
+    write_pictures(folder, ["ref"])
+    write_pictures(folder, ["tall"], (HEIGHT, WIDTH))
+    if change is not None:
+        change(folder)
+    with pytest.raises(ValueError, match=message):
+        run(folder, **params)
+    assert not list((tmp_path / "s_out").rglob("*.*"))  # nothing was done before
+
+
+def test_llff_refusals(tmp_path):
+    folder = prepare(tmp_path / "s", "llff", some_truth())
+    rows = np.load(folder / "poses_bounds.npy")
+    np.save(folder / "poses_bounds.npy", rows[:-1])
+    with pytest.raises(ValueError, match=r"5 poses.*6 pictures"):
+        run(folder)
+    rows[2, 3] = np.nan
+    np.save(folder / "poses_bounds.npy", rows)
+    with pytest.raises(ValueError, match=r"poses_bounds\.npy: rows \[2\]"):
+        run(folder)
+
+
+def test_cut_off_model_is_named(tmp_path):
+    folder = prepare(tmp_path / "s", "colmap", some_truth())
+    for name in ("images.bin", "points3D.bin", "cameras.bin"):
+        path = folder / "sparse" / "0" / name
+        whole = path.read_bytes()
+        path.write_bytes(whole[:-10])
+        with pytest.raises(ValueError, match=rf"{name}.*cut off"):
+            run(folder)
+        path.write_bytes(whole)
+
+
+def test_masks_none_is_a_scene_to_fit_only(tmp_path):
+    folder = prepare(tmp_path / "s", "transforms", some_truth())
+    scene, out = run(folder, masks="none", test="every 3")
+    assert not (out / "masks").exists() and len(scene.test) == 2
+    drop_masks(folder)
+    run(folder, region={"center": (0, 0, 0), "size": (1, 1, 1)})
