@@ -81,7 +81,7 @@ def test_layout_is_spin_nerfs(generate, mini):
     assert label.shape[:2] == (kind.height, kind.width)
     assert set(np.unique(label)) == {0, 1}
     scene = yaml.safe_load((mini / "scene.yaml").read_text())
-    assert set(scene) == {"reference"}
+    assert set(scene) == {"reference", "profile"} and scene["profile"] == "laptop"
     assert scene["reference"]["view"] in train
     assert io.load_image(mini / scene["reference"]["image"]).shape == (kind.height, kind.width, 3)
     demo = generate.KINDS["demo"]
