@@ -23,6 +23,9 @@ class Params(BaseModel):
     buried: float = Field(
         0.1, ge=0, description="blending weight in all views up to which a Gaussian votes by where it stands"
     )
+    hull: float = Field(
+        0.9, ge=0, le=1, description="masked too: centres inside C in more than this share of the views; 1 = none"
+    )
     explained: float = Field(0.5, gt=0, lt=1, description="blended observation from which a pixel is explained")
     witnesses: int = Field(1, ge=0, description="training views that must show a pixel's background; 0 = not asked")
     tolerance: float = Field(0.02, gt=0, description="relative depth by which a visible point may lie too far")
@@ -67,6 +70,10 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
     for name, camera in scene.cameras.items():
         share, shown[name] = masks.label_view(gaussians, labels, camera)
         consistent[name] = clean(share > params.tau_rendered)
+    # What stands where (almost) every view sees the object can only be the object, whatever it was painted with.
+    labels |= masks.hidden_inside(
+        gaussians, train, {n: consistent[n] for n in scene.train if n not in scene.clean}, share=params.hull
+    )
     hidden = consistent | {name: empty[name] for name in scene.clean}
     remaining, observed = gaussians.map(lambda p: p[~labels]), masks.evidence(seen, params.observed)[~labels]
 
