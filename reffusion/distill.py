@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import log10
 from pathlib import Path
@@ -48,6 +48,7 @@ class Settings:
         region_every: steps between prunings of Gaussians that changed region.
         stop_drop: stop when the reference's PSNR falls so many dB under its best, and give the best; 0: never.
         rates: Adam's step sizes.
+        masked_pace: parameter -> factor on them for masked Gaussians.
         checkpoint_seconds: seconds of work between checkpoints.
     """
 
@@ -66,6 +67,7 @@ class Settings:
     region_every: int = 50
     stop_drop: float = 0.0
     rates: Rates = field(default_factory=Rates)
+    masked_pace: Mapping[str, float] = field(default_factory=dict)
     checkpoint_seconds: float = 10.0
 
 
@@ -95,7 +97,7 @@ def distill(
     Raises:
         FloatingPointError: a value or gradient is not finite; names step, term and view.
     """
-    optimizer = GaussianOptimizer(initial, masked, settings.rates)
+    optimizer = GaussianOptimizer(initial, masked, settings.rates, settings.masked_pace)
     region = region_of(initial.means, masked) if masked.any() else None
     distilled = [sight for sight in sights if sight.repaint.any()] if settings.sds_weight > 0 else []
     if distilled and (prior is None or text is None):

@@ -5,6 +5,7 @@ Shared by `fit` and `distill`. Everything here takes tensors and plain numbers.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -95,6 +96,7 @@ class GaussianOptimizer:
     Attributes:
         gaussians: the parameters, leaves that require a gradient. A new object after each change of number.
         masked: [N] bool, the Gaussians' labels; they follow through `select` and `append`.
+        masked_pace: parameter -> factor on the step sizes of masked Gaussians; 1 where it names none.
         slope_sum, slope_count: [N], what `observe` has gathered since `forget_slopes`; they follow likewise.
     """
 
@@ -105,10 +107,12 @@ class GaussianOptimizer:
         gaussians: Gaussians,
         masked: Tensor | None = None,
         rates: Rates | None = None,
+        masked_pace: Mapping[str, float] | None = None,
         betas: tuple[float, float] = (0.9, 0.999),
         epsilon: float = 1e-15,
     ):
         self.rates, self.betas, self.epsilon = rates or Rates(), betas, epsilon
+        self.masked_pace = dict(masked_pace or {})
         self.masked = torch.zeros(len(gaussians), dtype=torch.bool) if masked is None else masked.clone()
         self.masked = self.masked.to(gaussians.means.device)
         self.gaussians = gaussians.map(_leaf)
@@ -158,7 +162,6 @@ class GaussianOptimizer:
             visible = torch.ones_like(self.masked)
         rates = self.rates.at(progress, self.gaussians)
         alike = torch.ones_like(self._steps, dtype=torch.float32)
-        reach = alike if reach is None else reach.detach().float().contiguous()
         self._steps += visible
         # Bias correction, per row; a row that never moved has t = 0 and is skipped.
         unbias = [1 / (1 - beta ** self._steps.clamp(min=1).double()).float() for beta in self.betas]
@@ -168,8 +171,10 @@ class GaussianOptimizer:
                     continue
                 rows = [_rows(getattr(g, name)) for g in (self.gaussians, self._first, self._second)]
                 update = _adam_cpu if gradient.device.type == "cpu" else _adam
-                steps = reach if name == "means" else alike
-                update(*rows, _rows(gradient), *unbias, steps, visible, rates[name], *self.betas, self.epsilon)
+                pace = torch.where(self.masked, self.masked_pace.get(name, 1.0), alike)
+                if name == "means" and reach is not None:
+                    pace = pace * reach.detach()
+                update(*rows, _rows(gradient), *unbias, pace, visible, rates[name], *self.betas, self.epsilon)
         self.forget_gradients()
 
     def forget_gradients(self) -> None:
@@ -242,29 +247,29 @@ def _rows(parameter: Tensor) -> Tensor:
     return parameter.detach().contiguous().view(parameter.shape[0], -1)
 
 
-def _adam(parameter, first, second, gradient, unbias1, unbias2, reach, visible, rates, beta1, beta2, epsilon) -> None:
+def _adam(parameter, first, second, gradient, unbias1, unbias2, pace, visible, rates, beta1, beta2, epsilon) -> None:
     """One Adam step in place on the visible rows of [N, D]; `unbias` [N] is 1 / (1 - beta^t), step sizes are
-    `rates` [D] times `reach` [N]."""
+    `rates` [D] times `pace` [N]."""
     rows = visible.nonzero()[:, 0]
     g = gradient[rows]
     m = first[rows].lerp_(g, 1 - beta1)
     v = second[rows].mul_(beta2).addcmul_(g, g, value=1 - beta2)
     first[rows], second[rows] = m, v
     denominator = (v * unbias2[rows, None]).sqrt() + epsilon
-    parameter[rows] -= rates.to(g) * (reach * unbias1)[rows, None] * m / denominator
+    parameter[rows] -= rates.to(g) * (pace * unbias1)[rows, None] * m / denominator
 
 
 def _adam_cpu(
-    parameter, first, second, gradient, unbias1, unbias2, reach, visible, rates, beta1, beta2, epsilon
+    parameter, first, second, gradient, unbias1, unbias2, pace, visible, rates, beta1, beta2, epsilon
 ) -> None:
     """`_adam` in one pass over memory, for float32."""
-    arrays = (t.numpy() for t in (parameter, first, second, gradient, unbias1, unbias2, reach, visible, rates))
+    arrays = (t.numpy() for t in (parameter, first, second, gradient, unbias1, unbias2, pace, visible, rates))
     share(_adam_kernel, *arrays, np.float32(beta1), np.float32(beta2), np.float32(epsilon))
 
 
 @numba.njit(fastmath={"contract", "reassoc", "nsz", "arcp"}, error_model="numpy", cache=True, nogil=True)
 def _adam_kernel(
-    tickets, parameter, first, second, gradient, unbias1, unbias2, reach, visible, rates, beta1, beta2, epsilon
+    tickets, parameter, first, second, gradient, unbias1, unbias2, pace, visible, rates, beta1, beta2, epsilon
 ):
     count, width = parameter.shape
     new1, new2 = np.float32(1) - beta1, np.float32(1) - beta2
@@ -282,4 +287,4 @@ def _adam_kernel(
                 a = np.float32(0) if abs(a) < least else a
                 b = beta2 * second[i, j] + new2 * g * g
                 first[i, j], second[i, j] = a, b
-                parameter[i, j] -= reach[i] * rates[j] * unbias1[i] * a / (np.sqrt(b * unbias2[i]) + epsilon)
+                parameter[i, j] -= pace[i] * rates[j] * unbias1[i] * a / (np.sqrt(b * unbias2[i]) + epsilon)

@@ -32,8 +32,9 @@ class Params(BaseModel):
     repaint: Literal["invent", "consistent"] = Field("invent", description="the pixels the UNet repaints")
     reconstruction_every: int = Field(1, ge=0, description="steps between two with a reconstruction term; 0: never")
     reference_weight: float = Field(0.0, ge=0, description="weight of the reference's pixels in its hole (paper: 0)")
-    # PAPER leaves open: Adam's step sizes here; 3DGS's.
-    rate: float = Field(1.0, gt=0, description="factor on all of 3DGS's step sizes")
+    # PAPER leaves open: Adam's step sizes here; 3DGS's. Those of unmasked Gaussians are left alone: what the object's
+    # blurred rim had tinted is to be mended by the reconstruction term.
+    rate: float = Field(1.0, gt=0, description="factor on 3DGS's step sizes of masked Gaussians")
     rate_opacity: float = Field(1.0, ge=0, description="further factor on the opacities'")
     rate_shape: float = Field(1.0, ge=0, description="further factor on those of means, scales and rotations")
     # PAPER leaves open: how densification changes. Among masked Gaussians those pulled hardest on the screen are
@@ -114,19 +115,12 @@ def settings(params: Params):
 
     from reffusion.confinement import Distillation
     from reffusion.distill import Settings
-    from reffusion.optimize import Rates
 
-    usual = Rates()
-    rates = Rates(
-        means=usual.means * params.rate * params.rate_shape,
-        means_last=usual.means_last * params.rate * params.rate_shape,
-        quaternions=usual.quaternions * params.rate * params.rate_shape,
-        log_scales=usual.log_scales * params.rate * params.rate_shape,
-        opacity_logits=usual.opacity_logits * params.rate * params.rate_opacity,
-        sh_dc=usual.sh_dc * params.rate,
-        sh_rest=usual.sh_rest * params.rate,
-    )
-    shared = {f.name: getattr(params, f.name) for f in fields(Settings) if f.name not in ("rates", "sds")}
+    shape = params.rate * params.rate_shape
+    pace = {"means": shape, "quaternions": shape, "log_scales": shape, "sh": params.rate}
+    pace["opacity_logits"] = params.rate * params.rate_opacity
+    given = ("rates", "masked_pace", "sds")
+    shared = {f.name: getattr(params, f.name) for f in fields(Settings) if f.name not in given}
     sds = Distillation(
         params.patches,
         params.t_low,
@@ -137,4 +131,4 @@ def settings(params: Params):
         params.guidance,
         params.reduction,
     )
-    return Settings(**shared, sds=sds, rates=rates)
+    return Settings(**shared, sds=sds, masked_pace=pace)

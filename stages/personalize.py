@@ -85,9 +85,7 @@ def run(params: Params, out: Path, *, poses: Path, masks: Path, reference: Path)
     if params.scene_crops > 0:
         views = P.clear_views(scene_views(scene, poses, masks, prior.native_size), training.size)
         if not views:
-            print(
-                f"note: no view has {training.size} px window free of masks: reference alone", flush=True
-            )
+            print(f"note: no view has {training.size} px window free of masks: reference alone", flush=True)
     lora = diffusion.add_lora(prior, params.rank, params.alpha, params.dropout, params.layers, params.seed)
     P.personalize(prior, lora, references, views, sampling, training, out)
     diffusion.save_lora(prior, out)

@@ -175,10 +175,10 @@ def test_plain_and_compiled_adam_agree():
     rows = [torch.randn(50, 6, generator=generator) for _ in range(4)]
     rows[2] = rows[2].abs()
     unbias, visible = list(1 + torch.rand(2, 50, generator=generator)), rows[0][:, 0] > 0
-    rates = torch.rand(6, generator=generator)
+    rates, pace = torch.rand(6, generator=generator), torch.rand(50, generator=generator)
     plain, compiled = [r.double() for r in rows], [r.clone() for r in rows]
-    _adam(*plain, *unbias, visible, rates, 0.9, 0.999, 1e-15)
-    _adam_cpu(*compiled, *unbias, visible, rates, 0.9, 0.999, 1e-15)
+    _adam(*plain, *unbias, pace, visible, rates, 0.9, 0.999, 1e-15)
+    _adam_cpu(*compiled, *unbias, pace, visible, rates, 0.9, 0.999, 1e-15)
     for a, b in zip(plain, compiled, strict=True):
         assert torch.allclose(a.float(), b, rtol=1e-5, atol=1e-6)
 
@@ -323,3 +323,18 @@ def test_capped_opacities_start_over():
     optimizer.cap_opacity(0.01)
     assert optimizer.gaussians.opacity_logits.sigmoid().max() < 0.01 + 1e-6
     assert torch.all(optimizer.state_dict()["first"]["opacity_logits"] == 0)
+
+
+def test_masked_gaussians_go_at_their_own_pace_and_far_ones_step_wider():
+    masked = torch.tensor([True, False, False])
+    rates = Rates(means=0.5, sh_dc=0.5, sh_rest=0.5)  # large, for differences of float32
+    optimizer = GaussianOptimizer(random_gaussians(3), masked, rates, {"means": 0.25, "sh": 0.5})
+    before = optimizer.gaussians.map(lambda p: p.detach().clone())
+    for name in PARAMETERS:
+        getattr(optimizer.gaussians, name).grad = torch.ones_like(getattr(optimizer.gaussians, name))
+    optimizer.step(0.0, reach=torch.tensor([1.0, 1.0, 7.0]))
+    moved = before.zipped(optimizer.gaussians, lambda a, b: (a - b).detach())
+    torch.testing.assert_close(moved.means / moved.means[1], torch.tensor([0.25, 1.0, 7.0])[:, None].expand(3, 3))
+    torch.testing.assert_close(moved.sh[0] / moved.sh[1], torch.full_like(moved.sh[0], 0.5))
+    torch.testing.assert_close(moved.sh[2], moved.sh[1])
+    torch.testing.assert_close(moved.log_scales[0], moved.log_scales[1])
