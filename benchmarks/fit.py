@@ -1,0 +1,96 @@
+"""PSNR of held-out views against seconds of fitting: `python benchmarks/fit.py --run runs/demo --out runs/fit/demo`.
+
+Fits the scene of a finished `poses` stage with the laptop profile's parameters and with variants of them, every 8th
+training view held out and only measured, the clock stopped meanwhile. Writes fit.png (the curves), fit.csv and fit.md
+(where they end). Variants that `--out` holds already are not run again; an interrupted one goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+import yaml
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from reffusion import trace
+from stages import fit
+
+ROOT = Path(__file__).parents[1]
+SAMPLING = {"densify_by": "mcmc", "opacity_weight": 0.01, "scale_weight": 0.01, "densify_every": 25}
+SAMPLING |= {"densify_until": 0.6}
+VARIANTS = {
+    "laptop": {},
+    "laptop, half the steps": {"iterations": 1000},
+    "laptop, twice the steps": {"iterations": 4000},
+    "sampling": SAMPLING,
+    "sampling, twice the steps": {**SAMPLING, "iterations": 4000},
+    "means by distance": {"by_distance": True},
+    "3DGS's rate of means": {"means_rate": 1.6e-4},
+}
+
+
+def parameters(profile: str, overrides: dict[str, object], every: int) -> fit.Params:
+    """The profile's parameters of `fit` with these in their place; ValueError naming an unknown one."""
+    given = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"][profile].get("fit", {})
+    return fit.Params(**{**given, **overrides, "holdout": every})
+
+
+def curve(poses: Path, out: Path, params: fit.Params) -> list[dict[str, float]]:
+    """The trace of a fit with these parameters, kept in `out`."""
+    said = out / "params.json"
+    if said.exists() and json.loads(said.read_text()) != params.model_dump():
+        raise ValueError(f"{out} holds a fit with other parameters; remove it, or name another --out")
+    out.mkdir(parents=True, exist_ok=True)
+    said.write_text(json.dumps(params.model_dump()))
+    if not (out / "gaussians.ply").exists():
+        fit.run(params, out, poses=poses)
+    return trace.read_trace(out / "trace.jsonl")
+
+
+def draw(curves: dict[str, list[dict[str, float]]], title: str, path: Path) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4.2), layout="constrained")
+    axes = figure.subplots()
+    for name, lines in curves.items():
+        late = [line for line in lines if line["seconds"] >= 1]
+        axes.plot([p["seconds"] for p in late], [p["psnr_held_out"] for p in late], marker=".", label=name)
+    axes.set(xscale="log", xlabel="seconds of fitting", ylabel="PSNR of held-out views (dB)", title=title)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    figure.savefig(path, dpi=110)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--run", type=Path, required=True, help="runs/<scene>, its stage `poses` finished")
+    parser.add_argument("--out", type=Path, help="default: runs/fit/<scene>")
+    parser.add_argument("--profile", default="laptop")
+    parser.add_argument("--every", type=int, default=8, help="every so manieth training view is held out")
+    parser.add_argument("--only", nargs="+", choices=list(VARIANTS), help="these variants")
+    given = parser.parse_args()
+    poses, out = given.run / "poses", given.out or Path("runs/fit") / given.run.name
+    if not (poses / "receipt.json").exists():
+        raise ValueError(f"{poses} is missing: run `make scene={given.run.name} poses` first")
+    chosen = {name: parameters(given.profile, VARIANTS[name], given.every) for name in given.only or VARIANTS}
+    curves = {}
+    for name, params in chosen.items():
+        curves[name] = curve(poses, out / name.replace(" ", "_").replace(",", ""), params)
+        last = curves[name][-1]
+        print(f"{name}: {last['psnr_held_out']:.2f} dB after {last['seconds']:.0f} s, {last['gaussians']} Gaussians")
+    columns = ("seconds", "iteration", "gaussians", "psnr", "psnr_held_out")
+    rows = [",".join([name.replace(",", ";"), *(str(p[c]) for c in columns)]) for name in curves for p in curves[name]]
+    (out / "fit.csv").write_text("\n".join([",".join(["variant", *columns]), *rows]) + "\n")
+    ends = [(name, lines[-1]) for name, lines in curves.items()]
+    cells = [f"| {n} | {p['seconds']:.0f} | {p['gaussians']} | {p['psnr_held_out']:.2f} |" for n, p in ends]
+    head = "| variant | seconds | Gaussians | held-out PSNR (dB) |\n|---|---|---|---|\n"
+    (out / "fit.md").write_text(head + "\n".join(cells) + "\n")
+    draw(curves, f"{given.run.name}, every {given.every}th view held out", out / "fit.png")
+
+
+if __name__ == "__main__":
+    main()
