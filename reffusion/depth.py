@@ -101,9 +101,7 @@ def _complete_region(disparity, confidence, guide, domain, stiffness, edge, most
     system = sparse.diags(data) + stiffness * bend.T @ bend
     solution = splu(
         system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-    ).solve(
-        data * rest[domain] / unit
-    )
+    ).solve(data * rest[domain] / unit)
     filled = plane.copy()
     filled[domain] += unit * solution
     return filled

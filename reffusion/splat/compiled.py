@@ -43,6 +43,11 @@ def kernel(function: Callable) -> Callable:
         numba.config.CACHE_DIR = before
 
 
+def inlined(function: Callable) -> Callable:
+    """Compile `function` as a part of every kernel that calls it."""
+    return numba.njit(forceinline=True, error_model="numpy")(function)
+
+
 def threads() -> int:
     """How many threads kernels use: torch's number, so one setting (or OMP_NUM_THREADS) rules both."""
     return torch.get_num_threads()
