@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from reffusion.splat.compiled import kernel, share
+from reffusion.splat.compiled import inlined, kernel, room, share
 from reffusion.splat.conventions import MAX_ALPHA
 from reffusion.splat.forward import (
     LANE_Y,
-    ROWS,
+    STEP_ROWS,
     STEPS,
     aligned,
     corner,
@@ -30,25 +30,15 @@ from reffusion.splat.layout import (
     FOOTPRINT,
     GRAD_FEATURES,
     GREEN,
+    MEMBER,
     RED,
+    ROWS,
+    SLOT,
     TILE_HEIGHT,
     TILE_WIDTH,
 )
-from reffusion.splat.vectors import (
-    LANES,
-    fma,
-    fnma,
-    load,
-    prefetch,
-    select,
-    some,
-    splat,
-    splat_at,
-    store,
-    store_totals,
-    take_ticket,
-    total,
-)
+from reffusion.splat.memory import load, prefetch, splat_at, store, store_totals, total
+from reffusion.splat.vectors import LANES, fma, fnma, select, some, splat, take_ticket
 
 _UPSTREAM = (
     6  # vectors of a step before those of features: transmittance, remainder, upstream gradients of r, g, b, depth
@@ -70,7 +60,7 @@ def blend_backward(footprints, features, bins, used, images, transmittance, grad
         [I] bool, which of them mean anything: a pair that no pixel takes has none.
     """
     columns = record_columns(features.shape[1])
-    records, written = np.empty((len(bins.members), columns), np.float32), np.zeros(len(bins.members), np.bool_)
+    records, written = room(len(bins.entries), columns), np.zeros(len(bins.entries), np.bool_)
     share(_blend_backward, footprints, features, bins, used, *images, transmittance, *gradients, records, written)
     return records, written
 
@@ -132,7 +122,7 @@ def _load_tile(left, top, state, stride, images, gradients):
     for row in range(min(TILE_HEIGHT, height - top)):
         y = top + row
         for lane in range(min(TILE_WIDTH, width - left)):
-            x, place = left + lane, row // ROWS * stride + row % ROWS * TILE_WIDTH + lane
+            x, place = left + lane, row // STEP_ROWS * stride + row % STEP_ROWS * TILE_WIDTH + lane
             behind = transmittance[y, x]
             g_depth = grad_depth[y, x] / alpha[y, x] if alpha[y, x] > 0 else np.float32(0.0)
             g_alpha = grad_alpha[y, x] - g_depth * depth[y, x]
@@ -152,58 +142,73 @@ def _tile_backward(left, top, start, stop, footprints, features, bins, state, st
     """Write the records of one tile's list."""
     channels = features.shape[1]
     columns = records.shape[0] // max(1, written.shape[0])
-    zero, one = splat(0.0), splat(1.0)
     for at in range(start, stop):
         soon = min(at + AHEAD, stop - 1)
-        prefetch(footprints, bins.members[soon] * FOOTPRINT)
-        prefetch(records, bins.slots[soon] * columns)
-        member, rows = bins.members[at], bins.rows[at]
-        base = member * FOOTPRINT
-        first_row, end_row = rows & 255, rows >> 8
-        middle = np.float32((first_row + end_row) // 2)
-        seen = shape(footprints, base, left, top, middle)
-        red, green = splat_at(footprints, base + RED), splat_at(footprints, base + GREEN)
-        blue, far = splat_at(footprints, base + BLUE), splat_at(footprints, base + DEPTH)
-        g_0 = g_1 = g_2 = to_red = to_green = to_blue = to_far = zero
+        prefetch(footprints, bins.entries[soon, MEMBER] * FOOTPRINT)
+        prefetch(records, bins.entries[soon, SLOT] * columns)
+        member, rows, slot = bins.entries[at, MEMBER], bins.entries[at, ROWS], bins.entries[at, SLOT]
         for c in range(channels):
-            store(sums, c * LANES, zero)
-        touched = False
-        for step in range(first_row // ROWS, (end_row + ROWS - 1) // ROWS):
-            place = step * stride
-            before = load(state, place)
-            j = load(LANE_Y, step * LANES) - splat(middle)
-            power = log_alpha(seen, j)
-            if not some((power >= splat(_CUT)) & (before > zero)):
-                continue
-            touched = True
-            raw, alpha, weight, after = meet(power, before)
-            store(state, place, after)
-            up_red, up_green = load(state, place + 2 * LANES), load(state, place + 3 * LANES)
-            up_blue, up_far = load(state, place + 4 * LANES), load(state, place + 5 * LANES)
-            shade = fma(far, up_far, fma(blue, up_blue, fma(green, up_green, red * up_red)))
-            to_red, to_green = fma(weight, up_red, to_red), fma(weight, up_green, to_green)
-            to_blue, to_far = fma(weight, up_blue, to_blue), fma(weight, up_far, to_far)
-            for c in range(channels):
-                up = load(state, place + (_UPSTREAM + c) * LANES)
-                shade = fma(splat(features[member, c]), up, shade)
-                store(sums, c * LANES, fma(weight, up, load(sums, c * LANES)))
-            behind = fnma(weight, shade, load(state, place + LANES))
-            store(state, place + LANES, behind)
-            # g = dLoss/d(ln alpha) = alpha (transmittance shade - behind / (1 - alpha)), 0 where clamped or not blended
-            g = fnma(behind, alpha / (one - alpha), weight * shade)
-            g = select((after > zero) & (raw < splat(_MAX_ALPHA)), g, zero)
-            gj = g * j
-            g_0, g_1, g_2 = g_0 + g, g_1 + gj, fma(gj, j, g_2)
+            store(sums, c * LANES, splat(0.0))
+        # a loop of its own where there are no features: LLVM then keeps more in registers
+        if channels == 0:
+            touched, to_all = _rows_backward(member, rows, left, top, footprints, features, 0, state, stride, sums)
+        else:
+            touched, to_all = _rows_backward(
+                member, rows, left, top, footprints, features, channels, state, stride, sums
+            )
+        written[slot] = touched
         if not touched:
             continue
-        slot = bins.slots[at]
-        written[slot] = True
-        store_totals(records, slot * columns, (*_moments(seen, g_0, g_1, g_2), to_far, to_red, to_green, to_blue))
+        store_totals(records, slot * columns, to_all)
         for c in range(channels):
             records[slot * columns + GRAD_FEATURES + c] = total(load(sums, c * LANES))
 
 
-@kernel
+@inlined
+def _rows_backward(member, rows, left, top, footprints, features, channels, state, stride, sums):
+    """One footprint in the rows of a tile.
+
+    Returns:
+        Whether any pixel takes it; by lane, the first ten columns of its record.
+    """
+    zero = splat(0.0)
+    base, first_row, end_row = member * FOOTPRINT, rows & 255, rows >> 8
+    middle = np.float32((first_row + end_row) // 2)
+    seen = shape(footprints, base, left, top, middle)
+    red, green = splat_at(footprints, base + RED), splat_at(footprints, base + GREEN)
+    blue, far = splat_at(footprints, base + BLUE), splat_at(footprints, base + DEPTH)
+    g_0 = g_1 = g_2 = to_red = to_green = to_blue = to_far = zero
+    touched = False
+    for step in range(first_row // STEP_ROWS, (end_row + STEP_ROWS - 1) // STEP_ROWS):
+        place = step * stride
+        before = load(state, place)
+        j = load(LANE_Y, step * LANES) - splat(middle)
+        power = log_alpha(seen, j)
+        if not some((power >= splat(_CUT)) & (before > zero)):
+            continue
+        touched = True
+        raw, alpha, weight, after = meet(power, before)
+        store(state, place, after)
+        up_red, up_green = load(state, place + 2 * LANES), load(state, place + 3 * LANES)
+        up_blue, up_far = load(state, place + 4 * LANES), load(state, place + 5 * LANES)
+        shade = fma(far, up_far, fma(blue, up_blue, fma(green, up_green, red * up_red)))
+        to_red, to_green = fma(weight, up_red, to_red), fma(weight, up_green, to_green)
+        to_blue, to_far = fma(weight, up_blue, to_blue), fma(weight, up_far, to_far)
+        for c in range(channels):
+            up = load(state, place + (_UPSTREAM + c) * LANES)
+            shade = fma(splat(features[member, c]), up, shade)
+            store(sums, c * LANES, fma(weight, up, load(sums, c * LANES)))
+        behind = fnma(weight, shade, load(state, place + LANES))
+        store(state, place + LANES, behind)
+        # g = dLoss/d(ln alpha) = alpha (transmittance shade - behind / (1 - alpha)), 0 where clamped or not blended
+        g = fnma(behind, alpha / (splat(1.0) - alpha), weight * shade)
+        g = select((after > zero) & (raw < splat(_MAX_ALPHA)), g, zero)
+        gj = g * j
+        g_0, g_1, g_2 = g_0 + g, g_1 + gj, fma(gj, j, g_2)
+    return touched, (*_moments(seen, g_0, g_1, g_2), to_far, to_red, to_green, to_blue)
+
+
+@inlined
 def _moments(seen, g_0, g_1, g_2):
     """From sums of g, g j, g j^2 in each lane to those of g, g u, g v, g u^2, g u v, g v^2 (`forward.shape`)."""
     u_middle, lean, v_middle, whiten_y, _ = seen
@@ -220,7 +225,7 @@ def gather_values(footprints, bins, values, count):
         records [I, columns], written [I]: as `blend_backward` does.
     """
     columns = -(-values.shape[2] // 16) * 16
-    records, written = np.zeros((len(bins.members), columns), np.float32), np.zeros(len(bins.members), np.bool_)
+    records, written = np.zeros((len(bins.entries), columns), np.float32), np.zeros(len(bins.entries), np.bool_)
     share(_gather_values, footprints, bins, values, count, records, written)
     return records, written
 
@@ -240,7 +245,7 @@ def _gather_values(tickets, footprints, bins, values, count, records, written):
         open_tile(state, stride, height - top, width - left)
         for row in range(min(TILE_HEIGHT, height - top)):
             for lane in range(min(TILE_WIDTH, width - left)):
-                place = row // ROWS * stride + row % ROWS * TILE_WIDTH + lane
+                place = row // STEP_ROWS * stride + row % STEP_ROWS * TILE_WIDTH + lane
                 for c in range(channels):
                     state[place + (1 + c) * LANES] = values[top + row, left + lane, c]
         _gather_tile(left, top, tile, footprints, bins, count, channels, state, stride, sums, records, written)
@@ -254,12 +259,12 @@ def _gather_tile(left, top, tile, footprints, bins, count, channels, state, stri
     for at in range(start, stop):
         if (at - start) % 32 == 31 and finished(state, stride):
             return
-        rows, slot = bins.rows[at], bins.slots[at]
-        seen = shape(footprints, bins.members[at] * FOOTPRINT, left, top, np.float32(0.0))
+        member, rows, slot = bins.entries[at, MEMBER], bins.entries[at, ROWS], bins.entries[at, SLOT]
+        seen = shape(footprints, member * FOOTPRINT, left, top, np.float32(0.0))
         for c in range(channels):
             store(sums, c * LANES, zero)
         touched = False
-        for step in range((rows & 255) // ROWS, ((rows >> 8) + ROWS - 1) // ROWS):
+        for step in range((rows & 255) // STEP_ROWS, ((rows >> 8) + STEP_ROWS - 1) // STEP_ROWS):
             place = step * stride
             before = load(state, place)
             power = log_alpha(seen, load(LANE_Y, step * LANES))

@@ -5,40 +5,34 @@ The lists do not depend on how the work is shared among threads.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
-from reffusion.splat.compiled import inlined, kernel, share
+from reffusion.splat.compiled import inlined, kernel, room, share
 from reffusion.splat.layout import (
     AHEAD,
     CHUNKS,
+    COLUMN,
     CUT,
     DEPTH,
+    ENTRY,
     FOOTPRINT,
-    LEVEL,
+    HALF_HEIGHT,
+    HALF_WIDTH,
+    INVERSE,
     MEAN_X,
     MEAN_Y,
-    SLANT,
+    MEMBER,
+    PEAK,
+    ROWS,
+    SLOT,
     TILE_HEIGHT,
     TILE_WIDTH,
-    WHITEN_X,
-    WHITEN_Y,
+    TILT,
 )
-from reffusion.splat.vectors import (
-    LANES,
-    ceiling,
-    maximum,
-    minimum,
-    prefetch,
-    ramp,
-    root,
-    select,
-    splat,
-    store_whole,
-    take_ticket,
-)
+from reffusion.splat.memory import prefetch, store_whole
+from reffusion.splat.vectors import LANES, ceiling, maximum, minimum, ramp, root, select, splat, take_ticket
 
 _F = np.float32
 _ROOM = 16  # pairs to a footprint that room is made for at first; untouched room costs nothing
@@ -49,16 +43,12 @@ class Bins(NamedTuple):
 
     Attributes:
         starts: [tiles + 1] int64, where each tile's list begins; tiles in reading order.
-        members: [I] int32, the Gaussians of each tile, front to back.
-        rows: [I] int32, first + 256 * (one past the last) row of the tile that the footprint can touch.
-        slots: [I] int32, place of this footprint-tile pair when pairs are ordered by Gaussian.
-        first_slots: [N + 1] int64, where each Gaussian's pairs begin in that order.
+        entries: [I, ENTRY] int32, the lists one after the other, front to back (`layout`).
+        first_slots: [N + 1] int64, where each Gaussian's records begin: they are ordered by Gaussian.
     """
 
     starts: np.ndarray
-    members: np.ndarray
-    rows: np.ndarray
-    slots: np.ndarray
+    entries: np.ndarray
     first_slots: np.ndarray
 
 
@@ -112,43 +102,51 @@ def bin_footprints(footprints, order, count: int, width: int, height: int) -> Bi
     part = -(-len(order) // CHUNKS) * _ROOM
     while True:
         first_slots, places = np.zeros(count + 1, np.int64), np.zeros((CHUNKS, tiles), np.int64)
-        pairs, needed = np.empty((CHUNKS, part, 2), np.int32), np.zeros(CHUNKS, np.int64)
+        pairs, needed = room(CHUNKS, part, 2).view(np.int32), np.zeros(CHUNKS, np.int64)
         share(_find_pairs, footprints, order, width, height, places, first_slots, pairs, needed)
         if needed.max() <= part:
             break
         part = needed.max()
     total = _counts_to_places(first_slots, places)
     starts = np.append(places[0], total)
-    members, rows, slots = (np.empty(total, np.int32) for _ in range(3))
-    share(_fill_lists, order, places, first_slots, pairs, members, rows, slots)
-    return Bins(starts, members, rows, slots, first_slots)
+    entries = room(total, ENTRY).view(np.int32)
+    share(_fill_lists, order, places, first_slots, pairs, entries)
+    return Bins(starts, entries, first_slots)
 
 
 @inlined
-def _ellipse(footprints, base):
-    """The alpha >= 1/255 ellipse of a footprint, a little enlarged against rounding.
+def ellipse(slant, whiten_x, whiten_y, level):
+    """The alpha >= 1/255 ellipse of footprints, a little enlarged against rounding; all in float32 lanes.
 
     Returns:
         half width, half height, slope of the middle line y(dx), squared half-height of a column at dx = 0,
         1 / half width^2, dx where the ellipse is highest.
     """
-    level = (footprints[base + LEVEL] - _F(CUT)) * _F(1.00002) + _F(1e-4)
-    whiten_x, whiten_y = footprints[base + WHITEN_X], footprints[base + WHITEN_Y]
-    across = _F(1.0) / (whiten_x * whiten_x)  # variance of x at fixed y, x log2(e) / 2
-    yy = _F(1.0) / (whiten_y * whiten_y)
-    slant = footprints[base + SLANT]
+    level = (level - CUT) * 1.00002 + 1e-4
+    across = 1.0 / (whiten_x * whiten_x)  # variance of x at fixed y, x log2(e) / 2
+    yy = 1.0 / (whiten_y * whiten_y)
     xx = across + slant * slant * yy
-    half_width = math.sqrt(level * xx)
-    half_height = math.sqrt(level * yy)
-    tilt = slant * yy / xx
-    column = level * yy * (across / xx)
-    return half_width, half_height, tilt, column, _F(1.0) / (level * xx), slant * half_height
+    half_height = root(level * yy)
+    return (
+        root(level * xx),
+        half_height,
+        slant * yy / xx,
+        level * yy * (across / xx),
+        1.0 / (level * xx),
+        slant * half_height,
+    )
 
 
 @inlined
-def _column_rows(ellipse, mean_x, mean_y, column, width, height, tops, bottoms):
+def _column_rows(footprints, base, column, width, height, tops, bottoms):
     """First and one past the last pixel row of the image that the ellipse can touch, for LANES tile columns."""
-    half_width, half_height, tilt, squared, inverse, peak = ellipse
+    mean_x, mean_y = footprints[base + MEAN_X], footprints[base + MEAN_Y]
+    half_width, half_height, tilt = (
+        footprints[base + HALF_WIDTH],
+        footprints[base + HALF_HEIGHT],
+        footprints[base + TILT],
+    )
+    squared, inverse, peak = footprints[base + COLUMN], footprints[base + INVERSE], footprints[base + PEAK]
     left = (ramp() + _F(column)) * _F(TILE_WIDTH)
     first = maximum(left + _F(0.5) - mean_x, -half_width)
     last = minimum(minimum(left + _F(TILE_WIDTH), _F(width)) - _F(0.5) - mean_x, half_width)
@@ -191,11 +189,9 @@ def _find_pairs(tickets, footprints, order, width, height, places, first_slots, 
         for m in range(ticket * len(order) // CHUNKS, stop):
             prefetch(footprints, order[min(m + AHEAD, stop - 1)] * FOOTPRINT)
             base, begin = order[m] * FOOTPRINT, at
-            mean_x, mean_y = footprints[base + MEAN_X], footprints[base + MEAN_Y]
-            ellipse = _ellipse(footprints, base)
-            first, last = _columns(mean_x, ellipse[0], tiles_x)
+            first, last = _columns(footprints[base + MEAN_X], footprints[base + HALF_WIDTH], tiles_x)
             for start in range(first, last, LANES):
-                _column_rows(ellipse, mean_x, mean_y, start, width, height, tops, bottoms)
+                _column_rows(footprints, base, start, width, height, tops, bottoms)
                 for k in range(min(LANES, last - start)):
                     top, bottom = tops[k], bottoms[k]
                     if top >= bottom:
@@ -226,7 +222,7 @@ def _counts_to_places(first_slots, places):
 
 
 @kernel
-def _fill_lists(tickets, order, all_places, first_slots, pairs, members, rows, slots):
+def _fill_lists(tickets, order, all_places, first_slots, pairs, entries):
     """Write the pairs to their places."""
     while True:
         ticket = take_ticket(tickets)
@@ -239,7 +235,7 @@ def _fill_lists(tickets, order, all_places, first_slots, pairs, members, rows, s
                 tile = found[at, 0]
                 place = places[tile]
                 places[tile] = place + 1
-                members[place] = member
-                rows[place] = found[at, 1]
-                slots[place] = slot
+                entries[place, MEMBER] = member
+                entries[place, ROWS] = found[at, 1]
+                entries[place, SLOT] = slot
                 at += 1

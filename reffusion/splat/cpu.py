@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from reffusion.splat import backward, binning, footprints, forward
-from reffusion.splat.compiled import share
+from reffusion.splat.compiled import room, share
 from reffusion.splat.layout import FOOTPRINT
 from reffusion.splat.projection import view_numbers
 from reffusion.types import Camera, Gaussians, Rendering
@@ -67,7 +67,7 @@ def look(parameters: list[np.ndarray], probe: np.ndarray, camera: Camera, degree
     """Project, sort and bin; `parameters` in the order of `types.PARAMETERS`."""
     count, width = len(parameters[0]), 3 * parameters[4].shape[1]
     rows = footprints.padded(count)
-    drawn, radii = np.empty(rows * FOOTPRINT, np.float32), np.zeros(rows, np.int32)
+    drawn, radii = room(rows * FOOTPRINT), np.zeros(rows, np.int32)
     flat = (array.reshape(-1) for array in parameters)
     share(footprints.draw, *flat, width, degree, probe.reshape(-1), view_numbers(camera), camera.center, drawn, radii)
     order = binning.depth_order(radii[:count], drawn)
@@ -115,8 +115,8 @@ class _Splat(torch.autograd.Function):
 def _to_parameters(view, records, written, parameters, channels, camera, degree, want_probe) -> list[np.ndarray]:
     """Gradients of the parameters, in the order of `types.PARAMETERS`, of the features and of the probe."""
     count, rows = len(parameters[0]), footprints.padded(len(parameters[0]))
-    shapes = [(rows, *array.shape[1:]) for array in parameters]
-    out = [np.empty(shape, np.float32) for shape in (*shapes, (rows, channels), (rows if want_probe else 0, 2))]
+    shapes = [(rows, *array.shape[1:]) for array in parameters] + [(rows, channels), (rows if want_probe else 0, 2)]
+    out = [room(*shape) for shape in shapes]
     flat_out = [array.reshape(-1) for array in out]
     share(
         footprints.draw_backward,

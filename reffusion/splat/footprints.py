@@ -5,51 +5,43 @@ from __future__ import annotations
 import numpy as np
 
 from reffusion.splat import harmonics, projection
+from reffusion.splat.binning import ellipse
 from reffusion.splat.compiled import inlined, kernel
 from reffusion.splat.layout import (
     BLUE,
     CHUNKS,
+    COLUMN,
     DEPTH,
     FOOTPRINT,
     GRAD_BLUE,
-    GRAD_DEPTH,
     GRAD_FEATURES,
     GRAD_GREEN,
     GRAD_RED,
     GREEN,
+    HALF_HEIGHT,
+    HALF_WIDTH,
+    INVERSE,
     LEVEL,
     MEAN_X,
     MEAN_Y,
+    PEAK,
     RED,
     SLANT,
-    SUM_G,
-    SUM_U,
-    SUM_UU,
-    SUM_UV,
-    SUM_V,
-    SUM_VV,
+    TILT,
     WHITEN_X,
     WHITEN_Y,
 )
-from reffusion.splat.vectors import (
-    LANES,
+from reffusion.splat.memory import (
     load,
     load_column,
+    load_columns,
     load_mask,
-    maximum,
-    minimum,
-    narrow,
-    select,
-    some,
-    splat,
     store,
     store_column,
+    store_columns,
     store_whole,
-    take_ticket,
-    widen,
 )
-
-_SCRATCH = 16 * LANES
+from reffusion.splat.vectors import LANES, maximum, minimum, narrow, select, some, splat, take_ticket, widen
 
 
 def padded(count: int) -> int:
@@ -79,7 +71,8 @@ def draw(
         footprints: [padded(N), FOOTPRINT] float32 flat, written for groups with a Gaussian that reaches the image.
         radii: [padded(N)] int32 zeros, written for the same.
     """
-    basis = np.empty(_SCRATCH, np.float32)
+    basis, drawn = np.zeros(16 * LANES, np.float32), np.zeros(FOOTPRINT * LANES, np.float32)
+    coefficients = np.zeros(width * LANES, np.float32)
     last = opacity_logits.shape[0] - 1
     while True:
         begin, end = next_part(tickets, radii.shape[0] // LANES)
@@ -98,19 +91,53 @@ def draw(
                 continue
             radius = minimum(maximum(maximum(reach_x, reach_y), 1.0), 1073741824.0)
             store_whole(radii, row, select(kept, radius, 0.0))
-            store_column(footprints, FOOTPRINT, MEAN_X, row, narrow(mean_x))
-            store_column(footprints, FOOTPRINT, MEAN_Y, row, narrow(mean_y))
-            store_column(footprints, FOOTPRINT, SLANT, row, narrow(slant))
-            store_column(footprints, FOOTPRINT, WHITEN_X, row, narrow(whiten_x))
-            store_column(footprints, FOOTPRINT, WHITEN_Y, row, narrow(whiten_y))
-            store_column(footprints, FOOTPRINT, LEVEL, row, narrow(level))
-            store_column(footprints, FOOTPRINT, DEPTH, row, narrow(z))
             dx, dy, dz, _ = harmonics.direction(mean, center)
             harmonics.fill_basis(degree, dx, dy, dz, basis)
-            red, green, blue = harmonics.colors(sh, width, degree, basis, row, last)
-            store_column(footprints, FOOTPRINT, RED, row, red)
-            store_column(footprints, FOOTPRINT, GREEN, row, green)
-            store_column(footprints, FOOTPRINT, BLUE, row, blue)
+            _read_rows(sh, width, row, last, coefficients)
+            red, green, blue = harmonics.colors(degree, basis, coefficients)
+            shape = narrow(slant), narrow(whiten_x), narrow(whiten_y), narrow(level)
+            half_width, half_height, tilt, column, inverse, peak = ellipse(shape[0], shape[1], shape[2], shape[3])
+            store(drawn, MEAN_X * LANES, narrow(mean_x))
+            store(drawn, MEAN_Y * LANES, narrow(mean_y))
+            store(drawn, SLANT * LANES, shape[0])
+            store(drawn, WHITEN_X * LANES, shape[1])
+            store(drawn, WHITEN_Y * LANES, shape[2])
+            store(drawn, LEVEL * LANES, shape[3])
+            store(drawn, DEPTH * LANES, narrow(z))
+            store(drawn, HALF_WIDTH * LANES, half_width)
+            store(drawn, HALF_HEIGHT * LANES, half_height)
+            store(drawn, TILT * LANES, tilt)
+            store(drawn, COLUMN * LANES, column)
+            store(drawn, INVERSE * LANES, inverse)
+            store(drawn, PEAK * LANES, peak)
+            store(drawn, RED * LANES, red)
+            store(drawn, GREEN * LANES, green)
+            store(drawn, BLUE * LANES, blue)
+            _write_rows(footprints, FOOTPRINT, row, drawn)
+
+
+@kernel
+def _read_rows(array, width, row, last, columns):
+    """Copy LANES rows of an array [R, width] (flat) into `columns`, LANES values to a column; `last`: of its rows."""
+    if width < LANES:
+        for column in range(width):
+            store(columns, column * LANES, load_column(array, width, column, row, last))
+        return
+    for start in range(0, width, LANES):
+        column = min(start, width - LANES)
+        load_columns(array, width, column, row, last, columns, column * LANES)
+
+
+@kernel
+def _write_rows(array, width, row, columns):
+    """The way back; the array has these rows."""
+    if width < LANES:
+        for column in range(width):
+            store_column(array, width, column, row, load(columns, column * LANES))
+        return
+    for start in range(0, width, LANES):
+        column = min(start, width - LANES)
+        store_columns(array, width, column, row, columns, column * LANES)
 
 
 @kernel
@@ -179,8 +206,9 @@ def draw_backward(
         grad_means, ...: [padded(N), columns] flat, written; grad_features [padded(N), C] not flat; grad_probe may be
             empty.
     """
-    basis, along = np.empty(_SCRATCH, np.float32), np.empty(_SCRATCH, np.float32)
-    sums = np.empty(LANES * columns, np.float32)
+    basis, along = np.zeros(16 * LANES, np.float32), np.zeros(16 * LANES, np.float32)
+    coefficients, used = np.zeros(width * LANES, np.float32), 3 * (degree + 1) * (degree + 1)
+    sums, moments = np.zeros(LANES * columns, np.float32), np.zeros(columns * LANES, np.float32)
     last, zero = opacity_logits.shape[0] - 1, splat(0.0)
     while True:
         begin, end = next_part(tickets, radii.shape[0] // LANES)
@@ -204,30 +232,17 @@ def draw_backward(
             x, y, z, inverse = harmonics.direction(mean, center)
             x, y, z = select(seen, x, zero), select(seen, y, zero), select(seen, z, zero)
             harmonics.fill_basis(degree, x, y, z, basis)
-            red = _color_gradient(sums, columns, GRAD_RED, footprints, RED, seen, row)
-            green = _color_gradient(sums, columns, GRAD_GREEN, footprints, GREEN, seen, row)
-            blue = _color_gradient(sums, columns, GRAD_BLUE, footprints, BLUE, seen, row)
-            harmonics.colors_backward(sh, width, degree, basis, row, last, red, green, blue, along, grad_sh)
+            _read_rows(sums, columns, 0, LANES - 1, moments)
+            red = _color_gradient(moments, GRAD_RED, footprints, RED, seen, row)
+            green = _color_gradient(moments, GRAD_GREEN, footprints, GREEN, seen, row)
+            blue = _color_gradient(moments, GRAD_BLUE, footprints, BLUE, seen, row)
+            _read_rows(sh, width, row, last, coefficients)
+            harmonics.colors_backward(degree, basis, coefficients, red, green, blue, along)
+            coefficients[used * LANES :] = np.float32(0.0)
+            _write_rows(grad_sh, width, row, coefficients)
             through_x, through_y, through_z = harmonics.direction_backward(degree, x, y, z, inverse, along)
-
-            moments = (
-                _sums_column(sums, columns, SUM_G),
-                _sums_column(sums, columns, SUM_U),
-                _sums_column(sums, columns, SUM_V),
-                _sums_column(sums, columns, SUM_UU),
-                _sums_column(sums, columns, SUM_UV),
-                _sums_column(sums, columns, SUM_VV),
-            )
             to_mean, to_quaternion, to_scales, to_logit, to_probe = projection.project_backward(
-                view,
-                mean,
-                quaternions,
-                log_scales,
-                opacity_logits,
-                row,
-                last,
-                moments,
-                _sums_column(sums, columns, GRAD_DEPTH),
+                view, mean, quaternions, log_scales, opacity_logits, row, last, moments
             )
             store_column(grad_means, 3, 0, row, select(seen, narrow(to_mean[0]) + through_x, zero))
             store_column(grad_means, 3, 1, row, select(seen, narrow(to_mean[1]) + through_y, zero))
@@ -253,12 +268,7 @@ def _store_zeros(array, width, row):
 
 
 @inlined
-def _sums_column(sums, columns, column):
-    return widen(load_column(sums, columns, column, 0, LANES - 1))
-
-
-@inlined
-def _color_gradient(sums, columns, column, footprints, color, seen, row):
+def _color_gradient(moments, column, footprints, color, seen, row):
     """Gradient of a colour, none where it is clamped at 0."""
     free = seen & (load_column(footprints, FOOTPRINT, color, row, row + LANES - 1) > 0.0)
-    return select(free, load_column(sums, columns, column, 0, LANES - 1), splat(0.0))
+    return select(free, load(moments, column * LANES), splat(0.0))

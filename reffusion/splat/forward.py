@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from reffusion.splat.compiled import inlined, kernel, share
+from reffusion.splat.compiled import inlined, kernel, room, share
 from reffusion.splat.conventions import MAX_ALPHA, MIN_TRANSMITTANCE
 from reffusion.splat.layout import (
     AHEAD,
@@ -16,32 +16,20 @@ from reffusion.splat.layout import (
     LEVEL,
     MEAN_X,
     MEAN_Y,
+    MEMBER,
     RED,
+    ROWS,
     SLANT,
     TILE_HEIGHT,
     TILE_WIDTH,
     WHITEN_X,
     WHITEN_Y,
 )
-from reffusion.splat.vectors import (
-    LANES,
-    exp2,
-    fma,
-    fnma,
-    load,
-    minimum,
-    minus_abs,
-    prefetch,
-    select,
-    some,
-    splat,
-    splat_at,
-    store,
-    take_ticket,
-)
+from reffusion.splat.memory import load, prefetch, splat_at, store
+from reffusion.splat.vectors import LANES, exp2, fma, fnma, minimum, minus_abs, select, some, splat, take_ticket
 
-ROWS = LANES // TILE_WIDTH  # rows of a vector
-STEPS = TILE_HEIGHT // ROWS  # vectors of a tile
+STEP_ROWS = LANES // TILE_WIDTH  # rows of a vector
+STEPS = TILE_HEIGHT // STEP_ROWS  # vectors of a tile
 LANE_X = np.arange(LANES, dtype=np.float32) % TILE_WIDTH + np.float32(0.5)  # pixel centre of each lane, from the left
 LANE_Y = (np.arange(TILE_HEIGHT * TILE_WIDTH) // TILE_WIDTH).astype(np.float32)  # row of each pixel of a tile
 _SUMS = 6  # vectors of a step before its features: transmittance, red, green, blue, depth, alpha
@@ -58,10 +46,8 @@ def blend(footprints, features, background, bins, width, height):
         color [H, W, 3], depth [H, W], alpha [H, W], features [H, W, C], transmittance [H, W], all float32, and used
         [tiles] int64: how many of a tile's list were looked at before all its pixels were finished.
     """
-    color = np.empty((height, width, 3), np.float32)
-    depth, alpha = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
-    blended = np.empty((height, width, features.shape[1]), np.float32)
-    transmittance = np.empty((height, width), np.float32)
+    color, blended = room(height, width, 3), room(height, width, features.shape[1])
+    depth, alpha, transmittance = room(height, width), room(height, width), room(height, width)
     used = np.empty(len(bins.starts) - 1, np.int64)
     outputs = color, depth, alpha, blended, transmittance, used
     share(_blend, footprints, features, background, bins, *outputs)
@@ -88,7 +74,7 @@ def open_tile(state, stride, rows, columns):
     """Set the transmittances, first vector of each step's `stride` floats: 1, or -1 (finished) outside the image."""
     for step in range(STEPS):
         for lane in range(LANES):
-            inside = step * ROWS + lane // TILE_WIDTH < rows and lane % TILE_WIDTH < columns
+            inside = step * STEP_ROWS + lane // TILE_WIDTH < rows and lane % TILE_WIDTH < columns
             state[step * stride + lane] = np.float32(1.0 if inside else -1.0)
 
 
@@ -160,29 +146,39 @@ def _blend_tile(tile, footprints, features, bins, size, state, stride):
     for at in range(start, stop):
         if (at - start) % 32 == 31 and finished(state, stride):
             return at - start
-        prefetch(footprints, bins.members[min(at + AHEAD, stop - 1)] * FOOTPRINT)
-        member, rows = bins.members[at], bins.rows[at]
-        base = member * FOOTPRINT
-        seen = shape(footprints, base, left, top, np.float32(0.0))
-        red, green = splat_at(footprints, base + RED), splat_at(footprints, base + GREEN)
-        blue, far = splat_at(footprints, base + BLUE), splat_at(footprints, base + DEPTH)
-        for step in range((rows & 255) // ROWS, ((rows >> 8) + ROWS - 1) // ROWS):
-            place = step * stride
-            before = load(state, place)
-            power = log_alpha(seen, load(LANE_Y, step * LANES))
-            if not some((power >= splat(_CUT)) & (before > splat(0.0))):
-                continue
-            _, _, weight, after = meet(power, before)
-            store(state, place, after)
-            store(state, place + LANES, fma(weight, red, load(state, place + LANES)))
-            store(state, place + 2 * LANES, fma(weight, green, load(state, place + 2 * LANES)))
-            store(state, place + 3 * LANES, fma(weight, blue, load(state, place + 3 * LANES)))
-            store(state, place + 4 * LANES, fma(weight, far, load(state, place + 4 * LANES)))
-            store(state, place + 5 * LANES, load(state, place + 5 * LANES) + weight)
-            for c in range(channels):
-                here = place + (_SUMS + c) * LANES
-                store(state, here, fma(weight, splat(features[member, c]), load(state, here)))
+        prefetch(footprints, bins.entries[min(at + AHEAD, stop - 1), MEMBER] * FOOTPRINT)
+        member, rows = bins.entries[at, MEMBER], bins.entries[at, ROWS]
+        # a loop of its own where there are no features: LLVM then keeps more in registers
+        if channels == 0:
+            _blend_rows(member, rows, left, top, footprints, features, 0, state, stride)
+        else:
+            _blend_rows(member, rows, left, top, footprints, features, channels, state, stride)
     return stop - start
+
+
+@inlined
+def _blend_rows(member, rows, left, top, footprints, features, channels, state, stride):
+    """Blend one footprint into the rows of a tile."""
+    base = member * FOOTPRINT
+    seen = shape(footprints, base, left, top, np.float32(0.0))
+    red, green = splat_at(footprints, base + RED), splat_at(footprints, base + GREEN)
+    blue, far = splat_at(footprints, base + BLUE), splat_at(footprints, base + DEPTH)
+    for step in range((rows & 255) // STEP_ROWS, ((rows >> 8) + STEP_ROWS - 1) // STEP_ROWS):
+        place = step * stride
+        before = load(state, place)
+        power = log_alpha(seen, load(LANE_Y, step * LANES))
+        if not some((power >= splat(_CUT)) & (before > splat(0.0))):
+            continue
+        _, _, weight, after = meet(power, before)
+        store(state, place, after)
+        store(state, place + LANES, fma(weight, red, load(state, place + LANES)))
+        store(state, place + 2 * LANES, fma(weight, green, load(state, place + 2 * LANES)))
+        store(state, place + 3 * LANES, fma(weight, blue, load(state, place + 3 * LANES)))
+        store(state, place + 4 * LANES, fma(weight, far, load(state, place + 4 * LANES)))
+        store(state, place + 5 * LANES, load(state, place + 5 * LANES) + weight)
+        for c in range(channels):
+            here = place + (_SUMS + c) * LANES
+            store(state, here, fma(weight, splat(features[member, c]), load(state, here)))
 
 
 @kernel
@@ -193,7 +189,7 @@ def _write_tile(tile, state, stride, background, color, depth, alpha, blended, t
     for row in range(min(TILE_HEIGHT, height - top)):
         y = top + row
         for lane in range(min(TILE_WIDTH, width - left)):
-            x, place = left + lane, row // ROWS * stride + row % ROWS * TILE_WIDTH + lane
+            x, place = left + lane, row // STEP_ROWS * stride + row % STEP_ROWS * TILE_WIDTH + lane
             behind, covered = abs(state[place]), state[place + 5 * LANES]
             transmittance[y, x] = behind
             alpha[y, x] = covered  # not 1 - behind, which has few digits where it is faint

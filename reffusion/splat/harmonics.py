@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from reffusion.splat.compiled import inlined
 from reffusion.splat.conventions import SH0, SH1, SH2, SH3
-from reffusion.splat.vectors import LANES, fma, load, load_column, maximum, narrow, root, splat, store, store_column
+from reffusion.splat.memory import load, store
+from reffusion.splat.vectors import LANES, fma, maximum, narrow, root, splat
 
 
 @inlined
@@ -44,41 +45,37 @@ def fill_basis(degree, x, y, z, basis):
 
 
 @inlined
-def colors(sh, width, degree, basis, row, last):
+def colors(degree, basis, coefficients):
     """max(0, 0.5 + sum_k Y_k sh_k).
 
     Args:
-        sh: [N, width / 3, 3] flat; basis: from `fill_basis`; row: the first of the group; last: of all.
+        basis: from `fill_basis`; coefficients: sh_k of red, green, blue, then the next k, LANES values each.
     """
     red = green = blue = splat(0.5)
     for k in range((degree + 1) * (degree + 1)):
-        y = load(basis, k * LANES)
-        red = fma(y, load_column(sh, width, 3 * k, row, last), red)
-        green = fma(y, load_column(sh, width, 3 * k + 1, row, last), green)
-        blue = fma(y, load_column(sh, width, 3 * k + 2, row, last), blue)
+        y, place = load(basis, k * LANES), 3 * k * LANES
+        red = fma(y, load(coefficients, place), red)
+        green = fma(y, load(coefficients, place + LANES), green)
+        blue = fma(y, load(coefficients, place + 2 * LANES), blue)
     return maximum(red, 0.0), maximum(green, 0.0), maximum(blue, 0.0)
 
 
 @inlined
-def colors_backward(sh, width, degree, basis, row, last, red, green, blue, along, grad_sh):
-    """Write the coefficients' gradients, given those of the colours (0 where clamped).
+def colors_backward(degree, basis, coefficients, red, green, blue, along):
+    """Replace the coefficients by their gradients, given those of the colours (0 where clamped).
 
     Args:
-        along: written, dLoss/dY_k for k >= 1, LANES values each.
-        grad_sh: [>= N, width / 3, 3] flat, written.
+        along: written, dLoss/dY_k, LANES values each.
     """
     for k in range((degree + 1) * (degree + 1)):
-        y = load(basis, k * LANES)
-        store_column(grad_sh, width, 3 * k, row, y * red)
-        store_column(grad_sh, width, 3 * k + 1, row, y * green)
-        store_column(grad_sh, width, 3 * k + 2, row, y * blue)
-    for k in range(1, (degree + 1) * (degree + 1)):
-        slope = red * load_column(sh, width, 3 * k, row, last)
-        slope = fma(green, load_column(sh, width, 3 * k + 1, row, last), slope)
-        slope = fma(blue, load_column(sh, width, 3 * k + 2, row, last), slope)
+        y, place = load(basis, k * LANES), 3 * k * LANES
+        slope = red * load(coefficients, place)
+        slope = fma(green, load(coefficients, place + LANES), slope)
+        slope = fma(blue, load(coefficients, place + 2 * LANES), slope)
         store(along, k * LANES, slope)
-    for column in range(3 * (degree + 1) * (degree + 1), width):
-        store_column(grad_sh, width, column, row, splat(0.0))
+        store(coefficients, place, y * red)
+        store(coefficients, place + LANES, y * green)
+        store(coefficients, place + 2 * LANES, y * blue)
 
 
 @inlined

@@ -7,7 +7,12 @@ from reffusion.splat.conventions import MIN_ALPHA
 # Columns of a footprint: 2D mean; slant xy/yy; the whitening factors along x and y, scaled so that
 # log2(alpha) = LEVEL - u^2 - v^2 with v = WHITEN_Y dy, u = WHITEN_X (dx - SLANT dy); camera z; colour.
 MEAN_X, MEAN_Y, SLANT, WHITEN_X, WHITEN_Y, LEVEL, DEPTH, RED, GREEN, BLUE = range(10)
-FOOTPRINT = 16  # columns, of which the last six are unused: one cache line each
+# Then its alpha >= 1/255 ellipse (`binning.ellipse`), which fills the cache line.
+HALF_WIDTH, HALF_HEIGHT, TILT, COLUMN, INVERSE, PEAK, FOOTPRINT = range(10, 17)
+
+# Columns of an entry of a tile's list: the Gaussian; first + 256 * (one past the last) row of the tile that it can
+# touch; the place of its gradient record; nothing.
+MEMBER, ROWS, SLOT, ENTRY = 0, 1, 2, 4
 
 # Columns of a gradient record: the sums over pixels of g = dLoss/d(ln alpha), and of g times u, v, uu, uv, vv;
 # then the gradients of camera z, colour and features.

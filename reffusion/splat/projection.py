@@ -19,7 +19,9 @@ from reffusion.splat.conventions import (
     MIN_ALPHA,
     NEAR,
 )
-from reffusion.splat.vectors import ceiling, exp2, load_column, log2, maximum, minimum, root, select, widen
+from reffusion.splat.layout import GRAD_DEPTH, SUM_G, SUM_U, SUM_UU, SUM_UV, SUM_V, SUM_VV
+from reffusion.splat.memory import load, load_column
+from reffusion.splat.vectors import LANES, ceiling, exp2, log2, maximum, minimum, root, select, widen
 from reffusion.types import Camera
 
 _LOG2_E = 1.4426950408889634
@@ -196,13 +198,12 @@ def in_image(view, mean_x, mean_y, reach_x, reach_y):
 
 
 @inlined
-def project_backward(view, mean, quaternions, log_scales, opacity_logits, row, last, sums, grad_depth):
+def project_backward(view, mean, quaternions, log_scales, opacity_logits, row, last, moments):
     """Gradients of LANES Gaussians' geometry.
 
     Args:
         view, ..., last: as in `project`.
-        sums: six float64 lanes, sums over pixels of g = dLoss/d(ln alpha) and of g times u, v, uu, uv, vv.
-        grad_depth: float64 lanes, dLoss/d(camera z) through the blended depth.
+        moments: the columns of their gradient records (`layout`), LANES values each.
 
     Returns:
         Gradients of the mean (3), quaternion (4), log-scales (3), opacity logit and 2D mean (2), float64 lanes.
@@ -215,10 +216,10 @@ def project_backward(view, mean, quaternions, log_scales, opacity_logits, row, l
     slant, lx, ly = xy / yy, root(yy / determinant), 1.0 / root(yy)
 
     # 2D mean: u = lx (dx - slant dy), v = ly dy, ln alpha = ln opacity - (u^2 + v^2) / 2
-    grad_mean_x = lx * (_UNSCALE * sums[1])
-    grad_mean_y = ly * (_UNSCALE * sums[2]) - slant * grad_mean_x
+    grad_mean_x = lx * (_UNSCALE * _column(moments, SUM_U))
+    grad_mean_y = ly * (_UNSCALE * _column(moments, SUM_V)) - slant * grad_mean_x
 
-    grad_a, grad_b = _root_backward(a, b, slant, lx, ly, sums)
+    grad_a, grad_b = _root_backward(a, b, slant, lx, ly, moments)
     grad_log_scales = (
         grad_a[0] * a[0] + grad_b[0] * b[0],
         grad_a[1] * a[1] + grad_b[1] * b[1],
@@ -229,21 +230,28 @@ def project_backward(view, mean, quaternions, log_scales, opacity_logits, row, l
     grad_x, grad_y, grad_z = _projector_backward(view, x, y, z_inverse, rotation, projector, grad_a, grad_b)
     grad_x = grad_x + view[12] * z_inverse * grad_mean_x
     grad_y = grad_y + view[13] * z_inverse * grad_mean_y
-    grad_z = grad_z + grad_depth - z_inverse * (x * grad_x + y * grad_y)
+    grad_z = grad_z + _column(moments, GRAD_DEPTH) - z_inverse * (x * grad_x + y * grad_y)
     grad_mean = (
         view[0] * grad_x + view[3] * grad_y + view[6] * grad_z,
         view[1] * grad_x + view[4] * grad_y + view[7] * grad_z,
         view[2] * grad_x + view[5] * grad_y + view[8] * grad_z,
     )
     opacity_logit = widen(load_column(opacity_logits, 1, 0, row, last))
-    grad_logit = sums[0] / (1.0 + exponential(opacity_logit))
+    grad_logit = _column(moments, SUM_G) / (1.0 + exponential(opacity_logit))
     return grad_mean, grad_quaternion, grad_log_scales, grad_logit, (grad_mean_x, grad_mean_y)
 
 
 @inlined
-def _root_backward(a, b, slant, lx, ly, sums):
+def _column(moments, column):
+    return widen(load(moments, column * LANES))
+
+
+@inlined
+def _root_backward(a, b, slant, lx, ly, moments):
     """dLoss/d(root) = L M Lᵀ root, with L the whitening factor and M the second moments of (u, v)."""
-    uu, uv, vv = _UNSCALE * _UNSCALE * sums[3], _UNSCALE * _UNSCALE * sums[4], _UNSCALE * _UNSCALE * sums[5]
+    uu = _UNSCALE * _UNSCALE * _column(moments, SUM_UU)
+    uv = _UNSCALE * _UNSCALE * _column(moments, SUM_UV)
+    vv = _UNSCALE * _UNSCALE * _column(moments, SUM_VV)
     w0, w1, w2 = lx * (a[0] - slant * b[0]), lx * (a[1] - slant * b[1]), lx * (a[2] - slant * b[2])
     h0, h1, h2 = ly * b[0], ly * b[1], ly * b[2]
     ga0, ga1, ga2 = lx * (uu * w0 + uv * h0), lx * (uu * w1 + uv * h1), lx * (uu * w2 + uv * h2)
