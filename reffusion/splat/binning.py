@@ -229,7 +229,9 @@ def _fill_lists(tickets, order, all_places, first_slots, pairs, entries):
         if ticket >= CHUNKS:
             return
         places, found, at = all_places[ticket], pairs[ticket], 0
-        for m in range(ticket * len(order) // CHUNKS, (ticket + 1) * len(order) // CHUNKS):
+        stop = (ticket + 1) * len(order) // CHUNKS
+        for m in range(ticket * len(order) // CHUNKS, stop):
+            prefetch(first_slots, order[min(m + AHEAD, stop - 1)])
             member = order[m]
             for slot in range(first_slots[member], first_slots[member + 1]):
                 tile = found[at, 0]

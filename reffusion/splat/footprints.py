@@ -147,12 +147,15 @@ def add_records(records, written, first_slots, columns, row, sums):
         begin, end = 0, 0
         if row + lane < first_slots.shape[0] - 1:
             begin, end = first_slots[row + lane], first_slots[row + lane + 1]
-        for part in range(0, columns, LANES):
-            value = splat(0.0)
+        for part in range(0, columns, 16):  # a cache line, in two vectors or (twice the same) one
+            other = part + 16 - LANES
+            value = other_value = splat(0.0)
             for slot in range(begin, end):
                 if written[slot]:
                     value = value + load(records, slot * columns + part)
+                    other_value = other_value + load(records, slot * columns + other)
             store(sums, lane * columns + part, value)
+            store(sums, lane * columns + other, other_value)
 
 
 @kernel
