@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import re
 import subprocess
 import sys
@@ -139,16 +140,17 @@ def fma_peak(rounds: int = 3_000_000, tries: int = 10) -> float:
 
 
 def first_image() -> float:
-    """Seconds from starting Python to the first small image, kernels in the cache."""
+    """CPU seconds from starting Python to the first small image, kernels in the cache."""
     code = (
         "import sys; sys.path.insert(0, 'benchmarks'); import splat as b; import numpy as np; "
         "view = b.Camera('v', 64, 48, 70.0, 70.0, 32.0, 24.0, np.eye(4)); b.splat.render(b.scene(100, view), view)"
     )
     run = lambda: subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[1])
     run()
-    start = time.perf_counter()
+    before = os.times()
     run()
-    return time.perf_counter() - start
+    after = os.times()
+    return after.children_user + after.children_system - before.children_user - before.children_system
 
 
 def scaling(case: Case, threads: int, repeats: int) -> float:
@@ -194,7 +196,8 @@ def main() -> None:
             for series, ms in zip((case.forward, case.backward), step(case, time.thread_time), strict=True):
                 series.append(ms)
     peak = max(peak, fma_peak())
-    print(f"FMA peak of one core {peak:.0f} GF/s; lanes of a vector: {v.LANES}; first image {first_image():.2f} s")
+    print(f"FMA peak of one core {peak:.0f} GF/s; {v.LANES} lanes to a vector; ", end="")
+    print(f"from import to first image {first_image():.2f} s of CPU")
     print(f"{'size':>16} {'pairs':>7} {'lanes':>7} {'fwd':>8} {'bwd':>8} {'step/aim':>9} {'scaled':>7} ", end="")
     print(f"{'Glane/s':>14} {'FMA share':>15} {'threads':>8}")
     for case in cases:
