@@ -22,7 +22,7 @@ STAGES := poses fit masks reference personalize initialize distill evaluate
 options = $(if $(profile),--profile '$(profile)') $(if $(variant),--variant '$(variant)') \
 	$(if $(set),--set "$$set") $(if $(trust),--trust) $(if $(runs),--runs '$(runs)')
 
-.PHONY: help setup all $(STAGES) plan clean batch demo prior test lint
+.PHONY: help setup all $(STAGES) plan clean batch demo prior test lint bench
 .DELETE_ON_ERROR:
 
 help:
@@ -34,6 +34,7 @@ help:
 	@echo 'make demo [seed=N]             make the demo scene, or another: data/demo-N'
 	@echo 'make prior [steps=N]           train the embedded prior further (hours)'
 	@echo 'make setup | test | lint       .venv; the tests; ruff'
+	@echo 'make bench                     speed of the CPU splatting'
 	@echo 'scene=  a name under data/, or the path of any folder'
 	@echo 'profile=auto|laptop|paper  variant=NAME  set="fit.iterations=500 distill.seed=3"  runs=FOLDER'
 	@echo 'trust=1  keep results of older code'
@@ -98,3 +99,6 @@ test: $(VENV)/.ready-dev
 
 lint: $(VENV)/.ready-dev
 	$(PY) -m ruff check .
+
+bench: $(VENV)/.ready
+	$(PY) benchmarks/splat.py

@@ -1,9 +1,9 @@
 """The terms of distillation and the Gaussians each may reach (RefFusion section 4.3), and the region they belong to.
 
-    term             pixels                                        Gaussians
-    reconstruction   outside the consistent mask; all if clean     unmasked; all if clean
-    SDS              whole view and patches, the hole repainted    masked
-    reference        the reference's hole (not in the paper)       masked
+term             pixels                                        Gaussians
+reconstruction   outside the consistent mask; all if clean     unmasked; all if clean
+SDS              whole view and patches, the hole repainted    masked
+reference        the reference's hole (not in the paper)       masked
 """
 
 from __future__ import annotations

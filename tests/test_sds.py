@@ -65,9 +65,7 @@ def test_weightings_differ_by_a_function_of_the_timestep_only():
     t, draw = torch.tensor([1, 40, 98]), generator(2)
     latents = torch.randn(3, 4, 5, 5, generator=draw, dtype=torch.float64)
     noise = torch.randn(3, 4, 5, 5, generator=draw, dtype=torch.float64)
-    one, x0, sigma2 = (
-        sds_gradient(latents, ideal, t, noise, ABAR, weighting=w) for w in ("one", "x0", "sigma2")
-    )
+    one, x0, sigma2 = (sds_gradient(latents, ideal, t, noise, ABAR, weighting=w) for w in ("one", "x0", "sigma2"))
     a2 = ABAR[t].view(-1, 1, 1, 1)
     torch.testing.assert_close(x0, ((1 - a2) / a2).sqrt() * one)
     torch.testing.assert_close(sigma2, (1 - a2) * one)

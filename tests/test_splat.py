@@ -188,6 +188,23 @@ def test_same_bits_for_any_number_of_threads():
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
+def test_footprints_over_many_tiles():
+    """Each covers the whole of an image of a hundred tiles, far more than room is made for at first."""
+    exact = assert_same(cloud(6, 0.3), camera(200, 150), channels=1)
+    assert (exact.radii > 200).all()
+
+
+def test_results_outlive_later_calls():
+    """Large arrays are made in memory of earlier calls, but only where nobody holds it any more."""
+    view = camera(160, 150)
+    drawn, gradients = differentiate(cloud(2000, -3.0), view, "cpu", torch.float32)
+    kept = [*drawn, *gradients.values()]
+    copies = [tensor.clone() for tensor in kept]
+    for seed in (1, 2):
+        differentiate(cloud(2000, -3.0, seed=seed), view, "cpu", torch.float32)
+    assert all(torch.equal(a, b) for a, b in zip(kept, copies, strict=True))
+
+
 def test_equal_depths_are_drawn_by_index():
     """Forty opaque Gaussians in the same place, the first one red, the others green."""
     gaussians = replace(cloud(40, -1.0), means=torch.zeros(40, 3), opacity_logits=torch.full((40,), 9.0))

@@ -8,64 +8,66 @@ from __future__ import annotations
 
 import numpy as np
 
-from reffusion.splat.binning import CUT, TILE_HEIGHT, TILE_WIDTH
-from reffusion.splat.compiled import kernel, share
-from reffusion.splat.conventions import MAX_ALPHA, MIN_TRANSMITTANCE
-from reffusion.splat.forward import aligned, finished, open_tile
-from reffusion.splat.projection import (
+from reffusion.splat.compiled import inlined, kernel, room, share
+from reffusion.splat.conventions import MAX_ALPHA
+from reffusion.splat.forward import (
+    LANE_Y,
+    STEP_ROWS,
+    STEPS,
+    aligned,
+    corner,
+    finished,
+    log_alpha,
+    meet,
+    open_tile,
+    shape,
+)
+from reffusion.splat.layout import (
     AHEAD,
     BLUE,
+    CUT,
     DEPTH,
     FOOTPRINT,
     GRAD_FEATURES,
     GREEN,
-    LEVEL,
-    MEAN_X,
-    MEAN_Y,
+    MEMBER,
     RED,
-    SLANT,
-    WHITEN_X,
-    WHITEN_Y,
-    next_part,
+    ROWS,
+    SLOT,
+    TILE_HEIGHT,
+    TILE_WIDTH,
 )
-from reffusion.splat.vectors import (
-    exp2,
-    fma,
-    fnma,
-    load,
-    minimum,
-    negative,
-    prefetch,
-    ramp,
-    select,
-    some,
-    splat,
-    store,
-    take_ticket,
-    total,
-    totals,
-)
+from reffusion.splat.memory import load, prefetch, splat_at, store, store_totals, total
+from reffusion.splat.vectors import LANES, fma, fnma, select, some, splat, take_ticket
 
-_UPSTREAM = 2  # vectors of a row before the upstream gradients: transmittance, remainder
+_UPSTREAM = (
+    6  # vectors of a step before those of features: transmittance, remainder, upstream gradients of r, g, b, depth
+)
+_CUT, _MAX_ALPHA = np.float32(CUT), np.float32(MAX_ALPHA)
 
 
 def blend_backward(footprints, features, bins, used, images, transmittance, gradients):
     """One gradient record per footprint-tile pair.
 
     Args:
-        footprints: [M, FOOTPRINT]; features: [M, C].
-        bins: starts, members, rows, slots, see `bin_footprints`.
+        footprints: [>= N, FOOTPRINT] flat; features: [N, C]; bins: see `binning`.
         images: color [H, W, 3], depth [H, W], alpha [H, W], features [H, W, C] as `blend` returned them.
         used, transmittance: from `blend`.
         gradients: dLoss/d(color, depth, alpha, features), shaped like them.
 
     Returns:
-        [I, columns] float32 ordered by footprint; the first GRAD_FEATURES + C columns are those of `projection`.
+        records [I, columns] float32 ordered by Gaussian, its first GRAD_FEATURES + C columns those of `layout`; written
+        [I] bool, which of them mean anything: a pair that no pixel takes has none.
     """
-    columns = -(-(GRAD_FEATURES + features.shape[1]) // 16) * 16
-    records = np.empty((len(bins[1]), columns), np.float32)
-    share(_blend_backward, footprints, features, *bins, used, *images, transmittance, *gradients, records)
-    return records
+    columns = record_columns(features.shape[1])
+    records, written = room(len(bins.entries), columns), np.zeros(len(bins.entries), np.bool_)
+    share(_blend_backward, footprints, features, bins, used, *images, transmittance, *gradients, records, written)
+    return records, written
+
+
+def record_columns(channels: int) -> int:
+    """Floats of a gradient record, whole cache lines."""
+    return -(-(GRAD_FEATURES + channels) // 16) * 16
 
 
 @kernel
@@ -73,10 +75,7 @@ def _blend_backward(
     tickets,
     footprints,
     features,
-    starts,
-    members,
-    rows,
-    slots,
+    bins,
     used,
     color,
     depth,
@@ -88,233 +87,197 @@ def _blend_backward(
     grad_alpha,
     grad_blended,
     records,
+    written,
 ):
     channels = features.shape[1]
-    stride = (_UPSTREAM + 4 + channels) * TILE_WIDTH
-    state = aligned(TILE_HEIGHT * (_UPSTREAM + 4 + channels))
+    stride = (_UPSTREAM + channels) * LANES
+    state = aligned(STEPS * (_UPSTREAM + channels))
     sums = aligned(channels)
     flat = records.reshape(-1)
+    images = color, depth, alpha, blended, transmittance
+    gradients = grad_color, grad_depth, grad_alpha, grad_blended
     while True:
         tile = take_ticket(tickets)
         if tile >= used.shape[0]:
             return
-        _load_tile(
-            tile,
-            state,
-            stride,
-            color,
-            depth,
-            alpha,
-            blended,
-            transmittance,
-            grad_color,
-            grad_depth,
-            grad_alpha,
-            grad_blended,
-        )
+        left, top = corner(tile, depth.shape[1])
+        _load_tile(left, top, state, stride, images, gradients)
+        start = bins.starts[tile]
         _tile_backward(
-            tile, footprints, features, starts, members, rows, slots, used, depth.shape[1], state, stride, sums, flat
+            left, top, start, start + used[tile], footprints, features, bins, state, stride, sums, flat, written
         )
 
 
 @kernel
-def _load_tile(
-    tile, state, stride, color, depth, alpha, blended, transmittance, grad_color, grad_depth, grad_alpha, grad_blended
-):
+def _load_tile(left, top, state, stride, images, gradients):
     """Upstream gradients of the blended sums, and the remainder: upstream dotted with all that was blended.
 
     depth = D / alpha and alpha = 1 - transmittance: D receives grad_depth / alpha, alpha loses depth times that.
     """
+    color, depth, alpha, blended, transmittance = images
+    grad_color, grad_depth, grad_alpha, grad_blended = gradients
     height, width = depth.shape
-    channels = blended.shape[2]
-    tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
-    left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
     state[:] = np.float32(0.0)
-    open_tile(state, stride, min(TILE_HEIGHT, height - top), min(TILE_WIDTH, width - left))
+    open_tile(state, stride, height - top, width - left)
     for row in range(min(TILE_HEIGHT, height - top)):
         y = top + row
         for lane in range(min(TILE_WIDTH, width - left)):
-            x, place = left + lane, row * stride + lane
+            x, place = left + lane, row // STEP_ROWS * stride + row % STEP_ROWS * TILE_WIDTH + lane
             behind = transmittance[y, x]
             g_depth = grad_depth[y, x] / alpha[y, x] if alpha[y, x] > 0 else np.float32(0.0)
             g_alpha = grad_alpha[y, x] - g_depth * depth[y, x]
             remainder = grad_depth[y, x] * depth[y, x] - behind * g_alpha
             for c in range(3):
-                state[place + 16 * (_UPSTREAM + c)] = grad_color[y, x, c]
+                state[place + (2 + c) * LANES] = grad_color[y, x, c]
                 remainder += grad_color[y, x, c] * color[y, x, c]
-            state[place + 16 * (_UPSTREAM + 3)] = g_depth
-            for c in range(channels):
-                state[place + 16 * (_UPSTREAM + 4 + c)] = grad_blended[y, x, c]
+            state[place + 5 * LANES] = g_depth
+            for c in range(blended.shape[2]):
+                state[place + (_UPSTREAM + c) * LANES] = grad_blended[y, x, c]
                 remainder += grad_blended[y, x, c] * blended[y, x, c]
-            state[place + 16] = remainder
+            state[place + LANES] = remainder
 
 
 @kernel
-def _tile_backward(tile, footprints, features, starts, members, rows, slots, used, width, state, stride, sums, records):
+def _tile_backward(left, top, start, stop, footprints, features, bins, state, stride, sums, records, written):
     """Write the records of one tile's list."""
     channels = features.shape[1]
-    columns_of_record = records.shape[0] // max(1, members.shape[0])
-    tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
-    left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
-    zero, one, cut = splat(0.0), splat(1.0), splat(CUT)
-    strongest, least = splat(MAX_ALPHA), splat(MIN_TRANSMITTANCE)
-    columns = ramp() + splat(np.float32(left) + np.float32(0.5))
-    flat_footprints, last = footprints.reshape(-1), members.shape[0] - 1
-    for at in range(starts[tile] + used[tile], starts[tile + 1]):
-        records[slots[at] * columns_of_record : (slots[at] + 1) * columns_of_record] = np.float32(0.0)
-    for at in range(starts[tile], starts[tile] + used[tile]):
-        prefetch(flat_footprints, members[min(at + AHEAD, last)] * FOOTPRINT)
-        prefetch(records, slots[min(at + AHEAD, last)] * columns_of_record)
-        footprint = footprints[members[at]]
-        extra = features[members[at]]
-        whiten_x, whiten_y, level = splat(footprint[WHITEN_X]), splat(footprint[WHITEN_Y]), splat(footprint[LEVEL])
-        lean = whiten_x * splat(footprint[SLANT])
-        across = whiten_x * (columns - splat(footprint[MEAN_X]))
-        red, green, blue = splat(footprint[RED]), splat(footprint[GREEN]), splat(footprint[BLUE])
-        far = splat(footprint[DEPTH])
-        above = np.float32(top) + np.float32(0.5) - footprint[MEAN_Y]
-        g_sum = g_u = g_v = g_uu = g_uv = g_vv = zero
-        to_red = to_green = to_blue = to_far = zero
+    columns = records.shape[0] // max(1, written.shape[0])
+    for at in range(start, stop):
+        soon = min(at + AHEAD, stop - 1)
+        prefetch(footprints, bins.entries[soon, MEMBER] * FOOTPRINT)
+        prefetch(records, bins.entries[soon, SLOT] * columns)
+        member, rows, slot = bins.entries[at, MEMBER], bins.entries[at, ROWS], bins.entries[at, SLOT]
         for c in range(channels):
-            store(sums, 16 * c, zero)
-        for row in range(rows[at] & 255, rows[at] >> 8):
-            place = row * stride
-            before = load(state, place)
-            dy = splat(above + np.float32(row))
-            u, v = fnma(lean, dy, across), whiten_y * dy
-            power = fnma(u, u, fnma(v, v, level))
-            seen = (power >= cut) & (before > zero)
-            if not some(seen):
-                continue
-            raw = exp2(power)
-            opacity = minimum(raw, strongest)
-            after = fnma(before, opacity, before)
-            kept = seen & (after >= least)
-            weight = select(kept, before * opacity, zero)
-            store(state, place, select(seen, select(kept, after, negative(before)), before))
-            up_red, up_green = load(state, place + 32), load(state, place + 48)
-            up_blue, up_far = load(state, place + 64), load(state, place + 80)
-            shade = fma(far, up_far, fma(blue, up_blue, fma(green, up_green, red * up_red)))
-            to_red, to_green = fma(weight, up_red, to_red), fma(weight, up_green, to_green)
-            to_blue, to_far = fma(weight, up_blue, to_blue), fma(weight, up_far, to_far)
-            for c in range(channels):
-                up = load(state, place + 16 * (_UPSTREAM + 4 + c))
-                shade = fma(splat(extra[c]), up, shade)
-                store(sums, 16 * c, fma(weight, up, load(sums, 16 * c)))
-            behind = fnma(weight, shade, load(state, place + 16))
-            store(state, place + 16, behind)
-            # g = dLoss/d(ln alpha) = alpha (transmittance shade - behind / (1 - alpha))
-            g = fnma(behind, opacity / (one - opacity), weight * shade)
-            g = select(kept & (raw < strongest), g, zero)
-            gu, gv = g * u, g * v
-            g_sum, g_u, g_v = g_sum + g, g_u + gu, g_v + gv
-            g_uu, g_uv, g_vv = fma(gu, u, g_uu), fma(gu, v, g_uv), fma(gv, v, g_vv)
-        first = slots[at] * columns_of_record
-        store(records, first, totals((g_sum, g_u, g_v, g_uu, g_uv, g_vv, to_far, to_red, to_green, to_blue)))
+            store(sums, c * LANES, splat(0.0))
+        # a loop of its own where there are no features: LLVM then keeps more in registers
+        if channels == 0:
+            touched, to_all = _rows_backward(member, rows, left, top, footprints, features, 0, state, stride, sums)
+        else:
+            touched, to_all = _rows_backward(
+                member, rows, left, top, footprints, features, channels, state, stride, sums
+            )
+        written[slot] = touched
+        if not touched:
+            continue
+        store_totals(records, slot * columns, to_all)
         for c in range(channels):
-            records[first + GRAD_FEATURES + c] = total(load(sums, 16 * c))
+            records[slot * columns + GRAD_FEATURES + c] = total(load(sums, c * LANES))
 
 
-def add_records(records, first_slots, columns):
-    """[M, columns]: the sum of each footprint's records, in their order."""
-    sums = np.empty((len(first_slots) - 1, columns), np.float32)
-    share(_add_records, records, first_slots, sums)
-    return sums
+@inlined
+def _rows_backward(member, rows, left, top, footprints, features, channels, state, stride, sums):
+    """One footprint in the rows of a tile.
+
+    Returns:
+        Whether any pixel takes it; by lane, the first ten columns of its record.
+    """
+    zero = splat(0.0)
+    base, first_row, end_row = member * FOOTPRINT, rows & 255, rows >> 8
+    middle = np.float32((first_row + end_row) // 2)
+    seen = shape(footprints, base, left, top, middle)
+    red, green = splat_at(footprints, base + RED), splat_at(footprints, base + GREEN)
+    blue, far = splat_at(footprints, base + BLUE), splat_at(footprints, base + DEPTH)
+    g_0 = g_1 = g_2 = to_red = to_green = to_blue = to_far = zero
+    touched = False
+    for step in range(first_row // STEP_ROWS, (end_row + STEP_ROWS - 1) // STEP_ROWS):
+        place = step * stride
+        before = load(state, place)
+        j = load(LANE_Y, step * LANES) - splat(middle)
+        power = log_alpha(seen, j)
+        if not some((power >= splat(_CUT)) & (before > zero)):
+            continue
+        touched = True
+        raw, alpha, weight, after = meet(power, before)
+        store(state, place, after)
+        up_red, up_green = load(state, place + 2 * LANES), load(state, place + 3 * LANES)
+        up_blue, up_far = load(state, place + 4 * LANES), load(state, place + 5 * LANES)
+        shade = fma(far, up_far, fma(blue, up_blue, fma(green, up_green, red * up_red)))
+        to_red, to_green = fma(weight, up_red, to_red), fma(weight, up_green, to_green)
+        to_blue, to_far = fma(weight, up_blue, to_blue), fma(weight, up_far, to_far)
+        for c in range(channels):
+            up = load(state, place + (_UPSTREAM + c) * LANES)
+            shade = fma(splat(features[member, c]), up, shade)
+            store(sums, c * LANES, fma(weight, up, load(sums, c * LANES)))
+        behind = fnma(weight, shade, load(state, place + LANES))
+        store(state, place + LANES, behind)
+        # g = dLoss/d(ln alpha) = alpha (transmittance shade - behind / (1 - alpha)), 0 where clamped or not blended
+        g = fnma(behind, alpha / (splat(1.0) - alpha), weight * shade)
+        g = select((after > zero) & (raw < splat(_MAX_ALPHA)), g, zero)
+        gj = g * j
+        g_0, g_1, g_2 = g_0 + g, g_1 + gj, fma(gj, j, g_2)
+    return touched, (*_moments(seen, g_0, g_1, g_2), to_far, to_red, to_green, to_blue)
 
 
-@kernel
-def _add_records(tickets, records, first_slots, sums):
-    columns = sums.shape[1]
-    while True:
-        begin, end = next_part(tickets, sums.shape[0])
-        if begin < 0:
-            return
-        for m in range(begin, end):
-            sums[m] = np.float32(0.0)
-            for slot in range(first_slots[m], first_slots[m + 1]):
-                for c in range(columns):
-                    sums[m, c] += records[slot, c]
+@inlined
+def _moments(seen, g_0, g_1, g_2):
+    """From sums of g, g j, g j^2 in each lane to those of g, g u, g v, g u^2, g u v, g v^2 (`forward.shape`)."""
+    u_middle, lean, v_middle, whiten_y, _ = seen
+    g_u, g_uj = fnma(lean, g_1, u_middle * g_0), fnma(lean, g_2, u_middle * g_1)
+    g_v, g_vj = fma(whiten_y, g_1, v_middle * g_0), fma(whiten_y, g_2, v_middle * g_1)
+    g_uu, g_uv = fnma(lean, g_uj, u_middle * g_u), fnma(lean, g_vj, u_middle * g_v)
+    return g_0, g_u, g_v, g_uu, g_uv, fma(whiten_y, g_vj, v_middle * g_v)
 
 
 def gather_values(footprints, bins, values, count):
-    """[I, C] per footprint-tile pair, ordered by footprint: pixel sums of weight x value (`count`: of value)."""
-    records = np.empty((len(bins[1]), values.shape[2]), np.float32)
-    share(_gather_values, footprints, *bins, values, count, records)
-    return records
+    """Per footprint-tile pair, ordered by Gaussian: pixel sums of weight x value (`count`: of value).
+
+    Returns:
+        records [I, columns], written [I]: as `blend_backward` does.
+    """
+    columns = -(-values.shape[2] // 16) * 16
+    records, written = np.zeros((len(bins.entries), columns), np.float32), np.zeros(len(bins.entries), np.bool_)
+    share(_gather_values, footprints, bins, values, count, records, written)
+    return records, written
 
 
 @kernel
-def _gather_values(tickets, footprints, starts, members, rows, slots, values, count, records):
+def _gather_values(tickets, footprints, bins, values, count, records, written):
     height, width, channels = values.shape
-    stride = (1 + channels) * TILE_WIDTH
-    state = aligned(TILE_HEIGHT * (1 + channels))
+    stride = (1 + channels) * LANES
+    state = aligned(STEPS * (1 + channels))
     sums = aligned(channels)
-    tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
     while True:
         tile = take_ticket(tickets)
-        if tile >= starts.shape[0] - 1:
+        if tile >= bins.starts.shape[0] - 1:
             return
-        left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
-        tile_rows, tile_columns = min(TILE_HEIGHT, height - top), min(TILE_WIDTH, width - left)
+        left, top = corner(tile, width)
         state[:] = np.float32(0.0)
-        open_tile(state, stride, tile_rows, tile_columns)
-        for row in range(tile_rows):
-            for lane in range(tile_columns):
+        open_tile(state, stride, height - top, width - left)
+        for row in range(min(TILE_HEIGHT, height - top)):
+            for lane in range(min(TILE_WIDTH, width - left)):
+                place = row // STEP_ROWS * stride + row % STEP_ROWS * TILE_WIDTH + lane
                 for c in range(channels):
-                    state[row * stride + 16 * (1 + c) + lane] = values[top + row, left + lane, c]
-        _gather_tile(
-            left,
-            top,
-            footprints,
-            starts[tile],
-            starts[tile + 1],
-            members,
-            rows,
-            slots,
-            count,
-            state,
-            stride,
-            sums,
-            records,
-        )
+                    state[place + (1 + c) * LANES] = values[top + row, left + lane, c]
+        _gather_tile(left, top, tile, footprints, bins, count, channels, state, stride, sums, records, written)
 
 
 @kernel
-def _gather_tile(left, top, footprints, start, stop, members, rows, slots, count, state, stride, sums, records):
+def _gather_tile(left, top, tile, footprints, bins, count, channels, state, stride, sums, records, written):
     """Write the records of one tile's list, its values being in `state`."""
-    channels = records.shape[1]
-    zero, cut = splat(0.0), splat(CUT)
-    strongest, least = splat(MAX_ALPHA), splat(MIN_TRANSMITTANCE)
-    columns = ramp() + splat(np.float32(left) + np.float32(0.5))
-    done = False
+    start, stop = bins.starts[tile], bins.starts[tile + 1]
+    zero = splat(0.0)
     for at in range(start, stop):
-        done = done or ((at - start) % 32 == 31 and finished(state, stride))
-        if done:
-            records[slots[at]] = np.float32(0.0)
-            continue
-        footprint = footprints[members[at]]
-        whiten_x, whiten_y, level = splat(footprint[WHITEN_X]), splat(footprint[WHITEN_Y]), splat(footprint[LEVEL])
-        lean = whiten_x * splat(footprint[SLANT])
-        across = whiten_x * (columns - splat(footprint[MEAN_X]))
-        above = np.float32(top) + np.float32(0.5) - footprint[MEAN_Y]
+        if (at - start) % 32 == 31 and finished(state, stride):
+            return
+        member, rows, slot = bins.entries[at, MEMBER], bins.entries[at, ROWS], bins.entries[at, SLOT]
+        seen = shape(footprints, member * FOOTPRINT, left, top, np.float32(0.0))
         for c in range(channels):
-            store(sums, 16 * c, zero)
-        for row in range(rows[at] & 255, rows[at] >> 8):
-            place = row * stride
+            store(sums, c * LANES, zero)
+        touched = False
+        for step in range((rows & 255) // STEP_ROWS, ((rows >> 8) + STEP_ROWS - 1) // STEP_ROWS):
+            place = step * stride
             before = load(state, place)
-            dy = splat(above + np.float32(row))
-            u, v = fnma(lean, dy, across), whiten_y * dy
-            power = fnma(u, u, fnma(v, v, level))
-            seen = (power >= cut) & (before > zero)
-            if not some(seen):
+            power = log_alpha(seen, load(LANE_Y, step * LANES))
+            if not some((power >= splat(_CUT)) & (before > zero)):
                 continue
-            opacity = minimum(exp2(power), strongest)
-            after = fnma(before, opacity, before)
-            kept = seen & (after >= least)
-            share_of_one = splat(1.0) if count else before * opacity
-            weight = select(kept, share_of_one, zero)
-            store(state, place, select(seen, select(kept, after, negative(before)), before))
+            touched = True
+            _, _, weight, after = meet(power, before)
+            store(state, place, after)
+            if count:
+                weight = select(weight > zero, splat(1.0), zero)
             for c in range(channels):
-                store(sums, 16 * c, fma(weight, load(state, place + 16 * (1 + c)), load(sums, 16 * c)))
-        for c in range(channels):
-            records[slots[at], c] = total(load(sums, 16 * c))
+                store(sums, c * LANES, fma(weight, load(state, place + (1 + c) * LANES), load(sums, c * LANES)))
+        written[slot] = touched
+        if touched:
+            for c in range(channels):
+                records[slot, c] = total(load(sums, c * LANES))

@@ -5,42 +5,75 @@ The lists do not depend on how the work is shared among threads.
 
 from __future__ import annotations
 
-import math
+from typing import NamedTuple
 
 import numpy as np
 
-from reffusion.splat.compiled import kernel, share
-from reffusion.splat.conventions import MIN_ALPHA
-from reffusion.splat.projection import CHUNKS, DEPTH, LEVEL, MEAN_X, MEAN_Y, SLANT, WHITEN_X, WHITEN_Y
-from reffusion.splat.vectors import take_ticket
+from reffusion.splat.compiled import inlined, kernel, room, share
+from reffusion.splat.layout import (
+    AHEAD,
+    CHUNKS,
+    COLUMN,
+    CUT,
+    DEPTH,
+    ENTRY,
+    FOOTPRINT,
+    HALF_HEIGHT,
+    HALF_WIDTH,
+    INVERSE,
+    MEAN_X,
+    MEAN_Y,
+    MEMBER,
+    PEAK,
+    ROWS,
+    SLOT,
+    TILE_HEIGHT,
+    TILE_WIDTH,
+    TILT,
+)
+from reffusion.splat.memory import prefetch, store_whole
+from reffusion.splat.vectors import LANES, ceiling, maximum, minimum, ramp, root, select, splat, take_ticket
 
-TILE_WIDTH = 16
-TILE_HEIGHT = 32
-CUT = np.float32(math.log2(MIN_ALPHA))  # log2(alpha) below which a pixel is skipped
+_F = np.float32
+_ROOM = 16  # pairs to a footprint that room is made for at first; untouched room costs nothing
+
+
+class Bins(NamedTuple):
+    """Tile lists, front to back.
+
+    Attributes:
+        starts: [tiles + 1] int64, where each tile's list begins; tiles in reading order.
+        entries: [I, ENTRY] int32, the lists one after the other, front to back (`layout`).
+        first_slots: [N + 1] int64, where each Gaussian's records begin: they are ordered by Gaussian.
+    """
+
+    starts: np.ndarray
+    entries: np.ndarray
+    first_slots: np.ndarray
 
 
 @kernel
 def depth_order(radii, footprints):
     """Sort the Gaussians that have a radius by depth, equal depths by index (radix sort, stable).
 
+    Args:
+        radii: [N] int32; footprints: [>= N, FOOTPRINT] flat.
+
     Returns:
-        order [M] int32, their indices front to back, and ranks [N] int32, the place of each in it (-1 without radius).
+        [M] int32, their indices front to back.
     """
     count = radii.shape[0]
     visible = 0
     for i in range(count):
         visible += radii[i] > 0
-    keys = np.empty(visible, np.uint32)
-    order = np.empty(visible, np.int32)
+    depths, order = np.empty(visible, np.float32), np.empty(visible, np.int32)
     at = 0
     for i in range(count):
         if radii[i] > 0:
             order[at] = i
+            depths[at] = footprints[i * FOOTPRINT + DEPTH]
             at += 1
-    depths = np.empty(visible, np.float32)
-    for k in range(visible):
-        depths[k] = footprints[order[k], DEPTH]
-    keys[:] = depths.view(np.uint32)  # positive floats sort like their bits
+    keys = depths.view(np.uint32)  # positive floats sort like their bits
     other_keys, other_order = np.empty_like(keys), np.empty_like(order)
     for shift in (0, 11, 22):
         starts = np.zeros(2049, np.int64)
@@ -56,113 +89,127 @@ def depth_order(radii, footprints):
             other_order[place] = order[k]
         keys, other_keys = other_keys, keys
         order, other_order = other_order, order
-    ranks = np.full(count, -1, np.int32)
-    for rank in range(visible):
-        ranks[order[rank]] = rank
-    return order, ranks
+    return order
 
 
-@kernel
-def _ellipse(footprint):
-    """The alpha >= 1/255 ellipse of a footprint, a little enlarged against rounding.
+def bin_footprints(footprints, order, count: int, width: int, height: int) -> Bins:
+    """Make the tile lists of an image.
+
+    Args:
+        footprints: [>= N, FOOTPRINT] flat; order: [M] int32 front to back; count: N.
+    """
+    tiles = -(-width // TILE_WIDTH) * -(-height // TILE_HEIGHT)
+    part = -(-len(order) // CHUNKS) * _ROOM
+    while True:
+        first_slots, places = np.zeros(count + 1, np.int64), np.zeros((CHUNKS, tiles), np.int64)
+        pairs, needed = room(CHUNKS, part, 2).view(np.int32), np.zeros(CHUNKS, np.int64)
+        share(_find_pairs, footprints, order, width, height, places, first_slots, pairs, needed)
+        if needed.max() <= part:
+            break
+        part = needed.max()
+    total = _counts_to_places(first_slots, places)
+    starts = np.append(places[0], total)
+    entries = room(total, ENTRY).view(np.int32)
+    share(_fill_lists, order, places, first_slots, pairs, entries)
+    return Bins(starts, entries, first_slots)
+
+
+@inlined
+def ellipse(slant, whiten_x, whiten_y, level):
+    """The alpha >= 1/255 ellipse of footprints, a little enlarged against rounding; all in float32 lanes.
 
     Returns:
         half width, half height, slope of the middle line y(dx), squared half-height of a column at dx = 0,
         1 / half width^2, dx where the ellipse is highest.
     """
-    level = (footprint[LEVEL] - CUT) * np.float32(1.00002) + np.float32(1e-4)
-    across = np.float32(1.0) / (footprint[WHITEN_X] * footprint[WHITEN_X])  # variance of x at fixed y, x log2(e) / 2
-    yy = np.float32(1.0) / (footprint[WHITEN_Y] * footprint[WHITEN_Y])
-    slant = footprint[SLANT]
+    level = (level - CUT) * 1.00002 + 1e-4
+    across = 1.0 / (whiten_x * whiten_x)  # variance of x at fixed y, x log2(e) / 2
+    yy = 1.0 / (whiten_y * whiten_y)
     xx = across + slant * slant * yy
-    half_width = math.sqrt(level * xx)
-    half_height = math.sqrt(level * yy)
-    tilt = slant * yy / xx
-    column = level * yy * (across / xx)
-    return half_width, half_height, tilt, column, np.float32(1.0) / (level * xx), slant * half_height
-
-
-@kernel
-def _column_rows(footprint, ellipse, left, width, height):
-    """First and one past the last pixel row of the image that the ellipse can touch in a tile column."""
-    half_width, half_height, tilt, column, inverse, peak = ellipse
-    first = max(np.float32(left) + np.float32(0.5) - footprint[MEAN_X], -half_width)
-    last = min(np.float32(min(left + TILE_WIDTH, width)) - np.float32(0.5) - footprint[MEAN_X], half_width)
-    if not first <= last:
-        return 0, 0
-    at_top = min(max(peak, first), last)
-    at_bottom = min(max(-peak, first), last)
-    high = tilt * at_top + math.sqrt(max(column * (np.float32(1.0) - at_top * at_top * inverse), np.float32(0.0)))
-    low = tilt * at_bottom - math.sqrt(
-        max(column * (np.float32(1.0) - at_bottom * at_bottom * inverse), np.float32(0.0))
+    half_height = root(level * yy)
+    return (
+        root(level * xx),
+        half_height,
+        slant * yy / xx,
+        level * yy * (across / xx),
+        1.0 / (level * xx),
+        slant * half_height,
     )
-    margin = np.float32(1e-3) + np.float32(1e-5) * half_height
-    begin = math.ceil(max(footprint[MEAN_Y] + low - margin - np.float32(0.5), np.float32(0.0)))
-    end = math.floor(min(footprint[MEAN_Y] + high + margin - np.float32(0.5), np.float32(height - 1))) + 1
-    return int(begin), int(max(end, begin))
 
 
-@kernel
-def _columns(footprint, half_width, tiles_x):
+@inlined
+def _column_rows(footprints, base, column, width, height, tops, bottoms):
+    """First and one past the last pixel row of the image that the ellipse can touch, for LANES tile columns."""
+    mean_x, mean_y = footprints[base + MEAN_X], footprints[base + MEAN_Y]
+    half_width, half_height, tilt = (
+        footprints[base + HALF_WIDTH],
+        footprints[base + HALF_HEIGHT],
+        footprints[base + TILT],
+    )
+    squared, inverse, peak = footprints[base + COLUMN], footprints[base + INVERSE], footprints[base + PEAK]
+    left = (ramp() + _F(column)) * _F(TILE_WIDTH)
+    first = maximum(left + _F(0.5) - mean_x, -half_width)
+    last = minimum(minimum(left + _F(TILE_WIDTH), _F(width)) - _F(0.5) - mean_x, half_width)
+    at_top, at_bottom = minimum(maximum(splat(peak), first), last), minimum(maximum(splat(-peak), first), last)
+    high = tilt * at_top + root(maximum(squared * (_F(1.0) - at_top * at_top * inverse), _F(0.0)))
+    low = tilt * at_bottom - root(maximum(squared * (_F(1.0) - at_bottom * at_bottom * inverse), _F(0.0)))
+    margin = _F(1e-3) + _F(1e-5) * half_height
+    begin = ceiling(minimum(maximum(low + (mean_y - margin - _F(0.5)), _F(0.0)), _F(height)))
+    end = ceiling(minimum(maximum(high + (mean_y + margin - _F(0.5)), _F(0.0)), _F(height)))
+    touched = first <= last
+    store_whole(tops, 0, select(touched, begin, _F(0.0)))
+    store_whole(bottoms, 0, select(touched, end, _F(0.0)))
+
+
+@inlined
+def _columns(mean_x, half_width, tiles_x):
     """First and one past the last tile column that the ellipse can touch."""
-    first = max(footprint[MEAN_X] - half_width - np.float32(0.5), np.float32(0.0))
-    last = min(footprint[MEAN_X] + half_width, np.float32(tiles_x * TILE_WIDTH - 1))
+    first = max(mean_x - half_width - _F(0.5), _F(0.0))
+    last = min(mean_x + half_width, _F(tiles_x * TILE_WIDTH - 1))
     if not first <= last:
         return 0, 0
     return int(first) // TILE_WIDTH, int(last) // TILE_WIDTH + 1
 
 
-def bin_footprints(footprints, width, height):
-    """Tile lists, front to back.
+@kernel
+def _find_pairs(tickets, footprints, order, width, height, places, first_slots, pairs, needed):
+    """Tile and rows of each pair, in chunks of the order; how many there are, by tile and by Gaussian.
 
     Args:
-        footprints: [M, FOOTPRINT] front to back.
-        width, height: the image's size in pixels.
-
-    Returns:
-        starts: [tiles + 1] int64, where each tile's list begins; tiles in reading order.
-        members: [I] int32, the footprints of each tile, front to back.
-        rows: [I] int32, first + 256 * (one past the last) row of the tile that the footprint can touch.
-        slots: [I] int64, place of this footprint-tile pair when pairs are ordered by footprint.
-        first_slots: [M + 1] int64, where each footprint's pairs begin in that order.
+        pairs: [CHUNKS, room, 2] int32, written as far as there is room; needed: [CHUNKS], how much it takes.
     """
-    tiles = -(-width // TILE_WIDTH) * -(-height // TILE_HEIGHT)
-    places = np.zeros((CHUNKS, tiles), np.int64)
-    first_slots = np.zeros(len(footprints) + 1, np.int64)
-    share(_count_pairs, footprints, width, height, places, first_slots)
-    total = _counts_to_places(first_slots, places)
-    starts = np.append(places[0], total)
-    members, rows, slots = np.empty(total, np.int32), np.empty(total, np.int32), np.empty(total, np.int64)
-    share(_fill_lists, footprints, width, height, places, first_slots, members, rows, slots)
-    return starts, members, rows, slots, first_slots
-
-
-@kernel
-def _count_pairs(tickets, footprints, width, height, places, first_slots):
-    """Count pairs by tile and by footprint."""
     tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
+    tops, bottoms = np.empty(LANES, np.int32), np.empty(LANES, np.int32)
     while True:
         ticket = take_ticket(tickets)
         if ticket >= CHUNKS:
             return
-        counts = places[ticket]
-        for m in range(ticket * len(footprints) // CHUNKS, (ticket + 1) * len(footprints) // CHUNKS):
-            footprint = footprints[m]
-            ellipse = _ellipse(footprint)
-            first, last = _columns(footprint, ellipse[0], tiles_x)
-            pairs = 0
-            for column in range(first, last):
-                top, bottom = _column_rows(footprint, ellipse, column * TILE_WIDTH, width, height)
-                if top < bottom:
+        counts, found, at = places[ticket], pairs[ticket], 0
+        stop = (ticket + 1) * len(order) // CHUNKS
+        for m in range(ticket * len(order) // CHUNKS, stop):
+            prefetch(footprints, order[min(m + AHEAD, stop - 1)] * FOOTPRINT)
+            base, begin = order[m] * FOOTPRINT, at
+            first, last = _columns(footprints[base + MEAN_X], footprints[base + HALF_WIDTH], tiles_x)
+            for start in range(first, last, LANES):
+                _column_rows(footprints, base, start, width, height, tops, bottoms)
+                for k in range(min(LANES, last - start)):
+                    top, bottom = tops[k], bottoms[k]
+                    if top >= bottom:
+                        continue
                     for tile_row in range(top // TILE_HEIGHT, (bottom - 1) // TILE_HEIGHT + 1):
-                        counts[tile_row * tiles_x + column] += 1
-                        pairs += 1
-            first_slots[m + 1] = pairs
+                        tile, tile_top = tile_row * tiles_x + start + k, tile_row * TILE_HEIGHT
+                        if at < found.shape[0]:
+                            counts[tile] += 1
+                            found[at, 0] = tile
+                            found[at, 1] = max(top - tile_top, 0) + 256 * min(bottom - tile_top, TILE_HEIGHT)
+                        at += 1
+            first_slots[order[m] + 1] = at - begin
+        needed[ticket] = at
 
 
 @kernel
 def _counts_to_places(first_slots, places):
-    """Running sums in place: by footprint, and by tile then chunk. Returns the number of pairs."""
+    """Running sums in place: by Gaussian, and by tile then chunk. Returns the number of pairs."""
     for m in range(first_slots.shape[0] - 1):
         first_slots[m + 1] += first_slots[m]
     total = 0
@@ -175,27 +222,22 @@ def _counts_to_places(first_slots, places):
 
 
 @kernel
-def _fill_lists(tickets, footprints, width, height, all_places, first_slots, members, rows, slots):
+def _fill_lists(tickets, order, all_places, first_slots, pairs, entries):
     """Write the pairs to their places."""
-    tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
     while True:
         ticket = take_ticket(tickets)
         if ticket >= CHUNKS:
             return
-        places = all_places[ticket]
-        for m in range(ticket * len(footprints) // CHUNKS, (ticket + 1) * len(footprints) // CHUNKS):
-            footprint = footprints[m]
-            ellipse = _ellipse(footprint)
-            first, last = _columns(footprint, ellipse[0], tiles_x)
-            slot = first_slots[m]
-            for column in range(first, last):
-                top, bottom = _column_rows(footprint, ellipse, column * TILE_WIDTH, width, height)
-                if top < bottom:
-                    for tile_row in range(top // TILE_HEIGHT, (bottom - 1) // TILE_HEIGHT + 1):
-                        tile, tile_top = tile_row * tiles_x + column, tile_row * TILE_HEIGHT
-                        at = places[tile]
-                        places[tile] = at + 1
-                        members[at] = m
-                        rows[at] = max(top - tile_top, 0) + 256 * min(bottom - tile_top, TILE_HEIGHT)
-                        slots[at] = slot
-                        slot += 1
+        places, found, at = all_places[ticket], pairs[ticket], 0
+        stop = (ticket + 1) * len(order) // CHUNKS
+        for m in range(ticket * len(order) // CHUNKS, stop):
+            prefetch(first_slots, order[min(m + AHEAD, stop - 1)])
+            member = order[m]
+            for slot in range(first_slots[member], first_slots[member + 1]):
+                tile = found[at, 0]
+                place = places[tile]
+                places[tile] = place + 1
+                entries[place, MEMBER] = member
+                entries[place, ROWS] = found[at, 1]
+                entries[place, SLOT] = slot
+                at += 1

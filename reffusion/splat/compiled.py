@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import math
 import os
 import shutil
+import threading
+import weakref
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 import numba
 import numpy as np
 import torch
 
+_LARGE, _BLOCKS = 2**16, 24  # numbers of an array worth keeping; how many are kept, some two steps' worth
 _CACHE = "splat-"  # folders of machine code in __pycache__, one per state of these sources
 
 
@@ -41,6 +46,51 @@ def kernel(function: Callable) -> Callable:
         return numba.njit(cache=True, nogil=True, error_model="numpy")(function)
     finally:
         numba.config.CACHE_DIR = before
+
+
+def inlined(function: Callable) -> Callable:
+    """Compile `function` as a part of every kernel that calls it."""
+    return numba.njit(forceinline=True, error_model="numpy")(function)
+
+
+def room(*shape: int) -> np.ndarray:
+    """Uninitialised float32 from a cache line's border on, where possible in memory given out before that nobody holds.
+
+    Arrays of megabytes are otherwise made of fresh pages each time, and clearing those costs a good part of a step.
+    """
+    size = math.prod(shape)
+    if size < _LARGE:
+        return _cache_aligned(size).reshape(shape)
+    blocks, lock = _blocks()
+    with lock:
+        fits = (block for block in blocks if size <= block.memory.size <= 2 * size and block.tenant() is None)
+        block = next(fits, None) or _Block(_cache_aligned(size))
+        others = [other for other in blocks if other is not block]
+        blocks[:] = [*others[1 - _BLOCKS :], block]
+        # through a memoryview, so that this array, not the block, is what its views refer to
+        array = np.frombuffer(memoryview(block.memory), np.float32, size)
+        block.tenant = weakref.ref(array)
+        return array.reshape(shape)
+
+
+def _cache_aligned(size: int) -> np.ndarray:
+    memory = np.empty(size + 16, np.float32)
+    first = -memory.ctypes.data // 4 % 16
+    return memory[first : first + size]
+
+
+@dataclass
+class _Block:
+    """Memory, and who has it."""
+
+    memory: np.ndarray
+    tenant: Callable[[], np.ndarray | None] = lambda: None
+
+
+@functools.cache
+def _blocks() -> tuple[list[_Block], threading.Lock]:
+    """Given out by `room`, the latest last."""
+    return [], threading.Lock()
 
 
 def threads() -> int:

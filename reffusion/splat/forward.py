@@ -1,182 +1,200 @@
-"""Blending tile by tile, front to back, sixteen pixels of a row at a time."""
+"""Blending tile by tile, front to back, a vector of pixels at a time: one row of eight, or two."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from reffusion.splat.binning import CUT, TILE_HEIGHT, TILE_WIDTH
-from reffusion.splat.compiled import kernel, share
+from reffusion.splat.compiled import inlined, kernel, room, share
 from reffusion.splat.conventions import MAX_ALPHA, MIN_TRANSMITTANCE
-from reffusion.splat.projection import (
+from reffusion.splat.layout import (
     AHEAD,
     BLUE,
+    CUT,
     DEPTH,
     FOOTPRINT,
     GREEN,
     LEVEL,
     MEAN_X,
     MEAN_Y,
+    MEMBER,
     RED,
+    ROWS,
     SLANT,
+    TILE_HEIGHT,
+    TILE_WIDTH,
     WHITEN_X,
     WHITEN_Y,
 )
-from reffusion.splat.vectors import (
-    exp2,
-    fma,
-    fnma,
-    load,
-    minimum,
-    negative,
-    prefetch,
-    ramp,
-    select,
-    some,
-    splat,
-    store,
-    take_ticket,
-)
+from reffusion.splat.memory import load, prefetch, splat_at, store
+from reffusion.splat.vectors import LANES, exp2, fma, fnma, minimum, minus_abs, select, some, splat, take_ticket
 
-_SUMS = 6  # vectors of a row before its features: transmittance, red, green, blue, depth, alpha
+STEP_ROWS = LANES // TILE_WIDTH  # rows of a vector
+STEPS = TILE_HEIGHT // STEP_ROWS  # vectors of a tile
+LANE_X = np.arange(LANES, dtype=np.float32) % TILE_WIDTH + np.float32(0.5)  # pixel centre of each lane, from the left
+LANE_Y = (np.arange(TILE_HEIGHT * TILE_WIDTH) // TILE_WIDTH).astype(np.float32)  # row of each pixel of a tile
+_SUMS = 6  # vectors of a step before its features: transmittance, red, green, blue, depth, alpha
+_MAX_ALPHA, _MIN_TRANSMITTANCE, _CUT = np.float32(MAX_ALPHA), np.float32(MIN_TRANSMITTANCE), np.float32(CUT)
 
 
-def blend(footprints, features, background, starts, members, rows, width, height):
+def blend(footprints, features, background, bins, width, height):
     """Blend every tile's list.
 
     Args:
-        footprints: [M, FOOTPRINT]; features: [M, C]; background: [3]; starts, members, rows: see `bin_footprints`.
+        footprints: [>= N, FOOTPRINT] flat; features: [N, C]; background: [3]; bins: see `binning`.
 
     Returns:
         color [H, W, 3], depth [H, W], alpha [H, W], features [H, W, C], transmittance [H, W], all float32, and used
         [tiles] int64: how many of a tile's list were looked at before all its pixels were finished.
     """
-    color = np.empty((height, width, 3), np.float32)
-    depth, alpha = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
-    blended = np.empty((height, width, features.shape[1]), np.float32)
-    transmittance = np.empty((height, width), np.float32)
-    used = np.empty(len(starts) - 1, np.int64)
+    color, blended = room(height, width, 3), room(height, width, features.shape[1])
+    depth, alpha, transmittance = room(height, width), room(height, width), room(height, width)
+    used = np.empty(len(bins.starts) - 1, np.int64)
     outputs = color, depth, alpha, blended, transmittance, used
-    share(_blend, footprints, features, background, starts, members, rows, *outputs)
+    share(_blend, footprints, features, background, bins, *outputs)
     return outputs
 
 
 @kernel
 def aligned(vectors):
     """Room for so many vectors, on a cache line's border."""
-    room = np.empty((vectors + 1) * 16, np.float32)
+    room = np.empty(vectors * LANES + 16, np.float32)
     first = (-room.ctypes.data // 4) % 16
-    return room[first : first + vectors * 16]
+    return room[first : first + vectors * LANES]
 
 
-@kernel
+@inlined
+def corner(tile, width):
+    """Left column and top row of a tile in the image."""
+    tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
+    return (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
+
+
+@inlined
 def open_tile(state, stride, rows, columns):
-    """Set the transmittances, first of each row's `stride` floats: 1, or -1 (finished) outside the image."""
-    for row in range(TILE_HEIGHT):
-        limit = np.float32(columns if row < rows else 0)
-        store(state, row * stride, select(ramp() < splat(limit), splat(1.0), splat(-1.0)))
+    """Set the transmittances, first vector of each step's `stride` floats: 1, or -1 (finished) outside the image."""
+    for step in range(STEPS):
+        for lane in range(LANES):
+            inside = step * STEP_ROWS + lane // TILE_WIDTH < rows and lane % TILE_WIDTH < columns
+            state[step * stride + lane] = np.float32(1.0 if inside else -1.0)
 
 
-@kernel
+@inlined
 def finished(state, stride):
     """Whether no pixel of the tile takes anything more."""
-    for row in range(TILE_HEIGHT):
-        if some(load(state, row * stride) > splat(0.0)):
+    for step in range(STEPS):
+        if some(load(state, step * stride) > splat(0.0)):
             return False
     return True
 
 
+@inlined
+def shape(footprints, base, left, top, middle):
+    """A footprint as seen from a tile: u = u_middle - lean j and v = v_middle + whiten_y j, j = row - middle.
+
+    Returns:
+        u_middle, lean, v_middle, whiten_y, level: the same in all lanes but u_middle.
+    """
+    whiten_x, whiten_y = footprints[base + WHITEN_X], splat_at(footprints, base + WHITEN_Y)
+    lean = splat(whiten_x * footprints[base + SLANT])
+    dy = splat(np.float32(top) + middle + np.float32(0.5) - footprints[base + MEAN_Y])
+    dx = load(LANE_X, 0) + (np.float32(left) - footprints[base + MEAN_X])
+    return fnma(lean, dy, whiten_x * dx), lean, whiten_y * dy, whiten_y, splat_at(footprints, base + LEVEL)
+
+
+@inlined
+def log_alpha(shape, j):
+    """log2(alpha) before clamping at the pixels of a step."""
+    u_middle, lean, v_middle, whiten_y, level = shape
+    u, v = fnma(lean, j, u_middle), fma(whiten_y, j, v_middle)
+    return fnma(u, u, fnma(v, v, level))
+
+
+@inlined
+def meet(power, before):
+    """A footprint of log2(alpha) = `power` meets pixels of transmittance `before` (negative: finished).
+
+    Returns:
+        raw alpha (anything where it is under the cut), alpha, weight, transmittance after it.
+    """
+    raw = exp2(power)
+    alpha = select(power >= splat(_CUT), minimum(raw, _MAX_ALPHA), np.float32(0.0))
+    after = fnma(before, alpha, before)
+    kept = after >= splat(_MIN_TRANSMITTANCE)
+    return raw, alpha, select(kept, before * alpha, np.float32(0.0)), select(kept, after, minus_abs(before))
+
+
 @kernel
-def _blend(
-    tickets,
-    footprints,
-    features,
-    background,
-    starts,
-    members,
-    rows,
-    color,
-    depth,
-    alpha,
-    blended,
-    transmittance,
-    used,
-):
-    channels = features.shape[1]
-    stride = (_SUMS + channels) * TILE_WIDTH
-    state = aligned(TILE_HEIGHT * (_SUMS + channels))
+def _blend(tickets, footprints, features, background, bins, color, depth, alpha, blended, transmittance, used):
+    stride = (_SUMS + features.shape[1]) * LANES
+    state = aligned(STEPS * (_SUMS + features.shape[1]))
     while True:
         tile = take_ticket(tickets)
         if tile >= used.shape[0]:
             return
-        used[tile] = _blend_tile(tile, footprints, features, starts, members, rows, depth.shape, state, stride)
+        used[tile] = _blend_tile(tile, footprints, features, bins, depth.shape, state, stride)
         _write_tile(tile, state, stride, background, color, depth, alpha, blended, transmittance)
 
 
 @kernel
-def _blend_tile(tile, footprints, features, starts, members, rows, size, state, stride):
+def _blend_tile(tile, footprints, features, bins, size, state, stride):
     """Blend one tile into `state`; returns how much of its list was used."""
-    height, width = size
     channels = features.shape[1]
-    tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
-    left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
+    left, top = corner(tile, size[1])
     state[:] = np.float32(0.0)
-    open_tile(state, stride, min(TILE_HEIGHT, height - top), min(TILE_WIDTH, width - left))
-    zero, cut = splat(0.0), splat(CUT)
-    strongest, least = splat(MAX_ALPHA), splat(MIN_TRANSMITTANCE)
-    columns = ramp() + splat(np.float32(left) + np.float32(0.5))
-    flat_footprints, last = footprints.reshape(-1), members.shape[0] - 1
-    for at in range(starts[tile], starts[tile + 1]):
-        if (at - starts[tile]) % 32 == 31 and finished(state, stride):
-            return at - starts[tile]
-        prefetch(flat_footprints, members[min(at + AHEAD, last)] * FOOTPRINT)
-        footprint = footprints[members[at]]
-        extra = features[members[at]]
-        whiten_x, whiten_y, level = splat(footprint[WHITEN_X]), splat(footprint[WHITEN_Y]), splat(footprint[LEVEL])
-        lean = whiten_x * splat(footprint[SLANT])
-        across = whiten_x * (columns - splat(footprint[MEAN_X]))
-        red, green, blue = splat(footprint[RED]), splat(footprint[GREEN]), splat(footprint[BLUE])
-        far = splat(footprint[DEPTH])
-        above = np.float32(top) + np.float32(0.5) - footprint[MEAN_Y]
-        for row in range(rows[at] & 255, rows[at] >> 8):
-            place = row * stride
-            before = load(state, place)
-            dy = splat(above + np.float32(row))
-            u, v = fnma(lean, dy, across), whiten_y * dy
-            power = fnma(u, u, fnma(v, v, level))
-            seen = (power >= cut) & (before > zero)
-            if not some(seen):
-                continue
-            opacity = minimum(exp2(power), strongest)
-            after = fnma(before, opacity, before)
-            kept = seen & (after >= least)
-            weight = select(kept, before * opacity, zero)
-            store(state, place, select(seen, select(kept, after, negative(before)), before))
-            store(state, place + 16, fma(weight, red, load(state, place + 16)))
-            store(state, place + 32, fma(weight, green, load(state, place + 32)))
-            store(state, place + 48, fma(weight, blue, load(state, place + 48)))
-            store(state, place + 64, fma(weight, far, load(state, place + 64)))
-            store(state, place + 80, load(state, place + 80) + weight)
-            for c in range(channels):
-                place_c = place + 16 * (_SUMS + c)
-                store(state, place_c, fma(weight, splat(extra[c]), load(state, place_c)))
-    return starts[tile + 1] - starts[tile]
+    open_tile(state, stride, size[0] - top, size[1] - left)
+    start, stop = bins.starts[tile], bins.starts[tile + 1]
+    for at in range(start, stop):
+        if (at - start) % 32 == 31 and finished(state, stride):
+            return at - start
+        prefetch(footprints, bins.entries[min(at + AHEAD, stop - 1), MEMBER] * FOOTPRINT)
+        member, rows = bins.entries[at, MEMBER], bins.entries[at, ROWS]
+        # a loop of its own where there are no features: LLVM then keeps more in registers
+        if channels == 0:
+            _blend_rows(member, rows, left, top, footprints, features, 0, state, stride)
+        else:
+            _blend_rows(member, rows, left, top, footprints, features, channels, state, stride)
+    return stop - start
+
+
+@inlined
+def _blend_rows(member, rows, left, top, footprints, features, channels, state, stride):
+    """Blend one footprint into the rows of a tile."""
+    base = member * FOOTPRINT
+    seen = shape(footprints, base, left, top, np.float32(0.0))
+    red, green = splat_at(footprints, base + RED), splat_at(footprints, base + GREEN)
+    blue, far = splat_at(footprints, base + BLUE), splat_at(footprints, base + DEPTH)
+    for step in range((rows & 255) // STEP_ROWS, ((rows >> 8) + STEP_ROWS - 1) // STEP_ROWS):
+        place = step * stride
+        before = load(state, place)
+        power = log_alpha(seen, load(LANE_Y, step * LANES))
+        if not some((power >= splat(_CUT)) & (before > splat(0.0))):
+            continue
+        _, _, weight, after = meet(power, before)
+        store(state, place, after)
+        store(state, place + LANES, fma(weight, red, load(state, place + LANES)))
+        store(state, place + 2 * LANES, fma(weight, green, load(state, place + 2 * LANES)))
+        store(state, place + 3 * LANES, fma(weight, blue, load(state, place + 3 * LANES)))
+        store(state, place + 4 * LANES, fma(weight, far, load(state, place + 4 * LANES)))
+        store(state, place + 5 * LANES, load(state, place + 5 * LANES) + weight)
+        for c in range(channels):
+            here = place + (_SUMS + c) * LANES
+            store(state, here, fma(weight, splat(features[member, c]), load(state, here)))
 
 
 @kernel
 def _write_tile(tile, state, stride, background, color, depth, alpha, blended, transmittance):
     """Put a blended tile into the images."""
     height, width = depth.shape
-    tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
-    left, top = (tile % tiles_x) * TILE_WIDTH, (tile // tiles_x) * TILE_HEIGHT
+    left, top = corner(tile, width)
     for row in range(min(TILE_HEIGHT, height - top)):
         y = top + row
         for lane in range(min(TILE_WIDTH, width - left)):
-            x, place = left + lane, row * stride + lane
-            behind, covered = abs(state[place]), state[place + 80]
+            x, place = left + lane, row // STEP_ROWS * stride + row % STEP_ROWS * TILE_WIDTH + lane
+            behind, covered = abs(state[place]), state[place + 5 * LANES]
             transmittance[y, x] = behind
             alpha[y, x] = covered  # not 1 - behind, which has few digits where it is faint
             for c in range(3):
-                color[y, x, c] = state[place + 16 * (1 + c)] + behind * background[c]
-            depth[y, x] = state[place + 64] / max(covered, np.float32(1e-30))
+                color[y, x, c] = state[place + (1 + c) * LANES] + behind * background[c]
+            depth[y, x] = state[place + 4 * LANES] / max(covered, np.float32(1e-30))
             for c in range(blended.shape[2]):
-                blended[y, x, c] = state[place + 16 * (_SUMS + c)]
+                blended[y, x, c] = state[place + (_SUMS + c) * LANES]

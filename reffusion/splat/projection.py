@@ -1,7 +1,7 @@
-"""From Gaussians to footprints and colours, and back: everything that is done once per Gaussian.
+"""Geometry of one group of LANES Gaussians: from their parameters to footprints, and back.
 
-Geometry is computed in float64: scales of any size stay finite and needles keep their gradients. What the pixels see is
-rounded to float32. Derivation of the backward pass: docs/splatting.md.
+Computed in float64: scales of any size stay finite and needles keep their gradients. What the pixels see is rounded to
+float32. Derivation of the backward pass: docs/splatting.md.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from reffusion.splat.compiled import kernel
+from reffusion.splat.compiled import inlined
 from reffusion.splat.conventions import (
     JACOBIAN_MARGIN,
     LOW_PASS,
@@ -19,27 +19,19 @@ from reffusion.splat.conventions import (
     MIN_ALPHA,
     NEAR,
 )
-from reffusion.splat.vectors import prefetch, take_ticket
+from reffusion.splat.layout import GRAD_DEPTH, SUM_G, SUM_U, SUM_UU, SUM_UV, SUM_V, SUM_VV
+from reffusion.splat.memory import load, load_column
+from reffusion.splat.vectors import LANES, ceiling, exp2, log2, maximum, minimum, root, select, widen
 from reffusion.types import Camera
-
-# Columns of a footprint: 2D mean; slant xy/yy; the whitening factors along x and y, scaled so that
-# log2(alpha) = LEVEL - u^2 - v^2 with v = WHITEN_Y dy, u = WHITEN_X (dx - SLANT dy); camera z; colour.
-MEAN_X, MEAN_Y, SLANT, WHITEN_X, WHITEN_Y, LEVEL, DEPTH, RED, GREEN, BLUE = range(10)
-FOOTPRINT = 16  # columns, of which the last six are unused: one cache line each
-
-# Columns of a gradient record: the sums over pixels of g = dLoss/d(ln alpha), and of g times u, v, uu, uv, vv;
-# then the gradients of camera z, colour and features.
-SUM_G, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, GRAD_DEPTH, GRAD_RED, GRAD_GREEN, GRAD_BLUE, GRAD_FEATURES = range(11)
-
-CHUNKS = 32  # pieces that the Gaussians are shared out in; fixed, so that nothing depends on the number of threads
-AHEAD = 8  # steps between asking for a row of another order (`vectors.prefetch`) and using it
 
 _LOG2_E = 1.4426950408889634
 _HALF_LOG2_E = math.sqrt(0.5 * _LOG2_E)
+_UNSCALE = 1.0 / _HALF_LOG2_E  # a footprint's u and v are scaled by sqrt(log2(e) / 2)
+_LEAST_LEVEL = math.log2(MIN_ALPHA)
 
 
 def view_numbers(camera: Camera) -> np.ndarray:
-    """[23] float64: rotation rows, translation, fx, fy, cx, cy, clamping range of x/z and y/z, size, unused."""
+    """[22] float64: rotation rows, translation, fx, fy, cx, cy, clamping range of x/z and y/z, size."""
     half_x, half_y = camera.width / 2 / camera.fx, camera.height / 2 / camera.fy
     return np.array(
         [
@@ -51,44 +43,31 @@ def view_numbers(camera: Camera) -> np.ndarray:
             -camera.cy / camera.fy - JACOBIAN_MARGIN * half_y,
             (camera.height - camera.cy) / camera.fy + JACOBIAN_MARGIN * half_y,
             *(camera.width, camera.height),
-            0.0,
         ],
         np.float64,
     )
 
 
-@kernel
-def next_part(tickets, count):
-    """Borders of the next of CHUNKS parts of range(count), or (-1, -1) when all are drawn."""
-    ticket = take_ticket(tickets)
-    if ticket >= CHUNKS:
-        return -1, -1
-    return ticket * count // CHUNKS, (ticket + 1) * count // CHUNKS
-
-
-@kernel
-def _rotation(q):
-    """Rotation matrix of a quaternion wxyz of any length (zero: identity), row by row, and 1 / length."""
-    w, x, y, z = np.float64(q[0]), np.float64(q[1]), np.float64(q[2]), np.float64(q[3])
-    square = w * w + x * x + y * y + z * z
-    zero = square == 0.0
-    inverse = 0.0 if zero else 1.0 / math.sqrt(square)
-    w = 1.0 if zero else w * inverse
-    x *= inverse
-    y *= inverse
-    z *= inverse
+@inlined
+def three_columns(array, row, last):
+    """Columns of a [R, 3] array (flat) in float64."""
     return (
-        (w, x, y, z, inverse),
-        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
-        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
-        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+        widen(load_column(array, 3, 0, row, last)),
+        widen(load_column(array, 3, 1, row, last)),
+        widen(load_column(array, 3, 2, row, last)),
     )
 
 
-@kernel
-def _to_camera(view, mean):
+@inlined
+def exponential(x):
+    """e^x, finite everywhere."""
+    return exp2(maximum(minimum(x * _LOG2_E, 1020.0), -1020.0))
+
+
+@inlined
+def camera_point(view, mean):
     """Camera coordinates of a mean."""
-    a, b, c = np.float64(mean[0]), np.float64(mean[1]), np.float64(mean[2])
+    a, b, c = mean
     return (
         view[0] * a + view[1] * b + view[2] * c + view[9],
         view[3] * a + view[4] * b + view[5] * c + view[10],
@@ -96,198 +75,230 @@ def _to_camera(view, mean):
     )
 
 
-@kernel
-def _projector(view, x, y, z):
-    """The two rows of Jacobian x rotation [2, 3], and the clamped slopes x/z and y/z."""
-    inverse = 1.0 / z
-    slope_x = min(max(x * inverse, view[16]), view[17])
-    slope_y = min(max(y * inverse, view[18]), view[19])
-    fx, fy = view[12] * inverse, view[13] * inverse
+@inlined
+def _unit_quaternion(quaternions, row, last):
+    """Quaternions wxyz divided by their length (zero: identity), and 1 / length (zero: 0)."""
+    w = widen(load_column(quaternions, 4, 0, row, last))
+    x = widen(load_column(quaternions, 4, 1, row, last))
+    y = widen(load_column(quaternions, 4, 2, row, last))
+    z = widen(load_column(quaternions, 4, 3, row, last))
+    square = w * w + x * x + y * y + z * z
+    some_length = square > 0.0
+    inverse = 1.0 / root(select(some_length, square, 1.0))
+    inverse = select(some_length, inverse, select(square <= 0.0, 0.0, square))  # not a number stays so
+    return select(some_length, w * inverse, 1.0), x * inverse, y * inverse, z * inverse, inverse
+
+
+@inlined
+def _rotation(w, x, y, z):
+    """Rotation matrix of a unit quaternion, row by row."""
+    xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
+    wx, wy, wz = w * x, w * y, w * z
     return (
-        (fx * (view[0] - slope_x * view[6]), fx * (view[1] - slope_x * view[7]), fx * (view[2] - slope_x * view[8])),
-        (fy * (view[3] - slope_y * view[6]), fy * (view[4] - slope_y * view[7]), fy * (view[5] - slope_y * view[8])),
-        slope_x,
-        slope_y,
+        (1.0 - 2.0 * (yy + zz), 2.0 * (xy - wz), 2.0 * (xz + wy)),
+        (2.0 * (xy + wz), 1.0 - 2.0 * (xx + zz), 2.0 * (yz - wx)),
+        (2.0 * (xz - wy), 2.0 * (yz + wx), 1.0 - 2.0 * (xx + yy)),
     )
 
 
-@kernel
-def project(tickets, means, quaternions, log_scales, opacity_logits, probe, view, footprints, radii):
-    """Footprints of all Gaussians.
+@inlined
+def _projector(view, x, y, z_inverse):
+    """The two rows of Jacobian x rotation [2, 3]."""
+    slope_x = maximum(minimum(x * z_inverse, view[17]), view[16])
+    slope_y = maximum(minimum(y * z_inverse, view[19]), view[18])
+    fx, fy = view[12] * z_inverse, view[13] * z_inverse
+    return (
+        (fx * (view[0] - slope_x * view[6]), fx * (view[1] - slope_x * view[7]), fx * (view[2] - slope_x * view[8])),
+        (fy * (view[3] - slope_y * view[6]), fy * (view[4] - slope_y * view[7]), fy * (view[5] - slope_y * view[8])),
+    )
+
+
+@inlined
+def _times_rotation(p, r):
+    """A row times the rotation matrix."""
+    return (
+        p[0] * r[0][0] + p[1] * r[1][0] + p[2] * r[2][0],
+        p[0] * r[0][1] + p[1] * r[1][1] + p[2] * r[2][1],
+        p[0] * r[0][2] + p[1] * r[1][2] + p[2] * r[2][2],
+    )
+
+
+@inlined
+def _times_scales(e, scales):
+    return e[0] * scales[0], e[1] * scales[1], e[2] * scales[2]
+
+
+@inlined
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@inlined
+def _covariance(a, b):
+    """Of root [2, 3] with rows a and b: xx, xy, yy of root rootᵀ without the low-pass, and the determinant with it.
+
+    Cauchy-Binet: the sum of the squared 2x2 minors has no cancellation where xx yy - xy^2 loses everything.
+    """
+    xx, xy, yy = _dot(a, a), _dot(a, b), _dot(b, b)
+    m0, m1, m2 = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    determinant = m0 * m0 + m1 * m1 + m2 * m2 + LOW_PASS * (xx + yy) + LOW_PASS * LOW_PASS
+    return xx, xy, yy, determinant
+
+
+@inlined
+def _frame(view, x, y, z_inverse, quaternions, log_scales, row, last):
+    """What forward and backward both start from: unit quaternion, rotation, projector, scales, rows of root [2, 3]."""
+    quaternion = _unit_quaternion(quaternions, row, last)
+    rotation = _rotation(quaternion[0], quaternion[1], quaternion[2], quaternion[3])
+    projector = _projector(view, x, y, z_inverse)
+    l0, l1, l2 = three_columns(log_scales, row, last)
+    scales = exponential(l0), exponential(l1), exponential(l2)
+    a = _times_scales(_times_rotation(projector[0], rotation), scales)
+    b = _times_scales(_times_rotation(projector[1], rotation), scales)
+    return quaternion, rotation, projector, scales, a, b
+
+
+@inlined
+def project(view, mean, quaternions, log_scales, opacity_logits, row, last):
+    """Footprints of LANES Gaussians.
 
     Args:
-        probe: [N, 2] added to the 2D means, or [0, 2].
         view: see `view_numbers`.
-        footprints: [N, FOOTPRINT] float32, written up to the depth for Gaussians that reach the image.
-        radii: [N] int32 zeros, written for the same Gaussians.
+        mean: their means, three float64 lanes.
+        quaternions, log_scales, opacity_logits: of all Gaussians, flat; row: the first of the group; last: of all.
+
+    Returns:
+        Which are in front of the camera, opaque and small enough (a mask), and in float64 lanes: 2D mean x, y; slant,
+        the two whitening factors and the level of a footprint; camera z; half width and height of the box around
+        alpha >= 1/255.
     """
-    while True:
-        begin, end = next_part(tickets, means.shape[0])
-        if begin < 0:
-            return
-        for i in range(begin, end):
-            x, y, z = _to_camera(view, means[i])
-            if not z >= NEAR:
-                continue
-            _, r0, r1, r2 = _rotation(quaternions[i])
-            p0, p1, _, _ = _projector(view, x, y, z)
-            s0 = math.exp(np.float64(log_scales[i, 0]))
-            s1 = math.exp(np.float64(log_scales[i, 1]))
-            s2 = math.exp(np.float64(log_scales[i, 2]))
-            # root [2, 3]: the covariance is root rootᵀ + low-pass
-            a0 = (p0[0] * r0[0] + p0[1] * r1[0] + p0[2] * r2[0]) * s0
-            a1 = (p0[0] * r0[1] + p0[1] * r1[1] + p0[2] * r2[1]) * s1
-            a2 = (p0[0] * r0[2] + p0[1] * r1[2] + p0[2] * r2[2]) * s2
-            b0 = (p1[0] * r0[0] + p1[1] * r1[0] + p1[2] * r2[0]) * s0
-            b1 = (p1[0] * r0[1] + p1[1] * r1[1] + p1[2] * r2[1]) * s1
-            b2 = (p1[0] * r0[2] + p1[1] * r1[2] + p1[2] * r2[2]) * s2
-            xx = a0 * a0 + a1 * a1 + a2 * a2
-            xy = a0 * b0 + a1 * b1 + a2 * b2
-            yy = b0 * b0 + b1 * b1 + b2 * b2
-            # Cauchy-Binet: the sum of the squared 2x2 minors has no cancellation where xx yy - xy^2 loses everything
-            m0, m1, m2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
-            determinant = m0 * m0 + m1 * m1 + m2 * m2 + LOW_PASS * (xx + yy) + LOW_PASS * LOW_PASS
-            xx += LOW_PASS
-            yy += LOW_PASS
-            mean_x = view[12] * x / z + view[14]
-            mean_y = view[13] * y / z + view[15]
-            if probe.shape[0] > 0:
-                mean_x += probe[i, 0]
-                mean_y += probe[i, 1]
-            opacity = 1.0 / (1.0 + math.exp(-np.float64(opacity_logits[i])))
-            near_enough = abs(mean_x) < MAX_PIXELS and abs(mean_y) < MAX_PIXELS
-            if not (opacity >= MIN_ALPHA and near_enough and xx < MAX_VARIANCE and yy < MAX_VARIANCE):
-                continue
-            cut = math.sqrt(2.0 * math.log(opacity / MIN_ALPHA))
-            reach_x, reach_y = math.ceil(cut * math.sqrt(xx)), math.ceil(cut * math.sqrt(yy))
-            inside_x = mean_x + reach_x > 0 and mean_x - reach_x < view[20]
-            inside_y = mean_y + reach_y > 0 and mean_y - reach_y < view[21]
-            if not (inside_x and inside_y):
-                continue
-            radii[i] = np.int32(min(max(reach_x, reach_y, 1.0), 1073741824.0))
-            footprints[i, MEAN_X] = mean_x
-            footprints[i, MEAN_Y] = mean_y
-            footprints[i, SLANT] = xy / yy
-            footprints[i, WHITEN_X] = _HALF_LOG2_E * math.sqrt(yy / determinant)
-            footprints[i, WHITEN_Y] = _HALF_LOG2_E / math.sqrt(yy)
-            footprints[i, LEVEL] = math.log(opacity) * _LOG2_E
-            footprints[i, DEPTH] = z
+    x, y, z = camera_point(view, mean)
+    z_inverse = 1.0 / z
+    _, _, _, _, a, b = _frame(view, x, y, z_inverse, quaternions, log_scales, row, last)
+    xx, xy, yy, determinant = _covariance(a, b)
+    kept = (z >= NEAR) & (xx < MAX_VARIANCE) & (yy < MAX_VARIANCE)
+    xx, yy = xx + LOW_PASS, yy + LOW_PASS
+    mean_x, mean_y = view[12] * x * z_inverse + view[14], view[13] * y * z_inverse + view[15]
+    opacity = 1.0 / (1.0 + exponential(0.0 - widen(load_column(opacity_logits, 1, 0, row, last))))
+    kept = kept & (opacity >= MIN_ALPHA)
+    level = log2(opacity)
+    cut = root(maximum((level - _LEAST_LEVEL) * (2.0 / _LOG2_E), 0.0))
+    whiten_x, whiten_y = _HALF_LOG2_E * root(yy / determinant), _HALF_LOG2_E / root(yy)
+    reach_x, reach_y = ceiling(cut * root(xx)), ceiling(cut * root(yy))
+    return kept, mean_x, mean_y, xy / yy, whiten_x, whiten_y, level, z, reach_x, reach_y
 
 
-@kernel
-def project_backward(
-    tickets,
-    sums,
-    ranks,
-    means,
-    quaternions,
-    log_scales,
-    opacity_logits,
-    view,
-    grad_means,
-    grad_quaternions,
-    grad_scales,
-    grad_opacities,
-    grad_probe,
-):
-    """From the sums of each footprint to the gradients of means, quaternions, log-scales, opacity logits and probe.
+@inlined
+def in_image(view, mean_x, mean_y, reach_x, reach_y):
+    """Which boxes touch the image (a mask)."""
+    near_enough = (mean_x > -MAX_PIXELS) & (mean_x < MAX_PIXELS) & (mean_y > -MAX_PIXELS) & (mean_y < MAX_PIXELS)
+    inside_x = (mean_x + reach_x > 0.0) & (mean_x - reach_x < view[20])
+    inside_y = (mean_y + reach_y > 0.0) & (mean_y - reach_y < view[21])
+    return near_enough & inside_x & inside_y
+
+
+@inlined
+def project_backward(view, mean, quaternions, log_scales, opacity_logits, row, last, moments):
+    """Gradients of LANES Gaussians' geometry.
 
     Args:
-        sums: [M, >= GRAD_FEATURES] per footprint, columns as above.
-        ranks: [N] int32, each Gaussian's row in `sums`, or -1.
-        grad_means, grad_quaternions, grad_scales, grad_opacities, grad_probe: float32 zeros, written for the Gaussians
-            with a rank; grad_probe may be [0, 2].
+        view, ..., last: as in `project`.
+        moments: the columns of their gradient records (`layout`), LANES values each.
+
+    Returns:
+        Gradients of the mean (3), quaternion (4), log-scales (3), opacity logit and 2D mean (2), float64 lanes.
     """
-    unscale = math.sqrt(2.0 / _LOG2_E)  # the record's u and v are scaled by sqrt(log2(e) / 2)
-    want_probe, flat_sums = grad_probe.shape[0] > 0, sums.reshape(-1)
-    while True:
-        begin, end = next_part(tickets, means.shape[0])
-        if begin < 0:
-            return
-        for i in range(begin, end):
-            prefetch(flat_sums, ranks[min(i + AHEAD, end - 1)] * sums.shape[1])
-            if ranks[i] < 0:
-                continue
-            record = sums[ranks[i]]
-            x, y, z = _to_camera(view, means[i])
-            (qw, qx, qy, qz, q_inverse), r0, r1, r2 = _rotation(quaternions[i])
-            p0, p1, _, _ = _projector(view, x, y, z)
-            s0 = math.exp(np.float64(log_scales[i, 0]))
-            s1 = math.exp(np.float64(log_scales[i, 1]))
-            s2 = math.exp(np.float64(log_scales[i, 2]))
-            e00 = p0[0] * r0[0] + p0[1] * r1[0] + p0[2] * r2[0]
-            e01 = p0[0] * r0[1] + p0[1] * r1[1] + p0[2] * r2[1]
-            e02 = p0[0] * r0[2] + p0[1] * r1[2] + p0[2] * r2[2]
-            e10 = p1[0] * r0[0] + p1[1] * r1[0] + p1[2] * r2[0]
-            e11 = p1[0] * r0[1] + p1[1] * r1[1] + p1[2] * r2[1]
-            e12 = p1[0] * r0[2] + p1[1] * r1[2] + p1[2] * r2[2]
-            a0, a1, a2 = e00 * s0, e01 * s1, e02 * s2
-            b0, b1, b2 = e10 * s0, e11 * s1, e12 * s2
-            xx = a0 * a0 + a1 * a1 + a2 * a2
-            xy = a0 * b0 + a1 * b1 + a2 * b2
-            yy = b0 * b0 + b1 * b1 + b2 * b2
-            m0, m1, m2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
-            determinant = m0 * m0 + m1 * m1 + m2 * m2 + LOW_PASS * (xx + yy) + LOW_PASS * LOW_PASS
-            yy += LOW_PASS
-            slant = xy / yy
-            lx, ly = math.sqrt(yy / determinant), 1.0 / math.sqrt(yy)
+    x, y, z = camera_point(view, mean)
+    z_inverse = 1.0 / z
+    quaternion, rotation, projector, scales, a, b = _frame(view, x, y, z_inverse, quaternions, log_scales, row, last)
+    _, xy, yy, determinant = _covariance(a, b)
+    yy = yy + LOW_PASS
+    slant, lx, ly = xy / yy, root(yy / determinant), 1.0 / root(yy)
 
-            # 2D mean: u = lx (dx - slant dy), v = ly dy, ln alpha = ln opacity - (u^2 + v^2) / 2
-            sum_u, sum_v = unscale * record[SUM_U], unscale * record[SUM_V]
-            g_mean_x = lx * sum_u
-            g_mean_y = ly * sum_v - slant * g_mean_x
-            if want_probe:
-                grad_probe[i, 0] = g_mean_x
-                grad_probe[i, 1] = g_mean_y
+    # 2D mean: u = lx (dx - slant dy), v = ly dy, ln alpha = ln opacity - (u^2 + v^2) / 2
+    grad_mean_x = lx * (_UNSCALE * _column(moments, SUM_U))
+    grad_mean_y = ly * (_UNSCALE * _column(moments, SUM_V)) - slant * grad_mean_x
 
-            # root: dLoss/d(root) = L M Lᵀ root, with L the whitening factor and M the second moments of (u, v)
-            uu = unscale * unscale * record[SUM_UU]
-            uv = unscale * unscale * record[SUM_UV]
-            vv = unscale * unscale * record[SUM_VV]
-            w0, w1, w2 = lx * (a0 - slant * b0), lx * (a1 - slant * b1), lx * (a2 - slant * b2)
-            h0, h1, h2 = ly * b0, ly * b1, ly * b2
-            ga0, ga1, ga2 = lx * (uu * w0 + uv * h0), lx * (uu * w1 + uv * h1), lx * (uu * w2 + uv * h2)
-            gb0 = ly * (uv * w0 + vv * h0) - slant * ga0
-            gb1 = ly * (uv * w1 + vv * h1) - slant * ga1
-            gb2 = ly * (uv * w2 + vv * h2) - slant * ga2
-            grad_scales[i, 0] = ga0 * a0 + gb0 * b0
-            grad_scales[i, 1] = ga1 * a1 + gb1 * b1
-            grad_scales[i, 2] = ga2 * a2 + gb2 * b2
-            ga0, ga1, ga2, gb0, gb1, gb2 = ga0 * s0, ga1 * s1, ga2 * s2, gb0 * s0, gb1 * s1, gb2 * s2
+    grad_a, grad_b = _root_backward(a, b, slant, lx, ly, moments)
+    grad_log_scales = (
+        grad_a[0] * a[0] + grad_b[0] * b[0],
+        grad_a[1] * a[1] + grad_b[1] * b[1],
+        grad_a[2] * a[2] + grad_b[2] * b[2],
+    )
+    grad_a, grad_b = _times_scales(grad_a, scales), _times_scales(grad_b, scales)
+    grad_quaternion = _quaternion_backward(quaternion, projector, grad_a, grad_b)
+    grad_x, grad_y, grad_z = _projector_backward(view, x, y, z_inverse, rotation, projector, grad_a, grad_b)
+    grad_x = grad_x + view[12] * z_inverse * grad_mean_x
+    grad_y = grad_y + view[13] * z_inverse * grad_mean_y
+    grad_z = grad_z + _column(moments, GRAD_DEPTH) - z_inverse * (x * grad_x + y * grad_y)
+    grad_mean = (
+        view[0] * grad_x + view[3] * grad_y + view[6] * grad_z,
+        view[1] * grad_x + view[4] * grad_y + view[7] * grad_z,
+        view[2] * grad_x + view[5] * grad_y + view[8] * grad_z,
+    )
+    opacity_logit = widen(load_column(opacity_logits, 1, 0, row, last))
+    grad_logit = _column(moments, SUM_G) / (1.0 + exponential(opacity_logit))
+    return grad_mean, grad_quaternion, grad_log_scales, grad_logit, (grad_mean_x, grad_mean_y)
 
-            # rotation, then quaternion (tangential to the unit sphere, divided by the length; zero stays zero)
-            g00, g01, g02 = p0[0] * ga0 + p1[0] * gb0, p0[0] * ga1 + p1[0] * gb1, p0[0] * ga2 + p1[0] * gb2
-            g10, g11, g12 = p0[1] * ga0 + p1[1] * gb0, p0[1] * ga1 + p1[1] * gb1, p0[1] * ga2 + p1[1] * gb2
-            g20, g21, g22 = p0[2] * ga0 + p1[2] * gb0, p0[2] * ga1 + p1[2] * gb1, p0[2] * ga2 + p1[2] * gb2
-            gw = 2.0 * (qx * (g21 - g12) + qy * (g02 - g20) + qz * (g10 - g01))
-            gx = 2.0 * (qw * (g21 - g12) + qy * (g01 + g10) + qz * (g02 + g20)) - 4.0 * qx * (g11 + g22)
-            gy = 2.0 * (qw * (g02 - g20) + qx * (g01 + g10) + qz * (g12 + g21)) - 4.0 * qy * (g00 + g22)
-            gz = 2.0 * (qw * (g10 - g01) + qx * (g02 + g20) + qy * (g12 + g21)) - 4.0 * qz * (g00 + g11)
-            radial = gw * qw + gx * qx + gy * qy + gz * qz
-            grad_quaternions[i, 0] = (gw - radial * qw) * q_inverse
-            grad_quaternions[i, 1] = (gx - radial * qx) * q_inverse
-            grad_quaternions[i, 2] = (gy - radial * qy) * q_inverse
-            grad_quaternions[i, 3] = (gz - radial * qz) * q_inverse
 
-            # projector rows fx/z (R0 - slope_x R2) and fy/z (R1 - slope_y R2), then camera coordinates
-            gp00 = ga0 * r0[0] + ga1 * r0[1] + ga2 * r0[2]
-            gp01 = ga0 * r1[0] + ga1 * r1[1] + ga2 * r1[2]
-            gp02 = ga0 * r2[0] + ga1 * r2[1] + ga2 * r2[2]
-            gp10 = gb0 * r0[0] + gb1 * r0[1] + gb2 * r0[2]
-            gp11 = gb0 * r1[0] + gb1 * r1[1] + gb2 * r1[2]
-            gp12 = gb0 * r2[0] + gb1 * r2[1] + gb2 * r2[2]
-            z_inverse = 1.0 / z
-            fx, fy = view[12] * z_inverse, view[13] * z_inverse
-            g_slope_x = -fx * (gp00 * view[6] + gp01 * view[7] + gp02 * view[8])
-            g_slope_y = -fy * (gp10 * view[6] + gp11 * view[7] + gp12 * view[8])
-            free_x = view[16] <= x * z_inverse <= view[17]
-            free_y = view[18] <= y * z_inverse <= view[19]
-            g_x = fx * g_mean_x + (g_slope_x * z_inverse if free_x else 0.0)
-            g_y = fy * g_mean_y + (g_slope_y * z_inverse if free_y else 0.0)
-            g_z = -z_inverse * (x * g_x + y * g_y) + record[GRAD_DEPTH]
-            g_z -= z_inverse * (gp00 * p0[0] + gp01 * p0[1] + gp02 * p0[2] + gp10 * p1[0] + gp11 * p1[1] + gp12 * p1[2])
-            grad_means[i, 0] = view[0] * g_x + view[3] * g_y + view[6] * g_z
-            grad_means[i, 1] = view[1] * g_x + view[4] * g_y + view[7] * g_z
-            grad_means[i, 2] = view[2] * g_x + view[5] * g_y + view[8] * g_z
+@inlined
+def _column(moments, column):
+    return widen(load(moments, column * LANES))
 
-            grad_opacities[i] = record[SUM_G] / (1.0 + math.exp(np.float64(opacity_logits[i])))
+
+@inlined
+def _root_backward(a, b, slant, lx, ly, moments):
+    """dLoss/d(root) = L M Lᵀ root, with L the whitening factor and M the second moments of (u, v)."""
+    uu = _UNSCALE * _UNSCALE * _column(moments, SUM_UU)
+    uv = _UNSCALE * _UNSCALE * _column(moments, SUM_UV)
+    vv = _UNSCALE * _UNSCALE * _column(moments, SUM_VV)
+    w0, w1, w2 = lx * (a[0] - slant * b[0]), lx * (a[1] - slant * b[1]), lx * (a[2] - slant * b[2])
+    h0, h1, h2 = ly * b[0], ly * b[1], ly * b[2]
+    ga0, ga1, ga2 = lx * (uu * w0 + uv * h0), lx * (uu * w1 + uv * h1), lx * (uu * w2 + uv * h2)
+    gb0 = ly * (uv * w0 + vv * h0) - slant * ga0
+    gb1 = ly * (uv * w1 + vv * h1) - slant * ga1
+    gb2 = ly * (uv * w2 + vv * h2) - slant * ga2
+    return (ga0, ga1, ga2), (gb0, gb1, gb2)
+
+
+@inlined
+def _quaternion_backward(quaternion, p, ga, gb):
+    """Through the rotation matrix; tangential to the unit sphere, divided by the length; zero stays zero.
+
+    Args:
+        p: the projector's rows; ga, gb: dLoss/d(root) diag(scales), its rows.
+    """
+    w, x, y, z, inverse = quaternion
+    p0, p1 = p
+    g00, g01, g02 = p0[0] * ga[0] + p1[0] * gb[0], p0[0] * ga[1] + p1[0] * gb[1], p0[0] * ga[2] + p1[0] * gb[2]
+    g10, g11, g12 = p0[1] * ga[0] + p1[1] * gb[0], p0[1] * ga[1] + p1[1] * gb[1], p0[1] * ga[2] + p1[1] * gb[2]
+    g20, g21, g22 = p0[2] * ga[0] + p1[2] * gb[0], p0[2] * ga[1] + p1[2] * gb[1], p0[2] * ga[2] + p1[2] * gb[2]
+    gw = 2.0 * (x * (g21 - g12) + y * (g02 - g20) + z * (g10 - g01))
+    gx = 2.0 * (w * (g21 - g12) + y * (g01 + g10) + z * (g02 + g20)) - 4.0 * x * (g11 + g22)
+    gy = 2.0 * (w * (g02 - g20) + x * (g01 + g10) + z * (g12 + g21)) - 4.0 * y * (g00 + g22)
+    gz = 2.0 * (w * (g10 - g01) + x * (g02 + g20) + y * (g12 + g21)) - 4.0 * z * (g00 + g11)
+    radial = gw * w + gx * x + gy * y + gz * z
+    return (
+        (gw - radial * w) * inverse,
+        (gx - radial * x) * inverse,
+        (gy - radial * y) * inverse,
+        (gz - radial * z) * inverse,
+    )
+
+
+@inlined
+def _projector_backward(view, x, y, z_inverse, r, p, ga, gb):
+    """Through the projector's rows fx/z (R0 - slope_x R2) and fy/z (R1 - slope_y R2) to camera coordinates.
+
+    What the slopes x/z and y/z owe to z is left to the caller, who has the same term for the 2D mean.
+    """
+    gp0 = _dot(ga, r[0]), _dot(ga, r[1]), _dot(ga, r[2])
+    gp1 = _dot(gb, r[0]), _dot(gb, r[1]), _dot(gb, r[2])
+    slope_x, slope_y = x * z_inverse, y * z_inverse
+    grad_slope_x = -view[12] * z_inverse * (gp0[0] * view[6] + gp0[1] * view[7] + gp0[2] * view[8])
+    grad_slope_y = -view[13] * z_inverse * (gp1[0] * view[6] + gp1[1] * view[7] + gp1[2] * view[8])
+    free_x = (slope_x >= view[16]) & (slope_x <= view[17])
+    free_y = (slope_y >= view[18]) & (slope_y <= view[19])
+    grad_x = select(free_x, grad_slope_x * z_inverse, 0.0)
+    grad_y = select(free_y, grad_slope_y * z_inverse, 0.0)
+    return grad_x, grad_y, 0.0 - z_inverse * (_dot(gp0, p[0]) + _dot(gp1, p[1]))

@@ -1,86 +1,121 @@
-"""Sixteen float32 lanes as one numba value, a thin layer over LLVM vectors.
+"""A few float32 or float64 lanes as one numba value, a thin layer over LLVM vectors.
 
 numba's loops are vectorised only when LLVM finds it safe and worthwhile, which it does not for blending. These few
-operations say it outright; the compiler turns them into AVX-512, AVX2 (two halves) or SSE (four quarters).
+operations say it outright; the compiler turns them into AVX-512, AVX2 or SSE instructions. There are LANES to a value:
+sixteen where the processor has AVX-512, else eight.
+
+Operators work lane by lane, a number on one side standing for as many copies; comparisons give masks.
 """
 
 from __future__ import annotations
 
+import math
 import operator
 
+import llvmlite.binding
 import numpy as np
 from llvmlite import ir
-from numba.core import types
+from numba import config
+from numba.core import cgutils, types
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
-LANES = 16
 
-_FLOATS = ir.VectorType(ir.FloatType(), LANES)
-_INTS = ir.VectorType(ir.IntType(32), LANES)
+def _has_avx512() -> bool:
+    """Whether numba will compile for AVX-512 (NUMBA_CPU_FEATURES overrules the processor)."""
+    if config.CPU_FEATURES is not None:
+        return "+avx512f" in config.CPU_FEATURES.split(",")
+    return llvmlite.binding.get_host_cpu_features().get("avx512f", False)
+
+
+LANES = 16 if _has_avx512() else 8
+
+FLOATS = ir.VectorType(ir.FloatType(), LANES)
+DOUBLES = ir.VectorType(ir.DoubleType(), LANES)
+INTS = ir.VectorType(ir.IntType(32), LANES)
+LONGS = ir.VectorType(ir.IntType(64), LANES)
 _BITS = ir.VectorType(ir.IntType(1), LANES)
+INT = ir.IntType(32)
 
 # Minimax polynomial of degree 5 for 2^f on [-0.5, 0.5]: relative error 7.5e-8, 2.1e-7 with float32 rounding.
 _EXP2 = (1.0000000717, 0.6931469671, 0.2402211972, 0.0555071327, 0.0096755413, 0.0013276472)
+_EXP2_DOUBLE = tuple(math.log(2) ** k / math.factorial(k) for k in range(13))  # series: 2e-16 on [-0.5, 0.5]
 
 
-class _Lanes(types.Type):
-    def __init__(self):
-        super().__init__("float32x16")
+class _Vector(types.Type):
+    """`lanes`, `wide` or `lane_mask`."""
 
 
-class _LaneMask(types.Type):
-    def __init__(self):
-        super().__init__("bool_x16")
+lanes, wide, lane_mask = _Vector(f"float32x{LANES}"), _Vector(f"float64x{LANES}"), _Vector(f"boolx{LANES}")
+_IR = {lanes: FLOATS, wide: DOUBLES, lane_mask: _BITS}
 
 
-lanes = _Lanes()
-lane_mask = _LaneMask()
-
-
-@register_model(_Lanes)
-class _LanesModel(models.PrimitiveModel):
+@register_model(_Vector)
+class _VectorModel(models.PrimitiveModel):
     def __init__(self, manager, kind):
-        super().__init__(manager, kind, _FLOATS)
+        super().__init__(manager, kind, _IR[kind])
 
 
-@register_model(_LaneMask)
-class _LaneMaskModel(models.PrimitiveModel):
-    def __init__(self, manager, kind):
-        super().__init__(manager, kind, _BITS)
-
-
-def _constant(value: float) -> ir.Constant:
-    return ir.Constant(_FLOATS, [float(np.float32(value))] * LANES)
+def _constant(kind: ir.VectorType, value: float) -> ir.Constant:
+    if kind.element == ir.FloatType():
+        value = float(np.float32(value))
+    return ir.Constant(kind, [value] * LANES)
 
 
 def _call(builder, name: str, *arguments):
-    """An LLVM intrinsic on whole vectors."""
-    kind = ir.FunctionType(_FLOATS, [_FLOATS] * len(arguments))
-    function = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
-    return builder.call(function, arguments)
+    """An LLVM intrinsic on whole vectors, all of one type."""
+    kind = arguments[0].type
+    name = f"llvm.{name}.v{LANES}f{32 if kind == FLOATS else 64}"
+    function_type = ir.FunctionType(kind, [kind] * len(arguments))
+    return builder.call(cgutils.get_or_insert_function(builder.module, function_type, name), arguments)
 
 
-def _binary(symbol, emit, left, right, result):
-    """Teach numba `left symbol right`."""
+def _fma(builder, x, y, z):
+    """Fused where the processor can."""
+    return _call(builder, "fmuladd", x, y, z)
+
+
+def copies(builder, kind: ir.VectorType, number):
+    one = builder.insert_element(ir.Constant(kind, ir.Undefined), number, INT(0))
+    return builder.shuffle_vector(one, ir.Constant(kind, ir.Undefined), ir.Constant(INTS, [0] * LANES))
+
+
+def _as_vector(context, builder, value, have, want):
+    """A vector as it is, a number copied to all lanes."""
+    if have == want:
+        return value
+    number = types.float32 if want == lanes else types.float64
+    return copies(builder, _IR[want], context.cast(builder, value, have, number))
+
+
+def _teach(symbol, emit, kind, result):
+    """Teach numba `left symbol right` on vectors of a kind, either of them a number perhaps."""
+    pairs = [(kind, kind)]
+    if kind != lane_mask:
+        pairs += [pair for number in (types.float32, types.float64) for pair in ((kind, number), (number, kind))]
 
     @infer_global(symbol)
     class _Typing(ConcreteTemplate):
-        cases = (signature(result, left, right),)
+        cases = tuple(signature(result, *pair) for pair in pairs)
 
-    @lower_builtin(symbol, left, right)
-    def _lower(context, builder, sig, args):
-        return emit(builder, *args)
+    for pair in pairs:
+
+        @lower_builtin(symbol, *pair)
+        def _lower(context, builder, sig, args):
+            both = (_as_vector(context, builder, value, have, kind) for value, have in zip(args, sig.args, strict=True))
+            return emit(builder, *both)
 
 
-_binary(operator.add, lambda b, x, y: b.fadd(x, y), lanes, lanes, lanes)
-_binary(operator.sub, lambda b, x, y: b.fsub(x, y), lanes, lanes, lanes)
-_binary(operator.mul, lambda b, x, y: b.fmul(x, y), lanes, lanes, lanes)
-_binary(operator.truediv, lambda b, x, y: b.fdiv(x, y), lanes, lanes, lanes)
-_binary(operator.lt, lambda b, x, y: b.fcmp_ordered("<", x, y), lanes, lanes, lane_mask)
-_binary(operator.gt, lambda b, x, y: b.fcmp_ordered(">", x, y), lanes, lanes, lane_mask)
-_binary(operator.ge, lambda b, x, y: b.fcmp_ordered(">=", x, y), lanes, lanes, lane_mask)
-_binary(operator.and_, lambda b, x, y: b.and_(x, y), lane_mask, lane_mask, lane_mask)
+for _kind in (lanes, wide):
+    _teach(operator.add, lambda b, x, y: b.fadd(x, y), _kind, _kind)
+    _teach(operator.sub, lambda b, x, y: b.fsub(x, y), _kind, _kind)
+    _teach(operator.mul, lambda b, x, y: b.fmul(x, y), _kind, _kind)
+    _teach(operator.truediv, lambda b, x, y: b.fdiv(x, y), _kind, _kind)
+    _teach(operator.lt, lambda b, x, y: b.fcmp_ordered("<", x, y), _kind, lane_mask)
+    _teach(operator.gt, lambda b, x, y: b.fcmp_ordered(">", x, y), _kind, lane_mask)
+    _teach(operator.le, lambda b, x, y: b.fcmp_ordered("<=", x, y), _kind, lane_mask)
+    _teach(operator.ge, lambda b, x, y: b.fcmp_ordered(">=", x, y), _kind, lane_mask)
+_teach(operator.and_, lambda b, x, y: b.and_(x, y), lane_mask, lane_mask)
 
 
 @intrinsic
@@ -88,124 +123,105 @@ def splat(typing, value):
     """The same float32 in every lane."""
 
     def emit(context, builder, sig, args):
-        value = context.cast(builder, args[0], sig.args[0], types.float32)
-        one = builder.insert_element(ir.Constant(_FLOATS, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
-        return builder.shuffle_vector(one, ir.Constant(_FLOATS, ir.Undefined), ir.Constant(_INTS, [0] * LANES))
+        return _as_vector(context, builder, args[0], sig.args[0], lanes)
 
     return lanes(value), emit
 
 
 @intrinsic
-def pack(typing, values):
-    """Sixteen float32 of a tuple, one to a lane."""
-
-    def emit(context, builder, sig, args):
-        packed = ir.Constant(_FLOATS, ir.Undefined)
-        for i in range(LANES):
-            packed = builder.insert_element(packed, builder.extract_value(args[0], i), ir.Constant(ir.IntType(32), i))
-        return packed
-
-    return lanes(values), emit
-
-
-@intrinsic
 def ramp(typing):
-    """0, 1, ... 15."""
+    """0, 1, ... LANES - 1."""
 
     def emit(context, builder, sig, args):
-        return ir.Constant(_FLOATS, [float(i) for i in range(LANES)])
+        return ir.Constant(FLOATS, [float(i) for i in range(LANES)])
 
     return lanes(), emit
 
 
-def _pointer(context, builder, sig, args):
-    """Address of element args[1] of a contiguous one-dimensional float32 array."""
-    data = context.make_array(sig.args[0])(context, builder, args[0]).data
-    place = context.cast(builder, args[1], sig.args[1], types.intp)
-    return builder.bitcast(builder.gep(data, [place]), _FLOATS.as_pointer())
-
-
-@intrinsic
-def load(typing, array, place):
-    """Sixteen consecutive elements of a contiguous one-dimensional float32 array (no bounds check)."""
-
-    def emit(context, builder, sig, args):
-        return builder.load(_pointer(context, builder, sig, args), align=4)
-
-    return lanes(array, place), emit
-
-
-@intrinsic
-def store(typing, array, place, value):
-    """Write sixteen consecutive elements."""
-
-    def emit(context, builder, sig, args):
-        builder.store(args[2], _pointer(context, builder, sig, args), align=4)
-        return context.get_dummy_value()
-
-    return types.void(array, place, value), emit
-
-
-@intrinsic
-def prefetch(typing, array, place):
-    """Ask for the cache line of an element that will be needed soon (any place will do, it is only a hint)."""
-
-    def emit(context, builder, sig, args):
-        pointer = builder.bitcast(_pointer(context, builder, sig, args), ir.IntType(8).as_pointer())
-        number = ir.IntType(32)
-        kind = ir.FunctionType(ir.VoidType(), [pointer.type, number, number, number])
-        name = "llvm.prefetch.p0i8"
-        function = builder.module.globals.get(name) or ir.Function(builder.module, kind, name)
-        builder.call(function, [pointer, number(0), number(3), number(1)])
-        return context.get_dummy_value()
-
-    return types.void(array, place), emit
-
-
 @intrinsic
 def fma(typing, x, y, z):
-    """x y + z, rounded once."""
+    """x y + z, rounded once where the processor can."""
 
     def emit(context, builder, sig, args):
-        return _call(builder, "llvm.fma.v16f32", *args)
+        return _fma(builder, *args)
 
-    return lanes(x, y, z), emit
+    return x(x, y, z), emit
 
 
 @intrinsic
 def fnma(typing, x, y, z):
-    """z - x y, rounded once."""
+    """z - x y, rounded once where the processor can."""
 
     def emit(context, builder, sig, args):
-        return _call(builder, "llvm.fma.v16f32", builder.fneg(args[0]), args[1], args[2])
+        return _fma(builder, builder.fneg(args[0]), args[1], args[2])
 
-    return lanes(x, y, z), emit
+    return x(x, y, z), emit
 
 
 @intrinsic
 def minimum(typing, x, y):
-    def emit(context, builder, sig, args):
-        return builder.select(builder.fcmp_ordered("<", *args), *args)
+    """The smaller; y where x is not a number."""
 
-    return lanes(x, y), emit
+    def emit(context, builder, sig, args):
+        both = [_as_vector(context, builder, value, have, x) for value, have in zip(args, sig.args, strict=True)]
+        return builder.select(builder.fcmp_ordered("<", *both), *both)
+
+    return x(x, y), emit
 
 
 @intrinsic
-def negative(typing, x):
-    def emit(context, builder, sig, args):
-        return builder.fneg(args[0])
+def maximum(typing, x, y):
+    """The larger; y where x is not a number."""
 
-    return lanes(x), emit
+    def emit(context, builder, sig, args):
+        both = [_as_vector(context, builder, value, have, x) for value, have in zip(args, sig.args, strict=True)]
+        return builder.select(builder.fcmp_ordered(">", *both), *both)
+
+    return x(x, y), emit
+
+
+@intrinsic
+def minus_abs(typing, x):
+    """-|x|."""
+
+    def emit(context, builder, sig, args):
+        return builder.fneg(_call(builder, "fabs", args[0]))
+
+    return x(x), emit
+
+
+@intrinsic
+def root(typing, x):
+    """Square root."""
+
+    def emit(context, builder, sig, args):
+        return _call(builder, "sqrt", args[0])
+
+    return x(x), emit
+
+
+@intrinsic
+def ceiling(typing, x):
+    """The next whole number."""
+
+    def emit(context, builder, sig, args):
+        return _call(builder, "ceil", args[0])
+
+    return x(x), emit
 
 
 @intrinsic
 def select(typing, mask, x, y):
-    """x where the mask is set, else y."""
+    """x where the mask is set, else y; one of them may be a number."""
+    kind = x if isinstance(x, _Vector) else y
 
     def emit(context, builder, sig, args):
-        return builder.select(*args)
+        x, y = (
+            _as_vector(context, builder, value, have, kind) for value, have in zip(args[1:], sig.args[1:], strict=True)
+        )
+        return builder.select(args[0], x, y)
 
-    return lanes(mask, x, y), emit
+    return kind(mask, x, y), emit
 
 
 @intrinsic
@@ -220,118 +236,68 @@ def some(typing, mask):
 
 
 @intrinsic
-def exp2(typing, x):
-    """2^x for x in [-126, 127], relative error below 2e-7; anything (not a trap) outside."""
+def widen(typing, x):
+    """float32 lanes as float64."""
 
     def emit(context, builder, sig, args):
-        whole = _call(builder, "llvm.rint.v16f32", args[0])
-        part = builder.fsub(args[0], whole)
-        value = _constant(_EXP2[-1])
-        for coefficient in _EXP2[-2::-1]:
-            value = _call(builder, "llvm.fma.v16f32", value, part, _constant(coefficient))
-        exponent = builder.shl(builder.fptosi(whole, _INTS), ir.Constant(_INTS, [23] * LANES))
-        return builder.bitcast(builder.add(builder.bitcast(value, _INTS), exponent), _FLOATS)
+        return builder.fpext(args[0], DOUBLES)
+
+    return wide(x), emit
+
+
+@intrinsic
+def narrow(typing, x):
+    """float64 lanes rounded to float32."""
+
+    def emit(context, builder, sig, args):
+        return builder.fptrunc(args[0], FLOATS)
 
     return lanes(x), emit
 
 
-@intrinsic
-def total(typing, x):
-    """Sum over the lanes, pairwise."""
-
-    def emit(context, builder, sig, args):
-        value = args[0]
-        for step in (8, 4, 2, 1):
-            turned = [(i + step) % LANES for i in range(LANES)]
-            value = builder.fadd(value, builder.shuffle_vector(value, value, ir.Constant(_INTS, turned)))
-        return builder.extract_element(value, ir.Constant(ir.IntType(32), 0))
-
-    return types.float32(x), emit
-
-
-@intrinsic
-def totals(typing, vectors):
-    """Sums over the lanes of up to sixteen vectors, given as a tuple: lane k of the result is the sum of vector k."""
-
-    def emit(context, builder, sig, args):
-        rows = [builder.extract_value(args[0], i) for i in range(len(sig.args[0]))]
-        rows += [ir.Constant(_FLOATS, [0.0] * LANES)] * (LANES - len(rows))
-        rows = [rows[int(f"{i:04b}"[::-1], 2)] for i in range(LANES)]  # folding leaves them in bit-reversed order
-        # Fold halves: each round puts two vectors side by side, with half as many partial sums of each.
-        width = LANES
-        while width > 1:
-            half, pairs = width // 2, len(rows) // 2
-            low = [i for block in range(0, LANES, width) for i in range(block, block + half)]
-            keep = [*low, *(LANES + i for i in low)]
-            fold = [i + half for i in keep]
-            rows = [
-                builder.fadd(
-                    builder.shuffle_vector(rows[k], rows[k + pairs], ir.Constant(_INTS, keep)),
-                    builder.shuffle_vector(rows[k], rows[k + pairs], ir.Constant(_INTS, fold)),
-                )
-                for k in range(pairs)
-            ]
-            width = half
-        return rows[0]
-
-    return lanes(vectors), emit
-
-
-_TRIPLE = types.UniTuple(lanes, 3)
-
-
-def _place_of(source: int) -> ir.Constant:
-    return ir.Constant(ir.IntType(32), source)
+def _exp2(builder, x):
+    """2^x by a polynomial in what is left of x after rounding; adding 1.5 2^p rounds, its low bits are the integer."""
+    single = x.type == FLOATS
+    whole_type, shift, series = (INTS, 23, _EXP2) if single else (LONGS, 52, _EXP2_DOUBLE)
+    magic = _constant(x.type, 1.5 * 2.0**shift)
+    shifted = builder.fadd(x, magic)
+    part = builder.fsub(x, builder.fsub(shifted, magic))
+    value = _constant(x.type, series[-1])
+    for coefficient in series[-2::-1]:
+        value = _fma(builder, value, part, _constant(x.type, coefficient))
+    exponent = builder.shl(builder.bitcast(shifted, whole_type), ir.Constant(whole_type, [shift] * LANES))
+    return builder.bitcast(builder.add(builder.bitcast(value, whole_type), exponent), x.type)
 
 
 @intrinsic
-def thrice(typing, x):
-    """Three vectors that hold each lane three times in a row: 0 0 0 1 1 1 ... 15 15 15."""
+def exp2(typing, x):
+    """2^x for x in [-126, 127], relative error below 2e-7; anything (not a trap) outside."""
 
     def emit(context, builder, sig, args):
-        parts = [
-            builder.shuffle_vector(args[0], args[0], ir.Constant(_INTS, [(16 * q + i) // 3 for i in range(LANES)]))
-            for q in range(3)
-        ]
-        return context.make_tuple(builder, _TRIPLE, parts)
+        return _exp2(builder, args[0])
 
-    return _TRIPLE(x), emit
+    return x(x), emit
 
 
 @intrinsic
-def striped(typing, red, green, blue):
-    """Three vectors red green blue red green blue ..., 48 lanes in all."""
+def log2(typing, x):
+    """log2 of positive normal float64 lanes; anything (not a trap) elsewhere."""
 
     def emit(context, builder, sig, args):
-        colors = ir.Constant(_FLOATS, ir.Undefined)
-        for c in range(3):
-            colors = builder.insert_element(
-                colors, context.cast(builder, args[c], sig.args[c], types.float32), _place_of(c)
-            )
-        parts = [
-            builder.shuffle_vector(colors, colors, ir.Constant(_INTS, [(16 * q + i) % 3 for i in range(LANES)]))
-            for q in range(3)
-        ]
-        return context.make_tuple(builder, _TRIPLE, parts)
+        number = lambda value: ir.Constant(LONGS, [int(np.float64(value).view(np.int64))] * LANES)
+        bits = builder.bitcast(args[0], LONGS)
+        # x = 2^e m with m between sqrt(1/2) and sqrt(2); ln m = 2 artanh s, s = (m - 1) / (m + 1)
+        e = builder.ashr(builder.sub(bits, number(math.sqrt(0.5))), ir.Constant(LONGS, [52] * LANES))
+        m = builder.bitcast(builder.sub(bits, builder.shl(e, ir.Constant(LONGS, [52] * LANES))), DOUBLES)
+        one, magic = _constant(DOUBLES, 1.0), 1.5 * 2.0**52
+        s = builder.fdiv(builder.fsub(m, one), builder.fadd(m, one))
+        square, value = builder.fmul(s, s), _constant(DOUBLES, 0.0)
+        for power in range(19, 0, -2):
+            value = _fma(builder, value, square, _constant(DOUBLES, 2.0 / math.log(2) / power))
+        whole = builder.fsub(builder.bitcast(builder.add(e, number(magic)), DOUBLES), _constant(DOUBLES, magic))
+        return _fma(builder, value, s, whole)
 
-    return _TRIPLE(red, green, blue), emit
-
-
-@intrinsic
-def triple_sums(typing, x, y, z):
-    """Of 48 lanes x y z, the sums of each three in a row."""
-
-    def emit(context, builder, sig, args):
-        value = None
-        for offset in range(3):
-            wanted = [3 * lane + offset for lane in range(LANES)]
-            low = builder.shuffle_vector(args[0], args[1], ir.Constant(_INTS, [min(w, 31) for w in wanted]))
-            mixed = [lane if w < 32 else LANES + w - 32 for lane, w in enumerate(wanted)]
-            part = builder.shuffle_vector(low, args[2], ir.Constant(_INTS, mixed))
-            value = part if value is None else builder.fadd(value, part)
-        return value
-
-    return lanes(x, y, z), emit
+    return wide(x), emit
 
 
 @intrinsic

@@ -1,0 +1,210 @@
+"""How fast the CPU splatting is: `python benchmarks/splat.py [--sizes 100000@512x384 ...] [--repeats 9] [--threads 2]`.
+
+A step is one rendering (colour, depth, alpha) and its backward pass. Times are medians of one thread's CPU time, all
+sizes taken in turn; thread scaling is wall clock. Columns:
+
+  pairs      pixel-Gaussian pairs that blend, millions, by the oracle's rule
+  lanes      pixel-Gaussian slots that the kernel visits, millions
+  fwd, bwd   milliseconds
+  step/aim   step over the aim: 0.28 us a Gaussian + 4.2 ns a pair + 8 ns a pixel, stated for a core with a measured
+             peak of 214 GF/s
+  scaled     the same with the aim's times multiplied by 214 / (peak measured in this run)
+  Glane/s    visited lanes over the pass's time, forward and backward
+  FMA share  operations that any renderer must do, over the peak: 31 a pair forward, 49 backward (an fma is two;
+             what is done once per Gaussian or pixel is not counted)
+  threads    wall time of one thread over that of --threads
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import re
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numba
+import numpy as np
+import torch
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from reffusion import splat
+from reffusion.splat import cpu, forward
+from reffusion.splat import vectors as v
+from reffusion.splat.layout import ROWS
+from reffusion.types import PARAMETERS, Camera, Gaussians
+
+SIZES = ("5000@256x192", "20000@320x240", "100000@512x384", "100000@1008x756", "500000@1008x756")
+PER_GAUSSIAN, PER_PAIR, PER_PIXEL, PEAK = 0.28e-6, 4.2e-9, 8e-9, 214.0  # the aim: seconds, and GF/s of its machine
+FORWARD_OPERATIONS = 2 + 4 + 13 + 3 + 9  # u; log2 alpha; exp2; weight and transmittance; colour, depth, alpha
+BACKWARD_OPERATIONS = 2 + 4 + 13 + 3 + 7 + 8 + 2 + 5 + 5  # the same; shade; colours; remainder; g; its moments
+LAYERS = 35  # about so many Gaussians over each pixel, the hidden ones too
+
+
+@dataclass
+class Case:
+    """One scene and view, and what was measured on it (milliseconds)."""
+
+    gaussians: Gaussians
+    camera: Camera
+    pairs: int
+    lanes: int
+    forward: list[float]
+    backward: list[float]
+
+    @property
+    def aim(self) -> float:
+        """Milliseconds a step."""
+        pixels = self.camera.width * self.camera.height
+        return 1e3 * (PER_GAUSSIAN * len(self.gaussians) + PER_PAIR * self.pairs + PER_PIXEL * pixels)
+
+
+def scene(count: int, camera: Camera, seed: int = 0) -> Gaussians:
+    """Gaussians all over a view's frustum, of sizes that give every pixel about LAYERS of them; SH degree 3."""
+    generator = torch.Generator().manual_seed(seed)
+    uniform = lambda *shape: torch.rand(*shape, generator=generator)
+    normal = lambda *shape: torch.randn(*shape, generator=generator)
+    depth = 1.5 + 5 * uniform(count)
+    place = (1.1 * uniform(count, 2) - 0.55) * torch.tensor([camera.width, camera.height])
+    sigma = 0.8 * math.sqrt(camera.width * camera.height / count * LAYERS / 25)  # pixels
+    return Gaussians(
+        means=torch.cat((place * depth[:, None] / camera.fx, depth[:, None]), 1),
+        quaternions=normal(count, 4),
+        log_scales=torch.log(sigma * depth / camera.fx)[:, None] - 0.1 + 0.5 * normal(count, 3),
+        opacity_logits=1.5 * normal(count) - 1,
+        sh=torch.cat((0.5 * normal(count, 1, 3), 0.1 * normal(count, 15, 3)), 1),
+    )
+
+
+def prepare(size: str) -> Case:
+    """From '100000@512x384'."""
+    match = re.fullmatch(r"(\d+)@(\d+)x(\d+)", size)
+    if not match:
+        raise ValueError(f"size {size!r}: write it like {SIZES[0]}")
+    count, width, height = map(int, match.groups())
+    camera = Camera("bench", width, height, 1.1 * width, 1.1 * width, width / 2, height / 2, np.eye(4))
+    gaussians = scene(count, camera)
+    pairs = splat.accumulate(gaussians, camera, torch.ones(height, width, 1), count=True).sum().item()
+    return Case(gaussians, camera, round(pairs), visited_lanes(gaussians, camera), [], [])
+
+
+def visited_lanes(gaussians: Gaussians, camera: Camera) -> int:
+    """Slots of the tile lists, as far as they are used."""
+    parameters = [getattr(gaussians, name).numpy() for name in PARAMETERS]
+    view = cpu.look(parameters, np.empty((0, 2), np.float32), camera, 0)
+    nothing, black = np.empty((len(gaussians), 0), np.float32), np.zeros(3, np.float32)
+    used = forward.blend(view.footprints, nothing, black, view.bins, camera.width, camera.height)[-1]
+    rows = view.bins.entries[:, ROWS]
+    rows = np.append(0, np.cumsum((rows >> 8) - (rows & 255)))
+    starts = view.bins.starts[:-1]
+    return 8 * int((rows[starts + used] - rows[starts]).sum())
+
+
+def step(case: Case, clock) -> tuple[float, float]:
+    """Milliseconds of one forward and one backward pass."""
+    leaves = case.gaussians.map(lambda tensor: tensor.detach().requires_grad_())
+    start = clock()
+    drawn = splat.render(leaves, case.camera)
+    middle = clock()
+    images = drawn.color, drawn.depth, drawn.alpha
+    torch.autograd.grad(images, [getattr(leaves, n) for n in PARAMETERS], [torch.ones_like(i) for i in images])
+    return 1e3 * (middle - start), 1e3 * (clock() - middle)
+
+
+@numba.njit(nogil=True)
+def _fma_chains(rounds):
+    """Ten chains of multiply-adds that do not wait for one another."""
+    x, y = v.splat(0.999), v.splat(0.001)
+    a, b, c, d, e = v.ramp(), v.ramp() * 2.0, v.ramp() * 3.0, v.ramp() * 4.0, v.ramp() * 5.0
+    f, g, h, i, j = v.ramp() * 6.0, v.ramp() * 7.0, v.ramp() * 8.0, v.ramp() * 9.0, v.ramp() * 10.0
+    for _ in range(rounds):
+        a, b, c, d, e = v.fma(a, x, y), v.fma(b, x, y), v.fma(c, x, y), v.fma(d, x, y), v.fma(e, x, y)
+        f, g, h, i, j = v.fma(f, x, y), v.fma(g, x, y), v.fma(h, x, y), v.fma(i, x, y), v.fma(j, x, y)
+    return v.some(a + b + c + d + e + f + g + h + i + j > v.splat(0.0))
+
+
+def fma_peak(rounds: int = 3_000_000, tries: int = 10) -> float:
+    """GF/s of one core, the best of a few tries."""
+    _fma_chains(1)
+    seconds = []
+    for _ in range(tries):
+        start = time.thread_time()
+        _fma_chains(rounds)
+        seconds.append(time.thread_time() - start)
+    return 2 * 10 * v.LANES * rounds / min(seconds) / 1e9
+
+
+def first_image() -> float:
+    """CPU seconds from starting Python to the first small image, kernels in the cache."""
+    code = (
+        "import sys; sys.path.insert(0, 'benchmarks'); import splat as b; import numpy as np; "
+        "view = b.Camera('v', 64, 48, 70.0, 70.0, 32.0, 24.0, np.eye(4)); b.splat.render(b.scene(100, view), view)"
+    )
+    run = lambda: subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[1])
+    run()
+    before = os.times()
+    run()
+    after = os.times()
+    return after.children_user + after.children_system - before.children_user - before.children_system
+
+
+def scaling(case: Case, threads: int, repeats: int) -> float:
+    """Wall time of one thread over that of several."""
+    times: dict[int, list[float]] = {1: [], threads: []}
+    for _ in range(repeats):
+        for count, series in times.items():
+            torch.set_num_threads(count)
+            series.append(sum(step(case, time.perf_counter)))
+    torch.set_num_threads(1)
+    return float(np.median(times[1]) / np.median(times[threads]))
+
+
+def report(case: Case, peak: float, speedup: float | None) -> str:
+    """One row of the table."""
+    fwd, bwd = float(np.median(case.forward)), float(np.median(case.backward))
+    size = f"{len(case.gaussians)}@{case.camera.width}x{case.camera.height}"
+    ratio = (fwd + bwd) / case.aim
+    share = [1e-6 * n * case.pairs / (ms * peak) for n, ms in ((FORWARD_OPERATIONS, fwd), (BACKWARD_OPERATIONS, bwd))]
+    return (
+        f"{size:>16} {case.pairs / 1e6:7.2f} {case.lanes / 1e6:7.2f} {fwd:8.1f} {bwd:8.1f} {ratio:9.2f} "
+        f"{ratio * peak / PEAK:7.2f} {1e-6 * case.lanes / fwd:8.2f} {1e-6 * case.lanes / bwd:5.2f} "
+        f"{share[0]:8.1%} {share[1]:6.1%} {'' if speedup is None else f'{speedup:8.2f}'}"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sizes", nargs="+", default=SIZES, help="Gaussians@WIDTHxHEIGHT")
+    parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--threads", type=int, default=2, help="compared with one; 1 leaves it out")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    try:
+        cases = [prepare(size) for size in options.sizes]
+    except ValueError as error:
+        sys.exit(f"error: {error}")
+    for case in cases:
+        step(case, time.thread_time)  # compiles, touches memory
+    peak = fma_peak()
+    for _ in range(options.repeats):
+        for case in cases:
+            step(case, time.thread_time)  # caches and memory as in a fit, where one step follows another
+            for series, ms in zip((case.forward, case.backward), step(case, time.thread_time), strict=True):
+                series.append(ms)
+    peak = max(peak, fma_peak())
+    print(f"FMA peak of one core {peak:.0f} GF/s; {v.LANES} lanes to a vector; ", end="")
+    print(f"from import to first image {first_image():.2f} s of CPU")
+    print(f"{'size':>16} {'pairs':>7} {'lanes':>7} {'fwd':>8} {'bwd':>8} {'step/aim':>9} {'scaled':>7} ", end="")
+    print(f"{'Glane/s':>14} {'FMA share':>15} {'threads':>8}")
+    for case in cases:
+        speedup = scaling(case, options.threads, options.repeats) if options.threads > 1 else None
+        print(report(case, peak, speedup), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,277 @@
+"""What is done once per Gaussian: footprints and colours, and from the sums over pixels back to the parameters."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from reffusion.splat import harmonics, projection
+from reffusion.splat.binning import ellipse
+from reffusion.splat.compiled import inlined, kernel
+from reffusion.splat.layout import (
+    BLUE,
+    CHUNKS,
+    COLUMN,
+    DEPTH,
+    FOOTPRINT,
+    GRAD_BLUE,
+    GRAD_FEATURES,
+    GRAD_GREEN,
+    GRAD_RED,
+    GREEN,
+    HALF_HEIGHT,
+    HALF_WIDTH,
+    INVERSE,
+    LEVEL,
+    MEAN_X,
+    MEAN_Y,
+    PEAK,
+    RED,
+    SLANT,
+    TILT,
+    WHITEN_X,
+    WHITEN_Y,
+)
+from reffusion.splat.memory import (
+    load,
+    load_column,
+    load_columns,
+    load_mask,
+    store,
+    store_column,
+    store_columns,
+    store_whole,
+)
+from reffusion.splat.vectors import LANES, maximum, minimum, narrow, select, some, splat, take_ticket, widen
+
+
+def padded(count: int) -> int:
+    """Rows of an array that kernels write LANES rows at a time."""
+    return -(-count // LANES) * LANES
+
+
+@kernel
+def next_part(tickets, count):
+    """Borders of the next of CHUNKS parts of range(count), or (-1, -1) when all are drawn."""
+    ticket = take_ticket(tickets)
+    if ticket >= CHUNKS:
+        return -1, -1
+    return ticket * count // CHUNKS, (ticket + 1) * count // CHUNKS
+
+
+@kernel
+def draw(
+    tickets, means, quaternions, log_scales, opacity_logits, sh, width, degree, probe, view, center, footprints, radii
+):
+    """Footprints of all Gaussians.
+
+    Args:
+        means, ..., sh: the parameters, flat; width: of a row of sh.
+        probe: added to the 2D means, flat, or empty.
+        view: see `projection.view_numbers`; center: the camera's.
+        footprints: [padded(N), FOOTPRINT] float32 flat, written for groups with a Gaussian that reaches the image.
+        radii: [padded(N)] int32 zeros, written for the same.
+    """
+    basis, drawn = np.zeros(16 * LANES, np.float32), np.zeros(FOOTPRINT * LANES, np.float32)
+    coefficients = np.zeros(width * LANES, np.float32)
+    last = opacity_logits.shape[0] - 1
+    while True:
+        begin, end = next_part(tickets, radii.shape[0] // LANES)
+        if begin < 0:
+            return
+        for row in range(begin * LANES, end * LANES, LANES):
+            mean = projection.three_columns(means, row, last)
+            kept, mean_x, mean_y, slant, whiten_x, whiten_y, level, z, reach_x, reach_y = projection.project(
+                view, mean, quaternions, log_scales, opacity_logits, row, last
+            )
+            if probe.shape[0] > 0:
+                mean_x = mean_x + widen(load_column(probe, 2, 0, row, last))
+                mean_y = mean_y + widen(load_column(probe, 2, 1, row, last))
+            kept = kept & projection.in_image(view, mean_x, mean_y, reach_x, reach_y)
+            if not some(kept):
+                continue
+            radius = minimum(maximum(maximum(reach_x, reach_y), 1.0), 1073741824.0)
+            store_whole(radii, row, select(kept, radius, 0.0))
+            dx, dy, dz, _ = harmonics.direction(mean, center)
+            harmonics.fill_basis(degree, dx, dy, dz, basis)
+            _read_rows(sh, width, row, last, coefficients)
+            red, green, blue = harmonics.colors(degree, basis, coefficients)
+            shape = narrow(slant), narrow(whiten_x), narrow(whiten_y), narrow(level)
+            half_width, half_height, tilt, column, inverse, peak = ellipse(shape[0], shape[1], shape[2], shape[3])
+            store(drawn, MEAN_X * LANES, narrow(mean_x))
+            store(drawn, MEAN_Y * LANES, narrow(mean_y))
+            store(drawn, SLANT * LANES, shape[0])
+            store(drawn, WHITEN_X * LANES, shape[1])
+            store(drawn, WHITEN_Y * LANES, shape[2])
+            store(drawn, LEVEL * LANES, shape[3])
+            store(drawn, DEPTH * LANES, narrow(z))
+            store(drawn, HALF_WIDTH * LANES, half_width)
+            store(drawn, HALF_HEIGHT * LANES, half_height)
+            store(drawn, TILT * LANES, tilt)
+            store(drawn, COLUMN * LANES, column)
+            store(drawn, INVERSE * LANES, inverse)
+            store(drawn, PEAK * LANES, peak)
+            store(drawn, RED * LANES, red)
+            store(drawn, GREEN * LANES, green)
+            store(drawn, BLUE * LANES, blue)
+            _write_rows(footprints, FOOTPRINT, row, drawn)
+
+
+@kernel
+def _read_rows(array, width, row, last, columns):
+    """Copy LANES rows of an array [R, width] (flat) into `columns`, LANES values to a column; `last`: of its rows."""
+    if width < LANES:
+        for column in range(width):
+            store(columns, column * LANES, load_column(array, width, column, row, last))
+        return
+    for start in range(0, width, LANES):
+        column = min(start, width - LANES)
+        load_columns(array, width, column, row, last, columns, column * LANES)
+
+
+@kernel
+def _write_rows(array, width, row, columns):
+    """The way back; the array has these rows."""
+    if width < LANES:
+        for column in range(width):
+            store_column(array, width, column, row, load(columns, column * LANES))
+        return
+    for start in range(0, width, LANES):
+        column = min(start, width - LANES)
+        store_columns(array, width, column, row, columns, column * LANES)
+
+
+@kernel
+def add_records(records, written, first_slots, columns, row, sums):
+    """Add up the records of LANES Gaussians into sums [LANES, columns], in their order."""
+    for lane in range(LANES):
+        begin, end = 0, 0
+        if row + lane < first_slots.shape[0] - 1:
+            begin, end = first_slots[row + lane], first_slots[row + lane + 1]
+        for part in range(0, columns, 16):  # a cache line, in two vectors or (twice the same) one
+            other = part + 16 - LANES
+            value = other_value = splat(0.0)
+            for slot in range(begin, end):
+                if written[slot]:
+                    value = value + load(records, slot * columns + part)
+                    other_value = other_value + load(records, slot * columns + other)
+            store(sums, lane * columns + part, value)
+            store(sums, lane * columns + other, other_value)
+
+
+@kernel
+def add_all_records(tickets, records, written, first_slots, gathered):
+    """Write the sums of the first columns of all Gaussians' records into gathered [padded(N), C]."""
+    columns, channels = records.shape[1], gathered.shape[1]
+    sums, flat = np.empty(LANES * columns, np.float32), records.reshape(-1)
+    while True:
+        begin, end = next_part(tickets, gathered.shape[0] // LANES)
+        if begin < 0:
+            return
+        for row in range(begin * LANES, end * LANES, LANES):
+            add_records(flat, written, first_slots, columns, row, sums)
+            for lane in range(LANES):
+                for c in range(channels):
+                    gathered[row + lane, c] = sums[lane * columns + c]
+
+
+@kernel
+def draw_backward(
+    tickets,
+    records,
+    written,
+    first_slots,
+    columns,
+    radii,
+    footprints,
+    means,
+    quaternions,
+    log_scales,
+    opacity_logits,
+    sh,
+    width,
+    degree,
+    view,
+    center,
+    grad_means,
+    grad_quaternions,
+    grad_scales,
+    grad_opacities,
+    grad_sh,
+    grad_features,
+    grad_probe,
+):
+    """From the records of each footprint to the gradients of all parameters.
+
+    Args:
+        records, written, first_slots: see `backward.blend_backward`; columns: of a record.
+        radii, footprints: as `draw` left them.
+        means, ..., sh: the parameters, flat.
+        grad_means, ...: [padded(N), columns] flat, written; grad_features [padded(N), C] not flat; grad_probe may be
+            empty.
+    """
+    basis, along = np.zeros(16 * LANES, np.float32), np.zeros(16 * LANES, np.float32)
+    coefficients, used = np.zeros(width * LANES, np.float32), 3 * (degree + 1) * (degree + 1)
+    sums, moments = np.zeros(LANES * columns, np.float32), np.zeros(columns * LANES, np.float32)
+    last, zero = opacity_logits.shape[0] - 1, splat(0.0)
+    while True:
+        begin, end = next_part(tickets, radii.shape[0] // LANES)
+        if begin < 0:
+            return
+        for row in range(begin * LANES, end * LANES, LANES):
+            add_records(records, written, first_slots, columns, row, sums)
+            seen = load_mask(radii, row)
+            for lane in range(LANES):
+                for c in range(grad_features.shape[1]):
+                    grad_features[row + lane, c] = sums[lane * columns + GRAD_FEATURES + c]
+            if not some(seen):
+                _store_zeros(grad_probe, 2 if grad_probe.shape[0] > 0 else 0, row)
+                _store_zeros(grad_means, 3, row)
+                _store_zeros(grad_quaternions, 4, row)
+                _store_zeros(grad_scales, 3, row)
+                _store_zeros(grad_opacities, 1, row)
+                _store_zeros(grad_sh, width, row)
+                continue
+            mean = projection.three_columns(means, row, last)
+            x, y, z, inverse = harmonics.direction(mean, center)
+            x, y, z = select(seen, x, zero), select(seen, y, zero), select(seen, z, zero)
+            harmonics.fill_basis(degree, x, y, z, basis)
+            _read_rows(sums, columns, 0, LANES - 1, moments)
+            red = _color_gradient(moments, GRAD_RED, footprints, RED, seen, row)
+            green = _color_gradient(moments, GRAD_GREEN, footprints, GREEN, seen, row)
+            blue = _color_gradient(moments, GRAD_BLUE, footprints, BLUE, seen, row)
+            _read_rows(sh, width, row, last, coefficients)
+            harmonics.colors_backward(degree, basis, coefficients, red, green, blue, along)
+            coefficients[used * LANES :] = np.float32(0.0)
+            _write_rows(grad_sh, width, row, coefficients)
+            through_x, through_y, through_z = harmonics.direction_backward(degree, x, y, z, inverse, along)
+            to_mean, to_quaternion, to_scales, to_logit, to_probe = projection.project_backward(
+                view, mean, quaternions, log_scales, opacity_logits, row, last, moments
+            )
+            store_column(grad_means, 3, 0, row, select(seen, narrow(to_mean[0]) + through_x, zero))
+            store_column(grad_means, 3, 1, row, select(seen, narrow(to_mean[1]) + through_y, zero))
+            store_column(grad_means, 3, 2, row, select(seen, narrow(to_mean[2]) + through_z, zero))
+            store_column(grad_quaternions, 4, 0, row, select(seen, narrow(to_quaternion[0]), zero))
+            store_column(grad_quaternions, 4, 1, row, select(seen, narrow(to_quaternion[1]), zero))
+            store_column(grad_quaternions, 4, 2, row, select(seen, narrow(to_quaternion[2]), zero))
+            store_column(grad_quaternions, 4, 3, row, select(seen, narrow(to_quaternion[3]), zero))
+            store_column(grad_scales, 3, 0, row, select(seen, narrow(to_scales[0]), zero))
+            store_column(grad_scales, 3, 1, row, select(seen, narrow(to_scales[1]), zero))
+            store_column(grad_scales, 3, 2, row, select(seen, narrow(to_scales[2]), zero))
+            store_column(grad_opacities, 1, 0, row, select(seen, narrow(to_logit), zero))
+            if grad_probe.shape[0] > 0:
+                store_column(grad_probe, 2, 0, row, select(seen, narrow(to_probe[0]), zero))
+                store_column(grad_probe, 2, 1, row, select(seen, narrow(to_probe[1]), zero))
+
+
+@inlined
+def _store_zeros(array, width, row):
+    """Clear LANES rows."""
+    for at in range(row * width, (row + LANES) * width, LANES):
+        store(array, at, splat(0.0))
+
+
+@inlined
+def _color_gradient(moments, column, footprints, color, seen, row):
+    """Gradient of a colour, none where it is clamped at 0."""
+    free = seen & (load_column(footprints, FOOTPRINT, color, row, row + LANES - 1) > 0.0)
+    return select(free, load(moments, column * LANES), splat(0.0))
