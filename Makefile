@@ -22,7 +22,7 @@ STAGES := poses fit masks reference personalize initialize distill evaluate
 options = $(if $(profile),--profile '$(profile)') $(if $(variant),--variant '$(variant)') \
 	$(if $(set),--set "$$set") $(if $(trust),--trust) $(if $(runs),--runs '$(runs)')
 
-.PHONY: help setup all $(STAGES) plan clean batch demo prior test lint bench
+.PHONY: help setup all $(STAGES) plan clean batch demo prior prior-report test bench lint
 .DELETE_ON_ERROR:
 
 help:
@@ -33,6 +33,7 @@ help:
 	@echo 'make data=FOLDER batch         every scene of a folder, and one table'
 	@echo 'make demo [seed=N]             make the demo scene, or another: data/demo-N'
 	@echo 'make prior [steps=N]           train the embedded prior further (hours)'
+	@echo 'make prior-report              measure it, and draw what it paints (minutes): runs/prior-report'
 	@echo 'make setup | test | lint       .venv; the tests; ruff'
 	@echo 'make bench                     speed of the CPU splatting'
 	@echo 'scene=  a name under data/, or the path of any folder'
@@ -92,7 +93,13 @@ batch: setup
 	@$(PY) -m runner batch --data '$(data)' $(options)
 
 prior: setup
-	$(PY) priors/tiny/train.py $(if $(steps),--steps '$(steps)')
+	$(PY) priors/tiny/train.py --start priors/tiny $(if $(steps),--steps '$(steps)')
+
+# Personalizes on the demo's reference, which is made first where it is missing.
+prior-report: data/demo/.generated setup
+	@$(PY) -m runner run reference --scene demo --profile laptop
+	$(PY) benchmarks/prior.py --run runs/demo --out runs/prior-report
+	$(PY) -m report.prior runs/prior-report
 
 test: $(VENV)/.ready-dev
 	$(PY) -m pytest

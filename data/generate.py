@@ -88,7 +88,6 @@ def _write_photos(out: Path, session: Session) -> None:
     for name, photo, mask in zip(session.names, session.photos, session.masks, strict=True):
         write_image(out / f"images/{name}.png", photo)
         write_image(out / f"masks/{name}.png", mask * np.uint8(255))
-    (out / "scene.yaml").write_text(PROFILE)
 
 
 def _write_pictures(out: Path, session: Session) -> None:

@@ -5,7 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors.torch
 import torch
+from small_prior import save_small_prior
 
 TINY = Path(__file__).resolve().parent.parent / "priors" / "tiny"
 sys.path.insert(0, str(TINY))
@@ -40,6 +42,20 @@ def test_the_linear_vae_is_linear_in_half_precision_too():
     assert (stored.decode(stored.encode(pixels).latent_dist.mean).sample - pixels).abs().max() < 4e-3
 
 
+def test_training_latents_are_the_vaes():
+    pixels = torch.rand(2, 3, 24, 24, generator=torch.Generator().manual_seed(1)) * 2 - 1
+    stored = build.linear_vae().encode(pixels).latent_dist.mean
+    assert (build.latents(pixels) - stored).abs().max() < 5e-3
+
+
+def test_timesteps_cover_the_schedule_in_every_batch():
+    for seed in range(20):
+        t = train.spread_timesteps(8, 1000, torch.Generator().manual_seed(seed))
+        assert sorted((t // 125).tolist()) == list(range(8))
+    drawn = torch.cat([train.spread_timesteps(8, 1000, torch.Generator().manual_seed(k)) for k in range(500)])
+    assert drawn.min() < 10 and drawn.max() > 990
+
+
 @pytest.fixture(scope="module")
 def pool():
     return train.Pool(0, 0, size=12)
@@ -47,12 +63,12 @@ def pool():
 
 def steps(pool, count, start=0, state=None):
     torch.set_num_threads(1)
-    model, vae, alphas = train.Model(0), build.linear_vae(), build.scheduler().alphas_cumprod
-    optimiser = torch.optim.AdamW(model.parameters(), lr=train.PEAK_RATE)
+    model, alphas = train.Model(0), build.scheduler().alphas_cumprod
+    optimiser = train.make_optimiser(model)
     if state:
         model.load_state_dict(state[0])
         optimiser.load_state_dict(state[1])
-    losses = [train.step_once(model, vae, alphas, optimiser, pool, k, 100) for k in range(start, count)]
+    losses = [train.step_once(model, alphas, optimiser, pool, k, 100) for k in range(start, count)]
     return losses, model.state_dict(), optimiser.state_dict()
 
 
@@ -64,3 +80,62 @@ def test_training_repeats_and_resumes_exactly(pool):
     tail, resumed, _ = steps(pool, 4, 2, (half, moments))
     assert tail == losses[2:]
     assert all(torch.equal(a, b) for a, b in zip(weights.values(), resumed.values(), strict=True))
+
+
+def weights_of(folder):
+    return {
+        part.name: safetensors.torch.load_file(next(part.glob("*.safetensors")))
+        for part in (folder / "unet", folder / "text_encoder")
+    }
+
+
+@pytest.fixture
+def command(monkeypatch, tmp_path):
+    """`train.py` with small batches; gives back the exported weights."""
+    for name, value in (("POOL", 6), ("SMALL", (16, 2)), ("LARGE", (16, 2)), ("VALIDATION", 2), ("KEEP", 3)):
+        monkeypatch.setattr(train, name, value)
+
+    def run(work, count, *more):
+        out = tmp_path / f"{work}-{count}"
+        options = ["--steps", str(count), "--threads", "1", "--work", str(tmp_path / work), "--out", str(out), *more]
+        monkeypatch.setattr(sys, "argv", ["train.py", *options])
+        train.main()
+        return weights_of(out)
+
+    return run
+
+
+def test_a_run_that_was_killed_and_resumed_equals_the_unbroken_one(command, monkeypatch):
+    unbroken, once = command("one", 6), train.step_once
+
+    def killed(*values):
+        if values[-2] == 4:  # one step after a checkpoint, an odd number of steps: a new image falls into the gap
+            raise KeyboardInterrupt
+        return once(*values)
+
+    monkeypatch.setattr(train, "step_once", killed)
+    with pytest.raises(KeyboardInterrupt):
+        command("two", 8)  # more steps than it will get: the first half of a run does not depend on their number
+    monkeypatch.setattr(train, "step_once", once)
+    resumed = command("two", 6)
+    for part, tensors in unbroken.items():
+        assert all(torch.equal(value, resumed[part][name]) for name, value in tensors.items()), part
+
+
+def test_start_begins_with_a_folders_weights(command):
+    given, after = weights_of(TINY), command("start", 1, "--start", str(TINY))
+    fresh = command("anew", 1)
+    for part, tensors in given.items():
+        # The first step of the warm-up moves each weight by about its rate, 5e-6; half precision rounds to 1e-3 of it.
+        moved = max(float((after[part][name] - value).abs().max()) for name, value in tensors.items())
+        assert moved < 4e-3, part
+        assert any(float((fresh[part][name] - value).abs().max()) > 0.05 for name, value in tensors.items())
+
+
+@pytest.mark.parametrize("lacks", ["all", "other"])
+def test_start_refuses_what_does_not_fit(command, tmp_path, lacks):
+    folder = tmp_path / "given"
+    if lacks == "other":
+        save_small_prior(folder)
+    with pytest.raises(ValueError, match="--start"):
+        command("refused", 1, "--start", str(folder))

@@ -11,6 +11,8 @@ from tempfile import TemporaryDirectory
 
 import torch
 from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
+from torch import Tensor
+from torch.nn.functional import conv2d
 from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer
 
 NATIVE = 64  # px
@@ -19,6 +21,22 @@ TEXT_LENGTH = 24
 # Opponent colours of (r, g, b) in [-1, 1], scaled to deviation about 1 over the training images, so that one noise
 # schedule serves light and colour alike; the fourth latent is the light's Laplacian: fine texture, made loud.
 LIGHT, WARM, GREEN, DETAIL = 1.9, 5.0, 9.0, 4.0
+
+
+def analysis() -> Tensor:
+    """[4, 3, 3, 3], the convolution that the VAE's encoder amounts to: pixels in [-1, 1] to latents."""
+    light = torch.tensor([1, 1, 1]) / 3
+    kernel = torch.zeros(4, 3, 3, 3)
+    kernel[0, :, 1, 1] = LIGHT * light
+    kernel[1, :, 1, 1] = WARM * torch.tensor([0.5, 0, -0.5])
+    kernel[2, :, 1, 1] = GREEN * torch.tensor([-0.25, 0.5, -0.25])
+    kernel[3] = DETAIL * light[:, None, None] * torch.tensor([[0.0, -1, 0], [-1, 4, -1], [0, -1, 0]])
+    return kernel
+
+
+def latents(pixels: Tensor) -> Tensor:
+    """[B, 3, H, W] in [-1, 1] -> [B, 4, H, W]: what the VAE's encoder gives, up to 1e-3, at a tenth of its cost."""
+    return conv2d(pixels, analysis(), padding=1)
 
 
 def linear_vae() -> AutoencoderKL:
@@ -43,16 +61,9 @@ def linear_vae() -> AutoencoderKL:
         use_post_quant_conv=False,
         mid_block_add_attention=False,
     )
-    light = torch.tensor([1, 1, 1]) / 3
-    colours = torch.stack(
-        [LIGHT * light, WARM * torch.tensor([0.5, 0, -0.5]), GREEN * torch.tensor([-0.25, 0.5, -0.25])]
-    )
-    kernel = torch.zeros(4, 3, 3, 3)
-    kernel[:3, :, 1, 1] = colours
-    laplacian = torch.tensor([[0.0, -1, 0], [-1, 4, -1], [0, -1, 0]])
-    kernel[3] = DETAIL * light[:, None, None] * laplacian
+    kernel = analysis()
     back = torch.zeros(3, 4, 3, 3)
-    back[:, :3, 1, 1] = torch.linalg.inv(colours)
+    back[:, :3, 1, 1] = torch.linalg.inv(kernel[:3, :, 1, 1])
     gain = constant * (2 / channels) ** 0.5  # what the group norm divides by
     with torch.no_grad():
         for module in vae.modules():

@@ -355,11 +355,18 @@ def mask(rng: np.random.Generator, size: int) -> np.ndarray:
         line = np.interp(np.arange(size), np.linspace(0, size, 64), wave) * size * rng.uniform(0, 0.08)
         canvas[(np.cos(angle) * ticks[None] + np.sin(angle) * ticks[:, None] + line[None]) > offset] = 1
     else:
-        for _ in range(rng.integers(1, 4)):
-            centre = rng.uniform(0.15, 0.85, 2) * size
-            count = rng.integers(5, 11)
-            radius = size * rng.uniform(0.12, 0.45) * rng.uniform(0.6, 1.2, count)
-            turn = np.sort(rng.uniform(0, 2 * np.pi, count))
-            outline = centre + np.stack([np.cos(turn) * radius, np.sin(turn) * radius * rng.uniform(0.6, 1.6)], 1)
-            cv2.fillPoly(canvas, [outline.astype(np.int32)], 1)
+        return silhouettes(rng, size)
+    return canvas.astype(bool)
+
+
+def silhouettes(rng: np.random.Generator, size: int) -> np.ndarray:
+    """One to three objects' outlines, as polygons; bool [size, size]."""
+    canvas = np.zeros((size, size), np.uint8)
+    for _ in range(rng.integers(1, 4)):
+        centre = rng.uniform(0.15, 0.85, 2) * size
+        count = rng.integers(5, 11)
+        radius = size * rng.uniform(0.12, 0.45) * rng.uniform(0.6, 1.2, count)
+        turn = np.sort(rng.uniform(0, 2 * np.pi, count))
+        outline = centre + np.stack([np.cos(turn) * radius, np.sin(turn) * radius * rng.uniform(0.6, 1.6)], 1)
+        cv2.fillPoly(canvas, [outline.astype(np.int32)], 1)
     return canvas.astype(bool)

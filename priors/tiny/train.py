@@ -21,24 +21,31 @@ import build  # noqa: E402
 import images  # noqa: E402
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
-from diffusers import StableDiffusionInpaintPipeline  # noqa: E402
+from diffusers import StableDiffusionInpaintPipeline, UNet2DConditionModel  # noqa: E402
 from torch import Tensor, nn  # noqa: E402
+from transformers import CLIPTextModel  # noqa: E402
 
 from reffusion.trace import generator, load_checkpoint, save_checkpoint, seed_for  # noqa: E402
 
-POOL = 2000  # images held in memory; step k replaces the oldest
+POOL = 500  # images held in memory
+FRESH = 2  # steps for each new image, which takes the place of the oldest; making one costs a twentieth of a step
 SMALL, LARGE = (
     (32, 24),
     (64, 8),
 )  # (crop side in px, batch): small crops three steps of four, whole native ones the fourth
-PEAK_RATE, WARMUP, EMA = 1e-3, 200, 0.999
+PEAK_RATE, WARMUP, FALL, EMA = 1e-3, 200, 0.5, 0.999  # FALL: share of the run, at its end, over which the rate falls
 OUTSIDE = 0.2  # weight of the loss on pixels the network is given anyway
+# Weight of each latent. In holes the fourth's error is nine times another's, since fine texture is mostly anyone's
+# guess; at weight 1 it made up three quarters of the loss, and as much of the gradient's noise.
+LATENTS = (1.0, 1.0, 1.0, 0.25)
+VALIDATION = 32  # held-out crops
+KEEP = 100  # steps between checkpoints
 
 
 class Pool:
     """The last `size` images of a seed; `advance` puts image number `index` in the place of the oldest."""
 
-    def __init__(self, seed: int, step: int, size: int = POOL, held_out: bool = False):
+    def __init__(self, seed: int, step: int, size: int, held_out: bool = False):
         self.seed, self.held_out = seed, held_out
         self.items: list[np.ndarray | None] = [None] * size
         self.captions = [""] * size
@@ -81,46 +88,52 @@ class Model(nn.Module):
         return self.unet(torch.cat([noisy, condition], 1), t, words).sample
 
 
-def loss(
-    model: Model, vae: nn.Module, alphas: Tensor, batch: tuple[Tensor, Tensor, list[str]], random: torch.Generator
-):
-    """Mean squared error of v = sqrt(a) eps - sqrt(1 - a) z, hole pixels at weight 1, given ones at OUTSIDE."""
+def spread_timesteps(count: int, steps: int, random: torch.Generator) -> Tensor:
+    """[count] long, each uniform in [0, steps), one in each of `count` equal parts, so that batches differ less."""
+    places = torch.randperm(count, generator=random) + torch.rand(1, generator=random)
+    return (places * (steps / count)).long().clamp(max=steps - 1)
+
+
+def loss(model: Model, alphas: Tensor, batch: tuple[Tensor, Tensor, list[str]], random: torch.Generator) -> Tensor:
+    """Mean squared error of v = sqrt(a) eps - sqrt(1 - a) z, weighted by OUTSIDE (hole pixels 1) and LATENTS."""
     pixels, masks, captions = batch
-    with torch.no_grad():
-        clean = vae.encode(pixels).latent_dist.mean
-        given = vae.encode(pixels * (masks < 0.5)).latent_dist.mean
-    t = torch.randint(0, len(alphas), (len(pixels),), generator=random)
+    clean, given = build.latents(pixels), build.latents(pixels * (masks < 0.5))
+    t = spread_timesteps(len(pixels), len(alphas), random)
     noise = torch.randn(clean.shape, generator=random)
     a = alphas[t].view(-1, 1, 1, 1)
     noisy, target = a.sqrt() * clean + (1 - a).sqrt() * noise, a.sqrt() * noise - (1 - a).sqrt() * clean
     predicted = model(noisy, t, torch.cat([masks, given], 1), captions)
-    weight = OUTSIDE + (1 - OUTSIDE) * masks
-    return (weight * (predicted - target) ** 2).sum() / (weight.sum() * clean.shape[1])
+    weight = (OUTSIDE + (1 - OUTSIDE) * masks) * torch.tensor(LATENTS).view(-1, 1, 1)
+    return (weight * (predicted - target) ** 2).sum() / weight.sum()
+
+
+def make_optimiser(model: Model) -> torch.optim.Optimizer:
+    return torch.optim.AdamW(model.parameters(), lr=PEAK_RATE, weight_decay=0.01, betas=(0.9, 0.99), fused=True)
 
 
 def rate(step: int, steps: int) -> float:
-    """Warm-up, constant, and a cosine over the last fifth."""
-    ending = max((step - 0.8 * steps) / (0.2 * steps), 0.0)
-    return PEAK_RATE * min((step + 1) / WARMUP, 1.0) * (0.5 + 0.5 * math.cos(math.pi * min(ending, 1.0))) + 1e-6
+    """Warm-up, constant, and half a cosine over the last `FALL` of the steps: until then it does not depend on them."""
+    ending = max((step / steps - 1) / FALL + 1, 0.0)
+    return PEAK_RATE * min((step + 1) / WARMUP, 1.0) * (0.5 + 0.5 * math.cos(math.pi * ending)) + 1e-6
 
 
-def validation(model: Model, vae: nn.Module, alphas: Tensor, pool: Pool) -> float:
+def validation(model: Model, alphas: Tensor, pool: Pool) -> float:
     """The loss on fixed held-out crops, masks, noise and timesteps."""
     rng = np.random.default_rng(seed_for(pool.seed, "validation"))
     with torch.no_grad():
-        batch = pool.batch(rng, build.NATIVE, 32)
-        return float(loss(model, vae, alphas, batch, generator(pool.seed, "validation noise")))
+        batch = pool.batch(rng, build.NATIVE, VALIDATION)
+        return float(loss(model, alphas, batch, generator(pool.seed, "validation noise")))
 
 
 def step_once(
-    model: Model, vae: nn.Module, alphas: Tensor, optimiser: torch.optim.Optimizer, pool: Pool, step: int, steps: int
+    model: Model, alphas: Tensor, optimiser: torch.optim.Optimizer, pool: Pool, step: int, steps: int
 ) -> float:
     """Training step number `step` of `steps`; returns its loss."""
     rng = np.random.default_rng(seed_for(pool.seed, "batch", step))
     side, count = LARGE if step % 4 == 3 else SMALL
     for group in optimiser.param_groups:
         group["lr"] = rate(step, steps)
-    error = loss(model, vae, alphas, pool.batch(rng, side, count), generator(pool.seed, "noise", step))
+    error = loss(model, alphas, pool.batch(rng, side, count), generator(pool.seed, "noise", step))
     if not torch.isfinite(error):
         raise FloatingPointError(f"training loss is {error.item()} at step {step}")
     optimiser.zero_grad(set_to_none=True)
@@ -138,7 +151,24 @@ def follow(average: dict[str, Tensor], model: Model, step: int) -> None:
         average[name].lerp_(value, 1 - keep) if value.is_floating_point() else average[name].copy_(value)
 
 
-def export(average: dict[str, Tensor], folder: Path = HERE) -> None:
+def load_weights(model: Model, folder: Path) -> None:
+    """Give `model` the UNet and text encoder of an exported folder.
+
+    Raises:
+        ValueError: there is no such folder, or its weights do not fit the model as `build` makes it.
+    """
+    try:
+        parts = {
+            "unet": UNet2DConditionModel.from_pretrained(folder, subfolder="unet", torch_dtype=torch.float32),
+            "text": CLIPTextModel.from_pretrained(folder, subfolder="text_encoder", dtype=torch.float32),
+        }
+        for name, part in parts.items():
+            getattr(model, name).load_state_dict(part.state_dict())
+    except (OSError, RuntimeError) as error:
+        raise ValueError(f"--start {folder}: {str(error).splitlines()[0]}") from error
+
+
+def export(average: dict[str, Tensor], folder: Path) -> None:
     """Write the diffusers folder with the averaged weights in half precision."""
     final = Model(0)
     final.load_state_dict(average)
@@ -155,41 +185,58 @@ def export(average: dict[str, Tensor], folder: Path = HERE) -> None:
     pipeline.to(dtype=torch.float16).save_pretrained(folder)
 
 
-def main() -> None:
+def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--steps", type=int, default=20000, help="training steps in all")
+    parser.add_argument(
+        "--steps",
+        type=int,
+        default=20000,
+        help="training steps in all; a resume may change it until half of them are done, when the rate starts to fall",
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--work", type=Path, default=HERE.parent.parent / "runs" / "prior", help="checkpoint and log")
-    parser.add_argument("--export-every", type=int, default=500, help="steps between exports of the folder")
+    parser.add_argument("--start", type=Path, help="an exported folder whose weights a new run begins with")
+    parser.add_argument("--out", type=Path, default=HERE, help="the folder to export to")
+    parser.add_argument("--export-every", type=int, default=500, help="steps between exports")
     parser.add_argument("--threads", type=int, default=os.cpu_count())
-    options = parser.parse_args()
+    return parser.parse_args()
+
+
+def main() -> None:
+    options = arguments()
     torch.set_num_threads(options.threads)
     options.work.mkdir(parents=True, exist_ok=True)
-
-    model, vae = Model(options.seed), build.linear_vae()
-    averaged = Model(options.seed)
+    model, averaged = Model(options.seed), Model(options.seed)
+    state = load_checkpoint(options.work)
+    if options.start and state is None:
+        load_weights(model, options.start)
     alphas = build.scheduler().alphas_cumprod
-    optimiser = torch.optim.AdamW(model.parameters(), lr=PEAK_RATE, weight_decay=0.01, betas=(0.9, 0.99))
+    optimiser = make_optimiser(model)
     average, start = {k: v.clone() for k, v in model.state_dict().items()}, 0
-    if (state := load_checkpoint(options.work)) is not None:
+    if state is not None:
         model.load_state_dict(state["model"])
         optimiser.load_state_dict(state["optimiser"])
         average, start = state["average"], state["step"]
-    pool, held_out, began = Pool(options.seed, start), Pool(options.seed, 0, 32, held_out=True), time.time()
+    pool, held_out = Pool(options.seed, start // FRESH, POOL), Pool(0, 0, VALIDATION, held_out=True)
+    began = time.time()
     for step in range(start, options.steps):
-        error = step_once(model, vae, alphas, optimiser, pool, step, options.steps)
+        error = step_once(model, alphas, optimiser, pool, step, options.steps)
         follow(average, model, step)
-        pool.advance(step + POOL)
         done = step + 1
-        if done % 100 == 0 or done == options.steps:
+        if done % FRESH == 0:
+            pool.advance(done // FRESH + POOL - 1)
+        if done % KEEP == 0 or done == options.steps:
             averaged.load_state_dict(average)
-            held = validation(averaged, vae, alphas, held_out)
+            held = validation(averaged, alphas, held_out)
             print(f"{done} loss {error:.4f} held-out {held:.4f} {time.time() - began:.0f} s", flush=True)
             state = {"model": model.state_dict(), "optimiser": optimiser.state_dict(), "average": average, "step": done}
             save_checkpoint(options.work, state)
         if done % options.export_every == 0 or done == options.steps:
-            export(average)
+            export(average, options.out)
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except ValueError as error:
+        sys.exit(f"error: {error}")

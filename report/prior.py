@@ -1,0 +1,125 @@
+"""What `benchmarks/prior.py` measured, as a page: tables, charts and sheets of pictures.
+
+python -m report.prior runs/prior-report
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reffusion import io
+from report.sheet import enlarged, framed
+
+ENLARGE = 3  # whole factor; held-out pictures are 64 px
+SHEETS = {
+    "inpainting": "Held-out pictures, filled from pure noise",
+    "whole": "Unseen views of the scene, whole, before and after personalization",
+    "window": "Unseen views, windows around the hole",
+}
+SCORES = {"psnr": "PSNR, dB", "ssim": "SSIM", "flip": "FLIP", "energy": "gradient energy"}
+
+
+def make(folder: Path) -> Path:
+    """Write prior.md, sheets and charts into the benchmark's folder; gives back the page's path.
+
+    Raises:
+        ValueError: nothing was measured there yet.
+    """
+    if not (folder / "prior.json").exists():
+        raise ValueError(f"{folder / 'prior.json'} is missing; run `python benchmarks/prior.py --out {folder}` first")
+    measured = io.load_json(folder / "prior.json")
+    lines = [f"# {measured['prior']}, measured", "", inpainting_table(measured["inpainting"]["scores"])]
+    lines += sheet(folder, "inpainting", measured["inpainting"]["columns"])
+    if "personalization" in measured:
+        personal = measured["personalization"]
+        charts(personal, folder / "charts.png")
+        lines += ["## Personalization", "", personalization_table(personal), "![](charts.png)", ""]
+        for scale in ("whole", "window"):
+            lines += sheet(folder, scale, personal["columns"])
+    page = folder / "prior.md"
+    page.write_text("\n".join(lines), encoding="utf-8")
+    return page
+
+
+def sheet(folder: Path, name: str, columns: list[str]) -> list[str]:
+    """Put the rows of pictures in folder/name together as folder/name.png; the page's lines for it."""
+    paths = sorted((folder / name).glob("*.png"))
+    rows = [np.split(io.load_image(path), len(columns), 1) for path in paths]
+    cells = [[enlarged(picture, ENLARGE) for picture in row] for row in rows]
+    io.save_image(folder / f"{name}.png", framed(cells, columns, [path.stem for path in paths]))
+    return [f"## {SHEETS[name]}", "", f"![]({name}.png)", ""]
+
+
+def inpainting_table(scores: dict[str, dict[str, dict[str, float]]]) -> str:
+    """Markdown: a row for each kind of picture and method."""
+    lines = [f"| inside the hole | pictures | {' | '.join(SCORES.values())} |", "|---" * (len(SCORES) + 2) + "|"]
+    kinds = dict.fromkeys(kind for by_kind in scores.values() for kind in by_kind)
+    for kind in kinds:
+        for name, by_kind in scores.items():
+            row = by_kind[kind]
+            cells = " | ".join(cell(row, column) for column in SCORES)
+            lines.append(f"| {kind}: {name} | {row['pictures']} | {cells} |")
+    return "\n".join(lines) + "\n"
+
+
+def cell(row: dict[str, float], column: str) -> str:
+    """A figure; PSNR with its standard error."""
+    if column == "psnr":
+        return f"{row['psnr']:.2f} ± {row['psnr_error']:.2f}"
+    return f"{row[column]:.3f}"
+
+
+def personalization_table(personal: dict[str, Any]) -> str:
+    """Markdown: samples of unseen views, and errors over all timesteps, before and after."""
+    titles = ("clean-latent error", "variance of the SDS gradient")
+    lines = [
+        f"| unseen views, {personal['steps']} steps | {' | '.join((*titles, *SCORES.values()))} |",
+        "|---" * (len(SCORES) + 3) + "|",
+    ]
+    for scale in ("whole", "window"):
+        for when, row in personal[scale].items():
+            figures = [f"{np.mean(row[key]):.4f}" for key in ("error", "variance")]
+            cells = [*figures, *(cell(row["samples"], column) for column in SCORES)]
+            lines.append(f"| {scale}, {when} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def charts(personal: dict[str, Any], path: Path) -> None:
+    """Error against steps; error and variance against the timestep, before and after."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure((12, 3.6), layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    left, *others = figure.subplots(1, 3)
+    steps = [row["iteration"] for row in personal["trace"]]
+    left.plot(steps, [row["clean_latent_mse"] for row in personal["trace"]], "k.-")
+    left.set(
+        title="the reference's own hole", xlabel="personalization step", ylabel="clean-latent error", ylim=(0, None)
+    )
+    for axes, key, title in zip(others, ("error", "variance"), ("clean-latent error", "variance of SDS"), strict=True):
+        for scale, style in (("whole", "-"), ("window", "--")):
+            for when, colour in (("before", "tab:grey"), ("after", "tab:blue")):
+                values = personal[scale][when][key]
+                axes.plot(personal["timesteps"], values, style, color=colour, label=f"{scale}, {when}")
+        axes.set(title=f"{title}, unseen views", xlabel="timestep", ylim=(0, None))
+    others[0].legend(fontsize="small")
+    canvas.draw()
+    io.save_image(path, np.asarray(canvas.buffer_rgba())[..., :3].copy())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="report.prior", description=__doc__.split("\n")[0])
+    parser.add_argument("folder", type=Path, help="what benchmarks/prior.py wrote to")
+    try:
+        print(make(parser.parse_args().folder))
+    except ValueError as error:
+        raise SystemExit(f"error: {error}") from None
+
+
+if __name__ == "__main__":
+    main()
