@@ -28,7 +28,9 @@ VARIANTS = {
     "laptop, twice the steps": {"iterations": 4000},
     "sampling": SAMPLING,
     "sampling, twice the steps": {**SAMPLING, "iterations": 4000},
-    "means by distance": {"by_distance": True},
+    "sparse points only": {"flow_cell": 0},
+    "antialiased": {"antialiased": True},
+    "exposure": {"exposure": True},
     "3DGS's rate of means": {"means_rate": 1.6e-4},
 }
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import log10
 from pathlib import Path
 
@@ -124,7 +124,7 @@ def distill(
             if settings.stop_drop > 0 and psnr > best_psnr:
                 best, best_psnr = _copy(optimizer), psnr
             if 0 < settings.stop_drop < best_psnr - psnr:
-                return Gaussians(**{name: best[name] for name in PARAMETERS}), best["masked"]
+                return replace(optimizer.gaussians, **{name: best[name] for name in PARAMETERS}), best["masked"]
         if log.seconds - saved > settings.checkpoint_seconds:
             saved = log.seconds
             state = {"optimizer": optimizer.state_dict(), "step": done, "seconds": saved}

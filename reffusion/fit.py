@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from reffusion import mcmc, trace
 from reffusion.densify import densify, prune, viewing_distance
+from reffusion.exposure import Exposures
 from reffusion.optimize import GaussianOptimizer, Rates, reconstruction_loss
 from reffusion.splat import render
 from reffusion.types import PARAMETERS, Camera, Gaussians
@@ -54,7 +56,7 @@ class Settings:
         least_opacity: fainter Gaussians are pruned.
         largest: Gaussians of a larger size are pruned.
         reset_every: part of the run after which opacities are capped at 0.01, while densifying; 0: never.
-        by_distance: step sizes of the means are multiplied by the distance to the step's camera (3DGS: no).
+        exposure: fit each view's exposure too, see `reffusion.exposure`.
         rates: Adam's step sizes.
         checkpoint_seconds: seconds of work between checkpoints.
     """
@@ -77,7 +79,7 @@ class Settings:
     least_opacity: float = 0.005
     largest: float = 0.5
     reset_every: float = 0.1
-    by_distance: bool = False
+    exposure: bool = False
     rates: Rates = field(default_factory=Rates)
     checkpoint_seconds: float = 10.0
 
@@ -98,9 +100,10 @@ def fit(
     Args:
         cameras: the views to fit, at least one.
         images: view name -> uint8 [H, W, 3], for `cameras` and `held_out`.
-        initial: the Gaussians to start from; the work is done on their device.
+        initial: the Gaussians to start from; the work is done on their device. Where there is a checkpoint, only their
+            degree, device and way of being drawn still matter.
         folder: gets trace.jsonl (loss, psnr of the steps since the last line, gaussians, and psnr_held_out, during
-            whose measurement the clock stands) and checkpoints.
+            whose measurement the clock stands), checkpoints, and exposures.json where they are fitted.
         weights: view name -> [H, W], how much each pixel counts; pixels of weight 0, and they alone, influence nothing.
             A view without an entry counts as a whole.
         held_out: views that are only measured.
@@ -116,24 +119,29 @@ def fit(
     _check_sizes(cameras, images, weights)
     _check_sizes(held_out, images, {})
     optimizer, start = GaussianOptimizer(initial, rates=settings.rates), 0
-    recent = {"loss": 0.0, "error": 0.0, "steps": 0}
+    exposures = Exposures((camera.name for camera in cameras), initial.means.device) if settings.exposure else None
+    recent, started_with = {"loss": 0.0, "error": 0.0, "steps": 0}, len(initial)
     state, seconds = trace.load_checkpoint(folder), 0.0
     if state is not None:
         optimizer.load_state_dict(state["optimizer"])
+        if exposures is not None:
+            exposures.load_state_dict(state["exposures"])
         start, seconds, recent = state["iteration"], state["seconds"], state["recent"]
+        started_with = state["started_with"]
     log = trace.Trace(folder, seconds, start + 1)  # a line is numbered by the steps done
     centers = torch.tensor(np.stack([camera.center for camera in cameras]), dtype=torch.float32)
     saved_at = time.monotonic()
 
-    for i in trace.progress(settings.iterations, "fit", start):
-        camera = cameras[_view(i, len(cameras), settings.seed)]
-        half = i < settings.coarse_until * settings.iterations
-        camera, target, counts = _sample(camera, images[camera.name], weights.get(camera.name), half)
+    for i, (camera, target, counts) in zip(
+        trace.progress(settings.iterations, "fit", start),
+        _samples(cameras, images, weights, settings, start),
+        strict=True,
+    ):
         target, counts = _move(target, optimizer), _move(counts, optimizer)
-        loss, error = _step(optimizer, camera, target, counts, settings, i, impl)
+        loss, error = _step(optimizer, exposures, camera, target, counts, settings, i, impl)
         recent = {"loss": recent["loss"] + loss, "error": recent["error"] + error, "steps": recent["steps"] + 1}
         done = i + 1
-        _adapt(optimizer, centers, len(initial), settings, done)
+        _adapt(optimizer, centers, started_with, settings, done)
         if trace.log_spaced(done, settings.iterations):
             _check_finite(optimizer.gaussians, f"step {i}, view '{camera.name}'")
             with log.paused():
@@ -143,21 +151,31 @@ def fit(
         if time.monotonic() - saved_at > settings.checkpoint_seconds and done < settings.iterations:
             _check_finite(optimizer.gaussians, f"step {i}, view '{camera.name}'")
             state = {"optimizer": optimizer.state_dict(), "iteration": done, "recent": recent, "seconds": log.seconds}
+            state |= {"started_with": started_with, "exposures": exposures and exposures.state_dict()}
             trace.save_checkpoint(folder, state)
             saved_at = time.monotonic()
+    if exposures is not None:
+        exposures.save(folder)
     return optimizer.gaussians.map(Tensor.detach)
 
 
 def initial_gaussians(
-    points: np.ndarray, colors: np.ndarray, sh_degree: int, budget: int, generator: torch.Generator
+    points: np.ndarray,
+    colors: np.ndarray,
+    sh_degree: int,
+    budget: int,
+    generator: torch.Generator,
+    opacity: float = 0.1,
+    size: float = 1.0,
 ) -> Gaussians:
-    """3DGS's start: a round Gaussian of opacity 0.1 at each point, as large as the way to its 3 nearest neighbours.
+    """3DGS's start: a round Gaussian at each point, sized by the way to its 3 nearest neighbours.
 
     Args:
         points: [P, 3] in the normalised frame, P >= 4.
         colors: [P, 3] uint8.
         budget: no more Gaussians than this; a random subset of the points then.
         generator: of that subset.
+        opacity: of each, in (0, 1). size: standard deviations over that way (root mean square).
 
     Raises:
         ValueError: fewer than 4 points.
@@ -168,7 +186,7 @@ def initial_gaussians(
         kept = torch.randperm(len(points), generator=generator)[:budget].numpy()
         points, colors = points[kept], colors[kept]
     distance = cKDTree(points).query(points, k=4)[0][:, 1:]
-    spread = np.sqrt((distance**2).mean(1)).clip(min=1e-4)
+    spread = size * np.sqrt((distance**2).mean(1)).clip(min=1e-4)
     count = len(points)
     sh = torch.zeros(count, (sh_degree + 1) ** 2, 3)
     sh[:, 0] = (torch.from_numpy(colors.astype(np.float32)) / 255 - 0.5) / SH_0
@@ -176,9 +194,31 @@ def initial_gaussians(
         means=torch.from_numpy(points.astype(np.float32)),
         quaternions=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
         log_scales=torch.from_numpy(np.log(spread).astype(np.float32))[:, None].repeat(1, 3),
-        opacity_logits=torch.full((count,), math.log(0.1 / 0.9)),
+        opacity_logits=torch.full((count,), math.log(opacity / (1 - opacity))),
         sh=sh,
     )
+
+
+def _samples(
+    cameras: Sequence[Camera],
+    images: Mapping[str, np.ndarray],
+    weights: Mapping[str, np.ndarray],
+    settings: Settings,
+    start: int,
+) -> Iterator[tuple[Camera, Tensor, Tensor | None]]:
+    """What the steps from `start` on see, each prepared by a thread of its own while the step before it runs."""
+
+    def sample(i: int) -> tuple[Camera, Tensor, Tensor | None]:
+        camera = cameras[_view(i, len(cameras), settings.seed)]
+        half = i < settings.coarse_until * settings.iterations
+        return _sample(camera, images[camera.name], weights.get(camera.name), half)
+
+    with ThreadPoolExecutor(1, thread_name_prefix="fit") as ahead:
+        coming = ahead.submit(sample, start)
+        for i in range(start, settings.iterations):
+            ready = coming.result()
+            coming = ahead.submit(sample, min(i + 1, settings.iterations - 1))
+            yield ready
 
 
 def _view(iteration: int, count: int, seed: int) -> int:
@@ -211,6 +251,7 @@ def _move(tensor: Tensor | None, optimizer: GaussianOptimizer) -> Tensor | None:
 
 def _step(
     optimizer: GaussianOptimizer,
+    exposures: Exposures | None,
     camera: Camera,
     target: Tensor,
     counts: Tensor | None,
@@ -226,28 +267,22 @@ def _step(
         background = torch.rand(3, generator=trace.generator(settings.seed, "background", i)).to(target.device)
     degree = _degree(settings, i)
     rendering = render(optimizer.gaussians, camera, background=background, impl=impl, sh_degree=degree, probe=probe)
-    loss = reconstruction_loss(rendering.color, target, counts)
+    image = rendering.color if exposures is None else exposures.apply(rendering.color, camera.name)
+    loss = reconstruction_loss(image, target, counts)
     value = float(loss.detach())
     if not math.isfinite(value):
         raise FloatingPointError(f"fit, {where}: the reconstruction loss is {value}")
     (loss + _thrift(optimizer.gaussians, settings)).backward()
     optimizer.observe(probe.grad, rendering.radii, camera.width, camera.height)
     try:
-        optimizer.step(i / settings.iterations, visible=rendering.radii > 0, reach=_reach(optimizer, camera, settings))
+        optimizer.step(i / settings.iterations, visible=rendering.radii > 0)
     except FloatingPointError as error:
         raise FloatingPointError(f"fit, {where}, reconstruction: {error}") from None
     if settings.densify_by == "mcmc":
         mcmc.explore(optimizer, i / settings.iterations, trace.generator(settings.seed, "explore", i))
-    return value, _squared_error(rendering.color.detach(), target, counts)
-
-
-def _reach(optimizer: GaussianOptimizer, camera: Camera, settings: Settings) -> Tensor | None:
-    """[N] each Gaussian's distance to the camera: what is ten times as far must step ten times as wide to be seen
-    to move."""
-    if not settings.by_distance:
-        return None
-    means = optimizer.gaussians.means.detach()
-    return (means - torch.as_tensor(camera.center, dtype=means.dtype, device=means.device)).norm(dim=1)
+    if exposures is not None:
+        exposures.step(i / settings.iterations)
+    return value, _squared_error(image.detach(), target, counts)
 
 
 def _thrift(gaussians: Gaussians, settings: Settings) -> Tensor | float:

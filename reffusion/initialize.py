@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -166,7 +166,5 @@ def match_colors(
         sh = gaussians.sh.clone()
         sh[seen, 0] += gathered[seen, :3] / gathered[seen, 3:] / geometry.SH_0
         sh[seen, 0] = sh[seen, 0].clamp(-0.5 / geometry.SH_0, 0.5 / geometry.SH_0)
-        gaussians = Gaussians(
-            gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.opacity_logits, sh
-        )
+        gaussians = replace(gaussians, sh=sh)
     return gaussians

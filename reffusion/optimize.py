@@ -142,13 +142,12 @@ class GaussianOptimizer:
         self.slope_sum = torch.zeros_like(self._steps, dtype=torch.float32)
         self.slope_count = torch.zeros_like(self._steps)
 
-    def step(self, progress: float, visible: Tensor | None = None, reach: Tensor | None = None) -> None:
+    def step(self, progress: float, visible: Tensor | None = None) -> None:
         """One Adam step along the gradients gathered since the last, which are then forgotten.
 
         Args:
             progress: in [0, 1], the part of the run that is done; it sets the step size of the means.
             visible: [N] bool, the Gaussians to move, e.g. `rendering.radii > 0`; None moves all.
-            reach: [N] factor on the step size of the means, e.g. each one's distance to the camera; None: 1.
 
         Raises:
             FloatingPointError: a gradient is not finite; says of which parameter. Nothing has been changed then.
@@ -172,8 +171,6 @@ class GaussianOptimizer:
                 rows = [_rows(getattr(g, name)) for g in (self.gaussians, self._first, self._second)]
                 update = _adam_cpu if gradient.device.type == "cpu" else _adam
                 pace = torch.where(self.masked, self.masked_pace.get(name, 1.0), alike)
-                if name == "means" and reach is not None:
-                    pace = pace * reach.detach()
                 update(*rows, _rows(gradient), *unbias, pace, visible, rates[name], *self.betas, self.epsilon)
         self.forget_gradients()
 
@@ -224,7 +221,7 @@ class GaussianOptimizer:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`, of any number of Gaussians."""
-        self.gaussians = Gaussians(**state["parameters"]).map(_leaf)
+        self.gaussians = Gaussians(**state["parameters"], antialiased=self.gaussians.antialiased).map(_leaf)
         self._first = Gaussians(**state["first"]).map(torch.clone)
         self._second = Gaussians(**state["second"]).map(torch.clone)
         for name in self._COUNTERS:

@@ -111,6 +111,8 @@ class Gaussians:
         opacity_logits: [N].
         sh: [N, K, 3] spherical harmonics, K = (degree + 1)^2 in {1, 4, 9, 16}; colour = 0.5 + sum_k Y_k sh_k,
             clamped from below at 0.
+        antialiased: how they are meant to be drawn: what the low-pass widens loses opacity in proportion
+            (Mip-Splatting's 2D filter), so that a Gaussian adds up to the same from any distance. 3DGS: no.
     """
 
     means: Tensor
@@ -118,6 +120,7 @@ class Gaussians:
     log_scales: Tensor
     opacity_logits: Tensor
     sh: Tensor
+    antialiased: bool = False
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -128,11 +131,12 @@ class Gaussians:
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
         """`function` applied to each parameter, e.g. `g.map(lambda p: p[keep])`."""
-        return Gaussians(*(function(getattr(self, name)) for name in PARAMETERS))
+        return Gaussians(*(function(getattr(self, name)) for name in PARAMETERS), antialiased=self.antialiased)
 
     def zipped(self, other: Gaussians, function: Callable[[Tensor, Tensor], Tensor]) -> Gaussians:
-        """`function` applied to each pair of parameters, e.g. concatenation."""
-        return Gaussians(*(function(getattr(self, name), getattr(other, name)) for name in PARAMETERS))
+        """`function` applied to each pair of parameters, e.g. concatenation; drawn as `self` is."""
+        pairs = ((getattr(self, name), getattr(other, name)) for name in PARAMETERS)
+        return Gaussians(*(function(*pair) for pair in pairs), antialiased=self.antialiased)
 
 
 PARAMETERS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")

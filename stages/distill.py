@@ -58,6 +58,7 @@ def run(
     out: Path,
     *,
     poses: Path,
+    fit: Path,
     masks: Path,
     reference: Path,
     personalize: Path | None,
@@ -83,21 +84,21 @@ def run(
         prior = prior if personalize is None else diffusion.load_lora(prior, personalize)
         with torch.no_grad():
             text = diffusion.embed_text(prior, list(PROMPTS))
-    sights = load_sights(params, scene, poses, masks)
+    sights = load_sights(params, scene, poses, fit, masks)
     gaussians, masked = distill(initial, masked, sights, holes, prior, text, settings(params), out)
     io.save_ply(out / "gaussians.ply", gaussians.map(lambda p: p.cpu()))
     io.save_labels(out / "labels.npy", masked.cpu())
     trace.clear_checkpoint(out)
 
 
-def load_sights(params: Params, scene, poses: Path, masks: Path) -> list:
+def load_sights(params: Params, scene, poses: Path, fit: Path, masks: Path) -> list:
     """The training views with the pixels that may supervise and those to repaint."""
     import torch
 
-    from reffusion import io
+    from reffusion import exposure, io
     from reffusion.confinement import Sight
 
-    photos, sets = io.load_views(poses, scene.train), io.load_mask_sets(masks, scene.train)
+    photos, sets = exposure.load_views(poses, fit, scene.train), io.load_mask_sets(masks, scene.train)
     place = lambda array: torch.from_numpy(array).to(params.device)
     sights = []
     for name in scene.train:

@@ -31,9 +31,13 @@ class Params(BaseModel):
     largest: float = Field(0.5, gt=0, description="Gaussians of a larger size are pruned; deviation / distance")
     reset_every: float = Field(0.1, ge=0, le=1, description="part of the run between opacity resets; 0 = none")
     means_rate: float = Field(1.6e-4, gt=0, description="first step size of positions; the last is a hundredth of it")
-    by_distance: bool = Field(False, description="multiply it by each Gaussian's distance to the camera (3DGS: no)")
     opacity_rate: float = Field(0.05, gt=0, description="step size of opacity logits")
     checkpoint_seconds: float = Field(10.0, gt=0, description="seconds of work between checkpoints")
+    antialiased: bool = Field(False, description="a Gaussian adds up to the same from any distance (Mip-Splatting)")
+    exposure: bool = Field(False, description="fit each view's exposure too; later stages see the views without it")
+    flow_cell: int = Field(0, ge=0, description="start also from a flow point per cell of so many px a side; 0: none")
+    start_opacity: float = Field(0.1, gt=0, lt=1, description="of the Gaussians at the points")
+    start_size: float = Field(1.0, gt=0, description="their deviation over the way to the next points (3DGS: 1)")
     holdout: int = Field(0, ge=0, description="every so manieth training view is only measured; 0 = none")
     device: Literal["cpu", "cuda"] = Field("cpu", description="where to compute")
 
@@ -44,7 +48,11 @@ def preview(params: Params, *, poses: Path) -> list[str]:
 
 
 def run(params: Params, out: Path, *, poses: Path) -> None:
-    from reffusion import io, trace
+    from dataclasses import replace
+
+    import numpy as np
+
+    from reffusion import io, stereo, trace
     from reffusion.fit import fit, initial_gaussians
 
     if (poses / "gaussians.ply").exists():
@@ -54,9 +62,16 @@ def run(params: Params, out: Path, *, poses: Path) -> None:
     held_out = scene.train[params.holdout // 2 :: params.holdout] if params.holdout else ()
     cameras = [scene.cameras[name] for name in scene.train if name not in held_out]
     images = io.load_views(poses, scene.train)
+    points, colors, chosen = scene.points, scene.point_colors, settings(params, cameras)
+    if params.flow_cell and not (out / trace.CHECKPOINT).exists():
+        seen, seen_colors = stereo.dense_points(cameras, images, params.flow_cell)
+        points, colors = np.concatenate([points, seen]), np.concatenate([colors, seen_colors])
+        print(f"{len(seen)} points by optical flow beside {len(scene.points)}", flush=True)
     noise = trace.generator(params.seed, "start")
-    chosen = settings(params, cameras)
-    start = initial_gaussians(scene.points, scene.point_colors, params.sh_degree, chosen.budget, noise)
+    start = initial_gaussians(
+        points, colors, params.sh_degree, chosen.budget, noise, params.start_opacity, params.start_size
+    )
+    start = replace(start, antialiased=params.antialiased)
     gaussians = fit(
         cameras,
         images,

@@ -45,7 +45,7 @@ class Params(BaseModel):
     checkpoint_seconds: float = Field(10.0, gt=0, description="seconds of work between checkpoints")
 
 
-def run(params: Params, out: Path, *, poses: Path, masks: Path, reference: Path) -> None:
+def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, reference: Path) -> None:
     import torch
 
     from reffusion import io, trace
@@ -83,7 +83,7 @@ def run(params: Params, out: Path, *, poses: Path, masks: Path, reference: Path)
     )
     views = []
     if params.scene_crops > 0:
-        views = P.clear_views(scene_views(scene, poses, masks, prior.native_size), training.size)
+        views = P.clear_views(scene_views(scene, poses, fit, masks, prior.native_size), training.size)
         if not views:
             print(f"note: no view has {training.size} px window free of masks: reference alone", flush=True)
     lora = diffusion.add_lora(prior, params.rank, params.alpha, params.dropout, params.layers, params.seed)
@@ -92,14 +92,14 @@ def run(params: Params, out: Path, *, poses: Path, masks: Path, reference: Path)
     trace.clear_checkpoint(out)
 
 
-def scene_views(scene, poses: Path, masks: Path, size: int) -> list:
+def scene_views(scene, poses: Path, fit: Path, masks: Path, size: int) -> list:
     """The training views as pictures whose consistent mask must not be used (nothing of it in a clean view)."""
     import torch
 
-    from reffusion import io
+    from reffusion import exposure, io
     from reffusion import personalize as P
 
-    photos, sets = io.load_views(poses, scene.train), io.load_mask_sets(masks, scene.train)
+    photos, sets = exposure.load_views(poses, fit, scene.train), io.load_mask_sets(masks, scene.train)
     return [
         P.picture(torch.from_numpy(photos[n]), torch.from_numpy(sets[n].consistent & (n not in scene.clean)), size)
         for n in scene.train

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 if TYPE_CHECKING:
     from reffusion.io import Capture, Roles
+    from reffusion.types import Scene
 
 STRICT = ConfigDict(extra="forbid", frozen=True)
 
@@ -45,8 +46,9 @@ class Params(BaseModel):
     gaussians: str | None = Field(None, description=".ply the scene brings in its own frame, 3DGS layout")
     region: Region | None = Field(None, description="3D box that holds the object, or is to be filled")
     longest: int = Field(1600, ge=16, description="larger image side in px; smaller pictures stay as they are")
-    least_points: int = Field(100, ge=0, description="with fewer sparse points, random ones are added to them")
-    random_points: int = Field(10_000, ge=1, description="how many")
+    refine: bool = Field(False, description="adjust cameras, the principal point of each view too, that flow belies")
+    least_points: int = Field(100, ge=0, description="with fewer sparse points, some of optical flow are added to them")
+    more_points: int = Field(10_000, ge=1, description="how many at most; random ones, where flow finds too few")
     seed: int = 0
 
     @property
@@ -89,11 +91,15 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
         pinholes[views[k]] = io.save_undistorted(out, views[k], capture, roles, params.longest)
     shutil.rmtree(out / "sfm", ignore_errors=True)
     normalised = frame.normalised(capture.poses, pinholes, roles.train, roles.test, roles.clean)
-    if len(normalised.points) < params.least_points or len(normalised.points) == 0:
+    if params.refine:
+        normalised = _refined(normalised, out)
+    if len(normalised.points) < max(params.least_points, 1):
+        normalised = _with_flow_points(params, normalised, out)
+    if len(normalised.points) < max(params.least_points, 1):
         ranges = frame.ranges_of(capture.poses, pinholes) * normalised.similarity.scale
         draws = trace.generator(params.seed, "poses", "random points")
         normalised = frame.filled_up(
-            normalised, ranges, params.random_points, draws, lambda v: io.load_views(out, [v])[v]
+            normalised, ranges, params.more_points, draws, lambda v: io.load_views(out, [v])[v]
         )
     io.save_scene(out, normalised)
     similarity = normalised.similarity
@@ -103,6 +109,42 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
         center = similarity.apply(params.region.center).tolist()
         size = [side * similarity.scale for side in params.region.size]
         io.save_json(out / "region.json", {"center": center, "size": size})
+
+
+def _refined(scene: Scene, out: Path) -> Scene:
+    """The scene with cameras that agree with optical flow; test views too, as they are in structure from motion."""
+    from reffusion import io
+    from reffusion.refine import refined
+
+    found = refined(list(scene.cameras.values()), io.load_views(out, scene.cameras))
+    if found.after is None:
+        print(f"cameras as given: the views miss each other by {found.before:.2f} px", flush=True)
+    else:
+        print(f"cameras adjusted: views missed each other by {found.before:.2f} px, now {found.after:.2f}", flush=True)
+    io.save_json(out / "refine.json", {"before": found.before, "after": found.after})
+    return replace(scene, cameras=found.cameras)
+
+
+def _with_flow_points(params: Params, scene: Scene, out: Path) -> Scene:
+    """The scene with points that its training views' optical flow shows."""
+    import numpy as np
+    import torch
+
+    from reffusion import io, stereo, trace
+
+    cameras = [scene.cameras[name] for name in scene.train]
+    pixels = sum(camera.width * camera.height for camera in cameras)
+    cell = max(2, round((pixels / params.more_points / 4) ** 0.5))  # most views' points were seen by another already
+    points, colors = stereo.dense_points(cameras, io.load_views(out, scene.train), cell)
+    kept = np.arange(len(points))
+    if len(points) > params.more_points:
+        draws = trace.generator(params.seed, "poses", "flow points")
+        kept = torch.randperm(len(points), generator=draws)[: params.more_points].numpy()
+    return replace(
+        scene,
+        points=np.concatenate([scene.points, points[kept]]),
+        point_colors=np.concatenate([scene.point_colors, colors[kept]]),
+    )
 
 
 def _place(params: Params, out: Path, capture: Capture) -> Capture:

@@ -37,13 +37,13 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path) -> No
 
     scene = io.load_scene(poses)
     given = sorted((poses / "references").glob("*.png"))
-    references = taken_over(given, scene, masks) if given else [inpainted(params, out, scene, poses, fit, masks)]
+    references = taken_over(given, scene, fit, masks) if given else [inpainted(params, out, scene, poses, fit, masks)]
     io.save_references(out, references)
 
 
-def taken_over(paths, scene, masks: Path) -> list:
-    """The scene's own references, each standing for the invent mask of its view."""
-    from reffusion import io
+def taken_over(paths, scene, fit: Path, masks: Path) -> list:
+    """The scene's own references, each standing for the invent mask of its view, and exposed as its photograph is."""
+    from reffusion import exposure, io
     from reffusion.types import Reference
 
     references = []
@@ -56,7 +56,7 @@ def taken_over(paths, scene, masks: Path) -> list:
             raise ValueError(f"{path}: {size} px, but its view has {camera.width} x {camera.height} px; resize it")
         mask = io.load_mask_sets(masks, [path.stem])[path.stem].invent
         if mask.any():
-            references.append(Reference(camera, image, mask))
+            references.append(Reference(camera, exposure.normalised(image, fit, path.stem), mask))
         else:
             print(f"reference {path.stem} is left out: nothing has to be invented in its view")
     if not references:
@@ -69,7 +69,7 @@ def inpainted(params: Params, out: Path, scene, poses: Path, fit: Path, masks: P
     in C where other views saw the background, the prior's own in I. Also writes the sheet of candidates."""
     import torch
 
-    from reffusion import inpaint, io, splat
+    from reffusion import exposure, inpaint, io, splat
     from reffusion import prior as diffusion
     from reffusion.types import Reference
 
@@ -79,7 +79,7 @@ def inpainted(params: Params, out: Path, scene, poses: Path, fit: Path, masks: P
     camera, pixels = scene.cameras[name], io.load_mask_sets(masks, [name])[name]
     keep = ~io.load_labels(masks / "labels.npy")
     background = splat.render(io.load_ply(fit / "gaussians.ply").map(lambda p: p[keep]), camera).color
-    photo = torch.from_numpy(io.load_views(poses, [name])[name]).float() / 255
+    photo = torch.from_numpy(exposure.load_views(poses, fit, [name])[name]).float() / 255
     base = torch.where(torch.from_numpy(pixels.consistent)[..., None], background, photo).clamp(0, 1)
 
     prior = diffusion.load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))

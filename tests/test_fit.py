@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from reffusion import exposure, io, trace
 from reffusion import fit as fitting
-from reffusion import io, trace
 from reffusion.fit import Settings, fit, initial_gaussians
 from reffusion.optimize import Rates
 from reffusion.splat import render
@@ -82,8 +82,9 @@ class Killed(Exception):
     pass
 
 
-def test_a_resumed_fit_is_the_unbroken_one_bit_for_bit(tmp_path, monkeypatch):
-    unbroken = run(tmp_path / "unbroken")
+@pytest.mark.parametrize("settings", [SETTINGS, replace(SETTINGS, exposure=True)], ids=["plain", "exposure"])
+def test_a_resumed_fit_is_the_unbroken_one_bit_for_bit(tmp_path, monkeypatch, settings):
+    unbroken = run(tmp_path / "unbroken", settings=settings)
     adapt, folder = fitting._adapt, tmp_path / "resumed"
     for moment in (3, 4, 13, 18):  # before the first checkpoint of a run, twice in a row, around densifications
 
@@ -94,15 +95,55 @@ def test_a_resumed_fit_is_the_unbroken_one_bit_for_bit(tmp_path, monkeypatch):
 
         monkeypatch.setattr(fitting, "_adapt", killing)
         with pytest.raises(Killed):
-            run(folder, settings=replace(SETTINGS, checkpoint_seconds=0.0))
+            run(folder, settings=replace(settings, checkpoint_seconds=0.0))
         assert trace.load_checkpoint(folder)["iteration"] == moment - 1
     monkeypatch.setattr(fitting, "_adapt", adapt)
-    resumed = run(folder)
+    resumed = run(folder, initial=start(truth().means.numpy()[:5].astype(np.float64)), settings=settings)
     for name in PARAMETERS:
         assert torch.equal(getattr(unbroken, name), getattr(resumed, name)), name
     broken, whole = (trace.read_trace(tmp_path / k / "trace.jsonl") for k in ("resumed", "unbroken"))
     drop = lambda lines: [{k: v for k, v in line.items() if k != "seconds"} for line in lines]
     assert drop(broken) == drop(whole)
+    if settings.exposure:
+        first, second = (io.load_json(tmp_path / k / exposure.FILE) for k in ("unbroken", "resumed"))
+        assert first == second
+
+
+def test_exposures_are_found_and_taken_out_again(tmp_path):
+    """Photographs of which each has another exposure: with the param the held-out view, exposed as on average, is
+    right; without it, it is not; and the photographs come back as if none had differed."""
+    held, cameras = ring_of_cameras(9)[4], [c for k, c in enumerate(ring_of_cameras(9)) if k != 4]
+    pictures, gains = photos([*cameras, held]), (0.7, 1.2, 0.8, 1.25, 1.1, 0.85, 1.15, 0.95)
+    poses = tmp_path / "poses"
+    for camera, gain in zip(cameras, gains, strict=True):
+        changed = (pictures[camera.name] * np.array([gain, 1.0, 2 - gain]) + 8 * (gain - 1)).clip(0, 255)
+        io.save_image(poses / "images" / f"{camera.name}.png", changed.round().astype(np.uint8))
+    shown = io.load_views(poses, [c.name for c in cameras]) | {held.name: pictures[held.name]}
+    settings = replace(SETTINGS, iterations=1000, reset_every=0, coarse_until=0, random_background=False)
+    scores = []
+    for on in (False, True):
+        folder = tmp_path / str(on)
+        folder.mkdir()
+        fit(cameras, shown, start(), replace(settings, exposure=on), folder=folder, held_out=[held])
+        scores.append(trace.read_trace(folder / "trace.jsonl")[-1]["psnr_held_out"])
+    assert scores[1] > scores[0] + 2
+    away = lambda views: np.mean([np.abs(v.astype(float) - pictures[n]).mean() for n, v in views.items()])
+    names = [c.name for c in cameras]
+    assert away(exposure.load_views(poses, tmp_path / "True", names)) < 0.3 * away(io.load_views(poses, names))
+    for view, image in exposure.load_views(poses, tmp_path / "False", names).items():
+        assert np.array_equal(image, shown[view])
+    assert exposure.normalised(pictures[held.name], tmp_path / "True", held.name) is pictures[held.name]
+
+
+def test_exposures_stay_the_identity_on_average():
+    exposures = exposure.Exposures(["a", "b", "c"])
+    for step in range(5):
+        (exposures.apply(torch.full((2, 2, 3), 0.5), "a") - 1).square().sum().backward()
+        exposures.step(step / 5)
+    matrices = exposures.state_dict()["matrices"]
+    mean = torch.stack(list(matrices.values())).mean(0)
+    torch.testing.assert_close(mean, torch.eye(3, 4), atol=1e-6, rtol=0)
+    assert matrices["a"].sum() > 3.05 and torch.equal(matrices["b"], matrices["c"])
 
 
 def test_seeds_matter_and_repeat(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -48,6 +49,14 @@ def some_scene(names=("b", "a", "c")) -> Scene:
 def test_io_costs_no_torch():
     code = "import sys, reffusion.io; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_a_ply_says_how_it_is_meant_to_be_drawn(tmp_path, antialiased):
+    io.save_ply(tmp_path / "g.ply", replace(some_gaussians(3, 1), antialiased=antialiased))
+    assert io.load_ply(tmp_path / "g.ply").antialiased == antialiased
+    header = (tmp_path / "g.ply").read_bytes().split(b"end_header")[0]
+    assert (b"comment antialiased" in header) == antialiased
 
 
 def test_images_round_trip_and_floats_are_rounded(tmp_path):

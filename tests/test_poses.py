@@ -205,9 +205,9 @@ def test_depth_falls_back_where_nothing_tells_it():
 def test_random_points_are_seen_seeded_and_coloured(tmp_path):
     truth = some_truth()
     folder = prepare(tmp_path / "s", "transforms", truth)
-    scene, _ = run(folder, random_points=500)
-    again, _ = run(folder, random_points=500)
-    other, _ = run(folder, random_points=500, seed=1)
+    scene, _ = run(folder, more_points=500)
+    again, _ = run(folder, more_points=500)
+    other, _ = run(folder, more_points=500, seed=1)
     assert np.array_equal(scene.points, again.points) and not np.array_equal(scene.points, other.points)
     seen = np.zeros(500, int)
     for camera in scene.cameras.values():
@@ -324,6 +324,7 @@ def test_fox(tmp_path):
     with pytest.warns(UserWarning, match=r"17 of the 67 frames.*images/0005\.jpg.*images/0113\.jpg"):
         scene, _ = real(tmp_path, "fox", masks="none", train=["0001", "0002", "0003"], longest=240)
     camera = scene.cameras["0001"]
-    assert (camera.width, camera.height) == (135, 240) and len(scene.points) == 10_000
+    assert (camera.width, camera.height) == (135, 240)
+    assert 100 < len(scene.points) <= 10_000, "it brings none, these are of flow"
     notes = poses.preview(poses.Params(masks="none", test="every 8"), capture("fox"))
     assert "43 training and 7 test views, 0 masks" in notes and any("OPENCV k1=0.05784" in n for n in notes)

@@ -122,9 +122,47 @@ def test_needles(footprint):
     assert_same(gaussians, camera(64, 64), relative=1e-3)
 
 
-def test_reference_against_finite_differences():
+@pytest.mark.parametrize("log_scale", [-5.0, -3.2, -1.5])
+def test_antialiased_equals_reference(log_scale):
+    """From footprints far below a pixel to large ones; faint ones are left out alike."""
+    exact = assert_same(replace(cloud(300, log_scale), antialiased=True), camera(61, 47))
+    assert exact.alpha.max() > 0.1
+    assert_same(replace(cloud(300, log_scale), antialiased=False), camera(61, 47))
+
+
+def test_antialiased_needles_and_sheets():
+    """Shapes whose sharp determinant is next to nothing, or nothing: neither is drawn, nor is anything not finite."""
+    gaussians = replace(cloud(40, 0.0, seed=5, spread=0.5), antialiased=True)
+    needles = replace(gaussians, log_scales=torch.tensor([-1.0, -7.9, -7.9]).repeat(40, 1))
+    assert (assert_same(needles, camera(64, 64), relative=1e-3).radii > 0).any()
+    lines = replace(gaussians, log_scales=torch.tensor([-1.0, -500.0, -500.0]).repeat(40, 1))
+    drawn, gradients = differentiate(lines, camera(64, 64), "cpu", torch.float32)
+    assert (drawn.radii == 0).all() and all(torch.isfinite(g).all() for g in gradients.values())
+
+
+@pytest.mark.parametrize("impl", ["cpu", "reference"])
+def test_antialiased_adds_up_to_the_same_from_any_distance(impl):
+    """The sum of alpha of a round Gaussian is 2 pi o (f s / z)^2, also where that is far below a pixel; 3DGS's low-pass
+    makes it at least 2 pi o 0.3, as bright from afar as from near."""
+    turn, logit = torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([2.0])
+    one = Gaussians(torch.zeros(1, 3), turn, torch.full((1, 3), -3.0), logit, torch.zeros(1, 1, 3))
+    opacity = torch.tensor(2.0).sigmoid().item()
+    for distance in (2.0, 5.0, 10.0, 20.0):
+        view = Camera("far", 64, 64, 100.0, 100.0, 32.0, 32.0, np.eye(4))
+        view.world_to_camera[2, 3] = distance
+        size = 100 * math.exp(-3) / distance
+        true = 2 * math.pi * opacity * size**2
+        total = splat.render(replace(one, antialiased=True), view, impl=impl).alpha.sum().item()
+        # what the 1/255 cut takes away is 1/255 of the peak's integral
+        faint = 2 * math.pi * (size**2 + 0.3) / 255
+        assert total == pytest.approx(true, abs=faint + 0.01 * true), distance
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_reference_against_finite_differences(antialiased):
     """Every parameter along random directions, in float64; the random scene has no pixel close to a threshold."""
-    gaussians, view = cloud(12, -1.2, seed=2).map(torch.Tensor.double), camera(9, 8)
+    gaussians, view = replace(cloud(12, -1.2, seed=2), antialiased=antialiased), camera(9, 8)
+    gaussians = gaussians.map(torch.Tensor.double)
     _, gradients = differentiate(gaussians, view, "reference", torch.float64)
     generator = torch.Generator().manual_seed(1)
     random = lambda *shape: torch.randn(*shape, generator=generator).double()
@@ -356,10 +394,11 @@ def test_bad_gaussians_are_named():
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
-def test_cuda_equals_reference():
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_cuda_equals_reference(antialiased):
     gaussians = replace(cloud(300, -3.2), opacity_logits=torch.linspace(-5, 4, 300))  # alpha stays under 0.99
-    view, cuda = camera(61, 47), cloud(300, -3.2)
-    cuda = replace(gaussians).map(torch.Tensor.cuda)
+    gaussians = replace(gaussians, antialiased=antialiased)
+    view, cuda = camera(61, 47), gaussians.map(torch.Tensor.cuda)
     exact = splat.render(gaussians.map(torch.Tensor.double), view, impl="reference")
     drawn = splat.render(cuda, view)
     for name in ("color", "depth", "alpha"):

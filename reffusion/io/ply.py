@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -16,6 +17,7 @@ DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALES = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 RED_GREEN_BLUE = ("red", "green", "blue")
+ANTIALIASED = "antialiased"  # a comment that says how the Gaussians are meant to be drawn
 
 
 def save_ply(path: Path, gaussians: Gaussians, similarity: Similarity | None = None) -> None:
@@ -47,12 +49,13 @@ def save_ply(path: Path, gaussians: Gaussians, similarity: Similarity | None = N
         (SCALES, log_scales),
         (ROTATION, columns["quaternions"]),
     )
+    comments = [ANTIALIASED] if gaussians.antialiased else []
     types = [(name, position_type if names is POSITION else "f4") for names, _ in blocks for name in names]
     table = np.empty(count, dtype=types)
     for names, values in blocks:
         for name, column in zip(names, values.T, strict=True):
             table[name] = column
-    _write(path, table)
+    _write(path, table, comments)
 
 
 _FIELDS = ("means", "quaternions", "log_scales", "opacity_logits", "sh")
@@ -91,7 +94,8 @@ def load_ply(path: Path, similarity: Similarity | None = None) -> Gaussians:
     for name, array in zip(_FIELDS, arrays, strict=True):
         if not np.isfinite(array).all():
             raise ValueError(f"{path}: {name} holds values that are not finite")
-    return Gaussians(*(torch.from_numpy(np.array(array, np.float32)) for array in arrays))
+    tensors = (torch.from_numpy(np.array(array, np.float32)) for array in arrays)
+    return Gaussians(*tensors, antialiased=ANTIALIASED in _comments(path))
 
 
 def save_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
@@ -118,11 +122,23 @@ def load_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return points, np.full((len(points), 3), 128, np.uint8)
 
 
-def _write(path: Path, table: np.ndarray) -> None:
+def _write(path: Path, table: np.ndarray, comments: Sequence[str] = ()) -> None:
     from plyfile import PlyData, PlyElement
 
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(str(path))
+    PlyData([PlyElement.describe(table, "vertex")], byte_order="<", comments=list(comments)).write(str(path))
+
+
+def _comments(path: Path) -> list[str]:
+    """Of a file that could be read."""
+    found = []
+    with open(path, "rb") as file:
+        for line in iter(file.readline, b"end_header\n"):
+            if line.startswith(b"comment "):
+                found.append(line[8:].decode("ascii", "replace").strip())
+            elif not line or line.rstrip() == b"end_header":
+                break
+    return found
 
 
 def _read(path: Path) -> np.ndarray:

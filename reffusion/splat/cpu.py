@@ -45,6 +45,7 @@ def render(
         background.new_empty(0, 2) if probe is None else probe,
         camera,
         degree,
+        gaussians.antialiased,
     )
     return Rendering(color, depth, alpha, None if features is None else blended, radii)
 
@@ -52,7 +53,8 @@ def render(
 def accumulate(gaussians: Gaussians, camera: Camera, values: Tensor, count: bool) -> Tensor:
     """See `reffusion.splat.accumulate`."""
     parameters = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.opacity_logits, gaussians.sh)
-    view = look([_array(p) for p in parameters], np.empty((0, 2), np.float32), camera, 0)
+    no_probe = np.empty((0, 2), np.float32)
+    view = look([_array(p) for p in parameters], gaussians.antialiased, no_probe, camera, 0)
     records, written = backward.gather_values(view.footprints, view.bins, _array(values), count)
     gathered = np.empty((footprints.padded(len(gaussians)), values.shape[-1]), np.float32)
     share(footprints.add_all_records, records, written, view.bins.first_slots, gathered)
@@ -63,13 +65,13 @@ def _array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().contiguous().numpy()
 
 
-def look(parameters: list[np.ndarray], probe: np.ndarray, camera: Camera, degree: int) -> View:
+def look(parameters: list[np.ndarray], antialiased: bool, probe: np.ndarray, camera: Camera, degree: int) -> View:
     """Project, sort and bin; `parameters` in the order of `types.PARAMETERS`."""
     count, width = len(parameters[0]), 3 * parameters[4].shape[1]
     rows = footprints.padded(count)
     drawn, radii = room(rows * FOOTPRINT), np.zeros(rows, np.int32)
-    flat = (array.reshape(-1) for array in parameters)
-    share(footprints.draw, *flat, width, degree, probe.reshape(-1), view_numbers(camera), camera.center, drawn, radii)
+    flat, numbers = (array.reshape(-1) for array in parameters), view_numbers(camera, antialiased)
+    share(footprints.draw, *flat, width, degree, probe.reshape(-1), numbers, camera.center, drawn, radii)
     order = binning.depth_order(radii[:count], drawn)
     return View(drawn, radii, binning.bin_footprints(drawn, order, count, camera.width, camera.height))
 
@@ -78,9 +80,11 @@ class _Splat(torch.autograd.Function):
     """Gaussians -> color, depth, alpha, features, radii."""
 
     @staticmethod
-    def forward(ctx, means, quaternions, log_scales, opacity_logits, sh, features, background, probe, camera, degree):
+    def forward(
+        ctx, means, quaternions, log_scales, opacity_logits, sh, features, background, probe, camera, degree, antialiased
+    ):
         parameters = [_array(t) for t in (means, quaternions, log_scales, opacity_logits, sh)]
-        view = look(parameters, _array(probe), camera, degree)
+        view = look(parameters, antialiased, _array(probe), camera, degree)
         color, depth, alpha, blended, transmittance, used = forward.blend(
             view.footprints, _array(features), _array(background), view.bins, camera.width, camera.height
         )
@@ -90,7 +94,7 @@ class _Splat(torch.autograd.Function):
         if any(ctx.needs_input_grad):
             inputs = (means, quaternions, log_scales, opacity_logits, sh, features)
             ctx.save_for_backward(*inputs, color, depth, alpha, blended)
-            ctx.rest = view, transmittance, used, camera, degree
+            ctx.rest = view, transmittance, used, view_numbers(camera, antialiased), camera.center, degree
         return color, depth, alpha, blended, radii
 
     @staticmethod
@@ -98,21 +102,23 @@ class _Splat(torch.autograd.Function):
     def backward(ctx, grad_color, grad_depth, grad_alpha, grad_blended, _):
         saved = [_array(t) for t in ctx.saved_tensors]
         parameters, features, images = saved[:5], saved[5], saved[6:]
-        view, transmittance, used, camera, degree = ctx.rest
+        view, transmittance, used, numbers, center, degree = ctx.rest
         gradients = [_array(g) for g in (grad_color, grad_depth, grad_alpha, grad_blended)]
         records, written = backward.blend_backward(
             view.footprints, features, view.bins, used, images, transmittance, gradients
         )
         arrays = _to_parameters(
-            view, records, written, parameters, features.shape[1], camera, degree, ctx.needs_input_grad[7]
+            view, records, written, parameters, features.shape[1], numbers, center, degree, ctx.needs_input_grad[7]
         )
         to_background = np.einsum("hw,hwc->c", transmittance, gradients[0]) if ctx.needs_input_grad[6] else None
         arrays = (*arrays[:6], to_background, arrays[6])
         needed = zip(arrays, ctx.needs_input_grad, strict=False)
-        return (*(torch.from_numpy(array) if need else None for array, need in needed), None, None)
+        return (*(torch.from_numpy(array) if need else None for array, need in needed), None, None, None)
 
 
-def _to_parameters(view, records, written, parameters, channels, camera, degree, want_probe) -> list[np.ndarray]:
+def _to_parameters(
+    view, records, written, parameters, channels, numbers, center, degree, want_probe
+) -> list[np.ndarray]:
     """Gradients of the parameters, in the order of `types.PARAMETERS`, of the features and of the probe."""
     count, rows = len(parameters[0]), footprints.padded(len(parameters[0]))
     shapes = [(rows, *array.shape[1:]) for array in parameters] + [(rows, channels), (rows if want_probe else 0, 2)]
@@ -129,8 +135,8 @@ def _to_parameters(view, records, written, parameters, channels, camera, degree,
         *(array.reshape(-1) for array in parameters),
         3 * parameters[4].shape[1],
         degree,
-        view_numbers(camera),
-        camera.center,
+        numbers,
+        center,
         *flat_out[:5],
         out[5],
         flat_out[6],

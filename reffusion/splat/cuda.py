@@ -117,7 +117,7 @@ def _project(gaussians: Gaussians, camera: Camera) -> _Footprints:
     zero = (gaussians.quaternions == 0).all(1, keepdim=True)
     quaternions = torch.where(zero, like.new_tensor([1.0, 0.0, 0.0, 0.0]), gaussians.quaternions)
     opacities = torch.sigmoid(gaussians.opacity_logits)
-    radii, means, depths, conics, _ = gsplat.fully_fused_projection(
+    radii, means, depths, conics, kept = gsplat.fully_fused_projection(
         like,
         None,
         quaternions,
@@ -128,13 +128,15 @@ def _project(gaussians: Gaussians, camera: Camera) -> _Footprints:
         camera.height,
         eps2d=LOW_PASS,
         near_plane=NEAR,
+        calc_compensations=gaussians.antialiased,
         opacities=opacities,
     )
+    opacities = opacities[None] if kept is None else opacities[None] * kept
     across, down = -(-camera.width // _TILE), -(-camera.height // _TILE)
     with torch.no_grad():
         _, pairs, lists = gsplat.isect_tiles(means, radii, depths, _TILE, across, down, n_images=1)
         starts = gsplat.isect_offset_encode(pairs, 1, across, down)
-    return _Footprints(means, radii, depths, conics, opacities[None], (starts.reshape(1, down, across), lists))
+    return _Footprints(means, radii, depths, conics, opacities, (starts.reshape(1, down, across), lists))
 
 
 def _empty(camera: Camera, features: Tensor | None, background: Tensor) -> Rendering:

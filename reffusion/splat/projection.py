@@ -30,8 +30,8 @@ _UNSCALE = 1.0 / _HALF_LOG2_E  # a footprint's u and v are scaled by sqrt(log2(e
 _LEAST_LEVEL = math.log2(MIN_ALPHA)
 
 
-def view_numbers(camera: Camera) -> np.ndarray:
-    """[22] float64: rotation rows, translation, fx, fy, cx, cy, clamping range of x/z and y/z, size."""
+def view_numbers(camera: Camera, antialiased: bool) -> np.ndarray:
+    """[23] float64: rotation rows, translation, fx, fy, cx, cy, clamping range of x/z and y/z, size, antialiased."""
     half_x, half_y = camera.width / 2 / camera.fx, camera.height / 2 / camera.fy
     return np.array(
         [
@@ -42,7 +42,7 @@ def view_numbers(camera: Camera) -> np.ndarray:
             (camera.width - camera.cx) / camera.fx + JACOBIAN_MARGIN * half_x,
             -camera.cy / camera.fy - JACOBIAN_MARGIN * half_y,
             (camera.height - camera.cy) / camera.fy + JACOBIAN_MARGIN * half_y,
-            *(camera.width, camera.height),
+            *(camera.width, camera.height, antialiased),
         ],
         np.float64,
     )
@@ -134,15 +134,20 @@ def _dot(a, b):
 
 
 @inlined
+def _cross(a, b):
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@inlined
 def _covariance(a, b):
-    """Of root [2, 3] with rows a and b: xx, xy, yy of root rootᵀ without the low-pass, and the determinant with it.
+    """Of root [2, 3] with rows a and b: xx, xy, yy and determinant of root rootᵀ, and the determinant with low-pass.
 
     Cauchy-Binet: the sum of the squared 2x2 minors has no cancellation where xx yy - xy^2 loses everything.
     """
     xx, xy, yy = _dot(a, a), _dot(a, b), _dot(b, b)
-    m0, m1, m2 = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-    determinant = m0 * m0 + m1 * m1 + m2 * m2 + LOW_PASS * (xx + yy) + LOW_PASS * LOW_PASS
-    return xx, xy, yy, determinant
+    m0, m1, m2 = _cross(a, b)
+    sharp = m0 * m0 + m1 * m1 + m2 * m2
+    return xx, xy, yy, sharp, sharp + LOW_PASS * (xx + yy) + LOW_PASS * LOW_PASS
 
 
 @inlined
@@ -175,11 +180,12 @@ def project(view, mean, quaternions, log_scales, opacity_logits, row, last):
     x, y, z = camera_point(view, mean)
     z_inverse = 1.0 / z
     _, _, _, _, a, b = _frame(view, x, y, z_inverse, quaternions, log_scales, row, last)
-    xx, xy, yy, determinant = _covariance(a, b)
+    xx, xy, yy, sharp, determinant = _covariance(a, b)
     kept = (z >= NEAR) & (xx < MAX_VARIANCE) & (yy < MAX_VARIANCE)
     xx, yy = xx + LOW_PASS, yy + LOW_PASS
     mean_x, mean_y = view[12] * x * z_inverse + view[14], view[13] * y * z_inverse + view[15]
     opacity = 1.0 / (1.0 + exponential(0.0 - widen(load_column(opacity_logits, 1, 0, row, last))))
+    opacity = opacity * root(maximum(1.0 - view[22] * (1.0 - sharp / determinant), 0.0))
     kept = kept & (opacity >= MIN_ALPHA)
     level = log2(opacity)
     cut = root(maximum((level - _LEAST_LEVEL) * (2.0 / _LOG2_E), 0.0))
@@ -211,7 +217,7 @@ def project_backward(view, mean, quaternions, log_scales, opacity_logits, row, l
     x, y, z = camera_point(view, mean)
     z_inverse = 1.0 / z
     quaternion, rotation, projector, scales, a, b = _frame(view, x, y, z_inverse, quaternions, log_scales, row, last)
-    _, xy, yy, determinant = _covariance(a, b)
+    _, xy, yy, sharp, determinant = _covariance(a, b)
     yy = yy + LOW_PASS
     slant, lx, ly = xy / yy, root(yy / determinant), 1.0 / root(yy)
 
@@ -220,6 +226,7 @@ def project_backward(view, mean, quaternions, log_scales, opacity_logits, row, l
     grad_mean_y = ly * (_UNSCALE * _column(moments, SUM_V)) - slant * grad_mean_x
 
     grad_a, grad_b = _root_backward(a, b, slant, lx, ly, moments)
+    grad_a, grad_b = _compensation_backward(a, b, sharp, determinant, view[22] * _column(moments, SUM_G), grad_a, grad_b)
     grad_log_scales = (
         grad_a[0] * a[0] + grad_b[0] * b[0],
         grad_a[1] * a[1] + grad_b[1] * b[1],
@@ -259,6 +266,31 @@ def _root_backward(a, b, slant, lx, ly, moments):
     gb1 = ly * (uv * w1 + vv * h1) - slant * ga1
     gb2 = ly * (uv * w2 + vv * h2) - slant * ga2
     return (ga0, ga1, ga2), (gb0, gb1, gb2)
+
+
+@inlined
+def _compensation_backward(a, b, sharp, determinant, grad, grad_a, grad_b):
+    """Add what ln sqrt(sharp / determinant) owes to root: `grad` times half the gradients of the two logarithms.
+
+    The minors' gradient is a cross product, again without cancellation. Where sharp is 0, nothing is drawn: grad is 0.
+    """
+    m = _cross(a, b)
+    sharpness = grad * (1.0 / maximum(sharp, 1e-300) - 1.0 / determinant)
+    width = grad * (LOW_PASS / determinant)
+    by_a, by_b = _cross(b, m), _cross(m, a)
+    return (
+        _moved_row(grad_a, by_a, sharpness, a, width),
+        _moved_row(grad_b, by_b, sharpness, b, width),
+    )
+
+
+@inlined
+def _moved_row(grad, by, sharpness, row, width):
+    return (
+        grad[0] + sharpness * by[0] - width * row[0],
+        grad[1] + sharpness * by[1] - width * row[1],
+        grad[2] + sharpness * by[2] - width * row[2],
+    )
 
 
 @inlined

@@ -131,9 +131,12 @@ def project(gaussians: Gaussians, camera: Camera, probe: Tensor | None) -> tuple
     yy = root[:, 1].square().sum(1)
     # Cauchy-Binet: det(root rootᵀ) is the sum of the squared 2x2 minors, without the cancellation of xx·yy - xy².
     minors = torch.linalg.cross(root[:, 0], root[:, 1])
-    determinants = minors.square().sum(1) + LOW_PASS * (xx + yy) + LOW_PASS**2
+    sharp = minors.square().sum(1)
+    determinants = sharp + LOW_PASS * (xx + yy) + LOW_PASS**2
     covariances = torch.stack((xx + LOW_PASS, xy, yy + LOW_PASS), 1)
     opacities = torch.sigmoid(gaussians.opacity_logits[index])
+    if gaussians.antialiased:
+        opacities = opacities * torch.where(sharp > 0, sharp / determinants, 1).sqrt() * (sharp > 0)
 
     with torch.no_grad():
         cut = torch.sqrt(2 * torch.log(torch.clamp(opacities / MIN_ALPHA, min=1.0)))

@@ -1,0 +1,119 @@
+"""Points by optical flow: exact where the matches are, robust where one is wrong, honest where there is no parallax."""
+
+import numpy as np
+import pytest
+
+from reffusion import stereo
+from reffusion.types import Camera
+
+WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
+
+
+def camera(name: str, x: float, y: float = 0.0, turn: float = 0.0) -> Camera:
+    """At (x, y, -1), looking along z, turned about y."""
+    c, s = np.cos(turn), np.sin(turn)
+    pose = np.eye(4)
+    pose[:3, :3] = [[c, 0, -s], [0, 1, 0], [s, 0, c]]
+    pose[:3, 3] = -pose[:3, :3] @ (x, y, -1.0)
+    return Camera(name, WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, pose)
+
+
+CAMERAS = [camera("a", 0.0), camera("b", 0.08), camera("c", -0.07, 0.03, 0.05), camera("d", 0.02, -0.09)]
+
+
+def matches_of(places_there, here, seen=None) -> stereo.Matches:
+    """Of view a with the others."""
+    there = np.array(places_there)
+    names = tuple(view.name for view in CAMERAS[1:])
+    return stereo.Matches("a", here, names, there, np.ones(there.shape[:2], bool) if seen is None else seen)
+
+
+BY_NAME = {view.name: view for view in CAMERAS}
+
+
+def places(points: np.ndarray, view: Camera) -> np.ndarray:
+    local = points @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
+    return local[:, :2] / local[:, 2:] * FOCAL + (WIDTH / 2, HEIGHT / 2)
+
+
+def some_points() -> np.ndarray:
+    return np.random.default_rng(0).uniform((-0.3, -0.2, -0.2), (0.3, 0.2, 8.0), (500, 3))
+
+
+def test_exact_matches_give_exact_depths():
+    points, others = some_points(), CAMERAS[1:]
+    matches = matches_of([places(points, o) for o in others], places(points, CAMERAS[0]))
+    depth, known = stereo.triangulate(matches, BY_NAME)
+    assert known.all()
+    np.testing.assert_allclose(depth, points[:, 2] + 1, rtol=1e-6)
+    assert np.abs(stereo.misses(matches, BY_NAME, depth)).max() < 1e-3
+    np.testing.assert_allclose(stereo.unproject(CAMERAS[0], matches.pixels, depth), points, atol=1e-5)
+
+
+def test_a_wrong_match_in_one_view_does_not_matter():
+    points, others = some_points(), CAMERAS[1:]
+    there = [places(points, o) for o in others]
+    there[1] = there[1] + (25.0, -14.0)
+    depth, known = stereo.triangulate(matches_of(there, places(points, CAMERAS[0])), BY_NAME)
+    assert known.mean() > 0.8
+    assert (np.abs(depth / (points[:, 2] + 1) - 1) < 1e-3)[known].mean() > 0.97
+
+
+def test_what_moves_or_matches_nothing_is_left_out():
+    points, others, rng = some_points(), CAMERAS[1:], np.random.default_rng(1)
+    here = places(points, CAMERAS[0])
+    scattered = [places(points, o) + rng.normal(0, 30, (len(points), 2)) for o in others]
+    assert stereo.triangulate(matches_of(scattered, here), BY_NAME)[1].mean() < 0.05
+    nowhere = matches_of([places(points, o) for o in others], here, np.zeros((3, len(points)), bool))
+    assert not stereo.triangulate(nowhere, BY_NAME)[1].any()
+
+
+def test_without_parallax_a_point_is_far_and_one_that_would_be_behind_is_none():
+    directions = np.random.default_rng(2).uniform((-0.3, -0.2, 1.0), (0.3, 0.2, 1.0), (200, 3))
+    others, here = CAMERAS[1:], places(CAMERAS[0].center + directions, CAMERAS[0])
+    depth, known = stereo.triangulate(matches_of([places(o.center + directions, o) for o in others], here), BY_NAME)
+    assert known.all() and (depth > 1e4).all()
+    behind = [places(o.center + directions + 0.3 * (o.center - CAMERAS[0].center), o) for o in others]
+    assert not stereo.triangulate(matches_of(behind, here), BY_NAME)[1].any()
+
+
+def pictures(slope: float) -> dict[str, np.ndarray]:
+    """Views of the plane z = 1 + slope x, painted with noise of several sizes."""
+    rng, drawn = np.random.default_rng(3), {}
+    waves = rng.normal(0, 14, (60, 2)), rng.uniform(0, 6.3, (60, 3))
+    for view in CAMERAS:
+        y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+        rays = np.stack([(x - WIDTH / 2) / FOCAL, (y - HEIGHT / 2) / FOCAL, np.ones_like(x)], -1)
+        rays = rays @ view.world_to_camera[:3, :3]
+        reach = (1 + slope * view.center[0] - view.center[2]) / (rays[..., 2] - slope * rays[..., 0])
+        at = view.center + rays * reach[..., None]
+        field = np.sin((at[..., :2] @ waves[0].T)[..., None] + waves[1]).sum(2) / 60**0.5
+        drawn[view.name] = (127 + 70 * field).clip(0, 255).astype(np.uint8)
+    return drawn
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.5])
+def test_a_painted_plane_comes_back(slope):
+    points, colors = stereo.dense_points(CAMERAS, pictures(slope), 3)
+    cells = WIDTH * HEIGHT / 9
+    assert 0.6 * cells < len(points) < 2 * cells  # later views add what the first does not see
+    assert colors.shape == points.shape and colors.dtype == np.uint8
+    away = np.abs(points[:, 2] - 1 - slope * points[:, 0]) / 2
+    assert np.median(away) < 0.01 and np.quantile(away, 0.95) < 0.05
+
+
+def test_plain_pictures_give_nothing():
+    plain = {name: np.full_like(picture, 90) for name, picture in pictures(0.0).items()}
+    assert len(stereo.dense_points(CAMERAS, plain, 3)[0]) == 0
+
+
+def test_lonely_views_and_opposite_ones_give_nothing():
+    shown = pictures(0.0)
+    assert len(stereo.dense_points(CAMERAS[:1], shown, 3)[0]) == 0
+    opposite = [CAMERAS[0], camera("b", 0.1, turn=np.pi)]
+    assert len(stereo.dense_points(opposite, shown, 3)[0]) == 0
+
+
+def test_the_same_pictures_give_the_same_points():
+    first, second = (stereo.dense_points(CAMERAS, pictures(0.2), 4) for _ in range(2))
+    assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
