@@ -44,7 +44,7 @@ PHOTOS = {view.name: photo(view) for view in EXACT}
 
 
 def shaken(shift: float, turn: float) -> list[Camera]:
-    """Cameras that claim another principal point, by about `shift` px, and another rotation, by about `turn` degrees."""
+    """Cameras that claim a principal point about `shift` px off and a rotation about `turn` degrees off."""
     rng, views = np.random.default_rng(5), []
     for view in EXACT:
         pose = view.world_to_camera.copy()

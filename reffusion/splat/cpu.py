@@ -81,10 +81,10 @@ class _Splat(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx, means, quaternions, log_scales, opacity_logits, sh, features, background, probe, camera, degree, antialiased
+        ctx, means, quaternions, log_scales, opacity_logits, sh, features, background, probe, camera, degree, antialias
     ):
         parameters = [_array(t) for t in (means, quaternions, log_scales, opacity_logits, sh)]
-        view = look(parameters, antialiased, _array(probe), camera, degree)
+        view = look(parameters, antialias, _array(probe), camera, degree)
         color, depth, alpha, blended, transmittance, used = forward.blend(
             view.footprints, _array(features), _array(background), view.bins, camera.width, camera.height
         )
@@ -94,7 +94,7 @@ class _Splat(torch.autograd.Function):
         if any(ctx.needs_input_grad):
             inputs = (means, quaternions, log_scales, opacity_logits, sh, features)
             ctx.save_for_backward(*inputs, color, depth, alpha, blended)
-            ctx.rest = view, transmittance, used, view_numbers(camera, antialiased), camera.center, degree
+            ctx.rest = view, transmittance, used, view_numbers(camera, antialias), camera.center, degree
         return color, depth, alpha, blended, radii
 
     @staticmethod

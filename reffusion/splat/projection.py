@@ -226,7 +226,9 @@ def project_backward(view, mean, quaternions, log_scales, opacity_logits, row, l
     grad_mean_y = ly * (_UNSCALE * _column(moments, SUM_V)) - slant * grad_mean_x
 
     grad_a, grad_b = _root_backward(a, b, slant, lx, ly, moments)
-    grad_a, grad_b = _compensation_backward(a, b, sharp, determinant, view[22] * _column(moments, SUM_G), grad_a, grad_b)
+    grad_a, grad_b = _compensation_backward(
+        a, b, sharp, determinant, view[22] * _column(moments, SUM_G), grad_a, grad_b
+    )
     grad_log_scales = (
         grad_a[0] * a[0] + grad_b[0] * b[0],
         grad_a[1] * a[1] + grad_b[1] * b[1],
