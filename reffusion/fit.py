@@ -93,6 +93,7 @@ def fit(
     folder: Path,
     weights: Mapping[str, np.ndarray] | None = None,
     held_out: Sequence[Camera] = (),
+    spent: float = 0.0,
     impl: str = "auto",
 ) -> Gaussians:
     """Optimise `initial` until its renders look like the views; resumes from `folder`'s checkpoint, bit for bit.
@@ -107,6 +108,7 @@ def fit(
         weights: view name -> [H, W], how much each pixel counts; pixels of weight 0, and they alone, influence nothing.
             A view without an entry counts as a whole.
         held_out: views that are only measured.
+        spent: seconds that making `initial` took; the trace counts from there.
         impl: `splat.render`'s.
 
     Raises:
@@ -121,7 +123,7 @@ def fit(
     optimizer, start = GaussianOptimizer(initial, rates=settings.rates), 0
     exposures = Exposures((camera.name for camera in cameras), initial.means.device) if settings.exposure else None
     recent, started_with = {"loss": 0.0, "error": 0.0, "steps": 0}, len(initial)
-    state, seconds = trace.load_checkpoint(folder), 0.0
+    state, seconds = trace.load_checkpoint(folder), spent
     if state is not None:
         optimizer.load_state_dict(state["optimizer"])
         if exposures is not None:

@@ -32,6 +32,10 @@ class Params(BaseModel):
     reset_every: float = Field(0.1, ge=0, le=1, description="part of the run between opacity resets; 0 = none")
     means_rate: float = Field(1.6e-4, gt=0, description="first step size of positions; the last is a hundredth of it")
     opacity_rate: float = Field(0.05, gt=0, description="step size of opacity logits")
+    scales_rate: float = Field(5e-3, gt=0, description="step size of log scales")
+    rotations_rate: float = Field(1e-3, gt=0, description="step size of quaternions")
+    color_rate: float = Field(2.5e-3, gt=0, description="step size of the constant spherical harmonic")
+    sh_rate: float = Field(1.25e-4, gt=0, description="step size of the others")
     checkpoint_seconds: float = Field(10.0, gt=0, description="seconds of work between checkpoints")
     antialiased: bool = Field(False, description="a Gaussian adds up to the same from any distance (Mip-Splatting)")
     exposure: bool = Field(False, description="fit each view's exposure too; later stages see the views without it")
@@ -48,6 +52,7 @@ def preview(params: Params, *, poses: Path) -> list[str]:
 
 
 def run(params: Params, out: Path, *, poses: Path) -> None:
+    import time
     from dataclasses import replace
 
     import numpy as np
@@ -63,6 +68,7 @@ def run(params: Params, out: Path, *, poses: Path) -> None:
     cameras = [scene.cameras[name] for name in scene.train if name not in held_out]
     images = io.load_views(poses, scene.train)
     points, colors, chosen = scene.points, scene.point_colors, settings(params, cameras)
+    began = time.monotonic()
     if params.flow_cell and not (out / trace.CHECKPOINT).exists():
         seen, seen_colors = stereo.dense_points(cameras, images, params.flow_cell)
         points, colors = np.concatenate([points, seen]), np.concatenate([colors, seen_colors])
@@ -79,6 +85,7 @@ def run(params: Params, out: Path, *, poses: Path) -> None:
         chosen,
         folder=out,
         held_out=[scene.cameras[name] for name in held_out],
+        spent=time.monotonic() - began,
     )
     io.save_ply(out / "gaussians.ply", gaussians.map(lambda p: p.cpu()))
     trace.clear_checkpoint(out)
@@ -94,5 +101,13 @@ def settings(params: Params, cameras: list):
     shared = {f.name: getattr(params, f.name) for f in fields(Settings) if f.name not in ("rates", "budget")}
     pixels = sum(camera.width * camera.height for camera in cameras) / len(cameras)
     most = max(4, round(params.per_pixel * pixels)) if params.per_pixel else params.budget
-    rates = Rates(means=params.means_rate, means_last=params.means_rate / 100, opacity_logits=params.opacity_rate)
+    rates = Rates(
+        means=params.means_rate,
+        means_last=params.means_rate / 100,
+        quaternions=params.rotations_rate,
+        log_scales=params.scales_rate,
+        opacity_logits=params.opacity_rate,
+        sh_dc=params.color_rate,
+        sh_rest=params.sh_rate,
+    )
     return Settings(**shared, budget=min(params.budget, most), rates=rates)

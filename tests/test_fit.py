@@ -1,6 +1,7 @@
 """The fit of a whole scene: it learns, resumes, ignores masked pixels, and fails by name."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -256,6 +257,22 @@ def test_the_stage_writes_its_artifact_and_never_reads_test_views(tmp_path):
     assert "psnr_held_out" in trace.read_trace(out / "trace.jsonl")[-1]
     assert trace.load_checkpoint(out) is None
     assert stage.preview(params, poses=poses) == []
+
+
+def test_the_stage_starts_from_flow_points_of_the_views_it_fits(tmp_path, capsys, monkeypatch):
+    from reffusion import stereo
+    from stages import fit as stage
+
+    write_scene(tmp_path / "poses")
+    seen, find = [], stereo.dense_points
+    monkeypatch.setattr(stereo, "dense_points", lambda cameras, *rest: seen.append(cameras) or find(cameras, *rest))
+    params = stage.Params(iterations=3, budget=500, sh_degree=0, flow_cell=2, holdout=4, antialiased=True)
+    (tmp_path / "out").mkdir()
+    stage.run(params, tmp_path / "out", poses=tmp_path / "poses")
+    found = int(re.search(r"(\d+) points by optical flow beside 120", capsys.readouterr().out)[1])
+    fitted = io.load_ply(tmp_path / "out" / "gaussians.ply")
+    assert found > 0 and len(fitted) == 120 + found and fitted.antialiased
+    assert len(seen) == 1 and {c.name for c in seen[0]} == {"view1", "view2", "view4"}, "not the held-out view"
 
 
 def test_larger_pictures_have_room_for_more_gaussians():
