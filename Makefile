@@ -13,6 +13,7 @@ name :=
 steps :=
 
 export set # its value may hold quotes, so recipes read it from the environment
+export GOMP_SPINCOUNT ?= 30000 # see reffusion/__init__.py
 
 PYTHON ?= python3
 VENV ?= .venv
