@@ -12,8 +12,9 @@ seed :=
 name :=
 steps :=
 
+# GOMP_SPINCOUNT: see reffusion/__init__.py
 export set # its value may hold quotes, so recipes read it from the environment
-export GOMP_SPINCOUNT ?= 30000 # see reffusion/__init__.py
+export GOMP_SPINCOUNT ?= 30000
 
 PYTHON ?= python3
 VENV ?= .venv

@@ -245,14 +245,15 @@ def by_timestep(prior: diffusion.Prior, cases: list[Case], prompt: str) -> dict[
 
 def personalization(prior: str, run: Path, steps: int | None, out: Path) -> dict:
     """Personalize on the run's reference, and measure before and after on views that were never seen."""
-    for needed in ("poses", "masks", "reference"):
+    needs = {need: run / need for need in ("poses", "fit", "masks", "reference")}
+    for needed in needs:
         if not (run / needed).is_dir():
             raise ValueError(f"{run / needed} is missing: run `make scene={run.name} reference` first")
     folder = out / "personalize"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     params = profile(prior, steps)
-    stage.run(params, folder, poses=run / "poses", masks=run / "masks", reference=run / "reference")
+    stage.run(params, folder, **needs)
     models = {
         "before": diffusion.load_prior(prior),
         "after": diffusion.load_lora(diffusion.load_prior(prior), folder),

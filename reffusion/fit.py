@@ -263,7 +263,9 @@ def _step(
 ) -> tuple[float, float]:
     """Render, compare, move; returns the loss and the mean squared error over the pixels that count."""
     where = f"step {i}, view '{camera.name}'"
-    probe = torch.zeros(len(optimizer.gaussians), 2, device=target.device, requires_grad=True)
+    probe = None
+    if settings.densify_by == "slopes" and i < settings.densify_until * settings.iterations:
+        probe = torch.zeros(len(optimizer.gaussians), 2, device=target.device, requires_grad=True)
     background = None
     if settings.random_background:
         background = torch.rand(3, generator=trace.generator(settings.seed, "background", i)).to(target.device)
@@ -275,7 +277,8 @@ def _step(
     if not math.isfinite(value):
         raise FloatingPointError(f"fit, {where}: the reconstruction loss is {value}")
     (loss + _thrift(optimizer.gaussians, settings)).backward()
-    optimizer.observe(probe.grad, rendering.radii, camera.width, camera.height)
+    if probe is not None:
+        optimizer.observe(probe.grad, rendering.radii, camera.width, camera.height)
     try:
         optimizer.step(i / settings.iterations, visible=rendering.radii > 0)
     except FloatingPointError as error:
@@ -298,9 +301,10 @@ def _thrift(gaussians: Gaussians, settings: Settings) -> Tensor | float:
 
 
 def _squared_error(image: Tensor, target: Tensor, counts: Tensor | None) -> float:
-    squared = (image - target).square()
     if counts is None:
-        return float(squared.mean())
+        error = (image - target).flatten()
+        return float(error @ error) / error.numel()
+    squared = (image - target).square()
     inside = counts > 0
     return float(squared[inside].mean()) if inside.any() else 0.0
 

@@ -163,7 +163,7 @@ class GaussianOptimizer:
         alike = torch.ones_like(self._steps, dtype=torch.float32)
         self._steps += visible
         # Bias correction, per row; a row that never moved has t = 0 and is skipped.
-        unbias = [1 / (1 - beta ** self._steps.clamp(min=1).double()).float() for beta in self.betas]
+        unbias = [table.to(self._steps.device)[self._steps] for table in _unbiasing(self.betas, int(self._steps.max()))]
         with torch.no_grad():
             for name, gradient in gradients.items():
                 if gradient is None:
@@ -230,6 +230,12 @@ class GaussianOptimizer:
     def _replace(self, function) -> None:
         self.gaussians = self.gaussians.map(lambda p: _leaf(function(p)))
         self._first, self._second = self._first.map(function), self._second.map(function)
+
+
+def _unbiasing(betas: tuple[float, float], last: int) -> list[Tensor]:
+    """1 / (1 - beta^t) for t = 0 (which is never used) to `last`, for each beta."""
+    t = torch.arange(last + 1, dtype=torch.float64).clamp(min=1)
+    return [(1 / (1 - beta**t)).float() for beta in betas]
 
 
 def _leaf(parameter: Tensor) -> Tensor:

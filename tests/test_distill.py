@@ -340,10 +340,10 @@ def test_stages_chain_through_files_with_the_scenes_own_reference(folders):
     assert (io.load_mask(folders["reference"] / "masks" / "a.png") == hole().numpy()).all()
 
     learning = personalize.Params(prior=folders["prior"], steps=2, batch=2, scene_crops=0.3, size=8)
-    personalize.run(learning, folders["personalize"], **pick(folders, "poses", "masks", "reference"))
+    personalize.run(learning, folders["personalize"], **pick(folders, "poses", "fit", "masks", "reference"))
     assert (folders["personalize"] / "pytorch_lora_weights.safetensors").exists()
 
-    needs = pick(folders, "poses", "masks", "reference", "personalize", "initialize")
+    needs = pick(folders, "poses", "fit", "masks", "reference", "personalize", "initialize")
     distill.run(distill.Params(prior=folders["prior"], iterations=2), folders["distill"], **needs)
     result = io.load_ply(folders["distill"] / "gaussians.ply")
     labels = io.load_labels(folders["distill"] / "labels.npy")
