@@ -11,13 +11,14 @@ PAPER leaves open: it takes the cameras as given.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from reffusion import stereo
+from reffusion.sfm import bundle_adjusted
 from reffusion.types import Camera
 
 ENOUGH = 0.15  # px of `misfit` with which cameras are left as they are; exact ones show 0.08, COLMAP's own 0.10
@@ -28,7 +29,6 @@ BLOCK = 8  # cells a side, over which flow's noise is averaged away by the media
 LEAST_IN_BLOCK = 15
 LOOKED_AT = 8  # views for the first look
 FARTHEST_SHIFT = 0.02  # of the longer side; a principal point that wants to go farther, beyond stabilisers, stays
-LEAST_SIGHTINGS = 100  # a view that shares fewer points with others stays as a whole
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def _adjusted(matches: Sequence[stereo.Matches], given: Mapping[str, Camera]) ->
     while True:
         cameras = dict(given)
         for _ in range(ROUNDS):
-            cameras = bundle_adjusted(matches, cameras, held)
+            cameras = bundle_adjusted(cameras, *_tracks(matches, cameras), held)
         astray = {name for name, camera in cameras.items() if _shift(camera, given[name]) > FARTHEST_SHIFT} - held
         if not astray:
             return cameras
@@ -102,55 +102,8 @@ def misfit(matches: Sequence[stereo.Matches], cameras: Mapping[str, Camera], cel
     return float(np.mean(lengths)) if lengths else 0.0
 
 
-def bundle_adjusted(
-    matches: Sequence[stereo.Matches], cameras: Mapping[str, Camera], held: Collection[str] = ()
-) -> dict[str, Camera]:
-    """Poses, and principal points but those of the views `held`, at the least robust reprojection error of the matches'
-    points, in a frame that is anyone's."""
-    import pycolmap
-
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
-    numbers = {name: k + 1 for k, name in enumerate(sorted(cameras))}
-    seen_at, points = _tracks(matches, cameras)
-    model, config = pycolmap.Reconstruction(), pycolmap.BundleAdjustmentConfig()
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    for name, number in numbers.items():
-        c = cameras[name]
-        lens = [c.fx, c.fy, c.cx, c.cy]
-        model.add_camera_with_trivial_rig(
-            pycolmap.Camera(camera_id=number, model="PINHOLE", width=c.width, height=c.height, params=lens)
-        )
-        places = np.array(seen_at[name]).reshape(-1, 2)
-        image = pycolmap.Image(name=name, camera_id=number, image_id=number, keypoints=places)
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(c.world_to_camera[:3, :3]), c.world_to_camera[:3, 3])
-        model.add_image_with_trivial_frame(image, pose)
-        config.add_image(number)
-        lonely = len(places) < LEAST_SIGHTINGS
-        if name in held or lonely:
-            config.set_constant_cam_intrinsics(number)
-        if lonely:
-            config.set_constant_rig_from_world_pose(model.images[number].frame_id)
-    for point, track in points:
-        elements = pycolmap.Track()
-        for name, index in track:
-            elements.add_element(numbers[name], index)
-        model.add_point3D(point, elements)
-    options = pycolmap.BundleAdjustmentOptions()
-    options.refine_focal_length, options.refine_principal_point, options.print_summary = False, True, False
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
-    options.ceres.solver_options.num_threads = 1  # the order of sums, and so the result, is fixed
-    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
-    return {name: _camera(cameras[name], model.images[k], model.cameras[k]) for name, k in numbers.items()}
-
-
-def _camera(camera: Camera, image, lens) -> Camera:
-    pose, (fx, fy, cx, cy) = np.eye(4), (float(value) for value in lens.params)
-    pose[:3] = image.cam_from_world().matrix()
-    return replace(camera, world_to_camera=pose, fx=fx, fy=fy, cx=cx, cy=cy)
-
-
 def _tracks(matches: Sequence[stereo.Matches], cameras: Mapping[str, Camera]):
-    """View name -> pixels of its sightings; and the points, each with its track of (view name, index of sighting)."""
+    """Sightings and points as `bundle_adjusted` wants them."""
     seen_at: dict[str, list[np.ndarray]] = {name: [] for name in cameras}
     points = []
     for match in matches:

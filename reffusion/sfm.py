@@ -1,17 +1,20 @@
-"""Structure from motion through COLMAP: SIFT on the CPU, exhaustive matching, incremental mapping."""
+"""Structure from motion through COLMAP: SIFT on the CPU, exhaustive matching, incremental mapping, adjustment."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from .io.layouts import Poses
 from .lens import from_colmap
+from .types import Camera
 
 LEAST_VIEWS = 3
+LEAST_SIGHTINGS = 100
 
 
 def solve(pictures: Mapping[str, Path], originals: Mapping[str, Path], work: Path, seed: int = 0) -> Poses:
@@ -108,3 +111,61 @@ def focal_of(photograph: Path) -> float | None:
 
     camera = pycolmap.infer_camera_from_image(photograph)
     return camera.mean_focal_length() / max(camera.width, camera.height) if camera.has_prior_focal_length else None
+
+
+def bundle_adjusted(
+    cameras: Mapping[str, Camera],
+    sightings: Mapping[str, Sequence[np.ndarray]],
+    points: Sequence[tuple[np.ndarray, Sequence[tuple[str, int]]]],
+    held: Collection[str] = (),
+) -> dict[str, Camera]:
+    """Poses, and each view's own principal point, at the points' least robust reprojection error.
+
+    Args:
+        cameras: view name -> camera, to start from; a view of fewer than `LEAST_SIGHTINGS` sightings stays as it is.
+        sightings: view name -> pixels [2] in it.
+        points: position [3] and track of each, (view name, index of sighting)s.
+        held: names of views whose principal points stay.
+
+    Returns:
+        The cameras in a frame that is near the given one's, but no more than that.
+    """
+    import pycolmap
+
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
+    numbers = {name: k + 1 for k, name in enumerate(sorted(cameras))}
+    model, config = pycolmap.Reconstruction(), pycolmap.BundleAdjustmentConfig()
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    for name, number in numbers.items():
+        c = cameras[name]
+        lens = [c.fx, c.fy, c.cx, c.cy]
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera(camera_id=number, model="PINHOLE", width=c.width, height=c.height, params=lens)
+        )
+        places = np.array(sightings[name]).reshape(-1, 2)
+        image = pycolmap.Image(name=name, camera_id=number, image_id=number, keypoints=places)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(c.world_to_camera[:3, :3]), c.world_to_camera[:3, 3])
+        model.add_image_with_trivial_frame(image, pose)
+        config.add_image(number)
+        lonely = len(places) < LEAST_SIGHTINGS
+        if name in held or lonely:
+            config.set_constant_cam_intrinsics(number)
+        if lonely:
+            config.set_constant_rig_from_world_pose(model.images[number].frame_id)
+    for point, track in points:
+        elements = pycolmap.Track()
+        for name, index in track:
+            elements.add_element(numbers[name], index)
+        model.add_point3D(point, elements)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length, options.refine_principal_point, options.print_summary = False, True, False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.solver_options.num_threads = 1  # the order of sums, and so the result, is fixed
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    return {name: _camera(cameras[name], model.images[k], model.cameras[k]) for name, k in numbers.items()}
+
+
+def _camera(camera: Camera, image, lens) -> Camera:
+    pose, (fx, fy, cx, cy) = np.eye(4), (float(value) for value in lens.params)
+    pose[:3] = image.cam_from_world().matrix()
+    return replace(camera, world_to_camera=pose, fx=fx, fy=fy, cx=cx, cy=cy)

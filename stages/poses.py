@@ -91,7 +91,7 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
         pinholes[views[k]] = io.save_undistorted(out, views[k], capture, roles, params.longest)
     shutil.rmtree(out / "sfm", ignore_errors=True)
     normalised = frame.normalised(capture.poses, pinholes, roles.train, roles.test, roles.clean)
-    if params.refine:
+    if params.refine and params.gaussians is None:  # Gaussians that the scene brings were fitted with its cameras
         normalised = _refined(normalised, out)
     if len(normalised.points) < max(params.least_points, 1):
         normalised = _with_flow_points(params, normalised, out)

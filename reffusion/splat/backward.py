@@ -19,6 +19,7 @@ from reffusion.splat.forward import (
     finished,
     log_alpha,
     meet,
+    next_tile,
     open_tile,
     shape,
 )
@@ -38,7 +39,7 @@ from reffusion.splat.layout import (
     TILE_WIDTH,
 )
 from reffusion.splat.memory import load, prefetch, splat_at, store, store_totals, total
-from reffusion.splat.vectors import LANES, fma, fnma, select, some, splat, take_ticket
+from reffusion.splat.vectors import LANES, fma, fnma, select, some, splat
 
 _UPSTREAM = (
     6  # vectors of a step before those of features: transmittance, remainder, upstream gradients of r, g, b, depth
@@ -97,8 +98,8 @@ def _blend_backward(
     images = color, depth, alpha, blended, transmittance
     gradients = grad_color, grad_depth, grad_alpha, grad_blended
     while True:
-        tile = take_ticket(tickets)
-        if tile >= used.shape[0]:
+        tile = next_tile(tickets, used.shape[0])
+        if tile < 0:
             return
         left, top = corner(tile, depth.shape[1])
         _load_tile(left, top, state, stride, images, gradients)
@@ -237,8 +238,8 @@ def _gather_values(tickets, footprints, bins, values, count, records, written):
     state = aligned(STEPS * (1 + channels))
     sums = aligned(channels)
     while True:
-        tile = take_ticket(tickets)
-        if tile >= bins.starts.shape[0] - 1:
+        tile = next_tile(tickets, bins.starts.shape[0] - 1)
+        if tile < 0:
             return
         left, top = corner(tile, width)
         state[:] = np.float32(0.0)

@@ -103,14 +103,14 @@ def bin_footprints(footprints, order, count: int, width: int, height: int) -> Bi
     while True:
         first_slots, places = np.zeros(count + 1, np.int64), np.zeros((CHUNKS, tiles), np.int64)
         pairs, needed = room(CHUNKS, part, 2).view(np.int32), np.zeros(CHUNKS, np.int64)
-        share(_find_pairs, footprints, order, width, height, places, first_slots, pairs, needed)
+        share(_find_pairs, footprints, order, width, height, places, first_slots, pairs, needed, gaussians=count)
         if needed.max() <= part:
             break
         part = needed.max()
     total = _counts_to_places(first_slots, places)
     starts = np.append(places[0], total)
     entries = room(total, ENTRY).view(np.int32)
-    share(_fill_lists, order, places, first_slots, pairs, entries)
+    share(_fill_lists, order, places, first_slots, pairs, entries, gaussians=count)
     return Bins(starts, entries, first_slots)
 
 

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 _LARGE, _BLOCKS = 2**16, 24  # numbers of an array worth keeping; how many are kept, some two steps' worth
+FEW = 8000  # Gaussians for which waking another thread takes longer than it saves
 _CACHE = "splat-"  # folders of machine code in __pycache__, one per state of these sources
 
 
@@ -98,14 +99,17 @@ def threads() -> int:
     return torch.get_num_threads()
 
 
-def share(function: Callable, *arguments) -> None:
+def share(function: Callable, *arguments, gaussians: int = FEW) -> None:
     """Call `function(tickets, *arguments)` on every thread at once; they draw tickets until the work is gone.
 
-    `tickets` is an int64 counter to draw from with `vectors.take_ticket`. What a piece of work writes must depend on
-    its number only, so that results are the same for any number of threads.
+    `tickets` [2] int64: a counter to draw from with `vectors.take_ticket`, and the number of threads. What a piece of
+    work writes must depend on its number only, so that results are the same for any number of threads.
+
+    Args:
+        gaussians: how many there are to look at, where that is all the work; fewer than FEW are left to this thread.
     """
-    tickets = np.zeros(1, np.int64)
-    helpers = threads() - 1
+    helpers = threads() - 1 if gaussians >= FEW else 0
+    tickets = np.array([0, helpers + 1])
     pending = [_pool(os.getpid(), helpers).submit(function, tickets, *arguments) for _ in range(helpers)]
     function(tickets, *arguments)
     for future in pending:

@@ -71,7 +71,8 @@ def look(parameters: list[np.ndarray], antialiased: bool, probe: np.ndarray, cam
     rows = footprints.padded(count)
     drawn, radii = room(rows * FOOTPRINT), np.zeros(rows, np.int32)
     flat, numbers = (array.reshape(-1) for array in parameters), view_numbers(camera, antialiased)
-    share(footprints.draw, *flat, width, degree, probe.reshape(-1), numbers, camera.center, drawn, radii)
+    arguments = width, degree, probe.reshape(-1), numbers, camera.center, drawn, radii
+    share(footprints.draw, *flat, *arguments, gaussians=count)
     order = binning.depth_order(radii[:count], drawn)
     return View(drawn, radii, binning.bin_footprints(drawn, order, count, camera.width, camera.height))
 

@@ -62,6 +62,23 @@ def aligned(vectors):
     return room[first : first + vectors * LANES]
 
 
+@kernel
+def next_tile(tickets, tiles):
+    """The next tile, or -1 when all are drawn: one of each of as many parts of the image in turn as there are threads.
+
+    Threads at neighbouring tiles would write to the same cache lines (images, a footprint's records) at the same time.
+    """
+    parts = tickets[1]
+    length = (tiles + parts - 1) // parts
+    while True:
+        ticket = take_ticket(tickets)
+        if ticket >= parts * length:
+            return -1
+        tile = ticket % parts * length + ticket // parts
+        if tile < tiles:
+            return tile
+
+
 @inlined
 def corner(tile, width):
     """Left column and top row of a tile in the image."""
@@ -128,8 +145,8 @@ def _blend(tickets, footprints, features, background, bins, color, depth, alpha,
     stride = (_SUMS + features.shape[1]) * LANES
     state = aligned(STEPS * (_SUMS + features.shape[1]))
     while True:
-        tile = take_ticket(tickets)
-        if tile >= used.shape[0]:
+        tile = next_tile(tickets, used.shape[0])
+        if tile < 0:
             return
         used[tile] = _blend_tile(tile, footprints, features, bins, depth.shape, state, stride)
         _write_tile(tile, state, stride, background, color, depth, alpha, blended, transmittance)
