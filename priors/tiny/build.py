@@ -19,8 +19,12 @@ NATIVE = 64  # px
 WORDS = ("a", "photo", "of", "sks", "cropped", ",")
 TEXT_LENGTH = 24
 # Opponent colours of (r, g, b) in [-1, 1], scaled to deviation about 1 over the training images, so that one noise
-# schedule serves light and colour alike; the fourth latent is the light's Laplacian: fine texture, made loud.
-LIGHT, WARM, GREEN, DETAIL = 1.9, 5.0, 9.0, 4.0
+# schedule serves light and colour alike. Diffusers' inpainting pipeline wants four latents; the fourth is empty.
+LIGHT, WARM, GREEN = 1.9, 5.0, 9.0
+# At full resolution what a hole holds is decided where the noise is strong: neighbours average weak noise away. So the
+# schedule spends most timesteps between a log signal-to-noise ratio of 0 and -7, and ends where even a hole's mean
+# colour is hidden (measured: with SD's schedule, which ends at -5.4, 1.1 dB of a hole's PSNR came from what showed through).
+TIMESTEPS, SHIFT, LOWEST = 1000, -2.2, -12.0
 
 
 def analysis() -> Tensor:
@@ -30,7 +34,6 @@ def analysis() -> Tensor:
     kernel[0, :, 1, 1] = LIGHT * light
     kernel[1, :, 1, 1] = WARM * torch.tensor([0.5, 0, -0.5])
     kernel[2, :, 1, 1] = GREEN * torch.tensor([-0.25, 0.5, -0.25])
-    kernel[3] = DETAIL * light[:, None, None] * torch.tensor([[0.0, -1, 0], [-1, 4, -1], [0, -1, 0]])
     return kernel
 
 
@@ -164,12 +167,18 @@ def unet(channels: tuple[int, ...] = (32, 64, 96), layers: int = 1) -> UNet2DCon
 
 def scheduler() -> DDIMScheduler:
     return DDIMScheduler(
-        beta_start=0.00085,
-        beta_end=0.012,
-        beta_schedule="scaled_linear",
+        trained_betas=betas(),
         prediction_type="v_prediction",
         clip_sample=False,
         set_alpha_to_one=True,
         steps_offset=1,
         timestep_spacing="trailing",
     )
+
+
+def betas() -> list[float]:
+    """The cosine schedule with its log signal-to-noise ratio moved by SHIFT (Hoogeboom et al. 2023), not under LOWEST."""
+    t = (torch.arange(TIMESTEPS, dtype=torch.float64) + 1) / (TIMESTEPS + 1)
+    ratio = (SHIFT - 2 * torch.log(torch.tan(torch.pi / 2 * t))).clamp_min(LOWEST)
+    kept = torch.cat([torch.ones(1, dtype=torch.float64), torch.sigmoid(ratio)])
+    return (1 - kept[1:] / kept[:-1]).clamp(1e-7, 0.999).tolist()
