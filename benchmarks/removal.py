@@ -25,7 +25,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from reffusion import io, metrics, splat, trace
-from reffusion.fit import fit, initial_gaussians
+from reffusion.fit import fit
 from reffusion.geometry import project
 from reffusion.types import Camera, Gaussians, Scene
 from stages import evaluate
@@ -59,7 +59,7 @@ class Run:
 def fit_unmasked(run: Run, scene: Scene, out: Path) -> Gaussians:
     """(a): the run's own fit, its masked pixels of weight 0; kept in `out` for runs of the same fit and masks.
 
-    Sparse points that most views show inside their masks are left out: no pixel would ever move them.
+    Points that most views show inside their masks are left out: no pixel would ever move them.
     """
     receipt = io.load_json(run.fit / "receipt.json")
     of = {"fit": receipt["key"], "poses": receipt["needs"]["poses"]}
@@ -70,14 +70,13 @@ def fit_unmasked(run: Run, scene: Scene, out: Path) -> Gaussians:
     params = fit_stage.Params(**receipt["params"])
     cameras = [scene.cameras[name] for name in scene.train]
     masks = io.load_raw_masks(run.poses, scene.train)
-    keep = ~mostly_inside(scene.points, cameras, masks)
-    noise = trace.generator(params.seed, "start")
-    chosen = fit_stage.settings(params, cameras)
-    start = initial_gaussians(scene.points[keep], scene.point_colors[keep], params.sh_degree, chosen.budget, noise)
+    images, chosen = io.load_views(run.poses, scene.train), fit_stage.settings(params, cameras)
+    points, colors = fit_stage.start_points(params, scene, cameras, images)
+    keep = ~mostly_inside(points, cameras, masks)
     result = fit(
         cameras,
-        io.load_views(run.poses, scene.train),
-        start.map(lambda p: p.to(params.device)),
+        images,
+        fit_stage.start(params, points[keep], colors[keep], chosen.budget),
         chosen,
         folder=out,
         weights={name: (~mask).astype(np.float32) for name, mask in masks.items()},

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from reffusion.types import Camera, Gaussians, Scene
 
 
 class Params(BaseModel):
@@ -53,35 +58,25 @@ def preview(params: Params, *, poses: Path) -> list[str]:
 
 def run(params: Params, out: Path, *, poses: Path) -> None:
     import time
-    from dataclasses import replace
 
-    import numpy as np
-
-    from reffusion import io, stereo, trace
-    from reffusion.fit import fit, initial_gaussians
+    from reffusion import io, trace
+    from reffusion.fit import fit
 
     if (poses / "gaussians.ply").exists():
         io.save_ply(out / "gaussians.ply", io.load_ply(poses / "gaussians.ply"))
         return
-    scene = io.load_scene(poses)
+    began, scene = time.monotonic(), io.load_scene(poses)
     held_out = scene.train[params.holdout // 2 :: params.holdout] if params.holdout else ()
     cameras = [scene.cameras[name] for name in scene.train if name not in held_out]
-    images = io.load_views(poses, scene.train)
-    points, colors, chosen = scene.points, scene.point_colors, settings(params, cameras)
-    began = time.monotonic()
-    if params.flow_cell and not (out / trace.CHECKPOINT).exists():
-        seen, seen_colors = stereo.dense_points(cameras, images, params.flow_cell)
-        points, colors = np.concatenate([points, seen]), np.concatenate([colors, seen_colors])
-        print(f"{len(seen)} points by optical flow beside {len(scene.points)}", flush=True)
-    noise = trace.generator(params.seed, "start")
-    start = initial_gaussians(
-        points, colors, params.sh_degree, chosen.budget, noise, params.start_opacity, params.start_size
-    )
-    start = replace(start, antialiased=params.antialiased)
+    images, chosen = io.load_views(poses, scene.train), settings(params, cameras)
+    if (out / trace.CHECKPOINT).exists():  # of what it starts from only the degree and the device still matter
+        points, colors = scene.points, scene.point_colors
+    else:
+        points, colors = start_points(params, scene, cameras, images)
     gaussians = fit(
         cameras,
         images,
-        start.map(lambda p: p.to(params.device)),
+        start(params, points, colors, chosen.budget),
         chosen,
         folder=out,
         held_out=[scene.cameras[name] for name in held_out],
@@ -89,6 +84,31 @@ def run(params: Params, out: Path, *, poses: Path) -> None:
     )
     io.save_ply(out / "gaussians.ply", gaussians.map(lambda p: p.cpu()))
     trace.clear_checkpoint(out)
+
+
+def start_points(params: Params, scene: Scene, cameras: list[Camera], images: dict[str, np.ndarray]):
+    """Positions [P, 3] and colours [P, 3] uint8: the scene's sparse points, and the flow points of these views."""
+    import numpy as np
+
+    from reffusion import stereo
+
+    if not params.flow_cell:
+        return scene.points, scene.point_colors
+    points, colors = stereo.dense_points(cameras, images, params.flow_cell)
+    print(f"{len(points)} points by optical flow beside {len(scene.points)}", flush=True)
+    return np.concatenate([scene.points, points]), np.concatenate([scene.point_colors, colors])
+
+
+def start(params: Params, points: np.ndarray, colors: np.ndarray, budget: int) -> Gaussians:
+    """The Gaussians to start from, on the device to compute on."""
+    from dataclasses import replace
+
+    from reffusion import trace
+    from reffusion.fit import initial_gaussians
+
+    noise = trace.generator(params.seed, "start")
+    first = initial_gaussians(points, colors, params.sh_degree, budget, noise, params.start_opacity, params.start_size)
+    return replace(first.map(lambda p: p.to(params.device)), antialiased=params.antialiased)
 
 
 def settings(params: Params, cameras: list):

@@ -23,7 +23,7 @@ TEXT_LENGTH = 24
 LIGHT, WARM, GREEN = 1.9, 5.0, 9.0
 # At full resolution what a hole holds is decided where the noise is strong: neighbours average weak noise away. So the
 # schedule spends most timesteps between a log signal-to-noise ratio of 0 and -7, and ends where even a hole's mean
-# colour is hidden (measured: with SD's schedule, which ends at -5.4, 1.1 dB of a hole's PSNR came from what showed through).
+# colour is hidden (with SD's schedule, which ends at -5.4, 1.1 dB of a hole's PSNR came from what showed through).
 TIMESTEPS, SHIFT, LOWEST = 1000, -2.2, -12.0
 
 
@@ -177,7 +177,7 @@ def scheduler() -> DDIMScheduler:
 
 
 def betas() -> list[float]:
-    """The cosine schedule with its log signal-to-noise ratio moved by SHIFT (Hoogeboom et al. 2023), not under LOWEST."""
+    """The cosine schedule, its log signal-to-noise ratio moved by SHIFT (Hoogeboom et al. 2023) and over LOWEST."""
     t = (torch.arange(TIMESTEPS, dtype=torch.float64) + 1) / (TIMESTEPS + 1)
     ratio = (SHIFT - 2 * torch.log(torch.tan(torch.pi / 2 * t))).clamp_min(LOWEST)
     kept = torch.cat([torch.ones(1, dtype=torch.float64), torch.sigmoid(ratio)])
