@@ -164,6 +164,7 @@ def scaling(case: Case, threads: int, repeats: int) -> float:
     for _ in range(repeats):
         for count, series in times.items():
             torch.set_num_threads(count)
+            step(case, time.perf_counter)  # torch makes its threads anew
             series.append(sum(step(case, time.perf_counter)))
     torch.set_num_threads(1)
     return float(np.median(times[1]) / np.median(times[threads]))
