@@ -62,7 +62,8 @@ $(VENV)/.ready-dev: $(VENV)/.ready
 
 # --------------------------------------------------------------------------------------------------------- scenes
 
-# The demo scenes are made by the project: `demo`, `demo-photos` (no poses), `demo-<seed>`.
+# The demo scenes are made by the project: `demo`, `demo-photos` (no poses), `demo-wide`, `demo-360`, each with `-<seed>` or not.
+kinds := photos wide 360
 made = $(filter demo demo-%,$(scene))
 
 demo: setup
@@ -70,8 +71,8 @@ demo: setup
 	@touch data/$(or $(name),demo$(if $(seed),-$(seed)))/.generated
 
 data/%/.generated: | $(VENV)/.ready
-	$(PY) data/generate.py --out data/$* \
-		$(if $(filter demo-photos,$*),--kind photos,--seed $(or $(patsubst demo-%,%,$(filter demo-%,$*)),0))
+	$(PY) data/generate.py --out data/$* $(patsubst %,--kind %,$(firstword $(filter $(kinds),$(subst -, ,$*)))) \
+		$(patsubst %,--seed %,$(firstword $(filter-out demo $(kinds),$(subst -, ,$*))))
 	@touch $@
 
 # ----------------------------------------------------------------------------------------------------------- jobs

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
@@ -42,7 +41,6 @@ class Settings:
         random_background: a new colour each step instead of black.
             PAPER leaves open: 3DGS takes black by default. Dark texture is then drawn by leaving holes, which the
             stages after this one would read as places that no Gaussian explains.
-        coarse_until: part of the run that sees the views at half their size.
         densify_by: `slopes`, 3DGS's way; `mcmc`, see `reffusion.mcmc`, in which `slope`, `split_above`, `largest` and
             `reset_every` mean nothing.
         opacity_weight, scale_weight: of the mean opacity and standard deviation in the loss; they make room for
@@ -57,7 +55,8 @@ class Settings:
         largest: Gaussians of a larger size are pruned.
         reset_every: part of the run after which opacities are capped at 0.01, while densifying; 0: never.
         exposure: fit each view's exposure too, see `reffusion.exposure`.
-        rates: Adam's step sizes.
+        rates, betas: Adam's step sizes, and its memory of gradients and of their squares (3DGS: 0.9, 0.999). A short run
+            is better off with a short memory.
         checkpoint_seconds: seconds of work between checkpoints.
     """
 
@@ -66,7 +65,6 @@ class Settings:
     sh_degree: int = 3
     sh_every: float = 1 / 30
     random_background: bool = True
-    coarse_until: float = 0.0
     densify_by: str = "slopes"
     opacity_weight: float = 0.0
     scale_weight: float = 0.0
@@ -81,6 +79,7 @@ class Settings:
     reset_every: float = 0.1
     exposure: bool = False
     rates: Rates = field(default_factory=Rates)
+    betas: tuple[float, float] = (0.9, 0.999)
     checkpoint_seconds: float = 10.0
 
 
@@ -120,7 +119,7 @@ def fit(
         raise ValueError("a fit needs at least one view")
     _check_sizes(cameras, images, weights)
     _check_sizes(held_out, images, {})
-    optimizer, start = GaussianOptimizer(initial, rates=settings.rates), 0
+    optimizer, start = GaussianOptimizer(initial, rates=settings.rates, betas=settings.betas), 0
     exposures = Exposures((camera.name for camera in cameras), initial.means.device) if settings.exposure else None
     recent, started_with = {"loss": 0.0, "error": 0.0, "steps": 0}, len(initial)
     state, seconds = trace.load_checkpoint(folder), spent
@@ -212,8 +211,7 @@ def _samples(
 
     def sample(i: int) -> tuple[Camera, Tensor, Tensor | None]:
         camera = cameras[_view(i, len(cameras), settings.seed)]
-        half = i < settings.coarse_until * settings.iterations
-        return _sample(camera, images[camera.name], weights.get(camera.name), half)
+        return _sample(camera, images[camera.name], weights.get(camera.name))
 
     with ThreadPoolExecutor(1, thread_name_prefix="fit") as ahead:
         coming = ahead.submit(sample, start)
@@ -229,22 +227,10 @@ def _view(iteration: int, count: int, seed: int) -> int:
     return int(order[iteration % count])
 
 
-def _sample(
-    camera: Camera, image: np.ndarray, weights: np.ndarray | None, half: bool
-) -> tuple[Camera, Tensor, Tensor | None]:
-    """The view as the step sees it: camera, image in [0, 1], weights; at half the size if `half`.
-
-    A half-size pixel that covers a pixel of weight 0 has weight 0, lest that pixel come in through the average.
-    """
-    weights = None if weights is None else np.asarray(weights, np.float32)
-    if half:
-        size = ((camera.width + 1) // 2, (camera.height + 1) // 2)
-        image, camera = cv2.resize(image, size, interpolation=cv2.INTER_AREA), camera.resized(*size)
-        if weights is not None:
-            touched = cv2.resize((weights == 0).astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0
-            weights = np.where(touched, 0, cv2.resize(weights, size, interpolation=cv2.INTER_AREA))
-    target = torch.from_numpy(image).float() / 255
-    return camera, target, None if weights is None else torch.from_numpy(weights)
+def _sample(camera: Camera, image: np.ndarray, weights: np.ndarray | None) -> tuple[Camera, Tensor, Tensor | None]:
+    """The view as the step sees it: camera, image in [0, 1], weights."""
+    counts = None if weights is None else torch.from_numpy(np.asarray(weights, np.float32))
+    return camera, torch.from_numpy(image).float() / 255, counts
 
 
 def _move(tensor: Tensor | None, optimizer: GaussianOptimizer) -> Tensor | None:
@@ -280,7 +266,7 @@ def _step(
     if probe is not None:
         optimizer.observe(probe.grad, rendering.radii, camera.width, camera.height)
     try:
-        optimizer.step(i / settings.iterations, visible=rendering.radii > 0)
+        optimizer.step(i / settings.iterations, visible=rendering.radii > 0, sh_degree=degree)
     except FloatingPointError as error:
         raise FloatingPointError(f"fit, {where}, reconstruction: {error}") from None
     if settings.densify_by == "mcmc":
@@ -366,7 +352,7 @@ def _summary(
     psnr = []
     for camera in held_out:
         image = render(gaussians, camera, impl=impl, sh_degree=degree).color.clamp(0, 1)
-        error = _squared_error(image, _move(_sample(camera, images[camera.name], None, False)[1], optimizer), None)
+        error = _squared_error(image, _move(_sample(camera, images[camera.name], None)[1], optimizer), None)
         psnr.append(-10 * math.log10(max(error, 1e-10)))
     return line | {"psnr_held_out": sum(psnr) / len(psnr)}
 

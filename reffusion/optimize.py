@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -142,12 +143,13 @@ class GaussianOptimizer:
         self.slope_sum = torch.zeros_like(self._steps, dtype=torch.float32)
         self.slope_count = torch.zeros_like(self._steps)
 
-    def step(self, progress: float, visible: Tensor | None = None) -> None:
+    def step(self, progress: float, visible: Tensor | None = None, sh_degree: int | None = None) -> None:
         """One Adam step along the gradients gathered since the last, which are then forgotten.
 
         Args:
             progress: in [0, 1], the part of the run that is done; it sets the step size of the means.
             visible: [N] bool, the Gaussians to move, e.g. `rendering.radii > 0`; None moves all.
+            sh_degree: the highest degree that was drawn up to now, where that is not all; the others lie still.
 
         Raises:
             FloatingPointError: a gradient is not finite; says of which parameter. Nothing has been changed then.
@@ -159,20 +161,21 @@ class GaussianOptimizer:
                 raise FloatingPointError(f"the gradient of the Gaussians' {name} is not finite")
         if visible is None:
             visible = torch.ones_like(self.masked)
-        rates = self.rates.at(progress, self.gaussians)
-        alike = torch.ones_like(self._steps, dtype=torch.float32)
         self._steps += visible
-        # Bias correction, per row; a row that never moved has t = 0 and is skipped.
-        unbias = [table.to(self._steps.device)[self._steps] for table in _unbiasing(self.betas, int(self._steps.max()))]
-        with torch.no_grad():
-            for name, gradient in gradients.items():
-                if gradient is None:
-                    continue
-                rows = [_rows(getattr(g, name)) for g in (self.gaussians, self._first, self._second)]
-                update = _adam_cpu if gradient.device.type == "cpu" else _adam
-                pace = torch.where(self.masked, self.masked_pace.get(name, 1.0), alike)
-                update(*rows, _rows(gradient), *unbias, pace, visible, rates[name], *self.betas, self.epsilon)
+        unbias = [table.to(self._steps.device) for table in _unbiasing(self.betas, 1 + int(self._steps.max()) // 1024)]
+        rates = self.rates.at(progress, self.gaussians)
+        updates = []
+        for name, gradient in gradients.items():
+            if gradient is not None:
+                rows = (_rows(t) for t in (*(getattr(g, name) for g in self._states()), gradient))
+                moving = rates[name] if name != "sh" or sh_degree is None else rates[name][: 3 * (sh_degree + 1) ** 2]
+                updates.append(Update(*rows, moving, self.masked_pace.get(name, 1.0)))
+        update = _adam_cpu if self.masked.device.type == "cpu" else _adam
+        update(updates, self._steps, visible, self.masked, *unbias, *self.betas, self.epsilon)
         self.forget_gradients()
+
+    def _states(self) -> tuple[Gaussians, Gaussians, Gaussians]:
+        return self.gaussians, self._first, self._second
 
     def forget_gradients(self) -> None:
         for name in PARAMETERS:
@@ -232,9 +235,10 @@ class GaussianOptimizer:
         self._first, self._second = self._first.map(function), self._second.map(function)
 
 
-def _unbiasing(betas: tuple[float, float], last: int) -> list[Tensor]:
-    """1 / (1 - beta^t) for t = 0 (which is never used) to `last`, for each beta."""
-    t = torch.arange(last + 1, dtype=torch.float64).clamp(min=1)
+@lru_cache(maxsize=4)
+def _unbiasing(betas: tuple[float, float], kilo: int) -> list[Tensor]:
+    """1 / (1 - beta^t) for t = 0 (which is never used) to 1024 `kilo` - 1, for each beta."""
+    t = torch.arange(1024 * kilo, dtype=torch.float64).clamp(min=1)
     return [(1 / (1 - beta**t)).float() for beta in betas]
 
 
@@ -250,44 +254,101 @@ def _rows(parameter: Tensor) -> Tensor:
     return parameter.detach().contiguous().view(parameter.shape[0], -1)
 
 
-def _adam(parameter, first, second, gradient, unbias1, unbias2, pace, visible, rates, beta1, beta2, epsilon) -> None:
-    """One Adam step in place on the visible rows of [N, D]; `unbias` [N] is 1 / (1 - beta^t), step sizes are
-    `rates` [D] times `pace` [N]."""
+class Update(NamedTuple):
+    """What a step of Adam needs for one parameter: it and its two moments [N, D], changed in place; its gradient [N, D];
+    step sizes [d] of the first d columns (the others stay) and the factor on them in masked rows."""
+
+    parameter: Tensor
+    first: Tensor
+    second: Tensor
+    gradient: Tensor
+    rates: Tensor
+    masked_pace: float
+
+
+@torch.no_grad()
+def _adam(updates: list[Update], steps, visible, masked, unbias1, unbias2, beta1, beta2, epsilon) -> None:
+    """One Adam step on the visible rows; `unbias` [T] is 1 / (1 - beta^t), `steps` [N] each row's t."""
     rows = visible.nonzero()[:, 0]
-    g = gradient[rows]
-    m = first[rows].lerp_(g, 1 - beta1)
-    v = second[rows].mul_(beta2).addcmul_(g, g, value=1 - beta2)
-    first[rows], second[rows] = m, v
-    denominator = (v * unbias2[rows, None]).sqrt() + epsilon
-    parameter[rows] -= rates.to(g) * (pace * unbias1)[rows, None] * m / denominator
+    first_unbias, second_unbias = unbias1[steps[rows], None], unbias2[steps[rows], None]
+    for *tables, rates, masked_pace in updates:
+        parameter, first, second, gradient = (table[:, : len(rates)] for table in tables)
+        g = gradient[rows]
+        m = first[rows].lerp_(g, 1 - beta1)
+        v = second[rows].mul_(beta2).addcmul_(g, g, value=1 - beta2)
+        first[rows], second[rows] = m, v
+        pace = torch.where(masked[rows], masked_pace, 1.0)[:, None]
+        parameter[rows] -= rates.to(g) * pace * first_unbias * m / ((v * second_unbias).sqrt() + epsilon)
 
 
-def _adam_cpu(
-    parameter, first, second, gradient, unbias1, unbias2, pace, visible, rates, beta1, beta2, epsilon
-) -> None:
+def _adam_cpu(updates: list[Update], steps, visible, masked, unbias1, unbias2, beta1, beta2, epsilon) -> None:
     """`_adam` in one pass over memory, for float32."""
-    arrays = (t.numpy() for t in (parameter, first, second, gradient, unbias1, unbias2, pace, visible, rates))
-    share(_adam_kernel, *arrays, np.float32(beta1), np.float32(beta2), np.float32(epsilon))
+    if not updates:
+        return
+    columns = [tuple(t.numpy() for t in kind) for kind in list(zip(*updates, strict=True))[:5]]
+    paces = np.array([update.masked_pace for update in updates], np.float32)
+    rows = (t.numpy() for t in (steps, visible, masked, unbias1, unbias2))
+    share(_adam_kernel, *columns, paces, *rows, np.float32(beta1), np.float32(beta2), np.float32(epsilon))
 
 
 @numba.njit(fastmath={"contract", "reassoc", "nsz", "arcp"}, error_model="numpy", cache=True, nogil=True)
 def _adam_kernel(
-    tickets, parameter, first, second, gradient, unbias1, unbias2, pace, visible, rates, beta1, beta2, epsilon
+    tickets,
+    parameters,
+    firsts,
+    seconds,
+    gradients,
+    rates,
+    paces,
+    steps,
+    visible,
+    masked,
+    unbias1,
+    unbias2,
+    beta1,
+    beta2,
+    epsilon,
 ):
-    count, width = parameter.shape
+    chunks = (len(steps) + _CHUNK - 1) // _CHUNK
+    while True:
+        ticket = take_ticket(tickets)
+        if ticket >= chunks * len(parameters):
+            return
+        kind, start = ticket // chunks, ticket % chunks * _CHUNK
+        rows = start, min(start + _CHUNK, len(steps))
+        tables = parameters[kind], firsts[kind], seconds[kind], gradients[kind], rates[kind]
+        _adam_rows(*rows, *tables, paces[kind], steps, visible, masked, unbias1, unbias2, beta1, beta2, epsilon)
+
+
+@numba.njit(fastmath={"contract", "reassoc", "nsz", "arcp"}, error_model="numpy", cache=True, nogil=True)
+def _adam_rows(
+    begin,
+    end,
+    parameter,
+    first,
+    second,
+    gradient,
+    rates,
+    masked_pace,
+    steps,
+    visible,
+    masked,
+    unbias1,
+    unbias2,
+    beta1,
+    beta2,
+    epsilon,
+):
     new1, new2 = np.float32(1) - beta1, np.float32(1) - beta2
     least = np.float32(1e-30)  # below it a first moment would soon be denormal, on which processors are slow
-    while True:
-        start = take_ticket(tickets) * _CHUNK
-        if start >= count:
-            return
-        for i in range(start, min(start + _CHUNK, count)):
-            if not visible[i]:
-                continue
-            for j in range(width):
-                g = gradient[i, j]
-                a = beta1 * first[i, j] + new1 * g
-                a = np.float32(0) if abs(a) < least else a
-                b = beta2 * second[i, j] + new2 * g * g
-                first[i, j], second[i, j] = a, b
-                parameter[i, j] -= pace[i] * rates[j] * unbias1[i] * a / (np.sqrt(b * unbias2[i]) + epsilon)
+    for i in range(begin, end):
+        if not visible[i]:
+            continue
+        pace, over = unbias1[steps[i]] * (masked_pace if masked[i] else np.float32(1)), unbias2[steps[i]]
+        for j in range(len(rates)):
+            g = gradient[i, j]
+            a = beta1 * first[i, j] + new1 * g
+            a = np.float32(0) if abs(a) < least else a
+            b = beta2 * second[i, j] + new2 * g * g
+            first[i, j], second[i, j] = a, b
+            parameter[i, j] -= pace * rates[j] * a / (np.sqrt(b * over) + epsilon)

@@ -6,7 +6,7 @@ import torch
 
 from reffusion import trace
 from reffusion.densify import SHRINK, densify, prune, rotate, split
-from reffusion.optimize import GaussianOptimizer, Rates, _adam, _adam_cpu, confine, reconstruction_loss
+from reffusion.optimize import GaussianOptimizer, Rates, Update, _adam, _adam_cpu, confine, reconstruction_loss
 from reffusion.splat import render
 from reffusion.ssim import dssim, dssim_torch
 from reffusion.types import PARAMETERS, Camera, Gaussians
@@ -172,15 +172,20 @@ def test_adam_is_torch_adam_where_all_are_visible():
 
 def test_plain_and_compiled_adam_agree():
     generator = trace.generator(3, "adam")
-    rows = [torch.randn(50, 6, generator=generator) for _ in range(4)]
-    rows[2] = rows[2].abs()
-    unbias, visible = list(1 + torch.rand(2, 50, generator=generator)), rows[0][:, 0] > 0
-    rates, pace = torch.rand(6, generator=generator), torch.rand(50, generator=generator)
-    plain, compiled = [r.double() for r in rows], [r.clone() for r in rows]
-    _adam(*plain, *unbias, pace, visible, rates, 0.9, 0.999, 1e-15)
-    _adam_cpu(*compiled, *unbias, pace, visible, rates, 0.9, 0.999, 1e-15)
-    for a, b in zip(plain, compiled, strict=True):
-        assert torch.allclose(a.float(), b, rtol=1e-5, atol=1e-6)
+    steps, visible = torch.arange(1500, dtype=torch.int32) % 40, torch.rand(1500, generator=generator) > 0.3
+    masked, unbias = torch.rand(1500, generator=generator) > 0.5, list(1 + torch.rand(2, 40, generator=generator))
+    results = []
+    for adam, dtype in ((_adam, torch.float64), (_adam_cpu, torch.float32)):
+        generator = trace.generator(3, "parameters")
+        updates = []
+        for width in (1, 3, 27):
+            rows = [torch.randn(1500, width, generator=generator).to(dtype) for _ in range(4)]
+            rows[2].abs_().add_(0.1)
+            updates.append(Update(*rows, torch.rand(width, generator=generator), masked_pace=1 / width))
+        adam(updates, steps, visible, masked, *unbias, 0.9, 0.999, 1e-15)
+        results.append([tensor.float() for update in updates for tensor in update[:3]])
+    for plain, compiled in zip(*results, strict=True):
+        assert torch.allclose(plain, compiled, rtol=1e-5, atol=1e-5)
 
 
 def test_unseen_gaussians_stay_and_late_ones_start_afresh():

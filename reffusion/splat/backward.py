@@ -9,9 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from reffusion.splat.compiled import inlined, kernel, room, share
-from reffusion.splat.conventions import MAX_ALPHA
 from reffusion.splat.forward import (
-    LANE_Y,
+    AT_CUT,
+    AT_MAX_ALPHA,
+    AT_ROW,
     STEP_ROWS,
     STEPS,
     aligned,
@@ -21,12 +22,13 @@ from reffusion.splat.forward import (
     meet,
     next_tile,
     open_tile,
+    or_none,
     shape,
+    working_numbers,
 )
 from reffusion.splat.layout import (
     AHEAD,
     BLUE,
-    CUT,
     DEPTH,
     FOOTPRINT,
     GRAD_FEATURES,
@@ -44,7 +46,6 @@ from reffusion.splat.vectors import LANES, fma, fnma, select, some, splat
 _UPSTREAM = (
     6  # vectors of a step before those of features: transmittance, remainder, upstream gradients of r, g, b, depth
 )
-_CUT, _MAX_ALPHA = np.float32(CUT), np.float32(MAX_ALPHA)
 
 
 def blend_backward(footprints, features, bins, used, images, transmittance, gradients):
@@ -62,7 +63,8 @@ def blend_backward(footprints, features, bins, used, images, transmittance, grad
     """
     columns = record_columns(features.shape[1])
     records, written = room(len(bins.entries), columns), np.zeros(len(bins.entries), np.bool_)
-    share(_blend_backward, footprints, features, bins, used, *images, transmittance, *gradients, records, written)
+    inputs = footprints, or_none(features), bins, used, *images, transmittance, *gradients
+    share(_blend_backward, *inputs, records, written)
     return records, written
 
 
@@ -90,10 +92,8 @@ def _blend_backward(
     records,
     written,
 ):
-    channels = features.shape[1]
-    stride = (_UPSTREAM + channels) * LANES
-    state = aligned(STEPS * (_UPSTREAM + channels))
-    sums = aligned(channels)
+    channels = blended.shape[2]
+    state, sums, numbers = aligned(STEPS * (_UPSTREAM + channels)), aligned(channels), working_numbers()
     flat = records.reshape(-1)
     images = color, depth, alpha, blended, transmittance
     gradients = grad_color, grad_depth, grad_alpha, grad_blended
@@ -102,10 +102,10 @@ def _blend_backward(
         if tile < 0:
             return
         left, top = corner(tile, depth.shape[1])
-        _load_tile(left, top, state, stride, images, gradients)
+        _load_tile(left, top, state, (_UPSTREAM + channels) * LANES, images, gradients)
         start = bins.starts[tile]
         _tile_backward(
-            left, top, start, start + used[tile], footprints, features, bins, state, stride, sums, flat, written
+            left, top, start, start + used[tile], footprints, features, bins, state, sums, numbers, flat, written
         )
 
 
@@ -139,34 +139,33 @@ def _load_tile(left, top, state, stride, images, gradients):
 
 
 @kernel
-def _tile_backward(left, top, start, stop, footprints, features, bins, state, stride, sums, records, written):
+def _tile_backward(left, top, start, stop, footprints, features, bins, state, sums, numbers, records, written):
     """Write the records of one tile's list."""
-    channels = features.shape[1]
     columns = records.shape[0] // max(1, written.shape[0])
+    stride = _UPSTREAM * LANES
+    if features is not None:
+        stride += features.shape[1] * LANES
     for at in range(start, stop):
         soon = min(at + AHEAD, stop - 1)
         prefetch(footprints, bins.entries[soon, MEMBER] * FOOTPRINT)
         prefetch(records, bins.entries[soon, SLOT] * columns)
         member, rows, slot = bins.entries[at, MEMBER], bins.entries[at, ROWS], bins.entries[at, SLOT]
-        for c in range(channels):
-            store(sums, c * LANES, splat(0.0))
-        # a loop of its own where there are no features: LLVM then keeps more in registers
-        if channels == 0:
-            touched, to_all = _rows_backward(member, rows, left, top, footprints, features, 0, state, stride, sums)
-        else:
-            touched, to_all = _rows_backward(
-                member, rows, left, top, footprints, features, channels, state, stride, sums
-            )
+        if features is not None:
+            sums[:] = np.float32(0.0)
+        touched, to_all = _rows_backward(
+            member, rows, left, top, footprints, features, state, stride, sums, numbers
+        )
         written[slot] = touched
         if not touched:
             continue
         store_totals(records, slot * columns, to_all)
-        for c in range(channels):
-            records[slot * columns + GRAD_FEATURES + c] = total(load(sums, c * LANES))
+        if features is not None:
+            for c in range(features.shape[1]):
+                records[slot * columns + GRAD_FEATURES + c] = total(load(sums, c * LANES))
 
 
 @inlined
-def _rows_backward(member, rows, left, top, footprints, features, channels, state, stride, sums):
+def _rows_backward(member, rows, left, top, footprints, features, state, stride, sums, numbers):
     """One footprint in the rows of a tile.
 
     Returns:
@@ -183,27 +182,29 @@ def _rows_backward(member, rows, left, top, footprints, features, channels, stat
     for step in range(first_row // STEP_ROWS, (end_row + STEP_ROWS - 1) // STEP_ROWS):
         place = step * stride
         before = load(state, place)
-        j = load(LANE_Y, step * LANES) - splat(middle)
+        j = load(numbers, (AT_ROW + step) * LANES) - splat(middle)
         power = log_alpha(seen, j)
-        if not some((power >= splat(_CUT)) & (before > zero)):
+        above = power >= load(numbers, AT_CUT * LANES)
+        if not some(above & (before > zero)):
             continue
         touched = True
-        raw, alpha, weight, after = meet(power, before)
+        raw, alpha, weight, after = meet(power, above, before, numbers)
         store(state, place, after)
         up_red, up_green = load(state, place + 2 * LANES), load(state, place + 3 * LANES)
         up_blue, up_far = load(state, place + 4 * LANES), load(state, place + 5 * LANES)
         shade = fma(far, up_far, fma(blue, up_blue, fma(green, up_green, red * up_red)))
         to_red, to_green = fma(weight, up_red, to_red), fma(weight, up_green, to_green)
         to_blue, to_far = fma(weight, up_blue, to_blue), fma(weight, up_far, to_far)
-        for c in range(channels):
-            up = load(state, place + (_UPSTREAM + c) * LANES)
-            shade = fma(splat(features[member, c]), up, shade)
-            store(sums, c * LANES, fma(weight, up, load(sums, c * LANES)))
+        if features is not None:
+            for c in range(features.shape[1]):
+                up = load(state, place + (_UPSTREAM + c) * LANES)
+                shade = fma(splat(features[member, c]), up, shade)
+                store(sums, c * LANES, fma(weight, up, load(sums, c * LANES)))
         behind = fnma(weight, shade, load(state, place + LANES))
         store(state, place + LANES, behind)
         # g = dLoss/d(ln alpha) = alpha (transmittance shade - behind / (1 - alpha)), 0 where clamped or not blended
         g = fnma(behind, alpha / (splat(1.0) - alpha), weight * shade)
-        g = select((after > zero) & (raw < splat(_MAX_ALPHA)), g, zero)
+        g = select((after > zero) & (raw < load(numbers, AT_MAX_ALPHA * LANES)), g, zero)
         gj = g * j
         g_0, g_1, g_2 = g_0 + g, g_1 + gj, fma(gj, j, g_2)
     return touched, (*_moments(seen, g_0, g_1, g_2), to_far, to_red, to_green, to_blue)
@@ -236,7 +237,7 @@ def _gather_values(tickets, footprints, bins, values, count, records, written):
     height, width, channels = values.shape
     stride = (1 + channels) * LANES
     state = aligned(STEPS * (1 + channels))
-    sums = aligned(channels)
+    sums, numbers = aligned(channels), working_numbers()
     while True:
         tile = next_tile(tickets, bins.starts.shape[0] - 1)
         if tile < 0:
@@ -249,13 +250,13 @@ def _gather_values(tickets, footprints, bins, values, count, records, written):
                 place = row // STEP_ROWS * stride + row % STEP_ROWS * TILE_WIDTH + lane
                 for c in range(channels):
                     state[place + (1 + c) * LANES] = values[top + row, left + lane, c]
-        _gather_tile(left, top, tile, footprints, bins, count, channels, state, stride, sums, records, written)
+        _gather_tile(left, top, tile, footprints, bins, count, channels, state, sums, numbers, records, written)
 
 
 @kernel
-def _gather_tile(left, top, tile, footprints, bins, count, channels, state, stride, sums, records, written):
+def _gather_tile(left, top, tile, footprints, bins, count, channels, state, sums, numbers, records, written):
     """Write the records of one tile's list, its values being in `state`."""
-    start, stop = bins.starts[tile], bins.starts[tile + 1]
+    start, stop, stride = bins.starts[tile], bins.starts[tile + 1], (1 + channels) * LANES
     zero = splat(0.0)
     for at in range(start, stop):
         if (at - start) % 32 == 31 and finished(state, stride):
@@ -268,11 +269,12 @@ def _gather_tile(left, top, tile, footprints, bins, count, channels, state, stri
         for step in range((rows & 255) // STEP_ROWS, ((rows >> 8) + STEP_ROWS - 1) // STEP_ROWS):
             place = step * stride
             before = load(state, place)
-            power = log_alpha(seen, load(LANE_Y, step * LANES))
-            if not some((power >= splat(_CUT)) & (before > zero)):
+            power = log_alpha(seen, load(numbers, (AT_ROW + step) * LANES))
+            above = power >= load(numbers, AT_CUT * LANES)
+            if not some(above & (before > zero)):
                 continue
             touched = True
-            _, _, weight, after = meet(power, before)
+            _, _, weight, after = meet(power, above, before, numbers)
             store(state, place, after)
             if count:
                 weight = select(weight > zero, splat(1.0), zero)

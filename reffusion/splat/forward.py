@@ -26,14 +26,23 @@ from reffusion.splat.layout import (
     WHITEN_Y,
 )
 from reffusion.splat.memory import load, prefetch, splat_at, store
-from reffusion.splat.vectors import LANES, exp2, fma, fnma, minimum, minus_abs, select, some, splat, take_ticket
+from reffusion.splat.vectors import EXP2, LANES, ROUND, fma, fnma, minimum, select, some, splat, take_ticket, times_power
 
 STEP_ROWS = LANES // TILE_WIDTH  # rows of a vector
 STEPS = TILE_HEIGHT // STEP_ROWS  # vectors of a tile
 LANE_X = np.arange(LANES, dtype=np.float32) % TILE_WIDTH + np.float32(0.5)  # pixel centre of each lane, from the left
-LANE_Y = (np.arange(TILE_HEIGHT * TILE_WIDTH) // TILE_WIDTH).astype(np.float32)  # row of each pixel of a tile
 _SUMS = 6  # vectors of a step before its features: transmittance, red, green, blue, depth, alpha
-_MAX_ALPHA, _MIN_TRANSMITTANCE, _CUT = np.float32(MAX_ALPHA), np.float32(MIN_TRANSMITTANCE), np.float32(CUT)
+
+# Numbers that every vector of pixels needs, each in all lanes, then the row of each pixel of a tile. The loops read
+# them from memory, from where arithmetic takes an operand at no cost: there are not registers enough for all, and
+# constants in the code would be fetched by two instructions each, more than the arithmetic itself has.
+AT_CUT, AT_ROUND, _AT_SERIES, AT_MAX_ALPHA, _AT_MIN_TRANSMITTANCE, AT_ROW = 0, 1, 2, 8, 9, 10
+_NUMBERS = np.concatenate(
+    [
+        np.repeat(np.float32([CUT, ROUND, *EXP2[::-1], MAX_ALPHA, MIN_TRANSMITTANCE]), LANES),
+        (np.arange(TILE_HEIGHT * TILE_WIDTH) // TILE_WIDTH).astype(np.float32),
+    ]
+)
 
 
 def blend(footprints, features, background, bins, width, height):
@@ -50,8 +59,13 @@ def blend(footprints, features, background, bins, width, height):
     depth, alpha, transmittance = room(height, width), room(height, width), room(height, width)
     used = np.empty(len(bins.starts) - 1, np.int64)
     outputs = color, depth, alpha, blended, transmittance, used
-    share(_blend, footprints, features, background, bins, *outputs)
+    share(_blend, footprints, or_none(features), background, bins, *outputs)
     return outputs
+
+
+def or_none(features):
+    """`features`, or None where there are no channels: kernels are compiled for that case on its own."""
+    return features if features.shape[1] else None
 
 
 @kernel
@@ -60,6 +74,14 @@ def aligned(vectors):
     room = np.empty(vectors * LANES + 16, np.float32)
     first = (-room.ctypes.data // 4) % 16
     return room[first : first + vectors * LANES]
+
+
+@kernel
+def working_numbers():
+    """_NUMBERS where the compiler does not know them."""
+    numbers = aligned(len(_NUMBERS) // LANES)
+    numbers[:] = _NUMBERS
+    return numbers
 
 
 @kernel
@@ -127,35 +149,56 @@ def log_alpha(shape, j):
 
 
 @inlined
-def meet(power, before):
-    """A footprint of log2(alpha) = `power` meets pixels of transmittance `before` (negative: finished).
+def exp2(x, numbers):
+    """2^x for x in [-126, 127], relative error below 2e-7; anything (not a trap) outside.
+
+    A polynomial in what is left of x after rounding.
+    """
+    rounded = x + load(numbers, AT_ROUND * LANES)
+    part = x - (rounded - load(numbers, AT_ROUND * LANES))
+    value = load(numbers, _AT_SERIES * LANES)
+    value = fma(value, part, load(numbers, (_AT_SERIES + 1) * LANES))
+    value = fma(value, part, load(numbers, (_AT_SERIES + 2) * LANES))
+    value = fma(value, part, load(numbers, (_AT_SERIES + 3) * LANES))
+    value = fma(value, part, load(numbers, (_AT_SERIES + 4) * LANES))
+    value = fma(value, part, load(numbers, (_AT_SERIES + 5) * LANES))
+    return times_power(value, rounded)
+
+
+@inlined
+def meet(power, above, before, numbers):
+    """A footprint of log2(alpha) = `power`, `above` the cut or not, meets pixels of transmittance `before` (negative:
+    finished).
 
     Returns:
         raw alpha (anything where it is under the cut), alpha, weight, transmittance after it.
     """
-    raw = exp2(power)
-    alpha = select(power >= splat(_CUT), minimum(raw, _MAX_ALPHA), np.float32(0.0))
+    raw = exp2(power, numbers)
+    alpha = select(above, minimum(raw, load(numbers, AT_MAX_ALPHA * LANES)), np.float32(0.0))
     after = fnma(before, alpha, before)
-    kept = after >= splat(_MIN_TRANSMITTANCE)
-    return raw, alpha, select(kept, before * alpha, np.float32(0.0)), select(kept, after, minus_abs(before))
+    kept = after >= load(numbers, _AT_MIN_TRANSMITTANCE * LANES)
+    weight = select(kept, before * alpha, np.float32(0.0))
+    return raw, alpha, weight, select(kept, after, minimum(before, splat(0.0) - before))
 
 
 @kernel
 def _blend(tickets, footprints, features, background, bins, color, depth, alpha, blended, transmittance, used):
-    stride = (_SUMS + features.shape[1]) * LANES
-    state = aligned(STEPS * (_SUMS + features.shape[1]))
+    stride = (_SUMS + blended.shape[2]) * LANES
+    state, numbers = aligned(STEPS * (_SUMS + blended.shape[2])), working_numbers()
     while True:
         tile = next_tile(tickets, used.shape[0])
         if tile < 0:
             return
-        used[tile] = _blend_tile(tile, footprints, features, bins, depth.shape, state, stride)
+        used[tile] = _blend_tile(tile, footprints, features, bins, depth.shape, state, numbers)
         _write_tile(tile, state, stride, background, color, depth, alpha, blended, transmittance)
 
 
 @kernel
-def _blend_tile(tile, footprints, features, bins, size, state, stride):
+def _blend_tile(tile, footprints, features, bins, size, state, numbers):
     """Blend one tile into `state`; returns how much of its list was used."""
-    channels = features.shape[1]
+    stride = _SUMS * LANES
+    if features is not None:
+        stride += features.shape[1] * LANES
     left, top = corner(tile, size[1])
     state[:] = np.float32(0.0)
     open_tile(state, stride, size[0] - top, size[1] - left)
@@ -165,37 +208,29 @@ def _blend_tile(tile, footprints, features, bins, size, state, stride):
             return at - start
         prefetch(footprints, bins.entries[min(at + AHEAD, stop - 1), MEMBER] * FOOTPRINT)
         member, rows = bins.entries[at, MEMBER], bins.entries[at, ROWS]
-        # a loop of its own where there are no features: LLVM then keeps more in registers
-        if channels == 0:
-            _blend_rows(member, rows, left, top, footprints, features, 0, state, stride)
-        else:
-            _blend_rows(member, rows, left, top, footprints, features, channels, state, stride)
+        base = member * FOOTPRINT
+        seen = shape(footprints, base, left, top, np.float32(0.0))
+        red, green = splat_at(footprints, base + RED), splat_at(footprints, base + GREEN)
+        blue, far = splat_at(footprints, base + BLUE), splat_at(footprints, base + DEPTH)
+        for step in range((rows & 255) // STEP_ROWS, ((rows >> 8) + STEP_ROWS - 1) // STEP_ROWS):
+            place = step * stride
+            before = load(state, place)
+            power = log_alpha(seen, load(numbers, (AT_ROW + step) * LANES))
+            above = power >= load(numbers, AT_CUT * LANES)
+            if not some(above & (before > splat(0.0))):
+                continue
+            _, _, weight, after = meet(power, above, before, numbers)
+            store(state, place, after)
+            store(state, place + LANES, fma(weight, red, load(state, place + LANES)))
+            store(state, place + 2 * LANES, fma(weight, green, load(state, place + 2 * LANES)))
+            store(state, place + 3 * LANES, fma(weight, blue, load(state, place + 3 * LANES)))
+            store(state, place + 4 * LANES, fma(weight, far, load(state, place + 4 * LANES)))
+            store(state, place + 5 * LANES, load(state, place + 5 * LANES) + weight)
+            if features is not None:
+                for c in range(features.shape[1]):
+                    here = place + (_SUMS + c) * LANES
+                    store(state, here, fma(weight, splat(features[member, c]), load(state, here)))
     return stop - start
-
-
-@inlined
-def _blend_rows(member, rows, left, top, footprints, features, channels, state, stride):
-    """Blend one footprint into the rows of a tile."""
-    base = member * FOOTPRINT
-    seen = shape(footprints, base, left, top, np.float32(0.0))
-    red, green = splat_at(footprints, base + RED), splat_at(footprints, base + GREEN)
-    blue, far = splat_at(footprints, base + BLUE), splat_at(footprints, base + DEPTH)
-    for step in range((rows & 255) // STEP_ROWS, ((rows >> 8) + STEP_ROWS - 1) // STEP_ROWS):
-        place = step * stride
-        before = load(state, place)
-        power = log_alpha(seen, load(LANE_Y, step * LANES))
-        if not some((power >= splat(_CUT)) & (before > splat(0.0))):
-            continue
-        _, _, weight, after = meet(power, before)
-        store(state, place, after)
-        store(state, place + LANES, fma(weight, red, load(state, place + LANES)))
-        store(state, place + 2 * LANES, fma(weight, green, load(state, place + 2 * LANES)))
-        store(state, place + 3 * LANES, fma(weight, blue, load(state, place + 3 * LANES)))
-        store(state, place + 4 * LANES, fma(weight, far, load(state, place + 4 * LANES)))
-        store(state, place + 5 * LANES, load(state, place + 5 * LANES) + weight)
-        for c in range(channels):
-            here = place + (_SUMS + c) * LANES
-            store(state, here, fma(weight, splat(features[member, c]), load(state, here)))
 
 
 @kernel

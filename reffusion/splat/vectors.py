@@ -37,8 +37,9 @@ LONGS = ir.VectorType(ir.IntType(64), LANES)
 _BITS = ir.VectorType(ir.IntType(1), LANES)
 INT = ir.IntType(32)
 
+ROUND = 1.5 * 2.0**23  # added to a small float32, it leaves the nearest whole number in the low bits
 # Minimax polynomial of degree 5 for 2^f on [-0.5, 0.5]: relative error 7.5e-8, 2.1e-7 with float32 rounding.
-_EXP2 = (1.0000000717, 0.6931469671, 0.2402211972, 0.0555071327, 0.0096755413, 0.0013276472)
+EXP2 = (1.0000000717, 0.6931469671, 0.2402211972, 0.0555071327, 0.0096755413, 0.0013276472)
 _EXP2_DOUBLE = tuple(math.log(2) ** k / math.factorial(k) for k in range(13))  # series: 2e-16 on [-0.5, 0.5]
 
 
@@ -181,16 +182,6 @@ def maximum(typing, x, y):
 
 
 @intrinsic
-def minus_abs(typing, x):
-    """-|x|."""
-
-    def emit(context, builder, sig, args):
-        return builder.fneg(_call(builder, "fabs", args[0]))
-
-    return x(x), emit
-
-
-@intrinsic
 def root(typing, x):
     """Square root."""
 
@@ -255,28 +246,31 @@ def narrow(typing, x):
     return lanes(x), emit
 
 
-def _exp2(builder, x):
-    """2^x by a polynomial in what is left of x after rounding; adding 1.5 2^p rounds, its low bits are the integer."""
-    single = x.type == FLOATS
-    whole_type, shift, series = (INTS, 23, _EXP2) if single else (LONGS, 52, _EXP2_DOUBLE)
-    magic = _constant(x.type, 1.5 * 2.0**shift)
-    shifted = builder.fadd(x, magic)
-    part = builder.fsub(x, builder.fsub(shifted, magic))
-    value = _constant(x.type, series[-1])
-    for coefficient in series[-2::-1]:
-        value = _fma(builder, value, part, _constant(x.type, coefficient))
-    exponent = builder.shl(builder.bitcast(shifted, whole_type), ir.Constant(whole_type, [shift] * LANES))
-    return builder.bitcast(builder.add(builder.bitcast(value, whole_type), exponent), x.type)
+@intrinsic
+def times_power(typing, x, rounded):
+    """x 2^n of float32 lanes, `rounded` being n + ROUND."""
+
+    def emit(context, builder, sig, args):
+        exponent = builder.shl(builder.bitcast(args[1], INTS), ir.Constant(INTS, [23] * LANES))
+        return builder.bitcast(builder.add(builder.bitcast(args[0], INTS), exponent), FLOATS)
+
+    return lanes(lanes, lanes), emit
 
 
 @intrinsic
 def exp2(typing, x):
-    """2^x for x in [-126, 127], relative error below 2e-7; anything (not a trap) outside."""
+    """2^x of float64 lanes in [-1022, 1023]; anything (not a trap) outside."""
 
     def emit(context, builder, sig, args):
-        return _exp2(builder, args[0])
+        magic, value = _constant(DOUBLES, 1.5 * 2.0**52), _constant(DOUBLES, _EXP2_DOUBLE[-1])
+        shifted = builder.fadd(args[0], magic)
+        part = builder.fsub(args[0], builder.fsub(shifted, magic))
+        for coefficient in _EXP2_DOUBLE[-2::-1]:
+            value = _fma(builder, value, part, _constant(DOUBLES, coefficient))
+        exponent = builder.shl(builder.bitcast(shifted, LONGS), ir.Constant(LONGS, [52] * LANES))
+        return builder.bitcast(builder.add(builder.bitcast(value, LONGS), exponent), DOUBLES)
 
-    return x(x), emit
+    return wide(wide), emit
 
 
 @intrinsic
