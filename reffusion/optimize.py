@@ -135,8 +135,8 @@ class GaussianOptimizer:
             width, height: of the rendered image, in pixels.
         """
         seen = radii > 0
-        slope = probe_gradient * probe_gradient.new_tensor([width / 2, height / 2])
-        self.slope_sum += torch.where(seen, slope.norm(dim=1), 0.0)
+        slope = torch.hypot(probe_gradient[:, 0] * (width / 2), probe_gradient[:, 1] * (height / 2))
+        self.slope_sum += torch.where(seen, slope, 0.0)
         self.slope_count += seen
 
     def forget_slopes(self) -> None:

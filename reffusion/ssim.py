@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from reffusion.splat.compiled import share
+from reffusion.splat.compiled import room, share
 from reffusion.splat.vectors import take_ticket
 
 RADIUS, SIGMA = 5, 1.5
@@ -76,15 +76,16 @@ class _FastDssim(torch.autograd.Function):
     def forward(ctx, image: Tensor, target: Tensor, weights: Tensor | None) -> Tensor:
         height, width, channels = image.shape
         flat = lambda t: t.detach().contiguous().numpy().reshape(height, width * channels)
-        per_pixel = np.ones((height, width), np.float32) if weights is None else weights.contiguous().numpy()
-        norm = _unmasked_norm(height, width) if weights is None else _norm(per_pixel)
-        weight_rows, norm_rows = np.repeat(per_pixel, channels, 1), np.repeat(norm, channels, 1)
+        if weights is None:
+            weight_rows, norm_rows = _unmasked_rows(height, width, channels)
+        else:
+            weight_rows, norm_rows = _rows(weights.contiguous().numpy(), channels)
         images = flat(image), flat(target), weight_rows
         fields, partials, sums = _padded(4, images[0]), _padded(3, images[0]), np.empty(height)
         share(_filter_products, *images, channels, fields)
         share(_compare, fields, weight_rows, norm_rows, channels, sums, partials)
         if ctx.needs_input_grad[0]:
-            gradient = np.empty_like(images[0])
+            gradient = room(*images[0].shape)
             share(_gather_gradient, partials, *images, gradient)
             ctx.gradient = torch.from_numpy(gradient).view(height, width, channels)
         return image.new_tensor(float(sums.sum()) / image.numel())
@@ -95,19 +96,22 @@ class _FastDssim(torch.autograd.Function):
 
 
 def _padded(count: int, image: np.ndarray) -> np.ndarray:
-    """`count` fields like `image`, with 5 rows of zeros above and below."""
-    return np.zeros((count, image.shape[0] + 2 * RADIUS, image.shape[1]), np.float32)
+    """`count` fields like `image`, to be written, with 5 rows of zeros above and below."""
+    fields = room(count, image.shape[0] + 2 * RADIUS, image.shape[1])
+    fields[:, :RADIUS], fields[:, -RADIUS:] = 0, 0
+    return fields
 
 
-def _norm(weights: np.ndarray) -> np.ndarray:
-    """[H, W] window sum of the weights; 1 where the pixel does not count, so that nothing divides by 0."""
-    rows = _filtered(weights, 1)
-    return np.where(weights > 0, rows, np.float32(1))
+def _rows(weights: np.ndarray, channels: int) -> tuple[np.ndarray, np.ndarray]:
+    """The weights [H, W], and their window sums (1 where a pixel does not count, so that nothing divides by 0), each
+    `channels` times over: [H, W * C]."""
+    norm = np.where(weights > 0, _filtered(weights, 1), np.float32(1))
+    return np.repeat(weights, channels, 1), np.repeat(norm, channels, 1)
 
 
 @lru_cache(maxsize=8)
-def _unmasked_norm(height: int, width: int) -> np.ndarray:
-    return _norm(np.ones((height, width), np.float32))
+def _unmasked_rows(height: int, width: int, channels: int) -> tuple[np.ndarray, np.ndarray]:
+    return _rows(np.ones((height, width), np.float32), channels)
 
 
 # The kernels hold an image as H rows of W * C numbers, so that each inner loop runs along memory. Rows of a field are

@@ -81,8 +81,19 @@ def match(
 ) -> Iterator[Matches]:
     """Matches of the `chosen` views, one pixel for each cell, with their neighbours among `cameras`; in their order."""
     gray = {camera.name: cv2.cvtColor(images[camera.name], cv2.COLOR_RGB2GRAY) for camera in cameras}
+    around = {camera.name: tuple(other.name for other in neighbours(camera, cameras)) for camera in chosen}
+    pairs = list(dict.fromkeys(tuple(sorted((name, other))) for name in around for other in around[name]))
+    found = {}
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        yield from pool.map(lambda camera: _match_one(camera, neighbours(camera, cameras), gray, cell), chosen)
+        both_ways = pool.map(lambda pair: _both_ways(gray[pair[0]], gray[pair[1]], cell), pairs)
+        for (one, other), (there, back) in zip(pairs, both_ways, strict=True):
+            found[one, other], found[other, one] = there, back
+    for camera in chosen:
+        pixels = _pixels(gray[camera.name], cell).reshape(-1, 2)
+        places, seen = np.empty((len(around[camera.name]), *pixels.shape)), np.empty((0, len(pixels)), bool)
+        if len(places):
+            places, seen = map(np.stack, zip(*(found[camera.name, other] for other in around[camera.name]), strict=True))
+        yield Matches(camera.name, pixels, around[camera.name], places, seen)
 
 
 def neighbours(camera: Camera, cameras: Sequence[Camera]) -> list[Camera]:
@@ -93,24 +104,29 @@ def neighbours(camera: Camera, cameras: Sequence[Camera]) -> list[Camera]:
     return sorted(others, key=lambda other: away[other.name])[:NEIGHBOURS]
 
 
-def _match_one(camera: Camera, others: Sequence[Camera], gray: Mapping[str, np.ndarray], cell: int) -> Matches:
-    rows = np.arange(cell // 2, camera.height, cell)
-    columns = np.arange(cell // 2, camera.width, cell)
+def _pixels(gray: np.ndarray, cell: int) -> np.ndarray:
+    """[h, w, 2], the pixel (x, y) looked at in each cell."""
+    rows, columns = np.arange(cell // 2, gray.shape[0], cell), np.arange(cell // 2, gray.shape[1], cell)
+    return np.stack(np.meshgrid(columns, rows), -1) + 0.5
+
+
+def _both_ways(one: np.ndarray, other: np.ndarray, cell: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """For each of two pictures, the places [P, 2] of its pixels in the other, and whether they mean anything [P]."""
     matcher = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    y, x = np.meshgrid(rows, columns, indexing="ij")
-    pixels = np.stack([x, y], -1) + 0.5
-    places, seen = np.empty((len(others), *pixels.shape)), np.empty((len(others), *y.shape), bool)
-    textured = _deviation(gray[camera.name])[y, x] > PLAIN
-    for k, other in enumerate(others):
-        there = matcher.calc(gray[camera.name], gray[other.name], None)[y, x]
-        back = matcher.calc(gray[other.name], gray[camera.name], None)
-        places[k] = pixels + there
-        at = (places[k] - 0.5).astype(np.float32)
-        # beyond the border no way back agrees
-        returned = cv2.remap(back, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(1e6,) * 4)
-        seen[k] = textured & (np.linalg.norm(there + returned, axis=-1) < ROUND_TRIP)
-    names, count = tuple(other.name for other in others), y.size
-    return Matches(camera.name, pixels.reshape(-1, 2), names, places.reshape(-1, count, 2), seen.reshape(-1, count))
+    there, back = matcher.calc(one, other, None), matcher.calc(other, one, None)
+    return [_followed(one, there, back, cell), _followed(other, back, there, cell)]
+
+
+def _followed(gray: np.ndarray, there: np.ndarray, back: np.ndarray, cell: int) -> tuple[np.ndarray, np.ndarray]:
+    pixels = _pixels(gray, cell)
+    columns, rows = pixels.astype(int).transpose(2, 0, 1)
+    moved = there[rows, columns]
+    at = (pixels + moved - 0.5).astype(np.float32)
+    # beyond the border no way back agrees
+    returned = cv2.remap(back, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(1e6,) * 4)
+    agree = np.linalg.norm(moved + returned, axis=-1) < ROUND_TRIP
+    seen = (_deviation(gray)[rows, columns] > PLAIN) & agree
+    return (pixels + moved).reshape(-1, 2), seen.reshape(-1)
 
 
 def _deviation(gray: np.ndarray) -> np.ndarray:

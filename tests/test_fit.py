@@ -120,7 +120,7 @@ def test_exposures_are_found_and_taken_out_again(tmp_path):
         changed = (pictures[camera.name] * np.array([gain, 1.0, 2 - gain]) + 8 * (gain - 1)).clip(0, 255)
         io.save_image(poses / "images" / f"{camera.name}.png", changed.round().astype(np.uint8))
     shown = io.load_views(poses, [c.name for c in cameras]) | {held.name: pictures[held.name]}
-    settings = replace(SETTINGS, iterations=1000, densify_until=0.3, reset_every=0, random_background=False)
+    settings = replace(SETTINGS, iterations=2000, densify_until=0.3, reset_every=0, random_background=False)
     scores = []
     for on in (False, True):
         folder = tmp_path / str(on)
