@@ -28,7 +28,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "priors" / "tiny")]
 
 import images  # noqa: E402
 
-from reffusion import io, metrics, trace  # noqa: E402
+from reffusion import io, lora, metrics, trace  # noqa: E402
 from reffusion import prior as diffusion  # noqa: E402
 from reffusion.sds import window_around  # noqa: E402
 from stages import evaluate  # noqa: E402
@@ -256,7 +256,7 @@ def personalization(prior: str, run: Path, steps: int | None, out: Path) -> dict
     stage.run(params, folder, **needs)
     models = {
         "before": diffusion.load_prior(prior),
-        "after": diffusion.load_lora(diffusion.load_prior(prior), folder),
+        "after": lora.merged(diffusion.load_prior(prior), folder),
     }
     prompts = {"whole": "A photo of sks", "window": "A photo of sks, cropped"}
     result: dict = {"steps": params.steps, "trace": trace.read_trace(folder / "trace.jsonl"), "timesteps": TIMESTEPS}

@@ -55,8 +55,8 @@ class Settings:
         largest: Gaussians of a larger size are pruned.
         reset_every: part of the run after which opacities are capped at 0.01, while densifying; 0: never.
         exposure: fit each view's exposure too, see `reffusion.exposure`.
-        rates, betas: Adam's step sizes, and its memory of gradients and of their squares (3DGS: 0.9, 0.999). A short run
-            is better off with a short memory.
+        rates, betas: Adam's step sizes, and its memory of gradients and of their squares (3DGS: 0.9, 0.999). A short
+            run is better off with a short memory.
         checkpoint_seconds: seconds of work between checkpoints.
     """
 

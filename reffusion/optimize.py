@@ -255,8 +255,12 @@ def _rows(parameter: Tensor) -> Tensor:
 
 
 class Update(NamedTuple):
-    """What a step of Adam needs for one parameter: it and its two moments [N, D], changed in place; its gradient [N, D];
-    step sizes [d] of the first d columns (the others stay) and the factor on them in masked rows."""
+    """What a step of Adam needs for one parameter.
+
+    Attributes:
+        parameter, first, second: it and its two moments [N, D], changed in place; gradient: [N, D].
+        rates: step sizes [d] of the first d columns; the others stay. masked_pace: the factor on them in masked rows.
+    """
 
     parameter: Tensor
     first: Tensor

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from reffusion import lora, trace
 from reffusion import prior as diffusion
-from reffusion import trace
 from reffusion.sds import enlarged, two_scale_masks, two_scales, window_around
 from reffusion.trace import generator as seeded
 
@@ -204,7 +204,7 @@ def held_out_samples(references: Sequence[Picture], size: int, seed: int) -> Sam
 @torch.no_grad()
 def held_out_error(prior: diffusion.Prior, samples: Samples, seed: int) -> dict[str, float]:
     """{"target_mse", "clean_latent_mse"} at four fixed timesteps with fixed noise: comparable through the training."""
-    diffusion.set_dropout(prior, False)
+    lora.set_dropout(prior, False)
     errors = []
     for level in (0.15, 0.4, 0.65, 0.9):
         timesteps = torch.full((len(samples.prompts),), round(level * (prior.timesteps - 1)))
@@ -256,7 +256,7 @@ class Training:
 
 def personalize(
     prior: diffusion.Prior,
-    lora: dict[str, list[torch.nn.Parameter]],
+    trained: dict[str, list[torch.nn.Parameter]],
     references: Sequence[Picture],
     views: Sequence[Clear],
     sampling: Sampling,
@@ -266,7 +266,7 @@ def personalize(
     """Train the prior's LoRA in place; resumes from `folder`'s checkpoint, bit for bit on the CPU.
 
     Args:
-        lora: what `prior.add_lora` returned.
+        trained: what `lora.add` returned.
         references, views: see `draw_samples`.
         folder: gets trace.jsonl (`held_out_error`, measured with the clock stopped) and checkpoints.
     Raises:
@@ -279,11 +279,11 @@ def personalize(
             f"up to the prior's native {prior.native_size} px"
         )
     rates = {"unet": training.lr_unet, "text": training.lr_text}
-    groups = [{"params": lora[part], "lr": rate} for part, rate in rates.items()]
+    groups = [{"params": trained[part], "lr": rate} for part, rate in rates.items()]
     optimizer = torch.optim.AdamW(groups, weight_decay=training.weight_decay)
     state, start, seconds = trace.load_checkpoint(folder), 0, 0.0
     if state is not None:
-        diffusion.load_lora_state(prior, state["lora"])
+        lora.load_state(prior, state["lora"])
         optimizer.load_state_dict(state["optimizer"])
         start, seconds = state["step"], state["seconds"]
     log, saved = trace.Trace(folder, seconds, start), seconds
@@ -300,13 +300,13 @@ def personalize(
         train_step(prior, optimizer, references, views, sampling, training, step)
         if log.seconds - saved > training.checkpoint_seconds:
             saved = log.seconds
-            weights = diffusion.lora_state(prior)
+            weights = lora.state(prior)
             done = {"lora": weights, "optimizer": optimizer.state_dict(), "step": step + 1, "seconds": saved}
             trace.save_checkpoint(folder, done)
     with log.paused():
         errors = held_out_error(prior, held_out, training.seed)
     log.log(training.steps, **errors)
-    diffusion.set_dropout(prior, False)
+    lora.set_dropout(prior, False)
 
 
 def train_step(
@@ -323,7 +323,7 @@ def train_step(
     Raises:
         FloatingPointError: naming the step; the weights are as before it.
     """
-    diffusion.set_dropout(prior, True)
+    lora.set_dropout(prior, True)
     optimizer.zero_grad(set_to_none=True)
     total = 0.0
     for part in range(training.accumulate):

@@ -1,6 +1,6 @@
-"""The inpainting latent diffusion model: load, encode, decode, predict, sample, adapt by LoRA.
+"""The inpainting latent diffusion model: load, encode, decode, predict, sample.
 
-The only importer of diffusers, transformers and peft. Works with any Stable-Diffusion-type inpainting folder
+The only importer of diffusers and transformers. Works with any Stable-Diffusion-type inpainting folder
 (latents C | mask 1 | masked latents C); sizes, factor and prediction type are read from its configuration, so the
 embedded prior and SD2-inpainting take the same path. In masks 1 = repaint.
 """
@@ -9,28 +9,13 @@ from __future__ import annotations
 
 import itertools
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
-
-LORA_FILE = "pytorch_lora_weights.safetensors"
-ATTENTION = ("to_q", "to_k", "to_v", "to_out.0")
-TEXT_ATTENTION = ("q_proj", "k_proj", "v_proj", "out_proj")
-CONVOLUTIONS = (
-    "conv_in",
-    "conv1",
-    "conv2",
-    "conv_shortcut",
-    "conv_out",
-    "proj_in",
-    "proj_out",
-    "ff.net.0.proj",
-    "ff.net.2",
-)
 
 
 @dataclass(frozen=True)
@@ -54,11 +39,11 @@ class Prior:
 
     @property
     def device(self) -> torch.device:
-        return self.unet.device
+        return self.alphas_cumprod.device  # a model's own answer searches all of its modules: 9 ms
 
     @property
     def dtype(self) -> torch.dtype:
-        return self.vae.dtype
+        return next(self.vae.parameters()).dtype
 
     @property
     def factor(self) -> int:
@@ -261,106 +246,9 @@ def guided(
     return (1 + guidance) * eps - guidance * eps_empty, (1 + guidance) * clean - guidance * clean_empty
 
 
-# ---------------------------------------------------------------------------------------------- LoRA
-
-
-def add_lora(
-    prior: Prior, rank: int, alpha: float, dropout: float, layers: str, seed: int
-) -> dict[str, list[nn.Parameter]]:
-    """Attach fresh LoRA layers to UNet and text encoder, in place.
-
-    Args:
-        rank, alpha, dropout: of every layer; the change of a weight is alpha / rank * B A.
-        layers: "attention" (the paper's), or "attention+conv" (UNet convolutions and feed-forward layers too).
-        seed: of the layers' initial values.
-
-    Returns:
-        {"unet": parameters, "text": parameters}, float32, requiring gradients.
-    """
-    from peft import LoraConfig
-
-    if layers not in ("attention", "attention+conv"):
-        raise ValueError(f"layers must be 'attention' or 'attention+conv', not {layers!r}")
-    targets = ATTENTION if layers == "attention" else ATTENTION + CONVOLUTIONS
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
-        for part, names in ((prior.unet, targets), (prior.text_encoder, TEXT_ATTENTION)):
-            part.add_adapter(LoraConfig(r=rank, lora_alpha=alpha, lora_dropout=dropout, target_modules=list(names)))
-    set_dropout(prior, False)
-    return {"unet": _lora_parameters(prior.unet), "text": _lora_parameters(prior.text_encoder)}
-
-
-def _lora_parameters(part: nn.Module) -> list[nn.Parameter]:
-    found = []
-    for name, parameter in part.named_parameters():
-        if "lora_" in name:
-            parameter.data = parameter.data.float()
-            parameter.requires_grad_(True)
-            found.append(parameter)
-    return found
-
-
-def lora_state(prior: Prior) -> dict[str, Tensor]:
-    """The LoRA weights by name, for checkpoints."""
-    return {
-        f"{label}.{name}": parameter.detach().cpu().clone()
-        for label, part in (("unet", prior.unet), ("text", prior.text_encoder))
-        for name, parameter in part.named_parameters()
-        if "lora_" in name
-    }
-
-
-def load_lora_state(prior: Prior, state: dict[str, Tensor]) -> None:
-    """Put back what `lora_state` gave, into layers that `add_lora` attached."""
-    for label, part in (("unet", prior.unet), ("text", prior.text_encoder)):
-        for name, parameter in part.named_parameters():
-            if "lora_" in name:
-                parameter.data.copy_(state[f"{label}.{name}"])
-
-
-def set_dropout(prior: Prior, active: bool) -> None:
-    """Training mode (LoRA dropout on) or evaluation mode."""
-    for part in (prior.unet, prior.text_encoder):
-        part.train(active)
-
-
-def save_lora(prior: Prior, folder: Path) -> None:
-    """Write `pytorch_lora_weights.safetensors` as diffusers' `load_lora_weights` reads it, rank and alpha included."""
-    from peft import get_peft_model_state_dict
-
-    _pipeline_class().save_lora_weights(
-        folder,
-        unet_lora_layers=get_peft_model_state_dict(prior.unet, save_embedding_layers=False),
-        text_encoder_lora_layers=get_peft_model_state_dict(prior.text_encoder, save_embedding_layers=False),
-        weight_name=LORA_FILE,
-        unet_lora_adapter_metadata=_adapter_facts(prior.unet),
-        text_encoder_lora_adapter_metadata=_adapter_facts(prior.text_encoder),
-    )
-
-
-def _adapter_facts(part: nn.Module) -> dict[str, Any]:
-    """The adapter's configuration (rank, alpha, layers) in an order of its own, without this machine's paths."""
-    facts = next(iter(part.peft_config.values())).to_dict()
-    plain = {key: sorted(value) if isinstance(value, set) else value for key, value in sorted(facts.items())}
-    return plain | {"base_model_name_or_path": None}
-
-
-def load_lora(prior: Prior, folder: Path) -> Prior:
-    """The prior adapted by the LoRA in `folder`, merged into the UNet's weights (the text encoder keeps its layers)."""
-    if not (folder / LORA_FILE).exists():
-        raise ValueError(f"{folder / LORA_FILE} does not exist; run the personalize stage first")
-    pipe = pipeline(prior)
-    pipe.load_lora_weights(folder, weight_name=LORA_FILE)
-    prior.unet.fuse_lora()
-    prior.unet.unload_lora()
-    for part in (prior.unet, prior.text_encoder):
-        part.requires_grad_(False).eval()
-    return replace(prior)
-
-
 def pipeline(prior: Prior) -> Any:
     """diffusers' own inpainting pipeline over the same parts."""
-    return _pipeline_class()(
+    return pipeline_class()(
         vae=prior.vae,
         text_encoder=prior.text_encoder,
         tokenizer=prior.tokenizer,
@@ -372,7 +260,7 @@ def pipeline(prior: Prior) -> Any:
     )
 
 
-def _pipeline_class() -> Any:
+def pipeline_class() -> Any:
     """StableDiffusionInpaintPipeline, imported without the advice to install torchvision, which nothing here needs."""
     from transformers.utils import logging as transformers_logging
 

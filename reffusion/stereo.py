@@ -92,7 +92,9 @@ def match(
         pixels = _pixels(gray[camera.name], cell).reshape(-1, 2)
         places, seen = np.empty((len(around[camera.name]), *pixels.shape)), np.empty((0, len(pixels)), bool)
         if len(places):
-            places, seen = map(np.stack, zip(*(found[camera.name, other] for other in around[camera.name]), strict=True))
+            places, seen = map(
+                np.stack, zip(*(found[camera.name, other] for other in around[camera.name]), strict=True)
+            )
         yield Matches(camera.name, pixels, around[camera.name], places, seen)
 
 

@@ -66,7 +66,7 @@ def run(
 ) -> None:
     import torch
 
-    from reffusion import io, trace
+    from reffusion import io, lora, trace
     from reffusion import prior as diffusion
     from reffusion.distill import distill
     from reffusion.personalize import PROMPTS
@@ -81,7 +81,7 @@ def run(
     prior = text = None
     if params.sds_weight > 0:
         prior = diffusion.load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
-        prior = prior if personalize is None else diffusion.load_lora(prior, personalize)
+        prior = prior if personalize is None else lora.merged(prior, personalize)
         with torch.no_grad():
             text = diffusion.embed_text(prior, list(PROMPTS))
     sights = load_sights(params, scene, poses, fit, masks)

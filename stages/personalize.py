@@ -48,7 +48,7 @@ class Params(BaseModel):
 def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, reference: Path) -> None:
     import torch
 
-    from reffusion import io, trace
+    from reffusion import io, lora, trace
     from reffusion import personalize as P
     from reffusion import prior as diffusion
 
@@ -86,9 +86,9 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
         views = P.clear_views(scene_views(scene, poses, fit, masks, prior.native_size), training.size)
         if not views:
             print(f"note: no view has {training.size} px window free of masks: reference alone", flush=True)
-    lora = diffusion.add_lora(prior, params.rank, params.alpha, params.dropout, params.layers, params.seed)
-    P.personalize(prior, lora, references, views, sampling, training, out)
-    diffusion.save_lora(prior, out)
+    trained = lora.add(prior, params.rank, params.alpha, params.dropout, params.layers, params.seed)
+    P.personalize(prior, trained, references, views, sampling, training, out)
+    lora.save(prior, out)
     trace.clear_checkpoint(out)
 
 

@@ -15,13 +15,19 @@ OWN = {"reffusion", "stages", "runner", "report"}
 ONE_DOOR = {
     "pycolmap": "reffusion/sfm.py",
     "diffusers": "reffusion/prior.py",
-    "peft": "reffusion/prior.py",
+    "peft": "reffusion/lora.py",
     "transformers": "reffusion/prior.py",
 }
 OPENERS = {"open", "read_text", "write_text", "read_bytes", "write_bytes", "imread", "imwrite", "imsave", "savez"}
 MAY_OPEN = ("reffusion/io/", "reffusion/trace.py")
 COMPILER = "reffusion/splat/compiled.py"
-OWN_FILES = ("reffusion/prior.py", "reffusion/lpips.py", "reffusion/sfm.py", COMPILER)  # weights, databases, kernels
+OWN_FILES = (
+    "reffusion/prior.py",
+    "reffusion/lora.py",
+    "reffusion/lpips.py",
+    "reffusion/sfm.py",
+    COMPILER,
+)  # weights, databases, kernels
 PURE = ("geometry", "splat/", "sds", "ssim", "densify", "discriminator", "types")  # tensors and plain numbers only
 
 

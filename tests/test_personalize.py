@@ -6,6 +6,7 @@ import pytest
 import torch
 from small_prior import small_prior
 
+from reffusion import lora
 from reffusion import personalize as P
 from reffusion import prior as diffusion
 from reffusion.trace import generator, load_checkpoint, read_trace
@@ -114,9 +115,9 @@ def test_learning_rate_warms_up_and_falls():
 
 
 def test_training_learns_the_reference_and_logs_it(tiny, tmp_path):
-    lora = diffusion.add_lora(tiny, 8, 16, 0.1, "attention+conv", 0)
+    trained = lora.add(tiny, 8, 16, 0.1, "attention+conv", 0)
     training = replace(TRAINING, steps=60, batch=4, lr_unet=4e-3)
-    P.personalize(tiny, lora, [striped()], [], P.Sampling(), training, tmp_path)
+    P.personalize(tiny, trained, [striped()], [], P.Sampling(), training, tmp_path)
     records = read_trace(tmp_path / "trace.jsonl")
     assert [records[0]["iteration"], records[-1]["iteration"]] == [0, 60]
     assert records[-1]["target_mse"] < 0.9 * records[0]["target_mse"]
@@ -127,10 +128,10 @@ def test_training_learns_the_reference_and_logs_it(tiny, tmp_path):
 def test_interrupted_training_resumes_to_the_same_weights(tmp_path, monkeypatch):
     def trained(folder):
         prior = small_prior()
-        lora = diffusion.add_lora(prior, 4, 8, 0.1, "attention", 0)
+        trained = lora.add(prior, 4, 8, 0.1, "attention", 0)
         training = replace(TRAINING, accumulate=2, schedule="cosine", warm_up=2, checkpoint_seconds=1e-9)
-        P.personalize(prior, lora, [striped()], [], P.Sampling(), training, folder)
-        return diffusion.lora_state(prior)
+        P.personalize(prior, trained, [striped()], [], P.Sampling(), training, folder)
+        return lora.state(prior)
 
     (tmp_path / "whole").mkdir()
     (tmp_path / "broken").mkdir()
@@ -155,10 +156,10 @@ def test_interrupted_training_resumes_to_the_same_weights(tmp_path, monkeypatch)
 
 
 def test_a_number_that_is_none_stops_the_training_and_names_the_step(tiny, tmp_path):
-    lora = diffusion.add_lora(tiny, 4, 8, 0.0, "attention", 0)
+    trained = lora.add(tiny, 4, 8, 0.0, "attention", 0)
     broken = replace(striped(), image=torch.full((3, 70, 90), float("nan")))
     with pytest.raises(FloatingPointError, match="step 0"):
-        P.personalize(tiny, lora, [broken], [], P.Sampling(), TRAINING, tmp_path)
-    assert all(torch.isfinite(w).all() for w in diffusion.lora_state(tiny).values())
+        P.personalize(tiny, trained, [broken], [], P.Sampling(), TRAINING, tmp_path)
+    assert all(torch.isfinite(w).all() for w in lora.state(tiny).values())
     with pytest.raises(ValueError, match="native 16 px"):
-        P.personalize(tiny, lora, [striped()], [], P.Sampling(), replace(TRAINING, size=128), tmp_path)
+        P.personalize(tiny, trained, [striped()], [], P.Sampling(), replace(TRAINING, size=128), tmp_path)

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from reffusion import lora
 from reffusion import prior as P
 from reffusion.trace import generator
 
@@ -92,16 +93,17 @@ def test_guidance_zero_is_the_conditional_prediction(tiny):
         P.guided(tiny, noisy, t, condition, text, None, 1.0)
 
 
+@pytest.mark.parametrize("dropout", [0.1, 0.0], ids=["beside the weights", "added to them"])
 @pytest.mark.parametrize("layers", ["attention", "attention+conv"])
-def test_saved_lora_gives_the_trained_epsilon_in_a_fresh_diffusers_pipeline(tiny, tmp_path, layers):
-    found = P.add_lora(tiny, rank=4, alpha=12.0, dropout=0.1, layers=layers, seed=0)
+def test_saved_lora_gives_the_trained_epsilon_in_a_fresh_diffusers_pipeline(tiny, tmp_path, layers, dropout):
+    found = lora.add(tiny, rank=4, alpha=12.0, dropout=dropout, layers=layers, seed=0)
     noise = generator(0, "lora")
     for parameter in found["unet"] + found["text"]:
         parameter.data += 0.05 * torch.randn(parameter.shape, generator=noise)
     noisy, t = torch.randn(1, 4, 16, 16, generator=noise), torch.tensor([400])
     condition = P.conditioning(tiny, pictures(1, 16), half_masks(1, 16))
     trained = P.raw_prediction(tiny, noisy, t, condition, P.embed_text(tiny, ["A photo of sks"]))
-    P.save_lora(tiny, tmp_path)
+    lora.save(tiny, tmp_path)
 
     from diffusers import StableDiffusionInpaintPipeline
 
@@ -114,18 +116,37 @@ def test_saved_lora_gives_the_trained_epsilon_in_a_fresh_diffusers_pipeline(tiny
     loaded = P.raw_prediction(fresh, noisy, t, condition, P.embed_text(fresh, ["A photo of sks"]))
     assert (loaded - trained).abs().max() < 1e-5
 
-    merged = P.load_lora(plain, tmp_path)
+    merged = lora.merged(plain, tmp_path)
     again = P.raw_prediction(merged, noisy, t, condition, P.embed_text(merged, ["A photo of sks"]))
     assert (again - trained).abs().max() < 2e-5
 
 
+def test_lora_added_to_the_weights_has_the_gradients_of_lora_beside_them():
+    gradients = []
+    for dropout in (0.1, 0.0):  # in evaluation mode dropout does nothing
+        prior = P.load_prior(TINY)
+        found = lora.add(prior, 4, 8.0, dropout, "attention+conv", 0)
+        noise = generator(0, "lora")
+        for parameter in found["unet"]:
+            parameter.data += 0.02 * torch.randn(parameter.shape, generator=noise)
+        noisy, condition = (
+            torch.randn(2, 4, 16, 16, generator=noise),
+            P.conditioning(prior, pictures(2, 16), half_masks(2, 16)),
+        )
+        output = P.raw_prediction(prior, noisy, torch.tensor([100, 700]), condition, P.embed_text(prior, ["", "a"]))
+        output.square().sum().backward()
+        gradients.append([parameter.grad for parameter in found["unet"]])
+    for beside, added in zip(*gradients, strict=True):
+        assert torch.allclose(beside, added, rtol=1e-3, atol=1e-4 * float(beside.abs().max()))
+
+
 def test_lora_state_round_trip(tiny):
-    found = P.add_lora(tiny, 2, 4.0, 0.0, "attention", 0)
-    state = P.lora_state(tiny)
+    found = lora.add(tiny, 2, 4.0, 0.0, "attention", 0)
+    state = lora.state(tiny)
     for parameter in found["unet"] + found["text"]:
         parameter.data += 1
-    P.load_lora_state(tiny, state)
-    assert all(torch.equal(a, b) for a, b in zip(state.values(), P.lora_state(tiny).values(), strict=True))
+    lora.load_state(tiny, state)
+    assert all(torch.equal(a, b) for a, b in zip(state.values(), lora.state(tiny).values(), strict=True))
 
 
 def test_the_stock_pipeline_inpaints():

@@ -152,9 +152,7 @@ def _tile_backward(left, top, start, stop, footprints, features, bins, state, su
         member, rows, slot = bins.entries[at, MEMBER], bins.entries[at, ROWS], bins.entries[at, SLOT]
         if features is not None:
             sums[:] = np.float32(0.0)
-        touched, to_all = _rows_backward(
-            member, rows, left, top, footprints, features, state, stride, sums, numbers
-        )
+        touched, to_all = _rows_backward(member, rows, left, top, footprints, features, state, stride, sums, numbers)
         written[slot] = touched
         if not touched:
             continue

@@ -26,7 +26,19 @@ from reffusion.splat.layout import (
     WHITEN_Y,
 )
 from reffusion.splat.memory import load, prefetch, splat_at, store
-from reffusion.splat.vectors import EXP2, LANES, ROUND, fma, fnma, minimum, select, some, splat, take_ticket, times_power
+from reffusion.splat.vectors import (
+    EXP2,
+    LANES,
+    ROUND,
+    fma,
+    fnma,
+    minimum,
+    select,
+    some,
+    splat,
+    take_ticket,
+    times_power,
+)
 
 STEP_ROWS = LANES // TILE_WIDTH  # rows of a vector
 STEPS = TILE_HEIGHT // STEP_ROWS  # vectors of a tile
