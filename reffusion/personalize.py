@@ -46,6 +46,8 @@ class Sampling:
     Attributes:
         local_share: of the reference's samples, those that are native-size crops around its mask.
         scene_share: of all samples, crops of the scene's own views that touch none of their masked pixels (paper: 0).
+        hole_share: of the reference's samples, those whose mask is the hole itself (paper: 0). That is the mask of the
+            job; rectangles leave most of the hole to be seen, and a short training does not get beyond them.
         empty_share: samples whose prompt is replaced by the empty one, so that guidance stays meaningful.
         border: largest share of height or width that a global sample loses at each side.
         rectangles: smallest and largest number of rectangles in a mask.
@@ -55,6 +57,7 @@ class Sampling:
 
     local_share: float = 0.5
     scene_share: float = 0.0
+    hole_share: float = 0.0
     empty_share: float = 0.1
     border: float = 0.1
     rectangles: tuple[int, int] = (1, 29)
@@ -91,12 +94,13 @@ def rectangle_mask(size: int, sampling: Sampling, generator: torch.Generator) ->
     return 1 - mask if _uniform(0, 1, generator) < sampling.inverted_share else mask
 
 
-def without_border(image: Tensor, border: float, generator: torch.Generator) -> Tensor:
-    """[3, H, W] -> the image less a thin strip, drawn for each of its four sides."""
-    height, width = image.shape[-2:]
+def without_border(source: Picture, border: float, generator: torch.Generator) -> Picture:
+    """The picture less a thin strip, drawn for each of its four sides: at most `border` of its height or width."""
+    height, width = source.region.shape
     top, bottom = (int(_uniform(0, border, generator) * height) for _ in range(2))
     left, right = (int(_uniform(0, border, generator) * width) for _ in range(2))
-    return image[:, top : height - bottom, left : width - right]
+    rows, columns = slice(top, height - bottom), slice(left, width - right)
+    return Picture(source.image[:, rows, columns], source.region[rows, columns])
 
 
 def clear_windows(region: Tensor, size: int) -> Tensor:
@@ -135,27 +139,50 @@ def draw_samples(
         references: what is to be learned; every pixel of them may be used.
         views: the scene's own views for `sampling.scene_share`, their windows of side `size`; none: no such samples.
         native: the side that distillation reduces a whole view to. A global sample is reduced to it as well, and,
-            where `size` is smaller, a window of it is taken, so that the model learns it in the scale it will see.
+            where `size` is smaller, a window of it that shows some of the hole, so that the model learns it in the
+            scale it will see.
     """
     images, masks, prompts = [], [], []
     for _ in range(count):
         if views and _uniform(0, 1, generator) < sampling.scene_share:
             view = views[int(torch.randint(len(views), (), generator=generator))]
             top, left = view.windows[int(torch.randint(len(view.windows), (), generator=generator))].tolist()
-            image, prompt = view.image[:, top : top + size, left : left + size], LOCAL
+            image, hole, prompt = view.image[:, top : top + size, left : left + size], None, LOCAL
         else:
             source = references[int(torch.randint(len(references), (), generator=generator))]
-            if _uniform(0, 1, generator) < sampling.local_share:
-                top, left = window_around(source.region, size, generator)
-                image, prompt = source.image[:, top : top + size, left : left + size], LOCAL
-            else:
-                whole = two_scales(without_border(source.image, sampling.border, generator), [], native)[0]
-                top, left = torch.randint(native - size + 1, (2,), generator=generator).tolist()
-                image, prompt = whole[:, top : top + size, left : left + size], GLOBAL
+            image, hole, prompt = _of_reference(source, native, size, sampling, generator)
         images.append(image)
-        masks.append(rectangle_mask(size, sampling, generator))
+        as_asked = hole is not None and hole.any() and _uniform(0, 1, generator) < sampling.hole_share
+        masks.append(hole if as_asked else rectangle_mask(size, sampling, generator))
         prompts.append(EMPTY if _uniform(0, 1, generator) < sampling.empty_share else prompt)
     return Samples(torch.stack(images), torch.stack(masks), torch.tensor(prompts))
+
+
+def _of_reference(
+    source: Picture, native: int, size: int, sampling: Sampling, generator: torch.Generator
+) -> tuple[Tensor, Tensor, int]:
+    """A local or global sample of a reference: image [3, size, size], its hole there [1, size, size], prompt."""
+    if _uniform(0, 1, generator) < sampling.local_share:
+        image, hole, prompt = source.image, source.region[None].to(torch.float32), LOCAL
+    else:
+        whole = without_border(source, sampling.border, generator)
+        image, hole = two_scales(whole.image, [], native)[0], two_scale_masks(whole.region, [], native)[0]
+        prompt = GLOBAL
+    if hole.shape[-2:] == (size, size):
+        return image, hole, prompt
+    window = window_around if hole.any() else _window_anywhere  # a border may have been all of the hole
+    top, left = window(hole[0] > 0, size, generator)
+    return image[:, top : top + size, left : left + size], hole[:, top : top + size, left : left + size], prompt
+
+
+def _window_anywhere(mask: Tensor, size: int, generator: torch.Generator) -> tuple[int, int]:
+    return tuple(int(torch.randint(extent - size + 1, (), generator=generator)) for extent in mask.shape)
+
+
+def spread_timesteps(count: int, steps: int, generator: torch.Generator) -> Tensor:
+    """[count] long, each uniform in [0, steps), one in each of `count` equal parts: batches differ less."""
+    places = torch.randperm(count, generator=generator) + torch.rand(1, generator=generator)
+    return (places * (steps / count)).long().clamp(max=steps - 1)
 
 
 def latent_shape(prior: diffusion.Prior, size: int) -> tuple[int, int, int]:
@@ -193,7 +220,7 @@ def denoising_error(
 
 
 def held_out_samples(references: Sequence[Picture], size: int, seed: int) -> Samples:
-    """The reference's own hole, which no training mask shows: the whole view and two crops. Same for equal seeds."""
+    """The reference's own hole: the whole view and two crops. Same for equal seeds."""
     draw = seeded(seed, "personalize", "held out")
     first = references[0]
     windows = [window_around(first.region, size, draw) for _ in range(2)]
@@ -233,7 +260,7 @@ class Training:
 
     Attributes:
         steps: optimiser steps, each on `accumulate` batches of `batch` samples.
-        lr_unet, lr_text: learning rates. weight_decay: AdamW's. clip: largest norm of the gradient.
+        lr_unet, lr_text: learning rates. weight_decay, betas: AdamW's. clip: largest norm of the gradient.
         warm_up, schedule: see `learning_rate_factor`.
         size: side of a sample in pixels, at most the prior's native size.
         seed: of samples, timesteps, noise and dropout.
@@ -246,6 +273,7 @@ class Training:
     batch: int
     accumulate: int
     weight_decay: float
+    betas: tuple[float, float]
     clip: float
     warm_up: int
     schedule: str
@@ -280,7 +308,7 @@ def personalize(
         )
     rates = {"unet": training.lr_unet, "text": training.lr_text}
     groups = [{"params": trained[part], "lr": rate} for part, rate in rates.items()]
-    optimizer = torch.optim.AdamW(groups, weight_decay=training.weight_decay)
+    optimizer = torch.optim.AdamW(groups, betas=training.betas, weight_decay=training.weight_decay)
     state, start, seconds = trace.load_checkpoint(folder), 0, 0.0
     if state is not None:
         lora.load_state(prior, state["lora"])
@@ -329,7 +357,7 @@ def train_step(
     for part in range(training.accumulate):
         draw = seeded(training.seed, "personalize", step, part)
         samples = draw_samples(references, views, prior.native_size, training.size, training.batch, sampling, draw)
-        timesteps = torch.randint(prior.timesteps, (training.batch,), generator=draw)
+        timesteps = spread_timesteps(training.batch, prior.timesteps, draw)
         noise = torch.randn(training.batch, *latent_shape(prior, training.size), generator=draw)
         # LoRA's dropout takes no generator of its own: seed the global one from the step's.
         torch.manual_seed(int(torch.randint(2**62, (), generator=draw)))

@@ -27,12 +27,14 @@ class Params(BaseModel):
     batch: int = Field(16, ge=1, description="samples in a batch")
     accumulate: int = Field(1, ge=1, description="batches in an optimiser step")
     weight_decay: float = Field(1e-2, ge=0, description="AdamW's")
+    betas: tuple[float, float] = Field((0.9, 0.999), description="AdamW's memory of gradients and of their squares")
     clip: float = Field(1.0, gt=0, description="largest norm of the gradient")
     warm_up: int = Field(0, ge=0, description="steps of linear warm-up")
     schedule: Literal["constant", "cosine"] = Field("constant", description="learning rate after the warm-up")
     # PAPER leaves open: how samples are drawn (reffusion.personalize.Sampling says where the figures come from).
     local_share: float = Field(0.5, ge=0, le=1, description="share of the reference's samples that are local crops")
     scene_crops: float = Field(0.0, ge=0, lt=1, description="share of samples from unmasked crops of the scene's views")
+    hole_share: float = Field(0.0, ge=0, le=1, description="share of the reference's samples whose mask is its hole")
     empty_share: float = Field(0.1, ge=0, lt=1, description="share of samples with the empty prompt")
     border: float = Field(0.1, ge=0, lt=0.5, description="largest strip cropped off each side, in sides")
     rectangles: tuple[int, int] = Field((1, 29), description="fewest and most rectangles of a mask")
@@ -56,6 +58,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
     sampling = P.Sampling(
         params.local_share,
         params.scene_crops,
+        params.hole_share,
         params.empty_share,
         params.border,
         params.rectangles,
@@ -74,6 +77,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
         batch=params.batch,
         accumulate=params.accumulate,
         weight_decay=params.weight_decay,
+        betas=params.betas,
         clip=params.clip,
         warm_up=params.warm_up,
         schedule=params.schedule,

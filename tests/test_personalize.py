@@ -13,7 +13,7 @@ from reffusion.trace import generator, load_checkpoint, read_trace
 
 NATIVE, SIZE = 16, 12
 TRAINING = P.Training(
-    steps=4, lr_unet=1e-3, lr_text=1e-4, batch=2, accumulate=1, weight_decay=1e-2, clip=1.0, warm_up=0,
+    steps=4, lr_unet=1e-3, lr_text=1e-4, batch=2, accumulate=1, weight_decay=1e-2, betas=(0.9, 0.999), clip=1.0, warm_up=0,
     schedule="constant", size=SIZE, seed=0, checkpoint_seconds=1e9,
 )  # fmt: skip
 
@@ -50,10 +50,28 @@ def test_rectangle_masks_repaint_something_and_keep_within_their_sides():
 
 
 def test_global_samples_lose_a_thin_border_only():
-    image = torch.zeros(3, 100, 200)
+    ramp = torch.arange(200.0).expand(3, 100, 200)
+    source = P.Picture(ramp, ramp[0] > 100)
     for seed in range(20):
-        height, width = P.without_border(image, 0.1, generator(seed)).shape[1:]
+        cut = P.without_border(source, 0.1, generator(seed))
+        height, width = cut.region.shape
         assert 80 <= height <= 100 and 160 <= width <= 200
+        assert torch.equal(cut.image[0] > 100, cut.region)
+
+
+@pytest.mark.parametrize("local_share", [0.0, 1.0])
+@pytest.mark.parametrize("size", [SIZE, NATIVE])
+def test_samples_masked_by_the_hole_show_it_where_it_is(local_share, size):
+    """The striped picture with its hole painted white: mask and white pixels must be the same."""
+    source = striped()
+    source = P.Picture(torch.where(source.region, 1.0, source.image.clamp(max=0)), source.region)
+    sampling = P.Sampling(local_share=local_share, hole_share=1.0, empty_share=0.0)
+    samples = P.draw_samples([source], [], NATIVE, size, 40, sampling, generator(5))
+    white = samples.images[:, :1]
+    assert (samples.masks.flatten(1).sum(1) > 0).all()
+    assert (white[samples.masks == 0] <= 1e-5).all()
+    if local_share == 1:
+        assert torch.equal(white == 1, samples.masks == 1)
 
 
 def test_clear_windows_are_all_windows_without_masked_pixels():

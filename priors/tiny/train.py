@@ -25,6 +25,7 @@ from diffusers import StableDiffusionInpaintPipeline, UNet2DConditionModel  # no
 from torch import Tensor, nn  # noqa: E402
 from transformers import CLIPTextModel  # noqa: E402
 
+from reffusion.personalize import spread_timesteps  # noqa: E402
 from reffusion.trace import generator, load_checkpoint, save_checkpoint, seed_for  # noqa: E402
 
 POOL = 500  # images held in memory
@@ -84,12 +85,6 @@ class Model(nn.Module):
         ids = self.tokens(captions, padding="max_length", truncation=True, return_tensors="pt").input_ids
         words = self.text(ids.to(noisy.device)).last_hidden_state
         return self.unet(torch.cat([noisy, condition], 1), t, words).sample
-
-
-def spread_timesteps(count: int, steps: int, random: torch.Generator) -> Tensor:
-    """[count] long, each uniform in [0, steps), one in each of `count` equal parts, so that batches differ less."""
-    places = torch.randperm(count, generator=random) + torch.rand(1, generator=random)
-    return (places * (steps / count)).long().clamp(max=steps - 1)
 
 
 def loss(model: Model, alphas: Tensor, batch: tuple[Tensor, Tensor, list[str]], random: torch.Generator) -> Tensor:
