@@ -189,6 +189,7 @@ def surface_gaussians(
     thickness: float = 0.1,
     grazing: float = 0.15,
     opacity: float = 0.95,
+    sunk: float = 0.0,
 ) -> Gaussians:
     """One Gaussian for each chosen pixel: a disk on the surface that the depth map describes.
 
@@ -207,6 +208,7 @@ def surface_gaussians(
         thickness: standard deviation along the normal over the smaller one within the surface.
         grazing: least cosine between surface and view; more slanted disks are not stretched further.
         opacity: in (0, 1).
+        sunk: how far behind the surface, along its normal, in pixels.
 
     Returns:
         Gaussians, one for each chosen pixel in row-major order, float32 on the CPU.
@@ -230,6 +232,7 @@ def surface_gaussians(
     axes = np.stack([across, np.cross(normals, across), normals], -1)
     width = spread * depth[pixels] / np.sqrt(camera.fx * camera.fy)
     scales = np.stack([width, width / cosine, thickness * width], -1)
+    points = points - sunk / spread * width[:, None] * normals
     colors = (image[pixels] / 255.0 if image.dtype == np.uint8 else image[pixels]).astype(np.float64)
     sh = np.zeros((len(points), sh_count, 3))
     sh[:, 0] = (colors - 0.5) / SH_0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -49,6 +50,33 @@ class Completion:
     seed: int
 
 
+@dataclass(frozen=True)
+class Sheets:
+    """How new Gaussians lie on a surface: a sheet of thin ones, and a second, opaque one behind it.
+
+    Opaque Gaussians next to each other cannot show a sharp picture from all sides: the nearer one hides part of the
+    next, so that each is seen on its far side only. What is painted on them seems to slide away from the camera by a
+    third of their distance, and so twice that between opposite views. The fainter they are, the less; the second sheet
+    keeps the surface closed. docs/initialization.md has figures.
+
+    PAPER leaves open: scale and opacity of the initial Gaussians.
+
+    Attributes:
+        spread, thickness, grazing: see `geometry.surface_gaussians`.
+        opacity: of the first sheet.
+        sunk, under_opacity: how far behind it the second lies, in pixels (0: there is none), and its opacity.
+        color_steps: corrections of the colours, see `match_colors`.
+    """
+
+    spread: float
+    thickness: float
+    grazing: float
+    opacity: float
+    sunk: float
+    under_opacity: float
+    color_steps: int
+
+
 @torch.no_grad()
 def depth_behind(
     remaining: Gaussians,
@@ -57,8 +85,9 @@ def depth_behind(
     hidden: np.ndarray,
     points: np.ndarray,
     how: Completion,
-) -> tuple[np.ndarray, str]:
-    """Depth [H, W] float64 of the scene without the object, made up in the hole, and how in words.
+) -> tuple[np.ndarray, np.ndarray, str]:
+    """The scene without the object in one view: depth [H, W] float64, as rendered where that is known, else made up;
+    the same made up everywhere; and how in words.
 
     Planes are found among the sparse points where there are enough (they are unbiased, while the expected depth of
     splats lies too near wherever haze hangs before a plain surface), else among the rendered depths.
@@ -97,7 +126,7 @@ def depth_behind(
         raise ValueError(f"reference {camera.name}: {error}") from error
     # Beyond infinity there is nothing: twice the farthest known depth stands in.
     made_up = 1.0 / np.maximum(solved, 0.5 * disparity[known].min())
-    return np.where(known, depth, made_up), said
+    return np.where(known, depth, made_up), made_up, said
 
 
 def visible_points(
@@ -139,10 +168,65 @@ def to_fill(
 
 
 @torch.no_grad()
+def seen_through(
+    gaussians: Gaussians,
+    reference: Camera,
+    depth: np.ndarray,
+    pixels: np.ndarray,
+    views: Sequence[tuple[Camera, np.ndarray]],
+    covered: float,
+) -> np.ndarray:
+    """bool [H, W]: those of `pixels` whose surface another view sees through, into nothing.
+
+    Beside the hole, behind the object, stand Gaussians that few views ever looked at from about one side: from there
+    they cover the ground, from the other side they do not, and leave a black gap between it and the new surface.
+
+    Args:
+        reference: the view; depth: [H, W] of its surface; pixels: bool [H, W].
+        views: other cameras, and C in them, bool; only there a gap is looked for.
+        covered: alpha under which there is nothing.
+    """
+    rows, columns = np.nonzero(pixels)
+    points, gap = geometry.unproject(depth, reference)[rows, columns], np.zeros(len(rows), bool)
+    for camera, hidden in views:
+        alpha = splat.render(gaussians, camera, sh_degree=0).alpha.cpu().numpy()
+        uv, z = geometry.project(points, camera)
+        empty, inside = geometry.sample_nearest(hidden & (alpha < covered), uv)
+        gap |= empty & inside & (z > 0)
+    found = np.zeros_like(pixels)
+    found[rows[gap], columns[gap]] = True
+    return found
+
+
+@torch.no_grad()
 def share_of(gaussians: Gaussians, labels: torch.Tensor, camera: Camera) -> np.ndarray:
     """[H, W] in [0, 1): blended share of the labelled Gaussians."""
     features = labels[:, None].to(gaussians.means.dtype)
     return splat.render(gaussians, camera, features=features, sh_degree=0).features[..., 0].cpu().numpy()
+
+
+def surface(
+    image: np.ndarray, depth: np.ndarray, pixels: np.ndarray, camera: Camera, sh_count: int, how: Sheets
+) -> Gaussians:
+    """Both sheets, see `geometry.surface_gaussians`."""
+    shown, shape = (image, depth, pixels, camera), {"sh_count": sh_count, "spread": how.spread}
+    shape |= {"thickness": how.thickness, "grazing": how.grazing}
+    sheet = geometry.surface_gaussians(*shown, **shape, opacity=how.opacity)
+    if not how.sunk:
+        return sheet
+    under = geometry.surface_gaussians(*shown, **shape, opacity=how.under_opacity, sunk=how.sunk)
+    return sheet.zipped(under, lambda a, b: torch.cat([a, b]))
+
+
+def placed(
+    gaussians: Gaussians, new: torch.Tensor, reference: Reference, depth: np.ndarray, pixels: np.ndarray, how: Sheets
+) -> tuple[Gaussians, torch.Tensor]:
+    """The Gaussians with a surface that shows these pixels of the reference, bool [H, W], and the labels of the new."""
+    added = surface(reference.image, depth, pixels, reference.camera, gaussians.sh.shape[1], how)
+    together = gaussians.zipped(added, lambda a, b: torch.cat([a, b]))
+    fresh = torch.arange(len(together)) >= len(gaussians)
+    together = match_colors(together, fresh, reference.image, pixels, reference.camera, how.color_steps)
+    return together, torch.cat([new, fresh[len(new) :]])
 
 
 @torch.no_grad()

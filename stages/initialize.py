@@ -13,6 +13,9 @@ class Params(BaseModel):
     leak: float = Field(1.0, gt=0, description="weight in never-seen over other pixels from which Gaussians are haze")
     overlap: float = Field(0.006, ge=0, description="how far new Gaussians reach beyond the hole, / image width")
     covered: float = Field(0.9, gt=0, le=1, description="alpha below which the reference also fills pixels of C")
+    seen_through: float = Field(
+        0.5, ge=0, lt=1, description="alpha in C of any view below which there is a gap to fill"
+    )
     explained: float = Field(0.5, gt=0, lt=1, description="alpha from which remaining Gaussians' depth is known")
     margin: float = Field(0.01, ge=0, description="known depth nearer to the hole than this is left out, / image width")
     ring: float = Field(0.08, gt=0, description="surroundings whose depth is continued, / image width")
@@ -26,10 +29,15 @@ class Params(BaseModel):
     solver_luma: float = Field(8.0, gt=0, description="bilateral solver: cell size, levels of 255")
     solver_chroma: float = Field(8.0, gt=0, description="bilateral solver: cell size, levels of 255")
     seed: int = Field(0, description="of the draws that find planes")
-    spread: float = Field(0.4, gt=0, description="standard deviation of new Gaussians, pixels of the reference")
+    spread: float = Field(0.35, gt=0, description="standard deviation of new Gaussians, pixels of the reference")
     thickness: float = Field(0.1, gt=0, description="their deviation along the normal over that within the surface")
     grazing: float = Field(0.15, gt=0, le=1, description="least cosine to the view at which they are stretched")
-    opacity: float = Field(0.95, gt=0, lt=1, description="their opacity")
+    # PAPER leaves open: opacity. Of opaque neighbours the nearer one hides half of the next, so that what is painted on
+    # them seems to slide by a third of a pixel, the other way in views from the other side. Thin ones slide less; a
+    # second sheet behind them keeps the surface closed. See docs/initialization.md.
+    opacity: float = Field(0.5, gt=0, lt=1, description="their opacity")
+    sunk: float = Field(1.5, ge=0, description="a second sheet lies so many pixels behind the first; 0: there is none")
+    under_opacity: float = Field(0.95, gt=0, lt=1, description="its opacity")
     color_steps: int = Field(5, ge=0, description="corrections of their colours until the reference is reproduced")
 
 
@@ -52,7 +60,10 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
     gaussians, new = gaussians.map(lambda p: p[~haze]), new[~haze]
     best = io.load_json(masks / "facts.json")["best_reference"]
     for each in sorted(references, key=lambda r: (r.camera.name != best, -int(r.mask.sum()))):
-        gaussians, new = filled(params, out, gaussians, new, each, sets[each.camera.name].consistent, scene.points)
+        views = [(camera, sets[camera.name].consistent) for camera in train]
+        gaussians, new = filled(
+            params, out, gaussians, new, each, sets[each.camera.name].consistent, scene.points, views
+        )
     io.save_ply(out / "gaussians.ply", gaussians)
     io.save_labels(out / "labels.npy", new)
     asked = covered = 0
@@ -67,26 +78,20 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
         print(f"{facts['uncovered_share']:.0%} of the invent masks is covered by no reference: add another view's")
 
 
-def filled(params: Params, out: Path, gaussians, new, reference, hidden, points):
+def filled(params: Params, out: Path, gaussians, new, reference, hidden, points, views):
     """The Gaussians with those of one reference, on what is still empty in its mask, and the labels."""
     from dataclasses import fields
 
-    import torch
+    from reffusion import initialize, io
 
-    from reffusion import geometry, initialize, io
-
-    camera = reference.camera
+    camera, chosen = reference.camera, lambda kind: {f.name: getattr(params, f.name) for f in fields(kind)}
+    how, sheets = (kind(**chosen(kind)) for kind in (initialize.Completion, initialize.Sheets))
     hole = initialize.to_fill(gaussians, new, reference, hidden, params.covered)
-    how = initialize.Completion(**{f.name: getattr(params, f.name) for f in fields(initialize.Completion)})
-    behind, said = initialize.depth_behind(gaussians.map(lambda p: p[~new]), reference, hole, hidden, points, how)
+    remaining = gaussians.map(lambda p: p[~new])
+    behind, made_up, said = initialize.depth_behind(remaining, reference, hole, hidden, points, how)
     print(f"depth of reference {camera.name}: {said}")
     io.save_exr(out / "depth" / f"{camera.name}.exr", behind.astype("float32"))
     pixels = initialize.grown(hole, params.overlap)
-    added = geometry.surface_gaussians(
-        reference.image, behind, pixels, camera, sh_count=gaussians.sh.shape[1], spread=params.spread,
-        thickness=params.thickness, grazing=params.grazing, opacity=params.opacity,
-    )  # fmt: skip
-    together = gaussians.zipped(added, lambda a, b: torch.cat([a, b]))
-    fresh = torch.cat([torch.zeros_like(new), torch.ones(len(added), dtype=torch.bool)])
-    together = initialize.match_colors(together, fresh, reference.image, pixels, camera, params.color_steps)
-    return together, torch.cat([new, fresh[len(new) :]])
+    gaussians, new = initialize.placed(gaussians, new, reference, behind, pixels, sheets)
+    gap = initialize.seen_through(gaussians, camera, made_up, hidden & ~pixels, views, params.seen_through)
+    return initialize.placed(gaussians, new, reference, made_up, gap, sheets)

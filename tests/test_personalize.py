@@ -13,8 +13,8 @@ from reffusion.trace import generator, load_checkpoint, read_trace
 
 NATIVE, SIZE = 16, 12
 TRAINING = P.Training(
-    steps=4, lr_unet=1e-3, lr_text=1e-4, batch=2, accumulate=1, weight_decay=1e-2, betas=(0.9, 0.999), clip=1.0, warm_up=0,
-    schedule="constant", size=SIZE, seed=0, checkpoint_seconds=1e9,
+    steps=4, lr_unet=1e-3, lr_text=1e-4, batch=2, accumulate=1, weight_decay=1e-2, betas=(0.9, 0.999), clip=1.0,
+    warm_up=0, schedule="constant", size=SIZE, seed=0, checkpoint_seconds=1e9,
 )  # fmt: skip
 
 
