@@ -49,6 +49,8 @@ class Settings:
         stop_drop: stop when the reference's PSNR falls so many dB under its best, and give the best; 0: never.
         rates: Adam's step sizes.
         masked_pace: parameter -> factor on them for masked Gaussians.
+        epsilon: Adam's; against it a gradient is large or small. At 3DGS's 1e-15 a Gaussian that hardly anything but SDS
+            reaches takes full steps, however small lambda is.
         checkpoint_seconds: seconds of work between checkpoints.
     """
 
@@ -68,6 +70,7 @@ class Settings:
     stop_drop: float = 0.0
     rates: Rates = field(default_factory=Rates)
     masked_pace: Mapping[str, float] = field(default_factory=dict)
+    epsilon: float = 1e-15
     checkpoint_seconds: float = 10.0
 
 
@@ -97,7 +100,7 @@ def distill(
     Raises:
         FloatingPointError: a value or gradient is not finite; names step, term and view.
     """
-    optimizer = GaussianOptimizer(initial, masked, settings.rates, settings.masked_pace)
+    optimizer = GaussianOptimizer(initial, masked, settings.rates, settings.masked_pace, epsilon=settings.epsilon)
     region = region_of(initial.means, masked) if masked.any() else None
     distilled = [sight for sight in sights if sight.repaint.any()] if settings.sds_weight > 0 else []
     if distilled and (prior is None or text is None):

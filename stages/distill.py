@@ -37,6 +37,8 @@ class Params(BaseModel):
     rate: float = Field(1.0, gt=0, description="factor on 3DGS's step sizes of masked Gaussians")
     rate_opacity: float = Field(1.0, ge=0, description="further factor on the opacities'")
     rate_shape: float = Field(1.0, ge=0, description="further factor on those of means, scales and rotations")
+    # PAPER leaves open: Adam's epsilon; 3DGS's 1e-15. The gradient of a mean over an image's pixels is about 1e-6.
+    epsilon: float = Field(1e-15, gt=0, description="gradients far below it do not move a Gaussian")
     # PAPER leaves open: how densification changes. Among masked Gaussians those pulled hardest on the screen are
     # cloned or split, a share of them, for the SDS gradient has no scale a threshold could refer to.
     densify_every: int = Field(0, ge=0, description="steps between densifications of masked Gaussians; 0: never")

@@ -188,6 +188,18 @@ def test_plain_and_compiled_adam_agree():
         assert torch.allclose(plain, compiled, rtol=1e-5, atol=1e-5)
 
 
+def test_against_epsilon_a_gradient_is_large_or_small():
+    steps = []
+    for size in (1e-3, 1e-9):
+        optimizer = GaussianOptimizer(random_gaussians(6), epsilon=1e-6)
+        before = optimizer.gaussians.means.detach().clone()
+        for name in PARAMETERS:
+            getattr(optimizer.gaussians, name).grad = torch.full_like(getattr(optimizer.gaussians, name), size)
+        optimizer.step(0.0)
+        steps.append(float((optimizer.gaussians.means - before).abs().mean()) / Rates().means)
+    assert abs(steps[0] - 1) < 0.01 and abs(steps[1] - 1e-3) < 1e-4
+
+
 def test_unseen_gaussians_stay_and_late_ones_start_afresh():
     optimizer = GaussianOptimizer(random_gaussians(6))
     visible = torch.tensor([True, True, True, False, False, False])
