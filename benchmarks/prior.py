@@ -4,7 +4,7 @@
                 PSNR, SSIM, FLIP and gradient energy inside the hole; every prior named, from the same noise
   personalize   the first prior on a scene's reference by the laptop profile: error against steps, then, before and
                 after, by timestep: error of the clean latent in holes of unseen views and the variance of the SDS
-                gradient over the noise; the same views filled from pure noise
+                gradient over the noise; the same views, and the reference's own hole, filled from pure noise
 Writes prior.json and rows of pictures to --out; `python -m report.prior` draws them (`make prior-report` does both).
 Every draw is seeded. LPIPS is left out: its network's weights are not in the repository.
 """
@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import shutil
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -189,7 +189,8 @@ def save_row(path: Path, case: Case, pictures: list[np.ndarray]) -> None:
 
 
 def scene_cases(run: Path, size: int) -> dict[str, list[Case]]:
-    """Unseen views with ground truth, their test masks as holes: whole, reduced to `size`, and a window of each.
+    """The first reference and its hole, `NOISES` times, and unseen views with ground truth, their test masks as holes:
+    whole, reduced to `size`, and a window of each.
 
     Raises:
         ValueError: the scene has no test view with a mask.
@@ -205,15 +206,25 @@ def scene_cases(run: Path, size: int) -> dict[str, list[Case]]:
         raise ValueError(f"{run / 'poses'}: no test view shows the scene without the object; take another scene")
     places = np.linspace(0, len(found) - 1, min(VIEWS, len(found))).round().astype(int)
     chosen = [list(found.values())[place] for place in places]
-    whole, windows = [], []
+    given = io.load_references(run / "reference", scene)[0]
+    own = _reduced(Case(given.image, given.mask, given.camera.name), size)
+    whole, windows = [_reduced(case, size) for case in chosen], []
     for case in chosen:
-        small = cv2.resize(case.truth, (size, size), interpolation=cv2.INTER_AREA)
-        hole = cv2.resize(case.hole.astype(np.float32), (size, size), interpolation=cv2.INTER_AREA) > 1e-4
-        whole.append(Case(small, hole, case.kind))
         top, left = window_around(torch.from_numpy(case.hole), size, trace.generator(SEED, "window", case.kind))
         here = (slice(top, top + size), slice(left, left + size))
         windows.append(Case(np.ascontiguousarray(case.truth[here]), np.ascontiguousarray(case.hole[here]), case.kind))
-    return {"whole": whole, "window": windows}
+    return {
+        "reference": [replace(own, kind=f"{own.kind}-{k}") for k in range(NOISES)],
+        "whole": whole,
+        "window": windows,
+    }
+
+
+def _reduced(case: Case, size: int) -> Case:
+    small = cv2.resize(case.truth, (size, size), interpolation=cv2.INTER_AREA)
+    return Case(
+        small, cv2.resize(case.hole.astype(np.float32), (size, size), interpolation=cv2.INTER_AREA) > 1e-4, case.kind
+    )
 
 
 def profile(prior: str, steps: int | None) -> stage.Params:
@@ -258,7 +269,7 @@ def personalization(prior: str, run: Path, steps: int | None, out: Path) -> dict
         "before": diffusion.load_prior(prior),
         "after": lora.merged(diffusion.load_prior(prior), folder),
     }
-    prompts = {"whole": "A photo of sks", "window": "A photo of sks, cropped"}
+    prompts = {"reference": "A photo of sks", "whole": "A photo of sks", "window": "A photo of sks, cropped"}
     result: dict = {"steps": params.steps, "trace": trace.read_trace(folder / "trace.jsonl"), "timesteps": TIMESTEPS}
     for scale, cases in scene_cases(run, models["before"].native_size).items():
         pictures = {when: painted(model, cases, SEED, prompts[scale]) for when, model in models.items()}
@@ -282,7 +293,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     given = parser.parse_args()
     torch.set_num_threads(given.threads)
-    for folder in ("inpainting", "whole", "window"):
+    for folder in ("inpainting", "reference", "whole", "window"):
         shutil.rmtree(given.out / folder, ignore_errors=True)
     result = {"prior": given.priors[0], "inpainting": inpainting(given.priors, given.pictures, given.out)}
     for name, kinds in result["inpainting"]["scores"].items():

@@ -49,8 +49,8 @@ class Settings:
         stop_drop: stop when the reference's PSNR falls so many dB under its best, and give the best; 0: never.
         rates: Adam's step sizes.
         masked_pace: parameter -> factor on them for masked Gaussians.
-        epsilon: Adam's; against it a gradient is large or small. At 3DGS's 1e-15 a Gaussian that hardly anything but SDS
-            reaches takes full steps, however small lambda is.
+        epsilon: Adam's; against it a gradient is large or small. At 3DGS's 1e-15 a Gaussian that hardly anything but
+            SDS reaches takes full steps, however small lambda is.
         checkpoint_seconds: seconds of work between checkpoints.
     """
 

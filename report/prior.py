@@ -15,8 +15,10 @@ from reffusion import io
 from report.sheet import enlarged, framed
 
 ENLARGE = 3  # whole factor; held-out pictures are 64 px
+SCALES = ("reference", "whole", "window")
 SHEETS = {
     "inpainting": "Held-out pictures, filled from pure noise",
+    "reference": "The reference's own hole, filled from pure noise three times, before and after personalization",
     "whole": "Unseen views of the scene, whole, before and after personalization",
     "window": "Unseen views, windows around the hole",
 }
@@ -38,7 +40,7 @@ def make(folder: Path) -> Path:
         personal = measured["personalization"]
         charts(personal, folder / "charts.png")
         lines += ["## Personalization", "", personalization_table(personal), "![](charts.png)", ""]
-        for scale in ("whole", "window"):
+        for scale in SCALES:
             lines += sheet(folder, scale, personal["columns"])
     page = folder / "prior.md"
     page.write_text("\n".join(lines), encoding="utf-8")
@@ -77,10 +79,10 @@ def personalization_table(personal: dict[str, Any]) -> str:
     """Markdown: samples of unseen views, and errors over all timesteps, before and after."""
     titles = ("clean-latent error", "variance of the SDS gradient")
     lines = [
-        f"| unseen views, {personal['steps']} steps | {' | '.join((*titles, *SCORES.values()))} |",
+        f"| holes, {personal['steps']} steps | {' | '.join((*titles, *SCORES.values()))} |",
         "|---" * (len(SCORES) + 3) + "|",
     ]
-    for scale in ("whole", "window"):
+    for scale in SCALES:
         for when, row in personal[scale].items():
             figures = [f"{np.mean(row[key]):.4f}" for key in ("error", "variance")]
             cells = [*figures, *(cell(row["samples"], column) for column in SCORES)]

@@ -69,7 +69,7 @@ def measured(folder: Path) -> None:
     """A small result of the benchmark, made up."""
     row = {"psnr": 20.0, "ssim": 0.5, "flip": 0.2, "energy": 0.7, "psnr_error": 0.3, "pictures": 2}
     levels = {"error": [0.1, 0.4], "variance": [0.2, 0.3], "samples": row}
-    for name, columns in (("inpainting", 4), ("whole", 4), ("window", 4)):
+    for name, columns in (("inpainting", 4), ("reference", 4), ("whole", 4), ("window", 4)):
         for index in range(2):
             io.save_image(folder / name / f"{index}.png", np.full((8, 8 * columns, 3), 90 * index, np.uint8))
     (folder / "prior.json").write_text(json.dumps({
@@ -79,20 +79,20 @@ def measured(folder: Path) -> None:
         "personalization": {
             "steps": 7, "timesteps": [100, 900], "columns": ["hole", "before", "after", "truth"],
             "trace": [{"iteration": 0, "clean_latent_mse": 0.3}, {"iteration": 7, "clean_latent_mse": 0.2}],
-            "whole": {"before": levels, "after": levels}, "window": {"before": levels, "after": levels},
+            **{scale: {"before": levels, "after": levels} for scale in ("reference", "whole", "window")},
         },
     }))  # fmt: skip
 
 
 def test_the_page_holds_every_table_and_picture(tmp_path):
-    for name in ("inpainting", "whole", "window"):
+    for name in ("inpainting", "reference", "whole", "window"):
         (tmp_path / name).mkdir()
     measured(tmp_path)
     text = page.make(tmp_path).read_text()
     assert "| all: Telea | 2 | 20.00 ± 0.30 | 0.500 | 0.200 | 0.700 |" in text
     assert "| window, after | 0.2500 | 0.2500 | 20.00 ± 0.30 |" in text
     linked = [line[4:-1] for line in text.splitlines() if line.startswith("![](")]
-    assert sorted(linked) == ["charts.png", "inpainting.png", "whole.png", "window.png"]
+    assert sorted(linked) == ["charts.png", "inpainting.png", "reference.png", "whole.png", "window.png"]
     assert all(io.load_image(tmp_path / name).shape[1] > 90 for name in linked)
 
 
