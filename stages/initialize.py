@@ -35,8 +35,8 @@ class Params(BaseModel):
     # PAPER leaves open: opacity. Of opaque neighbours the nearer one hides half of the next, so that what is painted on
     # them seems to slide by a third of a pixel, the other way in views from the other side. Thin ones slide less; a
     # second sheet behind them keeps the surface closed. See docs/initialization.md.
-    opacity: float = Field(0.5, gt=0, lt=1, description="their opacity")
-    sunk: float = Field(1.5, ge=0, description="a second sheet lies so many pixels behind the first; 0: there is none")
+    opacity: float = Field(0.4, gt=0, lt=1, description="their opacity")
+    sunk: float = Field(1.0, ge=0, description="a second sheet lies so many pixels behind the first; 0: there is none")
     under_opacity: float = Field(0.95, gt=0, lt=1, description="its opacity")
     color_steps: int = Field(5, ge=0, description="corrections of their colours until the reference is reproduced")
 
