@@ -71,8 +71,8 @@ demo: setup
 	@touch data/$(or $(name),demo$(if $(seed),-$(seed)))/.generated
 
 data/%/.generated: | $(VENV)/.ready
-	$(PY) data/generate.py --out data/$* $(patsubst %,--kind %,$(firstword $(filter $(kinds),$(subst -, ,$*)))) \
-		$(patsubst %,--seed %,$(firstword $(filter-out demo $(kinds),$(subst -, ,$*))))
+	$(strip $(PY) data/generate.py --out data/$* $(patsubst %,--kind %,$(filter $(kinds),$(subst -, ,$*))) \
+		$(patsubst %,--seed %,$(filter-out demo $(kinds),$(subst -, ,$*))))
 	@touch $@
 
 # ----------------------------------------------------------------------------------------------------------- jobs
