@@ -291,58 +291,28 @@ def _adam_cpu(updates: list[Update], steps, visible, masked, unbias1, unbias2, b
         return
     columns = [tuple(t.numpy() for t in kind) for kind in list(zip(*updates, strict=True))[:5]]
     paces = np.array([update.masked_pace for update in updates], np.float32)
-    rows = (t.numpy() for t in (steps, visible, masked, unbias1, unbias2))
-    share(_adam_kernel, *columns, paces, *rows, np.float32(beta1), np.float32(beta2), np.float32(epsilon))
+    rows = tuple(t.numpy() for t in (steps, visible, masked, unbias1, unbias2))
+    share(_adam_kernel, *columns, paces, rows, (np.float32(beta1), np.float32(beta2), np.float32(epsilon)))
 
 
 @numba.njit(fastmath={"contract", "reassoc", "nsz", "arcp"}, error_model="numpy", cache=True, nogil=True)
-def _adam_kernel(
-    tickets,
-    parameters,
-    firsts,
-    seconds,
-    gradients,
-    rates,
-    paces,
-    steps,
-    visible,
-    masked,
-    unbias1,
-    unbias2,
-    beta1,
-    beta2,
-    epsilon,
-):
-    chunks = (len(steps) + _CHUNK - 1) // _CHUNK
+def _adam_kernel(tickets, parameters, firsts, seconds, gradients, rates, paces, rows, numbers):
+    count = len(rows[0])
+    chunks = (count + _CHUNK - 1) // _CHUNK
     while True:
         ticket = take_ticket(tickets)
         if ticket >= chunks * len(parameters):
             return
         kind, start = ticket // chunks, ticket % chunks * _CHUNK
-        rows = start, min(start + _CHUNK, len(steps))
-        tables = parameters[kind], firsts[kind], seconds[kind], gradients[kind], rates[kind]
-        _adam_rows(*rows, *tables, paces[kind], steps, visible, masked, unbias1, unbias2, beta1, beta2, epsilon)
+        tables = parameters[kind], firsts[kind], seconds[kind], gradients[kind]
+        _adam_rows(start, min(start + _CHUNK, count), tables, rates[kind], paces[kind], rows, numbers)
 
 
 @numba.njit(fastmath={"contract", "reassoc", "nsz", "arcp"}, error_model="numpy", cache=True, nogil=True)
-def _adam_rows(
-    begin,
-    end,
-    parameter,
-    first,
-    second,
-    gradient,
-    rates,
-    masked_pace,
-    steps,
-    visible,
-    masked,
-    unbias1,
-    unbias2,
-    beta1,
-    beta2,
-    epsilon,
-):
+def _adam_rows(begin, end, tables, rates, masked_pace, rows, numbers):
+    parameter, first, second, gradient = tables
+    steps, visible, masked, unbias1, unbias2 = rows
+    beta1, beta2, epsilon = numbers
     new1, new2 = np.float32(1) - beta1, np.float32(1) - beta2
     least = np.float32(1e-30)  # below it a first moment would soon be denormal, on which processors are slow
     for i in range(begin, end):

@@ -182,10 +182,10 @@ def test_plain_and_compiled_adam_agree():
             rows = [torch.randn(1500, width, generator=generator).to(dtype) for _ in range(4)]
             rows[2].abs_().add_(0.1)
             updates.append(Update(*rows, torch.rand(width, generator=generator), masked_pace=1 / width))
-        adam(updates, steps, visible, masked, *unbias, 0.9, 0.999, 1e-15)
+        adam(updates, steps, visible, masked, *unbias, 0.875, 1 - 2**-10, 1e-15)  # exact in float32, too
         results.append([tensor.float() for update in updates for tensor in update[:3]])
     for plain, compiled in zip(*results, strict=True):
-        assert torch.allclose(plain, compiled, rtol=1e-5, atol=1e-5)
+        assert torch.allclose(plain, compiled, rtol=1e-5, atol=1e-6)
 
 
 def test_against_epsilon_a_gradient_is_large_or_small():
