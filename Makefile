@@ -62,8 +62,8 @@ $(VENV)/.ready-dev: $(VENV)/.ready
 
 # --------------------------------------------------------------------------------------------------------- scenes
 
-# The demo scenes are made by the project: `demo`, `demo-photos` (no poses), `demo-wide`, `demo-360`, each with `-<seed>` or not.
-kinds := photos wide 360
+# The demo scenes are made by the project: `demo`, `demo-photos` (no poses), `demo-wide`, `demo-360`, `demo-seen`, each with `-<seed>` or not.
+kinds := photos wide 360 seen
 made = $(filter demo demo-%,$(scene))
 
 demo: setup

@@ -136,6 +136,13 @@ def cabinet(f: Furniture, draw, x: float, z: float, wide: float, high: float, de
                removable=True)  # fmt: skip
 
 
+def lantern(f: Furniture, draw, x: float, z: float) -> None:
+    """The object of seen: a lantern that hangs on nothing, well away from all that stands behind it."""
+    low, radius = draw.uniform(0.72, 0.8), draw.uniform(0.11, 0.13)
+    f.sphere(x, low, z, radius, Material("ball"), draw.uniform(0, 360), removable=True)
+    f.cylinder(x, low + 1.8 * radius, z, 0.5 * radius, 0.07, Material("jar"), WOOD, removable=True)
+
+
 def daybed(f: Furniture, draw, x: float, z: float) -> None:
     """The object of 360: a low daybed with a ball and a jar on it; all around, only the floor below is hidden."""
     wide, deep, high = draw.uniform(1.1, 1.3), draw.uniform(0.8, 0.95), draw.uniform(0.14, 0.18)

@@ -20,6 +20,7 @@ class Kind:
         spread: degrees the cameras reach to either side of the object; from 180 on they circle it.
         texture: pixels a side of the largest textures; node: metres between nodes of the light map.
         bend: SIMPLE_RADIAL's k1 at its largest; points: sparse points wanted.
+        hangs: the object hangs in mid-air, so that other views show all that it hides.
     """
 
     width: int = 320
@@ -33,6 +34,7 @@ class Kind:
     node: float = 0.03
     bend: float = 0.045
     points: int = 3000
+    hangs: bool = False
 
     @property
     def around(self) -> bool:
@@ -45,6 +47,7 @@ KINDS = {
     "mini": Kind(width=64, height=48, train=8, test=3, texture=256, node=0.1, points=400),
     "wide": Kind(spread=50.0),
     "360": Kind(spread=180.0),
+    "seen": Kind(spread=34.0, hangs=True),
     "photos": Kind(width=480, height=360, train=26, test=0, photos=True, texture=2048, node=0.025),
 }
 

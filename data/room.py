@@ -1,9 +1,9 @@
-"""How the room is furnished: a corner with a cabinet, or a room all around a daybed."""
+"""How the room is furnished: a corner with a cabinet or a lantern, or a room all around a daybed."""
 
 from __future__ import annotations
 
 import numpy as np
-from furniture import WHITE, WOOD, Furniture, Material, cabinet, daybed, plant, shelf
+from furniture import WHITE, WOOD, Furniture, Material, cabinet, daybed, lantern, plant, shelf
 from kinds import Kind, randomness
 
 WALL = Material("wall", 1.8)
@@ -21,13 +21,19 @@ def furnish(seed: int, kind: Kind) -> tuple[Furniture, np.ndarray]:
     # The corner stands clear of the outermost camera.
     corner = 1.45 + max(0.0, 2.6 * np.sin(np.radians(kind.spread)) - 0.97)
     _corner(f, draw, planks, side, corner)
-    flat = kind.spread > 30
-    cabinet(f, draw, 0.0, 0.026 if flat else draw.uniform(0.06, 0.14), draw.uniform(0.98, 1.12), draw.uniform(0.6, 0.7),
-            draw.uniform(0.19, 0.22) if flat else draw.uniform(0.4, 0.46))  # fmt: skip
+    if kind.hangs:
+        lantern(f, draw, 0.0, 1.15)
+    else:
+        _cabinet(f, draw, flat=kind.spread > 30)
     plant(f, draw, side * (corner - 0.42), 0.36, draw.uniform(1.35, 1.6))
     shelf(f, draw, -side * draw.uniform(1.08, 1.2), 0.2, draw.uniform(0.7, 0.8))
     _pictures_and_clutter(f, draw, side)
     return f, np.array([0.0, 0.5, 0.1])
+
+
+def _cabinet(f: Furniture, draw, flat: bool) -> None:
+    cabinet(f, draw, 0.0, 0.026 if flat else draw.uniform(0.06, 0.14), draw.uniform(0.98, 1.12), draw.uniform(0.6, 0.7),
+            draw.uniform(0.19, 0.22) if flat else draw.uniform(0.4, 0.46))  # fmt: skip
 
 
 def _corner(f: Furniture, draw, planks: Material, side: int, corner: float) -> None:

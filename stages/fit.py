@@ -19,6 +19,7 @@ class Params(BaseModel):
     iterations: int = Field(30_000, ge=1, description="optimisation steps, one view each (3DGS: 30000)")
     seed: int = Field(0, description="of the order of views, backgrounds and splits")
     sh_degree: int = Field(3, ge=0, le=3, description="highest degree of the spherical harmonics")
+    sh_supported: bool = Field(True, description="no more coefficients than views in which a typical point is seen")
     sh_every: float = Field(1 / 30, ge=0, le=1, description="part of the run after which one more degree joins")
     random_background: bool = Field(True, description="a new background colour each step, instead of black")
     densify_by: Literal["slopes", "mcmc"] = Field("slopes", description="3DGS's densification, or 3DGS-MCMC's")
@@ -66,6 +67,7 @@ def run(params: Params, out: Path, *, poses: Path) -> None:
         io.save_ply(out / "gaussians.ply", io.load_ply(poses / "gaussians.ply"))
         return
     began, scene = time.monotonic(), io.load_scene(poses)
+    params = supported(params, scene)
     held_out = scene.train[params.holdout // 2 :: params.holdout] if params.holdout else ()
     cameras = [scene.cameras[name] for name in scene.train if name not in held_out]
     images, chosen = io.load_views(poses, scene.train), settings(params, cameras)
@@ -84,6 +86,18 @@ def run(params: Params, out: Path, *, poses: Path) -> None:
     )
     io.save_ply(out / "gaussians.ply", gaussians.map(lambda p: p.cpu()))
     trace.clear_checkpoint(out)
+
+
+def supported(params: Params, scene: Scene) -> Params:
+    """The parameters with no higher degree of spherical harmonics than the training views determine."""
+    from reffusion import support
+
+    if not params.sh_supported:
+        return params
+    degree, views = support.harmonics(scene.points, [scene.cameras[name] for name in scene.train], params.sh_degree)
+    if degree < params.sh_degree:
+        print(f"spherical harmonics of degree {degree}: a typical point is in {views} views", flush=True)
+    return params.model_copy(update={"sh_degree": degree})
 
 
 def start_points(params: Params, scene: Scene, cameras: list[Camera], images: dict[str, np.ndarray]):

@@ -31,12 +31,16 @@ class Params(BaseModel):
     tolerance: float = Field(0.02, gt=0, description="relative depth by which a visible point may lie too far")
     speck: float = Field(0.01, ge=0, description="islands of a mask below this diameter go, / image width")
     gap: float = Field(0.02, ge=0, description="holes in a mask below this diameter close, / image width")
-    invent: Literal["auto", "never_seen", "region"] = Field(
+    # PAPER leaves open: it always invents. So few pixels are rims of masks and crannies, not worth a diffusion model.
+    negligible: float = Field(0.005, ge=0, lt=1, description="share of C up to which never-seen pixels are left alone")
+    invent: Literal["auto", "never_seen", "consistent", "region"] = Field(
         "auto", description="what is made up; auto = the scene's 3D region where it names one, else never-seen pixels"
     )
 
 
 def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
+    from dataclasses import replace
+
     import numpy as np
     import torch
 
@@ -86,20 +90,25 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
         seen_by = masks.seen_elsewhere(disparity, asked, camera, train, hidden, shown, tolerance=params.tolerance)
         unseen = consistent[name] & ~(asked & (seen_by >= params.witnesses))
         unseen = clean(unseen) & hidden[name]
-        invent = masks.box_silhouette(**region, camera=camera, disparity=disparity) if fill_region else unseen
+        invent = hidden[name] if params.invent == "consistent" else unseen
+        if fill_region:
+            invent = masks.box_silhouette(**region, camera=camera, disparity=disparity)
         sets[name] = MaskSet(raw.get(name, empty[name]), consistent[name], unseen, invent)
 
+    count = lambda kind, chosen: int(sum(np.count_nonzero(getattr(sets[name], kind)) for name in chosen))
+    unseen_share = count("never_seen", scene.train) / max(count("consistent", scene.train), 1)
+    if params.invent != "consistent" and not fill_region and unseen_share <= params.negligible:
+        sets = {name: replace(each, invent=empty[name]) for name, each in sets.items()}
     io.save_labels(out / "labels.npy", labels.cpu())
     io.save_mask_sets(out, sets)
     invents = {name: each.invent for name, each in sets.items()}
-    count = lambda kind, chosen: int(sum(np.count_nonzero(getattr(sets[name], kind)) for name in chosen))
     facts = {
         "masked_gaussians": int(torch.count_nonzero(labels)),
         "gaussians": len(gaussians),
         "voting_views": len(ballots),
         "invent_pixels": count("invent", scene.train),
         "consistent_pixels": count("consistent", scene.train),
-        "never_seen_share": count("never_seen", scene.train) / max(count("consistent", scene.train), 1),
+        "never_seen_share": unseen_share,
         "invent_views": [name for name in scene.train if invents[name].any()],
         "best_reference": masks.best_view(invents, scene.train),
     }

@@ -46,6 +46,8 @@ class Params(BaseModel):
     gaussians: str | None = Field(None, description=".ply the scene brings in its own frame, 3DGS layout")
     region: Region | None = Field(None, description="3D box that holds the object, or is to be filled")
     longest: int = Field(1600, ge=16, description="larger image side in px; smaller pictures stay as they are")
+    # PAPER leaves open: pictures that are blurred or were enlarged. It takes 1600 px; half of them may show as much.
+    detail: float = Field(0.0, ge=0, description="pictures of less are halved, see reffusion.support; 0: never")
     refine: bool = Field(False, description="adjust cameras, the principal point of each view too, that flow belies")
     least_points: int = Field(100, ge=0, description="with fewer sparse points, some of optical flow are added to them")
     more_points: int = Field(10_000, ge=1, description="how many at most; random ones, where flow finds too few")
@@ -85,10 +87,10 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     if capture.poses is None:
         capture = _place(params, out, capture)
         roles = roles.among(set(capture.pictures))
-    views = sorted({*roles.train, *roles.test})
+    views, longest = sorted({*roles.train, *roles.test}), _supported_size(params, capture, roles)
     pinholes = {}
     for k in trace.progress(len(views), "poses"):
-        pinholes[views[k]] = io.save_undistorted(out, views[k], capture, roles, params.longest)
+        pinholes[views[k]] = io.save_undistorted(out, views[k], capture, roles, longest)
     shutil.rmtree(out / "sfm", ignore_errors=True)
     normalised = frame.normalised(capture.poses, pinholes, roles.train, roles.test, roles.clean)
     if params.refine and params.gaussians is None:  # Gaussians that the scene brings were fitted with its cameras
@@ -109,6 +111,21 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
         center = similarity.apply(params.region.center).tolist()
         size = [side * similarity.scale for side in params.region.size]
         io.save_json(out / "region.json", {"center": center, "size": size})
+
+
+def _supported_size(params: Params, capture: Capture, roles: Roles) -> int:
+    """The larger image side that the training views' pictures support, at most `longest`."""
+    from reffusion import io, support
+
+    if params.detail == 0:
+        return params.longest
+    chosen = roles.train[:: max(1, len(roles.train) // 8)]
+    images = [io.load_at(capture.pictures[name], params.longest, capture.upright) for name in chosen]
+    if not support.enlarged(images, params.detail):
+        return params.longest
+    side = max(images[0].shape[:2])
+    print(f"pictures of {side} px show no more than {side // 2} px would: taken at that size", flush=True)
+    return side // 2
 
 
 def _refined(scene: Scene, out: Path) -> Scene:

@@ -195,6 +195,16 @@ def test_two_fifths_of_the_mask_are_never_seen(generate, tmp_path, name):
         assert 0.06 < facts["mask_share"]["train"] < 0.25
 
 
+def test_what_hangs_hides_nothing_that_other_views_miss(generate, tmp_path):
+    kind = replace(
+        generate.KINDS["seen"], width=48, height=36, samples=1, train=20, test=6, texture=256, node=0.4, points=60
+    )
+    facts = generate.generate(tmp_path / "seen", 0, kind)
+    assert max(facts["never_seen_share"].values()) <= generate.MOST_NEVER_SEEN < 0.01
+    assert facts["mask_share"]["train"] > 0.01
+    assert "reference" not in yaml.safe_load((tmp_path / "seen/scene.yaml").read_text())
+
+
 def test_too_small_a_share_is_an_error_and_writes_nothing(generate, tmp_path, monkeypatch):
     monkeypatch.setattr(generate, "LEAST_NEVER_SEEN", 0.99)
     with pytest.raises(ValueError, match="never seen"):

@@ -1,0 +1,103 @@
+"""Nothing a scene does not need: no library, no pixel and no coefficient."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import small_scene as small
+import yaml
+
+from reffusion import io, support
+from stages import fit, masks
+
+ROOT = Path(__file__).resolve().parent.parent
+# Diffusion, structure from motion, the viewer, clusters, LPIPS' backbones: none of it is asked for below.
+UNUSED = ("diffusers", "transformers", "peft", "tokenizers", "pycolmap", "torchvision", "viser", "ray", "gsplat")
+
+
+STAGES = """
+import sys
+from pathlib import Path
+from stages import evaluate, initialize, masks
+home = Path(sys.argv[1])
+given = {"poses": home / "poses", "fit": home / "fit"}
+for name in ("masks", "initialize", "evaluate"):
+    (home / name).mkdir()
+masks.run(masks.Params(negligible=0.2), home / "masks", **given)
+given["masks"] = home / "masks"
+initialize.run(initialize.Params(), home / "initialize", **given, reference=None)
+evaluate.run(evaluate.Params(), home / "evaluate", **given, initialize=home / "initialize")
+print(sorted({name.split(".")[0] for name in sys.modules} & set(sys.argv[2].split())))
+"""
+
+
+def test_a_scene_whose_background_is_seen_imports_no_diffusion(tmp_path):
+    small.write(tmp_path, 0.8)  # far from the wall: each view shows what the others miss
+    command = [sys.executable, "-c", STAGES, str(tmp_path), " ".join(UNUSED)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert io.load_json(tmp_path / "masks/facts.json")["invent_pixels"] == 0
+    assert done.stdout.splitlines()[-1] == "[]"
+    assert io.load_json(tmp_path / "evaluate/metrics.json")["result"] == "initialize"
+
+
+def test_the_pipeline_leaves_diffusion_out_where_nothing_is_to_be_invented():
+    stages = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["stages"]
+    for name in ("reference", "personalize", "distill"):
+        facts = [c.get("fact") for c in stages[name]["left_out"]]
+        assert "masks.invent_pixels" in facts, name
+
+
+def test_few_unseen_pixels_are_negligible_and_it_can_be_forced(tmp_path):
+    poses, fitted, _ = small.write(tmp_path, 0.8)
+
+    def classified(**params):
+        out = tmp_path / "-".join(map(str, params.values()))
+        out.mkdir()
+        masks.run(masks.Params(**params), out, poses=poses, fit=fitted)
+        return io.load_mask_sets(out, small.TRAIN).values(), io.load_json(out / "facts.json")
+
+    sets, facts = classified(negligible=0.0)
+    assert 0 < facts["never_seen_share"] < 0.1 and facts["invent_pixels"] > 0
+    sets, few = classified(negligible=0.1)
+    assert few["invent_pixels"] == 0 and few["never_seen_share"] == facts["never_seen_share"]
+    assert not any(each.invent.any() for each in sets) and any(each.never_seen.any() for each in sets)
+    sets, _ = classified(invent="consistent")
+    assert all((each.invent == each.consistent).all() and each.invent.any() for each in sets)
+
+
+@pytest.mark.parametrize("filter_", [cv2.INTER_LINEAR, cv2.INTER_CUBIC, cv2.INTER_LANCZOS4])
+def test_enlarged_pictures_are_told_from_sharp_ones(filter_):
+    rng = np.random.default_rng(0)
+    # Photographs have about as much energy in each octave: noise whose amplitude falls as one over the frequency.
+    frequency = np.hypot(np.fft.fftfreq(96)[:, None], np.fft.fftfreq(128)[None]).clip(1 / 128)
+    fields = [np.fft.ifft2(np.fft.fft2(rng.normal(size=(96, 128))) / frequency).real for _ in range(3)]
+    sharp = [np.clip(128 + 45 * field / field.std(), 0, 255).astype(np.uint8) for field in fields]
+    sharp = [np.repeat(picture[..., None], 3, -1) for picture in sharp]
+    twice = [cv2.resize(picture, None, fx=2, fy=2, interpolation=filter_) for picture in sharp]
+    assert not support.enlarged(sharp, 0.1)
+    assert support.enlarged(twice, 0.1)
+    assert not support.enlarged(twice, 0.0)  # never
+    assert not support.enlarged([np.full((64, 64, 3), 7, np.uint8)], 0.1)  # plain: nothing says that it was
+
+
+def test_no_more_harmonics_than_views():
+    cameras = [small.camera(f"c{k}", 0.01 * k) for k in range(20)]
+    point, behind = np.array([[0.0, 0.0, small.WALL]]), np.array([[0.0, 0.0, -small.WALL]])
+    for count, degree in ((1, 0), (3, 0), (4, 1), (8, 1), (9, 2), (16, 3), (20, 3)):
+        assert support.harmonics(point, cameras[:count], 3) == (degree, count)
+    assert support.harmonics(point, cameras, 1)[0] == 1
+    assert support.harmonics(behind, cameras, 3) == (0, 0)
+    assert support.harmonics(np.zeros((0, 3)), cameras[:9], 3) == (2, 9)
+
+
+def test_fit_takes_the_degree_that_the_views_support(tmp_path):
+    poses, _, _ = small.write(tmp_path, 0.8)  # five training views
+    scene = io.load_scene(poses)
+    assert fit.supported(fit.Params(), scene).sh_degree == 1
+    assert fit.supported(fit.Params(sh_supported=False), scene).sh_degree == 3
