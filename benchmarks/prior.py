@@ -188,9 +188,9 @@ def save_row(path: Path, case: Case, pictures: list[np.ndarray]) -> None:
 # ---------------------------------------------------------------------------------------------- personalization
 
 
-def scene_cases(run: Path, size: int) -> dict[str, list[Case]]:
+def scene_cases(run: Path, size: int, pictures: dict[str, np.ndarray] | None = None) -> dict[str, list[Case]]:
     """The first reference and its hole, `NOISES` times, and unseen views with ground truth, their test masks as holes:
-    whole, reduced to `size`, and a window of each.
+    whole, reduced to `size`, and a window of each. `pictures`, view name -> uint8 [H, W, 3], stand for the truth.
 
     Raises:
         ValueError: the scene has no test view with a mask.
@@ -201,7 +201,7 @@ def scene_cases(run: Path, size: int) -> dict[str, list[Case]]:
         truth = evaluate.truth_of(scene.cameras[name], run / "poses")
         hole = evaluate.mask_of(scene.cameras[name], run / "poses", run / "masks")
         if truth is not None and hole.any():
-            found[name] = Case(truth, hole, name)
+            found[name] = Case(truth if pictures is None else pictures[name], hole, name)
     if not found:
         raise ValueError(f"{run / 'poses'}: no test view shows the scene without the object; take another scene")
     places = np.linspace(0, len(found) - 1, min(VIEWS, len(found))).round().astype(int)

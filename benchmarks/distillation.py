@@ -1,0 +1,161 @@
+"""What score distillation could gain at best, and from where on: `python benchmarks/distillation.py --run runs/demo`.
+
+In holes of test views, whole and in windows, a picture x of known error e = x - truth is given to the prior, and the
+SDS gradient g = E[z - x0(z_t)] over the noise is measured, in pixels. Against e it has a cosine c; a step along the
+exact -g, of the best length, leaves |e|^2 (1 - c^2): a gain of at most -10 log10(1 - c^2) dB (nothing where c <= 0).
+The pictures: the hole filled by Telea's method, mixed with the truth in equal steps of quality; the renders of the
+run's initialization and result. So the figure says up to which quality a prior has anything to teach, before the noise
+of single draws is counted. Truth is used to measure only; nothing here chooses a setting.
+Writes distillation.json and distillation.png to --out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
+
+from prior import Case, scene_cases, tensors  # noqa: E402
+
+from reffusion import io, lora, trace  # noqa: E402
+from reffusion import prior as diffusion  # noqa: E402
+
+TIMESTEPS = (20, 100, 300, 600, 850)
+NOISES = 4  # draws; with g's two halves from different ones, their noise does not pass for agreement
+MIXES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2)  # shares of Telea's filling in the picture
+RENDERS = {"initialization": "renders_initialize", "result": "renders"}
+SCALES = {"whole": "A photo of sks", "window": "A photo of sks, cropped"}
+
+
+def pictures_of(run: Path, cases: dict[str, list[Case]], renders: dict[str, dict[str, list[Case]]]):
+    """Name -> scale -> [B, 3, H, W] in [-1, 1]: the mixes, then the renders where the run has them."""
+    made: dict[str, dict[str, Tensor]] = {}
+    for scale in SCALES:
+        truth, hole = tensors(cases[scale])
+        filled = [cv2.inpaint(c.truth, c.hole.astype(np.uint8), 5, cv2.INPAINT_TELEA) for c in cases[scale]]
+        telea = tensors([replace(c, truth=f) for c, f in zip(cases[scale], filled, strict=True)])[0]
+        for mix in MIXES:
+            made.setdefault(f"{mix:g} Telea", {})[scale] = truth + mix * hole * (telea - truth)
+        for name, crops in renders.items():
+            made.setdefault(name, {})[scale] = truth + hole * (tensors(crops[scale])[0] - truth)
+    return made
+
+
+@torch.no_grad()
+def gradient(prior, pictures: Tensor, holes: Tensor, timestep: int, text: Tensor) -> tuple[Tensor, Tensor]:
+    """E[z - x0(z_t)] over two disjoint halves of the noises, each [B, 3, H, W] by decoding z - g and z."""
+    latents, condition = diffusion.encode(prior, pictures), diffusion.conditioning(prior, pictures, holes)
+    t, halves = torch.full((len(pictures),), timestep), []
+    for half in range(2):
+        guesses = torch.zeros_like(latents)
+        for k in range(NOISES // 2):
+            noise = torch.randn(latents.shape, generator=trace.generator(0, "distillation", timestep, half, k))
+            noisy = diffusion.add_noise(prior, latents, noise, t)
+            guesses += diffusion.predict(prior, noisy, t, condition, text)[1] / (NOISES // 2)
+        halves.append(diffusion.decode(prior, latents) - diffusion.decode(prior, guesses))
+    return halves[0], halves[1]
+
+
+def gain(halves: tuple[Tensor, Tensor], error: Tensor, holes: Tensor) -> dict[str, float]:
+    """The cosine of g and e in the holes, over all pictures at once, and the greatest gain in dB.
+
+    |g|^2 is the product of the two halves, which the noise left in either does not enlarge.
+    """
+    first, second = (half * holes for half in halves)
+    along = float(((first + second) / 2 * error).sum())
+    square = max(float((first * second).sum()), 1e-12)
+    cosine = min(along / (square * float(error.square().sum())) ** 0.5, 0.9999)
+    return {"cosine": cosine, "gain": float(-10 * np.log10(1 - max(cosine, 0.0) ** 2))}
+
+
+def measured(models: dict[str, diffusion.Prior], run: Path) -> list[dict]:
+    """A row for each model, scale, picture and timestep."""
+    first = next(iter(models.values()))
+    cases = scene_cases(run, first.native_size)
+    renders = {name: rendered_cases(run, folder, first.native_size) for name, folder in RENDERS.items()}
+    pictures, rows = pictures_of(run, cases, renders), []
+    for model, prior in models.items():
+        for scale, prompt in SCALES.items():
+            truth, hole = tensors(cases[scale])
+            text = diffusion.embed_text(prior, [prompt]).detach().expand(len(truth), -1, -1)
+            for name, by_scale in pictures.items():
+                error = (by_scale[scale] - truth) * hole
+                psnr = -10 * np.log10(float(error.square().sum() / hole.sum() / 3 / 4))
+                for timestep in TIMESTEPS:
+                    halves = gradient(prior, by_scale[scale], hole, timestep, text)
+                    row = {"model": model, "scale": scale, "picture": name, "psnr": psnr, "timestep": timestep}
+                    rows.append(row | gain(halves, error, hole))
+                best = max(rows[-len(TIMESTEPS) :], key=lambda row: row["gain"])
+                print(f"{model:12} {scale:7} {name:16} {psnr:5.2f} dB: {best['gain']:.3f} at t={best['timestep']}")
+    return rows
+
+
+def rendered_cases(run: Path, folder: str, size: int) -> dict[str, list[Case]]:
+    """`scene_cases` with evaluate's renders in place of the truth."""
+    scene = io.load_scene(run / "poses")
+    found = run / "evaluate" / folder
+    if not found.is_dir():
+        raise ValueError(f"{found} is missing: run `make scene={run.name} all` first")
+    shown = {name: io.load_image(found / f"{name}.png") for name in scene.test}
+    return scene_cases(run, size, shown)
+
+
+def draw(rows: list[dict], path: Path) -> None:
+    """The greatest gain over all timesteps against the quality of the picture, for each model and scale."""
+    from matplotlib.figure import Figure
+
+    figure = Figure((9, 3.8), layout="constrained")
+    for axes, scale in zip(figure.subplots(1, 2, sharey=True), SCALES, strict=True):
+        for model, style in (("unadapted", ("tab:grey", "--")), ("personalized", ("tab:blue", "-"))):
+            best: dict[str, dict] = {}
+            for row in rows:
+                if (row["model"], row["scale"]) == (model, scale):
+                    best[row["picture"]] = max(best.get(row["picture"], row), row, key=lambda r: r["gain"])
+            mixes = [row for name, row in best.items() if name not in RENDERS]
+            axes.plot(
+                [r["psnr"] for r in mixes], [r["gain"] for r in mixes], style[1] + "o", color=style[0], label=model
+            )
+            for name, marker in zip(RENDERS, "s^", strict=True):
+                if name in best:
+                    axes.plot(
+                        best[name]["psnr"], best[name]["gain"], marker, color=style[0], ms=9, label=f"{model}: {name}"
+                    )
+        axes.set(title=f"{scale} views" if scale == "whole" else "windows", xlabel="PSNR in the hole before (dB)")
+        axes.set_yscale("symlog", linthresh=0.01)
+        axes.grid(alpha=0.3)
+    figure.axes[0].set(ylabel="greatest gain of one exact step (dB)")
+    figure.axes[1].legend(fontsize=8)
+    figure.savefig(path, dpi=110)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--prior", default="priors/tiny", help="a diffusers folder")
+    parser.add_argument("--run", type=Path, required=True, help="runs/<scene>, finished, with ground truth")
+    parser.add_argument("--out", type=Path, default=Path("runs/distillation"))
+    given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
+    models = {
+        "unadapted": diffusion.load_prior(given.prior),
+        "personalized": lora.merged(diffusion.load_prior(given.prior), given.run / "personalize"),
+    }
+    rows = measured(models, given.run)
+    io.save_json(given.out / "distillation.json", rows)
+    draw(rows, given.out / "distillation.png")
+    print(given.out / "distillation.png")
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except ValueError as error:
+        sys.exit(f"error: {error}")
