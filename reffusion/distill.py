@@ -22,6 +22,8 @@ from reffusion.confinement import (
     strays,
 )
 from reffusion.densify import densify, prune
+from reffusion.depth_term import DepthRegularization, Estimator, depth_term
+from reffusion.geometry import Degenerate
 from reffusion.optimize import GaussianOptimizer, Rates
 from reffusion.prior import Prior
 from reffusion.splat import render
@@ -37,6 +39,9 @@ class Settings:
         seed: of views, windows, timesteps, noise and splits.
         sds_weight: lambda of the SDS term; 0 leaves it out.
         sds: the choices within that term.
+        depth_weight: lambda of the depth term; 0 leaves it out.
+        depth_every: steps between two with a depth term.
+        depth: the choices within that term.
         reconstruction_every: steps between two with a reconstruction term; 0: never.
         reference_weight: of the reference's own pixels in its hole (paper: 0).
         densify_every: steps between densifications of masked Gaussians; 0: never.
@@ -58,6 +63,9 @@ class Settings:
     seed: int = 0
     sds_weight: float = 1e-3
     sds: Distillation = field(default_factory=Distillation)
+    depth_weight: float = 0.0
+    depth_every: int = 8
+    depth: DepthRegularization = field(default_factory=DepthRegularization)
     reconstruction_every: int = 1
     reference_weight: float = 0.0
     densify_every: int = 0
@@ -83,6 +91,7 @@ def distill(
     text: Tensor | None,
     settings: Settings,
     folder: Path,
+    estimator: Estimator | None = None,
 ) -> tuple[Gaussians, Tensor]:
     """Optimise an initialization; resumes from `folder`'s checkpoint, bit for bit on the CPU.
 
@@ -90,11 +99,13 @@ def distill(
         initial, masked: the Gaussians and their labels [N] bool; everything else is on their device.
         sights: the training views; only those with pixels to repaint are distilled.
         holes: (camera, image [H, W, 3] in [0, 1], hole [H, W] bool) of each reference.
-        prior: adapted to the reference; None where `settings.sds_weight` is 0.
+        prior: adapted to the reference; None where neither SDS nor the depth term has a weight.
         text: [3, L, D], hidden states of the global, the local and the empty prompt.
         folder: gets trace.jsonl and checkpoints. A line of the trace: reconstruction (that term's value),
             reference_psnr (in the references' holes), sds_gradient_mean and _max (norm of the weighted SDS gradient
-            per masked Gaussian in that step), gaussians, masked_gaussians.
+            per masked Gaussian in that step), depth (value of the last depth term), depth_skipped_<reason> (how many
+            of them were left out so far, and why), gaussians, masked_gaussians.
+        estimator: of the depth term; None where that has no weight.
     Returns:
         The Gaussians, detached, and their labels.
     Raises:
@@ -102,18 +113,23 @@ def distill(
     """
     optimizer = GaussianOptimizer(initial, masked, settings.rates, settings.masked_pace, epsilon=settings.epsilon)
     region = region_of(initial.means, masked) if masked.any() else None
-    distilled = [sight for sight in sights if sight.repaint.any()] if settings.sds_weight > 0 else []
-    if distilled and (prior is None or text is None):
-        raise ValueError("distillation with sds_weight > 0 needs a prior and its prompts' embeddings")
+    distilled = [sight for sight in sights if sight.repaint.any()]
+    asked = distilled and (settings.sds_weight > 0 or settings.depth_weight > 0)
+    if asked and (prior is None or text is None):
+        raise ValueError("distillation with sds_weight or depth_weight > 0 needs a prior and its prompts' embeddings")
+    if distilled and settings.depth_weight > 0 and estimator is None:
+        raise ValueError("distillation with depth_weight > 0 needs an estimator of depth")
     state = trace.load_checkpoint(folder)
     start, seconds, best, best_psnr = 0, 0.0, None, -float("inf")
+    tally: dict[str, float] = {}
     if state is not None:
         optimizer.load_state_dict(state["optimizer"])
         start, seconds, best, best_psnr = (state[k] for k in ("step", "seconds", "best", "best_psnr"))
+        tally = state["tally"]
     log, saved = trace.Trace(folder, seconds, start + 1), seconds  # a line is numbered by the steps done
 
     for step in trace.progress(settings.iterations, "distill", start):
-        line = _step(optimizer, step, distilled, sights, holes, prior, text, settings)
+        line = _step(optimizer, step, distilled, sights, holes, prior, text, settings, estimator, tally)
         done = step + 1
         if settings.densify_every and done % settings.densify_every == 0:
             _densify(optimizer, settings, done)
@@ -123,14 +139,14 @@ def distill(
             with log.paused():
                 psnr = reference_psnr(optimizer.gaussians, holes)
             counts = {"gaussians": len(optimizer.masked), "masked_gaussians": int(optimizer.masked.sum())}
-            log.log(done, reference_psnr=psnr, **line, **counts)
+            log.log(done, reference_psnr=psnr, **line, **tally, **counts)
             if settings.stop_drop > 0 and psnr > best_psnr:
                 best, best_psnr = _copy(optimizer), psnr
             if 0 < settings.stop_drop < best_psnr - psnr:
                 return replace(optimizer.gaussians, **{name: best[name] for name in PARAMETERS}), best["masked"]
         if log.seconds - saved > settings.checkpoint_seconds:
             saved = log.seconds
-            state = {"optimizer": optimizer.state_dict(), "step": done, "seconds": saved}
+            state = {"optimizer": optimizer.state_dict(), "step": done, "seconds": saved, "tally": tally}
             trace.save_checkpoint(folder, state | {"best": best, "best_psnr": best_psnr})
     return optimizer.gaussians.map(Tensor.detach), optimizer.masked
 
@@ -150,11 +166,16 @@ def _step(
     prior: Prior | None,
     text: Tensor | None,
     settings: Settings,
+    estimator: Estimator | None,
+    tally: dict[str, float],
 ) -> dict[str, float]:
-    """The terms of one step, one after another, then one step of Adam; what there is to log."""
+    """The terms of one step, one after another, then one step of Adam; what there is to log.
+
+    What outlives the step is noted in `tally`.
+    """
     gaussians, masked = optimizer.gaussians, optimizer.masked
     moved, line = torch.zeros_like(masked), {}
-    if distilled and masked.any():
+    if settings.sds_weight > 0 and distilled and masked.any():
         sight = _drawn(distilled, step, settings.seed, "sds")
         probe = torch.zeros(len(masked), 2, device=masked.device, requires_grad=True)
         draw = trace.generator(settings.seed, "distill", "sds", step)
@@ -168,6 +189,10 @@ def _step(
         if settings.densify_every:
             optimizer.observe(probe.grad, rendering.radii * masked, sight.camera.width, sight.camera.height)
         moved |= masked & (rendering.radii > 0)
+    if settings.depth_weight > 0 and distilled and step % settings.depth_every == 0 and masked.any():
+        sight = _drawn(distilled, step // settings.depth_every, settings.seed, "depth")
+        draw = trace.generator(settings.seed, "distill", "depth", step)
+        moved |= _depth(gaussians, masked, sight, prior, text, settings, draw, estimator, step, tally)
     if settings.reference_weight > 0 and masked.any():
         camera, image, hole = holes[step % len(holes)]
         loss, rendering = reference_term(gaussians, masked, camera, image, hole)
@@ -181,6 +206,21 @@ def _step(
         moved |= (rendering.radii > 0) & (~masked | sight.clean)
     optimizer.step(step / settings.iterations, visible=moved)
     return line
+
+
+def _depth(gaussians, masked, sight, prior, text, settings, draw, estimator, step, tally) -> Tensor:
+    """[N] bool: the Gaussians that the depth term moves; none where the view tells nothing, which is counted."""
+    try:
+        loss, rendering = depth_term(gaussians, masked, sight, prior, text, settings.depth, draw, estimator)
+    except Degenerate as error:
+        reason = f"depth_skipped_{error.reason.replace(' ', '_')}"
+        tally[reason] = tally.get(reason, 0) + 1
+        return torch.zeros_like(masked)
+    except FloatingPointError as error:
+        raise FloatingPointError(f"distill, step {step}, depth, view '{sight.camera.name}': {error}") from None
+    _backward(settings.depth_weight * loss, gaussians, step, "depth", sight.camera)
+    tally["depth"] = float(loss.detach())
+    return masked & (rendering.radii > 0)
 
 
 def _drawn(sights: Sequence[Sight], turn: int, seed: int, label: str) -> Sight:

@@ -30,6 +30,22 @@ class Params(BaseModel):
     reduction: Literal["sum", "mean"] = Field("sum", description="over a latent's elements")
     # PAPER leaves open: which mask m is. Its text repaints the consistent mask; the invent mask keeps true background.
     repaint: Literal["invent", "consistent"] = Field("invent", description="the pixels the UNet repaints")
+    depth_weight: float = Field(0.0625, ge=0, description="lambda of the depth term; 0 leaves it out")
+    depth_every: int = Field(8, ge=1, description="steps between two with a depth term")
+    # PAPER leaves open: the depth model, and whether its alignment is plain or robust.
+    depth_model: str | None = Field(
+        None,
+        description="depth model: a transformers folder, or the name of one on the hub; none: the scene's own depth "
+        "around the hole is continued",
+        json_schema_extra={"weights": True},
+    )
+    depth_align: Literal["l2", "robust"] = Field("l2", description="fit of its scale and offset on known pixels")
+    # PAPER leaves open: the range of the "random timestep", the sampler's steps, the size that is painted. Its prior's
+    # 512 px are what a depth model sees of a view; the embedded prior's 64 px are not, hence finer levels.
+    depth_t_low: float = Field(0.02, gt=0, le=1, description="lowest timestep from which the view is repainted")
+    depth_t_high: float = Field(0.98, gt=0, le=1, description="highest")
+    depth_steps: int = Field(20, ge=1, description="sampler steps from pure noise; a later start takes its share")
+    depth_levels: int = Field(0, ge=0, description="sizes painted after the prior's native one, each twice the last")
     reconstruction_every: int = Field(1, ge=0, description="steps between two with a reconstruction term; 0: never")
     reference_weight: float = Field(0.0, ge=0, description="weight of the reference's pixels in its hole (paper: 0)")
     # PAPER leaves open: Adam's step sizes here; 3DGS's. Those of unmasked Gaussians are left alone: what the object's
@@ -81,13 +97,14 @@ def run(
         for r in io.load_references(reference, scene)
     ]
     prior = text = None
-    if params.sds_weight > 0:
+    if params.sds_weight > 0 or params.depth_weight > 0:
         prior = diffusion.load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
         prior = prior if personalize is None else lora.merged(prior, personalize)
         with torch.no_grad():
             text = diffusion.embed_text(prior, list(PROMPTS))
     sights = load_sights(params, scene, poses, fit, masks)
-    gaussians, masked = distill(initial, masked, sights, holes, prior, text, settings(params), out)
+    estimator = depth_estimator(params, scene) if params.depth_weight > 0 else None
+    gaussians, masked = distill(initial, masked, sights, holes, prior, text, settings(params), out, estimator)
     io.save_ply(out / "gaussians.ply", gaussians.map(lambda p: p.cpu()))
     io.save_labels(out / "labels.npy", masked.cpu())
     trace.clear_checkpoint(out)
@@ -117,12 +134,13 @@ def settings(params: Params):
     from dataclasses import fields
 
     from reffusion.confinement import Distillation
+    from reffusion.depth_term import DepthRegularization
     from reffusion.distill import Settings
 
     shape = params.rate * params.rate_shape
     pace = {"means": shape, "quaternions": shape, "log_scales": shape, "sh": params.rate}
     pace["opacity_logits"] = params.rate * params.rate_opacity
-    given = ("rates", "masked_pace", "sds")
+    given = ("rates", "masked_pace", "sds", "depth")
     shared = {f.name: getattr(params, f.name) for f in fields(Settings) if f.name not in given}
     sds = Distillation(
         params.patches,
@@ -134,4 +152,31 @@ def settings(params: Params):
         params.guidance,
         params.reduction,
     )
-    return Settings(**shared, sds=sds, masked_pace=pace)
+    depth = DepthRegularization(
+        params.depth_t_low,
+        params.depth_t_high,
+        params.depth_steps,
+        params.depth_levels,
+        guidance=params.guidance,
+        how=known_depth(params),
+    )
+    return Settings(**shared, sds=sds, depth=depth, masked_pace=pace)
+
+
+def known_depth(params: Params):
+    from reffusion.behind import Completion
+
+    return Completion(robust=params.depth_align == "robust", seed=params.seed)
+
+
+def depth_estimator(params: Params, scene):
+    """The depth term's estimator: by a network where one is named, else by continuation."""
+    from functools import partial
+
+    from reffusion import depth_term, monocular
+
+    how = known_depth(params)
+    if not params.depth_model:
+        return depth_term.by_continuation(scene.points, how)
+    network = monocular.load_network(params.depth_model, params.device)
+    return depth_term.by_network(partial(monocular.disparity, network), how)
