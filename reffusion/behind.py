@@ -152,8 +152,11 @@ def estimated(view: Seen, guide: np.ndarray, estimate: np.ndarray, how: Completi
     fitted = geometry.align(estimate, view.disparity, view.known, robust=how.robust)
     if fitted.scale <= 0:
         raise geometry.Degenerate("reversed", "the estimate falls where the scene's disparity grows: is it depth?")
-    confidence = view.known.astype(np.float64)
-    refined = bilateral.refine(fitted.apply(estimate), view.disparity, confidence, guide, how.solver)
+    aligned, confidence = fitted.apply(estimate), view.known.astype(np.float64)
+    error = np.abs(view.disparity - aligned)[view.known]
+    if how.robust and np.median(error) > 0:  # what the alignment lets go of is not to be spread either
+        confidence[view.known] = geometry.trusted(error)
+    refined = bilateral.refine(aligned, view.disparity, confidence, guide, how.solver)
     misfit = fitted.residual / np.abs(view.disparity[view.known]).mean()
     return refined, f"estimated, and aligned to {misfit:.1%} of the known disparity"
 

@@ -130,15 +130,19 @@ def align(
     result = _weighted_line(x, y, w)
     for _ in range(REWEIGHTINGS if robust else 0):
         error = np.abs(y - result.apply(x))
-        spread = 1.4826 * np.median(error)
-        if spread <= 1e-12 * np.abs(y).max():
+        if np.median(error) <= 1e-12 * np.abs(y).max():
             break
-        updated = _weighted_line(x, y, w / (1.0 + (error / (2.0 * spread)) ** 2) ** 2)
+        updated = _weighted_line(x, y, w * trusted(error))
         moved = np.abs(updated.apply(x) - result.apply(x)).max()
         result = updated
         if moved < 1e-9 * np.abs(y).max():
             break
     return result
+
+
+def trusted(error: np.ndarray) -> np.ndarray:
+    """Geman-McClure weights in (0, 1] of absolute residuals, their scale from the median, which must be positive."""
+    return (1.0 + (error / (2.0 * 1.4826 * np.median(error))) ** 2) ** -2
 
 
 def _weighted_line(x: np.ndarray, y: np.ndarray, w: np.ndarray) -> Alignment:

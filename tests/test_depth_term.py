@@ -112,12 +112,13 @@ def test_the_target_does_not_depend_on_the_estimates_unit(unit):
 def test_a_robust_alignment_lets_go_of_what_is_wrong():
     view = replace(shown(), depth=1 / WALL)
     estimate, guide = 40 * WALL - 7, np.random.default_rng(0).random((HEIGHT, WIDTH, 3))
+    estimate += 0.05 * np.random.default_rng(1).normal(size=WALL.shape)
     estimate[:, :4] += 3.0
     errors = []
     for robust in (False, True):
         disparity, _ = behind.estimated(view, guide, estimate, replace(HOW, robust=robust))
         errors.append(np.abs(disparity / WALL - 1)[HOLE].mean())
-    assert errors[1] < 0.2 * errors[0]
+    assert errors[1] < 0.3 * errors[0]
 
 
 def test_nothing_is_compared_where_depth_is_unknown():
