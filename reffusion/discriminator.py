@@ -83,7 +83,7 @@ class Critic(nn.Module):
     def __init__(self, size: int, width: int, generator: torch.Generator):
         super().__init__()
         halvings = (size // LAST).bit_length() - 1
-        if size != LAST << halvings or halvings < 1:
+        if halvings < 1 or size != LAST << halvings:
             raise ValueError(f"the side of a critic's patches must be 8, 16, 32, ... px, got {size}")
         channels = [min(width << level, max(width, MOST_CHANNELS)) for level in range(halvings + 1)]
         self.colors = Convolution(3, channels[0], 1, generator)

@@ -268,7 +268,7 @@ def _named(step: int, term: str, camera: Camera) -> Iterator[None]:
 
 def _backward(loss: Tensor, gaussians: Gaussians) -> None:
     if not torch.isfinite(loss):
-        raise FloatingPointError(f"the loss is {float(loss)}")
+        raise FloatingPointError(f"the loss is {float(loss.detach())}")
     loss.backward()
     for name in PARAMETERS:
         gradient = getattr(gaussians, name).grad
