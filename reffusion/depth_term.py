@@ -32,6 +32,8 @@ class DepthRegularization:
     PAPER leaves open: the timestep, the sampler, the guidance, at which size the view is painted, and the unit.
 
     Attributes:
+        weight: lambda; above 0.
+        every: steps between two with this term.
         low, high: range of the timestep from which the view is repainted, as parts of the schedule.
         steps: sampler steps from pure noise; a later start takes its share of them.
         levels: finer sizes that are painted after the whole view at the prior's native size, see `inpaint.repaint`.
@@ -42,6 +44,8 @@ class DepthRegularization:
         how: which rendered depth is known.
     """
 
+    weight: float = 0.0625
+    every: int = 8
     low: float = 0.02
     high: float = 0.98
     steps: int = 20

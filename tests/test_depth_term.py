@@ -291,7 +291,7 @@ def test_the_estimator_sees_the_repainted_view(prior, text):
 
 
 RUN = D.Settings(
-    6, sds_weight=0.0, depth_weight=0.5, depth_every=2, depth=SETTINGS, reconstruction_every=0, checkpoint_seconds=1e-9
+    6, sds_weight=0.0, depth=replace(SETTINGS, weight=0.5, every=2), reconstruction_every=0, checkpoint_seconds=1e-9
 )
 
 
@@ -349,4 +349,4 @@ def test_both_stages_find_depth_alike():
 
     params = initialize.Params()
     shared = {f.name: getattr(params, f.name) for f in fields(Completion) if f.name != "robust"}
-    assert Completion(**shared) == Completion() == distill.known_depth(distill.Params())
+    assert Completion(**shared) == Completion() == distill.depth_settings(distill.Params()).how
