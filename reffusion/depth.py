@@ -12,6 +12,7 @@ import numpy as np
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
 
+from reffusion.geometry import Degenerate
 from reffusion.planes import fit_plane
 
 CREASE_FLOOR = 1e-4  # weight left to a second difference across the strongest guide edge: keeps the system regular
@@ -75,8 +76,8 @@ def complete(
         [H, W] float64: the completion where confidence is 0, elsewhere the input (see `keep`).
 
     Raises:
-        ValueError: fewer than 3 known pixels next to some hole, or these on one line (no plane is fixed);
-            known values that are not finite; shapes that differ.
+        Degenerate: fewer than 3 known pixels next to some hole, or these on one line (no plane is fixed).
+        ValueError: known values that are not finite; shapes that differ.
     """
     disparity, confidence = np.asarray(disparity, np.float64), np.asarray(confidence, np.float64)
     check_maps(disparity, confidence, guide)
@@ -154,9 +155,10 @@ def _block_sum(array: np.ndarray, factor: int) -> np.ndarray:
 def _fixes_a_plane(known: np.ndarray) -> None:
     rows, columns = np.nonzero(known)
     if len(rows) < 3 or np.linalg.matrix_rank(np.stack([rows - rows[0], columns - columns[0]])) < 2:
-        raise ValueError(
+        raise Degenerate(
+            "no plane",
             f"a hole has {len(rows)} known pixels around it, which fix no plane: "
-            "mask less of the image, or widen the ring"
+            "mask less of the image, or widen the ring",
         )
 
 

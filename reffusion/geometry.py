@@ -19,6 +19,18 @@ REWEIGHTINGS = 30
 LEAST_SPREAD = 1e-6  # relative; below it float32 input carries no slope
 
 
+class Degenerate(ValueError):
+    """What is known does not determine what is asked for.
+
+    Attributes:
+        reason: in a word or two, to be counted where the loss of one view is no harm.
+    """
+
+    def __init__(self, reason: str, message: str):
+        super().__init__(message)
+        self.reason = reason
+
+
 def to_camera(points: np.ndarray, camera: Camera) -> np.ndarray:
     """[..., 3] world points in the camera's axes (x right, y down, z forward), float64."""
     pose = camera.world_to_camera
@@ -101,8 +113,9 @@ def align(
             residual), which lets go of outliers up to about a third of the pixels.
 
     Raises:
-        ValueError: fewer than 4 pixels of positive weight, an estimate whose spread there is under 1e-6 of its
-            magnitude (a constant fixes no scale), shapes that differ, or values that are not finite.
+        Degenerate: fewer than 4 pixels of positive weight, or an estimate whose spread there is under 1e-6 of its
+            magnitude (a constant fixes no scale).
+        ValueError: shapes that differ, or values that are not finite.
     """
     estimate, target = np.asarray(estimate, np.float64), np.asarray(target, np.float64)
     weights = np.ones(estimate.shape) if weights is None else np.asarray(weights, np.float64)
@@ -111,21 +124,25 @@ def align(
     chosen = weights > 0
     x, y, w = estimate[chosen], target[chosen], weights[chosen]
     if x.size < LEAST_PIXELS:
-        raise ValueError(f"alignment needs at least {LEAST_PIXELS} known pixels, got {x.size}")
+        raise Degenerate("few pixels", f"alignment needs at least {LEAST_PIXELS} known pixels, got {x.size}")
     if not (np.isfinite(x).all() and np.isfinite(y).all() and np.isfinite(w).all()):
         raise ValueError("alignment got values that are not finite: leave those pixels out by weight 0")
     result = _weighted_line(x, y, w)
     for _ in range(REWEIGHTINGS if robust else 0):
         error = np.abs(y - result.apply(x))
-        spread = 1.4826 * np.median(error)
-        if spread <= 1e-12 * np.abs(y).max():
+        if np.median(error) <= 1e-12 * np.abs(y).max():
             break
-        updated = _weighted_line(x, y, w / (1.0 + (error / (2.0 * spread)) ** 2) ** 2)
+        updated = _weighted_line(x, y, w * trusted(error))
         moved = np.abs(updated.apply(x) - result.apply(x)).max()
         result = updated
         if moved < 1e-9 * np.abs(y).max():
             break
     return result
+
+
+def trusted(error: np.ndarray) -> np.ndarray:
+    """Geman-McClure weights in (0, 1] of absolute residuals, their scale from the median, which must be positive."""
+    return (1.0 + (error / (2.0 * 1.4826 * np.median(error))) ** 2) ** -2
 
 
 def _weighted_line(x: np.ndarray, y: np.ndarray, w: np.ndarray) -> Alignment:
@@ -134,9 +151,10 @@ def _weighted_line(x: np.ndarray, y: np.ndarray, w: np.ndarray) -> Alignment:
     dx, dy = x - x_mean, y - y_mean
     spread = np.sqrt((w @ dx**2) / total)
     if spread <= LEAST_SPREAD * np.abs(x).max():
-        raise ValueError(
+        raise Degenerate(
+            "constant",
             f"alignment is degenerate: the estimate is constant ({x_mean:.6g}) on its {x.size} known pixels, "
-            "which fixes no scale"
+            "which fixes no scale",
         )
     scale = (w @ (dx / spread * dy)) / total / spread
     residual = np.sqrt((w @ (dy - scale * dx) ** 2) / total)

@@ -7,47 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy import ndimage
 
-from reffusion import bilateral, geometry, planes, splat, trace
-from reffusion.depth import Plate, complete
+from reffusion import behind, geometry, splat
+from reffusion.behind import Completion
 from reffusion.types import Camera, Gaussians, Reference
-
-ENOUGH_POINTS = 50  # fewer sparse points around the hole, and the rendered depth is asked instead
-BEHIND = 1.03  # relative depth from which a sparse point is hidden by what is rendered
-
-
-@dataclass(frozen=True)
-class Completion:
-    """How depth is continued behind the object; the fields are stages/initialize.py's parameters.
-
-    PAPER leaves open: the depth model. Without one the surroundings are continued, by two hypotheses: planes that meet
-    (rooms), taken where they explain the surroundings, else the smooth completion.
-
-    Attributes:
-        explained: alpha from which the rendered depth is known.
-        margin: known pixels nearer to the hole are left out, / image width: their depth is half the object's.
-        ring: surroundings that are continued, / image width.
-        planar_share: share of the surroundings that planes must explain to be taken; above 1 they never are.
-        planar_tolerance: relative disparity within which they do.
-        stiffness, edge, unknowns: see `depth.Plate`.
-        solver_smoothness, solver_spatial, solver_luma, solver_chroma: see `bilateral.Solver`.
-        seed: of the draws that find planes.
-    """
-
-    explained: float
-    margin: float
-    ring: float
-    planar_share: float
-    planar_tolerance: float
-    stiffness: float
-    edge: float
-    unknowns: int
-    solver_smoothness: float
-    solver_spatial: float
-    solver_luma: float
-    solver_chroma: float
-    seed: int
 
 
 @dataclass(frozen=True)
@@ -85,12 +48,12 @@ def depth_behind(
     hidden: np.ndarray,
     points: np.ndarray,
     how: Completion,
+    estimate: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """The scene without the object in one view: depth [H, W] float64, as rendered where that is known, else made up;
     the same made up everywhere; and how in words.
 
-    Planes are found among the sparse points where there are enough (they are unbiased, while the expected depth of
-    splats lies too near wherever haze hangs before a plain surface), else among the rendered depths.
+    With an estimate that is the paper's way (`behind.estimated`), else the surroundings are continued.
 
     Args:
         remaining: the Gaussians left.
@@ -99,60 +62,22 @@ def depth_behind(
         hidden: bool [H, W], C of that view: where the object stood.
         points: [P, 3] sparse points of the scene.
         how: parameters.
+        estimate: [H, W] a depth model's answer to the reference, disparity up to scale and offset; None: there is none.
 
     Raises:
-        ValueError: naming the view, where too little is known around the hole.
+        ValueError: naming the view, where too little is known around the hole, or the estimate does not fit.
     """
-    camera = reference.camera
-    drawn = splat.render(remaining, camera, sh_degree=0)
-    depth, alpha = drawn.depth.double().cpu().numpy(), drawn.alpha.cpu().numpy()
-    known = (alpha > how.explained) & (depth > 0) & ~grown(hole, how.margin)
-    disparity = np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0)
-    around = grown(hidden | hole, how.ring) & ~(hidden | hole)
+    view = behind.seen(splat.render(remaining, reference.camera, sh_degree=0), reference.camera, hole, hidden, how)
     try:
-        pixels, values = visible_points(points, camera, around, disparity)
-        source = "sparse points"
-        if len(values) < ENOUGH_POINTS:
-            rows, columns = np.nonzero(around & known)
-            pixels, values, source = np.stack([columns, rows], 1) + 0.5, disparity[rows, columns], "rendered depth"
-        draws = trace.generator(how.seed, "planes", camera.name)
-        planar = planes.planar_model(pixels, values, hole.shape, draws, tolerance=how.planar_tolerance)
-        said = f"{planar.planes} planes explain {planar.explained:.0%} of {len(values)} {source}"
-        if planar.explained >= how.planar_share:
-            solved = planar.disparity
+        if estimate is None:
+            solved, said = behind.continued(view, reference.image, points, how)
         else:
-            solved, said = _continued(disparity, known, reference.image, how), f"{said}: continued smoothly instead"
+            solved, said = behind.estimated(view, reference.image, estimate, how)
+        # Beyond infinity there is nothing: the farthest depth that can be told stands in.
+        made_up = 1.0 / np.maximum(solved, view.least_disparity)
     except ValueError as error:
-        raise ValueError(f"reference {camera.name}: {error}") from error
-    # Beyond infinity there is nothing: twice the farthest known depth stands in.
-    made_up = 1.0 / np.maximum(solved, 0.5 * disparity[known].min())
-    return np.where(known, depth, made_up), made_up, said
-
-
-def visible_points(
-    points: np.ndarray, camera: Camera, pixels: np.ndarray, disparity: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Image points [S, 2] and disparities [S] of the points that fall on `pixels`, not behind what is rendered."""
-    uv, z = geometry.project(points, camera)
-    chosen, inside = geometry.sample_nearest(pixels, uv)
-    shown, _ = geometry.sample_nearest(disparity, uv)
-    seen = chosen & inside & (z > 0) & (z * shown < BEHIND)
-    return uv[seen], 1.0 / z[seen]
-
-
-def _continued(disparity: np.ndarray, known: np.ndarray, guide: np.ndarray, how: Completion) -> np.ndarray:
-    """The smooth completion; its misfit on known pixels is spread by the bilateral solver, so that rims meet."""
-    plate = Plate(how.ring, how.stiffness, how.edge, how.unknowns)
-    solver = bilateral.Solver(how.solver_smoothness, how.solver_spatial, how.solver_luma, how.solver_chroma)
-    fitted = complete(disparity, known, guide, plate, keep=False)
-    return bilateral.refine(fitted, disparity, known.astype(np.float64), guide, solver)
-
-
-def grown(mask: np.ndarray, fraction: float) -> np.ndarray:
-    """`mask` and all pixels within `fraction` of the image's width of it."""
-    if not mask.any():
-        return mask
-    return ndimage.distance_transform_edt(~mask) <= fraction * mask.shape[1]
+        raise ValueError(f"reference {reference.camera.name}: {error}") from error
+    return np.where(view.known, view.depth, made_up), made_up, said
 
 
 @torch.no_grad()

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 
 import torch
 import torch.nn.functional as F
@@ -85,12 +86,12 @@ def paint(
     known = image.to(device)[None] * ~hole.to(device)
     whole_hole = hole.to(device, torch.float32)[None, None]
 
-    def sample(images: Tensor, mask: Tensor, start: float, *labels: object) -> Tensor:
+    def sample(images: Tensor, mask: Tensor, *place: int, start: float, level: int | str) -> Tensor:
         # Each candidate has a generator of its own: its picture does not depend on how many others are asked for.
         share = max(1, round(steps * start))
         rows = []
         for image, seed in zip(images, seeds, strict=True):
-            random = seeded(seed, "inpaint", *labels)
+            random = seeded(seed, "inpaint", level, *place)
             rows.append(diffusion.sample(prior, image[None], mask, text, share, random, guidance, empty, start))
         return torch.cat(rows)
 
@@ -100,21 +101,82 @@ def paint(
         return resized(known, *shape) / weight.clamp_min(1e-3), (weight < 1 - 1e-4).to(torch.float32)
 
     view, mask = scaled((size, size))
-    painted = sample((view * (1 - mask)).expand(count, -1, -1, -1), mask, 1.0, "whole")
+    painted = sample((view * (1 - mask)).expand(count, -1, -1, -1), mask, start=1.0, level="whole")
     for level, shape in enumerate(level_sizes(height, width, size)):
         view, mask = scaled(shape)
         painted = view * (1 - mask) + resized(painted, *shape) * mask
-        todo = mask[0, 0] > 0
-        for top, left in windows_over(todo.cpu(), size):
-            here = (..., slice(top, top + size), slice(left, left + size))
-            if not todo[here].any():
-                continue
-            part = todo[here].to(torch.float32)[None, None]
-            fresh = sample(painted[here], part, start, level, top, left)
-            painted[here] = painted[here] * (1 - part) + fresh * part
-            todo[here] = False
+        _paint_windows(painted, mask, size, partial(sample, start=start, level=level))
     painted = resized(painted, height, width)
     return image.to(device) * (1 - whole_hole) + painted * whole_hole
+
+
+def _paint_windows(painted: Tensor, mask: Tensor, size: int, sample: Callable[..., Tensor]) -> None:
+    """Paint `mask` [1, 1, h, w] of `painted` [B, 3, h, w] in place, each window seeing what its neighbours have become.
+
+    `sample(images, part, top, left)` gives the new picture of a window and what of it is to be painted.
+    """
+    todo = mask[0, 0] > 0
+    for top, left in windows_over(todo.cpu(), size):
+        here = (..., slice(top, top + size), slice(left, left + size))
+        if not todo[here].any():
+            continue
+        part = todo[here].to(torch.float32)[None, None]
+        fresh = sample(painted[here], part, top, left)
+        painted[here] = painted[here] * (1 - part) + fresh * part
+        todo[here] = False
+
+
+@torch.no_grad()
+def repaint(
+    prior: diffusion.Prior,
+    image: Tensor,
+    hole: Tensor,
+    text: Tensor,
+    random: torch.Generator,
+    *,
+    start: float,
+    finest: float,
+    levels: int,
+    steps: int,
+    guidance: float,
+) -> Tensor:
+    """A view whose hole is painted anew, beginning with what it shows: the nearer `start` is to 0 the less changes.
+
+    The whole view at the prior's native size, then `levels` of the finer sizes of `paint`. What a level changes is
+    enlarged and added to the view at the next, so that the view's own detail is not lost with its size.
+
+    Args:
+        image: [3, H, W] in [-1, 1].
+        hole: [H, W] bool, with at least one True pixel.
+        text: [3, L, D], hidden states of the prompts for the whole view and for windows, and of the empty one.
+        random: a CPU generator.
+        start: in (0, 1], the timestep from which the whole view is painted, as a part of the schedule.
+        finest: the finer levels start no higher; from pure noise a window would forget the whole.
+        steps: sampler steps from pure noise; a later start takes its share of them.
+        guidance: the paper's a.
+    Returns:
+        [3, H, W] in [-1, 1]; pixels outside the hole as they were.
+    """
+    size, (height, width), device = prior.native_size, hole.shape, prior.device
+    view, whole_hole = image.to(device)[None], hole.to(device, torch.float32)[None, None]
+    empty = text[2:]
+
+    def sample(prompt: Tensor, begin: float) -> Callable[..., Tensor]:
+        share = max(1, round(steps * begin))
+        return lambda images, mask, *_: diffusion.sample(
+            prior, images, mask, prompt, share, random, guidance, empty, begin
+        )
+
+    change = view.new_zeros(1, 3, 1, 1)
+    for level, shape in enumerate([(size, size), *level_sizes(height, width, size)[:levels]]):
+        small, mask = resized(view, *shape), (resized(whole_hole, *shape) > 1e-4).to(torch.float32)
+        painted = (small + resized(change, *shape) * mask).clamp(-1, 1)
+        if level == 0:
+            painted = painted * (1 - mask) + sample(text[:1], start)(painted, mask) * mask
+        else:
+            _paint_windows(painted, mask, size, sample(text[1:2], min(start, finest)))
+        change = painted - small
+    return (view + resized(change, height, width) * whole_hole).clamp(-1, 1)[0]
 
 
 def seam(candidates: Tensor, hole: Tensor) -> Tensor:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from reffusion.geometry import Degenerate
+
 LEAST_SAMPLES = 12  # four for each coefficient of a plane
 LEAST_SHARE = 0.03  # of the samples: fewer are not searched for a further plane
 
@@ -75,11 +77,13 @@ def planar_model(
         most_planes: candidates.
 
     Raises:
-        ValueError: fewer than 12 samples, or all on one line.
+        Degenerate: fewer than 12 samples, or all on one line.
     """
     scaled = np.column_stack([pixels / shape[1], np.ones(len(pixels))])
     if len(pixels) < LEAST_SAMPLES or np.linalg.matrix_rank(scaled, tol=1e-6) < 3:
-        raise ValueError(f"{len(pixels)} samples around the hole fix no plane: {LEAST_SAMPLES} off one line are needed")
+        raise Degenerate(
+            "no plane", f"{len(pixels)} samples around the hole fix no plane: {LEAST_SAMPLES} off one line are needed"
+        )
     near = tolerance * disparity
     planes = _planes_in(scaled, disparity, near, draws, trials, most_planes)
     candidates = [scaled @ plane for plane in planes]

@@ -1,6 +1,6 @@
 """The inpainting latent diffusion model: load, encode, decode, predict, sample.
 
-The only importer of diffusers and transformers. Works with any Stable-Diffusion-type inpainting folder
+The only importer of diffusers. Works with any Stable-Diffusion-type inpainting folder
 (latents C | mask 1 | masked latents C); sizes, factor and prediction type are read from its configuration, so the
 embedded prior and SD2-inpainting take the same path. In masks 1 = repaint.
 """

@@ -1,4 +1,4 @@
-"""distill: reconstruction and multi-scale score distillation, each confined to its Gaussians (RefFusion section 4)."""
+"""distill: reconstruction, multi-scale score distillation and a critic, each confined (RefFusion section 4)."""
 
 from __future__ import annotations
 
@@ -30,6 +30,37 @@ class Params(BaseModel):
     reduction: Literal["sum", "mean"] = Field("sum", description="over a latent's elements")
     # PAPER leaves open: which mask m is. Its text repaints the consistent mask; the invent mask keeps true background.
     repaint: Literal["invent", "consistent"] = Field("invent", description="the pixels the UNet repaints")
+    depth_weight: float = Field(0.0625, ge=0, description="lambda of the depth term; 0 leaves it out")
+    depth_every: int = Field(8, ge=1, description="steps between two with a depth term")
+    # PAPER leaves open: the depth model, and whether its alignment is plain or robust.
+    depth_model: str | None = Field(
+        None,
+        description="depth model: a transformers folder, or the name of one on the hub; none: the scene's own depth "
+        "around the hole is continued",
+        json_schema_extra={"weights": True},
+    )
+    depth_align: Literal["l2", "robust"] = Field("l2", description="fit of its scale and offset on known pixels")
+    # PAPER leaves open: the range of the "random timestep", the sampler's steps, the size that is painted. Its prior's
+    # 512 px are all that a depth model sees of a view.
+    depth_t_low: float = Field(0.02, gt=0, le=1, description="lowest timestep from which the view is repainted")
+    depth_t_high: float = Field(0.98, gt=0, le=1, description="highest")
+    depth_steps: int = Field(20, ge=1, description="sampler steps from pure noise; a later start takes its share")
+    depth_levels: int = Field(0, ge=0, description="sizes painted after the prior's native one, each twice the last")
+    adversarial_weight: float = Field(0.03, ge=0, description="lambda of the adversarial term; 0 leaves it out")
+    # PAPER leaves open: when it starts. At once: the paper trains with the sum of all terms.
+    adversarial_from: float = Field(0.0, ge=0, le=1, description="part of the run after which it acts")
+    adversarial_patches: int = Field(64, ge=4, multiple_of=4, description="real patches in a step, and fake ones")
+    adversarial_size: Literal[8, 16, 32, 64, 128, 256] = Field(64, description="their side, px")
+    # PAPER leaves open: the critic's width, StyleGAN2's here; its step size, GANeRF's.
+    adversarial_width: int = Field(512, ge=1, description="the critic's channels at that side, doubled up to 512")
+    adversarial_rate: float = Field(1e-3, gt=0, description="RMSprop's step size of the critic")
+    # PAPER leaves open: the generator's form; this one pulls where the critic is sure.
+    adversarial_form: Literal["non-saturating", "saturating"] = Field("non-saturating", description="generator's loss")
+    # PAPER leaves open: the weight, GANeRF's here. The paper prints the slope at the fake patches, GANeRF at the real.
+    adversarial_penalty: float = Field(0.2, ge=0, description="weight of half the squared slope of the critic (R1)")
+    adversarial_penalized: Literal["real", "fake"] = Field("fake", description="the patches where that slope is taken")
+    # PAPER leaves open: the paper's "all spherical harmonics" may mean all coefficients or those of all Gaussians.
+    adversarial_reaches: Literal["masked", "all"] = Field("masked", description="the Gaussians whose colour it moves")
     reconstruction_every: int = Field(1, ge=0, description="steps between two with a reconstruction term; 0: never")
     reference_weight: float = Field(0.0, ge=0, description="weight of the reference's pixels in its hole (paper: 0)")
     # PAPER leaves open: Adam's step sizes here; 3DGS's. Those of unmasked Gaussians are left alone: what the object's
@@ -81,13 +112,14 @@ def run(
         for r in io.load_references(reference, scene)
     ]
     prior = text = None
-    if params.sds_weight > 0:
+    if params.sds_weight > 0 or params.depth_weight > 0:
         prior = diffusion.load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
         prior = prior if personalize is None else lora.merged(prior, personalize)
         with torch.no_grad():
             text = diffusion.embed_text(prior, list(PROMPTS))
     sights = load_sights(params, scene, poses, fit, masks)
-    gaussians, masked = distill(initial, masked, sights, holes, prior, text, settings(params), out)
+    estimator = depth_estimator(params, scene.points) if params.depth_weight > 0 else None
+    gaussians, masked = distill(initial, masked, sights, holes, prior, text, settings(params), out, estimator)
     io.save_ply(out / "gaussians.ply", gaussians.map(lambda p: p.cpu()))
     io.save_labels(out / "labels.npy", masked.cpu())
     trace.clear_checkpoint(out)
@@ -116,13 +148,14 @@ def load_sights(params: Params, scene, poses: Path, fit: Path, masks: Path) -> l
 def settings(params: Params):
     from dataclasses import fields
 
+    from reffusion.adversary import Adversarial
     from reffusion.confinement import Distillation
     from reffusion.distill import Settings
 
     shape = params.rate * params.rate_shape
     pace = {"means": shape, "quaternions": shape, "log_scales": shape, "sh": params.rate}
     pace["opacity_logits"] = params.rate * params.rate_opacity
-    given = ("rates", "masked_pace", "sds")
+    given = ("rates", "masked_pace", "sds", "depth", "adversarial")
     shared = {f.name: getattr(params, f.name) for f in fields(Settings) if f.name not in given}
     sds = Distillation(
         params.patches,
@@ -134,4 +167,47 @@ def settings(params: Params):
         params.guidance,
         params.reduction,
     )
-    return Settings(**shared, sds=sds, masked_pace=pace)
+    adversarial = Adversarial(
+        params.adversarial_weight,
+        params.adversarial_from,
+        params.adversarial_patches,
+        params.adversarial_size,
+        params.adversarial_width,
+        params.adversarial_form,
+        params.adversarial_penalty,
+        params.adversarial_penalized,
+        params.adversarial_rate,
+        params.adversarial_reaches,
+    )
+    chosen = adversarial if params.adversarial_weight > 0 else None
+    depth = depth_settings(params) if params.depth_weight > 0 else None
+    return Settings(**shared, sds=sds, depth=depth, adversarial=chosen, masked_pace=pace)
+
+
+def depth_settings(params: Params):
+    from reffusion.behind import Completion
+    from reffusion.depth_term import DepthRegularization
+
+    return DepthRegularization(
+        params.depth_weight,
+        params.depth_every,
+        params.depth_t_low,
+        params.depth_t_high,
+        params.depth_steps,
+        params.depth_levels,
+        guidance=params.guidance,
+        how=Completion(robust=params.depth_align == "robust", seed=params.seed),
+    )
+
+
+def depth_estimator(params: Params, points):
+    """The depth term's estimator: by a network where one is named, else the scene's own depth continued."""
+    from functools import partial
+
+    from reffusion import depth_term, monocular
+
+    how = depth_settings(params).how
+    if not params.depth_model:
+        return depth_term.by_continuation(points, how)
+    network = monocular.load_network(params.depth_model, params.device)
+    return depth_term.by_network(partial(monocular.disparity, network), how)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -38,6 +39,14 @@ class Params(BaseModel):
     opacity: float = Field(0.4, gt=0, lt=1, description="their opacity")
     sunk: float = Field(1.0, ge=0, description="a second sheet lies so many pixels behind the first; 0: there is none")
     under_opacity: float = Field(0.95, gt=0, lt=1, description="its opacity")
+    # PAPER leaves open: the depth model of the reference, and whether its alignment is plain or robust.
+    depth_model: str | None = Field(
+        None,
+        description="depth model of the reference: a transformers folder, or the name of one on the hub; none: "
+        "the surroundings are continued",
+        json_schema_extra={"weights": True},
+    )
+    depth_align: Literal["l2", "robust"] = Field("l2", description="fit of its scale and offset on known pixels")
     color_steps: int = Field(5, ge=0, description="corrections of their colours until the reference is reproduced")
 
 
@@ -82,16 +91,40 @@ def filled(params: Params, out: Path, gaussians, new, reference, hidden, points,
     """The Gaussians with those of one reference, on what is still empty in its mask, and the labels."""
     from dataclasses import fields
 
-    from reffusion import initialize, io
+    from reffusion import behind, initialize, io
 
-    camera, chosen = reference.camera, lambda kind: {f.name: getattr(params, f.name) for f in fields(kind)}
-    how, sheets = (kind(**chosen(kind)) for kind in (initialize.Completion, initialize.Sheets))
+    camera, sheets = reference.camera, {f.name: getattr(params, f.name) for f in fields(initialize.Sheets)}
+    sheets, how = initialize.Sheets(**sheets), completion(params)
     hole = initialize.to_fill(gaussians, new, reference, hidden, params.covered)
     remaining = gaussians.map(lambda p: p[~new])
-    behind, made_up, said = initialize.depth_behind(remaining, reference, hole, hidden, points, how)
+    depth, made_up, said = initialize.depth_behind(
+        remaining, reference, hole, hidden, points, how, estimate_of(params, reference)
+    )
     print(f"depth of reference {camera.name}: {said}")
-    io.save_exr(out / "depth" / f"{camera.name}.exr", behind.astype("float32"))
-    pixels = initialize.grown(hole, params.overlap)
-    gaussians, new = initialize.placed(gaussians, new, reference, behind, pixels, sheets)
+    io.save_exr(out / "depth" / f"{camera.name}.exr", depth.astype("float32"))
+    pixels = behind.grown(hole, params.overlap)
+    gaussians, new = initialize.placed(gaussians, new, reference, depth, pixels, sheets)
     gap = initialize.seen_through(gaussians, camera, made_up, hidden & ~pixels, views, params.seen_through)
     return initialize.placed(gaussians, new, reference, made_up, gap, sheets)
+
+
+def completion(params: Params):
+    """How depth is found behind the object."""
+    from dataclasses import fields
+
+    from reffusion.behind import Completion
+
+    named = {f.name: getattr(params, f.name) for f in fields(Completion) if f.name != "robust"}
+    return Completion(**named, robust=params.depth_align == "robust")
+
+
+def estimate_of(params: Params, reference):
+    """The depth model's answer to the reference, [H, W] disparity up to scale and offset; None without a model."""
+    import torch
+
+    from reffusion import monocular
+
+    if not params.depth_model:
+        return None
+    image = torch.from_numpy(reference.image).permute(2, 0, 1) / 255
+    return monocular.disparity(monocular.load_network(params.depth_model), image).numpy()

@@ -7,7 +7,7 @@ import pytest
 import small_scene as small
 import torch
 
-from reffusion import geometry, io, splat
+from reffusion import behind, geometry, io, splat
 from reffusion import initialize as rules
 from reffusion.types import Camera, Reference
 from stages import initialize, masks
@@ -182,7 +182,7 @@ def test_sparse_points_count_where_they_are_visible():
     points = np.array([[0, 0, 2.0], [0, 0, 3.0], [0.9, 0, 2.0], [5, 0, 2.0], [0, 0, -2.0]])
     wall, left = np.full((small.HEIGHT, small.WIDTH), 0.5), np.zeros((small.HEIGHT, small.WIDTH), bool)
     left[:, :60] = True
-    pixels, values = rules.visible_points(points, view, left, wall)
+    pixels, values = behind.visible_points(points, view, left, wall)
     np.testing.assert_allclose(pixels, [[small.WIDTH / 2, small.HEIGHT / 2]])
     assert values.tolist() == [0.5]
 

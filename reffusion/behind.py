@@ -1,0 +1,179 @@
+"""Depth where a view shows nothing yet: the surroundings continued through the hole, or a picture's estimate fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from reffusion import bilateral, geometry, planes, trace
+from reffusion.depth import Plate, complete
+from reffusion.types import Camera, Rendering
+
+ENOUGH_POINTS = 50  # fewer sparse points around the hole, and the rendered depth is asked instead
+BEHIND = 1.03  # relative depth from which a sparse point is hidden by what is rendered
+FARTHEST = 2.0  # times the farthest known depth: beyond it lies infinity, of which nothing is known
+
+
+@dataclass(frozen=True)
+class Completion:
+    """How depth is found behind the object; the fields are stages/initialize.py's parameters, and its values.
+
+    PAPER leaves open: the depth model. Without one the surroundings are continued, by two hypotheses: planes that meet
+    (rooms), taken where they explain the surroundings, else the smooth completion.
+
+    Attributes:
+        explained: alpha from which the rendered depth is known.
+        margin: known pixels nearer to the hole are left out, / image width: their depth is half the object's.
+        ring: surroundings that are continued, / image width.
+        planar_share: share of the surroundings that planes must explain to be taken; above 1 they never are.
+        planar_tolerance: relative disparity within which they do.
+        stiffness, edge, unknowns: see `depth.Plate`.
+        solver_smoothness, solver_spatial, solver_luma, solver_chroma: see `bilateral.Solver`.
+        robust: an estimate is aligned with outliers let go, see `geometry.align`.
+        seed: of the draws that find planes.
+    """
+
+    explained: float = 0.5
+    margin: float = 0.01
+    ring: float = 0.08
+    planar_share: float = 0.7
+    planar_tolerance: float = 0.01
+    stiffness: float = 100.0
+    edge: float = 0.1
+    unknowns: int = 60_000
+    solver_smoothness: float = 128.0
+    solver_spatial: float = 8.0
+    solver_luma: float = 8.0
+    solver_chroma: float = 8.0
+    robust: bool = False
+    seed: int = 0
+
+    @property
+    def solver(self) -> bilateral.Solver:
+        return bilateral.Solver(self.solver_smoothness, self.solver_spatial, self.solver_luma, self.solver_chroma)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What one view shows of the scene's depth.
+
+    Attributes:
+        camera: the view.
+        depth: [H, W] float64 camera z as rendered.
+        known: bool [H, W], the pixels whose depth is the scene's: covered, and not beside the hole.
+        hole: bool [H, W], the pixels to be filled. hidden: bool [H, W], C: where the object stood.
+    """
+
+    camera: Camera
+    depth: np.ndarray
+    known: np.ndarray
+    hole: np.ndarray
+    hidden: np.ndarray
+
+    @property
+    def disparity(self) -> np.ndarray:
+        """[H, W] float64; 0 where there is no depth."""
+        return np.divide(1.0, self.depth, out=np.zeros_like(self.depth), where=self.depth > 0)
+
+    @property
+    def least_disparity(self) -> float:
+        """Of what is farther nothing is known. Degenerate where nothing is known at all."""
+        if not self.known.any():
+            raise geometry.Degenerate("few pixels", "no depth is known around the hole")
+        return 1.0 / (FARTHEST * self.depth[self.known].max())
+
+
+def seen(drawn: Rendering, camera: Camera, hole: np.ndarray, hidden: np.ndarray, how: Completion) -> Seen:
+    """The depth of a rendering, known where it is covered, but for the hole and a margin around it."""
+    depth, alpha = (t.detach().double().cpu().numpy() for t in (drawn.depth, drawn.alpha))
+    known = (alpha > how.explained) & (depth > 0) & ~grown(hole, how.margin)
+    return Seen(camera, depth, known, hole, hidden)
+
+
+def continued(
+    view: Seen, guide: np.ndarray | Callable[[], np.ndarray], points: np.ndarray, how: Completion
+) -> tuple[np.ndarray, str]:
+    """The scene's own disparity, [H, W] float64, continued through the hole; and how in words.
+
+    Planes are found among the sparse points where there are enough (they are unbiased, while the expected depth of
+    splats lies too near wherever haze hangs before a plain surface), else among the rendered depths. Where planes do
+    not explain the surroundings, they are continued smoothly but for creases at edges of the guide.
+
+    Args:
+        guide: [H, W, 3] uint8 or [0, 1], or what gives it when it is needed; the view's picture without the object.
+        points: [P, 3] sparse points of the scene; P = 0 allowed.
+    Raises:
+        Degenerate: too little is known around the hole.
+    """
+    planar, said = _planar(view, points, how)
+    if planar is not None:
+        return planar, said
+    guide = guide() if callable(guide) else guide
+    plate = Plate(how.ring, how.stiffness, how.edge, how.unknowns)
+    fitted = complete(view.disparity, view.known, guide, plate, keep=False)
+    # Its misfit on known pixels is spread by the bilateral solver, so that rims meet.
+    refined = bilateral.refine(fitted, view.disparity, view.known.astype(np.float64), guide, how.solver)
+    return refined, f"{said}: continued smoothly instead"
+
+
+def _planar(view: Seen, points: np.ndarray, how: Completion) -> tuple[np.ndarray | None, str]:
+    """Planes that explain the surroundings, [H, W] disparity, or None; and how many explain how much."""
+    around = grown(view.hidden | view.hole, how.ring) & ~(view.hidden | view.hole)
+    pixels, values = visible_points(points, view.camera, around, view.disparity)
+    source = "sparse points"
+    if len(values) < ENOUGH_POINTS:
+        rows, columns = np.nonzero(around & view.known)
+        values, source = view.disparity[rows, columns], "rendered depth"
+        pixels = np.stack([columns, rows], 1) + 0.5
+    draws = trace.generator(how.seed, "planes", view.camera.name)
+    planar = planes.planar_model(pixels, values, view.hole.shape, draws, tolerance=how.planar_tolerance)
+    said = f"{planar.planes} planes explain {planar.explained:.0%} of {len(values)} {source}"
+    return (planar.disparity if planar.explained >= how.planar_share else None), said
+
+
+def estimated(view: Seen, guide: np.ndarray, estimate: np.ndarray, how: Completion) -> tuple[np.ndarray, str]:
+    """A picture's estimate brought to the scene, [H, W] float64 disparity; and how well it fitted, in words.
+
+    As in the paper: scale and offset by L2 on the known pixels, then the fast bilateral solver, which spreads what
+    still misfits there along the picture into the hole.
+
+    PAPER leaves open: whether the alignment acts on depth or disparity; on disparity, for that is what the estimators
+    give, and an offset in one is no offset in the other.
+
+    Args:
+        guide: [H, W, 3] uint8 or [0, 1], the picture.
+        estimate: [H, W], disparity up to scale and offset.
+    Raises:
+        Degenerate: fewer than 4 known pixels; a constant estimate; one that falls where the disparity grows.
+    """
+    fitted = geometry.align(estimate, view.disparity, view.known, robust=how.robust)
+    if fitted.scale <= 0:
+        raise geometry.Degenerate("reversed", "the estimate falls where the scene's disparity grows: is it depth?")
+    aligned, confidence = fitted.apply(estimate), view.known.astype(np.float64)
+    error = np.abs(view.disparity - aligned)[view.known]
+    if how.robust and np.median(error) > 0:  # what the alignment lets go of is not to be spread either
+        confidence[view.known] = geometry.trusted(error)
+    refined = bilateral.refine(aligned, view.disparity, confidence, guide, how.solver)
+    misfit = fitted.residual / np.abs(view.disparity[view.known]).mean()
+    return refined, f"estimated, and aligned to {misfit:.1%} of the known disparity"
+
+
+def visible_points(
+    points: np.ndarray, camera: Camera, pixels: np.ndarray, disparity: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Image points [S, 2] and disparities [S] of the points that fall on `pixels`, not behind what is rendered."""
+    uv, z = geometry.project(points, camera)
+    chosen, inside = geometry.sample_nearest(pixels, uv)
+    shown, _ = geometry.sample_nearest(disparity, uv)
+    visible = chosen & inside & (z > 0) & (z * shown < BEHIND)
+    return uv[visible], 1.0 / z[visible]
+
+
+def grown(mask: np.ndarray, fraction: float) -> np.ndarray:
+    """`mask` and all pixels within `fraction` of the image's width of it."""
+    if not mask.any():
+        return mask
+    return ndimage.distance_transform_edt(~mask) <= fraction * mask.shape[1]

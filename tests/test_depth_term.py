@@ -1,0 +1,352 @@
+"""The depth term: alignment, target, gradient and whom it reaches, convergence, views that tell nothing, resume."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+from small_prior import small_prior
+
+from reffusion import behind, depth_term, geometry, inpaint
+from reffusion import distill as D
+from reffusion.behind import Completion
+from reffusion.confinement import Sight
+from reffusion.depth_term import DepthRegularization
+from reffusion.geometry import Degenerate
+from reffusion.optimize import GaussianOptimizer, Rates
+from reffusion.personalize import PROMPTS
+from reffusion.prior import embed_text
+from reffusion.splat import render
+from reffusion.trace import generator, load_checkpoint, read_trace
+from reffusion.types import PARAMETERS, Camera, Gaussians
+
+WIDTH, HEIGHT, FOCAL = 32, 24, 30.0
+VIEW = Camera("a", WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, np.eye(4))
+ROWS, COLUMNS = np.mgrid[:HEIGHT, :WIDTH]
+WALL = 0.5 + 0.004 * (COLUMNS + 0.5 - WIDTH / 2) - 0.002 * (ROWS + 0.5 - HEIGHT / 2)  # disparity of a slanted wall
+HOLE = (np.abs(COLUMNS + 0.5 - WIDTH / 2) < 7) & (np.abs(ROWS + 0.5 - HEIGHT / 2) < 6)
+NO_POINTS = np.zeros((0, 3))
+HOW = Completion(ring=0.2)
+SETTINGS = DepthRegularization(steps=2, how=HOW)
+
+
+def wall(moved: float = 1.0):
+    """The wall as Gaussians; those of its middle, masked, stand `moved` times as far from the camera as they should."""
+    wide = Camera("sheet", 52, 44, FOCAL, FOCAL, 26, 22, np.eye(4))
+    rows, columns = np.mgrid[:44, :52] + 0.5
+    disparity = 0.5 + 0.004 * (columns - 26) - 0.002 * (rows - 22)
+    picture = 0.5 + 0.3 * np.stack([np.sin(columns / 3), np.cos(rows / 4), np.sin((rows + columns) / 5)], -1)
+    everywhere = np.ones(disparity.shape, bool)
+    gaussians = geometry.surface_gaussians(
+        picture, 1 / disparity, everywhere, wide, sh_count=4, spread=0.6, opacity=0.98
+    )
+    masked = torch.from_numpy(((np.abs(columns - 26) < 6) & (np.abs(rows - 22) < 5)).ravel())
+    factor = torch.where(masked, moved, 1.0)[:, None]
+    moved_ones = replace(gaussians, means=gaussians.means * factor, log_scales=gaussians.log_scales + torch.log(factor))
+    return moved_ones, masked
+
+
+def sight(hole=HOLE):
+    hole = torch.from_numpy(hole)
+    return Sight(VIEW, torch.zeros(HEIGHT, WIDTH, 3), ~hole, hole, False)
+
+
+def leaves(gaussians):
+    return gaussians.map(lambda p: p.clone().requires_grad_())
+
+
+def term(gaussians, masked, estimator, prior=None, text=None, settings=SETTINGS, view=None):
+    return depth_term.depth_term(gaussians, masked, view or sight(), prior, text, settings, generator(1), estimator)
+
+
+def shown(moved=1.0, how=HOW):
+    """What the view shows of the wall's depth."""
+    with torch.no_grad():
+        return behind.seen(render(wall(moved)[0], VIEW), VIEW, HOLE, HOLE, how)
+
+
+def giving(estimate):
+    """The paper's estimator with a network that says `estimate`, whatever it is shown."""
+    return depth_term.by_network(lambda image: torch.as_tensor(np.asarray(estimate)), HOW)
+
+
+@pytest.fixture(scope="module")
+def prior():
+    return small_prior()
+
+
+@pytest.fixture(scope="module")
+def text(prior):
+    with torch.no_grad():
+        return embed_text(prior, list(PROMPTS))
+
+
+# ------------------------------------------------------------------------------------------ alignment and target
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_alignment_solves_the_normal_equations(weighted):
+    draw = np.random.default_rng(0)
+    x, noise = draw.normal(3, 2, 200), draw.normal(0, 0.3, 200)
+    y = 0.7 * x - 1.2 + noise
+    w = draw.random(200) if weighted else np.ones(200)
+    matrix = np.array([[(w * x * x).sum(), (w * x).sum()], [(w * x).sum(), w.sum()]])
+    scale, offset = np.linalg.inv(matrix) @ ((w * x * y).sum(), (w * y).sum())
+    found = geometry.align(x, y, w)
+    np.testing.assert_allclose((found.scale, found.offset), (scale, offset), rtol=1e-10)
+    misfit = np.sqrt((w * (y - scale * x - offset) ** 2).sum() / w.sum())
+    assert found.residual == pytest.approx(misfit, rel=1e-9)
+
+
+@pytest.mark.parametrize("unit", [1e-8, 1.0, 1e8])
+def test_the_target_does_not_depend_on_the_estimates_unit(unit):
+    """An estimate that is right but for scale and offset gives the wall, in whatever unit it comes."""
+    view = replace(shown(), depth=1 / WALL)
+    guide = np.full((HEIGHT, WIDTH, 3), 0.5)
+    disparity, _ = behind.estimated(view, guide, unit * (40 * WALL - 7), HOW)
+    target, compared = depth_term.depth_target(view, disparity, np.ones_like(HOLE))
+    assert (compared == HOLE).all()
+    np.testing.assert_allclose(target[HOLE], 1 / WALL[HOLE], rtol=1e-9)
+
+
+def test_a_robust_alignment_lets_go_of_what_is_wrong():
+    view = replace(shown(), depth=1 / WALL)
+    estimate, guide = 40 * WALL - 7, np.random.default_rng(0).random((HEIGHT, WIDTH, 3))
+    estimate += 0.05 * np.random.default_rng(1).normal(size=WALL.shape)
+    estimate[:, :4] += 3.0
+    errors = []
+    for robust in (False, True):
+        disparity, _ = behind.estimated(view, guide, estimate, replace(HOW, robust=robust))
+        errors.append(np.abs(disparity / WALL - 1)[HOLE].mean())
+    assert errors[1] < 0.3 * errors[0]
+
+
+def test_nothing_is_compared_where_depth_is_unknown():
+    view = replace(shown(), depth=1 / WALL)
+    beyond, thin = COLUMNS > 18, COLUMNS < 12
+    disparity = np.where(beyond, -0.1, WALL)
+    target, compared = depth_term.depth_target(view, disparity, ~thin)
+    assert (compared == (HOLE & ~beyond & ~thin)).all() and np.isfinite(target).all()
+    farthest = 0.51 / (1 / WALL)[view.known].max()
+    assert (depth_term.depth_target(view, np.full_like(WALL, farthest), ~thin)[1] == (HOLE & ~thin)).all()
+    with pytest.raises(Degenerate, match="no pixel"):
+        depth_term.depth_target(view, np.full_like(WALL, 0.9 * farthest), ~thin)
+    with pytest.raises(FloatingPointError, match="not finite"):
+        depth_term.depth_target(view, np.where(HOLE, np.nan, WALL), ~thin)
+
+
+# ------------------------------------------------------------------------------------------ value and gradient
+
+
+def test_a_surface_that_is_right_has_no_loss_and_one_that_is_not_is_pulled_the_right_way():
+    estimator = depth_term.by_continuation(NO_POINTS, HOW)
+    right = float(term(*wall(), estimator)[0])
+    for moved, sign in ((0.9, -1), (1.1, 1)):
+        gaussians, masked = wall(moved)
+        gaussians = leaves(gaussians)
+        loss, _ = term(gaussians, masked, estimator)
+        loss.backward()
+        whole = float((0.1 / WALL[HOLE].mean()) ** 2)  # part of the hole is the wall around the masked ones
+        assert 0.4 * whole < float(loss.detach()) < whole and right < 1e-3 * whole
+        pull = gaussians.means.grad[masked][:, 2]  # of the loss: down its slope is the way
+        assert (sign * pull.sum()) > 0 and (sign * pull > 0).float().mean() > 0.8
+
+
+def test_the_loss_is_in_units_of_the_extent():
+    gaussians, masked = wall(0.9)
+    estimator = depth_term.by_continuation(NO_POINTS, HOW)
+    once, thrice = (float(term(gaussians, masked, estimator, settings=replace(SETTINGS, extent=e))[0]) for e in (1, 3))
+    assert once == pytest.approx(9 * thrice)
+
+
+def test_a_displaced_surface_converges_to_the_wall():
+    gaussians, masked = wall(0.92)
+    optimizer = GaussianOptimizer(gaussians, masked, Rates(means=1.2e-2, means_last=1e-3))
+    estimator, losses = depth_term.by_continuation(NO_POINTS, HOW), []
+    for step in range(36):
+        loss, rendering = term(optimizer.gaussians, optimizer.masked, estimator)
+        loss.backward()
+        losses.append(float(loss.detach()))
+        optimizer.step(step / 36, visible=masked & (rendering.radii > 0))
+    assert losses[-1] < 0.02 * losses[0]
+    with torch.no_grad():
+        drawn = render(optimizer.gaussians, VIEW)
+    assert np.abs(drawn.depth.numpy() * WALL - 1)[HOLE].mean() < 0.01
+    assert (optimizer.gaussians.sh == gaussians.sh).all()
+    for name in PARAMETERS:
+        assert (getattr(optimizer.gaussians, name)[~masked] == getattr(gaussians, name)[~masked]).all(), name
+
+
+def test_the_gradient_reaches_the_geometry_of_masked_gaussians_only(prior, text):
+    gaussians, masked = wall(0.9)
+    gaussians = leaves(gaussians)
+    loss, rendering = term(gaussians, masked, giving(WALL), prior, text)
+    loss.backward()
+    assert gaussians.sh.grad is None or (gaussians.sh.grad == 0).all()
+    for name in ("means", "quaternions", "log_scales", "opacity_logits"):
+        gradient = getattr(gaussians, name).grad
+        assert (gradient[~masked] == 0).all(), name
+        assert (gradient[masked & (rendering.radii > 0)] != 0).any(), name
+
+
+def test_the_gradient_agrees_with_finite_differences_in_float64():
+    draw = generator(4, "few")
+    count = 14
+    few = Gaussians(
+        torch.rand(count, 3, generator=draw) * torch.tensor([0.8, 0.6, 0.4]) + torch.tensor([-0.4, -0.3, 1.8]),
+        torch.randn(count, 4, generator=draw),
+        torch.full((count, 3), -2.0) + 0.3 * torch.randn(count, 3, generator=draw),
+        torch.randn(count, generator=draw),
+        torch.randn(count, 1, 3, generator=draw),
+    )
+    masked = torch.arange(count) % 3 > 0
+    hole = (np.abs(COLUMNS + 0.5 - WIDTH / 2) < 4) & (np.abs(ROWS + 0.5 - HEIGHT / 2) < 4)
+    settings = replace(SETTINGS, how=replace(HOW, explained=0.2))
+    gaussians = leaves(few)
+    loss, drawn = term(gaussians, masked, lambda *_: WALL, settings=settings, view=sight(hole))
+    loss.backward()
+    compared = torch.from_numpy(hole) & (drawn.alpha > 0.2)
+    assert compared.sum() > 30
+    exact = few.map(lambda p: p.double())
+
+    def value(changed: Gaussians) -> float:
+        depth = render(changed, VIEW, impl="reference").depth
+        return float((depth[compared] - torch.from_numpy(1 / WALL)[compared]).square().mean())
+
+    assert float(loss.detach()) == pytest.approx(value(exact), rel=1e-4)
+    h = 1e-5
+    for name in ("means", "quaternions", "log_scales", "opacity_logits"):
+        gradient, scale = getattr(gaussians, name).grad.double(), float(getattr(gaussians, name).grad.abs().max())
+        for row in torch.nonzero(masked)[:6, 0].tolist():
+            bump = torch.zeros_like(getattr(exact, name))
+            bump[row] = torch.randn(bump[row].shape, generator=draw, dtype=torch.float64)
+            up, down = (value(replace(exact, **{name: getattr(exact, name) + s * h * bump})) for s in (1, -1))
+            assert float((gradient * bump).sum()) == pytest.approx((up - down) / (2 * h), rel=1e-2, abs=3e-3 * scale)
+
+
+# ------------------------------------------------------------------------------------------ views that tell nothing
+
+
+@pytest.mark.parametrize(
+    "estimate, reason",
+    [(np.full(WALL.shape, 3.0), "constant"), (-WALL, "reversed"), (np.zeros(WALL.shape), "constant")],
+)
+def test_estimates_that_fit_nothing_are_degenerate(estimate, reason, prior, text):
+    with pytest.raises(Degenerate) as caught:
+        term(*wall(), giving(estimate), prior, text)
+    assert caught.value.reason == reason
+
+
+def test_views_without_known_or_drawn_pixels_are_degenerate(prior, text):
+    everywhere = sight(np.ones_like(HOLE))
+    for estimator, reason in ((giving(WALL), "few pixels"), (depth_term.by_continuation(NO_POINTS, HOW), "no plane")):
+        with pytest.raises(Degenerate) as caught:
+            term(*wall(), estimator, prior, text, view=everywhere)
+        assert caught.value.reason == reason
+    gaussians, masked = wall()
+    around = gaussians.map(lambda p: p[~masked])
+    with pytest.raises(Degenerate) as caught:
+        inner = sight((np.abs(COLUMNS + 0.5 - WIDTH / 2) < 2) & (np.abs(ROWS + 0.5 - HEIGHT / 2) < 2))
+        term(around, masked[~masked], depth_term.by_continuation(NO_POINTS, HOW), view=inner)
+    assert caught.value.reason == "nothing compared"
+
+
+def test_a_view_larger_than_asked_for_is_rendered_smaller():
+    settings = replace(SETTINGS, longest=WIDTH // 2)
+    _, drawn = term(*wall(), depth_term.by_continuation(NO_POINTS, HOW), settings=settings)
+    assert drawn.depth.shape == (HEIGHT // 2, WIDTH // 2)
+
+
+# ------------------------------------------------------------------------------------------ repainting
+
+
+def test_repainting_changes_the_hole_only_and_the_less_the_later_it_starts(prior, text):
+    image = torch.rand(3, HEIGHT, WIDTH, generator=generator(5)) * 1.6 - 0.8
+    hole, changes = torch.from_numpy(HOLE), []
+    for start in (0.9, 0.001):
+        options = {"start": start, "finest": 0.6, "levels": 3, "steps": 3, "guidance": 0.5}
+        painted = inpaint.repaint(prior, image, hole, text, generator(6), **options)
+        assert (painted[:, ~hole] == image[:, ~hole]).all() and torch.isfinite(painted).all()
+        assert (painted == inpaint.repaint(prior, image, hole, text, generator(6), **options)).all()
+        changes.append(float((painted - image)[:, hole].abs().mean()))
+    assert 0 < changes[1] < 0.1 and changes[1] < 0.3 * changes[0]
+
+
+def test_the_estimator_sees_the_repainted_view(prior, text):
+    seen = []
+
+    def network(image):
+        seen.append(image)
+        return torch.from_numpy(WALL)
+
+    term(*wall(), depth_term.by_network(network, HOW), prior, text)
+    with torch.no_grad():
+        color = render(wall()[0], VIEW).color.clamp(0, 1).permute(2, 0, 1)
+    hole = torch.from_numpy(HOLE)
+    assert torch.allclose(seen[0][:, ~hole], color[:, ~hole], atol=1e-6)
+    assert (seen[0] - color)[:, hole].abs().mean() > 0.01 and seen[0].min() >= 0 and seen[0].max() <= 1
+
+
+# ------------------------------------------------------------------------------------------ in distillation
+
+
+RUN = D.Settings(
+    6, sds_weight=0.0, depth=replace(SETTINGS, weight=0.5, every=2), reconstruction_every=0, checkpoint_seconds=1e-9
+)
+
+
+def distilled(folder, prior, text, estimator, settings=RUN):
+    folder.mkdir(exist_ok=True)
+    gaussians, masked = wall(0.95)
+    with torch.no_grad():
+        image = render(gaussians, VIEW).color.clamp(0, 1)
+    holes = [(VIEW, image, torch.from_numpy(HOLE))]
+    return D.distill(gaussians, masked, [sight()], holes, prior, text, settings, folder, estimator)
+
+
+def lines(folder):
+    return [{k: v for k, v in line.items() if k != "seconds"} for line in read_trace(folder / "trace.jsonl")]
+
+
+def test_interrupted_distillation_with_the_depth_term_resumes_bit_for_bit(prior, text, tmp_path, monkeypatch):
+    whole, _ = distilled(tmp_path / "whole", prior, text, giving(WALL))
+    real = D._step
+
+    def interrupted(optimizer, step, *others):
+        if step == 3:
+            raise KeyboardInterrupt
+        return real(optimizer, step, *others)
+
+    monkeypatch.setattr(D, "_step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        distilled(tmp_path / "broken", prior, text, giving(WALL))
+    assert load_checkpoint(tmp_path / "broken")["step"] == 3
+    monkeypatch.setattr(D, "_step", real)
+    resumed, _ = distilled(tmp_path / "broken", prior, text, giving(WALL))
+    for name in PARAMETERS:
+        assert (getattr(whole, name) == getattr(resumed, name)).all(), name
+    assert lines(tmp_path / "whole") == lines(tmp_path / "broken")
+    assert 0 < lines(tmp_path / "whole")[-1]["depth"] < lines(tmp_path / "whole")[0]["depth"]
+
+
+def test_skipped_views_are_counted_by_reason_and_move_nothing(prior, text, tmp_path):
+    ended, _ = distilled(tmp_path, prior, text, giving(np.full(WALL.shape, 2.0)))
+    assert lines(tmp_path)[-1]["depth_skipped_constant"] == 3 and "depth" not in lines(tmp_path)[-1]
+    for name in PARAMETERS:
+        assert (getattr(ended, name) == getattr(wall(0.95)[0], name)).all(), name
+
+
+def test_an_estimate_that_is_not_finite_names_step_and_view(prior, text, tmp_path):
+    nowhere = lambda view, picture: np.full(WALL.shape, np.nan)
+    with pytest.raises(FloatingPointError, match="step 0, depth, view 'a'"):
+        distilled(tmp_path, prior, text, nowhere)
+    with pytest.raises(ValueError, match="estimator"):
+        distilled(tmp_path, prior, text, None)
+
+
+def test_both_stages_find_depth_alike():
+    from stages import distill, initialize
+
+    params = initialize.Params()
+    shared = {f.name: getattr(params, f.name) for f in fields(Completion) if f.name != "robust"}
+    assert Completion(**shared) == Completion() == distill.depth_settings(distill.Params()).how

@@ -1,0 +1,134 @@
+"""The depth network: loaded from a folder, fed as its own processor would feed it; clear refusals."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import small_scene as small
+import torch
+
+from reffusion import initialize, monocular
+from reffusion.behind import Completion
+from reffusion.trace import generator
+from reffusion.types import Reference
+
+TINY = Path(__file__).resolve().parent.parent / "priors" / "tiny"
+
+
+def small_model(kind="relative"):
+    """Depth Anything's architecture with random weights, 4 layers of 16 channels, for pictures of 56 px."""
+    from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
+
+    backbone = Dinov2Config(
+        hidden_size=16, num_hidden_layers=4, num_attention_heads=2, image_size=56, patch_size=14,
+        out_features=["stage1", "stage2", "stage3", "stage4"], reshape_hidden_states=False,
+    )  # fmt: skip
+    torch.manual_seed(0)
+    config = DepthAnythingConfig(
+        backbone_config=backbone, reassemble_hidden_size=16, neck_hidden_sizes=[8, 8, 16, 16], fusion_hidden_size=8,
+        head_hidden_size=8, depth_estimation_type=kind, initializer_range=0.2,
+    )  # fmt: skip
+    return DepthAnythingForDepthEstimation(config)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("network")
+    small_model().save_pretrained(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def network(folder):
+    return monocular.load_network(folder)
+
+
+def picture(height, width, seed=0):
+    coarse = torch.rand(1, 3, 5, 7, generator=generator(seed, "picture"))
+    smooth = torch.nn.functional.interpolate(coarse, (height, width), mode="bilinear")[0]
+    return (smooth * 255).round() / 255
+
+
+@pytest.mark.parametrize("size", [(48, 64), (64, 48), (200, 60), (56, 56), (3, 5)])
+def test_a_picture_is_prepared_as_the_models_own_processor_does(network, size):
+    from transformers.models.dpt.image_processing_pil_dpt import DPTImageProcessorPil
+
+    own = DPTImageProcessorPil(
+        size={"height": 56, "width": 56}, ensure_multiple_of=14, keep_aspect_ratio=True,
+        image_mean=list(monocular.MEAN), image_std=list(monocular.DEVIATION),
+    )  # fmt: skip
+    image = picture(*size)
+    wanted = own((image * 255).byte().numpy(), return_tensors="pt", input_data_format="channels_first").pixel_values
+    prepared = monocular.prepared(network, image)
+    assert prepared.shape == wanted.shape
+    assert (prepared - wanted).abs().max() < 0.02  # theirs is rounded to 8 bits: half a level is 0.009
+
+
+def test_disparity_has_the_pictures_size_and_repeats(network, folder):
+    image = picture(48, 64)
+    first = monocular.disparity(network, image)
+    assert first.shape == (48, 64) and torch.isfinite(first).all() and first.std() > 0
+    assert (first == monocular.disparity(monocular.load_network(folder), image)).all()
+    assert (first != monocular.disparity(network, picture(48, 64, 1))).any()
+    with pytest.raises(ValueError, match=r"\[3, H, W\]"):
+        monocular.disparity(network, image[None])
+
+
+def test_a_metric_model_is_inverted(network):
+    model = small_model("metric")
+    image = picture(48, 64)
+    answer = model(pixel_values=monocular.prepared(network, image)).predicted_depth
+    found = monocular.disparity(monocular.make_network(model), image)
+    inverse = 1 / answer[None].clamp(1e-6, 1e6)
+    wanted = torch.nn.functional.interpolate(inverse, (48, 64), mode="bilinear")[0, 0].detach()
+    torch.testing.assert_close(found, wanted)
+
+
+def test_refusals_name_what_is_wrong(tmp_path, monkeypatch, folder):
+    with pytest.raises(ValueError, match="no such folder"):
+        monocular.load_network(tmp_path / "nothing")
+    with pytest.raises(ValueError, match=r"lacks config\.json"):
+        monocular.load_network(tmp_path)
+    with pytest.raises(ValueError, match="clip_text_model"):
+        monocular.load_network(TINY / "text_encoder")
+    shutil.copy(folder / "config.json", tmp_path)
+    with pytest.raises(ValueError, match="leave `depth_model` empty"):
+        monocular.load_network(tmp_path)  # a configuration without weights
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    with pytest.raises(ValueError, match="leave `depth_model` empty"):
+        monocular.load_network("nobody/nothing-at-all")
+
+
+def test_the_references_depth_is_the_estimate_aligned():
+    """initialize: an estimate that is right but for scale and offset gives the hidden wall."""
+    view = small.CAMERAS["a2"]
+    gaussians, labels = small.gaussians(1.7)
+    hole = small.true_mask(view, 1.7)
+    reference = Reference(view, small.photo(view), hole)
+    remaining = gaussians.map(lambda p: p[~labels])
+    # A wall parallel to the view has one disparity, which fixes no scale: this one is tilted about the image's middle.
+    means = remaining.means.clone()
+    means *= 1 / (1 - 0.2 * means[:, 1:2] / small.WALL)
+    height = (np.mgrid[: small.HEIGHT, : small.WIDTH][0] + 0.5 - small.HEIGHT / 2) / small.FOCAL
+    true = (1 - 0.2 * height) / small.WALL
+    behind_it = lambda estimate: initialize.depth_behind(
+        replace(remaining, means=means), reference, hole, hole, np.zeros((0, 3)), Completion(), estimate
+    )
+    _, made_up, said = behind_it(50 * true - 3)
+    assert "aligned" in said
+    np.testing.assert_allclose(made_up[hole], 1 / true[hole], rtol=0.02)
+    with pytest.raises(ValueError, match="reference a2: the estimate falls"):
+        behind_it(-true)
+
+
+def test_the_stage_asks_the_model_of_its_parameter(folder, network):
+    from stages.initialize import Params, estimate_of
+
+    view = small.CAMERAS["a2"]
+    reference = Reference(view, small.photo(view), np.zeros((small.HEIGHT, small.WIDTH), bool))
+    image = torch.from_numpy(reference.image).permute(2, 0, 1) / 255
+    found = estimate_of(Params(depth_model=str(folder)), reference)
+    assert (found == monocular.disparity(network, image).numpy()).all()
+    assert estimate_of(Params(), reference) is None
