@@ -4,6 +4,7 @@ term             pixels                                        Gaussians
 reconstruction   outside the consistent mask; all if clean     unmasked; all if clean
 SDS              whole view and patches, the hole repainted    masked
 reference        the reference's hole (not in the paper)       masked
+lift             the hole, or patches around it (a baseline's) masked
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ class Sight:
         supervises: [H, W] bool, the pixels whose photo may be reconstructed: outside C, all of a clean view.
         repaint: [H, W] bool, what the UNet repaints; empty where the view is not distilled.
         clean: the object is absent from this view.
+        lifted: [H, W, 3] float32 in [0, 1], the view inpainted in 2D; None where it was not.
     """
 
     camera: Camera
@@ -48,6 +50,7 @@ class Sight:
     supervises: Tensor
     repaint: Tensor
     clean: bool
+    lifted: Tensor | None = None
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from reffusion.confinement import (
     strays,
 )
 from reffusion.densify import densify, prune
+from reffusion.lift import Lift, lift_term
 from reffusion.optimize import GaussianOptimizer, Rates
 from reffusion.prior import Prior
 from reffusion.splat import render
@@ -39,6 +40,9 @@ class Settings:
         sds: the choices within that term.
         reconstruction_every: steps between two with a reconstruction term; 0: never.
         reference_weight: of the reference's own pixels in its hole (paper: 0).
+        lift: supervision by pictures inpainted in 2D (baselines; not in the paper's method); None leaves it out.
+        confined: each term reaches its own Gaussians. False, an ablation: every term reaches all Gaussians, and none is
+            pruned for changing region.
         densify_every: steps between densifications of masked Gaussians; 0: never.
         densify_share: share of the masked Gaussians cloned or split each time.
         densify_until: part of the run after which no Gaussian is added.
@@ -60,6 +64,8 @@ class Settings:
     sds: Distillation = field(default_factory=Distillation)
     reconstruction_every: int = 1
     reference_weight: float = 0.0
+    lift: Lift | None = None
+    confined: bool = True
     densify_every: int = 0
     densify_share: float = 0.05
     densify_until: float = 0.5
@@ -92,7 +98,7 @@ def distill(
         holes: (camera, image [H, W, 3] in [0, 1], hole [H, W] bool) of each reference.
         prior: adapted to the reference; None where `settings.sds_weight` is 0.
         text: [3, L, D], hidden states of the global, the local and the empty prompt.
-        folder: gets trace.jsonl and checkpoints. A line of the trace: reconstruction (that term's value),
+        folder: gets trace.jsonl and checkpoints. A line of the trace: reconstruction and lift (those terms' values),
             reference_psnr (in the references' holes), sds_gradient_mean and _max (norm of the weighted SDS gradient
             per masked Gaussian in that step), gaussians, masked_gaussians.
     Returns:
@@ -101,10 +107,12 @@ def distill(
         FloatingPointError: a value or gradient is not finite; names step, term and view.
     """
     optimizer = GaussianOptimizer(initial, masked, settings.rates, settings.masked_pace, epsilon=settings.epsilon)
-    region = region_of(initial.means, masked) if masked.any() else None
+    region = region_of(initial.means, masked) if settings.confined and masked.any() else None
     distilled = [sight for sight in sights if sight.repaint.any()] if settings.sds_weight > 0 else []
     if distilled and (prior is None or text is None):
         raise ValueError("distillation with sds_weight > 0 needs a prior and its prompts' embeddings")
+    if settings.lift is not None and all(sight.lifted is None for sight in sights):
+        raise ValueError("distillation with lift_weight > 0 needs the pictures of the stage lift")
     state = trace.load_checkpoint(folder)
     start, seconds, best, best_psnr = 0, 0.0, None, -float("inf")
     if state is not None:
@@ -154,12 +162,14 @@ def _step(
     """The terms of one step, one after another, then one step of Adam; what there is to log."""
     gaussians, masked = optimizer.gaussians, optimizer.masked
     moved, line = torch.zeros_like(masked), {}
+    everyone = torch.full_like(masked, not settings.confined)
+    reached, kept = masked | everyone, ~masked | everyone  # by what fills the hole, and by the photographs
     if distilled and masked.any():
         sight = _drawn(distilled, step, settings.seed, "sds")
         probe = torch.zeros(len(masked), 2, device=masked.device, requires_grad=True)
         draw = trace.generator(settings.seed, "distill", "sds", step)
         try:
-            loss, rendering = sds_term(gaussians, masked, sight, prior, text, settings.sds, draw, probe)
+            loss, rendering = sds_term(gaussians, reached, sight, prior, text, settings.sds, draw, probe)
         except FloatingPointError as error:
             raise FloatingPointError(f"distill, step {step}, SDS, view '{sight.camera.name}': {error}") from None
         _backward(settings.sds_weight * loss, gaussians, step, "SDS", sight.camera)
@@ -167,18 +177,26 @@ def _step(
         line |= {"sds_gradient_mean": float(norms.mean()), "sds_gradient_max": float(norms.max())}
         if settings.densify_every:
             optimizer.observe(probe.grad, rendering.radii * masked, sight.camera.width, sight.camera.height)
-        moved |= masked & (rendering.radii > 0)
+        moved |= reached & (rendering.radii > 0)
     if settings.reference_weight > 0 and masked.any():
         camera, image, hole = holes[step % len(holes)]
-        loss, rendering = reference_term(gaussians, masked, camera, image, hole)
+        loss, rendering = reference_term(gaussians, reached, camera, image, hole)
         _backward(settings.reference_weight * loss, gaussians, step, "reference", camera)
-        moved |= masked & (rendering.radii > 0)
+        moved |= reached & (rendering.radii > 0)
+    lifted = [sight for sight in sights if sight.lifted is not None and sight.repaint.any()]
+    if settings.lift is not None and lifted and masked.any():
+        sight = _drawn(lifted, step, settings.seed, "lift")
+        draw = trace.generator(settings.seed, "distill", "lift", step)
+        loss, rendering = lift_term(gaussians, reached, sight, settings.lift, draw)
+        _backward(settings.lift.weight * loss, gaussians, step, "lift", sight.camera)
+        line["lift"] = float(loss.detach())
+        moved |= reached & (rendering.radii > 0)
     if settings.reconstruction_every and step % settings.reconstruction_every == 0:
         sight = _drawn(sights, step // settings.reconstruction_every, settings.seed, "reconstruction")
-        loss, rendering = reconstruction_term(gaussians, masked, sight)
+        loss, rendering = reconstruction_term(gaussians, ~kept, sight)
         _backward(loss, gaussians, step, "reconstruction", sight.camera)
         line["reconstruction"] = float(loss.detach())
-        moved |= (rendering.radii > 0) & (~masked | sight.clean)
+        moved |= (rendering.radii > 0) & (kept | sight.clean)
     optimizer.step(step / settings.iterations, visible=moved)
     return line
 

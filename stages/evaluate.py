@@ -10,9 +10,11 @@ from pydantic import BaseModel, ConfigDict, Field
 if TYPE_CHECKING:
     import numpy as np
 
+    from reffusion.consistency import Shown
     from reffusion.types import Camera, Gaussians, Scene
 
 FOLDERS = {"fit": "renders_fit", "initialize": "renders_initialize", "distill": "renders"}
+CONSISTENCY = ("consistency", "consistency_share")
 
 
 class Params(BaseModel):
@@ -23,6 +25,12 @@ class Params(BaseModel):
     lpips_weights: str | None = Field(
         None,
         description="folder with LPIPS weights, looked into before ~/.cache/reffusion/lpips and torch hub's cache",
+        json_schema_extra={"weights": True},
+    )
+    inpaint: bool = Field(False, description="a baseline: each rendered view is inpainted in 2D inside its mask")
+    lama: str | None = Field(
+        None,
+        description="folder with LaMa's TorchScript file, for that; none: OpenCV's FSR, else Telea",
         json_schema_extra={"weights": True},
     )
     device: Literal["cpu", "cuda"] = Field("cpu", description="where the views are rendered")
@@ -37,18 +45,20 @@ def run(
     masks: Path | None = None,
     reference: Path | None = None,
     personalize: Path | None = None,
+    lift: Path | None = None,
     initialize: Path | None = None,
     distill: Path | None = None,
 ) -> None:
     """Write renders*/, side_by_side/, metrics.json, per_view.csv and scene.ply.
 
     The result is what `distill` made, else `initialize`, else `fit` (a scene with nothing to remove). Training views
-    and test views without a picture are rendered and not scored. `reference` and `personalize` give their seconds only.
+    and test views without a picture are rendered and not scored. `reference`, `personalize` and `lift` give their
+    seconds only.
     """
-    from reffusion import io, lpips, metrics, trace
+    from reffusion import consistency, io, lpips, metrics, paint2d, trace
 
     needs = {"poses": poses, "fit": fit, "masks": masks, "reference": reference, "personalize": personalize}
-    needs |= {"initialize": initialize, "distill": distill}
+    needs |= {"lift": lift, "initialize": initialize, "distill": distill}
     scene = io.load_scene(poses)
     loaded = {net: lpips.load(net, params.lpips_weights) for net in ("vgg", "alex")}
     models = {net: model for net, (model, _) in loaded.items() if model}
@@ -58,18 +68,28 @@ def run(
         if needs[stage]
     }
     result = list(gaussians)[-1]
+    painter = paint2d.load(params.lama, params.device) if params.inpaint else None
 
     names, kind = views_of(scene)
-    rows = []
+    rows, before = [], None
     for index in trace.progress(len(names), "evaluate"):
         camera, file = scene.cameras[names[index]], f"{names[index]}.png"
         pictures = {stage: drawn(gaussians[stage], camera, out / FOLDERS[stage] / file) for stage in gaussians}
-        io.save_image(out / "renders" / file, pictures[result])
+        mask = mask_of(camera, poses, masks)
+        shown = seen(gaussians[result], camera, pictures[result], mask)
+        if painter:
+            shown = shown._replace(picture=painter.paint(shown.picture, mask))
+            shown = shown._replace(depth=consistency.depth_through(shown.depth, mask))
+        pictures[result] = shown.picture
+        io.save_image(out / "renders" / file, shown.picture)
+        if before:
+            rows[-1] |= dict(zip(CONSISTENCY, consistency.difference(before, shown), strict=True))
+        before = shown
         truth = truth_of(camera, poses) if kind == "test" else None
-        box = metrics.mask_box(mask_of(camera, poses, masks), params.box_dilation)
+        box = metrics.mask_box(mask, params.box_dilation)
         panels = [p for p in (pictures["fit"], truth, pictures[result]) if p is not None]
         io.save_image(out / "side_by_side" / file, metrics.side_by_side(panels, box))
-        row = {"view": camera.name, "width": camera.width, "height": camera.height}
+        row = {"view": camera.name, "width": camera.width, "height": camera.height} | dict.fromkeys(CONSISTENCY)
         row |= dict(zip(("left", "top", "right", "bottom"), box or (None,) * 4, strict=True))
         if truth is not None:
             row |= metrics.score_view(pictures[result], truth, box, models)
@@ -84,6 +104,12 @@ def run(
         **metrics.summary(rows),
         "rendered": f"{len(names)} {kind} views",
         "result": result,
+        "consistency": {
+            **{name: metrics.mean([row[name] for row in rows]) for name in CONSISTENCY},
+            "pairs": sum(row["consistency"] is not None for row in rows),
+            "protocol": consistency.PROTOCOL,
+        },
+        **used(painter and painter.name, distill),
         "lpips_unavailable": "; ".join(reason for _, reason in loaded.values() if reason) or None,
         "gaussians": {stage: len(value) for stage, value in gaussians.items()},
         "seconds": seconds(needs),
@@ -133,15 +159,38 @@ def truth_of(camera: Camera, poses: Path) -> np.ndarray | None:
 
 
 def mask_of(camera: Camera, poses: Path, masks: Path | None) -> np.ndarray:
-    """bool [H, W]: the view's test mask, else its consistent mask, else empty."""
+    """bool [H, W]: the view's test mask, else its consistent mask, else (a variant without the stage masks) its raw
+    mask, else empty. Where there are test masks, every variant is so scored in the same box."""
     import numpy as np
 
     from reffusion import io
 
-    size, given = (camera.height, camera.width), poses / "test_masks" / f"{camera.name}.png"
-    if given.exists():
-        return io.load_mask(given, size)
-    return io.load_mask(masks / "consistent" / f"{camera.name}.png", size) if masks else np.zeros(size, bool)
+    size, file = (camera.height, camera.width), f"{camera.name}.png"
+    given = [poses / "test_masks" / file, *([masks / "consistent" / file] if masks else []), poses / "masks" / file]
+    found = [path for path in given if path.exists()]
+    return io.load_mask(found[0], size) if found else np.zeros(size, bool)
+
+
+def seen(gaussians: Gaussians, camera: Camera, picture: np.ndarray, mask: np.ndarray) -> Shown:
+    """The view with its rendered depth, for the comparison with its neighbour."""
+    import numpy as np
+    import torch
+
+    from reffusion import consistency, splat
+
+    with torch.no_grad():
+        drawing = splat.render(gaussians, camera, sh_degree=0)
+    depth, alpha = drawing.depth.double().cpu().numpy(), drawing.alpha.cpu().numpy()
+    return consistency.Shown(camera, picture, np.where(alpha > consistency.SOLID, depth, 0.0), mask)
+
+
+def used(painter: str | None, distill: Path | None) -> dict[str, str | None]:
+    """{"inpainter", "perceptual"}: what painted in 2D and what compared patches, None where nothing did."""
+    from reffusion import io
+
+    facts = distill / "facts.json" if distill else None
+    said = io.load_json(facts) if facts and facts.exists() else {}
+    return {"inpainter": painter or said.get("inpainter"), "perceptual": said.get("perceptual")}
 
 
 def seconds(needs: dict[str, Path | None]) -> dict[str, float]:
