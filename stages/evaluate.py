@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     import numpy as np
 
     from reffusion.consistency import Shown
+    from reffusion.lpips import Lpips
+    from reffusion.metrics import Box
     from reffusion.types import Camera, Gaussians, Scene
 
 FOLDERS = {"fit": "renders_fit", "initialize": "renders_initialize", "distill": "renders"}
@@ -62,12 +64,9 @@ def run(
     scene = io.load_scene(poses)
     loaded = {net: lpips.load(net, params.lpips_weights) for net in ("vgg", "alex")}
     models = {net: model for net, (model, _) in loaded.items() if model}
-    gaussians = {
-        stage: io.load_ply(needs[stage] / "gaussians.ply").map(lambda p: p.to(params.device))
-        for stage in FOLDERS
-        if needs[stage]
-    }
-    result = list(gaussians)[-1]
+    made = [stage for stage in FOLDERS if needs[stage]]
+    gaussians = {s: io.load_ply(needs[s] / "gaussians.ply").map(lambda p: p.to(params.device)) for s in made}
+    result = made[-1]
     painter = paint2d.load(params.lama, params.device) if params.inpaint else None
 
     names, kind = views_of(scene)
@@ -75,28 +74,18 @@ def run(
     for index in trace.progress(len(names), "evaluate"):
         camera, file = scene.cameras[names[index]], f"{names[index]}.png"
         pictures = {stage: drawn(gaussians[stage], camera, out / FOLDERS[stage] / file) for stage in gaussians}
-        mask = mask_of(camera, poses, masks)
-        shown = seen(gaussians[result], camera, pictures[result], mask)
+        shown = seen(gaussians[result], camera, pictures[result], mask_of(camera, poses, masks))
         if painter:
-            shown = shown._replace(picture=painter.paint(shown.picture, mask))
-            shown = shown._replace(depth=consistency.depth_through(shown.depth, mask))
-        pictures[result] = shown.picture
+            depth = consistency.depth_through(shown.depth, shown.mask)
+            shown = shown._replace(picture=painter.paint(shown.picture, shown.mask), depth=depth)
         io.save_image(out / "renders" / file, shown.picture)
         if before:
             rows[-1] |= dict(zip(CONSISTENCY, consistency.difference(before, shown), strict=True))
-        before = shown
-        truth = truth_of(camera, poses) if kind == "test" else None
-        box = metrics.mask_box(mask, params.box_dilation)
-        panels = [p for p in (pictures["fit"], truth, pictures[result]) if p is not None]
+        before, truth = shown, truth_of(camera, poses) if kind == "test" else None
+        box = metrics.mask_box(shown.mask, params.box_dilation)
+        panels = [p for p in (pictures["fit"], truth, shown.picture) if p is not None]
         io.save_image(out / "side_by_side" / file, metrics.side_by_side(panels, box))
-        row = {"view": camera.name, "width": camera.width, "height": camera.height} | dict.fromkeys(CONSISTENCY)
-        row |= dict(zip(("left", "top", "right", "bottom"), box or (None,) * 4, strict=True))
-        if truth is not None:
-            row |= metrics.score_view(pictures[result], truth, box, models)
-            if initialize:
-                scores = metrics.score_view(pictures["initialize"], truth, box, models)
-                row |= {f"initialize_{column}": value for column, value in scores.items()}
-        rows.append(row)
+        rows.append(row_of(shown, pictures.get("initialize"), truth, box, models))
 
     (out / "per_view.csv").write_text(metrics.table(rows))
     io.save_ply(out / "scene.ply", gaussians[result], similarity=scene.similarity)
@@ -104,24 +93,57 @@ def run(
         **metrics.summary(rows),
         "rendered": f"{len(names)} {kind} views",
         "result": result,
-        "consistency": {
-            **{name: metrics.mean([row[name] for row in rows]) for name in CONSISTENCY},
-            "pairs": sum(row["consistency"] is not None for row in rows),
-            "protocol": consistency.PROTOCOL,
-        },
+        "consistency": consistency_of(rows),
         **used(painter and painter.name, distill),
         "lpips_unavailable": "; ".join(reason for _, reason in loaded.values() if reason) or None,
         "gaussians": {stage: len(value) for stage, value in gaussians.items()},
         "seconds": seconds(needs),
-        "protocol": {
-            **metrics.PROTOCOL,
-            "box_dilation": params.box_dilation,
-            "resolution": sorted({f"{row['width']}x{row['height']}" for row in rows}),
-            "lpips_weights": {name: digest for model in models.values() for name, digest in model.files.items()},
-            "versions": metrics.versions(),
-        },
+        "protocol": protocol(params, rows, models),
     }
     io.save_json(out / "metrics.json", summary)
+
+
+def row_of(
+    shown: Shown, initial: np.ndarray | None, truth: np.ndarray | None, box: Box | None, models: dict[str, Lpips]
+) -> dict[str, Any]:
+    """A view's line of per_view.csv: its box, and its scores and the initialization's where there is a truth."""
+    from reffusion import metrics
+
+    camera = shown.camera
+    row = {"view": camera.name, "width": camera.width, "height": camera.height} | dict.fromkeys(CONSISTENCY)
+    row |= dict(zip(("left", "top", "right", "bottom"), box or (None,) * 4, strict=True))
+    if truth is not None:
+        row |= metrics.score_view(shown.picture, truth, box, models)
+        if initial is not None:
+            scores = metrics.score_view(initial, truth, box, models)
+            row |= {f"initialize_{column}": value for column, value in scores.items()}
+    return row
+
+
+def consistency_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """{"mean", "share"}: means over the pairs of neighbours; {"pairs"}: those that could be compared; the protocol."""
+    from reffusion import consistency, metrics
+
+    difference, share = ([row[name] for row in rows] for name in CONSISTENCY)
+    return {
+        "mean": metrics.mean(difference),
+        "share": metrics.mean(share),
+        "pairs": sum(value is not None for value in difference),
+        "protocol": consistency.PROTOCOL,
+    }
+
+
+def protocol(params: Params, rows: list[dict[str, Any]], models: dict[str, Lpips]) -> dict[str, Any]:
+    """All that the numbers depend on, in words and versions."""
+    from reffusion import metrics
+
+    return {
+        **metrics.PROTOCOL,
+        "box_dilation": params.box_dilation,
+        "resolution": sorted({f"{row['width']}x{row['height']}" for row in rows}),
+        "lpips_weights": {name: digest for model in models.values() for name, digest in model.files.items()},
+        "versions": metrics.versions(),
+    }
 
 
 def views_of(scene: Scene) -> tuple[tuple[str, ...], str]:
