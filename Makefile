@@ -19,7 +19,7 @@ export GOMP_SPINCOUNT ?= 30000
 PYTHON ?= python3
 VENV ?= .venv
 PY := $(VENV)/bin/python
-STAGES := poses fit masks reference personalize initialize distill evaluate
+STAGES := poses fit masks reference lift personalize initialize distill evaluate
 
 options = $(if $(profile),--profile '$(profile)') $(if $(variant),--variant '$(variant)') \
 	$(if $(set),--set "$$set") $(if $(trust),--trust) $(if $(runs),--runs '$(runs)')

@@ -19,14 +19,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from reffusion import io, metrics, splat, trace
-from reffusion.fit import fit
-from reffusion.geometry import project
+from reffusion import io, metrics, paint2d, splat, trace
 from reffusion.types import Camera, Gaussians, Scene
 from stages import evaluate
 from stages import fit as fit_stage
@@ -34,7 +31,6 @@ from stages import fit as fit_stage
 RIVALS = ("(a) unmasked pixels only", "(b) Gaussians removed", "(c) Telea, each view")
 MARGIN = 2.0  # dB that the result must be ahead of each rival
 LOSS = 0.1  # dB that distillation may lose against the initialization
-TELEA_RADIUS = 5  # px
 SHEET = 3  # views in the picture
 
 
@@ -56,49 +52,17 @@ class Run:
         return run
 
 
-def fit_unmasked(run: Run, scene: Scene, out: Path) -> Gaussians:
-    """(a): the run's own fit, its masked pixels of weight 0; kept in `out` for runs of the same fit and masks.
-
-    Points that most views show inside their masks are left out: no pixel would ever move them.
-    """
+def fit_unmasked(run: Run, out: Path) -> Gaussians:
+    """(a): the run's own fit but of unmasked pixels, as the variant `masked`; kept in `out` for that fit."""
     receipt = io.load_json(run.fit / "receipt.json")
     of = {"fit": receipt["key"], "poses": receipt["needs"]["poses"]}
     if (out / "of.json").exists() and io.load_json(out / "of.json") == of:
         return io.load_ply(out / "gaussians.ply")
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
-    params = fit_stage.Params(**receipt["params"])
-    cameras = [scene.cameras[name] for name in scene.train]
-    masks = io.load_raw_masks(run.poses, scene.train)
-    images, chosen = io.load_views(run.poses, scene.train), fit_stage.settings(params, cameras)
-    points, colors = fit_stage.start_points(params, scene, cameras, images)
-    keep = ~mostly_inside(points, cameras, masks)
-    result = fit(
-        cameras,
-        images,
-        fit_stage.start(params, points[keep], colors[keep], chosen.budget),
-        chosen,
-        folder=out,
-        weights={name: (~mask).astype(np.float32) for name, mask in masks.items()},
-    ).map(lambda p: p.cpu())
-    io.save_ply(out / "gaussians.ply", result)
-    trace.clear_checkpoint(out)
+    fit_stage.run(fit_stage.Params(**receipt["params"] | {"pixels": "unmasked"}), out, poses=run.poses)
     io.save_json(out / "of.json", of)
     return io.load_ply(out / "gaussians.ply")
-
-
-def mostly_inside(points: np.ndarray, cameras: list[Camera], masks: dict[str, np.ndarray]) -> np.ndarray:
-    """Bool [P]: points in the mask of more than half of the masked views whose frame they are in."""
-    inside, shown = np.zeros(len(points)), np.zeros(len(points))
-    for camera in cameras:
-        if camera.name not in masks:
-            continue
-        uv, z = project(points, camera)
-        column, row = np.floor(np.where(z[:, None] > 0, uv, -1)).astype(int).T
-        seen = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-        shown += seen
-        inside[seen] += masks[camera.name][row[seen], column[seen]]
-    return inside > 0.5 * np.maximum(shown, 1)
 
 
 def drawer(gaussians: Gaussians) -> Callable[[Camera], np.ndarray]:
@@ -113,7 +77,7 @@ def drawer(gaussians: Gaussians) -> Callable[[Camera], np.ndarray]:
     return draw
 
 
-def competitors(run: Run, scene: Scene, out: Path) -> dict[str, Callable[[Camera], np.ndarray]]:
+def competitors(run: Run, out: Path) -> dict[str, Callable[[Camera], np.ndarray]]:
     """Name -> camera of a test view -> uint8 [H, W, 3]; ours first."""
     whole = io.load_ply(run.fit / "gaussians.ply")
     labels = io.load_labels(run.masks / "labels.npy")
@@ -123,19 +87,18 @@ def competitors(run: Run, scene: Scene, out: Path) -> dict[str, Callable[[Camera
         return lambda camera: io.load_image(run.evaluate / folder / f"{camera.name}.png")
 
     def telea(camera: Camera) -> np.ndarray:
-        mask = evaluate.mask_of(camera, run.poses, run.masks).astype(np.uint8)
-        return cv2.inpaint(draw_whole(camera), mask, TELEA_RADIUS, cv2.INPAINT_TELEA)
+        return paint2d.telea(draw_whole(camera), evaluate.mask_of(camera, run.poses, run.masks))
 
     ways = {"ours": saved("renders")}
     if (run.evaluate / "renders_initialize").exists():
         ways["initialize"] = saved("renders_initialize")
-    rivals = (drawer(fit_unmasked(run, scene, out / "unmasked")), drawer(whole.map(lambda p: p[~labels])), telea)
+    rivals = (drawer(fit_unmasked(run, out / "unmasked")), drawer(whole.map(lambda p: p[~labels])), telea)
     return ways | dict(zip(RIVALS, rivals, strict=True))
 
 
 def compare(run: Run, scene: Scene, out: Path) -> dict[str, dict[str, float | None]]:
     """Name -> means over the test views of every column of `metrics.COLUMNS` but LPIPS; saves a few pictures."""
-    ways = competitors(run, scene, out)
+    ways = competitors(run, out)
     dilation = io.load_json(run.evaluate / "metrics.json")["protocol"]["box_dilation"]
     rows: dict[str, list[dict[str, float | None]]] = {name: [] for name in ways}
     shown = {scene.test[round(k)] for k in np.linspace(0, len(scene.test) - 1, SHEET)}

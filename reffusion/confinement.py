@@ -6,6 +6,7 @@ SDS              whole view and patches, the hole repainted    masked
 depth            the hole (reffusion.depth_term)               masked, all but spherical harmonics
 adversarial      patches around the hole                       masked (or all), spherical harmonics only
 reference        the reference's hole (not in the paper)       masked
+lift             the hole, or patches around it (a baseline's) masked
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ class Sight:
         supervises: [H, W] bool, the pixels whose photo may be reconstructed: outside C, all of a clean view.
         repaint: [H, W] bool, what is made up, and the UNet repaints; empty where the view is not distilled.
         clean: the object is absent from this view.
+        lifted: [H, W, 3] float32 in [0, 1], the view inpainted in 2D; None where it was not.
     """
 
     camera: Camera
@@ -53,6 +55,7 @@ class Sight:
     supervises: Tensor
     repaint: Tensor
     clean: bool
+    lifted: Tensor | None = None
 
 
 @dataclass(frozen=True)

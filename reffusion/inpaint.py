@@ -5,12 +5,28 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from reffusion import prior as diffusion
+from reffusion import splat
 from reffusion.trace import generator as seeded
+from reffusion.types import Camera, Gaussians
+
+
+@torch.no_grad()
+def background(remaining: Gaussians, camera: Camera, photo: np.ndarray, consistent: np.ndarray) -> np.ndarray:
+    """A view as far as it is known without the object, uint8 [H, W, 3]: the photo outside C, in C the remaining
+    Gaussians' render, which shows what other views saw and nothing sensible where none did.
+
+    Args:
+        remaining: the Gaussians without the object's.
+        photo: uint8 [H, W, 3]. consistent: C, bool [H, W].
+    """
+    drawn = splat.render(remaining, camera).color.clamp(0, 1).cpu().numpy()
+    return np.where(consistent[..., None], np.round(drawn * 255).astype(np.uint8), photo)
 
 
 def resized(image: Tensor, height: int, width: int) -> Tensor:

@@ -94,13 +94,20 @@ def hidden_inside(
     The vote for Gaussians no view sees: those buried in the object would come to light with its removal.
     """
     means = gaussians.means.detach().cpu().double().numpy()
-    inside, framed = np.zeros(len(means)), np.zeros(len(means))
+    return torch.as_tensor(points_inside(means, cameras, masks, share), device=gaussians.means.device)
+
+
+def points_inside(
+    points: np.ndarray, cameras: Sequence[Camera], masks: Mapping[str, np.ndarray], share: float = 0.5
+) -> np.ndarray:
+    """bool [P]: points [P, 3] inside the mask of more than `share` of the views with a mask that frame them."""
+    inside, framed = np.zeros(len(points)), np.zeros(len(points))
     for camera in cameras:
         if camera.name in masks:
-            hit, within = geometry.sample_nearest(masks[camera.name], geometry.project(means, camera)[0])
+            hit, within = geometry.sample_nearest(masks[camera.name], geometry.project(points, camera)[0])
             inside += hit & within
             framed += within
-    return torch.as_tensor(inside > share * framed, device=gaussians.means.device)
+    return inside > share * framed
 
 
 @torch.no_grad()

@@ -61,10 +61,13 @@ class Condition(Strict):
 
 
 class Provided(Strict):
-    """The scene's own file stands for the stage: where scene.yaml has the key `by`, `artifact` is used in its place."""
+    """The scene's own file stands for the stage: where scene.yaml has the key `by`, `artifact` is used in its place;
+    where `param: <stage>.<name>` is given, only while that parameter is `equals`."""
 
     by: str
     artifact: str
+    param: str | None = None
+    equals: Any = None
 
 
 class Stage(Strict):

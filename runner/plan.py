@@ -49,9 +49,10 @@ def decide(job: Job, stage: str, earlier: dict[str, Decision]) -> Decision:
     spec = job.pipeline.stages[stage]
     if stage in job.broken:
         raise Refused(job.broken[stage])
-    if spec.provided and spec.provided.by in job.brings:
-        source = earlier[spec.provided.artifact]
-        return Decision("provided", f"the scene brings `{spec.provided.by}`", source.path, source.settled)
+    provided = spec.provided
+    if provided and provided.by in job.brings and (not provided.param or _is(job, provided.param, provided.equals)):
+        source = earlier[provided.artifact]
+        return Decision("provided", f"the scene brings `{provided.by}`", source.path, source.settled)
     unknown_yet = []
     for condition in spec.left_out:
         if holds := _holds(job, condition, earlier):
@@ -88,9 +89,7 @@ def _holds(job: Job, condition: Condition, earlier: dict[str, Decision]) -> bool
     if condition.unless and condition.unless in job.brings:
         return False
     if condition.param:
-        if name not in job.params.get(stage, {}):
-            raise Refused(f"{job.root / 'pipeline.yaml'}: a condition asks for {condition.param}, which is not there")
-        return job.params[stage][name] == condition.equals
+        return _is(job, condition.param, condition.equals)
     source = earlier[stage]
     if source.word == "skip":
         return False
@@ -102,6 +101,14 @@ def _holds(job: Job, condition: Condition, earlier: dict[str, Decision]) -> bool
         return json.loads((source.path / "facts.json").read_text())[name] == condition.equals
     except (OSError, ValueError, KeyError):
         raise Refused(f"{source.path / 'facts.json'}: has no {name!r}, which pipeline.yaml asks for") from None
+
+
+def _is(job: Job, param: str, value: Any) -> bool:
+    """Has `<stage>.<name>` this value?"""
+    stage, name = param.split(".", 1)
+    if name not in job.params.get(stage, {}):
+        raise Refused(f"{job.root / 'pipeline.yaml'}: a condition asks for {param}, which is not there")
+    return job.params[stage][name] == value
 
 
 def _there(job: Job, stage: str) -> Path | None:

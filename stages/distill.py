@@ -63,6 +63,16 @@ class Params(BaseModel):
     adversarial_reaches: Literal["masked", "all"] = Field("masked", description="the Gaussians whose colour it moves")
     reconstruction_every: int = Field(1, ge=0, description="steps between two with a reconstruction term; 0: never")
     reference_weight: float = Field(0.0, ge=0, description="weight of the reference's pixels in its hole (paper: 0)")
+    # Not in the paper's method: the terms of the baselines that carry pictures inpainted in 2D into the scene.
+    lift_weight: float = Field(0.0, ge=0, description="weight of the pictures of the stage lift; 0 leaves it out")
+    lift_loss: Literal["mse", "perceptual"] = Field(
+        "mse", description="squared error (NeRF-In), or patches (SPIn-NeRF)"
+    )
+    lift_patch: int = Field(64, ge=16, description="side of such a patch, px")
+    lpips_weights: str | None = Field(
+        None, description="folder with LPIPS weights, see evaluate.lpips_weights", json_schema_extra={"weights": True}
+    )
+    confined: bool = Field(True, description="each term reaches its own Gaussians; false (an ablation): all of them")
     # PAPER leaves open: Adam's step sizes here; 3DGS's. Those of unmasked Gaussians are left alone: what the object's
     # blurred rim had tinted is to be mended by the reconstruction term.
     rate: float = Field(1.0, gt=0, description="factor on 3DGS's step sizes of masked Gaussians")
@@ -96,6 +106,7 @@ def run(
     reference: Path,
     personalize: Path | None,
     initialize: Path,
+    lift: Path | None = None,
 ) -> None:
     import torch
 
@@ -117,16 +128,19 @@ def run(
         prior = prior if personalize is None else lora.merged(prior, personalize)
         with torch.no_grad():
             text = diffusion.embed_text(prior, list(PROMPTS))
-    sights = load_sights(params, scene, poses, fit, masks)
+    sights, (perceptual, lifting) = load_sights(params, scene, poses, fit, masks, lift), lift_choices(params)
     estimator = depth_estimator(params, scene.points) if params.depth_weight > 0 else None
-    gaussians, masked = distill(initial, masked, sights, holes, prior, text, settings(params), out, estimator)
+    chosen = settings(params, lifting)
+    gaussians, masked = distill(initial, masked, sights, holes, prior, text, chosen, out, estimator)
     io.save_ply(out / "gaussians.ply", gaussians.map(lambda p: p.cpu()))
     io.save_labels(out / "labels.npy", masked.cpu())
+    painted = io.load_json(lift / "facts.json")["inpainter"] if lift else None
+    io.save_json(out / "facts.json", {"inpainter": painted, "perceptual": perceptual})
     trace.clear_checkpoint(out)
 
 
-def load_sights(params: Params, scene, poses: Path, fit: Path, masks: Path) -> list:
-    """The training views with the pixels that may supervise and those to repaint."""
+def load_sights(params: Params, scene, poses: Path, fit: Path, masks: Path, lift: Path | None = None) -> list:
+    """The training views with the pixels that may supervise, those to repaint, and their pictures inpainted in 2D."""
     import torch
 
     from reffusion import exposure, io
@@ -134,6 +148,7 @@ def load_sights(params: Params, scene, poses: Path, fit: Path, masks: Path) -> l
 
     photos, sets = exposure.load_views(poses, fit, scene.train), io.load_mask_sets(masks, scene.train)
     place = lambda array: torch.from_numpy(array).to(params.device)
+    painted = io.load_views(lift, [n for n in scene.train if (lift / "images" / f"{n}.png").exists()]) if lift else {}
     sights = []
     for name in scene.train:
         clean, pixels = name in scene.clean, sets[name]
@@ -141,11 +156,30 @@ def load_sights(params: Params, scene, poses: Path, fit: Path, masks: Path) -> l
         # A view with nothing to invent shows the truth, or at least what other views saw: nothing is distilled there.
         repaint = repaint & pixels.invent.any() & (not clean)
         supervises = ~pixels.consistent | clean
-        sights.append(Sight(scene.cameras[name], place(photos[name]) / 255, place(supervises), place(repaint), clean))
+        lifted = place(painted[name]) / 255 if name in painted else None
+        photo = place(photos[name]) / 255
+        sights.append(Sight(scene.cameras[name], photo, place(supervises), place(repaint), clean, lifted))
     return sights
 
 
-def settings(params: Params):
+def lift_choices(params: Params) -> tuple:
+    """The name of the perceptual distance, None where none is used; and the term's choices, None where it is left out.
+
+    Raises ValueError where LPIPS weights are there but broken.
+    """
+    from reffusion import perceptual
+    from reffusion.lift import Lift
+
+    if not params.lift_weight:
+        return None, None
+    if params.lift_loss == "mse":
+        return None, Lift(params.lift_weight)
+    name, distance = perceptual.load(params.lpips_weights, params.device)
+    print(f"perceptual distance: {name}", flush=True)
+    return name, Lift(params.lift_weight, distance, params.lift_patch)
+
+
+def settings(params: Params, lift=None):
     from dataclasses import fields
 
     from reffusion.adversary import Adversarial
@@ -155,7 +189,7 @@ def settings(params: Params):
     shape = params.rate * params.rate_shape
     pace = {"means": shape, "quaternions": shape, "log_scales": shape, "sh": params.rate}
     pace["opacity_logits"] = params.rate * params.rate_opacity
-    given = ("rates", "masked_pace", "sds", "depth", "adversarial")
+    given = ("rates", "masked_pace", "sds", "depth", "adversarial", "lift")
     shared = {f.name: getattr(params, f.name) for f in fields(Settings) if f.name not in given}
     sds = Distillation(
         params.patches,
@@ -181,7 +215,7 @@ def settings(params: Params):
     )
     chosen = adversarial if params.adversarial_weight > 0 else None
     depth = depth_settings(params) if params.depth_weight > 0 else None
-    return Settings(**shared, sds=sds, depth=depth, adversarial=chosen, masked_pace=pace)
+    return Settings(**shared, sds=sds, depth=depth, adversarial=chosen, lift=lift, masked_pace=pace)
 
 
 def depth_settings(params: Params):

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 if TYPE_CHECKING:
     import numpy as np
 
+    from reffusion.consistency import Shown
+    from reffusion.lpips import Lpips
+    from reffusion.metrics import Box
     from reffusion.types import Camera, Gaussians, Scene
 
 FOLDERS = {"fit": "renders_fit", "initialize": "renders_initialize", "distill": "renders"}
+CONSISTENCY = ("consistency", "consistency_share")
 
 
 class Params(BaseModel):
@@ -23,6 +27,12 @@ class Params(BaseModel):
     lpips_weights: str | None = Field(
         None,
         description="folder with LPIPS weights, looked into before ~/.cache/reffusion/lpips and torch hub's cache",
+        json_schema_extra={"weights": True},
+    )
+    inpaint: bool = Field(False, description="a baseline: each rendered view is inpainted in 2D inside its mask")
+    lama: str | None = Field(
+        None,
+        description="folder with LaMa's TorchScript file, for that; none: OpenCV's FSR, else Telea",
         json_schema_extra={"weights": True},
     )
     device: Literal["cpu", "cuda"] = Field("cpu", description="where the views are rendered")
@@ -37,46 +47,45 @@ def run(
     masks: Path | None = None,
     reference: Path | None = None,
     personalize: Path | None = None,
+    lift: Path | None = None,
     initialize: Path | None = None,
     distill: Path | None = None,
 ) -> None:
     """Write renders*/, side_by_side/, metrics.json, per_view.csv and scene.ply.
 
     The result is what `distill` made, else `initialize`, else `fit` (a scene with nothing to remove). Training views
-    and test views without a picture are rendered and not scored. `reference` and `personalize` give their seconds only.
+    and test views without a picture are rendered and not scored. `reference`, `personalize` and `lift` give their
+    seconds only.
     """
-    from reffusion import io, lpips, metrics, trace
+    from reffusion import consistency, io, lpips, metrics, paint2d, trace
 
     needs = {"poses": poses, "fit": fit, "masks": masks, "reference": reference, "personalize": personalize}
-    needs |= {"initialize": initialize, "distill": distill}
+    needs |= {"lift": lift, "initialize": initialize, "distill": distill}
     scene = io.load_scene(poses)
     loaded = {net: lpips.load(net, params.lpips_weights) for net in ("vgg", "alex")}
     models = {net: model for net, (model, _) in loaded.items() if model}
-    gaussians = {
-        stage: io.load_ply(needs[stage] / "gaussians.ply").map(lambda p: p.to(params.device))
-        for stage in FOLDERS
-        if needs[stage]
-    }
-    result = list(gaussians)[-1]
+    made = [stage for stage in FOLDERS if needs[stage]]
+    gaussians = {s: io.load_ply(needs[s] / "gaussians.ply").map(lambda p: p.to(params.device)) for s in made}
+    result = made[-1]
+    painter = paint2d.load(params.lama, params.device) if params.inpaint else None
 
     names, kind = views_of(scene)
-    rows = []
+    rows, before = [], None
     for index in trace.progress(len(names), "evaluate"):
         camera, file = scene.cameras[names[index]], f"{names[index]}.png"
         pictures = {stage: drawn(gaussians[stage], camera, out / FOLDERS[stage] / file) for stage in gaussians}
-        io.save_image(out / "renders" / file, pictures[result])
-        truth = truth_of(camera, poses) if kind == "test" else None
-        box = metrics.mask_box(mask_of(camera, poses, masks), params.box_dilation)
-        panels = [p for p in (pictures["fit"], truth, pictures[result]) if p is not None]
+        shown = seen(gaussians[result], camera, pictures[result], mask_of(camera, poses, masks))
+        if painter:
+            depth = consistency.depth_through(shown.depth, shown.mask)
+            shown = shown._replace(picture=painter.paint(shown.picture, shown.mask), depth=depth)
+        io.save_image(out / "renders" / file, shown.picture)
+        if before:
+            rows[-1] |= dict(zip(CONSISTENCY, consistency.difference(before, shown), strict=True))
+        before, truth = shown, truth_of(camera, poses) if kind == "test" else None
+        box = metrics.mask_box(shown.mask, params.box_dilation)
+        panels = [p for p in (pictures["fit"], truth, shown.picture) if p is not None]
         io.save_image(out / "side_by_side" / file, metrics.side_by_side(panels, box))
-        row = {"view": camera.name, "width": camera.width, "height": camera.height}
-        row |= dict(zip(("left", "top", "right", "bottom"), box or (None,) * 4, strict=True))
-        if truth is not None:
-            row |= metrics.score_view(pictures[result], truth, box, models)
-            if initialize:
-                scores = metrics.score_view(pictures["initialize"], truth, box, models)
-                row |= {f"initialize_{column}": value for column, value in scores.items()}
-        rows.append(row)
+        rows.append(row_of(shown, pictures.get("initialize"), truth, box, models))
 
     (out / "per_view.csv").write_text(metrics.table(rows))
     io.save_ply(out / "scene.ply", gaussians[result], similarity=scene.similarity)
@@ -84,18 +93,57 @@ def run(
         **metrics.summary(rows),
         "rendered": f"{len(names)} {kind} views",
         "result": result,
+        "consistency": consistency_of(rows),
+        **used(painter and painter.name, distill),
         "lpips_unavailable": "; ".join(reason for _, reason in loaded.values() if reason) or None,
         "gaussians": {stage: len(value) for stage, value in gaussians.items()},
         "seconds": seconds(needs),
-        "protocol": {
-            **metrics.PROTOCOL,
-            "box_dilation": params.box_dilation,
-            "resolution": sorted({f"{row['width']}x{row['height']}" for row in rows}),
-            "lpips_weights": {name: digest for model in models.values() for name, digest in model.files.items()},
-            "versions": metrics.versions(),
-        },
+        "protocol": protocol(params, rows, models),
     }
     io.save_json(out / "metrics.json", summary)
+
+
+def row_of(
+    shown: Shown, initial: np.ndarray | None, truth: np.ndarray | None, box: Box | None, models: dict[str, Lpips]
+) -> dict[str, Any]:
+    """A view's line of per_view.csv: its box, and its scores and the initialization's where there is a truth."""
+    from reffusion import metrics
+
+    camera = shown.camera
+    row = {"view": camera.name, "width": camera.width, "height": camera.height} | dict.fromkeys(CONSISTENCY)
+    row |= dict(zip(("left", "top", "right", "bottom"), box or (None,) * 4, strict=True))
+    if truth is not None:
+        row |= metrics.score_view(shown.picture, truth, box, models)
+        if initial is not None:
+            scores = metrics.score_view(initial, truth, box, models)
+            row |= {f"initialize_{column}": value for column, value in scores.items()}
+    return row
+
+
+def consistency_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """{"mean", "share"}: means over the pairs of neighbours; {"pairs"}: those that could be compared; the protocol."""
+    from reffusion import consistency, metrics
+
+    difference, share = ([row[name] for row in rows] for name in CONSISTENCY)
+    return {
+        "mean": metrics.mean(difference),
+        "share": metrics.mean(share),
+        "pairs": sum(value is not None for value in difference),
+        "protocol": consistency.PROTOCOL,
+    }
+
+
+def protocol(params: Params, rows: list[dict[str, Any]], models: dict[str, Lpips]) -> dict[str, Any]:
+    """All that the numbers depend on, in words and versions."""
+    from reffusion import metrics
+
+    return {
+        **metrics.PROTOCOL,
+        "box_dilation": params.box_dilation,
+        "resolution": sorted({f"{row['width']}x{row['height']}" for row in rows}),
+        "lpips_weights": {name: digest for model in models.values() for name, digest in model.files.items()},
+        "versions": metrics.versions(),
+    }
 
 
 def views_of(scene: Scene) -> tuple[tuple[str, ...], str]:
@@ -133,15 +181,38 @@ def truth_of(camera: Camera, poses: Path) -> np.ndarray | None:
 
 
 def mask_of(camera: Camera, poses: Path, masks: Path | None) -> np.ndarray:
-    """bool [H, W]: the view's test mask, else its consistent mask, else empty."""
+    """bool [H, W]: the view's test mask, else its consistent mask, else (a variant without the stage masks) its raw
+    mask, else empty. Where there are test masks, every variant is so scored in the same box."""
     import numpy as np
 
     from reffusion import io
 
-    size, given = (camera.height, camera.width), poses / "test_masks" / f"{camera.name}.png"
-    if given.exists():
-        return io.load_mask(given, size)
-    return io.load_mask(masks / "consistent" / f"{camera.name}.png", size) if masks else np.zeros(size, bool)
+    size, file = (camera.height, camera.width), f"{camera.name}.png"
+    given = [poses / "test_masks" / file, *([masks / "consistent" / file] if masks else []), poses / "masks" / file]
+    found = [path for path in given if path.exists()]
+    return io.load_mask(found[0], size) if found else np.zeros(size, bool)
+
+
+def seen(gaussians: Gaussians, camera: Camera, picture: np.ndarray, mask: np.ndarray) -> Shown:
+    """The view with its rendered depth, for the comparison with its neighbour."""
+    import numpy as np
+    import torch
+
+    from reffusion import consistency, splat
+
+    with torch.no_grad():
+        drawing = splat.render(gaussians, camera, sh_degree=0)
+    depth, alpha = drawing.depth.double().cpu().numpy(), drawing.alpha.cpu().numpy()
+    return consistency.Shown(camera, picture, np.where(alpha > consistency.SOLID, depth, 0.0), mask)
+
+
+def used(painter: str | None, distill: Path | None) -> dict[str, str | None]:
+    """{"inpainter", "perceptual"}: what painted in 2D and what compared patches, None where nothing did."""
+    from reffusion import io
+
+    facts = distill / "facts.json" if distill else None
+    said = io.load_json(facts) if facts and facts.exists() else {}
+    return {"inpainter": painter or said.get("inpainter"), "perceptual": said.get("perceptual")}
 
 
 def seconds(needs: dict[str, Path | None]) -> dict[str, float]:

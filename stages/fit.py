@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -48,22 +50,25 @@ class Params(BaseModel):
     flow_cell: int = Field(0, ge=0, description="start also from a flow point per cell of so many px a side; 0: none")
     start_opacity: float = Field(0.1, gt=0, lt=1, description="of the Gaussians at the points")
     start_size: float = Field(1.0, gt=0, description="their deviation over the way to the next points (3DGS: 1)")
+    pixels: Literal["all", "unmasked"] = Field(
+        "all", description="those that supervise; unmasked, a baseline: masked pixels are never looked at (Masked NeRF)"
+    )
     holdout: int = Field(0, ge=0, description="every so manieth training view is only measured; 0 = none")
     device: Literal["cpu", "cuda"] = Field("cpu", description="where to compute")
 
 
 def preview(params: Params, *, poses: Path) -> list[str]:
-    given = poses is not None and (poses / "gaussians.ply").exists()
+    given = poses is not None and (poses / "gaussians.ply").exists() and params.pixels == "all"
     return ["takes over the scene's gaussians.ply: no optimisation"] if given else []
 
 
 def run(params: Params, out: Path, *, poses: Path) -> None:
     import time
 
-    from reffusion import io, trace
+    from reffusion import io, paint2d, trace
     from reffusion.fit import fit
 
-    if (poses / "gaussians.ply").exists():
+    if (poses / "gaussians.ply").exists() and params.pixels == "all":
         io.save_ply(out / "gaussians.ply", io.load_ply(poses / "gaussians.ply"))
         return
     began, scene = time.monotonic(), io.load_scene(poses)
@@ -71,16 +76,19 @@ def run(params: Params, out: Path, *, poses: Path) -> None:
     held_out = scene.train[params.holdout // 2 :: params.holdout] if params.holdout else ()
     cameras = [scene.cameras[name] for name in scene.train if name not in held_out]
     images, chosen = io.load_views(poses, scene.train), settings(params, cameras)
+    hidden = hidden_pixels(poses, scene) if params.pixels == "unmasked" else {}
+    images |= {name: paint2d.telea(images[name], mask) for name, mask in hidden.items()}  # flow looks at them too
     if (out / trace.CHECKPOINT).exists():  # of what it starts from only the degree and the device still matter
         points, colors = scene.points, scene.point_colors
     else:
-        points, colors = start_points(params, scene, cameras, images)
+        points, colors = start_points(params, scene, cameras, images, hidden)
     gaussians = fit(
         cameras,
         images,
         start(params, points, colors, chosen.budget),
         chosen,
         folder=out,
+        weights={name: (~mask).astype("float32") for name, mask in hidden.items()},
         held_out=[scene.cameras[name] for name in held_out],
         spent=time.monotonic() - began,
     )
@@ -100,17 +108,38 @@ def supported(params: Params, scene: Scene) -> Params:
     return params.model_copy(update={"sh_degree": degree})
 
 
-def start_points(params: Params, scene: Scene, cameras: list[Camera], images: dict[str, np.ndarray]):
-    """Positions [P, 3] and colours [P, 3] uint8: the scene's sparse points, and the flow points of these views."""
+def hidden_pixels(poses: Path, scene: Scene) -> dict[str, np.ndarray]:
+    """View name -> bool [H, W], its raw mask; none for a view without one, or one marked clean."""
+    from reffusion import io
+
+    masks = io.load_raw_masks(poses, [name for name in scene.train if name not in scene.clean])
+    if not masks:
+        raise ValueError(f"{poses / 'masks'}: fit.pixels is 'unmasked', but the scene has no masks")
+    return masks
+
+
+def start_points(
+    params: Params,
+    scene: Scene,
+    cameras: list[Camera],
+    images: dict[str, np.ndarray],
+    hidden: Mapping[str, np.ndarray] = MappingProxyType({}),
+):
+    """Positions [P, 3] and colours [P, 3] uint8: the scene's sparse points, and the flow points of these views.
+
+    Points that most views show inside `hidden` are left out: no pixel would ever move them.
+    """
     import numpy as np
 
-    from reffusion import stereo
+    from reffusion import masks, stereo
 
-    if not params.flow_cell:
-        return scene.points, scene.point_colors
-    points, colors = stereo.dense_points(cameras, images, params.flow_cell)
-    print(f"{len(points)} points by optical flow beside {len(scene.points)}", flush=True)
-    return np.concatenate([scene.points, points]), np.concatenate([scene.point_colors, colors])
+    points, colors = scene.points, scene.point_colors
+    if params.flow_cell:
+        found, found_colors = stereo.dense_points(cameras, images, params.flow_cell)
+        print(f"{len(found)} points by optical flow beside {len(points)}", flush=True)
+        points, colors = np.concatenate([points, found]), np.concatenate([colors, found_colors])
+    keep = ~masks.points_inside(points, cameras, hidden)
+    return points[keep], colors[keep]
 
 
 def start(params: Params, points: np.ndarray, colors: np.ndarray, budget: int) -> Gaussians:

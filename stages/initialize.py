@@ -11,6 +11,12 @@ from pydantic import BaseModel, ConfigDict, Field
 class Params(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    start: Literal["reference", "lift", "random", "nothing"] = Field(
+        "reference",
+        description="what fills the hole: the reference on its depth; instead (baselines) the picture that the stage "
+        "lift painted of the best view, Gaussians at random (reffusion.scatter), or nothing: it only removes",
+    )
+    random_gaussians: int = Field(0, ge=0, description="their number, started at random; 0: as many as were removed")
     leak: float = Field(1.0, gt=0, description="weight in never-seen over other pixels from which Gaussians are haze")
     overlap: float = Field(0.006, ge=0, description="how far new Gaussians reach beyond the hole, / image width")
     covered: float = Field(0.9, gt=0, le=1, description="alpha below which the reference also fills pixels of C")
@@ -50,7 +56,9 @@ class Params(BaseModel):
     color_steps: int = Field(5, ge=0, description="corrections of their colours until the reference is reproduced")
 
 
-def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, reference: Path | None) -> None:
+def run(
+    params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, reference: Path | None, lift: Path | None = None
+) -> None:
     import torch
 
     from reffusion import initialize, io
@@ -59,10 +67,14 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
     gaussians, labels = io.load_ply(fit / "gaussians.ply"), io.load_labels(masks / "labels.npy")
     if len(labels) != len(gaussians):
         raise ValueError(f"{masks}: {len(labels)} labels for {len(gaussians)} Gaussians of {fit}: run masks again")
+    removed = gaussians.map(lambda p: p[labels])
     gaussians = gaussians.map(lambda p: p[~labels])
     new = torch.zeros(len(gaussians), dtype=torch.bool)
     scene = io.load_scene(poses)
-    references = io.load_references(reference, scene) if reference else []
+    if params.start == "lift" and lift is None:
+        raise ValueError("initialize.start is 'lift', but the stage lift was left out: set distill.lift_weight")
+    completed = {"reference": reference, "lift": lift}.get(params.start)
+    references = io.load_references(completed, scene) if completed else []
     sets = io.load_mask_sets(masks, scene.cameras)
     train = [scene.cameras[name] for name in scene.train]
     haze = voting.leaking(gaussians, train, {c.name: sets[c.name].never_seen for c in train}, params.leak)
@@ -73,6 +85,10 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
         gaussians, new = filled(
             params, out, gaussians, new, each, sets[each.camera.name].consistent, scene.points, views
         )
+    if params.start == "random" and any(each.invent.any() for each in sets.values()):
+        added = at_random(params, removed, gaussians, scene, sets, poses)
+        gaussians = gaussians.zipped(added, lambda a, b: torch.cat([a, b]))
+        new = torch.cat([new, torch.ones(len(added), dtype=torch.bool)])
     io.save_ply(out / "gaussians.ply", gaussians)
     io.save_labels(out / "labels.npy", new)
     asked = covered = 0
@@ -85,6 +101,24 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
     io.save_json(out / "facts.json", facts)
     if references and facts["uncovered_share"] > 0.05:
         print(f"{facts['uncovered_share']:.0%} of the invent masks is covered by no reference: add another view's")
+
+
+def at_random(params: Params, removed, remaining, scene, sets, poses: Path):
+    """Gaussians at random in the region of the hole: that of the removed ones, or the box that the scene names."""
+    from reffusion import io, scatter, trace
+
+    region, train = poses / "region.json", [scene.cameras[name] for name in scene.train]
+    if region.exists():
+        box = scatter.box_around(**io.load_json(region))
+    elif len(removed):
+        box = scatter.box_of(removed.means.double().numpy())
+    else:
+        raise ValueError("initialize.start is 'random', but no Gaussian was removed: nothing says where the hole is")
+    invents = {camera.name: sets[camera.name].invent for camera in train if sets[camera.name].invent.any()}
+    count = params.random_gaussians or max(len(removed), scatter.FEWEST)
+    points = scatter.points_in(box, count, train, invents, trace.generator(params.seed, "initialize", "random"))
+    draw = trace.generator(params.seed, "initialize", "random colours")
+    return scatter.gaussians_at(points, remaining.sh.shape[1], remaining.antialiased, draw)
 
 
 def filled(params: Params, out: Path, gaussians, new, reference, hidden, points, views):

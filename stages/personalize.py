@@ -16,7 +16,7 @@ class Params(BaseModel):
         description="inpainting prior: a diffusers folder, or the name of one on the hub",
         json_schema_extra={"weights": True},
     )
-    steps: int = Field(2000, ge=1, description="optimiser steps")
+    steps: int = Field(2000, ge=0, description="optimiser steps; 0 leaves the stage out: the prior stays as it is")
     lr_unet: float = Field(2e-4, gt=0, description="AdamW learning rate of the UNet's LoRA")
     lr_text: float = Field(4e-5, gt=0, description="AdamW learning rate of the text encoder's LoRA")
     rank: int = Field(8, ge=1, description="LoRA rank")
@@ -54,6 +54,8 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
     from reffusion import personalize as P
     from reffusion import prior as diffusion
 
+    if not params.steps:
+        raise ValueError("personalize.steps is 0: there is nothing to learn, leave the stage out")
     scene = io.load_scene(poses)
     sampling = P.Sampling(
         params.local_share,

@@ -69,7 +69,7 @@ def inpainted(params: Params, out: Path, scene, poses: Path, fit: Path, masks: P
     in C where other views saw the background, the prior's own in I. Also writes the sheet of candidates."""
     import torch
 
-    from reffusion import exposure, inpaint, io, splat
+    from reffusion import exposure, inpaint, io
     from reffusion import prior as diffusion
     from reffusion.types import Reference
 
@@ -78,9 +78,9 @@ def inpainted(params: Params, out: Path, scene, poses: Path, fit: Path, masks: P
         raise ValueError(f"reference.choose is {params.choose}, but candidates are counted 0..{params.candidates - 1}")
     camera, pixels = scene.cameras[name], io.load_mask_sets(masks, [name])[name]
     keep = ~io.load_labels(masks / "labels.npy")
-    background = splat.render(io.load_ply(fit / "gaussians.ply").map(lambda p: p[keep]), camera).color
-    photo = torch.from_numpy(exposure.load_views(poses, fit, [name])[name]).float() / 255
-    base = torch.where(torch.from_numpy(pixels.consistent)[..., None], background, photo).clamp(0, 1)
+    remaining = io.load_ply(fit / "gaussians.ply").map(lambda p: p[keep])
+    photo = exposure.load_views(poses, fit, [name])[name]
+    base = torch.from_numpy(inpaint.background(remaining, camera, photo, pixels.consistent)).float() / 255
 
     prior = diffusion.load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
     hole = torch.from_numpy(pixels.invent)

@@ -317,6 +317,17 @@ def test_left_out_and_provided(root, capsys):
     assert said["masks"] == "skip the scene has no masks" and said["distill"].startswith("skip")
 
 
+def test_the_scenes_own_file_stands_for_a_stage_only_while_its_parameter_allows(root, capsys):
+    edit(root / "pipeline.yaml", "artifact: poses}", "artifact: poses, param: fit.rate, equals: 2}")
+    write(root, {"data/toy/scene.yaml": "gaussians: mine.ply\n", "data/toy/mine.ply": "50"})
+    assert words(root)["fit"] == "provided the scene brings `gaussians`"
+    ran(capsys, root, set="fit.rate=3")
+    assert words(root, set="fit.rate=3")["fit"] == "cached" and result(root) == 13.0  # 3 steps of 3, and the scene's 4
+    edit(root / "pipeline.yaml", "param: fit.rate", "param: fit.rat")
+    with pytest.raises(Refused, match=r"a condition asks for fit\.rat, which is not there"):
+        words(root)
+
+
 def test_scene_yaml_stages_rerun_only_their_stage(root, capsys):
     write(root, {"data/toy/scene.yaml": "profile: laptop\nstages: {distill: {gain: 3}}\n"})
     assert ran(capsys, root) == ["distill", "evaluate"]

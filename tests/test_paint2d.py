@@ -1,0 +1,107 @@
+"""2D inpainters: only the hole changes, what lies in it is not looked at, LaMa's module is fed as it expects."""
+
+import numpy as np
+import pytest
+import torch
+
+from reffusion import paint2d, perceptual
+from reffusion.trace import generator
+
+HEIGHT, WIDTH = 37, 50
+
+
+class Mean(torch.nn.Module):
+    """Stands in for LaMa: paints the mean of what it is shown outside the mask, half a unit apart by its size."""
+
+    def forward(self, image: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+        assert image.size(2) % 8 == 0 and image.size(3) % 8 == 0
+        assert mask.size(1) == 1 and image.size(2) == mask.size(2)
+        shown = (image * (1 - mask)).sum([2, 3], keepdim=True) / (1 - mask).sum()
+        return image * (1 - mask) + shown * mask
+
+
+class Broken(torch.nn.Module):
+    def forward(self, image: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+        return image[:, :, 1:]
+
+
+def picture():
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    return np.stack([3 * rows, 4 * columns, 100 + 0 * rows], -1).astype(np.uint8)
+
+
+def hole():
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    mask[12:24, 15:36] = True
+    return mask
+
+
+def painters(folder):
+    torch.jit.script(Mean()).save(folder / "any-name.pt")
+    return [paint2d.load(folder), paint2d.load(folder / "any-name.pt"), paint2d.load(),
+            paint2d.Painter("telea", paint2d.telea)]  # fmt: skip
+
+
+def test_only_the_hole_changes_and_its_content_does_not_count(tmp_path):
+    image, noise = picture(), np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+    poisoned = np.where(hole()[..., None], noise, image)
+    for painter in painters(tmp_path):
+        painted = painter.paint(image, hole())
+        assert (painted[~hole()] == image[~hole()]).all() and painted.dtype == np.uint8, painter.name
+        assert (painter.paint(poisoned, hole()) == painted).all(), painter.name
+        assert (painter.paint(image, np.zeros_like(hole())) == image).all(), painter.name
+
+
+def test_a_smooth_picture_is_continued():
+    for painter in (paint2d.load(), paint2d.Painter("telea", paint2d.telea)):
+        error = np.abs(painter.paint(picture(), hole()).astype(int) - picture())[hole()]
+        assert error.mean() < 12, painter.name
+
+
+def test_large_pictures_are_painted_small_by_fsr():
+    rows, columns = np.mgrid[:300, :400]
+    image = np.stack([rows // 3, columns // 3, 0 * rows + 50], -1).astype(np.uint8)
+    mask = np.zeros((300, 400), bool)
+    mask[100:160, 150:260] = True
+    painted = paint2d.fsr(image, mask)
+    assert (painted[~mask] == image[~mask]).all() and np.abs(painted.astype(int) - image)[mask].mean() < 10
+
+
+def test_lama_is_fed_and_named(tmp_path):
+    lama, named, fallback, _ = painters(tmp_path)
+    assert lama.name == named.name == "LaMa (any-name.pt)" and fallback.name.startswith("OpenCV")
+    painted = lama.paint(picture(), hole())[hole()]
+    assert (painted == painted[0]).all() and abs(int(painted[0, 2]) - 100) <= 1
+
+
+def test_weights_that_are_none_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"holds 0 .pt files; name the folder of one"):
+        paint2d.load(tmp_path)
+    (tmp_path / "a.pt").write_text("no module")
+    with pytest.raises(ValueError, match=r"a.pt is no TorchScript module"):
+        paint2d.load(tmp_path)
+    torch.jit.script(Broken()).save(tmp_path / "a.pt")
+    with pytest.raises(ValueError, match="the module's answer"):
+        paint2d.load(tmp_path).paint(picture(), hole())
+    (tmp_path / "b.pt").write_text("another")
+    with pytest.raises(ValueError, match="holds 2"):
+        paint2d.load(tmp_path)
+
+
+def test_the_stand_in_for_lpips_is_named_as_such_and_measures_structure(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    name, distance = perceptual.load()
+    assert name.startswith("multi-scale D-SSIM (no backbone for LPIPS (vgg)")
+    target = torch.rand(32, 32, 3, generator=generator(0))
+    assert float(distance(target, target)) == pytest.approx(0, abs=1e-5)
+    brighter, other = target * 0.8 + 0.2, torch.rand(32, 32, 3, generator=generator(1))
+    assert 0 < float(distance(brighter, target)) < 0.3 < float(distance(other, target))
+    render = other.clone().requires_grad_()
+    distance(render, target).backward()
+    step = 1e-3 * torch.randn(32, 32, 3, generator=generator(2))
+    told = float((render.grad * step).sum())
+    found = float(distance(other + step, target) - distance(other - step, target))
+    assert found == pytest.approx(2 * told, rel=0.05)
+    with pytest.raises(ValueError, match="11 px"):
+        distance(target[:10], target[:10])

@@ -1,0 +1,340 @@
+"""The variants of pipeline.yaml: what each leaves out and shares, which Gaussians its terms reach, and that it runs."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import small_scene as small
+import torch
+from small_capture import prepare as write_capture
+from small_capture import some_truth
+from small_prior import save_small_prior
+from test_distill import hole, leaves, reached, sight, wall
+
+from reffusion import distill as D
+from reffusion import io, perceptual, scatter, trace
+from reffusion.lift import Lift, lift_term
+from reffusion.types import PARAMETERS, Reference
+from runner.job import Job, Request, prepare
+from runner.pipeline import load_pipeline
+from runner.plan import Decision, decide
+from stages import distill, evaluate, fit, initialize, lift, masks
+
+ROOT = Path(__file__).resolve().parent.parent
+NEAR = 1.7
+
+# Variant -> (stages that run, stages left out beside `lift`); all others are shared with the scene's own run.
+AFTER = ("distill", "evaluate")
+FILLED = ("reference", "personalize", "initialize", "distill")
+PLANS = {
+    "no_personalization": (AFTER, ("personalize",)),
+    "no_splitting": (AFTER, ()),
+    "no_local_sds": (AFTER, ()),
+    "no_reference_init": (("initialize", *AFTER), ()),
+    "no_sds": (AFTER, ("personalize",)),
+    "masked": (("fit", "evaluate"), ("masks", *FILLED)),
+    "remove_only": (("initialize", "evaluate"), ("reference", "personalize", "distill")),
+    "inpaint_2d": (("evaluate",), FILLED),
+    "lift_mse": (("lift", "initialize", *AFTER), ("personalize",)),
+    "lift_perceptual": (("lift", "initialize", *AFTER), ("personalize",)),
+    "lift_perceptual_diffusion": (("lift", "initialize", *AFTER), ("personalize",)),
+    "sds_plain": (("initialize", *AFTER), ("personalize",)),
+    "reference_guided": (AFTER, ("personalize",)),
+}
+
+
+# ------------------------------------------------------------------------------------------------------- the plans
+
+
+def decisions(job: Job) -> dict[str, Decision]:
+    said: dict[str, Decision] = {}
+    for stage in job.pipeline.stages:
+        said[stage] = decide(job, stage, said)
+    return said
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    """A small scene, and runs/ as its own run would leave it, as far as the runner looks."""
+    home = tmp_path_factory.mktemp("variants")
+    scene, runs = write_capture(home / "scene", "llff", some_truth()), home / "runs"
+    job, said = prepare(Request(ROOT, runs, str(scene), profile="laptop")), {}
+    for stage in job.pipeline.stages:
+        said[stage] = decide(job, stage, said)
+        if said[stage].word == "run":
+            place = runs / "scene" / stage
+            (place / "masks").mkdir(parents=True)
+            (place / "masks" / "v00.png").write_text(stage)
+            (place / "facts.json").write_text(json.dumps({"invent_pixels": 7}))
+            inputs = said[stage].inputs
+            receipt = asdict(inputs) | {"key": inputs.key, "output": job.hashes.folder(place)}
+            (place / "receipt.json").write_text(json.dumps(receipt))
+            said[stage] = decide(job, stage, said)
+    assert [s for s, d in said.items() if d.word != "cached"] == ["lift"]
+    return scene, runs
+
+
+def test_every_variant_has_a_plan_here():
+    ours = set(load_pipeline(ROOT).variants)
+    assert set(PLANS) <= ours, "a variant is gone"
+    text = (ROOT / "docs" / "baselines.md").read_text()
+    assert all(f"`{name}`" in text for name in ours), "a variant is not described in docs/baselines.md"
+
+
+@pytest.mark.parametrize("variant", PLANS)
+def test_a_variant_runs_what_it_changes_and_shares_the_rest(capture, variant):
+    scene, runs = capture
+    said = decisions(prepare(Request(ROOT, runs, str(scene), profile="laptop", variant=variant)))
+    runs_here, left_out = PLANS[variant]
+    assert {s for s, d in said.items() if d.word == "skip"} == {*left_out, *({"lift"} - set(runs_here))}
+    assert {s for s, d in said.items() if d.word in ("run", "stale", "undecided")} == set(runs_here)
+    shared = {s for s, d in said.items() if d.word == "cached"}
+    assert shared == set(said) - set(runs_here) - set(left_out) - {"lift"}
+    assert all(said[s].reason == "shared with scene" for s in shared)
+
+
+def test_the_papers_profile_takes_every_variant(capture):
+    scene, runs = capture
+    for variant in ("lift_perceptual_diffusion", "sds_plain"):
+        prepare(Request(ROOT, runs, str(scene), profile="paper", variant=variant))
+
+
+# ------------------------------------------------------------------------------------------ what the terms may reach
+
+MSE, PATCHES = Lift(1.0), Lift(1.0, perceptual.multi_scale_dssim, 20)
+
+
+def lifted(name="a", shift=0.0):
+    view = sight(name, shift)
+    return replace(view, lifted=torch.rand(view.photo.shape, generator=trace.generator(4, name)))
+
+
+@pytest.mark.parametrize("how", [MSE, PATCHES], ids=["mse", "patches"])
+def test_lifted_pictures_reach_the_gaussians_they_may_and_no_other(how):
+    start, masked = wall()
+    for allowed in (masked, torch.ones_like(masked)):
+        gaussians = leaves(start)
+        loss, rendering = lift_term(gaussians, allowed, lifted(), how, trace.generator(1))
+        loss.backward()
+        got = reached(gaussians)
+        assert not got[~allowed].any() and (got & masked & (rendering.radii > 0)).any()
+    assert got[~masked].any(), "unconfined it reaches the unmasked ones"
+
+
+def test_the_squared_error_is_that_of_the_holes_pixels():
+    (gaussians, masked), view = wall(), lifted()
+    loss, rendering = lift_term(gaussians, masked, view, MSE, trace.generator(1))
+    expected = ((rendering.color - view.lifted)[hole()] ** 2).mean()
+    assert float(loss) == pytest.approx(float(expected))
+    outside = torch.where(hole()[..., None], view.lifted, float("nan"))
+    again, _ = lift_term(gaussians, masked, replace(view, lifted=outside), MSE, trace.generator(1))
+    assert float(again) == float(loss), "pixels outside the hole were looked at"
+
+
+def moved(start, ended):
+    return torch.stack([(getattr(ended, n) != getattr(start, n)).flatten(1).any(1) for n in PARAMETERS[:3]]).any(0)
+
+
+def run_distill(folder, views, **settings):
+    folder.mkdir()
+    settings = D.Settings(**{"iterations": 3, "sds_weight": 0.0, "region_every": 1, **settings})
+    (start, masked), holes = wall(), [(sight().camera, sight().photo, hole())]
+    ended, labels = D.distill(start, masked, views, holes, None, None, settings, folder)
+    return start, ended, masked, labels
+
+
+def test_distillation_carries_lifted_pictures_to_masked_gaussians_only(tmp_path):
+    views = [lifted("a"), lifted("b", 0.1)]
+    start, ended, masked, _ = run_distill(tmp_path / "x", views, lift=MSE, reconstruction_every=0)
+    assert moved(start, ended)[masked].any() and not moved(start, ended)[~masked].any()
+    assert trace.read_trace(tmp_path / "x" / "trace.jsonl")[-1]["lift"] > 0
+    with pytest.raises(ValueError, match="pictures of the stage lift"):
+        run_distill(tmp_path / "y", [sight()], lift=MSE)
+
+
+@pytest.mark.parametrize("confined", [True, False])
+def test_without_confinement_every_term_reaches_all_gaussians(tmp_path, confined):
+    views = [sight("a"), sight("b", 0.1)]
+    photographs = {"confined": confined, "reference_weight": 0.0}
+    start, ended, masked, labels = run_distill(tmp_path / "photographs", views, **photographs)
+    assert moved(start, ended)[~masked].any() and moved(start, ended)[masked].any() != confined
+    reference = {"confined": confined, "reference_weight": 1.0, "reconstruction_every": 0}
+    start, ended, masked, _ = run_distill(tmp_path / "reference", views, **reference)
+    assert moved(start, ended)[masked].any() and moved(start, ended)[~masked].any() != confined
+    assert (labels == masked).all()
+
+
+# ---------------------------------------------------------------------------------------------------- the stages
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene")
+    poses, fitted, _ = small.write(folder, NEAR)
+    found = {"poses": poses, "fit": fitted, "masks": folder / "masks"}
+    found["masks"].mkdir()
+    masks.run(masks.Params(), found["masks"], poses=poses, fit=fitted)
+    return found
+
+
+@pytest.fixture(scope="module")
+def painted(scene, tmp_path_factory):
+    out = tmp_path_factory.mktemp("lift")
+    lift.run(lift.Params(), out, **scene)
+    return out
+
+
+def initialized(scene, out, start, **needs):
+    out.mkdir()
+    needs = {"reference": None, **needs}
+    initialize.run(initialize.Params(start=start), out, **scene, **needs)
+    return io.load_ply(out / "gaussians.ply"), io.load_labels(out / "labels.npy")
+
+
+def test_lift_paints_the_hole_of_every_view_and_names_the_painter(scene, painted):
+    sets, facts = io.load_mask_sets(scene["masks"], small.TRAIN), io.load_json(painted / "facts.json")
+    assert facts["views"] == 5 and facts["inpainter"].startswith("OpenCV")
+    for name in small.TRAIN:
+        view, found = small.CAMERAS[name], io.load_image(painted / "images" / f"{name}.png")
+        assert (found[~sets[name].consistent] == small.photo(view)[~sets[name].consistent]).all()
+        # The square before the wall is red; what is painted continues the wall.
+        error = np.abs(found.astype(int) - small.photo(view))[sets[name].invent]
+        assert error.mean() < 30, name
+    (best,) = io.load_references(painted, io.load_scene(scene["poses"]))
+    assert best.camera.name == io.load_json(scene["masks"] / "facts.json")["best_reference"]
+
+
+def test_lift_goes_on_where_it_was_killed(scene, painted, tmp_path):
+    marked = np.full((small.HEIGHT, small.WIDTH, 3), 7, np.uint8)
+    io.save_image(tmp_path / "images" / "a0.png", marked)
+    (tmp_path / "images" / ".a1.png").write_bytes(b"half a picture")
+    lift.run(lift.Params(), tmp_path, **scene)
+    assert (io.load_image(tmp_path / "images" / "a0.png") == marked).all()
+    for name in ("a1", "a4"):
+        file = Path("images") / f"{name}.png"
+        assert (tmp_path / file).read_bytes() == (painted / file).read_bytes()
+
+
+def test_lift_by_diffusion(scene, tmp_path):
+    save_small_prior(tmp_path / "prior")
+    params = lift.Params(inpainter="diffusion", prior=str(tmp_path / "prior"), steps=1, every=5)
+    (tmp_path / "out").mkdir()
+    lift.run(params, tmp_path / "out", **scene)
+    facts = io.load_json(tmp_path / "out" / "facts.json")
+    assert facts["inpainter"].startswith("diffusion by") and facts["views"] <= 2
+
+
+def test_nothing_is_filled_where_nothing_shall_be(scene, tmp_path):
+    gaussians, new = initialized(scene, tmp_path / "nothing", "nothing", reference=tmp_path / "never read")
+    assert not new.any() and len(gaussians) < len(io.load_ply(scene["fit"] / "gaussians.ply"))
+
+
+def test_random_gaussians_fill_the_region_of_the_hole_by_their_seed(scene, tmp_path):
+    gaussians, new = initialized(scene, tmp_path / "random", "random")
+    removed = io.load_json(tmp_path / "random" / "facts.json")["removed_gaussians"]
+    assert int(new.sum()) == max(removed, scatter.FEWEST)
+    at = gaussians.means[new]
+    # Removed were the square and what of the wall it hides from all views.
+    assert (at[:, :2].abs() < 1.3 * small.HALF).all()
+    assert (at[:, 2] > NEAR - 0.1).all() and (at[:, 2] < small.WALL + 0.1).all()
+    again, _ = initialized(scene, tmp_path / "again", "random")
+    assert (again.means == gaussians.means).all() and (again.sh == gaussians.sh).all()
+
+
+def test_scattered_points_lie_where_the_holes_are():
+    box = scatter.box_of(np.random.default_rng(0).uniform(-1, 1, (4000, 3)))
+    assert np.allclose(box, [[-1.15] * 3, [1.15] * 3], atol=0.05)
+    assert np.allclose(scatter.box_around((0, 1, 2), (2, 2, 4)), [[-1, 0, 0], [1, 2, 4]])
+    view, half = small.CAMERAS["a2"], np.zeros((small.HEIGHT, small.WIDTH), bool)
+    half[:, : small.WIDTH // 2] = True
+    holes, box = ([view], {"a2": half}), scatter.box_around((0, 0, 2), (0.5, 0.5, 0.5))
+    points = scatter.points_in(box, 300, *holes, torch.Generator())
+    assert points.shape == (300, 3) and (points[:, 0] < 0).all()
+    with pytest.raises(ValueError, match="do not meet"):
+        scatter.points_in(scatter.box_around((9, 9, 2), (0.1, 0.1, 0.1)), 9, *holes, torch.Generator())
+
+
+def test_the_chain_of_lifted_pictures(scene, painted, tmp_path, monkeypatch):
+    """The hole of the wall filled from pictures inpainted one by one: nearer to the wall than to nothing."""
+    assert initialized(scene, tmp_path / "initialize", "lift", lift=painted)[1].any()
+    with pytest.raises(ValueError, match=r"set distill.lift_weight"):
+        initialized(scene, tmp_path / "without", "lift")
+    reference = tmp_path / "reference"
+    mask = io.load_mask_sets(scene["masks"], ["a2"])["a2"].invent
+    io.save_references(reference, [Reference(small.CAMERAS["a2"], small.photo(small.CAMERAS["a2"]), mask)])
+    chain = scene | {"reference": reference, "personalize": None, "initialize": tmp_path / "initialize"}
+    for name in ("XDG_CACHE_HOME", "TORCH_HOME"):
+        monkeypatch.setenv(name, str(tmp_path / "nothing"))  # as on a machine without weights
+    for loss, perceptual_name in (("mse", None), ("perceptual", "multi-scale D-SSIM")):
+        params = distill.Params(iterations=4, sds_weight=0, lift_weight=1, lift_loss=loss, lift_patch=24)
+        out = tmp_path / loss
+        out.mkdir()
+        distill.run(params, out, **chain, lift=painted)
+        facts = io.load_json(out / "facts.json")
+        said = facts["perceptual"] and facts["perceptual"].split(" (")[0]
+        assert facts["inpainter"].startswith("OpenCV") and said == perceptual_name
+        assert trace.read_trace(out / "trace.jsonl")[-1]["lift"] > 0
+    out = tmp_path / "evaluate"
+    out.mkdir()
+    evaluate.run(
+        evaluate.Params(), out, **scene, initialize=chain["initialize"], distill=tmp_path / "mse", lift=painted
+    )
+    summary = io.load_json(out / "metrics.json")
+    assert summary["inpainter"].startswith("OpenCV") and summary["perceptual"] is None
+    assert summary["result"] == "distill" and summary["mean"]["psnr_box"] > 20
+    assert summary["consistency"]["pairs"] == 1 and summary["consistency"]["mean"] < 0.05
+
+
+def test_rendered_views_inpainted_in_2d(scene, tmp_path):
+    (tmp_path / "fit").mkdir()
+    (tmp_path / "inpainted").mkdir()
+    evaluate.run(evaluate.Params(), tmp_path / "fit", **scene)
+    evaluate.run(evaluate.Params(inpaint=True), tmp_path / "inpainted", **scene)
+    before, after = (io.load_json(tmp_path / n / "metrics.json") for n in ("fit", "inpainted"))
+    assert before["inpainter"] is None and after["inpainter"].startswith("OpenCV") and after["result"] == "fit"
+    assert after["mean"]["psnr_box"] > before["mean"]["psnr_box"] + 5, "the red square is still there"
+    for name in small.TEST:
+        pictures = [io.load_image(tmp_path / n / "renders" / f"{name}.png") for n in ("fit", "inpainted")]
+        mask = io.load_mask(scene["masks"] / "consistent" / f"{name}.png")
+        assert (pictures[0][~mask] == pictures[1][~mask]).all() and (pictures[0][mask] != pictures[1][mask]).any()
+    raw = io.load_image(tmp_path / "inpainted" / "renders_fit" / "t0.png")
+    assert (raw == io.load_image(tmp_path / "fit" / "renders" / "t0.png")).all()
+
+
+def test_the_masked_fit_never_sees_a_masked_pixel(scene, tmp_path):
+    """Photographs with noise where they are masked, and another object's colour, give the same Gaussians to the bit."""
+    params = fit.Params(iterations=12, pixels="unmasked", sh_degree=0, flow_cell=6, budget=1500, densify_every=4)
+    found = []
+    for seed in (0, 1):
+        poses = small.write(tmp_path / f"scene{seed}", NEAR)[0]
+        for name, mask in io.load_raw_masks(poses, small.TRAIN).items():
+            noise = np.random.default_rng(seed).integers(0, 256, (*mask.shape, 3), np.uint8)
+            picture = np.where(mask[..., None], noise, small.photo(small.CAMERAS[name]))
+            io.save_image(poses / "images" / f"{name}.png", picture)
+        out = tmp_path / f"fit{seed}"
+        out.mkdir()
+        fit.run(params, out, poses=poses)
+        found.append((out / "gaussians.ply").read_bytes())
+    assert found[0] == found[1]
+    means = io.load_ply(out / "gaussians.ply").means
+    assert (means[:, 2] > 1.85).float().mean() > 0.95, "Gaussians stand where the object was"
+
+
+def test_a_masked_fit_needs_masks_and_fits_a_scene_that_brings_gaussians(scene, tmp_path):
+    poses = small.write(tmp_path, NEAR, masks={})[0]
+    with pytest.raises(ValueError, match=r"fit.pixels is 'unmasked', but the scene has no masks"):
+        fit.run(fit.Params(iterations=1, pixels="unmasked"), tmp_path, poses=poses)
+    io.save_ply(poses / "gaussians.ply", small.gaussians(NEAR)[0])
+    assert fit.preview(fit.Params(), poses=poses) and not fit.preview(fit.Params(pixels="unmasked"), poses=poses)
+
+
+def test_the_box_is_the_test_masks_whatever_was_left_out(scene, tmp_path):
+    view, given = small.CAMERAS["a1"], io.load_mask(scene["masks"] / "consistent" / "a1.png")
+    raw = io.load_raw_masks(scene["poses"], ["a1"])["a1"]
+    assert (evaluate.mask_of(view, scene["poses"], scene["masks"]) == given).all()
+    assert (evaluate.mask_of(view, scene["poses"], None) == raw).all()
+    assert not evaluate.mask_of(small.CAMERAS["t0"], scene["poses"], None).any()
