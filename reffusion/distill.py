@@ -47,6 +47,7 @@ class Settings:
         least_opacity: fainter ones are pruned when others are added.
         region_every: steps between prunings of Gaussians that changed region.
         stop_drop: stop when the reference's PSNR falls so many dB under its best, and give the best; 0: never.
+        patience, stop_gain: the same when in so many twentieths of the run it has not gained so many dB; 0: never.
         rates: Adam's step sizes.
         masked_pace: parameter -> factor on them for masked Gaussians.
         epsilon: Adam's; against it a gradient is large or small. At 3DGS's 1e-15 a Gaussian that hardly anything but
@@ -68,6 +69,8 @@ class Settings:
     least_opacity: float = 0.005
     region_every: int = 50
     stop_drop: float = 0.0
+    patience: int = 0
+    stop_gain: float = 0.0
     rates: Rates = field(default_factory=Rates)
     masked_pace: Mapping[str, float] = field(default_factory=dict)
     epsilon: float = 1e-15
@@ -106,11 +109,20 @@ def distill(
     if distilled and (prior is None or text is None):
         raise ValueError("distillation with sds_weight > 0 needs a prior and its prompts' embeddings")
     state = trace.load_checkpoint(folder)
-    start, seconds, best, best_psnr = 0, 0.0, None, -float("inf")
+    start, seconds, best, patience = (
+        0,
+        0.0,
+        None,
+        trace.Patience(settings.patience, settings.stop_gain, settings.stop_drop),
+    )
     if state is not None:
         optimizer.load_state_dict(state["optimizer"])
-        start, seconds, best, best_psnr = (state[k] for k in ("step", "seconds", "best", "best_psnr"))
-    log, saved = trace.Trace(folder, seconds, start + 1), seconds  # a line is numbered by the steps done
+        patience.load_state_dict(state["patience"])
+        start, seconds, best = (state[k] for k in ("step", "seconds", "best"))
+    log, saved = trace.Trace(folder, seconds, start + bool(start)), seconds  # a line is numbered by the steps done
+    if start == 0:
+        with log.paused():
+            log.log(0, reference_psnr=reference_psnr(optimizer.gaussians, holes), **_counts(optimizer))
 
     for step in trace.progress(settings.iterations, "distill", start):
         line = _step(optimizer, step, distilled, sights, holes, prior, text, settings)
@@ -119,20 +131,24 @@ def distill(
             _densify(optimizer, settings, done)
         if region is not None and (done % settings.region_every == 0 or done == settings.iterations):
             optimizer.select(~strays(region, optimizer.gaussians.means.detach(), optimizer.masked))
-        if trace.log_spaced(done, settings.iterations, per_octave=4):
+        if patience.due(done, settings.iterations, per_octave=4):
             with log.paused():
                 psnr = reference_psnr(optimizer.gaussians, holes)
-            counts = {"gaussians": len(optimizer.masked), "masked_gaussians": int(optimizer.masked.sum())}
-            log.log(done, reference_psnr=psnr, **line, **counts)
-            if settings.stop_drop > 0 and psnr > best_psnr:
-                best, best_psnr = _copy(optimizer), psnr
-            if 0 < settings.stop_drop < best_psnr - psnr:
+                end = patience.ends(done, settings.iterations, psnr)
+                log.log(done, reference_psnr=psnr, **line, **_counts(optimizer), **end)
+                if patience.watching and patience.best_at == done:
+                    best = _copy(optimizer)
+            if end and end["reason"] != "finished":
                 return replace(optimizer.gaussians, **{name: best[name] for name in PARAMETERS}), best["masked"]
         if log.seconds - saved > settings.checkpoint_seconds:
             saved = log.seconds
             state = {"optimizer": optimizer.state_dict(), "step": done, "seconds": saved}
-            trace.save_checkpoint(folder, state | {"best": best, "best_psnr": best_psnr})
+            trace.save_checkpoint(folder, state | {"best": best, "patience": patience.state_dict()})
     return optimizer.gaussians.map(Tensor.detach), optimizer.masked
+
+
+def _counts(optimizer: GaussianOptimizer) -> dict[str, int]:
+    return {"gaussians": len(optimizer.masked), "masked_gaussians": int(optimizer.masked.sum())}
 
 
 def _copy(optimizer: GaussianOptimizer) -> dict[str, Tensor]:

@@ -10,9 +10,10 @@ import torch
 
 from reffusion import exposure, io, trace
 from reffusion import fit as fitting
-from reffusion.fit import Settings, fit, initial_gaussians
+from reffusion.fit import Settings, fit
 from reffusion.optimize import Rates
 from reffusion.splat import render
+from reffusion.start import initial_gaussians
 from reffusion.types import PARAMETERS, Camera, Gaussians, Scene, Similarity
 
 WIDTH, HEIGHT = 22, 16
