@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -85,6 +85,7 @@ def depth_behind(
     hidden: np.ndarray,
     points: np.ndarray,
     how: Completion,
+    log: trace.Trace | None = None,
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """The scene without the object in one view: depth [H, W] float64, as rendered where that is known, else made up;
     the same made up everywhere; and how in words.
@@ -99,6 +100,7 @@ def depth_behind(
         hidden: bool [H, W], C of that view: where the object stood.
         points: [P, 3] sparse points of the scene.
         how: parameters.
+        log: gets a series for each solver (docs/traces.md).
 
     Raises:
         ValueError: naming the view, where too little is known around the hole.
@@ -111,17 +113,20 @@ def depth_behind(
     around = grown(hidden | hole, how.ring) & ~(hidden | hole)
     try:
         pixels, values = visible_points(points, camera, around, disparity)
-        source = "sparse points"
+        source, sparse = "sparse points", (pixels, values)
         if len(values) < ENOUGH_POINTS:
             rows, columns = np.nonzero(around & known)
             pixels, values, source = np.stack([columns, rows], 1) + 0.5, disparity[rows, columns], "rendered depth"
         draws = trace.generator(how.seed, "planes", camera.name)
         planar = planes.planar_model(pixels, values, hole.shape, draws, tolerance=how.planar_tolerance)
+        solvers = _Solvers(log, camera.name, *sparse)
+        solvers.solved("planes", planar.disparity)
         said = f"{planar.planes} planes explain {planar.explained:.0%} of {len(values)} {source}"
         if planar.explained >= how.planar_share:
             solved = planar.disparity
         else:
-            solved, said = _continued(disparity, known, reference.image, how), f"{said}: continued smoothly instead"
+            said = f"{said}: continued smoothly instead"
+            solved = _continued(disparity, known, reference.image, how, solvers)
     except ValueError as error:
         raise ValueError(f"reference {camera.name}: {error}") from error
     # Beyond infinity there is nothing: twice the farthest known depth stands in.
@@ -140,12 +145,45 @@ def visible_points(
     return uv[seen], 1.0 / z[seen]
 
 
-def _continued(disparity: np.ndarray, known: np.ndarray, guide: np.ndarray, how: Completion) -> np.ndarray:
+def _continued(
+    disparity: np.ndarray, known: np.ndarray, guide: np.ndarray, how: Completion, solvers: _Solvers
+) -> np.ndarray:
     """The smooth completion; its misfit on known pixels is spread by the bilateral solver, so that rims meet."""
     plate = Plate(how.ring, how.stiffness, how.edge, how.unknowns)
     solver = bilateral.Solver(how.solver_smoothness, how.solver_spatial, how.solver_luma, how.solver_chroma)
     fitted = complete(disparity, known, guide, plate, keep=False)
-    return bilateral.refine(fitted, disparity, known.astype(np.float64), guide, solver)
+    solvers.solved("completion", fitted)
+    refined = bilateral.refine(fitted, disparity, known.astype(np.float64), guide, solver, solvers.iterated)
+    solvers.solved("bilateral", refined, solvers.iterations)
+    return refined
+
+
+class _Solvers:
+    """The trace of the solvers in one view: how far their disparity lies from the sparse points', which none but the
+    planes get to see."""
+
+    def __init__(self, log: trace.Trace | None, view: str, pixels: np.ndarray, values: np.ndarray):
+        self.log, self.view, self.pixels, self.values, self.iterations = log, view, pixels, values, 0
+
+    def _error(self, solved: np.ndarray) -> dict[str, float]:
+        shown, _ = geometry.sample_nearest(solved, self.pixels)
+        relative = shown / self.values - 1
+        return {"disparity_error": float(np.sqrt(np.mean(relative**2)))} if len(relative) else {}
+
+    def iterated(self, iteration: int, look: Callable[[], tuple[np.ndarray, float]]) -> None:
+        """A `bilateral.Watch`."""
+        self.iterations = iteration
+        if self.log is not None and trace.log_spaced(iteration, -1, per_octave=4):
+            with self.log.paused():
+                solved, residual = look()
+                errors = {"residual": residual, **self._error(solved)}
+                self.log.log(iteration, series=f"bilateral {self.view}", **errors)
+
+    def solved(self, solver: str, solved: np.ndarray, iterations: int = 1) -> None:
+        if self.log is not None:
+            with self.log.paused():
+                end = {"of": iterations, "kept": iterations, "reason": "converged"}
+                self.log.log(iterations, series=f"{solver} {self.view}", **self._error(solved), **end)
 
 
 def grown(mask: np.ndarray, fraction: float) -> np.ndarray:

@@ -44,7 +44,7 @@ class Params(BaseModel):
 def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, reference: Path | None) -> None:
     import torch
 
-    from reffusion import initialize, io
+    from reffusion import initialize, io, trace
     from reffusion import masks as voting
 
     gaussians, labels = io.load_ply(fit / "gaussians.ply"), io.load_labels(masks / "labels.npy")
@@ -59,10 +59,11 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
     haze = voting.leaking(gaussians, train, {c.name: sets[c.name].never_seen for c in train}, params.leak)
     gaussians, new = gaussians.map(lambda p: p[~haze]), new[~haze]
     best = io.load_json(masks / "facts.json")["best_reference"]
+    log = trace.Trace(out) if references else None
     for each in sorted(references, key=lambda r: (r.camera.name != best, -int(r.mask.sum()))):
         views = [(camera, sets[camera.name].consistent) for camera in train]
         gaussians, new = filled(
-            params, out, gaussians, new, each, sets[each.camera.name].consistent, scene.points, views
+            params, out, gaussians, new, each, sets[each.camera.name].consistent, scene.points, views, log
         )
     io.save_ply(out / "gaussians.ply", gaussians)
     io.save_labels(out / "labels.npy", new)
@@ -78,7 +79,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
         print(f"{facts['uncovered_share']:.0%} of the invent masks is covered by no reference: add another view's")
 
 
-def filled(params: Params, out: Path, gaussians, new, reference, hidden, points, views):
+def filled(params: Params, out: Path, gaussians, new, reference, hidden, points, views, log):
     """The Gaussians with those of one reference, on what is still empty in its mask, and the labels."""
     from dataclasses import fields
 
@@ -88,7 +89,7 @@ def filled(params: Params, out: Path, gaussians, new, reference, hidden, points,
     how, sheets = (kind(**chosen(kind)) for kind in (initialize.Completion, initialize.Sheets))
     hole = initialize.to_fill(gaussians, new, reference, hidden, params.covered)
     remaining = gaussians.map(lambda p: p[~new])
-    behind, made_up, said = initialize.depth_behind(remaining, reference, hole, hidden, points, how)
+    behind, made_up, said = initialize.depth_behind(remaining, reference, hole, hidden, points, how, log)
     print(f"depth of reference {camera.name}: {said}")
     io.save_exr(out / "depth" / f"{camera.name}.exr", behind.astype("float32"))
     pixels = initialize.grown(hole, params.overlap)
