@@ -122,7 +122,9 @@ def distill(
     log, saved = trace.Trace(folder, seconds, start + bool(start)), seconds  # a line is numbered by the steps done
     if start == 0:
         with log.paused():
-            log.log(0, reference_psnr=reference_psnr(optimizer.gaussians, holes), **_counts(optimizer))
+            psnr, best = reference_psnr(optimizer.gaussians, holes), _copy(optimizer) if patience.watching else None
+            patience.ends(0, settings.iterations, psnr)
+            log.log(0, reference_psnr=psnr, **_counts(optimizer))
 
     for step in trace.progress(settings.iterations, "distill", start):
         line = _step(optimizer, step, distilled, sights, holes, prior, text, settings)

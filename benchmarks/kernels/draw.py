@@ -17,9 +17,11 @@ def draw(diagram: Diagram, path: Path) -> None:
     against_time = diagram.over == "seconds"
     figure = Figure(figsize=(7.2, 4.6) if against_time else (9.6, 4.2), layout="constrained")
     left = figure.subplots() if against_time else figure.subplots(1, 2)
+    long = against_time and min(p.seconds for p in diagram.points) > 10
+    scale, work = (1.0, "seconds") if long else (1e3, "milliseconds of CPU")
     axes = left if against_time else left[0]
     for curve, points in diagram.curves.items():
-        across = [1e3 * p.seconds if against_time else p.x for p in points]
+        across = [scale * p.seconds if against_time else p.x for p in points]
         axes.plot(across, [p.error for p in points], marker=".", label=curve)
         if not against_time:
             left[1].plot(across, [1e3 * p.seconds for p in points], marker=".", label=curve)
@@ -27,8 +29,8 @@ def draw(diagram: Diagram, path: Path) -> None:
             if against_time and point.stands:
                 axes.annotate(point.setting, (x, point.error), textcoords="offset points", xytext=(4, 4), fontsize=7)
             if (point.curve, point.setting) == diagram.default:
-                axes.plot([x], [point.error], "o", mfc="none", mec="black", ms=11, label="default")
-    axes.set(yscale="log", ylabel=diagram.error, xlabel="milliseconds of CPU" if against_time else diagram.over)
+                axes.scatter([x], [point.error], s=120, facecolors="none", edgecolors="black", label="default")
+    axes.set(yscale="log", ylabel=diagram.error, xlabel=work if against_time else diagram.over)
     if against_time or min(p.x for p in diagram.points) > 0:
         axes.set_xscale("log")
     if not against_time:
