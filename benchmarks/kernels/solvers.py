@@ -17,7 +17,7 @@ NOISE = 0.01
 
 
 def picture(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(truth, target, confidence, guide, part): [H, W] disparity of three slanted planes that meet; the same with noise;
+    """(truth, target, confidence, guide, part): [H, W] disparity of three slanted planes that meet; the same, noisy;
     0 in a round hole over their creases, else 1; a picture whose colours change where the planes do; the plane."""
     random = np.random.default_rng(trace.seed_for(seed, "solvers"))
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] / WIDTH
