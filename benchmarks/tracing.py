@@ -1,9 +1,9 @@
 """What tracing costs: `python benchmarks/tracing.py --run runs/demo`.
 
-Pairs of runs of `fit`, `personalize` and `distill` with the laptop profile, one with its trace, one that measures at its
-end only, in turn; CPU time, so that what others do on the machine counts little. Moments are log-spaced, so a short run
-pays more: the pairs take --steps steps (`fit` eight times as many, with every 8th view held out), and the last column is
-what follows for the profile's full length. Ends with code 1 where that is over 3 %.
+Pairs of runs of `fit`, `personalize` and `distill` with the laptop profile, one with its trace, one that measures at
+its end only, in turn; CPU time, so that what others do on the machine counts little. Moments are log-spaced, so a short
+run pays more: the pairs take --steps steps (`fit` eight times as many, with every 8th view held out), and the last
+column is what follows for the profile's full length. Ends with code 1 where that is over 3 %.
 """
 
 from __future__ import annotations

@@ -56,15 +56,20 @@ def relative(value: torch.Tensor, truth: torch.Tensor) -> float:
     return float((value.double() - truth).norm() / truth.norm())
 
 
+def errors(gaussians: Gaussians) -> tuple[float, float]:
+    """Relative errors of float32: of the image, and the worst of the gradients."""
+    (drawn, slopes), (color, gradients) = step(gaussians.map(torch.Tensor.float), "cpu"), step(gaussians, "reference")
+    return relative(drawn, color), max(relative(a, b) for a, b in zip(slopes, gradients, strict=True))
+
+
 def footprint_diagram() -> Diagram:
     points = []
     for sigma in FOOTPRINTS:
-        exact, single = scene(sigma), scene(sigma).map(torch.Tensor.float)
-        color, gradients = step(exact, "reference")
+        single = scene(sigma).map(torch.Tensor.float)
         seconds = cpu_seconds(lambda single=single: step(single, "cpu"), repeats=5)
-        drawn, slopes = step(single, "cpu")
-        worst = max(relative(a, b) for a, b in zip(slopes, gradients, strict=True))
-        points.append(Point("image", f"{sigma:g} px", sigma, relative(drawn, color), seconds))
+        # The median: rarely a contribution of 1/255 stands on the other side of the cut-off in float32.
+        image, worst = np.median([errors(scene(sigma, seed)) for seed in range(3)], 0).tolist()
+        points.append(Point("image", f"{sigma:g} px", sigma, image, seconds))
         points.append(Point("worst gradient", f"{sigma:g} px", sigma, worst, seconds))
     return Diagram(
         "footprint",
@@ -94,22 +99,17 @@ def cutoff_diagram() -> Diagram:
             per_pair = 4.2e-9  # seconds, docs/splatting.md: the oracle's own time knows no cut-off
             seconds, name = per_pair * pairs(), f"1/{1 / cutoff:.0f}"
             worst = max(relative(a, b) for a, b in zip(slopes, gradients, strict=True))
-            points.append(Point("image", name, cutoff, relative(drawn, color), seconds, False))
+            points.append(Point("image", name, cutoff, relative(drawn, color), seconds))
             points.append(Point("worst gradient", name, cutoff, worst, seconds, False))
     finally:
         reference.MIN_ALPHA = original
-    default = next(p for p in points if (p.curve, p.setting) == ("image", "1/255"))
-    dearest = points[0]
     return Diagram(
         "cutoff",
         "Cut-off of faint contributions, float64, footprints of 3 px (work: pairs that blend x 4.2 ns)",
         "relative L2 error against no cut-off",
-        None,
+        ("image", "1/255"),
         points,
-        why=(
-            f"1/255 is 3DGS's and what scenes are exchanged with: error {default.error:.2g} for "
-            f"{default.seconds / dearest.seconds:.0%} of the pairs of {dearest.setting}."
-        ),
+        why="Kept at 1/255, under half a level of 8 bits: it is 3DGS's, and what scenes are exchanged with.",
     )
 
 
@@ -138,10 +138,9 @@ def measured() -> dict[str, tuple[float, float]]:
     torch.set_num_threads(1)
     found = {}
     for sigma in (1.0, 3.0, 10.0):
-        single, (_, gradients) = scene(sigma).map(torch.Tensor.float), step(scene(sigma), "reference")
+        single = scene(sigma).map(torch.Tensor.float)
         seconds = cpu_seconds(lambda single=single: step(single, "cpu"), repeats=9)
-        worst = max(relative(a, b) for a, b in zip(step(single, "cpu")[1], gradients, strict=True))
-        found[f"footprints of {sigma:g} px"] = (worst, seconds)
+        found[f"footprints of {sigma:g} px"] = (errors(scene(sigma))[1], seconds)
     return found
 
 
