@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +11,7 @@ from scipy import ndimage
 
 from reffusion import bilateral, geometry, planes, splat, trace
 from reffusion.depth import Plate, complete
+from reffusion.solverlog import SolverLog
 from reffusion.types import Camera, Gaussians, Reference
 
 ENOUGH_POINTS = 50  # fewer sparse points around the hole, and the rendered depth is asked instead
@@ -119,7 +120,7 @@ def depth_behind(
             pixels, values, source = np.stack([columns, rows], 1) + 0.5, disparity[rows, columns], "rendered depth"
         draws = trace.generator(how.seed, "planes", camera.name)
         planar = planes.planar_model(pixels, values, hole.shape, draws, tolerance=how.planar_tolerance)
-        solvers = _Solvers(log, camera.name, *sparse)
+        solvers = SolverLog(log, camera.name, *sparse)
         solvers.solved("planes", planar.disparity)
         said = f"{planar.planes} planes explain {planar.explained:.0%} of {len(values)} {source}"
         if planar.explained >= how.planar_share:
@@ -146,7 +147,7 @@ def visible_points(
 
 
 def _continued(
-    disparity: np.ndarray, known: np.ndarray, guide: np.ndarray, how: Completion, solvers: _Solvers
+    disparity: np.ndarray, known: np.ndarray, guide: np.ndarray, how: Completion, solvers: SolverLog
 ) -> np.ndarray:
     """The smooth completion; its misfit on known pixels is spread by the bilateral solver, so that rims meet."""
     plate = Plate(how.ring, how.stiffness, how.edge, how.unknowns)
@@ -156,34 +157,6 @@ def _continued(
     refined = bilateral.refine(fitted, disparity, known.astype(np.float64), guide, solver, solvers.iterated)
     solvers.solved("bilateral", refined, solvers.iterations)
     return refined
-
-
-class _Solvers:
-    """The trace of the solvers in one view: how far their disparity lies from the sparse points', which none but the
-    planes get to see."""
-
-    def __init__(self, log: trace.Trace | None, view: str, pixels: np.ndarray, values: np.ndarray):
-        self.log, self.view, self.pixels, self.values, self.iterations = log, view, pixels, values, 0
-
-    def _error(self, solved: np.ndarray) -> dict[str, float]:
-        shown, _ = geometry.sample_nearest(solved, self.pixels)
-        relative = shown / self.values - 1
-        return {"disparity_error": float(np.sqrt(np.mean(relative**2)))} if len(relative) else {}
-
-    def iterated(self, iteration: int, look: Callable[[], tuple[np.ndarray, float]]) -> None:
-        """A `bilateral.Watch`."""
-        self.iterations = iteration
-        if self.log is not None and trace.log_spaced(iteration, -1, per_octave=4):
-            with self.log.paused():
-                solved, residual = look()
-                errors = {"residual": residual, **self._error(solved)}
-                self.log.log(iteration, series=f"bilateral {self.view}", **errors)
-
-    def solved(self, solver: str, solved: np.ndarray, iterations: int = 1) -> None:
-        if self.log is not None:
-            with self.log.paused():
-                end = {"of": iterations, "kept": iterations, "reason": "converged"}
-                self.log.log(iterations, series=f"{solver} {self.view}", **self._error(solved), **end)
 
 
 def grown(mask: np.ndarray, fraction: float) -> np.ndarray:
