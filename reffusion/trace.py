@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from math import floor, inf, log2, log10
+from math import floor, inf, isfinite, log2, log10
 from pathlib import Path
 from typing import Any
 
@@ -90,11 +90,17 @@ class Trace:
             self._since, self._standing = time.perf_counter(), was_standing
 
     def log(self, iteration: int, **errors: float | str) -> None:
-        """Append a line; the clock stands meanwhile. A value that is not finite is a ValueError."""
+        """Append a line; the clock stands meanwhile. FloatingPointError, naming it, for a value that is not finite."""
+        for name, value in errors.items():
+            if not isinstance(value, str) and not isfinite(value):
+                raise FloatingPointError(f"step {iteration}: {name} is {value}")
         with self.paused():
             record = {"seconds": round(self.seconds, 4), "iteration": iteration, **errors}
             with open(self.path, "a") as file:
-                file.write(json.dumps(record, allow_nan=False) + "\n")
+                file.write(json.dumps(record) + "\n")
+        if 0 < iteration < errors.get("of", 0):
+            saved = (errors["of"] - iteration) * record["seconds"] / iteration
+            print(f"ends after {iteration} of {errors['of']} steps: {errors['reason']}; {saved:.0f} s saved")
 
 
 class Patience:

@@ -10,6 +10,7 @@ import pytest
 import small_scene as small
 import torch
 from pydantic import ValidationError
+from safetensors.torch import load_file
 from small_prior import save_small_prior
 
 from benchmarks.kernels import gate
@@ -62,6 +63,20 @@ def run(stage: str, ready, out: Path, **changed) -> Path:
         needs |= {"personalize": None, "initialize": ready.home / "initialize"}
         distill.run(distill.Params(**{**DISTILL, **changed}), out, **needs)
     return out
+
+
+def result(folder: Path) -> list[torch.Tensor]:
+    """The numbers a stage made; the header of a file of LoRA weights is not the same in every run."""
+    if (folder / "gaussians.ply").exists():
+        gaussians = io.load_ply(folder / "gaussians.ply")
+        return [getattr(gaussians, name) for name in PARAMETERS]
+    weights = load_file(folder / "pytorch_lora_weights.safetensors")
+    return [weights[name] for name in sorted(weights)]
+
+
+def same(one: Path, other: Path) -> bool:
+    pairs = list(zip(result(one), result(other), strict=True))
+    return all(torch.equal(a, b) for a, b in pairs) and lines(one) == lines(other)
 
 
 def lines(folder: Path) -> list[dict]:
@@ -133,7 +148,7 @@ def test_the_clock_stands_while_something_is_measured(tmp_path, monkeypatch):
     now[0] += 3
     log.log(2, psnr=2.0)
     assert [line["seconds"] for line in trace.read_trace(log.path)] == [7, 10]
-    with pytest.raises(ValueError):
+    with pytest.raises(FloatingPointError, match="step 3: psnr is nan"):
         log.log(3, psnr=float("nan"))
 
 
@@ -194,9 +209,7 @@ def test_an_early_end_is_the_same_after_a_kill(ready, tmp_path, monkeypatch, sta
         run(stage, ready, tmp_path / "broken", **patient)
     monkeypatch.setattr(module, name, real)
     broken = run(stage, ready, tmp_path / "broken", **patient)
-    assert lines(broken) == lines(whole)
-    result = "pytorch_lora_weights.safetensors" if stage == "personalize" else "gaussians.ply"
-    assert (broken / result).read_bytes() == (whole / result).read_bytes()
+    assert same(broken, whole)
     assert not (broken / trace.CHECKPOINT).exists()
 
 
@@ -204,8 +217,7 @@ def test_an_early_end_of_distillation_gives_its_best_state(ready, tmp_path):
     """With huge steps every state is worse than the start."""
     out = run("distill", ready, tmp_path, rate=300.0, patience=2, stop_gain=0.1, region_every=1000)
     assert lines(out)[-1]["kept"] == 0 and lines(out)[-1]["reason"] == "no gain"
-    start, ended = io.load_ply(ready.home / "initialize" / "gaussians.ply"), io.load_ply(out / "gaussians.ply")
-    assert all(torch.equal(getattr(start, name), getattr(ended, name)) for name in PARAMETERS)
+    assert all(torch.equal(a, b) for a, b in zip(result(ready.home / "initialize"), result(out), strict=True))
 
 
 # ---------------------------------------------------------------------------------------------------- time budgets
@@ -270,9 +282,7 @@ def test_a_budget_shortens_a_stage_and_its_schedule(ready, tmp_path, stage):
     assert lines(out)[-1]["iteration"] == lines(out)[-1]["of"] == steps
     assert json.loads((out / trace.LENGTH).read_text())["steps"] == steps
     asked = run(stage, ready, tmp_path / "asked", **{"steps" if stage == "personalize" else "iterations": steps})
-    result = "pytorch_lora_weights.safetensors" if stage == "personalize" else "gaussians.ply"
-    assert (out / result).read_bytes() == (asked / result).read_bytes()
-    assert lines(out) == lines(asked)
+    assert same(out, asked)
 
 
 @pytest.mark.parametrize("stage", [fit, personalize])
