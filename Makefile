@@ -4,6 +4,7 @@
 scene :=
 profile :=
 variant :=
+budget :=
 set :=
 trust :=
 runs :=
@@ -11,6 +12,8 @@ data := data
 seed :=
 name :=
 steps :=
+gate :=
+slow :=
 
 # GOMP_SPINCOUNT: see reffusion/__init__.py
 export set # its value may hold quotes, so recipes read it from the environment
@@ -22,7 +25,7 @@ PY := $(VENV)/bin/python
 STAGES := poses fit masks reference lift personalize initialize distill evaluate
 
 options = $(if $(profile),--profile '$(profile)') $(if $(variant),--variant '$(variant)') \
-	$(if $(set),--set "$$set") $(if $(trust),--trust) $(if $(runs),--runs '$(runs)')
+	$(if $(budget),--budget '$(budget)') $(if $(set),--set "$$set") $(if $(trust),--trust) $(if $(runs),--runs '$(runs)')
 
 .PHONY: help setup all $(STAGES) plan clean batch demo prior prior-report test bench lint
 .DELETE_ON_ERROR:
@@ -37,9 +40,10 @@ help:
 	@echo 'make prior [steps=N]           train the embedded prior further (hours)'
 	@echo 'make prior-report              measure it, and draw what it paints (minutes): runs/prior-report'
 	@echo 'make setup | test | lint       .venv; the tests; ruff'
-	@echo 'make bench                     speed of the CPU splatting'
+	@echo 'make bench                     work-precision diagrams of the kernels: runs/bench; gate=1: against the baselines'
 	@echo 'scene=  a name under data/, or the path of any folder'
 	@echo 'profile=auto|laptop|paper  variant=NAME  set="fit.iterations=500 distill.seed=3"  runs=FOLDER'
+	@echo 'budget=5m  time for the whole job: sets the number of steps of fit, personalize and distill'
 	@echo 'trust=1  keep results of older code'
 
 # ---------------------------------------------------------------------------------------------------- environment
@@ -110,5 +114,7 @@ test: $(VENV)/.ready-dev
 lint: $(VENV)/.ready-dev
 	$(PY) -m ruff check .
 
+# slow=1 adds the splatting of 100,000 Gaussians and more, and personalization (an hour).
 bench: $(VENV)/.ready
-	$(PY) benchmarks/splat.py
+	$(PY) benchmarks/precision.py --out '$(or $(runs),runs)/bench' $(if $(gate),--gate) $(if $(slow),--slow)
+	$(if $(slow),$(PY) benchmarks/splat.py)

@@ -10,6 +10,7 @@ from scipy import ndimage
 
 from reffusion import bilateral, geometry, planes, trace
 from reffusion.depth import Plate, complete
+from reffusion.solverlog import SILENT, SolverLog
 from reffusion.types import Camera, Rendering
 
 ENOUGH_POINTS = 50  # fewer sparse points around the hole, and the rendered depth is asked instead
@@ -94,7 +95,11 @@ def seen(drawn: Rendering, camera: Camera, hole: np.ndarray, hidden: np.ndarray,
 
 
 def continued(
-    view: Seen, guide: np.ndarray | Callable[[], np.ndarray], points: np.ndarray, how: Completion
+    view: Seen,
+    guide: np.ndarray | Callable[[], np.ndarray],
+    points: np.ndarray,
+    how: Completion,
+    solvers: SolverLog = SILENT,
 ) -> tuple[np.ndarray, str]:
     """The scene's own disparity, [H, W] float64, continued through the hole; and how in words.
 
@@ -105,36 +110,50 @@ def continued(
     Args:
         guide: [H, W, 3] uint8 or [0, 1], or what gives it when it is needed; the view's picture without the object.
         points: [P, 3] sparse points of the scene; P = 0 allowed.
+        solvers: are told of what each solver finds.
     Raises:
         Degenerate: too little is known around the hole.
     """
     planar, said = _planar(view, points, how)
-    if planar is not None:
-        return planar, said
+    solvers.solved("planes", planar.disparity)
+    if planar.explained >= how.planar_share:
+        return planar.disparity, said
     guide = guide() if callable(guide) else guide
     plate = Plate(how.ring, how.stiffness, how.edge, how.unknowns)
     fitted = complete(view.disparity, view.known, guide, plate, keep=False)
+    solvers.solved("completion", fitted)
     # Its misfit on known pixels is spread by the bilateral solver, so that rims meet.
-    refined = bilateral.refine(fitted, view.disparity, view.known.astype(np.float64), guide, how.solver)
+    known = view.known.astype(np.float64)
+    refined = bilateral.refine(fitted, view.disparity, known, guide, how.solver, solvers.iterated)
+    solvers.solved("bilateral", refined, solvers.iterations)
     return refined, f"{said}: continued smoothly instead"
 
 
-def _planar(view: Seen, points: np.ndarray, how: Completion) -> tuple[np.ndarray | None, str]:
-    """Planes that explain the surroundings, [H, W] disparity, or None; and how many explain how much."""
-    around = grown(view.hidden | view.hole, how.ring) & ~(view.hidden | view.hole)
-    pixels, values = visible_points(points, view.camera, around, view.disparity)
-    source = "sparse points"
+def points_around(view: Seen, points: np.ndarray, how: Completion) -> tuple[np.ndarray, np.ndarray]:
+    """Image points [S, 2] and disparities [S] of the scene's points that are seen around the hole."""
+    return visible_points(points, view.camera, _around(view, how), view.disparity)
+
+
+def _around(view: Seen, how: Completion) -> np.ndarray:
+    taken = view.hidden | view.hole
+    return grown(taken, how.ring) & ~taken
+
+
+def _planar(view: Seen, points: np.ndarray, how: Completion) -> tuple[planes.PlanarModel, str]:
+    """Planes through the surroundings; and how many explain how much."""
+    (pixels, values), source = points_around(view, points, how), "sparse points"
     if len(values) < ENOUGH_POINTS:
-        rows, columns = np.nonzero(around & view.known)
+        rows, columns = np.nonzero(_around(view, how) & view.known)
         values, source = view.disparity[rows, columns], "rendered depth"
         pixels = np.stack([columns, rows], 1) + 0.5
     draws = trace.generator(how.seed, "planes", view.camera.name)
     planar = planes.planar_model(pixels, values, view.hole.shape, draws, tolerance=how.planar_tolerance)
-    said = f"{planar.planes} planes explain {planar.explained:.0%} of {len(values)} {source}"
-    return (planar.disparity if planar.explained >= how.planar_share else None), said
+    return planar, f"{planar.planes} planes explain {planar.explained:.0%} of {len(values)} {source}"
 
 
-def estimated(view: Seen, guide: np.ndarray, estimate: np.ndarray, how: Completion) -> tuple[np.ndarray, str]:
+def estimated(
+    view: Seen, guide: np.ndarray, estimate: np.ndarray, how: Completion, solvers: SolverLog = SILENT
+) -> tuple[np.ndarray, str]:
     """A picture's estimate brought to the scene, [H, W] float64 disparity; and how well it fitted, in words.
 
     As in the paper: scale and offset by L2 on the known pixels, then the fast bilateral solver, which spreads what
@@ -146,6 +165,7 @@ def estimated(view: Seen, guide: np.ndarray, estimate: np.ndarray, how: Completi
     Args:
         guide: [H, W, 3] uint8 or [0, 1], the picture.
         estimate: [H, W], disparity up to scale and offset.
+        solvers: are told of what each solver finds.
     Raises:
         Degenerate: fewer than 4 known pixels; a constant estimate; one that falls where the disparity grows.
     """
@@ -156,7 +176,8 @@ def estimated(view: Seen, guide: np.ndarray, estimate: np.ndarray, how: Completi
     error = np.abs(view.disparity - aligned)[view.known]
     if how.robust and np.median(error) > 0:  # what the alignment lets go of is not to be spread either
         confidence[view.known] = geometry.trusted(error)
-    refined = bilateral.refine(aligned, view.disparity, confidence, guide, how.solver)
+    refined = bilateral.refine(aligned, view.disparity, confidence, guide, how.solver, solvers.iterated)
+    solvers.solved("bilateral", refined, solvers.iterations)
     misfit = fitted.residual / np.abs(view.disparity[view.known]).mean()
     return refined, f"estimated, and aligned to {misfit:.1%} of the known disparity"
 

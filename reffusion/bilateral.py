@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,10 +33,17 @@ class Solver:
 
 
 USUAL = Solver()
+# What is told after each iteration: its number, and a function that gives the result so far and the relative residual.
+Watch = Callable[[int, Callable[[], tuple[np.ndarray, float]]], None]
 
 
 def refine(
-    estimate: np.ndarray, disparity: np.ndarray, confidence: np.ndarray, guide: np.ndarray, solver: Solver = USUAL
+    estimate: np.ndarray,
+    disparity: np.ndarray,
+    confidence: np.ndarray,
+    guide: np.ndarray,
+    solver: Solver = USUAL,
+    watch: Watch | None = None,
 ) -> np.ndarray:
     """An aligned estimate plus its misfit on known pixels, spread by the solver along the guide.
 
@@ -45,10 +53,17 @@ def refine(
         [H, W] float64 disparity: an estimate without misfit passes unchanged.
     """
     misfit = np.where(confidence > 0, disparity - np.asarray(estimate, np.float64), 0.0)
-    return estimate + solve(misfit, confidence, guide, solver)
+    told = watch and (lambda step, look: watch(step, lambda: (estimate + (now := look())[0], now[1])))
+    return estimate + solve(misfit, confidence, guide, solver, told)
 
 
-def solve(target: np.ndarray, confidence: np.ndarray, guide: np.ndarray, solver: Solver = USUAL) -> np.ndarray:
+def solve(
+    target: np.ndarray,
+    confidence: np.ndarray,
+    guide: np.ndarray,
+    solver: Solver = USUAL,
+    watch: Watch | None = None,
+) -> np.ndarray:
     """Minimises  sum_p c_p (x_p - t_p)^2 + smoothness/2 sum_pq W_pq (x_p - x_q)^2.
 
     W is the bistochastic bilateral affinity, the unknowns are the vertices of the guide's bilateral grid. The result
@@ -60,6 +75,7 @@ def solve(target: np.ndarray, confidence: np.ndarray, guide: np.ndarray, solver:
         confidence: [H, W] >= 0.
         guide: [H, W, 3] uint8 or [0, 1].
         solver: parameters.
+        watch: told after each iteration, and once more with the last.
 
     Returns:
         [H, W] float64. Cells that no confidence reaches hold the mean of the target under the confidence.
@@ -81,8 +97,17 @@ def solve(target: np.ndarray, confidence: np.ndarray, guide: np.ndarray, solver:
     unreached = 1e-9 * mass  # cells without data: regular, and 0
     data = sparse.diags(gather(confidence) + unreached)
     system = solver.smoothness * _laplacian(_blur(coordinates), mass, solver.rounds) + data
-    solution, stalled = cg(system.tocsr(), gather(confidence * offset), rtol=1e-8, maxiter=5000,
-                           M=sparse.diags(1.0 / system.diagonal()))  # fmt: skip
+    system, right = system.tocsr(), gather(confidence * offset)
+    steps = 0
+
+    def told(now: np.ndarray) -> None:
+        nonlocal steps
+        steps += 1
+        residual = lambda: float(np.linalg.norm(right - system @ now) / max(np.linalg.norm(right), 1e-300))
+        watch(steps, lambda: (mean + now[cell].reshape(target.shape), residual()))
+
+    solution, stalled = cg(system, right, rtol=1e-8, maxiter=5000, M=sparse.diags(1.0 / system.diagonal()),
+                           callback=told if watch else None)  # fmt: skip
     if stalled:
         raise ValueError(f"the bilateral solver did not converge at smoothness {solver.smoothness}: take a smaller one")
     return mean + solution[cell].reshape(target.shape)

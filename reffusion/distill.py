@@ -56,14 +56,21 @@ def distill(
     optimizer = GaussianOptimizer(initial, masked, settings.rates, settings.masked_pace, epsilon=settings.epsilon)
     region = region_of(initial.means, masked) if settings.confined and masked.any() else None
     state = trace.load_checkpoint(folder)
-    start, seconds, best, best_psnr = 0, 0.0, None, -float("inf")
+    start, seconds, best = 0, 0.0, None
+    patience = trace.Patience(settings.patience, settings.stop_gain, settings.stop_drop)
     if state is not None:
         optimizer.load_state_dict(state["optimizer"])
         if job.adversary is not None:
             job.adversary.load_state_dict(state["adversary"])
         job.tally.update(state["tally"])
-        start, seconds, best, best_psnr = (state[k] for k in ("step", "seconds", "best", "best_psnr"))
-    log, saved = trace.Trace(folder, seconds, start + 1), seconds  # a line is numbered by the steps done
+        patience.load_state_dict(state["patience"])
+        start, seconds, best = (state[k] for k in ("step", "seconds", "best"))
+    log, saved = trace.Trace(folder, seconds, start + bool(start)), seconds  # a line is numbered by the steps done
+    if start == 0:
+        with log.paused():
+            psnr, best = reference_psnr(optimizer.gaussians, holes), _copy(optimizer) if patience.watching else None
+            patience.ends(0, settings.iterations, psnr)
+            log.log(0, reference_psnr=psnr, **_counts(optimizer))
 
     for step in trace.progress(settings.iterations, "distill", start):
         line = step_of(optimizer, step, job)
@@ -72,21 +79,25 @@ def distill(
             _densify(optimizer, settings, done)
         if region is not None and (done % settings.region_every == 0 or done == settings.iterations):
             optimizer.select(~strays(region, optimizer.gaussians.means.detach(), optimizer.masked))
-        if trace.log_spaced(done, settings.iterations, per_octave=4):
+        if patience.due(done, settings.iterations, per_octave=4):
             with log.paused():
                 psnr = reference_psnr(optimizer.gaussians, holes)
-            counts = {"gaussians": len(optimizer.masked), "masked_gaussians": int(optimizer.masked.sum())}
-            log.log(done, reference_psnr=psnr, **line, **job.tally, **counts)
-            if settings.stop_drop > 0 and psnr > best_psnr:
-                best, best_psnr = _copy(optimizer), psnr
-            if 0 < settings.stop_drop < best_psnr - psnr:
+                end = patience.ends(done, settings.iterations, psnr)
+                log.log(done, reference_psnr=psnr, **line, **job.tally, **_counts(optimizer), **end)
+                if patience.watching and patience.best_at == done:
+                    best = _copy(optimizer)
+            if end and end["reason"] != "finished":
                 return replace(optimizer.gaussians, **{name: best[name] for name in PARAMETERS}), best["masked"]
         if log.seconds - saved > settings.checkpoint_seconds:
             saved = log.seconds
             state = {"optimizer": optimizer.state_dict(), "step": done, "seconds": saved, "tally": job.tally}
             state["adversary"] = None if job.adversary is None else job.adversary.state_dict()
-            trace.save_checkpoint(folder, state | {"best": best, "best_psnr": best_psnr})
+            trace.save_checkpoint(folder, state | {"best": best, "patience": patience.state_dict()})
     return optimizer.gaussians.map(Tensor.detach), optimizer.masked
+
+
+def _counts(optimizer: GaussianOptimizer) -> dict[str, int]:
+    return {"gaussians": len(optimizer.masked), "masked_gaussians": int(optimizer.masked.sum())}
 
 
 def _copy(optimizer: GaussianOptimizer) -> dict[str, Tensor]:

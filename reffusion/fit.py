@@ -4,26 +4,24 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from reffusion import mcmc, trace
 from reffusion.densify import densify, prune, viewing_distance
 from reffusion.exposure import Exposures
+from reffusion.feed import check_sizes, sample, samples
 from reffusion.optimize import GaussianOptimizer, Rates, reconstruction_loss
 from reffusion.splat import render
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
 GROWTH = 1.05  # mcmc: the number grows by at most a twentieth at a time
-SH_0 = 0.28209479177387814  # the constant spherical harmonic
 
 
 @dataclass(frozen=True)
@@ -57,6 +55,8 @@ class Settings:
         exposure: fit each view's exposure too, see `reffusion.exposure`.
         rates, betas: Adam's step sizes, and its memory of gradients and of their squares (3DGS: 0.9, 0.999). A short
             run is better off with a short memory.
+        patience, stop_gain: stop when in so many twentieths of the run the main quantity of the trace has not gained so
+            many dB; 0: never. Counted from `densify_until` on: before, it rises and falls with the Gaussians' number.
         checkpoint_seconds: seconds of work between checkpoints.
     """
 
@@ -80,6 +80,8 @@ class Settings:
     exposure: bool = False
     rates: Rates = field(default_factory=Rates)
     betas: tuple[float, float] = (0.9, 0.999)
+    patience: int = 0
+    stop_gain: float = 0.0
     checkpoint_seconds: float = 10.0
 
 
@@ -117,120 +119,99 @@ def fit(
     weights = weights or {}
     if not cameras:
         raise ValueError("a fit needs at least one view")
-    _check_sizes(cameras, images, weights)
-    _check_sizes(held_out, images, {})
-    optimizer, start = GaussianOptimizer(initial, rates=settings.rates, betas=settings.betas), 0
-    exposures = Exposures((camera.name for camera in cameras), initial.means.device) if settings.exposure else None
-    recent, started_with = {"loss": 0.0, "error": 0.0, "steps": 0}, len(initial)
-    state, seconds = trace.load_checkpoint(folder), spent
-    if state is not None:
-        optimizer.load_state_dict(state["optimizer"])
-        if exposures is not None:
-            exposures.load_state_dict(state["exposures"])
-        start, seconds, recent = state["iteration"], state["seconds"], state["recent"]
-        started_with = state["started_with"]
-    log = trace.Trace(folder, seconds, start + 1)  # a line is numbered by the steps done
+    check_sizes(cameras, images, weights)
+    check_sizes(held_out, images, {})
+    run = _Run.begun(initial, cameras, settings, trace.load_checkpoint(folder), spent)
+    optimizer, exposures = run.optimizer, run.exposures
+    log = trace.Trace(folder, run.seconds, run.iteration + 1 if run.iteration else 0)
     centers = torch.tensor(np.stack([camera.center for camera in cameras]), dtype=torch.float32)
-    saved_at = time.monotonic()
+    saved_at, measured = time.monotonic(), (held_out, images, settings)
+    if run.iteration == 0:
+        with log.paused():
+            log.log(0, **_summary(run, *measured, impl))
 
     for i, (camera, target, counts) in zip(
-        trace.progress(settings.iterations, "fit", start),
-        _samples(cameras, images, weights, settings, start),
-        strict=True,
+        trace.progress(settings.iterations, "fit", run.iteration),
+        samples(cameras, images, weights, range(run.iteration, settings.iterations), settings.seed),
+        strict=False,  # it may stop early
     ):
         target, counts = _move(target, optimizer), _move(counts, optimizer)
         loss, error = _step(optimizer, exposures, camera, target, counts, settings, i, impl)
-        recent = {"loss": recent["loss"] + loss, "error": recent["error"] + error, "steps": recent["steps"] + 1}
-        done = i + 1
-        _adapt(optimizer, centers, started_with, settings, done)
-        if trace.log_spaced(done, settings.iterations):
+        run.iteration = done = i + 1
+        run.loss, run.error, run.steps = run.loss + loss, run.error + error, run.steps + 1
+        _adapt(optimizer, centers, run.started_with, settings, done)
+        if run.patience.due(done, settings.iterations):
             _check_finite(optimizer.gaussians, f"step {i}, view '{camera.name}'")
             with log.paused():
-                line = _summary(recent, optimizer, held_out, images, settings, done, impl)
-            log.log(done, **line)
-            recent = {"loss": 0.0, "error": 0.0, "steps": 0}
+                line = _summary(run, *measured, impl)
+                end = _end(run, line, settings)
+                log.log(done, **line, **end)
+            run.loss, run.error, run.steps = 0.0, 0.0, 0
+            if end:
+                break
         if time.monotonic() - saved_at > settings.checkpoint_seconds and done < settings.iterations:
             _check_finite(optimizer.gaussians, f"step {i}, view '{camera.name}'")
-            state = {"optimizer": optimizer.state_dict(), "iteration": done, "recent": recent, "seconds": log.seconds}
-            state |= {"started_with": started_with, "exposures": exposures and exposures.state_dict()}
-            trace.save_checkpoint(folder, state)
+            trace.save_checkpoint(folder, run.state_dict() | {"seconds": log.seconds})
             saved_at = time.monotonic()
     if exposures is not None:
         exposures.save(folder)
     return optimizer.gaussians.map(Tensor.detach)
 
 
-def initial_gaussians(
-    points: np.ndarray,
-    colors: np.ndarray,
-    sh_degree: int,
-    budget: int,
-    generator: torch.Generator,
-    opacity: float = 0.1,
-    size: float = 1.0,
-) -> Gaussians:
-    """3DGS's start: a round Gaussian at each point, sized by the way to its 3 nearest neighbours.
+@dataclass
+class _Run:
+    """What a fit continues from.
 
-    Args:
-        points: [P, 3] in the normalised frame, P >= 4.
-        colors: [P, 3] uint8.
-        budget: no more Gaussians than this; a random subset of the points then.
-        generator: of that subset.
-        opacity: of each, in (0, 1). size: standard deviations over that way (root mean square).
-
-    Raises:
-        ValueError: fewer than 4 points.
+    Attributes:
+        started_with: Gaussians at the start. iteration, seconds: done and spent so far.
+        loss, error, steps: sums over the steps since the last line of the trace, and their number.
     """
-    if len(points) < 4:
-        raise ValueError(f"a fit starts from sparse points, at least 4; the scene has {len(points)}")
-    if len(points) > budget:
-        kept = torch.randperm(len(points), generator=generator)[:budget].numpy()
-        points, colors = points[kept], colors[kept]
-    distance = cKDTree(points).query(points, k=4)[0][:, 1:]
-    spread = size * np.sqrt((distance**2).mean(1)).clip(min=1e-4)
-    count = len(points)
-    sh = torch.zeros(count, (sh_degree + 1) ** 2, 3)
-    sh[:, 0] = (torch.from_numpy(colors.astype(np.float32)) / 255 - 0.5) / SH_0
-    return Gaussians(
-        means=torch.from_numpy(points.astype(np.float32)),
-        quaternions=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
-        log_scales=torch.from_numpy(np.log(spread).astype(np.float32))[:, None].repeat(1, 3),
-        opacity_logits=torch.full((count,), math.log(opacity / (1 - opacity))),
-        sh=sh,
-    )
+
+    optimizer: GaussianOptimizer
+    exposures: Exposures | None
+    patience: trace.Patience
+    started_with: int
+    seconds: float
+    iteration: int = 0
+    loss: float = 0.0
+    error: float = 0.0
+    steps: int = 0
+
+    _NUMBERS = ("started_with", "seconds", "iteration", "loss", "error", "steps")
+
+    @classmethod
+    def begun(
+        cls,
+        initial: Gaussians,
+        cameras: Sequence[Camera],
+        settings: Settings,
+        state: dict[str, Any] | None,
+        spent: float,
+    ) -> _Run:
+        """From the start, or from a checkpoint's state."""
+        exposures = Exposures((camera.name for camera in cameras), initial.means.device) if settings.exposure else None
+        optimizer = GaussianOptimizer(initial, rates=settings.rates, betas=settings.betas)
+        run = cls(optimizer, exposures, trace.Patience(settings.patience, settings.stop_gain), len(initial), spent)
+        if state is not None:
+            optimizer.load_state_dict(state["optimizer"])
+            run.patience.load_state_dict(state["patience"])
+            if exposures is not None:
+                exposures.load_state_dict(state["exposures"])
+            for name in cls._NUMBERS:
+                setattr(run, name, state[name])
+        return run
+
+    def state_dict(self) -> dict[str, Any]:
+        state = {"optimizer": self.optimizer.state_dict(), "patience": self.patience.state_dict()}
+        state["exposures"] = self.exposures and self.exposures.state_dict()
+        return state | {name: getattr(self, name) for name in self._NUMBERS}
 
 
-def _samples(
-    cameras: Sequence[Camera],
-    images: Mapping[str, np.ndarray],
-    weights: Mapping[str, np.ndarray],
-    settings: Settings,
-    start: int,
-) -> Iterator[tuple[Camera, Tensor, Tensor | None]]:
-    """What the steps from `start` on see, each prepared by a thread of its own while the step before it runs."""
-
-    def sample(i: int) -> tuple[Camera, Tensor, Tensor | None]:
-        camera = cameras[_view(i, len(cameras), settings.seed)]
-        return _sample(camera, images[camera.name], weights.get(camera.name))
-
-    with ThreadPoolExecutor(1, thread_name_prefix="fit") as ahead:
-        coming = ahead.submit(sample, start)
-        for i in range(start, settings.iterations):
-            ready = coming.result()
-            coming = ahead.submit(sample, min(i + 1, settings.iterations - 1))
-            yield ready
-
-
-def _view(iteration: int, count: int, seed: int) -> int:
-    """Every view once an epoch, in an order of the epoch's own."""
-    order = torch.randperm(count, generator=trace.generator(seed, "views", iteration // count))
-    return int(order[iteration % count])
-
-
-def _sample(camera: Camera, image: np.ndarray, weights: np.ndarray | None) -> tuple[Camera, Tensor, Tensor | None]:
-    """The view as the step sees it: camera, image in [0, 1], weights."""
-    counts = None if weights is None else torch.from_numpy(np.asarray(weights, np.float32))
-    return camera, torch.from_numpy(image).float() / 255, counts
+def _end(run: _Run, line: Mapping[str, float], settings: Settings) -> dict[str, Any]:
+    """What this line of the trace says of the end, {} while the fit goes on. Its result is always the last state."""
+    main = line.get("psnr_held_out", line["psnr"])
+    end = run.patience.ends(run.iteration, settings.iterations, main, settings.densify_until)
+    return end and end | {"kept": run.iteration}
 
 
 def _move(tensor: Tensor | None, optimizer: GaussianOptimizer) -> Tensor | None:
@@ -332,39 +313,21 @@ def _allowed(started_with: int, settings: Settings, done: int) -> int:
 
 
 def _summary(
-    recent: Mapping[str, float],
-    optimizer: GaussianOptimizer,
-    held_out: Sequence[Camera],
-    images: Mapping[str, np.ndarray],
-    settings: Settings,
-    done: int,
-    impl: str,
+    run: _Run, held_out: Sequence[Camera], images: Mapping[str, np.ndarray], settings: Settings, impl: str
 ) -> dict[str, Any]:
-    steps = max(recent["steps"], 1)
-    line = {
-        "loss": recent["loss"] / steps,
-        "psnr": -10 * math.log10(max(recent["error"] / steps, 1e-10)),
-        "gaussians": len(optimizer.gaussians),
-    }
+    """A line of the trace; without steps since the last line there is no loss and no training PSNR."""
+    line: dict[str, Any] = {"gaussians": len(run.optimizer.gaussians)}
+    if run.steps:
+        line = {"loss": run.loss / run.steps, "psnr": trace.decibels(run.error / run.steps)} | line
     if not held_out:
         return line
-    degree, gaussians = _degree(settings, done), optimizer.gaussians.map(Tensor.detach)
+    degree, gaussians = _degree(settings, run.iteration), run.optimizer.gaussians.map(Tensor.detach)
     psnr = []
     for camera in held_out:
         image = render(gaussians, camera, impl=impl, sh_degree=degree).color.clamp(0, 1)
-        error = _squared_error(image, _move(_sample(camera, images[camera.name], None)[1], optimizer), None)
-        psnr.append(-10 * math.log10(max(error, 1e-10)))
+        target = _move(sample(camera, images[camera.name], None)[1], run.optimizer)
+        psnr.append(trace.decibels(_squared_error(image, target, None)))
     return line | {"psnr_held_out": sum(psnr) / len(psnr)}
-
-
-def _check_sizes(cameras: Sequence[Camera], images: Mapping[str, np.ndarray], weights: Mapping[str, np.ndarray]):
-    for camera in cameras:
-        for kind, array in (("image", images.get(camera.name)), ("mask", weights.get(camera.name))):
-            if array is None and kind == "image":
-                raise ValueError(f"view '{camera.name}': no image was given")
-            if array is not None and array.shape[:2] != (camera.height, camera.width):
-                size = f"{array.shape[1]}x{array.shape[0]}"
-                raise ValueError(f"view '{camera.name}': {kind} is {size}, camera is {camera.width}x{camera.height}")
 
 
 def _check_finite(gaussians: Gaussians, where: str) -> None:

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from reffusion import behind, geometry, splat
+from reffusion import behind, geometry, splat, trace
 from reffusion.behind import Completion
+from reffusion.solverlog import SolverLog
 from reffusion.types import Camera, Gaussians, Reference
 
 
@@ -49,6 +50,7 @@ def depth_behind(
     points: np.ndarray,
     how: Completion,
     estimate: np.ndarray | None = None,
+    log: trace.Trace | None = None,
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """The scene without the object in one view: depth [H, W] float64, as rendered where that is known, else made up;
     the same made up everywhere; and how in words.
@@ -63,16 +65,18 @@ def depth_behind(
         points: [P, 3] sparse points of the scene.
         how: parameters.
         estimate: [H, W] a depth model's answer to the reference, disparity up to scale and offset; None: there is none.
+        log: gets a series for each solver (docs/traces.md).
 
     Raises:
         ValueError: naming the view, where too little is known around the hole, or the estimate does not fit.
     """
     view = behind.seen(splat.render(remaining, reference.camera, sh_degree=0), reference.camera, hole, hidden, how)
+    solvers = SolverLog(log, reference.camera.name, *behind.points_around(view, points, how))
     try:
         if estimate is None:
-            solved, said = behind.continued(view, reference.image, points, how)
+            solved, said = behind.continued(view, reference.image, points, how, solvers)
         else:
-            solved, said = behind.estimated(view, reference.image, estimate, how)
+            solved, said = behind.estimated(view, reference.image, estimate, how, solvers)
         # Beyond infinity there is nothing: the farthest depth that can be told stands in.
         made_up = 1.0 / np.maximum(solved, view.least_disparity)
     except ValueError as error:

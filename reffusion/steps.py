@@ -52,6 +52,7 @@ class Settings:
         least_opacity: fainter ones are pruned when others are added.
         region_every: steps between prunings of Gaussians that changed region.
         stop_drop: stop when the reference's PSNR falls so many dB under its best, and give the best; 0: never.
+        patience, stop_gain: the same when in so many twentieths of the run it has not gained so many dB; 0: never.
         rates: Adam's step sizes.
         masked_pace: parameter -> factor on them for masked Gaussians.
         epsilon: Adam's; against it a gradient is large or small. At 3DGS's 1e-15 a Gaussian that hardly anything but
@@ -77,6 +78,8 @@ class Settings:
     least_opacity: float = 0.005
     region_every: int = 50
     stop_drop: float = 0.0
+    patience: int = 0
+    stop_gain: float = 0.0
     rates: Rates = field(default_factory=Rates)
     masked_pace: Mapping[str, float] = field(default_factory=dict)
     epsilon: float = 1e-15

@@ -5,16 +5,22 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from math import floor, inf, isfinite, log2, log10
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from reffusion.io.traces import read_trace
+
 CHECKPOINT = "checkpoint.pt"
+LENGTH = "length.json"  # the number of steps that fit into a time budget
+TRIAL = 5  # steps by which a stage measures its speed
 
 
 def seed_for(seed: int, *labels: object) -> int:
@@ -54,10 +60,10 @@ def clear_checkpoint(folder: Path) -> None:
 
 
 class Trace:
-    """`trace.jsonl`: one line per moment, {"seconds", "iteration", <error name>: value, ...}.
+    """Writes `trace.jsonl`, one line per moment; what stands in a line says docs/traces.md.
 
     The clock counts work only: it stops inside `with trace.paused():` and continues from `start_seconds`
-    after a resume; lines past the resumed iteration are dropped.
+    after a resume; lines from `start_iteration` on are dropped.
     """
 
     def __init__(self, folder: Path, start_seconds: float = 0.0, start_iteration: int = 0):
@@ -67,45 +73,136 @@ class Trace:
         partial.write_text("".join(json.dumps(r) + "\n" for r in kept))
         os.replace(partial, self.path)
         self._offset, self._since = start_seconds, time.perf_counter()
+        self._standing = False
 
     @property
     def seconds(self) -> float:
-        return self._offset + time.perf_counter() - self._since
+        return self._offset + (0.0 if self._standing else time.perf_counter() - self._since)
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Stop the clock while something is measured or drawn."""
-        began = self.seconds
+        """Stop the clock while something is measured or drawn. May be nested."""
+        was_standing = self._standing
+        self._offset, self._standing = self.seconds, True
         try:
             yield
         finally:
-            self._offset, self._since = began, time.perf_counter()
+            self._since, self._standing = time.perf_counter(), was_standing
 
-    def log(self, iteration: int, **errors: float) -> None:
-        record = {"seconds": round(self.seconds, 4), "iteration": iteration, **errors}
-        with open(self.path, "a") as file:
-            file.write(json.dumps(record) + "\n")
+    def log(self, iteration: int, **errors: float | str) -> None:
+        """Append a line; the clock stands meanwhile. FloatingPointError, naming it, for a value that is not finite."""
+        for name, value in errors.items():
+            if not isinstance(value, str) and not isfinite(value):
+                raise FloatingPointError(f"step {iteration}: {name} is {value}")
+        with self.paused():
+            record = {"seconds": round(self.seconds, 4), "iteration": iteration, **errors}
+            with open(self.path, "a") as file:
+                file.write(json.dumps(record) + "\n")
+        if 0 < iteration < errors.get("of", 0):
+            saved = (errors["of"] - iteration) * record["seconds"] / iteration
+            print(f"ends after {iteration} of {errors['of']} steps: {errors['reason']}; {saved:.0f} s saved")
 
 
-def read_trace(path: Path) -> list[dict[str, float]]:
-    """The records of a `trace.jsonl`; a line cut off by a kill is ignored."""
-    records = []
-    for line in path.read_text().splitlines():
-        try:
-            records.append(json.loads(line))
-        except json.JSONDecodeError:
-            continue
-    return records
+class Patience:
+    """Ends a stage whose error has stopped improving (docs/traces.md).
+
+    Attributes:
+        moments: twentieths of the run in a row without a gain after which the stage ends; 0: never.
+        gain: dB that count as one.
+        drop: dB under the best from which on the stage ends, at any moment; 0: never.
+        best, best_at: the best value so far and its iteration.
+    """
+
+    def __init__(self, moments: int = 0, gain: float = 0.0, drop: float = 0.0):
+        self.moments, self.gain, self.drop = moments, gain, drop
+        self.best, self.best_at, self._mark, self._waited = -inf, -1, -inf, 0
+
+    @property
+    def watching(self) -> bool:
+        return self.moments > 0 or self.drop > 0
+
+    def due(self, iteration: int, last: int, per_octave: int = 2) -> bool:
+        """Is this a moment to measure? The log-spaced ones, and where patience counts, each twentieth of the run."""
+        return log_spaced(iteration, last, per_octave) or (self.moments > 0 and twentieth(iteration, last))
+
+    def ends(self, iteration: int, last: int, value: float, start: float = 0.0) -> dict[str, Any]:
+        """What the line of this moment says of the end, {} while the stage goes on.
+
+        Args:
+            value: the main quantity in dB, more is better. last: the planned number of iterations.
+            start: part of the run before which nothing is counted.
+        """
+        reason = "finished" if iteration == last else ""
+        if iteration >= start * last:
+            if value > self.best:
+                self.best, self.best_at = value, iteration
+            elif 0 < self.drop < self.best - value:
+                reason = "fell"
+            if twentieth(iteration, last):
+                gained = value >= self._mark + self.gain and value > self._mark
+                self._mark, self._waited = (value, 0) if gained else (self._mark, self._waited + 1)
+                if 0 < self.moments <= self._waited and not reason:
+                    reason = "no gain"
+        if not reason:
+            return {}
+        return {"of": last, "kept": iteration if reason == "finished" else self.best_at, "reason": reason}
+
+    def state_dict(self) -> dict[str, float]:
+        return {"best": self.best, "best_at": self.best_at, "mark": self._mark, "waited": self._waited}
+
+    def load_state_dict(self, state: dict[str, float]) -> None:
+        self.best, self.best_at, self._mark, self._waited = (state[k] for k in ("best", "best_at", "mark", "waited"))
+
+
+def decibels(squared_error: float) -> float:
+    """-10 log10 of a mean squared error, at most 100: so that errors and PSNR gain alike."""
+    return -10 * log10(max(squared_error, 1e-10))
 
 
 def log_spaced(iteration: int, last: int, per_octave: int = 2) -> bool:
     """True at the first and last iteration and `per_octave` times in each doubling between: when to measure."""
     if iteration in (0, last):
         return True
-    from math import floor, log2
-
     step = lambda i: floor(log2(i) * per_octave)
     return iteration > 0 and step(iteration) != step(max(iteration - 1, 0.5))
+
+
+def twentieth(iteration: int, last: int) -> bool:
+    """True where a twentieth of the run has been completed."""
+    return iteration > 0 and 20 * iteration // last != 20 * (iteration - 1) // last
+
+
+def affordable(
+    folder: Path, asked: int, seconds: float, spent: Callable[[], float], trial: Callable[[Path, int], object]
+) -> int:
+    """How many of `asked` steps a stage does in its `seconds`: at least a twentieth of them.
+
+    The answer depends on the machine and its load; it is written to `folder/length.json` and read back on a resume.
+
+    Args:
+        seconds: for the whole stage; 0: no limit, and nothing is measured or written.
+        spent: gives the seconds that are gone when the steps begin.
+        trial: does so many steps, a trace in the folder it is given; must leave everything else as it was.
+    """
+    if not seconds:
+        return asked
+    path = folder / LENGTH
+    if path.exists():
+        return json.loads(path.read_text())["steps"]
+    tried = folder / ".trial"
+    shutil.rmtree(tried, ignore_errors=True)  # of a run that was killed
+    tried.mkdir(parents=True)
+    trial(tried, TRIAL)
+    at = {line["iteration"]: line["seconds"] for line in read_trace(tried / "trace.jsonl")}
+    shutil.rmtree(tried)
+    step = (at[TRIAL] - at[1]) / (TRIAL - 1)  # the first step compiles and fills caches
+    steps = min(asked, max(-(-asked // 20), int((seconds - spent()) / max(step, 1e-9))))
+    said = {"steps": steps, "of": asked, "seconds_per_step": step, "seconds": seconds}
+    partial = path.with_suffix(".writing")
+    partial.write_text(json.dumps(said) + "\n")
+    os.replace(partial, path)
+    print(f"{steps} of {asked} steps fit into {seconds:.0f} s, at {step:.3g} s each", flush=True)
+    return steps
 
 
 def progress(total: int, label: str, start: int = 0) -> Iterator[int]:

@@ -1,6 +1,7 @@
 """The tiny runner: it knows files, hashes and YAML, and nothing of 3D.
 
 - pipeline.py: pipeline.yaml and scene.yaml: models, layers of parameters, clear refusals.
+- budget.py: a time budget, shared out over stages.
 - keys.py: what an artifact depends on, as hashes: contents of folders, code, parameters.
 - job.py: a request with everything about it resolved and checked.
 - plan.py: one word and a reason for each stage, from what lies on the disk.

@@ -19,7 +19,8 @@ def main() -> int:
     arguments = _parser().parse_args()
     root = arguments.root.resolve()
     runs = (arguments.runs or root / "runs").resolve()
-    request = Request(root, runs, arguments.scene, arguments.profile, arguments.variant, arguments.trust, arguments.set)
+    asked = (arguments.scene, arguments.profile, arguments.variant, arguments.trust, arguments.set, arguments.budget)
+    request = Request(root, runs, *asked)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # told to end: as Ctrl-C
     try:
         if arguments.command == "plan":
@@ -53,6 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--profile", help="auto, laptop or paper")
     parser.add_argument("--variant", help="a variant of pipeline.yaml")
     parser.add_argument("--trust", action="store_true", help="accept artifacts made by older code")
+    parser.add_argument("--budget", help="time for the whole job, like 5m: sets the number of steps")
     parser.add_argument("--set", default="", help="stage.parameter=value ...")
     parser.add_argument("--root", type=Path, default=Path(__file__).parent.parent, help="where pipeline.yaml is")
     parser.add_argument("--runs", type=Path, help="where artifacts go; root/runs")

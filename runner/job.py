@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from runner.budget import seconds_of, shared_out
 from runner.keys import Hashes
 from runner.pipeline import (
     Layers,
@@ -38,6 +39,7 @@ class Request:
     variant: str | None = None
     trust: bool = False
     set: str = ""
+    budget: str | None = None
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,11 @@ def prepare(request: Request) -> Job:
     home = runs / (f"{folder.name}@{request.variant}" if request.variant else folder.name)
     _one_folder_a_name(base, folder, root)
     profile = choose_profile(request.profile, scene, [home / "profile", base / "profile"], pipeline)
-    layers = layered(pipeline, scene, profile, request.variant, parse_set(request.set, pipeline))
+    given = (pipeline, scene, profile, request.variant, parse_set(request.set, pipeline))
+    layers = layered(*given, {})
+    if request.budget or scene.budget is not None:
+        origin, text = ("budget", request.budget) if request.budget else (str(scene.path), scene.budget)
+        layers = layered(*given, shared_out(pipeline, layers.values, seconds_of(text, origin)))
     described, broken = _described(root, pipeline, layers)
     params = {name: answer["params"] for name, answer in described.items()}
     scene_params = [params[stage] for stage in pipeline.scene_keys if stage in params]

@@ -8,10 +8,10 @@ import re
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 SCENE = "scene"  # the need that stands for the scene's own folder
 AUTO = "auto"
@@ -86,12 +86,14 @@ class Stage(Strict):
 
 
 class Pipeline(Strict):
-    """The stages in order; parameters by profile and by variant; the keys of scene.yaml and the stage they go to."""
+    """The stages in order; parameters by profile and by variant; the keys of scene.yaml and the stage they go to; the
+    parts of a time budget that stages get."""
 
     stages: dict[str, Stage]
     scene_keys: dict[str, tuple[str, ...]]
     profiles: dict[str, Overrides]
     variants: dict[str, Overrides] = {}
+    budget: dict[str, Annotated[float, Field(gt=0)]] = {}
 
     @model_validator(mode="after")
     def _names_are_known(self) -> Pipeline:
@@ -103,10 +105,13 @@ class Pipeline(Strict):
                 if need not in earlier:
                     raise ValueError(f"stage {name} names {need!r}, which is not a stage before it")
             earlier.append(name)
-        for label, layer in [("scene_keys", self.scene_keys), *self.profiles.items(), *self.variants.items()]:
+        tables = {"scene_keys": self.scene_keys, "budget": self.budget, **self.profiles, **self.variants}
+        for label, layer in tables.items():
             for stage in layer:
                 if stage not in self.stages:
                     raise ValueError(f"{label} names {unknown('stage', stage, self.stages)}")
+        if sum(self.budget.values()) > 1:
+            raise ValueError(f"budget: the parts add up to {sum(self.budget.values()):g}, which is more than 1")
         return self
 
     def closure(self, target: str) -> list[str]:
@@ -166,6 +171,7 @@ class SceneFile:
     Attributes:
         path: the file, present or not.
         profile: its `profile`, or None.
+        budget: its `budget`, or None.
         brings: the keys, with values, that describe the scene.
         stages: parameters of stages.
     """
@@ -174,6 +180,7 @@ class SceneFile:
     profile: str | None
     brings: dict[str, Any]
     stages: Overrides
+    budget: Any = None
 
 
 def load_scene_file(folder: Path, pipeline: Pipeline) -> SceneFile:
@@ -181,8 +188,8 @@ def load_scene_file(folder: Path, pipeline: Pipeline) -> SceneFile:
     content = _read_yaml(path) if path.is_file() else {}
     keys = [key for names in pipeline.scene_keys.values() for key in names]
     for key in content:
-        if key not in (*keys, "profile", "stages"):
-            raise Refused(f"{path}: {unknown('key', key, [*keys, 'profile', 'stages'])}")
+        if key not in (*keys, "profile", "budget", "stages"):
+            raise Refused(f"{path}: {unknown('key', key, [*keys, 'profile', 'budget', 'stages'])}")
     stages = content.get("stages") or {}
     if not isinstance(stages, dict) or not all(isinstance(v, dict) for v in stages.values()):
         raise Refused(f"{path}: stages: expected {{stage: {{parameter: value}}}}")
@@ -190,7 +197,7 @@ def load_scene_file(folder: Path, pipeline: Pipeline) -> SceneFile:
         if stage not in pipeline.stages:
             raise Refused(f"{path}: stages: {unknown('stage', stage, pipeline.stages)}")
     brings = {key: value for key, value in content.items() if key in keys and value is not None}
-    return SceneFile(path, content.get("profile"), brings, stages)
+    return SceneFile(path, content.get("profile"), brings, stages, content.get("budget"))
 
 
 def parse_set(text: str, pipeline: Pipeline) -> Overrides:
@@ -218,14 +225,17 @@ class Layers:
     origin: dict[str, dict[str, str]]
 
 
-def layered(pipeline: Pipeline, scene: SceneFile, profile: str, variant: str | None, asked: Overrides) -> Layers:
-    """Later layers win: stage defaults in pipeline.yaml, profile, scene.yaml, variant, `set=`."""
+def layered(
+    pipeline: Pipeline, scene: SceneFile, profile: str, variant: str | None, asked: Overrides, shares: Overrides
+) -> Layers:
+    """Later layers win: stage defaults in pipeline.yaml, profile, shares of a budget, scene.yaml, variant, `set=`."""
     brought = {
         stage: {k: scene.brings[k] for k in keys if k in scene.brings} for stage, keys in pipeline.scene_keys.items()
     }
     layers = [
         ("pipeline.yaml", {name: stage.params for name, stage in pipeline.stages.items()}),
         (f"pipeline.yaml: profile {profile}", pipeline.profiles[profile]),
+        ("budget", shares),
         (str(scene.path), brought),
         (f"{scene.path}: stages", scene.stages),
         (f"pipeline.yaml: variant {variant}", pipeline.variants.get(variant or "", {})),

@@ -90,6 +90,9 @@ class Params(BaseModel):
     least_opacity: float = Field(0.005, ge=0, lt=1, description="fainter ones are pruned when others are added")
     region_every: int = Field(50, ge=1, description="steps between prunings of Gaussians that changed region")
     stop_drop: float = Field(0.0, ge=0, description="dB the reference's PSNR may fall under its best; 0: no early stop")
+    seconds: float = Field(0.0, ge=0, description="the stage's share of a time budget: as many steps as fit; 0: all")
+    patience: int = Field(0, ge=0, description="stop after so many twentieths of the run without a gain; 0: never")
+    stop_gain: float = Field(0.02, ge=0, description="dB of the trace's main quantity that count as a gain")
     seed: int = 0
     device: Literal["cpu", "cuda"] = "cpu"
     dtype: Literal["float32", "bfloat16", "float16"] = Field("float32", description="of the prior's weights")
@@ -108,6 +111,10 @@ def run(
     initialize: Path,
     lift: Path | None = None,
 ) -> None:
+    import time
+    from dataclasses import replace
+
+    began = time.monotonic()
     import torch
 
     from reffusion import io, lora, trace
@@ -130,8 +137,10 @@ def run(
             text = diffusion.embed_text(prior, list(PROMPTS))
     sights, (perceptual, lifting) = load_sights(params, scene, poses, fit, masks, lift), lift_choices(params)
     estimator = depth_estimator(params, scene.points) if params.depth_weight > 0 else None
-    chosen = settings(params, lifting)
-    gaussians, masked = distill(initial, masked, sights, holes, prior, text, chosen, out, estimator)
+    chosen, given = settings(params, lifting), (initial, masked, sights, holes, prior, text)
+    made = lambda folder, steps: distill(*given, replace(chosen, iterations=steps), folder, estimator)
+    steps = trace.affordable(out, params.iterations, params.seconds, lambda: time.monotonic() - began, made)
+    gaussians, masked = made(out, steps)
     io.save_ply(out / "gaussians.ply", gaussians.map(lambda p: p.cpu()))
     io.save_labels(out / "labels.npy", masked.cpu())
     painted = io.load_json(lift / "facts.json")["inpainter"] if lift else None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     import numpy as np
 
     from reffusion.types import Camera, Gaussians, Scene
+
+Memory = Annotated[float, Field(ge=0, lt=1)]  # part of a mean that the next step keeps
 
 
 class Params(BaseModel):
@@ -43,7 +45,10 @@ class Params(BaseModel):
     rotations_rate: float = Field(1e-3, gt=0, description="step size of quaternions")
     color_rate: float = Field(2.5e-3, gt=0, description="step size of the constant spherical harmonic")
     sh_rate: float = Field(1.25e-4, gt=0, description="step size of the others")
-    betas: tuple[float, float] = Field((0.9, 0.999), description="Adam's memory of gradients and of their squares")
+    betas: tuple[Memory, Memory] = Field((0.9, 0.999), description="Adam's memory of gradients and of their squares")
+    seconds: float = Field(0.0, ge=0, description="the stage's share of a time budget: as many steps as fit; 0: all")
+    patience: int = Field(0, ge=0, description="stop after so many twentieths of the run without a gain; 0: never")
+    stop_gain: float = Field(0.02, ge=0, description="dB of the trace's main quantity that count as a gain")
     checkpoint_seconds: float = Field(10.0, gt=0, description="seconds of work between checkpoints")
     antialiased: bool = Field(False, description="a Gaussian adds up to the same from any distance (Mip-Splatting)")
     exposure: bool = Field(False, description="fit each view's exposure too; later stages see the views without it")
@@ -64,6 +69,7 @@ def preview(params: Params, *, poses: Path) -> list[str]:
 
 def run(params: Params, out: Path, *, poses: Path) -> None:
     import time
+    from dataclasses import replace
 
     from reffusion import io, paint2d, trace
     from reffusion.fit import fit
@@ -82,15 +88,20 @@ def run(params: Params, out: Path, *, poses: Path) -> None:
         points, colors = scene.points, scene.point_colors
     else:
         points, colors = start_points(params, scene, cameras, images, hidden)
+    views = (cameras, images, start(params, points, colors, chosen.budget))
+    spent, weights = (
+        lambda: time.monotonic() - began,
+        {name: (~mask).astype("float32") for name, mask in hidden.items()},
+    )
+    tried = lambda folder, steps: fit(*views, replace(chosen, iterations=steps), folder=folder, weights=weights)
+    steps = trace.affordable(out, params.iterations, params.seconds, spent, tried)
     gaussians = fit(
-        cameras,
-        images,
-        start(params, points, colors, chosen.budget),
-        chosen,
+        *views,
+        replace(chosen, iterations=steps),
         folder=out,
-        weights={name: (~mask).astype("float32") for name, mask in hidden.items()},
+        weights=weights,
         held_out=[scene.cameras[name] for name in held_out],
-        spent=time.monotonic() - began,
+        spent=spent(),
     )
     io.save_ply(out / "gaussians.ply", gaussians.map(lambda p: p.cpu()))
     trace.clear_checkpoint(out)
@@ -147,7 +158,7 @@ def start(params: Params, points: np.ndarray, colors: np.ndarray, budget: int) -
     from dataclasses import replace
 
     from reffusion import trace
-    from reffusion.fit import initial_gaussians
+    from reffusion.start import initial_gaussians
 
     noise = trace.generator(params.seed, "start")
     first = initial_gaussians(points, colors, params.sh_degree, budget, noise, params.start_opacity, params.start_size)

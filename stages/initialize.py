@@ -61,7 +61,7 @@ def run(
 ) -> None:
     import torch
 
-    from reffusion import initialize, io
+    from reffusion import initialize, io, trace
     from reffusion import masks as voting
 
     gaussians, labels = io.load_ply(fit / "gaussians.ply"), io.load_labels(masks / "labels.npy")
@@ -80,10 +80,11 @@ def run(
     haze = voting.leaking(gaussians, train, {c.name: sets[c.name].never_seen for c in train}, params.leak)
     gaussians, new = gaussians.map(lambda p: p[~haze]), new[~haze]
     best = io.load_json(masks / "facts.json")["best_reference"]
+    log = trace.Trace(out) if references else None
     for each in sorted(references, key=lambda r: (r.camera.name != best, -int(r.mask.sum()))):
         views = [(camera, sets[camera.name].consistent) for camera in train]
         gaussians, new = filled(
-            params, out, gaussians, new, each, sets[each.camera.name].consistent, scene.points, views
+            params, out, gaussians, new, each, sets[each.camera.name].consistent, scene.points, views, log
         )
     if params.start == "random" and any(each.invent.any() for each in sets.values()):
         added = at_random(params, removed, gaussians, scene, sets, poses)
@@ -121,7 +122,7 @@ def at_random(params: Params, removed, remaining, scene, sets, poses: Path):
     return scatter.gaussians_at(points, remaining.sh.shape[1], remaining.antialiased, draw)
 
 
-def filled(params: Params, out: Path, gaussians, new, reference, hidden, points, views):
+def filled(params: Params, out: Path, gaussians, new, reference, hidden, points, views, log):
     """The Gaussians with those of one reference, on what is still empty in its mask, and the labels."""
     from dataclasses import fields
 
@@ -132,7 +133,7 @@ def filled(params: Params, out: Path, gaussians, new, reference, hidden, points,
     hole = initialize.to_fill(gaussians, new, reference, hidden, params.covered)
     remaining = gaussians.map(lambda p: p[~new])
     depth, made_up, said = initialize.depth_behind(
-        remaining, reference, hole, hidden, points, how, estimate_of(params, reference)
+        remaining, reference, hole, hidden, points, how, estimate_of(params, reference), log
     )
     print(f"depth of reference {camera.name}: {said}")
     io.save_exr(out / "depth" / f"{camera.name}.exr", depth.astype("float32"))

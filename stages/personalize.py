@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
+
+Memory = Annotated[float, Field(ge=0, lt=1)]  # part of a mean that the next step keeps
 
 
 class Params(BaseModel):
@@ -27,7 +29,7 @@ class Params(BaseModel):
     batch: int = Field(16, ge=1, description="samples in a batch")
     accumulate: int = Field(1, ge=1, description="batches in an optimiser step")
     weight_decay: float = Field(1e-2, ge=0, description="AdamW's")
-    betas: tuple[float, float] = Field((0.9, 0.999), description="AdamW's memory of gradients and of their squares")
+    betas: tuple[Memory, Memory] = Field((0.9, 0.999), description="AdamW's memory of gradients and of their squares")
     clip: float = Field(1.0, gt=0, description="largest norm of the gradient")
     warm_up: int = Field(0, ge=0, description="steps of linear warm-up")
     schedule: Literal["constant", "cosine"] = Field("constant", description="learning rate after the warm-up")
@@ -44,10 +46,17 @@ class Params(BaseModel):
     seed: int = 0
     device: Literal["cpu", "cuda"] = "cpu"
     dtype: Literal["float32", "bfloat16", "float16"] = Field("float32", description="of the frozen weights")
+    seconds: float = Field(0.0, ge=0, description="the stage's share of a time budget: as many steps as fit; 0: all")
+    patience: int = Field(0, ge=0, description="stop after so many twentieths of the run without a gain; 0: never")
+    stop_gain: float = Field(0.02, ge=0, description="dB of the trace's main quantity that count as a gain")
     checkpoint_seconds: float = Field(10.0, gt=0, description="seconds of work between checkpoints")
 
 
 def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, reference: Path) -> None:
+    import time
+    from dataclasses import replace
+
+    began = time.monotonic()
     import torch
 
     from reffusion import io, lora, trace
@@ -86,6 +95,8 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
         size=params.size or prior.native_size,
         seed=params.seed,
         checkpoint_seconds=params.checkpoint_seconds,
+        patience=params.patience,
+        stop_gain=params.stop_gain,
     )
     views = []
     if params.scene_crops > 0:
@@ -93,7 +104,16 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
         if not views:
             print(f"note: no view has {training.size} px window free of masks: reference alone", flush=True)
     trained = lora.add(prior, params.rank, params.alpha, params.dropout, params.layers, params.seed)
-    P.personalize(prior, trained, references, views, sampling, training, out)
+
+    def learn(folder: Path, steps: int) -> None:
+        P.personalize(prior, trained, references, views, sampling, replace(training, steps=steps), folder)
+
+    def tried(folder: Path, steps: int) -> None:
+        before = lora.state(prior)
+        learn(folder, steps)
+        lora.load_state(prior, before)
+
+    learn(out, trace.affordable(out, params.steps, params.seconds, lambda: time.monotonic() - began, tried))
     lora.save(prior, out)
     trace.clear_checkpoint(out)
 

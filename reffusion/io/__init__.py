@@ -20,10 +20,13 @@ from .scene import (
     save_references,
     save_scene,
 )
+from .traces import MAIN, QUANTITIES, load_trace, main_quantity, read_trace
 from .undistorted import check_masks, load_at, save_undistorted
 
 __all__ = [
     "LAYOUTS",
+    "MAIN",
+    "QUANTITIES",
     "Capture",
     "Poses",
     "Roles",
@@ -45,7 +48,10 @@ __all__ = [
     "load_roles",
     "load_scene",
     "load_test_masks",
+    "load_trace",
     "load_views",
+    "main_quantity",
+    "read_trace",
     "save_exr",
     "save_image",
     "save_json",

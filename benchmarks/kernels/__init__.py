@@ -1,0 +1,9 @@
+"""Work-precision diagrams of the kernels: what `benchmarks/precision.py` measures, draws and holds to its baselines.
+
+- points.py: a measured point, a diagram, the choice of a default.
+- splat.py: the rasterizer against its float64 oracle.
+- solvers.py: the bilateral solver and the completion.
+- alignment.py: plain and robust alignment.
+- personalization.py: LoRA over steps, rank and learning rate (slow).
+- draw.py: pictures. gate.py: baselines.
+"""

@@ -1,0 +1,42 @@
+"""A diagram as a picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from benchmarks.kernels.points import Diagram
+
+
+def draw(diagram: Diagram, path: Path) -> None:
+    """Error against milliseconds, a line a curve, settings written beside their points, the default ringed.
+
+    Where the setting is a circumstance (`diagram.over`), it is the axis, and milliseconds have a picture of their own.
+    """
+    from matplotlib.figure import Figure
+
+    against_time = diagram.over == "seconds"
+    figure = Figure(figsize=(7.2, 4.6) if against_time else (9.6, 4.2), layout="constrained")
+    left = figure.subplots() if against_time else figure.subplots(1, 2)
+    long = against_time and min(p.seconds for p in diagram.points) > 10
+    scale, work = (1.0, "seconds") if long else (1e3, "milliseconds of CPU")
+    axes = left if against_time else left[0]
+    for curve, points in diagram.curves.items():
+        across = [scale * p.seconds if against_time else p.x for p in points]
+        axes.plot(across, [p.error for p in points], marker=".", label=curve)
+        if not against_time:
+            left[1].plot(across, [1e3 * p.seconds for p in points], marker=".", label=curve)
+        for x, point in zip(across, points, strict=True):
+            if against_time and point.stands:
+                axes.annotate(point.setting, (x, point.error), textcoords="offset points", xytext=(4, 4), fontsize=7)
+            if (point.curve, point.setting) == diagram.default:
+                axes.scatter([x], [point.error], s=120, facecolors="none", edgecolors="black", label="default")
+    axes.set(yscale="log", ylabel=diagram.error, xlabel=work if against_time else diagram.over)
+    if against_time or min(p.x for p in diagram.points) > 0:
+        axes.set_xscale("log")
+    if not against_time:
+        left[1].set(xlabel=diagram.over, ylabel="milliseconds of CPU", xscale=axes.get_xscale(), yscale="log")
+        left[1].grid(alpha=0.3, which="both")
+    axes.grid(alpha=0.3, which="both")
+    axes.legend(fontsize=8)
+    figure.suptitle(diagram.title, fontsize=10)
+    figure.savefig(path, dpi=110)

@@ -1,0 +1,67 @@
+"""Baselines of the diagrams: error is held tightly, time loosely and in units of this machine's speed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.kernels.points import Diagram, cpu_seconds
+
+SLOWER = 1.5  # factor on a baseline's time, in machine units, that is still no regression
+LEAST_SECONDS = 2e-3  # differences of less are noise
+LEAST_ERROR = 1e-9
+
+
+def machine_unit() -> float:
+    """CPU seconds of a fixed piece of work, part arithmetic, part memory: what times are divided by."""
+    random = np.random.default_rng(0)
+    square, long = random.standard_normal((300, 300)), random.standard_normal(300_000)
+
+    def work() -> None:
+        for _ in range(4):
+            np.sort(long)
+            square @ square
+            np.exp(long).cumsum()
+
+    return cpu_seconds(work, repeats=7)
+
+
+def table(diagrams: list[Diagram], unit: float) -> dict[str, Any]:
+    """What goes into a baseline: name -> {"curve, setting": [error, seconds]}."""
+    points = {d.name: {f"{p.curve}, {p.setting}": [p.error, p.seconds] for p in d.points} for d in diagrams}
+    return {"machine_unit": unit, "diagrams": points}
+
+
+def regressions(diagrams: list[Diagram], unit: float, baselines: dict[str, Any]) -> list[str]:
+    """One line for each point that is worse than its baseline, or that one of the two sides lacks."""
+    found, pace = [], unit / baselines["machine_unit"]
+    for diagram in diagrams:
+        if diagram.name not in baselines["diagrams"]:
+            found.append(f"{diagram.name}: no baseline; write one with --write-baselines")
+            continue
+        known = dict(baselines["diagrams"][diagram.name])
+        for point in diagram.points:
+            name = f"{point.curve}, {point.setting}"
+            if name not in known:
+                found.append(f"{diagram.name}: {name}: no baseline; write one with --write-baselines")
+                continue
+            error, seconds = known.pop(name)
+            if point.error > diagram.tolerance * error + LEAST_ERROR:
+                found.append(f"{diagram.name}: {name}: error {point.error:.4g}, baseline {error:.4g}")
+            if point.seconds > SLOWER * pace * seconds + LEAST_SECONDS:
+                found.append(
+                    f"{diagram.name}: {name}: {1e3 * point.seconds:.3g} ms, baseline {1e3 * pace * seconds:.3g} ms "
+                    "at this machine's speed"
+                )
+        found += [f"{diagram.name}: {name}: is in the baselines and was not measured" for name in known]
+    return found
+
+
+def load(path: Path) -> dict[str, Any]:
+    try:
+        return json.loads(path.read_text())
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no baselines; write them with --write-baselines") from None

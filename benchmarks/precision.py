@@ -1,0 +1,82 @@
+"""Work-precision diagrams of the kernels: `python benchmarks/precision.py --out runs/bench` (`make bench`).
+
+  footprint, cutoff   the float32 rasterizer against its float64 oracle; what skipping faint contributions costs
+  bilateral           the fast bilateral solver, along its iterations, by cell size
+  completion          the thin plate, by the size of its grid
+  alignment           plain and robust, over the share of outliers
+  personalization-recorded   what LOG.md has, drawn
+  tile                (--slow) the rasterizer, by height of a tile; compiles anew for each
+  personalization     (--slow) LoRA over steps, rank and learning rate; needs runs/demo with its stage `reference`
+
+Prints which setting each diagram recommends and why; writes a PNG for each and precision.json (every point: error and
+seconds of CPU time on one thread). --gate compares with benchmarks/baselines.json and ends with code 1 where a point is
+worse: in error beyond rounding, in time beyond 1.5 times the baseline, both counted in units of the machine's speed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+import torch
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from benchmarks.kernels import alignment, gate, personalization, solvers, splat  # noqa: E402
+from benchmarks.kernels.draw import draw  # noqa: E402
+from benchmarks.kernels.points import recommendation  # noqa: E402
+
+BASELINES = ROOT / "benchmarks" / "baselines.json"
+QUICK = {
+    "footprint": splat.footprint_diagram,
+    "cutoff": splat.cutoff_diagram,
+    "bilateral": solvers.bilateral_diagram,
+    "completion": solvers.completion_diagram,
+    "alignment": alignment.diagram,
+    "personalization-recorded": personalization.recorded_diagram,
+}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("runs/bench"))
+    parser.add_argument("--slow", action="store_true", help="tiles and personalization too")
+    parser.add_argument("--run", type=Path, default=Path("runs/demo"), help="scene of the personalization")
+    parser.add_argument("--gate", action="store_true", help="fail where a point is worse than its baseline")
+    parser.add_argument("--write-baselines", action="store_true", help="take what is measured now as baselines")
+    parser.add_argument("--baselines", type=Path, default=BASELINES)
+    parser.add_argument("--only", nargs="+", choices=[*QUICK, "tile", "personalization"], help="these diagrams")
+    given = parser.parse_args()
+    slow = {"tile": splat.tile_diagram, "personalization": lambda: personalization.diagram(given.run, given.out)}
+    every = QUICK | slow
+    chosen = given.only or [*QUICK, *(slow if given.slow else ())]
+    baselines = gate.load(given.baselines) if given.gate else None  # missing: told before any work
+    torch.set_num_threads(1)
+    given.out.mkdir(parents=True, exist_ok=True)
+    unit, diagrams = gate.machine_unit(), []
+    for name in chosen:
+        diagram = every[name]()
+        diagrams.append(diagram)
+        draw(diagram, given.out / f"{name}.png")
+        print(recommendation(diagram), flush=True)
+    unit = min(unit, gate.machine_unit())  # the quieter moment
+    measured = gate.table(diagrams, unit)
+    (given.out / "precision.json").write_text(json.dumps(measured, indent=1) + "\n")
+    print(f"pictures and precision.json in {given.out}/; machine unit {1e3 * unit:.1f} ms")
+    if given.write_baselines:
+        old = json.loads(given.baselines.read_text())["diagrams"] if given.only and given.baselines.exists() else {}
+        measured["diagrams"] = old | measured["diagrams"]
+        given.baselines.write_text(json.dumps(measured, indent=1) + "\n")
+    worse = gate.regressions(diagrams, unit, baselines) if baselines else []
+    for line in worse:
+        print(f"regression: {line}", file=sys.stderr)
+    if baselines and not worse:
+        print(f"gate: all {sum(len(d.points) for d in diagrams)} points hold")
+    return 1 if worse else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

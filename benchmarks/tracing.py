@@ -1,0 +1,87 @@
+"""What tracing costs: `python benchmarks/tracing.py --run runs/demo`.
+
+Pairs of runs of `fit`, `personalize` and `distill` with the laptop profile, one with its trace, one that measures at
+its end only, in turn; CPU time, so that what others do on the machine counts little. Moments are log-spaced, so a short
+run pays more: the pairs take --steps steps (`fit` eight times as many, with every 8th view held out), and the last
+column is what follows for the profile's full length. Ends with code 1 where that is over 3 %.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from pathlib import Path
+from types import ModuleType
+
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from reffusion import trace  # noqa: E402
+from stages import distill, fit, personalize  # noqa: E402
+
+STAGES = {
+    "fit": (fit, "iterations", ("poses",), 2),
+    "personalize": (personalize, "steps", ("poses", "fit", "masks", "reference"), 1),
+    "distill": (distill, "iterations", ("poses", "fit", "masks", "reference", "personalize", "initialize"), 4),
+}
+ALLOWED = 0.03
+
+
+def cpu_seconds(stage: ModuleType, params: object, needs: dict[str, Path | None]) -> tuple[float, int]:
+    """CPU time of a whole run and the lines of its trace."""
+    with tempfile.TemporaryDirectory() as folder:
+        began = time.process_time()
+        stage.run(params, Path(folder), **needs)
+        return time.process_time() - began, len(trace.read_trace(Path(folder) / "trace.jsonl"))
+
+
+def pairs(name: str, run: Path, steps: int, repeats: int) -> tuple[float, float, int, float]:
+    """Of the medians: seconds without and with a trace, and the moments it has more; seconds of a step without one."""
+    stage, count, needs, _ = STAGES[name]
+    given = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"][name]
+    given |= {count: steps, "checkpoint_seconds": 1e9} | ({"holdout": 8} if name == "fit" else {})
+    folders = {need: run / need if (run / need).exists() else None for need in needs}
+    params, every = stage.Params(**given), trace.log_spaced
+    taken: dict[bool, list[float]] = {False: [], True: []}
+    lines = {}
+    cpu_seconds(stage, stage.Params(**given | {count: 2}), folders)  # compiles, fills caches
+    try:
+        for _ in range(repeats):
+            for traced in (False, True):
+                trace.log_spaced = every if traced else (lambda i, last, per_octave=2: i == last)
+                seconds, lines[traced] = cpu_seconds(stage, params, folders)
+                taken[traced].append(seconds)
+    finally:
+        trace.log_spaced = every
+    plain, traced = (sorted(taken[which])[repeats // 2] for which in (False, True))
+    short = cpu_seconds(stage, stage.Params(**given | {count: 2}), folders)[0]
+    return plain, traced, lines[True] - lines[False], (plain - short) / (steps - 2)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--run", type=Path, required=True, help="runs/<scene>, its stages up to `initialize` finished")
+    parser.add_argument("--steps", type=int, default=40)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--only", nargs="+", choices=list(STAGES))
+    given = parser.parse_args()
+    over = 0
+    print(f"{'stage':<12} {'without':>9} {'with':>9} {'moments':>8} {'a moment':>9} {'a step':>8} {'full length':>12}")
+    for name in given.only or STAGES:
+        steps = 8 * given.steps if name == "fit" else given.steps
+        plain, traced, moments, step = pairs(name, given.run, steps, given.repeats)
+        profile = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"][name]
+        full = profile[STAGES[name][1]]
+        moment = (traced - plain) / moments
+        share = moment * sum(trace.log_spaced(i, full, STAGES[name][3]) for i in range(full + 1)) / (full * step)
+        over += share > ALLOWED
+        print(f"{name:<12} {plain:7.2f} s {traced:7.2f} s {moments:8} {moment:7.3f} s {step:6.3f} s {share:12.2%}")
+    return 1 if over else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,331 @@
+"""Error against run time: what stages log, a clock that stands while it measures, early ends, budgets, the gate."""
+
+import copy
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import small_scene as small
+import torch
+from pydantic import ValidationError
+from safetensors.torch import load_file
+from small_prior import save_small_prior
+
+from benchmarks.kernels import gate
+from benchmarks.kernels.points import Diagram, Point, recommendation
+from reffusion import distill as distilling
+from reffusion import fit as fitting
+from reffusion import io, trace
+from reffusion import personalize as personalizing
+from reffusion.types import PARAMETERS, Reference
+from runner.budget import seconds_of, shared_out
+from runner.pipeline import Refused, layered, load_pipeline, load_scene_file
+from stages import distill, fit, initialize, masks, personalize
+
+ROOT = Path(__file__).resolve().parent.parent
+NEAR = 1.7
+FIT = {"iterations": 40, "sh_degree": 0, "budget": 500, "holdout": 3, "densify_until": 0.3}
+PERSONALIZE = {"steps": 20, "batch": 2, "rank": 2, "alpha": 4, "size": 16, "lr_unet": 1e-3}
+DISTILL = {"iterations": 20, "sds_weight": 0, "reference_weight": 1}
+
+
+@pytest.fixture(scope="module")
+def ready(tmp_path_factory):
+    """Folders of a small scene up to `initialize`, and of a random prior."""
+    home = tmp_path_factory.mktemp("scene")
+    poses, fitted, _ = small.write(home, NEAR)
+    folders = {"poses": poses, "fit": fitted, "masks": home / "masks", "reference": home / "reference"}
+    for name in ("masks", "initialize"):
+        (home / name).mkdir()
+    masks.run(masks.Params(), home / "masks", poses=poses, fit=fitted)
+    view = small.CAMERAS["a2"]
+    io.save_references(
+        folders["reference"],
+        [Reference(view, small.photo(view), io.load_mask_sets(home / "masks", ["a2"])["a2"].invent)],
+    )
+    initialize.run(initialize.Params(planar_share=2.0), home / "initialize", **folders)  # no planes: both solvers
+    save_small_prior(home / "prior")
+    return SimpleNamespace(home=home, prior=str(home / "prior"), **folders)
+
+
+def run(stage: str, ready, out: Path, **changed) -> Path:
+    """One of the iterative stages on the small scene; its folder."""
+    out.mkdir(parents=True, exist_ok=True)
+    if stage == "fit":
+        fit.run(fit.Params(**{**FIT, **changed}), out, poses=ready.poses)
+        return out
+    needs = {"poses": ready.poses, "fit": ready.fit, "masks": ready.masks, "reference": ready.reference}
+    if stage == "personalize":
+        personalize.run(personalize.Params(**{**PERSONALIZE, "prior": ready.prior, **changed}), out, **needs)
+    else:
+        needs |= {"personalize": None, "initialize": ready.home / "initialize"}
+        distill.run(distill.Params(**{**DISTILL, **changed}), out, **needs)
+    return out
+
+
+def result(folder: Path) -> list[torch.Tensor]:
+    """The numbers a stage made; the header of a file of LoRA weights is not the same in every run."""
+    if (folder / "gaussians.ply").exists():
+        gaussians = io.load_ply(folder / "gaussians.ply")
+        return [getattr(gaussians, name) for name in PARAMETERS]
+    weights = load_file(folder / "pytorch_lora_weights.safetensors")
+    return [weights[name] for name in sorted(weights)]
+
+
+def same(one: Path, other: Path) -> bool:
+    pairs = list(zip(result(one), result(other), strict=True))
+    return all(torch.equal(a, b) for a, b in pairs) and lines(one) == lines(other)
+
+
+def lines(folder: Path) -> list[dict]:
+    return [{k: v for k, v in line.items() if k != "seconds"} for line in trace.read_trace(folder / "trace.jsonl")]
+
+
+# ------------------------------------------------------------------------------------------------------ the schema
+
+
+@pytest.mark.parametrize("stage", ["fit", "personalize", "distill"])
+def test_a_stages_trace_follows_the_schema(ready, tmp_path, stage):
+    series = io.load_trace(run(stage, ready, tmp_path / stage) / "trace.jsonl", stage)
+    found = series.pop("")
+    assert not series and found[0]["iteration"] == 0 and io.main_quantity(stage, found) == io.MAIN[stage][0]
+    steps = {"fit": 40, "personalize": 20, "distill": 20}[stage]
+    assert found[-1]["iteration"] == found[-1]["of"] == found[-1]["kept"] == steps
+    assert found[-1]["reason"] == "finished" and all("reason" not in line for line in found[:-1])
+    assert len(found) >= 5 and all(io.MAIN[stage][0] in line for line in found)
+
+
+def test_fit_without_held_out_views_is_judged_by_views_before_their_step(ready, tmp_path):
+    found = io.load_trace(run("fit", ready, tmp_path / "fit", holdout=0) / "trace.jsonl", "fit")[""]
+    assert io.main_quantity("fit", found) == "psnr" and "psnr" not in found[0] and "psnr" in found[1]
+
+
+def test_the_solvers_of_initialize_are_traced_against_points_they_do_not_get(ready):
+    series = io.load_trace(ready.home / "initialize" / "trace.jsonl", "initialize")
+    assert set(series) == {"planes a2", "completion a2", "bilateral a2"}
+    steps = series["bilateral a2"]
+    assert len(steps) > 3 and steps[-1]["reason"] == "converged"
+    assert steps[-2]["residual"] < 1e-2 * steps[0]["residual"]
+    assert all(0 <= line["disparity_error"] < 0.2 for line in steps)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"iteration": 2, "psnr": 1.0}, "no 'seconds'"),
+        ({"seconds": 1.0, "iteration": 2}, "seconds fell"),
+        ({"seconds": 3.0, "iteration": 1}, "iteration 1 after 1"),
+        ({"seconds": 3.0, "iteration": 2, "psnr": float("nan")}, "psnr = nan"),
+        ({"seconds": 3.0, "iteration": 2, "pnsr": 1.0}, "unknown quantity 'pnsr'"),
+        ({"seconds": 3.0, "iteration": 2, "of": 4}, "without kept, reason"),
+        ({"seconds": 3.0, "iteration": 2, "of": 4, "kept": 3, "reason": "fell"}, "an end of 2 of 4"),
+    ],
+)
+def test_what_does_not_follow_the_schema_is_refused_by_line(tmp_path, wrong, said):
+    good = {"seconds": 2.0, "iteration": 1, "psnr": 20.0}
+    (tmp_path / "trace.jsonl").write_text(f'{json.dumps(good)}\n{json.dumps(wrong)}\n{{"seconds": 9')
+    with pytest.raises(ValueError, match=f"trace.jsonl: line 2: .*{said}"):
+        io.load_trace(tmp_path / "trace.jsonl", "fit")
+    with pytest.raises(ValueError, match="no such file"):
+        io.load_trace(tmp_path / "none.jsonl", "fit")
+
+
+def test_the_clock_stands_while_something_is_measured(tmp_path, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(trace.time, "perf_counter", lambda: now[0])
+    log = trace.Trace(tmp_path, start_seconds=5.0)
+    now[0] += 2
+    with log.paused():
+        now[0] += 50
+        with log.paused():
+            now[0] += 7
+        now[0] += 1000
+        assert log.seconds == 7
+        log.log(1, psnr=1.0)
+        now[0] += 10
+    now[0] += 3
+    log.log(2, psnr=2.0)
+    assert [line["seconds"] for line in trace.read_trace(log.path)] == [7, 10]
+    with pytest.raises(FloatingPointError, match="step 3: psnr is nan"):
+        log.log(3, psnr=float("nan"))
+
+
+# --------------------------------------------------------------------------------------------------- early endings
+
+
+def test_patience_counts_twentieths_without_a_gain():
+    def ended(values, **given):
+        patience = trace.Patience(**given)
+        for i, value in enumerate(values):
+            if end := patience.ends(i, 20, value):
+                return i, end
+
+    rising = [float(i) for i in range(21)]
+    assert ended(rising, moments=1, gain=0.5) == (20, {"of": 20, "kept": 20, "reason": "finished"})
+    stuck = [0.0, 1, 2, 3, 3.1, 3.2, 3.15, 3.3, 9, 9]
+    assert ended(stuck, moments=3, gain=0.5) == (6, {"of": 20, "kept": 5, "reason": "no gain"})
+    assert ended([0.0, 5, 4.8, 4.4, 4, 4], drop=0.5) == (3, {"of": 20, "kept": 1, "reason": "fell"})
+    assert ended([1.0] * 21) == (20, {"of": 20, "kept": 20, "reason": "finished"})
+    late = trace.Patience(moments=1, gain=1.0)
+    assert not any(late.ends(i, 20, 0.0, start=0.5) for i in range(11)), "not counted before its start"
+    assert late.ends(11, 20, 0.0, start=0.5)["reason"] == "no gain"
+
+
+def test_moments_depend_on_the_iteration_only():
+    assert [i for i in range(41) if trace.log_spaced(i, 40)] == [0, 1, 2, 3, 4, 6, 8, 12, 16, 23, 32, 40]
+    assert [i for i in range(41) if trace.log_spaced(i, 40, 1)] == [0, 1, 2, 4, 8, 16, 32, 40]
+    assert [i for i in range(41) if trace.twentieth(i, 40)] == list(range(2, 41, 2))
+    plain, waiting = trace.Patience(), trace.Patience(moments=2)
+    assert not plain.due(38, 40) and waiting.due(38, 40)
+
+
+KILLED = {
+    "fit": (fitting, "_step", 6),
+    "personalize": (personalizing, "train_step", 6),
+    "distill": (distilling, "_step", 1),
+}
+
+
+@pytest.mark.parametrize("stage", list(KILLED))
+def test_an_early_end_is_the_same_after_a_kill(ready, tmp_path, monkeypatch, stage):
+    """No step gains 60 dB, so each stage ends at its third counted twentieth; a kill between two of them changes
+    nothing, and the result is the state that the last line names."""
+    module, name, position = KILLED[stage]
+    patient = {"patience": 2, "stop_gain": 60.0, "checkpoint_seconds": 1e-9}
+    whole = run(stage, ready, tmp_path / "whole", **patient)
+    last = lines(whole)[-1]
+    assert last["reason"] == "no gain" and last["iteration"] < last["of"] and last["kept"] <= last["iteration"]
+    real, moment = getattr(module, name), last["iteration"] - 1
+
+    def killing(*given):
+        if given[position] == moment:
+            raise KeyboardInterrupt
+        return real(*given)
+
+    monkeypatch.setattr(module, name, killing)
+    with pytest.raises(KeyboardInterrupt):
+        run(stage, ready, tmp_path / "broken", **patient)
+    monkeypatch.setattr(module, name, real)
+    broken = run(stage, ready, tmp_path / "broken", **patient)
+    assert same(broken, whole)
+    assert not (broken / trace.CHECKPOINT).exists()
+
+
+def test_an_early_end_of_distillation_gives_its_best_state(ready, tmp_path):
+    """With huge steps every state is worse than the start."""
+    out = run("distill", ready, tmp_path, rate=300.0, patience=2, stop_gain=0.1, region_every=1000)
+    assert lines(out)[-1]["kept"] == 0 and lines(out)[-1]["reason"] == "no gain"
+    assert all(torch.equal(a, b) for a, b in zip(result(ready.home / "initialize"), result(out), strict=True))
+
+
+# ---------------------------------------------------------------------------------------------------- time budgets
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [("5m", 300), ("90s", 90), ("1h30m", 5400), ("2.5m", 150), (120, 120), ("45", 45), ("1H", 3600)],
+)
+def test_times_are_read(text, seconds):
+    assert seconds_of(text, "x") == seconds
+
+
+@pytest.mark.parametrize("text", ["", "m", "5 minutes", "-5m", "0", "5x", None, "5m5", [5]])
+def test_what_is_no_time_is_refused(text):
+    with pytest.raises(Refused, match=r"scene.yaml: budget .* like 5m"):
+        seconds_of(text, "scene.yaml")
+
+
+def test_a_budget_is_shared_out_and_gives_way_to_what_is_said_by_name(tmp_path):
+    pipeline = load_pipeline(ROOT)
+    shares = {name: share["seconds"] for name, share in shared_out(pipeline, {}, 1000.0).items()}
+    assert set(shares) == {"fit", "personalize", "distill"}
+    assert shares == {name: pytest.approx(1000 * part) for name, part in pipeline.budget.items()}
+    less = shared_out(pipeline, {"distill": {"sds_weight": 0}}, 1000.0)
+    assert "personalize" not in less and sum(s["seconds"] for s in less.values()) == pytest.approx(sum(shares.values()))
+    assert less["fit"]["seconds"] / less["distill"]["seconds"] == pytest.approx(shares["fit"] / shares["distill"])
+    (tmp_path / "scene.yaml").write_text("budget: 5m\nstages: {fit: {seconds: 7}}\n")
+    scene = load_scene_file(tmp_path, pipeline)
+    assert scene.budget == "5m"
+    values = layered(pipeline, scene, "laptop", None, {}, shared_out(pipeline, {}, 300.0)).values
+    assert values["fit"]["seconds"] == 7 and values["distill"]["seconds"] == 300 * pipeline.budget["distill"]
+    with pytest.raises(Refused, match="no table `budget`"):
+        shared_out(pipeline.model_copy(update={"budget": {}}), {}, 60.0)
+
+
+def test_steps_that_fit_are_counted_once(tmp_path):
+    tried = []
+
+    def trial(folder, steps):
+        tried.append(folder)
+        seconds = [100.0] + [100.0 + 0.5 * i for i in range(steps)]  # the first step takes its time
+        rows = [{"seconds": s, "iteration": i} for i, s in enumerate(seconds)]
+        (folder / "trace.jsonl").write_text("\n".join(map(json.dumps, rows)))
+
+    count = lambda name, asked, seconds, spent: trace.affordable(tmp_path / name, asked, seconds, lambda: spent, trial)
+    assert count("a", 100, 0, 5.0) == 100 and not tried, "no budget, nothing measured"
+    assert count("b", 100, 30.0, 10.0) == 40
+    assert count("b", 100, 30.0, 29.0) == 40 and len(tried) == 1, "read back on a resume"
+    assert json.loads((tmp_path / "b" / trace.LENGTH).read_text()) == {
+        "steps": 40, "of": 100, "seconds_per_step": 0.5, "seconds": 30.0,
+    }  # fmt: skip
+    assert count("c", 100, 1000.0, 0.0) == 100 and count("d", 101, 1.0, 50.0) == 6
+    assert not any(folder.exists() for folder in tried)
+
+
+@pytest.mark.parametrize("stage", ["fit", "personalize", "distill"])
+def test_a_budget_shortens_a_stage_and_its_schedule(ready, tmp_path, stage):
+    """A moment's budget: the fewest steps, a twentieth; the trial before them leaves no mark on the result."""
+    steps = {"fit": 2, "personalize": 1, "distill": 1}[stage]
+    out = run(stage, ready, tmp_path / "short", seconds=1e-3)
+    assert lines(out)[-1]["iteration"] == lines(out)[-1]["of"] == steps
+    assert json.loads((out / trace.LENGTH).read_text())["steps"] == steps
+    asked = run(stage, ready, tmp_path / "asked", **{"steps" if stage == "personalize" else "iterations": steps})
+    assert same(out, asked)
+
+
+@pytest.mark.parametrize("stage", [fit, personalize])
+@pytest.mark.parametrize("betas", [(1.0, 0.999), (0.9, -0.1), (0.9, 1.5)])
+def test_betas_are_parts(stage, betas):
+    with pytest.raises(ValidationError, match=r"less than 1|greater than or equal to 0"):
+        stage.Params(betas=betas)
+
+
+# -------------------------------------------------------------------------------------------------------- the gate
+
+
+def as_measured(baselines: dict) -> list[Diagram]:
+    """The committed baselines as if they had been measured now."""
+    return [
+        Diagram(name, "", "", None, [Point(*key.rsplit(", ", 1), 0.0, *value) for key, value in points.items()])
+        for name, points in baselines["diagrams"].items()
+    ]
+
+
+def test_the_gate_sees_a_planted_regression():
+    baselines = gate.load(ROOT / "benchmarks" / "baselines.json")
+    diagrams, unit = as_measured(baselines), baselines["machine_unit"]
+    assert gate.regressions(diagrams, unit, baselines) == []
+    assert gate.regressions(diagrams, 2 * unit, baselines) == [], "a machine half as fast may take twice as long"
+    name, key = "bilateral", "8 px, converged"
+    better = copy.deepcopy(baselines)
+    better["diagrams"][name][key][0] *= 0.95
+    assert [key in line and "error" in line for line in gate.regressions(diagrams, unit, better)] == [True]
+    faster = copy.deepcopy(baselines)
+    faster["diagrams"][name][key][1] /= 2
+    assert [key in line and "ms" in line for line in gate.regressions(diagrams, unit, faster)] == [True]
+    assert gate.regressions(diagrams, unit / 2, baselines), "the same times on a machine twice as fast"
+    more = copy.deepcopy(baselines)
+    more["diagrams"][name]["8 px, step 0"] = [1.0, 1.0]
+    assert "was not measured" in gate.regressions(diagrams, unit, more)[0]
+    with pytest.raises(ValueError, match="--write-baselines"):
+        gate.load(ROOT / "benchmarks" / "none.json")
+
+
+def test_the_recommended_setting_is_the_cheapest_that_is_as_good_as_the_best():
+    points = [Point("a", "fine", 0, 1.0, 9.0), Point("a", "good", 0, 1.05, 2.0), Point("a", "rough", 0, 3.0, 1.0)]
+    diagram = Diagram("d", "", "", ("a", "good"), points)
+    assert "a good" in recommendation(diagram) and "It is the default" in recommendation(diagram)
+    other = recommendation(replace(diagram, default=("a", "rough")))
+    assert "The default, a rough, has 3" in other
