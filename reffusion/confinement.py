@@ -3,12 +3,13 @@
 term             pixels                                        Gaussians
 reconstruction   outside the consistent mask; all if clean     unmasked; all if clean
 SDS              whole view and patches, the hole repainted    masked
+adversarial      patches around the hole                       masked (or all), spherical harmonics only
 reference        the reference's hole (not in the paper)       masked
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -16,6 +17,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from reffusion import prior as diffusion
+from reffusion.adversary import Adversary
+from reffusion.discriminator import gathered
 from reffusion.optimize import confine, reconstruction_loss
 from reffusion.sds import (
     Weighting,
@@ -26,6 +29,7 @@ from reffusion.sds import (
     two_scale_masks,
     two_scales,
     window_around,
+    windows_around,
 )
 from reffusion.splat import render
 from reffusion.types import PARAMETERS, Camera, Gaussians, Rendering
@@ -39,7 +43,7 @@ class Sight:
         camera: the view.
         photo: [H, W, 3] float32 in [0, 1].
         supervises: [H, W] bool, the pixels whose photo may be reconstructed: outside C, all of a clean view.
-        repaint: [H, W] bool, what the UNet repaints; empty where the view is not distilled.
+        repaint: [H, W] bool, what is made up, and the UNet repaints; empty where the view is not distilled.
         clean: the object is absent from this view.
     """
 
@@ -153,6 +157,51 @@ def sds_term(
     if not torch.isfinite(gradient).all():
         raise FloatingPointError(f"the prior's answer at timesteps {timesteps.tolist()} is not finite")
     return sds_loss(latents, gradient, settings.reduction), rendering
+
+
+def adversarial_term(
+    gaussians: Gaussians,
+    masked: Tensor,
+    sight: Sight,
+    image: Tensor,
+    hole: Tensor,
+    adversary: Adversary,
+    generator: torch.Generator,
+) -> tuple[Tensor, Rendering, dict[str, float]]:
+    """The critic learns to tell a reference's patches from a view's, then says what it makes of the view's.
+
+    The gradient reaches the spherical harmonics of masked Gaussians only, or of all where the adversary says so.
+
+    PAPER leaves open: how the patches are drawn. A masked pixel first, as for SDS (`sds.window_around`); all fake ones
+    in one training view, another in each step; all real ones in one reference. A view or reference that is smaller
+    than a patch is enlarged until one fits.
+
+    Args:
+        sight: with at least one pixel to repaint: patches lie around those.
+        image: [H, W, 3] in [0, 1], a reference. hole: [H, W] bool, what it stands for, at least one pixel.
+        adversary: its critic takes a step.
+        generator: on the CPU; the windows come from it.
+    Returns:
+        The generator's loss, the rendering, and what to log.
+    Raises:
+        FloatingPointError: see `Adversary.learn`.
+    """
+    choices = adversary.choices
+    reached = torch.ones_like(masked) if choices.reaches == "all" else masked
+    shaded = replace(gaussians.map(Tensor.detach), sh=confine(gaussians, reached).sh)
+    rendering = render(shaded, sight.camera)
+    real = patches_around(image, hole, choices.patches, choices.size, generator)
+    fake = patches_around(rendering.color, sight.repaint, choices.patches, choices.size, generator)
+    said = adversary.learn(real, fake)
+    loss = adversary.loss(fake)
+    return loss, rendering, {"adversarial": float(loss.detach()), **said}
+
+
+def patches_around(image: Tensor, mask: Tensor, count: int, size: int, generator: torch.Generator) -> Tensor:
+    """[count, 3, size, size] in [-1, 1]: patches of [H, W, 3] in [0, 1] that show a masked pixel; differentiable."""
+    view = enlarged(image.permute(2, 0, 1) * 2 - 1, size)
+    mask = enlarged(mask.to(view)[None], size)[0] > 1e-4
+    return gathered(view, windows_around(mask.cpu(), size, count, generator), size)
 
 
 def gradient_norms(gaussians: Gaussians, masked: Tensor) -> Tensor:

@@ -1,8 +1,9 @@
-"""Distillation (RefFusion section 4): reconstruction and multi-scale SDS on one set of Gaussians, each confined."""
+"""Distillation (RefFusion section 4): several terms on one set of Gaussians, each confined to those it may reach."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from math import log10
 from pathlib import Path
@@ -11,9 +12,11 @@ import torch
 from torch import Tensor
 
 from reffusion import trace
+from reffusion.adversary import Adversarial, Adversary
 from reffusion.confinement import (
     Distillation,
     Sight,
+    adversarial_term,
     gradient_norms,
     reconstruction_term,
     reference_term,
@@ -34,9 +37,10 @@ class Settings:
 
     Attributes:
         iterations: optimisation steps, each with one view for SDS and one for reconstruction.
-        seed: of views, windows, timesteps, noise and splits.
+        seed: of views, windows, timesteps, noise, splits and the critic's first weights.
         sds_weight: lambda of the SDS term; 0 leaves it out.
         sds: the choices within that term.
+        adversarial: the adversarial term; None leaves it out.
         reconstruction_every: steps between two with a reconstruction term; 0: never.
         reference_weight: of the reference's own pixels in its hole (paper: 0).
         densify_every: steps between densifications of masked Gaussians; 0: never.
@@ -58,6 +62,7 @@ class Settings:
     seed: int = 0
     sds_weight: float = 1e-3
     sds: Distillation = field(default_factory=Distillation)
+    adversarial: Adversarial | None = None
     reconstruction_every: int = 1
     reference_weight: float = 0.0
     densify_every: int = 0
@@ -88,32 +93,34 @@ def distill(
 
     Args:
         initial, masked: the Gaussians and their labels [N] bool; everything else is on their device.
-        sights: the training views; only those with pixels to repaint are distilled.
+        sights: the training views; only those with pixels to repaint are distilled and judged by the critic.
         holes: (camera, image [H, W, 3] in [0, 1], hole [H, W] bool) of each reference.
         prior: adapted to the reference; None where `settings.sds_weight` is 0.
         text: [3, L, D], hidden states of the global, the local and the empty prompt.
         folder: gets trace.jsonl and checkpoints. A line of the trace: reconstruction (that term's value),
             reference_psnr (in the references' holes), sds_gradient_mean and _max (norm of the weighted SDS gradient
-            per masked Gaussian in that step), gaussians, masked_gaussians.
+            per masked Gaussian in that step), adversarial (the generator's loss), critic_loss, critic_slope (R1 before
+            its weight), gaussians, masked_gaussians.
     Returns:
         The Gaussians, detached, and their labels.
     Raises:
         FloatingPointError: a value or gradient is not finite; names step, term and view.
+        ValueError: a term lacks what it needs: a prior, a hole in a reference.
     """
+    job = _job(sights, holes, prior, text, settings, initial.means.device)
     optimizer = GaussianOptimizer(initial, masked, settings.rates, settings.masked_pace, epsilon=settings.epsilon)
     region = region_of(initial.means, masked) if masked.any() else None
-    distilled = [sight for sight in sights if sight.repaint.any()] if settings.sds_weight > 0 else []
-    if distilled and (prior is None or text is None):
-        raise ValueError("distillation with sds_weight > 0 needs a prior and its prompts' embeddings")
     state = trace.load_checkpoint(folder)
     start, seconds, best, best_psnr = 0, 0.0, None, -float("inf")
     if state is not None:
         optimizer.load_state_dict(state["optimizer"])
+        if job.adversary is not None:
+            job.adversary.load_state_dict(state["adversary"])
         start, seconds, best, best_psnr = (state[k] for k in ("step", "seconds", "best", "best_psnr"))
     log, saved = trace.Trace(folder, seconds, start + 1), seconds  # a line is numbered by the steps done
 
     for step in trace.progress(settings.iterations, "distill", start):
-        line = _step(optimizer, step, distilled, sights, holes, prior, text, settings)
+        line = _step(optimizer, step, job)
         done = step + 1
         if settings.densify_every and done % settings.densify_every == 0:
             _densify(optimizer, settings, done)
@@ -131,6 +138,7 @@ def distill(
         if log.seconds - saved > settings.checkpoint_seconds:
             saved = log.seconds
             state = {"optimizer": optimizer.state_dict(), "step": done, "seconds": saved}
+            state["adversary"] = None if job.adversary is None else job.adversary.state_dict()
             trace.save_checkpoint(folder, state | {"best": best, "best_psnr": best_psnr})
     return optimizer.gaussians.map(Tensor.detach), optimizer.masked
 
@@ -141,46 +149,106 @@ def _copy(optimizer: GaussianOptimizer) -> dict[str, Tensor]:
     return {name: tensor.detach().clone() for name, tensor in tensors.items()}
 
 
-def _step(
-    optimizer: GaussianOptimizer,
-    step: int,
-    distilled: Sequence[Sight],
-    sights: Sequence[Sight],
-    holes: Sequence[tuple[Camera, Tensor, Tensor]],
-    prior: Prior | None,
-    text: Tensor | None,
-    settings: Settings,
-) -> dict[str, float]:
-    """The terms of one step, one after another, then one step of Adam; what there is to log."""
-    gaussians, masked = optimizer.gaussians, optimizer.masked
-    moved, line = torch.zeros_like(masked), {}
-    if distilled and masked.any():
-        sight = _drawn(distilled, step, settings.seed, "sds")
-        probe = torch.zeros(len(masked), 2, device=masked.device, requires_grad=True)
-        draw = trace.generator(settings.seed, "distill", "sds", step)
-        try:
-            loss, rendering = sds_term(gaussians, masked, sight, prior, text, settings.sds, draw, probe)
-        except FloatingPointError as error:
-            raise FloatingPointError(f"distill, step {step}, SDS, view '{sight.camera.name}': {error}") from None
-        _backward(settings.sds_weight * loss, gaussians, step, "SDS", sight.camera)
-        norms = gradient_norms(gaussians, masked)
-        line |= {"sds_gradient_mean": float(norms.mean()), "sds_gradient_max": float(norms.max())}
-        if settings.densify_every:
-            optimizer.observe(probe.grad, rendering.radii * masked, sight.camera.width, sight.camera.height)
-        moved |= masked & (rendering.radii > 0)
-    if settings.reference_weight > 0 and masked.any():
-        camera, image, hole = holes[step % len(holes)]
-        loss, rendering = reference_term(gaussians, masked, camera, image, hole)
-        _backward(settings.reference_weight * loss, gaussians, step, "reference", camera)
-        moved |= masked & (rendering.radii > 0)
-    if settings.reconstruction_every and step % settings.reconstruction_every == 0:
-        sight = _drawn(sights, step // settings.reconstruction_every, settings.seed, "reconstruction")
-        loss, rendering = reconstruction_term(gaussians, masked, sight)
-        _backward(loss, gaussians, step, "reconstruction", sight.camera)
-        line["reconstruction"] = float(loss.detach())
-        moved |= (rendering.radii > 0) & (~masked | sight.clean)
-    optimizer.step(step / settings.iterations, visible=moved)
+@dataclass(frozen=True)
+class _Job:
+    """What the terms work with from the first step to the last; only the adversary changes.
+
+    Attributes:
+        painted: the sights with pixels to repaint.
+        others: see `distill`.
+    """
+
+    sights: Sequence[Sight]
+    painted: Sequence[Sight]
+    holes: Sequence[tuple[Camera, Tensor, Tensor]]
+    prior: Prior | None
+    text: Tensor | None
+    adversary: Adversary | None
+    settings: Settings
+
+
+def _job(sights, holes, prior, text, settings: Settings, device: torch.device) -> _Job:
+    painted = [sight for sight in sights if sight.repaint.any()]
+    if painted and settings.sds_weight > 0 and (prior is None or text is None):
+        raise ValueError("distillation with sds_weight > 0 needs a prior and its prompts' embeddings")
+    adversary = None
+    if painted and settings.adversarial is not None:
+        if not any(hole.any() for _, _, hole in holes):
+            raise ValueError("the adversarial term takes its real patches around a reference's hole; there is none")
+        adversary = Adversary(settings.adversarial, settings.seed, device)
+    return _Job(sights, painted, holes, prior, text, adversary, settings)
+
+
+def _step(optimizer: GaussianOptimizer, step: int, job: _Job) -> dict[str, float]:
+    """The terms of one step, one after another, then one step of Adam; what there is to log.
+
+    A term gathers its gradient and gives the Gaussians it drew and may move, [N] bool, and its part of the log; None
+    where this step is without it.
+    """
+    moved, line = torch.zeros_like(optimizer.masked), {}
+    for term in (_sds, _adversarial, _reference, _reconstruction):  # SDS first: it logs what has been gathered
+        done = term(optimizer, step, job)
+        if done is not None:
+            moved |= done[0]
+            line |= done[1]
+    optimizer.step(step / job.settings.iterations, visible=moved)
     return line
+
+
+_Done = tuple[Tensor, dict[str, float]] | None
+
+
+def _sds(optimizer: GaussianOptimizer, step: int, job: _Job) -> _Done:
+    gaussians, masked, settings = optimizer.gaussians, optimizer.masked, job.settings
+    if not (settings.sds_weight > 0 and job.painted and masked.any()):
+        return None
+    sight = _drawn(job.painted, step, settings.seed, "sds")
+    probe = torch.zeros(len(masked), 2, device=masked.device, requires_grad=True)
+    draw = trace.generator(settings.seed, "distill", "sds", step)
+    with _named(step, "SDS", sight.camera):
+        loss, rendering = sds_term(gaussians, masked, sight, job.prior, job.text, settings.sds, draw, probe)
+        _backward(settings.sds_weight * loss, gaussians)
+    norms = gradient_norms(gaussians, masked)
+    if settings.densify_every:
+        optimizer.observe(probe.grad, rendering.radii * masked, sight.camera.width, sight.camera.height)
+    line = {"sds_gradient_mean": float(norms.mean()), "sds_gradient_max": float(norms.max())}
+    return masked & (rendering.radii > 0), line
+
+
+def _adversarial(optimizer: GaussianOptimizer, step: int, job: _Job) -> _Done:
+    gaussians, masked, settings, adversary = optimizer.gaussians, optimizer.masked, job.settings, job.adversary
+    if adversary is None or step < adversary.choices.start * settings.iterations or not masked.any():
+        return None
+    sight = _drawn(job.painted, step, settings.seed, "adversarial")
+    real = [(image, hole) for _, image, hole in job.holes if hole.any()]
+    draw = trace.generator(settings.seed, "distill", "adversarial", step)
+    with _named(step, "adversarial", sight.camera):
+        loss, rendering, line = adversarial_term(gaussians, masked, sight, *real[step % len(real)], adversary, draw)
+        _backward(adversary.choices.weight * loss, gaussians)
+    drawn = rendering.radii > 0
+    return drawn if adversary.choices.reaches == "all" else drawn & masked, line
+
+
+def _reference(optimizer: GaussianOptimizer, step: int, job: _Job) -> _Done:
+    gaussians, masked, weight = optimizer.gaussians, optimizer.masked, job.settings.reference_weight
+    if not (weight > 0 and masked.any()):
+        return None
+    camera, image, hole = job.holes[step % len(job.holes)]
+    with _named(step, "reference", camera):
+        loss, rendering = reference_term(gaussians, masked, camera, image, hole)
+        _backward(weight * loss, gaussians)
+    return masked & (rendering.radii > 0), {}
+
+
+def _reconstruction(optimizer: GaussianOptimizer, step: int, job: _Job) -> _Done:
+    gaussians, masked, every = optimizer.gaussians, optimizer.masked, job.settings.reconstruction_every
+    if not every or step % every:
+        return None
+    sight = _drawn(job.sights, step // every, job.settings.seed, "reconstruction")
+    with _named(step, "reconstruction", sight.camera):
+        loss, rendering = reconstruction_term(gaussians, masked, sight)
+        _backward(loss, gaussians)
+    return (rendering.radii > 0) & (~masked | sight.clean), {"reconstruction": float(loss.detach())}
 
 
 def _drawn(sights: Sequence[Sight], turn: int, seed: int, label: str) -> Sight:
@@ -189,15 +257,23 @@ def _drawn(sights: Sequence[Sight], turn: int, seed: int, label: str) -> Sight:
     return sights[int(order[turn % len(sights)])]
 
 
-def _backward(loss: Tensor, gaussians: Gaussians, step: int, term: str, camera: Camera) -> None:
-    where = f"distill, step {step}, {term}, view '{camera.name}'"
+@contextmanager
+def _named(step: int, term: str, camera: Camera) -> Iterator[None]:
+    """A number that is not finite is said to have appeared here."""
+    try:
+        yield
+    except FloatingPointError as error:
+        raise FloatingPointError(f"distill, step {step}, {term}, view '{camera.name}': {error}") from None
+
+
+def _backward(loss: Tensor, gaussians: Gaussians) -> None:
     if not torch.isfinite(loss):
-        raise FloatingPointError(f"{where}: the loss is {float(loss)}")
+        raise FloatingPointError(f"the loss is {float(loss)}")
     loss.backward()
     for name in PARAMETERS:
         gradient = getattr(gaussians, name).grad
         if gradient is not None and not torch.isfinite(gradient.sum()):
-            raise FloatingPointError(f"{where}: the gradient of the Gaussians' {name} is not finite")
+            raise FloatingPointError(f"the gradient of the Gaussians' {name} is not finite")
 
 
 def _densify(optimizer: GaussianOptimizer, settings: Settings, done: int) -> None:

@@ -28,17 +28,21 @@ def window_around(mask: Tensor, size: int, generator: torch.Generator) -> tuple[
         mask: [H, W] bool with at least one True pixel.
         size: side of the window in pixels, at most min(H, W).
     """
+    return tuple(windows_around(mask, size, 1, generator)[0].tolist())
+
+
+def windows_around(mask: Tensor, size: int, count: int, generator: torch.Generator) -> Tensor:
+    """[count, 2] long: (top, left) of each of `count` windows, drawn independently as by `window_around`."""
     height, width = mask.shape
     if size > min(height, width):
         raise ValueError(f"a window of {size} px does not fit into a view of {width} x {height} px; enlarge it first")
-    rows, columns = torch.nonzero(mask, as_tuple=True)
-    if rows.numel() == 0:
+    pixels = torch.nonzero(mask)
+    if len(pixels) == 0:
         raise ValueError("no window can be drawn around an empty mask; leave this view out")
-    pick = int(torch.randint(rows.numel(), (), generator=generator))
-    shift = torch.randint(size, (2,), generator=generator)
-    top = min(max(int(rows[pick] - shift[0]), 0), height - size)
-    left = min(max(int(columns[pick] - shift[1]), 0), width - size)
-    return top, left
+    picks = torch.randint(len(pixels), (count,), generator=generator)
+    shifts = torch.randint(size, (count, 2), generator=generator)
+    corners = pixels[picks] - shifts
+    return torch.minimum(corners.clamp(min=0), torch.tensor([height - size, width - size]))
 
 
 def enlarged(image: Tensor, size: int) -> Tensor:

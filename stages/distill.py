@@ -1,4 +1,4 @@
-"""distill: reconstruction and multi-scale score distillation, each confined to its Gaussians (RefFusion section 4)."""
+"""distill: reconstruction, multi-scale score distillation and a critic, each confined (RefFusion section 4)."""
 
 from __future__ import annotations
 
@@ -30,6 +30,21 @@ class Params(BaseModel):
     reduction: Literal["sum", "mean"] = Field("sum", description="over a latent's elements")
     # PAPER leaves open: which mask m is. Its text repaints the consistent mask; the invent mask keeps true background.
     repaint: Literal["invent", "consistent"] = Field("invent", description="the pixels the UNet repaints")
+    adversarial_weight: float = Field(0.03, ge=0, description="lambda of the adversarial term; 0 leaves it out")
+    # PAPER leaves open: when it starts. At once: the paper trains with the sum of all terms.
+    adversarial_from: float = Field(0.0, ge=0, le=1, description="part of the run after which it acts")
+    adversarial_patches: int = Field(64, ge=4, multiple_of=4, description="real patches in a step, and fake ones")
+    adversarial_size: Literal[8, 16, 32, 64, 128, 256] = Field(64, description="their side, px")
+    # PAPER leaves open: the critic's width, StyleGAN2's here; its step size, GANeRF's.
+    adversarial_width: int = Field(512, ge=1, description="the critic's channels at that side, doubled up to 512")
+    adversarial_rate: float = Field(1e-3, gt=0, description="RMSprop's step size of the critic")
+    # PAPER leaves open: the generator's form; this one pulls where the critic is sure.
+    adversarial_form: Literal["non-saturating", "saturating"] = Field("non-saturating", description="generator's loss")
+    # PAPER leaves open: the weight, GANeRF's here. The paper prints the slope at the fake patches, GANeRF at the real.
+    adversarial_penalty: float = Field(0.2, ge=0, description="weight of half the squared slope of the critic (R1)")
+    adversarial_penalized: Literal["real", "fake"] = Field("fake", description="the patches where that slope is taken")
+    # PAPER leaves open: the paper's "all spherical harmonics" may mean all coefficients or those of all Gaussians.
+    adversarial_reaches: Literal["masked", "all"] = Field("masked", description="the Gaussians whose colour it moves")
     reconstruction_every: int = Field(1, ge=0, description="steps between two with a reconstruction term; 0: never")
     reference_weight: float = Field(0.0, ge=0, description="weight of the reference's pixels in its hole (paper: 0)")
     # PAPER leaves open: Adam's step sizes here; 3DGS's. Those of unmasked Gaussians are left alone: what the object's
@@ -116,13 +131,14 @@ def load_sights(params: Params, scene, poses: Path, fit: Path, masks: Path) -> l
 def settings(params: Params):
     from dataclasses import fields
 
+    from reffusion.adversary import Adversarial
     from reffusion.confinement import Distillation
     from reffusion.distill import Settings
 
     shape = params.rate * params.rate_shape
     pace = {"means": shape, "quaternions": shape, "log_scales": shape, "sh": params.rate}
     pace["opacity_logits"] = params.rate * params.rate_opacity
-    given = ("rates", "masked_pace", "sds")
+    given = ("rates", "masked_pace", "sds", "adversarial")
     shared = {f.name: getattr(params, f.name) for f in fields(Settings) if f.name not in given}
     sds = Distillation(
         params.patches,
@@ -134,4 +150,17 @@ def settings(params: Params):
         params.guidance,
         params.reduction,
     )
-    return Settings(**shared, sds=sds, masked_pace=pace)
+    adversarial = Adversarial(
+        params.adversarial_weight,
+        params.adversarial_from,
+        params.adversarial_patches,
+        params.adversarial_size,
+        params.adversarial_width,
+        params.adversarial_form,
+        params.adversarial_penalty,
+        params.adversarial_penalized,
+        params.adversarial_rate,
+        params.adversarial_reaches,
+    )
+    chosen = adversarial if params.adversarial_weight > 0 else None
+    return Settings(**shared, sds=sds, adversarial=chosen, masked_pace=pace)

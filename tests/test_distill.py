@@ -10,9 +10,11 @@ from small_prior import save_small_prior, small_prior
 
 from reffusion import distill as D
 from reffusion import inpaint, io
+from reffusion.adversary import Adversarial, Adversary
 from reffusion.confinement import (
     Distillation,
     Sight,
+    adversarial_term,
     reconstruction_term,
     reference_term,
     region_of,
@@ -28,6 +30,7 @@ from reffusion.types import PARAMETERS, Camera, Gaussians, MaskSet, Scene, Simil
 
 WIDTH, HEIGHT = 36, 28
 SDS = Distillation(weighting="x0", unit_rms=True, guidance=0.0)
+ADVERSARIAL = Adversarial(patches=4, size=8, width=4)
 
 
 def camera(name="a", shift=0.0):
@@ -142,6 +145,34 @@ def test_sds_without_patches_and_with_guidance(prior, text):
         assert torch.isfinite(moved.means.grad).all() and moved.means.grad[masked].ne(0).any()
 
 
+@pytest.mark.parametrize("reaches", ["masked", "all"])
+def test_the_critic_reaches_spherical_harmonics_only(reaches):
+    gaussians, masked = wall()
+    moved, view = leaves(gaussians), sight()
+    adversary = Adversary(replace(ADVERSARIAL, reaches=reaches), seed=0)
+    loss, rendering, said = adversarial_term(moved, masked, view, view.photo, hole(), adversary, generator(1))
+    loss.backward()
+    assert all(getattr(moved, name).grad is None for name in PARAMETERS if name != "sh")
+    got, drawn = moved.sh.grad.flatten(1).ne(0).any(1), rendering.radii > 0
+    assert got[~masked].any() == (reaches == "all")
+    assert got[masked & drawn].float().mean() > 0.5, "hardly any masked Gaussian has a gradient"
+    assert moved.sh.grad[masked][:, 1:].ne(0).any(), "the view-dependent coefficients have none"
+    assert said["adversarial"] == loss.item() and said["critic_loss"] > 0 and said["critic_slope"] > 0
+
+
+def test_the_adversarial_gradient_is_that_of_the_patches_by_finite_differences():
+    gaussians, masked = wall()
+    moved, view = leaves(gaussians), sight()
+    adversary = Adversary(replace(ADVERSARIAL, rate=1e-12), seed=0)  # the critic stands still
+    term = lambda g: adversarial_term(g, masked, view, view.photo, hole(), adversary, generator(1))[0]
+    term(moved).backward()
+    direction = torch.randn(gaussians.sh.shape, generator=generator(8)) * masked[:, None, None]
+    step = 2e-3
+    values = [float(term(replace(gaussians, sh=gaussians.sh + sign * step * direction))) for sign in (1, -1)]
+    by_hand = (values[0] - values[1]) / (2 * step)
+    assert (moved.sh.grad * direction).sum().item() == pytest.approx(by_hand, rel=0.02)
+
+
 def test_region_changers_are_found_and_no_one_else():
     gaussians, masked = wall(600)
     region = region_of(gaussians.means, masked)
@@ -160,8 +191,8 @@ def test_region_changers_are_found_and_no_one_else():
 
 
 SETTINGS = D.Settings(
-    iterations=6, sds_weight=1e-3, sds=SDS, reference_weight=0.5, densify_every=2, densify_until=1.0, region_every=2,
-    checkpoint_seconds=1e-9,
+    iterations=6, sds_weight=1e-3, sds=SDS, adversarial=ADVERSARIAL, reference_weight=0.5, densify_every=2,
+    densify_until=1.0, region_every=2, checkpoint_seconds=1e-9,
 )  # fmt: skip
 
 
@@ -198,17 +229,31 @@ def test_interrupted_distillation_resumes_to_the_same_gaussians(prior, text, tmp
     ]
     assert lines[0] == lines[1] and lines[0][-1]["iteration"] == 6
     assert lines[0][-1]["sds_gradient_max"] >= lines[0][-1]["sds_gradient_mean"] > 0
+    assert {"adversarial", "critic_loss", "critic_slope"} <= lines[0][-1].keys()
 
 
 def test_each_set_of_gaussians_moves_by_its_own_terms_only(prior, text, tmp_path):
     start, masked = wall()
-    plain = replace(SETTINGS, densify_every=0, reference_weight=0.0, region_every=100)
+    plain = replace(SETTINGS, adversarial=None, densify_every=0, reference_weight=0.0, region_every=100)
     views = [sight("a"), sight("b", 0.1)]
     one, labels = run(tmp_path / "sds", prior, text, replace(plain, reconstruction_every=0), views)
     assert (labels == masked).all() and (one.means[~masked] == start.means[~masked]).all()
     assert (one.sh[masked] != start.sh[masked]).any()
     two, _ = run(tmp_path / "reconstruction", None, None, replace(plain, sds_weight=0.0), views)
     assert (two.means[masked] == start.means[masked]).all() and (two.sh[~masked] != start.sh[~masked]).any()
+    alone = replace(plain, adversarial=ADVERSARIAL, sds_weight=0.0, reconstruction_every=0)
+    three, _ = run(tmp_path / "adversarial", None, None, alone, views)
+    for name in PARAMETERS:
+        still = ~masked if name == "sh" else torch.ones_like(masked)
+        assert (getattr(three, name)[still] == getattr(start, name)[still]).all(), name
+    assert (three.sh[masked] != start.sh[masked]).any()
+
+
+def test_the_critic_waits_for_its_part_of_the_run(tmp_path):
+    late = replace(SETTINGS, sds_weight=0.0, iterations=8, adversarial=replace(ADVERSARIAL, start=0.5))
+    run(tmp_path / "late", None, None, late)
+    judged = {r["iteration"]: "critic_loss" in r for r in read_trace(tmp_path / "late" / "trace.jsonl")}
+    assert judged == {step: step > 4 for step in judged} and len(set(judged.values())) == 2
 
 
 def test_the_reference_term_draws_the_reference(prior, text, tmp_path):
@@ -225,7 +270,7 @@ def test_the_reference_term_draws_the_reference(prior, text, tmp_path):
 
 
 def test_early_stopping_ends_before_the_last_step_and_gives_the_best(prior, text, tmp_path):
-    settings = replace(SETTINGS, iterations=60, reference_weight=0.0, densify_every=0, stop_drop=0.3)
+    settings = replace(SETTINGS, iterations=60, adversarial=None, reference_weight=0.0, densify_every=0, stop_drop=0.3)
     settings = replace(settings, rates=Rates(sh_dc=0.3))
     with torch.no_grad():
         image = render(wall()[0], camera()).color.clamp(0, 1)  # the start agrees perfectly
@@ -244,8 +289,20 @@ def test_a_number_that_is_none_names_step_term_and_view(prior, text, tmp_path):
     bad = replace(sight(), photo=torch.full((HEIGHT, WIDTH, 3), float("nan")))
     with pytest.raises(FloatingPointError, match=r"step 0, reconstruction, view 'a'"):
         run(tmp_path / "y", None, None, replace(SETTINGS, sds_weight=0.0, reference_weight=0.0), [bad])
+    alone = replace(SETTINGS, sds_weight=0.0, reference_weight=0.0)
+    for part, where in (("sh", "adversarial, view 'a': the critic's loss"), ("rate", "adversarial, view 'a'")):
+        gaussians, masked = wall()
+        if part == "sh":
+            gaussians = replace(gaussians, sh=torch.where(masked[:, None, None], float("nan"), gaussians.sh))
+        else:
+            alone = replace(alone, adversarial=replace(ADVERSARIAL, rate=1e30))
+        with pytest.raises(FloatingPointError, match=rf"step \d, {where}"):
+            run(tmp_path / part, None, None, alone, [sight()], gaussians)
     with pytest.raises(ValueError, match="prior"):
         run(tmp_path / "z", None, None)
+    bare = [(camera(), sight().photo, torch.zeros_like(hole()))]
+    with pytest.raises(ValueError, match="reference's hole"):
+        D.distill(*wall(), [sight()], bare, None, None, alone, tmp_path / "z")
 
 
 # ------------------------------------------------------------------------------------------ the reference
@@ -344,7 +401,8 @@ def test_stages_chain_through_files_with_the_scenes_own_reference(folders):
     assert (folders["personalize"] / "pytorch_lora_weights.safetensors").exists()
 
     needs = pick(folders, "poses", "fit", "masks", "reference", "personalize", "initialize")
-    distill.run(distill.Params(prior=folders["prior"], iterations=2), folders["distill"], **needs)
+    critic = {"adversarial_patches": 4, "adversarial_size": 8, "adversarial_width": 4}
+    distill.run(distill.Params(prior=folders["prior"], iterations=2, **critic), folders["distill"], **needs)
     result = io.load_ply(folders["distill"] / "gaussians.ply")
     labels = io.load_labels(folders["distill"] / "labels.npy")
     assert len(result) == len(labels) and labels.any()
