@@ -143,6 +143,8 @@ def fit(
         recent = {"loss": recent["loss"] + loss, "error": recent["error"] + error, "steps": recent["steps"] + 1}
         done = i + 1
         _adapt(optimizer, centers, started_with, settings, done)
+        if not len(optimizer.gaussians):
+            raise ValueError(f"fit, step {i}: pruning left no Gaussian: lower `least_opacity`, or raise `largest`")
         if trace.log_spaced(done, settings.iterations):
             _check_finite(optimizer.gaussians, f"step {i}, view '{camera.name}'")
             with log.paused():
