@@ -24,7 +24,7 @@ STAGES := poses fit masks reference personalize initialize distill evaluate
 options = $(if $(profile),--profile '$(profile)') $(if $(variant),--variant '$(variant)') \
 	$(if $(set),--set "$$set") $(if $(trust),--trust) $(if $(runs),--runs '$(runs)')
 
-.PHONY: help setup all $(STAGES) plan clean batch demo prior prior-report test bench lint
+.PHONY: help setup all $(STAGES) plan clean batch demo prior prior-report test bench stability lint
 .DELETE_ON_ERROR:
 
 help:
@@ -38,6 +38,7 @@ help:
 	@echo 'make prior-report              measure it, and draw what it paints (minutes): runs/prior-report'
 	@echo 'make setup | test | lint       .venv; the tests; ruff'
 	@echo 'make bench                     speed of the CPU splatting'
+	@echo 'make stability                 stiff and extreme cases, each with its bound (minutes): runs/stability.json'
 	@echo 'scene=  a name under data/, or the path of any folder'
 	@echo 'profile=auto|laptop|paper  variant=NAME  set="fit.iterations=500 distill.seed=3"  runs=FOLDER'
 	@echo 'trust=1  keep results of older code'
@@ -112,3 +113,6 @@ lint: $(VENV)/.ready-dev
 
 bench: $(VENV)/.ready
 	$(PY) benchmarks/splat.py
+
+stability: $(VENV)/.ready-dev
+	$(PY) -m benchmarks.stability --out '$(or $(runs),runs)/stability.json'

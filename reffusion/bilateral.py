@@ -86,7 +86,9 @@ def solve(target: np.ndarray, confidence: np.ndarray, guide: np.ndarray, solver:
     return mean + unit * solution[cell].reshape(target.shape)
 
 
-def system_of(confidence: np.ndarray, guide: np.ndarray, solver: Solver = USUAL) -> tuple[sparse.csr_matrix, np.ndarray]:
+def system_of(
+    confidence: np.ndarray, guide: np.ndarray, solver: Solver = USUAL
+) -> tuple[sparse.csr_matrix, np.ndarray]:
     """The solver's matrix [V, V], symmetric and positive definite, and the vertex of each pixel [H * W]."""
     cell, coordinates = _grid(guide, solver)
     gather = lambda values: np.bincount(cell, values.ravel(), minlength=len(coordinates))

@@ -18,7 +18,9 @@ SH_0 = 0.28209479177387814  # the constant spherical harmonic
 LEAST_PIXELS = 4  # two unknowns, and as many pixels again to notice a misfit
 LEAST_SPREAD = 1e-6  # relative; below it float32 input carries no slope
 REWEIGHTINGS = 30
-TRIALS = 1000  # of two pixels: of 10% inliers both are in one trial of a hundred, and all miss them once in 20,000 times
+TRIALS = (
+    1000  # of two pixels: of 10% inliers both are in one trial of a hundred; all trials miss once in 20,000
+)
 JURY = 500  # pixels that judge a trial: of 10% inliers 50 agree with the right line, with a wrong one a handful
 SUPPORTS = 32  # numbers of agreeing pixels that are looked at
 
@@ -168,9 +170,9 @@ def _robust_line(x: np.ndarray, y: np.ndarray, w: np.ndarray, plain: Alignment, 
 def _consensus(x: np.ndarray, y: np.ndarray, w: np.ndarray, draws: torch.Generator) -> tuple[Alignment, float] | None:
     """The line through two pixels, of many drawn, whose support chance explains least, and its share of the pixels.
 
-    A contrario, so that no noise level need be known: with q the part of the residuals to shuffled targets that is
-    within r, h of n within r have a probability of about exp(-n KL(h/n || q)) if x says nothing of y (Chernoff). The
-    line and the r with the largest exponent win. None where no line says more than chance.
+    A contrario, so that no noise level need be known: if x said nothing of y, and a share q of the residuals to shuffled
+    targets is within r, then h of n would be with probability exp(-n KL(h/n || q)) (Chernoff). The line and the r of the
+    largest exponent win; None where no line says more than chance.
     """
     uniform = lambda count: torch.rand(count, generator=draws, dtype=torch.float64).numpy()
     edges = np.cumsum(w) / w.sum()
@@ -193,8 +195,8 @@ def _consensus(x: np.ndarray, y: np.ndarray, w: np.ndarray, draws: torch.Generat
     if not surprise.any():
         return None
     trial, level = np.unravel_index(surprise.argmax(), surprise.shape)
-    k, scale = first[trial], slope[trial]
-    line = Alignment(float(scale), float(y[k] - scale * x[k]), float(error[trial, support[level] - 1]))
+    offset = y[first[trial]] - slope[trial] * x[first[trial]]
+    line = Alignment(float(slope[trial]), float(offset), float(error[trial, support[level] - 1]))
     return line, float(support[level] / len(jury))
 
 

@@ -34,7 +34,7 @@ def robust_error(outliers: float) -> float:
 
 def clean_loss() -> float:
     """Without outliers: the robust line against plain L2, over the latter's own standard error at the range's end."""
-    x, y, truth = samples(0.0)
+    x, y, _ = samples(0.0)
     apart = geometry.align(x, y, robust=True).apply(x) - geometry.align(x, y).apply(x)
     return float(np.abs(apart).max() / (NOISE * 2.0 / np.sqrt(len(x))))
 

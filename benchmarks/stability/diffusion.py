@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 
@@ -138,7 +137,8 @@ def nothing_hidden() -> float:
     """With an empty mask the conditioning is the picture's latents, bit for bit."""
     with torch.no_grad():
         condition = prior.conditioning(model(), images(), torch.zeros(1, 1, SIZE, SIZE))
-        return max(condition[:, :1].abs().max().item(), (condition[:, 1:] - prior.encode(model(), images())).abs().max().item())  # fmt: skip
+        apart = condition[:, 1:] - prior.encode(model(), images())
+    return max(condition[:, :1].abs().max().item(), apart.abs().max().item())
 
 
 def window_of_nothing() -> float:
@@ -160,7 +160,8 @@ def scene_gradient(low: float, high: float, guidance: float) -> float:
 
 def one_step_painted() -> float:
     """Painting in one step, everything masked: pixels outside [-1, 1] or no numbers."""
-    found = prior.sample(model(), images(), torch.ones(1, 1, SIZE, SIZE), prompts()[:1], 1, trace.generator(0), 100.0, prompts()[2:])  # fmt: skip
+    full, draws = torch.ones(1, 1, SIZE, SIZE), trace.generator(0)
+    found = prior.sample(model(), images(), full, prompts()[:1], 1, draws, 100.0, prompts()[2:])
     return float((~(found.abs() <= 1)).sum())
 
 
@@ -185,7 +186,7 @@ def sure_critic() -> float:
 def sure_generator() -> float:
     """The maker's losses at +-1e4, both forms: errors of values (relative) and slopes."""
     worst = 0.0
-    for form, sign in (("non-saturating", -1.0), ("saturating", 1.0)):
+    for form in ("non-saturating", "saturating"):
         for score in (1e4, -1e4):
             scores = torch.full((4,), score, requires_grad=True)
             value = discriminator.generator_loss(scores, form)

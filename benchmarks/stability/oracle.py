@@ -8,7 +8,6 @@ sorts by the depth in float32, as the kernel does. Everything else is float64.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -16,7 +15,7 @@ from torch import Tensor
 
 from reffusion import splat
 from reffusion.splat import reference
-from reffusion.splat.conventions import MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE
+from reffusion.splat.conventions import MAX_ALPHA
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
 BLOCKS = (*PARAMETERS, "features", "background", "probe")

@@ -6,8 +6,8 @@ import numpy as np
 
 from benchmarks.stability.cases import EPS64, EXACT, UNCLEAR, Case, unclear
 from reffusion import bilateral, depth
-from reffusion.trace import generator
 from reffusion.planes import planar_model
+from reffusion.trace import generator
 
 ROWS, COLUMNS = np.mgrid[:40, :56].astype(float)
 PLANE = 0.4 + 0.003 * COLUMNS - 0.002 * ROWS

@@ -111,7 +111,8 @@ def on_the_near_plane() -> float:
 
 def at_the_near_plane(gaussians: Gaussians) -> Gaussians:
     z = [0.0101, 0.0105, 0.011, 0.012, 0.015, 0.02, 0.03, 0.05]
-    return replace(scaled(2e-3, gaussians), means=in_camera([[0.001 * k, -0.001 * k, d] for k, d in enumerate(z)], camera()))  # fmt: skip
+    means = in_camera([[0.001 * k, -0.001 * k, depth] for k, depth in enumerate(z)], camera())
+    return replace(scaled(2e-3, gaussians), means=means)
 
 
 def behind(gaussians: Gaussians) -> Gaussians:
