@@ -18,9 +18,7 @@ SH_0 = 0.28209479177387814  # the constant spherical harmonic
 LEAST_PIXELS = 4  # two unknowns, and as many pixels again to notice a misfit
 LEAST_SPREAD = 1e-6  # relative; below it float32 input carries no slope
 REWEIGHTINGS = 30
-TRIALS = (
-    1000  # of two pixels: of 10% inliers both are in one trial of a hundred; all trials miss once in 20,000
-)
+TRIALS = 1000  # of two pixels: of 10% inliers both are in one of a hundred; all miss them once in 20,000 times
 JURY = 500  # pixels that judge a trial: of 10% inliers 50 agree with the right line, with a wrong one a handful
 SUPPORTS = 32  # numbers of agreeing pixels that are looked at
 
@@ -108,9 +106,8 @@ def align(
     Args:
         estimate, target: arrays of one shape, any unit.
         weights: same shape, >= 0 (bool for a choice of pixels); None: all ones.
-        robust: let go of outliers, up to 90% of the pixels where these do not lie on a line themselves: from the line
-            that chance explains least (`_consensus`), iteratively reweighted least squares with Geman-McClure weights,
-            their scale from the residuals of those that agree.
+        robust: let go of outliers, up to 90% of a few hundred pixels or more where these form no line themselves: from
+            the line that chance explains least, iteratively reweighted least squares with Geman-McClure weights.
         seed: of the robust start's draws.
 
     Raises:
@@ -137,14 +134,13 @@ def condition(estimate: np.ndarray, weights: np.ndarray | None = None) -> tuple[
     Those of `align` are about the weighted mean and in units of the weighted spread: two equations that do not know of
     each other. What remains is the rounding of the mean, relative to the spread.
 
-    Args, errors: as `align`.
+    Args: as `align`, the estimate not constant.
     """
     estimate = np.asarray(estimate, np.float64)
     weights = np.ones(estimate.shape) if weights is None else np.asarray(weights, np.float64)
     x, root = estimate[weights > 0], np.sqrt(weights[weights > 0])
     center = np.average(x, weights=root**2)
     spread = np.sqrt(np.average((x - center) ** 2, weights=root**2))
-    _refuse_constant(x, center, spread)
     squared = lambda column: float(np.linalg.cond(np.stack([column * root, root], 1)) ** 2)
     return squared(x), squared((x - center) / spread)
 
@@ -170,9 +166,9 @@ def _robust_line(x: np.ndarray, y: np.ndarray, w: np.ndarray, plain: Alignment, 
 def _consensus(x: np.ndarray, y: np.ndarray, w: np.ndarray, draws: torch.Generator) -> tuple[Alignment, float] | None:
     """The line through two pixels, of many drawn, whose support chance explains least, and its share of the pixels.
 
-    A contrario, so that no noise level need be known: if x said nothing of y, and a share q of the residuals to shuffled
-    targets is within r, then h of n would be with probability exp(-n KL(h/n || q)) (Chernoff). The line and the r of the
-    largest exponent win; None where no line says more than chance.
+    A contrario, so that no noise level need be known: if x said nothing of y, and a share q of the residuals to
+    shuffled targets is within r, h of n would be with probability exp(-n KL(h/n || q)) (Chernoff). The line and the r
+    of the largest exponent win; None where no line says more than chance.
     """
     uniform = lambda count: torch.rand(count, generator=draws, dtype=torch.float64).numpy()
     edges = np.cumsum(w) / w.sum()
