@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.stability.cases import EPS64, EXACT, UNCLEAR, Case, unclear
+from benchmarks.stability.cases import EPS64, EXACT, UNCLEAR, Case, largest, unclear
 from reffusion import geometry
 
 NOISE = 1e-3  # of the estimate's spread
@@ -28,7 +28,7 @@ def robust_error(outliers: float) -> float:
     worst = 0.0
     for seed in range(10):
         x, y, truth = samples(outliers, seed=seed)
-        worst = max(worst, np.abs(geometry.align(x, y, robust=True, seed=seed).apply(x) - truth).max() / NOISE)
+        worst = largest(worst, np.abs(geometry.align(x, y, robust=True, seed=seed).apply(x) - truth).max() / NOISE)
     return float(worst)
 
 
@@ -51,7 +51,7 @@ def unit_error(x_unit: float, y_unit: float, robust: bool) -> float:
     x, _, truth = samples(0.0)
     fitted = geometry.align(x_unit * x, y_unit * truth, robust=robust)
     scale = abs(fitted.scale * x_unit / y_unit / 2.0 - 1.0)
-    return float(max(scale, np.abs(fitted.apply(x_unit * x) / (y_unit * truth) - 1.0).max()))
+    return float(largest(scale, np.abs(fitted.apply(x_unit * x) / (y_unit * truth) - 1.0).max()))
 
 
 def far_offset() -> float:
@@ -73,7 +73,7 @@ def constant_depth() -> float:
         geometry.align_depth(estimate, np.full((12, 10), 2.5), np.ones((12, 10)), space=space, robust=robust)
         for space in ("depth", "disparity") for robust in (False, True)
     ]  # fmt: skip
-    return float(max(np.abs(depth / 2.5 - 1.0).max() for depth in aligned))
+    return float(largest(*(np.abs(depth / 2.5 - 1.0).max() for depth in aligned)))
 
 
 def constant_estimate() -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -30,6 +31,11 @@ def unclear(call: Callable[[], object], *words: str, error: type[Exception] = Va
     except error as refusal:
         return float(not all(word in str(refusal) for word in words))
     return 1.0
+
+
+def largest(*values: float) -> float:
+    """The largest, infinite where one is not a number (which `max` might pass over)."""
+    return math.inf if any(value != value for value in values) else float(max(values))
 
 
 UNCLEAR = "refusals without the cause in the message"

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from benchmarks.stability.cases import EPS32, EXACT, UNCLEAR, Case, unclear
+from benchmarks.stability.cases import EPS32, EXACT, UNCLEAR, Case, largest, unclear
 from benchmarks.stability.splatting import camera, cloud
 from reffusion import discriminator, prior, sds, trace
 from reffusion.confinement import Distillation, Sight, sds_term
@@ -63,7 +63,8 @@ def torn(t: int, guidance: float | None = None) -> float:
 
 def no_guidance() -> float:
     """Guidance 0 is the conditional prediction, bit for bit; largest difference."""
-    return max((a - b).abs().max().item() for a, b in zip(predicted(500, 0.0), predicted(500), strict=True))
+    pairs = zip(predicted(500, 0.0), predicted(500), strict=True)
+    return largest(*((a - b).abs().max().item() for a, b in pairs))
 
 
 def strong_guidance() -> float:
@@ -95,7 +96,7 @@ def half_precision(dtype: torch.dtype) -> float:
                 condition = prior.conditioning(model(kind), images(), mask)
                 noisy = normal(1, condition.shape[1] - 1, *condition.shape[-2:])
                 found.append(prior.predict(model(kind), noisy, torch.tensor([t]), condition, prompts()[:1])[0])
-        worst = max(worst, ((found[1] - found[0]).norm() / found[0].norm()).item())
+        worst = largest(worst, ((found[1] - found[0]).norm() / found[0].norm()).item())
     return worst
 
 
@@ -113,7 +114,7 @@ def distilled(t: int, dtype: torch.dtype) -> float:
         )
         # z - z_0 is a difference of numbers of order one at t = 0: its error is measured against those.
         size = latents.double().norm() if weighting == "x0" else truth.norm()
-        worst = max(worst, ((found.double() - truth).norm() / size).item())
+        worst = largest(worst, ((found.double() - truth).norm() / size).item())
     return worst
 
 
@@ -138,7 +139,7 @@ def nothing_hidden() -> float:
     with torch.no_grad():
         condition = prior.conditioning(model(), images(), torch.zeros(1, 1, SIZE, SIZE))
         apart = condition[:, 1:] - prior.encode(model(), images())
-    return max(condition[:, :1].abs().max().item(), apart.abs().max().item())
+    return largest(condition[:, :1].abs().max().item(), apart.abs().max().item())
 
 
 def window_of_nothing() -> float:
@@ -179,7 +180,7 @@ def sure_critic() -> float:
             scores = torch.full((4,), score, requires_grad=True)
             value = loss(scores) - torch.tensor(2.0).log()  # what scores of zero cost
             value.backward()
-            worst = max(worst, abs(value.item() - limit) / 1e4, (scores.grad * 4 - slope).abs().max().item())
+            worst = largest(worst, abs(value.item() - limit) / 1e4, (scores.grad * 4 - slope).abs().max().item())
     return worst
 
 
@@ -193,8 +194,8 @@ def sure_generator() -> float:
             value.backward()
             limit = -max(0.0, score) if form == "saturating" else max(0.0, -score)
             slope = -float(score > 0) if form == "saturating" else -float(score < 0)
-            worst = max(worst, abs(value.item() - limit) / 1e4, (scores.grad * 4 - slope).abs().max().item())
-    return worst if worst == worst else float("inf")
+            worst = largest(worst, abs(value.item() - limit) / 1e4, (scores.grad * 4 - slope).abs().max().item())
+    return worst
 
 
 @cache
@@ -211,7 +212,7 @@ def flat_critic() -> float:
     penalty = discriminator.gradient_penalty(flat(patches), patches)
     slopes = torch.autograd.grad(penalty, list(flat.parameters()), allow_unused=True)
     found = [penalty.item(), *(slope.abs().max().item() for slope in slopes if slope is not None)]
-    return max(found) if all(x == x for x in found) else float("inf")
+    return largest(*found)
 
 
 def equal_patches() -> float:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from plyfile import PlyData
 
-from benchmarks.stability.cases import EPS32, EPS64, Case
+from benchmarks.stability.cases import EPS32, EPS64, Case, largest
 from reffusion import frame, io, trace
 from reffusion.fit import Settings, fit, initial_gaussians
 from reffusion.lens import Lens
@@ -103,7 +103,7 @@ def cameras_apart(extent: float, offset: float) -> float:
     poses_apart = [
         np.abs(here.cameras[n].world_to_camera - there.cameras[n].world_to_camera).max() for n in there.cameras
     ]
-    return float(max(*poses_apart, np.abs(here.points - there.points).max()))
+    return float(largest(*poses_apart, np.abs(here.points - there.points).max()))
 
 
 def exported(extent: float, offset: float) -> np.ndarray:

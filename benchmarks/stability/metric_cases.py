@@ -7,7 +7,7 @@ import math
 import numpy as np
 import torch
 
-from benchmarks.stability.cases import EPS32, EPS64, EXACT, UNCLEAR, Case, unclear
+from benchmarks.stability.cases import EPS32, EPS64, EXACT, UNCLEAR, Case, largest, unclear
 from benchmarks.stability.splatting import camera, cloud
 from reffusion import masks, metrics
 from reffusion.lpips import Lpips
@@ -41,7 +41,7 @@ def constant_ssim() -> float:
     """Of two constant images SSIM is its luminance term, (2ab + C1) / (a^2 + b^2 + C1); difference."""
     apart = 0.0
     for a, b in ((0.0, 1.0), (0.25, 0.75), (0.0, 0.0), (1.0, 1.0)):
-        apart = max(apart, abs(metrics.ssim(flat(a), flat(b)) - (2 * a * b + C1) / (a * a + b * b + C1)))
+        apart = largest(apart, abs(metrics.ssim(flat(a), flat(b)) - (2 * a * b + C1) / (a * a + b * b + C1)))
     return apart
 
 
@@ -49,14 +49,15 @@ def constant_psnr() -> float:
     """-20 log10 of the difference, also where that is a grey level of 2^-24; relative error."""
     apart = 0.0
     for step in (1.0, 0.5, 2.0**-8, 2.0**-24):
-        apart = max(apart, abs(metrics.psnr(flat(0.0), flat(step)) + 20 * math.log10(step)) / max(1, -math.log2(step)))
+        missed = abs(metrics.psnr(flat(0.0), flat(step)) + 20 * math.log10(step))
+        apart = largest(apart, missed / max(1, -math.log2(step)))
     return apart
 
 
 def constant_flip() -> float:
     """Of a constant image with itself 0, of black and white within [0.9, 1]: by how much that is missed."""
     zero, most = metrics.flip(flat(0.3), flat(0.3)), metrics.flip(flat(0.0), flat(1.0))
-    return max(zero, 0.9 - most, most - 1.0)
+    return largest(zero, 0.9 - most, most - 1.0)
 
 
 def one_pixel() -> float:
@@ -98,8 +99,8 @@ def loss_of_constant_images() -> float:
             image = torch.full((9, 8, 3), value, requires_grad=True)
             loss = reconstruction_loss(image, torch.full((9, 8, 3), value), weights)
             loss.backward()
-            wrong = max(wrong, abs(loss.item()), image.grad.abs().max().item())
-    return wrong if wrong == wrong else math.inf
+            wrong = largest(wrong, abs(loss.item()), image.grad.abs().max().item())
+    return wrong
 
 
 def loss_of_one_pixel() -> float:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from benchmarks.stability import frames
-from benchmarks.stability.cases import EPS32, EXACT, Case
+from benchmarks.stability.cases import EPS32, EXACT, Case, largest
 from benchmarks.stability.splatting import camera, cloud
 from reffusion import io, mcmc, trace
 from reffusion.confinement import Sight
@@ -104,7 +104,9 @@ def fit_of_nobody() -> float:
     """A fit whose pruning takes everything says so, with the step."""
     scene = frames.normalised(1.0, 0.0)
     start = initial_gaussians(scene.points, scene.point_colors, 0, 1000, trace.generator(0))
-    settings = Settings(8, densify_from=0.0, densify_until=1.0, densify_every=4, least_opacity=1.1, slope=math.inf)
+    settings = Settings(
+        8, sh_degree=0, densify_from=0.0, densify_until=1.0, densify_every=4, least_opacity=1.1, slope=math.inf
+    )
     with tempfile.TemporaryDirectory() as folder:
         try:
             fit(list(scene.cameras.values()), frames.photographs(), start, settings, folder=Path(folder))
@@ -131,7 +133,7 @@ def gradients_of_any_size() -> float:
         optimizer.gaussians.means.grad = torch.full_like(before, size)
         optimizer.step(0.0)
         moved = (optimizer.gaussians.means.detach() - before).abs().max().item()
-        worst = max(worst, moved / 1e-3 - 1 if math.isfinite(moved) else math.inf)
+        worst = largest(worst, moved / 1e-3 - 1 if math.isfinite(moved) else math.inf)
     return worst
 
 

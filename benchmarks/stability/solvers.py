@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.stability.cases import EPS64, EXACT, UNCLEAR, Case, unclear
+from benchmarks.stability.cases import EPS64, EXACT, UNCLEAR, Case, largest, unclear
 from reffusion import bilateral, depth
 from reffusion.planes import planar_model
 from reffusion.trace import generator
@@ -49,7 +49,7 @@ def one_pixel_to_complete() -> float:
 def one_pixel_to_solve() -> float:
     """One known pixel says one value, everywhere; relative error."""
     solved = [bilateral.solve(PLANE, only((3, 3)), guide) for guide in (FLAT, textured())]
-    return float(max(np.abs(s / PLANE[3, 3] - 1.0).max() for s in solved))
+    return float(largest(*(np.abs(s / PLANE[3, 3] - 1.0).max() for s in solved)))
 
 
 def two_pixels_to_solve() -> float:
@@ -57,7 +57,7 @@ def two_pixels_to_solve() -> float:
     known = only((3, 3), (30, 50))
     low, high = sorted((PLANE[3, 3], PLANE[30, 50]))
     solved = np.concatenate([bilateral.solve(PLANE, known, guide).ravel() for guide in (FLAT, textured())])
-    return float(max(low - solved.min(), solved.max() - high) / (high - low))
+    return float(largest(low - solved.min(), solved.max() - high) / (high - low))
 
 
 def faint_confidence() -> float:
@@ -71,7 +71,7 @@ def unequal_confidence() -> float:
     random = np.random.default_rng(0)
     confidence = 10 ** random.uniform(-8, 4, PLANE.shape)
     solved = bilateral.solve(PLANE, confidence, textured())
-    return float(max(PLANE.min() - solved.min(), solved.max() - PLANE.max()) / np.ptp(PLANE))
+    return float(largest(PLANE.min() - solved.min(), solved.max() - PLANE.max()) / np.ptp(PLANE))
 
 
 def one_row() -> float:
