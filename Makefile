@@ -27,7 +27,7 @@ STAGES := poses fit masks reference lift personalize initialize distill evaluate
 options = $(if $(profile),--profile '$(profile)') $(if $(variant),--variant '$(variant)') \
 	$(if $(budget),--budget '$(budget)') $(if $(set),--set "$$set") $(if $(trust),--trust) $(if $(runs),--runs '$(runs)')
 
-.PHONY: help setup all $(STAGES) plan clean batch demo prior prior-report test bench lint
+.PHONY: help setup all $(STAGES) plan clean batch demo prior prior-report test bench stability lint
 .DELETE_ON_ERROR:
 
 help:
@@ -41,6 +41,7 @@ help:
 	@echo 'make prior-report              measure it, and draw what it paints (minutes): runs/prior-report'
 	@echo 'make setup | test | lint       .venv; the tests; ruff'
 	@echo 'make bench                     work-precision diagrams of the kernels: runs/bench; gate=1: against the baselines'
+	@echo 'make stability                 stiff and extreme cases, each with its bound (minutes): runs/stability.json'
 	@echo 'scene=  a name under data/, or the path of any folder'
 	@echo 'profile=auto|laptop|paper  variant=NAME  set="fit.iterations=500 distill.seed=3"  runs=FOLDER'
 	@echo 'budget=5m  time for the whole job: sets the number of steps of fit, personalize and distill'
@@ -118,3 +119,6 @@ lint: $(VENV)/.ready-dev
 bench: $(VENV)/.ready
 	$(PY) benchmarks/precision.py --out '$(or $(runs),runs)/bench' $(if $(gate),--gate) $(if $(slow),--slow)
 	$(if $(slow),$(PY) benchmarks/splat.py)
+
+stability: $(VENV)/.ready-dev
+	$(PY) -m benchmarks.stability --out '$(or $(runs),runs)/stability.json'

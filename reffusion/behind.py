@@ -175,7 +175,7 @@ def estimated(
     aligned, confidence = fitted.apply(estimate), view.known.astype(np.float64)
     error = np.abs(view.disparity - aligned)[view.known]
     if how.robust and np.median(error) > 0:  # what the alignment lets go of is not to be spread either
-        confidence[view.known] = geometry.trusted(error)
+        confidence[view.known] = geometry.trusted(error, 1.4826 * np.median(error))
     refined = bilateral.refine(aligned, view.disparity, confidence, guide, how.solver, solvers.iterated)
     solvers.solved("bilateral", refined, solvers.iterations)
     misfit = fitted.residual / np.abs(view.disparity[view.known]).mean()

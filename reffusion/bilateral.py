@@ -9,7 +9,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import cg
 
-from reffusion.depth import check_maps, unit_range
+from reffusion.depth import check_maps, extremes_ratio, unit_range
 
 
 @dataclass(frozen=True)
@@ -91,26 +91,47 @@ def solve(
         raise ValueError("the bilateral solver got no pixel of positive confidence")
     mean = (confidence[confidence > 0] @ target[confidence > 0]) / confidence.sum()
     offset = np.where(confidence > 0, target - mean, 0.0)
-    cell, coordinates = _grid(guide, solver)
-    gather = lambda values: np.bincount(cell, values.ravel(), minlength=len(coordinates))
-    mass = gather(np.ones(target.shape))
-    unreached = 1e-9 * mass  # cells without data: regular, and 0
-    data = sparse.diags(gather(confidence) + unreached)
-    system = solver.smoothness * _laplacian(_blur(coordinates), mass, solver.rounds) + data
-    system, right = system.tocsr(), gather(confidence * offset)
-    steps = 0
+    unit = np.abs(offset).max()  # so that the smallest numbers are as good as any
+    if unit == 0:
+        return np.full(target.shape, mean)
+    system, cell = system_of(confidence, guide, solver)
+    right = np.bincount(cell, (confidence * (offset / unit)).ravel(), minlength=system.shape[0])
+    whole, steps = lambda cells: mean + unit * cells[cell].reshape(target.shape), 0
 
     def told(now: np.ndarray) -> None:
         nonlocal steps
         steps += 1
-        residual = lambda: float(np.linalg.norm(right - system @ now) / max(np.linalg.norm(right), 1e-300))
-        watch(steps, lambda: (mean + now[cell].reshape(target.shape), residual()))
+        watch(steps, lambda: (whole(now), float(np.linalg.norm(right - system @ now) / np.linalg.norm(right))))
 
     solution, stalled = cg(system, right, rtol=1e-8, maxiter=5000, M=sparse.diags(1.0 / system.diagonal()),
                            callback=told if watch else None)  # fmt: skip
     if stalled:
         raise ValueError(f"the bilateral solver did not converge at smoothness {solver.smoothness}: take a smaller one")
-    return mean + solution[cell].reshape(target.shape)
+    return whole(solution)
+
+
+def system_of(
+    confidence: np.ndarray, guide: np.ndarray, solver: Solver = USUAL
+) -> tuple[sparse.csr_matrix, np.ndarray]:
+    """The solver's matrix [V, V], symmetric and positive definite, and the vertex of each pixel [H * W]."""
+    cell, coordinates = _grid(guide, solver)
+    gather = lambda values: np.bincount(cell, values.ravel(), minlength=len(coordinates))
+    mass = gather(np.ones(confidence.shape))
+    unreached = 1e-9 * mass  # cells without data: regular, and 0
+    data = sparse.diags(gather(confidence) + unreached)
+    system = solver.smoothness * _laplacian(_blur(coordinates), mass, solver.rounds) + data
+    return system.tocsr(), cell
+
+
+def condition(confidence: np.ndarray, guide: np.ndarray, solver: Solver = USUAL) -> tuple[float, float]:
+    """Condition numbers (largest over smallest eigenvalue) of the system: as it is, and preconditioned by Jacobi, as
+    `solve` does. The square root of it is about the number of steps of conjugate gradients.
+
+    Args: as `solve`.
+    """
+    system, _ = system_of(np.asarray(confidence, np.float64), guide, solver)
+    root = sparse.diags(1.0 / np.sqrt(system.diagonal()))
+    return extremes_ratio(system), extremes_ratio((root @ system @ root).tocsr())
 
 
 def _grid(guide: np.ndarray, solver: Solver) -> tuple[np.ndarray, np.ndarray]:

@@ -70,6 +70,8 @@ def split(gaussians: Gaussians, generator: torch.Generator) -> Gaussians:
 
 def rotate(quaternions: Tensor, vectors: Tensor) -> Tensor:
     """[M, 3] vectors turned by wxyz quaternions [M, 4] of any length (zero: not turned)."""
+    # First by the largest entry: the squares of short ones would vanish.
+    quaternions = quaternions / quaternions.abs().amax(1, keepdim=True).clamp_min(torch.finfo(quaternions.dtype).tiny)
     quaternions = torch.nn.functional.normalize(quaternions, dim=1)
     w, axis = quaternions[:, :1], quaternions[:, 1:]
     across = 2 * torch.linalg.cross(axis, vectors)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage, sparse
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import eigsh, splu
 
 from reffusion.geometry import Degenerate
 from reffusion.planes import fit_plane
@@ -122,12 +122,41 @@ def _complete_region(disparity, confidence, guide, domain, plate: Plate) -> np.n
     unit = np.abs(rest).max()
     if unit <= 1e-13 * np.abs(disparity[known]).max():
         return plane
-    bend = _bending(domain, guide, plate.edge)
-    system = sparse.diags(data[domain]) + plate.stiffness * bend.T @ bend
-    factors = splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     filled = plane.copy()
-    filled[domain] += unit * factors.solve(data[domain] * rest[domain] / unit)
+    filled[domain] += unit * factored(system_of(data, guide, domain, plate)).solve(data[domain] * rest[domain] / unit)
     return filled
+
+
+def system_of(confidence: np.ndarray, guide: np.ndarray | None, domain: np.ndarray, plate: Plate = USUAL):
+    """The completion's matrix over the pixels of `domain` (bool [H, W]), symmetric and positive definite, sparse."""
+    bend = _bending(domain, guide, plate.edge)
+    return (sparse.diags(confidence[domain]) + plate.stiffness * bend.T @ bend).tocsc()
+
+
+def factored(system: sparse.csc_matrix):
+    return splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+
+def condition(confidence: np.ndarray, guide: np.ndarray | None = None, plate: Plate = USUAL) -> float:
+    """Condition number (largest over smallest eigenvalue) of the completion's system over a whole map [H, W].
+
+    So many roundings of the right hand side's largest value may be in the answer: why `complete` solves for the
+    correction to a plane. Args: as `complete`.
+    """
+    confidence = np.asarray(confidence, np.float64)
+    colors = None if guide is None else unit_range(guide)
+    return extremes_ratio(system_of(confidence, colors, np.ones(confidence.shape, bool), plate))
+
+
+def extremes_ratio(matrix: sparse.spmatrix) -> float:
+    """Largest over smallest eigenvalue of a symmetric positive definite matrix."""
+    if matrix.shape[0] < 16:
+        values = np.linalg.eigvalsh(matrix.toarray())
+        return float(values[-1] / values[0])
+    start = np.ones(matrix.shape[0]) + 0.1 * np.arange(matrix.shape[0]) % 0.7  # the same answer each time
+    largest = eigsh(matrix, k=1, which="LA", v0=start, return_eigenvectors=False)[0]
+    smallest = eigsh(matrix.tocsc(), k=1, sigma=0.0, which="LM", v0=start, return_eigenvectors=False)[0]
+    return float(largest / smallest)
 
 
 def _corrected_coarsely(rest, data, guide, domain, plate: Plate) -> np.ndarray:

@@ -140,6 +140,8 @@ def fit(
         run.iteration = done = i + 1
         run.loss, run.error, run.steps = run.loss + loss, run.error + error, run.steps + 1
         _adapt(optimizer, centers, run.started_with, settings, done)
+        if not len(optimizer.gaussians):
+            raise ValueError(f"fit, step {i}: pruning left no Gaussian: lower `least_opacity`, or raise `largest`")
         if run.patience.due(done, settings.iterations):
             _check_finite(optimizer.gaussians, f"step {i}, view '{camera.name}'")
             with log.paused():

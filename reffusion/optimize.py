@@ -159,6 +159,8 @@ class GaussianOptimizer:
             # A sum is finite only if every term is, and costs no array of flags.
             if gradient is not None and not torch.isfinite(gradient.sum()):
                 raise FloatingPointError(f"the gradient of the Gaussians' {name} is not finite")
+        if not len(self.masked):
+            return self.forget_gradients()
         if visible is None:
             visible = torch.ones_like(self.masked)
         self._steps += visible

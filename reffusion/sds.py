@@ -120,12 +120,14 @@ def sds_gradient(
         [B, C, h, w] without gradient.
     """
     with torch.no_grad():
-        alpha_bar = alphas_cumprod.to(latents)[timesteps].reshape(-1, 1, 1, 1)
-        eps, x0 = denoise(alpha_bar.sqrt() * latents + (1 - alpha_bar).sqrt() * noise, timesteps)
+        alpha_bar = alphas_cumprod[timesteps].reshape(-1, 1, 1, 1)
+        # 1 - alpha_bar before any rounding to the latents' type: in half precision it would have no digits near t = 0.
+        signal, spread, variance = (x.to(latents) for x in (alpha_bar.sqrt(), (1 - alpha_bar).sqrt(), 1 - alpha_bar))
+        eps, x0 = denoise(signal * latents + spread * noise, timesteps)
         if weighting == "x0":
             gradient = latents - x0
         elif weighting == "sigma2":
-            gradient = (1 - alpha_bar) * (eps - noise)
+            gradient = variance * (eps - noise)
         elif weighting == "one":
             gradient = eps - noise
         else:

@@ -88,7 +88,7 @@ def load_ply(path: Path, similarity: Similarity | None = None) -> Gaussians:
         means, log_scales = similarity.apply(means), log_scales + np.log(similarity.scale)
     sh = take(DC)[:, None, :]
     if rest_names:
-        rest = take([f"f_rest_{i}" for i in range(len(rest_names))]).reshape(len(table), 3, -1)
+        rest = take([f"f_rest_{i}" for i in range(len(rest_names))]).reshape(len(table), 3, len(rest_names) // 3)
         sh = np.concatenate([sh, rest.transpose(0, 2, 1)], axis=1)
     arrays = (means, take(ROTATION), log_scales, table["opacity"], sh)
     for name, array in zip(_FIELDS, arrays, strict=True):

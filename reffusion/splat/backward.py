@@ -172,7 +172,9 @@ def _rows_backward(member, rows, left, top, footprints, features, state, stride,
     zero = splat(0.0)
     base, first_row, end_row = member * FOOTPRINT, rows & 255, rows >> 8
     middle = np.float32((first_row + end_row) // 2)
-    seen = shape(footprints, base, left, top, middle)
+    # The same bits as forward decide what is blended; the sums are about the middle row, where they lose least.
+    seen = shape(footprints, base, left, top, np.float32(0.0))
+    about = shape(footprints, base, left, top, middle)
     red, green = splat_at(footprints, base + RED), splat_at(footprints, base + GREEN)
     blue, far = splat_at(footprints, base + BLUE), splat_at(footprints, base + DEPTH)
     g_0 = g_1 = g_2 = to_red = to_green = to_blue = to_far = zero
@@ -180,8 +182,8 @@ def _rows_backward(member, rows, left, top, footprints, features, state, stride,
     for step in range(first_row // STEP_ROWS, (end_row + STEP_ROWS - 1) // STEP_ROWS):
         place = step * stride
         before = load(state, place)
-        j = load(numbers, (AT_ROW + step) * LANES) - splat(middle)
-        power = log_alpha(seen, j)
+        row = load(numbers, (AT_ROW + step) * LANES)
+        power = log_alpha(seen, row)
         above = power >= load(numbers, AT_CUT * LANES)
         if not some(above & (before > zero)):
             continue
@@ -203,9 +205,10 @@ def _rows_backward(member, rows, left, top, footprints, features, state, stride,
         # g = dLoss/d(ln alpha) = alpha (transmittance shade - behind / (1 - alpha)), 0 where clamped or not blended
         g = fnma(behind, alpha / (splat(1.0) - alpha), weight * shade)
         g = select((after > zero) & (raw < load(numbers, AT_MAX_ALPHA * LANES)), g, zero)
+        j = row - splat(middle)
         gj = g * j
         g_0, g_1, g_2 = g_0 + g, g_1 + gj, fma(gj, j, g_2)
-    return touched, (*_moments(seen, g_0, g_1, g_2), to_far, to_red, to_green, to_blue)
+    return touched, (*_moments(about, g_0, g_1, g_2), to_far, to_red, to_green, to_blue)
 
 
 @inlined

@@ -12,6 +12,10 @@ import numpy as np
 from reffusion.splat.compiled import inlined, kernel, room, share
 from reffusion.splat.layout import (
     AHEAD,
+    ANCHOR_U,
+    ANCHOR_V,
+    ANCHOR_X,
+    ANCHOR_Y,
     CHUNKS,
     COLUMN,
     CUT,
@@ -20,16 +24,15 @@ from reffusion.splat.layout import (
     FOOTPRINT,
     HALF_HEIGHT,
     HALF_WIDTH,
-    INVERSE,
-    MEAN_X,
-    MEAN_Y,
     MEMBER,
-    PEAK,
     ROWS,
+    SLANT,
     SLOT,
     TILE_HEIGHT,
     TILE_WIDTH,
     TILT,
+    WHITEN_X,
+    WHITEN_Y,
 )
 from reffusion.splat.memory import prefetch, store_whole
 from reffusion.splat.vectors import LANES, ceiling, maximum, minimum, ramp, root, select, splat, take_ticket
@@ -119,34 +122,34 @@ def ellipse(slant, whiten_x, whiten_y, level):
     """The alpha >= 1/255 ellipse of footprints, a little enlarged against rounding; all in float32 lanes.
 
     Returns:
-        half width, half height, slope of the middle line y(dx), squared half-height of a column at dx = 0,
-        1 / half width^2, dx where the ellipse is highest.
+        half width, half height, slope of the middle line y(dx), squared half-height of a column at dx = 0.
     """
     level = (level - CUT) * 1.00002 + 1e-4
     across = 1.0 / (whiten_x * whiten_x)  # variance of x at fixed y, x log2(e) / 2
     yy = 1.0 / (whiten_y * whiten_y)
     xx = across + slant * slant * yy
-    half_height = root(level * yy)
-    return (
-        root(level * xx),
-        half_height,
-        slant * yy / xx,
-        level * yy * (across / xx),
-        1.0 / (level * xx),
-        slant * half_height,
-    )
+    return root(level * xx), root(level * yy), slant * yy / xx, level * yy * (across / xx)
+
+
+@inlined
+def _mean(footprints, base):
+    """The 2D mean, from the anchor and what is whitened there."""
+    dy = footprints[base + ANCHOR_V] / footprints[base + WHITEN_Y]
+    dx = footprints[base + ANCHOR_U] / footprints[base + WHITEN_X] + footprints[base + SLANT] * dy
+    return footprints[base + ANCHOR_X] - dx, footprints[base + ANCHOR_Y] - dy
 
 
 @inlined
 def _column_rows(footprints, base, column, width, height, tops, bottoms):
     """First and one past the last pixel row of the image that the ellipse can touch, for LANES tile columns."""
-    mean_x, mean_y = footprints[base + MEAN_X], footprints[base + MEAN_Y]
+    mean_x, mean_y = _mean(footprints, base)
     half_width, half_height, tilt = (
         footprints[base + HALF_WIDTH],
         footprints[base + HALF_HEIGHT],
         footprints[base + TILT],
     )
-    squared, inverse, peak = footprints[base + COLUMN], footprints[base + INVERSE], footprints[base + PEAK]
+    squared, inverse = footprints[base + COLUMN], _F(1.0) / (half_width * half_width)
+    peak = footprints[base + SLANT] * half_height  # dx where the ellipse is highest
     left = (ramp() + _F(column)) * _F(TILE_WIDTH)
     first = maximum(left + _F(0.5) - mean_x, -half_width)
     last = minimum(minimum(left + _F(TILE_WIDTH), _F(width)) - _F(0.5) - mean_x, half_width)
@@ -189,7 +192,7 @@ def _find_pairs(tickets, footprints, order, width, height, places, first_slots, 
         for m in range(ticket * len(order) // CHUNKS, stop):
             prefetch(footprints, order[min(m + AHEAD, stop - 1)] * FOOTPRINT)
             base, begin = order[m] * FOOTPRINT, at
-            first, last = _columns(footprints[base + MEAN_X], footprints[base + HALF_WIDTH], tiles_x)
+            first, last = _columns(_mean(footprints, base)[0], footprints[base + HALF_WIDTH], tiles_x)
             for start in range(first, last, LANES):
                 _column_rows(footprints, base, start, width, height, tops, bottoms)
                 for k in range(min(LANES, last - start)):

@@ -8,6 +8,10 @@ from reffusion.splat import harmonics, projection
 from reffusion.splat.binning import ellipse
 from reffusion.splat.compiled import inlined, kernel
 from reffusion.splat.layout import (
+    ANCHOR_U,
+    ANCHOR_V,
+    ANCHOR_X,
+    ANCHOR_Y,
     BLUE,
     CHUNKS,
     COLUMN,
@@ -20,11 +24,7 @@ from reffusion.splat.layout import (
     GREEN,
     HALF_HEIGHT,
     HALF_WIDTH,
-    INVERSE,
     LEVEL,
-    MEAN_X,
-    MEAN_Y,
-    PEAK,
     RED,
     SLANT,
     TILT,
@@ -96,9 +96,12 @@ def draw(
             _read_rows(sh, width, row, last, coefficients)
             red, green, blue = harmonics.colors(degree, basis, coefficients)
             shape = narrow(slant), narrow(whiten_x), narrow(whiten_y), narrow(level)
-            half_width, half_height, tilt, column, inverse, peak = ellipse(shape[0], shape[1], shape[2], shape[3])
-            store(drawn, MEAN_X * LANES, narrow(mean_x))
-            store(drawn, MEAN_Y * LANES, narrow(mean_y))
+            half_width, half_height, tilt, column = ellipse(shape[0], shape[1], shape[2], shape[3])
+            x, y, u, v = projection.anchor(view, mean_x, mean_y, slant, whiten_x, whiten_y)
+            store(drawn, ANCHOR_X * LANES, narrow(x))
+            store(drawn, ANCHOR_Y * LANES, narrow(y))
+            store(drawn, ANCHOR_U * LANES, narrow(u))
+            store(drawn, ANCHOR_V * LANES, narrow(v))
             store(drawn, SLANT * LANES, shape[0])
             store(drawn, WHITEN_X * LANES, shape[1])
             store(drawn, WHITEN_Y * LANES, shape[2])
@@ -108,8 +111,6 @@ def draw(
             store(drawn, HALF_HEIGHT * LANES, half_height)
             store(drawn, TILT * LANES, tilt)
             store(drawn, COLUMN * LANES, column)
-            store(drawn, INVERSE * LANES, inverse)
-            store(drawn, PEAK * LANES, peak)
             store(drawn, RED * LANES, red)
             store(drawn, GREEN * LANES, green)
             store(drawn, BLUE * LANES, blue)

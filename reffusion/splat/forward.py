@@ -8,14 +8,16 @@ from reffusion.splat.compiled import inlined, kernel, room, share
 from reffusion.splat.conventions import MAX_ALPHA, MIN_TRANSMITTANCE
 from reffusion.splat.layout import (
     AHEAD,
+    ANCHOR_U,
+    ANCHOR_V,
+    ANCHOR_X,
+    ANCHOR_Y,
     BLUE,
     CUT,
     DEPTH,
     FOOTPRINT,
     GREEN,
     LEVEL,
-    MEAN_X,
-    MEAN_Y,
     MEMBER,
     RED,
     ROWS,
@@ -147,9 +149,11 @@ def shape(footprints, base, left, top, middle):
     """
     whiten_x, whiten_y = footprints[base + WHITEN_X], splat_at(footprints, base + WHITEN_Y)
     lean = splat(whiten_x * footprints[base + SLANT])
-    dy = splat(np.float32(top) + middle + np.float32(0.5) - footprints[base + MEAN_Y])
-    dx = load(LANE_X, 0) + (np.float32(left) - footprints[base + MEAN_X])
-    return fnma(lean, dy, whiten_x * dx), lean, whiten_y * dy, whiten_y, splat_at(footprints, base + LEVEL)
+    dy = splat(np.float32(top) + middle + np.float32(0.5) - footprints[base + ANCHOR_Y])
+    dx = load(LANE_X, 0) + (np.float32(left) - footprints[base + ANCHOR_X])
+    u = fnma(lean, dy, fma(splat(whiten_x), dx, splat_at(footprints, base + ANCHOR_U)))
+    v = fma(whiten_y, dy, splat_at(footprints, base + ANCHOR_V))
+    return u, lean, v, whiten_y, splat_at(footprints, base + LEVEL)
 
 
 @inlined

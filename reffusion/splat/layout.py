@@ -4,11 +4,13 @@ import math
 
 from reffusion.splat.conventions import MIN_ALPHA
 
-# Columns of a footprint: 2D mean; slant xy/yy; the whitening factors along x and y, scaled so that
-# log2(alpha) = LEVEL - u^2 - v^2 with v = WHITEN_Y dy, u = WHITEN_X (dx - SLANT dy); camera z; colour.
-MEAN_X, MEAN_Y, SLANT, WHITEN_X, WHITEN_Y, LEVEL, DEPTH, RED, GREEN, BLUE = range(10)
-# Then its alpha >= 1/255 ellipse (`binning.ellipse`), which fills the cache line.
-HALF_WIDTH, HALF_HEIGHT, TILT, COLUMN, INVERSE, PEAK, FOOTPRINT = range(10, 17)
+# Columns of a footprint: its anchor, the point of the image nearest the 2D mean; slant xy/yy; the whitening factors
+# along x and y, scaled so that log2(alpha) = LEVEL - u^2 - v^2 with v = ANCHOR_V + WHITEN_Y dy and
+# u = ANCHOR_U + WHITEN_X (dx - SLANT dy), dx and dy from the anchor; camera z; colour.
+ANCHOR_X, ANCHOR_Y, SLANT, WHITEN_X, WHITEN_Y, LEVEL, DEPTH, RED, GREEN, BLUE = range(10)
+# Then u and v at the anchor (0 where the mean is inside the image; without them a needle that comes from afar would
+# lose its digits to the distance), and its alpha >= 1/255 ellipse (`binning.ellipse`), which fills the cache line.
+ANCHOR_U, ANCHOR_V, HALF_WIDTH, HALF_HEIGHT, TILT, COLUMN, FOOTPRINT = range(10, 17)
 
 # Columns of an entry of a tile's list: the Gaussian; first + 256 * (one past the last) row of the tile that it can
 # touch; the place of its gradient record; nothing.

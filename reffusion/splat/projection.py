@@ -204,6 +204,14 @@ def in_image(view, mean_x, mean_y, reach_x, reach_y):
 
 
 @inlined
+def anchor(view, mean_x, mean_y, slant, whiten_x, whiten_y):
+    """The point of the image nearest the 2D mean, and the whitened coordinates u and v there."""
+    x, y = minimum(maximum(mean_x, 0.0), view[20]), minimum(maximum(mean_y, 0.0), view[21])
+    dx, dy = x - mean_x, y - mean_y
+    return x, y, whiten_x * (dx - slant * dy), whiten_y * dy
+
+
+@inlined
 def project_backward(view, mean, quaternions, log_scales, opacity_logits, row, last, moments):
     """Gradients of LANES Gaussians' geometry.
 

@@ -1,0 +1,146 @@
+"""What the form of a linear system buys: `python benchmarks/conditioning.py [--out docs/images/conditioning.png]`.
+
+Work-precision diagrams of the three systems behind depth: the alignment (plain normal equations against centred and
+scaled ones), the bilateral solver (conjugate gradients with Jacobi's preconditioning and without), and the completion
+(disparity itself against the correction to a plane). Prints the numbers, and the systems' condition numbers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import cg, spsolve
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from reffusion import bilateral, depth, geometry
+
+HEIGHT, WIDTH = 48, 64
+SPREADS = 10.0 ** np.arange(0, 12)  # offsets, in units of the data's spread
+STEPS = 400
+
+
+def alignment() -> list[tuple[float, float, float, float]]:
+    """Offset in spreads, condition number of the plain equations, errors of the plain and of the library's line.
+
+    Exact data; errors are the largest on the data, relative to the target's spread.
+    """
+    random, rows = np.random.default_rng(0), []
+    base = random.uniform(-1.0, 1.0, 1000)
+    for offset in SPREADS[SPREADS < 1e6]:
+        x, truth = base + offset, 2.0 * base
+        plain = np.linalg.solve([[x @ x, x.sum()], [x.sum(), float(x.size)]], [x @ truth, truth.sum()])
+        ours = geometry.align(x, truth)
+        error = lambda line, truth=truth: float(np.abs(line - truth).max() / np.ptp(truth))
+        rows.append((offset, geometry.condition(x)[0], error(plain[0] * x + plain[1]), error(ours.apply(x))))
+    return rows
+
+
+def scene() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(misfit, confidence from 1e-2 to 1e2 and 0 in a hole, guide): edges, texture, noise."""
+    random = np.random.default_rng(0)
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH].astype(float)
+    bright = np.where(columns + 0.4 * rows < 40, 80, 170)[..., None] + 12 * np.sin(columns / 3)[..., None]
+    guide = np.clip(bright + 6 * random.normal(size=(HEIGHT, WIDTH, 3)), 0, 255).astype(np.uint8)
+    hole = (rows > 14) & (rows < 34) & (columns > 20) & (columns < 44)
+    confidence = np.where(hole, 0.0, 10 ** random.uniform(-2, 2, hole.shape))
+    return np.where(columns + 0.4 * rows < 40, 0.1, -0.2) + 0.02 * random.normal(size=hole.shape), confidence, guide
+
+
+def solver() -> dict[str, tuple[float, list[tuple[float, float]]]]:
+    """Form -> (condition number, [seconds, relative L2 error after each step of conjugate gradients])."""
+    misfit, confidence, guide = scene()
+    system, cell = bilateral.system_of(confidence, guide)
+    right = np.bincount(cell, (confidence * misfit).ravel(), minlength=system.shape[0])
+    exact = spsolve(system.tocsc(), right)
+    jacobi = sparse.diags(1.0 / system.diagonal())
+    conditions = bilateral.condition(confidence, guide)
+    found = {}
+    for name, form, number in (("none", None, conditions[0]), ("Jacobi", jacobi, conditions[1])):
+        iterates, began = [], time.perf_counter()
+        note = lambda x, iterates=iterates, began=began: iterates.append((time.perf_counter() - began, x.copy()))
+        cg(system, right, rtol=1e-14, maxiter=STEPS, M=form, callback=note)
+        error = lambda x: float(np.linalg.norm(x - exact) / np.linalg.norm(exact))
+        found[name] = number, [(seconds, error(x)) for seconds, x in iterates]
+    return found
+
+
+def completion() -> tuple[float, list[tuple[float, float, float]]]:
+    """(condition number, [offset in spreads, error of the disparity's own system, error of the library's completion]).
+
+    A plane with a hole, solved by the same factorisation; errors in the hole, relative to the plane's spread.
+    """
+    _, confidence, _ = scene()
+    known = confidence > 0
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] / WIDTH
+    tilted, found = columns - 0.6 * rows, []
+    plate = depth.Plate(ring=2.0)  # so that the whole map takes part, as in the absolute form
+    factors = depth.factored(depth.system_of(known.astype(float), None, np.ones(known.shape, bool), plate))
+    for offset in SPREADS:
+        truth = tilted + offset * np.ptp(tilted)
+        absolute = factors.solve(np.where(known, truth, 0.0).ravel()).reshape(truth.shape)
+        ours = depth.complete(truth, known, plate=plate)
+        error = lambda x, truth=truth: float(np.abs(x - truth)[~known].max() / np.ptp(tilted))
+        found.append((offset, error(absolute), error(ours)))
+    return depth.condition(known.astype(float), plate=plate), found
+
+
+def report(say: Callable[[str], None]) -> tuple:
+    """Measure all three, saying the numbers."""
+    lines, systems, (number, maps) = alignment(), solver(), completion()
+    say("alignment: offset / spread, condition (plain), error plain, error centred and scaled (condition 1)")
+    for row in lines:
+        say("  {:8.0e} {:10.1e} {:10.1e} {:10.1e}".format(*row))
+    say("bilateral solver: preconditioning, condition, steps and milliseconds to 1e-6")
+    for name, (condition, steps) in systems.items():
+        k = next((k for k, (_, error) in enumerate(steps) if error < 1e-6), len(steps) - 1)
+        say(f"  {name:8} {condition:10.1e} {k + 1:6d} {1e3 * steps[k][0]:8.1f}")
+    say(f"completion, condition {number:.1e}: offset / spread, error absolute, error about a plane")
+    for row in maps:
+        say("  {:8.0e} {:10.1e} {:10.1e}".format(*row))
+    return lines, systems, number, maps
+
+
+def draw(lines, systems, number, maps, path: Path) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 3.6), layout="constrained")
+    first, second, third = figure.subplots(1, 3)
+    shown = lambda values: np.maximum(values, 2.0**-53)  # an error of 0 is one of less than a rounding
+    first.loglog([r[1] for r in lines], shown([r[2] for r in lines]), "o-", label="plain normal equations")
+    first.loglog([r[1] for r in lines], shown([r[3] for r in lines]), "s-", label="centred and scaled")
+    first.set(title="alignment", xlabel="condition number of the plain equations", ylabel="relative error")
+    for (name, (condition, steps)), style in zip(systems.items(), ("-", "--"), strict=True):
+        label = f"preconditioning {name}, condition {condition:.0e}"
+        second.semilogy(range(1, len(steps) + 1), [error for _, error in steps], style, label=label)
+    second.set(
+        title="bilateral solver", xlabel="steps of conjugate gradients", ylabel="relative error", ylim=(1e-12, 3)
+    )
+    third.loglog([r[0] for r in maps], shown([r[1] for r in maps]), "o-", label="disparity itself")
+    third.loglog([r[0] for r in maps], shown([r[2] for r in maps]), "s-", label="correction to a plane")
+    third.set(
+        title=f"completion, condition {number:.0e}", xlabel="offset / spread of the data", ylabel="relative error"
+    )
+    for axes in (first, second, third):
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=8)
+    figure.savefig(path, dpi=90)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("runs/conditioning.png"))
+    given = parser.parse_args()
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    draw(*report(print), given.out)
+    print(given.out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,44 @@
+"""Run every case: a table on the screen, and a file. Ends with 1 when a case is out of bound.
+
+python -m benchmarks.stability [--out runs/stability.json] [--only WORDS]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+import torch
+
+from benchmarks.stability import Row, all_cases, run
+
+
+def line(row: Row) -> str:
+    measured = "failed" if row.measured is None else f"{row.measured:.3g}"
+    return f"{'ok ' if row.ok else 'BAD'} {row.case:<58} {measured:>10} <= {row.bound:<9.3g} {row.quantity}"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("runs/stability.json"))
+    parser.add_argument("--only", default="", help="cases whose name contains this")
+    given = parser.parse_args()
+    cases = [case for case in all_cases() if given.only in case.name]
+    if not cases:
+        parser.error(f"no case's name contains {given.only!r}")
+    torch.set_num_threads(1)  # tiny scenes: other threads would only wait
+    rows = []
+    for case in cases:
+        rows.append(run(case))
+        print(line(rows[-1]), flush=True)
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    given.out.write_text(json.dumps([row._asdict() for row in rows], indent=1) + "\n")
+    bad = [row.case for row in rows if not row.ok]
+    print(f"{len(rows) - len(bad)} of {len(rows)} cases within bound; {given.out}")
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,255 @@
+"""Cases of the diffusion model, of score distillation and of the discriminator, with the embedded prior."""
+
+from __future__ import annotations
+
+from functools import cache, partial
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from benchmarks.stability.cases import EPS32, EXACT, UNCLEAR, Case, largest, unclear
+from benchmarks.stability.splatting import camera, cloud
+from reffusion import discriminator, prior, sds, trace
+from reffusion.confinement import Distillation, Sight, sds_term
+from reffusion.types import PARAMETERS
+
+TINY = Path(__file__).resolve().parents[2] / "priors" / "tiny"
+SIZE = 32  # px; the UNet takes any size that its halvings divide
+HALF = {torch.float16: 2.0**-11, torch.bfloat16: 2.0**-8}
+LAYERS = 100  # more than the UNet has one after another
+
+
+@cache
+def model(dtype: torch.dtype = torch.float32) -> prior.Prior:
+    return prior.load_prior(TINY, dtype=dtype)
+
+
+@cache
+def prompts() -> Tensor:
+    """[3, L, D] hidden states of the global, the local and the empty prompt."""
+    with torch.no_grad():
+        return prior.embed_text(model(), ["A photo of sks", "A photo of sks, cropped", ""])
+
+
+def normal(*shape: int, label: str = "") -> Tensor:
+    return torch.randn(*shape, generator=trace.generator(0, "stability", label))
+
+
+def images(label: str = "") -> Tensor:
+    return torch.rand(1, 3, SIZE, SIZE, generator=trace.generator(0, "images", label)) * 2 - 1
+
+
+@torch.no_grad()
+def predicted(t: int, guidance: float | None = None, empty: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    """z_t, and eps and z_0 that the prior finds in it; in the middle of the picture a square is repainted."""
+    mask = torch.zeros(1, 1, SIZE, SIZE)
+    mask[..., 8:24, 8:24] = 1
+    condition = prior.conditioning(model(), images(), mask)
+    noisy, times = normal(1, condition.shape[1] - 1, *condition.shape[-2:]), torch.tensor([t])
+    if guidance is None:
+        return noisy, *prior.predict(model(), noisy, times, condition, prompts()[:1])
+    empty = prompts()[2:] if empty is None else empty
+    return noisy, *prior.guided(model(), noisy, times, condition, prompts()[:1], empty, guidance)
+
+
+def torn(t: int, guidance: float | None = None) -> float:
+    """How far a z_0 + s eps is from z_t, relative to the largest number that takes part."""
+    noisy, eps, clean = (x.double() for x in predicted(t % model().timesteps, guidance))
+    a = model().alphas_cumprod[t].double()
+    largest = max(noisy.abs().max(), eps.abs().max(), (a.sqrt() * clean).abs().max())
+    return ((a.sqrt() * clean + (1 - a).sqrt() * eps - noisy).abs().max() / largest).item()
+
+
+def no_guidance() -> float:
+    """Guidance 0 is the conditional prediction, bit for bit; largest difference."""
+    pairs = zip(predicted(500, 0.0), predicted(500), strict=True)
+    return largest(*((a - b).abs().max().item() for a, b in pairs))
+
+
+def strong_guidance() -> float:
+    """Guidance 100 against the same sum in float64 of two separate predictions, relative to eps."""
+    _, eps, _ = predicted(500)
+    other = predicted(500, 0.0)
+    with torch.no_grad():
+        mask = torch.zeros(1, 1, SIZE, SIZE)
+        mask[..., 8:24, 8:24] = 1
+        condition = prior.conditioning(model(), images(), mask)
+        empty, _ = prior.predict(model(), other[0], torch.tensor([500]), condition, prompts()[2:])
+    exact = 101 * eps.double() - 100 * empty.double()
+    return ((predicted(500, 100.0)[1].double() - exact).abs().max() / eps.abs().max()).item()
+
+
+def guidance_to_nowhere() -> float:
+    """Guidance 100 between a prompt and itself changes nothing; largest difference relative to eps."""
+    _, eps, _ = predicted(500)
+    return ((predicted(500, 100.0, prompts()[:1])[1] - eps).abs().max() / eps.abs().max()).item()
+
+
+def half_precision(dtype: torch.dtype) -> float:
+    """The whole way in half precision against float32: relative L2 of eps at the first and the last timestep."""
+    mask, worst = torch.ones(1, 1, SIZE, SIZE), 0.0
+    for t in (0, model().timesteps - 1):
+        found = []
+        for kind in (torch.float32, dtype):
+            with torch.no_grad():
+                condition = prior.conditioning(model(kind), images(), mask)
+                noisy = normal(1, condition.shape[1] - 1, *condition.shape[-2:])
+                found.append(prior.predict(model(kind), noisy, torch.tensor([t]), condition, prompts()[:1])[0])
+        worst = largest(worst, ((found[1] - found[0]).norm() / found[0].norm()).item())
+    return worst
+
+
+def distilled(t: int, dtype: torch.dtype) -> float:
+    """Gradients of all weightings for data of unit variance, whose score is known (eps = s z_t, z_0 = a z_t), against
+    float64; relative L2."""
+    latents, noise = (normal(2, 4, 8, 8, label=name).to(dtype) for name in ("latents", "noise"))
+    abar, times, worst = model().alphas_cumprod, torch.full((2,), t % model().timesteps), 0.0
+    a, s = (x.double()[times[0]] for x in (abar.sqrt(), (1 - abar.double()).sqrt()))
+    noisy = a * latents.double() + s * noise.double()
+    exact = {"x0": latents.double() - a * noisy, "sigma2": s**2 * (s * noisy - noise), "one": s * noisy - noise}
+    for weighting, truth in exact.items():
+        found = sds.sds_gradient(
+            latents, lambda z, _: (s.to(z) * z, a.to(z) * z), times, noise, abar, weighting=weighting
+        )
+        # z - z_0 is a difference of numbers of order one at t = 0: its error is measured against those.
+        size = latents.double().norm() if weighting == "x0" else truth.norm()
+        worst = largest(worst, ((found.double() - truth).norm() / size).item())
+    return worst
+
+
+def empty_gradient() -> float:
+    """Distillation of an empty mask, normalised to unit size: zero, not 0 / 0."""
+    latents, noise, abar = normal(2, 4, 8, 8), normal(2, 4, 8, 8, label="noise"), model().alphas_cumprod
+    found = sds.sds_gradient(
+        latents, lambda z, _: (z, z), torch.tensor([3, 700]), noise, abar, unit_rms=True, mask=torch.zeros(2, 1, 8, 8)
+    )
+    return found.abs().max().item()
+
+
+def nothing_shines_through() -> float:
+    """Under a full mask the conditioning of two pictures is the same."""
+    full = torch.ones(1, 1, SIZE, SIZE)
+    one, other = (prior.conditioning(model(), images(name), full) for name in ("a", "b"))
+    return (one - other).abs().max().item()
+
+
+def nothing_hidden() -> float:
+    """With an empty mask the conditioning is the picture's latents, bit for bit."""
+    with torch.no_grad():
+        condition = prior.conditioning(model(), images(), torch.zeros(1, 1, SIZE, SIZE))
+        apart = condition[:, 1:] - prior.encode(model(), images())
+    return largest(condition[:, :1].abs().max().item(), apart.abs().max().item())
+
+
+def window_of_nothing() -> float:
+    nothing = torch.zeros(20, 30, dtype=torch.bool)
+    return unclear(lambda: sds.window_around(nothing, 8, trace.generator(0)), "empty mask")
+
+
+def scene_gradient(low: float, high: float, guidance: float) -> float:
+    """Score distillation of a scene that is to be repainted as a whole: numbers that are not finite."""
+    view, gaussians = camera(24, 18), cloud().map(lambda p: p.clone().requires_grad_())
+    everything = torch.ones(18, 24, dtype=torch.bool)
+    sight = Sight(view, torch.rand(18, 24, 3, generator=trace.generator(0)), ~everything, everything, clean=False)
+    settings = Distillation(patches=1, low=low, high=high, guidance=guidance)
+    masked = torch.ones(len(gaussians), dtype=torch.bool)
+    loss, _ = sds_term(gaussians, masked, sight, model(), prompts(), settings, trace.generator(1))
+    loss.backward()
+    return float(sum((~torch.isfinite(getattr(gaussians, name).grad)).sum() for name in PARAMETERS))
+
+
+def one_step_painted() -> float:
+    """Painting in one step, everything masked: pixels outside [-1, 1] or no numbers."""
+    full, draws = torch.ones(1, 1, SIZE, SIZE), trace.generator(0)
+    found = prior.sample(model(), images(), full, prompts()[:1], 1, draws, 100.0, prompts()[2:])
+    return float((~(found.abs() <= 1)).sum())
+
+
+# ------------------------------------------------------------------------------------------ discriminator
+
+
+def sure_critic() -> float:
+    """Losses and slopes at scores of +-1e4 against their limits, max(0, x) and 0 or 1; relative error."""
+    worst = 0.0
+    for score in (1e4, -1e4):
+        for loss, limit, slope in (
+            (lambda x: discriminator.critic_loss(x, torch.zeros(4)), max(0.0, -score), -float(score < 0)),
+            (lambda x: discriminator.critic_loss(torch.zeros(4), x), max(0.0, score), float(score > 0)),
+        ):
+            scores = torch.full((4,), score, requires_grad=True)
+            value = loss(scores) - torch.tensor(2.0).log()  # what scores of zero cost
+            value.backward()
+            worst = largest(worst, abs(value.item() - limit) / 1e4, (scores.grad * 4 - slope).abs().max().item())
+    return worst
+
+
+def sure_generator() -> float:
+    """The maker's losses at +-1e4, both forms: errors of values (relative) and slopes."""
+    worst = 0.0
+    for form in ("non-saturating", "saturating"):
+        for score in (1e4, -1e4):
+            scores = torch.full((4,), score, requires_grad=True)
+            value = discriminator.generator_loss(scores, form)
+            value.backward()
+            limit = -max(0.0, score) if form == "saturating" else max(0.0, -score)
+            slope = -float(score > 0) if form == "saturating" else -float(score < 0)
+            worst = largest(worst, abs(value.item() - limit) / 1e4, (scores.grad * 4 - slope).abs().max().item())
+    return worst
+
+
+@cache
+def critic() -> discriminator.Critic:
+    return discriminator.Critic(16, 8, trace.generator(0, "critic"))
+
+
+def flat_critic() -> float:
+    """A critic of weights zero has no slope: its penalty is 0, and so are the gradients of the penalty."""
+    flat = discriminator.Critic(16, 8, trace.generator(0))
+    for weight in flat.parameters():
+        weight.data.zero_()
+    patches = torch.rand(4, 3, 16, 16, generator=trace.generator(1)).requires_grad_()
+    penalty = discriminator.gradient_penalty(flat(patches), patches)
+    slopes = torch.autograd.grad(penalty, list(flat.parameters()), allow_unused=True)
+    found = [penalty.item(), *(slope.abs().max().item() for slope in slopes if slope is not None)]
+    return largest(*found)
+
+
+def equal_patches() -> float:
+    """Eight times the same patch: the deviation's root is of zero. Numbers that are not finite, of score and slopes."""
+    patches = torch.full((8, 3, 16, 16), 0.25, requires_grad=True)
+    scores = critic()(patches)
+    penalty = discriminator.gradient_penalty(scores, patches)
+    slopes = torch.autograd.grad(scores.sum() + penalty, [patches, *critic().parameters()], allow_unused=True)
+    return float(sum((~torch.isfinite(x)).sum() for x in (scores, *slopes) if x is not None))
+
+
+SDS = "numbers of the gradient that are not finite"
+CASES = (
+    *(Case(f"timestep {name}", "error of a z_0 + s eps = z_t, relative", 8 * EPS32, partial(torn, t))
+      for name, t in (("0", 0), ("T-1", -1))),
+    Case("timestep T-1, guidance 100", "error of a z_0 + s eps = z_t, relative", 8 * EPS32, partial(torn, -1, 100.0)),
+    *(Case(f"timestep {name}, score distillation", "relative L2 error against float64", 16 * EPS32,
+           partial(distilled, t, torch.float32)) for name, t in (("0", 0), ("T-1", -1))),
+    *(Case(f"timestep {name}, half precision, score distillation", "relative L2 error against float64",
+           16 * HALF[torch.float16], partial(distilled, t, torch.float16)) for name, t in (("0", 0), ("T-1", -1))),
+    # One rounding a layer, none of which the next may enlarge on the whole (each layer is normalised).
+    *(Case(f"{str(dtype)[6:]}, half precision of the prior", "relative L2 difference of eps from float32",
+           LAYERS * epsilon, partial(half_precision, dtype)) for dtype, epsilon in HALF.items()),
+    Case("guidance 0", "largest difference from no guidance", EXACT, no_guidance),
+    # 101 + 100 predictions, each rounded once a layer; batches of one and of two differ so.
+    Case("guidance 100", "error relative to eps", 201 * LAYERS * EPS32, strong_guidance),
+    Case("guidance 100, equal prompts", "difference from no guidance, relative to eps", 201 * LAYERS * EPS32,
+         guidance_to_nowhere),
+    Case("mask empty, conditioning", "difference from the picture's latents", EXACT, nothing_hidden),
+    Case("mask full, conditioning", "what of the picture is seen", EXACT, nothing_shines_through),
+    Case("mask empty, gradient of unit size", "largest number", EXACT, empty_gradient),
+    Case("mask empty, window", UNCLEAR, EXACT, window_of_nothing),
+    Case("mask full, timestep 0, guidance 100, scene", SDS, EXACT, partial(scene_gradient, 0.0, 1e-9, 100.0)),
+    Case("mask full, timestep T-1, guidance 0, scene", SDS, EXACT, partial(scene_gradient, 1 - 1e-9, 1.0, 0.0)),
+    Case("mask full, painted in one step, guidance 100", "pixels outside [-1, 1]", EXACT, one_step_painted),
+    Case("discriminator logits +-1e4, critic", "relative error of losses and slopes", 8 * EPS32, sure_critic),
+    Case("discriminator logits +-1e4, generator", "relative error of losses and slopes", 8 * EPS32, sure_generator),
+    Case("discriminator, zero gradients", "penalty and its largest gradient", EXACT, flat_critic),
+    Case("discriminator, equal patches", "numbers that are not finite", EXACT, equal_patches),
+)  # fmt: skip

@@ -1,0 +1,193 @@
+"""Cases of the metrics (identical, constant and 1-px images) and of masks (empty, full, contradicting, in one view)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+from benchmarks.stability.cases import EPS32, EPS64, EXACT, UNCLEAR, Case, largest, unclear
+from benchmarks.stability.splatting import camera, cloud
+from reffusion import masks, metrics
+from reffusion.lpips import Lpips
+from reffusion.optimize import reconstruction_loss
+from reffusion.ssim import C1
+
+VIEWS = [camera(12, 10), camera(12, 10, 1.2), camera(12, 10, 1.5)]
+NAMED = [type(view)(f"v{k}", *list(vars(view).values())[1:8]) for k, view in enumerate(VIEWS)]
+EMPTY, FULL = np.zeros((10, 12), bool), np.ones((10, 12), bool)
+
+
+def picture(height: int = 24, width: int = 32) -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, (height, width, 3)).astype(np.uint8)
+
+
+def flat(value: float, height: int = 24, width: int = 32) -> np.ndarray:
+    return np.full((height, width, 3), value)
+
+
+# ------------------------------------------------------------------------------------------------ metrics
+
+
+def identical() -> float:
+    """PSNR infinite, SSIM 1, FLIP 0, and 100 dB in a mean: how many of the four are not."""
+    found = metrics.score(picture(), picture())
+    good = found["psnr"] == math.inf, abs(found["ssim"] - 1) < 1e-12, found["flip"] == 0
+    return float(4 - sum(good) - (metrics.mean([found["psnr"]]) == metrics.PSNR_CAP))
+
+
+def constant_ssim() -> float:
+    """Of two constant images SSIM is its luminance term, (2ab + C1) / (a^2 + b^2 + C1); difference."""
+    apart = 0.0
+    for a, b in ((0.0, 1.0), (0.25, 0.75), (0.0, 0.0), (1.0, 1.0)):
+        apart = largest(apart, abs(metrics.ssim(flat(a), flat(b)) - (2 * a * b + C1) / (a * a + b * b + C1)))
+    return apart
+
+
+def constant_psnr() -> float:
+    """-20 log10 of the difference, also where that is a grey level of 2^-24; relative error."""
+    apart = 0.0
+    for step in (1.0, 0.5, 2.0**-8, 2.0**-24):
+        missed = abs(metrics.psnr(flat(0.0), flat(step)) + 20 * math.log10(step))
+        apart = largest(apart, missed / max(1, -math.log2(step)))
+    return apart
+
+
+def constant_flip() -> float:
+    """Of a constant image with itself 0, of black and white within [0.9, 1]: by how much that is missed."""
+    zero, most = metrics.flip(flat(0.3), flat(0.3)), metrics.flip(flat(0.0), flat(1.0))
+    return largest(zero, 0.9 - most, most - 1.0)
+
+
+def one_pixel() -> float:
+    """PSNR and FLIP of 1 x 1 px are finite numbers, SSIM has none: how many of the three are wrong."""
+    black, grey = flat(0.0, 1, 1), flat(0.5, 1, 1)
+    found = metrics.score(black, grey)
+    good = abs(found["psnr"] + 20 * math.log10(0.5)) < 1e-9, 0 < found["flip"] <= 1, found["ssim"] is None
+    return float(3 - sum(good))
+
+
+def one_pixel_box() -> float:
+    """A mask of one pixel in a corner has a box within the image, and a score."""
+    mask = np.zeros((24, 32), bool)
+    mask[-1, -1] = True
+    box = metrics.mask_box(mask)
+    scored = metrics.score_view(picture(), 255 - picture(), box)
+    inside = 0 <= box.left < box.right <= 32 and 0 <= box.top < box.bottom <= 24
+    return float(not inside) + float(not math.isfinite(scored["psnr_box"])) + float(scored["ssim_box"] is not None)
+
+
+def constant_lpips() -> float:
+    """LPIPS of constant images with random weights: 0 of equal ones, finite otherwise, and a finite gradient."""
+    torch.manual_seed(0)
+    model = Lpips("alex")
+    for weight in model.linear:
+        weight.data.fill_(1.0)
+    black, grey = torch.full((1, 3, 32, 32), -1.0), torch.zeros(1, 3, 32, 32, requires_grad=True)
+    same, apart = model(black, black), model(black, grey)
+    apart.sum().backward()
+    good = same.item() == 0, math.isfinite(apart.item()), torch.isfinite(grey.grad).all().item()
+    return float(3 - sum(good))
+
+
+def loss_of_constant_images() -> float:
+    """The reconstruction loss of equal and of constant images, whole and masked: wrong values and gradients."""
+    wrong = 0.0
+    for value in (0.0, 0.5, 1.0):
+        for weights in (None, torch.ones(9, 8), torch.zeros(9, 8)):
+            image = torch.full((9, 8, 3), value, requires_grad=True)
+            loss = reconstruction_loss(image, torch.full((9, 8, 3), value), weights)
+            loss.backward()
+            wrong = largest(wrong, abs(loss.item()), image.grad.abs().max().item())
+    return wrong
+
+
+def loss_of_one_pixel() -> float:
+    """1 x 1 px, grey against black: the closed form, 0.8 * 0.5 + 0.2 * (1 - C1 / (0.25 + C1)); difference."""
+    loss = reconstruction_loss(torch.full((1, 1, 3), 0.5), torch.zeros(1, 1, 3))
+    return abs(loss.item() - (0.4 + 0.2 * (1 - C1 / (0.25 + C1))))
+
+
+# -------------------------------------------------------------------------------------------------- masks
+
+
+def labelled(given: dict[str, np.ndarray]) -> float:
+    """How many of the Gaussians that a view sees are labelled as the object."""
+    return float(masks.label_gaussians(masks.cast_votes(cloud(), NAMED, given)).sum())
+
+
+def seen() -> int:
+    votes = masks.cast_votes(cloud(), NAMED, {view.name: FULL for view in NAMED})
+    return int((votes.masked > 0).sum())
+
+
+def all_full() -> float:
+    """Full masks label whatever is seen; how many are missed, or labelled unseen."""
+    return abs(labelled({view.name: FULL for view in NAMED}) - seen())
+
+
+def contradicting() -> float:
+    """One camera under two names, masked in one and not in the other: a tie, which stays unmasked (tau = 1)."""
+    twice = [NAMED[0], type(NAMED[0])("other", *list(vars(NAMED[0]).values())[1:8])]
+    votes = masks.cast_votes(cloud(), twice, {NAMED[0].name: FULL, "other": EMPTY})
+    return float(masks.label_gaussians(votes).sum() + (votes.masked != votes.unmasked).sum())
+
+
+def in_one_view() -> float:
+    """A mask in one view of three: the others do not vote, so all that this view sees is the object."""
+    votes = masks.cast_votes(cloud(), NAMED, {"v1": FULL})
+    return float((votes.unmasked > 0).sum() + (masks.label_gaussians(votes) != (votes.masked > 0)).sum())
+
+
+def in_no_view() -> float:
+    return unclear(lambda: masks.cast_votes(cloud(), NAMED, {}), "none of the training views has a mask")
+
+
+def nothing_remains() -> float:
+    """Every Gaussian is the object: views of what remains show nothing, and nothing of it is seen elsewhere."""
+    nobody = cloud().map(lambda p: p[:0])
+    disparity, explained = masks.remaining_view(nobody, torch.zeros(0), NAMED[0])
+    hidden = {view.name: FULL for view in NAMED}
+    count = masks.seen_elsewhere(disparity, FULL, NAMED[0], NAMED, hidden, {v.name: disparity for v in NAMED})
+    return float(np.abs(disparity).max() + np.abs(explained).max() + count.sum())
+
+
+def tidied() -> float:
+    """Empty and full masks stay what they are, whatever counts as a speck or a gap."""
+    changed = [(masks.tidy(mask, 5.0, 5.0) != mask).sum() for mask in (EMPTY, FULL)]
+    return float(sum(changed))
+
+
+def views_of_masks() -> float:
+    """The view to complete: none of empty masks, one of full ones; boxes likewise; how many are wrong."""
+    names = [view.name for view in NAMED]
+    none = masks.best_view(dict.fromkeys(names, EMPTY), names), metrics.mask_box(EMPTY)
+    some = masks.best_view(dict.fromkeys(names, FULL), names), metrics.mask_box(FULL)
+    return float(sum(x is not None for x in none) + sum(x is None for x in some) + (some[1] != (0, 0, 12, 10)))
+
+
+WRONG = "properties that do not hold"
+CASES = (
+    Case("metrics of identical images", WRONG, EXACT, identical),
+    # Means of squares of numbers of order one over eleven by eleven weights, in float64; C1 = 1e-4 divides.
+    Case("SSIM of constant images", "difference from the luminance term", 1e4 * EPS64 * 16, constant_ssim),
+    Case("PSNR of constant images", "error (dB, by binary digit)", 64 * EPS64, constant_psnr),
+    # FLIP computes in float32; white on black is its largest error, to which its own tone mapping leaves a few percent.
+    Case("FLIP of constant images", "how far outside [0, 0] and [0.9, 1]", 16 * EPS32, constant_flip),
+    Case("metrics of 1-px images", WRONG, EXACT, one_pixel),
+    Case("box of a 1-px mask", WRONG, EXACT, one_pixel_box),
+    Case("LPIPS of constant images", WRONG, EXACT, constant_lpips),
+    # E[x^2] - E[x]^2 of numbers of order one rounds by some 2^-24, against C2 = 9e-4.
+    Case("reconstruction loss of identical constant images", "largest value or gradient", 4 * EPS32 / 9e-4,
+         loss_of_constant_images),
+    Case("reconstruction loss of 1-px images", "difference from the closed form", 8 * EPS32, loss_of_one_pixel),
+    Case("masks empty", "Gaussians labelled", EXACT, lambda: labelled({view.name: EMPTY for view in NAMED})),
+    Case("masks full", "Gaussians labelled wrongly", EXACT, all_full),
+    Case("masks contradicting", "Gaussians labelled, and unequal votes", EXACT, contradicting),
+    Case("mask present in one view", "Gaussians labelled wrongly", EXACT, in_one_view),
+    Case("mask in no view", UNCLEAR, EXACT, in_no_view),
+    Case("masks full, nothing remains", "largest disparity, evidence or count", EXACT, nothing_remains),
+    Case("masks empty and full, tidied", "pixels changed", EXACT, tidied),
+    Case("masks empty and full, views and boxes", WRONG, EXACT, views_of_masks),
+)  # fmt: skip

@@ -1,0 +1,167 @@
+"""Cases of the optimisation: everything pruned, rates ten times too large, gradients of any size."""
+
+from __future__ import annotations
+
+import json
+import math
+import tempfile
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from benchmarks.stability import frames
+from benchmarks.stability.cases import EPS32, EXACT, Case, largest
+from benchmarks.stability.splatting import camera, cloud
+from reffusion import io, mcmc, trace
+from reffusion.confinement import Sight
+from reffusion.densify import densify, prune
+from reffusion.distill import Settings as Distilling
+from reffusion.distill import distill
+from reffusion.fit import Settings, fit, initial_gaussians
+from reffusion.optimize import GaussianOptimizer, Rates
+from reffusion.splat import render
+from reffusion.types import PARAMETERS, Gaussians
+
+STOPS = "neither recovered nor stopped by name, or wrote NaN"
+
+
+def psnr(gaussians: Gaussians) -> float:
+    """Over the views of `frames`, in dB."""
+    scene, pictures = frames.normalised(1.0, 0.0), frames.photographs()
+    error = np.mean([(render(gaussians, view).color.clamp(0, 1).numpy() - pictures[name] / 255.0) ** 2
+                     for name, view in scene.cameras.items()])  # fmt: skip
+    return float(-10 * math.log10(error))
+
+
+def written(folder: Path) -> bool:
+    """Whether every number of the trace is finite."""
+    return all(math.isfinite(v) for line in trace.read_trace(folder / "trace.jsonl") for v in line.values())
+
+
+def named(error: FloatingPointError, term: str) -> bool:
+    return "step" in str(error) and term in str(error)
+
+
+def too_fast(factor: float) -> float:
+    """A fit at so many times the usual rates ends above where it began, or says in which step which term failed."""
+    scene = frames.normalised(1.0, 0.0)
+    start = initial_gaussians(scene.points, scene.point_colors, 0, 1000, trace.generator(0))
+    usual = Rates(means=2e-3, means_last=2e-4, log_scales=1.5e-2, sh_dc=1.5e-2)
+    settings = Settings(60, sh_degree=0, random_background=False, densify_every=10, rates=frames.faster(usual, factor))
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        try:
+            found = fit(list(scene.cameras.values()), frames.photographs(), start, settings, folder=folder)
+        except FloatingPointError as error:
+            return float(not (named(error, "reconstruction") and written(folder)))
+        finite = all(torch.isfinite(getattr(found, n)).all() for n in PARAMETERS)
+        return float(not (finite and written(folder) and (psnr(found) > psnr(start) or factor > 100)))
+
+
+def too_fast_distillation(factor: float) -> float:
+    """The same of a distillation by reconstruction and reference, half of the Gaussians masked."""
+    scene, fitted, _ = frames.fitted(1.0, 0.0)
+    masked = fitted.means[:, 0] > 0
+    start = replace(fitted, sh=torch.where(masked[:, None, None], 0.0, fitted.sh))
+    pictures = {name: torch.from_numpy(p).float() / 255 for name, p in frames.photographs().items()}
+    whole = torch.ones(frames.HEIGHT, frames.WIDTH, dtype=torch.bool)
+    sights = [Sight(view, pictures[n], whole, ~whole, clean=False) for n, view in scene.cameras.items()]
+    settings = Distilling(
+        40, sds_weight=0.0, reference_weight=1.0, rates=frames.faster(Rates(means=2e-3), factor), epsilon=1e-6
+    )
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        try:
+            found, _ = distill(
+                start, masked, sights, [(scene.cameras["v2"], pictures["v2"], whole)], None, None, settings, folder
+            )
+        except FloatingPointError as error:
+            return float(not (named(error, "re") and written(folder)))
+        finite = all(torch.isfinite(getattr(found, n)).all() for n in PARAMETERS)
+        return float(not (finite and written(folder) and psnr(found) > psnr(start)))
+
+
+def nobody_left() -> float:
+    """All Gaussians pruned: pictures are background, steps do nothing, files hold none; how much of it fails."""
+    optimizer, view = GaussianOptimizer(cloud()), camera()
+    removed = prune(optimizer, 1.1, math.inf)
+    picture = render(optimizer.gaussians, view, background=torch.full((3,), 0.25))
+    picture.color.sum().backward()
+    optimizer.step(0.5, visible=picture.radii > 0)
+    grown = densify(optimizer, 0.0, 0.01, 100, trace.generator(0))
+    moved = mcmc.relocate(optimizer, 0.5, trace.generator(0))
+    with tempfile.TemporaryDirectory() as folder:
+        io.save_ply(Path(folder) / "none.ply", optimizer.gaussians)
+        again = len(io.load_ply(Path(folder) / "none.ply"))
+    good = removed == 8, (picture.color == 0.25).all(), not picture.alpha.any(), grown == moved == again == 0
+    return float(sum(not x for x in good))
+
+
+def fit_of_nobody() -> float:
+    """A fit whose pruning takes everything says so, with the step."""
+    scene = frames.normalised(1.0, 0.0)
+    start = initial_gaussians(scene.points, scene.point_colors, 0, 1000, trace.generator(0))
+    settings = Settings(
+        8, sh_degree=0, densify_from=0.0, densify_until=1.0, densify_every=4, least_opacity=1.1, slope=math.inf
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            fit(list(scene.cameras.values()), frames.photographs(), start, settings, folder=Path(folder))
+        except ValueError as error:
+            return float(not ("step 3" in str(error) and "no Gaussian" in str(error)))
+    return 1.0
+
+
+def oversized() -> float:
+    """Log-scales of 100 and more, whose exponential is infinite, are pruned as too large; how many are not."""
+    gaussians = cloud()
+    gaussians.log_scales[:4] = torch.tensor([100.0, 1e3, 1e4, 1e30])[:, None]
+    optimizer = GaussianOptimizer(gaussians)
+    prune(optimizer, 0.0, 1e3)
+    return float(len(optimizer.gaussians) - 4)
+
+
+def gradients_of_any_size() -> float:
+    """Adam's first step is one step size long, whatever the gradient; by how much it is longer, relative."""
+    worst = 0.0
+    for size in (1e-25, 1e-15, 1e-8, 1.0, 1e8, 1e18):
+        optimizer = GaussianOptimizer(cloud(degree=0), rates=Rates(means=1e-3, means_last=1e-3))
+        before = optimizer.gaussians.means.detach().clone()
+        optimizer.gaussians.means.grad = torch.full_like(before, size)
+        optimizer.step(0.0)
+        moved = (optimizer.gaussians.means.detach() - before).abs().max().item()
+        worst = largest(worst, moved / 1e-3 - 1 if math.isfinite(moved) else math.inf)
+    return worst
+
+
+def broken_gradient() -> float:
+    """A gradient that is NaN or infinite: a message that names the parameter, and nothing moved."""
+    wrong = 0
+    for value in (math.nan, math.inf):
+        optimizer = GaussianOptimizer(cloud())
+        before = json.dumps(optimizer.gaussians.log_scales.tolist())
+        optimizer.gaussians.log_scales.grad = torch.full((8, 3), value)
+        try:
+            optimizer.step(0.0)
+            wrong += 1
+        except FloatingPointError as error:
+            wrong += "log_scales" not in str(error)
+        wrong += json.dumps(optimizer.gaussians.log_scales.tolist()) != before
+    return float(wrong)
+
+
+CASES = (
+    *(Case(f"learning rates {factor:g} times too large, fit", STOPS, EXACT, partial(too_fast, factor))
+      for factor in (10.0, 1e6)),
+    Case("learning rates 10 times too large, distillation", STOPS, EXACT, partial(too_fast_distillation, 10.0)),
+    Case("all Gaussians pruned", "properties that do not hold", EXACT, nobody_left),
+    Case("all Gaussians pruned in a fit", "refusals without step and cause", EXACT, fit_of_nobody),
+    Case("log-scales whose exponential is infinite", "Gaussians not pruned", EXACT, oversized),
+    # A mean of order one is rounded to 2^-24, against a step of 1e-3; Adam's own arithmetic rounds some ten times.
+    Case("gradients of 1e-25 to 1e18", "how much longer than a step size, relative", 2e3 * EPS32 + 16 * EPS32,
+         gradients_of_any_size),
+    Case("gradients that are not numbers", "unnamed, or something moved", EXACT, broken_gradient),
+)  # fmt: skip

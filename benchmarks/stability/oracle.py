@@ -1,0 +1,125 @@
+"""The compiled rasterizer against plain torch in float64, with the compiled one's own order and cut-offs.
+
+A cut-off (alpha under 1/255, a finished pixel) is a jump: where float32 and float64 fall on different sides of one, a
+difference says nothing about accuracy. So the oracle is told which Gaussian the kernel blended into which pixel, and
+sorts by the depth in float32, as the kernel does. Everything else is float64.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from reffusion import splat
+from reffusion.splat import reference
+from reffusion.splat.conventions import MAX_ALPHA
+from reffusion.types import PARAMETERS, Camera, Gaussians
+
+BLOCKS = (*PARAMETERS, "features", "background", "probe")
+IMAGES = ("color", "depth", "alpha", "features")
+CHANNELS = 2
+EPSILON = 2.0**-24  # the relative error of one rounding to float32
+
+
+class Drawn(NamedTuple):
+    """What an implementation drew, and the gradients of a fixed random linear function of it.
+
+    Attributes:
+        images: colour, depth, alpha, features. gradients: by `BLOCKS`. radii: [N] int32.
+    """
+
+    images: Mapping[str, Tensor]
+    gradients: Mapping[str, Tensor]
+    radii: Tensor
+
+
+def draw(gaussians: Gaussians, camera: Camera, impl: str, seed: int = 0) -> Drawn:
+    """With `impl` "cpu" in float32; with "reference" in float64 with the cut-offs of "cpu"."""
+    dtype = torch.float32 if impl == "cpu" else torch.float64
+    random = torch.Generator().manual_seed(seed)
+    normal = lambda *shape: torch.randn(*shape, generator=random).to(dtype)
+    leaf = lambda tensor: tensor.detach().to(dtype).clone().requires_grad_()
+    count, blended = len(gaussians), None if impl == "cpu" else blended_pixels(gaussians, camera)
+    gaussians = gaussians.map(leaf)
+    features, background, probe = leaf(normal(count, CHANNELS)), leaf(normal(3)), leaf(torch.zeros(count, 2))
+    extras = {"features": features, "background": background, "probe": probe}
+    if impl == "cpu":
+        drawn = splat.render(gaussians, camera, impl="cpu", **extras)
+        images, radii = {name: getattr(drawn, name) for name in IMAGES}, drawn.radii
+    else:
+        images, radii = _drawn_with(blended, gaussians, camera, **extras)
+    loss = sum((image * normal(*image.shape)).sum() for image in images.values())
+    leaves = [*(getattr(gaussians, name) for name in PARAMETERS), features, background, probe]
+    found = torch.autograd.grad(loss, leaves, allow_unused=True)
+    gradients = {n: torch.zeros_like(x) if g is None else g for n, x, g in zip(BLOCKS, leaves, found, strict=True)}
+    return Drawn({name: image.detach() for name, image in images.items()}, gradients, radii)
+
+
+def blended_pixels(gaussians: Gaussians, camera: Camera) -> Tensor:
+    """bool [H * W, N]: which Gaussians the compiled kernel blends into which pixels. For small images."""
+    pixels = camera.width * camera.height
+    each = torch.eye(pixels).reshape(camera.height, camera.width, pixels)
+    return splat.accumulate(gaussians, camera, each, impl="cpu", count=True).T > 0
+
+
+def _drawn_with(blended: Tensor, gaussians: Gaussians, camera: Camera, features, background, probe):
+    """The reference's pictures with given cut-offs, and its radii."""
+    projected, radii = reference.project(gaussians, camera, probe)
+    again = torch.sort(projected.depths.float(), stable=True).indices  # of equal ones, those of lower index are first
+    projected = reference.Projected(*(array[again] for array in projected))
+    order = projected.order
+    columns, rows = torch.meshgrid(torch.arange(camera.width), torch.arange(camera.height), indexing="xy")
+    dx, dy = (torch.stack((columns, rows), -1).reshape(-1, 1, 2) + 0.5 - projected.means).unbind(2)
+    _, xy, yy = projected.covariances.unbind(1)
+    distance = dy.square() / yy + (dx - xy / yy * dy).square() * (yy / projected.determinants)
+    alpha = torch.clamp_max(projected.opacities * torch.exp(-0.5 * distance), MAX_ALPHA) * blended[:, order]
+    after = torch.cumprod(1 - alpha, 1)
+    weights = alpha * torch.cat((torch.ones_like(after[:, :1]), after), 1)[:, :-1]
+    behind = after[:, -1:] if len(order) else torch.ones_like(dx.sum(1, keepdim=True))
+    layers = (reference.colors(gaussians, camera, gaussians.sh_degree)[order], projected.depths[:, None])
+    image = weights @ torch.cat((*layers, features[order]), 1)
+    covered = weights.sum(1)
+    shaped = lambda array: array.reshape(camera.height, camera.width, *array.shape[1:])
+    depth = torch.where(covered > 0, image[:, 3], 0) / torch.where(covered > 0, covered, 1)
+    color = image[:, :3] + behind * background
+    return dict(zip(IMAGES, map(shaped, (color, depth, covered, image[:, 4:])), strict=True)), radii
+
+
+FLOOR = {"values": 1e-6, "gradients": 1e-5}
+"""Absolute errors that do not count: a sum over up to 200 pixels of 8 channels, each term of order one (upstream
+gradients are standard normal) and rounded about ten times on its way, keeps a random walk of 10 * 2^-24 * sqrt(1600) =
+2e-5 in the worst case; a value is a sum over one pixel's list only."""
+
+
+def errors(gaussians: Gaussians, camera: Camera, relative: float, seed: int = 0) -> dict[str, float]:
+    """Name of an image or parameter block -> relative L2 error |kernel - oracle| / (|oracle| + floor / relative).
+
+    So a value of at most `relative` says that the error is within relative * |oracle| + floor. A quaternion's
+    gradient counts times its length, as a rotation: otherwise the shortest one would drown all others.
+    """
+    fast, exact = draw(gaussians, camera, "cpu", seed), draw(gaussians, camera, "reference", seed)
+    if not torch.equal(fast.radii, exact.radii):
+        return {"radii": float("inf")}
+    lengths = gaussians.quaternions.double().norm(dim=1, keepdim=True)
+    found = {}
+    for kind, here, there in (("values", fast.images, exact.images), ("gradients", *_turned(fast, exact, lengths))):
+        for name in there:
+            error = (here[name].double() - there[name]).norm().item()
+            label = name if kind == "values" else f"gradient of {name}"
+            found[label] = error / (there[name].norm().item() + FLOOR[kind] / relative)
+    return found
+
+
+def _turned(fast: Drawn, exact: Drawn, lengths: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Both gradients, those of quaternions times their lengths."""
+    turn = lambda found: {**found, "quaternions": found["quaternions"].double() * lengths}
+    return turn(fast.gradients), turn(exact.gradients)
+
+
+def worst(gaussians: Gaussians, camera: Camera, relative: float) -> float:
+    """The largest of `errors`; infinite where one is not a number."""
+    found = errors(gaussians, camera, relative).values()
+    return max(error if error == error else float("inf") for error in found)

@@ -1,0 +1,83 @@
+"""The stability suite: every case within its bound, every phrase of what was asked for a case, every fault caught."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.stability import __main__ as command
+from benchmarks.stability import all_cases, random_scenes, run
+from benchmarks.stability.cases import Case
+from benchmarks.stability.faults import FAULTS, caught
+
+CASES = {case.name: case for case in all_cases()}
+LONG = [case.name for case in random_scenes.CASES]  # a tenth of them here, all in `make stability`
+SCENES = 100
+ASKED = (  # what must be covered: words that some case's name contains
+    "scales 1e-07", "scales 10000", "anisotropy 1e+06", "opacity logit +30", "opacity logit -30", "quaternion zero",
+    "quaternions of length", "on the near plane", "at the near plane", "behind the near plane", "camera centre",
+    "larger than the scene", "equal depths", "offset 1e6", "extent 1e-3", "extent 1e4", "one-pixel image",
+    "8k-wide image", "constant depth", "four pixels", "90% outliers", "scale 1e-08", "scale 1e+08",
+    "completion, zero confidence", "solver, zero confidence", "completion, one known", "solver, one known",
+    "hole touching the border", "constant guide", "timestep 0", "timestep T-1", "half precision", "mask empty",
+    "mask full", "guidance 0", "guidance 100", "logits +-1e4", "zero gradients", "identical", "constant images",
+    "1-px images", "masks empty", "masks full", "contradicting", "present in one view", "all Gaussians pruned",
+    "rates 10 times too large",
+)  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("name", [name for name in CASES if name not in LONG])
+def test_case(name):
+    row = run(CASES[name])
+    assert row.ok, f"{row.quantity}: {row.measured}, bound {row.bound}"
+
+
+@pytest.mark.parametrize(
+    ("scenes", "relative"),
+    [(random_scenes.ordinary, random_scenes.ORDINARY), (random_scenes.extreme, random_scenes.EXTREME)],
+)
+def test_random_scenes(scenes, relative):
+    worst = random_scenes.worst_of(scenes, relative, SCENES)
+    assert worst.scenes == SCENES and worst.error <= relative, worst
+
+
+@pytest.mark.parametrize("words", ASKED)
+def test_what_was_asked_for_is_a_case(words):
+    assert any(words in name for name in CASES)
+
+
+def test_names_are_unique_and_enough():
+    assert len(CASES) == len(all_cases()) >= 60
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
+def test_fault_is_caught(fault):
+    assert caught(fault)
+
+
+def test_command_writes_the_table_and_fails_by_exit_code(tmp_path, monkeypatch, capsys):
+    cases = [Case("fine", "of one", 1.0, lambda: 0.5), Case("too much", "of one", 1.0, lambda: 2.0)]
+    cases += [Case("no number", "of one", 1.0, lambda: float("nan")), Case("raises", "of one", 1.0, lambda: 1 / 0)]
+    monkeypatch.setattr(command, "all_cases", lambda: cases)
+    out = tmp_path / "runs" / "stability.json"
+    monkeypatch.setattr(sys, "argv", ["stability", "--out", str(out)])
+    assert command.main() == 1
+    rows = json.loads(out.read_text())
+    assert [set(row) for row in rows] == [{"case", "quantity", "bound", "measured", "ok"}] * 4
+    assert [(row["case"], row["measured"], row["ok"]) for row in rows] == [
+        ("fine", 0.5, True), ("too much", 2.0, False), ("no number", None, False), ("raises", None, False)
+    ]  # fmt: skip
+    monkeypatch.setattr(sys, "argv", ["stability", "--out", str(out), "--only", "fine"])
+    assert command.main() == 0 and "1 of 1 cases" in capsys.readouterr().out
