@@ -290,13 +290,3 @@ def _misfit_of_added(unet: Mapping[str, Any], texts: Sequence[Mapping[str, Any]]
     if width != wanted:
         return f"the UNet's added conditions are {wanted} numbers, the text encoder's and the sizes' {width}"
     return None
-
-
-def gigabytes(count: int | None) -> str:
-    """1.7 GB, 233 MB, 6 kB; "size unknown" for None."""
-    if count is None:
-        return "size unknown"
-    for unit, least in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if count >= least:
-            return f"{count / least:.2g} {unit}" if count < 10 * least else f"{count / least:.0f} {unit}"
-    return f"{count} bytes"

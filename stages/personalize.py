@@ -44,13 +44,22 @@ class Params(BaseModel):
     seed: int = 0
     device: Literal["cpu", "cuda"] = "cpu"
     dtype: Literal["float32", "bfloat16", "float16"] = Field("float32", description="of the frozen weights")
+    memory_gb: float = Field(0.0, ge=0, description="GB that the prior may take; batches are split to fit; 0: no limit")
+    checkpointing: bool = Field(False, description="compute activations again on the way back: less memory, more time")
     checkpoint_seconds: float = Field(10.0, gt=0, description="seconds of work between checkpoints")
+
+
+def needed_weights(params: Params, brings: frozenset[str]) -> list:
+    """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
+    from reffusion import weights
+
+    return [weights.of_model(params.prior, params.dtype)]
 
 
 def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, reference: Path) -> None:
     import torch
 
-    from reffusion import io, lora, trace
+    from reffusion import io, lora, memory, trace
     from reffusion import personalize as P
     from reffusion import prior as diffusion
 
@@ -66,6 +75,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
         params.inverted_share,
     )
     prior = diffusion.load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
+    prior = diffusion.recomputing(prior) if params.checkpointing else prior
     references = [
         P.picture(torch.from_numpy(r.image), torch.from_numpy(r.mask), prior.native_size)
         for r in io.load_references(reference, scene)
@@ -91,7 +101,10 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
         if not views:
             print(f"note: no view has {training.size} px window free of masks: reference alone", flush=True)
     trained = lora.add(prior, params.rank, params.alpha, params.dropout, params.layers, params.seed)
-    P.personalize(prior, trained, references, views, sampling, training, out)
+    row = lambda prior: P.one_sample(prior, references, training.seed)
+    with memory.blamed("personalize.memory_gb", params.memory_gb):
+        prior = memory.fitted(prior, params.memory_gb, "personalize.memory_gb", row)
+        P.personalize(prior, trained, references, views, sampling, training, out)
     lora.save(prior, out)
     trace.clear_checkpoint(out)
 
