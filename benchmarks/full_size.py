@@ -121,9 +121,7 @@ def networks(shape: Shape, dtype: torch.dtype) -> dict[str, torch.nn.Module]:
     from diffusers import AutoencoderKL, UNet2DConditionModel
     from transformers import CLIPTextConfig, CLIPTextModel, CLIPTextModelWithProjection
 
-    kinds = (CLIPTextModelWithProjection,) * 2 if len(shape.texts) == 2 else (CLIPTextModel,)
-    if len(shape.texts) == 2:
-        kinds = (CLIPTextModel, CLIPTextModelWithProjection)
+    kinds = (CLIPTextModel, CLIPTextModelWithProjection)
     before = torch.get_default_dtype()
     torch.set_default_dtype(dtype)
     try:
@@ -141,18 +139,43 @@ def count(shape: Shape) -> int:
         return sum(p.numel() for part in networks(shape, torch.float32).values() for p in part.parameters())
 
 
+def living(shape: Shape, dtype: torch.dtype) -> dict[str, float]:
+    """GB of weights and, for one sample, of the most tensors that live at once: counted, nothing is computed.
+
+    On torch's device without memory; attention is taken apart there, so that a GPU's kernels need less.
+    """
+    with torch.device("meta"):
+        made = networks(shape, dtype)
+    prior = assembled(shape, made, "meta")
+    picture = reference(prior.native_size)
+    steps = {"inpainting": memory.answering, "SDS": memory.encoding}
+    said = {"weights": prior.bytes}
+    said |= {name: memory.peak_bytes(lambda s=step: s(prior), "meta") for name, step in steps.items()}
+    trainer(prior, 1)
+    training = lambda: P.one_sample(prior, [picture], 0)
+    said["personalization"] = memory.peak_bytes(training, "meta")
+    diffusion.recomputing(prior)
+    said["SDS, checkpointing"] = memory.peak_bytes(lambda: memory.encoding(prior), "meta")
+    said["personalization, checkpointing"] = memory.peak_bytes(training, "meta")
+    return {name: round(count / 1e9, 6) for name, count in said.items()}
+
+
 def build(shape: Shape, dtype: torch.dtype, device: str = "cpu", seed: int = 0) -> diffusion.Prior:
     """A prior of random weights, the same for equal seeds."""
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        return assembled(shape, networks(shape, dtype), device)
+
+
+def assembled(shape: Shape, made: dict[str, torch.nn.Module], device: str) -> diffusion.Prior:
+    """The networks with a tokenizer (the embedded prior's: words do not matter here) and SD2's schedule."""
     from diffusers import DDIMScheduler
     from transformers import CLIPTokenizer
 
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
-        made = networks(shape, dtype)
     length = shape.texts[0]["max_position_embeddings"]
     tokens = CLIPTokenizer.from_pretrained(TINY / "tokenizer", model_max_length=length)
     schedule = DDIMScheduler(
-        beta_start=0.00085, beta_end=0.012, beta_schedule="scaled_linear", prediction_type="epsilon"
+        beta_start=0.00085, beta_end=0.012, beta_schedule="scaled_linear", clip_sample=False, steps_offset=1
     )
     second = made.get("text_encoder_2")
     return diffusion.make_prior(
@@ -189,7 +212,7 @@ def personalization_step(prior: diffusion.Prior, picture: P.Picture, batch: int,
     loss = P.train_step(prior, optimizer, [picture], [], P.Sampling(), training, 0)
     lora.set_dropout(prior, False)
     lora.save(prior, folder)
-    return {"loss": loss} | {f"lora_{part}": sum(float(p.abs().sum()) for p in of) for part, of in trained.items()}
+    return {"loss": loss} | {f"lora_{part}": sum(float(p.detach().abs().sum()) for p in of) for part, of in trained.items()}
 
 
 @torch.no_grad()
@@ -292,12 +315,16 @@ def main() -> None:
     parser.add_argument("--memory-gb", type=float, default=20.0, help="refuse to begin where the machine has less free")
     parser.add_argument("--checkpointing", action="store_true")
     parser.add_argument("--toy", action="store_true", help="few channels, 32 px")
+    parser.add_argument("--count", action="store_true", help="only count the memory that one sample takes")
     parser.add_argument("--out", type=Path, default=Path("runs/full-size"))
     options = parser.parse_args()
     shape = shrunk(SD2) if options.toy else SD2
     if options.size:
         factor = 2 ** (len(shape.vae["block_out_channels"]) - 1)
         shape = Shape(shape.unet | {"sample_size": options.size // factor}, shape.vae, shape.texts)
+    if options.count:
+        print(json.dumps(living(shape, getattr(torch, options.dtype)), indent=1))
+        return
     need = 1.2 * count(shape) * (4 if options.dtype == "float32" else 2) / 1e9
     if need > options.memory_gb:
         parser.error(f"the weights alone take {need:.0f} GB, more than --memory-gb {options.memory_gb:g}")

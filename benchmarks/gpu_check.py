@@ -147,7 +147,7 @@ def personalization(prior: diffusion.Prior, sizes: Sizes, device: str, out: Path
     step = lambda: {"loss": P.train_step(prior, optimizer, [picture], [], P.Sampling(), training, 0)}
     said = measured(step, device, sizes.repeats)
     moved = sum(float(p.detach().abs().sum()) for p in trained["text"])
-    return said | {"batch": sizes.batch, "at_once": prior.at_once, "lora_text": moved}
+    return said | {"batch": sizes.batch, "rows_in_one_pass": prior.rows_graded, "lora_text": moved}
 
 
 # -------------------------------------------------------------------------------------------------------------- the fit

@@ -49,7 +49,9 @@ def model(name: str, half: bool) -> Path:
         raise ValueError(
             f"{name}: the hub has no such model: misspelt, moved, deleted or private; correct the name, or {instead}"
         ) from None
-    except (OSError, hub.HfHubHTTPError, hub.LocalEntryNotFoundError) as error:
+    except ValueError:
+        raise
+    except Exception as error:  # the hub's library passes on what its HTTP library raises
         raise ValueError(f"{name}: the hub does not answer ({_line(error)}); {_ELSEWHERE}") from None
     for entry in facts.siblings:
         if entry.lfs and entry.rfilename in chosen:

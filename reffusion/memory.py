@@ -82,44 +82,42 @@ def rows_within(budget_gb: float, fixed: int, row: int, param: str) -> int:
 
 
 def fitted(
-    prior: diffusion.Prior, budget_gb: float, param: str, row: Callable[[diffusion.Prior], object]
+    prior: diffusion.Prior, budget_gb: float, param: str, graded: Callable[[diffusion.Prior], object] | None = None
 ) -> diffusion.Prior:
-    """The prior with as many samples at once as fit into the budget; as it is where that is 0.
+    """The prior with as many samples in one pass as fit into the budget; as it is where that is 0.
 
     Args:
-        row: does with the prior, for one sample, what will be done for many. Its gradients are thrown away.
+        graded: does for one sample what will be done with a gradient for many; what it leaves in `grad` is removed.
     Raises ValueError as `rows_within`.
     """
     if not budget_gb:
         return prior
-    one = peak_bytes(lambda: row(prior), prior.device)
+    rows = rows_within(budget_gb, prior.bytes, peak_bytes(lambda: answering(prior), prior.device), param)
+    if graded is None:
+        return replace(prior, rows=rows)
+    one = peak_bytes(lambda: graded(prior), prior.device)
     for network in (prior.unet, prior.vae, prior.text_encoder):
         if network is not None:
             network.zero_grad(set_to_none=True)
-    return replace(prior, at_once=rows_within(budget_gb, prior.bytes, one, param))
-
-
-def distilling(prior: diffusion.Prior) -> None:
-    """What score distillation does with a sample: encode it with a gradient, decode none, ask the UNet."""
-    size, wide = prior.native_size, prior.unet.config.cross_attention_dim
-    image = torch.zeros(1, 3, size, size, device=prior.device, requires_grad=True)
-    latents = diffusion.encode(prior, image)
-    latents.sum().backward()
-    with torch.no_grad():
-        condition = torch.cat([latents[:, :1], latents], 1)
-        at = torch.zeros(1, dtype=torch.long, device=prior.device)
-        diffusion.raw_prediction(prior, latents, at, condition, latents.new_zeros(1, 78, wide))
+    return replace(prior, rows=rows, rows_graded=rows_within(budget_gb, prior.bytes, one, param))
 
 
 @torch.no_grad()
-def painting(prior: diffusion.Prior) -> None:
-    """What inpainting does with a sample: encode, ask the UNet, decode."""
+def answering(prior: diffusion.Prior) -> None:
+    """What inpainting does with one sample: encode, ask the UNet, decode."""
     size, wide = prior.native_size, prior.unet.config.cross_attention_dim
     latents = diffusion.encode(prior, torch.zeros(1, 3, size, size, device=prior.device))
     condition = torch.cat([latents[:, :1], latents], 1)
     at = torch.zeros(1, dtype=torch.long, device=prior.device)
     diffusion.raw_prediction(prior, latents, at, condition, latents.new_zeros(1, 78, wide))
     diffusion.decode(prior, latents)
+
+
+def encoding(prior: diffusion.Prior) -> None:
+    """What score distillation does with a gradient for one sample: encode it."""
+    size = prior.native_size
+    image = torch.zeros(1, 3, size, size, device=prior.device, requires_grad=True)
+    diffusion.encode(prior, image).sum().backward()
 
 
 @contextmanager

@@ -368,7 +368,7 @@ def train_step(
         noise = torch.randn(training.batch, *latent_shape(prior, training.size), generator=draw)
         # LoRA's dropout takes no generator of its own: seed the global one from the step's.
         torch.manual_seed(int(torch.randint(2**62, (), generator=draw)))
-        for rows in torch.arange(training.batch).split(prior.at_once or training.batch):
+        for rows in torch.arange(training.batch).split(prior.rows_graded or training.batch):
             some = Samples(*(tensor[rows] for tensor in samples))
             loss = denoising_error(prior, some, timesteps[rows], noise[rows])[0].sum()
             loss = loss / training.batch / training.accumulate

@@ -41,8 +41,8 @@ class Prior:
         scheduler: the folder's scheduler object; only handed on when a pipeline is built.
         text_encoder_2, tokenizer_2: SDXL's second ones, else None.
         zero_empty: the empty prompt is embedded as zeros (SDXL says so of itself).
-        at_once: rows that UNet and VAE take in one pass; 0: all. A gradient through more is computed part by part,
-            each part's activations once more on the way back.
+        rows, rows_graded: samples that UNet and VAE take in one pass, without and with a gradient; 0: all. A gradient
+            through more is computed part by part, each part's activations once more on the way back.
     """
 
     unet: nn.Module
@@ -55,7 +55,8 @@ class Prior:
     text_encoder_2: nn.Module | None = None
     tokenizer_2: Any = None
     zero_empty: bool = False
-    at_once: int = 0
+    rows: int = 0
+    rows_graded: int = 0
 
     @property
     def device(self) -> torch.device:
@@ -226,8 +227,8 @@ def _ids(tokenizer: Any, encoder: nn.Module, prompts: list[str], device: torch.d
 
 
 def _in_parts(prior: Prior, function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
-    """`function` of the rows, at most `prior.at_once` of them in one pass."""
-    most = prior.at_once or len(rows[0])
+    """`function` of the rows, at most as many of them in one pass as the prior says."""
+    most = (prior.rows_graded if torch.is_grad_enabled() else prior.rows) or len(rows[0])
     if len(rows[0]) <= most:
         return function(*rows)
     parts = zip(*(tensor.split(most) for tensor in rows), strict=True)

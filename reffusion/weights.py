@@ -38,7 +38,7 @@ SDXL = "diffusers/stable-diffusion-xl-1.0-inpainting-0.1"
 DEPTH_ANYTHING = "depth-anything/Depth-Anything-V2-Small-hf"
 PUBLISHED = {
     SD2: Published(1_289_966_827, "stable-diffusion-v1-5/stable-diffusion-inpainting, or the embedded priors/tiny"),
-    SDXL: Published(3_468_855_207, f"{SD2}, or a reference painted elsewhere (`reference` in scene.yaml)"),
+    SDXL: Published(3_468_852_267, f"{SD2}, or a reference painted elsewhere (`reference` in scene.yaml)"),
     DEPTH_ANYTHING: Published(24_785_089, "depth-anything/Depth-Anything-V2-Base-hf"),
 }
 

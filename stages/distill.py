@@ -100,7 +100,7 @@ def run(
     sights = load_sights(params, scene, poses, fit, masks)
     with memory.blamed("distill.memory_gb", params.memory_gb):
         if prior is not None:
-            prior = memory.fitted(prior, params.memory_gb, "distill.memory_gb", memory.distilling)
+            prior = memory.fitted(prior, params.memory_gb, "distill.memory_gb", memory.encoding)
         gaussians, masked = distill(initial, masked, sights, holes, prior, text, settings(params), out)
     io.save_ply(out / "gaussians.ply", gaussians.map(lambda p: p.cpu()))
     io.save_labels(out / "labels.npy", masked.cpu())

@@ -91,7 +91,7 @@ def inpainted(params: Params, out: Path, scene, poses: Path, fit: Path, masks: P
     base = torch.where(torch.from_numpy(pixels.consistent)[..., None], background, photo).clamp(0, 1)
 
     prior = diffusion.load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
-    prior = memory.fitted(prior, params.memory_gb, "reference.memory_gb", memory.painting)
+    prior = memory.fitted(prior, params.memory_gb, "reference.memory_gb")
     hole = torch.from_numpy(pixels.invent)
     with memory.blamed("reference.memory_gb", params.memory_gb):
         candidates = inpaint.paint(
