@@ -14,6 +14,7 @@ name :=
 steps :=
 gate :=
 slow :=
+offline :=
 
 # GOMP_SPINCOUNT: see reffusion/__init__.py
 export set # its value may hold quotes, so recipes read it from the environment
@@ -27,7 +28,7 @@ STAGES := poses fit masks reference lift personalize initialize distill evaluate
 options = $(if $(profile),--profile '$(profile)') $(if $(variant),--variant '$(variant)') \
 	$(if $(budget),--budget '$(budget)') $(if $(set),--set "$$set") $(if $(trust),--trust) $(if $(runs),--runs '$(runs)')
 
-.PHONY: help setup all $(STAGES) plan clean batch demo prior prior-report test bench stability lint
+.PHONY: help setup all $(STAGES) plan clean batch weights demo prior prior-report test bench stability gpu-check lint
 .DELETE_ON_ERROR:
 
 help:
@@ -38,6 +39,8 @@ help:
 	@echo 'make data=FOLDER batch         every scene of a folder, and one table'
 	@echo 'make demo [seed=N]             make the demo scene, or another: data/demo-N'
 	@echo 'make prior [steps=N]           train the embedded prior further (hours)'
+	@echo 'make weights [profile=paper]     fetch what a profile needs, sizes first; offline=1 only says what is missing'
+	@echo 'make gpu-check                 values, time and memory at the paper'"'"'s sizes on a CUDA machine (8 minutes)'
 	@echo 'make prior-report              measure it, and draw what it paints (minutes): runs/prior-report'
 	@echo 'make setup | test | lint       .venv; the tests; ruff'
 	@echo 'make bench                     work-precision diagrams of the kernels: runs/bench; gate=1: against the baselines'
@@ -100,6 +103,9 @@ clean: named setup
 batch: setup
 	@$(PY) -m runner batch --data '$(data)' $(options)
 
+weights: setup
+	@$(PY) -m runner weights $(if $(scene),--scene '$(scene)') $(if $(offline),--offline) $(options)
+
 prior: setup
 	$(PY) priors/tiny/train.py --start priors/tiny $(if $(steps),--steps '$(steps)')
 
@@ -122,3 +128,6 @@ bench: $(VENV)/.ready
 
 stability: $(VENV)/.ready-dev
 	$(PY) -m benchmarks.stability --out '$(or $(runs),runs)/stability.json'
+
+gpu-check: $(VENV)/.ready
+	$(PY) benchmarks/gpu_check.py --out $(or $(runs),runs)/gpu-check

@@ -45,9 +45,13 @@ def add(prior: Prior, rank: int, alpha: float, dropout: float, layers: str, seed
 
     Returns:
         {"unet": parameters, "text": parameters}, float32, requiring gradients.
+    Raises:
+        ValueError: an SDXL prior, or layers of another name.
     """
     from peft import LoraConfig
 
+    if prior.text_encoder_2 is not None:
+        raise ValueError("SDXL cannot be adapted here: it paints references (reference.prior); adapt an SD2-type prior")
     if layers not in ("attention", "attention+conv"):
         raise ValueError(f"layers must be 'attention' or 'attention+conv', not {layers!r}")
     targets = ATTENTION if layers == "attention" else ATTENTION + CONVOLUTIONS

@@ -7,13 +7,14 @@ weights (keys `lin0.model.1.weight`). Where either is absent the metric is unava
 from __future__ import annotations
 
 import hashlib
-import os
 import re
 from pathlib import Path
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
+
+from reffusion.weights import lpips_folders
 
 Net = Literal["alex", "vgg"]
 
@@ -117,26 +118,19 @@ def from_states(net: Net, backbone: dict[str, Tensor], linear: dict[str, Tensor]
     return model
 
 
-def folders(first: str | Path | None = None) -> list[Path]:
-    """Where weights are looked for, in this order: the given folder, the project's cache, torch hub's."""
-    cache = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser()
-    hub = Path(os.environ.get("TORCH_HOME", cache / "torch")).expanduser()
-    return [*([Path(first).expanduser()] if first else []), cache / "reffusion" / "lpips", hub / "hub" / "checkpoints"]
-
-
 def load(net: Net, folder: str | Path | None = None) -> tuple[Lpips | None, str | None]:
     """(metric, None), or (None, why it is unavailable).
 
     Raises ValueError for a file that is there but broken: wrong keys or shapes, or other content than the hash
     in its name says. A damaged file is an error to mend, not an unavailable metric.
     """
-    places = folders(folder)
+    places = lpips_folders(folder)
     found = {}
     for role, pattern in [("backbone", BACKBONE_FILES[net]), ("linear weights", LINEAR_FILES[net])]:
         paths = [path for place in places for path in sorted(place.glob(pattern))]
         if not paths:
             looked = ", ".join(_short(place) for place in places)
-            return None, f"no {role} for LPIPS ({net}): put {pattern} into one of {looked} (see README)"
+            return None, f"no {role} for LPIPS ({net}): run `make weights`, or put {pattern} into one of {looked}"
         found[role] = paths[0]
     hashes = {path: _sha256(path) for path in found.values()}
     stated = found["backbone"].stem.rpartition("-")[2]

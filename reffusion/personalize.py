@@ -228,6 +228,13 @@ def held_out_samples(references: Sequence[Picture], size: int, seed: int) -> Sam
     return Samples(two_scales(first.image, windows, size), masks, torch.tensor([GLOBAL, LOCAL]))
 
 
+def one_sample(prior: diffusion.Prior, references: Sequence[Picture], seed: int) -> None:
+    """Loss and gradient of one sample: what `memory.fitted` measures."""
+    sample = Samples(*(tensor[:1] for tensor in held_out_samples(references, prior.native_size, seed)))
+    noise = torch.zeros(1, *latent_shape(prior, prior.native_size))
+    denoising_error(prior, sample, torch.zeros(1, dtype=torch.long), noise)[0].sum().backward()
+
+
 @torch.no_grad()
 def held_out_error(prior: diffusion.Prior, samples: Samples, seed: int) -> dict[str, float]:
     """{"target_mse", "clean_latent_mse"} at three fixed timesteps with fixed noise: comparable through the training.
@@ -378,9 +385,12 @@ def train_step(
         noise = torch.randn(training.batch, *latent_shape(prior, training.size), generator=draw)
         # LoRA's dropout takes no generator of its own: seed the global one from the step's.
         torch.manual_seed(int(torch.randint(2**62, (), generator=draw)))
-        loss = denoising_error(prior, samples, timesteps, noise)[0].mean() / training.accumulate
-        loss.backward()
-        total += loss.item()
+        for rows in torch.arange(training.batch).split(prior.rows_graded or training.batch):
+            some = Samples(*(tensor[rows] for tensor in samples))
+            loss = denoising_error(prior, some, timesteps[rows], noise[rows])[0].sum()
+            loss = loss / training.batch / training.accumulate
+            loss.backward()
+            total += loss.item()
     trained = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     norm = float(torch.nn.utils.clip_grad_norm_(trained, training.clip))
     if not (isfinite(norm) and isfinite(total)):

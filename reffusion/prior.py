@@ -1,21 +1,32 @@
 """The inpainting latent diffusion model: load, encode, decode, predict, sample.
 
-The only importer of diffusers. Works with any Stable-Diffusion-type inpainting folder
+The only importer of diffusers. Works with any Stable-Diffusion-type inpainting folder, SDXL's too
 (latents C | mask 1 | masked latents C); sizes, factor and prediction type are read from its configuration, so the
 embedded prior and SD2-inpainting take the same path. In masks 1 = repaint.
+
+Half precision is for UNet and text encoders. Float32 in any case:
+- the VAE: SDXL's overflows in float16, a gradient through the encoder underflows in it, and the 8 bits of bfloat16
+  show as bands in a decoded picture;
+- schedule, noise and x0 = (z_t - s eps) / a: at the last timestep 1 / a is 15, and a rounding is multiplied by it;
+- LoRA and its optimiser (reffusion.lora); the sums of a softmax, within PyTorch's attention kernels.
 """
 
 from __future__ import annotations
 
 import itertools
 import warnings
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
+from torch.utils.checkpoint import checkpoint
+
+from reffusion import weights
 
 
 @dataclass(frozen=True)
@@ -23,19 +34,29 @@ class Prior:
     """An inpainting diffusion model on one device.
 
     Attributes:
-        unet, vae, text_encoder, tokenizer: diffusers and transformers objects, frozen, in evaluation mode.
+        unet, vae, text_encoder, tokenizer: diffusers and transformers objects, frozen, in evaluation mode;
+            text_encoder is None once `without_text` has dropped it.
         alphas_cumprod: [T] float32, abar_t of the noise schedule.
         prediction_type: "epsilon" or "v_prediction".
         scheduler: the folder's scheduler object; only handed on when a pipeline is built.
+        text_encoder_2, tokenizer_2: SDXL's second ones, else None.
+        zero_empty: the empty prompt is embedded as zeros (SDXL says so of itself).
+        rows, rows_graded: samples that UNet and VAE take in one pass, without and with a gradient; 0: all. A gradient
+            through more is computed part by part, each part's activations once more on the way back.
     """
 
     unet: nn.Module
     vae: nn.Module
-    text_encoder: nn.Module
+    text_encoder: nn.Module | None
     tokenizer: Any
     alphas_cumprod: Tensor
     prediction_type: str
     scheduler: Any
+    text_encoder_2: nn.Module | None = None
+    tokenizer_2: Any = None
+    zero_empty: bool = False
+    rows: int = 0
+    rows_graded: int = 0
 
     @property
     def device(self) -> torch.device:
@@ -43,7 +64,8 @@ class Prior:
 
     @property
     def dtype(self) -> torch.dtype:
-        return next(self.vae.parameters()).dtype
+        """Of the UNet and the text encoders; the module's text says what is float32 beside them."""
+        return next(self.unet.parameters()).dtype
 
     @property
     def factor(self) -> int:
@@ -60,43 +82,78 @@ class Prior:
     def timesteps(self) -> int:
         return len(self.alphas_cumprod)
 
+    @property
+    def bytes(self) -> int:
+        """What its weights take in memory."""
+        parts = [p for p in (self.unet, self.vae, self.text_encoder, self.text_encoder_2) if p is not None]
+        return sum(p.numel() * p.element_size() for part in parts for p in part.parameters())
+
 
 def load_prior(source: str | Path, device: str = "cpu", dtype: torch.dtype = torch.float32) -> Prior:
-    """The model in a local diffusers folder, or a hub id.
+    """The model in a local diffusers folder, or of a hub id whose weights are on this machine (`weights.locate`).
+
+    Nothing is downloaded. `dtype` is that of UNet and text encoders.
 
     Raises:
-        ValueError: the folder is missing, is no inpainting model, or predicts neither epsilon nor v.
+        ValueError: no such weights here, a damaged file, parts or shapes that do not fit, no inpainting model, or one
+            that predicts neither epsilon nor v. What names, headers and configurations tell is told at once.
     """
     from diffusers import AutoencoderKL, DDIMScheduler, UNet2DConditionModel
-    from transformers import CLIPTextModel, CLIPTokenizer
+    from transformers import CLIPTextModel, CLIPTextModelWithProjection, CLIPTokenizer
+
+    try:
+        folder = weights.locate(source)
+        if folder is None:
+            raise ValueError(weights.absent(source))
+        weights.check(folder)
+    except ValueError as error:
+        raise ValueError(f"prior {error}") from None
+    second = (folder / "text_encoder_2").is_dir()
+    unet = _part(UNet2DConditionModel, folder, "unet", torch_dtype=dtype)
+    vae = _part(AutoencoderKL, folder, "vae", torch_dtype=torch.float32)
+    text = _part(CLIPTextModel, folder, "text_encoder", dtype=dtype)
+    text_2 = _part(CLIPTextModelWithProjection, folder, "text_encoder_2", dtype=dtype) if second else None
+    try:
+        tokenizers = [CLIPTokenizer.from_pretrained(folder / n) for n in ("tokenizer", "tokenizer_2")[: 1 + second]]
+        scheduler = DDIMScheduler.from_pretrained(folder / "scheduler")
+    except (OSError, ValueError, TypeError) as error:
+        raise ValueError(f"prior {folder}: tokenizer or scheduler cannot be read: {_line(error)}") from error
+    tokenizer_2 = tokenizers[1] if second else None
+    prior = make_prior(unet, vae, text, tokenizers[0], scheduler, device, str(source), text_2, tokenizer_2)
+    index = folder / "model_index.json"
+    return replace(prior, zero_empty=second and '"force_zeros_for_empty_prompt": true' in index.read_text())
+
+
+def _part(kind: Any, folder: Path, part: str, **dtype: torch.dtype) -> nn.Module:
+    """One network of the folder, every weight of it read. Raises ValueError naming what does not fit."""
     from transformers.utils import logging as transformers_logging
 
-    _check_source(source)
-    name = str(source)
     transformers_logging.disable_progress_bar()
+    level = transformers_logging.get_verbosity()
+    transformers_logging.set_verbosity_error()  # what it would say of shapes and missing weights is raised here
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            unet = UNet2DConditionModel.from_pretrained(name, subfolder="unet", torch_dtype=dtype)
-            vae = AutoencoderKL.from_pretrained(name, subfolder="vae", torch_dtype=dtype)
-            text = CLIPTextModel.from_pretrained(name, subfolder="text_encoder", dtype=dtype)
-            tokenizer = CLIPTokenizer.from_pretrained(name, subfolder="tokenizer")
-            scheduler = DDIMScheduler.from_pretrained(name, subfolder="scheduler")
-    except OSError as error:
-        raise ValueError(f"prior {name}: {str(error).splitlines()[0]}") from error
-    return make_prior(unet, vae, text, tokenizer, scheduler, device, name)
-
-
-def _check_source(source: str | Path) -> None:
-    path = Path(source)
-    if path.is_dir():
-        missing = [p for p in ("unet", "vae", "text_encoder", "tokenizer", "scheduler") if not (path / p).is_dir()]
-        if missing:
-            raise ValueError(
-                f"prior {path}: the folder lacks {', '.join(missing)}; it must be a diffusers pipeline folder"
+            network, found = kind.from_pretrained(
+                folder / part,
+                variant=weights.variant(folder / part),
+                use_safetensors=True,
+                local_files_only=True,
+                output_loading_info=True,
+                **dtype,
             )
-    elif path.is_absolute() or str(source).count("/") != 1 or str(source).startswith("."):
-        raise ValueError(f"prior {source}: no such folder, and not a hub id of the form owner/name")
+    except Exception as error:  # the libraries raise what they like for a shape that does not fit
+        raise ValueError(f"prior {folder / part}: the weights do not fit config.json: {_line(error)}") from error
+    finally:
+        transformers_logging.set_verbosity(level)
+    if lost := sorted(found["missing_keys"]):
+        raise ValueError(f"prior {folder / part}: {len(lost)} weights are missing, {lost[0]} first: take a whole copy")
+    return network
+
+
+def _line(error: BaseException) -> str:
+    text = " ".join(str(error).split())
+    return text if len(text) <= 300 else text[:297] + "..."
 
 
 def make_prior(
@@ -107,43 +164,91 @@ def make_prior(
     scheduler: Any,
     device: str = "cpu",
     name: str = "",
+    text_2: nn.Module | None = None,
+    tokenizer_2: Any = None,
 ) -> Prior:
-    """A Prior from parts already in memory, checked to fit together."""
-    channels, given = vae.config.latent_channels, unet.config.in_channels
-    if given != 2 * channels + 1:
-        raise ValueError(
-            f"prior {name}: the UNet takes {given} channels; an inpainting UNet for {channels} latent channels takes "
-            f"{2 * channels + 1} (latents, mask, masked latents)"
-        )
-    kind = scheduler.config.prediction_type
-    if kind not in ("epsilon", "v_prediction"):
-        raise ValueError(f"prior {name}: prediction_type {kind!r} is not supported; epsilon and v_prediction are")
-    for part in (unet, vae, text):
-        part.requires_grad_(False).eval().to(device)
-    return Prior(unet, vae, text, tokenizer, scheduler.alphas_cumprod.float().to(device), kind, scheduler)
+    """A Prior from parts already in memory, checked to fit together; the last two are SDXL's.
+
+    Raises ValueError as `load_prior` does.
+    """
+    configs = {"unet": dict(unet.config), "vae": dict(vae.config), "scheduler": dict(scheduler.config)}
+    configs["text_encoder"] = text.config.to_dict()
+    if text_2 is not None:
+        configs["text_encoder_2"] = text_2.config.to_dict()
+    if problem := weights.misfit(configs):
+        raise ValueError(f"prior {name}: {problem}")
+    kind, alphas = scheduler.config.prediction_type, scheduler.alphas_cumprod.float()
+    if kind == "epsilon" and float(alphas.min()) <= 0:
+        raise ValueError(f"prior {name}: it predicts epsilon where its schedule leaves no signal; take another model")
+    for part in (unet, vae, text, text_2):
+        if part is not None:
+            part.requires_grad_(False).eval().to(device)
+    return Prior(unet, vae, text, tokenizer, alphas.to(device), kind, scheduler, text_2, tokenizer_2)
+
+
+def without_text(prior: Prior) -> Prior:
+    """The prior less its text encoders, once every prompt is embedded: their memory is free for other things."""
+    return replace(prior, text_encoder=None, text_encoder_2=None)
+
+
+def recomputing(prior: Prior) -> Prior:
+    """The prior with UNet and VAE keeping a block's input only, and computing the block again in the backward pass."""
+    prior.unet.enable_gradient_checkpointing()
+    prior.vae.enable_gradient_checkpointing()
+    return prior
 
 
 # ---------------------------------------------------------------------------------------------- the model's maps
 
 
 def embed_text(prior: Prior, prompts: list[str]) -> Tensor:
-    """[B, L, D] hidden states of the prompts; differentiable in the text encoder's LoRA."""
-    length = min(prior.tokenizer.model_max_length, prior.text_encoder.config.max_position_embeddings)
-    ids = prior.tokenizer(
-        prompts, padding="max_length", max_length=length, truncation=True, return_tensors="pt"
-    ).input_ids
-    return prior.text_encoder(ids.to(prior.device)).last_hidden_state
+    """[B, L, D] hidden states of the prompts; differentiable in the text encoder's LoRA.
+
+    Of SDXL: the last hidden layer but one of both encoders side by side, and as one row more, filled up with zeros,
+    the pooled embedding that its UNet takes besides. So a prompt is one tensor for either kind.
+    """
+    if prior.text_encoder is None:
+        raise ValueError("this prior's text encoder was dropped; embed every prompt before `without_text`")
+    if prior.text_encoder_2 is None:
+        return prior.text_encoder(_ids(prior.tokenizer, prior.text_encoder, prompts, prior.device)).last_hidden_state
+    pairs = ((prior.tokenizer, prior.text_encoder), (prior.tokenizer_2, prior.text_encoder_2))
+    outputs = [net(_ids(tokens, net, prompts, prior.device), output_hidden_states=True) for tokens, net in pairs]
+    states = torch.cat([output.hidden_states[-2] for output in outputs], -1)
+    pooled = outputs[1].text_embeds
+    packed = torch.cat([states, F.pad(pooled, (0, states.shape[-1] - pooled.shape[-1]))[:, None]], 1)
+    said = torch.tensor([prompt != "" or not prior.zero_empty for prompt in prompts], device=prior.device)
+    return packed * said[:, None, None]
+
+
+def _ids(tokenizer: Any, encoder: nn.Module, prompts: list[str], device: torch.device) -> Tensor:
+    length = min(tokenizer.model_max_length, encoder.config.max_position_embeddings)
+    tokens = tokenizer(prompts, padding="max_length", max_length=length, truncation=True, return_tensors="pt")
+    return tokens.input_ids.to(device)
+
+
+def _in_parts(prior: Prior, function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
+    """`function` of the rows, at most as many of them in one pass as the prior says."""
+    most = (prior.rows_graded if torch.is_grad_enabled() else prior.rows) or len(rows[0])
+    if len(rows[0]) <= most:
+        return function(*rows)
+    parts = zip(*(tensor.split(most) for tensor in rows), strict=True)
+    if not torch.is_grad_enabled():
+        return torch.cat([function(*part) for part in parts])
+    return torch.cat([checkpoint(function, *part, use_reentrant=False) for part in parts])
 
 
 def encode(prior: Prior, images: Tensor) -> Tensor:
     """Images [B, 3, H, W] in [-1, 1] -> latents [B, C, H/f, W/f], the posterior's mean, scaled; differentiable."""
-    mean = prior.vae.encode(images.to(prior.dtype)).latent_dist.mean
+    dtype = next(prior.vae.parameters()).dtype
+    mean = _in_parts(prior, lambda part: prior.vae.encode(part.to(dtype)).latent_dist.mean, images)
     return (mean * prior.vae.config.scaling_factor).float()
 
 
 def decode(prior: Prior, latents: Tensor) -> Tensor:
     """Latents [B, C, h, w] -> images [B, 3, H, W], about [-1, 1]; differentiable."""
-    return prior.vae.decode((latents / prior.vae.config.scaling_factor).to(prior.dtype)).sample.float()
+    dtype = next(prior.vae.parameters()).dtype
+    scaled = latents / prior.vae.config.scaling_factor
+    return _in_parts(prior, lambda part: prior.vae.decode(part.to(dtype)).sample, scaled).float()
 
 
 @torch.no_grad()
@@ -172,7 +277,18 @@ def add_noise(prior: Prior, latents: Tensor, noise: Tensor, t: Tensor) -> Tensor
 def raw_prediction(prior: Prior, noisy: Tensor, t: Tensor, condition: Tensor, text: Tensor) -> Tensor:
     """The UNet's own output, eps or v, float32 [B, C, h, w]; for training."""
     inputs = torch.cat([noisy, condition], 1).to(prior.dtype)
-    return prior.unet(inputs, t, encoder_hidden_states=text.to(prior.dtype)).sample.float()
+    return _in_parts(prior, lambda *rows: _unet(prior, *rows), inputs, t, text.to(prior.dtype)).float()
+
+
+def _unet(prior: Prior, inputs: Tensor, t: Tensor, text: Tensor) -> Tensor:
+    if prior.unet.config.addition_embed_type is None:
+        return prior.unet(inputs, t, encoder_hidden_states=text).sample
+    # SDXL: size of the original, top left corner of the crop, size asked for; a window is a picture of its own here.
+    height, width = (extent * prior.factor for extent in inputs.shape[-2:])
+    sizes = inputs.new_tensor([height, width, 0, 0, height, width]).expand(len(inputs), -1)
+    pooled = prior.unet.config.projection_class_embeddings_input_dim - 6 * prior.unet.config.addition_time_embed_dim
+    added = {"text_embeds": text[:, -1, :pooled], "time_ids": sizes}
+    return prior.unet(inputs, t, encoder_hidden_states=text[:, :-1], added_cond_kwargs=added).sample
 
 
 def training_target(prior: Prior, latents: Tensor, noise: Tensor, t: Tensor) -> Tensor:
@@ -248,6 +364,17 @@ def guided(
 
 def pipeline(prior: Prior) -> Any:
     """diffusers' own inpainting pipeline over the same parts."""
+    if prior.text_encoder_2 is not None:
+        return pipeline_class("StableDiffusionXLInpaintPipeline")(
+            vae=prior.vae,
+            text_encoder=prior.text_encoder,
+            text_encoder_2=prior.text_encoder_2,
+            tokenizer=prior.tokenizer,
+            tokenizer_2=prior.tokenizer_2,
+            unet=prior.unet,
+            scheduler=prior.scheduler,
+            force_zeros_for_empty_prompt=prior.zero_empty,
+        )
     return pipeline_class()(
         vae=prior.vae,
         text_encoder=prior.text_encoder,
@@ -260,13 +387,14 @@ def pipeline(prior: Prior) -> Any:
     )
 
 
-def pipeline_class() -> Any:
-    """StableDiffusionInpaintPipeline, imported without the advice to install torchvision, which nothing here needs."""
+def pipeline_class(name: str = "StableDiffusionInpaintPipeline") -> Any:
+    """A pipeline of diffusers, imported without the advice to install torchvision, which nothing here needs."""
     from transformers.utils import logging as transformers_logging
 
     level = transformers_logging.get_verbosity()
     transformers_logging.set_verbosity_error()
-    from diffusers import StableDiffusionInpaintPipeline
+    import diffusers
 
+    found = getattr(diffusers, name)
     transformers_logging.set_verbosity(level)
-    return StableDiffusionInpaintPipeline
+    return found

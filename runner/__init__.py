@@ -6,5 +6,6 @@
 - job.py: a request with everything about it resolved and checked.
 - plan.py: one word and a reason for each stage, from what lies on the disk.
 - execute.py: locks, fresh processes, folders renamed into place, receipts, batches.
+- weights.py: what weights a profile needs, their sizes, and their download.
 - child.py: the other side: the process in which stages are imported.
 """

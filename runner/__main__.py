@@ -1,4 +1,4 @@
-"""python -m runner plan|run|batch|clean --scene NAME: what the Makefile calls."""
+"""python -m runner plan|run|batch|weights|clean --scene NAME: what the Makefile calls."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from runner.execute import Failed, batch, clean, run_scene, show_results
 from runner.job import Request, prepare
 from runner.pipeline import Refused
 from runner.plan import plan, table
+from runner.weights import weights
 
 
 def main() -> int:
@@ -31,6 +32,8 @@ def main() -> int:
             show_results(stage, folder)
         elif arguments.command == "batch":
             return 1 if batch(request, arguments.data) else 0
+        elif arguments.command == "weights":
+            return 1 if weights(request, arguments.offline) else 0
         else:
             clean(request)
     except (Refused, Failed) as error:
@@ -47,7 +50,7 @@ def main() -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="runner", description=__doc__)
-    parser.add_argument("command", choices=["plan", "run", "batch", "clean"])
+    parser.add_argument("command", choices=["plan", "run", "batch", "weights", "clean"])
     parser.add_argument("stage", nargs="?", default="all", help="run this stage and what it needs; `all` (default)")
     parser.add_argument("--scene", default="", help="a name under data/, or a path")
     parser.add_argument("--data", type=Path, default=Path("data"), help="batch: the folder of scenes")
@@ -55,6 +58,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--variant", help="a variant of pipeline.yaml")
     parser.add_argument("--trust", action="store_true", help="accept artifacts made by older code")
     parser.add_argument("--budget", help="time for the whole job, like 5m: sets the number of steps")
+    parser.add_argument("--offline", action="store_true", help="weights: only say what is missing")
     parser.add_argument("--set", default="", help="stage.parameter=value ...")
     parser.add_argument("--root", type=Path, default=Path(__file__).parent.parent, help="where pipeline.yaml is")
     parser.add_argument("--runs", type=Path, help="where artifacts go; root/runs")

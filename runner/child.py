@@ -1,4 +1,5 @@
-"""The process in which stages are imported: `describe` reads their parameters, `run` does a stage's work."""
+"""The process in which stages are imported: `describe` reads their parameters, `fetch` gets the weights they name,
+`run` does a stage's work."""
 
 from __future__ import annotations
 
@@ -13,6 +14,7 @@ import sys
 import threading
 import time
 import traceback
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +24,8 @@ INTERRUPTED = 130
 
 
 def describe() -> None:
-    """Standard input: {stage: {"params": asked for, "takes": names of needs, "needs": their paths (for a preview)}};
-    standard output: `_describe` of each.
+    """Standard input: {stage: {"params": asked for, "takes": names of needs, "needs": their paths (for a preview),
+    "brings": keys of scene.yaml}}; standard output: `_describe` of each.
 
     Costs the import of pydantic and of the stage modules, which import nothing heavy at their top.
     """
@@ -33,9 +35,14 @@ def describe() -> None:
 
 
 def _describe(
-    name: str, params: dict[str, Any], takes: list[str], needs: dict[str, str | None] | None = None
+    name: str,
+    params: dict[str, Any],
+    takes: list[str],
+    needs: dict[str, str | None] | None = None,
+    brings: list[str] | None = None,
 ) -> dict[str, Any]:
-    """All parameters and the names of those that name weights; or errors in them; or why the stage is "broken"."""
+    """All parameters, the names of those that name weights, and where `brings` is given the weights themselves; or
+    errors in them; or why the stage is "broken"."""
     try:
         stage = importlib.import_module(f"stages.{name}")
         inspect.signature(stage.run).bind(None, None, **dict.fromkeys(takes))
@@ -44,7 +51,7 @@ def _describe(
     fields = stage.Params.model_fields
     marked = {field: info.json_schema_extra for field, info in fields.items()}
     answer: dict[str, Any] = {
-        "params": {}, "errors": [], "known": list(fields), "notes": [], "refusal": None, "broken": None,
+        "params": {}, "errors": [], "known": list(fields), "notes": [], "refusal": None, "broken": None, "needed": [],
         "weights": [field for field, extra in marked.items() if isinstance(extra, dict) and extra.get("weights")],
     }  # fmt: skip
     try:
@@ -53,6 +60,8 @@ def _describe(
         answer["errors"] = [_error(e) for e in error.errors()]
         return answer
     answer["params"] = resolved.model_dump(mode="json")
+    if brings is not None and hasattr(stage, "needed_weights"):
+        answer["needed"] = [asdict(need) for need in stage.needed_weights(resolved, frozenset(brings))]
     if needs is not None and hasattr(stage, "preview"):
         try:
             answer["notes"] = list(stage.preview(resolved, **{n: p and Path(p) for n, p in needs.items()}))
@@ -61,6 +70,28 @@ def _describe(
         except Exception as error:
             answer["notes"] = [f"(its preview failed: {_one_line(error)})"]
     return answer
+
+
+def fetch() -> int:
+    """Get the weights that stages need and that are not here, each once. Standard input: {stage: {"params", "brings"}}.
+
+    Returns how many could not be had; each is told on standard error, and the others are fetched all the same.
+    """
+    wanted = {}
+    for name, asked in json.load(sys.stdin).items():
+        stage = importlib.import_module(f"stages.{name}")
+        if hasattr(stage, "needed_weights"):
+            needs = stage.needed_weights(stage.Params(**asked["params"]), frozenset(asked["brings"]))
+            wanted |= {need.name: need for need in needs if need.problem and need.fetched}
+    failed = 0
+    for need in wanted.values():
+        try:
+            need.fetch()
+            print(f"{need.name}: fetched", flush=True)
+        except ValueError as error:
+            failed += 1
+            print(f"error: {_one_line(error)}", file=sys.stderr, flush=True)
+    return failed
 
 
 def _error(error: Any) -> dict[str, Any]:
@@ -122,4 +153,4 @@ def _peak_memory_mb() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(describe() if sys.argv[1] == "describe" else run())
+    sys.exit({"describe": describe, "fetch": fetch, "run": run}[sys.argv[1]]())

@@ -49,10 +49,12 @@ class Job:
     Attributes:
         home: runs/<scene>, or runs/<scene>@<variant>.
         base: runs/<scene>.
+        why: what made the choice of the profile.
         brings: the keys of scene.yaml that have values.
         params: stage -> every parameter.
         broken: stages without parameters here, because their file is missing or is no stage -> what is wrong.
         weights: stage -> names of the parameters that name weights.
+        needed: stage -> the weights it works with, as it says of itself (reffusion.weights.Need).
         outside: files or folders named by the scene's parameters that lie outside its folder.
     """
 
@@ -64,11 +66,13 @@ class Job:
     base: Path
     pipeline: Pipeline
     profile: str
+    why: str
     trust: bool
     brings: frozenset[str]
     params: Overrides
     broken: dict[str, str]
     weights: dict[str, tuple[str, ...]]
+    needed: dict[str, list[dict[str, Any]]]
     outside: tuple[Path, ...]
     hashes: Hashes
 
@@ -88,13 +92,13 @@ def prepare(request: Request) -> Job:
     base = runs / folder.name
     home = runs / (f"{folder.name}@{request.variant}" if request.variant else folder.name)
     _one_folder_a_name(base, folder, root)
-    profile = choose_profile(request.profile, scene, [home / "profile", base / "profile"], pipeline)
+    profile, why = choose_profile(request.profile, scene, [home / "profile", base / "profile"], pipeline)
     given = (pipeline, scene, profile, request.variant, parse_set(request.set, pipeline))
     layers = layered(*given, {})
     if request.budget or scene.budget is not None:
         origin, text = ("budget", request.budget) if request.budget else (str(scene.path), scene.budget)
         layers = layered(*given, shared_out(pipeline, layers.values, seconds_of(text, origin)))
-    described, broken = _described(root, pipeline, layers)
+    described, broken = described_stages(root, pipeline, layers, sorted(scene.brings))
     params = {name: answer["params"] for name, answer in described.items()}
     scene_params = [params[stage] for stage in pipeline.scene_keys if stage in params]
     return Job(
@@ -106,11 +110,13 @@ def prepare(request: Request) -> Job:
         base=base,
         pipeline=pipeline,
         profile=profile,
+        why=why,
         trust=request.trust,
         brings=frozenset(scene.brings),
         params=params,
         broken=broken,
         weights={name: tuple(answer["weights"]) for name, answer in described.items()},
+        needed={name: answer["needed"] for name, answer in described.items()},
         outside=tuple(_outside(scene_params, folder)),
         hashes=Hashes(runs / ".hashes.json"),
     )
@@ -162,11 +168,15 @@ def ask(root: Path, question: dict[str, Any]) -> dict[str, Any]:
     return json.loads(answer)
 
 
-def _described(root: Path, pipeline: Pipeline, layers: Layers) -> tuple[dict[str, Any], dict[str, str]]:
-    """stage -> {"params": all parameters, "weights": names}, and broken stages; refuses the first wrong parameter."""
+def described_stages(
+    root: Path, pipeline: Pipeline, layers: Layers, brings: list[str]
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """stage -> `child._describe` of it, and broken stages; refuses the first wrong parameter."""
     broken = {name: f"stages/{name}.py: no such file, and pipeline.yaml names it" for name in pipeline.stages}
     here = [name for name in pipeline.stages if (root / "stages" / f"{name}.py").is_file()]
-    questions = {name: {"params": layers.values[name], "takes": pipeline.stages[name].takes} for name in here}
+    questions = {
+        name: {"params": layers.values[name], "takes": pipeline.stages[name].takes, "brings": brings} for name in here
+    }
     described = {}
     for stage, answer in ask(root, questions).items():
         if answer["broken"]:

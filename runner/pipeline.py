@@ -265,20 +265,23 @@ def find_scene(text: str, root: Path) -> Path:
     )
 
 
-def choose_profile(asked: str | None, scene: SceneFile, pinned: list[Path], pipeline: Pipeline) -> str:
-    """The profile asked for, else scene.yaml's, else the one this scene was run with, else by the machine."""
+def choose_profile(asked: str | None, scene: SceneFile, pinned: list[Path], pipeline: Pipeline) -> tuple[str, str]:
+    """The profile asked for, else scene.yaml's, else the one this scene was run with, else by the machine; and why."""
     origin = "profile" if asked else f"{scene.path}: profile"
+    why = "asked for" if asked else f"{scene.path.name} says so"
     profile = asked or scene.profile or AUTO
     if profile == AUTO:
         for path in pinned:
             if path.is_file():
-                origin, profile = str(path), path.read_text().strip()
+                origin, profile, why = str(path), path.read_text().strip(), "this scene was run with it"
                 break
         else:
-            origin, profile = "profile", "paper" if has_cuda() else "laptop"
+            origin, profile, why = "profile", "laptop", "no CUDA driver on this machine"
+            if has_cuda():
+                profile, why = "paper", "this machine has a CUDA driver"
     if profile not in pipeline.profiles:
         raise Refused(f"{origin}: {unknown('profile', profile, [AUTO, *pipeline.profiles])}")
-    return profile
+    return profile, why
 
 
 def has_cuda() -> bool:

@@ -171,7 +171,24 @@ def _on_this_machine(job: Job, stage: str, decision: Decision) -> Decision:
     if at_work and job.params[stage].get("device") == "cuda" and not has_cuda():
         cure = f'profile=laptop, or set="{stage}.device=cpu"'
         return Decision("missing", f"{stage}.device is cuda, and this machine has no CUDA driver: {cure}")
-    return decision
+    if not at_work:
+        return decision
+    notes = []
+    for need in (need for need in job.needed[stage] if need["problem"]):
+        fetch = f"; `make weights profile={job.profile}` fetches it ({amount(need['bytes'])})"
+        said = need["problem"] + (fetch if need["fetched"] else "")
+        if not need["optional"]:
+            return Decision("missing", said)
+        notes.append(said)
+    return replace(decision, notes=tuple(notes[:1]))
+
+
+def amount(count: int | None) -> str:
+    """Bytes as people read them; "size unknown" for None."""
+    if count is None:
+        return "size unknown"
+    unit, size = next(((u, s) for u, s in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)) if count >= s), ("bytes", 1))
+    return f"{count / size:.1f} {unit}" if unit == "GB" else f"{count / size:.0f} {unit}"
 
 
 def partial_folder(job: Job, stage: str, key: str) -> Path:
@@ -200,7 +217,7 @@ def plan(job: Job, stages: list[str], done: dict[str, Decision] | None = None) -
             paths = {need: path and str(path) for need, path in needs.items()}
             asked[stage] = {"params": job.params[stage], "takes": spec.takes, "needs": paths}
     for stage, answer in (ask(job.root, asked) if asked else {}).items():
-        decisions[stage] = replace(decisions[stage], notes=tuple(answer["notes"]))
+        decisions[stage] = replace(decisions[stage], notes=(*answer["notes"], *decisions[stage].notes))
         if answer["refusal"] and decisions[stage].inputs:  # its needs are what they will be
             decisions[stage] = replace(decisions[stage], word="missing", reason=answer["refusal"])
     job.hashes.save()
@@ -208,8 +225,8 @@ def plan(job: Job, stages: list[str], done: dict[str, Decision] | None = None) -
 
 
 def table(job: Job, decisions: dict[str, Decision]) -> str:
-    """A line a stage: word, stage, expected time, reason and notes."""
-    lines = [f"{job.label} ({job.profile})"]
+    """The profile and why; a line a stage: word, stage, expected time, reason and notes."""
+    lines = [f"{job.label} (profile {job.profile}: {job.why})"]
     for stage, decision in decisions.items():
         seconds = expected_seconds(job, stage) if decision.word in ("run", "stale", "undecided") else None
         time = f"~{seconds:.0f} s" if seconds is not None else ""

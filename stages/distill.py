@@ -96,7 +96,16 @@ class Params(BaseModel):
     seed: int = 0
     device: Literal["cpu", "cuda"] = "cpu"
     dtype: Literal["float32", "bfloat16", "float16"] = Field("float32", description="of the prior's weights")
+    memory_gb: float = Field(0.0, ge=0, description="GB that the prior may take; batches are split to fit; 0: no limit")
+    checkpointing: bool = Field(False, description="compute activations again on the way back: less memory, more time")
     checkpoint_seconds: float = Field(10.0, gt=0, description="seconds of work between checkpoints")
+
+
+def needed_weights(params: Params, brings: frozenset[str]) -> list:
+    """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
+    from reffusion import weights
+
+    return [weights.of_model(params.prior, params.dtype)] if params.sds_weight > 0 else []
 
 
 def run(
@@ -117,7 +126,7 @@ def run(
     began = time.monotonic()
     import torch
 
-    from reffusion import io, lora, trace
+    from reffusion import io, lora, memory, trace
     from reffusion import prior as diffusion
     from reffusion.distill import distill
     from reffusion.personalize import PROMPTS
@@ -135,12 +144,17 @@ def run(
         prior = prior if personalize is None else lora.merged(prior, personalize)
         with torch.no_grad():
             text = diffusion.embed_text(prior, list(PROMPTS))
+        prior = diffusion.without_text(prior)
+        prior = diffusion.recomputing(prior) if params.checkpointing else prior
     sights, (perceptual, lifting) = load_sights(params, scene, poses, fit, masks, lift), lift_choices(params)
     estimator = depth_estimator(params, scene.points) if params.depth_weight > 0 else None
-    chosen, given = settings(params, lifting), (initial, masked, sights, holes, prior, text)
-    made = lambda folder, steps: distill(*given, replace(chosen, iterations=steps), folder, estimator)
-    steps = trace.affordable(out, params.iterations, params.seconds, lambda: time.monotonic() - began, made)
-    gaussians, masked = made(out, steps)
+    with memory.blamed("distill.memory_gb", params.memory_gb):
+        if prior is not None:
+            prior = memory.fitted(prior, params.memory_gb, "distill.memory_gb", memory.encoding)
+        chosen, given = settings(params, lifting), (initial, masked, sights, holes, prior, text)
+        made = lambda folder, steps: distill(*given, replace(chosen, iterations=steps), folder, estimator)
+        steps = trace.affordable(out, params.iterations, params.seconds, lambda: time.monotonic() - began, made)
+        gaussians, masked = made(out, steps)
     io.save_ply(out / "gaussians.ply", gaussians.map(lambda p: p.cpu()))
     io.save_labels(out / "labels.npy", masked.cpu())
     painted = io.load_json(lift / "facts.json")["inpainter"] if lift else None

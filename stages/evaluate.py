@@ -38,6 +38,13 @@ class Params(BaseModel):
     device: Literal["cpu", "cuda"] = Field("cpu", description="where the views are rendered")
 
 
+def needed_weights(params: Params, brings: frozenset[str]) -> list:
+    """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
+    from reffusion import weights
+
+    return weights.of_lpips(params.lpips_weights)
+
+
 def run(
     params: Params,
     out: Path,

@@ -49,7 +49,16 @@ class Params(BaseModel):
     seconds: float = Field(0.0, ge=0, description="the stage's share of a time budget: as many steps as fit; 0: all")
     patience: int = Field(0, ge=0, description="stop after so many twentieths of the run without a gain; 0: never")
     stop_gain: float = Field(0.02, ge=0, description="dB of the trace's main quantity that count as a gain")
+    memory_gb: float = Field(0.0, ge=0, description="GB that the prior may take; batches are split to fit; 0: no limit")
+    checkpointing: bool = Field(False, description="compute activations again on the way back: less memory, more time")
     checkpoint_seconds: float = Field(10.0, gt=0, description="seconds of work between checkpoints")
+
+
+def needed_weights(params: Params, brings: frozenset[str]) -> list:
+    """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
+    from reffusion import weights
+
+    return [weights.of_model(params.prior, params.dtype)]
 
 
 def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, reference: Path) -> None:
@@ -59,7 +68,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
     began = time.monotonic()
     import torch
 
-    from reffusion import io, lora, trace
+    from reffusion import io, lora, memory, trace
     from reffusion import personalize as P
     from reffusion import prior as diffusion
 
@@ -77,6 +86,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
         params.inverted_share,
     )
     prior = diffusion.load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
+    prior = diffusion.recomputing(prior) if params.checkpointing else prior
     references = [
         P.picture(torch.from_numpy(r.image), torch.from_numpy(r.mask), prior.native_size)
         for r in io.load_references(reference, scene)
@@ -113,7 +123,10 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
         learn(folder, steps)
         lora.load_state(prior, before)
 
-    learn(out, trace.affordable(out, params.steps, params.seconds, lambda: time.monotonic() - began, tried))
+    row = lambda prior: P.one_sample(prior, references, training.seed)
+    with memory.blamed("personalize.memory_gb", params.memory_gb):
+        prior = memory.fitted(prior, params.memory_gb, "personalize.memory_gb", row)
+        learn(out, trace.affordable(out, params.steps, params.seconds, lambda: time.monotonic() - began, tried))
     lora.save(prior, out)
     trace.clear_checkpoint(out)
 

@@ -25,6 +25,14 @@ class Params(BaseModel):
     seed: int = Field(0, description="of the first candidate; the others count up")
     device: Literal["cpu", "cuda"] = "cpu"
     dtype: Literal["float32", "bfloat16", "float16"] = "float32"
+    memory_gb: float = Field(0.0, ge=0, description="GB that the prior may take; batches are split to fit; 0: no limit")
+
+
+def needed_weights(params: Params, brings: frozenset[str]) -> list:
+    """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
+    from reffusion import weights
+
+    return [] if "reference" in brings else [weights.of_model(params.prior, params.dtype)]
 
 
 def preview(params: Params, *, poses: Path, **_: Path) -> list[str]:
@@ -69,7 +77,7 @@ def inpainted(params: Params, out: Path, scene, poses: Path, fit: Path, masks: P
     in C where other views saw the background, the prior's own in I. Also writes the sheet of candidates."""
     import torch
 
-    from reffusion import exposure, inpaint, io
+    from reffusion import exposure, inpaint, io, memory
     from reffusion import prior as diffusion
     from reffusion.types import Reference
 
@@ -83,17 +91,19 @@ def inpainted(params: Params, out: Path, scene, poses: Path, fit: Path, masks: P
     base = torch.from_numpy(inpaint.background(remaining, camera, photo, pixels.consistent)).float() / 255
 
     prior = diffusion.load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
+    prior = memory.fitted(prior, params.memory_gb, "reference.memory_gb")
     hole = torch.from_numpy(pixels.invent)
-    candidates = inpaint.paint(
-        prior,
-        base.permute(2, 0, 1) * 2 - 1,
-        hole,
-        prompt=params.prompt,
-        seeds=[params.seed + index for index in range(params.candidates)],
-        steps=params.steps,
-        start=params.start,
-        guidance=params.guidance,
-    ).cpu()
+    with memory.blamed("reference.memory_gb", params.memory_gb):
+        candidates = inpaint.paint(
+            prior,
+            base.permute(2, 0, 1) * 2 - 1,
+            hole,
+            prompt=params.prompt,
+            seeds=[params.seed + index for index in range(params.candidates)],
+            steps=params.steps,
+            start=params.start,
+            guidance=params.guidance,
+        ).cpu()
     seams = inpaint.seam(candidates, hole)
     chosen = int(seams.argmin()) if params.choose is None else params.choose
     images = (candidates.permute(0, 2, 3, 1) + 1) / 2

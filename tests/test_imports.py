@@ -17,6 +17,7 @@ DOORS = {
     "diffusers": ("reffusion/prior.py",),
     "peft": ("reffusion/lora.py",),
     "transformers": ("reffusion/prior.py", "reffusion/monocular.py"),
+    "huggingface_hub": ("reffusion/download.py",),
 }
 OPENERS = {"open", "read_text", "write_text", "read_bytes", "write_bytes", "imread", "imwrite", "imsave", "savez"}
 MAY_OPEN = ("reffusion/io/", "reffusion/trace.py")
@@ -25,6 +26,8 @@ OWN_FILES = (
     "reffusion/prior.py",
     "reffusion/lora.py",
     "reffusion/lpips.py",
+    "reffusion/weights.py",
+    "reffusion/download.py",
     "reffusion/sfm.py",
     COMPILER,
 )  # weights, databases, kernels

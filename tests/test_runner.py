@@ -507,3 +507,57 @@ def test_batch_goes_on_after_a_failed_scene(root, capsys):
     assert rows["toy"] == ["done", "10.0000", ""] and rows["wide"] == ["done", "12.0000", ""]
     assert rows["bad"] == ["failed", "", ""]
     assert (root / "runs/results.md").read_text().splitlines()[-1] == "| mean of 2 |  | 11.0000 |  |"
+
+
+WEIGHTS = """
+
+def needed_weights(params, brings):
+    from reffusion.need import Need
+    here = Path("fetched.txt").exists()
+    if "gaussians" in brings:
+        return []
+    return [Need("acme/net", None if here else "acme/net is not here", 2_600_000_000),
+            Need("metric.pth", None if here else "metric.pth is not here", 5000, optional=True)]
+"""
+NEED = """
+from dataclasses import dataclass
+from pathlib import Path
+
+@dataclass
+class Need:
+    name: str
+    problem: str | None
+    bytes: int | None = None
+    fetched: bool = True
+    optional: bool = False
+
+    def fetch(self):
+        if Path("unreachable").exists():
+            raise ValueError(f"{self.name}: nobody answers")
+        Path("fetched.txt").write_text("x")
+"""
+
+
+def test_weights_that_are_missing_are_told_before_any_work_and_fetched(fresh, capsys):
+    from runner.weights import weights
+
+    source = fresh / "stages" / "distill.py"
+    source.write_text(source.read_text() + WEIGHTS)
+    (fresh / "reffusion" / "need.py").write_text(NEED)
+    assert words(fresh)["distill"] == "missing acme/net is not here; `make weights profile=laptop` fetches it (2.6 GB)"
+    with pytest.raises(Refused, match="acme/net is not here"):
+        run_scene(request(fresh), "all")
+    assert "toy (profile laptop: asked for)" in capsys.readouterr().out
+    assert not (fresh / "runs" / "toy" / "poses").exists()
+
+    asked = request(fresh, scene="")
+    assert weights(asked, offline=True) == 1
+    shown = capsys.readouterr().out
+    assert "to fetch        2.6 GB  acme/net  (distill)" in shown and "5 kB  metric.pth" in shown
+    (fresh / "unreachable").touch()
+    assert weights(asked, offline=False) == 2
+    (fresh / "unreachable").unlink()
+    assert weights(asked, offline=False) == 0 and (fresh / "fetched.txt").exists()
+    assert weights(asked, offline=False) == 0
+    assert "to fetch: about 0 bytes" in capsys.readouterr().out
+    assert not words(fresh)["distill"].startswith("missing")

@@ -1,0 +1,339 @@
+"""One personalization step and one SDS step of the full-size SD2-inpainting on this machine, with random weights.
+
+The configurations below are the published ones, written down as facts; the steps are the library's own. Also checked:
+the LoRA that was trained, saved and merged into a fresh model of the same weights gives the trained model's epsilon.
+
+    python benchmarks/full_size.py --dtype bfloat16 --out runs/full-size      (--toy: the same at a small size)
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import resource
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from reffusion import lora, memory, weights
+from reffusion import personalize as P
+from reffusion import prior as diffusion
+from reffusion.confinement import Distillation, Sight, sds_term
+from reffusion.trace import generator
+from reffusion.types import Camera, Gaussians
+
+TINY = Path(__file__).resolve().parent.parent / "priors" / "tiny"
+
+
+@dataclass(frozen=True)
+class Shape:
+    """The configurations of a prior's parts; `texts` has one entry, of SDXL two."""
+
+    unet: dict[str, Any]
+    vae: dict[str, Any]
+    texts: tuple[dict[str, Any], ...]
+
+
+_VAE = {
+    "block_out_channels": (128, 256, 512, 512),
+    "down_block_types": ("DownEncoderBlock2D",) * 4,
+    "up_block_types": ("UpDecoderBlock2D",) * 4,
+    "layers_per_block": 2,
+    "latent_channels": 4,
+    "norm_num_groups": 32,
+}
+_CLIP = {"vocab_size": 49408, "max_position_embeddings": 77}
+
+SD2 = Shape(
+    unet={
+        "sample_size": 64,
+        "in_channels": 9,
+        "out_channels": 4,
+        "block_out_channels": (320, 640, 1280, 1280),
+        "down_block_types": ("CrossAttnDownBlock2D",) * 3 + ("DownBlock2D",),
+        "up_block_types": ("UpBlock2D",) + ("CrossAttnUpBlock2D",) * 3,
+        "layers_per_block": 2,
+        "cross_attention_dim": 1024,
+        "attention_head_dim": (5, 10, 20, 20),
+        "use_linear_projection": True,
+    },
+    vae=_VAE | {"sample_size": 512, "scaling_factor": 0.18215},
+    texts=(
+        _CLIP
+        | {"hidden_size": 1024, "intermediate_size": 4096, "num_hidden_layers": 23, "num_attention_heads": 16}
+        | {"hidden_act": "gelu", "projection_dim": 512},
+    ),
+)
+SDXL = Shape(
+    unet={
+        "sample_size": 128,
+        "in_channels": 9,
+        "out_channels": 4,
+        "block_out_channels": (320, 640, 1280),
+        "down_block_types": ("DownBlock2D", "CrossAttnDownBlock2D", "CrossAttnDownBlock2D"),
+        "up_block_types": ("CrossAttnUpBlock2D", "CrossAttnUpBlock2D", "UpBlock2D"),
+        "layers_per_block": 2,
+        "transformer_layers_per_block": (1, 2, 10),
+        "cross_attention_dim": 2048,
+        "attention_head_dim": (5, 10, 20),
+        "use_linear_projection": True,
+        "addition_embed_type": "text_time",
+        "addition_time_embed_dim": 256,
+        "projection_class_embeddings_input_dim": 2816,
+    },
+    vae=_VAE | {"sample_size": 1024, "scaling_factor": 0.13025},
+    texts=(
+        _CLIP
+        | {"hidden_size": 768, "intermediate_size": 3072, "num_hidden_layers": 12, "num_attention_heads": 12}
+        | {"hidden_act": "quick_gelu", "projection_dim": 768},
+        _CLIP
+        | {"hidden_size": 1280, "intermediate_size": 5120, "num_hidden_layers": 32, "num_attention_heads": 20}
+        | {"hidden_act": "gelu", "projection_dim": 1280},
+    ),
+)
+
+
+def shrunk(shape: Shape) -> Shape:
+    """The same kinds of layers with few channels, 32 px: a forward pass in milliseconds."""
+    second = len(shape.texts) == 2
+    depth = len(shape.unet["block_out_channels"])
+    unet = shape.unet | {"sample_size": 16, "block_out_channels": (32, 64, 64, 64)[:depth], "cross_attention_dim": 64}
+    unet |= {"attention_head_dim": (2, 4, 4, 4)[:depth], "layers_per_block": 1, "norm_num_groups": 8}
+    if second:
+        unet |= {"cross_attention_dim": 96, "transformer_layers_per_block": (1, 1, 2), "addition_time_embed_dim": 8}
+        unet |= {"projection_class_embeddings_input_dim": 32 + 6 * 8}
+    vae = {"block_out_channels": (16, 16), "layers_per_block": 1, "norm_num_groups": 8, "sample_size": 32}
+    vae |= {"down_block_types": ("DownEncoderBlock2D",) * 2, "up_block_types": ("UpDecoderBlock2D",) * 2}
+    small = {"intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 2, "vocab_size": 527}
+    small |= {"max_position_embeddings": 24, "bos_token_id": 525, "eos_token_id": 526}
+    widths = (64, 32) if second else (64,)
+    texts = tuple(t | small | {"hidden_size": w, "projection_dim": w} for t, w in zip(shape.texts, widths, strict=True))
+    return Shape(unet, shape.vae | vae, texts)
+
+
+def networks(shape: Shape, dtype: torch.dtype) -> dict[str, torch.nn.Module]:
+    """UNet and text encoders in `dtype`, the VAE in float32; on torch's default device (`meta` only counts)."""
+    from diffusers import AutoencoderKL, UNet2DConditionModel
+    from transformers import CLIPTextConfig, CLIPTextModel, CLIPTextModelWithProjection
+
+    kinds = (CLIPTextModel, CLIPTextModelWithProjection)
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        made = {"unet": UNet2DConditionModel(**shape.unet)}
+        for name, kind, text in zip(("text_encoder", "text_encoder_2"), kinds, shape.texts, strict=False):
+            made[name] = kind(CLIPTextConfig(**text))
+    finally:
+        torch.set_default_dtype(before)
+    return made | {"vae": AutoencoderKL(**shape.vae)}
+
+
+def count(shape: Shape) -> int:
+    """Parameters of all parts, without making one."""
+    with torch.device("meta"):
+        return sum(p.numel() for part in networks(shape, torch.float32).values() for p in part.parameters())
+
+
+def living(shape: Shape, dtype: torch.dtype) -> dict[str, float]:
+    """GB of weights and, for one sample, of the most tensors that live at once: counted, nothing is computed.
+
+    On torch's device without memory; attention is taken apart there, so that a GPU's kernels need less.
+    """
+    with torch.device("meta"):
+        made = networks(shape, dtype)
+    prior = assembled(shape, made, "meta")
+    picture = reference(prior.native_size)
+    steps = {"inpainting": memory.answering, "SDS": memory.encoding}
+    said = {"weights": prior.bytes}
+    said |= {name: memory.peak_bytes(lambda s=step: s(prior), "meta") for name, step in steps.items()}
+    trainer(prior, 1)
+    training = lambda: P.one_sample(prior, [picture], 0)
+    said["personalization"] = memory.peak_bytes(training, "meta")
+    diffusion.recomputing(prior)
+    said["SDS, checkpointing"] = memory.peak_bytes(lambda: memory.encoding(prior), "meta")
+    said["personalization, checkpointing"] = memory.peak_bytes(training, "meta")
+    return {name: round(count / 1e9, 6) for name, count in said.items()}
+
+
+def build(shape: Shape, dtype: torch.dtype, device: str = "cpu", seed: int = 0) -> diffusion.Prior:
+    """A prior of random weights, the same for equal seeds."""
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        return assembled(shape, networks(shape, dtype), device)
+
+
+def assembled(shape: Shape, made: dict[str, torch.nn.Module], device: str) -> diffusion.Prior:
+    """The networks with a tokenizer (the embedded prior's: words do not matter here) and SD2's schedule."""
+    from diffusers import DDIMScheduler
+    from transformers import CLIPTokenizer
+
+    length = shape.texts[0]["max_position_embeddings"]
+    tokens = CLIPTokenizer.from_pretrained(TINY / "tokenizer", model_max_length=length)
+    schedule = DDIMScheduler(
+        beta_start=0.00085, beta_end=0.012, beta_schedule="scaled_linear", clip_sample=False, steps_offset=1
+    )
+    second = made.get("text_encoder_2")
+    return diffusion.make_prior(
+        made["unet"], made["vae"], made["text_encoder"], tokens, schedule, device, "random weights", second, tokens
+    )
+
+
+# ------------------------------------------------------------------------------------------------------- the two steps
+
+
+def reference(size: int) -> P.Picture:
+    """Stripes with a hole in the middle, a quarter wider than high."""
+    rows, columns = torch.meshgrid(torch.arange(size), torch.arange(size + size // 4), indexing="ij")
+    image = torch.stack([128 + 100 * torch.sin((rows + k * columns) / 9) for k in (1, 2, 3)], 2)
+    hole = torch.zeros(rows.shape, dtype=torch.bool)
+    hole[size // 3 : 2 * size // 3, size // 2 : size] = True
+    return P.picture(image.to(torch.uint8), hole, size)
+
+
+def trainer(prior: diffusion.Prior, batch: int) -> tuple[dict[str, list], torch.optim.Optimizer, P.Training]:
+    """The paper's LoRA on a prior: rank 8, alpha 16, dropout 0.1 on the attention layers; AdamW."""
+    trained = lora.add(prior, rank=8, alpha=16, dropout=0.1, layers="attention", seed=0)
+    groups = [{"params": trained["unet"], "lr": 2e-4}, {"params": trained["text"], "lr": 4e-5}]
+    training = P.Training(
+        steps=2000, lr_unet=2e-4, lr_text=4e-5, batch=batch, accumulate=1, weight_decay=1e-2, betas=(0.9, 0.999),
+        clip=1.0, warm_up=0, schedule="constant", size=prior.native_size, seed=0, checkpoint_seconds=1e9,
+    )  # fmt: skip
+    return trained, torch.optim.AdamW(groups, weight_decay=training.weight_decay), training
+
+
+def personalization_step(prior: diffusion.Prior, picture: P.Picture, batch: int, folder: Path) -> dict[str, float]:
+    """One optimiser step, and the LoRA saved in `folder`."""
+    trained, optimizer, training = trainer(prior, batch)
+    loss = P.train_step(prior, optimizer, [picture], [], P.Sampling(), training, 0)
+    lora.set_dropout(prior, False)
+    lora.save(prior, folder)
+    return {"loss": loss} | {f"lora_{part}": sum(float(p.detach().abs().sum()) for p in of) for part, of in trained.items()}
+
+
+@torch.no_grad()
+def epsilon(prior: diffusion.Prior) -> torch.Tensor:
+    """What the prior answers to fixed noise, a fixed picture and a prompt: compared before and after saving."""
+    side, draw = prior.native_size // prior.factor, generator(0, "epsilon")
+    channels = prior.vae.config.latent_channels
+    noisy, shown = (torch.randn(1, channels, side, side, generator=draw).to(prior.device) for _ in range(2))
+    condition = torch.cat([torch.ones_like(noisy[:, :1]), shown], 1)
+    at = torch.tensor([500], device=prior.device)
+    return diffusion.raw_prediction(prior, noisy, at, condition, diffusion.embed_text(prior, [P.PROMPTS[0]])).cpu()
+
+
+def sight(size: int, device: str) -> Sight:
+    """A view of `size` rows, a quarter wider, whose middle is to be repainted."""
+    width = size + size // 4
+    camera = Camera("view", width, size, width, width, width / 2, size / 2, np.eye(4))
+    hole = torch.zeros(size, width, dtype=torch.bool)
+    hole[size // 3 : 2 * size // 3, size // 2 : size] = True
+    photo = torch.rand(size, width, 3, generator=generator(0, "photo"))
+    return Sight(camera, photo.to(device), ~hole.to(device), hole.to(device), False)
+
+
+def gaussians(number: int, device: str, degree: int = 3) -> Gaussians:
+    """Random ones that fill the view of `sight`."""
+    draw = generator(0, "gaussians")
+    rand = lambda *shape: torch.rand(*shape, generator=draw)
+    means = torch.cat([rand(number, 2) * 2.4 - 1.2, 2 + rand(number, 1)], 1)
+    sizes = torch.full((number, 3), float(np.log(2.0 / number**0.5))) + 0.3 * rand(number, 3)
+    harmonics = torch.cat([rand(number, 1, 3) - 0.5, 0.1 * (rand(number, (degree + 1) ** 2 - 1, 3) - 0.5)], 1)
+    made = Gaussians(means, rand(number, 4) - 0.5, sizes, 2 * rand(number), harmonics)
+    return made.map(lambda p: p.to(device).requires_grad_(True))
+
+
+def sds_step(
+    prior: diffusion.Prior, text: torch.Tensor, view: Sight, scene: Gaussians, settings: Distillation, step: int = 0
+) -> dict[str, float]:
+    """One SDS term of the library, and its backward pass into the Gaussians."""
+    masked = torch.ones(len(scene), dtype=torch.bool, device=scene.means.device)
+    loss, _ = sds_term(scene, masked, view, prior, text, settings, generator(0, "sds", step))
+    (1e-3 * loss).backward()
+    norm = float(scene.sh.grad.norm())
+    if not (np.isfinite(norm) and norm > 0):
+        raise FloatingPointError(f"the SDS gradient's norm is {norm}")
+    return {"gradient_norm": norm}
+
+
+# ---------------------------------------------------------------------------------------------------------------- main
+
+
+def timed(report: dict[str, Any], name: str, work: Any) -> Any:
+    """The result of `work`, its seconds and the process's peak memory so far noted in the report."""
+    began, cpu = time.perf_counter(), time.process_time()
+    result = work()
+    line = {"seconds": time.perf_counter() - began, "cpu_seconds": time.process_time() - cpu}
+    line["peak_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
+    report[name] = {key: round(value, 3) for key, value in line.items()}
+    report[name] |= result if isinstance(result, dict) else {}
+    print(f"{name:<24} {json.dumps(report[name])}", flush=True)
+    return result
+
+
+def run(shape: Shape, dtype: torch.dtype, options: argparse.Namespace) -> dict[str, Any]:
+    """Both steps and the round trip of the LoRA; everything measured."""
+    options.out.mkdir(parents=True, exist_ok=True)
+    report: dict[str, Any] = {"parameters": count(shape), "dtype": str(dtype), "size": shape.unet["sample_size"] * 8}
+
+    def made() -> diffusion.Prior:
+        prior = build(shape, dtype)
+        return diffusion.recomputing(prior) if options.checkpointing else prior
+
+    prior = timed(report, "build", made)
+    report["size"] = size = prior.native_size
+    picture = reference(size)
+    timed(report, "personalization step", lambda: personalization_step(prior, picture, options.batch, options.out))
+    before = timed(report, "epsilon of the trained", lambda: epsilon(prior))
+    del prior
+    gc.collect()
+    prior = lora.merged(timed(report, "build again", made), options.out)
+    after = timed(report, "epsilon of the loaded", lambda: epsilon(prior))
+    report["epsilon difference"] = float((after - before).abs().max())
+    report["epsilon size"] = float(before.abs().max())
+    with torch.no_grad():
+        text = timed(report, "embed prompts", lambda: diffusion.embed_text(prior, list(P.PROMPTS)))
+    prior = diffusion.without_text(prior)
+    gc.collect()
+    settings = Distillation(patches=options.patches)
+    scene = gaussians(options.gaussians, "cpu")
+    timed(report, "SDS step", lambda: sds_step(prior, text, sight(size, "cpu"), scene, settings))
+    return report
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--dtype", choices=["float32", "bfloat16"], default="bfloat16")
+    parser.add_argument("--size", type=int, default=0, help="side in pixels that counts as native; 0: the published")
+    parser.add_argument("--batch", type=int, default=1, help="samples of the personalization step")
+    parser.add_argument("--patches", type=int, default=2, help="local patches of the SDS step")
+    parser.add_argument("--gaussians", type=int, default=2000)
+    parser.add_argument("--memory-gb", type=float, default=20.0, help="refuse to begin where the machine has less free")
+    parser.add_argument("--checkpointing", action="store_true")
+    parser.add_argument("--toy", action="store_true", help="few channels, 32 px")
+    parser.add_argument("--count", action="store_true", help="only count the memory that one sample takes")
+    parser.add_argument("--out", type=Path, default=Path("runs/full-size"))
+    options = parser.parse_args()
+    shape = shrunk(SD2) if options.toy else SD2
+    if options.size:
+        factor = 2 ** (len(shape.vae["block_out_channels"]) - 1)
+        shape = Shape(shape.unet | {"sample_size": options.size // factor}, shape.vae, shape.texts)
+    if options.count:
+        print(json.dumps(living(shape, getattr(torch, options.dtype)), indent=1))
+        return
+    need = 1.2 * count(shape) * (4 if options.dtype == "float32" else 2) / 1e9
+    if need > options.memory_gb:
+        parser.error(f"the weights alone take {need:.0f} GB, more than --memory-gb {options.memory_gb:g}")
+    with memory.blamed("--size", options.size):
+        report = run(shape, getattr(torch, options.dtype), options)
+    (options.out / "full_size.json").write_text(json.dumps(report, indent=1) + "\n")
+    if not options.toy and report["parameters"] != weights.PUBLISHED[weights.SD2].parameters:
+        raise SystemExit(f"error: reffusion/weights.py states another number of parameters: {report['parameters']}")
+
+
+if __name__ == "__main__":
+    main()

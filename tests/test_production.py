@@ -1,0 +1,233 @@
+"""The production path at a small size: SDXL, parts of a batch, half precision, memory budgets, the two benchmarks."""
+
+import gc
+import json
+import sys
+import weakref
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "benchmarks"))
+
+import full_size as F  # noqa: E402
+import gpu_check  # noqa: E402
+
+from reffusion import inpaint, lora, memory, weights  # noqa: E402
+from reffusion import personalize as P  # noqa: E402
+from reffusion import prior as D  # noqa: E402
+from reffusion.trace import generator  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def sdxl(tmp_path_factory):
+    """An SDXL-shaped prior as `load_prior` gives it, from a folder that diffusers wrote."""
+    folder = tmp_path_factory.mktemp("sdxl")
+    D.pipeline(replace(F.build(F.shrunk(F.SDXL), torch.float32), zero_empty=True)).save_pretrained(folder)
+    return D.load_prior(folder)
+
+
+@pytest.fixture
+def sd2():
+    return F.build(F.shrunk(F.SD2), torch.float32)
+
+
+def draw(*shape, seed=0):
+    return torch.randn(*shape, generator=generator(seed, "test"))
+
+
+# ----------------------------------------------------------------------------------------------------------------- SDXL
+
+
+def test_sdxl_prompts_and_unet_are_those_of_the_stock_pipeline(sdxl):
+    assert sdxl.text_encoder_2 is not None and sdxl.zero_empty and sdxl.native_size == 32
+    pipe = D.pipeline(sdxl)
+    hidden, empty, pooled, pooled_empty = pipe.encode_prompt("a red chair", device="cpu")
+    text = D.embed_text(sdxl, ["a red chair", ""])
+    assert torch.allclose(text[0, :-1], hidden[0], atol=1e-5)
+    assert torch.allclose(text[0, -1, : pooled.shape[1]], pooled[0], atol=1e-5)
+    assert not text[1].any() and not empty.any() and not pooled_empty.any()
+
+    noisy, condition = draw(1, 4, 16, 16), draw(1, 5, 16, 16, seed=1)
+    sizes = torch.tensor([[32.0, 32, 0, 0, 32, 32]])
+    added = {"text_embeds": pooled, "time_ids": sizes}
+    at = torch.tensor([300])
+    stock = pipe.unet(torch.cat([noisy, condition], 1), at, encoder_hidden_states=hidden, added_cond_kwargs=added)
+    assert torch.allclose(D.raw_prediction(sdxl, noisy, at, condition, text[:1]), stock.sample, atol=1e-5)
+    other = D.raw_prediction(sdxl, noisy, at, condition, text[1:])
+    assert (other - stock.sample).abs().max() > 1e-4
+
+
+def test_sdxl_paints_a_reference(sdxl):
+    image, hole = torch.rand(3, 40, 50, generator=generator(0, "image")) * 2 - 1, torch.zeros(40, 50, dtype=torch.bool)
+    hole[10:30, 15:40] = True
+    options = {"prompt": "a red chair", "seeds": [0], "steps": 2, "start": 0.5, "guidance": 1.0}
+    painted = inpaint.paint(sdxl, image, hole, **options)
+    assert painted.shape == (1, 3, 40, 50) and torch.isfinite(painted).all()
+    assert torch.equal(painted[0][:, ~hole], image[:, ~hole])
+    other = inpaint.paint(sdxl, image, hole, **options | {"prompt": "a table"})
+    assert not torch.equal(other, painted)
+
+
+def test_sdxl_is_refused_where_it_cannot_work(sdxl):
+    with pytest.raises(ValueError, match=r"reference.prior"):
+        lora.add(sdxl, 4, 4.0, 0.0, "attention", 0)
+
+
+# ----------------------------------------------------------------------------------------------------- parts of a batch
+
+
+def test_a_batch_in_parts_gives_the_same_values_and_gradients(sd2):
+    images = draw(3, 3, 32, 32).requires_grad_()
+    noisy, condition, at = draw(3, 4, 16, 16), draw(3, 5, 16, 16), torch.tensor([10, 500, 900])
+    text = D.embed_text(sd2, list(P.PROMPTS)).detach()
+    found = []
+    for prior in (sd2, replace(sd2, rows=1, rows_graded=2), D.recomputing(sd2)):
+        latents = D.encode(prior, images)
+        (gradient,) = torch.autograd.grad((latents * draw(*latents.shape)).sum(), images)
+        with torch.no_grad():
+            found.append((latents.detach(), gradient, D.raw_prediction(prior, noisy, at, condition, text)))
+    for other in found[1:]:
+        assert all(torch.allclose(a, b, atol=1e-5) for a, b in zip(found[0], other, strict=True))
+
+
+def test_a_training_step_in_parts_is_the_same_step():
+    after = []
+    for rows in (0, 2):
+        prior = F.build(F.shrunk(F.SD2), torch.float32)
+        trained, optimizer, training = F.trainer(prior, 5)
+        for part in (prior.unet, prior.text_encoder):  # dropout's draws depend on the parts
+            for layer in part.modules():
+                layer.p = 0.0 if isinstance(layer, torch.nn.Dropout) else getattr(layer, "p", None)
+        prior = replace(prior, rows_graded=rows)
+        loss = P.train_step(prior, optimizer, [F.reference(32)], [], P.Sampling(), training, 0)
+        after.append((loss, [p.detach().clone() for part in trained.values() for p in part]))
+    assert after[0][0] == pytest.approx(after[1][0], rel=1e-5)
+    # Adam's first step has the size of the learning rate; where a gradient is all but 0 its sign is a rounding's.
+    close = [torch.isclose(a, b, atol=2e-5).float().mean() for a, b in zip(after[0][1], after[1][1], strict=True)]
+    assert min(close) > 0.97
+
+
+def test_half_precision_stays_near_and_leaves_the_vae_alone(sd2):
+    half = F.build(F.shrunk(F.SD2), torch.bfloat16)
+    for name in ("unet", "text_encoder"):
+        getattr(half, name).load_state_dict(getattr(sd2, name).state_dict())
+    half.vae.load_state_dict(sd2.vae.state_dict())
+    images, noisy, at = draw(1, 3, 32, 32), draw(1, 4, 16, 16), torch.tensor([999])
+    assert torch.equal(D.encode(half, images), D.encode(sd2, images))
+    condition = draw(1, 5, 16, 16)
+    with torch.no_grad():
+        answers = [D.predict(p, noisy, at, condition, D.embed_text(p, ["a"])) for p in (sd2, half)]
+    (eps, clean), (eps_half, clean_half) = answers
+    assert eps_half.dtype == clean_half.dtype == torch.float32
+    error = (eps_half - eps).abs().max()
+    assert 0 < error < 0.1
+    # x0 = (z - s eps) / a itself loses nothing: its error is that of eps, times s / a.
+    a = D.abar(sd2, at)
+    assert torch.allclose(clean_half - clean, -((1 - a) / a).sqrt() * (eps_half - eps), atol=1e-4)
+
+
+def test_the_text_encoder_is_let_go():
+    prior = F.build(F.shrunk(F.SD2), torch.float32)
+    whole, encoder = prior.bytes, weakref.ref(prior.text_encoder)
+    text = D.embed_text(prior, list(P.PROMPTS)).detach()
+    prior = D.without_text(prior)
+    gc.collect()
+    assert encoder() is None and prior.bytes < whole
+    with pytest.raises(ValueError, match="text encoder was dropped"):
+        D.embed_text(prior, ["a"])
+    answer = D.raw_prediction(prior, draw(3, 4, 16, 16), torch.tensor([1, 2, 3]), draw(3, 5, 16, 16), text)
+    assert torch.isfinite(answer).all()
+
+
+# --------------------------------------------------------------------------------------------------------------- memory
+
+
+def test_living_tensors_are_counted():
+    def work():
+        a = torch.zeros(1000)  # 4000 bytes
+        b = a + 1
+        del a
+        c = b.view(10, 100)  # no memory of its own
+        return torch.cat([c, c])  # 8000 beside b's 4000
+
+    assert memory.peak_bytes(work, "cpu") == 12_000
+    kept = torch.zeros(1000)
+    assert memory.peak_bytes(lambda: kept.add_(1), "cpu") == 0
+
+
+def test_a_budget_chooses_the_parts(sd2):
+    assert memory.fitted(sd2, 0.0, "distill.memory_gb", memory.encoding) is sd2
+    one, answer = (memory.peak_bytes(lambda w=w: w(sd2), "cpu") for w in (memory.encoding, memory.answering))
+    budget = (sd2.bytes + 3.5 * one) / memory.SPARE / 1e9
+    chosen = memory.fitted(sd2, budget, "distill.memory_gb", memory.encoding)
+    assert chosen.rows_graded == 3 and chosen.rows == int(3.5 * one // answer)
+    with pytest.raises(ValueError, match=r"distill.memory_gb is 0.001, but the prior takes .* raise it to"):
+        memory.fitted(sd2, 1e-3, "distill.memory_gb", memory.encoding)
+    assert memory.peak_bytes(lambda: memory.encoding(D.recomputing(sd2)), "cpu") < one
+
+
+def test_measuring_a_training_sample_leaves_no_gradient(sd2):
+    trained, _, _ = F.trainer(sd2, 1)
+    row = lambda prior: P.one_sample(prior, [F.reference(32)], 0)
+    assert memory.fitted(sd2, 1.0, "personalize.memory_gb", row).rows_graded > 1
+    assert all(p.grad is None and p.requires_grad for part in trained.values() for p in part)
+
+
+def test_running_out_of_memory_names_the_param():
+    with pytest.raises(ValueError, match=r"out of memory: lower distill.memory_gb \(now 20\)"):
+        with memory.blamed("distill.memory_gb", 20.0):
+            torch.empty(2**60, dtype=torch.uint8)
+    with pytest.raises(ValueError, match=r"personalize.memory_gb \(now 0: no limit\)"):
+        with memory.blamed("personalize.memory_gb", 0.0):
+            raise torch.OutOfMemoryError("CUDA out of memory")
+    with pytest.raises(RuntimeError, match="other"):
+        with memory.blamed("distill.memory_gb", 20.0):
+            raise RuntimeError("other")
+
+
+# ----------------------------------------------------------------------------------------------------------- benchmarks
+
+
+def test_published_sizes_are_those_of_the_published_configurations():
+    assert F.count(F.SD2) == weights.PUBLISHED[weights.SD2].parameters
+    assert F.count(F.SDXL) == weights.PUBLISHED[weights.SDXL].parameters
+
+
+def test_memory_is_counted_without_computing():
+    shape = F.shrunk(F.SD2)
+    counted = F.living(shape, torch.float32)
+    made = F.build(shape, torch.float32)
+    assert counted["weights"] == pytest.approx(made.bytes / 1e9, abs=1e-6)
+    real = memory.peak_bytes(lambda: memory.encoding(made), "cpu") / 1e9
+    assert real <= counted["SDS"] < 2 * real  # attention is taken apart there
+    assert counted["personalization, checkpointing"] < counted["personalization"]
+
+
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_the_full_size_benchmark_at_a_small_size(tmp_path, monkeypatch, dtype):
+    monkeypatch.setattr(sys, "argv", ["full_size.py", "--toy", "--dtype", dtype, "--out", str(tmp_path)])
+    F.main()
+    report = json.loads((tmp_path / "full_size.json").read_text())
+    assert report["personalization step"]["lora_text"] > 0 and report["SDS step"]["gradient_norm"] > 0
+    # Saved with rank, alpha and text encoder, loaded by diffusers into a fresh model of the same weights.
+    assert report["epsilon difference"] < (1e-5 if dtype == "float32" else 0.05 * report["epsilon size"])
+
+
+def test_gpu_check_at_a_small_size(tmp_path):
+    report = gpu_check.check(True, tmp_path)
+    assert report["gsplat against the oracle"] == {"skipped": "gsplat runs on CUDA only"}
+    assert set(report["losses"]) == {"reconstruction", "reference", "SDS", "personalization"}
+    assert all(line["seconds"] > 0 and line["peak_gb"] > 0 for line in report["losses"].values())
+    assert report["fit"]["ok"] and "personalization" in (tmp_path / "gpu_check.md").read_text()
+    assert json.loads((tmp_path / "gpu_check.json").read_text()) == report
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
+def test_gpu_check_needs_a_gpu(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["gpu_check.py", "--out", str(tmp_path)])
+    assert gpu_check.main() == 2
+    assert capsys.readouterr().err.count("\n") == 1

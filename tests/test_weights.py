@@ -1,0 +1,373 @@
+"""Weights: found in each layout without a network; each way in which they may be wrong has its message; fetching."""
+
+import hashlib
+import http.server
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from reffusion import download, weights
+from reffusion import prior as P
+
+ROOT = Path(__file__).resolve().parent.parent
+TINY = ROOT / "priors" / "tiny"
+PARTS = ("unet", "vae", "text_encoder", "tokenizer", "scheduler")
+
+
+@pytest.fixture
+def caches(tmp_path, monkeypatch):
+    """Empty caches, a working directory without anything, and no network."""
+    for name in ("HF_HUB_CACHE", "HF_HUB_OFFLINE", "TORCH_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("HF_HOME", str(tmp_path / "hub"))
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+
+    def refuse(*_):
+        raise AssertionError("the network was asked")
+
+    monkeypatch.setattr(socket.socket, "connect", refuse)
+    monkeypatch.setattr(socket, "getaddrinfo", refuse)
+    return tmp_path
+
+
+def copied(target: Path) -> Path:
+    target.mkdir(parents=True)
+    for part in PARTS:
+        shutil.copytree(TINY / part, target / part)
+    shutil.copy(TINY / "model_index.json", target)
+    return target
+
+
+def cached(tmp_path, name="acme/paint", state="0123abc", main=True) -> Path:
+    """An entry of the hub's cache."""
+    entry = tmp_path / "hub" / "hub" / f"models--{name.replace('/', '--')}"
+    copied(entry / "snapshots" / state)
+    if main:
+        (entry / "refs").mkdir()
+        (entry / "refs" / "main").write_text(state)
+    return entry
+
+
+# ------------------------------------------------------------------------------------------------------ where they lie
+
+
+def test_an_id_is_found_in_the_hub_cache_and_loaded_without_a_network(caches):
+    entry = cached(caches)
+    assert weights.locate("acme/paint") == entry / "snapshots" / "0123abc"
+    prior = P.load_prior("acme/paint")
+    assert prior.native_size == 64 and P.load_prior(entry).native_size == 64
+
+
+def test_the_state_that_main_names_is_taken(caches):
+    entry = cached(caches, main=False)
+    assert weights.locate("acme/paint") == entry / "snapshots" / "0123abc"  # the only one
+    (entry / "snapshots" / "0456def").mkdir()
+    assert weights.locate("acme/paint") is None
+    (entry / "refs").mkdir()
+    (entry / "refs" / "main").write_text("0456def\n")
+    assert weights.locate("acme/paint").name == "0456def"
+
+
+def test_an_id_is_found_as_a_folder_here_and_in_the_projects_cache(caches):
+    mine = copied(caches / "cache" / "reffusion" / "acme" / "paint")
+    assert weights.locate("acme/paint") == mine
+    here = copied(caches / "elsewhere" / "acme" / "paint")
+    assert weights.locate("acme/paint").resolve() == here
+
+
+def test_the_hubs_own_variables_are_read(caches, monkeypatch):
+    assert weights.hub_cache() == caches / "hub" / "hub"
+    monkeypatch.setenv("HF_HUB_CACHE", str(caches / "other"))
+    assert weights.hub_cache() == caches / "other"
+
+
+def test_what_is_not_here_is_told_at_once_with_the_alternatives(caches):
+    with pytest.raises(
+        ValueError, match=r"prior priors/tiny is not on this machine: no folder .*elsewhere/priors/tiny"
+    ):
+        P.load_prior("priors/tiny")
+    with pytest.raises(ValueError, match=r"run `make weights`.*stable-diffusion-v1-5/stable-diffusion-inpainting"):
+        P.load_prior(weights.SD2)
+    for wrong in (caches / "absent", "./absent", "three/part/name", "~/absent"):
+        with pytest.raises(ValueError, match="no such folder"):
+            P.load_prior(wrong)
+
+
+def test_half_precision_files_alone_are_enough(caches):
+    folder = copied(caches / "half")
+    (folder / "unet" / "diffusion_pytorch_model.safetensors").rename(
+        folder / "unet" / "diffusion_pytorch_model.fp16.safetensors"
+    )
+    prior = P.load_prior(folder, dtype=torch.bfloat16)
+    assert prior.dtype == torch.bfloat16 and next(prior.vae.parameters()).dtype == torch.float32
+
+
+# -------------------------------------------------------------------------------------------------------- what is wrong
+
+
+def edit(path: Path, **changes) -> None:
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+def cut(path: Path, keep: float) -> None:
+    path.write_bytes(path.read_bytes()[: int(keep * path.stat().st_size)])
+
+
+def without_a_weight(path: Path) -> None:
+    state = load_file(path)
+    state.pop(sorted(state)[0])
+    save_file(state, path, metadata={"format": "pt"})
+
+
+UNET, VAE, TEXT = "unet/config.json", "vae/config.json", "text_encoder/config.json"
+WRONG = {
+    "a part is missing": (lambda f: shutil.rmtree(f / "vae"), "lacks vae; it must be a diffusers pipeline folder"),
+    "cut short": (
+        lambda f: cut(f / "unet/diffusion_pytorch_model.safetensors", 0.9),
+        r"unet/diffusion_pytorch_model.safetensors is cut short.*make weights",
+    ),
+    "cut to nothing": (lambda f: cut(f / "text_encoder/model.safetensors", 0), "no readable header"),
+    "a web page": (lambda f: (f / "text_encoder/model.safetensors").write_text("<html>" * 9), "no readable header"),
+    "no safetensors": (lambda f: (f / "text_encoder/model.safetensors").unlink(), "no .safetensors file there"),
+    "no configuration": (lambda f: (f / VAE).write_text("{"), r"vae/config.json cannot be read"),
+    "no inpainting model": (lambda f: edit(f / UNET, in_channels=4), "takes 4 channels.*takes 9"),
+    "parts of two models": (lambda f: edit(f / TEXT, hidden_size=32), "text of width 64, the text encoder gives 32"),
+    "unknown prediction": (
+        lambda f: edit(f / "scheduler/scheduler_config.json", prediction_type="sample"),
+        "prediction_type 'sample' is not supported; epsilon and v_prediction are",
+    ),
+    "shapes of the UNet": (lambda f: edit(f / UNET, block_out_channels=[32, 64, 128]), "unet: the weights do not fit"),
+    "shapes of the text encoder": (lambda f: edit(f / TEXT, intermediate_size=96), "text_encoder: the weights do not"),
+    "a weight is missing": (lambda f: without_a_weight(f / "text_encoder/model.safetensors"), "1 weights are missing"),
+    "a weight of the UNet is missing": (
+        lambda f: without_a_weight(f / "unet/diffusion_pytorch_model.safetensors"),
+        "unet: .*missing",
+    ),
+    "half an SDXL": (lambda f: edit(f / UNET, addition_embed_type="text_time"), "neither Stable Diffusion nor SDXL"),
+}
+
+
+@pytest.mark.parametrize("spoil, message", WRONG.values(), ids=WRONG)
+def test_each_fault_has_its_message(caches, spoil, message):
+    folder = copied(caches / "faulty")
+    spoil(folder)
+    with pytest.raises(ValueError, match=rf"prior (?s:.*){message}"):
+        P.load_prior(folder)
+
+
+def test_a_lost_shard_is_named(caches):
+    folder = copied(caches / "shards")
+    index = folder / "unet" / "diffusion_pytorch_model.safetensors.index.json"
+    index.write_text(json.dumps({"weight_map": {"a": "diffusion_pytorch_model-00001-of-00002.safetensors"}}))
+    with pytest.raises(ValueError, match=r"00001-of-00002.safetensors is missing"):
+        weights.check(folder)
+
+
+def test_what_a_stage_needs(caches):
+    need = weights.of_model(weights.SD2, "float16")
+    assert "not on this machine" in need.problem and need.fetched and 2.5e9 < need.bytes < 2.7e9
+    folder = copied(caches / "good")
+    assert weights.of_model(str(folder), "float32").problem is None
+    shutil.rmtree(folder / "unet")
+    broken = weights.of_model(str(folder), "float32")
+    assert "lacks unet" in broken.problem and not broken.fetched
+    names = {need.name: need for need in weights.of_lpips(None)}
+    assert all(need.problem and need.optional for need in names.values()) and len(names) == 4
+    (caches / "cache" / "reffusion" / "lpips").mkdir(parents=True)
+    (caches / "cache" / "reffusion" / "lpips" / "alex.pth").write_bytes(b"x")
+    assert {n.name for n in weights.of_lpips(None) if not n.problem} == {"alex.pth"}
+
+
+# ------------------------------------------------------------------------------------------------------------- fetching
+
+
+def test_one_set_of_weights_a_part_is_chosen():
+    names = ["model_index.json", "README.md", "sd.ckpt", "sd.safetensors", "unet/config.json", "vae/config.json",
+             "unet/diffusion_pytorch_model.safetensors", "unet/diffusion_pytorch_model.fp16.safetensors",
+             "unet/diffusion_pytorch_model.bin", "unet/diffusion_pytorch_model.non_ema.safetensors",
+             "vae/diffusion_pytorch_model.safetensors", "text_encoder/config.json",
+             "text_encoder/model.fp16.safetensors", "tokenizer/vocab.json", "tokenizer/merges.txt",
+             "scheduler/scheduler_config.json", "safety_checker/model.safetensors"]  # fmt: skip
+    half, full = set(download.chosen_files(names, True)), set(download.chosen_files(names, False))
+    assert half - full == {"unet/diffusion_pytorch_model.fp16.safetensors"}
+    assert full - half == {"unet/diffusion_pytorch_model.safetensors"}
+    assert half & full == {"model_index.json", "unet/config.json", "vae/config.json", "text_encoder/config.json",
+                           "vae/diffusion_pytorch_model.safetensors", "text_encoder/model.fp16.safetensors",
+                           "tokenizer/vocab.json", "tokenizer/merges.txt",
+                           "scheduler/scheduler_config.json"}  # fmt: skip
+    assert download.chosen_files(["config.json", "model.safetensors", "a.bin"], True) == [
+        "config.json",
+        "model.safetensors",
+    ]
+    assert download.chosen_files(["config.json", "pytorch_model.bin"], True) == []
+
+
+class Files(http.server.BaseHTTPRequestHandler):
+    """Plain files with ranges. `content`: path -> bytes; `sent`: bytes of each answer; set by the fixture."""
+
+    def do_GET(self):
+        body = self.content.get(self.path)
+        if body is None:
+            self.send_error(404)
+            return
+        first = int(self.headers.get("Range", "bytes=0-").removeprefix("bytes=").rstrip("-"))
+        if first >= len(body):
+            self.send_error(416)
+            return
+        self.send_response(206 if first else 200)
+        self.send_header("Content-Length", str(len(body) - first))
+        self.end_headers()
+        self.wfile.write(body[first:])
+        self.sent.append(len(body) - first)
+
+    def log_message(self, *_):
+        pass
+
+
+@pytest.fixture
+def served():
+    """(address, the handler's class) of a local server."""
+    handler = type("Handler", (Files,), {"content": {}, "sent": []})
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_port}", handler
+    server.shutdown()
+    server.server_close()
+
+
+def test_a_plain_file_is_fetched_gone_on_with_and_checked(tmp_path, served, monkeypatch):
+    monkeypatch.delenv("HF_HUB_OFFLINE", raising=False)
+    address, handler = served
+    body = os.urandom(300_000)
+    digest = hashlib.sha256(body).hexdigest()
+    handler.content["/net.pth"] = body
+    target = tmp_path / "deep" / "net.pth"
+    target.parent.mkdir()
+    target.with_name("net.pth.part").write_bytes(body[:100_000])
+    download.file(f"{address}/net.pth", target, digest[:8], len(body))
+    assert target.read_bytes() == body and handler.sent == [200_000]
+    assert not target.with_name("net.pth.part").exists()
+
+    target.unlink()
+    target.with_name("net.pth.part").write_bytes(body)  # whole, but stopped before it was renamed
+    download.file(f"{address}/net.pth", target, digest, len(body))
+    assert target.read_bytes() == body and handler.sent == [200_000]
+
+    target.unlink()
+    target.with_name("net.pth.part").write_bytes(b"other" * 10)
+    with pytest.raises(ValueError, match="arrived damaged"):
+        download.file(f"{address}/net.pth", target, digest, len(body))
+    assert not any(target.parent.iterdir())
+    with pytest.raises(ValueError, match=r"404.*moved\? Put the file at"):
+        download.file(f"{address}/gone.pth", target, digest, None)
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    with pytest.raises(ValueError, match="HF_HUB_OFFLINE is set"):
+        download.file(f"{address}/net.pth", target, digest, None)
+    monkeypatch.delenv("HF_HUB_OFFLINE")
+    with pytest.raises(ValueError, match="does not answer"):
+        download.file("http://127.0.0.1:9/net.pth", target, digest, None)
+
+
+class Hub(http.server.BaseHTTPRequestHandler):
+    """As much of a hub as fetching asks for: one model, one that is gated, none else."""
+
+    STATE = "a" * 40
+
+    def _answer(self, code, body=b"", **headers):
+        self.send_response(code)
+        for name, value in {"Content-Length": str(len(body)), **headers}.items():
+            self.send_header(name.replace("_", "-"), value)
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(body)
+
+    def do_GET(self):
+        path = self.path.partition("?")[0]
+        if "acme/gated" in path:
+            return self._answer(403, X_Error_Code="GatedRepo", X_Error_Message="Access is restricted")
+        if "acme/paint" not in path:
+            return self._answer(404, X_Error_Code="RepoNotFound", X_Error_Message="Repository Not Found")
+        files = {
+            p.relative_to(TINY).as_posix(): p for p in sorted(TINY.rglob("*")) if p.suffix in (".json", ".safetensors")
+        }
+        described = [
+            {"rfilename": n, "path": n, "type": "file", "size": p.stat().st_size, "oid": "0" * 40, "blobId": "0" * 40}
+            | ({"lfs": {"sha256": hashlib.sha256(p.read_bytes()).hexdigest(), "size": p.stat().st_size,
+                        "oid": hashlib.sha256(p.read_bytes()).hexdigest(), "pointerSize": 1}}
+               if p.suffix == ".safetensors" else {})
+            for n, p in files.items()
+        ]  # fmt: skip
+        if "/tree/" in path:
+            return self._answer(200, json.dumps(described).encode(), Content_Type="application/json")
+        if path.startswith("/api/"):
+            facts = {"id": "acme/paint", "sha": self.STATE, "siblings": described, "private": False, "tags": []}
+            return self._answer(200, json.dumps(facts).encode(), Content_Type="application/json")
+        name = path.partition("/resolve/")[2].partition("/")[2]
+        body = files[name].read_bytes()
+        tag = f'"{hashlib.sha256(body).hexdigest()}"'
+        return self._answer(200, body, ETag=tag, X_Repo_Commit=self.STATE, X_Linked_Etag=tag)
+
+    do_HEAD = do_GET
+
+    def log_message(self, *_):
+        pass
+
+
+FETCH = """
+import sys
+from reffusion import download
+for name in sys.argv[1:]:
+    try:
+        print(download.model(name, True))
+    except ValueError as error:
+        print(error)
+"""
+
+
+def fetched(*names, **environment) -> list[str]:
+    """What fetching these models says, a line each; a fresh process, for the hub's address is read once."""
+    variables = {k: v for k, v in os.environ.items() if not k.startswith("HF_")} | environment
+    variables |= {"PYTHONPATH": str(ROOT), "HF_HUB_DISABLE_XET": "1", "HF_HUB_ETAG_TIMEOUT": "2"}
+    done = subprocess.run(
+        [sys.executable, "-c", FETCH, *names], env=variables, text=True, capture_output=True, check=True
+    )
+    return done.stdout.strip().splitlines()
+
+
+def test_a_model_is_fetched_from_the_hub_and_its_refusals_are_told_apart(tmp_path, monkeypatch):
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Hub)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        said = fetched(
+            "acme/paint", "acme/gated", "acme/gone", weights.SD2,
+            HF_ENDPOINT=f"http://127.0.0.1:{server.server_port}", HF_HOME=str(tmp_path),
+        )  # fmt: skip
+    finally:
+        server.shutdown()
+        server.server_close()
+    folder, gated, gone, moved = said
+    monkeypatch.delenv("HF_HUB_CACHE", raising=False)
+    monkeypatch.setenv("HF_HOME", str(tmp_path))
+    assert weights.locate("acme/paint") == Path(folder)
+    weights.check(Path(folder))
+    assert "acme/gated is gated: accept its terms" in gated and "hf auth login" in gated
+    assert "acme/gone: the hub has no such model" in gone
+    assert "the hub has no such model" in moved and "stable-diffusion-v1-5/stable-diffusion-inpainting" in moved
+
+
+def test_no_network_and_the_offline_switch_are_told(tmp_path):
+    (unreachable,) = fetched("acme/paint", HF_ENDPOINT="http://127.0.0.1:9", HF_HOME=str(tmp_path))
+    assert "acme/paint: the hub does not answer" in unreachable and "copy its cache" in unreachable
+    (offline,) = fetched("acme/paint", HF_HUB_OFFLINE="1", HF_HOME=str(tmp_path))
+    assert "HF_HUB_OFFLINE is set" in offline
