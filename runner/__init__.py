@@ -5,5 +5,6 @@
 - job.py: a request with everything about it resolved and checked.
 - plan.py: one word and a reason for each stage, from what lies on the disk.
 - execute.py: locks, fresh processes, folders renamed into place, receipts, batches.
+- compare.py: a scene's own run and every variant of it.
 - child.py: the other side: the process in which stages are imported.
 """

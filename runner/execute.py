@@ -252,6 +252,21 @@ def clean(request: Request) -> None:
 # -------------------------------------------------------------------------------------------------------- results
 
 
+def record_plan(job: Job, decisions: dict[str, Decision]) -> None:
+    """Write runs/<scene>/plan.json, for the report: stage -> word, reason, notes, the artifact's folder below runs/."""
+    stages = {
+        stage: {
+            "word": decision.word,
+            "reason": decision.reason,
+            "notes": list(decision.notes),
+            "folder": decision.path and os.path.relpath(decision.path, job.runs),
+        }
+        for stage, decision in decisions.items()
+    }
+    job.home.mkdir(parents=True, exist_ok=True)
+    write_json(job.home / "plan.json", {"profile": job.profile, "stages": stages})
+
+
 def _mean(evaluate: Path | None, of: str = "mean") -> dict[str, float | None]:
     return json.loads((evaluate / "metrics.json").read_text()).get(of, {}) if evaluate else {}
 

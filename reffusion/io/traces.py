@@ -1,0 +1,114 @@
+"""`trace.jsonl`, error against run time: what may stand in one, and reading it (docs/traces.md)."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+REASONS = ("finished", "no gain", "fell", "converged")
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What a key of a trace means.
+
+    Attributes:
+        unit: "dB", "count", "1" for a ratio; "" where only the comparison within a scene means something.
+        better: "more" or "less"; "" where neither is.
+        label: for an axis.
+    """
+
+    unit: str
+    better: Literal["more", "less", ""]
+    label: str
+
+
+QUANTITIES = {
+    "loss": Quantity("", "less", "reconstruction loss"),
+    "psnr": Quantity("dB", "more", "PSNR of training views before their step"),
+    "psnr_held_out": Quantity("dB", "more", "PSNR of held-out views"),
+    "target_mse": Quantity("1", "less", "squared error of the UNet's target"),
+    "clean_latent_mse": Quantity("1", "less", "squared error of the clean latent"),
+    "reference_psnr": Quantity("dB", "more", "PSNR in the references' holes"),
+    "reconstruction": Quantity("", "less", "reconstruction term"),
+    "sds_gradient_mean": Quantity("1", "", "mean norm of the SDS gradient"),
+    "sds_gradient_max": Quantity("1", "", "largest norm of the SDS gradient"),
+    "residual": Quantity("1", "less", "relative residual"),
+    "disparity_error": Quantity("1", "less", "relative disparity error"),
+    "gaussians": Quantity("count", "", "Gaussians"),
+    "masked_gaussians": Quantity("count", "", "masked Gaussians"),
+}
+
+MAIN = {  # stage -> the quantities that stand for its error, the first that a trace has
+    "fit": ("psnr_held_out", "psnr"),
+    "personalize": ("clean_latent_mse",),
+    "distill": ("reference_psnr",),
+    "initialize": ("disparity_error", "residual"),
+}
+_ENDS = {"of", "kept", "reason"}
+
+
+def read_trace(path: Path) -> list[dict[str, Any]]:
+    """The lines of a `trace.jsonl` as they are; a line cut off by a kill is ignored."""
+    records = []
+    for line in path.read_text().splitlines():
+        try:
+            records.append(json.loads(line))
+        except json.JSONDecodeError:
+            continue
+    return records
+
+
+def load_trace(path: Path, stage: str) -> dict[str, list[dict[str, Any]]]:
+    """The lines of a stage's trace by series (docs/traces.md), "" for those without a name.
+
+    Raises:
+        ValueError: naming file, line and what does not follow the schema; or there is no file.
+    """
+    if not path.exists():
+        raise ValueError(f"{path}: no such file")
+    series: dict[str, list[dict[str, Any]]] = {}
+    seconds = 0.0
+    for number, line in enumerate(read_trace(path), 1):
+        own = series.setdefault(str(line.get("series", "")), [])
+        if wrong := _wrong(line, own[-1] if own else None, seconds, stage):
+            raise ValueError(f"{path}: line {number}: {wrong}")
+        own.append(line)
+        seconds = line["seconds"]
+    return series
+
+
+def main_quantity(stage: str, lines: list[dict[str, Any]]) -> str:
+    """The name of the quantity that stands for the stage's error in these lines of one series."""
+    for name in MAIN[stage]:
+        if any(name in line for line in lines):
+            return name
+    raise ValueError(f"a trace of {stage} has none of {', '.join(MAIN[stage])}")
+
+
+def _wrong(line: dict[str, Any], before: dict[str, Any] | None, seconds: float, stage: str) -> str | None:
+    """What does not follow the schema in a line, given the one before it in its series and the last moment."""
+    if missing := [key for key in ("seconds", "iteration") if key not in line]:
+        return f"no {missing[0]!r}"
+    texts = {"series", "reason"} & line.keys()
+    for key, value in line.items():
+        number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        if not (isinstance(value, str) if key in texts else number):
+            return f"{key} = {value!r}"
+    known = {"seconds", "iteration", "series", *QUANTITIES, *_ENDS}
+    if stage != "distill" and (strange := line.keys() - known):
+        return f"unknown quantity {sorted(strange)[0]!r}"
+    if line["seconds"] < seconds:
+        return f"its seconds fell from {seconds} to {line['seconds']}"
+    if line["iteration"] < 0 or (before and line["iteration"] <= before["iteration"]):
+        return f"iteration {line['iteration']} after {before['iteration'] if before else 'none'}"
+    if before and "reason" in before:
+        return "a line after the one with the reason of the end"
+    if (ends := _ENDS & line.keys()) and ends != _ENDS:
+        return f"{', '.join(sorted(ends))} without {', '.join(sorted(_ENDS - ends))}"
+    if ends and not (line["reason"] in REASONS and line["kept"] <= line["iteration"] <= line["of"]):
+        return f"an end of {line['iteration']} of {line['of']}, {line['kept']} kept, reason {line['reason']!r}"
+    return None
