@@ -4,6 +4,8 @@
 scene :=
 profile :=
 variant :=
+variants :=
+seeds :=
 set :=
 trust :=
 runs :=
@@ -24,13 +26,17 @@ STAGES := poses fit masks reference personalize initialize distill evaluate
 options = $(if $(profile),--profile '$(profile)') $(if $(variant),--variant '$(variant)') \
 	$(if $(set),--set "$$set") $(if $(trust),--trust) $(if $(runs),--runs '$(runs)')
 
-.PHONY: help setup all $(STAGES) plan clean batch demo prior prior-report test bench lint
+.PHONY: help setup all $(STAGES) plan compare report clean batch demo prior prior-report test bench lint
 .DELETE_ON_ERROR:
 
 help:
 	@echo 'make scene=demo all            the whole job; a second call finds everything cached'
 	@echo 'make scene=X STAGE             one stage and what it needs: $(STAGES)'
 	@echo 'make scene=X plan              what would run, and why'
+	@echo 'make scene=X compare           the full method, ablations and baselines side by side: runs/X/compare.html'
+	@echo '                               variants=a,b  only these; seeds=5  on demo, demo-1 ... demo-4, with intervals'
+	@echo 'make scene=X report            what was done, errors against seconds: runs/X/report/index.html'
+	@echo 'make data=FOLDER report        the same of all its scenes: runs/report/index.html'
 	@echo 'make scene=X clean             remove what was computed for it'
 	@echo 'make data=FOLDER batch         every scene of a folder, and one table'
 	@echo 'make demo [seed=N]             make the demo scene, or another: data/demo-N'
@@ -88,6 +94,21 @@ all $(STAGES): ready
 
 plan: ready
 	@$(PY) -m runner plan --scene '$(scene)' $(options)
+
+# On the demo scenes of other seeds too. A variant that fails (3) stops no other: the table is drawn, then make fails.
+others = $(if $(made),$(foreach n,$(shell seq 1 $$(( $(or $(seeds),1) - 1 ))),data/$(made)-$(n)/.generated))
+compare: ready $(others)
+	@$(PY) -m runner compare --scene '$(scene)' $(options) $(if $(variants),--variants '$(variants)') \
+		$(if $(seeds),--seeds '$(seeds)'); status=$$?; test $$status = 0 || test $$status = 3 || exit $$status; \
+		$(PY) -m report.compare --scene '$(scene)' $(if $(runs),--runs '$(runs)') && exit $$status
+
+report: $(if $(scene),ready,setup)
+ifneq ($(scene),)
+	@$(PY) -m runner plan --record --scene '$(scene)' $(options)
+	@$(PY) -m report.job --scene '$(scene)' $(if $(variant),--variant '$(variant)') $(if $(runs),--runs '$(runs)')
+else
+	@$(PY) -m report.job --data '$(data)' $(if $(variant),--variant '$(variant)') $(if $(runs),--runs '$(runs)')
+endif
 
 clean: named setup
 	@$(PY) -m runner clean --scene '$(scene)' $(options)

@@ -47,6 +47,12 @@ def save(drawn: Figure, path: Path) -> None:
     io.save_image(path, np.asarray(drawn.canvas.buffer_rgba())[..., :3].copy())
 
 
+def write(axes: Axes, text: str, at, offset=(0, 0), colour: str = INK, ha: str = "left", va: str = "center") -> None:
+    """Words beside a point of a chart; `offset` in points."""
+    look = {"fontsize": 9, "color": colour, "ha": ha, "va": va}
+    axes.annotate(text, at, offset, textcoords="offset points", **look)
+
+
 def spans(values: Sequence[float], factor: float = 12) -> bool:
     """Do positive values cover so much that a logarithmic axis serves them better?"""
     there = [value for value in values if value > 0]
@@ -133,7 +139,7 @@ def _box(point: np.ndarray, place: tuple[float, float], wide: float, high: float
 
 def _cost(box: np.ndarray, place: tuple[float, float], taken: list[np.ndarray], inside) -> float:
     """Pixels covered twice, those outside most; among free places the nearest."""
-    box = box + (-AIR, 0, AIR, 0)
+    box = box + np.array([-AIR, 0, AIR, 0])
     covered = sum(
         max(0, min(box[2], other[2]) - max(box[0], other[0])) * max(0, min(box[3], other[3]) - max(box[1], other[1]))
         for other in taken
@@ -178,7 +184,7 @@ def _interval(axes: Axes, difference: Difference, row: int, sign: int, far: floa
         side = "right" if (sign * mean > 0) else "left"
         text = f"{mean:+.2g} ▸" if side == "right" else f"◂ {mean:+.2g}"
         edge = float(np.copysign(far, mean))
-        axes.annotate(text, (edge, row), fontsize=9, color=colour, ha=side, va="center")
+        write(axes, text, (edge, row), colour=colour, ha=side)
         return
     if difference.scenes:
         ends = np.clip([mean - difference.scenes, mean + difference.scenes], -far, far)

@@ -28,7 +28,7 @@ TITLES = {
 DIGITS = {"psnr_box": 2, "ssim_box": 4, "flip_box": 4, "lpips_vgg_box": 4, "consistency": 5}
 ERRORS = {"flip_box": "FLIP in the box", "ssim_box": "1 − SSIM in the box", "lpips_vgg_box": "LPIPS (vgg) in the box"}
 SHORT = {"psnr_box": "PSNR, dB", "ssim_box": "SSIM", "flip_box": "FLIP", "lpips_vgg_box": "LPIPS (vgg)"}
-WAYS = {"inpainter": "2D inpainter", "perceptual": "perceptual distance"}  # keys of facts.json, in words
+WAYS = {"inpainter": "2D inpainter", "perceptual": "perceptual distance"}  # keys of the files, in words
 
 
 def make(home: Path) -> dict[str, Path]:
@@ -147,6 +147,9 @@ def notes(comparison: Comparison) -> list[str]:
     if not any(run.metrics.get("mean", {}).get("psnr_box") is not None for run in done):
         said.append("No box metrics: the scene has no ground truth.")
     said += dict.fromkeys(f"No LPIPS: {why}." for run in done if (why := run.metrics.get("lpips_unavailable")))
+    if any(row["consistency"] is not None for row in rows(comparison)):
+        words = "mean absolute difference inside the mask to the next view, by rendered depth; blur is consistent too."
+        said.append(f"consistency: {words}")
     said += dict.fromkeys(words for run in done for words in ways(run))
     for run in done:
         resumed = [stage for stage, receipt in run.receipts.items() if receipt.get("resumed")]
@@ -159,13 +162,11 @@ def notes(comparison: Comparison) -> list[str]:
 
 
 def ways(run: Run) -> list[str]:
-    """Which inpainter and which distance the stages of a method say they used."""
-    said = []
-    for stage, folder in run.folders.items():
-        if (folder / "facts.json").is_file():
-            facts = io.load_json(folder / "facts.json")
-            said += [f"{run.method}: {words} of {stage}: {facts[key]}." for key, words in WAYS.items() if facts.get(key)]
-    return said
+    """Which inpainter and which distance a method used, as metrics.json or the facts.json of its stages say."""
+    paths = [folder / "facts.json" for folder in run.folders.values()]
+    said = [run.metrics, *(io.load_json(path) for path in paths if path.is_file())]
+    found = {words: facts[key] for facts in said for key, words in WAYS.items() if facts.get(key)}
+    return [f"{run.method}: " + ", ".join(f"{words} {name}" for words, name in found.items()) + "."] if found else []
 
 
 def intervals(comparison: Comparison) -> str:
@@ -219,7 +220,8 @@ def main() -> None:
         made = make(arguments.runs / arguments.scene.expanduser().resolve().name)
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
-    print(made["md"].read_text(encoding="utf-8").split("## ")[0].split("\n", 2)[2].strip(), "", *made.values(), sep="\n")
+    text = made["md"].read_text(encoding="utf-8")
+    print(text[: text.find("\n\n![")].split("## ")[0].strip(), "", *made.values(), sep="\n")
 
 
 if __name__ == "__main__":

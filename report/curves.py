@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from reffusion.io.traces import MAIN, QUANTITIES
-from report.charts import BLUE, GREEN, GREY, INK, ORANGE, figure, plain_ticks, save, spans
+from report.charts import BLUE, GREEN, GREY, INK, ORANGE, figure, plain_ticks, save, spans, write
 from report.page import duration
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def best(name: str, values: Sequence[float]) -> int:
 
 
 def stage_chart(stage: str, series: dict[str, Lines], path: Path) -> list[str]:
-    """Error against seconds of work, a panel a quantity; gives back the quantities drawn, none where there is nothing."""
+    """Error against seconds of work, a panel a quantity; gives back the quantities drawn, or nothing."""
     names = quantities(stage, [line for lines in series.values() for line in lines])
     if not names:
         return []
@@ -75,12 +75,10 @@ def _curve(axes: Axes, name: str, points: np.ndarray, colour: str, main: bool) -
     """A line with its last value beside it; of the main quantity the best moment too, where that is another one."""
     axes.plot(*points.T, color=colour, linewidth=1.8, marker="o", markersize=3)
     last, top = points[-1], points[best(name, points[:, 1])]
-    axes.annotate(f"{last[1]:.3g}", last, (6, 0), textcoords="offset points", fontsize=9, color=colour, va="center")
+    write(axes, f"{last[1]:.3g}", last, (6, 0), colour)
     if main and top[1] != last[1]:
         axes.plot(*top, "o", markersize=8, markerfacecolor="none", color=ORANGE)
-        axes.annotate(
-            f"best {top[1]:.3g}", top, (-7, 0), textcoords="offset points", fontsize=9, color=ORANGE, ha="right", va="center"
-        )
+        write(axes, f"best {top[1]:.3g}", top, (-7, 0), ORANGE, ha="right")
 
 
 def from_edge(points: np.ndarray) -> np.ndarray:
@@ -116,7 +114,7 @@ def job_chart(
     for stage, lines in traces.items():
         names = [n for n in quantities(stage, lines)[:1] if n in QUANTITIES and QUANTITIES[n].unit == "dB"]
         if names and stage in begins:
-            curves[stage] = (names[0], column(lines, names[0]) + (begins[stage], 0))
+            curves[stage] = (names[0], column(lines, names[0]) + np.array([begins[stage], 0]))
     ends = {stage: (begins[stage] + seconds[stage], v) for stage, v in box.items() if v is not None and stage in begins}
     rows = 2 if curves or ends else 1
     bars = 0.6 + 0.26 * len(seconds)
@@ -136,14 +134,10 @@ def _errors(
         axes.plot(*points.T, color=colour, linewidth=1.8)
         words = f"{stage}: {QUANTITIES[name].label}, {points[-1, 1]:.1f}"
         late = points[-1, 0] > total / 2  # then there is no room to its right
-        place = {"xytext": (-8, 4), "ha": "right"} if late else {"xytext": (6, 0), "ha": "left"}
-        axes.annotate(words, points[-1], textcoords="offset points", fontsize=9, color=colour, va="center", **place)
+        write(axes, words, points[-1], *(((-8, 4), colour, "right") if late else ((6, 0), colour)))
     for stage, at in ends.items():
         axes.plot(*at, "D", color=INK, markersize=6)
-        axes.annotate(
-            f"box of the test views\nafter {stage}: {at[1]:.2f}", at, (-8, 0), textcoords="offset points", fontsize=9,
-            ha="right", va="center",
-        )  # fmt: skip
+        write(axes, f"box of the test views\nafter {stage}: {at[1]:.2f}", at, (-8, 0), ha="right")
     finals = [points[-1, 1] for _, points in curves.values()] + [value for _, value in ends.values()]
     highest = max([*finals, *(points[:, 1].max() for _, points in curves.values())])
     axes.set_ylim(min(finals) - 10, highest + 2)  # how a fit begins, at 10 dB, matters to no one
@@ -154,9 +148,7 @@ def _bars(axes: Axes, seconds: dict[str, float], begins: dict[str, float]) -> No
     total = sum(seconds.values())
     for row, (stage, value) in enumerate(seconds.items()):
         axes.barh(row, max(value, total / 500), left=begins[stage], color=GREY, height=0.62)
-        axes.annotate(
-            duration(value), (begins[stage] + value, row), (5, 0), textcoords="offset points", fontsize=9, va="center"
-        )
+        write(axes, duration(value), (begins[stage] + value, row), (5, 0))
     axes.set_yticks(range(len(seconds)), list(seconds))
     axes.set_ylim(len(seconds) - 0.4, -0.6)
     axes.set_xlim(0, total * 1.1)
@@ -191,10 +183,7 @@ def scenes_chart(curves: dict[str, tuple[str, list[np.ndarray]]], path: Path) ->
         axes.fill_between(moments, quartiles[0], quartiles[2], color=BLUE, alpha=0.2, linewidth=0)
         axes.plot(moments, quartiles[1], color=BLUE, linewidth=2)
         time_axis(axes, np.concatenate([points[:, 0] for points in lines]))
-        axes.annotate(
-            f"{quartiles[1, -1]:.3g}", (moments[-1], quartiles[1, -1]), (5, 0), textcoords="offset points", fontsize=9,
-            color=BLUE, va="center",
-        )  # fmt: skip
+        write(axes, f"{quartiles[1, -1]:.3g}", (moments[-1], quartiles[1, -1]), (5, 0), BLUE)
         axes.set_title(f"{stage}, {len(lines)} scenes\n{title(name)}", fontsize=9, loc="left")
         axes.set_xlabel("seconds of work", fontsize=10)
     save(made, path)

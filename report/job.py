@@ -92,7 +92,8 @@ def make(home: Path) -> Path:
     seconds = sum(receipt["seconds"] for receipt in job.receipts.values())
     done = f"{page.duration(seconds)} in {len(job.receipts)} stages"
     parts = [page.heading(title, 1), page.paragraph(f"{done}. {outcome(job)}")]
-    parts += pictures(job, out) + whole(job, out) + stages(job, out) + left_out(job) + receipts(job) + artifacts(job, out)
+    parts += pictures(job, out) + whole(job, out) + stages(job, out)
+    parts += left_out(job) + receipts(job) + artifacts(job, out)
     path = out / "index.html"
     path.write_text(page.document(title, parts), encoding="utf-8")
     return path
@@ -131,7 +132,9 @@ def whole(job: Job, out: Path) -> list[str]:
     curves.job_chart(seconds, {stage: own for stage, own in lines.items() if own}, box, out / "job.png")
     parts = [page.heading("The whole job"), page.picture(out / "job.png", "PSNR and stages against seconds")]
     if any(stage in lines for stage in ("fit", "distill")):
-        words = "Curves are of training views or references, each stage's own; the test views are only scored at the end."
+        words = (
+            "Curves: each stage's own error, on training views or references. Test views are only scored at the end."
+        )
         parts.append(page.paragraph(words, quiet=True))
     return parts + scores(job)
 
@@ -156,7 +159,7 @@ def stages(job: Job, out: Path) -> list[str]:
     for stage, series in job.traces.items():
         path = out / f"{stage}.png"
         if names := curves.stage_chart(stage, series, path):
-            parts += [page.heading(f"{stage}: error against seconds", 2), page.picture(path, f"{stage}: {', '.join(names)}")]
+            parts += [page.heading(f"{stage}: error against seconds"), page.picture(path, ", ".join(names))]
             parts += [page.paragraph(ended, quiet=True)] if (ended := end(series)) else []
     parts += [page.paragraph(f"Not drawn: {why}", quiet=True) for why in job.unread]
     return parts
@@ -192,8 +195,8 @@ def receipts(job: Job) -> list[str]:
     for stage, r in job.receipts.items():
         share = f"{100 * r['seconds'] / total:.0f}%" if total else "–"
         resumed = "last try only" if r.get("resumed") else ""
-        row = [stage, f"{r['seconds']:.1f}", share, f"{r['peak_memory_mb']:,}", r.get("device", "cpu"), r.get("machine", "")]
-        rows.append([*row, r["profile"], r.get("date", "")[:16].replace("T", " "), resumed])
+        place = [r.get("device", "cpu"), r.get("machine", ""), r["profile"], r.get("date", "")[:16].replace("T", " ")]
+        rows.append([stage, f"{r['seconds']:.1f}", share, f"{r['peak_memory_mb']:,}", *place, resumed])
     header = ["stage", "seconds", "share", "peak MB", "device", "machine", "profile", "made", ""]
     versions = {name: v for r in job.receipts.values() for name, v in r.get("versions", {}).items()}
     said = ", ".join(f"{name} {version}" for name, version in versions.items())

@@ -8,11 +8,13 @@ from html import escape
 from pathlib import Path
 
 STYLE = """
-body { font: 16px/1.5 system-ui, "DejaVu Sans", sans-serif; color: #222; max-width: 60rem; margin: 2rem auto; padding: 0 1rem }
+body { font: 16px/1.5 system-ui, "DejaVu Sans", sans-serif; color: #222; max-width: 60rem }
+body { margin: 2rem auto; padding: 0 1rem }
 h1 { font-size: 1.6rem; margin-bottom: .2rem } h2 { font-size: 1.2rem; margin: 2.2rem 0 .6rem }
 table { border-collapse: collapse; font-size: .85rem; font-variant-numeric: tabular-nums; margin: .6rem 0 }
-th, td { padding: .25rem .6rem; text-align: right; border-bottom: 1px solid #ddd; vertical-align: top; white-space: nowrap }
-th { font-weight: 600; border-bottom: 1px solid #888 } th:first-child, td:first-child { text-align: left; padding-left: 0 }
+th, td { padding: .25rem .6rem; text-align: right; border-bottom: 1px solid #ddd; vertical-align: top }
+th, td { white-space: nowrap } th:first-child, td:first-child { text-align: left; padding-left: 0 }
+th { font-weight: 600; border-bottom: 1px solid #888 }
 .text { text-align: left !important; white-space: normal } tr.ours td { background: #eef5fa }
 img { max-width: 100%; display: block; margin: .4rem 0 } p, li { max-width: 50rem }
 .wide { overflow-x: auto } .quiet { color: #666; font-size: .9rem } a { color: #0a5a8c }
@@ -22,8 +24,8 @@ img { max-width: 100%; display: block; margin: .4rem 0 } p, li { max-width: 50re
 def document(title: str, body: Sequence[str]) -> str:
     """A whole page; `title` is plain text, the parts of `body` are HTML."""
     head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{escape(title)}</title>'
-    parts = "\n".join(body)
-    return f'<!doctype html>\n<html lang="en"><head>{head}<style>{STYLE}</style></head>\n<body>\n{parts}\n</body></html>\n'
+    top = f'<!doctype html>\n<html lang="en"><head>{head}<style>{STYLE}</style></head>\n<body>'
+    return "\n".join([top, *body, "</body></html>\n"])
 
 
 def heading(text: str, level: int = 2) -> str:
@@ -66,7 +68,8 @@ def picture(path: Path, alt: str, embed: bool = False) -> str:
 
 def links(targets: dict[str, str]) -> str:
     """A list of {words: relative address}."""
-    return "<ul>" + "".join(f'<li><a href="{escape(to)}">{escape(name)}</a></li>' for name, to in targets.items()) + "</ul>"
+    lines = [f'<li><a href="{escape(to)}">{escape(name)}</a></li>' for name, to in targets.items()]
+    return "<ul>" + "".join(lines) + "</ul>"
 
 
 def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -96,7 +96,8 @@ def load_views(path: Path) -> dict[str, dict[str, float]]:
         return {}
     with open(path, newline="", encoding="utf-8") as file:
         rows = {row.pop("view"): row for row in csv.DictReader(file)}
-    return {view: {k: number for k, v in row.items() if (number := _number(k, v)) is not None} for view, row in rows.items()}
+    numbers = {view: {name: _number(name, text) for name, text in row.items()} for view, row in rows.items()}
+    return {view: {k: v for k, v in row.items() if v is not None} for view, row in numbers.items()}
 
 
 def _number(column: str, text: str | None) -> float | None:
@@ -160,10 +161,9 @@ def own_seconds(run: Run, full: Run) -> float | None:
 
 
 def consistency(run: Run) -> float | None:
-    """metrics.json's `consistency`, a number or an object with its `mean`."""
-    value = run.metrics.get("consistency")
-    value = value.get("mean") if isinstance(value, dict) else value
-    return float(value) if isinstance(value, int | float) else None
+    """The mean over pairs of neighbouring views, where metrics.json has it."""
+    value = (run.metrics.get("consistency") or {}).get("consistency")
+    return None if value is None else float(value)
 
 
 def save_csv(path: Path, rows: list[dict[str, Any]]) -> None:

@@ -30,7 +30,7 @@ def make(jobs: list[Job], out: Path) -> Path:
     if drawn := main_errors(jobs):
         curves.scenes_chart(drawn, out / "stages.png")
         parts += [page.heading("Error against seconds"), page.picture(out / "stages.png", "error against seconds")]
-        words = "Blue: the median and the quartiles of the scenes; grey: each scene. A stage that has ended keeps its error."
+        words = "Blue: median and quartiles of the scenes; grey: each scene. A stage that has ended keeps its error."
         parts.append(page.paragraph(words, quiet=True))
     parts += [page.heading("Median, and quartiles in brackets"), *tables(rows)]
     parts += [page.heading("Scenes"), by_scene(jobs, out)]

@@ -10,10 +10,12 @@ from pathlib import Path
 
 from runner.child import INTERRUPTED
 from runner.compare import compare
-from runner.execute import Failed, batch, clean, record_plan, run_scene, show_results
+from runner.execute import Failed, batch, clean, run_scene, show_results, write_json
 from runner.job import Request, prepare
 from runner.pipeline import Refused
-from runner.plan import plan, table
+from runner.plan import as_record, plan, table
+
+SOME_FAILED = 3  # compare: done, but for some variants
 
 
 def main() -> int:
@@ -27,14 +29,15 @@ def main() -> int:
             job = prepare(request)
             decisions = plan(job, job.pipeline.closure(arguments.stage))
             if arguments.record:
-                record_plan(job, decisions)
+                job.home.mkdir(parents=True, exist_ok=True)
+                write_json(job.home / "plan.json", as_record(job, decisions))
             else:
                 print(table(job, decisions))
         elif arguments.command == "run":
             stage, folder = list(run_scene(request, arguments.stage).items())[-1]
             show_results(stage, folder)
         elif arguments.command == "compare":
-            return 1 if compare(request, arguments.variants, arguments.seeds) else 0
+            return SOME_FAILED if compare(request, arguments.variants, arguments.seeds) else 0
         elif arguments.command == "batch":
             return 1 if batch(request, arguments.data) else 0
         else:

@@ -7,7 +7,6 @@ import re
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from runner.execute import Failed, run_scene, say, shown, write_json
