@@ -119,7 +119,8 @@ def label(axes: Axes, points: np.ndarray, names: Sequence[str], strong: np.ndarr
         )  # fmt: skip
         wide, high = text.get_window_extent(renderer).size
         boxes = [_box(pixels[index], place, wide, high, unit) for place in PLACES]
-        costs = [_cost(box, place, taken, inside) for box, place in zip(boxes, PLACES, strict=True)]
+        others = [box for number, box in enumerate(taken) if number != index]
+        costs = [_cost(box, place, others, inside) for box, place in zip(boxes, PLACES, strict=True)]
         best = int(np.argmin(costs))
         taken.append(boxes[best])
         corner = (boxes[best][:2] - pixels[index]) / unit
@@ -181,10 +182,10 @@ def _interval(axes: Axes, difference: Difference, row: int, sign: int, far: floa
     mean, views = difference.mean, difference.views or 0
     colour = GREY if abs(mean) <= views else BLUE if sign * mean > 0 else ORANGE
     if abs(mean) > far:
-        side = "right" if (sign * mean > 0) else "left"
-        text = f"{mean:+.2g} ▸" if side == "right" else f"◂ {mean:+.2g}"
-        edge = float(np.copysign(far, mean))
-        write(axes, text, (edge, row), colour=colour, ha=side)
+        worse = sign * mean < 0
+        words = f"◂ {mean:+.2g}" if worse else f"{mean:+.2g} ▸"
+        at = {"ha": "left" if worse else "right", "va": "center", "transform": axes.get_yaxis_transform()}
+        axes.text(0.01 if worse else 0.99, row, words.replace("-", "−"), fontsize=9, color=colour, **at)
         return
     if difference.scenes:
         ends = np.clip([mean - difference.scenes, mean + difference.scenes], -far, far)
