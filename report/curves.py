@@ -53,8 +53,10 @@ def stage_chart(stage: str, series: dict[str, Lines], path: Path) -> list[str]:
     for axes, name in zip(grid[0], names, strict=True):
         drawn = {key: column(lines, name) for key, lines in series.items()}
         drawn = {key: from_edge(points) for key, points in drawn.items() if len(points)}
-        for points in drawn.values():
-            _curve(axes, name, points, BLUE if len(drawn) == 1 else GREY, len(drawn) == 1 and name == names[0])
+        alone = len(drawn) == 1
+        for key, points in drawn.items():
+            words = "" if alone else f" {key}"
+            _curve(axes, name, points, BLUE if alone else GREY, words, main=alone and name == names[0])
         values = np.concatenate([points[:, 1] for points in drawn.values()])
         if spans(values, 10) and values.min() > 0:
             axes.set_yscale("log")
@@ -71,11 +73,11 @@ def column(lines: Lines, name: str) -> np.ndarray:
     return np.array([(line["seconds"], line[name]) for line in lines if name in line], np.float64).reshape(-1, 2)
 
 
-def _curve(axes: Axes, name: str, points: np.ndarray, colour: str, main: bool) -> None:
+def _curve(axes: Axes, name: str, points: np.ndarray, colour: str, words: str, main: bool) -> None:
     """A line with its last value beside it; of the main quantity the best moment too, where that is another one."""
     axes.plot(*points.T, color=colour, linewidth=1.8, marker="o", markersize=3)
     last, top = points[-1], points[best(name, points[:, 1])]
-    write(axes, f"{last[1]:.3g}", last, (6, 0), colour)
+    write(axes, f"{last[1]:.3g}{words}", last, (6, 0), colour if main or not words else INK)
     if main and top[1] != last[1]:
         axes.plot(*top, "o", markersize=8, markerfacecolor="none", color=ORANGE)
         write(axes, f"best {top[1]:.3g}", top, (-7, 0), ORANGE, ha="right")

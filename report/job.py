@@ -17,7 +17,7 @@ from reffusion.io.traces import load_trace
 from report import curves, page, scenes, sheet
 from report.results import load_receipts
 
-ORDER = ("poses", "fit", "masks", "reference", "personalize", "initialize", "distill", "evaluate")
+ORDER = ("poses", "fit", "masks", "reference", "lift", "personalize", "initialize", "distill", "evaluate")
 WORDS = {
     "skip": "left out", "provided": "brought by the scene", "cached": "done", "run": "would run", "stale": "would run",
     "missing": "cannot run", "undecided": "not decided yet",
@@ -41,7 +41,7 @@ class Job:
 
     Attributes:
         home: runs/<scene>, or runs/<scene>@<variant>.
-        plan: stage -> word, reason, notes, as the runner wrote them to plan.json; empty without that file.
+        plan: stage -> word, reason, notes, as the runner wrote them to plan.json; or empty, see `load_plan`.
         folders: stage -> its artifact, in order; a variant's may lie with the scene's own run.
         receipts: stage -> receipt.json.
         traces: stage -> series -> lines.
@@ -60,8 +60,7 @@ class Job:
 
 def load_job(home: Path) -> Job:
     """Raises ValueError where no stage has been done."""
-    path = home / "plan.json"
-    plan = io.load_json(path)["stages"] if path.exists() else {}
+    plan = load_plan(home)
     names = list(plan or ORDER)
     places = {s: home.parent / plan[s]["folder"] if plan and plan[s]["folder"] else None for s in plan}
     found = {stage: places.get(stage) or sheet.stage_folder(home, stage) for stage in names}
@@ -79,6 +78,14 @@ def load_job(home: Path) -> Job:
     metrics = folders.get("evaluate", Path()) / "metrics.json"
     scores = io.load_json(metrics) if metrics.is_file() else {}
     return Job(home, plan, folders, load_receipts(folders), traces, tuple(unread), scores)
+
+
+def load_plan(home: Path) -> dict[str, dict[str, Any]]:
+    """plan.json's stages; empty where there is none, or a stage was done after it was written."""
+    path = home / "plan.json"
+    if not path.exists() or any(r.stat().st_mtime > path.stat().st_mtime for r in home.glob("*/receipt.json")):
+        return {}
+    return io.load_json(path)["stages"]
 
 
 def make(home: Path) -> Path:
@@ -184,7 +191,7 @@ def left_out(job: Job) -> list[str]:
         for stage, said in job.plan.items()
         if said["word"] != "cached" or said["reason"]
     ]
-    parts = [page.heading("What was left out, and why")]
+    parts = [page.heading("What was left out or taken over, and why")]
     return parts + ([page.table(["stage", "", "because"], rows, text=(1, 2))] if rows else [page.paragraph("Nothing.")])
 
 

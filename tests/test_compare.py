@@ -320,7 +320,7 @@ def test_report_of_a_job(compared, home):
     assert "3 of 8 steps, stopped early: no gain any more; the state of step 2 was kept." in html
     targets = re.findall(r'href="([^"]*)"', html)
     assert len(targets) == 3 and all((path.parent / target).exists() for target in targets)
-    assert "What was left out, and why" in html and "http" not in html
+    assert "What was left out or taken over, and why" in html and "http" not in html
 
 
 def test_report_of_a_variant_says_what_was_left_out(compared, home):
