@@ -4,12 +4,12 @@
 scene :=
 profile :=
 variant :=
-variants :=
-seeds :=
 set :=
 trust :=
 runs :=
 data := data
+variants :=
+seeds :=
 seed :=
 name :=
 steps :=

@@ -178,7 +178,11 @@ def end(series: dict[str, curves.Lines]) -> str:
     if "reason" not in last:
         return ""
     text = f"{last['iteration']} of {last['of']} steps"
-    text += f", stopped early: {ENDS.get(last['reason'], last['reason'])}" if last["iteration"] < last["of"] else ""
+    if last["iteration"] < last["of"]:
+        text += f", stopped early: {ENDS.get(last['reason'], last['reason'])}"
+        if last["iteration"]:  # what the others would have taken, at the same pace
+            saved = last["seconds"] / last["iteration"] * (last["of"] - last["iteration"])
+            text += f", which saved about {page.duration(saved)}"
     return text + (f"; the state of step {last['kept']} was kept." if last["kept"] != last["iteration"] else ".")
 
 

@@ -103,7 +103,8 @@ def _wrong(line: dict[str, Any], before: dict[str, Any] | None, seconds: float, 
         return f"unknown quantity {sorted(strange)[0]!r}"
     if line["seconds"] < seconds:
         return f"its seconds fell from {seconds} to {line['seconds']}"
-    if line["iteration"] < 0 or (before and line["iteration"] <= before["iteration"]):
+    rises = before is None or line["iteration"] > before["iteration"]
+    if line["iteration"] < 0 or not (rises or ("reason" in line and line["iteration"] == before["iteration"])):
         return f"iteration {line['iteration']} after {before['iteration'] if before else 'none'}"
     if before and "reason" in before:
         return "a line after the one with the reason of the end"
