@@ -26,7 +26,7 @@ STAGES := poses fit masks reference personalize initialize distill evaluate
 options = $(if $(profile),--profile '$(profile)') $(if $(variant),--variant '$(variant)') \
 	$(if $(set),--set "$$set") $(if $(trust),--trust) $(if $(runs),--runs '$(runs)')
 
-.PHONY: help setup all $(STAGES) plan compare report clean batch demo prior prior-report test bench lint
+.PHONY: help setup all $(STAGES) plan clean batch demo prior prior-report test bench lint
 .DELETE_ON_ERROR:
 
 help:
@@ -95,6 +95,7 @@ all $(STAGES): ready
 plan: ready
 	@$(PY) -m runner plan --scene '$(scene)' $(options)
 
+.PHONY: compare report
 # On the demo scenes of other seeds too. A variant that fails (3) stops no other: the table is drawn, then make fails.
 others = $(if $(made),$(foreach n,$(shell seq 1 $$(( $(or $(seeds),1) - 1 ))),data/$(made)-$(n)/.generated))
 compare: ready $(others)

@@ -4,7 +4,7 @@
 - keys.py: what an artifact depends on, as hashes: contents of folders, code, parameters.
 - job.py: a request with everything about it resolved and checked.
 - plan.py: one word and a reason for each stage, from what lies on the disk.
-- execute.py: locks, fresh processes, folders renamed into place, receipts, batches.
 - compare.py: a scene's own run and every variant of it.
+- execute.py: locks, fresh processes, folders renamed into place, receipts, batches.
 - child.py: the other side: the process in which stages are imported.
 """
