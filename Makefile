@@ -9,6 +9,8 @@ set :=
 trust :=
 runs :=
 data := data
+variants :=
+seeds :=
 seed :=
 name :=
 steps :=
@@ -35,6 +37,10 @@ help:
 	@echo 'make scene=demo all            the whole job; a second call finds everything cached'
 	@echo 'make scene=X STAGE             one stage and what it needs: $(STAGES)'
 	@echo 'make scene=X plan              what would run, and why'
+	@echo 'make scene=X compare           the full method, ablations and baselines side by side: runs/X/compare.html'
+	@echo '                               variants=a,b  only these; seeds=5  on demo, demo-1 ... demo-4, with intervals'
+	@echo 'make scene=X report            what was done, errors against seconds: runs/X/report/index.html'
+	@echo 'make data=FOLDER report        the same of all its scenes: runs/report/index.html'
 	@echo 'make scene=X clean             remove what was computed for it'
 	@echo 'make data=FOLDER batch         every scene of a folder, and one table'
 	@echo 'make demo [seed=N]             make the demo scene, or another: data/demo-N'
@@ -96,6 +102,22 @@ all $(STAGES): ready
 
 plan: ready
 	@$(PY) -m runner plan --scene '$(scene)' $(options)
+
+.PHONY: compare report
+# On the demo scenes of other seeds too. A variant that fails (3) stops no other: the table is drawn, then make fails.
+others = $(if $(made),$(foreach n,$(shell seq 1 $$(( $(or $(seeds),1) - 1 ))),data/$(made)-$(n)/.generated))
+compare: ready $(others)
+	@$(PY) -m runner compare --scene '$(scene)' $(options) $(if $(variants),--variants '$(variants)') \
+		$(if $(seeds),--seeds '$(seeds)'); status=$$?; test $$status = 0 || test $$status = 3 || exit $$status; \
+		$(PY) -m report.compare --scene '$(scene)' $(if $(runs),--runs '$(runs)') && exit $$status
+
+report: $(if $(scene),ready,setup)
+ifneq ($(scene),)
+	@$(PY) -m runner plan --record --scene '$(scene)' $(options)
+	@$(PY) -m report.job --scene '$(scene)' $(if $(variant),--variant '$(variant)') $(if $(runs),--runs '$(runs)')
+else
+	@$(PY) -m report.job --data '$(data)' $(if $(variant),--variant '$(variant)') $(if $(runs),--runs '$(runs)')
+endif
 
 clean: named setup
 	@$(PY) -m runner clean --scene '$(scene)' $(options)

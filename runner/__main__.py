@@ -1,4 +1,4 @@
-"""python -m runner plan|run|batch|weights|clean --scene NAME: what the Makefile calls."""
+"""python -m runner plan|run|compare|batch|weights|clean --scene NAME: what the Makefile calls."""
 
 from __future__ import annotations
 
@@ -9,11 +9,14 @@ import sys
 from pathlib import Path
 
 from runner.child import INTERRUPTED
-from runner.execute import Failed, batch, clean, run_scene, show_results
+from runner.compare import compare
+from runner.execute import Failed, batch, clean, run_scene, show_results, write_json
 from runner.job import Request, prepare
 from runner.pipeline import Refused
-from runner.plan import plan, table
+from runner.plan import as_record, plan, table
 from runner.weights import weights
+
+SOME_FAILED = 3  # compare: done, but for some variants
 
 
 def main() -> int:
@@ -26,10 +29,17 @@ def main() -> int:
     try:
         if arguments.command == "plan":
             job = prepare(request)
-            print(table(job, plan(job, job.pipeline.closure(arguments.stage))))
+            decisions = plan(job, job.pipeline.closure(arguments.stage))
+            if arguments.record:
+                job.home.mkdir(parents=True, exist_ok=True)
+                write_json(job.home / "plan.json", as_record(job, decisions))
+            else:
+                print(table(job, decisions))
         elif arguments.command == "run":
             stage, folder = list(run_scene(request, arguments.stage).items())[-1]
             show_results(stage, folder)
+        elif arguments.command == "compare":
+            return SOME_FAILED if compare(request, arguments.variants, arguments.seeds) else 0
         elif arguments.command == "batch":
             return 1 if batch(request, arguments.data) else 0
         elif arguments.command == "weights":
@@ -50,12 +60,15 @@ def main() -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="runner", description=__doc__)
-    parser.add_argument("command", choices=["plan", "run", "batch", "weights", "clean"])
+    parser.add_argument("command", choices=["plan", "run", "compare", "batch", "weights", "clean"])
     parser.add_argument("stage", nargs="?", default="all", help="run this stage and what it needs; `all` (default)")
     parser.add_argument("--scene", default="", help="a name under data/, or a path")
     parser.add_argument("--data", type=Path, default=Path("data"), help="batch: the folder of scenes")
     parser.add_argument("--profile", help="auto, laptop or paper")
     parser.add_argument("--variant", help="a variant of pipeline.yaml")
+    parser.add_argument("--variants", default="", help="compare: these only, with commas between")
+    parser.add_argument("--seeds", type=int, default=1, help="compare: on so many scenes: X, X-1, X-2 ...")
+    parser.add_argument("--record", action="store_true", help="plan: write it to runs/<scene>/plan.json")
     parser.add_argument("--trust", action="store_true", help="accept artifacts made by older code")
     parser.add_argument("--budget", help="time for the whole job, like 5m: sets the number of steps")
     parser.add_argument("--offline", action="store_true", help="weights: only say what is missing")

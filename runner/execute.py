@@ -22,7 +22,7 @@ from typing import Any
 
 from runner.job import Job, Request, child, prepare, source_of
 from runner.pipeline import SCENE, Refused
-from runner.plan import MACHINE, RECEIPT, Decision, decide, expected_seconds, partial_folder, plan, table
+from runner.plan import MACHINE, RECEIPT, Decision, decide, expected_seconds, partial_folder, plan, receipt, table
 
 PACKAGES = ("reffusion", "numpy", "torch", "numba", "diffusers", "transformers", "peft", "pycolmap", "gsplat")
 GRACE = 20.0  # seconds an interrupted stage has to end by itself
@@ -102,6 +102,8 @@ def run_stage(job: Job, stage: str, decision: Decision, earlier: dict[str, Decis
     """Do the stage in `.partial-<stage>-<key>`, which may hold what an earlier try left, and put it in place."""
     assert decision.inputs
     partial, place = partial_folder(job, stage, decision.inputs.key), job.home / stage
+    if not partial.exists() and (other := copied_from_variant(job, stage, decision.inputs.key, partial)):
+        say(f"{stage}: the same as in {other}: copied")
     if not (partial / RECEIPT).exists():  # it is there where the runner was killed just before the swap
         resumed = partial.exists()
         partial.mkdir(parents=True, exist_ok=True)
@@ -115,6 +117,20 @@ def run_stage(job: Job, stage: str, decision: Decision, earlier: dict[str, Decis
         discard(other)
     job.hashes.save()
     return replace(decision, word="cached", reason="made now", path=place, settled=True)
+
+
+def copied_from_variant(job: Job, stage: str, key: str, to: Path) -> str | None:
+    """Where another variant of the scene has done this very work, copy it; that variant's folder, or None."""
+    for home in sorted(job.runs.glob(f"{job.name}@*")):
+        if home != job.home and (receipt(home / stage) or {}).get("key") == key:
+            with suppress(Refused), locked(job.runs, home.name, shared=True, wait=False):
+                copy, found = job.home / f".copying-{stage}", receipt(home / stage)
+                discard(copy)
+                if found and found["key"] == key and job.hashes.folder(home / stage) == found["output"]:
+                    shutil.copytree(home / stage, copy)
+                    copy.rename(to)
+                    return home.name
+    return None
 
 
 def _in_child(job: Job, stage: str, partial: Path, earlier: dict[str, Decision], lock: int) -> dict[str, Any]:

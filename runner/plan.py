@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import platform
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -233,6 +234,20 @@ def table(job: Job, decisions: dict[str, Decision]) -> str:
         lines.append(f"  {decision.word:<9} {stage:<12} {time:>7}  {decision.reason}".rstrip())
         lines += [f"{'':33}{note}" for note in decision.notes]
     return "\n".join(lines)
+
+
+def as_record(job: Job, decisions: dict[str, Decision]) -> dict[str, Any]:
+    """The same for plan.json, which the report reads: stage -> word, reason, notes, artifact's folder below runs/."""
+    stages = {
+        stage: {
+            "word": decision.word,
+            "reason": decision.reason,
+            "notes": list(decision.notes),
+            "folder": decision.path and os.path.relpath(decision.path, job.runs),
+        }
+        for stage, decision in decisions.items()
+    }
+    return {"profile": job.profile, "stages": stages}
 
 
 def expected_seconds(job: Job, stage: str) -> float | None:

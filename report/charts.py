@@ -1,0 +1,201 @@
+"""The look of all charts, and those of a comparison: error against run time, differences to the full method."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from reffusion import io
+from report.paired import Difference, pareto
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Okabe and Ito's colours, told apart by every kind of eye.
+BLUE, ORANGE, GREEN, GREY, INK = "#0072B2", "#D55E00", "#009E73", "#8a8a8a", "#222222"
+WIDTH, DPI = 9.6, 200  # inches, as wide as a page
+AIR = 12  # pixels between a label and what stands beside it
+PLACES = [(6, 0), (-6, 0), (5, 7), (-5, 7), (5, -7), (-5, -7), (0, 10), (0, -10),
+          (14, 14), (-14, 14), (14, -14), (-14, -14), (0, 22), (0, -22), (26, 24), (-26, 24), (26, -24), (-26, -24),
+          (0, 34), (0, -34), (40, 34), (-40, 34), (40, -34), (-40, -34)]  # fmt: skip
+
+
+def figure(height: float, rows: int = 1, columns: int = 1, **options) -> tuple[Figure, np.ndarray]:
+    """A figure of the page's width and its axes [rows, columns], in the common style."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    made = Figure((WIDTH, height), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(made)
+    grid = made.subplots(rows, columns, squeeze=False, **options)
+    for axes in grid.flat:
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.spines[["left", "bottom"]].set_color("#999")
+        axes.tick_params(colors=INK, labelsize=9, color="#999")
+        axes.grid(color="#eee", linewidth=0.8)
+        axes.set_axisbelow(True)
+    return made, grid
+
+
+def save(drawn: Figure, path: Path) -> None:
+    drawn.canvas.draw()
+    io.save_image(path, np.asarray(drawn.canvas.buffer_rgba())[..., :3].copy())
+
+
+def write(axes: Axes, text: str, at, offset=(0, 0), colour: str = INK, ha: str = "left", va: str = "center") -> None:
+    """Words beside a point of a chart; `offset` in points."""
+    look = {"fontsize": 9, "color": colour, "ha": ha, "va": va}
+    axes.annotate(text, at, offset, textcoords="offset points", **look)
+
+
+def spans(values: Sequence[float], factor: float = 12) -> bool:
+    """Do positive values cover so much that a logarithmic axis serves them better?"""
+    there = [value for value in values if value > 0]
+    return len(there) > 1 and max(there) > factor * min(there)
+
+
+def plain_ticks(axes: Axes, which: str = "x") -> None:
+    """A logarithmic axis with 10, 20, 50, 100 instead of powers."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis = axes.xaxis if which == "x" else axes.yaxis
+    low, high = axes.get_xlim() if which == "x" else axes.get_ylim()
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high / max(low, 1e-12) < 300 else (1,)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+# ------------------------------------------------------------------------------------------- error against run time
+
+
+def tradeoff(names: Sequence[str], seconds: Sequence[float], errors: dict[str, Sequence[float]], path: Path) -> None:
+    """All methods, a panel for each error (title -> a value a method, less is better), the Pareto front marked."""
+    made, grid = figure(0.5 + 3.6 * len(errors), len(errors), sharex=True)
+    for axes, (title, values) in zip(grid[:, 0], errors.items(), strict=True):
+        front = pareto(seconds, values)
+        order = np.argsort(np.asarray(seconds)[front], kind="stable")
+        steps = np.column_stack([seconds, values])[front][order]
+        axes.step(steps[:, 0], steps[:, 1], where="post", color=BLUE, linewidth=1.2, alpha=0.6)
+        axes.plot(*np.column_stack([seconds, values])[~front].T, "o", color=GREY, markersize=6, markerfacecolor="white")
+        axes.plot(*steps.T, "o", color=BLUE, markersize=7)
+        axes.set_ylabel(title, fontsize=10)
+        if spans(seconds):
+            axes.set_xscale("log")
+            plain_ticks(axes)
+        else:
+            low, high = min(seconds), max(seconds)
+            axes.set_xlim(0 if low < 0.3 * high else low - 0.15 * (high - low), high + 0.15 * (high - low) or None)
+        axes.set_ylim(0, max(values) * 1.12 or 1)
+    grid[-1, 0].set_xlabel("seconds of the whole job, evaluation included", fontsize=10)
+    note = "filled, on the line: the Pareto front (no other method is as fast and as good)"
+    grid[0, 0].set_title(note, fontsize=9, color=BLUE, loc="left")
+    made.canvas.draw()  # the layout is final: labels can be placed
+    made.set_layout_engine("none")
+    for axes, values in zip(grid[:, 0], errors.values(), strict=True):
+        label(axes, np.column_stack([seconds, values]), names, pareto(seconds, values))
+    save(made, path)
+
+
+def label(axes: Axes, points: np.ndarray, names: Sequence[str], strong: np.ndarray) -> None:
+    """Write each name [n] beside its point [n, 2], where it covers no other point or name; a thin line if far off."""
+    renderer = axes.figure.canvas.get_renderer()
+    unit = axes.figure.dpi / 72
+    pixels = axes.transData.transform(points)
+    taken = [np.array([x - 5 * unit, y - 5 * unit, x + 5 * unit, y + 5 * unit]) for x, y in pixels]
+    steps = pixels[strong][np.argsort(pixels[strong][:, 0], kind="stable")]
+    for (x, y), (to_x, to_y) in pairwise(steps):  # the front's own line
+        taken += [np.array([x, y - unit, to_x, y + unit]), np.array([to_x - unit, to_y, to_x + unit, y])]
+    inside = axes.get_window_extent(renderer)
+    for index in np.argsort(-pixels[:, 0], kind="stable"):
+        colour = BLUE if strong[index] else INK
+        text = axes.annotate(
+            names[index], points[index], (0, 0), textcoords="offset points", fontsize=9, color=colour, va="bottom",
+            weight="bold" if names[index] == "full" else "normal",
+        )  # fmt: skip
+        wide, high = text.get_window_extent(renderer).size
+        boxes = [_box(pixels[index], place, wide, high, unit) for place in PLACES]
+        others = [box for number, box in enumerate(taken) if number != index]
+        costs = [_cost(box, place, others, inside) for box, place in zip(boxes, PLACES, strict=True)]
+        best = int(np.argmin(costs))
+        taken.append(boxes[best])
+        corner = (boxes[best][:2] - pixels[index]) / unit
+        text.set_position(tuple(corner))
+        if np.hypot(*PLACES[best]) > 12:
+            end = np.array(PLACES[best]) * 0.85
+            line = {"arrowstyle": "-", "color": "#bbb", "linewidth": 0.7, "shrinkA": 0, "shrinkB": 4}
+            axes.annotate("", points[index], tuple(end), textcoords="offset points", arrowprops=line)
+
+
+def _box(point: np.ndarray, place: tuple[float, float], wide: float, high: float, unit: float) -> np.ndarray:
+    """[left, bottom, right, top] in pixels of a text of that size at an offset in points."""
+    x, y = point + np.array(place) * unit
+    left = x - wide / 2 if place[0] == 0 else x if place[0] > 0 else x - wide
+    return np.array([left, y - high / 2, left + wide, y + high / 2])
+
+
+def _cost(box: np.ndarray, place: tuple[float, float], taken: list[np.ndarray], inside) -> float:
+    """Pixels covered twice, those outside most; among free places the nearest."""
+    box = box + np.array([-AIR, 0, AIR, 0])
+    covered = sum(
+        max(0, min(box[2], other[2]) - max(box[0], other[0])) * max(0, min(box[3], other[3]) - max(box[1], other[1]))
+        for other in taken
+    )
+    outside = max(0, inside.x0 - box[0], box[2] - inside.x1) + max(0, inside.y0 - box[1], box[3] - inside.y1)
+    return covered + 1000 * outside + 2 * float(np.hypot(*place))
+
+
+# --------------------------------------------------------------------------------------- differences to the full one
+
+
+def forest(differences: dict[str, dict[str, Difference]], titles: dict[str, str], more: set[str], path: Path) -> None:
+    """A panel for each metric: method minus full, with its intervals; what lies to the left is worse in all panels.
+
+    `more`: the metrics of which more is better. Orange and blue: the interval over views leaves zero out.
+    """
+    names = list(dict.fromkeys(name for by_method in differences.values() for name in by_method))
+    made, grid = figure(0.9 + 0.3 * len(names), 1, len(differences), sharey=True)
+    for axes, (metric, by_method) in zip(grid[0], differences.items(), strict=True):
+        axes.axvline(0, color=INK, linewidth=1)
+        axes.grid(axis="y", visible=False)
+        far = _far(list(by_method.values()))
+        for row, name in enumerate(names):
+            if name in by_method:
+                _interval(axes, by_method[name], row, 1 if metric in more else -1, far)
+        axes.set_xlabel(titles[metric], fontsize=10)
+        if metric not in more:
+            axes.invert_xaxis()
+        axes.locator_params(axis="x", nbins=4)
+    grid[0, 0].set_yticks(range(len(names)), names)
+    grid[0, 0].set_ylim(len(names) - 0.4, -0.6)
+    grid[0, 0].set_title("← worse than full", fontsize=9, color=ORANGE, loc="left")
+    grid[0, -1].set_title("better than full →", fontsize=9, color=BLUE, loc="right")
+    save(made, path)
+
+
+def _interval(axes: Axes, difference: Difference, row: int, sign: int, far: float) -> None:
+    """One row of a panel; what lies further off than `far` is an arrow with its number."""
+    mean, views = difference.mean, difference.views or 0
+    colour = GREY if abs(mean) <= views else BLUE if sign * mean > 0 else ORANGE
+    if abs(mean) > far:
+        worse = sign * mean < 0
+        words = f"◂ {mean:+.2g}" if worse else f"{mean:+.2g} ▸"
+        at = {"ha": "left" if worse else "right", "va": "center", "transform": axes.get_yaxis_transform()}
+        axes.text(0.01 if worse else 0.99, row, words.replace("-", "−"), fontsize=9, color=colour, **at)
+        return
+    if difference.scenes:
+        ends = np.clip([mean - difference.scenes, mean + difference.scenes], -far, far)
+        axes.plot(ends, [row, row], color=colour, linewidth=1.2, solid_capstyle="butt")
+    axes.plot([mean - views, mean + views], [row, row], color=colour, linewidth=4, solid_capstyle="butt")
+    axes.plot(mean, row, "o", markersize=6, color=colour)
+
+
+def _far(differences: Sequence[Difference]) -> float:
+    """How far a panel reaches, so that some methods that fail do not press all others together."""
+    sizes = np.abs([difference.mean for difference in differences])
+    usual = 3 * float(np.median(sizes))
+    return usual if sizes.max() > usual > 0 else np.inf

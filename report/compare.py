@@ -1,0 +1,228 @@
+"""What `make scene=X compare` ran, as tables and pictures: runs/X/compare.md, .csv and .html.
+
+python -m report.compare --scene X --runs runs
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from reffusion import io
+from report import charts, page, pictures
+from report.results import AGAINST, BETTER, FULL, Comparison, Run, differences, load, rows, save_csv
+
+TITLES = {
+    "method": "method",
+    "psnr_box": "PSNR, dB ↑",
+    "ssim_box": "SSIM ↑",
+    "flip_box": "FLIP ↓",
+    "lpips_vgg_box": "LPIPS (vgg) ↓",
+    "consistency": "consistency ↓",
+    "seconds": "seconds",
+    "own_seconds": "own seconds",
+    "peak_memory_mb": "peak MB",
+    "gaussians": "Gaussians",
+}
+DIGITS = {"psnr_box": 2, "ssim_box": 4, "flip_box": 4, "lpips_vgg_box": 4, "consistency": 5}
+ERRORS = {"flip_box": "FLIP in the box", "ssim_box": "1 − SSIM in the box", "lpips_vgg_box": "LPIPS (vgg) in the box"}
+SHORT = {"psnr_box": "PSNR, dB", "ssim_box": "SSIM", "flip_box": "FLIP", "lpips_vgg_box": "LPIPS (vgg)"}
+WAYS = {"inpainter": "2D inpainter", "perceptual": "perceptual distance"}  # keys of the files, in words
+
+
+def make(home: Path) -> dict[str, Path]:
+    """Write the table and the pages of runs/<scene>; gives back {"csv", "md", "html"}.
+
+    Pictures go to runs/<scene>/compare/ and into the HTML page, which needs no other file.
+
+    Raises:
+        ValueError: nothing was compared yet.
+    """
+    comparison = load(home)
+    out = home / "compare"
+    out.mkdir(exist_ok=True)
+    for old in out.glob("*.png"):
+        old.unlink()
+    table = rows(comparison)
+    paths = {kind: home / f"compare.{kind}" for kind in ("csv", "md", "html")}
+    save_csv(paths["csv"], table)
+    drawn = {
+        "Error against run time": tradeoff(table, out / "tradeoff.png"),
+        "Difference to the full method": forest(comparison, out / "differences.png"),
+    }
+    views = pictures.sheets(comparison, out)
+    paths["md"].write_text(markdown(comparison, table, drawn, views), encoding="utf-8")
+    paths["html"].write_text(html(comparison, table, drawn, views), encoding="utf-8")
+    return paths
+
+
+# -------------------------------------------------------------------------------------------------------- figures
+
+
+def tradeoff(table: list[dict[str, Any]], path: Path) -> Path | None:
+    """Error against seconds of what is done: the box errors there are; the inconsistency where there is no truth."""
+    errors = {}
+    for name, title in {**ERRORS, "consistency": "inconsistency between views"}.items():
+        there = [row for row in table if row[name] is not None]
+        if there and not (name == "consistency" and errors):
+            errors[title] = {row["method"]: 1 - row[name] if name == "ssim_box" else row[name] for row in there}
+    common = [row for row in table if errors and all(row["method"] in values for values in errors.values())]
+    if not common:
+        return None
+    names, seconds = [row["method"] for row in common], [row["seconds"] for row in common]
+    charts.tradeoff(names, seconds, {title: [values[n] for n in names] for title, values in errors.items()}, path)
+    return path
+
+
+def forest(comparison: Comparison, path: Path) -> Path | None:
+    found = {metric: by_method for metric in BETTER if (by_method := differences(comparison, metric))}
+    if not found:
+        return None
+    more = {metric for metric, better in BETTER.items() if better == "more"}
+    charts.forest(found, {metric: f"{SHORT[metric]}, minus full" for metric in found}, more, path)
+    return path
+
+
+# --------------------------------------------------------------------------------------------------------- tables
+
+
+def cells(table: list[dict[str, Any]]) -> tuple[list[str], list[list[str]], list[list[bool]]]:
+    """Header, texts and which are best in their column; a metric that no method has is left out."""
+    names = [name for name in TITLES if name == "method" or any(row[name] is not None for row in table)]
+    best = {}
+    for name, better in {**BETTER, "consistency": "less"}.items():
+        values = [row[name] for row in table if row[name] is not None]
+        best[name] = (max if better == "more" else min)(values, default=None) if len(values) > 1 else None
+    texts, bold = [], []
+    for row in table:
+        state = "" if row["state"] == "done" else f" ({row['state']})"
+        texts.append([row["method"] + state if n == "method" else page.number(row[n], DIGITS.get(n, 0)) for n in names])
+        bold.append([best.get(n) is not None and row[n] == best[n] for n in names])
+    return [TITLES[name] for name in names], texts, bold
+
+
+def difference_cells(table: list[dict[str, Any]]) -> tuple[list[str], list[list[str]]] | None:
+    """Method minus full: the mean, half its interval over views, and over scenes where there are several."""
+    found = [metric for metric in BETTER if any(row[f"{metric}_minus_full"] is not None for row in table)]
+    lines = [[row["method"], *(_signed(row, metric) for metric in found)] for row in table if row["method"] != FULL]
+    return (["method", *(SHORT[metric] for metric in found)], lines) if found else None
+
+
+def _signed(row: dict[str, Any], metric: str) -> str:
+    mean, views, scenes = (row[f"{metric}_{what}"] for what in AGAINST)
+    if mean is None:
+        return "–"
+    text = f"{mean:+.{DIGITS[metric]}f}".replace("-", "−")
+    text += "" if views is None else f" ± {views:.{DIGITS[metric]}f}"
+    return text if scenes is None else f"{text} (± {scenes:.{DIGITS[metric]}f})"
+
+
+# ---------------------------------------------------------------------------------------------------------- words
+
+
+def summary(comparison: Comparison, table: list[dict[str, Any]]) -> str:
+    """What was compared, and what is the best in each metric."""
+    done = sum(run.state == "done" for run in comparison.runs.values())
+    place = f"{len(comparison.scenes)} scenes ({', '.join(comparison.scenes)})"
+    parts = [f"{len(table)} methods on {place if len(comparison.scenes) > 1 else comparison.scenes[0]}"]
+    parts[0] += "" if done == len(comparison.runs) else f", {done} of {len(comparison.runs)} runs done"
+    for metric, better in BETTER.items():
+        there = [row for row in table if row[metric] is not None]
+        if len(there) > 1:
+            best = (max if better == "more" else min)(there, key=lambda row: row[metric])
+            parts.append(f"best in {SHORT[metric].split(',')[0]}: {best['method']}")
+    return "; ".join(parts) + "."
+
+
+def notes(comparison: Comparison) -> list[str]:
+    """What a reader of the table must know, each thing once."""
+    done = [run for method in comparison.methods for run in comparison.of(method)]
+    said = [
+        "Box: the bounding box of the view's mask, 10% wider on each side. Means over the test views"
+        + (" and the scenes." if len(comparison.scenes) > 1 else "."),
+        "seconds: all stages of the method, evaluation included, from their receipts; own seconds: of the stages that "
+        "it does not share with the full method. Peak memory: of its hungriest stage.",
+    ]
+    if not any(run.metrics.get("mean", {}).get("psnr_box") is not None for run in done):
+        said.append("No box metrics: the scene has no ground truth.")
+    said += dict.fromkeys(f"No LPIPS: {why}." for run in done if (why := run.metrics.get("lpips_unavailable")))
+    if any(row["consistency"] is not None for row in rows(comparison)):
+        words = "mean absolute difference inside the mask to the next view, by rendered depth; blur is consistent too."
+        said.append(f"consistency: {words}")
+    said += dict.fromkeys(words for run in done for words in ways(run))
+    for run in done:
+        resumed = [stage for stage, receipt in run.receipts.items() if receipt.get("resumed")]
+        if resumed:
+            said.append(f"{run.method} on {run.scene}: {', '.join(resumed)} was resumed: more seconds than counted.")
+    said += [f"{r.method} on {r.scene} failed: {r.error}" for r in comparison.runs.values() if r.state == "failed"]
+    receipts = [receipt for run in done for receipt in run.receipts.values()]
+    machines = dict.fromkeys(f"{r.get('device', 'cpu')} of {r.get('machine', '?')}, {r['profile']}" for r in receipts)
+    return [*said, f"Ran on: {'; '.join(machines)}."] if machines else said
+
+
+def ways(run: Run) -> list[str]:
+    """Which inpainter and which distance a method used, as metrics.json or the facts.json of its stages say."""
+    paths = [folder / "facts.json" for folder in run.folders.values()]
+    said = [run.metrics, *(io.load_json(path) for path in paths if path.is_file())]
+    found = {words: facts[key] for facts in said for key, words in WAYS.items() if facts.get(key)}
+    return [f"{run.method}: " + ", ".join(f"{words} {name}" for words, name in found.items()) + "."] if found else []
+
+
+def intervals(comparison: Comparison) -> str:
+    text = "Method minus full, ± half the 95% interval of the paired t over pairs of equal views"
+    if len(comparison.scenes) == 1:
+        return f"{text} (the line through a dot). That speaks of this scene, not of others."
+    return (
+        f"{text} of all {len(comparison.scenes)} scenes (thick lines), which speaks of these scenes; in brackets over "
+        "the scenes' means (thin lines), which speaks of another scene of their kind."
+    )
+
+
+def markdown(comparison: Comparison, table: list[dict], drawn: dict[str, Path | None], views: dict[str, Path]) -> str:
+    header, texts, bold = cells(table)
+    strong = [[f"**{c}**" if b else c for c, b in zip(*line, strict=True)] for line in zip(texts, bold, strict=True)]
+    lines = [f"# {comparison.home.name}: methods compared", "", summary(comparison, table), ""]
+    lines += [page.markdown(header, strong)]
+    if found := difference_cells(table):
+        lines += ["## Difference to the full method", "", intervals(comparison), "", page.markdown(*found)]
+    for title, path in drawn.items():
+        lines += [f"![{title}](compare/{path.name})", ""] if path else []
+    for view, path in views.items():
+        lines += [f"## {view}", "", f"![{view} by every method](compare/{path.name})", ""]
+    return "\n".join([*lines, "## Notes", "", *(f"- {note}" for note in notes(comparison)), ""])
+
+
+def html(comparison: Comparison, table: list[dict], drawn: dict[str, Path | None], views: dict[str, Path]) -> str:
+    header, texts, bold = cells(table)
+    title = f"{comparison.home.name}: methods compared"
+    full = next((number for number, row in enumerate(table) if row["method"] == FULL), None)
+    body = [page.heading(title, 1), page.paragraph(summary(comparison, table))]
+    body += [page.table(header, texts, bold=bold, marked=full)]
+    for heading, path in drawn.items():
+        body += [page.heading(heading), page.picture(path, heading, embed=True)] if path else []
+    if found := difference_cells(table):
+        dots = " Orange and blue dots: the interval over views leaves zero out; an arrow: further off than shown."
+        body += [page.paragraph(intervals(comparison) + dots, quiet=True), page.table(*found)]
+    if views:
+        body += [page.heading("The same views"), page.paragraph("The box and a margin around it.", quiet=True)]
+    for view, path in views.items():
+        body += [page.heading(view, 3), page.picture(path, f"{view} by every method", embed=True)]
+    return page.document(title, [*body, page.heading("Notes"), page.bullets(notes(comparison))])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="report.compare", description=__doc__.split("\n")[0])
+    parser.add_argument("--scene", type=Path, required=True, help="its name, or the path of its folder")
+    parser.add_argument("--runs", type=Path, default=Path("runs"))
+    arguments = parser.parse_args()
+    try:
+        made = make(arguments.runs / arguments.scene.expanduser().resolve().name)
+    except ValueError as error:
+        raise SystemExit(f"error: {error}") from None
+    text = made["md"].read_text(encoding="utf-8")
+    print(text[: text.find("\n\n![")].split("## ")[0].strip(), "", *made.values(), sep="\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,251 @@
+"""One page on what a scene's job did: errors against time, seconds, pictures, what was left out and why.
+
+python -m report.job --scene X --runs runs          runs/X/report/index.html
+python -m report.job --data FOLDER --runs runs      runs/report/index.html, of all scenes in the folder
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from reffusion import io
+from reffusion.io.traces import load_trace
+from report import curves, page, scenes, sheet
+from report.results import load_receipts
+
+ORDER = ("poses", "fit", "masks", "reference", "lift", "personalize", "initialize", "distill", "evaluate")
+WORDS = {
+    "skip": "left out", "provided": "brought by the scene", "cached": "done", "run": "would run", "stale": "would run",
+    "missing": "cannot run", "undecided": "not decided yet",
+}  # fmt: skip
+ENDS = {"no gain": "no gain any more", "fell": "the error had risen", "converged": "converged", "finished": ""}
+RESULTS = {
+    "evaluate/scene.ply": "the result as Gaussians, in the scene's own frame",
+    "evaluate/renders": "renders of the result",
+    "evaluate/metrics.json": "scores, with their protocol",
+    "evaluate/per_view.csv": "scores of every view",
+    "evaluate/side_by_side": "with the object, ground truth, result",
+    "reference/references": "the references",
+    "personalize/pytorch_lora_weights.safetensors": "LoRA of the prior",
+    "fit/gaussians.ply": "the scene with the object, normalised frame",
+}
+
+
+@dataclass(frozen=True)
+class Job:
+    """What lies on the disk for a scene.
+
+    Attributes:
+        home: runs/<scene>, or runs/<scene>@<variant>.
+        plan: stage -> word, reason, notes, as the runner wrote them to plan.json; or empty, see `load_plan`.
+        folders: stage -> its artifact, in order; a variant's may lie with the scene's own run.
+        receipts: stage -> receipt.json.
+        traces: stage -> series -> lines.
+        unread: why a trace could not be read, in words.
+        metrics: metrics.json, or empty.
+    """
+
+    home: Path
+    plan: dict[str, dict[str, Any]]
+    folders: dict[str, Path]
+    receipts: dict[str, dict[str, Any]]
+    traces: dict[str, dict[str, curves.Lines]]
+    unread: tuple[str, ...]
+    metrics: dict[str, Any]
+
+
+def load_job(home: Path) -> Job:
+    """Raises ValueError where no stage has been done."""
+    plan = load_plan(home)
+    names = list(plan or ORDER)
+    places = {s: home.parent / plan[s]["folder"] if plan and plan[s]["folder"] else None for s in plan}
+    found = {stage: places.get(stage) or sheet.stage_folder(home, stage) for stage in names}
+    left_out = {stage for stage, said in plan.items() if said["word"] == "skip"}
+    folders = {s: f for s, f in found.items() if s not in left_out and (f / "receipt.json").exists()}
+    if not folders:
+        raise ValueError(f"{home}: no stage has been done; run `make scene={home.name} all` first")
+    traces, unread = {}, []
+    for stage, folder in folders.items():
+        if folder.name == stage and (folder / "trace.jsonl").exists():
+            try:
+                traces[stage] = load_trace(folder / "trace.jsonl", stage)
+            except ValueError as error:
+                unread.append(str(error))
+    metrics = folders.get("evaluate", Path()) / "metrics.json"
+    scores = io.load_json(metrics) if metrics.is_file() else {}
+    return Job(home, plan, folders, load_receipts(folders), traces, tuple(unread), scores)
+
+
+def load_plan(home: Path) -> dict[str, dict[str, Any]]:
+    """plan.json's stages; empty where there is none, or a stage was done after it was written."""
+    path = home / "plan.json"
+    if not path.exists() or any(r.stat().st_mtime > path.stat().st_mtime for r in home.glob("*/receipt.json")):
+        return {}
+    return io.load_json(path)["stages"]
+
+
+def make(home: Path) -> Path:
+    """Write runs/<scene>/report/: index.html and PNGs; gives back the page's path."""
+    job = load_job(home)
+    out = home / "report"
+    out.mkdir(exist_ok=True)
+    for old in out.glob("*.png"):
+        old.unlink()
+    title = f"{home.name}: what was done"
+    seconds = sum(receipt["seconds"] for receipt in job.receipts.values())
+    done = f"{page.duration(seconds)} in {len(job.receipts)} stages"
+    parts = [page.heading(title, 1), page.paragraph(f"{done}. {outcome(job)}")]
+    parts += pictures(job, out) + whole(job, out) + stages(job, out)
+    parts += left_out(job) + receipts(job) + artifacts(job, out)
+    path = out / "index.html"
+    path.write_text(page.document(title, parts), encoding="utf-8")
+    return path
+
+
+def outcome(job: Job) -> str:
+    """The result in a sentence."""
+    mean, counts = job.metrics.get("mean", {}), job.metrics.get("gaussians", {})
+    if not job.metrics:
+        return "It is not evaluated yet."
+    count = counts.get(job.metrics.get("result"))
+    gaussians = f"{count:,} Gaussians" if count else "The result"
+    if mean.get("psnr_box") is None:
+        return f"{gaussians}; no ground truth, so no scores."
+    return f"{gaussians}; {mean['psnr_box']:.2f} dB and FLIP {mean['flip_box']:.3f} in the box of the test views."
+
+
+# --------------------------------------------------------------------------------------------------------- sections
+
+
+def pictures(job: Job, out: Path) -> list[str]:
+    try:
+        path = sheet.make(job.home, out / "sheet.png")
+    except ValueError as error:
+        return [page.heading("Pictures"), page.paragraph(f"None yet: {error}")]
+    return [page.heading("Pictures"), page.picture(path, "views of the scene")]
+
+
+def whole(job: Job, out: Path) -> list[str]:
+    """The whole job against the clock, and the scores of initialization and result."""
+    seconds = {stage: receipt["seconds"] for stage, receipt in job.receipts.items()}
+    lines = {stage: series.get("", []) for stage, series in job.traces.items()}
+    result = job.metrics.get("result", "")
+    box = {"initialize": job.metrics.get("initialize", {}).get("psnr_box")}
+    box |= {result: job.metrics.get("mean", {}).get("psnr_box")}
+    curves.job_chart(seconds, {stage: own for stage, own in lines.items() if own}, box, out / "job.png")
+    parts = [page.heading("The whole job"), page.picture(out / "job.png", "PSNR and stages against seconds")]
+    if any(stage in lines for stage in ("fit", "distill")):
+        words = (
+            "Curves: each stage's own error, on training views or references. Test views are only scored at the end."
+        )
+        parts.append(page.paragraph(words, quiet=True))
+    return parts + scores(job)
+
+
+def scores(job: Job) -> list[str]:
+    """The mean metrics, those of the initialization beside them."""
+    after, before = job.metrics.get("mean", {}), job.metrics.get("initialize", {})
+    names = [name for name, value in after.items() if value is not None]
+    if not names:
+        return []
+    lines = [
+        [title, *(page.number(values.get(n), 2 if "psnr" in n else 4) for n in names)]
+        for title, values in (("initialization", before), ("result", after))
+        if any(values.get(name) is not None for name in names)
+    ]
+    return [page.table(["mean over test views", *names], lines)]
+
+
+def stages(job: Job, out: Path) -> list[str]:
+    """A chart for each stage with a trace."""
+    parts = []
+    for stage, series in job.traces.items():
+        path = out / f"{stage}.png"
+        if names := curves.stage_chart(stage, series, path):
+            parts += [page.heading(f"{stage}: error against seconds"), page.picture(path, ", ".join(names))]
+            parts += [page.paragraph(ended, quiet=True)] if (ended := end(series)) else []
+    parts += [page.paragraph(f"Not drawn: {why}", quiet=True) for why in job.unread]
+    return parts
+
+
+def end(series: dict[str, curves.Lines]) -> str:
+    """How a stage ended, where its trace says so: steps done and planned, the reason, what was kept."""
+    last = series.get("", [{}])[-1] if series.get("") else {}
+    if "reason" not in last:
+        return ""
+    text = f"{last['iteration']} of {last['of']} steps"
+    if last["iteration"] < last["of"]:
+        text += f", stopped early: {ENDS.get(last['reason'], last['reason'])}"
+        if last["iteration"]:  # what the others would have taken, at the same pace
+            saved = last["seconds"] / last["iteration"] * (last["of"] - last["iteration"])
+            text += f", which saved about {page.duration(saved)}"
+    return text + (f"; the state of step {last['kept']} was kept." if last["kept"] != last["iteration"] else ".")
+
+
+def left_out(job: Job) -> list[str]:
+    """The runner's words for stages that are not simply done."""
+    if not job.plan:
+        return []
+    rows = [
+        [stage, WORDS.get(said["word"], said["word"]), "; ".join([said["reason"], *said["notes"]])]
+        for stage, said in job.plan.items()
+        if said["word"] != "cached" or said["reason"]
+    ]
+    parts = [page.heading("What was left out or taken over, and why")]
+    return parts + ([page.table(["stage", "", "because"], rows, text=(1, 2))] if rows else [page.paragraph("Nothing.")])
+
+
+def receipts(job: Job) -> list[str]:
+    """Seconds, memory and where it ran; versions once."""
+    total = sum(receipt["seconds"] for receipt in job.receipts.values())
+    rows = []
+    for stage, r in job.receipts.items():
+        share = f"{100 * r['seconds'] / total:.0f}%" if total else "–"
+        resumed = "last try only" if r.get("resumed") else ""
+        place = [r.get("device", "cpu"), r.get("machine", ""), r["profile"], r.get("date", "")[:16].replace("T", " ")]
+        rows.append([stage, f"{r['seconds']:.1f}", share, f"{r['peak_memory_mb']:,}", *place, resumed])
+    header = ["stage", "seconds", "share", "peak MB", "device", "machine", "profile", "made", ""]
+    versions = {name: v for r in job.receipts.values() for name, v in r.get("versions", {}).items()}
+    said = ", ".join(f"{name} {version}" for name, version in versions.items())
+    table = page.table(header, rows, text=(4, 5, 6, 7, 8))
+    return [page.heading("Receipts"), table, page.paragraph(f"With {said}.", quiet=True) if said else ""]
+
+
+def artifacts(job: Job, out: Path) -> list[str]:
+    there = {}
+    for name, words in RESULTS.items():
+        stage, rest = name.split("/")
+        path = job.folders.get(stage, Path()) / rest
+        if stage in job.folders and path.exists():
+            there[f"{name}: {words}"] = os.path.relpath(path, out)
+    return [page.heading("Files"), page.links(there)]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="report.job", description=__doc__.split("\n")[0])
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--scene", type=Path, help="its name, or the path of its folder")
+    what.add_argument("--data", type=Path, help="a folder of scenes")
+    parser.add_argument("--variant", default="", help="of the scene")
+    parser.add_argument("--runs", type=Path, default=Path("runs"))
+    arguments = parser.parse_args()
+    suffix = f"@{arguments.variant}" if arguments.variant else ""
+    try:
+        if arguments.scene:
+            print(make(arguments.runs / (arguments.scene.expanduser().resolve().name + suffix)))
+            return
+        folders = sorted(path for path in arguments.data.iterdir() if path.is_dir()) if arguments.data.is_dir() else []
+        homes = [home for path in folders if (home := arguments.runs / (path.name + suffix)).is_dir()]
+        if not homes:
+            raise ValueError(f"data={arguments.data}: none of its scenes has a folder in {arguments.runs}")
+        print(scenes.make([load_job(home) for home in homes], arguments.runs / f"report{suffix}"))
+    except ValueError as error:
+        raise SystemExit(f"error: {error}") from None
+
+
+if __name__ == "__main__":
+    main()

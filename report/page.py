@@ -1,0 +1,93 @@
+"""Plain HTML pages: one file without scripts, fonts or addresses of other machines."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+STYLE = """
+body { font: 16px/1.5 system-ui, "DejaVu Sans", sans-serif; color: #222; max-width: 60rem }
+body { margin: 2rem auto; padding: 0 1rem }
+h1 { font-size: 1.6rem; margin-bottom: .2rem } h2 { font-size: 1.2rem; margin: 2.2rem 0 .6rem }
+table { border-collapse: collapse; font-size: .85rem; font-variant-numeric: tabular-nums; margin: .6rem 0 }
+th, td { padding: .25rem .6rem; text-align: right; border-bottom: 1px solid #ddd; vertical-align: top }
+th, td { white-space: nowrap } th:first-child, td:first-child { text-align: left; padding-left: 0 }
+th { font-weight: 600; border-bottom: 1px solid #888 }
+.text { text-align: left !important; white-space: normal } tr.ours td { background: #eef5fa }
+img { max-width: 100%; display: block; margin: .4rem 0 } p, li { max-width: 50rem }
+.wide { overflow-x: auto } .quiet { color: #666; font-size: .9rem } a { color: #0a5a8c }
+"""
+
+
+def document(title: str, body: Sequence[str]) -> str:
+    """A whole page; `title` is plain text, the parts of `body` are HTML."""
+    head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{escape(title)}</title>'
+    top = f'<!doctype html>\n<html lang="en"><head>{head}<style>{STYLE}</style></head>\n<body>'
+    return "\n".join([top, *body, "</body></html>\n"])
+
+
+def heading(text: str, level: int = 2) -> str:
+    return f"<h{level}>{escape(text)}</h{level}>"
+
+
+def paragraph(text: str, quiet: bool = False) -> str:
+    return f'<p class="quiet">{escape(text)}</p>' if quiet else f"<p>{escape(text)}</p>"
+
+
+def bullets(texts: Sequence[str]) -> str:
+    return "<ul>" + "".join(f"<li>{escape(text)}</li>" for text in texts) + "</ul>" if texts else ""
+
+
+def table(
+    header: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    *,
+    bold: Sequence[Sequence[bool]] = (),
+    text: Sequence[int] = (),
+    marked: int | None = None,
+) -> str:
+    """`bold`: cells to stand out, [rows][columns]; `text`: columns of words, set to the left; `marked`: a row."""
+    left = lambda column: ' class="text"' if column in text else ""
+    lines = ["<tr>" + "".join(f"<th{left(n)}>{escape(cell)}</th>" for n, cell in enumerate(header)) + "</tr>"]
+    for number, row in enumerate(rows):
+        cells = []
+        for column, cell in enumerate(row):
+            inside = f"<b>{escape(cell)}</b>" if bold and bold[number][column] else escape(cell)
+            cells.append(f"<td{left(column)}>{inside}</td>")
+        lines.append(("<tr class=ours>" if number == marked else "<tr>") + "".join(cells) + "</tr>")
+    return '<div class="wide"><table>\n' + "\n".join(lines) + "\n</table></div>"
+
+
+def picture(path: Path, alt: str, embed: bool = False) -> str:
+    """A PNG, by its name beside the page, or inside the page."""
+    source = f"data:image/png;base64,{base64.b64encode(path.read_bytes()).decode()}" if embed else escape(path.name)
+    return f'<img src="{source}" alt="{escape(alt)}">'
+
+
+def links(targets: dict[str, str]) -> str:
+    """A list of {words: relative address}."""
+    lines = [f'<li><a href="{escape(to)}">{escape(name)}</a></li>' for name, to in targets.items()]
+    return "<ul>" + "".join(lines) + "</ul>"
+
+
+def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """The same table for a text file."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "".join("| " + " | ".join(cell.replace("|", "/") for cell in line) + " |\n" for line in lines)
+
+
+def number(value: float | None, digits: int = 0) -> str:
+    """With thin groups of thousands; an en dash where there is none."""
+    return "–" if value is None else f"{value:,.{digits}f}"
+
+
+def duration(seconds: float | None) -> str:
+    """As people say it: 48 s, 5 min 20 s, 1 h 5 min."""
+    if seconds is None:
+        return "–"
+    if seconds < 100:
+        return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"

@@ -1,0 +1,83 @@
+"""The same test views by every method: crops around the box, side by side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from reffusion import io
+from report.results import FULL, Comparison, Run
+from report.sheet import GAP, enlarged, evenly
+
+WIDTH = 1920  # px of a sheet of crops, about
+CONTEXT = 0.15  # the crop is wider than the box by this share of it on each side
+BOX = ("left", "top", "right", "bottom")
+
+
+def sheets(comparison: Comparison, out: Path, count: int = 3) -> dict[str, Path]:
+    """View -> a PNG with what every method made of it, and the truth; views of the first scene, spread evenly."""
+    scene = comparison.scenes[0]
+    runs = [run for m in comparison.methods if (run := comparison.runs[m, scene]).state == "done" and run.views]
+    if not runs:
+        return {}
+    first = next((run for run in runs if run.method == FULL), runs[0])
+    boxed = [view for view, row in first.views.items() if all(side in row for side in BOX)]
+    made = {}
+    for view in evenly(boxed or list(first.views), count):
+        cells = _cells(runs, first, view)
+        if cells:
+            made[view] = out / f"{view}.png"
+            io.save_image(made[view], wall([picture for _, picture in cells], [title for title, _ in cells]))
+    return made
+
+
+def _cells(runs: list[Run], first: Run, view: str) -> list[tuple[str, np.ndarray]]:
+    poses = first.folders.get("poses", Path())
+    photo, views = poses / "images" / f"{view}.png", poses / "views.json"
+    cells = []
+    if photo.exists() and views.exists():
+        is_test = view in io.load_json(views)["test"]
+        cells.append(("ground truth" if is_test else "photograph, with the object", io.load_image(photo)))
+    for run in runs:
+        path = run.folders["evaluate"] / "renders" / f"{view}.png"
+        if path.exists():
+            cells.append((_title(run, view), io.load_image(path)))
+    return [(title, crop(picture, first.views[view])) for title, picture in cells]
+
+
+def _title(run: Run, view: str) -> str:
+    row = run.views.get(view, {})
+    scores = [f"{row['psnr_box']:.1f} dB"] if "psnr_box" in row else []
+    scores += [f"FLIP {row['flip_box']:.3f}"] if "flip_box" in row else []
+    return "\n".join([run.method, *([", ".join(scores)] if scores else [])])
+
+
+def crop(picture: np.ndarray, row: dict[str, float]) -> np.ndarray:
+    """[H, W, 3] -> the box of a row of per_view.csv with `CONTEXT` around; the whole picture where it has no box."""
+    if not all(side in row for side in BOX):
+        return picture
+    left, top, right, bottom = (int(row[side]) for side in BOX)
+    wide, high = round(CONTEXT * (right - left)), round(CONTEXT * (bottom - top))
+    return picture[max(0, top - high) : bottom + high, max(0, left - wide) : right + wide]
+
+
+def wall(cells: list[np.ndarray], titles: list[str]) -> np.ndarray:
+    """uint8 [H, W, 3]: pictures of one size in rows, each enlarged by a whole factor, its title (two lines) above."""
+    height, width = (max(cell.shape[axis] for cell in cells) for axis in (0, 1))
+    columns = min(len(cells), 4)
+    scale = max(1, round(WIDTH / columns / width))
+    size = max(13, min(26, width * scale // 14))
+    font, head = ImageFont.load_default(size), round(3.0 * size)
+    step = width * scale + 2 * GAP, height * scale + head + GAP
+    rows = -(-len(cells) // columns)
+    canvas = Image.new("RGB", (columns * step[0] - 2 * GAP, rows * step[1] - GAP), "white")
+    draw = ImageDraw.Draw(canvas)
+    for index, (cell, title) in enumerate(zip(cells, titles, strict=True)):
+        left, top = index % columns * step[0], index // columns * step[1]
+        name, _, score = title.partition("\n")
+        draw.text((left, top + head - size // 3), score, "#666", font, anchor="ls")
+        draw.text((left, top + head - size // 3 - round(1.2 * size)), name, "black", font, anchor="ls")
+        canvas.paste(Image.fromarray(enlarged(cell, scale)), (left, top + head))
+    return np.asarray(canvas)

@@ -1,0 +1,206 @@
+"""What the runs of a comparison measured: compare.json, and the artifacts it names."""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reffusion import io
+from report.paired import Difference, paired
+
+FULL = "full"
+BETTER = {"psnr_box": "more", "ssim_box": "more", "flip_box": "less", "lpips_vgg_box": "less"}
+PSNR_CAP = 100.0  # dB, what an identical view counts: as in metrics.json
+MEASURED = ("consistency", "seconds", "own_seconds", "peak_memory_mb", "gaussians", "scenes")
+AGAINST = ("minus_full", "interval_views", "interval_scenes")  # see report.paired.Difference; halves of intervals
+COLUMNS = ("method", "state", *BETTER, *MEASURED, *(f"{metric}_{what}" for metric in BETTER for what in AGAINST))
+
+
+@dataclass(frozen=True)
+class Run:
+    """One method on one scene.
+
+    Attributes:
+        state: done, failed or not run yet.
+        error: of a failed one, in a line.
+        folders: stage -> its artifact, of the stages that were not left out.
+        receipts: stage -> its receipt.json.
+        metrics: metrics.json; empty where there is none.
+        views: view -> the numbers of its row in per_view.csv.
+    """
+
+    method: str
+    scene: str
+    state: str
+    error: str
+    folders: dict[str, Path]
+    receipts: dict[str, dict[str, Any]]
+    metrics: dict[str, Any]
+    views: dict[str, dict[str, float]]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """All methods on all scenes. `runs[method, scene]`; the first method is the full one."""
+
+    home: Path
+    scenes: tuple[str, ...]
+    methods: tuple[str, ...]
+    runs: dict[tuple[str, str], Run]
+
+    def of(self, method: str) -> list[Run]:
+        """The method's finished runs."""
+        return [run for scene in self.scenes if (run := self.runs[method, scene]).state == "done"]
+
+
+def load(home: Path) -> Comparison:
+    """Read runs/<scene>/compare.json and what it names. Raises ValueError where nothing was compared yet."""
+    path = home / "compare.json"
+    if not path.exists():
+        raise ValueError(f"{path}: no such file; run `make scene={home.name} compare` first")
+    record = io.load_json(path)
+    runs = {(run["method"], run["scene"]): load_run(run, home.parent) for run in record["runs"]}
+    return Comparison(home, tuple(record["scenes"]), tuple(record["methods"]), runs)
+
+
+def load_run(record: dict[str, Any], runs: Path) -> Run:
+    folders = {stage: runs / folder for stage, folder in record.get("stages", {}).items() if folder}
+    evaluate = folders.get("evaluate", Path())
+    metrics = evaluate / "metrics.json"
+    return Run(
+        record["method"],
+        record["scene"],
+        record["state"],
+        record.get("error", ""),
+        folders,
+        load_receipts(folders),
+        io.load_json(metrics) if metrics.is_file() else {},
+        load_views(evaluate / "per_view.csv"),
+    )
+
+
+def load_receipts(folders: dict[str, Path]) -> dict[str, dict[str, Any]]:
+    """Stage -> receipt. A stage that the scene's own file stands for has another's folder, which counts once."""
+    paths = {stage: folder / "receipt.json" for stage, folder in folders.items() if folder.name == stage}
+    return {stage: io.load_json(path) for stage, path in paths.items() if path.is_file()}
+
+
+def load_views(path: Path) -> dict[str, dict[str, float]]:
+    """View -> its numbers; empty cells are left out, an identical picture's PSNR is `PSNR_CAP`."""
+    if not path.is_file():
+        return {}
+    with open(path, newline="", encoding="utf-8") as file:
+        rows = {row.pop("view"): row for row in csv.DictReader(file)}
+    numbers = {view: {name: _number(name, text) for name, text in row.items()} for view, row in rows.items()}
+    return {view: {k: v for k, v in row.items() if v is not None} for view, row in numbers.items()}
+
+
+def _number(column: str, text: str | None) -> float | None:
+    try:
+        value = float(text or "")
+    except ValueError:
+        return None
+    return min(value, PSNR_CAP) if "psnr" in column else value
+
+
+# ------------------------------------------------------------------------------------------------------- the table
+
+
+def rows(comparison: Comparison) -> list[dict[str, Any]]:
+    """A dict of `COLUMNS` for each method: means over its finished scenes; None where there is no value."""
+    table = [_row(comparison, method) for method in comparison.methods]
+    for metric in BETTER:
+        found = differences(comparison, metric)
+        for row in table:
+            if difference := found.get(row["method"]):
+                values = (difference.mean, difference.views, difference.scenes)
+                row |= {f"{metric}_{what}": value for what, value in zip(AGAINST, values, strict=True)}
+    return table
+
+
+def _row(comparison: Comparison, method: str) -> dict[str, Any]:
+    done = comparison.of(method)
+    states = [comparison.runs[method, scene].state for scene in comparison.scenes]
+    row: dict[str, Any] = dict.fromkeys(COLUMNS)
+    row |= {"method": method, "scenes": len(done)}
+    row["state"] = states[0] if len(set(states)) == 1 else f"{len(done)} of {len(states)} done"
+    for name in BETTER:
+        row[name] = mean([run.metrics.get("mean", {}).get(name) for run in done])
+    row["consistency"] = mean([consistency(run) for run in done])
+    row["seconds"] = mean([seconds(run) for run in done])
+    row["own_seconds"] = mean([own_seconds(run, comparison.runs[FULL, run.scene]) for run in done])
+    peaks = [receipt["peak_memory_mb"] for run in done for receipt in run.receipts.values()]
+    row["peak_memory_mb"] = max(peaks, default=None)
+    counts = mean([run.metrics.get("gaussians", {}).get(run.metrics.get("result")) for run in done])
+    row["gaussians"] = None if counts is None else round(counts)
+    return row
+
+
+def mean(values: list[float | None]) -> float | None:
+    """Of those that are there and finite; None where there are none."""
+    there = [value for value in values if value is not None and math.isfinite(value)]
+    return sum(there) / len(there) if there else None
+
+
+def seconds(run: Run) -> float:
+    """Of the whole job, its evaluation included."""
+    return round(sum(receipt["seconds"] for receipt in run.receipts.values()), 2)
+
+
+def own_seconds(run: Run, full: Run) -> float | None:
+    """Of the stages that it does not share with the full method; 0 for that one itself."""
+    if full.state != "done":
+        return None
+    own = [receipt["seconds"] for s, receipt in run.receipts.items() if run.folders[s] != full.folders.get(s)]
+    return round(sum(own), 2)
+
+
+def consistency(run: Run) -> float | None:
+    """The mean over pairs of neighbouring views, where metrics.json has it."""
+    value = (run.metrics.get("consistency") or {}).get("consistency")
+    return None if value is None else float(value)
+
+
+def save_csv(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Every digit; an empty cell where there is no value."""
+    with open(path, "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(COLUMNS), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def load_csv(path: Path) -> list[dict[str, Any]]:
+    """What `save_csv` wrote."""
+    with open(path, newline="", encoding="utf-8") as file:
+        return [{name: _value(name, text) for name, text in row.items()} for row in csv.DictReader(file)]
+
+
+def _value(name: str, text: str) -> Any:
+    if name in ("method", "state"):
+        return text
+    whole = name in ("peak_memory_mb", "gaussians", "scenes")
+    return None if text == "" else int(text) if whole else float(text)
+
+
+# ------------------------------------------------------------------------------------------------ against the full one
+
+
+def differences(comparison: Comparison, metric: str) -> dict[str, Difference]:
+    """Method -> its difference to the full one in a box metric, over the views that both have."""
+    found = {}
+    for method in comparison.methods:
+        if method == FULL:
+            continue
+        scenes = []
+        for run in comparison.of(method):
+            full = comparison.runs[FULL, run.scene]
+            both = [v for v in run.views if metric in run.views[v] and metric in full.views.get(v, {})]
+            scenes.append(np.array([run.views[v][metric] - full.views[v][metric] for v in both]))
+        if difference := paired(scenes):
+            found[method] = difference
+    return found

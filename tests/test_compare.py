@@ -1,0 +1,383 @@
+"""compare and report on a toy pipeline: resuming, failing variants, tables, intervals, the Pareto front, pages."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from report import compare as page
+from report import curves, job, results, scenes
+from report.paired import half_width, paired, pareto
+from runner.compare import compare
+from runner.job import Request
+from runner.pipeline import Refused
+
+REPO = Path(__file__).resolve().parent.parent
+FILES = {
+    "pipeline.yaml": """
+scene_keys: {}
+stages:
+  poses: {needs: [scene]}
+  distill:
+    needs: [poses]
+    left_out: [{param: distill.gain, equals: 0, because: no gain}]
+  evaluate: {needs: [poses], optional: [distill]}
+profiles: {laptop: {}}
+variants:
+  better: {distill: {gain: 3}}
+  twin: {distill: {gain: 3}}
+  bad: {distill: {gain: -1}}
+  none: {distill: {gain: 0}}
+""",
+    "stages/__init__.py": "",
+    "stages/common.py": """
+import json, time
+from pathlib import Path
+
+VIEWS = "abcd"
+
+def ran(out, name):
+    \"\"\"A line for each stage that came to its end.\"\"\"
+    with open(out.parent.parent / "ran.txt", "a") as file:
+        file.write(f"{out.parent.name} {name}\\n")
+""",
+    "stages/poses.py": """
+from pydantic import BaseModel
+from stages.common import *
+
+class Params(BaseModel, extra="forbid"):
+    pass
+
+def run(params, out, *, scene):
+    from PIL import Image
+    (out / "images").mkdir()
+    number = int((scene / "number.txt").read_text())
+    for view in VIEWS:
+        Image.new("RGB", (40, 30), (number, 200, 90)).save(out / "images" / f"{view}.png")
+    (out / "views.json").write_text(json.dumps({"train": [], "test": list(VIEWS), "number": number}))
+    ran(out, "poses")
+""",
+    "stages/distill.py": """
+from pydantic import BaseModel
+from stages.common import *
+
+class Params(BaseModel, extra="forbid"):
+    gain: int = 1
+    pause: float = 0.0
+
+def run(params, out, *, poses):
+    if params.gain < 0:
+        raise ValueError("a gain below 0 | cannot be")
+    time.sleep(params.pause)
+    lines = [{"seconds": 2.0 ** i, "iteration": i, "reference_psnr": 20.0 + i * params.gain} for i in range(4)]
+    lines[-1] |= {"of": 8, "kept": 2, "reason": "no gain"}
+    (out / "trace.jsonl").write_text("".join(json.dumps(line) + "\\n" for line in lines))
+    (out / "facts.json").write_text(json.dumps({"inpainter": "a brush", "perceptual": None}))
+    (out / "gain.txt").write_text(str(params.gain))
+    ran(out, "distill")
+""",
+    "stages/evaluate.py": """
+import csv
+from pydantic import BaseModel
+from stages.common import *
+
+class Params(BaseModel, extra="forbid"):
+    pass
+
+def run(params, out, *, poses, distill):
+    from PIL import Image
+    number = json.loads((poses / "views.json").read_text())["number"]
+    gain = int((distill / "gain.txt").read_text()) if distill else 0
+    (out / "renders").mkdir()
+    rows = []
+    for index, view in enumerate(VIEWS):
+        Image.new("RGB", (40, 30), (number, 10 * gain, 90)).save(out / "renders" / f"{view}.png")
+        row = {"view": view, "left": 10, "top": 8, "right": 30, "bottom": 22}
+        row |= {"psnr_box": 20 + index + gain * (1 + 0.1 * index) + number / 10, "lpips_vgg_box": None}
+        row |= {"flip_box": 0.3 / (1 + gain), "ssim_box": 0.5 + gain / 10}
+        rows.append(row)
+    with open(out / "per_view.csv", "w") as file:
+        writer = csv.DictWriter(file, rows[0].keys())
+        writer.writeheader()
+        writer.writerows(rows)
+    mean = lambda name: sum(row[name] for row in rows) / len(rows)
+    metrics = {"mean": {name: mean(name) for name in ("psnr_box", "ssim_box", "flip_box")} | {"lpips_vgg_box": None}}
+    metrics |= {"result": "distill", "gaussians": {"distill": 100 + gain}, "lpips_unavailable": "no weights"}
+    metrics |= {"consistency": {"consistency": 0.01 * gain}}
+    (out / "metrics.json").write_text(json.dumps(metrics))
+    ran(out, "evaluate")
+""",
+    "reffusion/__init__.py": "",
+    **{f"data/{name}/number.txt": text for name, text in (("toy", "10"), ("toy-1", "30"))},
+}
+
+
+def request(root: Path, scene: str = "toy", **options) -> Request:
+    return Request(root, root / "runs", scene, **{"profile": "laptop", **options})
+
+
+def written(root: Path) -> Path:
+    for name, text in FILES.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text)
+    return root
+
+
+def ran(root: Path) -> list[str]:
+    return sorted((root / "runs/ran.txt").read_text().splitlines())
+
+
+def by_method(home: Path) -> dict[str, dict]:
+    return {row["method"]: row for row in results.rows(results.load(home))}
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory) -> Path:
+    """All variants on the toy scene, one of which fails."""
+    root = written(tmp_path_factory.mktemp("compared"))
+    assert compare(request(root)) == 1
+    return root
+
+
+@pytest.fixture(scope="module")
+def pages(compared) -> dict[str, Path]:
+    return page.make(compared / "runs/toy")
+
+
+@pytest.fixture
+def home(compared, tmp_path) -> Path:
+    """A copy of its runs; the scene's folder."""
+    shutil.copytree(compared / "runs", tmp_path / "runs")
+    return tmp_path / "runs/toy"
+
+
+# -------------------------------------------------------------------------------------------------------- the runs
+
+
+def test_every_variant_once_and_what_is_equal_is_shared(compared):
+    own = ["toy distill", "toy evaluate", "toy poses"]
+    assert ran(compared) == sorted([*own, "toy@better distill", "toy@better evaluate", "toy@none evaluate"])
+    copy = compared / "runs/toy@twin/distill"  # copied from the variant that did the same
+    assert (copy / "gain.txt").read_text() == "3" and (copy / "receipt.json").exists()
+    assert not list((compared / "runs").glob("*/.copying*")) and not list((compared / "runs").glob("toy@twin/.*"))
+
+
+def test_a_failed_variant_shows_and_stops_no_other(compared, pages):
+    table = by_method(compared / "runs/toy")
+    assert [row["state"] for row in table.values()] == ["done", "done", "done", "failed", "done"]
+    assert table["bad"]["psnr_box"] is None and table["bad"]["seconds"] is None and table["none"]["psnr_box"] == 22.5
+    assert "| bad (failed) |" in pages["md"].read_text()
+    assert all("a gain below 0 | cannot be" in pages[kind].read_text() for kind in ("md", "html"))
+
+
+def test_killed_and_started_again_nothing_runs_twice(tmp_path):
+    root = written(tmp_path)
+    slow = root / "data/toy-1/scene.yaml"
+    slow.write_text("stages: {distill: {pause: 60}}")
+    command = [sys.executable, "-m", "runner", "compare", "--scene", "toy", "--root", str(root), "--profile", "laptop"]
+    command += ["--variants", "full", "--seeds", "2"]
+    environment = {**os.environ, "PYTHONPATH": str(REPO)}
+    process = subprocess.Popen(command, cwd=root, env=environment, stdout=subprocess.PIPE, text=True)
+    assert any("compare: full on toy-1, 2 of 2" in line for line in process.stdout)
+    for _ in range(1200):
+        if list((root / "runs/toy-1").glob(".partial-distill-*")):
+            break
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait(30)
+    before = ["toy distill", "toy evaluate", "toy poses", "toy-1 poses"]
+    assert ran(root) == sorted(before)
+    assert by_method(root / "runs/toy")["full"]["state"] == "1 of 2 done"  # a table can be drawn at any moment
+    slow.unlink()
+    assert compare(request(root), "full", 2) == 0
+    assert ran(root) == sorted([*before, "toy-1 distill", "toy-1 evaluate"])
+    row = by_method(root / "runs/toy")["full"]
+    assert row["scenes"] == 2 and row["psnr_box"] == pytest.approx(21.5 + 1.15 + (1 + 3) / 2)
+
+
+def test_refused_before_any_work(tmp_path):
+    root = written(tmp_path)
+    for arguments, options, message in [
+        (("beter",), {}, "variants: unknown variant 'beter'; did you mean 'better'"),
+        (("", 4), {}, "seeds=4 asks for the scenes toy to toy-3: unknown scene 'toy-2'"),
+        (("", 0), {}, "seeds=0"),
+        ((), {"variant": "better"}, "variants=better"),
+        ((), {"set": "distill.gian=1"}, "did you mean 'gain'"),
+    ]:
+        with pytest.raises(Refused, match=re.escape(message)):
+            compare(request(root, **options), *arguments)
+    (root / "pipeline.yaml").write_text(FILES["pipeline.yaml"].replace("{gain: 3}", "{gain: much}"))
+    with pytest.raises(Refused, match=r"variant better: distill.gain = 'much'"):
+        compare(request(root))
+    assert not list((root / "runs").glob("*/*/receipt.json"))
+    with pytest.raises(ValueError, match="make scene=toy compare"):
+        page.make(root / "runs/toy")
+
+
+# ------------------------------------------------------------------------------------------------- tables and pages
+
+
+def test_the_table_survives_its_csv(compared, pages):
+    home = compared / "runs/toy"
+    table = results.rows(results.load(home))
+    assert results.load_csv(pages["csv"]) == table
+    full = table[0]
+    assert full["method"] == "full" and full["psnr_box"] == 23.65 and full["lpips_vgg_box"] is None
+    receipts = [json.loads(p.read_text()) for p in home.glob("*/receipt.json")]
+    assert full["seconds"] == pytest.approx(sum(r["seconds"] for r in receipts)) and full["own_seconds"] == 0
+    assert full["peak_memory_mb"] == max(r["peak_memory_mb"] for r in receipts)
+    better = json.loads((home.parent / "toy@better/distill/receipt.json").read_text())["seconds"]
+    assert better <= table[1]["own_seconds"] < table[1]["seconds"]
+    assert table[1]["gaussians"] == 103 and table[1]["consistency"] == 0.03
+    assert table[1]["psnr_box_minus_full"] == pytest.approx(2 * 1.15)
+
+
+def test_the_page_needs_no_other_file(pages):
+    html = pages["html"].read_text()
+    sources = re.findall(r'src="([^"]*)"', html)
+    assert len(sources) == 5 and all(source.startswith("data:image/png;base64,") for source in sources)
+    assert "http" not in html and "<script" not in html and "@import" not in html
+    assert html.count("no weights") == 1 and "2D inpainter a brush" in html and "perceptual" not in html
+    linked = re.findall(r"\]\((.*?)\)", pages["md"].read_text())
+    assert len(linked) == 5 and all((pages["md"].parent / name).stat().st_size > 1000 for name in linked)
+
+
+def test_without_ground_truth(home):
+    for evaluate in home.parent.glob("*/evaluate"):
+        metrics = json.loads((evaluate / "metrics.json").read_text())
+        (evaluate / "metrics.json").write_text(json.dumps(metrics | {"mean": dict.fromkeys(metrics["mean"])}))
+        rows = [line.split(",")[:5] for line in (evaluate / "per_view.csv").read_text().splitlines()]
+        (evaluate / "per_view.csv").write_text("".join(",".join(row) + "\n" for row in rows))
+    html = page.make(home)["html"].read_text()
+    assert "No box metrics: the scene has no ground truth." in html and "PSNR" not in html
+    row = by_method(home)["better"]
+    assert row["psnr_box"] is None and row["psnr_box_minus_full"] is None and row["consistency"] == 0.03
+    assert (home / "compare/tradeoff.png").exists() and not (home / "compare/differences.png").exists()
+
+
+def test_several_scenes(home):
+    """`better` gains 2.0, 2.2, 2.4 and 2.6 dB in the views of one scene, and 1 dB more in those of the other."""
+    for name in ("toy", "toy@better"):
+        shutil.copytree(home.parent / name, home.parent / name.replace("toy", "toy-1"))
+    path = home.parent / "toy-1@better/evaluate/per_view.csv"
+    header, *lines = [line.split(",") for line in path.read_text().splitlines()]
+    for line in lines:
+        line[header.index("psnr_box")] = str(float(line[header.index("psnr_box")]) + 1)
+    path.write_text("".join(",".join(line) + "\n" for line in [header, *lines]))
+    record = json.loads((home / "compare.json").read_text()) | {
+        "scenes": ["toy", "toy-1"],
+        "methods": ["full", "better"],
+    }
+    runs = [run for run in record["runs"] if run["method"] in record["methods"]]
+    for run in runs.copy():
+        there = {stage: folder.replace("toy", "toy-1") for stage, folder in run["stages"].items()}
+        runs.append(run | {"scene": "toy-1", "stages": there})
+    (home / "compare.json").write_text(json.dumps(record | {"runs": runs}))
+    row = by_method(home)["better"]
+    views = np.array([2.0, 2.2, 2.4, 2.6, 3.0, 3.2, 3.4, 3.6])
+    assert row["scenes"] == 2 and row["psnr_box_minus_full"] == pytest.approx(2.8)
+    assert row["psnr_box_interval_views"] == pytest.approx(2.364624 * views.std(ddof=1) / np.sqrt(8), rel=1e-6)
+    assert row["psnr_box_interval_scenes"] == pytest.approx(12.706205 * 0.5, rel=1e-6)
+    assert "+2.80 ± 0.49 (± 6.35)" in page.make(home)["md"].read_text()
+
+
+# ------------------------------------------------------------------------------------------------------- statistics
+
+
+def test_the_interval_is_students():
+    """Quantiles from the printed table of Student's t: 2.776445 with 4 degrees of freedom, 12.706205 with 1."""
+    values = np.array([1.0, 2, 3, 4, 5])
+    assert half_width(values) == pytest.approx(2.776445 * np.sqrt(2.5) / np.sqrt(5), rel=1e-6)
+    assert half_width(values[:1]) is None and half_width(np.full(7, 0.3)) == pytest.approx(0, abs=1e-12)
+    found = paired([values, values[:3] - 2])
+    assert found.pairs == 8 and found.mean == pytest.approx(15 / 8)
+    assert found.scenes == pytest.approx(12.706205 * np.std([3, 0], ddof=1) / np.sqrt(2), rel=1e-6)
+    assert paired([]) is None and paired([np.zeros(0)]) is None
+    assert paired([values]).scenes is None and paired([values]).views == half_width(values)
+
+
+def test_pareto_front_against_all_pairs():
+    random = np.random.default_rng(0)
+    for count in range(1, 40):
+        points = random.integers(0, 12, (count, 2)).astype(float)  # with many ties
+        beaten = [any((q <= p).all() and (q < p).any() for q in points) for p in points]
+        assert (pareto(*points.T) == ~np.array(beaten)).all()
+    assert not len(pareto([], []))
+
+
+def test_the_median_of_curves():
+    steps = np.array([1.0, 10, 100])
+    lines = [np.column_stack([steps[:n], np.full(n, value)]) for n, value in ((3, 1.0), (2, 2.0), (3, 4.0), (3, 9.0))]
+    moments, quartiles = curves.band(lines)
+    assert moments[0] == pytest.approx(1) and moments[-1] == pytest.approx(100)  # the one that ended keeps its value
+    assert np.allclose(quartiles.T, np.percentile([1, 2, 4, 9], [25, 50, 75]))
+
+
+# --------------------------------------------------------------------------------------------------- a job's report
+
+
+def plan_of(root: Path, runs: Path, *options: str) -> None:
+    command = [sys.executable, "-m", "runner", "plan", "--record", "--scene", "toy", "--root", str(root)]
+    environment = {**os.environ, "PYTHONPATH": str(REPO)}
+    subprocess.run([*command, "--runs", str(runs), *options], cwd=root, env=environment, check=True)
+
+
+def test_report_of_a_job(compared, home):
+    plan_of(compared, home.parent)
+    path = job.make(home)
+    html = path.read_text()
+    assert {p.name for p in path.parent.glob("*.png")} == {"sheet.png", "job.png", "distill.png"}
+    assert "101 Gaussians; 23.65 dB and FLIP 0.150" in html
+    assert "3 of 8 steps, stopped early: no gain any more, which saved about 13 s" in html
+    assert "the state of step 2 was kept." in html
+    targets = re.findall(r'href="([^"]*)"', html)
+    assert len(targets) == 3 and all((path.parent / target).exists() for target in targets)
+    assert "What was left out or taken over, and why" in html and "http" not in html
+
+
+def test_report_of_a_variant_says_what_was_left_out(compared, home):
+    plan_of(compared, home.parent, "--variant", "none")
+    html = job.make(home.with_name("toy@none")).read_text()
+    assert re.search(r"<td>distill</td><td[^>]*>left out</td><td[^>]*>no gain</td>", html)
+    assert "shared with toy" in html and "distill.png" not in html
+
+
+def test_report_with_pieces_missing(home):
+    shutil.rmtree(home / "evaluate")
+    with open(home / "distill/trace.jsonl", "a") as file:
+        file.write('{"seconds": 1.0, "iteration": 9}\n')
+    html = job.make(home).read_text()
+    assert "It is not evaluated yet." in html and "None yet: " in html and "Not drawn: " in html
+    (home / "distill/trace.jsonl").unlink()
+    assert "Not drawn" not in job.make(home).read_text()
+    for stage in ("distill", "poses"):
+        shutil.rmtree(home / stage)
+    with pytest.raises(ValueError, match="no stage has been done; run `make scene=toy all`"):
+        job.make(home)
+
+
+def test_report_of_many_scenes(home):
+    jobs = [job.load_job(path) for path in (home, home.with_name("toy@better"), home.with_name("toy@twin"))]
+    path = scenes.make(jobs, home.parent / "report")
+    rows = [line.split(",") for line in (path.parent / "stages.csv").read_text().splitlines()]
+    found = {(stage, quantity): [float(value) for value in values] for stage, quantity, *values in rows[1:]}
+    assert found["distill", "reference_psnr"] == [3, 26, 29, 29]
+    assert found["whole job", "flip_box"] == pytest.approx([3, 0.075, 0.075, 0.1125])
+    assert (path.parent / "stages.png").exists() and "29 [26, 29]" in path.read_text()
+
+
+def test_a_job_that_failed_is_still_reported(home):
+    """Without a plan: the stages of the scene's own run are taken for the variant's, as far as they are there."""
+    for stage in ("distill", "evaluate"):
+        shutil.rmtree(home / stage)
+    assert "in 1 stages. It is not evaluated yet." in job.make(home.with_name("toy@bad")).read_text()
