@@ -34,7 +34,8 @@ def shared_out(pipeline: Pipeline, values: dict[str, dict[str, Any]], seconds: f
     """
     if not pipeline.budget:
         raise Refused("pipeline.yaml: a budget is asked for, and there is no table `budget` that shares it out")
-    asks = lambda c: c.param is not None and values.get(c.names[0], {}).get(c.names[1], ...) == c.equals
+    named = lambda param: values.get(param.split(".", 1)[0], {}).get(param.split(".", 1)[1], ...)
+    asks = lambda c: c.param is not None and all(named(param) == c.equals for param in c.params)
     stays = [name for name in pipeline.budget if not any(asks(c) for c in pipeline.stages[name].left_out)]
     if not stays:
         return {}

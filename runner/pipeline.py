@@ -31,13 +31,13 @@ class Condition(Strict):
     """A reason to leave a stage out: one question, whose answer is yes.
 
     `fact: <stage>.<name>`, of an earlier stage's facts.json, is `equals`; or so is `param: <stage>.<name>`, a parameter
-    of any stage; or the folder `empty: <stage>/<folder>` of an earlier artifact holds no file.
+    of any stage, or each of a list of them; or the folder `empty: <stage>/<folder>` of an earlier artifact holds no file.
     Ignored where the scene brings the key `unless`.
     """
 
     because: str
     fact: str | None = None
-    param: str | None = None
+    param: str | tuple[str, ...] | None = None
     equals: Any = None
     empty: str | None = None
     unless: str | None = None
@@ -51,8 +51,13 @@ class Condition(Strict):
     @property
     def names(self) -> tuple[str, str]:
         """The stage the question is about, and the name of the fact, parameter or folder."""
-        stage, name = re.split(r"[./]", self.fact or self.param or self.empty or "", maxsplit=1)
+        stage, name = re.split(r"[./]", self.fact or self.empty or self.params[0], maxsplit=1)
         return stage, name
+
+    @property
+    def params(self) -> tuple[str, ...]:
+        """The parameters asked about."""
+        return (self.param,) if isinstance(self.param, str) else self.param or ()
 
     @property
     def waits_for(self) -> tuple[str, ...]:

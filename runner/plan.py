@@ -90,7 +90,7 @@ def _holds(job: Job, condition: Condition, earlier: dict[str, Decision]) -> bool
     if condition.unless and condition.unless in job.brings:
         return False
     if condition.param:
-        return _is(job, condition.param, condition.equals)
+        return all(_is(job, param, condition.equals) for param in condition.params)
     source = earlier[stage]
     if source.word == "skip":
         return False
