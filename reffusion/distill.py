@@ -151,11 +151,11 @@ def _copy(optimizer: GaussianOptimizer) -> dict[str, Tensor]:
 
 @dataclass(frozen=True)
 class _Job:
-    """What the terms work with from the first step to the last; only the adversary changes.
+    """What `distill` was given, for its terms; only the adversary changes.
 
     Attributes:
         painted: the sights with pixels to repaint.
-        others: see `distill`.
+        adversary: the critic; None where it has no part.
     """
 
     sights: Sequence[Sight]
@@ -179,6 +179,9 @@ def _job(sights, holes, prior, text, settings: Settings, device: torch.device) -
     return _Job(sights, painted, holes, prior, text, adversary, settings)
 
 
+_Done = tuple[Tensor, dict[str, float]] | None  # what a term gives: see `_step`
+
+
 def _step(optimizer: GaussianOptimizer, step: int, job: _Job) -> dict[str, float]:
     """The terms of one step, one after another, then one step of Adam; what there is to log.
 
@@ -193,9 +196,6 @@ def _step(optimizer: GaussianOptimizer, step: int, job: _Job) -> dict[str, float
             line |= done[1]
     optimizer.step(step / job.settings.iterations, visible=moved)
     return line
-
-
-_Done = tuple[Tensor, dict[str, float]] | None
 
 
 def _sds(optimizer: GaussianOptimizer, step: int, job: _Job) -> _Done:
