@@ -88,12 +88,12 @@ class Settings:
 
 @dataclass(frozen=True)
 class Job:
-    """What the terms work with from the first step to the last; only the adversary and the tally change.
+    """What `distill` was given, for its terms; only the adversary and the tally change.
 
     Attributes:
         painted: the sights with pixels to repaint.
+        adversary: the critic; None where it has no part.
         tally: what there is to log of steps gone by, of terms that not every step has.
-        others: see `distill`.
     """
 
     sights: Sequence[Sight]
@@ -133,6 +133,9 @@ def job_of(
     return Job(sights, painted, holes, prior, text, estimator, adversary, settings, {})
 
 
+_Done = tuple[Tensor, dict[str, float]] | None  # what a term gives: see `step_of`
+
+
 def step_of(optimizer: GaussianOptimizer, step: int, job: Job) -> dict[str, float]:
     """The terms of one step, one after another, then one step of Adam; what there is to log.
 
@@ -148,9 +151,6 @@ def step_of(optimizer: GaussianOptimizer, step: int, job: Job) -> dict[str, floa
             line |= done[1]
     optimizer.step(step / job.settings.iterations, visible=moved)
     return line
-
-
-_Done = tuple[Tensor, dict[str, float]] | None
 
 
 def _reached(optimizer: GaussianOptimizer, job: Job) -> Tensor:
