@@ -31,13 +31,15 @@ class Condition(Strict):
     """A reason to leave a stage out: one question, whose answer is yes.
 
     `fact: <stage>.<name>`, of an earlier stage's facts.json, is `equals`; or so is `param: <stage>.<name>`, a parameter
-    of any stage; or the folder `empty: <stage>/<folder>` of an earlier artifact holds no file.
+    of any stage, and another one, `also`, where that is given; or the folder `empty: <stage>/<folder>` of an earlier
+    artifact holds no file.
     Ignored where the scene brings the key `unless`.
     """
 
     because: str
     fact: str | None = None
     param: str | None = None
+    also: str | None = None
     equals: Any = None
     empty: str | None = None
     unless: str | None = None

@@ -88,9 +88,7 @@ def _holds(job: Job, condition: Condition, earlier: dict[str, Decision]) -> bool
     if condition.unless and condition.unless in job.brings:
         return False
     if condition.param:
-        if name not in job.params.get(stage, {}):
-            raise Refused(f"{job.root / 'pipeline.yaml'}: a condition asks for {condition.param}, which is not there")
-        return job.params[stage][name] == condition.equals
+        return all(_is(job, param, condition.equals) for param in (condition.param, condition.also) if param)
     source = earlier[stage]
     if source.word == "skip":
         return False
@@ -102,6 +100,14 @@ def _holds(job: Job, condition: Condition, earlier: dict[str, Decision]) -> bool
         return json.loads((source.path / "facts.json").read_text())[name] == condition.equals
     except (OSError, ValueError, KeyError):
         raise Refused(f"{source.path / 'facts.json'}: has no {name!r}, which pipeline.yaml asks for") from None
+
+
+def _is(job: Job, param: str, value: Any) -> bool:
+    """Has `<stage>.<name>` this value?"""
+    stage, name = param.split(".", 1)
+    if name not in job.params.get(stage, {}):
+        raise Refused(f"{job.root / 'pipeline.yaml'}: a condition asks for {param}, which is not there")
+    return job.params[stage][name] == value
 
 
 def _there(job: Job, stage: str) -> Path | None:

@@ -317,6 +317,16 @@ def test_left_out_and_provided(root, capsys):
     assert said["masks"] == "skip the scene has no masks" and said["distill"].startswith("skip")
 
 
+def test_a_condition_may_ask_for_two_parameters(root):
+    one, both = "{param: distill.gain, equals", "{param: distill.gain, also: poses.shift, equals"
+    write(root, {"pipeline.yaml": FILES["pipeline.yaml"].replace(one, both)})
+    assert words(root, set="distill.gain=0 poses.shift=0")["distill"] == "skip no gain"
+    assert not words(root, set="distill.gain=0 poses.shift=1")["distill"].startswith("skip")
+    write(root, {"pipeline.yaml": FILES["pipeline.yaml"].replace(one, both.replace("shift", "nothing"))})
+    with pytest.raises(Refused, match=r"poses\.nothing, which is not there"):
+        words(root, set="distill.gain=0")
+
+
 def test_scene_yaml_stages_rerun_only_their_stage(root, capsys):
     write(root, {"data/toy/scene.yaml": "profile: laptop\nstages: {distill: {gain: 3}}\n"})
     assert ran(capsys, root) == ["distill", "evaluate"]
