@@ -9,6 +9,7 @@ from scipy import sparse
 from scipy.sparse.linalg import cg
 
 from reffusion.depth import check_maps, unit_range
+from reffusion.geometry import Degenerate
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,8 @@ def solve(target: np.ndarray, confidence: np.ndarray, guide: np.ndarray, solver:
         [H, W] float64. Cells that no confidence reaches hold the mean of the target under the confidence.
 
     Raises:
-        ValueError: no pixel of positive confidence; non-finite target there; shapes that differ; no convergence.
+        Degenerate: no convergence.
+        ValueError: no pixel of positive confidence; non-finite target there; shapes that differ.
     """
     target, confidence = np.asarray(target, np.float64), np.asarray(confidence, np.float64)
     check_maps(target, confidence, guide)
@@ -84,7 +86,10 @@ def solve(target: np.ndarray, confidence: np.ndarray, guide: np.ndarray, solver:
     solution, stalled = cg(system.tocsr(), gather(confidence * offset), rtol=1e-8, maxiter=5000,
                            M=sparse.diags(1.0 / system.diagonal()))  # fmt: skip
     if stalled:
-        raise ValueError(f"the bilateral solver did not converge at smoothness {solver.smoothness}: take a smaller one")
+        raise Degenerate(
+            "no convergence",
+            f"the bilateral solver did not converge at smoothness {solver.smoothness}: take a smaller one",
+        )
     return mean + solution[cell].reshape(target.shape)
 
 

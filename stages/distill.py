@@ -117,8 +117,8 @@ def run(
         prior = prior if personalize is None else lora.merged(prior, personalize)
         with torch.no_grad():
             text = diffusion.embed_text(prior, list(PROMPTS))
-    sights = load_sights(params, scene, poses, fit, masks)
     estimator = depth_estimator(params, scene.points) if params.depth_weight > 0 else None
+    sights = load_sights(params, scene, poses, fit, masks)
     gaussians, masked = distill(initial, masked, sights, holes, prior, text, settings(params), out, estimator)
     io.save_ply(out / "gaussians.ply", gaussians.map(lambda p: p.cpu()))
     io.save_labels(out / "labels.npy", masked.cpu())

@@ -53,7 +53,7 @@ class Params(BaseModel):
 def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, reference: Path | None) -> None:
     import torch
 
-    from reffusion import initialize, io
+    from reffusion import initialize, io, monocular
     from reffusion import masks as voting
 
     gaussians, labels = io.load_ply(fit / "gaussians.ply"), io.load_labels(masks / "labels.npy")
@@ -63,6 +63,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
     new = torch.zeros(len(gaussians), dtype=torch.bool)
     scene = io.load_scene(poses)
     references = io.load_references(reference, scene) if reference else []
+    network = monocular.load_network(params.depth_model) if params.depth_model and references else None
     sets = io.load_mask_sets(masks, scene.cameras)
     train = [scene.cameras[name] for name in scene.train]
     haze = voting.leaking(gaussians, train, {c.name: sets[c.name].never_seen for c in train}, params.leak)
@@ -71,7 +72,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
     for each in sorted(references, key=lambda r: (r.camera.name != best, -int(r.mask.sum()))):
         views = [(camera, sets[camera.name].consistent) for camera in train]
         gaussians, new = filled(
-            params, out, gaussians, new, each, sets[each.camera.name].consistent, scene.points, views
+            params, out, gaussians, new, each, sets[each.camera.name].consistent, scene.points, views, network
         )
     io.save_ply(out / "gaussians.ply", gaussians)
     io.save_labels(out / "labels.npy", new)
@@ -87,7 +88,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
         print(f"{facts['uncovered_share']:.0%} of the invent masks is covered by no reference: add another view's")
 
 
-def filled(params: Params, out: Path, gaussians, new, reference, hidden, points, views):
+def filled(params: Params, out: Path, gaussians, new, reference, hidden, points, views, network):
     """The Gaussians with those of one reference, on what is still empty in its mask, and the labels."""
     from dataclasses import fields
 
@@ -98,7 +99,7 @@ def filled(params: Params, out: Path, gaussians, new, reference, hidden, points,
     hole = initialize.to_fill(gaussians, new, reference, hidden, params.covered)
     remaining = gaussians.map(lambda p: p[~new])
     depth, made_up, said = initialize.depth_behind(
-        remaining, reference, hole, hidden, points, how, estimate_of(params, reference)
+        remaining, reference, hole, hidden, points, how, estimate_of(network, reference)
     )
     print(f"depth of reference {camera.name}: {said}")
     io.save_exr(out / "depth" / f"{camera.name}.exr", depth.astype("float32"))
@@ -118,13 +119,13 @@ def completion(params: Params):
     return Completion(**named, robust=params.depth_align == "robust")
 
 
-def estimate_of(params: Params, reference):
+def estimate_of(network, reference):
     """The depth model's answer to the reference, [H, W] disparity up to scale and offset; None without a model."""
     import torch
 
     from reffusion import monocular
 
-    if not params.depth_model:
+    if network is None:
         return None
     image = torch.from_numpy(reference.image).permute(2, 0, 1) / 255
-    return monocular.disparity(monocular.load_network(params.depth_model), image).numpy()
+    return monocular.disparity(network, image).numpy()
