@@ -159,12 +159,12 @@ def _copy(optimizer: GaussianOptimizer) -> dict[str, Tensor]:
 
 @dataclass(frozen=True)
 class _Job:
-    """What the terms work with from the first step to the last; only the adversary and the tally change.
+    """What `distill` was given, for its terms; only the adversary and the tally change.
 
     Attributes:
         painted: the sights with pixels to repaint.
+        adversary: the critic; None where it has no part.
         tally: what there is to log of steps gone by, of terms that not every step has.
-        others: see `distill`.
     """
 
     sights: Sequence[Sight]
@@ -193,6 +193,9 @@ def _job(sights, holes, prior, text, estimator, settings: Settings, device: torc
     return _Job(sights, painted, holes, prior, text, estimator, adversary, settings, {})
 
 
+_Done = tuple[Tensor, dict[str, float]] | None  # what a term gives: see `_step`
+
+
 def _step(optimizer: GaussianOptimizer, step: int, job: _Job) -> dict[str, float]:
     """The terms of one step, one after another, then one step of Adam; what there is to log.
 
@@ -207,9 +210,6 @@ def _step(optimizer: GaussianOptimizer, step: int, job: _Job) -> dict[str, float
             line |= done[1]
     optimizer.step(step / job.settings.iterations, visible=moved)
     return line
-
-
-_Done = tuple[Tensor, dict[str, float]] | None
 
 
 def _sds(optimizer: GaussianOptimizer, step: int, job: _Job) -> _Done:
