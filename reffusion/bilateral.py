@@ -10,6 +10,7 @@ from scipy import sparse
 from scipy.sparse.linalg import cg
 
 from reffusion.depth import check_maps, extremes_ratio, unit_range
+from reffusion.geometry import Degenerate
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,8 @@ def solve(
         [H, W] float64. Cells that no confidence reaches hold the mean of the target under the confidence.
 
     Raises:
-        ValueError: no pixel of positive confidence; non-finite target there; shapes that differ; no convergence.
+        Degenerate: no convergence.
+        ValueError: no pixel of positive confidence; non-finite target there; shapes that differ.
     """
     target, confidence = np.asarray(target, np.float64), np.asarray(confidence, np.float64)
     check_maps(target, confidence, guide)
@@ -106,7 +108,10 @@ def solve(
     solution, stalled = cg(system, right, rtol=1e-8, maxiter=5000, M=sparse.diags(1.0 / system.diagonal()),
                            callback=told if watch else None)  # fmt: skip
     if stalled:
-        raise ValueError(f"the bilateral solver did not converge at smoothness {solver.smoothness}: take a smaller one")
+        raise Degenerate(
+            "no convergence",
+            f"the bilateral solver did not converge at smoothness {solver.smoothness}: take a smaller one",
+        )
     return whole(solution)
 
 

@@ -6,8 +6,10 @@ Its own processor would ask for torchvision; the few lines that it takes are her
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -51,18 +53,22 @@ def load_network(source: str | Path, device: str = "cpu") -> DepthNetwork:
     if path.is_dir() and not (path / "config.json").is_file():
         raise ValueError(f"depth model {path}: the folder lacks config.json; it must be a transformers model folder")
     transformers_logging.disable_progress_bar()
+    _check_kind(_loaded(name, lambda: AutoConfig.from_pretrained(name)), name)
+    model = _loaded(name, lambda: AutoModelForDepthEstimation.from_pretrained(name, dtype=torch.float32))
+    return make_network(model, device)
+
+
+def _loaded(name: str, load: Callable[[], Any]) -> Any:
+    """What transformers loads; its complaint in one line, with what can be done."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            config = AutoConfig.from_pretrained(name)
-            _check_kind(config, name)
-            model = AutoModelForDepthEstimation.from_pretrained(name, dtype=torch.float32)
-    except OSError as error:
+            return load()
+    except (OSError, ValueError) as error:
         raise ValueError(
             f"depth model {name}: {str(error).splitlines()[0]} Name a local folder, or leave `depth_model` empty: "
             "depth is then continued from the surroundings"
         ) from error
-    return make_network(model, device)
 
 
 def _check_kind(config, name: str) -> None:

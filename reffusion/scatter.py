@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from reffusion.fit import initial_gaussians
 from reffusion.masks import points_inside
+from reffusion.start import initial_gaussians
 from reffusion.types import Camera, Gaussians
 
 FEWEST = 1000

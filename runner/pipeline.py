@@ -31,7 +31,8 @@ class Condition(Strict):
     """A reason to leave a stage out: one question, whose answer is yes.
 
     `fact: <stage>.<name>`, of an earlier stage's facts.json, is `equals`; or so is `param: <stage>.<name>`, a parameter
-    of any stage, or each of a list of them; or the folder `empty: <stage>/<folder>` of an earlier artifact holds no file.
+    of any stage, or each of a list of them; or the folder `empty: <stage>/<folder>` of an earlier artifact is without
+    a file.
     Ignored where the scene brings the key `unless`.
     """
 

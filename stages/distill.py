@@ -146,8 +146,8 @@ def run(
             text = diffusion.embed_text(prior, list(PROMPTS))
         prior = diffusion.without_text(prior)
         prior = diffusion.recomputing(prior) if params.checkpointing else prior
-    sights, (perceptual, lifting) = load_sights(params, scene, poses, fit, masks, lift), lift_choices(params)
     estimator = depth_estimator(params, scene.points) if params.depth_weight > 0 else None
+    sights, (perceptual, lifting) = load_sights(params, scene, poses, fit, masks, lift), lift_choices(params)
     with memory.blamed("distill.memory_gb", params.memory_gb):
         if prior is not None:
             prior = memory.fitted(prior, params.memory_gb, "distill.memory_gb", memory.encoding)

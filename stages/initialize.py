@@ -61,7 +61,7 @@ def run(
 ) -> None:
     import torch
 
-    from reffusion import initialize, io, trace
+    from reffusion import initialize, io, monocular, trace
     from reffusion import masks as voting
 
     gaussians, labels = io.load_ply(fit / "gaussians.ply"), io.load_labels(masks / "labels.npy")
@@ -75,6 +75,7 @@ def run(
         raise ValueError("initialize.start is 'lift', but the stage lift was left out: set distill.lift_weight")
     completed = {"reference": reference, "lift": lift}.get(params.start)
     references = io.load_references(completed, scene) if completed else []
+    network = monocular.load_network(params.depth_model) if params.depth_model and references else None
     sets = io.load_mask_sets(masks, scene.cameras)
     train = [scene.cameras[name] for name in scene.train]
     haze = voting.leaking(gaussians, train, {c.name: sets[c.name].never_seen for c in train}, params.leak)
@@ -84,7 +85,7 @@ def run(
     for each in sorted(references, key=lambda r: (r.camera.name != best, -int(r.mask.sum()))):
         views = [(camera, sets[camera.name].consistent) for camera in train]
         gaussians, new = filled(
-            params, out, gaussians, new, each, sets[each.camera.name].consistent, scene.points, views, log
+            params, out, gaussians, new, each, sets[each.camera.name].consistent, scene.points, views, network, log
         )
     if params.start == "random" and any(each.invent.any() for each in sets.values()):
         added = at_random(params, removed, gaussians, scene, sets, poses)
@@ -122,7 +123,7 @@ def at_random(params: Params, removed, remaining, scene, sets, poses: Path):
     return scatter.gaussians_at(points, remaining.sh.shape[1], remaining.antialiased, draw)
 
 
-def filled(params: Params, out: Path, gaussians, new, reference, hidden, points, views, log):
+def filled(params: Params, out: Path, gaussians, new, reference, hidden, points, views, network, log):
     """The Gaussians with those of one reference, on what is still empty in its mask, and the labels."""
     from dataclasses import fields
 
@@ -133,7 +134,7 @@ def filled(params: Params, out: Path, gaussians, new, reference, hidden, points,
     hole = initialize.to_fill(gaussians, new, reference, hidden, params.covered)
     remaining = gaussians.map(lambda p: p[~new])
     depth, made_up, said = initialize.depth_behind(
-        remaining, reference, hole, hidden, points, how, estimate_of(params, reference), log
+        remaining, reference, hole, hidden, points, how, estimate_of(network, reference), log
     )
     print(f"depth of reference {camera.name}: {said}")
     io.save_exr(out / "depth" / f"{camera.name}.exr", depth.astype("float32"))
@@ -153,13 +154,13 @@ def completion(params: Params):
     return Completion(**named, robust=params.depth_align == "robust")
 
 
-def estimate_of(params: Params, reference):
+def estimate_of(network, reference):
     """The depth model's answer to the reference, [H, W] disparity up to scale and offset; None without a model."""
     import torch
 
     from reffusion import monocular
 
-    if not params.depth_model:
+    if network is None:
         return None
     image = torch.from_numpy(reference.image).permute(2, 0, 1) / 255
-    return monocular.disparity(monocular.load_network(params.depth_model), image).numpy()
+    return monocular.disparity(network, image).numpy()

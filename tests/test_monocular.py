@@ -93,6 +93,9 @@ def test_refusals_name_what_is_wrong(tmp_path, monkeypatch, folder):
         monocular.load_network(tmp_path)
     with pytest.raises(ValueError, match="clip_text_model"):
         monocular.load_network(TINY / "text_encoder")
+    (tmp_path / "config.json").write_text("{}")
+    with pytest.raises(ValueError, match="leave `depth_model` empty"):
+        monocular.load_network(tmp_path)
     shutil.copy(folder / "config.json", tmp_path)
     with pytest.raises(ValueError, match="leave `depth_model` empty"):
         monocular.load_network(tmp_path)  # a configuration without weights
@@ -123,12 +126,11 @@ def test_the_references_depth_is_the_estimate_aligned():
         behind_it(-true)
 
 
-def test_the_stage_asks_the_model_of_its_parameter(folder, network):
-    from stages.initialize import Params, estimate_of
+def test_the_stage_shows_the_model_the_reference(network):
+    from stages.initialize import estimate_of
 
     view = small.CAMERAS["a2"]
     reference = Reference(view, small.photo(view), np.zeros((small.HEIGHT, small.WIDTH), bool))
     image = torch.from_numpy(reference.image).permute(2, 0, 1) / 255
-    found = estimate_of(Params(depth_model=str(folder)), reference)
-    assert (found == monocular.disparity(network, image).numpy()).all()
-    assert estimate_of(Params(), reference) is None
+    assert (estimate_of(network, reference) == monocular.disparity(network, image).numpy()).all()
+    assert estimate_of(None, reference) is None

@@ -328,6 +328,16 @@ def test_the_scenes_own_file_stands_for_a_stage_only_while_its_parameter_allows(
         words(root)
 
 
+def test_a_condition_may_ask_for_two_parameters(root):
+    one, both = "{param: distill.gain, equals", "{param: [distill.gain, poses.shift], equals"
+    write(root, {"pipeline.yaml": FILES["pipeline.yaml"].replace(one, both)})
+    assert words(root, set="distill.gain=0 poses.shift=0")["distill"] == "skip no gain"
+    assert not words(root, set="distill.gain=0 poses.shift=1")["distill"].startswith("skip")
+    write(root, {"pipeline.yaml": FILES["pipeline.yaml"].replace(one, both.replace("shift", "nothing"))})
+    with pytest.raises(Refused, match=r"poses\.nothing, which is not there"):
+        words(root, set="distill.gain=0")
+
+
 def test_scene_yaml_stages_rerun_only_their_stage(root, capsys):
     write(root, {"data/toy/scene.yaml": "profile: laptop\nstages: {distill: {gain: 3}}\n"})
     assert ran(capsys, root) == ["distill", "evaluate"]

@@ -13,10 +13,11 @@ from plyfile import PlyData
 
 from benchmarks.stability.cases import EPS32, EPS64, Case, largest
 from reffusion import frame, io, trace
-from reffusion.fit import Settings, fit, initial_gaussians
+from reffusion.fit import Settings, fit
 from reffusion.lens import Lens
 from reffusion.optimize import Rates
 from reffusion.splat import render
+from reffusion.start import initial_gaussians
 from reffusion.types import Camera, Gaussians, Scene, Similarity
 
 WIDTH, HEIGHT, VIEWS = 24, 18, 5

@@ -20,9 +20,10 @@ from reffusion.confinement import Sight
 from reffusion.densify import densify, prune
 from reffusion.distill import Settings as Distilling
 from reffusion.distill import distill
-from reffusion.fit import Settings, fit, initial_gaussians
+from reffusion.fit import Settings, fit
 from reffusion.optimize import GaussianOptimizer, Rates
 from reffusion.splat import render
+from reffusion.start import initial_gaussians
 from reffusion.types import PARAMETERS, Gaussians
 
 STOPS = "neither recovered nor stopped by name, or wrote NaN"
