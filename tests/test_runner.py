@@ -324,7 +324,7 @@ def test_the_scenes_own_file_stands_for_a_stage_only_while_its_parameter_allows(
     ran(capsys, root, set="fit.rate=3")
     assert words(root, set="fit.rate=3")["fit"] == "cached" and result(root) == 13.0  # 3 steps of 3, and the scene's 4
     edit(root / "pipeline.yaml", "param: fit.rate", "param: fit.rat")
-    with pytest.raises(Refused, match="a condition asks for fit.rat, which is not there"):
+    with pytest.raises(Refused, match=r"a condition asks for fit\.rat, which is not there"):
         words(root)
 
 
