@@ -54,6 +54,14 @@ def load(folder: str | Path | None = None, device: str = "cpu") -> Painter:
     return Painter(f"LaMa ({files[0].name})", lambda image, hole: lama(module, image, hole, device))
 
 
+def widened(mask: np.ndarray, fraction: float) -> np.ndarray:
+    """The mask, bool [H, W], and all pixels within `fraction` of the image's width. At the rim of a mask the object's
+    blurred edge remains, and an inpainter would continue it into the hole."""
+    reach = round(fraction * mask.shape[1])
+    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    return cv2.dilate(mask.astype(np.uint8), disk) > 0
+
+
 @torch.no_grad()
 def lama(module: torch.nn.Module, image: np.ndarray, hole: np.ndarray, device: str = "cpu") -> np.ndarray:
     """One forward pass. The module takes a picture [1, 3, H, W] in [0, 1] and a mask [1, 1, H, W], 1 = hole, both of

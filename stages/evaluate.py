@@ -30,6 +30,7 @@ class Params(BaseModel):
         json_schema_extra={"weights": True},
     )
     inpaint: bool = Field(False, description="a baseline: each rendered view is inpainted in 2D inside its mask")
+    widen: float = Field(0.01, ge=0, description="how much wider than the mask it is inpainted, / image width")
     lama: str | None = Field(
         None,
         description="folder with LaMa's TorchScript file, for that; none: OpenCV's FSR, else Telea",
@@ -83,8 +84,9 @@ def run(
         pictures = {stage: drawn(gaussians[stage], camera, out / FOLDERS[stage] / file) for stage in gaussians}
         shown = seen(gaussians[result], camera, pictures[result], mask_of(camera, poses, masks))
         if painter:
-            depth = consistency.depth_through(shown.depth, shown.mask)
-            shown = shown._replace(picture=painter.paint(shown.picture, shown.mask), depth=depth)
+            wide = paint2d.widened(shown.mask, params.widen)
+            depth = consistency.depth_through(shown.depth, wide)
+            shown = shown._replace(picture=painter.paint(shown.picture, wide), depth=depth)
         io.save_image(out / "renders" / file, shown.picture)
         if before:
             rows[-1] |= dict(zip(CONSISTENCY, consistency.difference(before, shown), strict=True))

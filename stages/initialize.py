@@ -78,7 +78,9 @@ def run(
     network = monocular.load_network(params.depth_model) if params.depth_model and references else None
     sets = io.load_mask_sets(masks, scene.cameras)
     train = [scene.cameras[name] for name in scene.train]
-    haze = voting.leaking(gaussians, train, {c.name: sets[c.name].never_seen for c in train}, params.leak)
+    haze = torch.zeros(len(gaussians), dtype=torch.bool)
+    if params.start != "nothing":  # where nothing is put in its place, haze is better than a black hole
+        haze = voting.leaking(gaussians, train, {c.name: sets[c.name].never_seen for c in train}, params.leak)
     gaussians, new = gaussians.map(lambda p: p[~haze]), new[~haze]
     best = io.load_json(masks / "facts.json")["best_reference"]
     log = trace.Trace(out) if references else None

@@ -21,6 +21,7 @@ class Params(BaseModel):
         description="folder with LaMa's TorchScript file, e.g. big-lama.pt; none: OpenCV's FSR, else Telea",
         json_schema_extra={"weights": True},
     )
+    widen: float = Field(0.01, ge=0, description="how much wider than the hole is painted, / image width")
     every: int = Field(1, ge=1, description="every so manieth training view is inpainted; the reference's always")
     prior: str = Field(
         "sd2-community/stable-diffusion-2-inpainting",
@@ -41,7 +42,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path) -> No
 
     Views that an earlier try finished are not painted again.
     """
-    from reffusion import exposure, inpaint, io, trace
+    from reffusion import exposure, inpaint, io, paint2d, trace
     from reffusion.types import Reference
 
     scene, facts = io.load_scene(poses), io.load_json(masks / "facts.json")
@@ -58,7 +59,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path) -> No
         photo, pixels = exposure.load_views(poses, fit, [name])[name], io.load_mask_sets(masks, [name])[name]
         base = inpaint.background(remaining, scene.cameras[name], photo, pixels.consistent)
         writing = path.with_name(f".{path.name}")
-        io.save_image(writing, paint(base, pixels.invent, name))
+        io.save_image(writing, paint(base, paint2d.widened(pixels.invent, params.widen), name))
         writing.rename(path)  # a kill leaves no half picture
     image, mask = io.load_image(out / "images" / f"{best}.png"), io.load_mask_sets(masks, [best])[best].invent
     io.save_references(out, [Reference(scene.cameras[best], image, mask)])

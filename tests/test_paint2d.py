@@ -52,6 +52,12 @@ def test_only_the_hole_changes_and_its_content_does_not_count(tmp_path):
         assert (painter.paint(image, np.zeros_like(hole())) == image).all(), painter.name
 
 
+def test_a_mask_is_widened_by_a_share_of_the_width():
+    wide = paint2d.widened(hole(), 0.04)  # 2 px
+    assert (wide[10:26, 25]).all() and not wide[9, 25] and not wide[26, 25] and wide[18, 13] and not wide[18, 12]
+    assert (paint2d.widened(hole(), 0) == hole()).all() and not paint2d.widened(np.zeros_like(hole()), 0.1).any()
+
+
 def test_a_smooth_picture_is_continued():
     for painter in (paint2d.load(), paint2d.Painter("telea", paint2d.telea)):
         error = np.abs(painter.paint(picture(), hole()).astype(int) - picture())[hole()]
