@@ -348,7 +348,7 @@ def test_report_of_a_job(compared, home):
 def test_report_of_a_variant_says_what_was_left_out(compared, home):
     plan_of(compared, home.parent, "--variant", "none")
     html = job.make(home.with_name("toy@none")).read_text()
-    assert re.search(r"<td>distill</td><td[^>]*>left out</td><td[^>]*>no gain</td>", html)
+    assert re.search(r"<td>distill</td><td[^>]*>left.out</td><td[^>]*>no gain</td>", html)
     assert "shared with toy" in html and "distill.png" not in html
 
 
