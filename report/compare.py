@@ -88,10 +88,10 @@ def forest(comparison: Comparison, path: Path) -> Path | None:
 
 
 def cells(table: list[dict[str, Any]]) -> tuple[list[str], list[list[str]], list[list[bool]]]:
-    """Header, texts and which are best in their column; a metric that no method has is left out."""
-    names = [name for name in TITLES if name == "method" or any(row[name] is not None for row in table)]
+    """Header, texts and which are best in their column; a dash where there is no value."""
+    names = [name for name in TITLES if name != "consistency" or any(row[name] is not None for row in table)]
     best = {}
-    for name, better in {**BETTER, "consistency": "less"}.items():
+    for name, better in BETTER.items():  # not in consistency, which blur has too
         values = [row[name] for row in table if row[name] is not None]
         best[name] = (max if better == "more" else min)(values, default=None) if len(values) > 1 else None
     texts, bold = [], []

@@ -55,7 +55,7 @@ def stage_chart(stage: str, series: dict[str, Lines], path: Path) -> list[str]:
         drawn = {key: from_edge(points) for key, points in drawn.items() if len(points)}
         alone = len(drawn) == 1
         for key, points in drawn.items():
-            words = "" if alone else f" {key}"
+            words = f" {key}" if 1 < len(drawn) <= 4 else ""
             _curve(axes, name, points, BLUE if alone else GREY, words, main=alone and name == names[0])
         values = np.concatenate([points[:, 1] for points in drawn.values()])
         if spans(values, 10) and values.min() > 0:

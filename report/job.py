@@ -19,8 +19,8 @@ from report.results import load_receipts
 
 ORDER = ("poses", "fit", "masks", "reference", "lift", "personalize", "initialize", "distill", "evaluate")
 WORDS = {
-    "skip": "left out", "provided": "brought by the scene", "cached": "done", "run": "would run", "stale": "would run",
-    "missing": "cannot run", "undecided": "not decided yet",
+    "skip": "left\u00a0out", "provided": "brought", "cached": "done", "run": "to\u00a0run", "stale": "to\u00a0run",
+    "missing": "cannot\u00a0run", "undecided": "undecided",
 }  # fmt: skip
 ENDS = {"no gain": "no gain any more", "fell": "the error had risen", "converged": "converged", "finished": ""}
 RESULTS = {

@@ -79,7 +79,7 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def number(value: float | None, digits: int = 0) -> str:
-    """With thin groups of thousands; an en dash where there is none."""
+    """With commas between thousands; a dash where there is none."""
     return "–" if value is None else f"{value:,.{digits}f}"
 
 

@@ -69,7 +69,8 @@ def wall(cells: list[np.ndarray], titles: list[str]) -> np.ndarray:
     columns = min(len(cells), 4)
     scale = max(1, round(WIDTH / columns / width))
     size = max(13, min(26, width * scale // 14))
-    font, head = ImageFont.load_default(size), round(3.0 * size)
+    below = round(1.2 * size) if any("\n" in title for title in titles) else 0  # room for a second line
+    font, head = ImageFont.load_default(size), round(1.8 * size) + below
     step = width * scale + 2 * GAP, height * scale + head + GAP
     rows = -(-len(cells) // columns)
     canvas = Image.new("RGB", (columns * step[0] - 2 * GAP, rows * step[1] - GAP), "white")
@@ -78,6 +79,6 @@ def wall(cells: list[np.ndarray], titles: list[str]) -> np.ndarray:
         left, top = index % columns * step[0], index // columns * step[1]
         name, _, score = title.partition("\n")
         draw.text((left, top + head - size // 3), score, "#666", font, anchor="ls")
-        draw.text((left, top + head - size // 3 - round(1.2 * size)), name, "black", font, anchor="ls")
+        draw.text((left, top + head - size // 3 - below), name, "black", font, anchor="ls")
         canvas.paste(Image.fromarray(enlarged(cell, scale)), (left, top + head))
     return np.asarray(canvas)

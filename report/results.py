@@ -105,6 +105,8 @@ def _number(column: str, text: str | None) -> float | None:
         value = float(text or "")
     except ValueError:
         return None
+    if math.isnan(value):
+        return None
     return min(value, PSNR_CAP) if "psnr" in column else value
 
 
