@@ -102,7 +102,7 @@ def half_precision(dtype: torch.dtype) -> float:
 
 def distilled(t: int, dtype: torch.dtype) -> float:
     """Gradients of all weightings for data of unit variance, whose score is known (eps = s z_t, z_0 = a z_t), against
-    float64; relative L2."""
+    float64; L2 relative to what each is a difference of."""
     latents, noise = (normal(2, 4, 8, 8, label=name).to(dtype) for name in ("latents", "noise"))
     abar, times, worst = model().alphas_cumprod, torch.full((2,), t % model().timesteps), 0.0
     a, s = (x.double()[times[0]] for x in (abar.sqrt(), (1 - abar.double()).sqrt()))
@@ -112,8 +112,8 @@ def distilled(t: int, dtype: torch.dtype) -> float:
         found = sds.sds_gradient(
             latents, lambda z, _: (s.to(z) * z, a.to(z) * z), times, noise, abar, weighting=weighting
         )
-        # z - z_0 is a difference of numbers of order one at t = 0: its error is measured against those.
-        size = latents.double().norm() if weighting == "x0" else truth.norm()
+        # Each is a difference of numbers of order one (at t = 0, or at T-1): its error is measured against those.
+        size = {"x0": latents.double(), "sigma2": s**2 * noise.double(), "one": noise.double()}[weighting].norm()
         worst = largest(worst, ((found.double() - truth).norm() / size).item())
     return worst
 

@@ -36,8 +36,11 @@ class Drawn(NamedTuple):
     radii: Tensor
 
 
-def draw(gaussians: Gaussians, camera: Camera, impl: str, seed: int = 0) -> Drawn:
-    """With `impl` "cpu" in float32; with "reference" in float64 with the cut-offs of "cpu"."""
+def draw(gaussians: Gaussians, camera: Camera, impl: str, seed: int = 0, far: float = 1.0) -> Drawn:
+    """With `impl` "cpu" in float32; with "reference" in float64 with the cut-offs of "cpu".
+
+    `far`: the unit of depth in the linear function.
+    """
     dtype = torch.float32 if impl == "cpu" else torch.float64
     random = torch.Generator().manual_seed(seed)
     normal = lambda *shape: torch.randn(*shape, generator=random).to(dtype)
@@ -51,7 +54,8 @@ def draw(gaussians: Gaussians, camera: Camera, impl: str, seed: int = 0) -> Draw
         images, radii = {name: getattr(drawn, name) for name in IMAGES}, drawn.radii
     else:
         images, radii = _drawn_with(blended, gaussians, camera, **extras)
-    loss = sum((image * normal(*image.shape)).sum() for image in images.values())
+    units = {"depth": far}
+    loss = sum((image * normal(*image.shape)).sum() / units.get(name, 1.0) for name, image in images.items())
     leaves = [*(getattr(gaussians, name) for name in PARAMETERS), features, background, probe]
     found = torch.autograd.grad(loss, leaves, allow_unused=True)
     gradients = {n: torch.zeros_like(x) if g is None else g for n, x, g in zip(BLOCKS, leaves, found, strict=True)}
@@ -100,7 +104,9 @@ def errors(gaussians: Gaussians, camera: Camera, relative: float, seed: int = 0)
     So a value of at most `relative` says that the error is within relative * |oracle| + floor. A quaternion's
     gradient counts times its length, as a rotation: otherwise the shortest one would drown all others.
     """
-    fast, exact = draw(gaussians, camera, "cpu", seed), draw(gaussians, camera, "reference", seed)
+    # Depths count in units of the farthest, so that the terms of every sum are of order one, as the floor has them.
+    far = max(1.0, splat.render(gaussians, camera, impl="cpu").depth.max().item())
+    fast, exact = (draw(gaussians, camera, impl, seed, far) for impl in ("cpu", "reference"))
     if not torch.equal(fast.radii, exact.radii):
         return {"radii": float("inf")}
     lengths = gaussians.quaternions.double().norm(dim=1, keepdim=True)
