@@ -27,8 +27,8 @@ from stages import distill, fit, initialize, masks, personalize
 ROOT = Path(__file__).resolve().parent.parent
 NEAR = 1.7
 FIT = {"iterations": 40, "sh_degree": 0, "budget": 500, "holdout": 3, "densify_until": 0.3}
-PERSONALIZE = {"steps": 20, "batch": 2, "rank": 2, "alpha": 4, "size": 16, "lr_unet": 1e-3}
-DISTILL = {"iterations": 20, "sds_weight": 0, "reference_weight": 1}
+PERSONALIZE = {"steps": 10, "batch": 2, "rank": 2, "alpha": 4, "size": 16, "lr_unet": 1e-3}
+DISTILL = {"iterations": 8, "sds_weight": 0, "reference_weight": 1}
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +91,7 @@ def test_a_stages_trace_follows_the_schema(ready, tmp_path, stage):
     series = io.load_trace(run(stage, ready, tmp_path / stage) / "trace.jsonl", stage)
     found = series.pop("")
     assert not series and found[0]["iteration"] == 0 and io.main_quantity(stage, found) == io.MAIN[stage][0]
-    steps = {"fit": 40, "personalize": 20, "distill": 20}[stage]
+    steps = {"fit": 40, "personalize": 10, "distill": 8}[stage]
     assert found[-1]["iteration"] == found[-1]["of"] == found[-1]["kept"] == steps
     assert found[-1]["reason"] == "finished" and all("reason" not in line for line in found[:-1])
     assert len(found) >= 5 and all(io.MAIN[stage][0] in line for line in found)
