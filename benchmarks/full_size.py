@@ -212,9 +212,8 @@ def personalization_step(prior: diffusion.Prior, picture: P.Picture, batch: int,
     loss = P.train_step(prior, optimizer, [picture], [], P.Sampling(), training, 0)
     lora.set_dropout(prior, False)
     lora.save(prior, folder)
-    return {"loss": loss} | {
-        f"lora_{part}": sum(float(p.detach().abs().sum()) for p in of) for part, of in trained.items()
-    }
+    moved = {f"lora_{part}": sum(float(p.detach().abs().sum()) for p in of) for part, of in trained.items()}
+    return {"loss": loss} | moved
 
 
 @torch.no_grad()

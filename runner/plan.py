@@ -174,14 +174,14 @@ def _on_this_machine(job: Job, stage: str, decision: Decision) -> Decision:
         return Decision("missing", f"{stage}.device is cuda, and this machine has no CUDA driver: {cure}")
     if not at_work:
         return decision
-    notes = []
-    for need in (need for need in job.needed[stage] if need["problem"]):
+    lacks = [need for need in job.needed[stage] if need["problem"]]
+    for need in (need for need in lacks if not need["optional"]):
         fetch = f"; `make weights profile={job.profile}` fetches it ({amount(need['bytes'])})"
-        said = need["problem"] + (fetch if need["fetched"] else "")
-        if not need["optional"]:
-            return Decision("missing", said)
-        notes.append(said)
-    return replace(decision, notes=tuple(notes[:1]))
+        return Decision("missing", need["problem"] + (fetch if need["fetched"] else ""))
+    if lacks:
+        fetch = f"`make weights profile={job.profile}` fetches it ({amount(sum(need['bytes'] or 0 for need in lacks))})"
+        return replace(decision, notes=(f"{lacks[0]['problem']}; {fetch}",))
+    return decision
 
 
 def amount(count: int | None) -> str:
@@ -226,13 +226,17 @@ def plan(job: Job, stages: list[str], done: dict[str, Decision] | None = None) -
 
 
 def table(job: Job, decisions: dict[str, Decision]) -> str:
-    """The profile and why; a line a stage: word, stage, expected time, reason and notes."""
+    """The profile and why; a line a stage: word, stage, expected time, reason, notes; what there is to download."""
     lines = [f"{job.label} (profile {job.profile}: {job.why})"]
     for stage, decision in decisions.items():
         seconds = expected_seconds(job, stage) if decision.word in ("run", "stale", "undecided") else None
         time = f"~{seconds:.0f} s" if seconds is not None else ""
         lines.append(f"  {decision.word:<9} {stage:<12} {time:>7}  {decision.reason}".rstrip())
         lines += [f"{'':33}{note}" for note in decision.notes]
+    to_come = [stage for stage, decision in decisions.items() if decision.word not in ("cached", "provided", "skip")]
+    needs = {need["name"]: need for stage in to_come for need in job.needed[stage] if need["problem"]}
+    if sizes := [need["bytes"] or 0 for need in needs.values() if need["fetched"] and not need["optional"]]:
+        lines.append(f"  weights to fetch: {amount(sum(sizes))}, by `make weights profile={job.profile}`")
     return "\n".join(lines)
 
 

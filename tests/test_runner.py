@@ -557,7 +557,9 @@ def test_weights_that_are_missing_are_told_before_any_work_and_fetched(fresh, ca
     assert words(fresh)["distill"] == "missing acme/net is not here; `make weights profile=laptop` fetches it (2.6 GB)"
     with pytest.raises(Refused, match="acme/net is not here"):
         run_scene(request(fresh), "all")
-    assert "toy (profile laptop: asked for)" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "toy (profile laptop: asked for)" in shown
+    assert "weights to fetch: 2.6 GB, by `make weights profile=laptop`" in shown
     assert not (fresh / "runs" / "toy" / "poses").exists()
 
     asked = request(fresh, scene="")
