@@ -310,23 +310,23 @@ def lines(folder):
 
 def test_interrupted_distillation_with_the_depth_term_resumes_bit_for_bit(prior, text, tmp_path, monkeypatch):
     whole, _ = distilled(tmp_path / "whole", prior, text, giving(WALL))
-    real = D._step
+    real = D.step_of
 
     def interrupted(optimizer, step, *others):
         if step == 3:
             raise KeyboardInterrupt
         return real(optimizer, step, *others)
 
-    monkeypatch.setattr(D, "_step", interrupted)
+    monkeypatch.setattr(D, "step_of", interrupted)
     with pytest.raises(KeyboardInterrupt):
         distilled(tmp_path / "broken", prior, text, giving(WALL))
     assert load_checkpoint(tmp_path / "broken")["step"] == 3
-    monkeypatch.setattr(D, "_step", real)
+    monkeypatch.setattr(D, "step_of", real)
     resumed, _ = distilled(tmp_path / "broken", prior, text, giving(WALL))
     for name in PARAMETERS:
         assert (getattr(whole, name) == getattr(resumed, name)).all(), name
     assert lines(tmp_path / "whole") == lines(tmp_path / "broken")
-    assert 0 < lines(tmp_path / "whole")[-1]["depth"] < lines(tmp_path / "whole")[0]["depth"]
+    assert 0 < lines(tmp_path / "whole")[-1]["depth"] < lines(tmp_path / "whole")[1]["depth"]
 
 
 def test_skipped_views_are_counted_by_reason_and_move_nothing(prior, text, tmp_path):

@@ -273,7 +273,8 @@ def test_the_chain_of_lifted_pictures(scene, painted, tmp_path, monkeypatch):
     for name in ("XDG_CACHE_HOME", "TORCH_HOME"):
         monkeypatch.setenv(name, str(tmp_path / "nothing"))  # as on a machine without weights
     for loss, perceptual_name in (("mse", None), ("perceptual", "multi-scale D-SSIM")):
-        params = distill.Params(iterations=4, sds_weight=0, lift_weight=1, lift_loss=loss, lift_patch=24)
+        without = {"sds_weight": 0, "adversarial_weight": 0, "depth_weight": 0}
+        params = distill.Params(iterations=4, lift_weight=1, lift_loss=loss, lift_patch=24, **without)
         out = tmp_path / loss
         out.mkdir()
         distill.run(params, out, **chain, lift=painted)
