@@ -272,6 +272,22 @@ def test_repainting_changes_the_hole_only_and_the_less_the_later_it_starts(prior
     assert 0 < changes[1] < 0.1 and changes[1] < 0.3 * changes[0]
 
 
+def test_the_picture_is_painted_only_where_planes_do_not_explain(prior, text):
+    asked = []
+
+    def guide():
+        asked.append(1)
+        return np.full((HEIGHT, WIDTH, 3), 0.5)
+
+    view = replace(shown(), depth=1 / WALL)
+    for share, times in ((0.7, 0), (2.0, 1)):
+        found, _ = behind.continued(view, guide, NO_POINTS, replace(HOW, planar_share=share))
+        np.testing.assert_allclose(found[HOLE], WALL[HOLE], rtol=1e-3)
+        assert len(asked) == times
+    smooth = depth_term.by_continuation(NO_POINTS, replace(HOW, planar_share=2.0))
+    assert float(term(*wall(), smooth, prior, text)[0]) < 1e-3
+
+
 def test_the_estimator_sees_the_repainted_view(prior, text):
     seen = []
 

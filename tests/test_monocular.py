@@ -10,7 +10,7 @@ import small_scene as small
 import torch
 
 from reffusion import initialize, monocular
-from reffusion.behind import Completion
+from reffusion.behind import Completion, Seen
 from reffusion.trace import generator
 from reffusion.types import Reference
 
@@ -134,3 +134,15 @@ def test_the_stage_shows_the_model_the_reference(network):
     image = torch.from_numpy(reference.image).permute(2, 0, 1) / 255
     assert (estimate_of(network, reference) == monocular.disparity(network, image).numpy()).all()
     assert estimate_of(None, reference) is None
+
+
+def test_the_depth_term_asks_the_model_of_its_parameter(folder, network):
+    """A scene whose disparity is the model's own answer, scaled and moved: that is what it finds in the hole."""
+    from stages import distill
+
+    view, image = small.CAMERAS["a2"], picture(small.HEIGHT, small.WIDTH)
+    true = 2.0 + 0.3 * monocular.disparity(network, image).double().numpy()
+    hole = small.true_mask(view, 1.7)
+    seen = Seen(view, np.where(hole, 0.0, 1 / true), ~hole, hole, hole)
+    estimator = distill.depth_estimator(distill.Params(depth_model=str(folder)), np.zeros((0, 3)))
+    np.testing.assert_allclose(estimator(seen, lambda: image.permute(1, 2, 0).numpy()), true, rtol=1e-6)
