@@ -1,4 +1,4 @@
-"""Stiff and extreme cases, each with a bound that was argued before anything was measured (docs/stability.md)."""
+"""Stiff and extreme cases, each with a bound that is argued beside it (docs/stability.md)."""
 
 from __future__ import annotations
 
