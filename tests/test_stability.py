@@ -4,6 +4,7 @@ import json
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -68,7 +69,10 @@ def test_fault_is_caught(fault):
 
 
 def test_command_writes_the_table_and_fails_by_exit_code(tmp_path, monkeypatch, capsys):
-    cases = [Case("fine", "of one", 1.0, lambda: 0.5), Case("too much", "of one", 1.0, lambda: 2.0)]
+    cases = [
+        Case("fine", "of one", np.float64(1.0), lambda: np.float64(0.5)),
+        Case("too much", "of one", 1.0, lambda: 2.0),
+    ]
     cases += [Case("no number", "of one", 1.0, lambda: float("nan")), Case("raises", "of one", 1.0, lambda: 1 / 0)]
     monkeypatch.setattr(command, "all_cases", lambda: cases)
     out = tmp_path / "runs" / "stability.json"

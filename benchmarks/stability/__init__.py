@@ -1,4 +1,4 @@
-"""Stiff and extreme cases, each with a bound that was argued before anything was measured (docs/stability.md)."""
+"""Stiff and extreme cases, each with a bound that is argued beside it (docs/stability.md)."""
 
 from __future__ import annotations
 
@@ -45,5 +45,5 @@ def run(case: Case) -> Row:
         traceback.print_exc(file=sys.stderr)
         measured = math.nan
     finite = math.isfinite(measured)
-    ok = finite and measured <= case.bound
+    ok = finite and bool(measured <= case.bound)
     return Row(case.name, case.quantity, float(case.bound), measured if finite else None, ok)

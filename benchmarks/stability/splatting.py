@@ -48,7 +48,10 @@ def in_camera(points: list[list[float]], view: Camera) -> torch.Tensor:
 
 
 def error(change: Callable[[Gaussians], Gaussians], view: Camera | None = None) -> float:
-    return oracle.worst(change(cloud()), view or camera(), RELATIVE)
+    """The worst block's; infinite where nothing is drawn, which would say nothing."""
+    gaussians, view = change(cloud()), view or camera()
+    drawn = splat.render(gaussians, view, impl="cpu").alpha.max() > 0
+    return oracle.worst(gaussians, view, RELATIVE) if drawn else math.inf
 
 
 def scaled(scale: float, gaussians: Gaussians) -> Gaussians:
