@@ -4,6 +4,7 @@ The only importer of peft.
 
 W' = W + alpha / rank * B A. Without dropout the product is added to the weights once a forward pass, instead of running
 every input through A and B too: the same function and gradients, a fifth of a step cheaper for the embedded prior.
+Not in half precision: there most of a small product would be lost in the sum, while beside it A and B are float32.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ def add(prior: Prior, rank: int, alpha: float, dropout: float, layers: str, seed
             part.add_adapter(LoraConfig(r=rank, lora_alpha=alpha, lora_dropout=dropout, target_modules=list(names)))
     set_dropout(prior, False)
     found = {"unet": _lora_parameters(prior.unet), "text": _lora_parameters(prior.text_encoder)}
-    if dropout == 0:
+    if dropout == 0 and prior.dtype == torch.float32:
         _add_to_weights(prior.unet)
     return found
 

@@ -285,8 +285,8 @@ def _misfit_of_added(unet: Mapping[str, Any], texts: Sequence[Mapping[str, Any]]
         return f"{len(texts)} text encoder(s) with addition_embed_type {kind!r}; neither Stable Diffusion nor SDXL"
     if kind is None:
         return None
-    width = texts[1].get("projection_dim", 512) + 6 * unet["addition_time_embed_dim"]
-    wanted = unet["projection_class_embeddings_input_dim"]
+    width = texts[1].get("projection_dim", 512) + 6 * (unet.get("addition_time_embed_dim") or 0)
+    wanted = unet.get("projection_class_embeddings_input_dim")
     if width != wanted:
         return f"the UNet's added conditions are {wanted} numbers, the text encoder's and the sizes' {width}"
     return None

@@ -130,6 +130,27 @@ def test_half_precision_stays_near_and_leaves_the_vae_alone(sd2):
     assert torch.allclose(clean_half - clean, -((1 - a) / a).sqrt() * (eps_half - eps), atol=1e-4)
 
 
+@pytest.mark.parametrize("dropout", [0.0, 0.1])
+def test_a_small_lora_is_not_lost_in_half_precision(sd2, dropout):
+    half = F.build(F.shrunk(F.SD2), torch.bfloat16)
+    half.unet.load_state_dict(sd2.unet.state_dict())
+    sd2.unet.load_state_dict(half.unet.state_dict())  # the same rounded weights in float32
+    noisy, condition, at, text = draw(1, 4, 16, 16), draw(1, 5, 16, 16), torch.tensor([500]), draw(1, 24, 64)
+    changes = []
+    for prior in (sd2, half):
+        found = lora.add(prior, 4, 4.0, dropout, "attention", 0)
+        before = D.raw_prediction(prior, noisy, at, condition, text).detach()
+        noise = generator(0, "lora")
+        for parameter in found["unet"]:
+            parameter.data += 5e-4 * torch.randn(parameter.shape, generator=noise)
+        layer = next(m for m in prior.unet.modules() if hasattr(m, "lora_A"))
+        x = draw(1, 8, layer.base_layer.in_features, seed=3).to(prior.dtype)
+        changes.append((layer(x) - layer.base_layer(x)).float().flatten().detach())
+        assert torch.isfinite(D.raw_prediction(prior, noisy, at, condition, text) - before).all()
+    exact, rounded = changes
+    assert torch.dot(exact, rounded) / exact.norm() / rounded.norm() > 0.65  # 0.41 where it is added to the weights
+
+
 def test_the_text_encoder_is_let_go():
     prior = F.build(F.shrunk(F.SD2), torch.float32)
     whole, encoder = prior.bytes, weakref.ref(prior.text_encoder)
