@@ -52,7 +52,7 @@ def _asked(request: Request) -> tuple[str, str, dict[str, Any], dict[str, list[d
         raise Refused(f"unknown variant {request.variant!r}; known: {', '.join(pipeline.variants) or 'none'}")
     scene = SceneFile(request.root / "scene.yaml", None, {}, {})
     profile, why = choose_profile(request.profile, scene, [], pipeline)
-    layers = layered(pipeline, scene, profile, request.variant, parse_set(request.set, pipeline))
+    layers = layered(pipeline, scene, profile, request.variant, parse_set(request.set, pipeline), {})
     described, _ = described_stages(request.root, pipeline, layers, [])
     params = {stage: answer["params"] for stage, answer in described.items()}
     return profile, why, params, {stage: answer["needed"] for stage, answer in described.items()}, []

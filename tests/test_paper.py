@@ -56,7 +56,7 @@ CONSTANTS = {
 def params():
     """stage -> parameters of the paper profile, without a scene."""
     pipeline = load_pipeline(ROOT)
-    layers = layered(pipeline, SceneFile(ROOT / "scene.yaml", None, {}, {}), "paper", None, {})
+    layers = layered(pipeline, SceneFile(ROOT / "scene.yaml", None, {}, {}), "paper", None, {}, {})
     described, broken = described_stages(ROOT, pipeline, layers, [])
     assert not broken
     return {stage: answer["params"] for stage, answer in described.items()}
