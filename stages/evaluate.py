@@ -130,13 +130,14 @@ def row_of(
 
 
 def consistency_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """{"mean", "share"}: means over the pairs of neighbours; {"pairs"}: those that could be compared; the protocol."""
+    """{"consistency", "consistency_share"}: means over the pairs of neighbours; {"pairs"}: how many could be compared;
+    {"protocol"}."""
     from reffusion import consistency, metrics
 
     difference, share = ([row[name] for row in rows] for name in CONSISTENCY)
     return {
-        "mean": metrics.mean(difference),
-        "share": metrics.mean(share),
+        "consistency": metrics.mean(difference),
+        "consistency_share": metrics.mean(share),
         "pairs": sum(value is not None for value in difference),
         "protocol": consistency.PROTOCOL,
     }

@@ -316,6 +316,9 @@ def test_the_gate_sees_a_planted_regression():
     faster["diagrams"][name][key][1] /= 2
     assert [key in line and "ms" in line for line in gate.regressions(diagrams, unit, faster)] == [True]
     assert gate.regressions(diagrams, unit / 2, baselines), "the same times on a machine twice as fast"
+    slow = [replace(d, points=[replace(p, seconds=9.0) for p in d.points]) for d in diagrams]
+    again = [gate.quicker(one, other) for one, other in zip(slow, diagrams, strict=True)]
+    assert gate.regressions(slow, unit, baselines) and gate.regressions(again, unit, baselines) == []
     more = copy.deepcopy(baselines)
     more["diagrams"][name]["8 px, step 0"] = [1.0, 1.0]
     assert "was not measured" in gate.regressions(diagrams, unit, more)[0]

@@ -290,7 +290,7 @@ def test_the_chain_of_lifted_pictures(scene, painted, tmp_path, monkeypatch):
     summary = io.load_json(out / "metrics.json")
     assert summary["inpainter"].startswith("OpenCV") and summary["perceptual"] is None
     assert summary["result"] == "distill" and summary["mean"]["psnr_box"] > 20
-    assert summary["consistency"]["pairs"] == 1 and summary["consistency"]["mean"] < 0.05
+    assert summary["consistency"]["pairs"] == 1 and summary["consistency"]["consistency"] < 0.05
 
 
 def test_rendered_views_inpainted_in_2d(scene, tmp_path):
