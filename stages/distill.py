@@ -105,7 +105,9 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list:
     """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
     from reffusion import weights
 
-    return [weights.of_model(params.prior, params.dtype)] if params.sds_weight > 0 else []
+    found = [weights.of_model(params.prior, params.dtype)] if params.sds_weight > 0 or params.depth_weight > 0 else []
+    estimates = params.depth_weight > 0 and params.depth_model
+    return found + ([weights.of_model(params.depth_model, "float32")] if estimates else [])
 
 
 def run(

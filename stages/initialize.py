@@ -56,6 +56,13 @@ class Params(BaseModel):
     color_steps: int = Field(5, ge=0, description="corrections of their colours until the reference is reproduced")
 
 
+def needed_weights(params: Params, brings: frozenset[str]) -> list:
+    """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
+    from reffusion import weights
+
+    return [weights.of_model(params.depth_model, "float32")] if params.depth_model else []
+
+
 def run(
     params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, reference: Path | None, lift: Path | None = None
 ) -> None:

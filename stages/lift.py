@@ -37,6 +37,13 @@ class Params(BaseModel):
     dtype: Literal["float32", "bfloat16", "float16"] = "float32"
 
 
+def needed_weights(params: Params, brings: frozenset[str]) -> list:
+    """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
+    from reffusion import weights
+
+    return [weights.of_model(params.prior, params.dtype)] if params.inpainter == "diffusion" else []
+
+
 def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path) -> None:
     """Write images/<view>.png, inpainted in the invent mask; the best view as a reference too; and facts.json.
 
