@@ -15,6 +15,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
+from reffusion import weights
+
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet's pixels, which the backbone was fed
 KIND = "depth_anything"
 FARTHEST = 1e6  # metres: what a metric network puts beyond has no disparity to speak of
@@ -41,34 +43,34 @@ def load_network(source: str | Path, device: str = "cpu") -> DepthNetwork:
     """The model in a local folder, or a hub id such as depth-anything/Depth-Anything-V2-Small-hf; float32.
 
     Raises:
-        ValueError: no such folder, no such id or no way to it, a folder without a model, or a model of another kind.
+        ValueError: not on this machine, a folder without a model, or a model of another kind.
     """
     from transformers import AutoConfig, AutoModelForDepthEstimation
     from transformers.utils import logging as transformers_logging
 
-    name = str(source)
-    path = Path(source)
-    if not path.is_dir() and (path.is_absolute() or name.count("/") != 1 or name.startswith(".")):
-        raise ValueError(f"depth model {name}: no such folder, and not a hub id of the form owner/name")
-    if path.is_dir() and not (path / "config.json").is_file():
-        raise ValueError(f"depth model {path}: the folder lacks config.json; it must be a transformers model folder")
+    cure = "Name a local folder, or leave `depth_model` empty: depth is then continued from the surroundings"
+    try:
+        folder = weights.locate(source)
+        if folder is None:
+            raise ValueError(weights.absent(source))
+        if not (folder / "config.json").is_file():
+            raise ValueError(f"{folder} lacks config.json; it must be a transformers model folder")
+    except ValueError as error:
+        raise ValueError(f"depth model {error}. {cure}") from None
     transformers_logging.disable_progress_bar()
-    _check_kind(_loaded(name, lambda: AutoConfig.from_pretrained(name)), name)
-    model = _loaded(name, lambda: AutoModelForDepthEstimation.from_pretrained(name, dtype=torch.float32))
+    _check_kind(_loaded(folder, cure, lambda: AutoConfig.from_pretrained(folder)), str(source))
+    model = _loaded(folder, cure, lambda: AutoModelForDepthEstimation.from_pretrained(folder, dtype=torch.float32))
     return make_network(model, device)
 
 
-def _loaded(name: str, load: Callable[[], Any]) -> Any:
+def _loaded(folder: Path, cure: str, load: Callable[[], Any]) -> Any:
     """What transformers loads; its complaint in one line, with what can be done."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return load()
     except (OSError, ValueError) as error:
-        raise ValueError(
-            f"depth model {name}: {str(error).splitlines()[0]} Name a local folder, or leave `depth_model` empty: "
-            "depth is then continued from the surroundings"
-        ) from error
+        raise ValueError(f"depth model {folder}: {str(error).splitlines()[0]} {cure}") from error
 
 
 def _check_kind(config, name: str) -> None:
