@@ -137,8 +137,9 @@ prior-report: data/demo/.generated setup
 	$(PY) benchmarks/prior.py --run runs/demo --out runs/prior-report
 	$(PY) -m report.prior runs/prior-report
 
+# Two processes of one thread each, whole files to each: kernels that are compiled for one test serve the next.
 test: $(VENV)/.ready-dev
-	$(PY) -m pytest
+	OMP_NUM_THREADS=1 $(PY) -m pytest --numprocesses 2 --dist loadfile
 
 lint: $(VENV)/.ready-dev
 	$(PY) -m ruff check .

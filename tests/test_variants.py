@@ -35,6 +35,8 @@ PLANS = {
     "no_splitting": (AFTER, ()),
     "no_local_sds": (AFTER, ()),
     "no_reference_init": (("initialize", *AFTER), ()),
+    "no_adversarial": ((), ()),  # the laptop profile has neither term
+    "no_depth": ((), ()),
     "no_sds": (AFTER, ("personalize",)),
     "masked": (("fit", "evaluate"), ("masks", *FILLED)),
     "remove_only": (("initialize", "evaluate"), ("reference", "personalize", "distill")),
