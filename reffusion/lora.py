@@ -9,6 +9,7 @@ Not in half precision: there most of a small product would be lost in the sum, w
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from types import MethodType
@@ -139,6 +140,19 @@ def save(prior: Prior, folder: Path) -> None:
         unet_lora_adapter_metadata=_adapter_facts(prior.unet),
         text_encoder_lora_adapter_metadata=_adapter_facts(prior.text_encoder),
     )
+    _put_in_order(folder / LORA_FILE)
+
+
+def _put_in_order(path: Path) -> None:
+    """Sort the facts in the file's header: safetensors writes them in another order each time, and equal weights must
+    give equal files, or every stage after this one would run again."""
+    content = path.read_bytes()
+    end = 8 + int.from_bytes(content[:8], "little")
+    header = json.loads(content[8:end])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    text += b" " * (-len(text) % 8)  # the tensors begin at a multiple of 8
+    path.write_bytes(len(text).to_bytes(8, "little") + text + content[end:])
 
 
 def _adapter_facts(part: nn.Module) -> dict[str, Any]:

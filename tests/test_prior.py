@@ -104,6 +104,10 @@ def test_saved_lora_gives_the_trained_epsilon_in_a_fresh_diffusers_pipeline(tiny
     condition = P.conditioning(tiny, pictures(1, 16), half_masks(1, 16))
     trained = P.raw_prediction(tiny, noisy, t, condition, P.embed_text(tiny, ["A photo of sks"]))
     lora.save(tiny, tmp_path)
+    written = (tmp_path / lora.LORA_FILE).read_bytes()
+    for _ in range(5):
+        lora.save(tiny, tmp_path)
+        assert (tmp_path / lora.LORA_FILE).read_bytes() == written, "equal weights, another file"
 
     from diffusers import StableDiffusionInpaintPipeline
 
