@@ -39,7 +39,8 @@ def psnr(gaussians: Gaussians) -> float:
 
 def written(folder: Path) -> bool:
     """Whether every number of the trace is finite."""
-    return all(math.isfinite(v) for line in trace.read_trace(folder / "trace.jsonl") for v in line.values())
+    values = [v for line in trace.read_trace(folder / "trace.jsonl") for v in line.values() if not isinstance(v, str)]
+    return all(math.isfinite(v) for v in values)
 
 
 def named(error: FloatingPointError, term: str) -> bool:
