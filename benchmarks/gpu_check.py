@@ -24,11 +24,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reffusion import memory, splat, trace, weights
+from reffusion import memory, monocular, splat, trace, weights
 from reffusion import personalize as P
 from reffusion import prior as diffusion
-from reffusion.confinement import Distillation, reconstruction_term, reference_term
+from reffusion.adversary import Adversarial, Adversary
+from reffusion.behind import Completion, Seen
+from reffusion.confinement import Distillation, adversarial_term, reconstruction_term, reference_term
+from reffusion.depth_term import DepthRegularization, Estimator, by_network, depth_term
 from reffusion.fit import Settings, fit
+from reffusion.geometry import Degenerate
 from reffusion.trace import generator
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
@@ -46,10 +50,11 @@ class Sizes:
     fit_steps: int
     views: int
     repeats: int
+    critic: Adversarial
 
 
-PAPER = Sizes(rows=1280, gaussians=500_000, batch=16, fit_steps=400, views=12, repeats=3)  # 1600 x 1280 px
-TOY = Sizes(rows=40, gaussians=300, batch=2, fit_steps=4, views=3, repeats=1)
+PAPER = Sizes(1280, 500_000, batch=16, fit_steps=400, views=12, repeats=3, critic=Adversarial())  # 1600 x 1280 px
+TOY = Sizes(40, 300, batch=2, fit_steps=4, views=3, repeats=1, critic=Adversarial(patches=8, size=8, width=8))
 
 
 def measured(work: Callable[[], dict[str, float] | None], device: str, repeats: int) -> dict[str, float]:
@@ -112,6 +117,14 @@ def losses(shape: full_size.Shape, sizes: Sizes, device: str, out: Path) -> dict
             sizes.repeats,
         ),
     }
+    critic = Adversary(sizes.critic, 0, device)
+
+    def judged() -> dict[str, float]:
+        loss, _, said = adversarial_term(scene, masked, view, view.photo, view.repaint, critic, generator(0, "patches"))
+        term(loss)
+        return said
+
+    found["adversarial"] = measured(judged, device, sizes.repeats)
     prior, source = ready(shape, device, torch.float16 if half else torch.float32)
     with torch.no_grad():
         text = diffusion.embed_text(prior, list(P.PROMPTS))
@@ -124,12 +137,51 @@ def losses(shape: full_size.Shape, sizes: Sizes, device: str, out: Path) -> dict
         return said
 
     found["SDS"] = measured(distilled, device, sizes.repeats) | {"weights": source}
+    estimator, whose = depth_estimator(sizes, device)
+
+    def depths() -> dict[str, float]:
+        choices, draw = DepthRegularization(), generator(0, "depth")
+        loss, _ = depth_term(scene, masked, view, prior, text, choices, draw, estimator)
+        term(loss)
+        return {"loss": float(loss.detach())}
+
+    found["depth"] = measured(depths, device, sizes.repeats) | {"weights": f"{source}, {whose}"}
     del prior
     if half:
         torch.cuda.empty_cache()
     prior, source = ready(shape, device, torch.bfloat16 if half else torch.float32)
     found["personalization"] = personalization(prior, sizes, device, out) | {"weights": source}
     return found
+
+
+def depth_estimator(sizes: Sizes, device: str) -> tuple[Estimator, str]:
+    """Depth Anything V2 Small, published or with random weights, of which the sign that fits the scene is taken."""
+    from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
+
+    if sizes == PAPER and weights.locate(weights.DEPTH_ANYTHING) is not None:
+        network, source = monocular.load_network(weights.DEPTH_ANYTHING, device), weights.DEPTH_ANYTHING
+    else:
+        backbone = Dinov2Config(
+            hidden_size=384, num_hidden_layers=12, num_attention_heads=6, image_size=518 if sizes == PAPER else 56,
+            patch_size=14, out_features=["stage3", "stage6", "stage9", "stage12"], reshape_hidden_states=False,
+        )  # fmt: skip
+        torch.manual_seed(0)
+        model = DepthAnythingForDepthEstimation(DepthAnythingConfig(
+            backbone_config=backbone, reassemble_hidden_size=384, neck_hidden_sizes=[48, 96, 192, 384],
+            fusion_hidden_size=64, head_hidden_size=32, initializer_range=0.1,
+        ))  # fmt: skip
+        network, source = monocular.make_network(model, device), "random"
+    tries = [by_network(lambda image, sign=sign: sign * monocular.disparity(network, image), Completion())
+             for sign in (1, -1)]  # fmt: skip
+
+    def estimator(view: Seen, picture: Callable[[], np.ndarray]) -> np.ndarray:
+        painted = picture()
+        try:
+            return tries[0](view, lambda: painted)
+        except Degenerate:
+            return tries[1](view, lambda: painted)
+
+    return estimator, source
 
 
 def ready(shape: full_size.Shape, device: str, dtype: torch.dtype) -> tuple[diffusion.Prior, str]:
