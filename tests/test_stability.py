@@ -45,13 +45,11 @@ def test_case(name):
     assert row.ok, f"{row.quantity}: {row.measured}, bound {row.bound}"
 
 
-@pytest.mark.parametrize(
-    ("scenes", "relative"),
-    [(random_scenes.ordinary, random_scenes.ORDINARY), (random_scenes.extreme, random_scenes.EXTREME)],
-)
-def test_random_scenes(scenes, relative):
-    worst = random_scenes.worst_of(scenes, relative, SCENES)
-    assert worst.scenes == SCENES and worst.error <= relative, worst
+@pytest.mark.parametrize("case", random_scenes.CASES, ids=lambda case: case.name)
+def test_a_tenth_of_the_random_scenes(case):
+    *given, count = case.measure.args
+    assert count == 10 * SCENES
+    assert case.measure.func(*given, SCENES) <= case.bound
 
 
 @pytest.mark.parametrize("words", ASKED)

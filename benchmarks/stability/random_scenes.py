@@ -123,6 +123,6 @@ def _measured(scenes: Callable, relative: float, count: int) -> float:
 
 QUANTITY = "worst relative L2 error of a value or gradient block against float64"
 CASES = (
-    Case("1,000 random ordinary scenes", QUANTITY, ORDINARY, partial(_measured, ordinary, 1000)),
-    Case("1,000 random extreme scenes", QUANTITY, EXTREME, partial(_measured, extreme, 1000)),
+    Case("1,000 random ordinary scenes", QUANTITY, ORDINARY, partial(_measured, ordinary, ORDINARY, 1000)),
+    Case("1,000 random extreme scenes", QUANTITY, EXTREME, partial(_measured, extreme, EXTREME, 1000)),
 )
