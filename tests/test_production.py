@@ -241,7 +241,8 @@ def test_the_full_size_benchmark_at_a_small_size(tmp_path, monkeypatch, dtype):
 def test_gpu_check_at_a_small_size(tmp_path):
     report = gpu_check.check(True, tmp_path)
     assert report["gsplat against the oracle"] == {"skipped": "gsplat runs on CUDA only"}
-    assert set(report["losses"]) == {"reconstruction", "reference", "SDS", "personalization"}
+    terms = {"reconstruction", "reference", "SDS", "depth", "adversarial", "personalization"}
+    assert set(report["losses"]) == terms
     assert all(line["seconds"] > 0 and line["peak_gb"] > 0 for line in report["losses"].values())
     assert report["fit"]["ok"] and "personalization" in (tmp_path / "gpu_check.md").read_text()
     assert json.loads((tmp_path / "gpu_check.json").read_text()) == report
