@@ -12,7 +12,9 @@ sizes taken in turn; thread scaling is wall clock. Columns:
   Glane/s    visited lanes over the pass's time, forward and backward
   FMA share  operations that any renderer must do, over the peak: 31 a pair forward, 49 backward (an fma is two;
              what is done once per Gaussian or pixel is not counted)
-  threads    wall time of one thread over that of --threads
+  threads    wall time of one thread over that of --threads: median and upper quartile of pairs of steps taken one
+             after the other
+  ceiling    the same of arithmetic that shares nothing, in between those steps: what the machine had to give then
 """
 
 from __future__ import annotations
@@ -24,8 +26,10 @@ import re
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -62,6 +66,17 @@ class Case:
         """Milliseconds a step."""
         pixels = self.camera.width * self.camera.height
         return 1e3 * (PER_GAUSSIAN * len(self.gaussians) + PER_PAIR * self.pairs + PER_PIXEL * pixels)
+
+
+class Scaling(NamedTuple):
+    """Of --threads over one: median and upper quartile of a step's, median of the machine's."""
+
+    median: float
+    upper: float
+    ceiling: float
+
+    def __str__(self) -> str:
+        return f"{self.median:8.2f} {self.upper:4.2f} {self.ceiling:8.2f}"
 
 
 def scene(count: int, camera: Camera, seed: int = 0) -> Gaussians:
@@ -158,19 +173,35 @@ def first_image() -> tuple[float, float]:
     return min(seconds(image) for _ in range(3)), min(seconds("import torch") for _ in range(3))
 
 
-def scaling(case: Case, threads: int, repeats: int) -> float:
-    """Wall time of one thread over that of several."""
-    times: dict[int, list[float]] = {1: [], threads: []}
-    for _ in range(repeats):
-        for count, series in times.items():
-            torch.set_num_threads(count)
-            step(case, time.perf_counter)  # torch makes its threads anew
-            series.append(sum(step(case, time.perf_counter)))
+def scaling(case: Case, threads: int, repeats: int) -> Scaling:
+    """Wall time of one thread over that of several, by pairs of steps taken one after the other."""
+    steps, ceilings = [], []
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(time.sleep, threads * [0.01]))  # starts the threads
+        for _ in range(repeats):
+            ceilings.append(_ceiling(pool, threads))
+            steps.append(_best_step(case, 1) / _best_step(case, threads))
     torch.set_num_threads(1)
-    return float(np.median(times[1]) / np.median(times[threads]))
+    return Scaling(*np.percentile(steps, (50, 75)), float(np.median(ceilings)))
 
 
-def report(case: Case, peak: float, speedup: float | None) -> str:
+def _best_step(case: Case, threads: int, tries: int = 2) -> float:
+    """Milliseconds of wall time."""
+    torch.set_num_threads(threads)
+    step(case, time.perf_counter)  # torch makes its threads anew
+    return min(sum(step(case, time.perf_counter)) for _ in range(tries))
+
+
+def _ceiling(pool: ThreadPoolExecutor, threads: int, rounds: int = 20_000_000) -> float:
+    """How many times as much arithmetic so many threads do as one does."""
+    start = time.perf_counter()
+    _fma_chains(rounds)
+    middle = time.perf_counter()
+    list(pool.map(_fma_chains, threads * [rounds]))
+    return threads * (middle - start) / (time.perf_counter() - middle)
+
+
+def report(case: Case, peak: float, speedup: Scaling | None) -> str:
     """One row of the table."""
     fwd, bwd = float(np.median(case.forward)), float(np.median(case.backward))
     size = f"{len(case.gaussians)}@{case.camera.width}x{case.camera.height}"
@@ -179,7 +210,7 @@ def report(case: Case, peak: float, speedup: float | None) -> str:
     return (
         f"{size:>16} {case.pairs / 1e6:7.2f} {case.lanes / 1e6:7.2f} {fwd:8.1f} {bwd:8.1f} {ratio:9.2f} "
         f"{ratio * peak / PEAK:7.2f} {1e-6 * case.lanes / fwd:8.2f} {1e-6 * case.lanes / bwd:5.2f} "
-        f"{share[0]:8.1%} {share[1]:6.1%} {'' if speedup is None else f'{speedup:8.2f}'}"
+        f"{share[0]:8.1%} {share[1]:6.1%} {speedup or ''}"
     )
 
 
@@ -207,7 +238,7 @@ def main() -> None:
     first, torch_alone = first_image()
     print(f"from import to first image {first:.2f} s of CPU, {torch_alone:.2f} of them torch's import")
     print(f"{'size':>16} {'pairs':>7} {'lanes':>7} {'fwd':>8} {'bwd':>8} {'step/aim':>9} {'scaled':>7} ", end="")
-    print(f"{'Glane/s':>14} {'FMA share':>15} {'threads':>8}")
+    print(f"{'Glane/s':>14} {'FMA share':>15} {'threads':>13} {'ceiling':>8}")
     for case in cases:
         speedup = scaling(case, options.threads, options.repeats) if options.threads > 1 else None
         print(report(case, peak, speedup), flush=True)

@@ -7,20 +7,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 
-from reffusion.splat.compiled import share
+from reffusion.splat.compiled import FREE_ROUNDING, kernel, share
 from reffusion.splat.vectors import take_ticket
 from reffusion.ssim import dssim
 from reffusion.types import PARAMETERS, Gaussians
 
 _CHUNK = 512  # rows that a thread takes at once
+_jit = partial(kernel, fastmath=FREE_ROUNDING)
 
 
 def reconstruction_loss(image: Tensor, target: Tensor, weights: Tensor | None = None, share: float = 0.2) -> Tensor:
@@ -297,7 +297,7 @@ def _adam_cpu(updates: list[Update], steps, visible, masked, unbias1, unbias2, b
     share(_adam_kernel, *columns, paces, rows, (np.float32(beta1), np.float32(beta2), np.float32(epsilon)))
 
 
-@numba.njit(fastmath={"contract", "reassoc", "nsz", "arcp"}, error_model="numpy", cache=True, nogil=True)
+@_jit
 def _adam_kernel(tickets, parameters, firsts, seconds, gradients, rates, paces, rows, numbers):
     count = len(rows[0])
     chunks = (count + _CHUNK - 1) // _CHUNK
@@ -310,7 +310,7 @@ def _adam_kernel(tickets, parameters, firsts, seconds, gradients, rates, paces, 
         _adam_rows(start, min(start + _CHUNK, count), tables, rates[kind], paces[kind], rows, numbers)
 
 
-@numba.njit(fastmath={"contract", "reassoc", "nsz", "arcp"}, error_model="numpy", cache=True, nogil=True)
+@_jit
 def _adam_rows(begin, end, tables, rates, masked_pace, rows, numbers):
     parameter, first, second, gradient = tables
     steps, visible, masked, unbias1, unbias2 = rows

@@ -1,4 +1,4 @@
-"""Deterministic 2D inpainting: LaMa from weights that lie on this machine, else what OpenCV has.
+"""Deterministic 2D inpainting: LaMa from weights that lie on this machine, else what OpenCV has; by exemplars, too.
 
 Nothing is downloaded, and what was used is named: a table of results must say whether LaMa or its stand-in painted.
 """
@@ -97,6 +97,26 @@ def fsr(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
     painted = np.zeros_like(small)
     cv2.xphoto.inpaint(small, known, painted, cv2.xphoto.INPAINT_FSR_FAST)
     return _inside(image, cv2.resize(painted, hole.shape[::-1], interpolation=cv2.INTER_CUBIC), hole)
+
+
+def exemplar(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
+    """OpenCV's shift maps (after He and Sun, Statistics of Patch Offsets for Image Completion, 2012): the hole is put
+    together from pieces of the picture moved by the offsets at which it resembles itself most. As sharp as the
+    picture; it repeats what is there and invents nothing. Pixels that no offset reaches are filled by `telea`.
+
+    Raises:
+        ValueError: this OpenCV has no xphoto module.
+    """
+    if not hole.any():  # OpenCV would crash
+        return image.copy()
+    if not hasattr(cv2, "xphoto"):
+        raise ValueError("this OpenCV has no xphoto module; `pip install opencv-contrib-python-headless`")
+    known, painted = np.where(hole, 0, 255).astype(np.uint8), np.zeros_like(image)
+    lab = cv2.cvtColor(_blanked(image, hole), cv2.COLOR_RGB2Lab)
+    cv2.xphoto.inpaint(lab, known, painted, cv2.xphoto.INPAINT_SHIFTMAP)
+    unreached = hole & ~painted.any(2)  # zeros are no colour: grey has a = b = 128
+    picture = _inside(image, cv2.cvtColor(painted, cv2.COLOR_Lab2RGB), hole)
+    return telea(picture, unreached) if unreached.any() else picture
 
 
 def telea(image: np.ndarray, hole: np.ndarray) -> np.ndarray:

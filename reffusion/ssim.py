@@ -10,15 +10,14 @@ masked, would paint an edge that both share into the windows around a mask and s
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, partial
 
-import numba
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from reffusion.splat.compiled import room, share
+from reffusion.splat.compiled import FREE_ROUNDING, kernel, room, share
 from reffusion.splat.vectors import take_ticket
 
 RADIUS, SIGMA = 5, 1.5
@@ -118,8 +117,7 @@ def _unmasked_rows(height: int, width: int, channels: int) -> tuple[np.ndarray, 
 # filtered along the row first, then columns; both are symmetric, so each is its own adjoint (borders count as 0).
 # Threads share out rows.
 _K0, _K1, _K2, _K3, _K4, _K5 = (np.float32(k) for k in _window()[RADIUS:])
-# Rounding may vary, but NaN and infinity stay what they are: `fit` looks for them.
-_jit = numba.njit(fastmath={"contract", "reassoc", "nsz", "arcp"}, error_model="numpy", cache=True, nogil=True)
+_jit = partial(kernel, fastmath=FREE_ROUNDING)
 
 
 @_jit

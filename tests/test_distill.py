@@ -422,6 +422,20 @@ def test_reference_inpaints_the_best_view_and_keeps_all_else(folders):
         reference.run(third, folders["reference"], **pick(folders, "poses", "fit", "masks"))
 
 
+def test_a_reference_made_of_pieces_of_itself_needs_no_prior(folders, tmp_path):
+    from stages import reference
+
+    params = reference.Params(inpainter="exemplar", prior="no/such-model", prompt="a vase")
+    assert not reference.needed_weights(params, frozenset())
+    (note,) = reference.preview(params, poses=folders["poses"])
+    assert "a vase" in note and "not read" in note
+    reference.run(params, folders["reference"], **pick(folders, "poses", "fit", "masks"))
+    (found,) = io.load_references(folders["reference"], io.load_scene(folders["poses"]))
+    photo = io.load_image(folders["poses"] / "images" / "b.png")
+    rim = io.load_mask_sets(folders["masks"], ["b"])["b"].consistent
+    assert found.mask.any() and (found.image[~found.mask & ~rim] == photo[~found.mask & ~rim]).all()
+
+
 def test_a_reference_that_does_not_fit_is_refused_by_name(folders):
     from stages import reference
 

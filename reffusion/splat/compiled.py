@@ -20,6 +20,8 @@ import torch
 
 _LARGE, _BLOCKS = 2**16, 24  # numbers of an array worth keeping; how many are kept, some two steps' worth
 FEW = 8000  # Gaussians for which waking another thread takes longer than it saves
+# Rounding may vary, but NaN and infinity stay what they are: `fit` looks for them.
+FREE_ROUNDING = "contract", "reassoc", "nsz", "arcp"
 _CACHE = "splat-"  # folders of machine code in __pycache__, one per state of these sources
 
 
@@ -32,7 +34,7 @@ def _cache_folder() -> Path:
     return Path(__file__).parent / "__pycache__" / (_CACHE + digest)
 
 
-def kernel(function: Callable) -> Callable:
+def kernel(function: Callable, fastmath: tuple[str, ...] = ()) -> Callable:
     """Compile `function` at its first call, without the interpreter's lock; later processes load it from disk."""
     folder, before = _cache_folder(), numba.config.CACHE_DIR
     try:
@@ -44,7 +46,7 @@ def kernel(function: Callable) -> Callable:
     except OSError:
         pass  # an installation that cannot be written to: numba falls back to the user's cache folder
     try:
-        return numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+        return numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=set(fastmath))(function)
     finally:
         numba.config.CACHE_DIR = before
 
