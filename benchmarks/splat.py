@@ -31,13 +31,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+# Before torch: it tells torch's idle threads not to spin, which costs the second thread all of its gain.
+from reffusion import splat  # isort: skip
+
 import numba
 import numpy as np
 import torch
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
-from reffusion import splat
 from reffusion.splat import cpu, forward
 from reffusion.splat import vectors as v
 from reffusion.splat.layout import ROWS

@@ -7,8 +7,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-
 RIM = 0.006  # of the picture's width, repainted around I too, as far as it is no photograph
+
 
 class Params(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
