@@ -7,8 +7,9 @@ import pytest
 import torch
 from small_prior import small_prior
 
-from reffusion import behind, depth_term, geometry, inpaint
+from reffusion import behind, depth_term, inpaint
 from reffusion import distill as D
+from reffusion.alignment import align
 from reffusion.behind import Completion
 from reffusion.confinement import Sight
 from reffusion.depth_term import DepthRegularization
@@ -17,6 +18,7 @@ from reffusion.optimize import GaussianOptimizer, Rates
 from reffusion.personalize import PROMPTS
 from reffusion.prior import embed_text
 from reffusion.splat import render
+from reffusion.surfels import surface_gaussians
 from reffusion.trace import generator, load_checkpoint, read_trace
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
@@ -37,7 +39,7 @@ def wall(moved: float = 1.0):
     disparity = 0.5 + 0.004 * (columns - 26) - 0.002 * (rows - 22)
     picture = 0.5 + 0.3 * np.stack([np.sin(columns / 3), np.cos(rows / 4), np.sin((rows + columns) / 5)], -1)
     everywhere = np.ones(disparity.shape, bool)
-    gaussians = geometry.surface_gaussians(
+    gaussians = surface_gaussians(
         picture, 1 / disparity, everywhere, wide, sh_count=4, spread=0.6, opacity=0.98
     )
     masked = torch.from_numpy(((np.abs(columns - 26) < 6) & (np.abs(rows - 22) < 5)).ravel())
@@ -92,7 +94,7 @@ def test_alignment_solves_the_normal_equations(weighted):
     w = draw.random(200) if weighted else np.ones(200)
     matrix = np.array([[(w * x * x).sum(), (w * x).sum()], [(w * x).sum(), w.sum()]])
     scale, offset = np.linalg.inv(matrix) @ ((w * x * y).sum(), (w * y).sum())
-    found = geometry.align(x, y, w)
+    found = align(x, y, w)
     np.testing.assert_allclose((found.scale, found.offset), (scale, offset), rtol=1e-10)
     misfit = np.sqrt((w * (y - scale * x - offset) ** 2).sum() / w.sum())
     assert found.residual == pytest.approx(misfit, rel=1e-9)
