@@ -24,8 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reffusion import memory, monocular, splat, trace, weights
-from reffusion import personalize as P
+from reffusion import crops, denoising, memory, monocular, splat, trace, weights
 from reffusion import prior as diffusion
 from reffusion.adversary import Adversarial, Adversary
 from reffusion.behind import Completion, Seen
@@ -33,6 +32,7 @@ from reffusion.confinement import Distillation, adversarial_term, reconstruction
 from reffusion.depth_term import DepthRegularization, Estimator, by_network, depth_term
 from reffusion.fit import Settings, fit
 from reffusion.geometry import Degenerate
+from reffusion.personalize import train_step
 from reffusion.trace import generator
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
@@ -127,7 +127,7 @@ def losses(shape: full_size.Shape, sizes: Sizes, device: str, out: Path) -> dict
     found["adversarial"] = measured(judged, device, sizes.repeats)
     prior, source = ready(shape, device, torch.float16 if half else torch.float32)
     with torch.no_grad():
-        text = diffusion.embed_text(prior, list(P.PROMPTS))
+        text = diffusion.embed_text(prior, list(crops.PROMPTS))
     prior = diffusion.without_text(prior)
 
     def distilled() -> dict[str, float]:
@@ -195,8 +195,8 @@ def personalization(prior: diffusion.Prior, sizes: Sizes, device: str, out: Path
     """Steps of the paper's LoRA, as many samples at once as fit into 20 GB."""
     picture = full_size.reference(prior.native_size)
     trained, optimizer, training = full_size.trainer(prior, sizes.batch)
-    prior = memory.fitted(prior, 20.0, "personalize.memory_gb", lambda p: P.one_sample(p, [picture], 0))
-    step = lambda: {"loss": P.train_step(prior, optimizer, [picture], [], P.Sampling(), training, 0)}
+    prior = memory.fitted(prior, 20.0, "personalize.memory_gb", lambda p: denoising.one_sample(p, [picture], 0))
+    step = lambda: {"loss": train_step(prior, optimizer, [picture], [], crops.Sampling(), training, 0)}
     said = measured(step, device, sizes.repeats)
     moved = sum(float(p.detach().abs().sum()) for p in trained["text"])
     return said | {"batch": sizes.batch, "rows_in_one_pass": prior.rows_graded, "lora_text": moved}

@@ -130,8 +130,8 @@ def run(
 
     from reffusion import io, lora, memory, trace
     from reffusion import prior as diffusion
+    from reffusion.crops import PROMPTS
     from reffusion.distill import distill
-    from reffusion.personalize import PROMPTS
 
     scene = io.load_scene(poses)
     initial = io.load_ply(initialize / "gaussians.ply").map(lambda p: p.to(params.device))

@@ -12,10 +12,10 @@ from reffusion import distill as D
 from reffusion.alignment import align
 from reffusion.behind import Completion
 from reffusion.confinement import Sight
+from reffusion.crops import PROMPTS
 from reffusion.depth_term import DepthRegularization
 from reffusion.geometry import Degenerate
 from reffusion.optimize import GaussianOptimizer, Rates
-from reffusion.personalize import PROMPTS
 from reffusion.prior import embed_text
 from reffusion.splat import render
 from reffusion.surfels import surface_gaussians

@@ -21,8 +21,8 @@ from reffusion.confinement import (
     sds_term,
     strays,
 )
+from reffusion.crops import PROMPTS
 from reffusion.optimize import Rates
-from reffusion.personalize import PROMPTS
 from reffusion.prior import embed_text
 from reffusion.splat import render
 from reffusion.trace import generator, load_checkpoint, read_trace

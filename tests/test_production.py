@@ -16,9 +16,9 @@ sys.path.insert(0, str(ROOT / "benchmarks"))
 import full_size as F  # noqa: E402
 import gpu_check  # noqa: E402
 
-from reffusion import inpaint, lora, memory, weights  # noqa: E402
-from reffusion import personalize as P  # noqa: E402
+from reffusion import crops, denoising, inpaint, lora, memory, weights  # noqa: E402  # noqa: E402
 from reffusion import prior as D  # noqa: E402
+from reffusion.personalize import train_step  # noqa: E402
 from reffusion.trace import generator  # noqa: E402
 
 
@@ -83,7 +83,7 @@ def test_sdxl_is_refused_where_it_cannot_work(sdxl):
 def test_a_batch_in_parts_gives_the_same_values_and_gradients(sd2):
     images = draw(3, 3, 32, 32).requires_grad_()
     noisy, condition, at = draw(3, 4, 16, 16), draw(3, 5, 16, 16), torch.tensor([10, 500, 900])
-    text = D.embed_text(sd2, list(P.PROMPTS)).detach()
+    text = D.embed_text(sd2, list(crops.PROMPTS)).detach()
     found = []
     for prior in (sd2, replace(sd2, rows=1, rows_graded=2), D.recomputing(sd2)):
         latents = D.encode(prior, images)
@@ -103,7 +103,7 @@ def test_a_training_step_in_parts_is_the_same_step():
             for layer in part.modules():
                 layer.p = 0.0 if isinstance(layer, torch.nn.Dropout) else getattr(layer, "p", None)
         prior = replace(prior, rows_graded=rows)
-        loss = P.train_step(prior, optimizer, [F.reference(32)], [], P.Sampling(), training, 0)
+        loss = train_step(prior, optimizer, [F.reference(32)], [], crops.Sampling(), training, 0)
         after.append((loss, [p.detach().clone() for part in trained.values() for p in part]))
     assert after[0][0] == pytest.approx(after[1][0], rel=1e-5)
     # Adam's first step has the size of the learning rate; where a gradient is all but 0 its sign is a rounding's.
@@ -154,7 +154,7 @@ def test_a_small_lora_is_not_lost_in_half_precision(sd2, dropout):
 def test_the_text_encoder_is_let_go():
     prior = F.build(F.shrunk(F.SD2), torch.float32)
     whole, encoder = prior.bytes, weakref.ref(prior.text_encoder)
-    text = D.embed_text(prior, list(P.PROMPTS)).detach()
+    text = D.embed_text(prior, list(crops.PROMPTS)).detach()
     prior = D.without_text(prior)
     gc.collect()
     assert encoder() is None and prior.bytes < whole
@@ -193,7 +193,7 @@ def test_a_budget_chooses_the_parts(sd2):
 
 def test_measuring_a_training_sample_leaves_no_gradient(sd2):
     trained, _, _ = F.trainer(sd2, 1)
-    row = lambda prior: P.one_sample(prior, [F.reference(32)], 0)
+    row = lambda prior: denoising.one_sample(prior, [F.reference(32)], 0)
     assert memory.fitted(sd2, 1.0, "personalize.memory_gb", row).rows_graded > 1
     assert all(p.grad is None and p.requires_grad for part in trained.values() for p in part)
 
