@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from reffusion import crops, denoising, lora, memory, weights
-from reffusion import prior as diffusion
+from reffusion import crops, denoising, diffusion, lora, memory, weights
 from reffusion.confinement import Distillation, Sight, sds_term
 from reffusion.personalize import Training, train_step
+from reffusion.prior import Prior, make_prior, recomputing, without_text
 from reffusion.trace import generator
 from reffusion.types import Camera, Gaussians
 
@@ -154,20 +154,20 @@ def living(shape: Shape, dtype: torch.dtype) -> dict[str, float]:
     trainer(prior, 1)
     training = lambda: denoising.one_sample(prior, [picture], 0)
     said["personalization"] = memory.peak_bytes(training, "meta")
-    diffusion.recomputing(prior)
+    recomputing(prior)
     said["SDS, checkpointing"] = memory.peak_bytes(lambda: memory.encoding(prior), "meta")
     said["personalization, checkpointing"] = memory.peak_bytes(training, "meta")
     return {name: round(count / 1e9, 6) for name, count in said.items()}
 
 
-def build(shape: Shape, dtype: torch.dtype, device: str = "cpu", seed: int = 0) -> diffusion.Prior:
+def build(shape: Shape, dtype: torch.dtype, device: str = "cpu", seed: int = 0) -> Prior:
     """A prior of random weights, the same for equal seeds."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         return assembled(shape, networks(shape, dtype), device)
 
 
-def assembled(shape: Shape, made: dict[str, torch.nn.Module], device: str) -> diffusion.Prior:
+def assembled(shape: Shape, made: dict[str, torch.nn.Module], device: str) -> Prior:
     """The networks with a tokenizer (the embedded prior's: words do not matter here) and SD2's schedule."""
     from diffusers import DDIMScheduler
     from transformers import CLIPTokenizer
@@ -178,7 +178,7 @@ def assembled(shape: Shape, made: dict[str, torch.nn.Module], device: str) -> di
         beta_start=0.00085, beta_end=0.012, beta_schedule="scaled_linear", clip_sample=False, steps_offset=1
     )
     second = made.get("text_encoder_2")
-    return diffusion.make_prior(
+    return make_prior(
         made["unet"], made["vae"], made["text_encoder"], tokens, schedule, device, "random weights", second, tokens
     )
 
@@ -195,7 +195,7 @@ def reference(size: int) -> crops.Picture:
     return crops.picture(image.to(torch.uint8), hole, size)
 
 
-def trainer(prior: diffusion.Prior, batch: int) -> tuple[dict[str, list], torch.optim.Optimizer, Training]:
+def trainer(prior: Prior, batch: int) -> tuple[dict[str, list], torch.optim.Optimizer, Training]:
     """The paper's LoRA on a prior: rank 8, alpha 16, dropout 0.1 on the attention layers; AdamW."""
     trained = lora.add(prior, rank=8, alpha=16, dropout=0.1, layers="attention", seed=0)
     groups = [{"params": trained["unet"], "lr": 2e-4}, {"params": trained["text"], "lr": 4e-5}]
@@ -206,7 +206,7 @@ def trainer(prior: diffusion.Prior, batch: int) -> tuple[dict[str, list], torch.
     return trained, torch.optim.AdamW(groups, weight_decay=training.weight_decay), training
 
 
-def personalization_step(prior: diffusion.Prior, picture: crops.Picture, batch: int, folder: Path) -> dict[str, float]:
+def personalization_step(prior: Prior, picture: crops.Picture, batch: int, folder: Path) -> dict[str, float]:
     """One optimiser step, and the LoRA saved in `folder`."""
     trained, optimizer, training = trainer(prior, batch)
     loss = train_step(prior, optimizer, [picture], [], crops.Sampling(), training, 0)
@@ -217,7 +217,7 @@ def personalization_step(prior: diffusion.Prior, picture: crops.Picture, batch: 
 
 
 @torch.no_grad()
-def epsilon(prior: diffusion.Prior) -> torch.Tensor:
+def epsilon(prior: Prior) -> torch.Tensor:
     """What the prior answers to fixed noise, a fixed picture and a prompt: compared before and after saving."""
     side, draw = prior.native_size // prior.factor, generator(0, "epsilon")
     channels = prior.vae.config.latent_channels
@@ -249,7 +249,7 @@ def gaussians(number: int, device: str, degree: int = 3) -> Gaussians:
 
 
 def sds_step(
-    prior: diffusion.Prior, text: torch.Tensor, view: Sight, scene: Gaussians, settings: Distillation, step: int = 0
+    prior: Prior, text: torch.Tensor, view: Sight, scene: Gaussians, settings: Distillation, step: int = 0
 ) -> dict[str, float]:
     """One SDS term of the library, and its backward pass into the Gaussians."""
     masked = torch.ones(len(scene), dtype=torch.bool, device=scene.means.device)
@@ -281,9 +281,9 @@ def run(shape: Shape, dtype: torch.dtype, options: argparse.Namespace) -> dict[s
     options.out.mkdir(parents=True, exist_ok=True)
     report: dict[str, Any] = {"parameters": count(shape), "dtype": str(dtype), "size": shape.unet["sample_size"] * 8}
 
-    def made() -> diffusion.Prior:
+    def made() -> Prior:
         prior = build(shape, dtype)
-        return diffusion.recomputing(prior) if options.checkpointing else prior
+        return recomputing(prior) if options.checkpointing else prior
 
     prior = timed(report, "build", made)
     report["size"] = size = prior.native_size
@@ -298,7 +298,7 @@ def run(shape: Shape, dtype: torch.dtype, options: argparse.Namespace) -> dict[s
     report["epsilon size"] = float(before.abs().max())
     with torch.no_grad():
         text = timed(report, "embed prompts", lambda: diffusion.embed_text(prior, list(crops.PROMPTS)))
-    prior = diffusion.without_text(prior)
+    prior = without_text(prior)
     gc.collect()
     settings = Distillation(patches=options.patches)
     scene = gaussians(options.gaussians, "cpu")

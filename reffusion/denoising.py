@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from reffusion import lora
-from reffusion import prior as diffusion
+from reffusion import diffusion, lora
 from reffusion.crops import GLOBAL, LOCAL, PROMPTS, Picture, Samples
+from reffusion.prior import Prior
 from reffusion.sds import two_scale_masks, two_scales, window_around
 from reffusion.trace import generator as seeded
 
@@ -20,14 +20,14 @@ def spread_timesteps(count: int, steps: int, generator: torch.Generator) -> Tens
     return (places * (steps / count)).long().clamp(max=steps - 1)
 
 
-def latent_shape(prior: diffusion.Prior, size: int) -> tuple[int, int, int]:
+def latent_shape(prior: Prior, size: int) -> tuple[int, int, int]:
     """(C, h, w) of the latents of a size x size image."""
     side = size // prior.factor
     return prior.vae.config.latent_channels, side, side
 
 
 def denoising_error(
-    prior: diffusion.Prior, samples: Samples, timesteps: Tensor, noise: Tensor
+    prior: Prior, samples: Samples, timesteps: Tensor, noise: Tensor
 ) -> tuple[Tensor, Tensor]:
     """([B], [B]): mean squared error of the prior's own target over the whole image, and of the clean latent.
 
@@ -63,7 +63,7 @@ def held_out_samples(references: Sequence[Picture], size: int, seed: int) -> Sam
     return Samples(two_scales(first.image, windows, size), masks, torch.tensor([GLOBAL, LOCAL]))
 
 
-def one_sample(prior: diffusion.Prior, references: Sequence[Picture], seed: int) -> None:
+def one_sample(prior: Prior, references: Sequence[Picture], seed: int) -> None:
     """Loss and gradient of one sample: what `memory.fitted` measures."""
     sample = Samples(*(tensor[:1] for tensor in held_out_samples(references, prior.native_size, seed)))
     noise = torch.zeros(1, *latent_shape(prior, prior.native_size))
@@ -71,7 +71,7 @@ def one_sample(prior: diffusion.Prior, references: Sequence[Picture], seed: int)
 
 
 @torch.no_grad()
-def held_out_error(prior: diffusion.Prior, samples: Samples, seed: int) -> dict[str, float]:
+def held_out_error(prior: Prior, samples: Samples, seed: int) -> dict[str, float]:
     """{"target_mse", "clean_latent_mse"} at three fixed timesteps with fixed noise: comparable through the training.
 
     It costs a small model about a step of training.

@@ -69,14 +69,14 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
     import torch
 
     from reffusion import crops, denoising, io, lora, memory, trace
-    from reffusion import prior as diffusion
     from reffusion.personalize import personalize
+    from reffusion.prior import load_prior, recomputing
 
     if not params.steps:
         raise ValueError("personalize.steps is 0: there is nothing to learn, leave the stage out")
     scene = io.load_scene(poses)
-    prior = diffusion.load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
-    prior = diffusion.recomputing(prior) if params.checkpointing else prior
+    prior = load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
+    prior = recomputing(prior) if params.checkpointing else prior
     references = [
         crops.picture(torch.from_numpy(r.image), torch.from_numpy(r.mask), prior.native_size)
         for r in io.load_references(reference, scene)

@@ -78,7 +78,7 @@ def inpainted(params: Params, out: Path, scene, poses: Path, fit: Path, masks: P
     import torch
 
     from reffusion import exposure, inpaint, io, memory
-    from reffusion import prior as diffusion
+    from reffusion.prior import load_prior
     from reffusion.types import Reference
 
     name = io.load_json(masks / "facts.json")["best_reference"]
@@ -90,7 +90,7 @@ def inpainted(params: Params, out: Path, scene, poses: Path, fit: Path, masks: P
     photo = exposure.load_views(poses, fit, [name])[name]
     base = torch.from_numpy(inpaint.background(remaining, camera, photo, pixels.consistent)).float() / 255
 
-    prior = diffusion.load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
+    prior = load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
     prior = memory.fitted(prior, params.memory_gb, "reference.memory_gb")
     hole = torch.from_numpy(pixels.invent)
     with memory.blamed("reference.memory_gb", params.memory_gb):

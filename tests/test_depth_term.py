@@ -14,9 +14,9 @@ from reffusion.behind import Completion
 from reffusion.confinement import Sight
 from reffusion.crops import PROMPTS
 from reffusion.depth_term import DepthRegularization
+from reffusion.diffusion import embed_text
 from reffusion.geometry import Degenerate
 from reffusion.optimize import GaussianOptimizer, Rates
-from reffusion.prior import embed_text
 from reffusion.splat import render
 from reffusion.surfels import surface_gaussians
 from reffusion.trace import generator, load_checkpoint, read_trace

@@ -22,8 +22,8 @@ from reffusion.confinement import (
     strays,
 )
 from reffusion.crops import PROMPTS
+from reffusion.diffusion import embed_text
 from reffusion.optimize import Rates
-from reffusion.prior import embed_text
 from reffusion.splat import render
 from reffusion.trace import generator, load_checkpoint, read_trace
 from reffusion.types import PARAMETERS, Camera, Gaussians, MaskSet, Scene, Similarity

@@ -6,9 +6,8 @@ import pytest
 import torch
 from small_prior import small_prior
 
-from reffusion import crops, denoising, lora
+from reffusion import crops, denoising, diffusion, lora
 from reffusion import personalize as P
-from reffusion import prior as diffusion
 from reffusion.crops import Sampling
 from reffusion.trace import generator, load_checkpoint, read_trace
 

@@ -56,7 +56,7 @@ FAULTS = (
     Fault("1 - alpha bar in half precision", "reffusion.sds", "sds_gradient",
           "alpha_bar = alphas_cumprod[timesteps]", "alpha_bar = alphas_cumprod.to(latents)[timesteps]",
           "timestep 0, half precision, score distillation"),
-    Fault("guidance of a instead of 1 + a", "reffusion.prior", "guided",
+    Fault("guidance of a instead of 1 + a", "reffusion.diffusion", "guided",
           "return (1 + guidance) * eps", "return guidance * eps", "guidance 100, equal prompts"),
     Fault("a tie that masks", "reffusion.masks", "label_gaussians",
           "votes.masked > tau * votes.unmasked", "votes.masked >= tau * votes.unmasked", "masks contradicting"),
