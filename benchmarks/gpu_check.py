@@ -29,7 +29,8 @@ from reffusion.adversary import Adversarial, Adversary
 from reffusion.behind import Completion, Seen
 from reffusion.confinement import Distillation, adversarial_term, reconstruction_term, reference_term
 from reffusion.depth_term import DepthRegularization, Estimator, by_network, depth_term
-from reffusion.fit import Settings, fit
+from reffusion.fit import fit
+from reffusion.fit_step import Settings
 from reffusion.geometry import Degenerate
 from reffusion.personalize import train_step
 from reffusion.prior import Prior, load_prior, without_text
