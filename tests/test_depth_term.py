@@ -5,16 +5,13 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import torch
-from small_prior import small_prior
 
 from reffusion import behind, depth_term, inpaint
 from reffusion import distill as D
 from reffusion.alignment import align
 from reffusion.behind import Completion
 from reffusion.confinement import Sight
-from reffusion.crops import PROMPTS
 from reffusion.depth_term import DepthRegularization
-from reffusion.diffusion import embed_text
 from reffusion.geometry import Degenerate
 from reffusion.optimize import GaussianOptimizer, Rates
 from reffusion.splat import render
@@ -70,17 +67,6 @@ def shown(moved=1.0, how=HOW):
 def giving(estimate):
     """The paper's estimator with a network that says `estimate`, whatever it is shown."""
     return depth_term.by_network(lambda image: torch.as_tensor(np.asarray(estimate)), HOW)
-
-
-@pytest.fixture(scope="module")
-def prior():
-    return small_prior()
-
-
-@pytest.fixture(scope="module")
-def text(prior):
-    with torch.no_grad():
-        return embed_text(prior, list(PROMPTS))
 
 
 # ------------------------------------------------------------------------------------------ alignment and target
