@@ -19,14 +19,14 @@ from scipy.sparse.linalg import cg, spsolve
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from reffusion import bilateral, depth, geometry
+from reffusion import alignment, bilateral, depth
 
 HEIGHT, WIDTH = 48, 64
 SPREADS = 10.0 ** np.arange(0, 12)  # offsets, in units of the data's spread
 STEPS = 400
 
 
-def alignment() -> list[tuple[float, float, float, float]]:
+def aligned() -> list[tuple[float, float, float, float]]:
     """Offset in spreads, condition number of the plain equations, errors of the plain and of the library's line.
 
     Exact data; errors are the largest on the data, relative to the target's spread.
@@ -36,9 +36,9 @@ def alignment() -> list[tuple[float, float, float, float]]:
     for offset in SPREADS[SPREADS < 1e6]:
         x, truth = base + offset, 2.0 * base
         plain = np.linalg.solve([[x @ x, x.sum()], [x.sum(), float(x.size)]], [x @ truth, truth.sum()])
-        ours = geometry.align(x, truth)
+        ours = alignment.align(x, truth)
         error = lambda line, truth=truth: float(np.abs(line - truth).max() / np.ptp(truth))
-        rows.append((offset, geometry.condition(x)[0], error(plain[0] * x + plain[1]), error(ours.apply(x))))
+        rows.append((offset, alignment.condition(x)[0], error(plain[0] * x + plain[1]), error(ours.apply(x))))
     return rows
 
 
@@ -93,7 +93,7 @@ def completion() -> tuple[float, list[tuple[float, float, float]]]:
 
 def report(say: Callable[[str], None]) -> tuple:
     """Measure all three, saying the numbers."""
-    lines, systems, (number, maps) = alignment(), solver(), completion()
+    lines, systems, (number, maps) = aligned(), solver(), completion()
     say("alignment: offset / spread, condition (plain), error plain, error centred and scaled (condition 1)")
     for row in lines:
         say("  {:8.0e} {:10.1e} {:10.1e} {:10.1e}".format(*row))

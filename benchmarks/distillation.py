@@ -26,8 +26,13 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 from prior import Case, scene_cases, tensors  # noqa: E402
 
-from reffusion import io, lora, trace  # noqa: E402
-from reffusion import prior as diffusion  # noqa: E402
+from reffusion import (  # noqa: E402
+    diffusion,
+    io,
+    lora,
+    trace,
+)
+from reffusion.prior import Prior, load_prior  # noqa: E402
 
 TIMESTEPS = (20, 100, 300, 600, 850)
 NOISES = 4  # draws; with g's two halves from different ones, their noise does not pass for agreement
@@ -77,7 +82,7 @@ def gain(halves: tuple[Tensor, Tensor], error: Tensor, holes: Tensor) -> dict[st
     return {"cosine": cosine, "gain": float(-10 * np.log10(1 - max(cosine, 0.0) ** 2))}
 
 
-def measured(models: dict[str, diffusion.Prior], run: Path) -> list[dict]:
+def measured(models: dict[str, Prior], run: Path) -> list[dict]:
     """A row for each model, scale, picture and timestep."""
     first = next(iter(models.values()))
     cases = scene_cases(run, first.native_size)
@@ -145,8 +150,8 @@ def main() -> None:
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     models = {
-        "unadapted": diffusion.load_prior(given.prior),
-        "personalized": lora.merged(diffusion.load_prior(given.prior), given.run / "personalize"),
+        "unadapted": load_prior(given.prior),
+        "personalized": lora.merged(load_prior(given.prior), given.run / "personalize"),
     }
     rows = measured(models, given.run)
     io.save_json(given.out / "distillation.json", rows)

@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from reffusion import lora, memory, weights
-from reffusion import personalize as P
-from reffusion import prior as diffusion
+from reffusion import crops, denoising, diffusion, lora, memory, weights
 from reffusion.confinement import Distillation, Sight, sds_term
+from reffusion.personalize import Training, train_step
+from reffusion.prior import Prior, make_prior, recomputing, without_text
 from reffusion.trace import generator
 from reffusion.types import Camera, Gaussians
 
@@ -152,22 +152,22 @@ def living(shape: Shape, dtype: torch.dtype) -> dict[str, float]:
     said = {"weights": prior.bytes}
     said |= {name: memory.peak_bytes(lambda s=step: s(prior), "meta") for name, step in steps.items()}
     trainer(prior, 1)
-    training = lambda: P.one_sample(prior, [picture], 0)
+    training = lambda: denoising.one_sample(prior, [picture], 0)
     said["personalization"] = memory.peak_bytes(training, "meta")
-    diffusion.recomputing(prior)
+    recomputing(prior)
     said["SDS, checkpointing"] = memory.peak_bytes(lambda: memory.encoding(prior), "meta")
     said["personalization, checkpointing"] = memory.peak_bytes(training, "meta")
     return {name: round(count / 1e9, 6) for name, count in said.items()}
 
 
-def build(shape: Shape, dtype: torch.dtype, device: str = "cpu", seed: int = 0) -> diffusion.Prior:
+def build(shape: Shape, dtype: torch.dtype, device: str = "cpu", seed: int = 0) -> Prior:
     """A prior of random weights, the same for equal seeds."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         return assembled(shape, networks(shape, dtype), device)
 
 
-def assembled(shape: Shape, made: dict[str, torch.nn.Module], device: str) -> diffusion.Prior:
+def assembled(shape: Shape, made: dict[str, torch.nn.Module], device: str) -> Prior:
     """The networks with a tokenizer (the embedded prior's: words do not matter here) and SD2's schedule."""
     from diffusers import DDIMScheduler
     from transformers import CLIPTokenizer
@@ -178,7 +178,7 @@ def assembled(shape: Shape, made: dict[str, torch.nn.Module], device: str) -> di
         beta_start=0.00085, beta_end=0.012, beta_schedule="scaled_linear", clip_sample=False, steps_offset=1
     )
     second = made.get("text_encoder_2")
-    return diffusion.make_prior(
+    return make_prior(
         made["unet"], made["vae"], made["text_encoder"], tokens, schedule, device, "random weights", second, tokens
     )
 
@@ -186,30 +186,30 @@ def assembled(shape: Shape, made: dict[str, torch.nn.Module], device: str) -> di
 # ------------------------------------------------------------------------------------------------------- the two steps
 
 
-def reference(size: int) -> P.Picture:
+def reference(size: int) -> crops.Picture:
     """Stripes with a hole in the middle, a quarter wider than high."""
     rows, columns = torch.meshgrid(torch.arange(size), torch.arange(size + size // 4), indexing="ij")
     image = torch.stack([128 + 100 * torch.sin((rows + k * columns) / 9) for k in (1, 2, 3)], 2)
     hole = torch.zeros(rows.shape, dtype=torch.bool)
     hole[size // 3 : 2 * size // 3, size // 2 : size] = True
-    return P.picture(image.to(torch.uint8), hole, size)
+    return crops.picture(image.to(torch.uint8), hole, size)
 
 
-def trainer(prior: diffusion.Prior, batch: int) -> tuple[dict[str, list], torch.optim.Optimizer, P.Training]:
+def trainer(prior: Prior, batch: int) -> tuple[dict[str, list], torch.optim.Optimizer, Training]:
     """The paper's LoRA on a prior: rank 8, alpha 16, dropout 0.1 on the attention layers; AdamW."""
     trained = lora.add(prior, rank=8, alpha=16, dropout=0.1, layers="attention", seed=0)
     groups = [{"params": trained["unet"], "lr": 2e-4}, {"params": trained["text"], "lr": 4e-5}]
-    training = P.Training(
+    training = Training(
         steps=2000, lr_unet=2e-4, lr_text=4e-5, batch=batch, accumulate=1, weight_decay=1e-2, betas=(0.9, 0.999),
         clip=1.0, warm_up=0, schedule="constant", size=prior.native_size, seed=0, checkpoint_seconds=1e9,
     )  # fmt: skip
     return trained, torch.optim.AdamW(groups, weight_decay=training.weight_decay), training
 
 
-def personalization_step(prior: diffusion.Prior, picture: P.Picture, batch: int, folder: Path) -> dict[str, float]:
+def personalization_step(prior: Prior, picture: crops.Picture, batch: int, folder: Path) -> dict[str, float]:
     """One optimiser step, and the LoRA saved in `folder`."""
     trained, optimizer, training = trainer(prior, batch)
-    loss = P.train_step(prior, optimizer, [picture], [], P.Sampling(), training, 0)
+    loss = train_step(prior, optimizer, [picture], [], crops.Sampling(), training, 0)
     lora.set_dropout(prior, False)
     lora.save(prior, folder)
     moved = {f"lora_{part}": sum(float(p.detach().abs().sum()) for p in of) for part, of in trained.items()}
@@ -217,14 +217,14 @@ def personalization_step(prior: diffusion.Prior, picture: P.Picture, batch: int,
 
 
 @torch.no_grad()
-def epsilon(prior: diffusion.Prior) -> torch.Tensor:
+def epsilon(prior: Prior) -> torch.Tensor:
     """What the prior answers to fixed noise, a fixed picture and a prompt: compared before and after saving."""
     side, draw = prior.native_size // prior.factor, generator(0, "epsilon")
     channels = prior.vae.config.latent_channels
     noisy, shown = (torch.randn(1, channels, side, side, generator=draw).to(prior.device) for _ in range(2))
     condition = torch.cat([torch.ones_like(noisy[:, :1]), shown], 1)
     at = torch.tensor([500], device=prior.device)
-    return diffusion.raw_prediction(prior, noisy, at, condition, diffusion.embed_text(prior, [P.PROMPTS[0]])).cpu()
+    return diffusion.raw_prediction(prior, noisy, at, condition, diffusion.embed_text(prior, [crops.PROMPTS[0]])).cpu()
 
 
 def sight(size: int, device: str) -> Sight:
@@ -249,7 +249,7 @@ def gaussians(number: int, device: str, degree: int = 3) -> Gaussians:
 
 
 def sds_step(
-    prior: diffusion.Prior, text: torch.Tensor, view: Sight, scene: Gaussians, settings: Distillation, step: int = 0
+    prior: Prior, text: torch.Tensor, view: Sight, scene: Gaussians, settings: Distillation, step: int = 0
 ) -> dict[str, float]:
     """One SDS term of the library, and its backward pass into the Gaussians."""
     masked = torch.ones(len(scene), dtype=torch.bool, device=scene.means.device)
@@ -281,9 +281,9 @@ def run(shape: Shape, dtype: torch.dtype, options: argparse.Namespace) -> dict[s
     options.out.mkdir(parents=True, exist_ok=True)
     report: dict[str, Any] = {"parameters": count(shape), "dtype": str(dtype), "size": shape.unet["sample_size"] * 8}
 
-    def made() -> diffusion.Prior:
+    def made() -> Prior:
         prior = build(shape, dtype)
-        return diffusion.recomputing(prior) if options.checkpointing else prior
+        return recomputing(prior) if options.checkpointing else prior
 
     prior = timed(report, "build", made)
     report["size"] = size = prior.native_size
@@ -297,8 +297,8 @@ def run(shape: Shape, dtype: torch.dtype, options: argparse.Namespace) -> dict[s
     report["epsilon difference"] = float((after - before).abs().max())
     report["epsilon size"] = float(before.abs().max())
     with torch.no_grad():
-        text = timed(report, "embed prompts", lambda: diffusion.embed_text(prior, list(P.PROMPTS)))
-    prior = diffusion.without_text(prior)
+        text = timed(report, "embed prompts", lambda: diffusion.embed_text(prior, list(crops.PROMPTS)))
+    prior = without_text(prior)
     gc.collect()
     settings = Distillation(patches=options.patches)
     scene = gaussians(options.gaussians, "cpu")

@@ -24,15 +24,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reffusion import memory, monocular, splat, trace, weights
-from reffusion import personalize as P
-from reffusion import prior as diffusion
+from reffusion import crops, denoising, diffusion, memory, monocular, splat, trace, weights
 from reffusion.adversary import Adversarial, Adversary
 from reffusion.behind import Completion, Seen
 from reffusion.confinement import Distillation, adversarial_term, reconstruction_term, reference_term
 from reffusion.depth_term import DepthRegularization, Estimator, by_network, depth_term
-from reffusion.fit import Settings, fit
+from reffusion.fit import fit
+from reffusion.fit_step import Settings
 from reffusion.geometry import Degenerate
+from reffusion.personalize import train_step
+from reffusion.prior import Prior, load_prior, without_text
 from reffusion.trace import generator
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
@@ -127,8 +128,8 @@ def losses(shape: full_size.Shape, sizes: Sizes, device: str, out: Path) -> dict
     found["adversarial"] = measured(judged, device, sizes.repeats)
     prior, source = ready(shape, device, torch.float16 if half else torch.float32)
     with torch.no_grad():
-        text = diffusion.embed_text(prior, list(P.PROMPTS))
-    prior = diffusion.without_text(prior)
+        text = diffusion.embed_text(prior, list(crops.PROMPTS))
+    prior = without_text(prior)
 
     def distilled() -> dict[str, float]:
         said = full_size.sds_step(prior, text, view, scene, Distillation())
@@ -184,19 +185,19 @@ def depth_estimator(sizes: Sizes, device: str) -> tuple[Estimator, str]:
     return estimator, source
 
 
-def ready(shape: full_size.Shape, device: str, dtype: torch.dtype) -> tuple[diffusion.Prior, str]:
+def ready(shape: full_size.Shape, device: str, dtype: torch.dtype) -> tuple[Prior, str]:
     """The published weights where they are here and of this shape, else random ones."""
     if shape == full_size.SD2 and weights.locate(weights.SD2) is not None:
-        return diffusion.load_prior(weights.SD2, device, dtype), weights.SD2
+        return load_prior(weights.SD2, device, dtype), weights.SD2
     return full_size.build(shape, dtype, device), "random"
 
 
-def personalization(prior: diffusion.Prior, sizes: Sizes, device: str, out: Path) -> dict[str, Any]:
+def personalization(prior: Prior, sizes: Sizes, device: str, out: Path) -> dict[str, Any]:
     """Steps of the paper's LoRA, as many samples at once as fit into 20 GB."""
     picture = full_size.reference(prior.native_size)
     trained, optimizer, training = full_size.trainer(prior, sizes.batch)
-    prior = memory.fitted(prior, 20.0, "personalize.memory_gb", lambda p: P.one_sample(p, [picture], 0))
-    step = lambda: {"loss": P.train_step(prior, optimizer, [picture], [], P.Sampling(), training, 0)}
+    prior = memory.fitted(prior, 20.0, "personalize.memory_gb", lambda p: denoising.one_sample(p, [picture], 0))
+    step = lambda: {"loss": train_step(prior, optimizer, [picture], [], crops.Sampling(), training, 0)}
     said = measured(step, device, sizes.repeats)
     moved = sum(float(p.detach().abs().sum()) for p in trained["text"])
     return said | {"batch": sizes.batch, "rows_in_one_pass": prior.rows_graded, "lora_text": moved}

@@ -28,8 +28,8 @@ sys.path[:0] = [str(ROOT), str(ROOT / "priors" / "tiny")]
 
 import images  # noqa: E402
 
-from reffusion import io, lora, metrics, trace  # noqa: E402
-from reffusion import prior as diffusion  # noqa: E402
+from reffusion import diffusion, io, lora, metrics, trace  # noqa: E402
+from reffusion.prior import Prior, load_prior  # noqa: E402
 from reffusion.sds import window_around  # noqa: E402
 from stages import evaluate  # noqa: E402
 from stages import personalize as stage  # noqa: E402
@@ -146,7 +146,7 @@ def tensors(cases: list[Case]) -> tuple[Tensor, Tensor]:
     return pictures, torch.from_numpy(np.stack([case.hole for case in cases]))[:, None].float()
 
 
-def painted(prior: diffusion.Prior, cases: list[Case], seed: int, prompt: str = "") -> list[np.ndarray]:
+def painted(prior: Prior, cases: list[Case], seed: int, prompt: str = "") -> list[np.ndarray]:
     """The holes filled from pure noise: uint8 [H, W, 3] each."""
     done = []
     for first in range(0, len(cases), BATCH):
@@ -167,7 +167,7 @@ def inpainting(priors: list[str], count: int, out: Path) -> dict:
         for name, flag in (("Telea", cv2.INPAINT_TELEA), ("Navier-Stokes", cv2.INPAINT_NS))
     }
     for name in priors:
-        ways[name] = painted(diffusion.load_prior(name), cases, SEED)
+        ways[name] = painted(load_prior(name), cases, SEED)
     for index, case in enumerate(cases[:SHOWN]):
         save_row(out / "inpainting" / f"{index:02d}.png", case, [pictures[index] for pictures in ways.values()])
     result = {}
@@ -234,7 +234,7 @@ def profile(prior: str, steps: int | None) -> stage.Params:
 
 
 @torch.no_grad()
-def by_timestep(prior: diffusion.Prior, cases: list[Case], prompt: str) -> dict[str, list[float]]:
+def by_timestep(prior: Prior, cases: list[Case], prompt: str) -> dict[str, list[float]]:
     """For each of `TIMESTEPS`, means over the holes: the squared error of the clean latent predicted from the noised
     truth, and the variance of that prediction (so of z - x0, the SDS gradient) over `NOISES` draws of the noise."""
     pictures, holes = tensors(cases)
@@ -266,8 +266,8 @@ def personalization(prior: str, run: Path, steps: int | None, out: Path) -> dict
     params = profile(prior, steps)
     stage.run(params, folder, **needs)
     models = {
-        "before": diffusion.load_prior(prior),
-        "after": lora.merged(diffusion.load_prior(prior), folder),
+        "before": load_prior(prior),
+        "after": lora.merged(load_prior(prior), folder),
     }
     prompts = {"reference": "A photo of sks", "whole": "A photo of sks", "window": "A photo of sks, cropped"}
     result: dict = {"steps": params.steps, "trace": trace.read_trace(folder / "trace.jsonl"), "timesteps": TIMESTEPS}

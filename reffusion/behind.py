@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from reffusion import bilateral, geometry, planes, trace
+from reffusion import alignment, bilateral, geometry, planes, trace
 from reffusion.depth import Plate, complete
 from reffusion.solverlog import SILENT, SolverLog
 from reffusion.types import Camera, Rendering
@@ -33,7 +33,7 @@ class Completion:
         planar_tolerance: relative disparity within which they do.
         stiffness, edge, unknowns: see `depth.Plate`.
         solver_smoothness, solver_spatial, solver_luma, solver_chroma: see `bilateral.Solver`.
-        robust: an estimate is aligned with outliers let go, see `geometry.align`.
+        robust: an estimate is aligned with outliers let go, see `alignment.align`.
         seed: of the draws that find planes.
     """
 
@@ -169,13 +169,13 @@ def estimated(
     Raises:
         Degenerate: fewer than 4 known pixels; a constant estimate; one that falls where the disparity grows.
     """
-    fitted = geometry.align(estimate, view.disparity, view.known, robust=how.robust)
+    fitted = alignment.align(estimate, view.disparity, view.known, robust=how.robust)
     if fitted.scale <= 0:
         raise geometry.Degenerate("reversed", "the estimate falls where the scene's disparity grows: is it depth?")
     aligned, confidence = fitted.apply(estimate), view.known.astype(np.float64)
     error = np.abs(view.disparity - aligned)[view.known]
     if how.robust and np.median(error) > 0:  # what the alignment lets go of is not to be spread either
-        confidence[view.known] = geometry.trusted(error, 1.4826 * np.median(error))
+        confidence[view.known] = alignment.trusted(error, 1.4826 * np.median(error))
     refined = bilateral.refine(aligned, view.disparity, confidence, guide, how.solver, solvers.iterated)
     solvers.solved("bilateral", refined, solvers.iterations)
     misfit = fitted.residual / np.abs(view.disparity[view.known]).mean()

@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from reffusion import prior as diffusion
+from reffusion import diffusion
 from reffusion.adversary import Adversary
 from reffusion.discriminator import gathered
 from reffusion.optimize import confine, reconstruction_loss

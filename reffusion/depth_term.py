@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from reffusion import behind
-from reffusion import prior as diffusion
 from reffusion.behind import Completion, Seen
 from reffusion.confinement import Sight
 from reffusion.geometry import Degenerate
 from reffusion.inpaint import repaint
 from reffusion.optimize import confine
+from reffusion.prior import Prior
 from reffusion.splat import render
 from reffusion.types import Gaussians, Rendering
 
@@ -85,7 +85,7 @@ def depth_term(
     gaussians: Gaussians,
     masked: Tensor,
     sight: Sight,
-    prior: diffusion.Prior,
+    prior: Prior,
     text: Tensor,
     settings: DepthRegularization,
     generator: torch.Generator,

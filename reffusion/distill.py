@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from math import log10
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,7 +17,7 @@ from reffusion.depth_term import Estimator
 from reffusion.optimize import GaussianOptimizer
 from reffusion.prior import Prior
 from reffusion.splat import render
-from reffusion.steps import Settings, job_of, step_of
+from reffusion.steps import Job, Settings, job_of, step_of
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
 
@@ -55,45 +55,82 @@ def distill(
     job = job_of(sights, holes, prior, text, estimator, settings, initial.means.device)
     optimizer = GaussianOptimizer(initial, masked, settings.rates, settings.masked_pace, epsilon=settings.epsilon)
     region = region_of(initial.means, masked) if settings.confined and masked.any() else None
-    state = trace.load_checkpoint(folder)
-    start, seconds, best = 0, 0.0, None
-    patience = trace.Patience(settings.patience, settings.stop_gain, settings.stop_drop)
-    if state is not None:
-        optimizer.load_state_dict(state["optimizer"])
-        if job.adversary is not None:
-            job.adversary.load_state_dict(state["adversary"])
-        job.tally.update(state["tally"])
-        patience.load_state_dict(state["patience"])
-        start, seconds, best = (state[k] for k in ("step", "seconds", "best"))
-    log, saved = trace.Trace(folder, seconds, start + bool(start)), seconds  # a line is numbered by the steps done
-    if start == 0:
-        with log.paused():
-            psnr, best = reference_psnr(optimizer.gaussians, holes), _copy(optimizer) if patience.watching else None
-            patience.ends(0, settings.iterations, psnr)
-            log.log(0, reference_psnr=psnr, **_counts(optimizer))
+    run = _Run.begun(optimizer, job, trace.load_checkpoint(folder))
+    log = trace.Trace(folder, run.seconds, run.step + bool(run.step))  # a line is numbered by the steps done
+    if run.step == 0:
+        _write_line(log, run, {})
 
-    for step in trace.progress(settings.iterations, "distill", start):
+    for step in trace.progress(settings.iterations, "distill", run.step):
         line = step_of(optimizer, step, job)
-        done = step + 1
+        run.step = done = step + 1
         if settings.densify_every and done % settings.densify_every == 0:
             _densify(optimizer, settings, done)
         if region is not None and (done % settings.region_every == 0 or done == settings.iterations):
             optimizer.select(~strays(region, optimizer.gaussians.means.detach(), optimizer.masked))
-        if patience.due(done, settings.iterations, per_octave=4):
-            with log.paused():
-                psnr = reference_psnr(optimizer.gaussians, holes)
-                end = patience.ends(done, settings.iterations, psnr)
-                log.log(done, reference_psnr=psnr, **line, **job.tally, **_counts(optimizer), **end)
-                if patience.watching and patience.best_at == done:
-                    best = _copy(optimizer)
+        if run.patience.due(done, settings.iterations, per_octave=4):
+            end = _write_line(log, run, line)
             if end and end["reason"] != "finished":
-                return replace(optimizer.gaussians, **{name: best[name] for name in PARAMETERS}), best["masked"]
-        if log.seconds - saved > settings.checkpoint_seconds:
-            saved = log.seconds
-            state = {"optimizer": optimizer.state_dict(), "step": done, "seconds": saved, "tally": job.tally}
-            state["adversary"] = None if job.adversary is None else job.adversary.state_dict()
-            trace.save_checkpoint(folder, state | {"best": best, "patience": patience.state_dict()})
+                best = {name: run.best[name] for name in PARAMETERS}
+                return replace(optimizer.gaussians, **best), run.best["masked"]
+        if log.seconds - run.seconds > settings.checkpoint_seconds:
+            run.seconds = log.seconds
+            trace.save_checkpoint(folder, run.state_dict())
     return optimizer.gaussians.map(Tensor.detach), optimizer.masked
+
+
+@dataclass
+class _Run:
+    """What a distillation continues from.
+
+    Attributes:
+        best: the Gaussians' parameters and labels where reference_psnr was best; None where an early end is not asked.
+        step, seconds: steps done so far; seconds spent at the last checkpoint.
+    """
+
+    optimizer: GaussianOptimizer
+    job: Job
+    patience: trace.Patience
+    best: dict[str, Tensor] | None = None
+    step: int = 0
+    seconds: float = 0.0
+
+    @classmethod
+    def begun(cls, optimizer: GaussianOptimizer, job: Job, state: dict[str, Any] | None) -> _Run:
+        """From the start, or from a checkpoint's state."""
+        settings = job.settings
+        run = cls(optimizer, job, trace.Patience(settings.patience, settings.stop_gain, settings.stop_drop))
+        if state is not None:
+            optimizer.load_state_dict(state["optimizer"])
+            if job.adversary is not None:
+                job.adversary.load_state_dict(state["adversary"])
+            job.tally.update(state["tally"])
+            run.patience.load_state_dict(state["patience"])
+            run.step, run.seconds, run.best = state["step"], state["seconds"], state["best"]
+        return run
+
+    def state_dict(self) -> dict[str, Any]:
+        adversary = self.job.adversary
+        return {
+            "optimizer": self.optimizer.state_dict(),
+            "adversary": None if adversary is None else adversary.state_dict(),
+            "tally": self.job.tally,
+            "patience": self.patience.state_dict(),
+            "step": self.step,
+            "seconds": self.seconds,
+            "best": self.best,
+        }
+
+
+def _write_line(log: trace.Trace, run: _Run, line: dict[str, float]) -> dict[str, Any]:
+    """A line of the trace, written with the clock stopped; what it says of the end, {} while the work goes on."""
+    optimizer, job = run.optimizer, run.job
+    with log.paused():
+        psnr = reference_psnr(optimizer.gaussians, job.holes)
+        end = run.patience.ends(run.step, job.settings.iterations, psnr)
+        log.log(run.step, reference_psnr=psnr, **line, **job.tally, **_counts(optimizer), **end)
+        if run.patience.watching and run.patience.best_at == run.step:
+            run.best = _copy(optimizer)
+    return end
 
 
 def _counts(optimizer: GaussianOptimizer) -> dict[str, int]:
@@ -122,4 +159,4 @@ def _densify(optimizer: GaussianOptimizer, settings: Settings, done: int) -> Non
 def reference_psnr(gaussians: Gaussians, holes: Sequence[tuple[Camera, Tensor, Tensor]]) -> float:
     """PSNR in dB over the pixels of all the references' holes."""
     squared = [(render(gaussians, c).color.clamp(0, 1) - image)[hole].square().flatten() for c, image, hole in holes]
-    return -10 * log10(max(float(torch.cat(squared).mean()), 1e-10))
+    return trace.decibels(float(torch.cat(squared).mean()))

@@ -11,6 +11,8 @@ import torch
 from reffusion import behind, geometry, splat, trace
 from reffusion.behind import Completion
 from reffusion.solverlog import SolverLog
+from reffusion.splat.conventions import SH0
+from reffusion.surfels import surface_gaussians
 from reffusion.types import Camera, Gaussians, Reference
 
 
@@ -26,7 +28,7 @@ class Sheets:
     PAPER leaves open: scale and opacity of the initial Gaussians.
 
     Attributes:
-        spread, thickness, grazing: see `geometry.surface_gaussians`.
+        spread, thickness, grazing: see `surface_gaussians`.
         opacity: of the first sheet.
         sunk, under_opacity: how far behind it the second lies, in pixels (0: there is none), and its opacity.
         color_steps: corrections of the colours, see `match_colors`.
@@ -137,13 +139,13 @@ def share_of(gaussians: Gaussians, labels: torch.Tensor, camera: Camera) -> np.n
 def surface(
     image: np.ndarray, depth: np.ndarray, pixels: np.ndarray, camera: Camera, sh_count: int, how: Sheets
 ) -> Gaussians:
-    """Both sheets, see `geometry.surface_gaussians`."""
+    """Both sheets, see `surface_gaussians`."""
     shown, shape = (image, depth, pixels, camera), {"sh_count": sh_count, "spread": how.spread}
     shape |= {"thickness": how.thickness, "grazing": how.grazing}
-    sheet = geometry.surface_gaussians(*shown, **shape, opacity=how.opacity)
+    sheet = surface_gaussians(*shown, **shape, opacity=how.opacity)
     if not how.sunk:
         return sheet
-    under = geometry.surface_gaussians(*shown, **shape, opacity=how.under_opacity, sunk=how.sunk)
+    under = surface_gaussians(*shown, **shape, opacity=how.under_opacity, sunk=how.sunk)
     return sheet.zipped(under, lambda a, b: torch.cat([a, b]))
 
 
@@ -177,7 +179,7 @@ def match_colors(
         gathered = splat.accumulate(gaussians, camera, torch.cat([residual, chosen], -1))
         seen = labels & (gathered[:, 3] > 1e-3)
         sh = gaussians.sh.clone()
-        sh[seen, 0] += gathered[seen, :3] / gathered[seen, 3:] / geometry.SH_0
-        sh[seen, 0] = sh[seen, 0].clamp(-0.5 / geometry.SH_0, 0.5 / geometry.SH_0)
+        sh[seen, 0] += gathered[seen, :3] / gathered[seen, 3:] / SH0
+        sh[seen, 0] = sh[seen, 0].clamp(-0.5 / SH0, 0.5 / SH0)
         gaussians = replace(gaussians, sh=sh)
     return gaussians

@@ -10,8 +10,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from reffusion import prior as diffusion
-from reffusion import splat
+from reffusion import diffusion, splat
+from reffusion.prior import Prior
 from reffusion.trace import generator as seeded
 from reffusion.types import Camera, Gaussians
 
@@ -70,7 +70,7 @@ def windows_over(hole: Tensor, size: int) -> Iterator[tuple[int, int]]:
 
 @torch.no_grad()
 def paint(
-    prior: diffusion.Prior,
+    prior: Prior,
     image: Tensor,
     hole: Tensor,
     *,
@@ -144,7 +144,7 @@ def _paint_windows(painted: Tensor, mask: Tensor, size: int, sample: Callable[..
 
 @torch.no_grad()
 def repaint(
-    prior: diffusion.Prior,
+    prior: Prior,
     image: Tensor,
     hole: Tensor,
     text: Tensor,

@@ -13,7 +13,8 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from reffusion import prior as diffusion
+from reffusion import diffusion
+from reffusion.prior import Prior
 
 SPARE = 0.9  # part of a budget that is planned with: kernels have workspaces, allocators gaps
 
@@ -82,8 +83,8 @@ def rows_within(budget_gb: float, fixed: int, row: int, param: str) -> int:
 
 
 def fitted(
-    prior: diffusion.Prior, budget_gb: float, param: str, graded: Callable[[diffusion.Prior], object] | None = None
-) -> diffusion.Prior:
+    prior: Prior, budget_gb: float, param: str, graded: Callable[[Prior], object] | None = None
+) -> Prior:
     """The prior with as many samples in one pass as fit into the budget; as it is where that is 0.
 
     Args:
@@ -103,7 +104,7 @@ def fitted(
 
 
 @torch.no_grad()
-def answering(prior: diffusion.Prior) -> None:
+def answering(prior: Prior) -> None:
     """What inpainting does with one sample: encode, ask the UNet, decode."""
     size, wide = prior.native_size, prior.unet.config.cross_attention_dim
     latents = diffusion.encode(prior, torch.zeros(1, 3, size, size, device=prior.device))
@@ -113,7 +114,7 @@ def answering(prior: diffusion.Prior) -> None:
     diffusion.decode(prior, latents)
 
 
-def encoding(prior: diffusion.Prior) -> None:
+def encoding(prior: Prior) -> None:
     """What score distillation does with a gradient for one sample: encode it."""
     size = prior.native_size
     image = torch.zeros(1, 3, size, size, device=prior.device, requires_grad=True)

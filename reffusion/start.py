@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from reffusion.geometry import SH_0
+from reffusion.splat.conventions import SH0
 from reffusion.types import Gaussians
 
 
@@ -42,7 +42,7 @@ def initial_gaussians(
     spread = size * np.sqrt((distance**2).mean(1)).clip(min=1e-4)
     count = len(points)
     sh = torch.zeros(count, (sh_degree + 1) ** 2, 3)
-    sh[:, 0] = (torch.from_numpy(colors.astype(np.float32)) / 255 - 0.5) / SH_0
+    sh[:, 0] = (torch.from_numpy(colors.astype(np.float32)) / 255 - 0.5) / SH0
     return Gaussians(
         means=torch.from_numpy(points.astype(np.float32)),
         quaternions=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),

@@ -128,10 +128,10 @@ def run(
     began = time.monotonic()
     import torch
 
-    from reffusion import io, lora, memory, trace
-    from reffusion import prior as diffusion
+    from reffusion import diffusion, io, lora, memory, trace
+    from reffusion.crops import PROMPTS
     from reffusion.distill import distill
-    from reffusion.personalize import PROMPTS
+    from reffusion.prior import load_prior, recomputing, without_text
 
     scene = io.load_scene(poses)
     initial = io.load_ply(initialize / "gaussians.ply").map(lambda p: p.to(params.device))
@@ -142,12 +142,12 @@ def run(
     ]
     prior = text = None
     if params.sds_weight > 0 or params.depth_weight > 0:
-        prior = diffusion.load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
+        prior = load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
         prior = prior if personalize is None else lora.merged(prior, personalize)
         with torch.no_grad():
             text = diffusion.embed_text(prior, list(PROMPTS))
-        prior = diffusion.without_text(prior)
-        prior = diffusion.recomputing(prior) if params.checkpointing else prior
+        prior = without_text(prior)
+        prior = recomputing(prior) if params.checkpointing else prior
     estimator = depth_estimator(params, scene.points) if params.depth_weight > 0 else None
     sights, (perceptual, lifting) = load_sights(params, scene, poses, fit, masks, lift), lift_choices(params)
     with memory.blamed("distill.memory_gb", params.memory_gb):

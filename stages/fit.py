@@ -170,7 +170,7 @@ def settings(params: Params, cameras: list):
     """The fit's settings for these views: a larger picture has room for more Gaussians."""
     from dataclasses import fields
 
-    from reffusion.fit import Settings
+    from reffusion.fit_step import Settings
     from reffusion.optimize import Rates
 
     shared = {f.name: getattr(params, f.name) for f in fields(Settings) if f.name not in ("rates", "budget")}

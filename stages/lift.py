@@ -78,12 +78,12 @@ def painter_of(params: Params) -> tuple[str, Callable]:
     import torch
 
     from reffusion import inpaint, paint2d, trace
-    from reffusion import prior as diffusion
+    from reffusion.prior import load_prior
 
     if params.inpainter == "deterministic":
         painter = paint2d.load(params.lama, params.device)
         return painter.name, lambda image, hole, _: painter.paint(image, hole)
-    prior = diffusion.load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
+    prior = load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
 
     def paint(image, hole, name):
         (picture,) = inpaint.paint(

@@ -3,10 +3,18 @@ invent mask."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
+
+if TYPE_CHECKING:
+    import numpy as np
+    from torch import Tensor
+
+    from reffusion.masks import Votes
+    from reffusion.types import Camera, Gaussians, MaskSet, Scene
 
 
 class Params(BaseModel):
@@ -44,8 +52,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
     import numpy as np
     import torch
 
-    from reffusion import io, masks, trace
-    from reffusion.types import MaskSet
+    from reffusion import io, masks
 
     scene, gaussians = io.load_scene(poses), io.load_ply(fit / "gaussians.ply")
     train = [scene.cameras[name] for name in scene.train]
@@ -55,49 +62,25 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
     ballots = raw | {name: empty[name] for name in scene.clean}
     if params.invent == "region" and region is None:
         raise ValueError(f"masks.invent is 'region', but {poses / 'region.json'} is missing: set region in scene.yaml")
+    if not raw and region is None:
+        raise ValueError(f"{poses}: neither masks nor a region say what is to be changed: add masks, or a region")
 
     # Observation outside the masks is measured by weight, whatever the votes count.
     seen = masks.cast_votes(gaussians, train, ballots or empty, mode="weight")
     if raw:
-        votes = seen if params.vote == "weight" else masks.cast_votes(gaussians, train, ballots, mode=params.vote)
-        labels = masks.label_gaussians(votes, params.tau)
-        # What hardly any view sees (buried in the object, or in the wall behind it) votes by where it stands.
-        unseen = seen.masked + seen.unmasked <= params.buried
-        labels |= unseen & masks.hidden_inside(gaussians, train, ballots)
-    elif region is not None:
-        labels = masks.inside_box(gaussians, region["center"], region["size"])
+        labels = voted(params, gaussians, train, ballots, seen)
     else:
-        raise ValueError(f"{poses}: neither masks nor a region say what is to be changed: add masks, or a region")
-
-    clean = lambda mask: masks.tidy(mask, params.speck * mask.shape[1], params.gap * mask.shape[1])
-    consistent, shown = {}, {}
-    for name, camera in scene.cameras.items():
-        share, shown[name] = masks.label_view(gaussians, labels, camera)
-        consistent[name] = clean(share > params.tau_rendered)
+        labels = masks.inside_box(gaussians, region["center"], region["size"])
+    consistent, shown = drawn(params, gaussians, labels, scene.cameras)
     # What stands where (almost) every view sees the object can only be the object, whatever it was painted with.
     labels |= masks.hidden_inside(
         gaussians, train, {n: consistent[n] for n in scene.train if n not in scene.clean}, share=params.hull
     )
-    hidden = consistent | {name: empty[name] for name in scene.clean}
     remaining, observed = gaussians.map(lambda p: p[~labels]), masks.evidence(seen, params.observed)[~labels]
-
-    sets, names = {}, list(scene.cameras)
-    fill_region = params.invent == "region" or (params.invent == "auto" and region is not None)
-    for k in trace.progress(len(names), "masks"):
-        name, camera = names[k], scene.cameras[names[k]]
-        disparity, explained = masks.remaining_view(remaining, observed, camera)
-        asked = consistent[name] & (explained > params.explained)
-        seen_by = masks.seen_elsewhere(disparity, asked, camera, train, hidden, shown, tolerance=params.tolerance)
-        unseen = consistent[name] & ~(asked & (seen_by >= params.witnesses))
-        unseen = clean(unseen) & hidden[name]
-        invent = hidden[name] if params.invent == "consistent" else unseen
-        if fill_region:
-            invent = masks.box_silhouette(**region, camera=camera, disparity=disparity)
-        sets[name] = MaskSet(raw.get(name, empty[name]), consistent[name], unseen, invent)
-
-    count = lambda kind, chosen: int(sum(np.count_nonzero(getattr(sets[name], kind)) for name in chosen))
-    unseen_share = count("never_seen", scene.train) / max(count("consistent", scene.train), 1)
-    if params.invent != "consistent" and not fill_region and unseen_share <= params.negligible:
+    fill = region if params.invent in ("region", "auto") else None
+    sets = classified(params, scene, remaining, observed, raw, consistent, shown, fill)
+    unseen = share_unseen(sets, scene.train)
+    if params.invent != "consistent" and fill is None and unseen <= params.negligible:
         sets = {name: replace(each, invent=empty[name]) for name, each in sets.items()}
     io.save_labels(out / "labels.npy", labels.cpu())
     io.save_mask_sets(out, sets)
@@ -106,10 +89,87 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
         "masked_gaussians": int(torch.count_nonzero(labels)),
         "gaussians": len(gaussians),
         "voting_views": len(ballots),
-        "invent_pixels": count("invent", scene.train),
-        "consistent_pixels": count("consistent", scene.train),
-        "never_seen_share": unseen_share,
+        "invent_pixels": pixels_of("invent", sets, scene.train),
+        "consistent_pixels": pixels_of("consistent", sets, scene.train),
+        "never_seen_share": unseen,
         "invent_views": [name for name in scene.train if invents[name].any()],
         "best_reference": masks.best_view(invents, scene.train),
     }
     io.save_json(out / "facts.json", facts)
+
+
+def voted(
+    params: Params, gaussians: Gaussians, train: list[Camera], ballots: dict[str, np.ndarray], seen: Votes
+) -> Tensor:
+    """Labels [N] bool by the masks of the views that vote; `seen`: the votes by weight."""
+    from reffusion import masks
+
+    votes = seen if params.vote == "weight" else masks.cast_votes(gaussians, train, ballots, mode=params.vote)
+    labels = masks.label_gaussians(votes, params.tau)
+    # What hardly any view sees (buried in the object, or in the wall behind it) votes by where it stands.
+    unseen = seen.masked + seen.unmasked <= params.buried
+    return labels | (unseen & masks.hidden_inside(gaussians, train, ballots))
+
+
+def drawn(params: Params, gaussians: Gaussians, labels: Tensor, cameras: dict[str, Camera]) -> tuple[dict, dict]:
+    """The labels rendered back into each view: its consistent mask C, and the disparity that it shows, [H, W]."""
+    from reffusion import masks
+
+    consistent, shown = {}, {}
+    for name, camera in cameras.items():
+        share, shown[name] = masks.label_view(gaussians, labels, camera)
+        consistent[name] = tidied(params, share > params.tau_rendered)
+    return consistent, shown
+
+
+def classified(
+    params: Params,
+    scene: Scene,
+    remaining: Gaussians,
+    observed: Tensor,
+    raw: dict[str, np.ndarray],
+    consistent: dict[str, np.ndarray],
+    shown: dict[str, np.ndarray],
+    fill: dict | None,
+) -> dict[str, MaskSet]:
+    """The masks of each view: what the remaining Gaussians explain, and other views saw, is background to be shown.
+
+    `observed`: [M], evidence of the remaining ones; `fill`: the region that is made up whatever anyone saw, or None.
+    """
+    import numpy as np
+
+    from reffusion import masks, trace
+    from reffusion.types import MaskSet
+
+    train, names = [scene.cameras[name] for name in scene.train], list(scene.cameras)
+    hidden = consistent | {name: np.zeros_like(consistent[name]) for name in scene.clean}
+    sets = {}
+    for k in trace.progress(len(names), "masks"):
+        name, camera = names[k], scene.cameras[names[k]]
+        disparity, explained = masks.remaining_view(remaining, observed, camera)
+        asked = consistent[name] & (explained > params.explained)
+        seen_by = masks.seen_elsewhere(disparity, asked, camera, train, hidden, shown, tolerance=params.tolerance)
+        unseen = consistent[name] & ~(asked & (seen_by >= params.witnesses))
+        unseen = tidied(params, unseen) & hidden[name]
+        invent = hidden[name] if params.invent == "consistent" else unseen
+        if fill is not None:
+            invent = masks.box_silhouette(**fill, camera=camera, disparity=disparity)
+        sets[name] = MaskSet(raw.get(name, np.zeros_like(unseen)), consistent[name], unseen, invent)
+    return sets
+
+
+def tidied(params: Params, mask: np.ndarray) -> np.ndarray:
+    from reffusion import masks
+
+    return masks.tidy(mask, params.speck * mask.shape[1], params.gap * mask.shape[1])
+
+
+def pixels_of(kind: str, sets: dict[str, MaskSet], names: Sequence[str]) -> int:
+    import numpy as np
+
+    return int(sum(np.count_nonzero(getattr(sets[name], kind)) for name in names))
+
+
+def share_unseen(sets: dict[str, MaskSet], names: Sequence[str]) -> float:
+    """Of the consistent masks' pixels, those that no view saw behind them."""
+    return pixels_of("never_seen", sets, names) / max(pixels_of("consistent", sets, names), 1)

@@ -33,7 +33,7 @@ class Params(BaseModel):
     clip: float = Field(1.0, gt=0, description="largest norm of the gradient")
     warm_up: int = Field(0, ge=0, description="steps of linear warm-up")
     schedule: Literal["constant", "cosine"] = Field("constant", description="learning rate after the warm-up")
-    # PAPER leaves open: how samples are drawn (reffusion.personalize.Sampling says where the figures come from).
+    # PAPER leaves open: how samples are drawn (reffusion.crops.Sampling says where the figures come from).
     local_share: float = Field(0.5, ge=0, le=1, description="share of the reference's samples that are local crops")
     scene_crops: float = Field(0.0, ge=0, lt=1, description="share of samples from unmasked crops of the scene's views")
     hole_share: float = Field(0.0, ge=0, le=1, description="share of the reference's samples whose mask is its hole")
@@ -68,14 +68,51 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
     began = time.monotonic()
     import torch
 
-    from reffusion import io, lora, memory, trace
-    from reffusion import personalize as P
-    from reffusion import prior as diffusion
+    from reffusion import crops, denoising, io, lora, memory, trace
+    from reffusion.personalize import personalize
+    from reffusion.prior import load_prior, recomputing
 
     if not params.steps:
         raise ValueError("personalize.steps is 0: there is nothing to learn, leave the stage out")
     scene = io.load_scene(poses)
-    sampling = P.Sampling(
+    prior = load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
+    prior = recomputing(prior) if params.checkpointing else prior
+    references = [
+        crops.picture(torch.from_numpy(r.image), torch.from_numpy(r.mask), prior.native_size)
+        for r in io.load_references(reference, scene)
+    ]
+    sampling, training = settings(params, prior.native_size)
+    views = []
+    if params.scene_crops > 0:
+        views = crops.clear_views(scene_views(scene, poses, fit, masks, prior.native_size), training.size)
+        if not views:
+            print(f"note: no view has {training.size} px window free of masks: reference alone", flush=True)
+    trained = lora.add(prior, params.rank, params.alpha, params.dropout, params.layers, params.seed)
+
+    def learn(folder: Path, steps: int) -> None:
+        personalize(prior, trained, references, views, sampling, replace(training, steps=steps), folder)
+
+    def tried(folder: Path, steps: int) -> None:
+        before = lora.state(prior)
+        learn(folder, steps)
+        lora.load_state(prior, before)
+
+    row = lambda prior: denoising.one_sample(prior, references, training.seed)
+    with memory.blamed("personalize.memory_gb", params.memory_gb):
+        prior = memory.fitted(prior, params.memory_gb, "personalize.memory_gb", row)
+        learn(out, trace.affordable(out, params.steps, params.seconds, lambda: time.monotonic() - began, tried))
+    lora.save(prior, out)
+    trace.clear_checkpoint(out)
+
+
+def settings(params: Params, native: int) -> tuple:
+    """How samples are drawn, and how LoRA is trained on them; `native`: the prior's size in pixels."""
+    from dataclasses import fields
+
+    from reffusion.crops import Sampling
+    from reffusion.personalize import Training
+
+    sampling = Sampling(
         params.local_share,
         params.scene_crops,
         params.hole_share,
@@ -85,61 +122,18 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
         params.side,
         params.inverted_share,
     )
-    prior = diffusion.load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
-    prior = diffusion.recomputing(prior) if params.checkpointing else prior
-    references = [
-        P.picture(torch.from_numpy(r.image), torch.from_numpy(r.mask), prior.native_size)
-        for r in io.load_references(reference, scene)
-    ]
-    training = P.Training(
-        steps=params.steps,
-        lr_unet=params.lr_unet,
-        lr_text=params.lr_text,
-        batch=params.batch,
-        accumulate=params.accumulate,
-        weight_decay=params.weight_decay,
-        betas=params.betas,
-        clip=params.clip,
-        warm_up=params.warm_up,
-        schedule=params.schedule,
-        size=params.size or prior.native_size,
-        seed=params.seed,
-        checkpoint_seconds=params.checkpoint_seconds,
-        patience=params.patience,
-        stop_gain=params.stop_gain,
-    )
-    views = []
-    if params.scene_crops > 0:
-        views = P.clear_views(scene_views(scene, poses, fit, masks, prior.native_size), training.size)
-        if not views:
-            print(f"note: no view has {training.size} px window free of masks: reference alone", flush=True)
-    trained = lora.add(prior, params.rank, params.alpha, params.dropout, params.layers, params.seed)
-
-    def learn(folder: Path, steps: int) -> None:
-        P.personalize(prior, trained, references, views, sampling, replace(training, steps=steps), folder)
-
-    def tried(folder: Path, steps: int) -> None:
-        before = lora.state(prior)
-        learn(folder, steps)
-        lora.load_state(prior, before)
-
-    row = lambda prior: P.one_sample(prior, references, training.seed)
-    with memory.blamed("personalize.memory_gb", params.memory_gb):
-        prior = memory.fitted(prior, params.memory_gb, "personalize.memory_gb", row)
-        learn(out, trace.affordable(out, params.steps, params.seconds, lambda: time.monotonic() - began, tried))
-    lora.save(prior, out)
-    trace.clear_checkpoint(out)
+    named = {f.name: getattr(params, f.name) for f in fields(Training) if f.name != "size"}
+    return sampling, Training(**named, size=params.size or native)
 
 
 def scene_views(scene, poses: Path, fit: Path, masks: Path, size: int) -> list:
     """The training views as pictures whose consistent mask must not be used (nothing of it in a clean view)."""
     import torch
 
-    from reffusion import exposure, io
-    from reffusion import personalize as P
+    from reffusion import crops, exposure, io
 
     photos, sets = exposure.load_views(poses, fit, scene.train), io.load_mask_sets(masks, scene.train)
     return [
-        P.picture(torch.from_numpy(photos[n]), torch.from_numpy(sets[n].consistent & (n not in scene.clean)), size)
+        crops.picture(torch.from_numpy(photos[n]), torch.from_numpy(sets[n].consistent & (n not in scene.clean)), size)
         for n in scene.train
     ]

@@ -115,9 +115,9 @@ def from_prior(params: Params, out: Path, name: str, base, invent):
     import torch
 
     from reffusion import inpaint, io, memory
-    from reffusion import prior as diffusion
+    from reffusion.prior import load_prior
 
-    prior = diffusion.load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
+    prior = load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
     prior = memory.fitted(prior, params.memory_gb, "reference.memory_gb")
     hole = torch.from_numpy(invent)
     with memory.blamed("reference.memory_gb", params.memory_gb):

@@ -5,12 +5,12 @@ from pathlib import Path
 import torch
 from diffusers import UNet2DConditionModel
 
-from reffusion import prior as diffusion
+from reffusion.prior import Prior, make_prior, pipeline
 
 TINY = Path(__file__).resolve().parent.parent / "priors" / "tiny"
 
 
-def small_prior(seed: int = 0) -> diffusion.Prior:
+def small_prior(seed: int = 0) -> Prior:
     """The embedded prior's VAE, text encoder and schedule around a UNet of 16 and 16 channels, seeded."""
     from diffusers import AutoencoderKL, DDIMScheduler
     from transformers import CLIPTextModel, CLIPTokenizer
@@ -29,7 +29,7 @@ def small_prior(seed: int = 0) -> diffusion.Prior:
         norm_num_groups=4,
         use_linear_projection=True,
     )
-    return diffusion.make_prior(
+    return make_prior(
         unet,
         AutoencoderKL.from_pretrained(TINY / "vae"),
         CLIPTextModel.from_pretrained(TINY / "text_encoder"),
@@ -40,4 +40,4 @@ def small_prior(seed: int = 0) -> diffusion.Prior:
 
 def save_small_prior(folder: Path, seed: int = 0) -> None:
     """The same as a diffusers folder."""
-    diffusion.pipeline(small_prior(seed)).save_pretrained(folder)
+    pipeline(small_prior(seed)).save_pretrained(folder)

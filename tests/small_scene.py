@@ -4,6 +4,7 @@ import numpy as np
 import torch
 
 from reffusion import geometry, io
+from reffusion.surfels import surface_gaussians
 from reffusion.types import Camera, Scene, Similarity
 
 WALL, HALF, RIM = 2.0, 0.17, 0.015  # depth of the wall; half the side of the square, and its soft rim; scene units
@@ -33,7 +34,7 @@ def plane(depth: float, half_x: float, half_y: float, color):
     view = Camera("sheet", wide, high, fx, fy, wide / 2, high / 2, np.eye(4))
     points = geometry.unproject(np.full((high, wide), depth), view)
     picture = color(points[..., 0], points[..., 1])
-    return geometry.surface_gaussians(
+    return surface_gaussians(
         picture, np.full((high, wide), depth), np.ones((high, wide), bool), view, sh_count=1, spread=0.6, opacity=0.98
     )
 

@@ -5,18 +5,17 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import torch
-from small_prior import small_prior
 
-from reffusion import behind, depth_term, geometry, inpaint
+from reffusion import behind, depth_term, inpaint
 from reffusion import distill as D
+from reffusion.alignment import align
 from reffusion.behind import Completion
 from reffusion.confinement import Sight
 from reffusion.depth_term import DepthRegularization
 from reffusion.geometry import Degenerate
 from reffusion.optimize import GaussianOptimizer, Rates
-from reffusion.personalize import PROMPTS
-from reffusion.prior import embed_text
 from reffusion.splat import render
+from reffusion.surfels import surface_gaussians
 from reffusion.trace import generator, load_checkpoint, read_trace
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
@@ -37,7 +36,7 @@ def wall(moved: float = 1.0):
     disparity = 0.5 + 0.004 * (columns - 26) - 0.002 * (rows - 22)
     picture = 0.5 + 0.3 * np.stack([np.sin(columns / 3), np.cos(rows / 4), np.sin((rows + columns) / 5)], -1)
     everywhere = np.ones(disparity.shape, bool)
-    gaussians = geometry.surface_gaussians(
+    gaussians = surface_gaussians(
         picture, 1 / disparity, everywhere, wide, sh_count=4, spread=0.6, opacity=0.98
     )
     masked = torch.from_numpy(((np.abs(columns - 26) < 6) & (np.abs(rows - 22) < 5)).ravel())
@@ -70,17 +69,6 @@ def giving(estimate):
     return depth_term.by_network(lambda image: torch.as_tensor(np.asarray(estimate)), HOW)
 
 
-@pytest.fixture(scope="module")
-def prior():
-    return small_prior()
-
-
-@pytest.fixture(scope="module")
-def text(prior):
-    with torch.no_grad():
-        return embed_text(prior, list(PROMPTS))
-
-
 # ------------------------------------------------------------------------------------------ alignment and target
 
 
@@ -92,7 +80,7 @@ def test_alignment_solves_the_normal_equations(weighted):
     w = draw.random(200) if weighted else np.ones(200)
     matrix = np.array([[(w * x * x).sum(), (w * x).sum()], [(w * x).sum(), w.sum()]])
     scale, offset = np.linalg.inv(matrix) @ ((w * x * y).sum(), (w * y).sum())
-    found = geometry.align(x, y, w)
+    found = align(x, y, w)
     np.testing.assert_allclose((found.scale, found.offset), (scale, offset), rtol=1e-10)
     misfit = np.sqrt((w * (y - scale * x - offset) ** 2).sum() / w.sum())
     assert found.residual == pytest.approx(misfit, rel=1e-9)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from small_prior import save_small_prior, small_prior
+from small_prior import save_small_prior
 
 from reffusion import distill as D
 from reffusion import inpaint, io
@@ -22,8 +22,6 @@ from reffusion.confinement import (
     strays,
 )
 from reffusion.optimize import Rates
-from reffusion.personalize import PROMPTS
-from reffusion.prior import embed_text
 from reffusion.splat import render
 from reffusion.trace import generator, load_checkpoint, read_trace
 from reffusion.types import PARAMETERS, Camera, Gaussians, MaskSet, Scene, Similarity
@@ -66,17 +64,6 @@ def sight(name="a", shift=0.0, clean=False):
     photo = torch.rand(HEIGHT, WIDTH, 3, generator=generator(3, name))
     supervises = torch.ones_like(hole()) if clean else ~hole()
     return Sight(camera(name, shift), photo, supervises, hole() & (not clean), clean)
-
-
-@pytest.fixture(scope="module")
-def prior():
-    return small_prior()
-
-
-@pytest.fixture(scope="module")
-def text(prior):
-    with torch.no_grad():
-        return embed_text(prior, list(PROMPTS))
 
 
 def leaves(gaussians):

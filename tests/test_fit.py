@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from reffusion import exposure, feed, io, trace
+from reffusion import exposure, feed, fit_step, io, trace
 from reffusion import fit as fitting
-from reffusion.fit import Settings, fit
+from reffusion.fit import fit
+from reffusion.fit_step import Settings
 from reffusion.optimize import Rates
 from reffusion.splat import render
 from reffusion.start import initial_gaussians
@@ -91,7 +92,7 @@ class Killed(Exception):
 )
 def test_a_resumed_fit_is_the_unbroken_one_bit_for_bit(tmp_path, monkeypatch, settings):
     unbroken = run(tmp_path / "unbroken", settings=settings)
-    adapt, folder = fitting._adapt, tmp_path / "resumed"
+    adapt, folder = fitting.adapt, tmp_path / "resumed"
     for moment in (3, 4, 13, 18):  # before the first checkpoint of a run, twice in a row, around densifications
 
         def killing(optimizer, centers, started_with, settings, done, moment=moment):
@@ -99,11 +100,11 @@ def test_a_resumed_fit_is_the_unbroken_one_bit_for_bit(tmp_path, monkeypatch, se
             if done == moment:
                 raise Killed
 
-        monkeypatch.setattr(fitting, "_adapt", killing)
+        monkeypatch.setattr(fitting, "adapt", killing)
         with pytest.raises(Killed):
             run(folder, settings=replace(settings, checkpoint_seconds=0.0))
         assert trace.load_checkpoint(folder)["iteration"] == moment - 1
-    monkeypatch.setattr(fitting, "_adapt", adapt)
+    monkeypatch.setattr(fitting, "adapt", adapt)
     resumed = run(folder, initial=start(truth().means.numpy()[:5].astype(np.float64)), settings=settings)
     for name in PARAMETERS:
         assert torch.equal(getattr(unbroken, name), getattr(resumed, name)), name
@@ -226,7 +227,7 @@ def test_what_is_not_finite_stops_and_is_named(tmp_path, monkeypatch, broken):
     def burst(image, target, weights=None, share=0.2):
         return image.sum() * float("inf")
 
-    monkeypatch.setattr(fitting, "reconstruction_loss", burst)
+    monkeypatch.setattr(fit_step, "reconstruction_loss", burst)
     with pytest.raises(FloatingPointError, match=r"step 0, view 'view\d': the reconstruction loss"):
         run(tmp_path)
 

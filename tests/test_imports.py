@@ -33,6 +33,8 @@ OWN_FILES = (
 )  # weights, databases, kernels
 PURE = (
     "geometry",
+    "alignment",
+    "surfels",
     "splat/",
     "sds",
     "ssim",

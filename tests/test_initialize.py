@@ -9,6 +9,7 @@ import torch
 
 from reffusion import behind, geometry, io, splat
 from reffusion import initialize as rules
+from reffusion.surfels import surface_gaussians, surface_normals
 from reffusion.types import Camera, Reference
 from stages import initialize, masks
 
@@ -92,14 +93,14 @@ def slanted(degrees: float):
 @pytest.mark.parametrize("degrees", [0.0, 40.0, -60.0])
 def test_normals_of_a_plane_are_exact(degrees):
     disparity, view, normal = slanted(degrees)
-    found = geometry.surface_normals(1 / disparity, view)
+    found = surface_normals(1 / disparity, view)
     np.testing.assert_allclose(found, np.broadcast_to(normal, found.shape), atol=1e-9)
 
 
 def test_normals_beside_a_crease_belong_to_their_own_plane():
     left, view, _ = slanted(30.0)
     right = slanted(-30.0)[0]
-    normals = geometry.surface_normals(1 / np.maximum(left, right), view)
+    normals = surface_normals(1 / np.maximum(left, right), view)
     sides = np.sort(normals[36, :, 0])
     assert (np.abs(np.abs(sides) - 0.5) < 1e-9).all()
 
@@ -144,7 +145,7 @@ def test_what_is_painted_on_the_new_surface_stays_in_place_from_the_other_side()
     view, opposite = floor_view(0.0), floor_view(180.0)
     depth, picture = floor(view)
     reference = Reference(view, (picture * 255).round().astype(np.uint8), np.ones(depth.shape, bool))
-    nothing = geometry.surface_gaussians(picture, depth, np.zeros(depth.shape, bool), view, sh_count=1)
+    nothing = surface_gaussians(picture, depth, np.zeros(depth.shape, bool), view, sh_count=1)
     errors = []
     for how in (replace(SHEETS, opacity=0.95, sunk=0.0, spread=0.4), SHEETS):
         drawn, _ = rules.placed(nothing, torch.zeros(0, dtype=torch.bool), reference, depth, reference.mask, how)
@@ -160,8 +161,8 @@ def test_bad_depth_is_refused():
     depth = np.ones((small.HEIGHT, small.WIDTH))
     depth[3, 3] = np.nan
     with pytest.raises(ValueError, match="not positive and finite"):
-        geometry.surface_gaussians(np.zeros((*depth.shape, 3)), depth, np.ones(depth.shape, bool), view, sh_count=1)
-    none = geometry.surface_gaussians(np.zeros((*depth.shape, 3)), depth, np.zeros(depth.shape, bool), view, sh_count=4)
+        surface_gaussians(np.zeros((*depth.shape, 3)), depth, np.ones(depth.shape, bool), view, sh_count=1)
+    none = surface_gaussians(np.zeros((*depth.shape, 3)), depth, np.zeros(depth.shape, bool), view, sh_count=4)
     assert len(none) == 0 and none.sh.shape == (0, 4, 3)
 
 
@@ -191,7 +192,7 @@ def test_the_reference_is_reproduced_by_matched_colors():
     view = small.camera("v", 0.0)
     picture, depth = small.photo(view), np.full((small.HEIGHT, small.WIDTH), small.WALL)
     everything = np.ones(depth.shape, bool)
-    new = geometry.surface_gaussians(picture, depth, everything, view, sh_count=1, spread=0.4)
+    new = surface_gaussians(picture, depth, everything, view, sh_count=1, spread=0.4)
     labels = torch.ones(len(new), dtype=torch.bool)
     error = lambda g: np.abs(splat.render(g, view).color.numpy() - picture / 255)[4:-4, 4:-4].mean()
     matched = rules.match_colors(new, labels, picture, everything, view, 5)

@@ -87,10 +87,10 @@ def test_constants_of_the_library():
     sys.path.insert(0, str(ROOT / "benchmarks"))
     import full_size
 
-    from reffusion import lora, personalize
+    from reffusion import crops, lora
     from reffusion.optimize import reconstruction_loss
 
-    assert personalize.PROMPTS == ("A photo of sks", "A photo of sks, cropped", "")
+    assert crops.PROMPTS == ("A photo of sks", "A photo of sks, cropped", "")
     assert 8 * full_size.SD2.unet["sample_size"] == 512
     assert set(lora.TEXT_ATTENTION) == {"q_proj", "k_proj", "v_proj", "out_proj"}
     assert set(lora.ATTENTION) == {"to_q", "to_k", "to_v", "to_out.0"}

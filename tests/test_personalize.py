@@ -6,9 +6,9 @@ import pytest
 import torch
 from small_prior import small_prior
 
-from reffusion import lora
+from reffusion import crops, denoising, diffusion, lora
 from reffusion import personalize as P
-from reffusion import prior as diffusion
+from reffusion.crops import Sampling
 from reffusion.trace import generator, load_checkpoint, read_trace
 
 NATIVE, SIZE = 16, 12
@@ -29,31 +29,31 @@ def striped(height=70, width=90):
     image = torch.stack([128 + 100 * torch.sin((rows + k * columns) / 4) for k in (1, 2, 3)], 2)
     hole = torch.zeros(height, width, dtype=torch.bool)
     hole[20:50, 30:60] = True
-    return P.picture(image.to(torch.uint8), hole, NATIVE)
+    return crops.picture(image.to(torch.uint8), hole, NATIVE)
 
 
 def test_pictures_are_enlarged_until_a_crop_fits():
-    small = P.picture(torch.zeros(30, 50, 3, dtype=torch.uint8), torch.ones(30, 50, dtype=torch.bool), 64)
+    small = crops.picture(torch.zeros(30, 50, 3, dtype=torch.uint8), torch.ones(30, 50, dtype=torch.bool), 64)
     assert small.image.shape == (3, 64, 107) and small.region.shape == (64, 107) and small.region.all()
     assert float(small.image.min()) == -1
 
 
 def test_rectangle_masks_repaint_something_and_keep_within_their_sides():
-    once = P.Sampling(rectangles=(1, 1), side=(0.25, 0.5), inverted_share=0.0)
+    once = Sampling(rectangles=(1, 1), side=(0.25, 0.5), inverted_share=0.0)
     for seed in range(50):
-        mask = P.rectangle_mask(64, once, generator(seed))[0]
+        mask = crops.rectangle_mask(64, once, generator(seed))[0]
         rows, columns = mask.any(1).sum(), mask.any(0).sum()
         assert set(mask.unique().tolist()) == {0.0, 1.0} and mask.sum() == rows * columns
         assert 16 <= rows <= 32 and 16 <= columns <= 32
-    inverted = [float(P.rectangle_mask(64, P.Sampling(), generator(seed)).mean()) for seed in range(200)]
+    inverted = [float(crops.rectangle_mask(64, Sampling(), generator(seed)).mean()) for seed in range(200)]
     assert min(inverted) < 0.1 and max(inverted) > 0.9 and 0.4 < sum(inverted) / 200 < 0.6
 
 
 def test_global_samples_lose_a_thin_border_only():
     ramp = torch.arange(200.0).expand(3, 100, 200)
-    source = P.Picture(ramp, ramp[0] > 100)
+    source = crops.Picture(ramp, ramp[0] > 100)
     for seed in range(20):
-        cut = P.without_border(source, 0.1, generator(seed))
+        cut = crops.without_border(source, 0.1, generator(seed))
         height, width = cut.region.shape
         assert 80 <= height <= 100 and 160 <= width <= 200
         assert torch.equal(cut.image[0] > 100, cut.region)
@@ -64,9 +64,9 @@ def test_global_samples_lose_a_thin_border_only():
 def test_samples_masked_by_the_hole_show_it_where_it_is(local_share, size):
     """The striped picture with its hole painted white: mask and white pixels must be the same."""
     source = striped()
-    source = P.Picture(torch.where(source.region, 1.0, source.image.clamp(max=0)), source.region)
-    sampling = P.Sampling(local_share=local_share, hole_share=1.0, empty_share=0.0)
-    samples = P.draw_samples([source], [], NATIVE, size, 40, sampling, generator(5))
+    source = crops.Picture(torch.where(source.region, 1.0, source.image.clamp(max=0)), source.region)
+    sampling = Sampling(local_share=local_share, hole_share=1.0, empty_share=0.0)
+    samples = crops.draw_samples([source], [], NATIVE, size, 40, sampling, generator(5))
     white = samples.images[:, :1]
     assert (samples.masks.flatten(1).sum(1) > 0).all()
     assert (white[samples.masks == 0] <= 1e-5).all()
@@ -76,7 +76,7 @@ def test_samples_masked_by_the_hole_show_it_where_it_is(local_share, size):
 
 def test_clear_windows_are_all_windows_without_masked_pixels():
     region = torch.rand(20, 23, generator=generator(1)) > 0.97
-    clear = {tuple(w) for w in P.clear_windows(region, 6).tolist()}
+    clear = {tuple(w) for w in crops.clear_windows(region, 6).tolist()}
     for top in range(15):
         for left in range(18):
             assert ((top, left) in clear) == (not region[top : top + 6, left : left + 6].any())
@@ -85,25 +85,25 @@ def test_clear_windows_are_all_windows_without_masked_pixels():
 def test_scene_crops_never_show_a_masked_pixel():
     view = striped()
     poisoned = torch.where(view.region, float("nan"), view.image)
-    sampling = P.Sampling(scene_share=1.0, empty_share=0.0)
-    clear = P.clear_views([P.Picture(poisoned, view.region)], 16)
-    samples = P.draw_samples([view], clear, NATIVE, 16, 40, sampling, generator(2))
-    assert torch.isfinite(samples.images).all() and (samples.prompts == P.LOCAL).all()
-    full = P.Picture(poisoned, torch.ones_like(view.region))
-    assert P.clear_views([full], 16) == []
-    without = P.draw_samples([view], [], NATIVE, 16, 4, sampling, generator(2))
+    sampling = Sampling(scene_share=1.0, empty_share=0.0)
+    clear = crops.clear_views([crops.Picture(poisoned, view.region)], 16)
+    samples = crops.draw_samples([view], clear, NATIVE, 16, 40, sampling, generator(2))
+    assert torch.isfinite(samples.images).all() and (samples.prompts == crops.LOCAL).all()
+    full = crops.Picture(poisoned, torch.ones_like(view.region))
+    assert crops.clear_views([full], 16) == []
+    without = crops.draw_samples([view], [], NATIVE, 16, 4, sampling, generator(2))
     assert torch.isfinite(without.images).all(), "the reference alone where no view has a free window"
 
 
 def test_local_samples_show_the_hole_in_full_resolution_and_prompts_follow():
     view = striped()
-    local = P.draw_samples([view], [], NATIVE, SIZE, 10, P.Sampling(local_share=1.0, empty_share=0.0), generator(3))
+    local = crops.draw_samples([view], [], NATIVE, SIZE, 10, Sampling(local_share=1.0, empty_share=0.0), generator(3))
     windows = view.image.unfold(1, SIZE, 1).unfold(2, SIZE, 1).permute(1, 2, 0, 3, 4).flatten(0, 1)
     for image in local.images:
         assert (windows == image).all((1, 2, 3)).any(), "not a crop of the reference"
-    whole = P.draw_samples([view], [], NATIVE, NATIVE, 10, P.Sampling(local_share=0.0, empty_share=0.0), generator(3))
-    assert (local.prompts == P.LOCAL).all() and (whole.prompts == P.GLOBAL).all()
-    mixed = P.draw_samples([view], [], NATIVE, SIZE, 300, P.Sampling(empty_share=0.2), generator(3)).prompts
+    whole = crops.draw_samples([view], [], NATIVE, NATIVE, 10, Sampling(local_share=0.0, empty_share=0.0), generator(3))
+    assert (local.prompts == crops.LOCAL).all() and (whole.prompts == crops.GLOBAL).all()
+    mixed = crops.draw_samples([view], [], NATIVE, SIZE, 300, Sampling(empty_share=0.2), generator(3)).prompts
     shares = torch.bincount(mixed, minlength=3) / 300
     torch.testing.assert_close(shares, torch.tensor([0.4, 0.4, 0.2]), atol=0.09, rtol=0)
 
@@ -111,14 +111,14 @@ def test_local_samples_show_the_hole_in_full_resolution_and_prompts_follow():
 @pytest.mark.parametrize("kind", ["epsilon", "v_prediction"])
 def test_loss_is_the_priors_own_and_its_clean_latent_error_is_predicts(tiny, kind):
     prior, draw = replace(tiny, prediction_type=kind), generator(4)
-    samples = P.draw_samples([striped()], [], NATIVE, SIZE, 3, P.Sampling(), draw)
+    samples = crops.draw_samples([striped()], [], NATIVE, SIZE, 3, Sampling(), draw)
     t, noise = torch.tensor([10, 500, 950]), torch.randn(3, 4, SIZE, SIZE, generator=draw)
     with torch.no_grad():
-        error, clean = P.denoising_error(prior, samples, t, noise)
+        error, clean = denoising.denoising_error(prior, samples, t, noise)
         latents = diffusion.encode(prior, samples.images)
         noisy = diffusion.add_noise(prior, latents, noise, t)
         condition = diffusion.conditioning(prior, samples.images, samples.masks)
-        text = diffusion.embed_text(prior, [P.PROMPTS[p] for p in samples.prompts])
+        text = diffusion.embed_text(prior, [crops.PROMPTS[p] for p in samples.prompts])
         eps, x0 = diffusion.predict(prior, noisy, t, condition, text)
     torch.testing.assert_close(clean, (x0 - latents).square().mean((1, 2, 3)), rtol=1e-3, atol=1e-5)
     if kind == "epsilon":
@@ -135,7 +135,7 @@ def test_learning_rate_warms_up_and_falls():
 def test_training_learns_the_reference_and_logs_it(tiny, tmp_path):
     trained = lora.add(tiny, 8, 16, 0.1, "attention+conv", 0)
     training = replace(TRAINING, steps=60, batch=4, lr_unet=4e-3)
-    P.personalize(tiny, trained, [striped()], [], P.Sampling(), training, tmp_path)
+    P.personalize(tiny, trained, [striped()], [], Sampling(), training, tmp_path)
     records = read_trace(tmp_path / "trace.jsonl")
     assert [records[0]["iteration"], records[-1]["iteration"]] == [0, 60]
     assert records[-1]["target_mse"] < 0.9 * records[0]["target_mse"]
@@ -148,7 +148,7 @@ def test_interrupted_training_resumes_to_the_same_weights(tmp_path, monkeypatch)
         prior = small_prior()
         trained = lora.add(prior, 4, 8, 0.1, "attention", 0)
         training = replace(TRAINING, accumulate=2, schedule="cosine", warm_up=2, checkpoint_seconds=1e-9)
-        P.personalize(prior, trained, [striped()], [], P.Sampling(), training, folder)
+        P.personalize(prior, trained, [striped()], [], Sampling(), training, folder)
         return lora.state(prior)
 
     (tmp_path / "whole").mkdir()
@@ -177,7 +177,7 @@ def test_a_number_that_is_none_stops_the_training_and_names_the_step(tiny, tmp_p
     trained = lora.add(tiny, 4, 8, 0.0, "attention", 0)
     broken = replace(striped(), image=torch.full((3, 70, 90), float("nan")))
     with pytest.raises(FloatingPointError, match="step 0"):
-        P.personalize(tiny, trained, [broken], [], P.Sampling(), TRAINING, tmp_path)
+        P.personalize(tiny, trained, [broken], [], Sampling(), TRAINING, tmp_path)
     assert all(torch.isfinite(w).all() for w in lora.state(tiny).values())
     with pytest.raises(ValueError, match="native 16 px"):
-        P.personalize(tiny, trained, [striped()], [], P.Sampling(), replace(TRAINING, size=128), tmp_path)
+        P.personalize(tiny, trained, [striped()], [], Sampling(), replace(TRAINING, size=128), tmp_path)

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from reffusion import lora
-from reffusion import prior as P
+from reffusion import diffusion, lora
+from reffusion.prior import load_prior, make_prior
 from reffusion.trace import generator
 
 TINY = Path(__file__).resolve().parent.parent / "priors" / "tiny"
@@ -16,7 +16,7 @@ TINY = Path(__file__).resolve().parent.parent / "priors" / "tiny"
 
 @pytest.fixture
 def tiny():
-    return P.load_prior(TINY)
+    return load_prior(TINY)
 
 
 def pictures(count=2, side=32, seed=0):
@@ -35,13 +35,13 @@ def test_sizes_are_read_from_the_folder(tiny):
 
 def test_vae_round_trip_is_exact(tiny):
     images = pictures(2, 48)
-    assert (P.decode(tiny, P.encode(tiny, images)) - images).abs().max() < 3e-3
+    assert (diffusion.decode(tiny, diffusion.encode(tiny, images)) - images).abs().max() < 3e-3
 
 
 def test_encoding_is_linear(tiny):
     a, b = pictures(1, 24, 1), pictures(1, 24, 2)
-    middle = P.encode(tiny, (a + b) / 2)
-    assert torch.allclose(middle, (P.encode(tiny, a) + P.encode(tiny, b)) / 2, atol=3e-3)
+    middle = diffusion.encode(tiny, (a + b) / 2)
+    assert torch.allclose(middle, (diffusion.encode(tiny, a) + diffusion.encode(tiny, b)) / 2, atol=3e-3)
 
 
 @pytest.mark.parametrize("kind", ["epsilon", "v_prediction"])
@@ -50,13 +50,14 @@ def test_predictions_reproduce_the_noisy_latents(tiny, kind):
 
     prior = replace(tiny, prediction_type=kind)
     t, noise = torch.tensor([0, 999]), torch.randn(2, 4, 32, 32, generator=generator(0))
-    clean = P.encode(prior, pictures())
-    noisy = P.add_noise(prior, clean, noise, t)
-    text, condition = P.embed_text(prior, ["A photo of sks", ""]), P.conditioning(prior, pictures(), half_masks())
-    eps, x0 = P.predict(prior, noisy, t, condition, text)
-    assert torch.allclose(P.add_noise(prior, x0, eps, t), noisy, atol=1e-4)
-    target = P.training_target(prior, clean, noise, t)
-    a = P.abar(prior, t)
+    clean = diffusion.encode(prior, pictures())
+    noisy = diffusion.add_noise(prior, clean, noise, t)
+    text = diffusion.embed_text(prior, ["A photo of sks", ""])
+    condition = diffusion.conditioning(prior, pictures(), half_masks())
+    eps, x0 = diffusion.predict(prior, noisy, t, condition, text)
+    assert torch.allclose(diffusion.add_noise(prior, x0, eps, t), noisy, atol=1e-4)
+    target = diffusion.training_target(prior, clean, noise, t)
+    a = diffusion.abar(prior, t)
     recovered = (
         (noisy - (1 - a).sqrt() * target) / a.sqrt()
         if kind == "epsilon"
@@ -68,29 +69,29 @@ def test_predictions_reproduce_the_noisy_latents(tiny, kind):
 def test_conditioning_hides_what_lies_under_the_mask(tiny):
     images, masks = pictures(), half_masks()
     other = torch.where(masks > 0, torch.ones(()), images)
-    assert torch.equal(P.conditioning(tiny, images, masks), P.conditioning(tiny, other, masks))
+    assert torch.equal(diffusion.conditioning(tiny, images, masks), diffusion.conditioning(tiny, other, masks))
     images.requires_grad_(True)
-    assert not P.conditioning(tiny, images, masks).requires_grad
+    assert not diffusion.conditioning(tiny, images, masks).requires_grad
 
 
 def test_sampling_repeats_with_its_seed_and_is_finite(tiny):
-    text = P.embed_text(tiny, ["A photo of sks"] * 2)
-    run = lambda seed: P.sample(tiny, pictures(), half_masks(), text, 3, generator(seed))
+    text = diffusion.embed_text(tiny, ["A photo of sks"] * 2)
+    run = lambda seed: diffusion.sample(tiny, pictures(), half_masks(), text, 3, generator(seed))
     first, again, other = run(0), run(0), run(1)
     assert torch.equal(first, again) and not torch.equal(first, other)
     assert torch.isfinite(first).all() and first.abs().max() <= 1
 
 
 def test_guidance_zero_is_the_conditional_prediction(tiny):
-    text, empty = P.embed_text(tiny, ["A photo of sks"]), P.embed_text(tiny, [""])
+    text, empty = diffusion.embed_text(tiny, ["A photo of sks"]), diffusion.embed_text(tiny, [""])
     noisy, t = torch.randn(1, 4, 16, 16, generator=generator(3)), torch.tensor([500])
-    condition = P.conditioning(tiny, pictures(1, 16), half_masks(1, 16))
-    plain, _ = P.predict(tiny, noisy, t, condition, text)
-    without, _ = P.predict(tiny, noisy, t, condition, empty)
-    guided, _ = P.guided(tiny, noisy, t, condition, text, empty, 2.0)
+    condition = diffusion.conditioning(tiny, pictures(1, 16), half_masks(1, 16))
+    plain, _ = diffusion.predict(tiny, noisy, t, condition, text)
+    without, _ = diffusion.predict(tiny, noisy, t, condition, empty)
+    guided, _ = diffusion.guided(tiny, noisy, t, condition, text, empty, 2.0)
     assert torch.allclose(guided, 3 * plain - 2 * without, atol=1e-5)
     with pytest.raises(ValueError, match="empty prompt"):
-        P.guided(tiny, noisy, t, condition, text, None, 1.0)
+        diffusion.guided(tiny, noisy, t, condition, text, None, 1.0)
 
 
 @pytest.mark.parametrize("dropout", [0.1, 0.0], ids=["beside the weights", "added to them"])
@@ -101,8 +102,8 @@ def test_saved_lora_gives_the_trained_epsilon_in_a_fresh_diffusers_pipeline(tiny
     for parameter in found["unet"] + found["text"]:
         parameter.data += 0.1 * torch.randn(parameter.shape, generator=noise)
     noisy, t = torch.randn(1, 4, 16, 16, generator=noise), torch.tensor([400])
-    condition = P.conditioning(tiny, pictures(1, 16), half_masks(1, 16))
-    trained = P.raw_prediction(tiny, noisy, t, condition, P.embed_text(tiny, ["A photo of sks"]))
+    condition = diffusion.conditioning(tiny, pictures(1, 16), half_masks(1, 16))
+    trained = diffusion.raw_prediction(tiny, noisy, t, condition, diffusion.embed_text(tiny, ["A photo of sks"]))
     lora.save(tiny, tmp_path)
     written = (tmp_path / lora.LORA_FILE).read_bytes()
     for _ in range(5):
@@ -112,32 +113,33 @@ def test_saved_lora_gives_the_trained_epsilon_in_a_fresh_diffusers_pipeline(tiny
     from diffusers import StableDiffusionInpaintPipeline
 
     pipe = StableDiffusionInpaintPipeline.from_pretrained(TINY, safety_checker=None, torch_dtype=torch.float32)
-    plain = P.load_prior(TINY)
-    base = P.raw_prediction(plain, noisy, t, condition, P.embed_text(plain, ["A photo of sks"]))
+    plain = load_prior(TINY)
+    base = diffusion.raw_prediction(plain, noisy, t, condition, diffusion.embed_text(plain, ["A photo of sks"]))
     assert (trained - base).abs().max() > 1e-3
     pipe.load_lora_weights(tmp_path)
-    fresh = P.make_prior(pipe.unet, pipe.vae, pipe.text_encoder, pipe.tokenizer, pipe.scheduler)
-    loaded = P.raw_prediction(fresh, noisy, t, condition, P.embed_text(fresh, ["A photo of sks"]))
+    fresh = make_prior(pipe.unet, pipe.vae, pipe.text_encoder, pipe.tokenizer, pipe.scheduler)
+    loaded = diffusion.raw_prediction(fresh, noisy, t, condition, diffusion.embed_text(fresh, ["A photo of sks"]))
     assert (loaded - trained).abs().max() < 1e-5
 
     merged = lora.merged(plain, tmp_path)
-    again = P.raw_prediction(merged, noisy, t, condition, P.embed_text(merged, ["A photo of sks"]))
+    again = diffusion.raw_prediction(merged, noisy, t, condition, diffusion.embed_text(merged, ["A photo of sks"]))
     assert (again - trained).abs().max() < 2e-5
 
 
 def test_lora_added_to_the_weights_has_the_gradients_of_lora_beside_them():
     gradients = []
     for dropout in (0.1, 0.0):  # in evaluation mode dropout does nothing
-        prior = P.load_prior(TINY)
+        prior = load_prior(TINY)
         found = lora.add(prior, 4, 8.0, dropout, "attention+conv", 0)
         noise = generator(0, "lora")
         for parameter in found["unet"]:
             parameter.data += 0.02 * torch.randn(parameter.shape, generator=noise)
         noisy, condition = (
             torch.randn(2, 4, 16, 16, generator=noise),
-            P.conditioning(prior, pictures(2, 16), half_masks(2, 16)),
+            diffusion.conditioning(prior, pictures(2, 16), half_masks(2, 16)),
         )
-        output = P.raw_prediction(prior, noisy, torch.tensor([100, 700]), condition, P.embed_text(prior, ["", "a"]))
+        text = diffusion.embed_text(prior, ["", "a"])
+        output = diffusion.raw_prediction(prior, noisy, torch.tensor([100, 700]), condition, text)
         output.square().sum().backward()
         gradients.append([parameter.grad for parameter in found["unet"]])
     for beside, added in zip(*gradients, strict=True):
@@ -166,13 +168,13 @@ def test_the_stock_pipeline_inpaints():
 
 def test_clear_errors(tmp_path):
     with pytest.raises(ValueError, match="no such folder"):
-        P.load_prior(tmp_path / "absent")
+        load_prior(tmp_path / "absent")
     (tmp_path / "unet").mkdir()
     with pytest.raises(ValueError, match="lacks vae"):
-        P.load_prior(tmp_path)
+        load_prior(tmp_path)
     copy = tmp_path / "copy"
     shutil.copytree(TINY, copy)
     config = copy / "scheduler" / "scheduler_config.json"
     config.write_text(json.dumps(json.loads(config.read_text()) | {"prediction_type": "sample"}))
     with pytest.raises(ValueError, match="prediction_type"):
-        P.load_prior(copy)
+        load_prior(copy)

@@ -16,9 +16,9 @@ sys.path.insert(0, str(ROOT / "benchmarks"))
 import full_size as F  # noqa: E402
 import gpu_check  # noqa: E402
 
-from reffusion import inpaint, lora, memory, weights  # noqa: E402
-from reffusion import personalize as P  # noqa: E402
-from reffusion import prior as D  # noqa: E402
+from reffusion import crops, denoising, diffusion, inpaint, lora, memory, weights  # noqa: E402
+from reffusion.personalize import train_step  # noqa: E402
+from reffusion.prior import load_prior, pipeline, recomputing, without_text  # noqa: E402
 from reffusion.trace import generator  # noqa: E402
 
 
@@ -26,8 +26,8 @@ from reffusion.trace import generator  # noqa: E402
 def sdxl(tmp_path_factory):
     """An SDXL-shaped prior as `load_prior` gives it, from a folder that diffusers wrote."""
     folder = tmp_path_factory.mktemp("sdxl")
-    D.pipeline(replace(F.build(F.shrunk(F.SDXL), torch.float32), zero_empty=True)).save_pretrained(folder)
-    return D.load_prior(folder)
+    pipeline(replace(F.build(F.shrunk(F.SDXL), torch.float32), zero_empty=True)).save_pretrained(folder)
+    return load_prior(folder)
 
 
 @pytest.fixture
@@ -44,9 +44,9 @@ def draw(*shape, seed=0):
 
 def test_sdxl_prompts_and_unet_are_those_of_the_stock_pipeline(sdxl):
     assert sdxl.text_encoder_2 is not None and sdxl.zero_empty and sdxl.native_size == 32
-    pipe = D.pipeline(sdxl)
+    pipe = pipeline(sdxl)
     hidden, empty, pooled, pooled_empty = pipe.encode_prompt("a red chair", device="cpu")
-    text = D.embed_text(sdxl, ["a red chair", ""])
+    text = diffusion.embed_text(sdxl, ["a red chair", ""])
     assert torch.allclose(text[0, :-1], hidden[0], atol=1e-5)
     assert torch.allclose(text[0, -1, : pooled.shape[1]], pooled[0], atol=1e-5)
     assert not text[1].any() and not empty.any() and not pooled_empty.any()
@@ -56,8 +56,8 @@ def test_sdxl_prompts_and_unet_are_those_of_the_stock_pipeline(sdxl):
     added = {"text_embeds": pooled, "time_ids": sizes}
     at = torch.tensor([300])
     stock = pipe.unet(torch.cat([noisy, condition], 1), at, encoder_hidden_states=hidden, added_cond_kwargs=added)
-    assert torch.allclose(D.raw_prediction(sdxl, noisy, at, condition, text[:1]), stock.sample, atol=1e-5)
-    other = D.raw_prediction(sdxl, noisy, at, condition, text[1:])
+    assert torch.allclose(diffusion.raw_prediction(sdxl, noisy, at, condition, text[:1]), stock.sample, atol=1e-5)
+    other = diffusion.raw_prediction(sdxl, noisy, at, condition, text[1:])
     assert (other - stock.sample).abs().max() > 1e-4
 
 
@@ -83,13 +83,13 @@ def test_sdxl_is_refused_where_it_cannot_work(sdxl):
 def test_a_batch_in_parts_gives_the_same_values_and_gradients(sd2):
     images = draw(3, 3, 32, 32).requires_grad_()
     noisy, condition, at = draw(3, 4, 16, 16), draw(3, 5, 16, 16), torch.tensor([10, 500, 900])
-    text = D.embed_text(sd2, list(P.PROMPTS)).detach()
+    text = diffusion.embed_text(sd2, list(crops.PROMPTS)).detach()
     found = []
-    for prior in (sd2, replace(sd2, rows=1, rows_graded=2), D.recomputing(sd2)):
-        latents = D.encode(prior, images)
+    for prior in (sd2, replace(sd2, rows=1, rows_graded=2), recomputing(sd2)):
+        latents = diffusion.encode(prior, images)
         (gradient,) = torch.autograd.grad((latents * draw(*latents.shape)).sum(), images)
         with torch.no_grad():
-            found.append((latents.detach(), gradient, D.raw_prediction(prior, noisy, at, condition, text)))
+            found.append((latents.detach(), gradient, diffusion.raw_prediction(prior, noisy, at, condition, text)))
     for other in found[1:]:
         assert all(torch.allclose(a, b, atol=1e-5) for a, b in zip(found[0], other, strict=True))
 
@@ -103,7 +103,7 @@ def test_a_training_step_in_parts_is_the_same_step():
             for layer in part.modules():
                 layer.p = 0.0 if isinstance(layer, torch.nn.Dropout) else getattr(layer, "p", None)
         prior = replace(prior, rows_graded=rows)
-        loss = P.train_step(prior, optimizer, [F.reference(32)], [], P.Sampling(), training, 0)
+        loss = train_step(prior, optimizer, [F.reference(32)], [], crops.Sampling(), training, 0)
         after.append((loss, [p.detach().clone() for part in trained.values() for p in part]))
     assert after[0][0] == pytest.approx(after[1][0], rel=1e-5)
     # Adam's first step has the size of the learning rate; where a gradient is all but 0 its sign is a rounding's.
@@ -117,16 +117,16 @@ def test_half_precision_stays_near_and_leaves_the_vae_alone(sd2):
         getattr(half, name).load_state_dict(getattr(sd2, name).state_dict())
     half.vae.load_state_dict(sd2.vae.state_dict())
     images, noisy, at = draw(1, 3, 32, 32), draw(1, 4, 16, 16), torch.tensor([999])
-    assert torch.equal(D.encode(half, images), D.encode(sd2, images))
+    assert torch.equal(diffusion.encode(half, images), diffusion.encode(sd2, images))
     condition = draw(1, 5, 16, 16)
     with torch.no_grad():
-        answers = [D.predict(p, noisy, at, condition, D.embed_text(p, ["a"])) for p in (sd2, half)]
+        answers = [diffusion.predict(p, noisy, at, condition, diffusion.embed_text(p, ["a"])) for p in (sd2, half)]
     (eps, clean), (eps_half, clean_half) = answers
     assert eps_half.dtype == clean_half.dtype == torch.float32
     error = (eps_half - eps).abs().max()
     assert 0 < error < 0.1
     # x0 = (z - s eps) / a itself loses nothing: its error is that of eps, times s / a.
-    a = D.abar(sd2, at)
+    a = diffusion.abar(sd2, at)
     assert torch.allclose(clean_half - clean, -((1 - a) / a).sqrt() * (eps_half - eps), atol=1e-4)
 
 
@@ -139,14 +139,14 @@ def test_a_small_lora_is_not_lost_in_half_precision(sd2, dropout):
     changes = []
     for prior in (sd2, half):
         found = lora.add(prior, 4, 4.0, dropout, "attention", 0)
-        before = D.raw_prediction(prior, noisy, at, condition, text).detach()
+        before = diffusion.raw_prediction(prior, noisy, at, condition, text).detach()
         noise = generator(0, "lora")
         for parameter in found["unet"]:
             parameter.data += 5e-4 * torch.randn(parameter.shape, generator=noise)
         layer = next(m for m in prior.unet.modules() if hasattr(m, "lora_A"))
         x = draw(1, 8, layer.base_layer.in_features, seed=3).to(prior.dtype)
         changes.append((layer(x) - layer.base_layer(x)).float().flatten().detach())
-        assert torch.isfinite(D.raw_prediction(prior, noisy, at, condition, text) - before).all()
+        assert torch.isfinite(diffusion.raw_prediction(prior, noisy, at, condition, text) - before).all()
     exact, rounded = changes
     assert torch.dot(exact, rounded) / exact.norm() / rounded.norm() > 0.65  # 0.41 where it is added to the weights
 
@@ -154,13 +154,13 @@ def test_a_small_lora_is_not_lost_in_half_precision(sd2, dropout):
 def test_the_text_encoder_is_let_go():
     prior = F.build(F.shrunk(F.SD2), torch.float32)
     whole, encoder = prior.bytes, weakref.ref(prior.text_encoder)
-    text = D.embed_text(prior, list(P.PROMPTS)).detach()
-    prior = D.without_text(prior)
+    text = diffusion.embed_text(prior, list(crops.PROMPTS)).detach()
+    prior = without_text(prior)
     gc.collect()
     assert encoder() is None and prior.bytes < whole
     with pytest.raises(ValueError, match="text encoder was dropped"):
-        D.embed_text(prior, ["a"])
-    answer = D.raw_prediction(prior, draw(3, 4, 16, 16), torch.tensor([1, 2, 3]), draw(3, 5, 16, 16), text)
+        diffusion.embed_text(prior, ["a"])
+    answer = diffusion.raw_prediction(prior, draw(3, 4, 16, 16), torch.tensor([1, 2, 3]), draw(3, 5, 16, 16), text)
     assert torch.isfinite(answer).all()
 
 
@@ -188,12 +188,12 @@ def test_a_budget_chooses_the_parts(sd2):
     assert chosen.rows_graded == 3 and chosen.rows == int(3.5 * one // answer)
     with pytest.raises(ValueError, match=r"distill.memory_gb is 0.001, but the prior takes .* raise it to"):
         memory.fitted(sd2, 1e-3, "distill.memory_gb", memory.encoding)
-    assert memory.peak_bytes(lambda: memory.encoding(D.recomputing(sd2)), "cpu") < one
+    assert memory.peak_bytes(lambda: memory.encoding(recomputing(sd2)), "cpu") < one
 
 
 def test_measuring_a_training_sample_leaves_no_gradient(sd2):
     trained, _, _ = F.trainer(sd2, 1)
-    row = lambda prior: P.one_sample(prior, [F.reference(32)], 0)
+    row = lambda prior: denoising.one_sample(prior, [F.reference(32)], 0)
     assert memory.fitted(sd2, 1.0, "personalize.memory_gb", row).rows_graded > 1
     assert all(p.grad is None and p.requires_grad for part in trained.values() for p in part)
 

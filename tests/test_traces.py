@@ -182,7 +182,7 @@ def test_moments_depend_on_the_iteration_only():
 
 
 KILLED = {
-    "fit": (fitting, "_step", 6),
+    "fit": (fitting, "step", 6),
     "personalize": (personalizing, "train_step", 6),
     "distill": (distilling, "step_of", 1),
 }

@@ -16,7 +16,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from reffusion import download, weights
-from reffusion import prior as P
+from reffusion.prior import load_prior
 
 ROOT = Path(__file__).resolve().parent.parent
 TINY = ROOT / "priors" / "tiny"
@@ -65,8 +65,8 @@ def cached(tmp_path, name="acme/paint", state="0123abc", main=True) -> Path:
 def test_an_id_is_found_in_the_hub_cache_and_loaded_without_a_network(caches):
     entry = cached(caches)
     assert weights.locate("acme/paint") == entry / "snapshots" / "0123abc"
-    prior = P.load_prior("acme/paint")
-    assert prior.native_size == 64 and P.load_prior(entry).native_size == 64
+    prior = load_prior("acme/paint")
+    assert prior.native_size == 64 and load_prior(entry).native_size == 64
 
 
 def test_the_state_that_main_names_is_taken(caches):
@@ -96,12 +96,12 @@ def test_what_is_not_here_is_told_at_once_with_the_alternatives(caches):
     with pytest.raises(
         ValueError, match=r"prior priors/tiny is not on this machine: no folder .*elsewhere/priors/tiny"
     ):
-        P.load_prior("priors/tiny")
+        load_prior("priors/tiny")
     with pytest.raises(ValueError, match=r"run `make weights`.*stable-diffusion-v1-5/stable-diffusion-inpainting"):
-        P.load_prior(weights.SD2)
+        load_prior(weights.SD2)
     for wrong in (caches / "absent", "./absent", "three/part/name", "~/absent"):
         with pytest.raises(ValueError, match="no such folder"):
-            P.load_prior(wrong)
+            load_prior(wrong)
 
 
 def test_half_precision_files_alone_are_enough(caches):
@@ -109,7 +109,7 @@ def test_half_precision_files_alone_are_enough(caches):
     (folder / "unet" / "diffusion_pytorch_model.safetensors").rename(
         folder / "unet" / "diffusion_pytorch_model.fp16.safetensors"
     )
-    prior = P.load_prior(folder, dtype=torch.bfloat16)
+    prior = load_prior(folder, dtype=torch.bfloat16)
     assert prior.dtype == torch.bfloat16 and next(prior.vae.parameters()).dtype == torch.float32
 
 
@@ -163,7 +163,7 @@ def test_each_fault_has_its_message(caches, spoil, message):
     folder = copied(caches / "faulty")
     spoil(folder)
     with pytest.raises(ValueError, match=rf"prior (?s:.*){message}"):
-        P.load_prior(folder)
+        load_prior(folder)
 
 
 def test_a_lost_shard_is_named(caches):

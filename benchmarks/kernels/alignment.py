@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.kernels.points import Diagram, Point, cpu_seconds
-from reffusion import geometry, trace
+from reffusion import trace
+from reffusion.alignment import align
 
 SIZE = 120 * 160
 SHARES = (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
@@ -32,9 +33,9 @@ def diagram() -> Diagram:
             errors = []
             for seed in range(SEEDS):
                 estimate, target, truth = maps(share, seed)
-                fitted = geometry.align(estimate, target, robust=robust).apply(estimate)
+                fitted = align(estimate, target, robust=robust).apply(estimate)
                 errors.append(np.sqrt(np.mean((fitted - truth) ** 2)) / truth.std())
-            seconds = cpu_seconds(lambda r=robust, e=estimate, t=target: geometry.align(e, t, robust=r))
+            seconds = cpu_seconds(lambda r=robust, e=estimate, t=target: align(e, t, robust=r))
             # What is recommended is the way, at a share of outliers that masks at an object's rim bring about.
             points.append(Point(curve, f"{share:.0%}", share, float(np.mean(errors)), seconds, share == 0.1))
     why = "At 10 % outliers; without any both are equally good, and plain is what the paper's L2 says."

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from benchmarks.stability.cases import EPS64, EXACT, UNCLEAR, Case, largest, unclear
-from reffusion import geometry
+from reffusion import alignment
 
 NOISE = 1e-3  # of the estimate's spread
 PIXELS = 2000
@@ -28,14 +28,14 @@ def robust_error(outliers: float) -> float:
     worst = 0.0
     for seed in range(10):
         x, y, truth = samples(outliers, seed=seed)
-        worst = largest(worst, np.abs(geometry.align(x, y, robust=True, seed=seed).apply(x) - truth).max() / NOISE)
+        worst = largest(worst, np.abs(alignment.align(x, y, robust=True, seed=seed).apply(x) - truth).max() / NOISE)
     return float(worst)
 
 
 def clean_loss() -> float:
     """Without outliers: the robust line against plain L2, over the latter's own standard error at the range's end."""
     x, y, _ = samples(0.0)
-    apart = geometry.align(x, y, robust=True).apply(x) - geometry.align(x, y).apply(x)
+    apart = alignment.align(x, y, robust=True).apply(x) - alignment.align(x, y).apply(x)
     return float(np.abs(apart).max() / (NOISE * 2.0 / np.sqrt(len(x))))
 
 
@@ -43,13 +43,13 @@ def side_by_side() -> float:
     """A third of the pixels lies on a line of its own: the larger group wins; error in standard deviations."""
     x, y, truth = samples(0.0)
     y = np.where(np.arange(len(x)) % 3 == 0, y - truth + 4.0 - 0.5 * x, y)
-    return float(np.abs(geometry.align(x, y, robust=True).apply(x) - truth).max() / NOISE)
+    return float(np.abs(alignment.align(x, y, robust=True).apply(x) - truth).max() / NOISE)
 
 
 def unit_error(x_unit: float, y_unit: float, robust: bool) -> float:
     """Relative error of scale and of the aligned values, data without noise in these units."""
     x, _, truth = samples(0.0)
-    fitted = geometry.align(x_unit * x, y_unit * truth, robust=robust)
+    fitted = alignment.align(x_unit * x, y_unit * truth, robust=robust)
     scale = abs(fitted.scale * x_unit / y_unit / 2.0 - 1.0)
     return float(largest(scale, np.abs(fitted.apply(x_unit * x) / (y_unit * truth) - 1.0).max()))
 
@@ -57,20 +57,20 @@ def unit_error(x_unit: float, y_unit: float, robust: bool) -> float:
 def far_offset() -> float:
     """An offset of 1e5 spreads in the estimate: error of the aligned values, relative to their spread."""
     x, _, truth = samples(0.0)
-    return float(np.abs(geometry.align(x + 5e4, truth).apply(x + 5e4) - truth).max() / np.ptp(truth))
+    return float(np.abs(alignment.align(x + 5e4, truth).apply(x + 5e4) - truth).max() / np.ptp(truth))
 
 
 def too_far_offset() -> float:
     """Of 1e8 spreads: an estimate in float32 holds nothing but the offset then."""
     x, _, truth = samples(0.0)
-    return unclear(lambda: geometry.align(x + 5e7, truth), "constant")
+    return unclear(lambda: alignment.align(x + 5e7, truth), "constant")
 
 
 def constant_depth() -> float:
     """The scene's depth is constant, the estimate is not: a wall. Relative error of the aligned depth."""
     estimate = np.random.default_rng(0).uniform(1.0, 3.0, (12, 10))
     aligned = [
-        geometry.align_depth(estimate, np.full((12, 10), 2.5), np.ones((12, 10)), space=space, robust=robust)
+        alignment.align_depth(estimate, np.full((12, 10), 2.5), np.ones((12, 10)), space=space, robust=robust)
         for space in ("depth", "disparity") for robust in (False, True)
     ]  # fmt: skip
     return float(largest(*(np.abs(depth / 2.5 - 1.0).max() for depth in aligned)))
@@ -78,23 +78,23 @@ def constant_depth() -> float:
 
 def constant_estimate() -> float:
     flat, depth = np.full((12, 10), 0.7), np.random.default_rng(0).uniform(1.0, 3.0, (12, 10))
-    calls = [partial(geometry.align_depth, flat, depth, np.ones((12, 10)), robust=robust) for robust in (False, True)]
+    calls = [partial(alignment.align_depth, flat, depth, np.ones((12, 10)), robust=robust) for robust in (False, True)]
     return sum(unclear(call, "constant", "0.7") for call in calls)
 
 
 def four_pixels(robust: bool) -> float:
     """The least that is taken: exact data, relative error."""
     x = np.array([1.0, 1.5, 2.5, 3.0])
-    fitted = geometry.align(x, 2.0 * x + 1.0, robust=robust)
+    fitted = alignment.align(x, 2.0 * x + 1.0, robust=robust)
     return float(np.abs(fitted.apply(x) / (2.0 * x + 1.0) - 1.0).max())
 
 
 def three_pixels() -> float:
-    return unclear(lambda: geometry.align(np.arange(3.0), np.arange(3.0)), "at least 4")
+    return unclear(lambda: alignment.align(np.arange(3.0), np.arange(3.0)), "at least 4")
 
 
 def no_pixels() -> float:
-    return unclear(lambda: geometry.align_depth(np.ones((3, 3)), np.ones((3, 3)), np.zeros((3, 3))), "at least 4")
+    return unclear(lambda: alignment.align_depth(np.ones((3, 3)), np.ones((3, 3)), np.zeros((3, 3))), "at least 4")
 
 
 def tiny_weights() -> float:
@@ -102,7 +102,7 @@ def tiny_weights() -> float:
     x, y, truth = samples(0.5)
     weights = np.where(np.arange(len(x)) < len(x) // 2, 1e-12, 1.0)
     exact = np.where(weights < 1.0, y, truth)
-    return float(np.abs(geometry.align(x, exact, weights).apply(x) / truth - 1.0).max())
+    return float(np.abs(alignment.align(x, exact, weights).apply(x) / truth - 1.0).max())
 
 
 def beyond_infinity() -> float:
@@ -110,13 +110,13 @@ def beyond_infinity() -> float:
     disparity = np.linspace(-0.5, 2.0, 120).reshape(12, 10)
     known = disparity > 0.1
     depth = np.where(known, 1.0 / np.where(known, disparity, 1.0), 0.0)
-    found = geometry.align_depth(disparity, depth, known)
+    found = alignment.align_depth(disparity, depth, known)
     return float((~(np.isfinite(found) & (found > 0))).sum())
 
 
 def plain_condition() -> float:
     """Condition number of what `align` solves where the estimate stands 1e4 spreads from zero."""
-    return geometry.condition(1e4 + np.random.default_rng(0).normal(size=1000))[1]
+    return alignment.condition(1e4 + np.random.default_rng(0).normal(size=1000))[1]
 
 
 # A sum over n pixels in float64 rounds by some sqrt(n) 2^-53 of its terms; data of order one, slopes included.

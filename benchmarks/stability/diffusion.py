@@ -10,8 +10,9 @@ from torch import Tensor
 
 from benchmarks.stability.cases import EPS32, EXACT, UNCLEAR, Case, largest, unclear
 from benchmarks.stability.splatting import camera, cloud
-from reffusion import discriminator, prior, sds, trace
+from reffusion import diffusion, discriminator, sds, trace
 from reffusion.confinement import Distillation, Sight, sds_term
+from reffusion.prior import Prior, load_prior
 from reffusion.types import PARAMETERS
 
 TINY = Path(__file__).resolve().parents[2] / "priors" / "tiny"
@@ -21,15 +22,15 @@ LAYERS = 100  # more than the UNet has one after another
 
 
 @cache
-def model(dtype: torch.dtype = torch.float32) -> prior.Prior:
-    return prior.load_prior(TINY, dtype=dtype)
+def model(dtype: torch.dtype = torch.float32) -> Prior:
+    return load_prior(TINY, dtype=dtype)
 
 
 @cache
 def prompts() -> Tensor:
     """[3, L, D] hidden states of the global, the local and the empty prompt."""
     with torch.no_grad():
-        return prior.embed_text(model(), ["A photo of sks", "A photo of sks, cropped", ""])
+        return diffusion.embed_text(model(), ["A photo of sks", "A photo of sks, cropped", ""])
 
 
 def normal(*shape: int, label: str = "") -> Tensor:
@@ -45,12 +46,12 @@ def predicted(t: int, guidance: float | None = None, empty: Tensor | None = None
     """z_t, and eps and z_0 that the prior finds in it; in the middle of the picture a square is repainted."""
     mask = torch.zeros(1, 1, SIZE, SIZE)
     mask[..., 8:24, 8:24] = 1
-    condition = prior.conditioning(model(), images(), mask)
+    condition = diffusion.conditioning(model(), images(), mask)
     noisy, times = normal(1, condition.shape[1] - 1, *condition.shape[-2:]), torch.tensor([t])
     if guidance is None:
-        return noisy, *prior.predict(model(), noisy, times, condition, prompts()[:1])
+        return noisy, *diffusion.predict(model(), noisy, times, condition, prompts()[:1])
     empty = prompts()[2:] if empty is None else empty
-    return noisy, *prior.guided(model(), noisy, times, condition, prompts()[:1], empty, guidance)
+    return noisy, *diffusion.guided(model(), noisy, times, condition, prompts()[:1], empty, guidance)
 
 
 def torn(t: int, guidance: float | None = None) -> float:
@@ -74,8 +75,8 @@ def strong_guidance() -> float:
     with torch.no_grad():
         mask = torch.zeros(1, 1, SIZE, SIZE)
         mask[..., 8:24, 8:24] = 1
-        condition = prior.conditioning(model(), images(), mask)
-        empty, _ = prior.predict(model(), other[0], torch.tensor([500]), condition, prompts()[2:])
+        condition = diffusion.conditioning(model(), images(), mask)
+        empty, _ = diffusion.predict(model(), other[0], torch.tensor([500]), condition, prompts()[2:])
     exact = 101 * eps.double() - 100 * empty.double()
     return ((predicted(500, 100.0)[1].double() - exact).abs().max() / eps.abs().max()).item()
 
@@ -93,9 +94,9 @@ def half_precision(dtype: torch.dtype) -> float:
         found = []
         for kind in (torch.float32, dtype):
             with torch.no_grad():
-                condition = prior.conditioning(model(kind), images(), mask)
+                condition = diffusion.conditioning(model(kind), images(), mask)
                 noisy = normal(1, condition.shape[1] - 1, *condition.shape[-2:])
-                found.append(prior.predict(model(kind), noisy, torch.tensor([t]), condition, prompts()[:1])[0])
+                found.append(diffusion.predict(model(kind), noisy, torch.tensor([t]), condition, prompts()[:1])[0])
         worst = largest(worst, ((found[1] - found[0]).norm() / found[0].norm()).item())
     return worst
 
@@ -130,15 +131,15 @@ def empty_gradient() -> float:
 def nothing_shines_through() -> float:
     """Under a full mask the conditioning of two pictures is the same."""
     full = torch.ones(1, 1, SIZE, SIZE)
-    one, other = (prior.conditioning(model(), images(name), full) for name in ("a", "b"))
+    one, other = (diffusion.conditioning(model(), images(name), full) for name in ("a", "b"))
     return (one - other).abs().max().item()
 
 
 def nothing_hidden() -> float:
     """With an empty mask the conditioning is the picture's latents, bit for bit."""
     with torch.no_grad():
-        condition = prior.conditioning(model(), images(), torch.zeros(1, 1, SIZE, SIZE))
-        apart = condition[:, 1:] - prior.encode(model(), images())
+        condition = diffusion.conditioning(model(), images(), torch.zeros(1, 1, SIZE, SIZE))
+        apart = condition[:, 1:] - diffusion.encode(model(), images())
     return largest(condition[:, :1].abs().max().item(), apart.abs().max().item())
 
 
@@ -162,7 +163,7 @@ def scene_gradient(low: float, high: float, guidance: float) -> float:
 def one_step_painted() -> float:
     """Painting in one step, everything masked: pixels outside [-1, 1] or no numbers."""
     full, draws = torch.ones(1, 1, SIZE, SIZE), trace.generator(0)
-    found = prior.sample(model(), images(), full, prompts()[:1], 1, draws, 100.0, prompts()[2:])
+    found = diffusion.sample(model(), images(), full, prompts()[:1], 1, draws, 100.0, prompts()[2:])
     return float((~(found.abs() <= 1)).sum())
 
 

@@ -13,7 +13,8 @@ from plyfile import PlyData
 
 from benchmarks.stability.cases import EPS32, EPS64, Case, largest
 from reffusion import frame, io, trace
-from reffusion.fit import Settings, fit
+from reffusion.fit import fit
+from reffusion.fit_step import Settings
 from reffusion.lens import Lens
 from reffusion.optimize import Rates
 from reffusion.splat import render

@@ -20,7 +20,8 @@ from reffusion.confinement import Sight
 from reffusion.densify import densify, prune
 from reffusion.distill import Settings as Distilling
 from reffusion.distill import distill
-from reffusion.fit import Settings, fit
+from reffusion.fit import fit
+from reffusion.fit_step import Settings
 from reffusion.optimize import GaussianOptimizer, Rates
 from reffusion.splat import render
 from reffusion.start import initial_gaussians

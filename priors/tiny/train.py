@@ -25,7 +25,7 @@ from diffusers import StableDiffusionInpaintPipeline, UNet2DConditionModel  # no
 from torch import Tensor, nn  # noqa: E402
 from transformers import CLIPTextModel  # noqa: E402
 
-from reffusion.personalize import spread_timesteps  # noqa: E402
+from reffusion.denoising import spread_timesteps  # noqa: E402
 from reffusion.trace import generator, load_checkpoint, save_checkpoint, seed_for  # noqa: E402
 
 POOL = 500  # images held in memory

@@ -97,15 +97,7 @@ def load_roles(
     label_files = _test_mask_files(folder, capture, test_masks)
     train_named, test_named = (_chosen(value, capture, key) for key, value in (("train", train), ("test", test)))
     labelled = None if label_files is None else _labelled(capture, mask_files, label_files, test_named)
-    test_views = test_named if test_named is not None else (labelled or [])
-    if train_named is None:
-        train_named = [name for name in capture.pictures if name not in set(test_views)]
-    elif test_named is None:
-        test_views = [name for name in test_views if name not in set(train_named)]
-    both = sorted(set(train_named) & set(test_views))
-    if both:
-        raise ValueError(f"scene.yaml: {', '.join(both)} in both train and test; a view is for one of them")
-    _check_enough(train_named)
+    train_named, test_views = _parted(train_named, test_named, labelled, capture)
     clean_views = frozenset(known(name, capture, "clean") for name in clean)
     if clean_views - set(train_named):
         raise ValueError(f"scene.yaml: clean: {', '.join(sorted(clean_views - set(train_named)))} is no training view")
@@ -136,6 +128,22 @@ def known(name: str, capture: Capture, key: str) -> str:
             return candidate
     near = get_close_matches(name, capture.pictures, 3, 0.0)
     raise ValueError(f"scene.yaml: {key}: there is no view '{name}'; views are named like {', '.join(near)}")
+
+
+def _parted(
+    train: list[str] | None, test: list[str] | None, labelled: list[str] | None, capture: Capture
+) -> tuple[list[str], list[str]]:
+    """Training and test views from those named, None where they are not, and those that test masks tell of."""
+    test_views = test if test is not None else (labelled or [])
+    if train is None:
+        train = [name for name in capture.pictures if name not in set(test_views)]
+    elif test is None:
+        test_views = [name for name in test_views if name not in set(train)]
+    both = sorted(set(train) & set(test_views))
+    if both:
+        raise ValueError(f"scene.yaml: {', '.join(both)} in both train and test; a view is for one of them")
+    _check_enough(train)
+    return train, test_views
 
 
 def _check_enough(train: Sequence[str]) -> None:

@@ -1,0 +1,23 @@
+"""What several tests are given."""
+
+import pytest
+
+
+@pytest.fixture(scope="module")
+def prior():
+    """A small random inpainting prior, one for all tests of a module."""
+    from small_prior import small_prior
+
+    return small_prior()
+
+
+@pytest.fixture(scope="module")
+def text(prior):
+    """[3, L, D], hidden states of the global, the local and the empty prompt."""
+    import torch
+
+    from reffusion.crops import PROMPTS
+    from reffusion.diffusion import embed_text
+
+    with torch.no_grad():
+        return embed_text(prior, list(PROMPTS))
