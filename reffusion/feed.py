@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -20,18 +19,12 @@ def samples(
     weights: Mapping[str, np.ndarray],
     steps: range,
     seed: int,
-    coarse: float = 0,
 ) -> Iterator[tuple[Camera, Tensor, Tensor | None]]:
-    """What each of the steps sees, prepared by a thread of its own while the step before it runs.
-
-    Args:
-        coarse: steps before this one see half the width and height.
-    """
+    """What each of the steps sees, prepared by a thread of its own while the step before it runs."""
 
     def prepared(i: int) -> tuple[Camera, Tensor, Tensor | None]:
         camera = cameras[_view(i, len(cameras), seed)]
-        view = camera, images[camera.name], weights.get(camera.name)
-        return sample(*(halved(*view) if i < coarse else view))
+        return sample(camera, images[camera.name], weights.get(camera.name))
 
     with ThreadPoolExecutor(1, thread_name_prefix="fit") as ahead:
         coming = ahead.submit(prepared, steps.start)
@@ -51,19 +44,6 @@ def sample(camera: Camera, image: np.ndarray, weights: np.ndarray | None) -> tup
     """The view as the step sees it: camera, image in [0, 1], weights."""
     counts = None if weights is None else torch.from_numpy(np.asarray(weights, np.float32))
     return camera, torch.from_numpy(image).float() / 255, counts
-
-
-def halved(
-    camera: Camera, image: np.ndarray, weights: np.ndarray | None
-) -> tuple[Camera, np.ndarray, np.ndarray | None]:
-    """The view at half its width and height, rounded up; a pixel counts where all that it is made of counts."""
-    size = -(-camera.width // 2), -(-camera.height // 2)
-    smaller = lambda array: cv2.resize(array, size, interpolation=cv2.INTER_AREA)
-    if weights is not None:
-        weights = np.asarray(weights, np.float32)
-        whole = smaller((weights > 0).astype(np.float32)) > 1 - 1e-4
-        weights = np.where(whole, smaller(weights), np.float32(0))
-    return camera.resized(*size), smaller(image), weights
 
 
 def check_sizes(cameras: Sequence[Camera], images: Mapping[str, np.ndarray], weights: Mapping[str, np.ndarray]) -> None:

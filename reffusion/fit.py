@@ -62,10 +62,9 @@ def fit(
     if run.iteration == 0:
         _write_line(log, run, *measured)
 
-    coarse = settings.coarse_until * settings.iterations
     for i, (camera, target, counts) in zip(
         trace.progress(settings.iterations, "fit", run.iteration),
-        samples(cameras, images, weights, range(run.iteration, settings.iterations), settings.seed, coarse),
+        samples(cameras, images, weights, range(run.iteration, settings.iterations), settings.seed),
         strict=False,  # it may stop early
     ):
         target, counts = _move(target, optimizer), _move(counts, optimizer)

@@ -33,7 +33,6 @@ class Settings:
         random_background: a new colour each step instead of black.
             PAPER leaves open: 3DGS takes black by default. Dark texture is then drawn by leaving holes, which the
             stages after this one would read as places that no Gaussian explains.
-        coarse_until: part of the run on views of half the width and height, whose steps take about a third of the time.
         densify_by: `slopes`, 3DGS's way; `mcmc`, see `reffusion.mcmc`, in which `slope`, `split_above`, `largest` and
             `reset_every` mean nothing.
         opacity_weight, scale_weight: of the mean opacity and standard deviation in the loss; they make room for
@@ -60,7 +59,6 @@ class Settings:
     sh_degree: int = 3
     sh_every: float = 1 / 30
     random_background: bool = True
-    coarse_until: float = 0.0
     densify_by: str = "slopes"
     opacity_weight: float = 0.0
     scale_weight: float = 0.0

@@ -26,7 +26,6 @@ class Params(BaseModel):
     sh_supported: bool = Field(True, description="no more coefficients than views in which a typical point is seen")
     sh_every: float = Field(1 / 30, ge=0, le=1, description="part of the run after which one more degree joins")
     random_background: bool = Field(True, description="a new background colour each step, instead of black")
-    coarse_until: float = Field(0.0, ge=0, le=1, description="part of the run on views of half the size; 3DGS: none")
     densify_by: Literal["slopes", "mcmc"] = Field("slopes", description="3DGS's densification, or 3DGS-MCMC's")
     opacity_weight: float = Field(0.0, ge=0, description="price of the mean opacity in the loss (mcmc: 0.01)")
     scale_weight: float = Field(0.0, ge=0, description="price of the mean standard deviation (mcmc: 0.01)")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from reffusion import exposure, feed, fit_step, io, trace
+from reffusion import exposure, fit_step, io, trace
 from reffusion import fit as fitting
 from reffusion.fit import fit
 from reffusion.fit_step import Settings
@@ -85,11 +85,7 @@ class Killed(Exception):
     pass
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [SETTINGS, replace(SETTINGS, exposure=True), replace(SETTINGS, coarse_until=0.55)],
-    ids=["plain", "exposure", "coarse"],
-)
+@pytest.mark.parametrize("settings", [SETTINGS, replace(SETTINGS, exposure=True)], ids=["plain", "exposure"])
 def test_a_resumed_fit_is_the_unbroken_one_bit_for_bit(tmp_path, monkeypatch, settings):
     unbroken = run(tmp_path / "unbroken", settings=settings)
     adapt, folder = fitting.adapt, tmp_path / "resumed"
@@ -151,32 +147,6 @@ def test_exposures_stay_the_identity_on_average():
     mean = torch.stack(list(matrices.values())).mean(0)
     torch.testing.assert_close(mean, torch.eye(3, 4), atol=1e-6, rtol=0)
     assert matrices["a"].sum() > 3.05 and torch.equal(matrices["b"], matrices["c"])
-
-
-@pytest.mark.parametrize(("width", "height"), [(96, 64), (95, 61)], ids=["even", "odd"])
-def test_a_halved_view_shows_what_its_camera_sees(width, height):
-    """Its pixels are means of the whole view's, in the same places: a shift by a quarter of a pixel would show."""
-    smooth = Gaussians(
-        torch.tensor([[0.1, -0.05, 0.0], [-0.15, 0.1, 0.2]]), torch.tensor([[1.0, 0, 0, 0]] * 2),
-        torch.full((2, 3), -2.2), torch.tensor([2.0, 1.0]), torch.tensor([[[1.0, 0, -1]], [[-1.0, 1, 0]]]),
-    )  # fmt: skip
-    camera = Camera("v", width, height, width, width, 0.53 * width, 0.48 * height, ring_of_cameras()[1].world_to_camera)
-    photo = (render(smooth, camera).color * 255).round().byte().numpy()
-    half, image, _ = feed.halved(camera, photo, None)
-    assert image.shape == (half.height, half.width, 3) == (-(-height // 2), -(-width // 2), 3)
-    drawn = lambda view: render(smooth, view).color.numpy() * 255
-    error = lambda view: np.abs(drawn(view) - image).mean()
-    assert error(half) < 0.5, "rounding to bytes, and the mean over a pixel against its middle"
-    assert min(error(replace(half, cx=half.cx + shift)) for shift in (-0.25, 0.25)) > 2 * error(half)
-
-
-def test_a_halved_pixel_counts_only_where_all_it_is_made_of_counts():
-    camera, image = ring_of_cameras()[0], np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    weights = np.ones((HEIGHT, WIDTH), np.float32)
-    weights[5, 8], weights[10, 2:4] = 0, 0.5
-    _, _, halved = feed.halved(camera, image, weights)
-    assert halved[2, 4] == 0 and (halved == 0).sum() == 1
-    assert halved[5, 1] == pytest.approx(0.75)
 
 
 def test_seeds_matter_and_repeat(tmp_path):
