@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks.kernels.points import Diagram, cpu_seconds
 
-SLOWER = 2.0  # factor on a baseline's time, in machine units, that is still no regression: repeats on one machine differ by 1.6
+SLOWER = 2.0  # factor on a baseline's time, in machine units: repeats on one machine differ by up to 1.6
 LEAST_SECONDS = 2e-3  # differences of less are noise
 LEAST_ERROR = 1e-9
 
