@@ -30,7 +30,7 @@ STAGES := poses fit masks reference lift personalize initialize distill evaluate
 options = $(if $(profile),--profile '$(profile)') $(if $(variant),--variant '$(variant)') \
 	$(if $(budget),--budget '$(budget)') $(if $(set),--set "$$set") $(if $(trust),--trust) $(if $(runs),--runs '$(runs)')
 
-.PHONY: help setup all $(STAGES) plan clean batch weights demo prior prior-report test bench stability gpu-check lint
+.PHONY: help setup all $(STAGES) plan clean batch weights demo prior prior-report turntable test bench stability gpu-check lint
 .DELETE_ON_ERROR:
 
 help:
@@ -118,6 +118,9 @@ ifneq ($(scene),)
 else
 	@$(PY) -m report.job --data '$(data)' $(if $(variant),--variant '$(variant)') $(if $(runs),--runs '$(runs)')
 endif
+
+turntable: named setup
+	@$(PY) -m report.turntable --scene '$(scene)' $(if $(variant),--variant '$(variant)') $(if $(runs),--runs '$(runs)')
 
 clean: named setup
 	@$(PY) -m runner clean --scene '$(scene)' $(options)

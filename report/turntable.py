@@ -1,0 +1,57 @@
+"""A flight around a finished scene as a video: `python -m report.turntable --scene demo` (`make scene=X turntable`)."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from reffusion import flight, io, splat
+
+FRAMES, RATE = 144, 24  # six seconds
+CODEC = "VP90"  # in a .webm: what OpenCV's wheels can write and browsers play
+
+
+def make(home: Path, frames: int = FRAMES) -> Path:
+    """Write turntable.webm beside the scene's stages, with the result on a way around the capture; its path.
+
+    Args:
+        home: runs/<scene> or runs/<scene>@<variant>, its stage `evaluate` finished.
+
+    Raises:
+        ValueError: that stage has not run, or this OpenCV writes no such video.
+    """
+    finished = home / "evaluate" / "scene.ply"
+    if not finished.exists():
+        raise ValueError(f"{finished} is missing; `make scene={home.name.split('@')[0]} all` makes it")
+    scene = io.load_scene(home.with_name(home.name.split("@")[0]) / "poses")
+    gaussians = io.load_ply(finished, scene.similarity)
+    train = [scene.cameras[name] for name in scene.train]
+    path, cameras = home / "turntable.webm", flight.around(train, scene.points, frames)
+    film = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*CODEC), RATE, (cameras[0].width, cameras[0].height))
+    if not film.isOpened():
+        raise ValueError(f"{path}: this OpenCV writes no {CODEC} video; `pip install opencv-contrib-python-headless`")
+    for camera in cameras:
+        picture = (splat.render(gaussians, camera).color.clamp(0, 1) * 255).round().byte().numpy()
+        film.write(np.ascontiguousarray(picture[..., ::-1]))
+    film.release()
+    return path
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="report.turntable", description=__doc__.split("\n")[0])
+    parser.add_argument("--scene", type=Path, required=True, help="its name, or the path of its folder")
+    parser.add_argument("--variant", default="", help="of the scene")
+    parser.add_argument("--runs", type=Path, default=Path("runs"))
+    arguments = parser.parse_args()
+    name = arguments.scene.expanduser().resolve().name + (f"@{arguments.variant}" if arguments.variant else "")
+    try:
+        print(make(arguments.runs / name))
+    except ValueError as error:
+        raise SystemExit(f"error: {error}") from None
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,70 @@
+"""The way around a capture: where its cameras stand, what they look at, and the video along it."""
+
+import cv2
+import numpy as np
+import pytest
+import small_scene
+import torch
+
+from reffusion import flight, geometry, io
+from reffusion.types import Camera, Scene, Similarity
+from report import turntable
+
+
+def ring(count: int, radius: float, height: float = 0.3) -> list[Camera]:
+    """Cameras on a circle about the y axis, rows downwards along +y, all looking at the origin."""
+    turns = 2 * np.pi * np.arange(count) / count
+    centers = np.stack([radius * np.cos(turns), np.full(count, -height), radius * np.sin(turns)], 1)
+    poses = [flight.looking(center, np.zeros(3), np.array([0.0, 1.0, 0.0])) for center in centers]
+    return [Camera(str(k), 64, 48, 60.0, 60.0, 31.0, 25.0, pose) for k, pose in enumerate(poses)]
+
+
+def test_a_ring_of_cameras_gives_the_ring_back():
+    made = flight.around(ring(9, 2.0), np.random.default_rng(0).normal(0, 0.1, (50, 3)), 12)
+    centers = np.stack([camera.center for camera in made])
+    assert np.allclose(np.hypot(centers[:, 0], centers[:, 2]), 2.0) and np.allclose(centers[:, 1], -0.3)
+    steps = np.linalg.norm(np.diff(centers, axis=0, append=centers[:1]), axis=1)
+    assert np.allclose(steps, steps[0]), "closed, and even"
+    assert np.allclose(flight.focus(ring(9, 2.0), np.zeros((0, 3))), 0, atol=0.02)
+
+
+def test_every_camera_looks_at_the_focus_upright():
+    cameras = list(small_scene.CAMERAS.values())
+    points = np.array([[0.0, 0.0, 2.0]])
+    target = flight.focus(cameras, points)
+    assert target[2] == pytest.approx(2.0, abs=0.05), "parallel axes: the points say how far"
+    for camera in flight.around(cameras, points, 8):
+        rotation = camera.world_to_camera[:3, :3]
+        assert np.allclose(rotation @ rotation.T, np.eye(3)) and np.linalg.det(rotation) > 0
+        pixels, depth = geometry.project(target[None], camera)
+        assert np.allclose(pixels[0], (camera.width / 2, camera.height / 2)) and depth[0] > 0
+        assert rotation[1, 1] > 0.9, "rows go down as the photographs' do"
+
+
+def test_odd_captures_have_a_way_too():
+    above = [flight.looking(np.array([0.0, -2.0, 0.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]))]
+    one = [Camera("v", 8, 6, 9.0, 9.0, 4.0, 3.0, above[0])]
+    for camera in flight.around(one, np.zeros((0, 3)), 3):
+        assert np.isfinite(camera.world_to_camera).all() and np.allclose(camera.center, (0, -2, 0))
+    with pytest.raises(ValueError, match="needs a camera"):
+        flight.around([], np.zeros((0, 3)), 3)
+
+
+def test_the_video_shows_the_result_of_a_variant_in_the_scenes_poses(tmp_path):
+    gaussians, labels = small_scene.gaussians(1.0)
+    similarity = Similarity(2.0, np.array([0.1, 0.2, 0.3]))
+    train = {name: small_scene.CAMERAS[name] for name in small_scene.TRAIN}
+    points = gaussians.means.double().numpy()[~labels.numpy()]
+    scene = Scene(train, small_scene.TRAIN, (), frozenset(), points, np.zeros((len(points), 3), np.uint8), similarity)
+    io.save_scene(tmp_path / "x" / "poses", scene)
+    with pytest.raises(ValueError, match="make scene=x all"):
+        turntable.make(tmp_path / "x@no_sds")
+    wall = gaussians.map(lambda p: p[~labels])
+    io.save_ply(tmp_path / "x@no_sds" / "evaluate" / "scene.ply", wall, similarity=similarity)
+    film, frames = cv2.VideoCapture(str(turntable.make(tmp_path / "x@no_sds", frames=6))), []
+    while (read := film.read())[0]:
+        frames.append(read[1])
+    assert len(frames) == 6 and frames[0].shape == (small_scene.HEIGHT, small_scene.WIDTH, 3)
+    first = flight.around(list(train.values()), points, 6)[0]
+    drawn = turntable.splat.render(wall, first).color
+    assert (torch.from_numpy(frames[0][..., ::-1].copy()) / 255 - drawn).abs().mean() < 0.03, "but for compression"
