@@ -30,7 +30,8 @@ STAGES := poses fit masks reference lift personalize initialize distill evaluate
 options = $(if $(profile),--profile '$(profile)') $(if $(variant),--variant '$(variant)') \
 	$(if $(budget),--budget '$(budget)') $(if $(set),--set "$$set") $(if $(trust),--trust) $(if $(runs),--runs '$(runs)')
 
-.PHONY: help setup all $(STAGES) plan clean batch weights demo prior prior-report turntable test bench stability gpu-check lint
+.PHONY: help setup all $(STAGES) plan clean batch weights demo prior prior-report sds-variance turntable test bench \
+	stability gpu-check lint
 .DELETE_ON_ERROR:
 
 help:
@@ -40,6 +41,7 @@ help:
 	@echo 'make scene=X compare           the full method, ablations and baselines side by side: runs/X/compare.html'
 	@echo '                               variants=a,b  only these; seeds=5  on demo, demo-1 ... demo-4, with intervals'
 	@echo 'make scene=X report            what was done, errors against seconds: runs/X/report/index.html'
+	@echo 'make scene=X sds-variance      the SDS gradient over noise and timesteps, before and after personalization'
 	@echo 'make data=FOLDER report        the same of all its scenes: runs/report/index.html'
 	@echo 'make scene=X clean             remove what was computed for it'
 	@echo 'make data=FOLDER batch         every scene of a folder, and one table'
@@ -139,6 +141,12 @@ prior-report: data/demo/.generated setup
 	@$(PY) -m runner run reference --scene demo --profile laptop
 	$(PY) benchmarks/prior.py --run runs/demo --out runs/prior-report
 	$(PY) -m report.prior runs/prior-report
+
+# On any scene; what it lacks of personalization and initialization is made first.
+sds-variance: ready
+	@$(PY) -m runner run personalize --scene '$(scene)' $(options)
+	@$(PY) -m runner run initialize --scene '$(scene)' $(options)
+	$(PY) benchmarks/sds_variance.py --run '$(or $(runs),runs)/$(notdir $(abspath $(scene)))'
 
 # Two processes of one thread each, whole files to each: kernels that are compiled for one test serve the next.
 test: $(VENV)/.ready-dev

@@ -1,7 +1,7 @@
 """The terms of distillation and the Gaussians each may reach (RefFusion section 4.3), and the region they belong to.
 
 term             pixels                                        Gaussians
-reconstruction   outside the consistent mask; all if clean     unmasked; all if clean
+reconstruction   outside the consistent mask; all if clean     unmasked (or all that show there); all if clean
 SDS              whole view and patches, the hole repainted    masked
 depth            the hole (reffusion.depth_term)               masked, all but spherical harmonics
 adversarial      patches around the hole                       masked (or all), spherical harmonics only

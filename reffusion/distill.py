@@ -144,12 +144,14 @@ def _copy(optimizer: GaussianOptimizer) -> dict[str, Tensor]:
 
 
 def _densify(optimizer: GaussianOptimizer, settings: Settings, done: int) -> None:
-    """Clone or split the masked Gaussians pulled hardest on the screen; only they have been observed."""
+    """Clone or split masked Gaussians that are pulled hard on the screen; only they have been observed."""
     if done > settings.densify_until * settings.iterations or not optimizer.masked.any():
         return
     slopes = (optimizer.slope_sum / optimizer.slope_count.clamp(min=1))[optimizer.masked]
-    least = torch.finfo(slopes.dtype).tiny
-    threshold = max(float(slopes.kthvalue(max(1, round((1 - settings.densify_share) * len(slopes)))).values), least)
+    threshold = settings.densify_slope
+    if settings.densify_rule == "share":
+        threshold = float(slopes.kthvalue(max(1, round((1 - settings.densify_share) * len(slopes)))).values)
+    threshold = max(threshold, torch.finfo(slopes.dtype).tiny)  # what is not pulled at all stays single
     noise = trace.generator(settings.seed, "distill", "densify", done)
     densify(optimizer, threshold, settings.split_above, settings.budget, noise)
     prune(optimizer, settings.least_opacity, float("inf"))

@@ -1,4 +1,4 @@
-"""PSNR, SSIM, FLIP and LPIPS on the mask's box and on the full image.
+"""PSNR, SSIM, FLIP and LPIPS on the mask's box, outside the mask and on the full image.
 
 Images are [H, W, 3] sRGB, uint8 or float in [0, 1]. A box is cut out first and scored as an image of its own: nothing
 outside it enters, and nothing is resized. Every function raises ValueError on unequal or empty images.
@@ -29,6 +29,9 @@ COLUMNS = (
     "flip_box",
     "lpips_vgg_box",
     "lpips_alex_box",
+    "psnr_outside",
+    "ssim_outside",
+    "flip_outside",
     "psnr_full",
     "ssim_full",
     "flip_full",
@@ -39,6 +42,11 @@ PROTOCOL = {
     "box": "bounding box of the view's test mask (its consistent mask where the scene gives none), moved outwards by "
     "10% of its width and height on each side, rounded outwards, clipped to the image; cut out before scoring",
     "empty_box": "a view with an empty mask has no box: it is left out of the box means",
+    "outside": "the pixels outside the view's mask, which is first grown by the share `outside_margin` of the image's "
+    "width; inside it both pictures show the photograph, so that nothing painted there enters through a window or a "
+    "filter; no value where the mask covers all",
+    "held_out": "a test view whose photograph shows the object (its mask lies among the training masks) has no truth "
+    "inside its mask: it is scored outside only",
     "psnr": f"dB, peak 1, mean squared error over pixels and channels; a view above {PSNR_CAP:.0f} dB "
     f"(identical: infinite) counts {PSNR_CAP:.0f} dB in a mean",
     "ssim": f"Gaussian window {SSIM_WINDOW} px, sigma {SSIM_SIGMA} px, population covariance, data range 1, mean over "
@@ -91,12 +99,17 @@ def psnr(image: np.ndarray, truth: np.ndarray) -> float:
 
 def ssim(image: np.ndarray, truth: np.ndarray) -> float:
     """Structural similarity (Wang et al., 2004) as `PROTOCOL["ssim"]` says. Raises ValueError under 11 px a side."""
+    return float(ssim_map(image, truth).mean())
+
+
+def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """[H - 10, W - 10, 3]: SSIM of the windows that lie inside the image. Raises ValueError under 11 px a side."""
     from skimage.metrics import structural_similarity
 
     image, truth = _pair(image, truth)
     if min(image.shape[:2]) < SSIM_WINDOW:
         raise ValueError(f"SSIM needs {SSIM_WINDOW} px a side; the image is {image.shape[1]}x{image.shape[0]} px")
-    value = structural_similarity(
+    _, values = structural_similarity(
         image,
         truth,
         gaussian_weights=True,
@@ -104,18 +117,25 @@ def ssim(image: np.ndarray, truth: np.ndarray) -> float:
         use_sample_covariance=False,
         data_range=1.0,
         channel_axis=2,
+        full=True,
     )
-    return float(value)
+    edge = SSIM_WINDOW // 2
+    return values[edge:-edge, edge:-edge]
 
 
 def flip(image: np.ndarray, truth: np.ndarray) -> float:
     """Mean LDR-FLIP (Andersson et al., 2020) in [0, 1], 0 for identical images."""
+    return float(flip_map(image, truth).mean(dtype=np.float64))
+
+
+def flip_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """[H, W] float32 in [0, 1]: LDR-FLIP at each pixel."""
     import flip_evaluator
 
     image, truth = (np.ascontiguousarray(x, np.float32) for x in _pair(image, truth))
     settings = {"ppd": PIXELS_PER_DEGREE}
     errors = flip_evaluator.evaluate(truth, image, "LDR", applyMagma=False, computeMeanError=False, parameters=settings)
-    return float(errors[0].mean(dtype=np.float64))
+    return errors[0].reshape(truth.shape[:2])
 
 
 def lpips(image: np.ndarray, truth: np.ndarray, model: Lpips) -> float:
@@ -138,14 +158,45 @@ def score(image: np.ndarray, truth: np.ndarray, models: dict[str, Lpips] | None 
 
 
 def score_view(
-    image: np.ndarray, truth: np.ndarray, box: Box | None, models: dict[str, Lpips] | None = None
+    image: np.ndarray,
+    truth: np.ndarray,
+    box: Box | None,
+    models: dict[str, Lpips] | None = None,
+    mask: np.ndarray | None = None,
+    shows_object: bool = False,
 ) -> dict[str, float | None]:
-    """A value for each of `COLUMNS`: `score` on the box (None without one), and on the full image without LPIPS."""
-    inside = score(box.crop(image), box.crop(truth), models) if box is not None else {}
-    whole = score(image, truth)
-    values = {f"{name}_box": value for name, value in inside.items()}
-    values |= {f"{name}_full": value for name, value in whole.items()}
+    """A value for each of `COLUMNS`: `score` on the box (None without one), `outside` of the mask (bool [H, W]; None:
+    no pixel is masked), and `score` on the full image without LPIPS.
+
+    Args:
+        shows_object: the truth has the object in it, so that only what lies outside its mask is true.
+    """
+    values = outside(image, truth, np.zeros(truth.shape[:2], bool) if mask is None else mask)
+    if not shows_object:
+        inside = score(box.crop(image), box.crop(truth), models) if box is not None else {}
+        values |= {f"{name}_box": value for name, value in inside.items()}
+        values |= {f"{name}_full": value for name, value in score(image, truth).items()}
     return {column: values.get(column) for column in COLUMNS}
+
+
+def outside(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> dict[str, float | None]:
+    """{"psnr", "ssim", "flip"}_outside: over the pixels where the bool mask [H, W] is False; None where there are none.
+
+    SSIM, and FLIP's filters, look at surroundings: inside the mask the truth stands in both pictures, so that nothing
+    painted there counts, and no difference at its border is one of the object's.
+    """
+    kept = ~mask
+    if not kept.any():
+        return dict.fromkeys(("psnr_outside", "ssim_outside", "flip_outside"))
+    image, truth = _pair(image, truth)
+    error = float(np.mean((image - truth)[kept] ** 2))
+    shown, edge = np.where(kept[..., None], image, truth), SSIM_WINDOW // 2
+    windows = kept[edge:-edge, edge:-edge]  # empty where the image is smaller than a window
+    return {
+        "psnr_outside": -10.0 * log10(error) if error > 0 else inf,
+        "ssim_outside": float(ssim_map(shown, truth)[windows].mean()) if windows.any() else None,
+        "flip_outside": float(flip_map(shown, truth)[kept].mean(dtype=np.float64)),
+    }
 
 
 def mean(values: list[float | None]) -> float | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -42,10 +43,15 @@ class Settings:
         reconstruction_every: steps between two with a reconstruction term; 0: never.
         reference_weight: of the reference's own pixels in its hole (paper: 0).
         lift: supervision by pictures inpainted in 2D (baselines; not in the paper's method); None leaves it out.
+        reconstruction_reaches: "unmasked" Gaussians, or all that are "shown" in the pixels a photograph may supervise:
+            also the masked ones at the hole's rim, whose footprints reach out of it.
         confined: each term reaches its own Gaussians. False, an ablation: every term reaches all Gaussians, and none is
             pruned for changing region.
         densify_every: steps between densifications of masked Gaussians; 0: never.
+        densify_rule: "share": those pulled hardest on the screen, a share of the masked ones; "slope", 3DGS's: all that
+            are pulled by `densify_slope` or more.
         densify_share: share of the masked Gaussians cloned or split each time.
+        densify_slope: 3DGS's threshold, in its units (see `GaussianOptimizer.observe`).
         densify_until: part of the run after which no Gaussian is added.
         split_above: standard deviation from which a Gaussian is split, not cloned.
         budget: most Gaussians.
@@ -69,9 +75,12 @@ class Settings:
     reconstruction_every: int = 1
     reference_weight: float = 0.0
     lift: Lift | None = None
+    reconstruction_reaches: Literal["unmasked", "shown"] = "unmasked"
     confined: bool = True
     densify_every: int = 0
+    densify_rule: Literal["share", "slope"] = "share"
     densify_share: float = 0.05
+    densify_slope: float = 2e-4
     densify_until: float = 0.5
     split_above: float = 0.01
     budget: int = 2_000_000
@@ -237,7 +246,8 @@ def _reconstruction(optimizer: GaussianOptimizer, step: int, job: Job) -> _Done:
     if not every or step % every:
         return None
     sight = _drawn(job.sights, step // every, job.settings.seed, "reconstruction")
-    left = optimizer.masked & job.settings.confined  # Gaussians that photographs without the clean mark leave alone
+    # Gaussians that photographs without the clean mark leave alone.
+    left = optimizer.masked & (job.settings.confined and job.settings.reconstruction_reaches == "unmasked")
     with _named(step, "reconstruction", sight.camera):
         loss, rendering = reconstruction_term(gaussians, left, sight)
         _backward(loss, gaussians)

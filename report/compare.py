@@ -11,7 +11,7 @@ from typing import Any
 
 from reffusion import io
 from report import charts, page, pictures
-from report.results import AGAINST, BETTER, FULL, Comparison, Run, differences, load, rows, save_csv
+from report.results import AGAINST, BETTER, FULL, OUTSIDE, SCORES, Comparison, Run, differences, load, rows, save_csv
 
 TITLES = {
     "method": "method",
@@ -19,6 +19,9 @@ TITLES = {
     "ssim_box": "SSIM ↑",
     "flip_box": "FLIP ↓",
     "lpips_vgg_box": "LPIPS (vgg) ↓",
+    "psnr_outside": "outside: PSNR ↑",
+    "ssim_outside": "outside: SSIM ↑",
+    "flip_outside": "outside: FLIP ↓",
     "consistency": "consistency ↓",
     "seconds": "seconds",
     "own_seconds": "own seconds",
@@ -26,8 +29,11 @@ TITLES = {
     "gaussians": "Gaussians",
 }
 DIGITS = {"psnr_box": 2, "ssim_box": 4, "flip_box": 4, "lpips_vgg_box": 4, "consistency": 5}
+DIGITS |= {"psnr_outside": 2, "ssim_outside": 4, "flip_outside": 4}
 ERRORS = {"flip_box": "FLIP in the box", "ssim_box": "1 − SSIM in the box", "lpips_vgg_box": "LPIPS (vgg) in the box"}
 SHORT = {"psnr_box": "PSNR, dB", "ssim_box": "SSIM", "flip_box": "FLIP", "lpips_vgg_box": "LPIPS (vgg)"}
+SHORT |= {"psnr_outside": "PSNR outside, dB", "ssim_outside": "SSIM outside", "flip_outside": "FLIP outside"}
+WHERE_THERE = ("consistency", *OUTSIDE)  # columns that are left out where no method has a value
 WAYS = {"inpainter": "2D inpainter", "perceptual": "perceptual distance"}  # keys of the files, in words
 
 
@@ -76,10 +82,12 @@ def tradeoff(table: list[dict[str, Any]], path: Path) -> Path | None:
 
 
 def forest(comparison: Comparison, path: Path) -> Path | None:
+    """Method minus full in the box; outside the masks where no truth shows what is inside."""
     found = {metric: by_method for metric in BETTER if (by_method := differences(comparison, metric))}
+    found = found or {metric: by_method for metric in OUTSIDE if (by_method := differences(comparison, metric))}
     if not found:
         return None
-    more = {metric for metric, better in BETTER.items() if better == "more"}
+    more = {metric for metric, better in SCORES.items() if better == "more"}
     charts.forest(found, {metric: f"{SHORT[metric]}, minus full" for metric in found}, more, path)
     return path
 
@@ -89,9 +97,9 @@ def forest(comparison: Comparison, path: Path) -> Path | None:
 
 def cells(table: list[dict[str, Any]]) -> tuple[list[str], list[list[str]], list[list[bool]]]:
     """Header, texts and which are best in their column; a dash where there is no value."""
-    names = [name for name in TITLES if name != "consistency" or any(row[name] is not None for row in table)]
+    names = [name for name in TITLES if name not in WHERE_THERE or any(row[name] is not None for row in table)]
     best = {}
-    for name, better in BETTER.items():  # not in consistency, which blur has too
+    for name, better in SCORES.items():  # not in consistency, which blur has too
         values = [row[name] for row in table if row[name] is not None]
         best[name] = (max if better == "more" else min)(values, default=None) if len(values) > 1 else None
     texts, bold = [], []
@@ -104,7 +112,7 @@ def cells(table: list[dict[str, Any]]) -> tuple[list[str], list[list[str]], list
 
 def difference_cells(table: list[dict[str, Any]]) -> tuple[list[str], list[list[str]]] | None:
     """Method minus full: the mean, half its interval over views, and over scenes where there are several."""
-    found = [metric for metric in BETTER if any(row[f"{metric}_minus_full"] is not None for row in table)]
+    found = [metric for metric in SCORES if any(row[f"{metric}_minus_full"] is not None for row in table)]
     lines = [[row["method"], *(_signed(row, metric) for metric in found)] for row in table if row["method"] != FULL]
     return (["method", *(SHORT[metric] for metric in found)], lines) if found else None
 
@@ -127,11 +135,12 @@ def summary(comparison: Comparison, table: list[dict[str, Any]]) -> str:
     place = f"{len(comparison.scenes)} scenes ({', '.join(comparison.scenes)})"
     parts = [f"{len(table)} methods on {place if len(comparison.scenes) > 1 else comparison.scenes[0]}"]
     parts[0] += "" if done == len(comparison.runs) else f", {done} of {len(comparison.runs)} runs done"
-    for metric, better in BETTER.items():
+    boxed = any(row["psnr_box"] is not None for row in table)
+    for metric, better in (BETTER if boxed else OUTSIDE).items():
         there = [row for row in table if row[metric] is not None]
         if len(there) > 1:
             best = (max if better == "more" else min)(there, key=lambda row: row[metric])
-            parts.append(f"best in {SHORT[metric].split(',')[0]}: {best['method']}")
+            parts.append(f"best in {SHORT[metric].removesuffix(', dB')}: {best['method']}")
     return "; ".join(parts) + "."
 
 
@@ -146,6 +155,11 @@ def notes(comparison: Comparison) -> list[str]:
     ]
     if not any(run.metrics.get("mean", {}).get("psnr_box") is not None for run in done):
         said.append("No box metrics: the scene has no ground truth.")
+    if any(run.metrics.get("mean", {}).get("psnr_outside") is not None for run in done):
+        said.append(
+            "outside: the test views' pixels outside their masks (1% of the width wider), which all methods should "
+            "leave as they are."
+        )
     said += dict.fromkeys(f"No LPIPS: {why}." for run in done if (why := run.metrics.get("lpips_unavailable")))
     if any(row["consistency"] is not None for row in rows(comparison)):
         words = "mean absolute difference inside the mask to the next view, by rendered depth; blur is consistent too."

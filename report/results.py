@@ -15,10 +15,12 @@ from report.paired import Difference, paired
 
 FULL = "full"
 BETTER = {"psnr_box": "more", "ssim_box": "more", "flip_box": "less", "lpips_vgg_box": "less"}
+OUTSIDE = {"psnr_outside": "more", "ssim_outside": "more", "flip_outside": "less"}  # of the masks
+SCORES = BETTER | OUTSIDE
 PSNR_CAP = 100.0  # dB, what an identical view counts: as in metrics.json
 MEASURED = ("consistency", "seconds", "own_seconds", "peak_memory_mb", "gaussians", "scenes")
 AGAINST = ("minus_full", "interval_views", "interval_scenes")  # see report.paired.Difference; halves of intervals
-COLUMNS = ("method", "state", *BETTER, *MEASURED, *(f"{metric}_{what}" for metric in BETTER for what in AGAINST))
+COLUMNS = ("method", "state", *SCORES, *MEASURED, *(f"{metric}_{what}" for metric in SCORES for what in AGAINST))
 
 
 @dataclass(frozen=True)
@@ -116,7 +118,7 @@ def _number(column: str, text: str | None) -> float | None:
 def rows(comparison: Comparison) -> list[dict[str, Any]]:
     """A dict of `COLUMNS` for each method: means over its finished scenes; None where there is no value."""
     table = [_row(comparison, method) for method in comparison.methods]
-    for metric in BETTER:
+    for metric in SCORES:
         found = differences(comparison, metric)
         for row in table:
             if difference := found.get(row["method"]):
@@ -131,7 +133,7 @@ def _row(comparison: Comparison, method: str) -> dict[str, Any]:
     row: dict[str, Any] = dict.fromkeys(COLUMNS)
     row |= {"method": method, "scenes": len(done)}
     row["state"] = states[0] if len(set(states)) == 1 else f"{len(done)} of {len(states)} done"
-    for name in BETTER:
+    for name in SCORES:
         row[name] = mean([run.metrics.get("mean", {}).get(name) for run in done])
     row["consistency"] = mean([consistency(run) for run in done])
     row["seconds"] = mean([seconds(run) for run in done])
@@ -193,7 +195,7 @@ def _value(name: str, text: str) -> Any:
 
 
 def differences(comparison: Comparison, metric: str) -> dict[str, Difference]:
-    """Method -> its difference to the full one in a box metric, over the views that both have."""
+    """Method -> its difference to the full one in a score, over the views that both have."""
     found = {}
     for method in comparison.methods:
         if method == FULL:

@@ -72,6 +72,11 @@ class Params(BaseModel):
     lpips_weights: str | None = Field(
         None, description="folder with LPIPS weights, see evaluate.lpips_weights", json_schema_extra={"weights": True}
     )
+    # PAPER leaves open: what happens at the rim, where masked and unmasked Gaussians are blended into the same pixels.
+    # Its text confines reconstruction to unmasked ones; yet a photograph is true wherever new footprints reach as well.
+    reconstruction_reaches: Literal["unmasked", "shown"] = Field(
+        "unmasked", description="Gaussians that photographs move: unmasked ones, or all that show outside the mask"
+    )
     confined: bool = Field(True, description="each term reaches its own Gaussians; false (an ablation): all of them")
     # PAPER leaves open: Adam's step sizes here; 3DGS's. Those of unmasked Gaussians are left alone: what the object's
     # blurred rim had tinted is to be mended by the reconstruction term.
@@ -83,7 +88,9 @@ class Params(BaseModel):
     # PAPER leaves open: how densification changes. Among masked Gaussians those pulled hardest on the screen are
     # cloned or split, a share of them, for the SDS gradient has no scale a threshold could refer to.
     densify_every: int = Field(0, ge=0, description="steps between densifications of masked Gaussians; 0: never")
+    densify_rule: Literal["share", "slope"] = Field("share", description="by share, or (3DGS's) by a threshold")
     densify_share: float = Field(0.05, gt=0, lt=1, description="share of the masked Gaussians chosen each time")
+    densify_slope: float = Field(2e-4, ge=0, description="3DGS's threshold on the mean screen-space gradient")
     densify_until: float = Field(0.5, ge=0, le=1, description="part of the run after which no Gaussian is added")
     split_above: float = Field(0.01, gt=0, description="standard deviation from which a Gaussian is split, not cloned")
     budget: int = Field(2_000_000, ge=1, description="most Gaussians")

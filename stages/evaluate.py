@@ -24,6 +24,9 @@ class Params(BaseModel):
     box_dilation: float = Field(
         0.1, ge=0.0, description="each side of the mask's box moves outwards by this share of the box's extent"
     )
+    outside_margin: float = Field(
+        0.01, ge=0, description="how much wider than the mask is left out of the scores outside it, / image width"
+    )
     lpips_weights: str | None = Field(
         None,
         description="folder with LPIPS weights, looked into before ~/.cache/reffusion/lpips and torch hub's cache",
@@ -94,7 +97,9 @@ def run(
         box = metrics.mask_box(shown.mask, params.box_dilation)
         panels = [p for p in (pictures["fit"], truth, shown.picture) if p is not None]
         io.save_image(out / "side_by_side" / file, metrics.side_by_side(panels, box))
-        rows.append(row_of(shown, pictures.get("initialize"), truth, box, models))
+        margin = paint2d.widened(shown.mask, params.outside_margin)
+        held_out = (poses / "masks" / file).exists()  # a test view whose photograph shows the object
+        rows.append(row_of(shown, pictures.get("initialize"), truth, box, models, margin, held_out))
 
     (out / "per_view.csv").write_text(metrics.table(rows))
     io.save_ply(out / "scene.ply", gaussians[result], similarity=scene.similarity)
@@ -113,18 +118,26 @@ def run(
 
 
 def row_of(
-    shown: Shown, initial: np.ndarray | None, truth: np.ndarray | None, box: Box | None, models: dict[str, Lpips]
+    shown: Shown,
+    initial: np.ndarray | None,
+    truth: np.ndarray | None,
+    box: Box | None,
+    models: dict[str, Lpips],
+    margin: np.ndarray,
+    held_out: bool,
 ) -> dict[str, Any]:
-    """A view's line of per_view.csv: its box, and its scores and the initialization's where there is a truth."""
+    """A view's line of per_view.csv: its box, and its scores and the initialization's where there is a truth; see
+    `metrics.score_view`, whose `mask` and `shows_object` the last two are."""
     from reffusion import metrics
 
     camera = shown.camera
     row = {"view": camera.name, "width": camera.width, "height": camera.height} | dict.fromkeys(CONSISTENCY)
     row |= dict(zip(("left", "top", "right", "bottom"), box or (None,) * 4, strict=True))
     if truth is not None:
-        row |= metrics.score_view(shown.picture, truth, box, models)
+        given = truth, box, models, margin, held_out
+        row |= metrics.score_view(shown.picture, *given)
         if initial is not None:
-            scores = metrics.score_view(initial, truth, box, models)
+            scores = metrics.score_view(initial, *given)
             row |= {f"initialize_{column}": value for column, value in scores.items()}
     return row
 
@@ -150,6 +163,7 @@ def protocol(params: Params, rows: list[dict[str, Any]], models: dict[str, Lpips
     return {
         **metrics.PROTOCOL,
         "box_dilation": params.box_dilation,
+        "outside_margin": params.outside_margin,
         "resolution": sorted({f"{row['width']}x{row['height']}" for row in rows}),
         "lpips_weights": {name: digest for model in models.values() for name, digest in model.files.items()},
         "versions": metrics.versions(),

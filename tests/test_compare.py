@@ -263,6 +263,25 @@ def test_without_ground_truth(home):
     row = by_method(home)["better"]
     assert row["psnr_box"] is None and row["psnr_box_minus_full"] is None and row["consistency"] == 0.03
     assert (home / "compare/tradeoff.png").exists() and not (home / "compare/differences.png").exists()
+    assert row["psnr_outside"] is None and "outside" not in html
+
+
+def test_without_ground_truth_held_out_views_are_compared_outside_their_masks(home):
+    for evaluate in home.parent.glob("*/evaluate"):
+        gain = 2.0 if "@better" in str(evaluate.resolve()) or "@twin" in str(evaluate.resolve()) else 1.0
+        metrics = json.loads((evaluate / "metrics.json").read_text())
+        mean = dict.fromkeys(metrics["mean"]) | {"psnr_outside": 30 + gain, "ssim_outside": 0.9, "flip_outside": 0.1}
+        (evaluate / "metrics.json").write_text(json.dumps(metrics | {"mean": mean}))
+        lines = [f"{view},10,8,30,22,{30 + gain + 0.1 * gain * k}" for k, view in enumerate("abcd")]
+        (evaluate / "per_view.csv").write_text("\n".join(["view,left,top,right,bottom,psnr_outside", *lines, ""]))
+    made = page.make(home)
+    row = by_method(home)["better"]
+    assert row["psnr_outside"] == 32 and row["psnr_box"] is None
+    assert row["psnr_outside_minus_full"] == pytest.approx(1.15) and row["psnr_outside_interval_views"] > 0
+    text = made["md"].read_text()
+    assert "outside: PSNR ↑" in text and "| +1.15 ± 0.21 |" in text and "best in PSNR outside: better" in text
+    assert "all methods should leave as they are" in made["html"].read_text()
+    assert (home / "compare/differences.png").exists()
 
 
 def test_several_scenes(home):

@@ -9,7 +9,7 @@ import torch
 from small_prior import save_small_prior
 
 from reffusion import distill as D
-from reffusion import inpaint, io
+from reffusion import inpaint, io, splat
 from reffusion.adversary import Adversarial, Adversary
 from reffusion.confinement import (
     Distillation,
@@ -219,6 +219,21 @@ def test_interrupted_distillation_resumes_to_the_same_gaussians(prior, text, tmp
     assert {"adversarial", "critic_loss", "critic_slope"} <= lines[0][-1].keys()
 
 
+def test_densification_takes_a_share_whatever_the_weight_and_by_3dgs_rule_what_exceeds_a_slope(prior, text, tmp_path):
+    plain = replace(SETTINGS, adversarial=None, reference_weight=0.0, iterations=2, least_opacity=0.0, confined=False)
+
+    def grown(name, **options):
+        _, labels = run(tmp_path / name, prior, text, replace(plain, **options))
+        return int(labels.sum() - wall()[1].sum())
+
+    masked = int(wall()[1].sum())
+    shares = [grown(f"share {w:g}", sds_weight=w, densify_share=0.25) for w in (1e-6, 1e-2)]
+    assert shares[0] == shares[1] and abs(shares[0] - 0.25 * masked) <= 2
+    slopes = [grown(f"slope {w:g}", densify_rule="slope", sds_weight=w, densify_slope=1e-6) for w in (1e-9, 1e2)]
+    assert slopes[0] == 0 and slopes[1] > 0.5 * masked  # the SDS gradient has no scale of its own
+    assert grown("never", densify_every=0) == 0
+
+
 def test_each_set_of_gaussians_moves_by_its_own_terms_only(prior, text, tmp_path):
     start, masked = wall()
     plain = replace(SETTINGS, adversarial=None, densify_every=0, reference_weight=0.0, region_every=100)
@@ -234,6 +249,26 @@ def test_each_set_of_gaussians_moves_by_its_own_terms_only(prior, text, tmp_path
         still = ~masked if name == "sh" else torch.ones_like(masked)
         assert (getattr(three, name)[still] == getattr(start, name)[still]).all(), name
     assert (three.sh[masked] != start.sh[masked]).any()
+
+
+def test_photographs_may_reach_the_masked_gaussians_that_show_outside_the_hole(tmp_path):
+    """Those that show inside it only lie still."""
+    start, masked = wall()
+    plain = replace(SETTINGS, adversarial=None, densify_every=0, sds_weight=0.0, reference_weight=0.0, region_every=100)
+    view = sight("a")
+    outside = splat.accumulate(start, view.camera, (~hole())[..., None].float())[:, 0] > 0
+    assert (masked & outside).any() and (masked & ~outside).any()
+    for reaches in ("unmasked", "shown"):
+        settings = replace(plain, iterations=2, reconstruction_reaches=reaches)
+        moved = changed(start, run(tmp_path / reaches, None, None, settings, [view])[0])
+        assert not (moved & ~outside).any() and (moved & ~masked).any()
+        assert (moved & masked).any() == (reaches == "shown")
+
+
+def changed(before, after):
+    """[N] bool: any parameter."""
+    rows = [(getattr(before, n) != getattr(after, n)).reshape(len(before), -1) for n in PARAMETERS]
+    return torch.cat(rows, 1).any(1)
 
 
 def test_the_critic_waits_for_its_part_of_the_run(tmp_path):

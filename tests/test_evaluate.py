@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from reffusion import io, metrics, trace
+from reffusion.paint2d import widened
 from reffusion.types import Camera, Gaussians, MaskSet, Scene, Similarity
 from report import sheet
 from stages import evaluate
@@ -87,6 +88,7 @@ def done(tmp_path_factory):
 def test_scores_are_those_of_the_saved_pictures(done):
     out = done / "evaluate"
     summary = io.load_json(out / "metrics.json")
+    cameras = io.load_scene(done / "poses").cameras
     boxes = {"view0": metrics.Box(2, 8, 38, 32), "view1": None, "view2": metrics.Box(17, 2, 48, 26)}
     for kind, renders in (("mean", "renders"), ("initialize", "renders_initialize")):
         rows = [
@@ -94,6 +96,7 @@ def test_scores_are_those_of_the_saved_pictures(done):
                 io.load_image(out / renders / f"{name}.png"),
                 io.load_image(done / "poses" / "images" / f"{name}.png"),
                 box,
+                mask=widened(evaluate.mask_of(cameras[name], done / "poses", done / "masks"), 0.01),
             )
             for name, box in boxes.items()
         ]
@@ -176,6 +179,22 @@ def test_a_test_view_without_picture_is_rendered_and_one_of_another_size_refused
     io.save_image(picture, np.zeros((HEIGHT, WIDTH + 1, 3)))
     with pytest.raises(ValueError, match=r"view1.png: 49x36 px, its camera 48x36"):
         run(tmp_path / "again", folders)
+
+
+def test_a_held_out_view_that_shows_the_object_is_scored_outside_its_mask_only(tmp_path, folders):
+    shutil.copytree(folders["poses"] / "test_masks", folders["poses"] / "masks")
+    (folders["poses"] / "masks" / "view1.png").unlink()
+    summary = run(tmp_path / "out", folders, outside_margin=0.05)
+    assert summary["views"]["psnr_outside"] == 3 and summary["views"]["psnr_full"] == 2  # view0 shows the object
+    with open(tmp_path / "out" / "per_view.csv") as file:
+        row = next(csv.DictReader(file))
+    assert row["view"] == "view0" and row["psnr_box"] == "" and row["left"] == "2"
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    mask[8:32, 3:37] = True  # 2 px wider, a disk at its corners
+    picture, truth = (io.load_image(p / "view0.png") for p in (tmp_path / "out/renders", folders["poses"] / "images"))
+    nearly = metrics.outside(picture, truth, mask)
+    assert float(row["psnr_outside"]) == pytest.approx(nearly["psnr_outside"], abs=0.05)
+    assert summary["protocol"]["outside_margin"] == 0.05
 
 
 def test_the_contact_sheet_shows_each_picture_enlarged_without_blur(done, tmp_path):

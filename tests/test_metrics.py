@@ -108,6 +108,40 @@ def test_ssim_edges():
         metrics.ssim(image[:10], truth[:10])
 
 
+# --- outside
+
+
+def test_outside_a_mask_only_what_lies_outside_counts():
+    image, truth = pair(40, 50)
+    mask = np.zeros((40, 50), bool)
+    mask[10:25, 15:35] = True
+    found = metrics.outside(image, truth, mask)
+    assert found["psnr_outside"] == pytest.approx(-10 * np.log10(((image - truth)[~mask] ** 2).mean()))
+    other = np.where(mask[..., None], np.random.default_rng(1).random((40, 50, 3)), image)
+    assert metrics.outside(other, truth, mask) == found
+    right = np.where(mask[..., None], image, truth)
+    clean = metrics.outside(right, truth, mask)
+    assert clean["psnr_outside"] == math.inf and clean["ssim_outside"] == pytest.approx(1) and not clean["flip_outside"]
+
+
+def test_outside_nothing_is_the_whole_picture_and_outside_all_is_nothing():
+    image, truth = pair(20, 30)
+    found, whole = metrics.outside(image, truth, np.zeros((20, 30), bool)), metrics.score(image, truth)
+    assert found == {f"{name}_outside": pytest.approx(value) for name, value in whole.items()}
+    assert set(metrics.outside(image, truth, np.ones((20, 30), bool)).values()) == {None}
+    small = metrics.outside(image[:10], truth[:10], np.zeros((10, 30), bool))
+    assert small["ssim_outside"] is None and small["flip_outside"] > 0
+
+
+def test_where_the_truth_shows_the_object_only_the_outside_is_scored():
+    image, truth = pair(40, 50)
+    mask = np.zeros((40, 50), bool)
+    mask[10:25, 15:35] = True
+    found = metrics.score_view(image, truth, mask_box(mask), mask=mask, shows_object=True)
+    there = {name for name, value in found.items() if value is not None}
+    assert there == {"psnr_outside", "ssim_outside", "flip_outside"} and tuple(found) == metrics.COLUMNS
+
+
 # --- FLIP
 
 

@@ -132,7 +132,8 @@ def test_splits_from_scene_yaml(tmp_path):
     prepare(tmp_path / "s", "transforms", some_truth(views=9))
     scene, out = run(tmp_path / "s", test="every 4", clean=["v01"])
     assert scene.test == ("v00", "v04", "v08") and len(scene.train) == 6 and scene.clean == {"v01"}
-    assert sorted(io.load_test_masks(out)) == list(scene.test)  # the object is in these views
+    assert sorted(io.load_test_masks(out)) == list(scene.test)
+    assert sorted(io.load_raw_masks(out, scene.test)) == list(scene.test)  # the object is in these views
     scene, _ = run(tmp_path / "s", train=["v03", "v01", "v02.png"], test=["v05"])
     assert scene.train == ("v01", "v02", "v03") and scene.test == ("v05",) and len(scene.cameras) == 4
 

@@ -30,7 +30,15 @@ class GivenReference:
 
 @dataclass(frozen=True)
 class Roles:
-    """Names are sorted; `masks` are of training views (others' are dropped), `test_masks` of test views."""
+    """Names are sorted.
+
+    Attributes:
+        train, test, clean: names of views.
+        masks: where a photograph shows the object: of training views, and of test views that show it too.
+        test_masks: where a test view shows the object, or would show it; what its box comes from.
+        references: completed views that the scene brings.
+        warnings: what is odd.
+    """
 
     train: tuple[str, ...]
     test: tuple[str, ...]
@@ -101,10 +109,13 @@ def load_roles(
     clean_views = frozenset(known(name, capture, "clean") for name in clean)
     if clean_views - set(train_named):
         raise ValueError(f"scene.yaml: clean: {', '.join(sorted(clean_views - set(train_named)))} is no training view")
-    # Where test views have masks of their own among the training masks, these say where the object is.
-    beside = {name: path for name, path in mask_files.items() if name in set(test_views)}
+    # Test views with masks of their own among the training masks show the object: held out, but without a truth inside.
+    held_out = {name: path for name, path in mask_files.items() if name in set(test_views)}
+    beside = dict(held_out)
     if label_files is not None and labelled is not None:
-        beside |= {n: p for n, p in zip(labelled, label_files, strict=True) if n in set(test_views)}
+        labels = {n: p for n, p in zip(labelled, label_files, strict=True) if n in set(test_views)}
+        beside |= labels
+        held_out = {name: path for name, path in held_out.items() if name not in labels}
     kept = {name: path for name, path in mask_files.items() if name in set(train_named)}
     for name, path in (*kept.items(), *beside.items()):
         _check_proportions(path, name, capture, 0.10, "mask")
@@ -114,7 +125,7 @@ def load_roles(
         tuple(train_named),
         tuple(test_views),
         clean_views,
-        kept,
+        dict(sorted((kept | held_out).items())),
         beside,
         _references(folder, capture, references),
         (warning,) if warning else (),

@@ -1,0 +1,158 @@
+"""The variance of a scene's SDS gradient over noise and timesteps, before and after personalization.
+
+`python benchmarks/sds_variance.py --run runs/demo`, or `make scene=X sds-variance`: on any scene, with ground truth or
+without, once `initialize` and `personalize` are done. Training views with something to invent are rendered from the
+initialization and given to the prior as distillation gives them: whole, and in a window around the hole. The gradient
+is g = z - x0(z_t), that of `weighting: x0`; any other weighting multiplies it by a function of t alone. In the hole's
+latents, means over them and over the views:
+
+  noise       variance of g over draws of the noise, at each timestep
+  pull        square of the mean over these draws, what remains of it in the long run (their own noise is taken off)
+  over noise, over timesteps, together: the mean of `noise` over the timesteps, the variance of that mean gradient from
+              one timestep to another, and their sum: the variance of what one step of distillation draws
+
+Every draw is seeded, and the same before and after. Prints tables, and writes sds_variance.json to --out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from reffusion import (  # noqa: E402
+    diffusion,
+    io,
+    lora,
+    sds,
+    splat,
+    trace,
+)
+from reffusion.crops import PROMPTS  # noqa: E402
+from reffusion.prior import Prior, load_prior  # noqa: E402
+
+VIEWS = 6
+NOISES = 8
+TIMESTEPS = (0.02, 0.1, 0.2, 0.3, 0.5, 0.7, 0.9)  # parts of the schedule
+SCALES = ("whole", "window")
+SEED = 0
+
+
+@torch.no_grad()
+def inputs(run: Path, prior: Prior) -> dict[str, tuple[Tensor, Tensor]]:
+    """Scale -> (pictures [B, 3, S, S] in [-1, 1], holes [B, 1, S, S], 1 = repaint) of up to `VIEWS` training views.
+
+    Raises:
+        ValueError: naming what is missing, or where nothing is to be invented.
+    """
+    for stage in ("poses", "masks", "initialize"):
+        if not (run / stage).is_dir():
+            raise ValueError(f"{run / stage} is missing: run `make scene={run.name} initialize` first")
+    scene, gaussians = io.load_scene(run / "poses"), io.load_ply(run / "initialize" / "gaussians.ply")
+    sets = io.load_mask_sets(run / "masks", scene.train)
+    names = [name for name in scene.train if sets[name].invent.any() and name not in scene.clean]
+    if not names:
+        raise ValueError(f"{run / 'masks'}: nothing is to be invented, so nothing is distilled")
+    places = np.linspace(0, len(names) - 1, min(VIEWS, len(names))).round().astype(int)
+    size, pictures, holes = prior.native_size, [], []
+    for name in (names[place] for place in places):
+        view = splat.render(gaussians, scene.cameras[name]).color.clamp(0, 1).permute(2, 0, 1) * 2 - 1
+        view = sds.enlarged(view, size)
+        hole = sds.enlarged(torch.from_numpy(sets[name].invent).to(view)[None], size)[0] > 1e-4
+        windows = [sds.window_around(hole, size, trace.generator(SEED, "sds variance", name))]
+        pictures.append(sds.two_scales(view, windows, size))
+        holes.append(sds.two_scale_masks(hole, windows, size))
+    pictures, holes = torch.stack(pictures, 1), torch.stack(holes, 1)  # [scale, view, ...]
+    return {scale: (pictures[k], holes[k]) for k, scale in enumerate(SCALES)}
+
+
+@torch.no_grad()
+def gradients(prior: Prior, pictures: Tensor, holes: Tensor, prompt: str) -> Tensor:
+    """[T, K, M]: z - x0(z_t) at `TIMESTEPS`, for each of `NOISES` draws, in the M latent values of the holes."""
+    latents, condition = diffusion.encode(prior, pictures), diffusion.conditioning(prior, pictures, holes)
+    text = diffusion.embed_text(prior, [prompt]).expand(len(latents), -1, -1)
+    inside, found = condition[:, :1].expand_as(latents) > 0.5, []
+    for part in TIMESTEPS:
+        t = torch.full((len(latents),), round(part * (prior.timesteps - 1)))
+        for k in range(NOISES):
+            noise = torch.randn(latents.shape, generator=trace.generator(SEED, "sds variance", int(t[0]), k))
+            clean = diffusion.predict(prior, diffusion.add_noise(prior, latents, noise, t), t, condition, text)[1]
+            found.append((latents - clean)[inside])
+    return torch.stack(found).view(len(TIMESTEPS), NOISES, -1)
+
+
+def variances(drawn: Tensor) -> dict:
+    """See the module's first lines. Args: drawn: [T, K, M], T and K at least 2."""
+    noise = drawn.var(1)  # [T, M], unbiased
+    mean = drawn.mean(1)
+    left = noise / drawn.shape[1]  # what of the noise remains in the mean of K draws
+    over_noise = noise.mean()
+    over_timesteps = (mean.var(0) - left.mean(0)).mean().clamp(min=0)
+    return {
+        "noise": noise.mean(1).tolist(),
+        "pull": (mean.square() - left).mean(1).clamp(min=0).tolist(),
+        "over_noise": float(over_noise),
+        "over_timesteps": float(over_timesteps),
+        "together": float(over_noise + over_timesteps),
+    }
+
+
+def measured(models: dict[str, Prior], run: Path) -> dict[str, dict[str, dict]]:
+    """Scale -> "before" or "after" -> `variances`."""
+    given = inputs(run, next(iter(models.values())))
+    return {
+        scale: {when: variances(gradients(model, *given[scale], prompt)) for when, model in models.items()}
+        for scale, prompt in zip(SCALES, PROMPTS, strict=False)
+    }
+
+
+def table(found: dict[str, dict[str, dict]]) -> str:
+    """Markdown: for each scale a row a timestep, then the three sums; variance before and after, and their ratio."""
+    lines = []
+    for scale, by_time in found.items():
+        before, after = by_time["before"], by_time["after"]
+        lines += [f"{scale}: squared latents", "", "| | before | after | after / before | pull before | pull after |"]
+        lines.append("|---|---|---|---|---|---|")
+        for k, part in enumerate(TIMESTEPS):
+            pulls = f"{before['pull'][k]:.4f} | {after['pull'][k]:.4f}"
+            lines.append(f"| t = {part:g} | {_pair(before['noise'][k], after['noise'][k])} | {pulls} |")
+        for name in ("over_noise", "over_timesteps", "together"):
+            lines.append(f"| {name.replace('_', ' ')} | {_pair(before[name], after[name])} | | |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _pair(before: float, after: float) -> str:
+    return f"{before:.4f} | {after:.4f} | {after / max(before, 1e-12):.2f}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--run", type=Path, required=True, help="runs/<scene>, with initialize and personalize")
+    parser.add_argument("--prior", help="the one that was personalized; default: as personalize's receipt names it")
+    parser.add_argument("--out", type=Path, help="default: runs/<scene>/sds-variance")
+    given = parser.parse_args()
+    adapted = given.run / "personalize"
+    if not adapted.is_dir():
+        raise ValueError(f"{adapted} is missing: run `make scene={given.run.name} personalize` first")
+    base = given.prior or io.load_json(adapted / "receipt.json")["params"]["prior"]
+    models = {"before": load_prior(base), "after": lora.merged(load_prior(base), adapted)}
+    found, out = measured(models, given.run), given.out or given.run / "sds-variance"
+    out.mkdir(parents=True, exist_ok=True)
+    io.save_json(out / "sds_variance.json", {"prior": base, "timesteps": TIMESTEPS, **found})
+    print(table(found))
+    print(out / "sds_variance.json")
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except ValueError as error:
+        sys.exit(f"error: {error}")

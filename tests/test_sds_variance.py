@@ -1,0 +1,71 @@
+"""The variance of the SDS gradient: its parts against draws of known variance, and on a small run."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from small_prior import small_prior
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "benchmarks"))
+
+import sds_variance as benchmark  # noqa: E402
+
+from reffusion import io, trace  # noqa: E402
+from reffusion.types import Camera, Gaussians, MaskSet, Scene, Similarity  # noqa: E402
+
+
+def test_variance_is_split_into_that_of_noise_and_that_of_timesteps():
+    """Means 0, 1, ..., 4 at five timesteps (variance 2.5), noise of variance 4 around them."""
+    draw = trace.generator(0, "variances")
+    means = torch.arange(5.0)[:, None, None]
+    found = benchmark.variances(means + 2 * torch.randn(5, 8, 20_000, generator=draw))
+    assert found["over_noise"] == pytest.approx(4, rel=0.01) and found["noise"] == pytest.approx([4] * 5, rel=0.03)
+    assert found["over_timesteps"] == pytest.approx(2.5, rel=0.02)
+    assert found["together"] == pytest.approx(6.5, rel=0.02)
+    assert found["pull"] == pytest.approx([0, 1, 4, 9, 16], abs=0.15)
+
+
+def test_without_noise_and_without_a_pull_nothing_is_left():
+    same = torch.full((3, 4, 10), 0.7)
+    found = benchmark.variances(same)
+    assert found["over_noise"] == found["over_timesteps"] == found["together"] == 0
+    assert found["pull"] == pytest.approx([0.49] * 3)
+
+
+def small_run(home, invent):
+    """A wall in front of three views; `invent`: bool [H, W], the hole in each."""
+    draw = trace.generator(0, "wall")
+    means = torch.rand(80, 3, generator=draw) * torch.tensor([1.6, 1.2, 0.1]) - torch.tensor([0.8, 0.6, -1.5])
+    wall = Gaussians(
+        means, torch.zeros(80, 4), torch.full((80, 3), -2.0), torch.full((80,), 2.0), torch.zeros(80, 1, 3)
+    )
+    names, height, width = ("a", "b", "c"), *invent.shape
+    cameras = {name: Camera(name, width, height, 40.0, 40.0, width / 2, height / 2, np.eye(4)) for name in names}
+    still = Similarity(1.0, np.zeros(3))
+    scene = Scene(cameras, names, (), frozenset({"c"}), np.zeros((1, 3)), np.zeros((1, 3), np.uint8), still)
+    io.save_scene(home / "poses", scene)
+    io.save_ply(home / "initialize" / "gaussians.ply", wall)
+    io.save_mask_sets(home / "masks", dict.fromkeys(names, MaskSet(*[invent] * 4)))
+    return home
+
+
+def test_on_a_scene_without_ground_truth(tmp_path):
+    prior, hole = small_prior(), np.zeros((36, 48), bool)
+    hole[10:24, 12:30] = True
+    found = benchmark.measured({"before": prior, "after": prior}, small_run(tmp_path / "run", hole))
+    assert set(found) == {"whole", "window"}
+    for by_time in found.values():
+        assert by_time["before"] == by_time["after"] and by_time["before"]["over_noise"] > 0
+    assert benchmark.inputs(tmp_path / "run", prior)["whole"][0].shape[0] == 2  # the clean view is not distilled
+    text = benchmark.table(found)
+    assert text.count("| 1.00 |") == 2 * (len(benchmark.TIMESTEPS) + 3)
+
+
+def test_what_is_missing_is_named(tmp_path):
+    with pytest.raises(ValueError, match="make scene=nowhere initialize"):
+        benchmark.inputs(tmp_path / "nowhere", small_prior())
+    with pytest.raises(ValueError, match="nothing is to be invented"):
+        benchmark.inputs(small_run(tmp_path / "run", np.zeros((36, 48), bool)), small_prior())
