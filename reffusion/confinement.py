@@ -22,7 +22,6 @@ from reffusion import diffusion
 from reffusion.adversary import Adversary
 from reffusion.discriminator import gathered
 from reffusion.optimize import confine, reconstruction_loss
-from reffusion.prior import Prior
 from reffusion.sds import (
     Weighting,
     draw_timesteps,
