@@ -22,6 +22,7 @@ from reffusion import diffusion
 from reffusion.adversary import Adversary
 from reffusion.discriminator import gathered
 from reffusion.optimize import confine, reconstruction_loss
+from reffusion.prior import Prior
 from reffusion.sds import (
     Weighting,
     draw_timesteps,
@@ -111,7 +112,7 @@ def sds_term(
     gaussians: Gaussians,
     masked: Tensor,
     sight: Sight,
-    prior: diffusion.Prior,
+    prior: Prior,
     text: Tensor,
     settings: Distillation,
     generator: torch.Generator,
