@@ -169,10 +169,14 @@ def with_picture(reference: Path, picture: Path, folder: Path) -> Path:
 
 
 def learnt(params: stage.Params, needs: dict[str, Path], folder: Path) -> tuple[diffusion.Prior, list[dict]]:
-    """The prior personalized in `folder`, and the trace of that."""
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    stage.run(params, folder, **needs)
+    """The prior personalized in `folder`, and the trace of that; what was begun there with these parameters goes on."""
+    settings, made = params.model_dump(mode="json"), folder / "settings.json"
+    if not made.exists() or io.load_json(made) != settings:
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        io.save_json(made, settings)
+    if not (folder / lora.LORA_FILE).exists():
+        stage.run(params, folder, **needs)
     return lora.merged(diffusion.load_prior(params.prior), folder), trace.read_trace(folder / "trace.jsonl")
 
 
@@ -271,7 +275,7 @@ def arguments() -> argparse.Namespace:
 def main() -> None:
     given = arguments()
     torch.set_num_threads(given.threads)
-    for folder in ("inpainting", "reference", "whole", "window", "personalize"):
+    for folder in ("inpainting", "reference", "whole", "window"):
         shutil.rmtree(given.out / folder, ignore_errors=True)
     first = given.priors[0]
     result: dict = {"prior": first}
