@@ -8,7 +8,8 @@
                 after, by timestep: error of the clean latent in holes of unseen views and the variance of the SDS
                 gradient over the noise; the same views, and the reference's own hole, filled from pure noise
   --seeds       that as often, each with its own draws in training and in sampling
-  --wrong-reference   and once more with another picture as the reference: it must not help
+  --wrong-reference   and once more with another reference: a picture to learn instead, at the same place, or another
+                scene's run, whose personalization is taken as it is. It must not help
 Writes prior.json and rows of pictures to --out; `python -m report.prior` draws them (`make prior-report` does both).
 Every draw is seeded. LPIPS is left out: its network's weights are not in the repository.
 """
@@ -180,6 +181,16 @@ def learnt(params: stage.Params, needs: dict[str, Path], folder: Path) -> tuple[
     return lora.merged(diffusion.load_prior(params.prior), folder), trace.read_trace(folder / "trace.jsonl")
 
 
+def mislearnt(params: stage.Params, needs: dict[str, Path], wrong: Path, folder: Path) -> diffusion.Prior:
+    """The prior personalized on what is not the scene's reference: a picture, or another scene's run as it is."""
+    if wrong.is_dir():
+        return lora.merged(diffusion.load_prior(params.prior), wrong / "personalize")
+    other = with_picture(needs["reference"], wrong, folder / "other")
+    model, _ = learnt(params, needs | {"reference": other}, folder / f"{params.seed}-wrong")
+    shutil.rmtree(other)
+    return model
+
+
 def filled(model: diffusion.Prior, cases: dict[str, list[Case]], seed: int) -> dict[str, list[np.ndarray]]:
     """Scale -> its holes filled from pure noise."""
     return {scale: painted(model, some, SEED + seed, PROMPTS[scale]) for scale, some in cases.items()}
@@ -196,7 +207,7 @@ def personalization(
     """Personalize on the run's reference, once a seed, and measure before and after on views that were never seen.
 
     Returns the first seed's measurements, and in "seeds" the samples' scores of every seed: "before", "after" and,
-    where a picture stands for a `wrong` reference, "wrong".
+    with a `wrong` reference, "wrong".
     """
     needs = {need: run / need for need in LEARNS}
     for folder in needs.values():
@@ -210,9 +221,7 @@ def personalization(
         model, log = learnt(mine, needs, out / "personalize" / str(seed))
         models = {"before": base, "after": model}
         if wrong:
-            other = needs | {"reference": with_picture(run / "reference", wrong, out / "personalize" / "other")}
-            models["wrong"], _ = learnt(mine, other, out / "personalize" / f"{seed}-wrong")
-            shutil.rmtree(other["reference"])
+            models["wrong"] = mislearnt(mine, needs, wrong, out / "personalize")
         pictures = {when: filled(model, cases, seed) for when, model in models.items()}
         result["seeds"][str(seed)] = {when: samples(made, cases) for when, made in pictures.items()}
         result["seeds"][str(seed)]["seconds"] = log[-1]["seconds"]
@@ -265,7 +274,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--steps", type=int, nargs="*", default=[], help="numbers of sampler steps to compare")
     parser.add_argument("--run", type=Path, help="runs/<scene>, with its reference; without it no personalization")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of personalization, one after the other")
-    parser.add_argument("--wrong-reference", type=Path, help="a picture to learn instead, to be measured beside it")
+    parser.add_argument("--wrong-reference", type=Path, help="a picture, or runs/<another scene>, to measure beside it")
     parser.add_argument("--set", type=setting, nargs="*", default=[], help="personalization's: steps=500 rank=32")
     parser.add_argument("--out", type=Path, default=Path("runs/prior-report"))
     parser.add_argument("--threads", type=int, default=2)
