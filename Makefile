@@ -139,7 +139,7 @@ prior: setup
 # Personalizes on the demo's reference, which is made first where it is missing.
 prior-report: data/demo/.generated setup
 	@$(PY) -m runner run reference --scene demo --profile laptop
-	$(PY) benchmarks/prior.py --run runs/demo --out runs/prior-report
+	$(PY) benchmarks/prior.py --steps 1 4 12 --run runs/demo --out runs/prior-report
 	$(PY) -m report.prior runs/prior-report
 
 # On any scene; what it lacks of personalization and initialization is made first.

@@ -2,9 +2,14 @@
 
   inpainting    held-out pictures of 64 px, a silhouette cut out of each, against OpenCV's Telea and Navier-Stokes:
                 PSNR, SSIM, FLIP and gradient energy inside the hole; every prior named, from the same noise
+  --steps       the first prior with other numbers of sampler steps. Few steps give nearly the mean of all fillings, the
+                best picture by PSNR and SSIM and a blurred one; many give one of them
   personalize   the first prior on a scene's reference by the laptop profile: error against steps, then, before and
                 after, by timestep: error of the clean latent in holes of unseen views and the variance of the SDS
                 gradient over the noise; the same views, and the reference's own hole, filled from pure noise
+  --seeds       that as often, each with its own draws in training and in sampling
+  --wrong-reference   and once more with another reference: a picture to learn instead, at the same place, or another
+                scene's run, whose personalization is taken as it is. It must not help
 Writes prior.json and rows of pictures to --out; `python -m report.prior` draws them (`make prior-report` does both).
 Every draw is seeded. LPIPS is left out: its network's weights are not in the repository.
 """
@@ -14,175 +19,81 @@ from __future__ import annotations
 import argparse
 import shutil
 import sys
-from dataclasses import dataclass, replace
+import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
 import yaml
-from torch import Tensor
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "priors" / "tiny")]
+sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
-import images  # noqa: E402
+from holes import COLUMNS, SEED, Case, held_out, hole_scores, means, painted, save_row, tensors  # noqa: E402
 
-from reffusion import diffusion, io, lora, metrics, trace  # noqa: E402
+from reffusion import (  # noqa: E402
+    diffusion,
+    io,
+    lora,
+    trace,
+)
 from reffusion.prior import Prior, load_prior  # noqa: E402
 from reffusion.sds import window_around  # noqa: E402
 from stages import evaluate  # noqa: E402
 from stages import personalize as stage  # noqa: E402
 
-SIDE = 64  # px, of the held-out pictures
-SEED = 20  # of the held-out set; training and its own validation use others
-COVER = (0.05, 0.4)  # share of a held-out picture that its hole takes
-SAMPLER_STEPS = 12  # the laptop profile's, for its reference
-BATCH = 16
 TELEA_RADIUS = 5  # px, of both rivals
 TIMESTEPS = (20, 100, 250, 400, 550, 700, 850, 980)
 NOISES = 4  # draws for the variance of the SDS gradient
 VIEWS = 6  # unseen views
 SHOWN = 12  # held-out pictures on the sheet
-COLUMNS = ("psnr", "ssim", "flip", "energy")
-
-
-@dataclass(frozen=True)
-class Case:
-    """A picture to fill: uint8 [H, W, 3] truth, bool [H, W] hole, and its kind ("photograph" or "procedural")."""
-
-    truth: np.ndarray
-    hole: np.ndarray
-    kind: str
-
-
-def held_out(count: int, seed: int = SEED) -> list[Case]:
-    """`count` pictures that no training has seen, each with a silhouette that covers `COVER` of it."""
-    cases = []
-    for index in range(count):
-        picture, caption = images.image(seed, index, held_out=True)
-        truth = cv2.resize(picture, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
-        rng = np.random.default_rng(trace.seed_for(seed, "hole", index))
-        hole = images.silhouettes(rng, SIDE)
-        while not COVER[0] <= hole.mean() <= COVER[1]:
-            hole = images.silhouettes(rng, SIDE)
-        kind = "photograph" if caption.split()[-1] in images.HELD_OUT_PHOTOS else "procedural"
-        cases.append(Case(truth, hole, kind))
-    return cases
-
-
-# ---------------------------------------------------------------------------------------------- scores
-
-
-def hole_scores(picture: np.ndarray, truth: np.ndarray, hole: np.ndarray) -> dict[str, float]:
-    """PSNR (dB), SSIM and FLIP, each its map's mean over the hole, and the gradient energy in units of the truth's.
-
-    Args:
-        picture, truth: uint8 [H, W, 3]; outside the hole the truth stands in for the picture.
-        hole: bool [H, W], not empty.
-    """
-    if not hole.any():
-        raise ValueError("the hole is empty: there is nothing to score")
-    picture = np.where(hole[..., None], picture, truth)
-    error = float(np.mean((picture[hole] / 255.0 - truth[hole] / 255.0) ** 2))
-    return {
-        "psnr": min(-10 * np.log10(error), metrics.PSNR_CAP) if error > 0 else metrics.PSNR_CAP,
-        "ssim": float(ssim_map(picture, truth)[hole].mean()),
-        "flip": float(flip_map(picture, truth)[hole].mean()),
-        "energy": gradient_energy(picture, hole) / max(gradient_energy(truth, hole), 1e-9),
-    }
-
-
-def ssim_map(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """[H, W], with the window of `metrics.ssim`, mean over RGB."""
-    from skimage.metrics import structural_similarity
-
-    _, values = structural_similarity(
-        picture / 255.0,
-        truth / 255.0,
-        gaussian_weights=True,
-        sigma=metrics.SSIM_SIGMA,
-        use_sample_covariance=False,
-        data_range=1.0,
-        channel_axis=2,
-        full=True,
-    )
-    return values.mean(2)
-
-
-def flip_map(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """[H, W] LDR-FLIP, with the viewing distance of `metrics.flip`."""
-    import flip_evaluator
-
-    pair = [np.ascontiguousarray(x / 255.0, np.float32) for x in (truth, picture)]
-    settings = {"ppd": metrics.PIXELS_PER_DEGREE}
-    values = flip_evaluator.evaluate(*pair, "LDR", applyMagma=False, computeMeanError=False, parameters=settings)
-    return values[0][..., 0]
-
-
-def gradient_energy(picture: np.ndarray, hole: np.ndarray) -> float:
-    """Mean squared step of brightness between neighbours that both lie in the hole."""
-    light, total, count = picture.mean(2) / 255, 0.0, 0
-    for axis in (0, 1):
-        both = np.logical_and(*(hole.take(range(k, hole.shape[axis] - 1 + k), axis) for k in (0, 1)))
-        total += (np.diff(light, axis=axis)[both] ** 2).sum()
-        count += both.sum()
-    return float(total / max(count, 1))
-
-
-def means(rows: list[dict[str, float]]) -> dict[str, float]:
-    """The mean of each column, and of PSNR also its standard error."""
-    values = {column: float(np.mean([row[column] for row in rows])) for column in COLUMNS}
-    spread = np.std([row["psnr"] for row in rows], ddof=1) / len(rows) ** 0.5 if len(rows) > 1 else 0.0
-    return values | {"psnr_error": float(spread), "pictures": len(rows)}
-
+PROMPTS = {"reference": "A photo of sks", "whole": "A photo of sks", "window": "A photo of sks, cropped"}
+LEARNS = ("poses", "fit", "masks", "reference")  # what personalization needs of a run
 
 # ---------------------------------------------------------------------------------------------- inpainting
 
 
-def tensors(cases: list[Case]) -> tuple[Tensor, Tensor]:
-    """[B, 3, H, W] in [-1, 1] and [B, 1, H, W], 1 = repaint."""
-    pictures = torch.from_numpy(np.stack([case.truth for case in cases])).permute(0, 3, 1, 2).float() / 127.5 - 1
-    return pictures, torch.from_numpy(np.stack([case.hole for case in cases]))[:, None].float()
+def scored(pictures: list[np.ndarray], cases: list[Case]) -> dict[str, float]:
+    """Means of the scores inside the holes."""
+    return means([hole_scores(p, c.truth, c.hole) for p, c in zip(pictures, cases, strict=True)])
 
 
-def painted(prior: Prior, cases: list[Case], seed: int, prompt: str = "") -> list[np.ndarray]:
-    """The holes filled from pure noise: uint8 [H, W, 3] each."""
-    done = []
-    for first in range(0, len(cases), BATCH):
-        pictures, holes = tensors(cases[first : first + BATCH])
-        text = diffusion.embed_text(prior, [prompt]).detach().expand(len(pictures), -1, -1)
-        noise = trace.generator(seed, "sample", first)
-        filled = diffusion.sample(prior, pictures * (1 - holes), holes, text, SAMPLER_STEPS, noise)
-        filled = ((pictures * (1 - holes) + filled * holes).permute(0, 2, 3, 1) + 1) * 127.5
-        done += list(filled.round().clamp(0, 255).to(torch.uint8).numpy())
-    return done
+def timed(work) -> tuple:
+    """(what `work` gives, seconds of this process on all its threads): other work on the machine does not count."""
+    began = time.process_time()
+    return work(), time.process_time() - began
 
 
-def inpainting(priors: list[str], count: int, out: Path) -> dict:
-    """Method -> kind -> means; and the first `SHOWN` cases as rows of pictures."""
-    cases = held_out(count)
-    ways = {
-        name: [cv2.inpaint(case.truth, case.hole.astype(np.uint8), TELEA_RADIUS, flag) for case in cases]
-        for name, flag in (("Telea", cv2.INPAINT_TELEA), ("Navier-Stokes", cv2.INPAINT_NS))
-    }
+def inpainting(priors: list[str], cases: list[Case], out: Path) -> dict:
+    """Method -> kind -> means, and seconds of a picture; the first `SHOWN` cases as rows of pictures."""
+    rivals = {"Telea": cv2.INPAINT_TELEA, "Navier-Stokes": cv2.INPAINT_NS}
+    ways, seconds = {}, {}
+    for name, flag in rivals.items():
+        fill = lambda flag=flag: [cv2.inpaint(c.truth, c.hole.astype(np.uint8), TELEA_RADIUS, flag) for c in cases]
+        ways[name], seconds[name] = timed(fill)
     for name in priors:
-        ways[name] = painted(load_prior(name), cases, SEED)
+        prior = load_prior(name)
+        ways[name], seconds[name] = timed(lambda prior=prior: painted(prior, cases, SEED))
     for index, case in enumerate(cases[:SHOWN]):
         save_row(out / "inpainting" / f"{index:02d}.png", case, [pictures[index] for pictures in ways.values()])
     result = {}
     for name, pictures in ways.items():
-        scored = [(c.kind, hole_scores(p, c.truth, c.hole)) for p, c in zip(pictures, cases, strict=True)]
-        kinds = ["all", *sorted({kind for kind, _ in scored})]
-        result[name] = {kind: means([row for own, row in scored if kind in ("all", own)]) for kind in kinds}
+        rows = [(c.kind, hole_scores(p, c.truth, c.hole)) for p, c in zip(pictures, cases, strict=True)]
+        kinds = ["all", *sorted({kind for kind, _ in rows})]
+        result[name] = {kind: means([row for own, row in rows if kind in ("all", own)]) for kind in kinds}
+        result[name]["all"]["seconds"] = seconds[name] / len(cases)
     return {"columns": ["hole", *ways, "truth"], "scores": result}
 
 
-def save_row(path: Path, case: Case, pictures: list[np.ndarray]) -> None:
-    """Hole, pictures and truth side by side."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    hollow = np.where(case.hole[..., None], np.uint8(128), case.truth)
-    io.save_image(path, np.concatenate([hollow, *pictures, case.truth], 1))
+def by_steps(prior: Prior, cases: list[Case], steps: list[int], prompt: str = "") -> dict[str, dict]:
+    """Number of sampler steps -> means, and CPU seconds of a picture."""
+    result = {}
+    for count in steps:
+        pictures, seconds = timed(lambda count=count: painted(prior, cases, SEED, prompt, count))
+        result[str(count)] = scored(pictures, cases) | {"seconds": seconds / len(cases)}
+    return result
 
 
 # ---------------------------------------------------------------------------------------------- personalization
@@ -227,10 +138,10 @@ def _reduced(case: Case, size: int) -> Case:
     )
 
 
-def profile(prior: str, steps: int | None) -> stage.Params:
-    """The laptop profile's parameters of `personalize`, for another prior and number of steps."""
+def profile(prior: str, settings: dict) -> stage.Params:
+    """The laptop profile's parameters of `personalize` for a prior; `settings` come last."""
     values = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"]["personalize"]
-    return stage.Params(**values | {"prior": prior} | ({"steps": steps} if steps else {}))
+    return stage.Params(**values | {"prior": prior} | settings)
 
 
 @torch.no_grad()
@@ -254,52 +165,147 @@ def by_timestep(prior: Prior, cases: list[Case], prompt: str) -> dict[str, list[
     return result
 
 
-def personalization(prior: str, run: Path, steps: int | None, out: Path) -> dict:
-    """Personalize on the run's reference, and measure before and after on views that were never seen."""
-    needs = {need: run / need for need in ("poses", "fit", "masks", "reference")}
-    for needed in needs:
-        if not (run / needed).is_dir():
-            raise ValueError(f"{run / needed} is missing: run `make scene={run.name} reference` first")
-    folder = out / "personalize"
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    params = profile(prior, steps)
-    stage.run(params, folder, **needs)
-    models = {
-        "before": load_prior(prior),
-        "after": lora.merged(load_prior(prior), folder),
-    }
-    prompts = {"reference": "A photo of sks", "whole": "A photo of sks", "window": "A photo of sks, cropped"}
-    result: dict = {"steps": params.steps, "trace": trace.read_trace(folder / "trace.jsonl"), "timesteps": TIMESTEPS}
-    for scale, cases in scene_cases(run, models["before"].native_size).items():
-        pictures = {when: painted(model, cases, SEED, prompts[scale]) for when, model in models.items()}
+def with_picture(reference: Path, picture: Path, folder: Path) -> Path:
+    """A copy of the stage's folder in which every reference shows `picture` instead, at its size; masks stay."""
+    shutil.copytree(reference, folder)
+    for path in (folder / "references").glob("*.png"):
+        height, width = io.load_image(path).shape[:2]
+        io.save_image(path, cv2.resize(io.load_image(picture), (width, height), interpolation=cv2.INTER_AREA))
+    return folder
+
+
+def learnt(params: stage.Params, needs: dict[str, Path], folder: Path) -> tuple[Prior, list[dict]]:
+    """The prior personalized in `folder`, and the trace of that; what was begun there with these parameters goes on."""
+    settings, made = params.model_dump(mode="json"), folder / "settings.json"
+    if not made.exists() or io.load_json(made) != settings:
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        io.save_json(made, settings)
+    if not (folder / lora.LORA_FILE).exists():
+        stage.run(params, folder, **needs)
+    return lora.merged(load_prior(params.prior), folder), trace.read_trace(folder / "trace.jsonl")
+
+
+def mislearnt(params: stage.Params, needs: dict[str, Path], wrong: Path, folder: Path) -> Prior:
+    """The prior personalized on what is not the scene's reference: a picture, or another scene's run as it is."""
+    if wrong.is_dir():
+        return lora.merged(load_prior(params.prior), wrong / "personalize")
+    other = with_picture(needs["reference"], wrong, folder / "other")
+    model, _ = learnt(params, needs | {"reference": other}, folder / f"{params.seed}-wrong")
+    shutil.rmtree(other)
+    return model
+
+
+def filled(model: Prior, cases: dict[str, list[Case]], seed: int) -> dict[str, list[np.ndarray]]:
+    """Scale -> its holes filled from pure noise."""
+    return {scale: painted(model, some, SEED + seed, PROMPTS[scale]) for scale, some in cases.items()}
+
+
+def samples(pictures: dict[str, list[np.ndarray]], cases: dict[str, list[Case]]) -> dict[str, dict[str, float]]:
+    """Scale -> means of the scores."""
+    return {scale: scored(pictures[scale], some) for scale, some in cases.items()}
+
+
+def personalization(
+    params: stage.Params, run: Path, seeds: list[int], wrong: Path | None, steps: list[int], out: Path
+) -> dict:
+    """Personalize on the run's reference, once a seed, and measure before and after on views that were never seen.
+
+    Returns the first seed's measurements, and in "seeds" the samples' scores of every seed: "before", "after" and,
+    with a `wrong` reference, "wrong".
+    """
+    needs = {need: run / need for need in LEARNS}
+    for folder in needs.values():
+        if not folder.is_dir():
+            raise ValueError(f"{folder} is missing: run `make scene={run.name} reference` first")
+    base = load_prior(params.prior)
+    cases = scene_cases(run, base.native_size)
+    result: dict = {"settings": params.model_dump(mode="json"), "steps": params.steps, "seeds": {}}
+    for seed in seeds:
+        mine = params.model_copy(update={"seed": seed})
+        model, log = learnt(mine, needs, out / "personalize" / str(seed))
+        models = {"before": base, "after": model}
+        if wrong:
+            models["wrong"] = mislearnt(mine, needs, wrong, out / "personalize")
+        pictures = {when: filled(model, cases, seed) for when, model in models.items()}
+        result["seeds"][str(seed)] = {when: samples(made, cases) for when, made in pictures.items()}
+        result["seeds"][str(seed)]["seconds"] = log[-1]["seconds"]
+        print_seed(seed, result["seeds"][str(seed)])
+        if seed == seeds[0]:
+            result |= first_seed(models, cases, pictures, log, steps, out)
+    return result
+
+
+def print_seed(seed: int, scores: dict) -> None:
+    print(f"seed {seed}, {scores['seconds']:.0f} s", flush=True)
+    for when in ("before", "after", "wrong"):
+        for scale, row in scores.get(when, {}).items():
+            print(f"  {when}, {scale}", {column: round(row[column], 3) for column in COLUMNS}, flush=True)
+
+
+def first_seed(
+    models: dict[str, Prior],
+    cases: dict[str, list[Case]],
+    pictures: dict[str, dict[str, list[np.ndarray]]],
+    log: list[dict],
+    steps: list[int],
+    out: Path,
+) -> dict:
+    """What is measured once: errors by timestep, the effect of the sampler's steps, rows of pictures."""
+    result: dict = {"trace": log, "timesteps": TIMESTEPS, "columns": ["hole", *models, "truth"]}
+    for scale, some in cases.items():
         result[scale] = {
-            when: by_timestep(model, cases, prompts[scale])
-            | {"samples": means([hole_scores(p, c.truth, c.hole) for p, c in zip(pictures[when], cases, strict=True)])}
+            when: by_timestep(model, some, PROMPTS[scale]) | {"samples": scored(pictures[when][scale], some)}
             for when, model in models.items()
         }
-        for index, case in enumerate(cases):
-            save_row(out / scale / f"{case.kind}.png", case, [pictures[when][index] for when in models])
-    return result | {"columns": ["hole", *models, "truth"]}
+        for index, case in enumerate(some):
+            save_row(out / scale / f"{case.kind}.png", case, [made[scale][index] for made in pictures.values()])
+    result["sampler"] = {s: by_steps(models["after"], cases[s], steps, PROMPTS[s]) for s in ("reference", "whole")}
+    return result
+
+
+def setting(text: str) -> tuple[str, object]:
+    """("steps", 500) of "steps=500"."""
+    name, found, value = text.partition("=")
+    if not found:
+        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE")
+    return name, yaml.safe_load(value)
+
+
+def arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--priors", nargs="+", default=["priors/tiny"], help="diffusers folders; the first is the one")
+    parser.add_argument("--pictures", type=int, default=64, help="held-out pictures to fill; 0: leave them out")
+    parser.add_argument("--steps", type=int, nargs="*", default=[], help="numbers of sampler steps to compare")
+    parser.add_argument("--run", type=Path, help="runs/<scene>, with its reference; without it no personalization")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of personalization, one after the other")
+    parser.add_argument("--wrong-reference", type=Path, help="a picture, or runs/<another scene>, to measure beside it")
+    parser.add_argument("--set", type=setting, nargs="*", default=[], help="personalization's: steps=500 rank=32")
+    parser.add_argument("--out", type=Path, default=Path("runs/prior-report"))
+    parser.add_argument("--threads", type=int, default=2)
+    return parser.parse_args()
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--priors", nargs="+", default=["priors/tiny"], help="diffusers folders; the first is the one")
-    parser.add_argument("--pictures", type=int, default=64, help="held-out pictures to fill")
-    parser.add_argument("--run", type=Path, help="runs/<scene>, with its reference; without it no personalization")
-    parser.add_argument("--steps", type=int, help="personalization steps (default: the laptop profile's)")
-    parser.add_argument("--out", type=Path, default=Path("runs/prior-report"))
-    parser.add_argument("--threads", type=int, default=2)
-    given = parser.parse_args()
+    given = arguments()
     torch.set_num_threads(given.threads)
     for folder in ("inpainting", "reference", "whole", "window"):
         shutil.rmtree(given.out / folder, ignore_errors=True)
-    result = {"prior": given.priors[0], "inpainting": inpainting(given.priors, given.pictures, given.out)}
-    for name, kinds in result["inpainting"]["scores"].items():
-        print(name, {column: round(kinds["all"][column], 3) for column in COLUMNS}, flush=True)
+    first = given.priors[0]
+    result: dict = {"prior": first}
+    if given.pictures:
+        cases = held_out(given.pictures)
+        result["inpainting"] = inpainting(given.priors, cases, given.out)
+        for name, kinds in result["inpainting"]["scores"].items():
+            print(name, {column: round(kinds["all"][column], 3) for column in (*COLUMNS, "seconds")}, flush=True)
+        result["sampler"] = by_steps(load_prior(first), cases, given.steps)
+        for count, row in result["sampler"].items():
+            print(f"{count} steps", {column: round(row[column], 3) for column in (*COLUMNS, "seconds")}, flush=True)
     if given.run:
-        result["personalization"] = personalization(given.priors[0], given.run, given.steps, given.out)
+        params = profile(first, dict(given.set))
+        result["personalization"] = personalization(
+            params, given.run, given.seeds, given.wrong_reference, given.steps, given.out
+        )
     io.save_json(given.out / "prior.json", result)
     print(given.out / "prior.json")
 

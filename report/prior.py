@@ -34,12 +34,19 @@ def make(folder: Path) -> Path:
     if not (folder / "prior.json").exists():
         raise ValueError(f"{folder / 'prior.json'} is missing; run `python benchmarks/prior.py --out {folder}` first")
     measured = io.load_json(folder / "prior.json")
-    lines = [f"# {measured['prior']}, measured", "", inpainting_table(measured["inpainting"]["scores"])]
-    lines += sheet(folder, "inpainting", measured["inpainting"]["columns"])
+    lines = [f"# {measured['prior']}, measured", ""]
+    if "inpainting" in measured:
+        lines += [inpainting_table(measured["inpainting"]["scores"])]
+        lines += sheet(folder, "inpainting", measured["inpainting"]["columns"])
+    if measured.get("sampler"):
+        lines += ["## Numbers of sampler steps", "", sampler_table({"held out": measured["sampler"]})]
     if "personalization" in measured:
         personal = measured["personalization"]
         charts(personal, folder / "charts.png")
         lines += ["## Personalization", "", personalization_table(personal), "![](charts.png)", ""]
+        lines += ["Every seed's samples:", "", seeds_table(personal["seeds"])]
+        if personal["sampler"]["reference"]:
+            lines += ["Personalized, with other numbers of sampler steps:", "", sampler_table(personal["sampler"])]
         for scale in SCALES:
             lines += sheet(folder, scale, personal["columns"])
     page = folder / "prior.md"
@@ -88,6 +95,40 @@ def personalization_table(personal: dict[str, Any]) -> str:
             cells = [*figures, *(cell(row["samples"], column) for column in SCORES)]
             lines.append(f"| {scale}, {when} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
+
+
+def sampler_table(by_name: dict[str, dict[str, dict[str, float]]]) -> str:
+    """Markdown: a row for each set of holes and number of sampler steps."""
+    lines = [
+        f"| holes, sampler steps | {' | '.join(SCORES.values())} | CPU ms each |",
+        "|---" * (len(SCORES) + 2) + "|",
+    ]
+    for name, by_count in by_name.items():
+        for count, row in by_count.items():
+            cells = " | ".join(cell(row, column) for column in SCORES)
+            lines.append(f"| {name}, {count} | {cells} | {1000 * row['seconds']:.0f} |")
+    return "\n".join(lines) + "\n"
+
+
+def seeds_table(seeds: dict[str, dict[str, Any]]) -> str:
+    """Markdown: for each kind of holes, without and with the reference or a wrong one, mean and spread over seeds."""
+    lines = [
+        f"| holes, {len(seeds)} seeds: mean (lowest to highest) | {' | '.join(SCORES.values())} |",
+        "|---" * (len(SCORES) + 1) + "|",
+    ]
+    whens = [when for when in ("before", "after", "wrong") if all(when in scores for scores in seeds.values())]
+    for scale in SCALES:
+        for when in whens:
+            rows = [scores[when][scale] for scores in seeds.values()]
+            cells = (spread([row[column] for row in rows], 2 if column == "psnr" else 3) for column in SCORES)
+            lines.append(f"| {scale}, {when} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def spread(values: list[float], digits: int) -> str:
+    """Mean, and lowest to highest where there are several."""
+    mean = f"{np.mean(values):.{digits}f}"
+    return f"{mean} ({min(values):.{digits}f} to {max(values):.{digits}f})" if len(values) > 1 else mean
 
 
 def charts(personal: dict[str, Any], path: Path) -> None:

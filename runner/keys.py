@@ -15,6 +15,7 @@ from runner.pipeline import Refused
 
 LIBRARY = "reffusion"  # the package whose modules count as a stage's code
 NOT_CONTENT = ("receipt.json", "trace.jsonl", "checkpoint.pt", "checkpoint.pt.writing")
+NOT_WEIGHTS = (".md", ".py", ".png", ".jpg")  # a model's card, its pictures, the scripts that trained it
 
 
 def digest(*parts: str) -> str:
@@ -62,6 +63,11 @@ class Hashes:
             if name not in leave_out:
                 parts += [name, self.file(path)]
         return digest(*parts)
+
+    def weights(self, folder: Path) -> str:
+        """Of a model's folder: what a library may read of it. Writing in its card reruns nothing."""
+        files = (path for path in files_below(folder) if path.suffix not in NOT_WEIGHTS)
+        return digest(*(part for path in files for part in (path.relative_to(folder).as_posix(), self.file(path))))
 
     def save(self) -> None:
         if len(self._known) == self._saved:

@@ -142,7 +142,7 @@ def _inputs(job: Job, stage: str, needs: dict[str, Path | None], code: dict[str,
     for param in job.weights[stage]:
         if name := job.params[stage][param]:
             folder = _weights_folder(job, name)
-            weights[param] = job.hashes.folder(folder) if folder else name
+            weights[param] = job.hashes.weights(folder) if folder else name
     return Inputs(job.params[stage], job.profile, hashes, weights, code)
 
 

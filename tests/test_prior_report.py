@@ -1,5 +1,6 @@
 """The prior's report: scores inside a hole, a held-out set that was never trained on, the page that is drawn."""
 
+import argparse
 import json
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT / "benchmarks"), str(ROOT / "priors" / "tiny")]
 
+import holes  # noqa: E402
 import images  # noqa: E402
 import prior as benchmark  # noqa: E402
 
@@ -20,14 +22,14 @@ from report import prior as page  # noqa: E402
 
 @pytest.fixture(scope="module")
 def cases():
-    return benchmark.held_out(16)
+    return holes.held_out(16)
 
 
 def test_a_perfect_picture_a_blurred_one_and_a_flat_one_are_told_apart(cases):
     for case in cases[:6]:
-        perfect = benchmark.hole_scores(case.truth, case.truth, case.hole)
+        perfect = holes.hole_scores(case.truth, case.truth, case.hole)
         assert perfect == {"psnr": metrics.PSNR_CAP, "ssim": 1, "flip": 0, "energy": 1}
-        soft, softer = (benchmark.hole_scores(cv2.GaussianBlur(case.truth, (0, 0), s), case.truth, case.hole)
+        soft, softer = (holes.hole_scores(cv2.GaussianBlur(case.truth, (0, 0), s), case.truth, case.hole)
                         for s in (1, 4))  # fmt: skip
         for better, worse in ((perfect, soft), (soft, softer)):
             assert better["psnr"] > worse["psnr"] and better["ssim"] > worse["ssim"]
@@ -37,37 +39,58 @@ def test_a_perfect_picture_a_blurred_one_and_a_flat_one_are_told_apart(cases):
 def test_only_the_hole_counts(cases):
     case = cases[0]
     spoilt = np.where(case.hole[..., None], case.truth, 255 - case.truth)
-    assert benchmark.hole_scores(spoilt, case.truth, case.hole)["psnr"] == metrics.PSNR_CAP
+    assert holes.hole_scores(spoilt, case.truth, case.hole)["psnr"] == metrics.PSNR_CAP
     inside = case.truth.copy()
     inside[case.hole] = np.clip(inside[case.hole].astype(int) + 10, 0, 255)
     whole = metrics.psnr(inside, case.truth) + 10 * np.log10(case.hole.mean())  # all of its error lies in the hole
-    assert benchmark.hole_scores(inside, case.truth, case.hole)["psnr"] == pytest.approx(whole)
+    assert holes.hole_scores(inside, case.truth, case.hole)["psnr"] == pytest.approx(whole)
     with pytest.raises(ValueError, match="hole is empty"):
-        benchmark.hole_scores(case.truth, case.truth, case.hole & False)
+        holes.hole_scores(case.truth, case.truth, case.hole & False)
 
 
 def test_the_held_out_set_is_fixed_and_shares_no_picture_with_training(cases):
-    again = benchmark.held_out(3)
+    again = holes.held_out(3)
     assert all(np.array_equal(a.truth, b.truth) and np.array_equal(a.hole, b.hole) for a, b in zip(again, cases))  # noqa: B905
     kinds = [case.kind for case in cases]
     assert 0 < kinds.count("photograph") < len(kinds)
-    trained = {images.image(seed, index)[0].tobytes() for seed in (0, 1, benchmark.SEED) for index in range(10)}
-    fresh = {images.image(benchmark.SEED, index, held_out=True)[0].tobytes() for index in range(10)}
+    trained = {images.image(seed, index)[0].tobytes() for seed in (0, 1, holes.SEED) for index in range(10)}
+    fresh = {images.image(holes.SEED, index, held_out=True)[0].tobytes() for index in range(10)}
     assert len(fresh) == 10 and not fresh & trained
-    captions = {images.image(benchmark.SEED, index)[1].split()[-1] for index in range(30)}
+    captions = {images.image(holes.SEED, index)[1].split()[-1] for index in range(30)}
     assert captions & set(images.PHOTOS) and not captions & set(images.HELD_OUT_PHOTOS)
 
 
 def test_holes_are_objects_of_a_fair_size(cases):
     for case in cases:
-        assert benchmark.COVER[0] <= case.hole.mean() <= benchmark.COVER[1]
+        assert holes.COVER[0] <= case.hole.mean() <= holes.COVER[1]
         parts, _ = cv2.connectedComponents(case.hole.astype(np.uint8))
         assert parts - 1 <= 3 + 2  # three outlines; a self-crossing one may fall into pieces
+
+
+def test_a_wrong_reference_has_another_picture_and_the_same_holes(tmp_path):
+    for folder, value in (("references", 90), ("masks", 255)):
+        io.save_image(tmp_path / "given" / folder / "a.png", np.full((6, 8, 3), value, np.uint8))
+    io.save_image(tmp_path / "other.png", np.full((30, 40, 3), 200, np.uint8))
+    made = benchmark.with_picture(tmp_path / "given", tmp_path / "other.png", tmp_path / "made")
+    assert io.load_image(made / "references/a.png").shape == (6, 8, 3)
+    assert (io.load_image(made / "references/a.png") == 200).all()
+    assert (made / "masks/a.png").read_bytes() == (tmp_path / "given/masks/a.png").read_bytes()
+
+
+def test_settings_are_checked_and_come_last():
+    assert benchmark.setting("betas=[0.8, 0.99]") == ("betas", [0.8, 0.99])
+    assert benchmark.profile("a/prior", {"steps": 7}).steps == 7
+    with pytest.raises(ValueError, match="steeps"):
+        benchmark.profile("a/prior", {"steeps": 7})
+    with pytest.raises(argparse.ArgumentTypeError, match="NAME=VALUE"):
+        benchmark.setting("steps")
 
 
 def measured(folder: Path) -> None:
     """A small result of the benchmark, made up."""
     row = {"psnr": 20.0, "ssim": 0.5, "flip": 0.2, "energy": 0.7, "psnr_error": 0.3, "pictures": 2}
+    better, scales = row | {"psnr": 22.0}, ("reference", "whole", "window")
+    sampler = {"4": row | {"seconds": 0.05}}
     levels = {"error": [0.1, 0.4], "variance": [0.2, 0.3], "samples": row}
     for name, columns in (("inpainting", 4), ("reference", 4), ("whole", 4), ("window", 4)):
         for index in range(2):
@@ -76,10 +99,15 @@ def measured(folder: Path) -> None:
         "prior": "a/prior",
         "inpainting": {"columns": ["hole", "Telea", "a/prior", "truth"],
                        "scores": {name: {"all": row, "photograph": row} for name in ("Telea", "a/prior")}},
+        "sampler": sampler,
         "personalization": {
+            "seeds": {str(seed): {"before": dict.fromkeys(scales, row), "after": dict.fromkeys(scales, after),
+                                  "wrong": dict.fromkeys(scales, row), "seconds": 9.0}
+                      for seed, after in ((0, row), (1, better))},
+            "sampler": {"reference": sampler, "whole": sampler},
             "steps": 7, "timesteps": [100, 900], "columns": ["hole", "before", "after", "truth"],
             "trace": [{"iteration": 0, "clean_latent_mse": 0.3}, {"iteration": 7, "clean_latent_mse": 0.2}],
-            **{scale: {"before": levels, "after": levels} for scale in ("reference", "whole", "window")},
+            **{scale: {"before": levels, "after": levels} for scale in scales},
         },
     }))  # fmt: skip
 
@@ -91,6 +119,9 @@ def test_the_page_holds_every_table_and_picture(tmp_path):
     text = page.make(tmp_path).read_text()
     assert "| all: Telea | 2 | 20.00 ± 0.30 | 0.500 | 0.200 | 0.700 |" in text
     assert "| window, after | 0.2500 | 0.2500 | 20.00 ± 0.30 |" in text
+    assert "| held out, 4 | 20.00 ± 0.30 | 0.500 | 0.200 | 0.700 | 50 |" in text
+    assert "| whole, after | 21.00 (20.00 to 22.00) | 0.500 (0.500 to 0.500) |" in text
+    assert "| whole, wrong | 20.00 (20.00 to 20.00) |" in text
     linked = [line[4:-1] for line in text.splitlines() if line.startswith("![](")]
     assert sorted(linked) == ["charts.png", "inpainting.png", "reference.png", "whole.png", "window.png"]
     assert all(io.load_image(tmp_path / name).shape[1] > 90 for name in linked)

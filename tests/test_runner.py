@@ -291,6 +291,15 @@ def test_fingerprint():
     assert fingerprint("x = '''a'''") != fingerprint("x = '''b'''")
 
 
+def test_a_models_card_and_its_training_script_are_no_weights(root):
+    before = words(root)
+    for name in ("README.md", "train.py", "held_out.png"):
+        (root / "weights" / name).write_text("about it")
+    assert words(root) == before
+    (root / "weights/config.json").write_text("{}")
+    assert words(root)["distill"] == "run weights prior changed"
+
+
 def test_weights_profile_and_hand_edits(root, capsys):
     (root / "weights/model.bin").write_text("v")
     assert words(root)["distill"] == "run weights prior changed"

@@ -1,0 +1,121 @@
+"""What distillation gains over its initialization: `python benchmarks/gain.py runs/demo-wide runs/demo-wide@no_sds`.
+
+For each run, over its test views: the scores in the mask's box that evaluate gave to result and initialization, and the
+gradient energy of both in that box and inside the mask itself, in units of the truth's. Under 1 is too smooth, over 1
+is grain or doubled edges. Shares of the masks that no training view saw are `masks`' own, and, with --scene, the
+generator's by casting rays. Pictures of some views go to --out: photo with the object, initialization, result, truth.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
+
+from holes import gradient_energy  # noqa: E402
+
+from reffusion import io, metrics  # noqa: E402
+from report.sheet import enlarged, evenly, framed, stage_folder  # noqa: E402
+from stages import evaluate  # noqa: E402
+
+WAYS = {"initialization": "renders_initialize", "result": "renders"}
+SCORES = {"psnr_box": 2, "ssim_box": 4, "flip_box": 4}  # column of metrics.json, digits
+VIEWS = 4  # on the sheet
+ENLARGE = 2  # whole factor
+
+
+def measured(run: Path) -> dict:
+    """{"initialization", "result"}: box scores, "energy_box" and "energy_mask" in units of the truth's.
+
+    Raises:
+        ValueError: the run has not been evaluated, or has no ground truth.
+    """
+    if not (run / "evaluate" / "metrics.json").exists():
+        raise ValueError(f"{run / 'evaluate/metrics.json'} is missing: run `make scene={run.name} all` first")
+    scored, scene = io.load_json(run / "evaluate/metrics.json"), io.load_scene(stage_folder(run, "poses"))
+    if not scored["views"]["psnr_box"]:
+        raise ValueError(f"{run}: no test view has ground truth and a mask")
+    energies: dict[str, list[tuple[float, float]]] = {"truth": [], **{way: [] for way in WAYS}}
+    for name in scene.test:
+        mask = evaluate.mask_of(scene.cameras[name], stage_folder(run, "poses"), stage_folder(run, "masks"))
+        left, top, right, bottom = metrics.mask_box(mask)
+        box = np.zeros_like(mask)
+        box[top:bottom, left:right] = True
+        pictures = {"truth": evaluate.truth_of(scene.cameras[name], stage_folder(run, "poses"))}
+        pictures |= {way: io.load_image(run / "evaluate" / folder / f"{name}.png") for way, folder in WAYS.items()}
+        for way, picture in pictures.items():
+            energies[way].append((gradient_energy(picture, box), gradient_energy(picture, mask)))
+    total = {way: np.mean(values, 0) for way, values in energies.items()}
+    result = {}
+    for way, column in (("initialization", "initialize"), ("result", "mean")):
+        box, mask = (total[way] / total["truth"]).tolist()
+        result[way] = {name: scored[column][name] for name in SCORES} | {"energy_box": box, "energy_mask": mask}
+    return result
+
+
+def table(runs: dict[str, dict], shares: dict[str, dict[str, float]]) -> str:
+    """Markdown: the initialization once for each run whose result differs from it."""
+    lines = ["| | PSNR box, dB | SSIM | FLIP | energy, box | energy, mask |", "|---" * 6 + "|"]
+    for name, ways in runs.items():
+        for way, row in ways.items():
+            if way == "initialization" and "@" in name and name.split("@")[0] in runs:
+                continue  # the scene's own
+            cells = [f"{row[column]:.{digits}f}" for column, digits in SCORES.items()]
+            cells += [f"{row[column]:.2f}" for column in ("energy_box", "energy_mask")]
+            lines.append(f"| {name}, {way} | {' | '.join(cells)} |")
+    for name, share in shares.items():
+        lines += ["", f"{name}, share of the masks that no training view saw: " + str(share)]
+    return "\n".join(lines) + "\n"
+
+
+def never_seen(run: Path, scene: Path | None) -> dict[str, float]:
+    """By `masks`, over the training views; by the generator's rays, over training and test views."""
+    share = {"by masks": round(io.load_json(stage_folder(run, "masks") / "facts.json")["never_seen_share"], 3)}
+    facts = io.load_json(scene / "truth/facts.json")["never_seen_share"] if scene else {}
+    return share | {f"by rays, {kind} views": round(value, 3) for kind, value in facts.items() if value is not None}
+
+
+def sheet(run: Path, path: Path) -> None:
+    """`VIEWS` test views as rows: the fit with the object, initialization, result, truth; cut to the mask's box."""
+    scene = io.load_scene(stage_folder(run, "poses"))
+    names, rows = evenly(list(scene.test), VIEWS), []
+    for name in names:
+        camera = scene.cameras[name]
+        folders = ("renders_fit", *WAYS.values())
+        pictures = [io.load_image(run / "evaluate" / folder / f"{name}.png") for folder in folders]
+        pictures.append(evaluate.truth_of(camera, stage_folder(run, "poses")))
+        left, top, right, bottom = metrics.mask_box(
+            evaluate.mask_of(camera, stage_folder(run, "poses"), stage_folder(run, "masks")), 0.3
+        )
+        rows.append([enlarged(picture[top:bottom, left:right], ENLARGE) for picture in pictures])
+    height, width = (max(cell.shape[axis] for row in rows for cell in row) for axis in (0, 1))
+    room = [[np.pad(c, ((0, height - c.shape[0]), (0, width - c.shape[1]), (0, 0))) for c in row] for row in rows]
+    io.save_image(path, framed(room, ["fit", *WAYS, "truth"], names))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", type=Path, nargs="+", help="runs/<scene> and runs/<scene>@<variant>, evaluated")
+    parser.add_argument("--scene", type=Path, help="data/<scene> of the first, made by data/generate.py")
+    parser.add_argument("--out", type=Path, default=Path("runs/gain"))
+    given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
+    first, runs = given.runs[0], {run.name: measured(run) for run in given.runs}
+    text = table(runs, {first.name: never_seen(first, given.scene)})
+    for run in given.runs:
+        sheet(run, given.out / f"{run.name}.png")
+    io.save_json(given.out / "gain.json", runs)
+    (given.out / "gain.md").write_text(text, encoding="utf-8")
+    print(text)
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except ValueError as error:
+        sys.exit(f"error: {error}")

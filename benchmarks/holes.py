@@ -1,0 +1,150 @@
+"""Holes to fill, and how well one was filled: what `benchmarks/prior.py` and its neighbours measure with.
+
+Held-out pictures come from the prior's own generators under seeds that no training uses. Every draw is seeded.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "priors" / "tiny")]
+
+import images  # noqa: E402
+
+from reffusion import (  # noqa: E402
+    diffusion,
+    io,
+    metrics,
+    trace,
+)
+from reffusion.prior import Prior  # noqa: E402
+
+SIDE = 64  # px, of the held-out pictures
+SEED = 20  # of the held-out set; training and its own validation use others
+COVER = (0.05, 0.4)  # share of a held-out picture that its hole takes
+SAMPLER_STEPS = 12  # the laptop profile's, for its reference
+BATCH = 16
+COLUMNS = ("psnr", "ssim", "flip", "energy")
+
+
+@dataclass(frozen=True)
+class Case:
+    """A picture to fill: uint8 [H, W, 3] truth, bool [H, W] hole; kind: "photograph", "procedural" or a name."""
+
+    truth: np.ndarray
+    hole: np.ndarray
+    kind: str
+
+
+def held_out(count: int, seed: int = SEED) -> list[Case]:
+    """`count` pictures that no training has seen, each with a silhouette that covers `COVER` of it."""
+    cases = []
+    for index in range(count):
+        picture, caption = images.image(seed, index, held_out=True)
+        truth = cv2.resize(picture, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
+        rng = np.random.default_rng(trace.seed_for(seed, "hole", index))
+        hole = images.silhouettes(rng, SIDE)
+        while not COVER[0] <= hole.mean() <= COVER[1]:
+            hole = images.silhouettes(rng, SIDE)
+        kind = "photograph" if caption.split()[-1] in images.HELD_OUT_PHOTOS else "procedural"
+        cases.append(Case(truth, hole, kind))
+    return cases
+
+
+def hole_scores(picture: np.ndarray, truth: np.ndarray, hole: np.ndarray) -> dict[str, float]:
+    """PSNR (dB), SSIM and FLIP, each its map's mean over the hole, and the gradient energy in units of the truth's.
+
+    Args:
+        picture, truth: uint8 [H, W, 3]; outside the hole the truth stands in for the picture.
+        hole: bool [H, W], not empty.
+    """
+    if not hole.any():
+        raise ValueError("the hole is empty: there is nothing to score")
+    picture = np.where(hole[..., None], picture, truth)
+    error = float(np.mean((picture[hole] / 255.0 - truth[hole] / 255.0) ** 2))
+    return {
+        "psnr": min(-10 * np.log10(error), metrics.PSNR_CAP) if error > 0 else metrics.PSNR_CAP,
+        "ssim": float(ssim_map(picture, truth)[hole].mean()),
+        "flip": float(flip_map(picture, truth)[hole].mean()),
+        "energy": gradient_energy(picture, hole) / max(gradient_energy(truth, hole), 1e-9),
+    }
+
+
+def ssim_map(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """[H, W], with the window of `metrics.ssim`, mean over RGB."""
+    from skimage.metrics import structural_similarity
+
+    _, values = structural_similarity(
+        picture / 255.0,
+        truth / 255.0,
+        gaussian_weights=True,
+        sigma=metrics.SSIM_SIGMA,
+        use_sample_covariance=False,
+        data_range=1.0,
+        channel_axis=2,
+        full=True,
+    )
+    return values.mean(2)
+
+
+def flip_map(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """[H, W] LDR-FLIP, with the viewing distance of `metrics.flip`."""
+    import flip_evaluator
+
+    pair = [np.ascontiguousarray(x / 255.0, np.float32) for x in (truth, picture)]
+    settings = {"ppd": metrics.PIXELS_PER_DEGREE}
+    values = flip_evaluator.evaluate(*pair, "LDR", applyMagma=False, computeMeanError=False, parameters=settings)
+    return values[0][..., 0]
+
+
+def gradient_energy(picture: np.ndarray, hole: np.ndarray) -> float:
+    """Mean squared step of brightness between neighbours that both lie in the hole."""
+    light, total, count = picture.mean(2) / 255, 0.0, 0
+    for axis in (0, 1):
+        both = np.logical_and(*(hole.take(range(k, hole.shape[axis] - 1 + k), axis) for k in (0, 1)))
+        total += (np.diff(light, axis=axis)[both] ** 2).sum()
+        count += both.sum()
+    return float(total / max(count, 1))
+
+
+def means(rows: list[dict[str, float]]) -> dict[str, float]:
+    """The mean of each column, and of PSNR also its standard error."""
+    values = {column: float(np.mean([row[column] for row in rows])) for column in COLUMNS}
+    spread = np.std([row["psnr"] for row in rows], ddof=1) / len(rows) ** 0.5 if len(rows) > 1 else 0.0
+    return values | {"psnr_error": float(spread), "pictures": len(rows)}
+
+
+def tensors(cases: list[Case]) -> tuple[Tensor, Tensor]:
+    """[B, 3, H, W] in [-1, 1] and [B, 1, H, W], 1 = repaint."""
+    pictures = torch.from_numpy(np.stack([case.truth for case in cases])).permute(0, 3, 1, 2).float() / 127.5 - 1
+    return pictures, torch.from_numpy(np.stack([case.hole for case in cases]))[:, None].float()
+
+
+def painted(
+    prior: Prior, cases: list[Case], seed: int, prompt: str = "", steps: int = SAMPLER_STEPS
+) -> list[np.ndarray]:
+    """The holes filled from pure noise in `steps` of the sampler: uint8 [H, W, 3] each."""
+    done = []
+    for first in range(0, len(cases), BATCH):
+        pictures, holes = tensors(cases[first : first + BATCH])
+        text = diffusion.embed_text(prior, [prompt]).detach().expand(len(pictures), -1, -1)
+        noise = trace.generator(seed, "sample", first)
+        filled = diffusion.sample(prior, pictures * (1 - holes), holes, text, steps, noise)
+        filled = ((pictures * (1 - holes) + filled * holes).permute(0, 2, 3, 1) + 1) * 127.5
+        done += list(filled.round().clamp(0, 255).to(torch.uint8).numpy())
+    return done
+
+
+def save_row(path: Path, case: Case, pictures: list[np.ndarray]) -> None:
+    """Hole, pictures and truth side by side."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    hollow = np.where(case.hole[..., None], np.uint8(128), case.truth)
+    io.save_image(path, np.concatenate([hollow, *pictures, case.truth], 1))
