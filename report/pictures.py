@@ -38,8 +38,8 @@ def _cells(runs: list[Run], first: Run, view: str) -> list[tuple[str, np.ndarray
     photo, views = poses / "images" / f"{view}.png", poses / "views.json"
     cells = []
     if photo.exists() and views.exists():
-        is_test = view in io.load_json(views)["test"]
-        cells.append(("ground truth" if is_test else "photograph, with the object", io.load_image(photo)))
+        shows_object = view not in io.load_json(views)["test"] or (poses / "masks" / photo.name).exists()
+        cells.append(("ground truth" if not shows_object else "photograph, with the object", io.load_image(photo)))
     for run in runs:
         path = run.folders["evaluate"] / "renders" / f"{view}.png"
         if path.exists():

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from report import compare as page
-from report import curves, job, results, scenes
+from report import curves, job, pictures, results, scenes
 from report.paired import half_width, paired, pareto
 from runner.compare import compare
 from runner.job import Request
@@ -281,6 +281,12 @@ def test_without_ground_truth_held_out_views_are_compared_outside_their_masks(ho
     text = made["md"].read_text()
     assert "outside: PSNR ↑" in text and "| +1.15 ± 0.21 |" in text and "best in PSNR outside: better" in text
     assert "all methods should leave as they are" in made["html"].read_text()
+    runs = results.load(home)
+    title = lambda: pictures._cells([runs.runs["full", "toy"]], runs.runs["full", "toy"], "a")[0][0]
+    assert title() == "ground truth"
+    (home / "poses/masks").mkdir()
+    (home / "poses/masks/a.png").touch()  # as `poses` leaves it of a test view that shows the object
+    assert title() == "photograph, with the object"
     assert (home / "compare/differences.png").exists()
 
 
