@@ -21,12 +21,13 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from reffusion import trace  # noqa: E402
+from reffusion.fit import FIRST_MOMENT  # noqa: E402
 from stages import distill, fit, personalize  # noqa: E402
 
 STAGES = {
-    "fit": (fit, "iterations", ("poses",), 2),
-    "personalize": (personalize, "steps", ("poses", "fit", "masks", "reference"), 1),
-    "distill": (distill, "iterations", ("poses", "fit", "masks", "reference", "personalize", "initialize"), 4),
+    "fit": (fit, "iterations", ("poses",), (2, FIRST_MOMENT)),
+    "personalize": (personalize, "steps", ("poses", "fit", "masks", "reference"), (1, 1)),
+    "distill": (distill, "iterations", ("poses", "fit", "masks", "reference", "personalize", "initialize"), (4, 1)),
 }
 ALLOWED = 0.03
 
@@ -52,7 +53,7 @@ def pairs(name: str, run: Path, steps: int, repeats: int) -> tuple[float, float,
     try:
         for _ in range(repeats):
             for traced in (False, True):
-                trace.log_spaced = every if traced else (lambda i, last, per_octave=2: i == last)
+                trace.log_spaced = every if traced else (lambda i, last, per_octave=2, first=1: i == last)
                 seconds, lines[traced] = cpu_seconds(stage, params, folders)
                 taken[traced].append(seconds)
     finally:
@@ -77,7 +78,7 @@ def main() -> int:
         profile = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"][name]
         full = profile[STAGES[name][1]]
         moment = (traced - plain) / moments
-        share = moment * sum(trace.log_spaced(i, full, STAGES[name][3]) for i in range(full + 1)) / (full * step)
+        share = moment * sum(trace.log_spaced(i, full, *STAGES[name][3]) for i in range(full + 1)) / (full * step)
         over += share > ALLOWED
         print(f"{name:<12} {plain:7.2f} s {traced:7.2f} s {moments:8} {moment:7.3f} s {step:6.3f} s {share:12.2%}")
     return 1 if over else 0

@@ -20,6 +20,8 @@ from reffusion.optimize import GaussianOptimizer
 from reffusion.splat import render
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
+FIRST_MOMENT = 16  # of the trace, after the start: measuring held-out views takes as long as several steps
+
 
 def fit(
     cameras: Sequence[Camera],
@@ -73,7 +75,7 @@ def fit(
         if not len(optimizer.gaussians):
             raise ValueError(f"fit, step {i}: pruning left no Gaussian: lower `least_opacity`, or raise `largest`")
         where = f"step {i}, view '{camera.name}'"
-        if run.patience.due(run.iteration, settings.iterations):
+        if run.patience.due(run.iteration, settings.iterations, first=FIRST_MOMENT):
             _check_finite(optimizer.gaussians, where)
             if _write_line(log, run, *measured):
                 break

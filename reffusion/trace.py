@@ -121,9 +121,9 @@ class Patience:
     def watching(self) -> bool:
         return self.moments > 0 or self.drop > 0
 
-    def due(self, iteration: int, last: int, per_octave: int = 2) -> bool:
+    def due(self, iteration: int, last: int, per_octave: int = 2, first: int = 1) -> bool:
         """Is this a moment to measure? The log-spaced ones, and where patience counts, each twentieth of the run."""
-        return log_spaced(iteration, last, per_octave) or (self.moments > 0 and twentieth(iteration, last))
+        return log_spaced(iteration, last, per_octave, first) or (self.moments > 0 and twentieth(iteration, last))
 
     def ends(self, iteration: int, last: int, value: float, start: float = 0.0) -> dict[str, Any]:
         """What the line of this moment says of the end, {} while the stage goes on.
@@ -159,12 +159,12 @@ def decibels(squared_error: float) -> float:
     return -10 * log10(max(squared_error, 1e-10))
 
 
-def log_spaced(iteration: int, last: int, per_octave: int = 2) -> bool:
-    """True at the first and last iteration and `per_octave` times in each doubling between: when to measure."""
-    if iteration in (0, last):
+def log_spaced(iteration: int, last: int, per_octave: int = 2, first: int = 1) -> bool:
+    """True at iterations 0, 1 and `last`, and `per_octave` times in each doubling from `first` on: when to measure."""
+    if iteration in (0, 1, last):
         return True
     step = lambda i: floor(log2(i) * per_octave)
-    return iteration > 0 and step(iteration) != step(max(iteration - 1, 0.5))
+    return iteration >= first and step(iteration) != step(iteration - 1)
 
 
 def twentieth(iteration: int, last: int) -> bool:

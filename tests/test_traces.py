@@ -175,6 +175,7 @@ def test_patience_counts_twentieths_without_a_gain():
 
 def test_moments_depend_on_the_iteration_only():
     assert [i for i in range(41) if trace.log_spaced(i, 40)] == [0, 1, 2, 3, 4, 6, 8, 12, 16, 23, 32, 40]
+    assert [i for i in range(41) if trace.log_spaced(i, 40, 2, 16)] == [0, 1, 16, 23, 32, 40]
     assert [i for i in range(41) if trace.log_spaced(i, 40, 1)] == [0, 1, 2, 4, 8, 16, 32, 40]
     assert [i for i in range(41) if trace.twentieth(i, 40)] == list(range(2, 41, 2))
     plain, waiting = trace.Patience(), trace.Patience(moments=2)
