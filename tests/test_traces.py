@@ -314,9 +314,9 @@ def test_the_gate_sees_a_planted_regression():
     better["diagrams"][name][key][0] *= 0.95
     assert [key in line and "error" in line for line in gate.regressions(diagrams, unit, better)] == [True]
     faster = copy.deepcopy(baselines)
-    faster["diagrams"][name][key][1] /= 2
+    faster["diagrams"][name][key][1] /= 3
     assert [key in line and "ms" in line for line in gate.regressions(diagrams, unit, faster)] == [True]
-    assert gate.regressions(diagrams, unit / 2, baselines), "the same times on a machine twice as fast"
+    assert gate.regressions(diagrams, unit / 3, baselines), "the same times on a machine three times as fast"
     slow = [replace(d, points=[replace(p, seconds=9.0) for p in d.points]) for d in diagrams]
     again = [gate.quicker(one, other) for one, other in zip(slow, diagrams, strict=True)]
     assert gate.regressions(slow, unit, baselines) and gate.regressions(again, unit, baselines) == []
