@@ -11,7 +11,8 @@ import numpy as np
 from reffusion import flight, io, splat
 
 FRAMES, RATE = 144, 24  # six seconds
-CODEC = "VP90"  # in a .webm: what browsers play and OpenCV's wheels write, with a complaint about the tag that means nothing
+# In a .webm: what browsers play and OpenCV's wheels write, with a complaint about the tag that means nothing.
+CODEC = "VP90"
 
 
 def make(home: Path, frames: int = FRAMES) -> Path:
