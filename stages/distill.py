@@ -133,28 +133,12 @@ def run(
     from dataclasses import replace
 
     began = time.monotonic()
-    import torch
-
-    from reffusion import diffusion, io, lora, memory, trace
-    from reffusion.crops import PROMPTS
+    from reffusion import io, memory, trace
     from reffusion.distill import distill
-    from reffusion.prior import load_prior, recomputing, without_text
 
     scene = io.load_scene(poses)
-    initial = io.load_ply(initialize / "gaussians.ply").map(lambda p: p.to(params.device))
-    masked = io.load_labels(initialize / "labels.npy").to(params.device)
-    holes = [
-        (r.camera, torch.from_numpy(r.image).to(params.device) / 255, torch.from_numpy(r.mask).to(params.device))
-        for r in io.load_references(reference, scene)
-    ]
-    prior = text = None
-    if params.sds_weight > 0 or params.depth_weight > 0:
-        prior = load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
-        prior = prior if personalize is None else lora.merged(prior, personalize)
-        with torch.no_grad():
-            text = diffusion.embed_text(prior, list(PROMPTS))
-        prior = without_text(prior)
-        prior = recomputing(prior) if params.checkpointing else prior
+    initial, masked, holes = start(params, scene, reference, initialize)
+    prior, text = adapted_prior(params, personalize)
     estimator = depth_estimator(params, scene.points) if params.depth_weight > 0 else None
     sights, (perceptual, lifting) = load_sights(params, scene, poses, fit, masks, lift), lift_choices(params)
     with memory.blamed("distill.memory_gb", params.memory_gb):
@@ -169,6 +153,37 @@ def run(
     painted = io.load_json(lift / "facts.json")["inpainter"] if lift else None
     io.save_json(out / "facts.json", {"inpainter": painted, "perceptual": perceptual})
     trace.clear_checkpoint(out)
+
+
+def start(params: Params, scene, reference: Path, initialize: Path) -> tuple:
+    """The initialization's Gaussians and labels, and (camera, image, hole) of each reference, on the device."""
+    import torch
+
+    from reffusion import io
+
+    initial = io.load_ply(initialize / "gaussians.ply").map(lambda p: p.to(params.device))
+    masked = io.load_labels(initialize / "labels.npy").to(params.device)
+    place = lambda array: torch.from_numpy(array).to(params.device)
+    holes = [(r.camera, place(r.image) / 255, place(r.mask)) for r in io.load_references(reference, scene)]
+    return initial, masked, holes
+
+
+def adapted_prior(params: Params, personalize: Path | None) -> tuple:
+    """The prior with what it learnt, without its text encoder, and the prompts' embeddings; None, None if unused."""
+    import torch
+
+    from reffusion import diffusion, lora
+    from reffusion.crops import PROMPTS
+    from reffusion.prior import load_prior, recomputing, without_text
+
+    if not (params.sds_weight > 0 or params.depth_weight > 0):
+        return None, None
+    prior = load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
+    prior = prior if personalize is None else lora.merged(prior, personalize)
+    with torch.no_grad():
+        text = diffusion.embed_text(prior, list(PROMPTS))
+    prior = without_text(prior)
+    return recomputing(prior) if params.checkpointing else prior, text
 
 
 def load_sights(params: Params, scene, poses: Path, fit: Path, masks: Path, lift: Path | None = None) -> list:

@@ -1,0 +1,155 @@
+"""Every way of distilling that was tried, error against seconds: `python benchmarks/attempts.py --run runs/demo`.
+
+From one initialization, each setting of `ATTEMPTS` runs for the laptop profile's number of steps; at some of them the
+Gaussians are rendered from test views, with the clock stopped, and scored in the mask's box. The initialization is the
+run's own; --start takes another folder with gaussians.ply and labels.npy, such as runs/demo@lift_mse/initialize, whose
+pictures are worse: what a prior is worth depends on what there is left to teach.
+Test views measure here; nothing chooses a setting by them. Writes attempts.json and attempts.png to --out; settings
+that are in the file already are not run again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import torch
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT)]
+
+from reffusion import io, metrics, splat, trace  # noqa: E402
+from reffusion.optimize import GaussianOptimizer  # noqa: E402
+from reffusion.steps import job_of, step_of  # noqa: E402
+from report import charts  # noqa: E402
+from stages import distill as stage  # noqa: E402
+from stages import evaluate  # noqa: E402
+
+MOMENTS = (0, 5, 10, 20, 40, 75, 110, 150)  # steps done
+VIEWS = 10  # test views, evenly over all
+SCORES = ("psnr_box", "ssim_box", "flip_box")
+NEEDS = ("poses", "fit", "masks", "reference", "initialize")
+BASE = "personalize"  # a key that is none of distill's: False takes the prior as it is
+FREE = {"epsilon": 1e-15, "rate": 1.0, "rate_opacity": 1.0}  # Adam's full steps for masked Gaussians, as in the paper
+# What differs from the laptop profile.
+ATTEMPTS: dict[str, dict] = {
+    "the profile": {},
+    "no SDS": {"sds_weight": 0},
+    "prior not personalized": {BASE: False},
+    "ten times the weight": {"sds_weight": 0.3},
+    "whole view only": {"patches": 0},
+    "all timesteps": {"t_high": 0.98},
+    "all timesteps, unit RMS": {"t_high": 0.98, "unit_rms": True, "reduction": "sum", "sds_weight": 1e-5},
+    "free steps": FREE,
+    "free steps, all timesteps": FREE | {"t_high": 0.98},
+    "free steps, all timesteps, not personalized": FREE | {"t_high": 0.98, BASE: False},
+    "free steps, no SDS": FREE | {"sds_weight": 0},
+}
+
+
+def profile(overrides: dict) -> stage.Params:
+    """The laptop profile's parameters of `distill`, changed."""
+    values = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"]["distill"]
+    return stage.Params(**values | {name: value for name, value in overrides.items() if name != BASE})
+
+
+def test_views(run: Path) -> list[tuple]:
+    """(camera, truth uint8 [H, W, 3], box) of `VIEWS` test views.
+
+    Raises:
+        ValueError: none has a truth and a mask.
+    """
+    scene, found = io.load_scene(run / "poses"), []
+    for name in scene.test:
+        camera = scene.cameras[name]
+        truth = evaluate.truth_of(camera, run / "poses")
+        box = metrics.mask_box(evaluate.mask_of(camera, run / "poses", run / "masks"))
+        if truth is not None and box is not None:
+            found.append((camera, truth, box))
+    if not found:
+        raise ValueError(f"{run / 'poses'}: no test view shows the scene without the object; take another scene")
+    return [found[place] for place in np.linspace(0, len(found) - 1, min(VIEWS, len(found))).round().astype(int)]
+
+
+@torch.no_grad()
+def scored(gaussians, views: list[tuple]) -> dict[str, float]:
+    """Means of `SCORES` of 8-bit renders, as `evaluate` gives them."""
+    rows = []
+    for camera, truth, box in views:
+        picture = (splat.render(gaussians, camera).color.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+        rows.append(metrics.score(box.crop(picture), box.crop(truth)))
+    return {name: float(np.mean([row[name.removesuffix("_box")] for row in rows])) for name in SCORES}
+
+
+def curve(overrides: dict, run: Path, start: Path, views: list[tuple]) -> list[dict[str, float]]:
+    """Lines {"seconds", "iteration", the scores} of one attempt."""
+    params = profile(overrides)
+    scene = io.load_scene(run / "poses")
+    initial, masked, holes = stage.start(params, scene, run / "reference", start)
+    adapted = run / "personalize" if overrides.get(BASE, True) else None
+    prior, text = stage.adapted_prior(params, adapted)
+    sights = stage.load_sights(params, scene, run / "poses", run / "fit", run / "masks")
+    settings = stage.settings(params)
+    job = job_of(sights, holes, prior, text, None, settings, initial.means.device)
+    optimizer = GaussianOptimizer(initial, masked, settings.rates, settings.masked_pace, epsilon=settings.epsilon)
+    splat.render(optimizer.gaussians, holes[0][0]).color.sum().backward()  # compiles, before the clock starts
+    optimizer.forget_gradients()
+    with tempfile.TemporaryDirectory() as folder:
+        log = trace.Trace(Path(folder))
+        for step in range(max(MOMENTS) + 1):
+            if step in MOMENTS:
+                with log.paused():
+                    log.log(step, **scored(optimizer.gaussians, views))
+            if step < max(MOMENTS):
+                step_of(optimizer, step, job)
+        return trace.read_trace(log.path)
+
+
+def draw(curves: dict[str, list[dict]], path: Path, title: str) -> None:
+    """PSNR and FLIP against seconds, a line an attempt."""
+    figure, grid = charts.figure(4.2, 1, 2)
+    for axes, (name, label) in zip(grid[0], (("psnr_box", "PSNR, dB ↑"), ("flip_box", "FLIP ↓")), strict=True):
+        for index, (attempt, lines) in enumerate(curves.items()):
+            look = {"color": f"C{index % 10}", "linestyle": "--" if "no SDS" in attempt else "-", "linewidth": 1.3}
+            points = np.array([(line["seconds"], line[name]) for line in lines])
+            axes.plot(*points.T, label=attempt, **look)
+        axes.set(xlabel="seconds", title=label)
+    grid[0, 0].legend(fontsize=6.5, frameon=False)
+    figure.suptitle(title, fontsize=9)
+    charts.save(figure, path)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--run", type=Path, required=True, help="runs/<scene>, personalized and initialized")
+    parser.add_argument("--start", type=Path, help="a folder with another initialization of the same scene")
+    parser.add_argument("--only", nargs="+", choices=list(ATTEMPTS), help="these attempts")
+    parser.add_argument("--out", type=Path, default=Path("runs/attempts"))
+    parser.add_argument("--threads", type=int, default=2)
+    given = parser.parse_args()
+    torch.set_num_threads(given.threads)
+    for need in (*NEEDS, "personalize"):
+        if not (given.run / need).is_dir():
+            raise ValueError(f"{given.run / need} is missing: run `make scene={given.run.name} all` first")
+    given.out.mkdir(parents=True, exist_ok=True)
+    file, views = given.out / "attempts.json", test_views(given.run)
+    curves = io.load_json(file) if file.exists() else {}
+    for name in given.only or ATTEMPTS:
+        if name not in curves:
+            curves[name] = curve(ATTEMPTS[name], given.run, given.start or given.run / "initialize", views)
+            io.save_json(file, curves)
+        last = curves[name][-1]
+        print(f"{name:44}", {s: round(last[s], 4) for s in SCORES}, f"{last['seconds']:.0f} s", flush=True)
+    draw(curves, given.out / "attempts.png", str(given.start or given.run))
+    print(given.out / "attempts.png")
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except ValueError as error:
+        sys.exit(f"error: {error}")

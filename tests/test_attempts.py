@@ -1,0 +1,77 @@
+"""Ways of distilling, error against seconds: every setting is one of the stage's, and a curve is that of the stage."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import small_scene as small
+import torch
+
+from reffusion import io, metrics, splat
+from reffusion.types import Reference
+from stages import distill, initialize, masks
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "benchmarks"))
+
+import attempts as benchmark  # noqa: E402
+
+NEAR = 1.7
+NO_PRIOR = {"sds_weight": 0, "iterations": 4}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A small run up to `initialize`, whose test views have a truth."""
+    home = tmp_path_factory.mktemp("scene")
+    poses, fitted, _ = small.write(home, NEAR)
+    for name in ("masks", "initialize"):
+        (home / name).mkdir()
+    folders = {"poses": poses, "fit": fitted, "masks": home / "masks", "reference": home / "reference"}
+    masks.run(masks.Params(), home / "masks", poses=poses, fit=fitted)
+    view = small.CAMERAS["a2"]
+    invent = io.load_mask_sets(home / "masks", ["a2"])["a2"].invent
+    io.save_references(home / "reference", [Reference(view, small.photo(view), invent)])
+    initialize.run(initialize.Params(), home / "initialize", **folders)
+    for name in small.TEST:
+        io.save_image(poses / "images" / f"{name}.png", small.photo(small.CAMERAS[name]))
+        io.save_mask(poses / "test_masks" / f"{name}.png", small.true_mask(small.CAMERAS[name], NEAR))
+    return home
+
+
+@pytest.mark.parametrize("name", benchmark.ATTEMPTS)
+def test_every_attempt_is_a_setting_of_the_stage(name):
+    changed = {key: value for key, value in benchmark.ATTEMPTS[name].items() if key != benchmark.BASE}
+    params = benchmark.profile(benchmark.ATTEMPTS[name])
+    assert all(getattr(params, key) == value for key, value in changed.items())
+    if changed:
+        assert params != benchmark.profile({})
+
+
+def test_a_curve_begins_at_the_initialization_and_ends_where_the_stage_ends(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(benchmark, "MOMENTS", (0, 4))
+    views = benchmark.test_views(run)
+    lines = benchmark.curve(NO_PRIOR, run, run / "initialize", views)
+    assert [line["iteration"] for line in lines] == [0, 4]
+    needs = {name: run / name for name in benchmark.NEEDS}
+    distill.run(benchmark.profile(NO_PRIOR), tmp_path, personalize=None, **needs)
+    for folder, line in ((run / "initialize", lines[0]), (tmp_path, lines[1])):
+        expected = benchmark.scored(io.load_ply(folder / "gaussians.ply"), views)
+        assert {name: line[name] for name in benchmark.SCORES} == pytest.approx(expected, rel=1e-4)
+
+
+def test_scores_are_those_of_the_box(run):
+    gaussians = io.load_ply(run / "initialize" / "gaussians.ply")
+    camera, truth, box = benchmark.test_views(run)[0]
+    with torch.no_grad():
+        picture = (splat.render(gaussians, camera).color.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    expected = metrics.score_view(picture, truth, box, {}, np.zeros(truth.shape[:2], bool), False)
+    found = benchmark.scored(gaussians, [(camera, truth, box)])
+    assert found == pytest.approx({name: expected[name] for name in benchmark.SCORES})
+
+
+def test_a_scene_without_ground_truth_is_refused(run, tmp_path):
+    poses, _, _ = small.write(tmp_path, NEAR)
+    with pytest.raises(ValueError, match="take another scene"):
+        benchmark.test_views(poses.parent)
