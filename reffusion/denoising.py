@@ -27,7 +27,7 @@ def latent_shape(prior: Prior, size: int) -> tuple[int, int, int]:
 
 
 def denoising_error(
-    prior: Prior, samples: Samples, timesteps: Tensor, noise: Tensor
+    prior: Prior, samples: Samples, timesteps: Tensor, noise: Tensor, outside_weight: float = 1.0
 ) -> tuple[Tensor, Tensor]:
     """([B], [B]): mean squared error of the prior's own target over the whole image, and of the clean latent.
 
@@ -37,6 +37,7 @@ def denoising_error(
     Args:
         timesteps: [B] long.
         noise: [B, C, h, w] standard normal, shaped as the latents.
+        outside_weight: of latents that are given anyway; those to repaint have weight 1. The mean is over the weights.
     """
     images, masks = samples.images.to(prior.device), samples.masks.to(prior.device)
     timesteps, noise = timesteps.to(prior.device), noise.to(prior.device)
@@ -47,7 +48,8 @@ def denoising_error(
         target = diffusion.training_target(prior, latents, noise, timesteps)
     text = diffusion.embed_text(prior, list(PROMPTS))[samples.prompts.to(prior.device)]
     output = diffusion.raw_prediction(prior, noisy, timesteps, condition, text)
-    error = (output - target).square().mean((1, 2, 3))
+    weight = torch.where(condition[:, :1] > 0.5, 1.0, outside_weight)  # the mask comes first
+    error = (weight * (output - target).square()).mean((1, 2, 3)) / weight.mean((1, 2, 3))
     # z_t is given, so both targets are linear in the clean latent: an error of 1 in it is one of a/s in eps, 1/s in v.
     alpha_bar = diffusion.abar(prior, timesteps).flatten()
     odds = alpha_bar if prior.prediction_type == "epsilon" else 1.0

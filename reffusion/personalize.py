@@ -40,6 +40,7 @@ class Training:
         size: side of a sample in pixels, at most the prior's native size.
         seed: of samples, timesteps, noise and dropout.
         checkpoint_seconds: seconds of work between checkpoints.
+        outside_weight: of what a sample's mask leaves to be seen, in the loss.
         patience, stop_gain: stop when in so many twentieths of the steps `clean_latent_mse` has not fallen so many dB,
             and give the weights that were best; 0: never.
     """
@@ -57,6 +58,7 @@ class Training:
     size: int
     seed: int
     checkpoint_seconds: float
+    outside_weight: float = 1.0
     patience: int = 0
     stop_gain: float = 0.0
 
@@ -156,8 +158,8 @@ def train_step(
         torch.manual_seed(int(torch.randint(2**62, (), generator=draw)))
         for rows in torch.arange(training.batch).split(prior.rows_graded or training.batch):
             some = Samples(*(tensor[rows] for tensor in samples))
-            loss = denoising_error(prior, some, timesteps[rows], noise[rows])[0].sum()
-            loss = loss / training.batch / training.accumulate
+            error, _ = denoising_error(prior, some, timesteps[rows], noise[rows], training.outside_weight)
+            loss = error.sum() / training.batch / training.accumulate
             loss.backward()
             total += loss.item()
     trained = [parameter for group in optimizer.param_groups for parameter in group["params"]]

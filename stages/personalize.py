@@ -37,6 +37,8 @@ class Params(BaseModel):
     local_share: float = Field(0.5, ge=0, le=1, description="share of the reference's samples that are local crops")
     scene_crops: float = Field(0.0, ge=0, lt=1, description="share of samples from unmasked crops of the scene's views")
     hole_share: float = Field(0.0, ge=0, le=1, description="share of the reference's samples whose mask is its hole")
+    # What is given is soon denoised well; at weight 1 the hole, a small part of a sample, learns from what is left.
+    outside_weight: float = Field(1.0, gt=0, le=1, description="weight in the loss of what a mask leaves to be seen")
     empty_share: float = Field(0.1, ge=0, lt=1, description="share of samples with the empty prompt")
     border: float = Field(0.1, ge=0, lt=0.5, description="largest strip cropped off each side, in sides")
     rectangles: tuple[int, int] = Field((1, 29), description="fewest and most rectangles of a mask")

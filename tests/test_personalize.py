@@ -125,6 +125,23 @@ def test_loss_is_the_priors_own_and_its_clean_latent_error_is_predicts(tiny, kin
         torch.testing.assert_close(error, (eps - noise).square().mean((1, 2, 3)))
 
 
+def test_what_a_mask_leaves_to_be_seen_counts_by_its_weight(tiny):
+    draw = generator(5)
+    samples = crops.draw_samples([striped()], [], NATIVE, SIZE, 3, Sampling(), draw)
+    t, noise = torch.tensor([10, 500, 950]), torch.randn(3, 4, SIZE, SIZE, generator=draw)
+    with torch.no_grad():
+        latents = diffusion.encode(tiny, samples.images)
+        condition = diffusion.conditioning(tiny, samples.images, samples.masks)
+        noisy = diffusion.add_noise(tiny, latents, noise, t)
+        text = diffusion.embed_text(tiny, [crops.PROMPTS[p] for p in samples.prompts])
+        wrong = diffusion.raw_prediction(tiny, noisy, t, condition, text)
+        wrong = (wrong - diffusion.training_target(tiny, latents, noise, t)).square().mean(1, keepdim=True)
+        for weight in (1.0, 0.2, 1e-6):
+            error, _ = denoising.denoising_error(tiny, samples, t, noise, weight)
+            of_each = samples.masks + weight * (1 - samples.masks)
+            torch.testing.assert_close(error, (of_each * wrong).sum((1, 2, 3)) / of_each.sum((1, 2, 3)))
+
+
 def test_learning_rate_warms_up_and_falls():
     factor = lambda step, schedule: P.learning_rate_factor(step, 100, 10, schedule)
     assert factor(0, "cosine") == 0.1 and factor(9, "constant") == 1 and factor(99, "constant") == 1
