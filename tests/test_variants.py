@@ -33,9 +33,9 @@ FILLED = ("reference", "personalize", "initialize", "distill")
 PLANS = {
     "no_personalization": (AFTER, ("personalize",)),
     "no_splitting": (AFTER, ()),
-    "no_local_sds": (AFTER, ()),
     "no_reference_init": (("initialize", *AFTER), ()),
-    "no_adversarial": ((), ()),  # the laptop profile has neither term
+    "no_local_sds": ((), ()),  # the laptop profile has none of these three
+    "no_adversarial": ((), ()),
     "no_depth": ((), ()),
     "no_sds": (AFTER, ("personalize",)),
     "masked": (("fit", "evaluate"), ("masks", *FILLED)),
