@@ -42,6 +42,8 @@ class Settings:
         adversarial: the adversarial term; None leaves it out.
         reconstruction_every: steps between two with a reconstruction term; 0: never.
         reference_weight: of the reference's own pixels in its hole (paper: 0).
+        reference_reaches: the Gaussians that those pixels move: "masked" ones, or "all" that show in the hole; what of
+            the background other views saw there carries the object's tint.
         lift: supervision by pictures inpainted in 2D (baselines; not in the paper's method); None leaves it out.
         reconstruction_reaches: "unmasked" Gaussians, or all that are "shown" in the pixels a photograph may supervise:
             also the masked ones at the hole's rim, whose footprints reach out of it.
@@ -74,6 +76,7 @@ class Settings:
     adversarial: Adversarial | None = None
     reconstruction_every: int = 1
     reference_weight: float = 0.0
+    reference_reaches: Literal["masked", "all"] = "masked"
     lift: Lift | None = None
     reconstruction_reaches: Literal["unmasked", "shown"] = "unmasked"
     confined: bool = True
@@ -221,7 +224,8 @@ def _reference(optimizer: GaussianOptimizer, step: int, job: Job) -> _Done:
     gaussians, masked, weight = optimizer.gaussians, optimizer.masked, job.settings.reference_weight
     if not (weight > 0 and masked.any()):
         return None
-    (camera, image, hole), reached = job.holes[step % len(job.holes)], _reached(optimizer, job)
+    camera, image, hole = job.holes[step % len(job.holes)]
+    reached = _reached(optimizer, job) | (job.settings.reference_reaches == "all")
     with _named(step, "reference", camera):
         loss, rendering = reference_term(gaussians, reached, camera, image, hole)
         _backward(weight * loss, gaussians)

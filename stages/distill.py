@@ -63,6 +63,9 @@ class Params(BaseModel):
     adversarial_reaches: Literal["masked", "all"] = Field("masked", description="the Gaussians whose colour it moves")
     reconstruction_every: int = Field(1, ge=0, description="steps between two with a reconstruction term; 0: never")
     reference_weight: float = Field(0.0, ge=0, description="weight of the reference's pixels in its hole (paper: 0)")
+    reference_reaches: Literal["masked", "all"] = Field(
+        "masked", description="Gaussians that these pixels move: masked ones, or all that show in the hole"
+    )
     # Not in the paper's method: the terms of the baselines that carry pictures inpainted in 2D into the scene.
     lift_weight: float = Field(0.0, ge=0, description="weight of the pictures of the stage lift; 0 leaves it out")
     lift_loss: Literal["mse", "perceptual"] = Field(

@@ -170,6 +170,13 @@ def test_without_confinement_every_term_reaches_all_gaussians(tmp_path, confined
     assert (labels == masked).all()
 
 
+@pytest.mark.parametrize("reaches", ["masked", "all"])
+def test_the_references_pixels_may_move_the_background_in_the_hole_too(tmp_path, reaches):
+    chosen = {"reference_reaches": reaches, "reference_weight": 1.0, "reconstruction_every": 0}
+    start, ended, masked, _ = run_distill(tmp_path / reaches, [sight("a")], **chosen)
+    assert moved(start, ended)[masked].any() and moved(start, ended)[~masked].any() == (reaches == "all")
+
+
 # ---------------------------------------------------------------------------------------------------- the stages
 
 
