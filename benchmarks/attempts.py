@@ -112,14 +112,16 @@ def curve(overrides: dict, run: Path, start: Path, views: list[tuple]) -> list[d
 
 def draw(curves: dict[str, list[dict]], path: Path, title: str) -> None:
     """PSNR and FLIP against seconds, a line an attempt."""
-    figure, grid = charts.figure(4.2, 1, 2)
+    figure, grid = charts.figure(4.6, 1, 2)
     for axes, (name, label) in zip(grid[0], (("psnr_box", "PSNR, dB ↑"), ("flip_box", "FLIP ↓")), strict=True):
         for index, (attempt, lines) in enumerate(curves.items()):
-            look = {"color": f"C{index % 10}", "linestyle": "--" if "no SDS" in attempt else "-", "linewidth": 1.3}
+            style = "--" if "no SDS" in attempt else ":" if attempt.startswith("free") else "-"
+            look = {"color": f"C{index % 10}" if index < 10 else charts.INK, "linestyle": style, "linewidth": 1.5}
             points = np.array([(line["seconds"], line[name]) for line in lines])
             axes.plot(*points.T, label=attempt, **look)
         axes.set(xlabel="seconds", title=label)
-    grid[0, 0].legend(fontsize=6.5, frameon=False)
+    named = grid[0, 0].get_legend_handles_labels()
+    figure.legend(*named, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
     figure.suptitle(title, fontsize=9)
     charts.save(figure, path)
 
