@@ -1,4 +1,4 @@
-"""Every way of distilling that was tried, error against seconds: `python benchmarks/attempts.py --run runs/demo`.
+"""Ways of distilling, error against seconds: `python benchmarks/attempts.py --run runs/demo`.
 
 From one initialization, each setting of `ATTEMPTS` runs for the laptop profile's number of steps; at some of them the
 Gaussians are rendered from test views, with the clock stopped, and scored in the mask's box. The initialization is the
@@ -34,7 +34,7 @@ VIEWS = 10  # test views, evenly over all
 SCORES = ("psnr_box", "ssim_box", "flip_box")
 NEEDS = ("poses", "fit", "masks", "reference", "initialize")
 BASE = "personalize"  # a key that is none of distill's: False takes the prior as it is
-FREE = {"epsilon": 1e-15, "rate": 1.0, "rate_opacity": 1.0}  # Adam's full steps for masked Gaussians, as in the paper
+FREE = {"epsilon": 1e-15, "rate": 1.0, "rate_opacity": 1.0}  # 3DGS's full steps for masked Gaussians
 # What differs from the laptop profile.
 ATTEMPTS: dict[str, dict] = {
     "the profile": {},
