@@ -2,10 +2,10 @@
 
 term             pixels                                        Gaussians
 reconstruction   outside the consistent mask; all if clean     unmasked (or all that show there); all if clean
-SDS              whole view and patches, the hole repainted    masked
+SDS              whole view and patches, the hole repainted    masked (or all)
 depth            the hole (reffusion.depth_term)               masked, all but spherical harmonics
 adversarial      patches around the hole                       masked (or all), spherical harmonics only
-reference        the reference's hole (not in the paper)       masked
+reference        the reference's hole (not in the paper)       masked (or all)
 lift             the hole, or patches around it (a baseline's) masked
 """
 

@@ -38,6 +38,7 @@ class Settings:
         seed: of views, windows, timesteps, noise, splits and the critic's first weights.
         sds_weight: lambda of the SDS term; 0 leaves it out.
         sds: the choices within that term.
+        sds_reaches: the Gaussians that it moves: "masked" ones, or "all" that show, the background in the hole too.
         depth: the depth term; None leaves it out.
         adversarial: the adversarial term; None leaves it out.
         reconstruction_every: steps between two with a reconstruction term; 0: never.
@@ -72,6 +73,7 @@ class Settings:
     seed: int = 0
     sds_weight: float = 1e-3
     sds: Distillation = field(default_factory=Distillation)
+    sds_reaches: Literal["masked", "all"] = "masked"
     depth: DepthRegularization | None = None
     adversarial: Adversarial | None = None
     reconstruction_every: int = 1
@@ -174,7 +176,8 @@ def _sds(optimizer: GaussianOptimizer, step: int, job: Job) -> _Done:
     gaussians, masked, settings = optimizer.gaussians, optimizer.masked, job.settings
     if not (settings.sds_weight > 0 and job.painted and masked.any()):
         return None
-    sight, reached = _drawn(job.painted, step, settings.seed, "sds"), _reached(optimizer, job)
+    sight = _drawn(job.painted, step, settings.seed, "sds")
+    reached = _reached(optimizer, job) | (settings.sds_reaches == "all")
     probe = torch.zeros(len(masked), 2, device=masked.device, requires_grad=True)
     draw = trace.generator(settings.seed, "distill", "sds", step)
     with _named(step, "SDS", sight.camera):

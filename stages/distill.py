@@ -19,6 +19,8 @@ class Params(BaseModel):
     # PAPER leaves open: the number of iterations; 3DGS's own, less the fit's, is of this size.
     iterations: int = Field(5000, ge=1, description="optimisation steps")
     sds_weight: float = Field(1e-3, ge=0, description="lambda of the SDS term; 0 leaves it out")
+    # The paper confines it to masked ones. Background that was seen through the hole wears the object's tint.
+    sds_reaches: Literal["masked", "all"] = Field("masked", description="Gaussians it moves; all: all that show there")
     patches: int = Field(2, ge=0, description="local patches beside the whole view")
     # PAPER leaves open: timesteps, w(t), normalisation, guidance, reduction: see reffusion.sds. threestudio's here.
     t_low: float = Field(0.02, ge=0, le=1, description="lowest timestep, as a part of the schedule")

@@ -251,6 +251,15 @@ def test_each_set_of_gaussians_moves_by_its_own_terms_only(prior, text, tmp_path
     assert (three.sh[masked] != start.sh[masked]).any()
 
 
+def test_distillation_may_reach_the_background_too_but_not_what_does_not_show(prior, text, tmp_path):
+    start, masked = wall()
+    plain = replace(SETTINGS, adversarial=None, densify_every=0, reference_weight=0.0, region_every=100, iterations=2)
+    settings, view = replace(plain, reconstruction_every=0, sds_reaches="all"), sight("a")
+    moved = changed(start, run(tmp_path / "all", prior, text, settings, [view])[0])
+    shown = splat.accumulate(start, view.camera, torch.ones(*hole().shape, 1))[:, 0] > 0
+    assert (moved & masked).any() and (moved & ~masked).any() and not (moved & ~shown).any()
+
+
 def test_photographs_may_reach_the_masked_gaussians_that_show_outside_the_hole(tmp_path):
     """Those that show inside it only lie still."""
     start, masked = wall()
