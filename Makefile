@@ -17,6 +17,7 @@ steps :=
 gate :=
 slow :=
 offline :=
+port :=
 
 # GOMP_SPINCOUNT: see reffusion/__init__.py
 export set # its value may hold quotes, so recipes read it from the environment
@@ -30,8 +31,8 @@ STAGES := poses fit masks reference lift personalize initialize distill evaluate
 options = $(if $(profile),--profile '$(profile)') $(if $(variant),--variant '$(variant)') \
 	$(if $(budget),--budget '$(budget)') $(if $(set),--set "$$set") $(if $(trust),--trust) $(if $(runs),--runs '$(runs)')
 
-.PHONY: help setup all $(STAGES) plan clean batch weights demo prior prior-report sds-variance turntable test bench \
-	stability gpu-check lint
+.PHONY: help setup all $(STAGES) plan clean batch weights demo prior prior-report sds-variance view turntable test \
+	bench stability gpu-check lint
 .DELETE_ON_ERROR:
 
 help:
@@ -41,6 +42,7 @@ help:
 	@echo 'make scene=X compare           the full method, ablations and baselines side by side: runs/X/compare.html'
 	@echo '                               variants=a,b  only these; seeds=5  on demo, demo-1 ... demo-4, with intervals'
 	@echo 'make scene=X report            what was done, errors against seconds: runs/X/report/index.html'
+	@echo 'make scene=X view              walk through the finished scene in a browser; port=8080'
 	@echo 'make scene=X turntable         the finished scene on a way around the capture: runs/X/turntable.webm'
 	@echo 'make scene=X sds-variance      the SDS gradient over noise and timesteps, before and after personalization'
 	@echo 'make data=FOLDER report        the same of all its scenes: runs/report/index.html'
@@ -71,6 +73,10 @@ $(VENV)/bin/python:
 
 $(VENV)/.ready: pyproject.toml constraints.txt | $(VENV)/bin/python
 	$(PY) -m pip install --quiet --no-compile --constraint constraints.txt --editable .
+	@touch $@
+
+$(VENV)/.ready-view: $(VENV)/.ready
+	$(PY) -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[view]'
 	@touch $@
 
 $(VENV)/.ready-dev: $(VENV)/.ready
@@ -121,6 +127,10 @@ ifneq ($(scene),)
 else
 	@$(PY) -m report.job --data '$(data)' $(if $(variant),--variant '$(variant)') $(if $(runs),--runs '$(runs)')
 endif
+
+view: named $(VENV)/.ready-view
+	@$(PY) -m report.view --scene '$(scene)' $(if $(variant),--variant '$(variant)') $(if $(runs),--runs '$(runs)') \
+		$(if $(port),--port '$(port)')
 
 turntable: named setup
 	@$(PY) -m report.turntable --scene '$(scene)' $(if $(variant),--variant '$(variant)') $(if $(runs),--runs '$(runs)')

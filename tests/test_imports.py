@@ -111,7 +111,8 @@ def test_library(path):
 @pytest.mark.parametrize("path", sources("report"), ids=named)
 def test_report_reads_through_io(path):
     own = {name for name in imports(path) if name.split(".")[0] in OWN - {"report"}}
-    drawing = ("reffusion.flight", "reffusion.splat") if named(path) == "report/turntable.py" else ()
+    draws = named(path) in ("report/turntable.py", "report/view.py")
+    drawing = ("reffusion.flight", "reffusion.splat", "reffusion.types") if draws else ()
     assert all(name.startswith(("reffusion.io", *drawing)) for name in own), own
 
 

@@ -1,0 +1,117 @@
+"""The viewer: whose camera is drawn, which layers there are, what a visitor is shown, and when."""
+
+import time
+import urllib.request
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import small_scene
+import torch
+
+from reffusion import io, splat
+from reffusion.types import Scene, Similarity
+from report import view
+
+SIMILARITY = Similarity(2.0, np.array([0.1, 0.2, 0.3]))
+NEEDS = {"poses": "a", "fit": "b", "masks": "c", "initialize": "d", "distill": "e", "lift": None}
+
+
+def finished(home, needs):
+    """A run whose result is the wall; before distillation the square stood before it, too."""
+    gaussians, labels = small_scene.gaussians(1.0)
+    train = {name: small_scene.CAMERAS[name] for name in small_scene.TRAIN}
+    points = gaussians.means.double().numpy()
+    scene = Scene(train, small_scene.TRAIN, (), frozenset(), points, np.zeros((len(points), 3), np.uint8), SIMILARITY)
+    poses = home.with_name(home.name.split("@")[0]) / "poses"
+    io.save_scene(poses, scene)
+    for name in small_scene.TRAIN:
+        io.save_image(poses / "images" / f"{name}.png", small_scene.photo(train[name]))
+    for stage in ("fit", "initialize", "distill"):
+        io.save_ply(home / stage / "gaussians.ply", gaussians)
+        if stage != "fit":
+            io.save_labels(home / stage / "labels.npy", labels)
+    shown = gaussians if needs["distill"] else gaussians.map(lambda p: p[~labels])
+    io.save_ply(home / "evaluate" / "scene.ply", shown, similarity=SIMILARITY)
+    io.save_json(home / "evaluate" / "receipt.json", {"needs": needs})
+    return gaussians, labels
+
+
+def visitor(camera):
+    """A visitor's camera as viser describes it."""
+    rotation = camera.world_to_camera[:3, :3]
+    place = {"wxyz": view._quaternion(rotation.T), "position": camera.center}
+    return SimpleNamespace(**place, fov=view.field_of_view(camera), aspect=camera.width / camera.height)
+
+
+def test_a_visitor_who_stands_at_a_view_sees_that_view():
+    gaussians, _ = small_scene.gaussians(1.0)
+    for camera in small_scene.CAMERAS.values():
+        centred = camera.cropped(0, 0, round(2 * camera.cx), round(2 * camera.cy))
+        seen = view.camera_of(visitor(centred), centred.height)
+        assert (seen.width, seen.height) == (centred.width, centred.height)
+        assert np.allclose(seen.world_to_camera, centred.world_to_camera)
+        expected = (splat.render(gaussians, centred).color.clamp(0, 1) * 255).round().byte().numpy()
+        assert np.abs(view.picture(gaussians, seen).astype(int) - expected).max() <= 1
+
+
+def test_the_layers_are_those_that_the_result_was_made_from(tmp_path):
+    gaussians, labels = finished(tmp_path / "x", NEEDS)
+    found = view.layers(tmp_path / "x", SIMILARITY)
+    assert list(found) == ["result", "before distillation", "as photographed"]
+    assert torch.allclose(found["result"].gaussians.means, gaussians.means, atol=1e-6)
+    assert len(found["result"].shown(there=True, added=True)) == len(gaussians)
+    assert len(found["result"].shown(there=False, added=True)) == int(labels.sum())
+    assert len(found["as photographed"].shown(there=False, added=True)) == 0
+    finished(tmp_path / "x@remove", NEEDS | {"initialize": None, "distill": None})
+    assert list(view.layers(tmp_path / "x@remove", SIMILARITY)) == ["result"]
+    with pytest.raises(ValueError, match="make scene=x variant=no_sds all"):
+        view.layers(tmp_path / "x@no_sds", SIMILARITY)
+
+
+def test_nothing_is_served_of_a_scene_that_is_not_there(tmp_path):
+    with pytest.raises(ValueError, match="make scene=y all"):
+        view.Window(tmp_path / "y")
+
+
+@pytest.fixture
+def window(tmp_path):
+    finished(tmp_path / "x", NEEDS)
+    opened = view.Window(tmp_path / "x", port=8300)
+    yield opened
+    opened.close()
+
+
+def test_the_page_is_served_on_this_machine_only(window):
+    assert window.server.get_host() == "127.0.0.1"
+    with urllib.request.urlopen(f"http://127.0.0.1:{window.server.get_port()}") as page:
+        assert page.status == 200
+
+
+def test_a_visitor_gets_a_small_picture_at_once_then_the_whole_and_another_when_he_chooses(window, monkeypatch):
+    drawn = []
+
+    camera = visitor(small_scene.CAMERAS[small_scene.TRAIN[0]])
+    camera.on_update = lambda _: None
+    guest = SimpleNamespace(
+        client_id=7, camera=camera, scene=SimpleNamespace(set_background_image=lambda image, **_: drawn.append(image))
+    )
+    monkeypatch.setattr(window.server, "get_clients", lambda: {7: guest})
+    window._visit(guest)
+    wait(lambda: len(drawn) == 2)
+    assert [image.shape[0] for image in drawn] == [view.MOVING, view.STILL]
+    assert np.array_equal(drawn[-1], view.picture(window.shown, view.camera_of(camera, view.STILL)))
+    there = next(h for h in window.server.gui._gui_input_handle_from_uuid.values() if h.label == "what was there")
+    there.value = False
+    wait(lambda: len(drawn) == 4)
+    assert drawn[-1].mean() < drawn[1].mean(), "the wall is gone"
+    monkeypatch.setattr(window.server, "get_clients", dict)
+    wait(lambda: 7 not in window.asked)
+
+
+def wait(done):
+    for _ in range(600):
+        if done():
+            return
+        time.sleep(0.05)
+    raise AssertionError("it did not happen within half a minute")
