@@ -30,7 +30,9 @@ class Sheets:
     Attributes:
         spread, thickness, grazing: see `surface_gaussians`.
         opacity: of the first sheet.
-        sunk, under_opacity: how far behind it the second lies, in pixels (0: there is none), and its opacity.
+        sunk: how far behind it the second lies, in pixels (0: there is none).
+        under_spread, under_opacity: the second's. Wider Gaussians than the first's leave no gaps between them, which a
+            nearer view would show as a grid; what that blurs the colours of the first make up for.
         color_steps: corrections of the colours, see `match_colors`.
     """
 
@@ -39,6 +41,7 @@ class Sheets:
     grazing: float
     opacity: float
     sunk: float
+    under_spread: float
     under_opacity: float
     color_steps: int
 
@@ -140,12 +143,12 @@ def surface(
     image: np.ndarray, depth: np.ndarray, pixels: np.ndarray, camera: Camera, sh_count: int, how: Sheets
 ) -> Gaussians:
     """Both sheets, see `surface_gaussians`."""
-    shown, shape = (image, depth, pixels, camera), {"sh_count": sh_count, "spread": how.spread}
-    shape |= {"thickness": how.thickness, "grazing": how.grazing}
-    sheet = surface_gaussians(*shown, **shape, opacity=how.opacity)
+    shown = (image, depth, pixels, camera)
+    shape = {"sh_count": sh_count, "thickness": how.thickness, "grazing": how.grazing}
+    sheet = surface_gaussians(*shown, **shape, spread=how.spread, opacity=how.opacity)
     if not how.sunk:
         return sheet
-    under = surface_gaussians(*shown, **shape, opacity=how.under_opacity, sunk=how.sunk)
+    under = surface_gaussians(*shown, **shape, spread=how.under_spread, opacity=how.under_opacity, sunk=how.sunk)
     return sheet.zipped(under, lambda a, b: torch.cat([a, b]))
 
 

@@ -36,7 +36,7 @@ class Params(BaseModel):
     solver_luma: float = Field(8.0, gt=0, description="bilateral solver: cell size, levels of 255")
     solver_chroma: float = Field(8.0, gt=0, description="bilateral solver: cell size, levels of 255")
     seed: int = Field(0, description="of the draws that find planes")
-    spread: float = Field(0.35, gt=0, description="standard deviation of new Gaussians, pixels of the reference")
+    spread: float = Field(0.3, gt=0, description="standard deviation of new Gaussians, pixels of the reference")
     thickness: float = Field(0.1, gt=0, description="their deviation along the normal over that within the surface")
     grazing: float = Field(0.15, gt=0, le=1, description="least cosine to the view at which they are stretched")
     # PAPER leaves open: opacity. Of opaque neighbours the nearer one hides half of the next, so that what is painted on
@@ -44,7 +44,8 @@ class Params(BaseModel):
     # second sheet behind them keeps the surface closed. See docs/initialization.md.
     opacity: float = Field(0.4, gt=0, lt=1, description="their opacity")
     sunk: float = Field(1.0, ge=0, description="a second sheet lies so many pixels behind the first; 0: there is none")
-    under_opacity: float = Field(0.95, gt=0, lt=1, description="its opacity")
+    under_spread: float = Field(0.6, gt=0, description="standard deviation of its Gaussians, pixels of the reference")
+    under_opacity: float = Field(0.8, gt=0, lt=1, description="its opacity")
     # PAPER leaves open: the depth model of the reference, and whether its alignment is plain or robust.
     depth_model: str | None = Field(
         None,
