@@ -120,6 +120,15 @@ def test_the_new_surface_shows_no_holes_nearer_by_or_from_the_side(degrees, clos
     assert splat.render(surface, other).alpha.min() > 0.8
 
 
+@pytest.mark.parametrize("degrees", [0.0, 40.0, 60.0])
+def test_no_grid_shows_from_four_times_nearer(degrees):
+    disparity, view, _ = slanted(degrees)
+    white, whole = np.full((*disparity.shape, 3), 255, np.uint8), np.ones(disparity.shape, bool)
+    near = view.cropped(view.width // 2 - 8, view.height // 2 - 8, 16, 16).resized(64, 64)
+    alpha = splat.render(rules.surface(white, 1 / disparity, whole, view, 1, SHEETS), near).alpha
+    assert alpha.min() > 0.9 and alpha.std() < 0.02
+
+
 def floor_view(turn: float) -> Camera:
     """A point of the floor y = 0 seen from 30 degrees above it, `turn` degrees around the vertical."""
     a, b = np.radians(turn), np.radians(30)
