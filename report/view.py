@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from reffusion import flight, io, splat
 from reffusion.types import Camera, Gaussians, Scene, Similarity
@@ -30,7 +32,7 @@ class Layer:
     """A state of the scene: its Gaussians, and which of them were added, [N] bool."""
 
     gaussians: Gaussians
-    added: Any
+    added: Tensor
 
     def shown(self, there: bool, added: bool) -> Gaussians:
         """Of what was there, and what was added, the asked parts."""
@@ -59,7 +61,7 @@ def layers(home: Path, similarity: Similarity) -> dict[str, Layer]:
         if stage in used:
             labels, title = folder / "labels.npy", title if found else "result"
             gaussians = io.load_ply(folder / "gaussians.ply") if found else result
-            added = io.load_labels(labels) if labels.exists() else gaussians.opacity_logits.isnan()
+            added = io.load_labels(labels) if labels.exists() else torch.zeros(len(gaussians), dtype=torch.bool)
             found[title] = Layer(gaussians, added)
     return found
 
