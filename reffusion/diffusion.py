@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 from torch.utils.checkpoint import checkpoint
 
+from reffusion import fill
 from reffusion.prior import Prior
 
 
@@ -73,10 +74,11 @@ def decode(prior: Prior, latents: Tensor) -> Tensor:
 def conditioning(prior: Prior, images: Tensor, masks: Tensor) -> Tensor:
     """What the UNet sees beside the noisy latents: [mask | latents of the image outside the mask], [B, 1 + C, h, w].
 
-    Carries no gradient. `images` [B, 3, H, W] in [-1, 1], `masks` [B, 1, H, W], 1 = repaint.
+    Carries no gradient. `images` [B, 3, H, W] in [-1, 1], `masks` [B, 1, H, W], 1 = repaint; the hole is grey, or filled
+    from its surroundings, by `prior.fills`.
     """
     hidden = (masks > 0.5).to(images.dtype)
-    latents = encode(prior, images * (1 - hidden))
+    latents = encode(prior, fill.extended(images, hidden) if prior.fills else images * (1 - hidden))
     small = interpolate(hidden, size=latents.shape[-2:], mode="nearest") if prior.factor > 1 else hidden
     return torch.cat([small.float(), latents], 1)
 

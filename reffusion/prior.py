@@ -13,6 +13,7 @@ Half precision is for UNet and text encoders. Float32 in any case:
 
 from __future__ import annotations
 
+import json
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +23,9 @@ import torch
 from torch import Tensor, nn
 
 from reffusion import weights
+
+CONDITIONING = "conditioning.json"  # of a folder, {"hole": one of HOLES}: what the masked image shows in its hole
+HOLES = ("grey", "harmonic")
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,8 @@ class Prior:
         zero_empty: the empty prompt is embedded as zeros (SDXL says so of itself).
         rows, rows_graded: samples that UNet and VAE take in one pass, without and with a gradient; 0: all. A gradient
             through more is computed part by part, each part's activations once more on the way back.
+        fills: beside the noisy latents the model is shown the picture with the hole filled from its surroundings
+            (`fill.extended`), as the folder's conditioning.json says; else with a grey hole, as libraries do.
     """
 
     unet: nn.Module
@@ -52,6 +58,7 @@ class Prior:
     zero_empty: bool = False
     rows: int = 0
     rows_graded: int = 0
+    fills: bool = False
 
     @property
     def device(self) -> torch.device:
@@ -116,7 +123,22 @@ def load_prior(source: str | Path, device: str = "cpu", dtype: torch.dtype = tor
     tokenizer_2 = tokenizers[1] if second else None
     prior = make_prior(unet, vae, text, tokenizers[0], scheduler, device, str(source), text_2, tokenizer_2)
     index = folder / "model_index.json"
-    return replace(prior, zero_empty=second and '"force_zeros_for_empty_prompt": true' in index.read_text())
+    zero_empty = second and '"force_zeros_for_empty_prompt": true' in index.read_text()
+    return replace(prior, zero_empty=zero_empty, fills=_fills(folder))
+
+
+def _fills(folder: Path) -> bool:
+    """What the folder's conditioning.json says of holes; without that file they are grey."""
+    path = folder / CONDITIONING
+    if not path.exists():
+        return False
+    try:
+        hole = json.loads(path.read_text())["hole"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"prior {path}: cannot be read: {_line(error)}") from error
+    if hole not in HOLES:
+        raise ValueError(f"prior {path}: hole is {hole!r}, not one of {', '.join(HOLES)}")
+    return hole == "harmonic"
 
 
 def _part(kind: Any, folder: Path, part: str, **dtype: torch.dtype) -> nn.Module:

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from reffusion import diffusion, lora
-from reffusion.prior import load_prior, make_prior
+from reffusion import diffusion, fill, lora
+from reffusion.prior import CONDITIONING, load_prior, make_prior
 from reffusion.trace import generator
 
 TINY = Path(__file__).resolve().parent.parent / "priors" / "tiny"
@@ -72,6 +72,25 @@ def test_conditioning_hides_what_lies_under_the_mask(tiny):
     assert torch.equal(diffusion.conditioning(tiny, images, masks), diffusion.conditioning(tiny, other, masks))
     images.requires_grad_(True)
     assert not diffusion.conditioning(tiny, images, masks).requires_grad
+
+
+def test_a_folder_says_what_the_hole_shows(tiny, tmp_path):
+    images, masks = pictures(), half_masks()
+    filled = fill.extended(images, masks)
+    assert tiny.fills
+    expected = torch.cat([masks, diffusion.encode(tiny, filled)], 1)
+    assert torch.equal(diffusion.conditioning(tiny, images, masks), expected)
+    folder = tmp_path / "prior"
+    shutil.copytree(TINY, folder)
+    said = folder / CONDITIONING
+    for text in ('{"hole": "grey"}', None):
+        said.write_text(text) if text else said.unlink()
+        grey = diffusion.conditioning(load_prior(folder), images, masks)
+        assert torch.equal(grey, torch.cat([masks, diffusion.encode(tiny, images * (1 - masks))], 1))
+    for text in ('{"hole": "blue"}', "{}", "[", "3"):
+        said.write_text(text)
+        with pytest.raises(ValueError, match=CONDITIONING):
+            load_prior(folder)
 
 
 def test_sampling_repeats_with_its_seed_and_is_finite(tiny):

@@ -25,7 +25,10 @@ from diffusers import StableDiffusionInpaintPipeline, UNet2DConditionModel  # no
 from torch import Tensor, nn  # noqa: E402
 from transformers import CLIPTextModel  # noqa: E402
 
+from reffusion import fill  # noqa: E402
 from reffusion.denoising import spread_timesteps  # noqa: E402
+from reffusion.io import save_json  # noqa: E402
+from reffusion.prior import CONDITIONING  # noqa: E402
 from reffusion.trace import generator, load_checkpoint, save_checkpoint, seed_for  # noqa: E402
 
 POOL = 500  # images held in memory
@@ -36,6 +39,8 @@ SMALL, LARGE = (
 )  # (crop side in px, batch): small crops three steps of four, whole native ones the fourth
 PEAK_RATE, WARMUP, FALL, EMA = 1e-3, 200, 0.5, 0.999  # FALL: share of the run, at its end, over which the rate falls
 OUTSIDE = 0.2  # weight of the loss on pixels the network is given anyway
+FILLED = 0.8  # share of samples that show the hole filled from its surroundings, as conditioning.json says; else grey
+NOISIEST = 0.15
 LATENTS = (1.0, 1.0, 1.0, 0.02)  # weight of each latent; the fourth is empty, and need only stay near that
 VALIDATION = 32  # held-out crops
 KEEP = 100  # steps between checkpoints
@@ -87,11 +92,24 @@ class Model(nn.Module):
         return self.unet(torch.cat([noisy, condition], 1), t, words).sample
 
 
+def noisy_quarter(t: Tensor, steps: int) -> Tensor:
+    """Timesteps of which every fourth is moved into the last `NOISIEST` of the schedule.
+
+    There the network can only answer the mean of all fillings, and must forget the noise: what the sampler's first
+    step, which decides colours and layout, is made of.
+    """
+    last = steps - 1
+    moved = last - ((last - t) * NOISIEST).long()
+    return torch.where(torch.arange(len(t)) % 4 == 0, moved, t)
+
+
 def loss(model: Model, alphas: Tensor, batch: tuple[Tensor, Tensor, list[str]], random: torch.Generator) -> Tensor:
     """Mean squared error of v = sqrt(a) eps - sqrt(1 - a) z, weighted by OUTSIDE (hole pixels 1) and LATENTS."""
     pixels, masks, captions = batch
-    clean, given = build.latents(pixels), build.latents(pixels * (masks < 0.5))
-    t = spread_timesteps(len(pixels), len(alphas), random)
+    filled = torch.rand(len(pixels), 1, 1, 1, generator=random) < FILLED
+    shown = torch.where(filled, fill.extended(pixels, masks), pixels * (masks < 0.5))
+    clean, given = build.latents(pixels), build.latents(shown)
+    t = noisy_quarter(spread_timesteps(len(pixels), len(alphas), random), len(alphas))
     noise = torch.randn(clean.shape, generator=random)
     a = alphas[t].view(-1, 1, 1, 1)
     noisy, target = a.sqrt() * clean + (1 - a).sqrt() * noise, a.sqrt() * noise - (1 - a).sqrt() * clean
@@ -176,6 +194,7 @@ def export(average: dict[str, Tensor], folder: Path) -> None:
         requires_safety_checker=False,
     )
     pipeline.to(dtype=torch.float16).save_pretrained(folder)
+    save_json(folder / CONDITIONING, {"hole": "harmonic"})
 
 
 def arguments() -> argparse.Namespace:
