@@ -66,7 +66,7 @@ class Distillation:
     Attributes:
         patches: local patches beside the whole view (paper: 2; 0 leaves the local term out).
         low, high: range of the timesteps, as parts of the schedule.
-        weighting, unit_rms: of the gradient.
+        weighting, unit_rms, keep_contrast: of the gradient.
         hole_only: drop the gradient at latents that are not repainted.
         guidance: the paper's a.
         reduction: sum or mean over the elements of a latent.
@@ -78,6 +78,7 @@ class Distillation:
     weighting: Weighting = "sigma2"
     unit_rms: bool = False
     hole_only: bool = False
+    keep_contrast: bool = False
     guidance: float = 7.5
     reduction: Literal["sum", "mean"] = "sum"
 
@@ -157,6 +158,7 @@ def sds_term(
         prior.alphas_cumprod,
         weighting=settings.weighting,
         unit_rms=settings.unit_rms,
+        keep_contrast=settings.keep_contrast,
         mask=condition[:, :1] if settings.hole_only else None,
     )
     if not torch.isfinite(gradient).all():

@@ -88,6 +88,26 @@ def draw_timesteps(count: int, steps: int, low: float, high: float, generator: t
     return torch.randint(first, last + 1, (count,), generator=generator)
 
 
+def unfaded(x0: Tensor, latents: Tensor, mask: Tensor) -> Tensor:
+    """`x0` with its contrast inside the mask raised to that of the latents, as far as it shows the same.
+
+    A denoiser answers a mean over what it holds possible, which is paler than any of it; step by step that takes
+    contrast from a render that was right. So for each sample and channel, deviations from the mean are multiplied by
+    b = <z', x0'> / <x0', x0'>, the factor that brings them nearest to the latents' own. Never by less than 1: what x0
+    has more of, it may add. Where b counts, |b x0'| <= |z'|: nothing is blown up.
+
+    Args:
+        x0, latents: [B, C, h, w]. mask: [B, 1, h, w], 1 inside.
+    """
+    count = mask.sum((2, 3), keepdim=True).clamp(min=1)
+    mean = (x0 * mask).sum((2, 3), keepdim=True) / count
+    deviation = (x0 - mean) * mask
+    energy = deviation.square().sum((2, 3), keepdim=True)
+    shared = (latents * deviation).sum((2, 3), keepdim=True)  # the deviations sum to 0: the latents' mean drops out
+    factor = torch.where(shared > energy, shared / energy.clamp(min=torch.finfo(x0.dtype).tiny), 1.0)
+    return mean + factor * (x0 - mean)
+
+
 def sds_gradient(
     latents: Tensor,
     denoise: Denoiser,
@@ -97,6 +117,7 @@ def sds_gradient(
     *,
     weighting: Weighting = "sigma2",
     unit_rms: bool = False,
+    keep_contrast: bool = False,
     mask: Tensor | None = None,
 ) -> Tensor:
     """w(t) (eps_theta(z_t, t) - eps), one noise for each latent; the UNet's Jacobian left out (DreamFusion eq. 3).
@@ -114,6 +135,7 @@ def sds_gradient(
         noise: [B, C, h, w], standard normal.
         alphas_cumprod: [T], alpha_bar of every timestep.
         unit_rms: divide each sample by its own root mean square. PAPER leaves open: any normalisation.
+        keep_contrast: x0_theta is taken `unfaded`. Not in the paper.
         mask: [B, 1, h, w], 1 where the gradient is kept; None keeps it everywhere.
             PAPER leaves open: it distils the whole view; only masked Gaussians receive the gradient in any case.
     Returns:
@@ -124,6 +146,9 @@ def sds_gradient(
         # 1 - alpha_bar before any rounding to the latents' type: in half precision it would have no digits near t = 0.
         signal, spread, variance = (x.to(latents) for x in (alpha_bar.sqrt(), (1 - alpha_bar).sqrt(), 1 - alpha_bar))
         eps, x0 = denoise(signal * latents + spread * noise, timesteps)
+        if keep_contrast:
+            clear = unfaded(x0, latents, torch.ones_like(latents[:, :1]) if mask is None else mask)
+            eps, x0 = eps + signal / spread * (x0 - clear), clear
         if weighting == "x0":
             gradient = latents - x0
         elif weighting == "sigma2":

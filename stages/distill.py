@@ -28,6 +28,8 @@ class Params(BaseModel):
     weighting: Literal["x0", "sigma2", "one"] = Field("sigma2", description="w(t) of the SDS gradient")
     unit_rms: bool = Field(False, description="divide each sample's gradient by its root mean square")
     hole_only: bool = Field(False, description="drop the gradient at latents that are not repainted")
+    # Not in the paper: a small prior's answers are paler than what they stand for, and fade a render that was right.
+    keep_contrast: bool = Field(False, description="the prior's answer does not lower the hole's contrast")
     guidance: float = Field(7.5, ge=0, description="the paper's a; libraries' guidance scale is 1 + a")
     reduction: Literal["sum", "mean"] = Field("sum", description="over a latent's elements")
     # PAPER leaves open: which mask m is. Its text repaints the consistent mask; the invent mask keeps true background.
@@ -250,6 +252,7 @@ def settings(params: Params, lift=None):
         params.weighting,
         params.unit_rms,
         params.hole_only,
+        params.keep_contrast,
         params.guidance,
         params.reduction,
     )

@@ -10,6 +10,7 @@ from reffusion.sds import (
     sds_loss,
     two_scale_masks,
     two_scales,
+    unfaded,
     window_around,
 )
 from reffusion.trace import generator
@@ -83,6 +84,56 @@ def test_unit_rms_is_per_sample_and_over_the_hole():
     torch.testing.assert_close(gradient[:, :, 2:5].square().mean((1, 2, 3)), torch.ones(2, dtype=torch.float64))
     blank = sds_gradient(latents, ideal, t, noise, ABAR, unit_rms=True, mask=torch.zeros_like(mask))
     assert (blank == 0).all()
+
+
+def faded(factor, shift=0.2):
+    """(x0, z, mask): x0 has `factor` of z's contrast inside the mask and a mean of its own; outside, other noise."""
+    z, other = torch.randn(2, 3, 4, 8, 8, generator=generator(9), dtype=torch.float64)
+    mask = torch.zeros(3, 1, 8, 8, dtype=torch.float64)
+    mask[:, :, 1:6, 2:7] = 1
+    mean = (z * mask).sum((2, 3), keepdim=True) / 25
+    return torch.where(mask > 0, mean + shift + factor * (z - mean), other), z, mask
+
+
+def test_a_faded_answer_gets_the_contrast_of_the_render_and_keeps_its_mean():
+    x0, z, mask = faded(0.6)
+    clear = unfaded(x0, z, mask)
+    torch.testing.assert_close(clear * mask, (z + 0.2) * mask)
+    torch.testing.assert_close(unfaded(clear, z, mask), clear)
+
+
+def test_what_the_prior_has_more_of_it_may_add():
+    for factor in (1.0, 1.5, -0.5):  # as strong, stronger, the opposite
+        x0, z, mask = faded(factor)
+        torch.testing.assert_close(unfaded(x0, z, mask), x0)
+
+
+def test_unfading_asks_for_no_more_contrast_and_blows_nothing_up():
+    draw = generator(10)
+    z, mask = torch.randn(1, 4, 8, 8, generator=draw, dtype=torch.float64), torch.ones(1, 1, 8, 8, dtype=torch.float64)
+    centred = lambda x: x - x.mean((2, 3), keepdim=True)
+    for size in (0.0, 1e-200, 1e-160, 1e-6, 0.3):
+        x0 = size * torch.randn(1, 4, 8, 8, generator=draw, dtype=torch.float64)
+        clear = unfaded(x0, z, mask)
+        assert (centred(clear).norm(dim=(2, 3)) <= centred(z).norm(dim=(2, 3)) * (1 + 1e-12)).all()
+        raised = centred(clear).norm(dim=(2, 3)) > centred(x0).norm(dim=(2, 3)) * (1 + 1e-9)
+        along = ((z - clear) * centred(clear)).sum((2, 3))
+        assert (along.abs() <= 1e-9)[raised].all(), "the gradient still changes the contrast"
+    flat = torch.full_like(z, 0.4)
+    torch.testing.assert_close(unfaded(flat, z, mask), flat)
+    assert (unfaded(flat, z, torch.zeros_like(mask)) == flat).all()
+
+
+def test_kept_contrast_means_the_same_in_every_weighting():
+    t, draw = torch.tensor([1, 40, 98]), generator(11)
+    latents, noise = torch.randn(2, 3, 4, 5, 5, generator=draw, dtype=torch.float64)
+    one, x0, sigma2 = (
+        sds_gradient(latents, ideal, t, noise, ABAR, weighting=w, keep_contrast=True) for w in ("one", "x0", "sigma2")
+    )
+    a2 = ABAR[t].view(-1, 1, 1, 1)
+    torch.testing.assert_close(x0, ((1 - a2) / a2).sqrt() * one)
+    torch.testing.assert_close(sigma2, (1 - a2) * one)
+    assert not torch.allclose(x0, sds_gradient(latents, ideal, t, noise, ABAR, weighting="x0"))
 
 
 @pytest.mark.parametrize("patches", [0, 1, 2])
