@@ -74,8 +74,8 @@ def decode(prior: Prior, latents: Tensor) -> Tensor:
 def conditioning(prior: Prior, images: Tensor, masks: Tensor) -> Tensor:
     """What the UNet sees beside the noisy latents: [mask | latents of the image outside the mask], [B, 1 + C, h, w].
 
-    Carries no gradient. `images` [B, 3, H, W] in [-1, 1], `masks` [B, 1, H, W], 1 = repaint; the hole is grey, or filled
-    from its surroundings, by `prior.fills`.
+    Carries no gradient. `images` [B, 3, H, W] in [-1, 1], `masks` [B, 1, H, W], 1 = repaint; the hole is grey, or
+    filled from its surroundings, by `prior.fills`.
     """
     hidden = (masks > 0.5).to(images.dtype)
     latents = encode(prior, fill.extended(images, hidden) if prior.fills else images * (1 - hidden))

@@ -82,9 +82,7 @@ def rows_within(budget_gb: float, fixed: int, row: int, param: str) -> int:
     return count
 
 
-def fitted(
-    prior: Prior, budget_gb: float, param: str, graded: Callable[[Prior], object] | None = None
-) -> Prior:
+def fitted(prior: Prior, budget_gb: float, param: str, graded: Callable[[Prior], object] | None = None) -> Prior:
     """The prior with as many samples in one pass as fit into the budget; as it is where that is 0.
 
     Args:

@@ -36,9 +36,7 @@ def wall(moved: float = 1.0):
     disparity = 0.5 + 0.004 * (columns - 26) - 0.002 * (rows - 22)
     picture = 0.5 + 0.3 * np.stack([np.sin(columns / 3), np.cos(rows / 4), np.sin((rows + columns) / 5)], -1)
     everywhere = np.ones(disparity.shape, bool)
-    gaussians = surface_gaussians(
-        picture, 1 / disparity, everywhere, wide, sh_count=4, spread=0.6, opacity=0.98
-    )
+    gaussians = surface_gaussians(picture, 1 / disparity, everywhere, wide, sh_count=4, spread=0.6, opacity=0.98)
     masked = torch.from_numpy(((np.abs(columns - 26) < 6) & (np.abs(rows - 22) < 5)).ravel())
     factor = torch.where(masked, moved, 1.0)[:, None]
     moved_ones = replace(gaussians, means=gaussians.means * factor, log_scales=gaussians.log_scales + torch.log(factor))
