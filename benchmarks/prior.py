@@ -49,6 +49,7 @@ TIMESTEPS = (20, 100, 250, 400, 550, 700, 850, 980)
 NOISES = 4  # draws for the variance of the SDS gradient
 VIEWS = 6  # unseen views
 SHOWN = 12  # held-out pictures on the sheet
+SAMPLER = 50  # steps in which a personalized prior paints: the stock pipeline's own number
 PROMPTS = {"reference": "A photo of sks", "whole": "A photo of sks", "window": "A photo of sks, cropped"}
 LEARNS = ("poses", "fit", "masks", "reference")  # what personalization needs of a run
 
@@ -198,7 +199,7 @@ def mislearnt(params: stage.Params, needs: dict[str, Path], wrong: Path, folder:
 
 def filled(model: Prior, cases: dict[str, list[Case]], seed: int) -> dict[str, list[np.ndarray]]:
     """Scale -> its holes filled from pure noise."""
-    return {scale: painted(model, some, SEED + seed, PROMPTS[scale]) for scale, some in cases.items()}
+    return {scale: painted(model, some, SEED + seed, PROMPTS[scale], SAMPLER) for scale, some in cases.items()}
 
 
 def samples(pictures: dict[str, list[np.ndarray]], cases: dict[str, list[Case]]) -> dict[str, dict[str, float]]:
