@@ -42,6 +42,7 @@ ATTEMPTS: dict[str, dict] = {
     "prior not personalized": {BASE: False},
     "a tenth of the weight": {"sds_weight": 0.03},
     "ten times the weight": {"sds_weight": 3},
+    "every view": {"sds_within": 180},
     "contrast not kept": {"keep_contrast": False},
     "two windows as well": {"patches": 2},
     "two windows, a tenth of the weight": {"patches": 2, "sds_weight": 0.03},
@@ -97,7 +98,7 @@ def curve(overrides: dict, run: Path, start: Path, views: list[tuple]) -> list[d
     prior, text = stage.adapted_prior(params, adapted)
     sights = stage.load_sights(params, scene, run / "poses", run / "fit", run / "masks")
     settings = stage.settings(params)
-    job = job_of(sights, holes, prior, text, None, settings, initial.means.device)
+    job = job_of(sights, holes, prior, text, None, settings, initial, masked)
     optimizer = GaussianOptimizer(initial, masked, settings.rates, settings.masked_pace, epsilon=settings.epsilon)
     splat.render(optimizer.gaussians, holes[0][0]).color.sum().backward()  # compiles, before the clock starts
     optimizer.forget_gradients()

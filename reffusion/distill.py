@@ -42,9 +42,9 @@ def distill(
         text: [3, L, D], hidden states of the global, the local and the empty prompt.
         folder: gets trace.jsonl and checkpoints. A line of the trace: reconstruction and lift (those terms' values),
             reference_psnr (in the references' holes), sds_gradient_mean and _max (norm of the weighted SDS gradient
-            per masked Gaussian in that step), depth (the last depth term's value), depth_skipped_<reason> (how often it
-            was left out so far), adversarial (the generator's loss), critic_loss, critic_slope (R1 before its weight),
-            gaussians, masked_gaussians.
+            per masked Gaussian in that step; none where its view was too far from a reference), depth (the last depth
+            term's value), depth_skipped_<reason> (how often it was left out so far), adversarial (the generator's
+            loss), critic_loss, critic_slope (R1 before its weight), gaussians, masked_gaussians.
         estimator: of the depth term; None where there is none.
     Returns:
         The Gaussians, detached, and their labels.
@@ -52,7 +52,7 @@ def distill(
         FloatingPointError: a value or gradient is not finite; names step, term and view.
         ValueError: a term lacks what it needs: a prior, an estimator, a hole in a reference.
     """
-    job = job_of(sights, holes, prior, text, estimator, settings, initial.means.device)
+    job = job_of(sights, holes, prior, text, estimator, settings, initial, masked)
     optimizer = GaussianOptimizer(initial, masked, settings.rates, settings.masked_pace, epsilon=settings.epsilon)
     region = region_of(initial.means, masked) if settings.confined and masked.any() else None
     run = _Run.begun(optimizer, job, trace.load_checkpoint(folder))

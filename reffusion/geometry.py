@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from reffusion.types import Camera
@@ -67,3 +69,15 @@ def sample_nearest(image: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.nd
         inside = (uv[..., 0] >= 0) & (uv[..., 0] < width) & (uv[..., 1] >= 0) & (uv[..., 1] < height)
     column, row = (np.where(inside, uv[..., axis], 0.0).astype(np.int64) for axis in (0, 1))
     return image[row, column], inside
+
+
+def angle_between_views(point: np.ndarray, camera: Camera, others: Sequence[Camera]) -> float:
+    """Degrees in [0, 180] at `point` [3] between the direction to `camera` and that to the nearest of `others`.
+
+    A camera at the point itself has no direction: 180.
+    """
+    towards = np.stack([view.center - point for view in (camera, *others)])
+    lengths = np.linalg.norm(towards, axis=1)
+    cosines = towards[1:] @ towards[0] / np.maximum(lengths[1:] * lengths[0], np.finfo(np.float64).tiny)
+    known = (lengths[1:] > 0) & (lengths[0] > 0)
+    return float(np.degrees(np.arccos(np.where(known, cosines, -1.0).clip(-1, 1))).min())

@@ -22,7 +22,7 @@ from reffusion.confinement import (
     sds_term,
 )
 from reffusion.depth_term import DepthRegularization, Estimator, depth_term
-from reffusion.geometry import Degenerate
+from reffusion.geometry import Degenerate, angle_between_views
 from reffusion.lift import Lift, lift_term
 from reffusion.optimize import GaussianOptimizer, Rates
 from reffusion.prior import Prior
@@ -39,6 +39,8 @@ class Settings:
         sds_weight: lambda of the SDS term; 0 leaves it out.
         sds: the choices within that term.
         sds_reaches: the Gaussians that it moves: "masked" ones, or "all" that show, the background in the hole too.
+        sds_within: degrees, at the middle of the masked Gaussians, between a view and the nearest reference, up to
+            which the view is distilled; 180: every view. A step that draws another view is without the term.
         depth: the depth term; None leaves it out.
         adversarial: the adversarial term; None leaves it out.
         reconstruction_every: steps between two with a reconstruction term; 0: never.
@@ -74,6 +76,7 @@ class Settings:
     sds_weight: float = 1e-3
     sds: Distillation = field(default_factory=Distillation)
     sds_reaches: Literal["masked", "all"] = "masked"
+    sds_within: float = 180.0
     depth: DepthRegularization | None = None
     adversarial: Adversarial | None = None
     reconstruction_every: int = 1
@@ -106,12 +109,14 @@ class Job:
 
     Attributes:
         painted: the sights with pixels to repaint.
+        taught: names of those that SDS distils: near enough to a reference.
         adversary: the critic; None where it has no part.
         tally: what there is to log of steps gone by, of terms that not every step has.
     """
 
     sights: Sequence[Sight]
     painted: Sequence[Sight]
+    taught: frozenset[str]
     holes: Sequence[tuple[Camera, Tensor, Tensor]]
     prior: Prior | None
     text: Tensor | None
@@ -128,7 +133,8 @@ def job_of(
     text: Tensor | None,
     estimator: Estimator | None,
     settings: Settings,
-    device: torch.device,
+    initial: Gaussians,
+    masked: Tensor,
 ) -> Job:
     """ValueError where a term lacks what it needs."""
     painted = [sight for sight in sights if sight.repaint.any()]
@@ -141,10 +147,23 @@ def job_of(
     if painted and settings.adversarial is not None:
         if not any(hole.any() for _, _, hole in holes):
             raise ValueError("the adversarial term takes its real patches around a reference's hole; there is none")
-        adversary = Adversary(settings.adversarial, settings.seed, device)
+        adversary = Adversary(settings.adversarial, settings.seed, initial.means.device)
     if settings.lift is not None and all(sight.lifted is None for sight in sights):
         raise ValueError("distillation with lift_weight > 0 needs the pictures of the stage lift")
-    return Job(sights, painted, holes, prior, text, estimator, adversary, settings, {})
+    references = [camera for camera, _, _ in holes]
+    taught = near_a_reference(painted, references, initial.means[masked], settings.sds_within)
+    return Job(sights, painted, taught, holes, prior, text, estimator, adversary, settings, {})
+
+
+def near_a_reference(
+    sights: Sequence[Sight], references: Sequence[Camera], means: Tensor, degrees: float
+) -> frozenset[str]:
+    """Names of the sights that see the middle of `means` [M, 3] from within so many degrees of a reference."""
+    if degrees >= 180 or len(means) == 0:
+        return frozenset(sight.camera.name for sight in sights)
+    middle = means.detach().median(0).values.double().cpu().numpy()
+    angles = {sight.camera.name: angle_between_views(middle, sight.camera, references) for sight in sights}
+    return frozenset(name for name, angle in angles.items() if angle <= degrees)
 
 
 _Done = tuple[Tensor, dict[str, float]] | None  # what a term gives: see `step_of`
@@ -177,6 +196,8 @@ def _sds(optimizer: GaussianOptimizer, step: int, job: Job) -> _Done:
     if not (settings.sds_weight > 0 and job.painted and masked.any()):
         return None
     sight = _drawn(job.painted, step, settings.seed, "sds")
+    if sight.camera.name not in job.taught:
+        return None
     reached = _reached(optimizer, job) | (settings.sds_reaches == "all")
     probe = torch.zeros(len(masked), 2, device=masked.device, requires_grad=True)
     draw = trace.generator(settings.seed, "distill", "sds", step)

@@ -21,6 +21,10 @@ class Params(BaseModel):
     sds_weight: float = Field(1e-3, ge=0, description="lambda of the SDS term; 0 leaves it out")
     # The paper confines it to masked ones. Background that was seen through the hole wears the object's tint.
     sds_reaches: Literal["masked", "all"] = Field("masked", description="Gaussians it moves; all: all that show there")
+    # The paper distils every view. What a small prior knows of a place ends not far from the picture it learnt it by.
+    sds_within: float = Field(
+        180, gt=0, le=180, description="degrees between a view and the nearest reference up to which it is distilled"
+    )
     patches: int = Field(2, ge=0, description="local patches beside the whole view")
     # PAPER leaves open: timesteps, w(t), normalisation, guidance, reduction: see reffusion.sds. threestudio's here.
     t_low: float = Field(0.02, ge=0, le=1, description="lowest timestep, as a part of the schedule")
@@ -148,6 +152,8 @@ def run(
     prior, text = adapted_prior(params, personalize)
     estimator = depth_estimator(params, scene.points) if params.depth_weight > 0 else None
     sights, (perceptual, lifting) = load_sights(params, scene, poses, fit, masks, lift), lift_choices(params)
+    if params.sds_weight > 0 and params.sds_within < 180:
+        print(within(params, initial.means[masked], sights, holes), flush=True)
     with memory.blamed("distill.memory_gb", params.memory_gb):
         if prior is not None:
             prior = memory.fitted(prior, params.memory_gb, "distill.memory_gb", memory.encoding)
@@ -214,6 +220,15 @@ def load_sights(params: Params, scene, poses: Path, fit: Path, masks: Path, lift
         photo = place(photos[name]) / 255
         sights.append(Sight(scene.cameras[name], photo, place(supervises), place(repaint), clean, lifted))
     return sights
+
+
+def within(params: Params, means, sights: list, holes: list) -> str:
+    """How many of the views that could be distilled are."""
+    from reffusion.steps import near_a_reference
+
+    painted = [sight for sight in sights if sight.repaint.any()]
+    near = near_a_reference(painted, [camera for camera, _, _ in holes], means, params.sds_within)
+    return f"SDS in {len(near)} of {len(painted)} views: those within {params.sds_within:g} degrees of a reference"
 
 
 def lift_choices(params: Params) -> tuple:

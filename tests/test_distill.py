@@ -23,6 +23,7 @@ from reffusion.confinement import (
 )
 from reffusion.optimize import Rates
 from reffusion.splat import render
+from reffusion.steps import near_a_reference
 from reffusion.trace import generator, load_checkpoint, read_trace
 from reffusion.types import PARAMETERS, Camera, Gaussians, MaskSet, Scene, Similarity
 
@@ -258,6 +259,19 @@ def test_distillation_may_reach_the_background_too_but_not_what_does_not_show(pr
     moved = changed(start, run(tmp_path / "all", prior, text, settings, [view])[0])
     shown = splat.accumulate(start, view.camera, torch.ones(*hole().shape, 1))[:, 0] > 0
     assert (moved & masked).any() and (moved & ~masked).any() and not (moved & ~shown).any()
+
+
+def test_views_far_from_every_reference_are_not_distilled(prior, text, tmp_path):
+    start, masked = wall()
+    near, far, settings = sight("a"), sight("b", 0.5), replace(SETTINGS, adversarial=None, densify_every=0)
+    taught = lambda degrees: near_a_reference([near, far], [camera()], start.means[masked], degrees)  # 26 degrees aside
+    assert [taught(x) for x in (1, 20, 35, 180)] == [{"a"}, {"a"}, {"a", "b"}, {"a", "b"}]
+    settings = replace(settings, reference_weight=0.0, reconstruction_every=0, region_every=100, iterations=3)
+    for degrees in (20, 35):
+        ended, _ = run(tmp_path / str(degrees), prior, text, replace(settings, sds_within=degrees), [far])
+        assert changed(start, ended).any() == (degrees == 35)
+        logged = ["sds_gradient_mean" in line for line in read_trace(tmp_path / str(degrees) / "trace.jsonl")[1:]]
+        assert logged == [degrees == 35] * len(logged)
 
 
 def test_photographs_may_reach_the_masked_gaussians_that_show_outside_the_hole(tmp_path):

@@ -53,3 +53,21 @@ def test_samples_outside_are_told():
     values, inside = geometry.sample_nearest(image, uv)
     assert inside.tolist() == [True, True, False, False, False]
     assert values[:2].tolist() == [0, 5]
+
+
+def looking_from(*center):
+    pose = np.eye(4)
+    pose[:3, 3] = -np.asarray(center, float)
+    return Camera("view", 40, 30, 35.0, 33.0, 20.0, 15.0, pose)
+
+
+def test_the_angle_between_views_is_the_smallest_and_is_taken_at_the_point():
+    point, view = np.array([1.0, 0.0, 0.0]), looking_from(3.0, 0.0, 0.0)
+    for degrees in (0.0, 1e-3, 40.0, 90.0, 179.0, 180.0):
+        turned = np.radians(degrees)
+        other = looking_from(1 + 5 * np.cos(turned), 5 * np.sin(turned), 0.0)  # further away, which does not count
+        assert geometry.angle_between_views(point, view, [other]) == pytest.approx(degrees, abs=1e-4)
+    aside = [looking_from(1.0, 2.0, 0.0), looking_from(3.0, 2.0, 0.0)]
+    assert geometry.angle_between_views(point, view, aside) == pytest.approx(45)
+    assert geometry.angle_between_views(point * 1e-200, looking_from(3e-200, 0.0, 0.0), aside[:1]) <= 180
+    assert geometry.angle_between_views(view.center, view, aside) == 180, "from where it stands it has no direction"
