@@ -7,6 +7,7 @@
   personalize   the first prior on a scene's reference by the laptop profile: error against steps, then, before and
                 after, by timestep: error of the clean latent in holes of unseen views and the variance of the SDS
                 gradient over the noise; the same views, and the reference's own hole, filled from pure noise
+  --sampler     steps for that; 50, the stock pipeline's own number. More are sharper and further from the truth
   --seeds       that as often, each with its own draws in training and in sampling
   --wrong-reference   and once more with another reference: a picture to learn instead, at the same place, or another
                 scene's run, whose personalization is taken as it is. It must not help
@@ -49,7 +50,6 @@ TIMESTEPS = (20, 100, 250, 400, 550, 700, 850, 980)
 NOISES = 4  # draws for the variance of the SDS gradient
 VIEWS = 6  # unseen views
 SHOWN = 12  # held-out pictures on the sheet
-SAMPLER = 50  # steps in which a personalized prior paints: the stock pipeline's own number
 PROMPTS = {"reference": "A photo of sks", "whole": "A photo of sks", "window": "A photo of sks, cropped"}
 LEARNS = ("poses", "fit", "masks", "reference")  # what personalization needs of a run
 
@@ -197,9 +197,9 @@ def mislearnt(params: stage.Params, needs: dict[str, Path], wrong: Path, folder:
     return model
 
 
-def filled(model: Prior, cases: dict[str, list[Case]], seed: int) -> dict[str, list[np.ndarray]]:
-    """Scale -> its holes filled from pure noise."""
-    return {scale: painted(model, some, SEED + seed, PROMPTS[scale], SAMPLER) for scale, some in cases.items()}
+def filled(model: Prior, cases: dict[str, list[Case]], seed: int, sampler: int) -> dict[str, list[np.ndarray]]:
+    """Scale -> its holes filled from pure noise in `sampler` steps."""
+    return {scale: painted(model, some, SEED + seed, PROMPTS[scale], sampler) for scale, some in cases.items()}
 
 
 def samples(pictures: dict[str, list[np.ndarray]], cases: dict[str, list[Case]]) -> dict[str, dict[str, float]]:
@@ -208,7 +208,7 @@ def samples(pictures: dict[str, list[np.ndarray]], cases: dict[str, list[Case]])
 
 
 def personalization(
-    params: stage.Params, run: Path, seeds: list[int], wrong: Path | None, steps: list[int], out: Path
+    params: stage.Params, run: Path, seeds: list[int], wrong: Path | None, steps: list[int], sampler: int, out: Path
 ) -> dict:
     """Personalize on the run's reference, once a seed, and measure before and after on views that were never seen.
 
@@ -221,14 +221,14 @@ def personalization(
             raise ValueError(f"{folder} is missing: run `make scene={run.name} reference` first")
     base = load_prior(params.prior)
     cases = scene_cases(run, base.native_size)
-    result: dict = {"settings": params.model_dump(mode="json"), "steps": params.steps, "seeds": {}}
+    result: dict = {"settings": params.model_dump(mode="json"), "steps": params.steps, "sampler_steps": sampler, "seeds": {}}
     for seed in seeds:
         mine = params.model_copy(update={"seed": seed})
         model, log = learnt(mine, needs, out / "personalize" / str(seed))
         models = {"before": base, "after": model}
         if wrong:
             models["wrong"] = mislearnt(mine, needs, wrong, out / "personalize")
-        pictures = {when: filled(model, cases, seed) for when, model in models.items()}
+        pictures = {when: filled(model, cases, seed, sampler) for when, model in models.items()}
         result["seeds"][str(seed)] = {when: samples(made, cases) for when, made in pictures.items()}
         result["seeds"][str(seed)]["seconds"] = log[-1]["seconds"]
         print_seed(seed, result["seeds"][str(seed)])
@@ -280,6 +280,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--steps", type=int, nargs="*", default=[], help="numbers of sampler steps to compare")
     parser.add_argument("--run", type=Path, help="runs/<scene>, with its reference; without it no personalization")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of personalization, one after the other")
+    parser.add_argument("--sampler", type=int, default=50, help="steps in which a personalized prior paints")
     parser.add_argument("--wrong-reference", type=Path, help="a picture, or runs/<another scene>, to measure beside it")
     parser.add_argument("--set", type=setting, nargs="*", default=[], help="personalization's: steps=500 rank=32")
     parser.add_argument("--out", type=Path, default=Path("runs/prior-report"))
@@ -305,7 +306,7 @@ def main() -> None:
     if given.run:
         params = profile(first, dict(given.set))
         result["personalization"] = personalization(
-            params, given.run, given.seeds, given.wrong_reference, given.steps, given.out
+            params, given.run, given.seeds, given.wrong_reference, given.steps, given.sampler, given.out
         )
     io.save_json(given.out / "prior.json", result)
     print(given.out / "prior.json")
