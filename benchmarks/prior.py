@@ -221,7 +221,8 @@ def personalization(
             raise ValueError(f"{folder} is missing: run `make scene={run.name} reference` first")
     base = load_prior(params.prior)
     cases = scene_cases(run, base.native_size)
-    result: dict = {"settings": params.model_dump(mode="json"), "steps": params.steps, "sampler_steps": sampler, "seeds": {}}
+    result: dict = {"settings": params.model_dump(mode="json"), "steps": params.steps, "sampler_steps": sampler}
+    result["seeds"] = {}
     for seed in seeds:
         mine = params.model_copy(update={"seed": seed})
         model, log = learnt(mine, needs, out / "personalize" / str(seed))
