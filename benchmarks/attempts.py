@@ -119,7 +119,8 @@ def draw(curves: dict[str, list[dict]], path: Path, title: str) -> None:
     for axes, (name, label) in zip(grid[0], (("psnr_box", "PSNR, dB ↑"), ("flip_box", "FLIP ↓")), strict=True):
         for index, (attempt, lines) in enumerate(curves.items()):
             style = "--" if "no SDS" in attempt else ":" if attempt.startswith("free") else "-"
-            look = {"color": f"C{index % 10}" if index < 10 else charts.INK, "linestyle": style, "linewidth": 1.5}
+            color = f"C{index % 10}" if index < 10 or style != "-" else charts.INK  # there are ten colours
+            look = {"color": color, "linestyle": style, "linewidth": 1.5}
             points = np.array([(line["seconds"], line[name]) for line in lines])
             axes.plot(*points.T, label=attempt, **look)
         axes.set(xlabel="seconds", title=label)
