@@ -57,7 +57,7 @@ help:
 	@echo 'make bench                     work-precision diagrams of the kernels: runs/bench; gate=1: against the baselines'
 	@echo 'make stability                 stiff and extreme cases, each with its bound (minutes): runs/stability.json'
 	@echo 'scene=  a name under data/, or the path of any folder'
-	@echo 'profile=auto|laptop|paper  variant=NAME  set="fit.iterations=500 distill.seed=3"  runs=FOLDER'
+	@echo 'profile=auto|laptop|paper|paper-terms  variant=NAME  set="fit.iterations=500 distill.seed=3"  runs=FOLDER'
 	@echo 'budget=5m  time for the whole job: sets the number of steps of fit, personalize and distill'
 	@echo 'trust=1  keep results of older code'
 

@@ -64,7 +64,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("stage", nargs="?", default="all", help="run this stage and what it needs; `all` (default)")
     parser.add_argument("--scene", default="", help="a name under data/, or a path")
     parser.add_argument("--data", type=Path, default=Path("data"), help="batch: the folder of scenes")
-    parser.add_argument("--profile", help="auto, laptop or paper")
+    parser.add_argument("--profile", help="auto, or a profile of pipeline.yaml: laptop, paper, paper-terms")
     parser.add_argument("--variant", help="a variant of pipeline.yaml")
     parser.add_argument("--variants", default="", help="compare: these only, with commas between")
     parser.add_argument("--seeds", type=int, default=1, help="compare: on so many scenes: X, X-1, X-2 ...")

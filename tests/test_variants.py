@@ -99,6 +99,23 @@ def test_a_variant_runs_what_it_changes_and_shares_the_rest(capture, variant):
     assert all(said[s].reason == "shared with scene" for s in shared)
 
 
+@pytest.mark.parametrize("variant", [name for name in PLANS if name.startswith("no_")])
+def test_with_the_papers_terms_every_ablation_leaves_something_out(tmp_path, variant):
+    scene = write_capture(tmp_path / "scene", "llff", some_truth())
+    request = Request(ROOT, tmp_path / "runs", str(scene), profile="paper-terms")
+    assert prepare(request).params != prepare(replace(request, variant=variant)).params
+
+
+def test_the_papers_terms_are_the_papers_at_the_laptops_size(tmp_path):
+    scene, runs = write_capture(tmp_path / "scene", "llff", some_truth()), tmp_path / "runs"
+    terms = prepare(Request(ROOT, runs, str(scene), profile="paper-terms")).params
+    laptop = prepare(Request(ROOT, runs, str(scene), profile="laptop")).params
+    size = {"prior", "iterations", "depth_steps", "adversarial_patches", "adversarial_size", "adversarial_width"}
+    paper = distill.Params().model_dump(mode="json")
+    assert {name for name, value in terms["distill"].items() if value != paper[name]} == size
+    assert {stage for stage in terms if terms[stage] != laptop[stage]} == {"personalize", "distill"}
+
+
 def test_the_papers_profile_takes_every_variant(capture):
     scene, runs = capture
     for variant in ("lift_perceptual_diffusion", "sds_plain"):
