@@ -113,6 +113,7 @@ def test_the_papers_terms_are_the_papers_at_the_laptops_size(tmp_path):
     size = {"prior", "iterations", "depth_steps", "adversarial_patches", "adversarial_size", "adversarial_width"}
     paper = distill.Params().model_dump(mode="json")
     assert {name for name, value in terms["distill"].items() if value != paper[name]} == size
+    assert all(terms["distill"][name] == laptop["distill"][name] for name in size)
     assert {stage for stage in terms if terms[stage] != laptop[stage]} == {"personalize", "distill"}
 
 
