@@ -23,7 +23,7 @@ from reffusion import io, lens, trace
 from reffusion.types import Camera, Scene
 from stages import masks as masks_stage
 
-ASKED = {"exact": {"consistent": 0.95, "never_seen": 0.85}, "perturbed": {"consistent": 0.90, "never_seen": 0.85}}
+ASKED = {"exact": {"consistent": 0.95, "undecided": 0.85}, "perturbed": {"consistent": 0.90, "undecided": 0.85}}
 LARGEST, MISSING = 0.02, 0.1  # of the image's width; share of the views
 
 
@@ -79,7 +79,7 @@ def measure(scene_folder: Path, run: Path, out: Path, seed: int) -> dict[str, di
     scene = io.load_scene(run / "poses")
     exact = io.load_raw_masks(run / "poses", scene.train)
     cameras = [scene.cameras[name] for name in scene.train]
-    truth = {"consistent": exact, "never_seen": true_never_seen(scene_folder, cameras)}
+    truth = {"consistent": exact, "undecided": true_never_seen(scene_folder, cameras)}
     random = np.random.default_rng(trace.seed_for(seed, "perturbed masks"))
     kept = random.permutation(len(scene.train))[round(MISSING * len(scene.train)) :]
     noisy = {scene.train[k]: perturbed(exact[scene.train[k]], random) for k in sorted(kept)}
