@@ -10,11 +10,13 @@ from scipy import ndimage
 
 from reffusion import alignment, bilateral, geometry, planes, trace
 from reffusion.depth import Plate, complete
+from reffusion.layers import shared_out
 from reffusion.solverlog import SILENT, SolverLog
 from reffusion.types import Camera, Rendering
 
 ENOUGH_POINTS = 50  # fewer sparse points around the hole, and the rendered depth is asked instead
 BEHIND = 1.03  # relative depth from which a sparse point is hidden by what is rendered
+STRETCH = 1.15  # a surface continued beyond the disparities that are seen of it, by so much at most
 FARTHEST = 2.0  # times the farthest known depth: beyond it lies infinity, of which nothing is known
 
 
@@ -66,6 +68,7 @@ class Seen:
         depth: [H, W] float64 camera z as rendered.
         known: bool [H, W], the pixels whose depth is the scene's: covered, and not beside the hole.
         hole: bool [H, W], the pixels to be filled. hidden: bool [H, W], C: where the object stood.
+        anchored: bool [H, W], pixels of the hole whose `depth` is that of a plane which goes on there.
     """
 
     camera: Camera
@@ -73,6 +76,7 @@ class Seen:
     known: np.ndarray
     hole: np.ndarray
     hidden: np.ndarray
+    anchored: np.ndarray
 
     @property
     def disparity(self) -> np.ndarray:
@@ -87,11 +91,27 @@ class Seen:
         return 1.0 / (FARTHEST * self.depth[self.known].max())
 
 
-def seen(drawn: Rendering, camera: Camera, hole: np.ndarray, hidden: np.ndarray, how: Completion) -> Seen:
-    """The depth of a rendering, known where it is covered, but for the hole and a margin around it."""
+def seen(
+    drawn: Rendering,
+    camera: Camera,
+    hole: np.ndarray,
+    hidden: np.ndarray,
+    how: Completion,
+    continued: np.ndarray | None = None,
+    outer: np.ndarray | None = None,
+) -> Seen:
+    """The depth of a rendering, known where it is covered, but for the hole and a margin around it.
+
+    Args:
+        continued: [H, W] depth of planes that go on in the hole, inf where none does (`undecided.Behind`).
+        outer: [H, W] depth that is better known than the rendering's, above 0 where there is one.
+    """
     depth, alpha = (t.detach().double().cpu().numpy() for t in (drawn.depth, drawn.alpha))
+    if outer is not None:
+        depth, alpha = np.where(outer > 0, outer, depth), np.where(outer > 0, 1.0, alpha)
     known = (alpha > how.explained) & (depth > 0) & ~grown(hole, how.margin)
-    return Seen(camera, depth, known, hole, hidden)
+    anchored = hole & np.isfinite(continued) if continued is not None else np.zeros_like(hole)
+    return Seen(camera, np.where(anchored, continued, depth) if anchored.any() else depth, known, hole, hidden, anchored)
 
 
 def continued(
@@ -120,13 +140,35 @@ def continued(
         return planar.disparity, said
     guide = guide() if callable(guide) else guide
     plate = Plate(how.ring, how.stiffness, how.edge, how.unknowns)
-    fitted = complete(view.disparity, view.known, guide, plate, keep=False)
+    given = view.known | view.anchored
+    surfaces = shared_out(view.disparity, given & grown(view.hole, how.ring), view.hole, guide)
+    if surfaces.max() > 1:
+        layered, said = _layered(view, given, surfaces, guide, plate), f"{said}: {surfaces.max()} surfaces continued"
+        solvers.solved("completion", layered)
+        return layered, said
+    fitted = complete(view.disparity, given, guide, plate, keep=False)
     solvers.solved("completion", fitted)
     # Its misfit on known pixels is spread by the bilateral solver, so that rims meet.
-    known = view.known.astype(np.float64)
-    refined = bilateral.refine(fitted, view.disparity, known, guide, how.solver, solvers.iterated)
+    refined = bilateral.refine(fitted, view.disparity, given.astype(np.float64), guide, how.solver, solvers.iterated)
     solvers.solved("bilateral", refined, solvers.iterations)
-    return refined, f"{said}: continued smoothly instead"
+    share = view.anchored.sum() / max(view.hole.sum(), 1)
+    onward = f", planes that go on in {share:.0%} of the hole" if share else ""
+    return np.where(view.anchored, view.disparity, refined), f"{said}: continued smoothly instead{onward}"
+
+
+def _layered(view: Seen, given: np.ndarray, surfaces: np.ndarray, guide: np.ndarray, plate: Plate) -> np.ndarray:
+    """[H, W] disparity: each surface continued smoothly by itself, with a step where two meet."""
+    found = np.where(given, view.disparity, 0.0)
+    for surface in range(1, surfaces.max() + 1):
+        own, part = surfaces == surface, view.hole & (surfaces == surface) & ~given
+        if not part.any():
+            continue
+        # Unknown for this surface is what is to be filled; what belongs to others takes no part.
+        done = complete(view.disparity, given & own, guide, plate)
+        low, high = np.percentile(view.disparity[given & own], [1, 99])
+        found[part] = done[part].clip(low / STRETCH, high * STRETCH)
+    rest = ~given & (found <= 0)
+    return np.where(rest, complete(found, found > 0, guide, plate), found) if rest.any() else found
 
 
 def points_around(view: Seen, points: np.ndarray, how: Completion) -> tuple[np.ndarray, np.ndarray]:

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from reffusion import behind, geometry, splat, trace
 from reffusion.behind import Completion
+from reffusion.continuation import Plane
 from reffusion.solverlog import SolverLog
 from reffusion.splat.conventions import SH0
 from reffusion.surfels import surface_gaussians
 from reffusion.types import Camera, Gaussians, Reference
+from reffusion.witness import Witness, with_photographed_depth
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,7 @@ class Sheets:
         under_spread, under_opacity: the second's. Wider Gaussians than the first's leave no gaps between them, which a
             nearer view would show as a grid; what that blurs the colours of the first make up for.
         color_steps: corrections of the colours, see `match_colors`.
+        gloss: neighbours that lend their view-dependent colour, see `with_gloss`; 0: the new ones have none.
     """
 
     spread: float
@@ -44,6 +48,7 @@ class Sheets:
     under_spread: float
     under_opacity: float
     color_steps: int
+    gloss: int = 0
 
 
 @torch.no_grad()
@@ -56,6 +61,8 @@ def depth_behind(
     how: Completion,
     estimate: np.ndarray | None = None,
     log: trace.Trace | None = None,
+    continued: np.ndarray | None = None,
+    outer: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """The scene without the object in one view: depth [H, W] float64, as rendered where that is known, else made up;
     the same made up everywhere; and how in words.
@@ -71,11 +78,13 @@ def depth_behind(
         how: parameters.
         estimate: [H, W] a depth model's answer to the reference, disparity up to scale and offset; None: there is none.
         log: gets a series for each solver (docs/traces.md).
+        continued, outer: see `behind.seen`.
 
     Raises:
         ValueError: naming the view, where too little is known around the hole, or the estimate does not fit.
     """
-    view = behind.seen(splat.render(remaining, reference.camera, sh_degree=0), reference.camera, hole, hidden, how)
+    drawn = splat.render(remaining, reference.camera, sh_degree=0)
+    view = behind.seen(drawn, reference.camera, hole, hidden, how, continued, outer)
     solvers = SolverLog(log, reference.camera.name, *behind.points_around(view, points, how))
     try:
         if estimate is None:
@@ -132,11 +141,34 @@ def seen_through(
     return found
 
 
+@dataclass(frozen=True)
+class Surroundings:
+    """What is known around the object.
+
+    Attributes:
+        cameras: the training views.
+        hidden: view name -> bool [H, W], C.
+        views: the training views as witnesses. planes: those that go on into what nobody saw.
+        points: [P, 3] sparse points of the scene.
+    """
+
+    cameras: Sequence[Camera]
+    hidden: Mapping[str, np.ndarray]
+    views: Sequence[Witness]
+    planes: Sequence[Plane]
+    points: np.ndarray
+
+    def photographed(self, camera: Camera) -> np.ndarray:
+        """[H, W] depth that a training view shows outside its mask; 0 elsewhere."""
+        nothing = np.zeros((camera.height, camera.width))
+        return with_photographed_depth(nothing, camera, self.views)
+
+
 @torch.no_grad()
-def share_of(gaussians: Gaussians, labels: torch.Tensor, camera: Camera) -> np.ndarray:
-    """[H, W] in [0, 1): blended share of the labelled Gaussians."""
-    features = labels[:, None].to(gaussians.means.dtype)
-    return splat.render(gaussians, camera, features=features, sh_degree=0).features[..., 0].cpu().numpy()
+def uncovered(gaussians: Gaussians, camera: Camera, hidden: np.ndarray, covered: float = 0.9) -> float:
+    """Share in [0, 1] of C (`hidden`, bool [H, W]) whose alpha is below `covered`."""
+    alpha = splat.render(gaussians, camera, sh_degree=0).alpha.cpu().numpy()
+    return float((alpha[hidden] < covered).mean()) if hidden.any() else 0.0
 
 
 def surface(
@@ -159,8 +191,34 @@ def placed(
     added = surface(reference.image, depth, pixels, reference.camera, gaussians.sh.shape[1], how)
     together = gaussians.zipped(added, lambda a, b: torch.cat([a, b]))
     fresh = torch.arange(len(together)) >= len(gaussians)
+    if how.gloss:
+        together = with_gloss(together, fresh, how.gloss)
     together = match_colors(together, fresh, reference.image, pixels, reference.camera, how.color_steps)
     return together, torch.cat([new, fresh[len(new) :]])
+
+
+@torch.no_grad()
+def with_gloss(gaussians: Gaussians, fresh: torch.Tensor, neighbours: int) -> Gaussians:
+    """The fresh Gaussians with the mean view-dependent colour of their nearest old neighbours.
+
+    One picture tells how a surface looks from one side. A wet table or a leaf in the sun is brighter from another, and
+    what is new would stand out there as a patch; what stands around it knows.
+
+    Args:
+        fresh: [N] bool. neighbours: how many are averaged, by opacity and size.
+    """
+    lenders = torch.nonzero(~fresh & (gaussians.opacity_logits > 0))[:, 0]  # opacity above one half
+    if gaussians.sh.shape[1] == 1 or len(lenders) < neighbours or not fresh.any():
+        return gaussians
+    tree = cKDTree(gaussians.means[lenders].cpu().numpy())
+    _, index = tree.query(gaussians.means[fresh].cpu().numpy(), k=neighbours)
+    nearest = lenders[torch.from_numpy(index)]
+    size = gaussians.log_scales.exp().sort(1).values[:, 1:].prod(1)
+    weight = (gaussians.opacity_logits.sigmoid() * size)[nearest]
+    weight = weight / weight.sum(1, keepdim=True)
+    sh = gaussians.sh.clone()
+    sh[fresh, 1:] = (gaussians.sh[nearest, 1:] * weight[..., None, None]).sum(1)
+    return replace(gaussians, sh=sh)
 
 
 @torch.no_grad()

@@ -1,4 +1,4 @@
-"""2D masks -> votes -> labelled Gaussians -> consistent masks -> never-seen pixels (paper, mask consolidation)."""
+"""2D masks -> votes -> labelled Gaussians -> consistent masks -> the view to complete (paper, mask consolidation)."""
 
 from __future__ import annotations
 
@@ -71,19 +71,19 @@ def label_gaussians(votes: Votes, tau: float = 1.0) -> Tensor:
 
 
 def leaking(
-    remaining: Gaussians, cameras: Sequence[Camera], never_seen: Mapping[str, np.ndarray], tau: float = 1.0
+    remaining: Gaussians, cameras: Sequence[Camera], undecided: Mapping[str, np.ndarray], tau: float = 1.0
 ) -> Tensor:
-    """bool [M]: haze, the Gaussians that with the object gone show mostly in never-seen pixels.
+    """bool [M]: haze, the Gaussians that with the object gone show mostly in undecided pixels.
 
     The fit had no say in what they show there: footprints that reached far into or behind the object while it hid
     them. The same ratio that labels the object decides, counted without the object.
 
     Args:
         remaining: M Gaussians, the masked ones gone.
-        never_seen: view name -> bool [H, W].
-        tau: ratio of contributions in never-seen pixels to those in all others.
+        undecided: view name -> bool [H, W].
+        tau: ratio of contributions in undecided pixels to those in all others.
     """
-    return label_gaussians(cast_votes(remaining, cameras, never_seen, mode="weight"), tau)
+    return label_gaussians(cast_votes(remaining, cameras, undecided, mode="weight"), tau)
 
 
 def hidden_inside(
@@ -111,19 +111,21 @@ def points_inside(
 
 
 @torch.no_grad()
-def label_view(gaussians: Gaussians, labels: Tensor, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """What one view shows of the labels: (blended label [H, W] in [0, 1), disparity [H, W], 0 where nothing is).
+def label_view(gaussians: Gaussians, labels: Tensor, camera: Camera) -> np.ndarray:
+    """What one view shows of the labels, [H, W] in [0, 1).
 
-    C is where the blended label exceeds tau'. PAPER leaves open: whether it is divided by alpha first. Not here: where
-    alpha is small nothing hides the background, whatever the label of the haze.
+    C is where it exceeds tau'. PAPER leaves open: whether it is divided by alpha first. Not here: where alpha is small
+    nothing hides the background, whatever the label of the haze.
     """
     drawn = splat.render(gaussians, camera, features=labels[:, None].to(gaussians.means.dtype), sh_degree=0)
-    return drawn.features[..., 0].cpu().numpy(), _inverse(drawn.depth)
+    return drawn.features[..., 0].cpu().numpy()
 
 
-def _inverse(depth: Tensor) -> np.ndarray:
-    values = depth.double().cpu().numpy()
-    return np.divide(1.0, values, out=np.zeros_like(values), where=values > 0)
+def extent(means: Tensor) -> tuple[np.ndarray, float]:
+    """Middle [3] and radius, float64, of most of the points [N, 3], N at least 1."""
+    points = means.detach().double().cpu().numpy()
+    centre = np.median(points, 0)
+    return centre, float(np.percentile(np.linalg.norm(points - centre, axis=1), 95))
 
 
 def tidy(mask: np.ndarray, speck: float, gap: float) -> np.ndarray:
@@ -138,58 +140,6 @@ def _small_parts(mask: np.ndarray, diameter: float) -> np.ndarray:
     small = area < np.pi / 4 * diameter**2
     small[0] = False
     return small[parts]
-
-
-def evidence(votes: Votes, enough: float) -> Tensor:
-    """[N] in [0, 1]: how far a Gaussian was observed outside the masks, 1 from `enough` (in the unit of the votes)."""
-    return (votes.unmasked / enough).clamp(0, 1)
-
-
-@torch.no_grad()
-def remaining_view(remaining: Gaussians, observed: Tensor, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """What one view shows with the object gone: (disparity [H, W], 0 where nothing is; explained [H, W] in [0, 1)).
-
-    `explained` is the evidence of the M remaining Gaussians, `observed` [M], blended like a colour: tails and haze that
-    no photograph showed do not explain a pixel, however opaque.
-    """
-    drawn = splat.render(remaining, camera, features=observed[:, None].to(remaining.means.dtype), sh_degree=0)
-    return _inverse(drawn.depth), drawn.features[..., 0].cpu().numpy()
-
-
-def seen_elsewhere(
-    disparity: np.ndarray,
-    pixels: np.ndarray,
-    camera: Camera,
-    witnesses: Sequence[Camera],
-    hidden: Mapping[str, np.ndarray],
-    surfaces: Mapping[str, np.ndarray],
-    *,
-    tolerance: float = 0.02,
-) -> np.ndarray:
-    """int [H, W]: in how many training views the background point behind each of `pixels` is plainly visible.
-
-    A witness sees a point that falls into its frame, outside its C, and not behind the surface it shows.
-
-    Args:
-        disparity: [H, W] of the scene without the object, in `camera`.
-        pixels: bool [H, W], those asked for; others get 0.
-        witnesses: the training views.
-        hidden: view name -> bool [H, W], where that view shows the object (its C; all False in a clean view).
-        surfaces: view name -> [H, W] disparity of what that view shows outside C.
-        tolerance: relative depth by which a point may lie behind that surface.
-    """
-    count = np.zeros(pixels.shape, np.int64)
-    rows, columns = np.nonzero(pixels & (disparity > 0))
-    rays = geometry.pixel_rays(camera)[rows, columns]
-    pose = camera.world_to_camera
-    points = (rays / disparity[rows, columns, None] - pose[:3, 3]) @ pose[:3, :3]
-    for witness in witnesses:
-        uv, z = geometry.project(points, witness)
-        covered, framed = geometry.sample_nearest(hidden[witness.name], uv)
-        shown, _ = geometry.sample_nearest(surfaces[witness.name], uv)
-        with np.errstate(invalid="ignore"):
-            count[rows, columns] += framed & ~covered & (z * shown < 1 + tolerance)
-    return count
 
 
 def box_silhouette(center: np.ndarray, size: np.ndarray, camera: Camera, disparity: np.ndarray) -> np.ndarray:

@@ -167,13 +167,13 @@ class MaskSet:
     Attributes:
         raw: the given 2D mask (all False where none was given).
         consistent: C, rendered back from the labelled Gaussians; it must not supervise.
-        never_seen: N, inside C, explained by no remaining Gaussian.
-        invent: I, the pixels to be made up: N, or the region the scene asks to fill.
+        undecided: U, inside C: no other photograph shows what is to be seen there.
+        invent: I, the pixels to be made up: U, or the region the scene asks to fill.
     """
 
     raw: np.ndarray
     consistent: np.ndarray
-    never_seen: np.ndarray
+    undecided: np.ndarray
     invent: np.ndarray
 
 

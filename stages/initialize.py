@@ -8,6 +8,9 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 
+WARN_FROM = 0.01  # share of C that shows nothing, from which a view is named
+
+
 class Params(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -17,7 +20,7 @@ class Params(BaseModel):
         "lift painted of the best view, Gaussians at random (reffusion.scatter), or nothing: it only removes",
     )
     random_gaussians: int = Field(0, ge=0, description="their number, started at random; 0: as many as were removed")
-    leak: float = Field(1.0, gt=0, description="weight in never-seen over other pixels from which Gaussians are haze")
+    leak: float = Field(1.0, gt=0, description="weight in undecided over other pixels from which Gaussians are haze")
     overlap: float = Field(0.006, ge=0, description="how far new Gaussians reach beyond the hole, / image width")
     covered: float = Field(0.9, gt=0, le=1, description="alpha below which the reference also fills pixels of C")
     seen_through: float = Field(
@@ -55,6 +58,11 @@ class Params(BaseModel):
     )
     depth_align: Literal["l2", "robust"] = Field("l2", description="fit of its scale and offset on known pixels")
     color_steps: int = Field(5, ge=0, description="corrections of their colours until the reference is reproduced")
+    # PAPER leaves open: the new Gaussians' view-dependent colour. The reference shows one side only.
+    gloss: int = Field(0, ge=0, description="old neighbours that lend new Gaussians theirs; 0: they have none")
+    # PAPER leaves open: what the reference's camera does not see of the hole.
+    further: int = Field(0, ge=0, description="most views completed beside the references, until nothing is uncovered")
+    settle: int = Field(0, ge=0, description="steps of reconstruction after filling; 0: none")
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list:
@@ -75,9 +83,6 @@ def run(
     gaussians, labels = io.load_ply(fit / "gaussians.ply"), io.load_labels(masks / "labels.npy")
     if len(labels) != len(gaussians):
         raise ValueError(f"{masks}: {len(labels)} labels for {len(gaussians)} Gaussians of {fit}: run masks again")
-    removed = gaussians.map(lambda p: p[labels])
-    gaussians = gaussians.map(lambda p: p[~labels])
-    new = torch.zeros(len(gaussians), dtype=torch.bool)
     scene = io.load_scene(poses)
     if params.start == "lift" and lift is None:
         raise ValueError("initialize.start is 'lift', but the stage lift was left out: set distill.lift_weight")
@@ -85,34 +90,48 @@ def run(
     references = io.load_references(completed, scene) if completed else []
     network = monocular.load_network(params.depth_model) if params.depth_model and references else None
     sets = io.load_mask_sets(masks, scene.cameras)
+    around = surroundings(params, scene, gaussians, labels, sets) if references else None
+    removed = gaussians.map(lambda p: p[labels])
+    gaussians = gaussians.map(lambda p: p[~labels])
+    new = torch.zeros(len(gaussians), dtype=torch.bool)
     train = [scene.cameras[name] for name in scene.train]
     haze = torch.zeros(len(gaussians), dtype=torch.bool)
     if params.start != "nothing":  # where nothing is put in its place, haze is better than a black hole
-        haze = voting.leaking(gaussians, train, {c.name: sets[c.name].never_seen for c in train}, params.leak)
+        haze = voting.leaking(gaussians, train, {c.name: sets[c.name].undecided for c in train}, params.leak)
     gaussians, new = gaussians.map(lambda p: p[~haze]), new[~haze]
     best = io.load_json(masks / "facts.json")["best_reference"]
     log = trace.Trace(out) if references else None
     for each in sorted(references, key=lambda r: (r.camera.name != best, -int(r.mask.sum()))):
-        views = [(camera, sets[camera.name].consistent) for camera in train]
-        gaussians, new = filled(
-            params, out, gaussians, new, each, sets[each.camera.name].consistent, scene.points, views, network, log
-        )
+        gaussians, new = filled(params, out, gaussians, new, each, around, network, log)
+    if references and params.further:
+        gaussians, new, further = completed_further(params, out, gaussians, new, around, poses, fit)
+        references = [*references, *further]
     if params.start == "random" and any(each.invent.any() for each in sets.values()):
         added = at_random(params, removed, gaussians, scene, sets, poses)
         gaussians = gaussians.zipped(added, lambda a, b: torch.cat([a, b]))
         new = torch.cat([new, torch.ones(len(added), dtype=torch.bool)])
+    if references and params.settle:
+        gaussians = settled(params, out, gaussians, references, around, poses, fit)
     io.save_ply(out / "gaussians.ply", gaussians)
     io.save_labels(out / "labels.npy", new)
-    asked = covered = 0
-    for name in scene.train:
-        each = sets[name]
-        asked += int(each.invent.sum())
-        covered += int((initialize.share_of(gaussians, new, scene.cameras[name]) > 0.5)[each.invent].sum())
+    uncovered = {name: initialize.uncovered(gaussians, scene.cameras[name], sets[name].consistent) for name in scene.train}
     facts = {"new_gaussians": int(new.sum()), "removed_gaussians": int(labels.sum()), "haze": int(haze.sum())}
-    facts["uncovered_share"] = 1 - covered / asked if asked else 0.0
+    facts |= {"references": [each.camera.name for each in references], "uncovered": uncovered}
+    facts["uncovered_share"] = sum(uncovered.values()) / max(len(uncovered), 1)
     io.save_json(out / "facts.json", facts)
-    if references and facts["uncovered_share"] > 0.05:
-        print(f"{facts['uncovered_share']:.0%} of the invent masks is covered by no reference: add another view's")
+    if bare := [f"{name} ({share:.1%})" for name, share in uncovered.items() if share > WARN_FROM]:
+        print(f"uncovered in {len(bare)} views: {', '.join(bare)}: complete another view and add it to the references")
+
+
+def surroundings(params: Params, scene, gaussians, labels, sets):
+    """What the photographs say of the space around the object, and the planes that go on into what they do not."""
+    from reffusion import continuation, initialize, masks, witness
+
+    hidden = {name: each.consistent & (name not in scene.clean) for name, each in sets.items()}
+    train = [scene.cameras[name] for name in scene.train]
+    views = witness.witnesses(gaussians, train, hidden)
+    planes = continuation.planes_around(*masks.extent(gaussians.means[labels]), views, params.seed) if labels.any() else []
+    return initialize.Surroundings(train, {n: sets[n].consistent for n in sets}, views, planes, scene.points)
 
 
 def at_random(params: Params, removed, remaining, scene, sets, poses: Path):
@@ -133,25 +152,68 @@ def at_random(params: Params, removed, remaining, scene, sets, poses: Path):
     return scatter.gaussians_at(points, remaining.sh.shape[1], remaining.antialiased, draw)
 
 
-def filled(params: Params, out: Path, gaussians, new, reference, hidden, points, views, network, log):
+def filled(params: Params, out: Path, gaussians, new, reference, around, network, log):
     """The Gaussians with those of one reference, on what is still empty in its mask, and the labels."""
     from dataclasses import fields
 
-    from reffusion import behind, initialize, io
+    from reffusion import behind, initialize, io, undecided
 
     camera, sheets = reference.camera, {f.name: getattr(params, f.name) for f in fields(initialize.Sheets)}
-    sheets, how = initialize.Sheets(**sheets), completion(params)
+    sheets, how, hidden = initialize.Sheets(**sheets), completion(params), around.hidden[reference.camera.name]
     hole = initialize.to_fill(gaussians, new, reference, hidden, params.covered)
     remaining = gaussians.map(lambda p: p[~new])
+    continued = undecided.behind(remaining, camera, hidden, around.views, around.planes).continued
     depth, made_up, said = initialize.depth_behind(
-        remaining, reference, hole, hidden, points, how, estimate_of(network, reference), log
+        remaining, reference, hole, hidden, around.points, how, estimate_of(network, reference), log, continued,
+        around.photographed(camera),
     )
     print(f"depth of reference {camera.name}: {said}")
     io.save_exr(out / "depth" / f"{camera.name}.exr", depth.astype("float32"))
     pixels = behind.grown(hole, params.overlap)
     gaussians, new = initialize.placed(gaussians, new, reference, depth, pixels, sheets)
+    views = [(each, around.hidden[each.name]) for each in around.cameras]
     gap = initialize.seen_through(gaussians, camera, made_up, hidden & ~pixels, views, params.seen_through)
     return initialize.placed(gaussians, new, reference, made_up, gap, sheets)
+
+
+def completed_further(params: Params, out: Path, gaussians, new, around, poses: Path, fit: Path):
+    """Views completed by pieces of themselves, one after another, the one that shows most that nothing covers first;
+    the Gaussians with what they show, the labels, and the views."""
+    from reffusion import coverage, exposure, inpaint, io, paint2d
+    from reffusion.types import Reference
+
+    photos, further = exposure.load_views(poses, fit, [camera.name for camera in around.cameras]), []
+    found = coverage.undecided_views(gaussians, new, around, around.cameras)
+    haze = coverage.haze(gaussians, new, around, found, params.leak)
+    gaussians, new = gaussians.map(lambda p: p[~haze]), new[~haze]
+    while len(further) < params.further and (camera := coverage.barest(around, found)):
+        mask, hidden = found[camera.name], around.hidden[camera.name]
+        base = inpaint.background(gaussians, camera, photos[camera.name], hidden)
+        picture = paint2d.telea(base, mask | hidden & paint2d.widened(mask, coverage.RIM))
+        reference = Reference(camera, picture, mask)
+        print(f"further view {camera.name}: {mask.sum() / hidden.sum():.1%} of the mask is shown by nothing else")
+        io.save_image(out / "further" / f"{camera.name}.png", picture)
+        gaussians, new = filled(params, out, gaussians, new, reference, around, None, None)
+        further.append(reference)
+        found |= coverage.undecided_views(gaussians, new, around, [c for c in around.cameras if found[c.name].any()])
+    return gaussians, new, further
+
+
+def settled(params: Params, out: Path, gaussians, references, around, poses: Path, fit: Path):
+    """The Gaussians after `params.settle` steps of reconstruction; see `reffusion.settle`."""
+    from dataclasses import replace
+
+    from reffusion import exposure
+    from reffusion.settle import Known, settle
+
+    names = [camera.name for camera in around.cameras]
+    photos = exposure.load_views(poses, fit, names)
+    hidden = {view.camera.name: view.hidden for view in around.views}
+    # A reference is true all over C, and not only where it was asked.
+    whole = [replace(each, mask=around.hidden[each.camera.name]) for each in references]
+    (out / "settle").mkdir(exist_ok=True)
+    known = Known(around.cameras, photos, hidden, whole)
+    return settle(gaussians, known, params.settle, params.seed, out / "settle")
 
 
 def completion(params: Params):

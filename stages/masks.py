@@ -1,4 +1,4 @@
-"""masks: votes label the object's Gaussians; rendered back they give every view's consistent, never-seen and
+"""masks: votes label the object's Gaussians; rendered back they give every view's consistent, undecided and
 invent mask."""
 
 from __future__ import annotations
@@ -13,8 +13,10 @@ if TYPE_CHECKING:
     import numpy as np
     from torch import Tensor
 
+    from reffusion.continuation import Plane
     from reffusion.masks import Votes
     from reffusion.types import Camera, Gaussians, MaskSet, Scene
+    from reffusion.witness import Witness
 
 
 class Params(BaseModel):
@@ -25,25 +27,22 @@ class Params(BaseModel):
     )
     tau: float = Field(1.0, gt=0, description="masked from this ratio of masked to unmasked contributions (paper: 1)")
     tau_rendered: float = Field(0.3, gt=0, lt=1, description="C is where the rendered label exceeds it (paper: 0.3)")
-    observed: float = Field(
-        1.0, gt=0, description="unmasked blending weight, summed over pixels and views, of a fully observed Gaussian"
-    )
     buried: float = Field(
         0.1, ge=0, description="blending weight in all views up to which a Gaussian votes by where it stands"
     )
     hull: float = Field(
         0.9, ge=0, le=1, description="masked too: centres inside C in more than this share of the views; 1 = none"
     )
-    explained: float = Field(0.5, gt=0, lt=1, description="blended observation from which a pixel is explained")
+    debris: bool = Field(True, description="masked too: what the removal brings to light and no photograph supports")
     witnesses: int = Field(1, ge=0, description="training views that must show a pixel's background; 0 = not asked")
-    tolerance: float = Field(0.02, gt=0, description="relative depth by which a visible point may lie too far")
     speck: float = Field(0.01, ge=0, description="islands of a mask below this diameter go, / image width")
     gap: float = Field(0.02, ge=0, description="holes in a mask below this diameter close, / image width")
     # PAPER leaves open: it always invents. So few pixels are rims of masks and crannies, not worth a diffusion model.
-    negligible: float = Field(0.005, ge=0, lt=1, description="share of C up to which never-seen pixels are left alone")
-    invent: Literal["auto", "never_seen", "consistent", "region"] = Field(
-        "auto", description="what is made up; auto = the scene's 3D region where it names one, else never-seen pixels"
+    negligible: float = Field(0.005, ge=0, lt=1, description="share of C up to which undecided pixels are left alone")
+    invent: Literal["auto", "undecided", "consistent", "region"] = Field(
+        "auto", description="what is made up; auto = the scene's 3D region where it names one, else undecided pixels"
     )
+    seed: int = Field(0, description="of the draws that find planes")
 
 
 def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
@@ -52,7 +51,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
     import numpy as np
     import torch
 
-    from reffusion import io, masks
+    from reffusion import io, masks, witness
 
     scene, gaussians = io.load_scene(poses), io.load_ply(fit / "gaussians.ply")
     train = [scene.cameras[name] for name in scene.train]
@@ -71,16 +70,19 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
         labels = voted(params, gaussians, train, ballots, seen)
     else:
         labels = masks.inside_box(gaussians, region["center"], region["size"])
-    consistent, shown = drawn(params, gaussians, labels, scene.cameras)
+    consistent = drawn(params, gaussians, labels, scene.cameras)
     # What stands where (almost) every view sees the object can only be the object, whatever it was painted with.
     labels |= masks.hidden_inside(
         gaussians, train, {n: consistent[n] for n in scene.train if n not in scene.clean}, share=params.hull
     )
-    remaining, observed = gaussians.map(lambda p: p[~labels]), masks.evidence(seen, params.observed)[~labels]
+    hidden = {name: empty[name] if name in scene.clean else consistent[name] for name in scene.cameras}
+    views = witness.witnesses(gaussians, train, hidden)
+    if params.debris:
+        labels |= witness.debris(gaussians, labels, views, hidden)
     fill = region if params.invent in ("region", "auto") else None
-    sets = classified(params, scene, remaining, observed, raw, consistent, shown, fill)
-    unseen = share_unseen(sets, scene.train)
-    if params.invent != "consistent" and fill is None and unseen <= params.negligible:
+    sets = classified(params, scene, gaussians, labels, raw, consistent, views, fill)
+    undecided = share_undecided(sets, scene.train)
+    if params.invent != "consistent" and fill is None and undecided <= params.negligible:
         sets = {name: replace(each, invent=empty[name]) for name, each in sets.items()}
     io.save_labels(out / "labels.npy", labels.cpu())
     io.save_mask_sets(out, sets)
@@ -91,7 +93,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
         "voting_views": len(ballots),
         "invent_pixels": pixels_of("invent", sets, scene.train),
         "consistent_pixels": pixels_of("consistent", sets, scene.train),
-        "never_seen_share": unseen,
+        "undecided_share": undecided,
         "invent_views": [name for name in scene.train if invents[name].any()],
         "best_reference": masks.best_view(invents, scene.train),
     }
@@ -111,51 +113,54 @@ def voted(
     return labels | (unseen & masks.hidden_inside(gaussians, train, ballots))
 
 
-def drawn(params: Params, gaussians: Gaussians, labels: Tensor, cameras: dict[str, Camera]) -> tuple[dict, dict]:
-    """The labels rendered back into each view: its consistent mask C, and the disparity that it shows, [H, W]."""
+def drawn(params: Params, gaussians: Gaussians, labels: Tensor, cameras: dict[str, Camera]) -> dict[str, np.ndarray]:
+    """The labels rendered back into each view: its consistent mask C, bool [H, W]."""
     from reffusion import masks
 
-    consistent, shown = {}, {}
-    for name, camera in cameras.items():
-        share, shown[name] = masks.label_view(gaussians, labels, camera)
-        consistent[name] = tidied(params, share > params.tau_rendered)
-    return consistent, shown
+    shares = {name: masks.label_view(gaussians, labels, camera) for name, camera in cameras.items()}
+    return {name: tidied(params, share > params.tau_rendered) for name, share in shares.items()}
 
 
 def classified(
     params: Params,
     scene: Scene,
-    remaining: Gaussians,
-    observed: Tensor,
+    gaussians: Gaussians,
+    labels: Tensor,
     raw: dict[str, np.ndarray],
     consistent: dict[str, np.ndarray],
-    shown: dict[str, np.ndarray],
+    views: list[Witness],
     fill: dict | None,
 ) -> dict[str, MaskSet]:
-    """The masks of each view: what the remaining Gaussians explain, and other views saw, is background to be shown.
+    """The masks of each view: what other views show behind the object is decided, and is not invented.
 
-    `observed`: [M], evidence of the remaining ones; `fill`: the region that is made up whatever anyone saw, or None.
+    `labels`: [N] bool, what goes; `fill`: the region that is made up whatever anyone saw, or None.
     """
     import numpy as np
 
-    from reffusion import masks, trace
+    from reffusion import masks, trace, undecided
     from reffusion.types import MaskSet
 
-    train, names = [scene.cameras[name] for name in scene.train], list(scene.cameras)
-    hidden = consistent | {name: np.zeros_like(consistent[name]) for name in scene.clean}
+    remaining, names = gaussians.map(lambda p: p[~labels]), list(scene.cameras)
+    planes = continuations(params, gaussians, labels, views)
     sets = {}
     for k in trace.progress(len(names), "masks"):
         name, camera = names[k], scene.cameras[names[k]]
-        disparity, explained = masks.remaining_view(remaining, observed, camera)
-        asked = consistent[name] & (explained > params.explained)
-        seen_by = masks.seen_elsewhere(disparity, asked, camera, train, hidden, shown, tolerance=params.tolerance)
-        unseen = consistent[name] & ~(asked & (seen_by >= params.witnesses))
-        unseen = tidied(params, unseen) & hidden[name]
-        invent = hidden[name] if params.invent == "consistent" else unseen
+        found = undecided.behind(remaining, camera, consistent[name], views, planes, witnesses=params.witnesses)
+        unknown = tidied(params, found.undecided) & consistent[name] & (name not in scene.clean)
+        invent = consistent[name] & (name not in scene.clean) if params.invent == "consistent" else unknown
         if fill is not None:
+            disparity = np.divide(1.0, found.depth, out=np.zeros_like(found.depth), where=found.depth > 0)
             invent = masks.box_silhouette(**fill, camera=camera, disparity=disparity)
-        sets[name] = MaskSet(raw.get(name, np.zeros_like(unseen)), consistent[name], unseen, invent)
+        sets[name] = MaskSet(raw.get(name, np.zeros_like(unknown)), consistent[name], unknown, invent)
     return sets
+
+
+def continuations(params: Params, gaussians: Gaussians, labels: Tensor, views: list[Witness]) -> list[Plane]:
+    """The planes around what goes; none where nothing does."""
+    from reffusion.continuation import planes_around
+    from reffusion.masks import extent
+
+    return planes_around(*extent(gaussians.means[labels]), views, params.seed) if labels.any() else []
 
 
 def tidied(params: Params, mask: np.ndarray) -> np.ndarray:
@@ -170,6 +175,6 @@ def pixels_of(kind: str, sets: dict[str, MaskSet], names: Sequence[str]) -> int:
     return int(sum(np.count_nonzero(getattr(sets[name], kind)) for name in names))
 
 
-def share_unseen(sets: dict[str, MaskSet], names: Sequence[str]) -> float:
-    """Of the consistent masks' pixels, those that no view saw behind them."""
-    return pixels_of("never_seen", sets, names) / max(pixels_of("consistent", sets, names), 1)
+def share_undecided(sets: dict[str, MaskSet], names: Sequence[str]) -> float:
+    """Of the consistent masks' pixels, those behind which no photograph tells what is to be seen."""
+    return pixels_of("undecided", sets, names) / max(pixels_of("consistent", sets, names), 1)

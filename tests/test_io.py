@@ -263,7 +263,7 @@ def test_mask_sets_and_references(tmp_path):
     io.save_mask_sets(tmp_path, sets)
     again = io.load_mask_sets(tmp_path, scene.cameras)
     for name, mask_set in sets.items():
-        for kind in ("raw", "consistent", "never_seen", "invent"):
+        for kind in ("raw", "consistent", "undecided", "invent"):
             assert np.array_equal(getattr(again[name], kind), getattr(mask_set, kind))
     image = generator.integers(0, 256, (8, 12, 3)).astype(np.uint8)
     io.save_references(tmp_path / "reference", [Reference(scene.cameras["b"], image, draw())])

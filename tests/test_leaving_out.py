@@ -63,10 +63,10 @@ def test_few_unseen_pixels_are_negligible_and_it_can_be_forced(tmp_path):
         return io.load_mask_sets(out, small.TRAIN).values(), io.load_json(out / "facts.json")
 
     sets, facts = classified(negligible=0.0)
-    assert 0 < facts["never_seen_share"] < 0.1 and facts["invent_pixels"] > 0
+    assert 0 < facts["undecided_share"] < 0.1 and facts["invent_pixels"] > 0
     sets, few = classified(negligible=0.1)
-    assert few["invent_pixels"] == 0 and few["never_seen_share"] == facts["never_seen_share"]
-    assert not any(each.invent.any() for each in sets) and any(each.never_seen.any() for each in sets)
+    assert few["invent_pixels"] == 0 and few["undecided_share"] == facts["undecided_share"]
+    assert not any(each.invent.any() for each in sets) and any(each.undecided.any() for each in sets)
     sets, _ = classified(invent="consistent")
     assert all((each.invent == each.consistent).all() and each.invent.any() for each in sets)
 

@@ -85,14 +85,14 @@ def test_tidy_removes_specks_and_closes_gaps():
     assert not masks.tidy(mask, 3, 3)[15, 15]
 
 
-def test_consistent_and_never_seen_masks_match_the_truth(tmp_path):
+def test_consistent_and_undecided_masks_match_the_truth(tmp_path):
     sets, facts, found, labels = classify(tmp_path, NEAR)
     assert (found == labels).float().mean() > 0.99
     for name, view in small.CAMERAS.items():
         assert small.iou(sets[name].consistent, small.true_mask(view, NEAR)) > 0.9
-        assert small.iou(sets[name].never_seen, small.true_never_seen(view, NEAR)) > 0.75
-        assert not (sets[name].never_seen & ~sets[name].consistent).any()
-        assert (sets[name].invent == sets[name].never_seen).all()
+        assert small.iou(sets[name].undecided, small.true_never_seen(view, NEAR)) > 0.75
+        assert not (sets[name].undecided & ~sets[name].consistent).any()
+        assert (sets[name].invent == sets[name].undecided).all()
     assert facts["best_reference"] in small.TRAIN and facts["invent_views"] == list(small.TRAIN)
     assert facts["masked_gaussians"] == int(found.sum())
     assert facts["invent_pixels"] == sum(int(sets[name].invent.sum()) for name in small.TRAIN)
@@ -102,7 +102,7 @@ def test_what_other_views_saw_is_not_invented(tmp_path):
     sets, facts, _, _ = classify(tmp_path, FAR)
     assert all(small.iou(sets[n].consistent, small.true_mask(v, FAR)) > 0.9 for n, v in small.CAMERAS.items())
     # Some is: a band of half a footprint, whose Gaussians the masks' rim outvotes.
-    assert facts["never_seen_share"] < 0.1
+    assert facts["undecided_share"] < 0.1
 
 
 def test_a_missing_and_a_contradicting_mask_are_outvoted(tmp_path):
@@ -136,7 +136,7 @@ def test_a_clean_view_shows_what_the_object_hid(tmp_path):
     given = {name: small.true_mask(small.CAMERAS[name], NEAR) for name in small.TRAIN if name != "a2"}
     sets, facts, _, _ = classify(tmp_path, NEAR, masks=given, clean=("a2",))
     assert facts["voting_views"] == 5
-    assert not sets["a2"].never_seen.any()
+    assert not sets["a2"].undecided.any()
     hidden = classify(tmp_path / "b", NEAR)[1] if (tmp_path / "b").mkdir() is None else None
     assert facts["invent_pixels"] <= hidden["invent_pixels"]
 

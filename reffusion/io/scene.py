@@ -19,7 +19,7 @@ from .images import load_image, load_mask, save_image, save_mask
 if TYPE_CHECKING:
     from reffusion.types import MaskSet, Reference, Scene
 
-PIXEL_CLASSES = ("raw", "consistent", "never_seen", "invent")
+PIXEL_CLASSES = ("raw", "consistent", "undecided", "invent")
 
 
 def save_scene(poses_dir: Path, scene: Scene) -> None:
@@ -87,7 +87,7 @@ def load_given_references(poses_dir: Path) -> dict[str, np.ndarray]:
 
 
 def save_mask_sets(masks_dir: Path, sets: Mapping[str, MaskSet]) -> None:
-    """Write raw/, consistent/, never_seen/ and invent/<view>.png."""
+    """Write raw/, consistent/, undecided/ and invent/<view>.png."""
     for name, mask_set in sets.items():
         for kind in PIXEL_CLASSES:
             save_mask(Path(masks_dir) / kind / f"{name}.png", getattr(mask_set, kind))

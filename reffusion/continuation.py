@@ -1,0 +1,145 @@
+"""Planes that stand around a hole, and where each goes on into space that no photograph shows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from reffusion import geometry, trace
+from reffusion.behind import grown
+from reffusion.types import Camera
+from reffusion.witness import Witness, votes
+
+REACH = 2.5  # radii of the object around its middle within which surfaces are looked for
+RING = 0.12  # of the image's width: how far around the masks surfaces are sampled
+VIEWS = 12  # views that are sampled
+SAMPLES = 1500  # of each
+TOLERANCE = 0.08  # of the object's radius: distance within which a sample belongs to a plane
+TRIALS = 300  # draws of three samples for each plane
+LEAST_SHARE = 0.1  # of the samples that a plane must explain
+MOST = 5  # planes
+CELLS = 160  # a side of a plane's map
+TOUCHING = 0.25  # share of an unknown patch's border that must be seen for the plane to go on into it
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A plane in the world, and a map of what is known on it.
+
+    Attributes:
+        normal: [3], of unit length. height: normal . x on the plane.
+        origin: [3] on the plane, the map's middle. along: [2, 3], the map's axes. pitch: side of a cell.
+        goes_on: bool [CELLS, CELLS], unknown cells into which the plane continues.
+        within: bool [CELLS, CELLS], these and what they enclose with what is seen of the plane: mirrored light makes a
+            polished part look like a pit.
+    """
+
+    normal: np.ndarray
+    height: float
+    origin: np.ndarray
+    along: np.ndarray
+    pitch: float
+    goes_on: np.ndarray
+    within: np.ndarray
+
+    def depth(self, camera: Camera) -> np.ndarray:
+        """[H, W] camera z where a view's rays meet the plane; inf where they do not."""
+        rays = geometry.pixel_rays(camera) @ camera.world_to_camera[:3, :3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth = (self.height - camera.center @ self.normal) / (rays @ self.normal)
+        return np.where(np.isfinite(depth) & (depth > 0), depth, np.inf)
+
+    def on(self, cells_meant: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
+        """bool [H, W]: where the rays meet the plane, at `depth`, in one of the cells meant (bool [CELLS, CELLS])."""
+        rays, ahead = geometry.pixel_rays(camera) @ camera.world_to_camera[:3, :3], np.isfinite(depth)
+        depth = np.where(ahead, depth, 1.0)
+        place = (camera.center + rays * depth[..., None] - self.origin) @ self.along.T / self.pitch
+        cells = np.floor(place + CELLS / 2).astype(np.int64)
+        ahead &= ((cells >= 0) & (cells < CELLS)).all(-1)
+        row, column = (np.where(ahead, cells[..., axis], 0) for axis in (0, 1))
+        return ahead & cells_meant[row, column]
+
+
+def planes_around(centre: np.ndarray, radius: float, views: Sequence[Witness], seed: int = 0) -> list[Plane]:
+    """The planes around what is removed, those with the most samples first.
+
+    Found in the world, from the surfaces that several views show around their masks: one view's depth alone is rough,
+    and a plane seen at a slant by one is seen well by another.
+
+    Args:
+        centre: [3], the middle of what is removed. radius: of most of it.
+    """
+    samples = _samples(centre, REACH * radius, views, seed)
+    near, free, found = TOLERANCE * radius, np.ones(len(samples), bool), []
+    draws = np.random.default_rng(trace.seed_for(seed, "planes around"))
+    while free.sum() >= max(50, LEAST_SHARE * len(samples)) and len(found) < MOST:
+        normal, height, support = _best_plane(samples[free], near, draws)
+        if support < LEAST_SHARE * len(samples):
+            break
+        found.append(_mapped(normal, height, centre, REACH * radius, views))
+        free &= np.abs(samples @ normal - height) >= 1.5 * near
+    return found
+
+
+def _samples(centre: np.ndarray, reach: float, views: Sequence[Witness], seed: int) -> np.ndarray:
+    """[S, 3] points of the surfaces that views show around their masks, within reach."""
+    draws, found = np.random.default_rng(trace.seed_for(seed, "surfaces around")), [np.zeros((0, 3))]
+    for view in views[:: max(1, len(views) // VIEWS)]:
+        # Where nearest and farthest agree no depth edge mixes two surfaces.
+        plain = (view.nearest > 0) & (view.farthest < 1.06 * view.nearest)
+        rows, columns = np.nonzero(grown(view.hidden, RING) & ~view.hidden & plain)
+        if len(rows):
+            chosen = draws.choice(len(rows), min(SAMPLES, len(rows)), replace=False)
+            found.append(geometry.unproject(view.depth, view.camera)[rows[chosen], columns[chosen]])
+    points = np.concatenate(found)
+    return points[np.linalg.norm(points - centre, axis=1) < reach]
+
+
+def _best_plane(points: np.ndarray, near: float, draws: np.random.Generator) -> tuple[np.ndarray, float, int]:
+    """Normal, height and support of the plane through three of the points that most are near to, fitted to its own."""
+    first, second, third = (points[draws.integers(len(points), size=TRIALS)] for _ in range(3))
+    normals = np.cross(second - first, third - first)
+    length = np.linalg.norm(normals, axis=1)
+    normals = normals[length > 1e-12] / length[length > 1e-12, None]
+    if not len(normals):
+        return np.array([0.0, 0.0, 1.0]), 0.0, 0
+    heights = (normals * first[length > 1e-12]).sum(1)
+    support = (np.abs(points @ normals.T - heights) < near).sum(0)
+    normal, height = normals[support.argmax()], heights[support.argmax()]
+    for _ in range(5):
+        own = points[np.abs(points @ normal - height) < near]
+        if len(own) < 3:
+            break
+        middle = own.mean(0)
+        normal = np.linalg.svd(own - middle, full_matrices=False)[2][2]
+        height = float(middle @ normal)
+    return normal, float(height), int((np.abs(points @ normal - height) < near).sum())
+
+
+def _mapped(normal: np.ndarray, height: float, centre: np.ndarray, reach: float, views: Sequence[Witness]) -> Plane:
+    """The plane with its map: a patch of it that nobody saw, because the object was in the way, and that touches what
+    was seen of it, is where it goes on; where views look through it, it does not."""
+    first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    along = np.stack([first / np.linalg.norm(first), np.cross(normal, first / np.linalg.norm(first))])
+    origin, pitch = centre - (centre @ normal - height) * normal, 2 * reach / CELLS
+    steps = (np.arange(CELLS) + 0.5 - CELLS / 2) * pitch
+    points = origin + steps[:, None, None] * along[0] + steps[None, :, None] * along[1]
+    # On the object's side: a table's underside, seen from below, is not the top under the object.
+    facing = normal if centre @ normal > height else -normal
+    said = votes(points.reshape(-1, 3), views, np.broadcast_to(facing, (CELLS * CELLS, 3)))
+    shape = (CELLS, CELLS)
+    seen = ((said.seen >= 1) & (said.seen >= said.free)).reshape(shape)
+    free = ((said.free >= 2) & (said.free > said.seen)).reshape(shape)
+    unknown = ~seen & ~free & (said.hidden > 0).reshape(shape)
+    patches, count = ndimage.label(unknown)
+    goes_on = np.zeros(shape, bool)
+    for patch in range(1, count + 1):
+        inside = patches == patch
+        border = ndimage.binary_dilation(inside, iterations=2) & ~inside
+        if inside.sum() >= 4 and seen[border].mean() > TOUCHING:
+            goes_on |= inside
+    within = goes_on | (ndimage.binary_fill_holes(seen | goes_on) & ~seen & (said.hidden > 0).reshape(shape))
+    return Plane(normal, height, origin, along, pitch, goes_on, within)

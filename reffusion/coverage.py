@@ -1,0 +1,44 @@
+"""What no reference shows: the pixels still undecided after filling, and the view to complete next."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from torch import Tensor
+
+from reffusion import masks, undecided
+from reffusion.initialize import Surroundings
+from reffusion.types import Camera, Gaussians
+from reffusion.witness import OPAQUE
+
+RIM = 0.006  # of the picture's width, repainted around what is undecided too, as far as it is no photograph
+ENOUGH = 0.004  # share of a view's C under which what is undecided is left to its neighbours
+
+
+def undecided_views(
+    gaussians: Gaussians, new: Tensor, around: Surroundings, cameras: Sequence[Camera]
+) -> dict[str, np.ndarray]:
+    """View name -> bool [H, W], pixels of C that neither the new Gaussians nor another photograph show."""
+    found = {}
+    for camera in cameras:
+        hidden = around.hidden[camera.name]
+        behind = undecided.behind(gaussians, camera, hidden, around.views, around.planes, given=new)
+        # Without a true picture a made-up surface is worse than what stands there, but for holes and planes.
+        wanted = behind.undecided & (np.isfinite(behind.continued) | (behind.alpha <= OPAQUE))
+        speck, gap = 0.01 * camera.width, 0.02 * camera.width
+        found[camera.name] = masks.tidy(wanted, speck, gap) & behind.undecided
+    return found
+
+
+def haze(
+    gaussians: Gaussians, new: Tensor, around: Surroundings, found: Mapping[str, np.ndarray], leak: float
+) -> Tensor:
+    """bool [N]: old Gaussians that show mostly where nothing is decided."""
+    return masks.leaking(gaussians, around.cameras, found, leak) & ~new
+
+
+def barest(around: Surroundings, found: Mapping[str, np.ndarray]) -> Camera | None:
+    """The view with the most undecided pixels; None where in each they are too few to count."""
+    bare = [c for c in around.cameras if found[c.name].sum() > ENOUGH * max(around.hidden[c.name].sum(), 1)]
+    return max(bare, key=lambda camera: int(found[camera.name].sum()), default=None)

@@ -1,0 +1,90 @@
+"""Which pixels behind an object are decided: there other photographs show what is to be seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+
+from reffusion import geometry, splat
+from reffusion.continuation import Plane
+from reffusion.types import Camera, Gaussians
+from reffusion.witness import OPAQUE, SURFACE, Witness, smoothed_normals, votes, with_photographed_depth, without_slivers
+
+BEFORE = 0.97  # of the depth shown: a continuation must be nearer than that to hide it
+BESIDE = 0.03  # of the image's width: how far around a plane's patch it is compared with what is shown
+AGREES = 0.3  # share of these pixels that must lie on the plane
+
+
+@dataclass(frozen=True)
+class Behind:
+    """What one view shows with the object gone.
+
+    Attributes:
+        undecided: bool [H, W], inside C: no photograph tells what is to be seen there.
+        continued: [H, W], depth of the plane that goes on there; inf where none does, or outside `undecided`.
+        depth, alpha: [H, W] float64, as rendered; outside the mask the photographed depth.
+    """
+
+    undecided: np.ndarray
+    continued: np.ndarray
+    depth: np.ndarray
+    alpha: np.ndarray
+
+
+@torch.no_grad()
+def behind(
+    remaining: Gaussians,
+    camera: Camera,
+    hidden: np.ndarray,
+    views: Sequence[Witness],
+    planes: Sequence[Plane],
+    *,
+    given: torch.Tensor | None = None,
+    witnesses: int = 1,
+) -> Behind:
+    """A pixel of C is decided if its ray meets no continuation of a surface before one that another view shows,
+    unmasked, at that depth and from the same side.
+
+    Args:
+        remaining: the M Gaussians without the object.
+        hidden: bool [H, W], C of that view.
+        given: [M] bool, Gaussians made of completed pictures: what they show is decided.
+        witnesses: views that must show the point; 0: the rest alone decides.
+    """
+    labels = torch.zeros(len(remaining), dtype=torch.bool) if given is None else given
+    drawn = splat.render(remaining, camera, features=labels[:, None].to(remaining.means), sh_degree=0)
+    depth, alpha = (t.double().cpu().numpy() for t in (drawn.depth, drawn.alpha))
+    asked = hidden & (drawn.features[..., 0].cpu().numpy() <= 0.5 * np.maximum(alpha, 1e-6))
+    rows, columns = np.nonzero(asked & (alpha > OPAQUE))
+    undecided = asked.copy()
+    if len(rows):
+        points = geometry.unproject(depth, camera)[rows, columns]
+        normals = smoothed_normals(depth, camera)[rows, columns]
+        undecided[rows, columns] = votes(points, views, normals).seen < witnesses
+    depth = with_photographed_depth(depth, camera, views)
+    hides, reach = np.zeros_like(asked), np.full(asked.shape, np.inf)
+    for plane in planes:
+        at = plane.depth(camera)
+        before = asked & (at < BEFORE * np.where(depth > 0, depth, np.inf)) & plane.on(plane.goes_on, at, camera)
+        # Where nothing is known the plane goes on too, but not behind something that stands before it.
+        beneath = undecided & ((at < depth / BEFORE) | (alpha <= OPAQUE)) & plane.on(plane.within, at, camera)
+        if _grows_out_of(before | beneath, at, depth, ~hidden & (alpha > OPAQUE)):
+            hides |= before
+            reach = np.where(before | beneath, np.minimum(reach, at), reach)
+    undecided = without_slivers(undecided | hides) & asked
+    return Behind(undecided, np.where(undecided, reach, np.inf), depth, alpha)
+
+
+def _grows_out_of(patch: np.ndarray, at: np.ndarray, depth: np.ndarray, known: np.ndarray) -> bool:
+    """Does the plane lie at the rendered depth around the patch of it (bool [H, W])? One that only cuts through what
+    stands there does not."""
+    if not patch.any():
+        return False
+    reach = max(3, round(BESIDE * patch.shape[1]))
+    beside = cv2.dilate(patch.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
+    beside &= known & np.isfinite(at)
+    return bool(beside.any()) and float((np.abs(depth[beside] / at[beside] - 1) < SURFACE).mean()) > AGREES

@@ -1,0 +1,158 @@
+"""Seen, free or unknown: what the photographs say of points in space, outside the masks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+
+from reffusion import geometry, splat
+from reffusion.surfels import surface_normals
+from reffusion.types import Camera, Gaussians
+
+OPAQUE = 0.9  # alpha from which a pixel shows a surface
+SURFACE = 0.02  # relative depth, to either side, within which a point lies on the surface that a view shows
+FREE = 0.03  # relative depth by which a view must look past a point to say that nothing is there
+MARGIN = 0.004  # of the image's width: a view says nothing so near to its mask, where object and background mix
+
+
+@dataclass(frozen=True)
+class Witness:
+    """A training view as a witness of where surfaces are.
+
+    Attributes:
+        camera: the view.
+        depth: [H, W] float32 of the surface shown, 0 where the view shows nothing opaque.
+        nearest, farthest: [H, W] float32, its range in  the 3 x 3 pixels around each: about the same but at depth edges.
+        hidden: bool [H, W], where it shows the object, and a margin around.
+    """
+
+    camera: Camera
+    depth: np.ndarray
+    nearest: np.ndarray
+    farthest: np.ndarray
+    hidden: np.ndarray
+
+
+@torch.no_grad()
+def witnesses(
+    gaussians: Gaussians, cameras: Sequence[Camera], hidden: Mapping[str, np.ndarray], margin: float = MARGIN
+) -> list[Witness]:
+    """The views as witnesses.
+
+    Args:
+        gaussians: the whole scene, the object included: what the photographs show.
+        hidden: view name -> bool [H, W], where the object is shown (all False in a clean view).
+        margin: pixels so near to it say nothing either, / image width.
+    """
+    found = []
+    for camera in cameras:
+        drawn = splat.render(gaussians, camera, sh_degree=0)
+        depth = torch.where(drawn.alpha > OPAQUE, drawn.depth, 0).cpu().numpy().astype(np.float32)
+        nearest = cv2.erode(np.where(depth > 0, depth, np.float32(np.inf)), np.ones((3, 3), np.uint8))
+        wide = widened(hidden[camera.name], margin)
+        found.append(Witness(camera, depth, np.where(depth > 0, nearest, 0), cv2.dilate(depth, np.ones((3, 3))), wide))
+    return found
+
+
+def with_photographed_depth(depth: np.ndarray, camera: Camera, views: Sequence[Witness]) -> np.ndarray:
+    """[H, W] float64: `depth`, rendered without the object, but outside the mask what the view shows with it.
+
+    There the photograph had its say; without the object's blurred rim the same pixels show what lies behind them.
+    """
+    for view in views:
+        if view.camera.name == camera.name:
+            return np.where(~view.hidden & (view.depth > 0), view.depth, depth).astype(np.float64)
+    return depth
+
+
+def widened(mask: np.ndarray, fraction: float) -> np.ndarray:
+    """The mask, bool [H, W], and all pixels within `fraction` of the image's width."""
+    reach = max(1, round(fraction * mask.shape[1]))
+    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    return cv2.dilate(mask.astype(np.uint8), disk) > 0
+
+
+@dataclass(frozen=True)
+class Votes:
+    """How many views say what of each of P points.
+
+    Attributes:
+        seen: [P], views that show a surface there. With normals: a surface that faces them.
+        free: [P], views that look past the point onto something farther.
+        hidden: [P], views that see the object in the point's direction.
+    """
+
+    seen: np.ndarray
+    free: np.ndarray
+    hidden: np.ndarray
+
+
+def votes(points: np.ndarray, views: Sequence[Witness], normals: np.ndarray | None = None) -> Votes:
+    """What the views say of points [P, 3].
+
+    Two-sided: a point that lies before or behind what a view shows is not seen there.
+
+    Args:
+        normals: [P, 3], of the surface that the points lie on, towards the side asked about; a view from the other
+            side does not count, so that the underside of a table is no witness of its top.
+    """
+    seen, free, hidden = np.zeros((3, len(points)), np.int64)
+    for view in views:
+        uv, z = geometry.project(points, view.camera)
+        masked, inside = geometry.sample_nearest(view.hidden, uv)
+        nearest, _ = geometry.sample_nearest(view.nearest, uv)
+        farthest, _ = geometry.sample_nearest(view.farthest, uv)
+        shown = inside & ~masked & (z > 0) & (nearest > 0)
+        on = shown & (z > nearest * (1 - SURFACE)) & (z < farthest * (1 + SURFACE))
+        if normals is not None:
+            on &= ((view.camera.center - points) * normals).sum(-1) > 0
+        seen += on
+        free += shown & (nearest > z * (1 + FREE))
+        hidden += inside & masked & (z > 0)
+    return Votes(seen, free, hidden)
+
+
+def smoothed_normals(depth: np.ndarray, camera: Camera) -> np.ndarray:
+    """[H, W, 3] unit normals of a rendered depth map [H, W], towards the camera, without the splats' own roughness."""
+    return surface_normals(cv2.medianBlur(depth.astype(np.float32), 5).astype(np.float64), camera)
+
+
+@torch.no_grad()
+def debris(
+    gaussians: Gaussians, labels: torch.Tensor, views: Sequence[Witness], hidden: Mapping[str, np.ndarray]
+) -> torch.Tensor:
+    """bool [N]: Gaussians that the masks' removal brings to light and no photograph supports.
+
+    They stand within the object or in its shadow, where the fit had no say: without the object they show more inside
+    the masks than they ever did outside; and where other views look, there is no surface, or a free sight.
+
+    Args:
+        gaussians: N of them, the object included. labels: [N] bool, the object's.
+        hidden: view name -> bool [H, W], C.
+    """
+    remaining = gaussians.map(lambda p: p[~labels])
+    uncovered, outside = torch.zeros(len(remaining)), torch.zeros(len(remaining))
+    for view in views:
+        inside = torch.from_numpy(hidden[view.camera.name])[..., None]
+        uncovered += splat.accumulate(remaining, view.camera, inside.to(remaining.means.dtype))[:, 0].cpu()
+        photographed = torch.from_numpy(~view.hidden)[..., None].to(gaussians.means.dtype)
+        outside += splat.accumulate(gaussians, view.camera, photographed)[:, 0].cpu()[~labels.cpu()]
+    suspects = torch.nonzero((uncovered > 0.5) & (uncovered > outside))[:, 0]
+    said = votes(remaining.means[suspects].double().cpu().numpy(), views)
+    unsupported = torch.from_numpy((said.seen < 2) | (said.seen <= said.free))
+    found, rest = torch.zeros_like(labels), torch.nonzero(~labels)[:, 0]
+    found[rest[suspects[unsupported].to(rest.device)]] = True
+    return found
+
+
+def without_slivers(mask: np.ndarray, fraction: float = MARGIN) -> np.ndarray:
+    """The mask, bool [H, W], without what is narrower than twice `fraction` of the image's width: depth edges."""
+    reach = max(1, round(fraction * mask.shape[1]))
+    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    padded = np.pad(mask.astype(np.uint8), reach, mode="edge")
+    opened = cv2.morphologyEx(padded, cv2.MORPH_OPEN, disk)[reach:-reach, reach:-reach] > 0
+    return mask & opened

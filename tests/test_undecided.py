@@ -1,0 +1,145 @@
+"""What photographs say of the space behind an object: a table with free space under it, seen by analytic views."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from reffusion import geometry
+from reffusion.behind import Completion, Seen, continued
+from reffusion.continuation import planes_around
+from reffusion.initialize import with_gloss
+from reffusion.layers import shared_out
+from reffusion.types import Camera, Gaussians
+from reffusion.witness import Witness, votes, without_slivers
+
+TOP, FLOOR, EDGE, BOX, HIGH = 0.0, -1.0, 1.0, 0.3, 0.5  # z of table top and floor; half sides; height of the box
+SIZE, FOCAL = 160, 150.0
+
+
+def camera(name: str, azimuth: float, height: float, away: float = 3.5) -> Camera:
+    """Looks at the middle of the table; azimuth in degrees; z is up in the world."""
+    angle = np.radians(azimuth)
+    center = np.array([away * np.cos(angle), away * np.sin(angle), height])
+    forward = -center / np.linalg.norm(center)
+    right = np.cross(forward, (0, 0, 1.0))
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ center
+    return Camera(name, SIZE, SIZE, FOCAL, FOCAL, SIZE / 2, SIZE / 2, pose)
+
+
+def drawn(view: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Depth [H, W] of table and floor, whether the ray meets the box first, whether the table shows without it."""
+    rays = geometry.pixel_rays(view) @ view.world_to_camera[:3, :3]
+    to = lambda z: (z - view.center[2]) / rays[..., 2]
+    at = lambda t: view.center + rays * t[..., None]
+    table, floor = to(TOP), to(FLOOR)
+    on_table = (table > 0) & (np.abs(at(table)[..., :2]) <= EDGE).all(-1)
+    floor = np.where(floor > 0, floor, 20.0)
+    depth = np.where(on_table & (table < floor), table, floor)
+    low, high = np.array([-BOX, -BOX, 0.0]), np.array([BOX, BOX, HIGH])
+    bounds = np.stack([(low - view.center) / rays, (high - view.center) / rays])
+    enter, leave = bounds.min(0).max(-1), bounds.max(0).min(-1)
+    return depth, (enter < leave) & (leave > 0) & (enter < depth), on_table & (table < floor)
+
+
+def witness(view: Camera) -> Witness:
+    depth, hidden, _ = drawn(view)
+    kernel = np.ones((3, 3))
+    wide = cv2.dilate(hidden.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    return Witness(view, depth, cv2.erode(depth, kernel), cv2.dilate(depth, kernel), wide)
+
+
+@pytest.fixture(scope="module")
+def views():
+    above = [witness(camera(f"a{k}", 30 * k, 1.6)) for k in range(12)]
+    return above + [witness(camera(f"l{k}", 60 * k, -0.5)) for k in range(6)]  # these look under the table
+
+
+def test_a_point_is_seen_on_its_surface_only(views):
+    points = np.array([[0.7, 0.7, 0.0], [0.7, 0.7, 0.4], [0.7, 0.7, -0.5], [0.0, 0.0, 0.25], [0.0, 0.0, 0.0]])
+    said = votes(points, views)
+    assert said.seen[0] >= 6 and said.free[0] == 0, "the table's top"
+    assert said.free[1] >= 6 and said.seen[1] == 0, "the air above it"
+    assert said.seen[2] == 0 and said.free[2] >= 2, "under the table low views look through"
+    assert said.seen[3] == said.free[3] == 0 and said.hidden[3] == len(views), "within the box nobody knows"
+    above = votes(points, views, np.tile([0.0, 0.0, 1.0], (5, 1)))
+    assert above.seen[4] == 0 and above.free[4] == 0, "nor, from above, what it stands on"
+
+
+def test_a_surface_does_not_face_views_from_its_other_side(views):
+    point = np.array([[0.7, 0.7, 0.0]])
+    up, down = (votes(point, views, np.array([[0.0, 0.0, z]])).seen[0] for z in (1.0, -1.0))
+    assert up + down == votes(point, views).seen[0]
+    assert up >= 6 and down >= 1, "the thin top is seen from both"
+
+
+def test_the_table_goes_on_under_the_box_and_ends_at_its_edge(views):
+    planes = planes_around(np.array([0.0, 0.0, HIGH / 2]), 0.45, views)
+    table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.height))
+    assert abs(table.normal[2]) > 0.999 and abs(table.height) < 0.01
+    view = camera("new", 15.0, 1.6)
+    depth, hidden, on_table = drawn(view)
+    at = table.depth(view)
+    goes_on = table.on(table.goes_on, at, view)
+    place = geometry.unproject(np.where(np.isfinite(at), at, 1.0), view)
+    footprint = on_table & (np.abs(place[..., :2]) < BOX - 0.05).all(-1)
+    beyond = ~(np.abs(place[..., :2]) < EDGE + 0.05).all(-1)
+    assert goes_on[footprint].mean() > 0.95
+    assert not (goes_on & beyond).any()
+    np.testing.assert_allclose(at[footprint], depth[footprint], rtol=0.01)
+
+
+def test_slivers_go_and_patches_stay():
+    mask = np.zeros((100, 200), bool)
+    mask[20:22, 10:190] = True
+    mask[50:80, 50:90] = True
+    found = without_slivers(mask, 0.01)
+    assert not found[:40].any() and found[52:78, 52:88].all() and not (found & ~mask).any()
+
+
+def step_scene():
+    """Disparity with a step at column 60 that goes on through a hole, and a picture whose edge is there."""
+    rows, columns = np.mgrid[:100, :120]
+    disparity = np.where(columns < 60, 1.0 + 0.001 * rows, 0.6 + 0.0005 * columns)
+    picture = np.where((columns < 60)[..., None], (0.8, 0.3, 0.2), (0.2, 0.5, 0.3))
+    hole = (np.abs(rows - 50) < 25) & (np.abs(columns - 62) < 22)
+    return disparity, picture, hole
+
+
+def test_a_hole_is_shared_out_along_the_pictures_edge():
+    disparity, picture, hole = step_scene()
+    surfaces = shared_out(disparity, ~hole, hole, picture)
+    left = np.arange(120) < 60
+    assert surfaces.max() == 2
+    assert (surfaces[hole & left] == surfaces[0, 0]).mean() > 0.97
+    assert (surfaces[hole & ~left] == surfaces[0, -1]).mean() > 0.97
+
+
+def test_depth_steps_where_the_picture_has_an_edge():
+    disparity, picture, hole = step_scene()
+    view = Camera("v", 120, 100, 100.0, 100.0, 60.0, 50.0, np.eye(4))
+    seen = Seen(view, 1 / disparity, ~hole, hole, hole, np.zeros_like(hole))
+    found, said = continued(seen, picture, np.zeros((0, 3)), Completion(planar_share=2.0, ring=0.2))
+    assert "2 surfaces" in said
+    error = np.abs(found / disparity - 1)[hole]
+    assert np.quantile(error, 0.95) < 0.01
+
+
+def test_new_gaussians_shine_as_their_neighbours_do():
+    """A surface brighter from the left: what is new takes that over, and keeps its own constant colour."""
+    count, fresh = 200, torch.arange(200) >= 190
+    generator = torch.Generator().manual_seed(0)
+    sh = torch.zeros(count, 4, 3)
+    sh[:, 0] = torch.rand(count, 3, generator=generator)
+    sh[~fresh, 3] = 0.25
+    scene = Gaussians(
+        torch.rand(count, 3, generator=generator), torch.zeros(count, 4), torch.full((count, 3), -4.0),
+        torch.full((count,), 3.0), sh,
+    )  # fmt: skip
+    lit = with_gloss(scene, fresh, 16)
+    torch.testing.assert_close(lit.sh[fresh, 3], torch.full((10, 3), 0.25))
+    assert torch.equal(lit.sh[:, 0], scene.sh[:, 0]) and torch.equal(lit.sh[~fresh], scene.sh[~fresh])
+    assert with_gloss(scene, torch.zeros_like(fresh), 16) is scene
