@@ -79,8 +79,9 @@ def run(
     models = {net: model for net, (model, _) in loaded.items() if model}
     made = [stage for stage in FOLDERS if needs[stage]]
     gaussians = {s: io.load_ply(needs[s] / "gaussians.ply").map(lambda p: p.to(params.device)) for s in made}
-    result, captured = made[-1], gaussians["fit"]
-    gaussians |= finished(params, scene, gaussians, result)
+    result, captured, counts = made[-1], gaussians["fit"], {stage: len(value) for stage, value in gaussians.items()}
+    if params.beyond and not (poses / "gaussians.ply").exists():  # brought Gaussians may know more than these views
+        gaussians |= finished(scene, gaussians, result)
     painter = paint2d.load(params.lama, params.device) if params.inpaint else None
 
     names, kind = views_of(scene)
@@ -115,7 +116,7 @@ def run(
         "consistency": consistency_of(rows),
         **used(painter and painter.name, distill),
         "lpips_unavailable": "; ".join(reason for _, reason in loaded.values() if reason) or None,
-        "gaussians": {stage: len(value) for stage, value in gaussians.items()},
+        "gaussians": counts,  # as the stages left them
         "seconds": seconds(needs),
         "protocol": protocol(params, rows, models),
     }
@@ -185,11 +186,11 @@ def views_of(scene: Scene) -> tuple[tuple[str, ...], str]:
     return (eighth, "training, every 8th") if len(eighth) >= 8 else (scene.train, "training")
 
 
-def finished(params: Params, scene: Scene, gaussians: dict[str, Gaussians], result: str) -> dict[str, Gaussians]:
+def finished(scene: Scene, gaussians: dict[str, Gaussians], result: str) -> dict[str, Gaussians]:
     """Stage -> its Gaussians completed by what lies beyond the capture: of the result, and of the initialization."""
     from reffusion import beyond
 
-    stages = [stage for stage in ("initialize", result) if params.beyond and stage in gaussians]
+    stages = [stage for stage in ("initialize", result) if stage in gaussians]
     cameras = [scene.cameras[name] for name in scene.train]
     return {stage: beyond.completed(gaussians[stage], cameras) for stage in dict.fromkeys(stages)}
 
