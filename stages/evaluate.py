@@ -65,8 +65,8 @@ def run(
 ) -> None:
     """Write renders*/, side_by_side/, metrics.json, per_view.csv and scene.ply.
 
-    The result and the initialization are completed by what lies beyond the capture; what the fit alone shows is not,
-    and says which pixels were seen. The result is what `distill` made, else `initialize`, else `fit` (a scene with nothing to remove). Training views
+    The result and the initialization are completed beyond the capture; the fit is not, and says which pixels were
+    seen. The result is what `distill` made, else `initialize`, else `fit` (nothing to remove). Training views
     and test views without a picture are rendered and not scored. `reference`, `personalize` and `lift` give their
     seconds only.
     """
