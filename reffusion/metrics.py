@@ -32,6 +32,8 @@ COLUMNS = (
     "psnr_outside",
     "ssim_outside",
     "flip_outside",
+    "psnr_outside_seen",
+    "unseen_share",
     "psnr_full",
     "ssim_full",
     "flip_full",
@@ -164,14 +166,20 @@ def score_view(
     models: dict[str, Lpips] | None = None,
     mask: np.ndarray | None = None,
     shows_object: bool = False,
+    unseen: np.ndarray | None = None,
 ) -> dict[str, float | None]:
     """A value for each of `COLUMNS`: `score` on the box (None without one), `outside` of the mask (bool [H, W]; None:
     no pixel is masked), and `score` on the full image without LPIPS.
 
     Args:
         shows_object: the truth has the object in it, so that only what lies outside its mask is true.
+        unseen: bool [H, W], pixels that no training view saw; None where that is not known: then what is said of them
+            has no value.
     """
-    values = outside(image, truth, np.zeros(truth.shape[:2], bool) if mask is None else mask)
+    mask = np.zeros(truth.shape[:2], bool) if mask is None else mask
+    values = outside(image, truth, mask)
+    if unseen is not None:
+        values |= outside_seen(image, truth, mask, unseen)
     if not shows_object:
         inside = score(box.crop(image), box.crop(truth), models) if box is not None else {}
         values |= {f"{name}_box": value for name, value in inside.items()}
@@ -189,14 +197,32 @@ def outside(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> dict[str,
     if not kept.any():
         return dict.fromkeys(("psnr_outside", "ssim_outside", "flip_outside"))
     image, truth = _pair(image, truth)
-    error = float(np.mean((image - truth)[kept] ** 2))
     shown, edge = np.where(kept[..., None], image, truth), SSIM_WINDOW // 2
     windows = kept[edge:-edge, edge:-edge]  # empty where the image is smaller than a window
     return {
-        "psnr_outside": -10.0 * log10(error) if error > 0 else inf,
+        "psnr_outside": _psnr_at(image, truth, kept),
         "ssim_outside": float(ssim_map(shown, truth)[windows].mean()) if windows.any() else None,
         "flip_outside": float(flip_map(shown, truth)[kept].mean(dtype=np.float64)),
     }
+
+
+def outside_seen(image: np.ndarray, truth: np.ndarray, mask: np.ndarray, unseen: np.ndarray) -> dict[str, float | None]:
+    """{"psnr_outside_seen", "unseen_share"}: PSNR over the pixels outside the bool mask [H, W] that some training view
+    saw, and the share of those outside it that none saw; None where there are no such pixels."""
+    kept = ~mask
+    return {
+        "psnr_outside_seen": _psnr_at(image, truth, kept & ~unseen),
+        "unseen_share": float(unseen[kept].mean()) if kept.any() else None,
+    }
+
+
+def _psnr_at(image: np.ndarray, truth: np.ndarray, pixels: np.ndarray) -> float | None:
+    """PSNR over the chosen pixels, bool [H, W]; None where there are none."""
+    if not pixels.any():
+        return None
+    image, truth = _pair(image, truth)
+    error = float(np.mean((image - truth)[pixels] ** 2))
+    return -10.0 * log10(error) if error > 0 else inf
 
 
 def mean(values: list[float | None]) -> float | None:

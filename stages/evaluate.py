@@ -39,6 +39,7 @@ class Params(BaseModel):
         description="folder with LaMa's TorchScript file, for that; none: OpenCV's FSR, else Telea",
         json_schema_extra={"weights": True},
     )
+    beyond: bool = Field(True, description="what no training view saw is closed by a soft backdrop, scene.ply's too")
     device: Literal["cpu", "cuda"] = Field("cpu", description="where the views are rendered")
 
 
@@ -64,11 +65,12 @@ def run(
 ) -> None:
     """Write renders*/, side_by_side/, metrics.json, per_view.csv and scene.ply.
 
-    The result is what `distill` made, else `initialize`, else `fit` (a scene with nothing to remove). Training views
+    The result and the initialization are completed beyond the capture; the fit is not, and says which pixels were
+    seen. The result is what `distill` made, else `initialize`, else `fit` (nothing to remove). Training views
     and test views without a picture are rendered and not scored. `reference`, `personalize` and `lift` give their
     seconds only.
     """
-    from reffusion import consistency, io, lpips, metrics, paint2d, trace
+    from reffusion import consistency, io, lpips, metrics, paint2d, sight, trace
 
     needs = {"poses": poses, "fit": fit, "masks": masks, "reference": reference, "personalize": personalize}
     needs |= {"lift": lift, "initialize": initialize, "distill": distill}
@@ -77,15 +79,18 @@ def run(
     models = {net: model for net, (model, _) in loaded.items() if model}
     made = [stage for stage in FOLDERS if needs[stage]]
     gaussians = {s: io.load_ply(needs[s] / "gaussians.ply").map(lambda p: p.to(params.device)) for s in made}
-    result = made[-1]
+    result, captured, counts = made[-1], gaussians["fit"], {stage: len(value) for stage, value in gaussians.items()}
+    if params.beyond and not (poses / "gaussians.ply").exists():  # brought Gaussians may know more than these views
+        gaussians |= finished(scene, gaussians, result)
     painter = paint2d.load(params.lama, params.device) if params.inpaint else None
 
     names, kind = views_of(scene)
+    seen_by = sight.witnesses(*captured_by(scene, captured, poses, masks)) if kind == "test" else []
     rows, before = [], None
     for index in trace.progress(len(names), "evaluate"):
         camera, file = scene.cameras[names[index]], f"{names[index]}.png"
         pictures = {stage: drawn(gaussians[stage], camera, out / FOLDERS[stage] / file) for stage in gaussians}
-        shown = seen(gaussians[result], camera, pictures[result], mask_of(camera, poses, masks))
+        shown = view_of(gaussians[result], camera, pictures[result], mask_of(camera, poses, masks))
         if painter:
             wide = paint2d.widened(shown.mask, params.widen)
             depth = consistency.depth_through(shown.depth, wide)
@@ -99,7 +104,8 @@ def run(
         io.save_image(out / "side_by_side" / file, metrics.side_by_side(panels, box))
         margin = paint2d.widened(shown.mask, params.outside_margin)
         held_out = (poses / "masks" / file).exists()  # a test view whose photograph shows the object
-        rows.append(row_of(shown, pictures.get("initialize"), truth, box, models, margin, held_out))
+        unseen = sight.unseen(captured, camera, seen_by) if truth is not None else None
+        rows.append(row_of(shown, pictures.get("initialize"), truth, box, models, margin, held_out, unseen))
 
     (out / "per_view.csv").write_text(metrics.table(rows))
     io.save_ply(out / "scene.ply", gaussians[result], similarity=scene.similarity)
@@ -110,7 +116,7 @@ def run(
         "consistency": consistency_of(rows),
         **used(painter and painter.name, distill),
         "lpips_unavailable": "; ".join(reason for _, reason in loaded.values() if reason) or None,
-        "gaussians": {stage: len(value) for stage, value in gaussians.items()},
+        "gaussians": counts,  # as the stages left them
         "seconds": seconds(needs),
         "protocol": protocol(params, rows, models),
     }
@@ -125,16 +131,17 @@ def row_of(
     models: dict[str, Lpips],
     margin: np.ndarray,
     held_out: bool,
+    unseen: np.ndarray | None,
 ) -> dict[str, Any]:
     """A view's line of per_view.csv: its box, and its scores and the initialization's where there is a truth; see
-    `metrics.score_view`, whose `mask` and `shows_object` the last two are."""
+    `metrics.score_view`, whose `mask`, `shows_object` and `unseen` the last three are."""
     from reffusion import metrics
 
     camera = shown.camera
     row = {"view": camera.name, "width": camera.width, "height": camera.height} | dict.fromkeys(CONSISTENCY)
     row |= dict(zip(("left", "top", "right", "bottom"), box or (None,) * 4, strict=True))
     if truth is not None:
-        given = truth, box, models, margin, held_out
+        given = truth, box, models, margin, held_out, unseen
         row |= metrics.score_view(shown.picture, *given)
         if initial is not None:
             scores = metrics.score_view(initial, *given)
@@ -158,10 +165,11 @@ def consistency_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 def protocol(params: Params, rows: list[dict[str, Any]], models: dict[str, Lpips]) -> dict[str, Any]:
     """All that the numbers depend on, in words and versions."""
-    from reffusion import metrics
+    from reffusion import metrics, sight
 
     return {
         **metrics.PROTOCOL,
+        "seen": sight.PROTOCOL,
         "box_dilation": params.box_dilation,
         "outside_margin": params.outside_margin,
         "resolution": sorted({f"{row['width']}x{row['height']}" for row in rows}),
@@ -176,6 +184,24 @@ def views_of(scene: Scene) -> tuple[tuple[str, ...], str]:
         return scene.test, "test"
     eighth = scene.train[::8]
     return (eighth, "training, every 8th") if len(eighth) >= 8 else (scene.train, "training")
+
+
+def finished(scene: Scene, gaussians: dict[str, Gaussians], result: str) -> dict[str, Gaussians]:
+    """Stage -> its Gaussians completed by what lies beyond the capture: of the result, and of the initialization."""
+    from reffusion import beyond
+
+    stages = [stage for stage in ("initialize", result) if stage in gaussians]
+    cameras = [scene.cameras[name] for name in scene.train]
+    return {stage: beyond.completed(gaussians[stage], cameras) for stage in dict.fromkeys(stages)}
+
+
+def captured_by(
+    scene: Scene, captured: Gaussians, poses: Path, masks: Path | None
+) -> tuple[Gaussians, list[Camera], dict[str, np.ndarray]]:
+    """What `sight.witnesses` takes: the fit, the training views, and where those show the object."""
+    cameras = [scene.cameras[name] for name in scene.train]
+    hidden = {camera.name: mask_of(camera, poses, masks) for camera in cameras if camera.name not in scene.clean}
+    return captured, cameras, hidden
 
 
 def drawn(gaussians: Gaussians, camera: Camera, path: Path) -> np.ndarray:
@@ -217,7 +243,7 @@ def mask_of(camera: Camera, poses: Path, masks: Path | None) -> np.ndarray:
     return io.load_mask(found[0], size) if found else np.zeros(size, bool)
 
 
-def seen(gaussians: Gaussians, camera: Camera, picture: np.ndarray, mask: np.ndarray) -> Shown:
+def view_of(gaussians: Gaussians, camera: Camera, picture: np.ndarray, mask: np.ndarray) -> Shown:
     """The view with its rendered depth, for the comparison with its neighbour."""
     import numpy as np
     import torch

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from reffusion import io, metrics, trace
+from reffusion import beyond, io, metrics, sight, trace
 from reffusion.paint2d import widened
 from reffusion.types import Camera, Gaussians, MaskSet, Scene, Similarity
 from report import sheet
@@ -90,6 +90,10 @@ def test_scores_are_those_of_the_saved_pictures(done):
     summary = io.load_json(out / "metrics.json")
     cameras = io.load_scene(done / "poses").cameras
     boxes = {"view0": metrics.Box(2, 8, 38, 32), "view1": None, "view2": metrics.Box(17, 2, 48, 26)}
+    train = [cameras[name] for name in io.load_scene(done / "poses").train]
+    fit = io.load_ply(done / "fit" / "gaussians.ply")
+    hidden = {camera.name: evaluate.mask_of(camera, done / "poses", done / "masks") for camera in train}
+    seen_by = sight.witnesses(fit, train, hidden)
     for kind, renders in (("mean", "renders"), ("initialize", "renders_initialize")):
         rows = [
             metrics.score_view(
@@ -97,6 +101,7 @@ def test_scores_are_those_of_the_saved_pictures(done):
                 io.load_image(done / "poses" / "images" / f"{name}.png"),
                 box,
                 mask=widened(evaluate.mask_of(cameras[name], done / "poses", done / "masks"), 0.01),
+                unseen=sight.unseen(fit, cameras[name], seen_by),
             )
             for name, box in boxes.items()
         ]
@@ -119,6 +124,8 @@ def test_scores_are_those_of_the_saved_pictures(done):
 
 def test_the_scene_is_exported_in_its_own_frame(done):
     exported, result = io.load_ply(done / "evaluate" / "scene.ply"), io.load_ply(done / "distill" / "gaussians.ply")
+    scene = io.load_scene(done / "poses")
+    result = beyond.completed(result, [scene.cameras[name] for name in scene.train])
     back = SIMILARITY.apply(exported.means.double().numpy())
     # 500 km away a float of the scene's own frame is worth 0.03 units, 6e-4 of the normalised frame.
     assert np.abs(back - result.means.double().numpy()).max() < 1e-3

@@ -1,0 +1,169 @@
+"""What no training view saw: rendered without holes and blobs, and counted apart."""
+
+import numpy as np
+import pytest
+import small_scene
+import torch
+
+from reffusion import beyond, io, metrics, sight, splat
+from reffusion.types import Camera, Gaussians
+
+TRAIN = [small_scene.CAMERAS[name] for name in small_scene.TRAIN]
+
+
+def wall() -> Gaussians:
+    return small_scene.plane(small_scene.WALL, 2.0, 1.4, small_scene.texture)
+
+
+def picture(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+    return splat.render(gaussians, camera).color.clamp(0, 1).numpy()
+
+
+def turned(degrees: float) -> Camera:
+    """A camera in the middle, turned to the right about its vertical axis."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    pose = np.eye(4)
+    pose[:3, :3] = [[c, 0, -s], [0, 1, 0], [s, 0, c]]
+    size = small_scene.WIDTH, small_scene.HEIGHT
+    return Camera("t", *size, small_scene.FOCAL, small_scene.FOCAL, size[0] / 2, size[1] / 2, pose)
+
+
+def with_more(gaussians: Gaussians, mean, sizes, color) -> Gaussians:
+    """One Gaussian more, opaque."""
+    sh = torch.zeros(1, gaussians.sh.shape[1], 3)
+    sh[0, 0] = (torch.tensor(color) - 0.5) / 0.2820948
+    rows = torch.tensor([mean]), torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([sizes]).log(), torch.tensor([4.0]), sh
+    return gaussians.zipped(Gaussians(*rows), lambda a, b: torch.cat([a, b]))
+
+
+# --- what is shown there
+
+
+def test_beyond_the_capture_the_picture_goes_on_softly_and_seen_pixels_stay():
+    scene = wall()
+    done = beyond.completed(scene, TRAIN)
+    for camera in TRAIN:
+        assert np.abs(picture(done, camera) - picture(scene, camera)).max() < 0.02
+    away = turned(75)
+    assert splat.render(scene, away).alpha.numpy().mean() < 0.5  # black, most of it
+    drawn = splat.render(done, away)
+    assert drawn.alpha.min() > 0.95
+    open_ = splat.render(scene, away).alpha.numpy() < 0.01
+    colors = drawn.color.numpy()[open_]
+    seen = np.concatenate([picture(scene, camera).reshape(-1, 3) for camera in TRAIN])
+    assert (colors > seen.min(0) - 0.05).all() and (colors < seen.max(0) + 0.05).all()
+    steps = np.abs(np.diff(drawn.color.numpy(), axis=1)).max(-1)[open_[:, 1:] & open_[:, :-1]]
+    assert steps.max() < 0.03
+
+
+def test_each_direction_takes_the_colours_that_lie_there():
+    left, right = (0.9, 0.1, 0.1), (0.1, 0.1, 0.9)
+    color = lambda x, y: np.where(x[..., None] < 0, left, right)
+    done = beyond.completed(small_scene.plane(small_scene.WALL, 2.0, 1.4, color), TRAIN)
+    to_the_left, to_the_right = (picture(done, turned(angle)).mean((0, 1)) for angle in (-80, 80))
+    assert to_the_left[0] > 2 * to_the_left[2] and to_the_right[2] > 2 * to_the_right[0]
+
+
+def test_needles_beyond_the_capture_go():
+    needle = with_more(wall(), [5.0, 0.0, 2.0], [0.8, 0.01, 0.01], [0.0, 1.0, 0.0])
+    away = turned(65)
+    assert (picture(needle, away)[..., 1] - picture(wall(), away)[..., 1]).max() > 0.5
+    with_it, without = (picture(beyond.completed(scene, TRAIN), away) for scene in (needle, wall()))
+    assert np.abs(with_it - without).max() < 0.05
+
+
+def test_what_one_training_view_shows_stays():
+    spot = with_more(wall(), [0.9, 0.0, 1.9], [0.02, 0.02, 0.02], [0.0, 1.0, 0.0])
+    assert any(np.abs(picture(spot, camera) - picture(wall(), camera)).max() > 0.3 for camera in TRAIN)
+    done = beyond.completed(spot, TRAIN)
+    assert (done.means == spot.means[-1]).all(1).any()
+
+
+def test_a_scene_without_training_views_or_gaussians_is_left_alone():
+    scene = wall()
+    assert beyond.completed(scene, []) is scene
+    nothing = scene.map(lambda p: p[:0])
+    assert len(beyond.completed(nothing, TRAIN)) == 0
+    behind = Camera("b", 8, 8, 8.0, 8.0, 4.0, 4.0, np.diag([-1.0, 1.0, -1.0, 1.0]))
+    assert len(beyond.completed(scene, [behind])) == len(scene)  # it sees none: nothing to continue
+
+
+# --- what was seen
+
+
+def seen_by(scene: Gaussians, masks=None) -> list[sight.Witness]:
+    return sight.witnesses(scene, TRAIN, masks or {})
+
+
+def test_a_view_that_everything_saw_has_nothing_unseen():
+    scene = wall()
+    for name in small_scene.TEST:
+        assert not sight.unseen(scene, small_scene.CAMERAS[name], seen_by(scene))[2:-2, 2:-2].any()
+
+
+def test_unseen_is_what_lies_outside_all_frames():
+    scene = small_scene.plane(small_scene.WALL, 4.0, 2.4, small_scene.texture)
+    aside = small_scene.camera("aside", 1.0)
+    x = small_scene.wall_points(aside)[..., 0]
+    edge = TRAIN[-1].center[0] + small_scene.WALL * small_scene.WIDTH / 2 / small_scene.FOCAL
+    found = sight.unseen(scene, aside, seen_by(scene))
+    assert small_scene.iou(found, x > edge) > 0.95
+    assert 0.3 < found.mean() < 0.9
+
+
+def test_unseen_is_what_all_training_views_hide_behind_something_or_under_masks():
+    at = 1.0
+    scene, _ = small_scene.gaussians(at)
+    full = small_scene.plane(small_scene.WALL, 2.0, 1.4, small_scene.texture)
+    square = small_scene.plane(at, small_scene.HALF, small_scene.HALF, lambda x, y: np.full((*x.shape, 3), 0.5))
+    both = full.zipped(square, lambda a, b: torch.cat([a, b]))
+    aside = small_scene.camera("aside", 0.9)
+    points = small_scene.wall_points(aside)
+    framed = np.any([((uv >= 0) & (uv < (c.width, c.height))).all(-1) & ~small_scene.behind_square(points, c, at)
+                     for c in TRAIN for uv in [small_scene.geometry.project(points, c)[0]]], 0)  # fmt: skip
+    here = ~small_scene.behind_square(points, aside, at)  # the square itself was seen
+    assert small_scene.iou(sight.unseen(both, aside, seen_by(both)) & here, ~framed & here) > 0.85
+    hidden = {c.name: np.ones((c.height, c.width), bool) for c in TRAIN}
+    assert sight.unseen(scene, TRAIN[0], seen_by(scene, hidden)).all()
+
+
+# --- what is counted
+
+
+def test_scores_of_seen_pixels_only():
+    rng = np.random.default_rng(0)
+    truth = rng.random((30, 40, 3))
+    image, unseen, mask = truth.copy(), np.zeros((30, 40), bool), np.zeros((30, 40), bool)
+    unseen[:, 30:], mask[:, :10] = True, True
+    image[:, 30:] = 0.0
+    image[:, 10:30] = np.clip(truth[:, 10:30] + 0.01, 0, 1)
+    row = metrics.score_view(image, truth, None, mask=mask, unseen=unseen)
+    assert row["unseen_share"] == pytest.approx(1 / 3)
+    assert row["psnr_outside_seen"] == pytest.approx(metrics.psnr(image[:, 10:30], truth[:, 10:30]))
+    assert row["psnr_outside"] < row["psnr_outside_seen"] - 20
+    row = metrics.score_view(image, truth, None, mask=mask)
+    assert row["psnr_outside_seen"] is None and row["unseen_share"] is None
+    row = metrics.score_view(image, truth, None, mask=mask, unseen=np.zeros_like(mask))
+    assert row["psnr_outside_seen"] == row["psnr_outside"] and row["unseen_share"] == 0
+
+
+def test_evaluate_counts_the_unseen_apart_and_shows_no_black(tmp_path):
+    from stages import evaluate
+
+    poses, fit, _ = small_scene.write(tmp_path, 1.0)
+    scene = io.load_scene(poses)
+    aside = small_scene.camera("t0", 1.0)
+    cameras = scene.cameras | {"t0": aside}
+    io.save_scene(poses, type(scene)(**{**scene.__dict__, "cameras": cameras}))
+    io.save_image(poses / "images" / "t0.png", small_scene.photo(aside))
+    for name in ("on", "off"):
+        (tmp_path / name).mkdir()
+        evaluate.run(evaluate.Params(beyond=name == "on"), tmp_path / name, poses=poses, fit=fit)
+    on, off = (io.load_json(tmp_path / name / "metrics.json") for name in ("on", "off"))
+    assert on["mean"]["unseen_share"] == off["mean"]["unseen_share"] > 0.1
+    assert on["mean"]["psnr_outside_seen"] > off["mean"]["psnr_outside_seen"] - 0.05
+    assert "unseen_share" in (tmp_path / "on" / "per_view.csv").read_text().splitlines()[0]
+    assert "unseen_share" in on["protocol"]["seen"]
+    away = turned(75)
+    covered = [splat.render(io.load_ply(tmp_path / name / "scene.ply"), away).alpha.min() for name in ("on", "off")]
+    assert covered[0] > 0.9 and covered[1] < 0.01
