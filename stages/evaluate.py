@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from reffusion.types import Camera, Gaussians, Scene
 
 FOLDERS = {"fit": "renders_fit", "initialize": "renders_initialize", "distill": "renders"}
+LEAST_UNSEEN = 0.005  # mean share of a test view's pixels from which the scene is closed by a backdrop
 CONSISTENCY = ("consistency", "consistency_share")
 
 
@@ -80,12 +81,14 @@ def run(
     made = [stage for stage in FOLDERS if needs[stage]]
     gaussians = {s: io.load_ply(needs[s] / "gaussians.ply").map(lambda p: p.to(params.device)) for s in made}
     result, captured, counts = made[-1], gaussians["fit"], {stage: len(value) for stage, value in gaussians.items()}
-    if params.beyond and not (poses / "gaussians.ply").exists():  # brought Gaussians may know more than these views
+    names, kind = views_of(scene)
+    seen_by = sight.witnesses(*captured_by(scene, captured, poses, masks)) if kind == "test" else []
+    unseen = {name: sight.unseen(captured, scene.cameras[name], seen_by) for name in names if seen_by}
+    # Brought Gaussians may know more than these views do.
+    if params.beyond and reaches_beyond(unseen) and not (poses / "gaussians.ply").exists():
         gaussians |= finished(scene, gaussians, result)
     painter = paint2d.load(params.lama, params.device) if params.inpaint else None
 
-    names, kind = views_of(scene)
-    seen_by = sight.witnesses(*captured_by(scene, captured, poses, masks)) if kind == "test" else []
     rows, before = [], None
     for index in trace.progress(len(names), "evaluate"):
         camera, file = scene.cameras[names[index]], f"{names[index]}.png"
@@ -104,8 +107,8 @@ def run(
         io.save_image(out / "side_by_side" / file, metrics.side_by_side(panels, box))
         margin = paint2d.widened(shown.mask, params.outside_margin)
         held_out = (poses / "masks" / file).exists()  # a test view whose photograph shows the object
-        unseen = sight.unseen(captured, camera, seen_by) if truth is not None else None
-        rows.append(row_of(shown, pictures.get("initialize"), truth, box, models, margin, held_out, unseen))
+        given = (truth, box, models, margin, held_out, unseen.get(camera.name))
+        rows.append(row_of(shown, pictures.get("initialize"), *given))
 
     (out / "per_view.csv").write_text(metrics.table(rows))
     io.save_ply(out / "scene.ply", gaussians[result], similarity=scene.similarity)
@@ -184,6 +187,13 @@ def views_of(scene: Scene) -> tuple[tuple[str, ...], str]:
         return scene.test, "test"
     eighth = scene.train[::8]
     return (eighth, "training, every 8th") if len(eighth) >= 8 else (scene.train, "training")
+
+
+def reaches_beyond(unseen: dict[str, np.ndarray]) -> bool:
+    """Do the test views show enough that no training view saw for a backdrop to be worth it? Without any: perhaps."""
+    import numpy as np
+
+    return not unseen or float(np.mean([each.mean() for each in unseen.values()])) > LEAST_UNSEEN
 
 
 def finished(scene: Scene, gaussians: dict[str, Gaussians], result: str) -> dict[str, Gaussians]:
