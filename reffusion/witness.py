@@ -143,7 +143,7 @@ def debris(
         outside += splat.accumulate(gaussians, view.camera, photographed)[:, 0].cpu()[~labels.cpu()]
     suspects = torch.nonzero((uncovered > 0.5) & (uncovered > outside))[:, 0]
     said = votes(remaining.means[suspects].double().cpu().numpy(), views)
-    unsupported = torch.from_numpy((said.seen < 2) | (said.seen <= said.free))
+    unsupported = torch.from_numpy(said.seen <= said.free)
     found, rest = torch.zeros_like(labels), torch.nonzero(~labels)[:, 0]
     found[rest[suspects[unsupported].to(rest.device)]] = True
     return found

@@ -77,7 +77,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
     )
     hidden = {name: empty[name] if name in scene.clean else consistent[name] for name in scene.cameras}
     views = witness.witnesses(gaussians, train, hidden)
-    if params.debris:
+    if params.debris and raw:
         labels |= witness.debris(gaussians, labels, views, hidden)
     fill = region if params.invent in ("region", "auto") else None
     sets = classified(params, scene, gaussians, labels, raw, consistent, views, fill)

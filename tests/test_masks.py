@@ -125,7 +125,7 @@ def test_what_stands_inside_every_mask_is_the_object_although_it_was_outvoted(tm
     found = {}
     for hull in (0.9, 1.0):
         (tmp_path / str(hull)).mkdir()
-        _, _, found[hull], truth = classify(tmp_path / str(hull), NEAR, Params(gap=0.1, hull=hull), masks=given)
+        _, _, found[hull], truth = classify(tmp_path / str(hull), NEAR, Params(gap=0.1, hull=hull, debris=False), masks=given)
     lost = truth & ~found[1.0]
     assert lost.sum() >= 4, "the vote alone leaves the spot standing"
     assert found[0.9][lost].all()
@@ -190,20 +190,3 @@ def test_haze_shows_mostly_where_nobody_saw():
     aside.means[0, 0] = 0.4
     both = blob.zipped(aside, lambda a, b: torch.cat([a, b]))
     assert masks.leaking(both, [view], {"v": inside}).tolist() == [True, False]
-
-
-def test_evidence_is_what_was_observed_outside_the_masks():
-    votes = masks.Votes(torch.tensor([9.0, 0.0, 0.0]), torch.tensor([0.0, 0.5, 7.0]))
-    assert masks.evidence(votes, 1.0).tolist() == [0.0, 0.5, 1.0]
-
-
-def test_a_point_is_seen_in_front_of_what_a_view_shows_and_outside_its_mask():
-    view, other = small.camera("v", 0.0), small.camera("w", 0.1)
-    shape = (small.HEIGHT, small.WIDTH)
-    wall, pixels, none = np.full(shape, 1 / small.WALL), np.ones(shape, bool), np.zeros(shape, bool)
-    count = lambda hidden, shown: masks.seen_elsewhere(wall, pixels, view, [other], {"w": hidden}, {"w": shown})
-    inside = count(none, wall)
-    assert inside[:, 8:].all() and not inside[:, :4].any()  # beyond the frame of the other view
-    assert not count(pixels, wall).any()
-    assert not count(none, np.full(shape, 1 / 1.5)).any()  # something stands before it there
-    assert count(none, np.full(shape, 0.0))[:, 8:].all()  # nothing there at all: it is not hidden
