@@ -74,7 +74,8 @@ def _walk(kind: Kind, count: int, reach: float, draw: np.random.Generator) -> tu
         return azimuth, height, 2.25 + 0.1 * np.sin(6.28 * 5 * s + phase[2])
     # Few views walk one arc and back; many go to and fro, so that heights and sides mix.
     azimuth = reach * kind.spread * np.sin(6.28 * 2.5 * s + phase[0])
-    height = 1.22 + 0.2 * np.sin(6.28 * 1.5 * s + phase[1])
+    middle, swing = (1.22, 0.2) if kind.low is None else (kind.low / 2 + 0.71, 0.71 - kind.low / 2)
+    height = middle + swing * np.sin(6.28 * 1.5 * s + phase[1])
     return azimuth, height, 2.45 + 0.08 * np.sin(6.28 * 4 * s + phase[2])
 
 
