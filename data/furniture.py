@@ -53,7 +53,7 @@ class Furniture:
         half = np.array(size) / 2
         cells = np.maximum(np.round(np.array(size) / cell), 1).astype(int)
         *extents, lean = leaf
-        self.leaves[len(self.solids)] = ((*cells, drawn_from), (*np.array(extents) / 2, np.radians(lean)))
+        self.leaves[len(self.solids)] = (*cells, *np.array(extents) / 2, np.radians(lean), drawn_from)
         self._add(THICKET, (x, bottom + half[1], z), half, yaw, [material], False)
 
     def arrays(self, index: dict[str, int], node: float) -> tuple[Solids, Faces]:
@@ -62,16 +62,16 @@ class Furniture:
 
     def _solid_arrays(self) -> Solids:
         kind, center, half, turn, first, removable = zip(*self.solids, strict=True)
-        leaves = [self.leaves.get(n, ((0,) * 4, (0.0,) * 4)) for n in range(len(self.solids))]
+        leaves = [self.leaves.get(n, (0,) * 8) for n in range(len(self.solids))]
         return Solids(
             np.array(kind, np.int32), np.array(center, float), np.array(half, float),
             np.array(turn, float), np.array(first, np.int32), np.array(removable, bool),
             np.array([_reach(k, h) for k, h in zip(kind, half, strict=True)]),
-            np.array([lattice for lattice, _ in leaves], np.int64), np.array([leaf for _, leaf in leaves], float),
+            np.array(leaves, float),
         )  # fmt: skip
 
     def _face_arrays(self, index: dict[str, int], node: float) -> Faces:
-        lawns = [n in self.leaves and self.leaves[n][0][1] == 1 for n in range(len(self.solids))]
+        lawns = [n in self.leaves and self.leaves[n][1] == 1 for n in range(len(self.solids))]
         solids = zip(self.solids, lawns, strict=True)
         sizes = np.array([size for solid, lawn in solids for size in _face_sizes(solid[0], solid[2], lawn)])
         spacing = np.full((len(sizes), 1), node)
@@ -169,7 +169,7 @@ def table(f: Furniture, x: float, z: float, size: tuple[float, float, float]) ->
 
 def chest(f: Furniture, draw, x: float, bottom: float, z: float) -> None:
     """The object of table: a chest with a ball and a jar on its lid. z is its front; it stands straight."""
-    wide, high, deep = draw.uniform(0.6, 0.7), draw.uniform(0.36, 0.42), draw.uniform(0.32, 0.38)
+    wide, high, deep = draw.uniform(0.6, 0.7), draw.uniform(0.36, 0.42), draw.uniform(0.4, 0.46)
     z -= deep / 2
     f.box(x, bottom, z, (wide, high, deep), Material("paint", 1.3), Material("front"), removable=True)
     f.box(x, bottom + high, z, (wide + 0.03, 0.02, deep + 0.02), WOOD, removable=True)
@@ -190,18 +190,19 @@ def keepsake(f: Furniture, draw, x: float, z: float) -> None:
 
 
 def hedge(f: Furniture, draw, z: float, wide: float, high: float) -> None:
-    """Foliage 0.4 m deep over a dark core, from wall to wall; z is its front."""
-    f.box(0, 0, z - 0.4, (wide, high - 0.06, 0.2), Material("leaves", 0.6, (0.25, 0.3, 0.2)))
-    for number, deep, tint in ((draw.integers(1 << 20), 0.3, 0.8), (draw.integers(1 << 20), 0.24, 1.6)):
-        f.thicket(0, 0, z - 0.15, (wide, high, deep), 0.07, (0.05, 0.07, 0.008, 80), Material("foliage", 0.8, (tint,) * 3),
-                  int(number), draw.uniform(-0.5, 0.5))  # fmt: skip
+    """Foliage 0.4 m deep over a dark core, from wall to wall; z is its front. Layers of unlike cells hide each other's
+    rows."""
+    f.box(0, 0, z - 0.4, (wide, high - 0.06, 0.2), Material("leaves", 0.6, (0.5, 0.6, 0.4)))
+    for cell, back, tint in ((0.065, 0.05, 1.4), (0.08, 0.02, 2.0), (0.1, 0.0, 2.6)):
+        f.thicket(0, 0, z - 0.15 - back, (wide, high - back, 0.3), cell, (0.8 * cell, 1.1 * cell, 0.008, 80),
+                  Material("foliage", 0.8, (tint,) * 3), int(draw.integers(1 << 20)), draw.uniform(-1.2, 1.2))  # fmt: skip
 
 
 def lawn(f: Furniture, draw, z: float, wide: float) -> None:
     """Two layers of grass that do not lie in the same rows, a low dark one and a high light one."""
-    for number, high, tint in ((draw.integers(1 << 20), 0.07, 0.8), (draw.integers(1 << 20), 0.12, 1.5)):
+    for high, tint in ((0.07, 1.2), (0.12, 2.4)):
         f.thicket(0, -0.02, z, (wide, high + 0.02, wide), (0.04, high + 0.02, 0.04), (0.014, high + 0.01, 0.006, 14),
-                  Material("foliage", 0.8, (tint,) * 3), int(number), draw.uniform(0, 90))  # fmt: skip
+                  Material("foliage", 0.8, (tint,) * 3), int(draw.integers(1 << 20)), draw.uniform(0, 90))  # fmt: skip
 
 
 def daybed(f: Furniture, draw, x: float, z: float) -> None:

@@ -56,7 +56,7 @@ KINDS = {
     "360": Kind(spread=180.0),
     "seen": Kind(spread=34.0, hangs=True),
     "behind": Kind(spread=50.0, place="behind"),
-    "table": Kind(spread=34.0, place="table", least=0.1, low=0.5),
+    "table": Kind(spread=34.0, place="table", least=0.05, low=0.45),
     "corner": Kind(spread=30.0, place="corner", least=0.25),
     "grass": Kind(spread=30.0, node=0.04, place="grass"),
     "photos": Kind(width=480, height=360, train=26, test=0, photos=True, texture=2048, node=0.025),

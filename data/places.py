@@ -25,12 +25,12 @@ def shell(f: Furniture, draw, planks: Material, side: int, corner: float) -> Non
 
 def table_room(f: Furniture, draw, planks: Material) -> np.ndarray:
     """The object sticks out a little over a table's edge; things under the table and behind it show that it is free."""
-    side, high, deep = draw.choice((-1, 1)), draw.uniform(0.66, 0.74), draw.uniform(0.7, 0.8)
+    side, high, deep = draw.choice((-1, 1)), draw.uniform(0.64, 0.7), draw.uniform(0.8, 0.9)
     shell(f, draw, planks, side, 2.2)
     edge = 1.5  # z of the table's edge
     table(f, 0.0, edge - deep / 2, (1.7, high, deep))
     chest(f, draw, draw.uniform(-0.15, 0.15), high, edge + draw.uniform(0.03, 0.06))
-    f.cylinder(side * 0.68, high, edge - deep * draw.uniform(0.4, 0.6), 0.075, 0.26, Material("vase"))
+    f.cylinder(side * 0.68, high, edge - deep * draw.uniform(0.45, 0.65), 0.075, 0.26, Material("vase"))
     f.box(-side * 0.66, high, edge - deep * 0.5, (0.2, 0.16, 0.16), Material("books2"), yaw=draw.uniform(-20, 20))
     f.box(draw.uniform(-0.1, 0.1), 0, edge - deep / 2, (2.2, 0.008, 1.4), RUG, yaw=draw.uniform(-5, 5))
     f.box(side * draw.uniform(0.3, 0.45), 0.008, edge - deep * 0.6, (0.26, 0.2, 0.2), Material("crate"),

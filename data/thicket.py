@@ -30,14 +30,14 @@ def _mixed(state):
 def _leaf(solids, n, i, j, k, leaf):
     """Write cell (i, j, k)'s leaf of solid n to `leaf` [4, 3]: its centre, and the three axes of its ellipsoid, wide,
     long and thin, each of the length 1 / half extent. False for a bare cell."""
-    columns, layers, rows = solids.lattice[n, 0], solids.lattice[n, 1], solids.lattice[n, 2]
-    state = _mixed(((k * layers + j) * columns + i + 1) * 7919 + solids.lattice[n, 3])
+    columns, layers = int(solids.leaves[n, 0]), int(solids.leaves[n, 1])
+    state = _mixed(((k * layers + j) * columns + i + 1) * 7919 + int(solids.leaves[n, 7]))
     if state < BARE * 4294967296.0:
         return False
     state = _mixed(state + 1)
     turn = 2.0 * math.pi * state / 4294967296.0
     state = _mixed(state + 2)
-    lean = solids.leaf[n, 3] * (2.0 * state / 4294967296.0 - 1.0)
+    lean = solids.leaves[n, 6] * (2.0 * state / 4294967296.0 - 1.0)
     c, s, up, down = math.cos(turn), math.sin(turn), math.cos(lean), math.sin(lean)
     leaf[1, 0], leaf[1, 1], leaf[1, 2] = c, 0.0, -s
     leaf[2, 0], leaf[2, 1], leaf[2, 2] = down * s, up, down * c
@@ -45,16 +45,16 @@ def _leaf(solids, n, i, j, k, leaf):
     # It is shrunk where it would stick out of its cell, and moved about in what room is left.
     smaller = 1.0
     for axis in range(3):
-        half = solids.half[n, axis] / solids.lattice[n, axis]
+        half = solids.half[n, axis] / solids.leaves[n, axis]
         smaller = min(smaller, half / _extent(solids, n, leaf, axis))
     for axis, cell in enumerate((i, j, k)):
-        half = solids.half[n, axis] / solids.lattice[n, axis]
+        half = solids.half[n, axis] / solids.leaves[n, axis]
         state = _mixed(state + 3)
         room = half - smaller * _extent(solids, n, leaf, axis)
         leaf[0, axis] = (2 * cell + 1) * half - solids.half[n, axis] + room * (2.0 * state / 4294967296.0 - 1.0)
     for side in range(3):
         for axis in range(3):
-            leaf[1 + side, axis] /= smaller * solids.leaf[n, side]
+            leaf[1 + side, axis] /= smaller * solids.leaves[n, 3 + side]
     return True
 
 
@@ -63,7 +63,7 @@ def _extent(solids, n, leaf, axis):
     """Half the width of the unshrunk leaf along an axis; leaf[1:] are still of unit length."""
     total = 0.0
     for side in range(3):
-        total += (leaf[1 + side, axis] * solids.leaf[n, side]) ** 2
+        total += (leaf[1 + side, axis] * solids.leaves[n, 3 + side]) ** 2
     return math.sqrt(total)
 
 
@@ -85,7 +85,7 @@ def _in_leaf(leaf, ox, oy, oz, dx, dy, dz):
 @kernel(inline="always")
 def _cell(solids, n, axis, x):
     """(the cell that x lies in, its width); the outermost ones hold what lies outside."""
-    cells = solids.lattice[n, axis]
+    cells = int(solids.leaves[n, axis])
     wide = 2.0 * solids.half[n, axis] / cells
     return min(max(int(math.floor((x + solids.half[n, axis]) / wide)), 0), cells - 1), wide
 
@@ -126,7 +126,7 @@ def first_leaf(solids, n, ox, oy, oz, dx, dy, dz, near, far, least):
             j, to_y = j + step_y, to_y + every_y
         else:
             k, to_z = k + step_z, to_z + every_z
-        if min(i, j, k) < 0 or i >= solids.lattice[n, 0] or j >= solids.lattice[n, 1] or k >= solids.lattice[n, 2]:
+        if min(i, j, k) < 0 or i >= solids.leaves[n, 0] or j >= solids.leaves[n, 1] or k >= solids.leaves[n, 2]:
             return 1e30
 
 
