@@ -1,0 +1,164 @@
+"""What a composite's result is worth: its scores beside the ceiling's and Telea's, what it leaves uncovered, a sheet."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from holes import gradient_energy
+
+from reffusion import io, metrics, paint2d, splat
+from reffusion.types import Camera, Gaussians, Scene
+from stages import evaluate
+
+THIN = 0.9  # alpha under which a pixel is uncovered
+BLACK, LIT = 0.06, 0.15  # brightest channel: of what looks uncovered, where the truth has more than that
+AROUND = 0.6  # of the box's extent that a sheet shows to each side
+ROW = 200  # px, height of a sheet's rows
+COLUMNS = ("psnr", "ssim", "flip")
+WAYS = ("result", "initialize", "ceiling", "telea")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished job: its folder, its scene, and what evaluate wrote down."""
+
+    folder: Path
+    scene: Scene
+    metrics: dict
+
+    @classmethod
+    def at(cls, folder: Path) -> Run:
+        return cls(folder, io.load_scene(folder / "poses"), io.load_json(folder / "evaluate/metrics.json"))
+
+    def picture(self, name: str, kind: str = "renders") -> np.ndarray:
+        """uint8 [H, W, 3], a test view as evaluate drew it."""
+        return io.load_image(self.folder / "evaluate" / kind / f"{name}.png")
+
+    def truth(self, name: str) -> np.ndarray:
+        """uint8 [H, W, 3], a test view's photograph."""
+        return io.load_image(self.folder / f"poses/images/{name}.png")
+
+    def mask(self, name: str) -> np.ndarray:
+        """bool [H, W]: where the object is: the test mask of a test view, else the consistent mask."""
+        masks = self.folder / "masks"
+        return evaluate.mask_of(self.scene.cameras[name], self.folder / "poses", masks if masks.exists() else None)
+
+    def gaussians(self) -> Gaussians:
+        """The result."""
+        return io.load_ply(self.folder / self.metrics["result"] / "gaussians.ply")
+
+
+def scores(run: Run, ceiling: Run) -> dict[str, dict[str, float | None] | float | None]:
+    """A place's row: for each of WAYS its means of COLUMNS over the test views' boxes (+ 10 %); "sharpness" of result
+    and ceiling; "uncovered", worst view, of "train" and "test"; "seconds" of the job."""
+    row: dict = {
+        "result": _means(run.metrics["mean"]),
+        "initialize": _means(run.metrics["initialize"]),
+        "ceiling": _means(ceiling.metrics["mean"]),
+        "telea": _telea(run),
+        "sharpness": {"result": _sharpness(run), "ceiling": _sharpness(ceiling)},
+        "uncovered": {
+            "train": _worst(run, {name: _untouched(run, ceiling, name) for name in run.scene.train}),
+            "test": _worst(run, {name: run.truth(name) for name in run.scene.test}),
+        },
+        "seconds": sum(run.metrics["seconds"].values()),
+    }
+    return row
+
+
+def _means(of: dict[str, float | None]) -> dict[str, float | None]:
+    return {column: of[f"{column}_box"] for column in COLUMNS}
+
+
+def _telea(run: Run) -> dict[str, float | None]:
+    """Telea's filling of the test masks in our own renders: our surroundings, but inside them no method at all."""
+    rows = []
+    for name in run.scene.test:
+        mask = run.mask(name)
+        box = metrics.mask_box(mask)
+        if box is not None:
+            painted = paint2d.telea(run.picture(name), mask)
+            rows.append(metrics.score(box.crop(painted), box.crop(run.truth(name))))
+    return {column: metrics.mean([row[column] for row in rows]) for column in COLUMNS}
+
+
+def _sharpness(run: Run) -> float | None:
+    """Mean over the test views of the gradients' energy in the box over that of the truth; 1 is as sharp."""
+    shares = []
+    for name in run.scene.test:
+        box = metrics.mask_box(run.mask(name))
+        if box is not None:
+            ours, true = box.crop(run.picture(name)), box.crop(run.truth(name))
+            whole = np.ones(true.shape[:2], bool)
+            shares.append(gradient_energy(ours, whole) / max(gradient_energy(true, whole), 1e-9))
+    return metrics.mean(shares)
+
+
+def _untouched(run: Run, ceiling: Run, name: str) -> np.ndarray | None:
+    """A training view's photograph without the object, of which the ceiling's fit has the undistorted; None where that
+    came out at another size."""
+    picture, camera = ceiling.truth(name), run.scene.cameras[name]
+    return picture if picture.shape[:2] == (camera.height, camera.width) else None
+
+
+def _worst(run: Run, truths: dict[str, np.ndarray | None]) -> float | None:
+    """The largest `uncovered` share of the named views."""
+    gaussians = run.gaussians()
+    found = [uncovered(gaussians, run.scene.cameras[name], run.mask(name), truth) for name, truth in truths.items()]
+    return max((share for share in found if share is not None), default=None)
+
+
+def uncovered(gaussians: Gaussians, camera: Camera, mask: np.ndarray, truth: np.ndarray | None) -> float | None:
+    """Share of the mask's pixels, bool [H, W], that nothing covers: alpha under THIN, or near black where the truth
+    (uint8 [H, W, 3]) is not. None for an empty mask."""
+    import torch
+
+    if not mask.any():
+        return None
+    with torch.no_grad():
+        drawing = splat.render(gaussians, camera)
+    bare = drawing.alpha.cpu().numpy() < THIN
+    if truth is not None:
+        bare |= (drawing.color.cpu().numpy().max(2) < BLACK) & (truth.max(2) / 255.0 > LIT)
+    return float(bare[mask].mean())
+
+
+def sheet(run: Run, ceiling: Run) -> np.ndarray:
+    """uint8 [H, W, 3], a row a test view around its box: truth, with the object (the fit's render), ours, the
+    ceiling, and the absolute difference between ours and the truth."""
+    rows = []
+    for name in run.scene.test:
+        box, same = (metrics.mask_box(of.mask(name), AROUND) for of in (run, ceiling))
+        if box is None or same is None:
+            continue
+        truth, ours = box.crop(run.truth(name)), box.crop(run.picture(name))
+        apart = cv2.absdiff(truth, ours)
+        panels = [truth, box.crop(run.picture(name, "renders_fit")), ours, same.crop(ceiling.picture(name)), apart]
+        rows.append(_row(panels))
+    width = max(row.shape[1] for row in rows)
+    return np.concatenate([np.pad(row, ((0, 4), (0, width - row.shape[1]), (0, 0))) for row in rows])
+
+
+def _row(panels: list[np.ndarray]) -> np.ndarray:
+    """Panels side by side, all of ROW px, 4 px of black between them."""
+    scaled = [cv2.resize(p, (round(p.shape[1] * ROW / p.shape[0]), ROW), interpolation=cv2.INTER_AREA) for p in panels]
+    return np.concatenate([np.pad(p, ((0, 0), (0, 4), (0, 0))) for p in scaled], 1)
+
+
+def table(rows: list[dict]) -> str:
+    """Markdown: a row a place; scores are PSNR / SSIM / FLIP, shares in percent."""
+    heads = [*WAYS, "sharpness", "its ceiling", "uncovered, train %", "test %", "seconds"]
+    lines = ["| place | " + " | ".join(heads) + " |", "|---" * (len(heads) + 1) + "|"]
+    for row in rows:
+        cells = [" / ".join(_number(row[way][c], 2 if c == "psnr" else 3) for c in COLUMNS) for way in WAYS]
+        cells += [_number(row["sharpness"][way], 2) for way in ("result", "ceiling")]
+        cells += [_number(row["uncovered"][split], 2, 100) for split in ("train", "test")]
+        lines.append(f"| {row['place']} | " + " | ".join([*cells, _number(row["seconds"], 0)]) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _number(value: float | None, digits: int, factor: float = 1.0) -> str:
+    return "-" if value is None else f"{value * factor:.{digits}f}"
