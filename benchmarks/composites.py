@@ -111,7 +111,7 @@ def main() -> int:
     parser.add_argument("--report", action="store_true", help="the places that no setting is chosen on")
     parser.add_argument("--out", type=Path, default=Path("runs/composites"))
     parser.add_argument("--alone", action="store_true", help="hand over no reference")
-    parser.add_argument("--shadow", type=float, default=0.0, help="strength of a cast shadow that is in no mask, 0 to 1")
+    parser.add_argument("--shadow", type=float, default=0.0, help="strength, 0 to 1, of a shadow that is in no mask")
     parser.add_argument("--rough", type=int, default=0, help="px by which training masks are wrong")
     parser.add_argument("--seed", type=int, default=0, help="of the object's colours and the masks' faults")
     parser.add_argument("--profile", default="laptop", help="of pipeline.yaml")

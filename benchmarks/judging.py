@@ -1,4 +1,4 @@
-"""What a composite's result is worth: its scores beside the ceiling's and Telea's, what it leaves uncovered, a sheet."""
+"""What a composite's result is worth: its scores beside the ceiling's and Telea's, what stays uncovered, a sheet."""
 
 from __future__ import annotations
 

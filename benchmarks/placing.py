@@ -170,7 +170,8 @@ def _surface(capture: Photographs, place: Place) -> np.ndarray:
     image, depth = capture.project(capture.cameras[place.view], capture.points)
     close = (depth > 0) & (np.linalg.norm(image - place.pixel, axis=1) < place.near)
     if close.sum() < FEWEST:
-        raise ValueError(f"{place.name}: {close.sum()} points within {place.near:g} px of its pixel, {FEWEST} are needed")
+        found = f"{close.sum()} points within {place.near:g} px of its pixel"
+        raise ValueError(f"{place.name}: {found}, {FEWEST} are needed")
     return capture.points[close & (depth < SLACK * np.percentile(depth[close], 20))]
 
 

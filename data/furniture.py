@@ -194,15 +194,18 @@ def hedge(f: Furniture, draw, z: float, wide: float, high: float) -> None:
     rows."""
     f.box(0, 0, z - 0.4, (wide, high - 0.06, 0.2), Material("leaves", 0.6, (0.5, 0.6, 0.4)))
     for cell, back, tint in ((0.065, 0.05, 1.4), (0.08, 0.02, 2.0), (0.1, 0.0, 2.6)):
-        f.thicket(0, 0, z - 0.15 - back, (wide, high - back, 0.3), cell, (0.8 * cell, 1.1 * cell, 0.008, 80),
-                  Material("foliage", 0.8, (tint,) * 3), int(draw.integers(1 << 20)), draw.uniform(-1.2, 1.2))  # fmt: skip
+        leaf, material = (0.8 * cell, 1.1 * cell, 0.008, 80), Material("foliage", 0.8, (tint,) * 3)
+        drawn_from, yaw = int(draw.integers(1 << 20)), draw.uniform(-1.2, 1.2)
+        f.thicket(0, 0, z - 0.15 - back, (wide, high - back, 0.3), cell, leaf, material, drawn_from, yaw)
 
 
 def lawn(f: Furniture, draw, z: float, wide: float) -> None:
     """Two layers of grass that do not lie in the same rows, a low dark one and a high light one."""
     for high, tint in ((0.07, 1.2), (0.12, 2.4)):
-        f.thicket(0, -0.02, z, (wide, high + 0.02, wide), (0.04, high + 0.02, 0.04), (0.014, high + 0.01, 0.006, 14),
-                  Material("foliage", 0.8, (tint,) * 3), int(draw.integers(1 << 20)), draw.uniform(0, 90))  # fmt: skip
+        blade, material = (0.014, high + 0.01, 0.006, 14), Material("foliage", 0.8, (tint,) * 3)
+        drawn_from, yaw = int(draw.integers(1 << 20)), draw.uniform(0, 90)
+        cell = (0.04, high + 0.02, 0.04)
+        f.thicket(0, -0.02, z, (wide, high + 0.02, wide), cell, blade, material, drawn_from, yaw)
 
 
 def daybed(f: Furniture, draw, x: float, z: float) -> None:

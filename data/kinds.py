@@ -58,7 +58,7 @@ KINDS = {
     "behind": Kind(spread=50.0, place="behind"),
     "table": Kind(spread=34.0, place="table", least=0.05, low=0.45),
     "corner": Kind(spread=30.0, place="corner", least=0.25),
-    "grass": Kind(spread=30.0, node=0.04, place="grass"),
+    "grass": Kind(samples=2, spread=30.0, node=0.08, place="grass"),
     "photos": Kind(width=480, height=360, train=26, test=0, photos=True, texture=2048, node=0.025),
 }
 

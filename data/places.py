@@ -57,7 +57,8 @@ def wall_corner(f: Furniture, draw, planks: Material) -> np.ndarray:
     shelf(f, draw, -side * draw.uniform(1.12, 1.24), deep + 0.2, draw.uniform(0.7, 0.8))
     f.box(-side * draw.uniform(0.95, 1.1), draw.uniform(0.95, 1.05), deep + 0.012, (0.52, 0.4, 0.024), WOOD,
           Material("picture"))  # fmt: skip
-    f.box(side * draw.uniform(0.55, 0.75), draw.uniform(1.0, 1.15), 0.012, (0.4, 0.5, 0.024), WOOD, Material("picture2"))
+    f.box(side * draw.uniform(0.55, 0.75), draw.uniform(1.0, 1.15), 0.012, (0.4, 0.5, 0.024), WOOD,
+          Material("picture2"))  # fmt: skip
     f.box(draw.uniform(-0.1, 0.1), 0, deep + 1.35, (1.5, 0.008, 1.1), RUG, yaw=draw.uniform(-6, 6))
     f.box(side * draw.uniform(0.9, 1.0), 0, deep + 0.45, (0.26, 0.2, 0.2), Material("crate"), yaw=draw.uniform(10, 60))
     return np.array([0.0, 0.5, deep + 0.1])

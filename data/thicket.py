@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-
 from compiled import kernel
 
 BARE = 0.12  # share of the cells that hold no leaf
@@ -46,11 +45,12 @@ def _leaf(solids, n, i, j, k, leaf):
     smaller = 1.0
     for axis in range(3):
         half = solids.half[n, axis] / solids.leaves[n, axis]
-        smaller = min(smaller, half / _extent(solids, n, leaf, axis))
+        leaf[0, axis] = _extent(solids, n, leaf, axis)
+        smaller = min(smaller, half / leaf[0, axis])
     for axis, cell in enumerate((i, j, k)):
         half = solids.half[n, axis] / solids.leaves[n, axis]
         state = _mixed(state + 3)
-        room = half - smaller * _extent(solids, n, leaf, axis)
+        room = half - smaller * leaf[0, axis]
         leaf[0, axis] = (2 * cell + 1) * half - solids.half[n, axis] + room * (2.0 * state / 4294967296.0 - 1.0)
     for side in range(3):
         for axis in range(3):
@@ -87,7 +87,7 @@ def _cell(solids, n, axis, x):
     """(the cell that x lies in, its width); the outermost ones hold what lies outside."""
     cells = int(solids.leaves[n, axis])
     wide = 2.0 * solids.half[n, axis] / cells
-    return min(max(int(math.floor((x + solids.half[n, axis]) / wide)), 0), cells - 1), wide
+    return min(max(math.floor((x + solids.half[n, axis]) / wide), 0), cells - 1), wide
 
 
 @kernel(inline="always")
