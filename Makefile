@@ -48,7 +48,8 @@ help:
 	@echo 'make data=FOLDER report        the same of all its scenes: runs/report/index.html'
 	@echo 'make scene=X clean             remove what was computed for it'
 	@echo 'make data=FOLDER batch         every scene of a folder, and one table'
-	@echo 'make demo [seed=N]             make the demo scene, or another: data/demo-N'
+	@echo 'make demo [seed=N]             make the demo scene, or another: data/demo-N; others are made when named:'
+	@echo '                               demo-wide, -360, -seen, -photos, -behind, -table, -corner, -grass, with -N too'
 	@echo 'make prior [steps=N]           train the embedded prior further (hours)'
 	@echo 'make weights [profile=paper]   fetch what a profile needs, sizes first; offline=1 only says what is missing'
 	@echo 'make gpu-check                 values, time and memory at the paper'"'"'s sizes on a CUDA machine (8 minutes)'
@@ -85,8 +86,8 @@ $(VENV)/.ready-dev: $(VENV)/.ready
 
 # --------------------------------------------------------------------------------------------------------- scenes
 
-# The demo scenes are made by the project: `demo`, `demo-photos` (no poses), `demo-wide`, `demo-360`, `demo-seen`, each with `-<seed>` or not.
-kinds := photos wide 360 seen
+# The demo scenes are made by the project: `demo`, `demo-photos` (no poses) and demo-<one of the others>, each with `-<seed>` or not.
+kinds := photos wide 360 seen behind table corner grass
 made = $(filter demo demo-%,$(scene))
 
 demo: setup

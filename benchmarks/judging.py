@@ -1,4 +1,4 @@
-"""What a composite's result is worth: its scores beside the ceiling's and Telea's, what it leaves uncovered, a sheet."""
+"""What a composite's result is worth: its scores beside the ceiling's and Telea's, what stays uncovered, a sheet."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from holes import gradient_energy
 
 from reffusion import io, metrics, paint2d, splat
 from reffusion.types import Camera, Gaussians, Scene
@@ -90,15 +91,10 @@ def _sharpness(run: Run) -> float | None:
     for name in run.scene.test:
         box = metrics.mask_box(run.mask(name))
         if box is not None:
-            shares.append(energy(box.crop(run.picture(name))) / max(energy(box.crop(run.truth(name))), 1e-12))
+            ours, true = box.crop(run.picture(name)), box.crop(run.truth(name))
+            whole = np.ones(true.shape[:2], bool)
+            shares.append(gradient_energy(ours, whole) / max(gradient_energy(true, whole), 1e-9))
     return metrics.mean(shares)
-
-
-def energy(picture: np.ndarray) -> float:
-    """Mean squared gradient of a picture's grey, uint8 [H, W, 3] -> 1 / px^2."""
-    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) / 255.0
-    down, across = np.gradient(grey)
-    return float((down**2 + across**2).mean())
 
 
 def _untouched(run: Run, ceiling: Run, name: str) -> np.ndarray | None:

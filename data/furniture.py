@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from solids import BOX, CYLINDER, ROOM, SPHERE, Faces, Solids
+from solids import BOX, CYLINDER, ROOM, SPHERE, THICKET, Faces, Solids
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,7 @@ class Furniture:
 
     def __init__(self) -> None:
         self.solids: list[tuple] = []
+        self.leaves: dict[int, tuple] = {}
         self.materials: list[Material] = []
 
     def _add(self, kind, center, half, yaw, materials, removable):
@@ -46,20 +47,33 @@ class Furniture:
         half = (radius, high / 2, radius)
         self._add(CYLINDER, (x, bottom + high / 2, z), half, 0.0, [side, top or side, side], removable)
 
+    def thicket(self, x, bottom, z, size, cell, leaf, material, drawn_from, yaw=0.0):
+        """A box of size (wide, high, deep) full of leaves, one in each cell of about the size `cell`, metres; `leaf`:
+        its width, length, thickness in metres, and by how many degrees it leans at most; drawn_from: an integer."""
+        half = np.array(size) / 2
+        cells = np.maximum(np.round(np.array(size) / cell), 1).astype(int)
+        *extents, lean = leaf
+        self.leaves[len(self.solids)] = (*cells, *np.array(extents) / 2, np.radians(lean), drawn_from)
+        self._add(THICKET, (x, bottom + half[1], z), half, yaw, [material], False)
+
     def arrays(self, index: dict[str, int], node: float) -> tuple[Solids, Faces]:
         """Everything as the arrays that kernels read; `index`: texture name -> number, `node`: metres."""
         return self._solid_arrays(), self._face_arrays(index, node)
 
     def _solid_arrays(self) -> Solids:
         kind, center, half, turn, first, removable = zip(*self.solids, strict=True)
+        leaves = [self.leaves.get(n, (0,) * 8) for n in range(len(self.solids))]
         return Solids(
             np.array(kind, np.int32), np.array(center, float), np.array(half, float),
             np.array(turn, float), np.array(first, np.int32), np.array(removable, bool),
             np.array([_reach(k, h) for k, h in zip(kind, half, strict=True)]),
+            np.array(leaves, float),
         )  # fmt: skip
 
     def _face_arrays(self, index: dict[str, int], node: float) -> Faces:
-        sizes = np.array([size for solid in self.solids for size in _face_sizes(solid[0], solid[2])])
+        lawns = [n in self.leaves and self.leaves[n][1] == 1 for n in range(len(self.solids))]
+        solids = zip(self.solids, lawns, strict=True)
+        sizes = np.array([size for solid, lawn in solids for size in _face_sizes(solid[0], solid[2], lawn)])
         spacing = np.full((len(sizes), 1), node)
         spacing[[2, 4]] *= 4  # ceiling and front wall: hardly ever in a picture
         nodes = np.clip(np.ceil(sizes / spacing).astype(int) + 1, 5, 256)
@@ -85,8 +99,10 @@ def _reach(kind: int, half) -> float:
     return np.hypot(half[0], half[1]) if kind == CYLINDER else np.linalg.norm(half)
 
 
-def _face_sizes(kind: int, half) -> list[tuple[float, float]]:
+def _face_sizes(kind: int, half, lawn: bool) -> list[tuple[float, float]]:
     a, b, c = (2 * h for h in half)
+    if kind == THICKET:
+        return [(a, c) if lawn else (a, b)]
     if kind == SPHERE:
         return [(np.pi * a, np.pi * a / 2)]
     if kind == CYLINDER:
@@ -141,6 +157,55 @@ def lantern(f: Furniture, draw, x: float, z: float) -> None:
     low, radius = draw.uniform(0.72, 0.8), draw.uniform(0.11, 0.13)
     f.sphere(x, low, z, radius, Material("ball"), draw.uniform(0, 360), removable=True)
     f.cylinder(x, low + 1.8 * radius, z, 0.5 * radius, 0.07, Material("jar"), WOOD, removable=True)
+
+
+def table(f: Furniture, x: float, z: float, size: tuple[float, float, float]) -> None:
+    """A table of size (wide, high, deep) on four legs, nothing but air under its thin top."""
+    wide, high, deep = size
+    f.box(x, high - 0.04, z, (wide, 0.04, deep), WOOD)
+    for a, b in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
+        f.box(x + a * (wide / 2 - 0.07), 0, z + b * (deep / 2 - 0.07), (0.06, high - 0.04, 0.06), WOOD)
+
+
+def chest(f: Furniture, draw, x: float, bottom: float, z: float) -> None:
+    """The object of table: a chest with a ball and a jar on its lid. z is its front; it stands straight."""
+    wide, high, deep = draw.uniform(0.6, 0.7), draw.uniform(0.36, 0.42), draw.uniform(0.4, 0.46)
+    z -= deep / 2
+    f.box(x, bottom, z, (wide, high, deep), Material("paint", 1.3), Material("front"), removable=True)
+    f.box(x, bottom + high, z, (wide + 0.03, 0.02, deep + 0.02), WOOD, removable=True)
+    side, top = draw.choice((-1, 1)), bottom + high + 0.02
+    f.sphere(x + side * wide * 0.24, top, z, draw.uniform(0.1, 0.13), Material("ball"), draw.uniform(0, 360),
+             removable=True)  # fmt: skip
+    f.cylinder(x - side * wide * 0.22, top, z, 0.08, draw.uniform(0.14, 0.2), Material("jar"), removable=True)
+
+
+def keepsake(f: Furniture, draw, x: float, z: float) -> None:
+    """What stays and stands before the object of behind: a large ball, or a stool with a globe on it."""
+    if draw.random() < 0.5:
+        f.sphere(x, 0, z, draw.uniform(0.24, 0.28), Material("globe"), draw.uniform(0, 360))
+    else:
+        high, radius = draw.uniform(0.24, 0.32), draw.uniform(0.17, 0.2)
+        f.cylinder(x, 0, z, 0.16, high, Material("crate", 0.7), WOOD)
+        f.sphere(x, high, z, radius, Material("globe"), draw.uniform(0, 360))
+
+
+def hedge(f: Furniture, draw, z: float, wide: float, high: float) -> None:
+    """Foliage 0.4 m deep over a dark core, from wall to wall; z is its front. Layers of unlike cells hide each other's
+    rows."""
+    f.box(0, 0, z - 0.4, (wide, high - 0.06, 0.2), Material("leaves", 0.6, (0.5, 0.6, 0.4)))
+    for cell, back, tint in ((0.065, 0.05, 1.4), (0.08, 0.02, 2.0), (0.1, 0.0, 2.6)):
+        leaf, material = (0.8 * cell, 1.1 * cell, 0.008, 80), Material("foliage", 0.8, (tint,) * 3)
+        drawn_from, yaw = int(draw.integers(1 << 20)), draw.uniform(-1.2, 1.2)
+        f.thicket(0, 0, z - 0.15 - back, (wide, high - back, 0.3), cell, leaf, material, drawn_from, yaw)
+
+
+def lawn(f: Furniture, draw, z: float, wide: float) -> None:
+    """Two layers of grass that do not lie in the same rows, a low dark one and a high light one."""
+    for high, tint in ((0.07, 1.2), (0.12, 2.4)):
+        blade, material = (0.014, high + 0.01, 0.006, 14), Material("foliage", 0.8, (tint,) * 3)
+        drawn_from, yaw = int(draw.integers(1 << 20)), draw.uniform(0, 90)
+        cell = (0.04, high + 0.02, 0.04)
+        f.thicket(0, -0.02, z, (wide, high + 0.02, wide), cell, blade, material, drawn_from, yaw)
 
 
 def daybed(f: Furniture, draw, x: float, z: float) -> None:

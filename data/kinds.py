@@ -21,6 +21,10 @@ class Kind:
         texture: pixels a side of the largest textures; node: metres between nodes of the light map.
         bend: SIMPLE_RADIAL's k1 at its largest; points: sparse points wanted.
         hangs: the object hangs in mid-air, so that other views show all that it hides.
+        place: where the object is: "room", "behind" (a kept thing before it), "table" (on the edge of one), "corner"
+            (before the corner of a wall) or "grass".
+        least: share of the masks that no training view may show, at least.
+        low: metres above the floor of the lowest cameras; None: all at the height of a person's eyes.
     """
 
     width: int = 320
@@ -35,6 +39,9 @@ class Kind:
     bend: float = 0.045
     points: int = 3000
     hangs: bool = False
+    place: str = "room"
+    least: float = 0.4
+    low: float | None = None
 
     @property
     def around(self) -> bool:
@@ -48,6 +55,10 @@ KINDS = {
     "wide": Kind(spread=50.0),
     "360": Kind(spread=180.0),
     "seen": Kind(spread=34.0, hangs=True),
+    "behind": Kind(spread=50.0, place="behind"),
+    "table": Kind(spread=34.0, place="table", least=0.05, low=0.45),
+    "corner": Kind(spread=30.0, place="corner", least=0.25),
+    "grass": Kind(samples=2, spread=30.0, node=0.08, place="grass"),
     "photos": Kind(width=480, height=360, train=26, test=0, photos=True, texture=2048, node=0.025),
 }
 

@@ -36,7 +36,7 @@ def photographed(seed: int, kind: Kind, world: World, target: np.ndarray) -> Ses
     train, test = (path(seed, kind, target, n, label) for n, label in ((kind.train, "train"), (kind.test, "test")))
     cameras = np.concatenate([test, train])
     names = [f"IMG_{k + 2000:04d}" for k in range(len(cameras))]
-    middle = kind.test + int(np.argmin(np.linalg.norm(train[:, 13:] - train[:, 13:].mean(0), axis=1)))
+    middle = kind.test + _middle(train, kind)
     world = exposed(world, cameras[middle], kind)
     shots = [shoot(world, camera, kind, k >= kind.test) for k, camera in enumerate(cameras)]
     photos, masks = (np.stack(pictures) for pictures in zip(*shots, strict=True))
@@ -64,6 +64,14 @@ def path(seed: int, kind: Kind, target: np.ndarray, count: int, label: str) -> n
     return cameras
 
 
+def _middle(cameras: np.ndarray, kind: Kind) -> int:
+    """The camera nearest to the mean of all; where some are low, to the mean at the height of the highest."""
+    wanted = cameras[:, 13:].mean(0)
+    if kind.low is not None:
+        wanted[1] = cameras[:, 14].max()
+    return int(np.argmin(np.linalg.norm(cameras[:, 13:] - wanted, axis=1)))
+
+
 def _walk(kind: Kind, count: int, reach: float, draw: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Azimuth [count] in degrees, height and horizontal distance from the target in metres."""
     s = (np.arange(count) + 0.5) / max(count, 1)
@@ -74,7 +82,9 @@ def _walk(kind: Kind, count: int, reach: float, draw: np.random.Generator) -> tu
         return azimuth, height, 2.25 + 0.1 * np.sin(6.28 * 5 * s + phase[2])
     # Few views walk one arc and back; many go to and fro, so that heights and sides mix.
     azimuth = reach * kind.spread * np.sin(6.28 * 2.5 * s + phase[0])
-    height = 1.22 + 0.2 * np.sin(6.28 * 1.5 * s + phase[1])
+    swing = np.sin(6.28 * 1.5 * s + phase[1])
+    # With a low end, most views still come from above.
+    height = 1.22 + 0.2 * swing if kind.low is None else 1.42 - (1.42 - kind.low) * (0.5 - 0.5 * swing) ** 2
     return azimuth, height, 2.45 + 0.08 * np.sin(6.28 * 4 * s + phase[2])
 
 

@@ -14,7 +14,8 @@ from compiled import kernel
 from light import irradiance
 from mipmaps import albedo
 from numba import prange
-from solids import EPSILON, blocked, distance, nearest, surface
+from solids import EPSILON, THICKET, blocked, distance, nearest, surface
+from thicket import leaf_light
 
 TILE = 16  # pixels
 
@@ -98,8 +99,9 @@ def _add_radiance(solids, faces, textures, light, camera, i, t, dx, dy, dz, samp
     color, falling = scratch[0], scratch[1]
     albedo(faces, textures, face, u, v, t / (camera[0] * samples * math.sqrt(cosine)), color)
     irradiance(faces, light, face, u, v, falling)
+    share = leaf_light(nx, ny, nz) if solids.kind[i] == THICKET else 1.0
     for ch in range(3):
-        out[ch] += color[ch] * falling[ch]
+        out[ch] += color[ch] * falling[ch] * share
 
 
 @kernel(parallel=True)

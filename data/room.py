@@ -1,14 +1,12 @@
-"""How the room is furnished: a corner with a cabinet or a lantern, or a room all around a daybed."""
+"""How the room is furnished: a corner with a cabinet or a lantern, or a room all around a daybed; for the places where
+removal is harder than against a wall see `places.py`."""
 
 from __future__ import annotations
 
 import numpy as np
-from furniture import WHITE, WOOD, Furniture, Material, cabinet, daybed, lantern, plant, shelf
+from furniture import WHITE, WOOD, Furniture, Material, cabinet, daybed, keepsake, lantern, plant, shelf
 from kinds import Kind, randomness
-
-WALL = Material("wall", 1.8)
-PLAIN = Material("side", 2.6)
-RUG = Material("rug")
+from places import PLAIN, RUG, WALL, garden, shell, table_room, wall_corner
 
 
 def furnish(seed: int, kind: Kind) -> tuple[Furniture, np.ndarray]:
@@ -17,10 +15,13 @@ def furnish(seed: int, kind: Kind) -> tuple[Furniture, np.ndarray]:
     planks = Material("floor", 3.0, turned=bool(draw.integers(2)))
     if kind.around:
         return f, _round_room(f, draw, planks)
+    others = {"table": table_room, "corner": wall_corner, "grass": garden}
+    if kind.place in others:
+        return f, others[kind.place](f, draw, planks)
     side = draw.choice((-1, 1))  # where the corner is
     # The corner stands clear of the outermost camera.
     corner = 1.45 + max(0.0, 2.6 * np.sin(np.radians(kind.spread)) - 0.97)
-    _corner(f, draw, planks, side, corner)
+    shell(f, draw, planks, side, corner)
     if kind.hangs:
         lantern(f, draw, 0.0, 1.15)
     else:
@@ -28,22 +29,14 @@ def furnish(seed: int, kind: Kind) -> tuple[Furniture, np.ndarray]:
     plant(f, draw, side * (corner - 0.42), 0.36, draw.uniform(1.35, 1.6))
     shelf(f, draw, -side * draw.uniform(1.08, 1.2), 0.2, draw.uniform(0.7, 0.8))
     _pictures_and_clutter(f, draw, side)
+    if kind.place == "behind":
+        keepsake(f, draw, draw.uniform(-0.15, 0.15), draw.uniform(0.58, 0.62))
     return f, np.array([0.0, 0.5, 0.1])
 
 
 def _cabinet(f: Furniture, draw, flat: bool) -> None:
     cabinet(f, draw, 0.0, 0.026 if flat else draw.uniform(0.06, 0.14), draw.uniform(0.98, 1.12), draw.uniform(0.6, 0.7),
             draw.uniform(0.19, 0.22) if flat else draw.uniform(0.4, 0.46))  # fmt: skip
-
-
-def _corner(f: Furniture, draw, planks: Material, side: int, corner: float) -> None:
-    """The room with its skirting; the near side wall is `corner` metres from the middle."""
-    left, right = (-corner, 4.0) if side < 0 else (-4.0, corner)
-    middle = (left + right) / 2
-    f.room((middle, 1.35, 3.2), ((right - left) / 2, 1.35, 3.2), PLAIN, PLAIN, WHITE, planks, PLAIN, WALL)
-    skirt = WHITE if draw.random() < 0.6 else WOOD
-    f.box(middle, 0, 0.008, (right - left, 0.1, 0.016), skirt)
-    f.box(side * (corner - 0.008), 0, 3.2, (0.016, 0.1, 6.4), skirt)
 
 
 def _pictures_and_clutter(f: Furniture, draw, side: int) -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import textures as paint
 from furniture import Furniture
+from greens import foliage
 from kinds import Kind, randomness
 from light import bounced_light, direct_light, light_nodes
 from mipmaps import Textures, mipmapped
@@ -62,6 +63,7 @@ def paint_textures(seed: int, size: int) -> dict[str, np.ndarray]:
         "quilt": (paint.quilt, small, {"first": hues[first][0], "second": hues[second][1]}),
         "jar": (paint.glazed, small, {"color": hues[first][1], "bands": hues[second][0]}),
         "white": (paint.plaster, small, {"color": (236, 234, 228)}),
+        "foliage": (foliage, small, {}),
     }
     return {name: maker(randomness(seed, name), n, **how) for name, (maker, n, how) in made.items()}
 

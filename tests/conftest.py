@@ -1,6 +1,23 @@
 """What several tests are given."""
 
+import sys
+from pathlib import Path
+
 import pytest
+
+DATA = Path(__file__).parents[1] / "data"
+
+
+@pytest.fixture(scope="module")
+def generate():
+    """data/generate.py, its neighbours importable."""
+    sys.path.insert(0, str(DATA))
+    try:
+        import generate
+
+        yield generate
+    finally:
+        sys.path.remove(str(DATA))
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,19 +12,6 @@ import yaml
 
 from reffusion import io
 from reffusion.io import colmap
-
-DATA = Path(__file__).parents[1] / "data"
-
-
-@pytest.fixture(scope="module")
-def generate():
-    sys.path.insert(0, str(DATA))
-    try:
-        import generate
-
-        yield generate
-    finally:
-        sys.path.remove(str(DATA))
 
 
 @pytest.fixture(scope="module")
@@ -205,10 +191,9 @@ def test_what_hangs_hides_nothing_that_other_views_miss(generate, tmp_path):
     assert "reference" not in yaml.safe_load((tmp_path / "seen/scene.yaml").read_text())
 
 
-def test_too_small_a_share_is_an_error_and_writes_nothing(generate, tmp_path, monkeypatch):
-    monkeypatch.setattr(generate, "LEAST_NEVER_SEEN", 0.99)
+def test_too_small_a_share_is_an_error_and_writes_nothing(generate, tmp_path):
     with pytest.raises(ValueError, match="never seen"):
-        generate.generate(tmp_path / "scene", 0, generate.KINDS["mini"])
+        generate.generate(tmp_path / "scene", 0, replace(generate.KINDS["mini"], least=0.99))
     assert not (tmp_path / "scene").exists()
 
 

@@ -1,0 +1,131 @@
+"""The benchmark on real captures: `python benchmarks/composites.py --places dino-ground`.
+
+An object that is not there is drawn into the training photographs of a nerfstudio capture; the untouched photographs
+are the exact truth of what it hides. For each place: the scene, the job on it (given the true reference, unless
+--alone), and a fit to the untouched photographs of the same views, scored in the same boxes: the ceiling.
+Writes composites.md, composites.json and a sheet of all test views a place (truth, with the object, ours, ceiling,
+difference) to --out. Settings are chosen on the places that run without --report; those with it are for reporting.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+import drawing  # noqa: E402
+import judging  # noqa: E402
+import placing  # noqa: E402
+from placing import Place  # noqa: E402
+
+from reffusion import io  # noqa: E402
+
+CHOOSE = (
+    Place("table", "garden", "frame_00097", (180, 270), 0.16, 50, 34, 8),
+    Place("bear-rock", "bear", "frame_00041", (255, 395), 0.13, 100, 40, 5),
+    Place("dino-ground", "dinosaur", "frame_00056", (250, 430), 0.14, 45, test=4, near=40, shape="ellipsoid"),
+)
+REPORT = (
+    Place("table-rim", "garden", "frame_00151", (377, 343), 0.12, 60, 34, 5),
+    Place("table-vase", "garden", "frame_00120", (234, 285), 0.12, 50, 34, 8),
+    Place("bear-back", "bear", "frame_00037", (110, 390), 0.12, 90, 40, 4),
+    Place("bear-rim", "bear", "frame_00061", (400, 366), 0.12, 45, 40, 4),
+    Place("dino-gravel", "dinosaur", "frame_00055", (343, 423), 0.12, 60, 40, 6, near=40),
+    Place("dino-plinth", "dinosaur", "frame_00019", (170, 440), 0.12, 60, 40, 6, near=40, shape="ellipsoid"),
+)
+
+
+def made(place: Place, captures: Path, options: drawing.Options, out: Path) -> tuple[Path, Path]:
+    """(the place's scene, the same without the object) under out/scenes; made anew only where what they are made of
+    has changed."""
+    scenes = out / "scenes"
+    scene, untouched = scenes / (place.name + options.suffix), scenes / f"{place.name}-untouched"
+    capture = None
+    for folder, of in ((scene, [place, options]), (untouched, [place])):
+        told = json.dumps([repr(part) for part in of])
+        if (folder / "made.json").exists() and (folder / "made.json").read_text() == told:
+            continue
+        capture = capture or placing.load(captures / place.capture)
+        if folder == scene:
+            drawing.write(place, capture, options, folder)
+        else:
+            drawing.write_untouched(place, capture, scene, folder)
+        (folder / "made.json").write_text(told)
+    return scene, untouched
+
+
+def job(scene: Path, runs: Path, profile: str) -> Path:
+    """The whole job on a scene by the runner, which finds what is done; its folder. ValueError where it fails."""
+    command = ["run", "all", "--scene", str(scene), "--runs", str(runs), "--profile", profile]
+    if subprocess.run([sys.executable, "-m", "runner", *command], cwd=ROOT).returncode:
+        raise ValueError(f"{scene.name}: the job failed; see above")
+    return runs / scene.name
+
+
+def measured(place: Place, captures: Path, options: drawing.Options, out: Path, profile: str) -> dict:
+    """The place's row of the table; its sheet is saved."""
+    scene, untouched = made(place, captures, options, out)
+    run, ceiling = (judging.Run.at(job(folder, out / "runs", profile)) for folder in (scene, untouched))
+    io.save_image(out / f"{scene.name}.png", judging.sheet(run, ceiling))
+    return {"place": scene.name, **judging.scores(run, ceiling)}
+
+
+def chosen(names: str, report: bool) -> tuple[Place, ...]:
+    """The places of a set, or those named, of either set. ValueError for one that is not known."""
+    if not names:
+        return REPORT if report else CHOOSE
+    known = {place.name: place for place in (*CHOOSE, *REPORT)}
+    wrong = [name for name in names.split(",") if name not in known]
+    if wrong:
+        raise ValueError(f"no place is called {', '.join(wrong)}; there are {', '.join(known)}")
+    return tuple(known[name] for name in names.split(","))
+
+
+def benchmark(given: argparse.Namespace) -> int:
+    options = drawing.Options(not given.alone, given.shadow, given.rough, given.seed)
+    out, rows = given.out.resolve(), []
+    for place in chosen(given.places, given.report):
+        if not (given.captures / place.capture).is_dir():
+            print(f"{place.name} skipped: there is no capture {given.captures / place.capture}")
+            continue
+        if given.make:
+            print("made", *made(place, given.captures, options, out))
+            continue
+        rows.append(measured(place, given.captures, options, out, given.profile))
+        (out / "composites.json").write_text(json.dumps(rows, indent=1))
+        (out / "composites.md").write_text(judging.table(rows))
+    if rows:
+        print(judging.table(rows))
+    return 0
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--captures", type=Path, default=Path("../shared/data"), help="folder of nerfstudio captures")
+    parser.add_argument("--places", default="", help="these only, with commas between")
+    parser.add_argument("--report", action="store_true", help="the places that no setting is chosen on")
+    parser.add_argument("--out", type=Path, default=Path("runs/composites"))
+    parser.add_argument("--alone", action="store_true", help="hand over no reference")
+    parser.add_argument("--shadow", type=float, default=0.0, help="strength, 0 to 1, of a shadow that is in no mask")
+    parser.add_argument("--rough", type=int, default=0, help="px by which training masks are wrong")
+    parser.add_argument("--seed", type=int, default=0, help="of the object's colours and the masks' faults")
+    parser.add_argument("--profile", default="laptop", help="of pipeline.yaml")
+    parser.add_argument("--make", action="store_true", help="make the scenes only, to look at")
+    given = parser.parse_args()
+    if not given.captures.is_dir():
+        print(f"skipped: there are no captures at {given.captures}")
+        return 0
+    try:
+        return benchmark(given)
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,194 @@
+"""An object that is not there, drawn into photographs: the scenes of `benchmarks/composites.py`.
+
+The object is drawn before everything: a place is good only where nothing should hide it. Photographs that are not drawn
+into stay as they are, so behind the object the truth is exact.
+"""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import cv2
+import numpy as np
+import placing
+
+from reffusion import io
+
+SAMPLES = 3  # rays a side of a pixel
+DARKEST, SQUARES = 0.45, 3  # of the object's light; of its pattern, over half an edge
+LIGHT = (0.9, -0.2, 1.0)  # along the object's axes
+SHADOW_AT, SHADOW_REACH = (-0.8, 0.15), (0.95, 0.8)  # of the object's height, along its first two axes
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a scene has beside the object.
+
+    Attributes:
+        reference: whether the untouched photograph of the middle training view is handed over.
+        shadow: strength, 0 to 1, of a soft shadow on the surface that is in no mask.
+        rough: training masks are grown or shrunk, and shifted, each at random by up to so many px.
+        seed: of the object's colours and of that.
+    """
+
+    reference: bool = True
+    shadow: float = 0.0
+    rough: int = 0
+    seed: int = 0
+
+    @property
+    def suffix(self) -> str:
+        """Tells scenes of unlike options apart."""
+        parts = [f"-shadow{self.shadow:g}" if self.shadow else "", f"-rough{self.rough}" if self.rough else ""]
+        return "".join(parts) + ("" if self.reference else "-alone") + (f"-{self.seed}" if self.seed else "")
+
+
+@dataclass(frozen=True)
+class Pictured:
+    """A capture with the rays of its pixels, the lens undone: the same in every view."""
+
+    capture: placing.Photographs
+
+    def rays(self, samples: int) -> np.ndarray:
+        """[H samples W samples, 3], z 1, row by row, in the camera's axes."""
+        k = self.capture
+        u, v = np.meshgrid(*((np.arange(side * samples) + 0.5) / samples for side in (k.width, k.height)))
+        bent = np.stack([u, v], -1).reshape(-1, 1, 2)
+        straight = cv2.undistortPoints(bent, k.intrinsics, k.distortion).reshape(-1, 2)
+        return np.concatenate([straight, np.ones((len(straight), 1))], 1)
+
+    @cached_property
+    def fine(self) -> np.ndarray:
+        return self.rays(SAMPLES)
+
+    @cached_property
+    def coarse(self) -> np.ndarray:
+        return self.rays(1)
+
+    def mean(self, values: np.ndarray) -> np.ndarray:
+        """Values [N, ...] at the fine rays -> [H, W, ...]."""
+        k = self.capture
+        return values.reshape(k.height, SAMPLES, k.width, SAMPLES, *values.shape[1:]).mean((1, 3))
+
+
+def draw(view: Pictured, camera: np.ndarray, thing: placing.Thing, tints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(RGB [H, W, 3] times coverage, coverage [H, W]) of the object, each in [0, 1]; tints: [3, 3], of its faces."""
+    # In the object's own axes, divided by its half extents: a cube, or a ball of radius 1.
+    ways = view.fine @ camera[:3, :3].T @ thing.axes.T / thing.half
+    start = (camera[:3, 3] - thing.middle) @ thing.axes.T / thing.half
+    far, hit, normal, face = (_cube if thing.shape == "box" else _ball)(ways, start, thing.half)
+    at = start + np.where(hit, far, 0)[:, None] * ways
+    # A face of the cube lies between two layers of squares: a hair decides, not rounding.
+    pattern = np.floor(at * SQUARES + 1e-6).sum(1).astype(int) % 2 * 0.5 + 0.5
+    light = np.array(LIGHT) / np.linalg.norm(LIGHT)
+    lit = DARKEST + (1 - DARKEST) * np.clip(normal @ light, 0, 1)
+    color = tints[face] * (pattern * lit * hit)[:, None]
+    return view.mean(color), view.mean(hit.astype(float))
+
+
+def _cube(ways: np.ndarray, start: np.ndarray, half: np.ndarray):
+    """(distance [N], hit [N], normal [N, 3] in the object's axes, face [N]: its axis) of rays to the unit cube."""
+    with np.errstate(divide="ignore"):
+        walls = np.stack([(-1 - start) / ways, (1 - start) / ways])
+    enter, leave = walls.min(0), walls.max(0)
+    far, face, row = enter.max(1), enter.argmax(1), np.arange(len(ways))
+    normal = np.zeros_like(ways)
+    normal[row, face] = -np.sign(ways[row, face])
+    return far, (far < leave.min(1)) & (far > 0), normal, face
+
+
+def _ball(ways: np.ndarray, start: np.ndarray, half: np.ndarray):
+    """As `_cube`, to the unit ball, which has one face."""
+    a, b, c = (ways * ways).sum(1), (ways * start).sum(1), (start * start).sum() - 1
+    root = b * b - a * c
+    far = (-b - np.sqrt(np.maximum(root, 0))) / a
+    normal = (start + far[:, None] * ways) / half
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-12
+    return far, (root > 0) & (far > 0), normal, np.zeros(len(ways), int)
+
+
+def light_left(view: Pictured, camera: np.ndarray, thing: placing.Thing, strength: float) -> np.ndarray:
+    """[H, W]: what the object's soft shadow leaves of the light on the surface; 1 without a shadow."""
+    ways = view.coarse @ camera[:3, :3].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        far = ((thing.foot - camera[:3, 3]) @ thing.normal) / (ways @ thing.normal)
+    ahead = np.isfinite(far) & (far > 0)
+    at = (camera[:3, 3] + np.where(ahead, far, 0)[:, None] * ways - thing.foot) @ thing.axes[:2].T / thing.height
+    away = (((at - SHADOW_AT) / SHADOW_REACH) ** 2).sum(1)
+    left = np.where(ahead, 1 - strength * np.exp(-(away**2)), 1.0)
+    return left.reshape(view.capture.height, view.capture.width)
+
+
+def roughened(mask: np.ndarray, most: int, random: np.random.Generator) -> np.ndarray:
+    """A uint8 mask [H, W] grown or shrunk by up to `most` px, then shifted by up to `most` px along each axis."""
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * random.integers(1, most + 1) + 1,) * 2)
+    mask = cv2.dilate(mask, disc) if random.random() < 0.5 else cv2.erode(mask, disc)
+    down, right = (int(step) for step in random.integers(-most, most + 1, 2))
+    return cv2.warpAffine(mask, np.float32([[1, 0, right], [0, 1, down]]), mask.shape[::-1], flags=cv2.INTER_NEAREST)
+
+
+def write(place: placing.Place, capture: placing.Photographs, options: Options, out: Path) -> None:
+    """The scene of a place in a new folder `out`: images, masks, test_masks, truth, transforms.json, scene.yaml.
+
+    Raises:
+        ValueError: the object cannot be placed, too few photographs show it, or one is of another size.
+    """
+    thing = placing.stand(capture, place)
+    views = placing.views_around(capture, place, thing)
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    random, view = np.random.default_rng(options.seed), Pictured(capture)
+    tints = random.uniform(0.35, 0.9, (3, 3))
+    for name in views.all:
+        camera, photo = capture.cameras[name], _photograph(capture, name)
+        color, cover = draw(view, camera, thing, tints)
+        mask = (cover > 0).astype(np.uint8) * 255
+        io.save_image(out / f"truth/{name}.png", photo)
+        if name in views.test:
+            io.save_image(out / f"images/{name}.png", photo)
+            io.save_image(out / f"test_masks/{name}.png", mask)
+            continue
+        light = light_left(view, camera, thing, options.shadow)[..., None] if options.shadow else 1.0
+        both = photo / 255.0 * light * (1 - cover[..., None]) + color
+        io.save_image(out / f"images/{name}.png", (both * 255 + 0.5).clip(0, 255).astype(np.uint8))
+        given = roughened(mask, options.rough, random) if options.rough else mask
+        io.save_image(out / f"masks/{name}.png", given)
+    _write_meta(capture, views, out)
+    lines = ["masks: masks", "test_masks: test_masks", f"test: {_listed(views.test)}"]
+    if options.reference:
+        middle = views.train[len(views.train) // 2]
+        lines += ["reference:", f'  view: "{middle}"', f"  image: truth/{middle}.png"]
+    (out / "scene.yaml").write_text("\n".join(lines) + "\n")
+
+
+def write_untouched(place: placing.Place, capture: placing.Photographs, scene: Path, out: Path) -> None:
+    """The same views without the object, nothing to remove: what a fit to them reaches is the ceiling. `scene`: the
+    place's folder as `write` made it."""
+    views = placing.views_around(capture, place, placing.stand(capture, place))
+    shutil.rmtree(out, ignore_errors=True)
+    shutil.copytree(scene / "truth", out / "images")
+    shutil.copytree(scene / "test_masks", out / "test_masks")
+    _write_meta(capture, views, out)
+    (out / "scene.yaml").write_text(f"masks: none\ntest_masks: test_masks\ntest: {_listed(views.test)}\n")
+
+
+def _write_meta(capture: placing.Photographs, views: placing.Views, out: Path) -> None:
+    placing.save_meta(capture, views.all, out / "transforms.json")
+    (out / capture.cloud).parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(capture.folder / capture.cloud, out / capture.cloud)
+
+
+def _photograph(capture: placing.Photographs, name: str) -> np.ndarray:
+    path = capture.folder / capture.frames[name]["file_path"]
+    photo = io.load_image(path)
+    if photo.shape[:2] != (capture.height, capture.width):
+        raise ValueError(f"{path} is {photo.shape[1]}x{photo.shape[0]} px, transforms.json says "
+                         f"{capture.width}x{capture.height}")  # fmt: skip
+    return photo
+
+
+def _listed(names: list[str]) -> str:
+    return "[" + ", ".join(f'"{name}"' for name in names) + "]"

@@ -1,0 +1,218 @@
+"""Where an object that is not there would stand in a real capture, and which of its photographs would show it.
+
+A capture is a nerfstudio folder: `transforms.json` and a cloud of points. Its frame is kept as it is; a camera here is
+a camera-to-world matrix [4, 4] that looks along +z, x right, y down.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from reffusion import io
+
+MARGIN = 20  # px from the picture's border within which the object's axis must not come
+SLACK = 1.06  # depth over the nearest points' up to which a point is of the surface in front
+FEWEST = 8  # points that make a surface
+TURN = 25.0  # degrees that the object is turned away from the view in which it is placed
+HALF = (0.55, 0.4, 0.5)  # extents of the object, of its height
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where to put an object.
+
+    Attributes:
+        name: of the place; capture: its folder's name.
+        view: the photograph in which the place is pointed at; pixel: where in it, px.
+        size: the object's height over its distance from that view; shape: "box" or "ellipsoid".
+        arc: degrees about the surface's normal to either side of `view` from which photographs are taken.
+        train, test: how many photographs at most.
+        near: px around the pixel within which points make the surface.
+    """
+
+    name: str
+    capture: str
+    view: str
+    pixel: tuple[float, float]
+    size: float
+    arc: float
+    train: int = 45
+    test: int = 15
+    near: float = 18.0
+    shape: str = "box"
+
+
+@dataclass(frozen=True)
+class Photographs:
+    """A capture.
+
+    Attributes:
+        folder: where it lies; meta: transforms.json as read, its frames left out.
+        intrinsics: [3, 3]; distortion: [4], OpenCV's k1, k2, p1, p2; width, height: px.
+        frames: view -> its entry in transforms.json; cameras: view -> camera [4, 4]. Views without a file are left out.
+        points: [P, 3].
+    """
+
+    folder: Path
+    meta: dict[str, Any]
+    intrinsics: np.ndarray
+    distortion: np.ndarray
+    width: int
+    height: int
+    frames: dict[str, dict[str, Any]]
+    cameras: dict[str, np.ndarray]
+    points: np.ndarray
+
+    @property
+    def cloud(self) -> str:
+        """The name of the points' file."""
+        return self.meta.get("ply_file_path", "sparse_pc.ply")
+
+    def project(self, camera: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Image points [P, 2], the lens's bend left out, and depths [P] of points [P, 3]."""
+        seen = (points - camera[:3, 3]) @ camera[:3, :3]
+        depth = seen[:, 2]
+        image = seen[:, :2] / depth[:, None]
+        return image @ self.intrinsics[:2, :2].T + self.intrinsics[:2, 2], depth
+
+
+@dataclass(frozen=True)
+class Thing:
+    """The object in the capture's frame.
+
+    Attributes:
+        foot: [3], the point on the surface that it stands on; height: its own, in the capture's unit.
+        axes: [3, 3], its sides, front and up (the surface's normal), a row each; half: [3] half extents along them.
+        shape: "box" or "ellipsoid".
+    """
+
+    foot: np.ndarray
+    height: float
+    axes: np.ndarray
+    half: np.ndarray
+    shape: str
+
+    @property
+    def normal(self) -> np.ndarray:
+        return self.axes[2]
+
+    @property
+    def middle(self) -> np.ndarray:
+        return self.foot + self.normal * self.half[2]
+
+
+class Views(NamedTuple):
+    """Names of photographs by azimuth about the object: all, and those of them that are test views."""
+
+    all: list[str]
+    test: list[str]
+
+    @property
+    def train(self) -> list[str]:
+        return [name for name in self.all if name not in self.test]
+
+
+def load(folder: Path) -> Photographs:
+    """ValueError where transforms.json or the points are missing."""
+    if not (folder / "transforms.json").exists():
+        raise ValueError(f"{folder} holds no transforms.json: it is no nerfstudio capture")
+    meta = io.load_json(folder / "transforms.json")
+    frames = {Path(frame["file_path"]).stem: frame for frame in meta.pop("frames")}
+    frames = {name: frame for name, frame in frames.items() if (folder / frame["file_path"]).exists()}
+    cloud = folder / meta.get("ply_file_path", "sparse_pc.ply")
+    if not cloud.exists():
+        raise ValueError(f"{cloud} is missing: a place needs the capture's points")
+    intrinsics = np.array([[meta["fl_x"], 0, meta["cx"]], [0, meta["fl_y"], meta["cy"]], [0, 0, 1.0]])
+    cameras = {name: np.array(frame["transform_matrix"], float) @ OPENGL for name, frame in frames.items()}
+    distortion = np.array([meta.get(key, 0.0) for key in ("k1", "k2", "p1", "p2")])
+    size = int(meta["w"]), int(meta["h"])
+    return Photographs(folder, meta, intrinsics, distortion, *size, frames, cameras, io.load_points(cloud)[0])
+
+
+def save_meta(capture: Photographs, names: list[str], path: Path) -> None:
+    """transforms.json of some views, whose pictures lie in images/<view>.png."""
+    frames = [capture.frames[name] | {"file_path": f"images/{name}.png"} for name in names]
+    path.write_text(json.dumps(capture.meta | {"frames": frames}, indent=1))
+
+
+def stand(capture: Photographs, place: Place) -> Thing:
+    """The object on the plane through the points around the place's pixel.
+
+    Raises:
+        ValueError: no such view, or too few points near the pixel.
+    """
+    if place.view not in capture.cameras:
+        raise ValueError(f"{place.name}: {capture.folder} has no photograph {place.view}")
+    camera = capture.cameras[place.view]
+    through, normal = _plane(_surface(capture, place))
+    up = -np.mean([other[:3, 1] for other in capture.cameras.values()], 0)
+    normal = normal if normal @ up > 0 else -normal
+    ray = camera[:3, :3] @ np.linalg.solve(capture.intrinsics, [*place.pixel, 1.0])
+    ray /= np.linalg.norm(ray)
+    foot = camera[:3, 3] + ray * ((through - camera[:3, 3]) @ normal) / (ray @ normal)
+    height = place.size * float(np.linalg.norm(foot - camera[:3, 3]))
+    across = np.cross(normal, ray)
+    across /= np.linalg.norm(across)
+    ahead = np.cross(across, normal)
+    c, s = np.cos(np.radians(TURN)), np.sin(np.radians(TURN))
+    axes = np.stack([c * across + s * ahead, c * ahead - s * across, normal])
+    return Thing(foot, height, axes, np.array(HALF) * height, place.shape)
+
+
+def _surface(capture: Photographs, place: Place) -> np.ndarray:
+    """The points [P, 3] of the surface in front around the place's pixel."""
+    image, depth = capture.project(capture.cameras[place.view], capture.points)
+    close = (depth > 0) & (np.linalg.norm(image - place.pixel, axis=1) < place.near)
+    if close.sum() < FEWEST:
+        found = f"{close.sum()} points within {place.near:g} px of its pixel"
+        raise ValueError(f"{place.name}: {found}, {FEWEST} are needed")
+    return capture.points[close & (depth < SLACK * np.percentile(depth[close], 20))]
+
+
+def _plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(a point [3] on it, normal [3]) of the plane through most of the points [P, 3]; the farthest are let go."""
+    for _ in range(5):
+        normal = np.linalg.svd(points - points.mean(0))[2][2]
+        off = np.abs((points - np.median(points, 0)) @ normal)
+        points = points[off <= max(np.percentile(off, 85), 1e-9)]
+    return np.median(points, 0), normal
+
+
+def azimuth(thing: Thing, base: np.ndarray, camera: np.ndarray) -> float:
+    """Degrees from camera `base` to another about the surface's normal."""
+    one, other = (_along(thing, at[:3, 3] - thing.foot) for at in (base, camera))
+    return float(np.degrees(np.arctan2(np.cross(one, other) @ thing.normal, one @ other)))
+
+
+def _along(thing: Thing, vector: np.ndarray) -> np.ndarray:
+    return vector - thing.normal * (vector @ thing.normal)
+
+
+def views_around(capture: Photographs, place: Place, thing: Thing) -> Views:
+    """Photographs that show the object, evenly taken, test views evenly among them.
+
+    Raises:
+        ValueError: too few to train on, or none to test with.
+    """
+    axis = np.stack([thing.foot, thing.middle, thing.foot + 2 * thing.normal * thing.half[2]])
+    base, angles = capture.cameras[place.view], {}
+    for name in sorted(capture.cameras):
+        camera = capture.cameras[name]
+        image, depth = capture.project(camera, axis)
+        angle = azimuth(thing, base, camera)
+        inside = (image > MARGIN).all() and (image < [capture.width - MARGIN, capture.height - MARGIN]).all()
+        if depth.min() > 0 and abs(angle) <= place.arc and inside:
+            angles[name] = angle
+    shown = sorted(angles, key=angles.__getitem__)
+    count = min(len(shown), place.train + place.test)
+    if count < 4:
+        raise ValueError(f"{place.name}: {count} photographs show the object, 4 are needed")
+    taken = [shown[k] for k in np.linspace(0, len(shown) - 1, count).round().astype(int)]
+    every = max(2, round(count / max(1, place.test)))
+    return Views(taken, taken[every // 2 :: every])

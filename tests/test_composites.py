@@ -1,0 +1,196 @@
+"""Composites of real captures: where the object stands, what its drawing touches, the table."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT / "benchmarks")]
+
+import composites  # noqa: E402
+import drawing  # noqa: E402
+import judging  # noqa: E402
+import placing  # noqa: E402
+
+from reffusion import io, lens  # noqa: E402
+
+WIDTH, HEIGHT = 96, 72
+LENS = {"fl_x": 80.0, "fl_y": 82.0, "cx": 47.0, "cy": 36.5, "k1": 0.05, "k2": -0.03, "p1": 0.002, "p2": -0.001}
+PLACE = placing.Place("here", "small", "v03", (48.0, 40.0), 0.25, 60.0, train=5, test=2, near=14.0)
+
+
+def camera_at(angle: float) -> np.ndarray:
+    """[4, 4] camera-to-world, on an arc 3 away from the origin and 2 above the ground y = 0."""
+    center = np.array([3 * np.sin(angle), 2.0, 3 * np.cos(angle)])
+    forward = -center / np.linalg.norm(center)
+    right = np.cross(forward, [0.0, 1.0, 0.0])
+    right /= np.linalg.norm(right)
+    camera = np.eye(4)
+    camera[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+    camera[:3, 3] = center
+    return camera
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory) -> Path:
+    """A folder with one capture: 8 noisy photographs of a flat ground with a bent lens; one has no file."""
+    folder, random = tmp_path_factory.mktemp("captures"), np.random.default_rng(0)
+    frames = []
+    for k, angle in enumerate(np.radians(np.linspace(-40, 40, 8))):
+        matrix = camera_at(angle) @ placing.OPENGL
+        frames.append({"file_path": f"images/v{k:02d}.png", "transform_matrix": matrix.tolist()})
+        photo = random.integers(60, 200, (HEIGHT, WIDTH, 3), np.uint8)
+        io.save_image(folder / f"small/images/v{k:02d}.png", photo)
+    frames.append({"file_path": "images/lost.png", "transform_matrix": np.eye(4).tolist()})
+    meta = {"w": WIDTH, "h": HEIGHT, "camera_model": "OPENCV", **LENS, "frames": frames}
+    (folder / "small/transforms.json").write_text(json.dumps(meta))
+    ground = random.uniform(-1.5, 1.5, (4000, 3)) * [1, 0, 1]
+    io.save_points(folder / "small/sparse_pc.ply", ground, np.full((4000, 3), 128, np.uint8))
+    return folder
+
+
+def scene_of(captures: Path, out: Path, place=PLACE, **options) -> Path:
+    drawing.write(place, placing.load(captures / place.capture), drawing.Options(**options), out)
+    return out
+
+
+def masks(scene: Path, folder: str = "masks") -> dict[str, np.ndarray]:
+    return {path.stem: io.load_mask(path) for path in sorted((scene / folder).glob("*.png"))}
+
+
+def through_lens(capture: placing.Photographs, name: str, points: np.ndarray) -> np.ndarray:
+    """Image points [P, 2] by the project's own lens."""
+    of = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
+    bent = lens.from_colmap("OPENCV", WIDTH, HEIGHT, tuple(LENS[key] for key in of))
+    camera = capture.cameras[name]
+    seen = (points - camera[:3, 3]) @ camera[:3, :3]
+    return lens.to_pixels(lens.distort(seen[:, :2] / seen[:, 2:], bent), bent)
+
+
+def test_the_object_stands_on_the_ground_where_it_was_pointed_at(captures):
+    capture = placing.load(captures / "small")
+    assert sorted(capture.cameras) == [f"v{k:02d}" for k in range(8)]
+    thing = placing.stand(capture, PLACE)
+    np.testing.assert_allclose(thing.normal, [0, 1, 0], atol=1e-9)
+    assert abs(thing.foot[1]) < 1e-9
+    image, depth = capture.project(capture.cameras["v03"], thing.foot[None])
+    np.testing.assert_allclose(image[0], PLACE.pixel, atol=1e-6)
+    distance = np.linalg.norm(thing.foot - capture.cameras["v03"][:3, 3])
+    assert thing.height == pytest.approx(0.25 * distance) and depth[0] > 0
+
+
+@pytest.mark.parametrize("shape", ["box", "ellipsoid"])
+def test_masks_are_the_projected_object(captures, tmp_path, shape):
+    """The hull of the object's projected surface covers the mask, and the mask covers it, but for a pixel."""
+    place, capture = replace(PLACE, shape=shape), placing.load(captures / "small")
+    thing, scene = placing.stand(capture, place), scene_of(captures, tmp_path / "scene", place)
+    unit = np.random.default_rng(1).normal(size=(4000, 3))
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True) if shape == "ellipsoid" else np.abs(unit).max(1, keepdims=True)
+    surface = thing.middle + (unit * thing.half) @ thing.axes
+    for name, mask in {**masks(scene), **masks(scene, "test_masks")}.items():
+        outline = cv2.convexHull(np.round(16 * (through_lens(capture, name, surface) - 0.5)).astype(np.int32))
+        hull = np.zeros(mask.shape, np.uint8)
+        cv2.fillConvexPoly(hull, outline, 1, shift=4)
+        ring = np.ones((3, 3), np.uint8)
+        assert not (mask & (cv2.dilate(hull, ring) == 0)).any()
+        assert not ((cv2.erode(hull, ring) > 0) & ~mask).any()
+
+
+def test_only_masked_pixels_of_training_photographs_change(captures, tmp_path):
+    scene = scene_of(captures, tmp_path / "scene")
+    yes = yaml.safe_load((scene / "scene.yaml").read_text())
+    train, test = masks(scene), masks(scene, "test_masks")
+    assert len(train) == 5 and sorted(test) == sorted(yes["test"]) and not set(train) & set(test)
+    assert yes["reference"]["view"] in train
+    for name in (*train, *test):
+        photo, truth, before = (
+            io.load_image(folder / f"{name}.png")
+            for folder in (scene / "images", scene / "truth", captures / "small/images")
+        )
+        assert np.array_equal(truth, before)
+        drawn = train.get(name, np.zeros(photo.shape[:2], bool))
+        assert np.array_equal(photo[~drawn], before[~drawn])
+        assert name in test or (photo[drawn] != before[drawn]).any(1).mean() > 0.9
+
+
+def test_a_shadow_darkens_the_ground_outside_the_masks(captures, tmp_path):
+    plain = scene_of(captures, tmp_path / "plain")
+    shaded = scene_of(captures, tmp_path / "shaded", shadow=0.6)
+    for name, mask in masks(plain).items():
+        assert np.array_equal(mask, masks(shaded)[name])
+        before, after = (io.load_image(s / f"images/{name}.png")[~mask].astype(int) for s in (plain, shaded))
+        assert (after <= before).all()
+        assert (after < 0.6 * before).any(1).sum() > 10
+    for name in masks(plain, "test_masks"):
+        assert np.array_equal(*(io.load_image(s / f"images/{name}.png") for s in (plain, shaded)))
+
+
+def test_rough_masks_are_wrong_by_no_more_than_they_may(captures, tmp_path):
+    """Grown or shrunk by at most 3 px, and shifted by at most 3: no border is more than 6 px away along an axis."""
+    plain, rough = scene_of(captures, tmp_path / "plain"), scene_of(captures, tmp_path / "rough", rough=3)
+    far, wrong = np.ones((13, 13), np.uint8), 0
+    for name, mask in masks(plain).items():
+        found = masks(rough)[name]
+        assert not (found & (cv2.dilate(mask.astype(np.uint8), far) == 0)).any()
+        assert not ((cv2.erode(mask.astype(np.uint8), far) > 0) & ~found).any()
+        wrong += (found != mask).any()
+        assert np.array_equal(*(io.load_image(s / f"images/{name}.png") for s in (plain, rough)))
+    assert wrong >= 4
+    exact = masks(plain, "test_masks")
+    assert all(np.array_equal(mask, exact[name]) for name, mask in masks(rough, "test_masks").items())
+
+
+def test_the_untouched_scene_has_the_same_views_and_nothing_to_remove(captures, tmp_path):
+    options = drawing.Options()
+    scene, untouched = composites.made(PLACE, captures, options, tmp_path)
+    told = (untouched / "scene.yaml").stat().st_mtime_ns
+    assert yaml.safe_load((untouched / "scene.yaml").read_text())["masks"] == "none"
+    assert (untouched / "transforms.json").read_text() == (scene / "transforms.json").read_text()
+    for name in masks(scene):
+        same = io.load_image(untouched / f"images/{name}.png"), io.load_image(scene / f"truth/{name}.png")
+        assert np.array_equal(*same)
+    composites.made(PLACE, captures, options, tmp_path)
+    assert (untouched / "scene.yaml").stat().st_mtime_ns == told
+    alone, _ = composites.made(PLACE, captures, replace(options, reference=False), tmp_path)
+    assert alone != scene and "reference" not in yaml.safe_load((alone / "scene.yaml").read_text())
+
+
+def test_a_place_without_a_surface_is_an_error(captures):
+    capture = placing.load(captures / "small")
+    with pytest.raises(ValueError, match="points within"):
+        placing.stand(capture, replace(PLACE, near=0.1))
+    with pytest.raises(ValueError, match="no photograph"):
+        placing.stand(capture, replace(PLACE, view="lost"))
+    with pytest.raises(ValueError, match="no transforms"):
+        placing.load(captures)
+
+
+def test_without_captures_it_is_skipped(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["composites.py", "--captures", str(tmp_path / "none")])
+    assert composites.main() == 0
+    said = capsys.readouterr().out
+    assert len(said.splitlines()) == 1 and "skipped" in said
+
+
+def test_the_sets_share_no_place_and_unknown_ones_are_named():
+    names = [place.name for place in (*composites.CHOOSE, *composites.REPORT)]
+    assert len(set(names)) == len(names) == 9
+    assert composites.chosen("bear-rim,table", report=False) == (composites.REPORT[3], composites.CHOOSE[0])
+    with pytest.raises(ValueError, match="no place is called moon"):
+        composites.chosen("moon", report=False)
+
+
+def test_the_table_has_a_row_a_place():
+    scores = {"psnr": 21.234, "ssim": 0.6, "flip": None}
+    row = {"place": "here", **dict.fromkeys(judging.WAYS, scores), "seconds": 61.6}
+    row |= {"sharpness": {"result": 0.8, "ceiling": None}, "uncovered": {"train": 0.001, "test": 0.0125}}
+    assert "| here | 21.23 / 0.600 / - |" in judging.table([row])
+    assert judging.table([row]).splitlines()[-1].endswith("| 0.80 | - | 0.10 | 1.25 | 62 |")

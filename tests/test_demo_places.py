@@ -1,0 +1,113 @@
+"""The generator's harder places: before the object something stays, a table's edge, a wall's corner, foliage."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+
+@pytest.mark.parametrize(
+    ("name", "mask", "share"),
+    [("behind", 0.06, 0.6), ("table", 0.05, 0.05), ("corner", 0.1, 0.4), ("grass", 0.1, 0.5)],
+)
+def test_harder_places_have_masks_of_the_demos_size(generate, tmp_path, name, mask, share):
+    for seed in (0, 11):
+        facts = generate.generate(tmp_path / f"{name}{seed}", seed, small(generate.KINDS[name]))
+        assert share <= min(facts["never_seen_share"].values()) < 0.9
+        assert mask < facts["mask_share"]["train"] < 0.25
+
+
+def small(kind):
+    """A kind at the size of a stamp."""
+    return replace(kind, width=48, height=36, samples=1, train=24, test=6, texture=256, node=0.4, points=60)
+
+
+def shot(generate, kind, seed: int):
+    """(solids, cameras of the training views, what `photographs.photographed` makes) of a scene."""
+    import photographs
+
+    furniture, target = generate.furnish(seed, kind)
+    world = generate.bake(furniture, seed, kind)
+    session = photographs.photographed(seed, kind, world, target)
+    return world.solids, session.cameras[kind.test :], session
+
+
+def test_what_stays_hides_a_part_of_the_hole_from_the_reference_only(generate):
+    import photographs
+    import raycast
+
+    kind = small(generate.KINDS["behind"])
+    for seed in (0, 1, 2):
+        solids, cameras, session = shot(generate, kind, seed)
+        without = solids._replace(**{f: v[~solids.removable] for f, v in solids._asdict().items()})
+        unseen = [
+            raycast.surface_points(solids, session.cameras[k], photographs.pixel_centers(session.hidden[k]), False)[0]
+            for k in range(kind.test, kind.test + kind.train)
+        ]
+        seen = np.isfinite(
+            raycast.observations(without, cameras, kind.width, kind.height, np.concatenate(unseen))[..., 0]
+        )
+        reference = session.middle - kind.test
+        assert 0.05 < 1 - seen[:, reference].mean() < 0.6
+        assert seen.any(1).mean() > 0.99
+
+
+def test_the_table_stands_in_free_space(generate):
+    """Under its top low cameras see what high ones do not, and the object reaches beyond its edge."""
+    kind = small(generate.KINDS["table"])
+    solids, cameras, session = shot(generate, kind, 0)
+    top = next(n for n in range(len(solids.kind)) if solids.half[n, 1] == 0.02 and not solids.removable[n])
+    chest = np.flatnonzero(solids.removable)[0]
+    (_, y, z), (_, thick, deep) = solids.center[top], solids.half[top]
+    assert cameras[:, 14].min() < y - thick < y + 0.4 < cameras[session.middle - kind.test, 14]
+    edge, front = z + deep, solids.center[chest, 2] + solids.half[chest, 2]
+    assert edge < front < edge + 0.1 and solids.center[chest, 2] < edge
+    assert solids.center[chest, 1] - solids.half[chest, 1] == pytest.approx(y + thick)
+
+
+def test_behind_the_object_a_corner_makes_a_step(generate):
+    """Without the object the hole of one view shows the jutting wall and what is far behind its edge."""
+    import photographs
+    import raycast
+
+    kind = small(generate.KINDS["corner"])
+    solids, cameras, session = shot(generate, kind, 0)
+    pixels = photographs.pixel_centers(session.masks[session.middle])
+    points, which = raycast.surface_points(solids, cameras[session.middle - kind.test], pixels, False)
+    wall = next(n for n in range(len(solids.kind)) if solids.half[n, 1] == 1.35 and n > 0)
+    back = (which == 0) & (points[:, 1] > 0.01) & (points[:, 2] < 0.01)
+    assert (which == wall).mean() > 0.2 and back.mean() > 0.1
+    assert points[which == wall, 2].max() > 0.4
+
+
+def test_leaves_are_where_the_rays_meet_them(generate):
+    """Walking from cell to cell finds the same leaf as looking back along the ray, and none that it skipped."""
+    import raycast
+    import solids as solid
+    from furniture import Furniture, Material
+
+    f = Furniture()
+    f.room((0, 2, 0), (4, 2, 4), *[Material("white")] * 6)
+    f.thicket(0.1, 0.5, 0.2, (0.9, 0.8, 0.7), 0.1, (0.06, 0.09, 0.01, 80), Material("white"), 5, yaw=30)
+    thing, _ = f.arrays({"white": 0}, 0.4)
+    draw = np.random.default_rng(0)
+    centers, aims = draw.uniform(-1, 1, (40, 3)) * [3.5, 1.5, 3.5] + [0, 2, 0], draw.uniform(-0.3, 0.3, (40, 3))
+    aims += np.array([0.1, 0.9, 0.2])
+    hits = 0
+    for center, aim in zip(centers, aims, strict=True):
+        way = (aim - center) / np.linalg.norm(aim - center)
+        far = solid.distance(thing, 1, *center, *way)
+        if far > 1e20:
+            continue
+        hits += 1
+        point = center + far * way
+        face, u, v, *normal = solid.surface(thing, 1, *point)
+        assert face == 6 and 0 <= u <= 0.9 and 0 <= v <= 0.8
+        assert np.linalg.norm(normal) == pytest.approx(1) and np.dot(normal, way) < 0
+        # A step before it the leaf is still the first thing ahead, or another one nearer; behind it nothing is seen.
+        assert solid.distance(thing, 1, *(point - 0.02 * way), *way) <= 0.02 + 1e-9
+        camera = np.array([1, 0, 0, 0, *np.eye(3).ravel(), *center])
+        assert not raycast._reaches(thing, camera, True, *(point + 0.02 * way))
+    assert hits > 20
