@@ -186,7 +186,8 @@ def _aligned(picture: np.ndarray, photo: np.ndarray, known: np.ndarray, start: n
     for level in range(levels, -1, -1):
         size = (max(2, width >> level), max(2, height >> level))
         scale = np.array(size) / (width, height)
-        shrunk = (cv2.resize(cv2.GaussianBlur(each, (0, 0), 1.0), size, interpolation=cv2.INTER_AREA) for each in (a, b))
+        blurred = (cv2.GaussianBlur(each, (0, 0), 1.0) for each in (a, b))
+        shrunk = (cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in blurred)
         seen = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.9
         moved = _solved(*shrunk, seen, _scaled(moved, scale))
         if moved is None:

@@ -77,8 +77,8 @@ class Provided(Strict):
 
 
 class Stage(Strict):
-    """needs: earlier stages, or `scene`. optional: needs that may be left out, and then arrive as None. hands_out: folders
-    of its artifact that people work with, copied to runs/<scene>/ where they outlive it."""
+    """needs: earlier stages, or `scene`. optional: needs that may be left out, and then arrive as None. hands_out:
+    folders of its artifact that people work with, copied to runs/<scene>/ where they outlive it."""
 
     needs: tuple[str, ...]
     optional: tuple[str, ...] = ()
