@@ -54,6 +54,17 @@ class Registration:
         """Is it a picture of this view? Yes where nothing can be said."""
         return not self.agrees < ACCEPTED
 
+    @property
+    def misfit(self) -> str:
+        """How badly it fits, in words."""
+        moved = (
+            f"moved by up to {self.shift:.0f} px and its colours matched" if self.moved is not None else "as it lies"
+        )
+        return (
+            f"{moved}, only {self.agrees:.0%} of what it shows around the hole agrees with the photograph "
+            f"(at least {ACCEPTED:.0%} must; correlation {self.correlation:.2f})"
+        )
+
     def __str__(self) -> str:
         if np.isnan(self.agrees):
             return "what it shows around the hole is too plain to be compared"

@@ -149,13 +149,12 @@ def fitted(given: GivenReference, sets: MaskSet, scene: Scene, poses: Path, fit:
     photo, hidden = views[given.view], sets.raw | sets.consistent | sets.invent
     image, inside = io.load_straight(given, lens, upright)
     found = registration.register(image, photo, hidden)
-    print(f"reference {given.view}: {found}", flush=True)
     if not found.fits:
         raise ValueError(
-            f"{given.path}: does not fit its view '{given.view}': at best {found}, and at least "
-            f"{registration.ACCEPTED:.0%} must (correlation {found.correlation:.2f}); "
+            f"{given.path}: does not fit its view '{given.view}': {found.misfit}; "
             "is it of another view, or of another scene?"
         )
+    print(f"reference {given.view}: {found}", flush=True)
     if not found.untouched:
         image, inside = io.load_straight(given, lens, upright, found.moved)
         image = registration.recolored(image, found.gain, found.offset)
