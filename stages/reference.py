@@ -185,6 +185,8 @@ def lay_out(folder: Path, painted: list[str], scene: Scene, poses: Path, fit: Pa
         io.save_mask(folder / f"{name}_mask.png", invent[name])
     if views:
         io.save_text(folder / "ranked.txt", painting.words(views, painted))
+        names = ", ".join(f"{each.view} ({each.share:.0%})" for each in views)
+        print(f"to be painted by hand, and what each covers more: {names}; see {TO_PAINT}/ranked.txt", flush=True)
 
 
 def inpainted(params: Params, out: Path, scene, poses: Path, fit: Path, masks: Path):
