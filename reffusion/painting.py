@@ -99,19 +99,18 @@ def ranked(holes: Mapping[str, Hole], chosen: Sequence[str], most: int) -> list[
     if not total:
         return []
     left, result = np.ones(total, bool), []
-    whole = [name for name in holes if not _cut_off(holes[name])]
     named = [name for name in chosen if name in holes]
-    for position in range(len(named) + most):
-        taken = {each.view for each in result}
-        candidates = named[position : position + 1] or sorted(set(whole or holes) - taken)
-        if not candidates:
-            break
-        best = max(candidates, key=lambda name: int((covers[name] & left).sum()))
-        share = float((covers[best] & left).sum() / total)
-        if position >= len(named) and share < LEAST:
-            break
-        result.append(Ranked(best, share))
-        left &= ~covers[best]
+    cut_off = {name for name in holes if _cut_off(holes[name])}
+    groups = [([name], 1, 0.0) for name in named] + [(set(holes) - cut_off, most, LEAST), (cut_off, most, LEAST)]
+    for group, count, least in groups:
+        for _ in range(min(count, len(named) + most - len(result))):
+            candidates = sorted(set(group) - {each.view for each in result})
+            gains = {name: int((covers[name] & left).sum()) for name in candidates}
+            best = max(candidates, key=gains.__getitem__, default=None)
+            if best is None or gains[best] < least * total:
+                break
+            result.append(Ranked(best, gains[best] / total))
+            left &= ~covers[best]
     return result
 
 
