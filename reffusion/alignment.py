@@ -19,6 +19,8 @@ REWEIGHTINGS = 30
 TRIALS = 1000  # of two pixels: of 10% inliers both are in one of a hundred; all miss them once in 20,000 times
 JURY = 500  # pixels that judge a trial: of 10% inliers 50 agree with the right line, with a wrong one a handful
 SUPPORTS = 32  # numbers of agreeing pixels that are looked at
+DISAGREES = 0.7  # of the spread of what is known: half the pixels missing by more, and a map says nothing of the scene
+LEAST_DISPARITY = 0.02  # relative; a scene that varies less is flat, and any map that is right to this fits
 
 
 @dataclass(frozen=True)
@@ -205,3 +207,48 @@ def align_depth(
         nearest = depth[weights > 0].min()
         return np.where(aligned > 0, aligned, nearest)
     return np.divide(1.0, aligned, out=np.full(aligned.shape, farthest), where=aligned > 1.0 / (1e3 * farthest))
+
+
+def align_either(estimate: np.ndarray, depth: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, Space]:
+    """A depth map of unknown kind brought to the scene's: (depth [H, W] float64 camera z, what the map is affine in).
+
+    It is taken as depth and as disparity, each with a scale and an offset, robustly; of the two that rise with the
+    scene's the one that comes nearer in disparity is kept.
+
+    Args:
+        estimate: [H, W], depth or disparity of any scale and offset; NaN where it says nothing.
+        depth: [H, W] the scene's depth, read where `known`.
+        known: bool or weights [H, W]; pixels of depth <= 0 do not count.
+
+    Returns:
+        depth, NaN where the estimate is; beyond infinity the largest, before the camera the smallest known depth.
+
+    Raises:
+        Degenerate: too few known pixels, or a map that is constant there.
+        ValueError: the map falls where the scene's depth and disparity grow, or agrees with neither.
+    """
+    said = np.isfinite(estimate)
+    estimate, depth = np.where(said, estimate, 0.0).astype(np.float64), np.asarray(depth, np.float64)
+    weights = np.asarray(known, np.float64) * (depth > 0) * said
+    shown = weights > 0
+    found: dict[Space, tuple[float, np.ndarray]] = {}
+    for space in ("disparity", "depth"):
+        try:
+            aligned = align_depth(estimate, depth, weights, space=space, robust=True)
+        except Degenerate:
+            raise
+        except ValueError:
+            continue
+        found[space] = (float(np.median(np.abs(1 / aligned[shown] - 1 / depth[shown]))), aligned)
+    if not found:
+        raise ValueError("the depth map falls where the scene's depth grows, and where its disparity does; invert it")
+    space = min(found, key=lambda each: found[each][0])
+    error, aligned = found[space]
+    disparity = 1 / depth[shown]
+    spread = float(np.median(np.abs(disparity - np.median(disparity))))
+    if error > DISAGREES * max(spread, LEAST_DISPARITY * float(np.median(disparity))):
+        raise ValueError(
+            f"the depth map does not fit what is seen: half of it misses by {error / np.median(disparity):.0%} of the "
+            f"disparity or more, and the scene's own varies by {spread / np.median(disparity):.0%}"
+        )
+    return np.where(said, aligned, np.nan), space

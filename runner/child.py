@@ -20,14 +20,17 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from runner.keys import files_below
+
 INTERRUPTED = 130
 
 
 def describe() -> None:
     """Standard input: {stage: {"params": asked for, "takes": names of needs, "needs": their paths (for a preview),
-    "brings": keys of scene.yaml}}; standard output: `_describe` of each.
+    "brings": keys of scene.yaml and its folders, "scene": its folder}}; standard output: `_describe` of each.
 
-    Costs the import of pydantic and of the stage modules, which import nothing heavy at their top.
+    Costs the import of pydantic and of the stage modules, which import nothing heavy at their top, and what a stage
+    needs to tell which files of the scene it reads.
     """
     question = json.load(sys.stdin)
     answer_to, sys.stdout = sys.stdout, sys.stderr  # whatever a module prints must not mix with the answer
@@ -40,9 +43,10 @@ def _describe(
     takes: list[str],
     needs: dict[str, str | None] | None = None,
     brings: list[str] | None = None,
+    scene: str | None = None,
 ) -> dict[str, Any]:
-    """All parameters, the names of those that name weights, and where `brings` is given the weights themselves; or
-    errors in them; or why the stage is "broken"."""
+    """All parameters, the names of those that name weights, and where `brings` is given the weights themselves; where
+    `scene` is, the files of the scene it "reads" (None: all); or errors in them; or why the stage is "broken"."""
     try:
         stage = importlib.import_module(f"stages.{name}")
         inspect.signature(stage.run).bind(None, None, **dict.fromkeys(takes))
@@ -52,6 +56,7 @@ def _describe(
     marked = {field: info.json_schema_extra for field, info in fields.items()}
     answer: dict[str, Any] = {
         "params": {}, "errors": [], "known": list(fields), "notes": [], "refusal": None, "broken": None, "needed": [],
+        "reads": None,
         "weights": [field for field, extra in marked.items() if isinstance(extra, dict) and extra.get("weights")],
     }  # fmt: skip
     try:
@@ -62,6 +67,9 @@ def _describe(
     answer["params"] = resolved.model_dump(mode="json")
     if brings is not None and hasattr(stage, "needed_weights"):
         answer["needed"] = [asdict(need) for need in stage.needed_weights(resolved, frozenset(brings))]
+    if scene is not None and hasattr(stage, "scene_files"):
+        files = stage.scene_files(resolved, Path(scene), list(files_below(Path(scene))))
+        answer["reads"] = sorted(str(path) for path in files)
     if needs is not None and hasattr(stage, "preview"):
         try:
             answer["notes"] = list(stage.preview(resolved, **{n: p and Path(p) for n, p in needs.items()}))

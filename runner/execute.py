@@ -20,6 +20,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from runner.handout import hand_out
 from runner.job import Job, Request, child, prepare, source_of
 from runner.pipeline import SCENE, Refused
 from runner.plan import MACHINE, RECEIPT, Decision, decide, expected_seconds, partial_folder, plan, receipt, table
@@ -112,6 +113,8 @@ def run_stage(job: Job, stage: str, decision: Decision, earlier: dict[str, Decis
         result = _in_child(job, stage, partial, earlier, lock)
         say(f"{stage}: done in {result['seconds']:.1f} s, {result['peak_memory_mb']} MB")
         write_json(partial / RECEIPT, _receipt(job, stage, decision, partial, resumed, result))
+    for line in hand_out(partial, place, job.home, job.pipeline.stages[stage].hands_out):
+        say(line)
     put_in_place(partial, place)
     for other in job.home.glob(f".partial-{stage}-*"):
         discard(other)

@@ -6,7 +6,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from typing import Any
 from runner.budget import seconds_of, shared_out
 from runner.keys import Hashes
 from runner.pipeline import (
+    SCENE,
     Layers,
     Overrides,
     Pipeline,
@@ -51,11 +52,11 @@ class Job:
         base: runs/<scene>.
         why: what made the choice of the profile.
         brings: the keys of scene.yaml that have values.
+        reads: stage -> the files of the scene that it reads; stages that do not tell (they read all) are left out.
         params: stage -> every parameter.
         broken: stages without parameters here, because their file is missing or is no stage -> what is wrong.
         weights: stage -> names of the parameters that name weights.
         needed: stage -> the weights it works with, as it says of itself (reffusion.weights.Need).
-        outside: files or folders named by the scene's parameters that lie outside its folder.
     """
 
     root: Path
@@ -73,7 +74,7 @@ class Job:
     broken: dict[str, str]
     weights: dict[str, tuple[str, ...]]
     needed: dict[str, list[dict[str, Any]]]
-    outside: tuple[Path, ...]
+    reads: dict[str, tuple[Path, ...]]
     hashes: Hashes
 
     @property
@@ -98,9 +99,8 @@ def prepare(request: Request) -> Job:
     if request.budget or scene.budget is not None:
         origin, text = ("budget", request.budget) if request.budget else (str(scene.path), scene.budget)
         layers = layered(*given, shared_out(pipeline, layers.values, seconds_of(text, origin)))
-    described, broken = described_stages(root, pipeline, layers, sorted(scene.brings))
+    described, broken = described_stages(root, pipeline, layers, brought(scene.brings, folder), folder)
     params = {name: answer["params"] for name, answer in described.items()}
-    scene_params = [params[stage] for stage in pipeline.scene_keys if stage in params]
     return Job(
         root=root,
         runs=runs,
@@ -117,7 +117,7 @@ def prepare(request: Request) -> Job:
         broken=broken,
         weights={name: tuple(answer["weights"]) for name, answer in described.items()},
         needed={name: answer["needed"] for name, answer in described.items()},
-        outside=tuple(_outside(scene_params, folder)),
+        reads={name: tuple(map(Path, of)) for name, a in described.items() if (of := a["reads"]) is not None},
         hashes=Hashes(runs / ".hashes.json"),
     )
 
@@ -138,11 +138,16 @@ def _one_folder_a_name(base: Path, folder: Path, root: Path) -> None:
             )
 
 
-def _outside(value: Any, folder: Path) -> Iterator[Path]:
+def brought(keys: Iterable[str], folder: Path) -> list[str]:
+    """What a scene brings of itself: the keys of its scene.yaml, and the names of its folders."""
+    return sorted({*keys, *(path.name for path in folder.iterdir() if path.is_dir())})
+
+
+def outside(value: Any, folder: Path) -> Iterator[Path]:
     """Files and folders named anywhere in `value`, relative to the scene, that the scene's folder does not hold."""
     if isinstance(value, dict | list):
         for part in value.values() if isinstance(value, dict) else value:
-            yield from _outside(part, folder)
+            yield from outside(part, folder)
     elif isinstance(value, str) and value and "\0" not in value and len(value) < 1024:
         path = (folder / value).resolve()
         if ("/" in value or os.sep in value) and not path.is_relative_to(folder) and path.exists():
@@ -169,13 +174,19 @@ def ask(root: Path, question: dict[str, Any]) -> dict[str, Any]:
 
 
 def described_stages(
-    root: Path, pipeline: Pipeline, layers: Layers, brings: list[str]
+    root: Path, pipeline: Pipeline, layers: Layers, brings: list[str], scene: Path | None = None
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """stage -> `child._describe` of it, and broken stages; refuses the first wrong parameter."""
     broken = {name: f"stages/{name}.py: no such file, and pipeline.yaml names it" for name in pipeline.stages}
     here = [name for name in pipeline.stages if (root / "stages" / f"{name}.py").is_file()]
     questions = {
-        name: {"params": layers.values[name], "takes": pipeline.stages[name].takes, "brings": brings} for name in here
+        name: {
+            "params": layers.values[name],
+            "takes": pipeline.stages[name].takes,
+            "brings": brings,
+            "scene": str(scene) if scene and SCENE in pipeline.stages[name].takes else None,
+        }
+        for name in here
     }
     described = {}
     for stage, answer in ask(root, questions).items():

@@ -6,7 +6,7 @@ import ast
 import hashlib
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -57,12 +57,12 @@ class Hashes:
 
     def folder(self, folder: Path, leave_out: tuple[str, ...] = NOT_CONTENT) -> str:
         """Names and contents of all files below `folder`, but hidden ones and those at its top in `leave_out`."""
-        parts = []
-        for path in files_below(folder):
-            name = path.relative_to(folder).as_posix()
-            if name not in leave_out:
-                parts += [name, self.file(path)]
-        return digest(*parts)
+        files = (path for path in files_below(folder) if path.relative_to(folder).as_posix() not in leave_out)
+        return self.files(folder, files)
+
+    def files(self, folder: Path, files: Iterable[Path]) -> str:
+        """Names as seen from `folder` and contents of these files, in this order."""
+        return digest(*(part for path in files for part in (os.path.relpath(path, folder), self.file(path))))
 
     def weights(self, folder: Path) -> str:
         """Of a model's folder: what a library may read of it. Writing in its card reruns nothing."""

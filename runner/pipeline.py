@@ -77,12 +77,14 @@ class Provided(Strict):
 
 
 class Stage(Strict):
-    """needs: earlier stages, or `scene`. optional: needs that may be left out, and then arrive as None."""
+    """needs: earlier stages, or `scene`. optional: needs that may be left out, and then arrive as None. hands_out:
+    folders of its artifact that people work with, copied to runs/<scene>/ where they outlive it."""
 
     needs: tuple[str, ...]
     optional: tuple[str, ...] = ()
     provided: Provided | None = None
     left_out: tuple[Condition, ...] = ()
+    hands_out: tuple[str, ...] = ()
     params: dict[str, Any] = {}
 
     @property

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from runner.job import Job, ask
+from runner.job import Job, ask, outside
 from runner.keys import Inputs, changes, code_changes, code_of, files_below
 from runner.pipeline import SCENE, Condition, Refused, has_cuda
 
@@ -134,9 +134,11 @@ def _missing_weights(job: Job, stage: str) -> str | None:
 
 def _inputs(job: Job, stage: str, needs: dict[str, Path | None], code: dict[str, str]) -> Inputs:
     hashes = {need: path and job.hashes.folder(path) for need, path in needs.items()}
-    if SCENE in job.pipeline.stages[stage].takes:
+    if stage in job.reads:
+        hashes[SCENE] = job.hashes.files(job.folder, job.reads[stage])
+    elif SCENE in job.pipeline.stages[stage].takes:
         hashes[SCENE] = job.hashes.folder(job.folder, leave_out=("scene.yaml",))
-        for path in job.outside:
+        for path in outside(job.params[stage], job.folder):
             hashes[str(path)] = job.hashes.folder(path) if path.is_dir() else job.hashes.file(path)
     weights = {}
     for param in job.weights[stage]:
@@ -213,16 +215,29 @@ def plan(job: Job, stages: list[str], done: dict[str, Decision] | None = None) -
     asked = {}
     for stage in stages:
         spec = job.pipeline.stages[stage]
-        needs = {need: job.folder if need == SCENE else decisions[need].path for need in spec.takes}
-        if decisions[stage].word in ("run", "stale", "undecided") and all(needs[need] for need in spec.needs):
+        needs = _previewed(job, stage, decisions)
+        if decisions[stage].word in ("run", "stale", "undecided") and (
+            SCENE in needs or all(needs[need] for need in spec.needs)
+        ):
             paths = {need: path and str(path) for need, path in needs.items()}
             asked[stage] = {"params": job.params[stage], "takes": spec.takes, "needs": paths}
     for stage, answer in (ask(job.root, asked) if asked else {}).items():
         decisions[stage] = replace(decisions[stage], notes=(*answer["notes"], *decisions[stage].notes))
-        if answer["refusal"] and decisions[stage].inputs:  # its needs are what they will be
+        # what it looked at is what it will be
+        if answer["refusal"] and (decisions[stage].inputs or SCENE in job.pipeline.stages[stage].takes):
             decisions[stage] = replace(decisions[stage], word="missing", reason=answer["refusal"])
     job.hashes.save()
     return {stage: decisions[stage] for stage in stages}
+
+
+def _previewed(job: Job, stage: str, decisions: dict[str, Decision]) -> dict[str, Path | None]:
+    """What a stage may look at beforehand: its needs as they stand. One that reads the scene is asked, and may refuse,
+    before its other needs are made; of these it is shown only what will not change any more."""
+    takes = job.pipeline.stages[stage].takes
+    others = {need: decisions[need] for need in takes if need != SCENE}
+    if SCENE not in takes:
+        return {need: decision.path for need, decision in others.items()}
+    return {SCENE: job.folder} | {need: each.path if each.settled else None for need, each in others.items()}
 
 
 def table(job: Job, decisions: dict[str, Decision]) -> str:

@@ -6,7 +6,7 @@ import json
 import sys
 from typing import Any
 
-from runner.job import Request, child, described_stages, prepare
+from runner.job import Request, brought, child, described_stages, prepare
 from runner.pipeline import Refused, SceneFile, choose_profile, layered, load_pipeline, parse_set
 from runner.plan import amount
 
@@ -43,10 +43,10 @@ def weights(request: Request, offline: bool) -> int:
 
 
 def _asked(request: Request) -> tuple[str, str, dict[str, Any], dict[str, list[dict[str, Any]]], list[str]]:
-    """(profile, why, params of each stage, weights of each stage, keys the scene brings)."""
+    """(profile, why, params of each stage, weights of each stage, what the scene brings)."""
     if request.scene:
         job = prepare(request)
-        return job.profile, job.why, job.params, job.needed, sorted(job.brings)
+        return job.profile, job.why, job.params, job.needed, brought(job.brings, job.folder)
     pipeline = load_pipeline(request.root)
     if request.variant and request.variant not in pipeline.variants:
         raise Refused(f"unknown variant {request.variant!r}; known: {', '.join(pipeline.variants) or 'none'}")

@@ -15,14 +15,8 @@ if TYPE_CHECKING:
     from reffusion.types import Scene
 
 STRICT = ConfigDict(extra="forbid", frozen=True)
-
-
-class GivenReference(BaseModel):
-    model_config = STRICT
-
-    view: str = Field(description="name of the view it completes")
-    image: str = Field(description="picture, relative to the scene, in its view's proportions")
-    undistorted: bool = Field(False, description="painted over `poses`' own undistorted image, not over the photo")
+# pictures count where they are photographs or masks; depth maps belong to references
+NOT_READ = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".npy", ".exr")
 
 
 class Region(BaseModel):
@@ -42,7 +36,6 @@ class Params(BaseModel):
     train: list[str] | str | None = Field(None, description='view names, or "every N"; None: all that are not test')
     test: list[str] | str | None = Field(None, description='view names, or "every N"; None: those of the test masks')
     clean: list[str] = Field([], description="training views in which the object is absent")
-    reference: GivenReference | list[GivenReference] | None = Field(None, description="completed views of the scene's")
     gaussians: str | None = Field(None, description=".ply the scene brings in its own frame, 3DGS layout")
     region: Region | None = Field(None, description="3D box that holds the object, or is to be filled")
     longest: int = Field(1600, ge=16, description="larger image side in px; smaller pictures stay as they are")
@@ -53,10 +46,19 @@ class Params(BaseModel):
     more_points: int = Field(10_000, ge=1, description="how many at most; random ones, where flow finds too few")
     seed: int = 0
 
-    @property
-    def references(self) -> list[GivenReference]:
-        given = self.reference
-        return [] if given is None else given if isinstance(given, list) else [given]
+
+def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
+    """Of the scene's files those that this stage reads, and what it reads elsewhere: the photographs and masks, and
+    all that is neither a picture nor a depth map. So a new reference, wherever it lies, reruns nothing here."""
+    others = [path for path in files if path.parent != scene or path.name != "scene.yaml"]
+    try:
+        capture, roles = _read(params, scene)
+    except ValueError:  # `preview` refuses it
+        return others
+    read = {*capture.pictures.values(), *roles.masks.values(), *roles.test_masks.values()}
+    read |= {scene / params.gaussians} if params.gaussians is not None else set()
+    kept = [path for path in others if path.suffix.lower() not in NOT_READ or path.name == "poses_bounds.npy"]
+    return sorted(read | {path for path in kept if path.parent != scene / "painted"})
 
 
 def preview(params: Params, scene: Path) -> list[str]:
@@ -88,9 +90,10 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
         capture = _place(params, out, capture)
         roles = roles.among(set(capture.pictures))
     views, longest = sorted({*roles.train, *roles.test}), _supported_size(params, capture, roles)
-    pinholes = {}
+    lenses, pinholes = {}, {}
     for k in trace.progress(len(views), "poses"):
-        pinholes[views[k]] = io.save_undistorted(out, views[k], capture, roles, longest)
+        lenses[views[k]], pinholes[views[k]] = io.save_undistorted(out, views[k], capture, roles, longest)
+    io.save_lenses(out, lenses, capture.upright)
     shutil.rmtree(out / "sfm", ignore_errors=True)
     normalised = frame.normalised(capture.poses, pinholes, roles.train, roles.test, roles.clean)
     if params.refine and params.gaussians is None:  # Gaussians that the scene brings were fitted with its cameras
@@ -192,7 +195,6 @@ def _read(params: Params, scene: Path) -> tuple[Capture, Roles]:
         train=params.train,
         test=params.test,
         clean=params.clean,
-        references=[(given.view, given.image, given.undistorted) for given in params.references],
         region=params.region is not None,
     )
     if params.gaussians is not None and not (scene / params.gaussians).is_file():

@@ -3,16 +3,42 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+if TYPE_CHECKING:
+    from reffusion.io import GivenReference
+    from reffusion.types import MaskSet, Reference, Scene
+
+PAINTED = "painted"  # folder of the scene: <view>.png and <view>_depth.*, made over what lies in to_paint
+TO_PAINT, VIEWS_TO_PAINT = "to_paint", 4
 RIM = 0.006  # of the picture's width, repainted around I too, as far as it is no photograph
+MARGIN, BLEND = 0.01, 0.01  # of it: taken from a reference from elsewhere around the hole, and blended beyond
+WHOLE = 0.9  # share of the hole that a reference from elsewhere must have
+STRICT = ConfigDict(extra="forbid", frozen=True)
+
+
+class Given(BaseModel):
+    model_config = STRICT
+
+    view: str = Field(description="name of the view it completes")
+    image: str = Field(description="picture, relative to the scene; of another size or cropped a little is fine")
+    depth: str | None = Field(None, description="its depth or disparity, any scale: 16-bit .png, .npy or .exr")
+    undistorted: bool = Field(False, description="painted over `poses`' own undistorted image, not over the photo")
 
 
 class Params(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = STRICT
 
+    reference: Given | list[Given] | None = Field(None, description="completed views that the scene brings")
+    # what tells, before `poses` has run, which views there are: as there
+    layout: str | None = None
+    images: str | None = None
+    masks: str | None = None
+    test_masks: str | None = None
+    train: list[str] | str | None = None
+    test: list[str] | str | None = None
     inpainter: Literal["diffusion", "exemplar"] = Field(
         "diffusion", description="the prior; or pieces of the picture itself, sharp, with nothing new in them"
     )
@@ -34,53 +60,133 @@ class Params(BaseModel):
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list:
-    """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
+    """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml, and its folders."""
     from reffusion import weights
 
-    given = "reference" in brings or params.inpainter == "exemplar"
+    given = params.reference is not None or PAINTED in brings or params.inpainter == "exemplar"
     return [] if given else [weights.of_model(params.prior, params.dtype)]
 
 
-def preview(params: Params, *, poses: Path, **_: Path) -> list[str]:
-    given = sorted(path.stem for path in (poses / "references").glob("*.png")) if poses else []
-    if given:
-        return [f"takes over the scene's reference {', '.join(given)}: no diffusion here"]
+def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
+    """Of the scene's files those that this stage reads, and what it reads elsewhere."""
+    named = {scene / name for each in _named(params) for name in (each.image, each.depth) if name}
+    return sorted({path for path in named if path.is_file()} | {p for p in files if p.parent == scene / PAINTED})
+
+
+def preview(params: Params, *, scene: Path, poses: Path | None = None, **_: Path | None) -> list[str]:
+    """What the stage will do. ValueError where it would refuse a reference for its name, its file or its view."""
+    if given := _given(params, scene, poses):
+        views = ", ".join(each.view + (" (painted)" if each.painted else "") for each in given)
+        return [f"takes over the scene's reference {views}: no diffusion here"]
     if params.inpainter == "diffusion":
         return []
     unread = f"; the prompt '{params.prompt}' is not read, reference.inpainter=diffusion would" if params.prompt else ""
     return [f"completes the reference from pieces of itself: no diffusion here{unread}"]
 
 
-def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path) -> None:
+def run(params: Params, out: Path, *, scene: Path, poses: Path, fit: Path, masks: Path) -> None:
     from reffusion import io
 
-    scene = io.load_scene(poses)
-    given = sorted((poses / "references").glob("*.png"))
-    references = taken_over(given, scene, fit, masks) if given else [inpainted(params, out, scene, poses, fit, masks)]
+    placed, given = io.load_scene(poses), _given(params, scene, poses)
+    if given:
+        references = taken_over(given, placed, poses, fit, masks)
+    else:
+        references = [inpainted(params, out, placed, poses, fit, masks)]
     io.save_references(out, references)
+    if params.reference is None:
+        lay_out(out / TO_PAINT, [each.view for each in given], placed, poses, fit, masks)
 
 
-def taken_over(paths, scene, fit: Path, masks: Path) -> list:
+def _named(params: Params) -> list[Given]:
+    given = params.reference
+    return [] if given is None else given if isinstance(given, list) else [given]
+
+
+def _given(params: Params, scene: Path, poses: Path | None) -> list[GivenReference]:
+    """The references that the scene brings, checked against its views, and against those that `poses` placed."""
+    painted = sorted(p for p in (scene / PAINTED).glob("[!.]*") if p.is_file())
+    if not painted and params.reference is None:
+        return []
+    from reffusion import io
+
+    capture = io.load_capture(scene, params.layout, params.images)
+    usual = {"masks": params.masks, "test_masks": params.test_masks, "train": params.train, "test": params.test}
+    roles = io.load_roles(scene, capture, **usual, region=True)
+    named = [(each.view, each.image, each.depth, each.undistorted) for each in _named(params)]
+    given = io.load_given(scene, capture, roles, named, painted)
+    placed = io.load_lenses(poses)[0] if poses else capture.pictures
+    for each in given:
+        if each.view not in placed:
+            raise ValueError(f"{each.path}: its view '{each.view}' could not be placed; make it for another view")
+    return given
+
+
+def taken_over(given: list[GivenReference], scene: Scene, poses: Path, fit: Path, masks: Path) -> list[Reference]:
     """The scene's own references, each standing for the invent mask of its view, and exposed as its photograph is."""
-    from reffusion import exposure, io
-    from reffusion.types import Reference
+    from reffusion import io
 
     references = []
-    for path in paths:
-        if path.stem not in scene.cameras:
-            raise ValueError(f"{path}: no view is called {path.stem}; name the picture after its view")
-        camera, image = scene.cameras[path.stem], io.load_image(path)
-        if image.shape[:2] != (camera.height, camera.width):
-            size = f"{image.shape[1]} x {image.shape[0]}"
-            raise ValueError(f"{path}: {size} px, but its view has {camera.width} x {camera.height} px; resize it")
-        mask = io.load_mask_sets(masks, [path.stem])[path.stem].invent
-        if mask.any():
-            references.append(Reference(camera, exposure.normalised(image, fit, path.stem), mask))
+    for each in given:
+        sets = io.load_mask_sets(masks, [each.view])[each.view]
+        if sets.invent.any():
+            references.append(fitted(each, sets, scene, poses, fit))
         else:
-            print(f"reference {path.stem} is left out: nothing has to be invented in its view")
+            print(f"reference {each.view} is left out: nothing has to be invented in its view")
     if not references:
-        raise ValueError(f"{paths[0].parent}: in none of these views anything has to be invented; choose other views")
+        raise ValueError(f"{given[0].path}: in no reference's view anything has to be invented; choose other views")
     return references
+
+
+def fitted(given: GivenReference, sets: MaskSet, scene: Scene, poses: Path, fit: Path) -> Reference:
+    """One of them, registered to its photograph: as it is where it is the photograph outside the object, else only the
+    hole of it and a blended rim."""
+    from reffusion import exposure, io, registration
+    from reffusion.types import Reference
+
+    lenses, upright = io.load_lenses(poses)
+    camera, lens = scene.cameras[given.view], lenses[given.view]
+    views = exposure.load_views(poses, fit, [given.view]) if given.painted else io.load_views(poses, [given.view])
+    photo, hidden = views[given.view], sets.raw | sets.consistent | sets.invent
+    image, inside = io.load_straight(given, lens, upright)
+    found = registration.register(image, photo, hidden)
+    if not found.fits:
+        raise ValueError(
+            f"{given.path}: does not fit its view '{given.view}': {found.misfit}; "
+            "is it of another view, or of another scene?"
+        )
+    print(f"reference {given.view}: {found}", flush=True)
+    if not found.untouched:
+        image, inside = io.load_straight(given, lens, upright, found.moved)
+        image = registration.recolored(image, found.gain, found.offset)
+        margin, blend = (share * camera.width for share in (MARGIN, BLEND))
+        image = registration.cut_in(image, photo, hidden, inside, margin, blend)
+    if (share := inside[sets.invent].mean()) < WHOLE:
+        raise ValueError(f"{given.path}: shows only {share:.0%} of the hole in '{given.view}'; crop less")
+    image = image if given.painted else exposure.normalised(image, fit, given.view)
+    depth = io.load_straight_depth(given, lens, upright, found.moved)
+    return Reference(camera, image, sets.invent & inside, depth)
+
+
+def lay_out(folder: Path, painted: list[str], scene: Scene, poses: Path, fit: Path, masks: Path) -> None:
+    """Write what people can paint: <view>.png and <view>_mask.png of the views that cover most of what has to be
+    invented, those painted already first, and ranked.txt."""
+    from reffusion import exposure, inpaint, io, painting
+
+    sets = io.load_mask_sets(masks, scene.train)
+    keep = ~io.load_labels(masks / "labels.npy")
+    remaining = io.load_ply(fit / "gaussians.ply").map(lambda p: p[keep])
+    hidden, invent = ({n: getattr(each, kind) for n, each in sets.items()} for kind in ("consistent", "invent"))
+    holes = painting.holes(remaining, [scene.cameras[name] for name in scene.train], hidden, invent)
+    views = painting.ranked(holes, painted, VIEWS_TO_PAINT)
+    for name in (each.view for each in views):
+        photo = exposure.load_views(poses, fit, [name])[name]
+        known = inpaint.background(remaining, scene.cameras[name], photo, hidden[name])
+        io.save_image(folder / f"{name}.png", painting.to_paint(known, invent[name]))
+        io.save_mask(folder / f"{name}_mask.png", invent[name])
+    if views:
+        io.save_text(folder / "ranked.txt", painting.words(views, painted))
+        names = ", ".join(f"{each.view} ({each.share:.0%})" for each in views)
+        print(f"to be painted by hand, and what each covers more: {names}; see {TO_PAINT}/ranked.txt", flush=True)
 
 
 def inpainted(params: Params, out: Path, scene, poses: Path, fit: Path, masks: Path):

@@ -4,6 +4,7 @@ import numpy as np
 import torch
 
 from reffusion import geometry, io
+from reffusion.lens import Lens
 from reffusion.surfels import surface_gaussians
 from reffusion.types import Camera, Scene, Similarity
 
@@ -94,6 +95,14 @@ def write(folder, square_at: float, masks=None, clean=()):
     everything, labels = gaussians(square_at)
     io.save_ply(fit / "gaussians.ply", everything)
     return poses, fit, labels
+
+
+def write_photos(scene, poses, cameras) -> None:
+    """The scene's own folder that the pictures of a `poses` folder could be from, and what undistorting them takes."""
+    for name in cameras:
+        io.save_image(scene / "images" / f"{name}.png", io.load_image(poses / "images" / f"{name}.png"))
+    lenses = {n: Lens(c.width, c.height, c.fx, c.fy, c.cx, c.cy) for n, c in cameras.items()}
+    io.save_lenses(poses, lenses, upright=False)
 
 
 def iou(a: np.ndarray, b: np.ndarray) -> float:

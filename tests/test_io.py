@@ -268,7 +268,14 @@ def test_mask_sets_and_references(tmp_path):
     image = generator.integers(0, 256, (8, 12, 3)).astype(np.uint8)
     io.save_references(tmp_path / "reference", [Reference(scene.cameras["b"], image, draw())])
     (reference,) = io.load_references(tmp_path / "reference", scene)
-    assert reference.camera is scene.cameras["b"] and np.array_equal(reference.image, image)
+    assert reference.camera is scene.cameras["b"] and np.array_equal(reference.image, image) and reference.depth is None
+    depth = np.where(draw(), np.nan, generator.random((8, 12))).astype(np.float32)
+    io.save_references(tmp_path / "deep", [Reference(scene.cameras["b"], image, draw(), depth)])
+    (deep,) = io.load_references(tmp_path / "deep", scene)
+    assert np.array_equal(deep.depth, depth, equal_nan=True)
+    io.save_exr(tmp_path / "deep" / "depth" / "b.exr", depth[:4])
+    with pytest.raises(ValueError, match=r"b\.png.*its depth must have their view's size"):
+        io.load_references(tmp_path / "deep", scene)
     io.save_image(tmp_path / "reference" / "references" / "z.png", image)
     with pytest.raises(ValueError, match=r"z\.png.*no view"):
         io.load_references(tmp_path / "reference", scene)
@@ -281,4 +288,3 @@ def test_views_and_masks_of_a_poses_folder(tmp_path):
     io.save_mask(tmp_path / "test_masks" / "t.png", mask)
     assert np.array_equal(io.load_views(tmp_path, ["a"])["a"], image)
     assert list(io.load_raw_masks(tmp_path, ["a", "b"])) == ["a"] and list(io.load_test_masks(tmp_path)) == ["t"]
-    assert io.load_given_references(tmp_path) == {}

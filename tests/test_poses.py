@@ -225,13 +225,10 @@ def test_what_the_scene_brings_comes_into_the_normalised_frame(tmp_path):
     means = torch.from_numpy(truth.points).float()
     gaussians = Gaussians(means, torch.ones(60, 4), torch.zeros(60, 3), torch.zeros(60), torch.zeros(60, 4, 3))
     io.save_ply(folder / "given.ply", gaussians)
-    io.save_image(folder / "ref.png", np.full((2 * HEIGHT, 2 * WIDTH, 3), 77, np.uint8))
-    io.save_image(folder / "ref2.png", np.arange(HEIGHT * WIDTH * 3).reshape(HEIGHT, WIDTH, 3).astype(np.uint8))
     given = yaml.safe_load(
         """
         gaussians: given.ply
         region: {center: [50, 0, 0], size: [1, 2, 3]}
-        reference: [{view: v02, image: ref.png}, {view: v03, image: ref2.png, undistorted: true}]
         """
     )
     scene, out = run(folder, **given)
@@ -240,9 +237,8 @@ def test_what_the_scene_brings_comes_into_the_normalised_frame(tmp_path):
     region = io.load_json(out / "region.json")
     np.testing.assert_allclose(region["center"], similarity.apply(np.array([50.0, 0.0, 0.0])))
     np.testing.assert_allclose(region["size"], np.array([1.0, 2.0, 3.0]) * similarity.scale)
-    references = io.load_given_references(out)
-    assert references["v02"].shape == (HEIGHT, WIDTH, 3) and (references["v02"] == 77).all()
-    assert np.array_equal(references["v03"], io.load_image(folder / "ref2.png"))
+    lenses, upright = io.load_lenses(out)
+    assert set(lenses.values()) == {truth.lens} and list(lenses) == sorted(truth.world_to_camera) and not upright
 
 
 def test_preview_is_light_and_says_what_will_happen(tmp_path):

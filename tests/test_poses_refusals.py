@@ -70,9 +70,6 @@ REFUSALS = [
     ("clean view that is a test view", None, {"clean": ["v00"], "test": ["v00"]}, "v00 is no training view"),
     ("both train and test", None, {"train": ["v00", "v01", "v02"], "test": ["v02"]}, "v02 in both"),
     ("split that is neither", None, {"test": "some"}, "'some' is neither"),
-    ("unknown reference view", None, {"reference": {"view": "q", "image": "ref.png"}}, "reference: there is no view"),
-    ("missing reference", None, {"reference": {"view": "v01", "image": "no.png"}}, r"no\.png: no such file"),
-    ("reference of other proportions", None, {"reference": {"view": "v01", "image": "tall.png"}}, r"tall\.png: 72x96"),
     ("missing images folder", None, {"images": "nowhere"}, "nowhere: no such folder"),
     ("missing gaussians", None, {"gaussians": "no.ply"}, r"no\.ply: no such file"),
     ("layout that is not there", None, {"layout": "colmap"}, "no COLMAP model"),
@@ -82,8 +79,6 @@ REFUSALS = [
 @pytest.mark.parametrize(("change", "params", "message"), [r[1:] for r in REFUSALS], ids=[r[0] for r in REFUSALS])
 def test_refusals_name_file_and_remedy(tmp_path, change, params, message):
     folder = prepare(tmp_path / "s", "transforms", some_truth())
-    write_pictures(folder, ["ref"])
-    write_pictures(folder, ["tall"], (HEIGHT, WIDTH))
     if change is not None:
         change(folder)
     with pytest.raises(ValueError, match=message):

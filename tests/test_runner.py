@@ -268,6 +268,65 @@ def test_identical_output_stops_a_rerun(root, capsys):
     assert ran(capsys, root, set="masks.threshold=99") == ["poses"]
 
 
+def test_a_stage_depends_on_those_files_of_the_scene_that_it_says_it_reads(root, capsys):
+    edit(
+        root / "stages/poses.py",
+        "def preview(",
+        """def scene_files(params, scene, files):
+    return [path for path in files if path.parent.name != "drafts"]
+
+def preview(""",
+    )
+    ran(capsys, root)
+    write(root, {"data/toy/drafts/idea.txt": "?"})
+    assert set(words(root).values()) == {"cached"}
+    write(root, {"data/toy/notes/idea.txt": "?"})
+    assert words(root)["poses"] == "run need scene changed"
+
+
+def test_a_stage_that_reads_the_scene_refuses_before_its_other_needs_are_made(fresh):
+    edit(fresh / "pipeline.yaml", "masks:\n    needs: [poses, fit]", "masks:\n    needs: [scene, poses, fit]")
+    edit(
+        fresh / "stages/masks.py",
+        "def run(params: Params, out: Path, *,",
+        """def preview(params, *, scene, poses, fit):
+    assert poses is None and fit is None
+    if (scene / "wrong").exists():
+        raise ValueError(f"{scene / 'wrong'}: remove it")
+    return ["looked at the scene"]
+
+def run(params: Params, out: Path, *, scene: Path,""",
+    )
+    assert words(fresh)["masks"].startswith("undecided")
+    write(fresh, {"data/toy/wrong": ""})
+    assert "remove it" in words(fresh)["masks"]
+    with pytest.raises(Refused, match=r"masks: .*wrong: remove it"):
+        run_scene(request(fresh), "all")
+    assert not (fresh / "runs/toy/poses").exists()
+
+
+def test_what_is_handed_out_outlives_its_artifact_and_is_never_lost(root, capsys):
+    edit(root / "pipeline.yaml", "masks:\n    needs", "masks:\n    hands_out: [drafts]\n    needs")
+    edit(
+        root / "stages/masks.py",
+        "    invent = ",
+        """    (out / "drafts").mkdir()
+    for name in ("a", "b", "c")[: params.threshold % 10]:
+        (out / "drafts" / name).write_text(str(params.threshold))
+    invent = """,
+    )
+    given = lambda: {path.name: path.read_text() for path in (root / "runs/toy/drafts").iterdir()}
+    ran(capsys, root, set="masks.threshold=102")
+    assert given() == {"a": "102", "b": "102"}
+    (root / "runs/toy/drafts/a").write_text("drawn")
+    (root / "runs/toy/drafts/mine").write_text("too")
+    run_scene(request(root, set="masks.threshold=103"), "masks")
+    assert given() == {"a": "drawn", "b": "103", "c": "103", "mine": "too"}
+    assert "toy/drafts/a was changed by hand: kept" in capsys.readouterr().out
+    ran(capsys, root, set="masks.threshold=101")
+    assert given() == {"a": "drawn", "mine": "too"}
+
+
 def test_code_edits(root, capsys):
     optimize = root / "reffusion/optimize.py"
     edit(optimize, "# forwards", "# onwards")

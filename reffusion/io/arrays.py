@@ -19,6 +19,12 @@ def save_json(path: Path, value: Any) -> None:
     path.write_text(json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
+def save_text(path: Path, text: str) -> None:
+    """Write lines for people, creating the folder."""
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    Path(path).write_text(text, encoding="utf-8")
+
+
 def load_json(path: Path) -> Any:
     """The value in a JSON file; ValueError naming the file where it is absent or not JSON."""
     try:

@@ -1,4 +1,4 @@
-"""What each view of a capture is for: training, test or clean; which mask and which reference belong to it."""
+"""What each view of a capture is for: training, test or clean; which mask belongs to it."""
 
 from __future__ import annotations
 
@@ -16,19 +16,6 @@ NONE = "none"
 
 
 @dataclass(frozen=True)
-class GivenReference:
-    """A completed view that the scene brings.
-
-    Attributes:
-        path: the picture. Of its view's proportions; another size is resized.
-        undistorted: the picture was painted over `poses`' own undistorted image, not over the photograph.
-    """
-
-    path: Path
-    undistorted: bool
-
-
-@dataclass(frozen=True)
 class Roles:
     """Names are sorted.
 
@@ -36,7 +23,6 @@ class Roles:
         train, test, clean: names of views.
         masks: where a photograph shows the object: of training views, and of test views that show it too.
         test_masks: where a test view shows the object, or would show it; what its box comes from.
-        references: completed views that the scene brings.
         warnings: what is odd.
     """
 
@@ -45,18 +31,14 @@ class Roles:
     clean: frozenset[str]
     masks: dict[str, Path]
     test_masks: dict[str, Path]
-    references: dict[str, GivenReference]
     warnings: tuple[str, ...]
 
     def among(self, names: set[str]) -> Roles:
         """Without the views that are not in `names` (those that structure from motion could not place).
 
         Raises:
-            ValueError: where fewer than 3 training views are left, or one that a reference was made for is gone.
+            ValueError: where fewer than 3 training views are left.
         """
-        for name, given in self.references.items():
-            if name not in names:
-                raise ValueError(f"{given.path}: its view '{name}' could not be placed; make it for another view")
         kept = lambda values: {name: value for name, value in values.items() if name in names}
         roles = replace(
             self,
@@ -79,7 +61,6 @@ def load_roles(
     train: Sequence[str] | str | None = None,
     test: Sequence[str] | str | None = None,
     clean: Sequence[str] = (),
-    references: Sequence[tuple[str, str, bool]] = (),
     region: bool = False,
 ) -> Roles:
     """The roles of the capture's views, from scene.yaml's keys and the folder's usual places.
@@ -92,13 +73,11 @@ def load_roles(
         masks: folder of masks; "none" for a scene without; None looks into <images>/label, masks, mask, label.
         test_masks: folder of the test views' masks, named like the views or in their order; "none"; None looks.
         train, test: names, or "every 8" (the first of each eight in order of names), or None.
-        references: (view, picture relative to the scene, painted over an undistorted image?).
         region: the scene names a 3D region, so it may lack masks.
 
     Raises:
         ValueError: naming the file and the remedy: a mask for no picture, of other proportions (over 10%), no mask
-            at all, an unknown view, a view for both training and test, fewer than 3 training views, a reference
-            of other proportions than its view.
+            at all, an unknown view, a view for both training and test, fewer than 3 training views.
     """
     folder = Path(folder)
     mask_files = _mask_files(folder, capture, masks, region)
@@ -118,7 +97,7 @@ def load_roles(
         held_out = {name: path for name, path in held_out.items() if name not in labels}
     kept = {name: path for name, path in mask_files.items() if name in set(train_named)}
     for name, path in (*kept.items(), *beside.items()):
-        _check_proportions(path, name, capture, 0.10, "mask")
+        check_proportions(path, name, capture, 0.10, "mask")
     bare = [name for name in train_named if name not in kept and name not in clean_views]
     warning = f"{len(bare)} training views have no mask: {', '.join(bare)}" if kept and bare else None
     return Roles(
@@ -127,7 +106,6 @@ def load_roles(
         clean_views,
         dict(sorted((kept | held_out).items())),
         beside,
-        _references(folder, capture, references),
         (warning,) if warning else (),
     )
 
@@ -242,20 +220,8 @@ def _labelled(capture: Capture, masks: dict[str, Path], labels: list[Path], test
     )
 
 
-def _references(folder: Path, capture: Capture, given: Sequence[tuple[str, str, bool]]) -> dict[str, GivenReference]:
-    result: dict[str, GivenReference] = {}
-    for view, image, undistorted in given:
-        name, path = known(view, capture, "reference"), folder / image
-        if name in result:
-            raise ValueError(f"scene.yaml: reference: two for the view '{name}'; keep one")
-        if not path.is_file():
-            raise ValueError(f"{path}: no such file; correct `reference` in scene.yaml")
-        _check_proportions(path, name, capture, 0.01, "reference")
-        result[name] = GivenReference(path, undistorted)
-    return dict(sorted(result.items()))
-
-
-def _check_proportions(path: Path, name: str, capture: Capture, tolerance: float, what: str) -> None:
+def check_proportions(path: Path, name: str, capture: Capture, tolerance: float, what: str) -> None:
+    """ValueError where a picture's sides are not in the proportion of its view's, by more than `tolerance`."""
     width, height = image_size(path, upright=capture.upright and what == "reference")
     of_width, of_height = image_size(capture.pictures[name], upright=capture.upright)
     if abs(width * of_height - height * of_width) > tolerance * width * of_height:

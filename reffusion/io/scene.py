@@ -1,7 +1,7 @@
 """The artifacts of the stages: scenes, views, masks and references.
 
 Layout of the folder `poses` leaves behind: images/<view>.png, masks/<view>.png, test_masks/<view>.png,
-references/<view>.png, sparse/0/*.bin, transform.json, views.json.
+sparse/0/*.bin, transform.json, views.json, lenses.json.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 from .arrays import load_json, save_json
 from .colmap import ModelCamera, ModelImage, load_cameras, load_images, load_model_points, save_model
-from .images import load_image, load_mask, save_image, save_mask
+from .images import load_exr, load_image, load_mask, save_exr, save_image, save_mask
 
 if TYPE_CHECKING:
     from reffusion.types import MaskSet, Reference, Scene
@@ -81,11 +81,6 @@ def load_test_masks(poses_dir: Path) -> dict[str, np.ndarray]:
     return {path.stem: load_mask(path) for path in sorted((Path(poses_dir) / "test_masks").glob("*.png"))}
 
 
-def load_given_references(poses_dir: Path) -> dict[str, np.ndarray]:
-    """View name -> uint8 [H, W, 3]: the completed views that the scene brings; empty where it brings none."""
-    return {path.stem: load_image(path) for path in sorted((Path(poses_dir) / "references").glob("*.png"))}
-
-
 def save_mask_sets(masks_dir: Path, sets: Mapping[str, MaskSet]) -> None:
     """Write raw/, consistent/, undecided/ and invent/<view>.png."""
     for name, mask_set in sets.items():
@@ -102,11 +97,17 @@ def load_mask_sets(masks_dir: Path, names: Iterable[str]) -> dict[str, MaskSet]:
 
 
 def save_references(reference_dir: Path, references: Sequence[Reference]) -> None:
-    """Write references/<view>.png and masks/<view>.png."""
+    """Write references/<view>.png and masks/<view>.png; depth/<view>.exr where a reference has depth."""
     for reference in references:
         name = f"{reference.camera.name}.png"
         save_image(Path(reference_dir) / "references" / name, reference.image)
         save_mask(Path(reference_dir) / "masks" / name, reference.mask)
+        if reference.depth is not None:
+            save_exr(_depth_file(reference_dir, reference.camera.name), reference.depth)
+
+
+def _depth_file(reference_dir: Path, view: str) -> Path:
+    return Path(reference_dir) / "depth" / f"{view}.exr"
 
 
 def load_references(reference_dir: Path, scene: Scene) -> list[Reference]:
@@ -124,7 +125,12 @@ def load_references(reference_dir: Path, scene: Scene) -> list[Reference]:
         if camera is None:
             raise ValueError(f"{path}: the scene has no view '{path.stem}'")
         image, mask = load_image(path), load_mask(Path(reference_dir) / "masks" / path.name)
-        if image.shape[:2] != (camera.height, camera.width) or mask.shape != image.shape[:2]:
-            raise ValueError(f"{path}: it and its mask must have their view's size {camera.width}x{camera.height}")
-        found.append(Reference(camera, image, mask))
+        depth_file = _depth_file(reference_dir, path.stem)
+        depth = load_exr(depth_file) if depth_file.is_file() else None
+        shapes = {image.shape[:2], mask.shape, mask.shape if depth is None else depth.shape}
+        if shapes != {(camera.height, camera.width)}:
+            raise ValueError(
+                f"{path}: it, its mask and its depth must have their view's size {camera.width}x{camera.height}"
+            )
+        found.append(Reference(camera, image, mask, depth))
     return found

@@ -1,0 +1,424 @@
+"""References that people bring: named, painted or from other tools; what reruns for them, and what is refused."""
+
+from __future__ import annotations
+
+import io as buffers
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import small_scene as small
+import yaml
+from PIL import Image
+from small_capture import HEIGHT, OPENCV, WIDTH, prepare, run, some_truth, write_pictures, write_transforms
+
+from reffusion import alignment, io, lens, painting, registration
+from reffusion.io import GivenReference
+from reffusion.types import MaskSet
+from runner.execute import clean, run_scene
+from runner.job import Request
+from runner.job import prepare as prepare_job
+from runner.plan import plan
+from stages import poses, reference
+
+ROOT = Path(__file__).resolve().parent.parent
+SIZE = (160, 120)
+
+
+def pattern(seed: int, size=SIZE) -> np.ndarray:
+    """uint8 [H, W, 3] with as much energy in each octave, as photographs have."""
+    rng, (width, height) = np.random.default_rng(seed), size
+    frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width)[None]).clip(1 / width)
+    fields = [np.fft.ifft2(np.fft.fft2(rng.normal(size=(height, width))) / frequency).real for _ in range(3)]
+    mixed = [fields[0] + 0.3 * field for field in fields]  # mostly grey, as photographs are
+    return np.stack([np.clip(128 + 40 * f / f.std(), 0, 255) for f in mixed], -1).astype(np.uint8)
+
+
+def from_another_tool(image: np.ndarray, scale=0.97, crop=5, quality=80, gain=0.92) -> np.ndarray:
+    """Resized, cropped at its upper left, darker, and saved as JPEG."""
+    size = tuple(round(side * scale) for side in image.shape[1::-1])
+    small_one = cv2.resize(image, size, interpolation=cv2.INTER_AREA)[crop:, crop:]
+    file = buffers.BytesIO()
+    Image.fromarray((small_one * gain).astype(np.uint8)).save(file, "JPEG", quality=quality)
+    return np.array(Image.open(file).convert("RGB"))
+
+
+def psnr(a: np.ndarray, b: np.ndarray, where: np.ndarray) -> float:
+    return float(10 * np.log10(255**2 / max(((a.astype(float) - b)[where] ** 2).mean(), 1e-3)))
+
+
+def object_at() -> np.ndarray:
+    hidden = np.zeros(SIZE[::-1], bool)
+    hidden[40:80, 60:100] = True
+    return hidden
+
+
+def with_object(image: np.ndarray) -> np.ndarray:
+    return np.where(object_at()[..., None], np.uint8(250), image)
+
+
+# --------------------------------------------------------------------------------------------------- registration
+
+
+@pytest.mark.parametrize("how", [{}, {"crop": 0}, {"scale": 1.0, "quality": 95}, {"scale": 0.8, "crop": 12, "gain": 1}])
+def test_a_picture_from_another_tool_comes_back_onto_its_photograph(how):
+    truth, size = pattern(0), SIZE
+    photo, changed = with_object(truth), from_another_tool(truth, **how)
+    picture = cv2.resize(changed, size, interpolation=cv2.INTER_CUBIC)
+    found = registration.register(picture, photo, object_at())
+    assert found.fits and found.agrees > 0.95
+    crop, (height, width) = how.get("crop", 5), changed.shape[:2]
+    scale = np.array([width + crop, height + crop]) / size * np.array(size) / (width, height)
+    expected = np.stack([[scale[0], 0, -crop * size[0] / width], [0, scale[1], -crop * size[1] / height]])
+    moved = registration.IDENTITY if found.moved is None else found.moved
+    corners = np.array([(0, 0), (160, 0), (0, 120), (160, 120)])
+    error = corners @ (moved - expected)[:, :2].T + (moved - expected)[:, 2]
+    assert np.abs(error).max() < 0.25, "pixels"
+    result = registration.recolored(registration.warped(picture, moved)[0], found.gain, found.offset)
+    gain = np.full(3, 1 / how.get("gain", 0.92))
+    ideal = registration.recolored(registration.warped(picture, expected)[0], gain, np.zeros(3))
+    assert psnr(result, truth, object_at()) > psnr(ideal, truth, object_at()) - 0.5 > psnr(picture, truth, object_at())
+
+
+def test_an_aligned_reference_comes_through_untouched():
+    truth = pattern(0)
+    found = registration.register(truth, with_object(truth), object_at())
+    assert found.untouched and found.moved is None and (found.gain == 1).all() and not found.offset.any()
+    slightly = from_another_tool(truth, scale=1.0, crop=0, quality=70, gain=1)
+    found = registration.register(slightly, with_object(truth), object_at())
+    assert found.fits and found.moved is None and not found.untouched, "not resampled, cut in only"
+
+
+def test_what_was_repainted_elsewhere_moves_nothing():
+    truth = pattern(0)
+    picture = from_another_tool(truth, scale=1.0, crop=0, quality=90, gain=0.9)
+    picture[90:, :50] = pattern(1)[90:, :50]
+    found = registration.register(picture, with_object(truth), object_at())
+    assert found.fits and found.moved is None and found.gain == pytest.approx(1 / 0.9, abs=0.01)
+
+
+def test_another_picture_fits_badly_and_a_plain_one_cannot_be_told():
+    photo = with_object(pattern(0))
+    found = registration.register(pattern(1), photo, object_at())
+    assert not found.fits and found.agrees < 0.2 and f"only {found.agrees:.0%}" in found.misfit
+    plain = np.full_like(photo, 90)
+    found = registration.register(plain, with_object(plain + 20), object_at())
+    assert found.fits and np.isnan(found.agrees) and "too plain" in str(found)
+
+
+def test_only_the_hole_and_its_rim_are_taken():
+    photo, picture, everywhere = (
+        np.zeros((20, 20, 3), np.uint8),
+        np.full((20, 20, 3), 200, np.uint8),
+        np.ones((20, 20), bool),
+    )
+    hole = np.zeros((20, 20), bool)
+    hole[8:12, 8:12] = True
+    result = registration.cut_in(picture, photo, hole, everywhere, margin=1, rim=3)[..., 0]
+    assert (result[7:13, 8:12] == 200).all() and 0 < result[10, 14] < 200 and (result[:, 16:] == 0).all()
+    lacking = registration.cut_in(picture, photo, hole, ~hole, margin=1, rim=3)
+    assert not lacking[hole].any()
+
+
+def test_a_moved_reference_is_read_once_through_the_lens(tmp_path):
+    """Distorted, cropped, resized: straight again, as the photograph's own undistorted picture."""
+    shot = lens.from_colmap(OPENCV[0], WIDTH, HEIGHT, OPENCV[1])
+    image = pattern(3, (WIDTH, HEIGHT))
+    io.save_image(tmp_path / "whole.png", image)
+    whole, inside = io.load_straight(GivenReference("v", tmp_path / "whole.png"), shot, False)
+    still, _ = io.load_straight(GivenReference("v", tmp_path / "whole.png"), shot, False, np.eye(2, 3))
+    assert inside.all() and np.abs(whole.astype(int) - still).max() <= 1
+    depth = np.tile(np.linspace(1, 2, WIDTH), (HEIGHT, 1))
+    np.save(tmp_path / "depth.npy", depth)
+    given = GivenReference("v", tmp_path / "whole.png", tmp_path / "depth.npy")
+    straight = io.load_straight_depth(given, shot, False)
+    where = lens.sampling_map(shot, lens.without_distortion(shot))
+    np.testing.assert_allclose(straight, 1 + (where[..., 0] - 0.5) / (WIDTH - 1), atol=0.6 / WIDTH)
+    shifted = io.load_straight_depth(given, shot.pinhole, False, np.array([[1.0, 0, 4], [0, 1, 0]]))
+    np.testing.assert_allclose(shifted[:, :-4], depth[:, 4:], rtol=1e-6)
+    assert np.isnan(shifted[:, -4:]).all()
+
+
+# ----------------------------------------------------------------------------------------------------- depth maps
+
+
+def save_png16(path: Path, values: np.ndarray) -> None:
+    Image.fromarray(values.astype(np.uint16)).save(path)
+
+
+DEPTHS = {
+    "disparity.png": lambda path, z: save_png16(path, 60000 / z * z.min()),
+    "depth.png": lambda path, z: save_png16(path, 5000 + 20000 * (z - z.min())),
+    "depth.npy": lambda path, z: np.save(path, 37.0 * z),
+    "affine disparity.exr": lambda path, z: io.save_exr(path, 4.0 / z - 1),
+}
+
+
+@pytest.mark.parametrize("kind", DEPTHS)
+def test_depth_of_any_kind_is_brought_to_the_scenes(tmp_path, kind):
+    rng = np.random.default_rng(0)
+    z = cv2.GaussianBlur(rng.uniform(0, 60, (60, 80)), (0, 0), 4) / 8
+    z += 1 - z.min()
+    known = np.ones_like(z, bool)
+    known[20:40, 30:50] = False
+    DEPTHS[kind](tmp_path / kind.split()[-1], z)
+    seen = np.where(rng.random(z.shape) < 0.2, 1.5 * z, z)  # a fifth of what is seen is something else
+    aligned, space = alignment.align_either(io.load_depth(tmp_path / kind.split()[-1]), np.where(known, seen, 0), known)
+    np.testing.assert_allclose(aligned, z, rtol=2e-3)
+    assert space == ("disparity" if "disparity" in kind else "depth")
+
+
+def test_depth_that_says_nothing_of_the_scene_is_refused():
+    rng = np.random.default_rng(0)
+    z, everywhere = rng.uniform(1, 3, (40, 40)), np.ones((40, 40), bool)
+    with pytest.raises(ValueError, match=r"does not fit what is seen|falls where"):
+        alignment.align_either(rng.uniform(1, 3, (40, 40)), z, everywhere)
+    holey = np.where(rng.random(z.shape) < 0.3, np.nan, z)
+    aligned, _ = alignment.align_either(holey, z, everywhere)
+    assert np.array_equal(np.isnan(aligned), np.isnan(holey))
+
+
+@pytest.mark.parametrize(
+    ("name", "write", "message"),
+    [
+        ("eight.png", lambda p: Image.fromarray(np.eye(4, dtype=np.uint8)).save(p), "8 bits are too coarse"),
+        ("flat.npy", lambda p: np.save(p, np.ones((4, 4))), "all its values are 1"),
+        ("rgb.npy", lambda p: np.save(p, np.ones((4, 4, 3))), "one number for each pixel"),
+        ("nothing.npy", lambda p: np.save(p, np.full((4, 4), np.nan)), "not finite"),
+        ("cut.npy", lambda p: p.write_bytes(b""), "not a readable depth map"),
+    ],
+)
+def test_what_is_no_depth_map_is_refused(tmp_path, name, write, message):
+    write(tmp_path / name)
+    with pytest.raises(ValueError, match=rf"{name}.*{message}"):
+        io.load_depth(tmp_path / name)
+
+
+# ------------------------------------------------------------------------------------- refusals, before any work
+
+
+def named(view, image="ref.png", **more):
+    return {"reference": {"view": view, "image": image, **more}}
+
+
+REFUSALS = [
+    ("unknown view", named("q"), (), "reference: there is no view 'q'.*v0"),
+    ("missing file", named("v01", "no.png"), (), r"no\.png: no such file; correct `reference`"),
+    ("missing depth", named("v01", depth="no.npy"), (), r"no\.npy: no such file"),
+    ("depth of another kind", named("v01", depth="note.txt"), (), r"note\.txt: a depth map is a 16-bit"),
+    ("other proportions", named("v01", "tall.png"), (), r"tall\.png: 72x96"),
+    (
+        "two for a view",
+        {"reference": [*named("v01").values(), *named("v01.png").values()]},
+        (),
+        "two for the view 'v01'",
+    ),
+    ("test view", named("v01") | {"test": ["v01"]}, (), r"ref\.png: 'v01' is a test view"),
+    ("neither", named("v01") | {"train": ["v00", "v02", "v03"], "test": ["v04"]}, (), "'v01' is neither a training"),
+    ("painting of no view", {}, ["zebra.png"], r"painted/zebra\.png: no view is called 'zebra'"),
+    ("painting of a test view", {"test": ["v01"]}, ["v01.png"], r"painted/v01\.png: 'v01' is a test view"),
+    ("two paintings", {}, ["v01.png", "v01.jpg"], r"v01\.png: there is v01\.jpg too"),
+    ("depth alone", {}, ["v01_depth.png"], r"v01_depth\.png: a depth map without a painting"),
+    ("no picture", {}, ["v01.psd"], r"v01\.psd: no picture"),
+]
+
+
+@pytest.mark.parametrize(("params", "painted", "message"), [r[1:] for r in REFUSALS], ids=[r[0] for r in REFUSALS])
+def test_references_are_refused_before_any_work(tmp_path, params, painted, message):
+    folder = prepare(tmp_path / "s", "transforms", some_truth())
+    write_pictures(folder, ["ref"])
+    write_pictures(folder, ["tall"], (HEIGHT, WIDTH))
+    (folder / "note.txt").write_text("")
+    for name in painted:
+        (folder / "painted").mkdir(exist_ok=True)
+        shutil.copy(folder / "ref.png", folder / "painted" / name)
+    with pytest.raises(ValueError, match=message):
+        reference.preview(reference.Params(**params), scene=folder)
+
+
+def test_paintings_stand_for_named_references_and_masks_beside_them_are_passed_over(tmp_path):
+    folder = prepare(tmp_path / "s", "transforms", some_truth())
+    write_pictures(folder, ["ref", "painted/v01", "painted/v01_mask", "painted/v03", "painted/v03_depth"])
+    params = reference.Params(reference=[{"view": "v01", "image": "ref.png"}, {"view": "v02", "image": "ref.png"}])
+    (note,) = reference.preview(params, scene=folder)
+    assert "v01 (painted), v02, v03 (painted)" in note
+    assert not reference.needed_weights(reference.Params(), frozenset({"painted"}))
+
+
+def test_a_view_that_was_not_placed_is_told(tmp_path):
+    folder = prepare(tmp_path / "s", "transforms", some_truth())
+    write_pictures(folder, ["ref"])
+    io.save_lenses(tmp_path, {"v00": some_truth().lens}, False)
+    with pytest.raises(ValueError, match=r"ref\.png: its view 'v01' could not be placed"):
+        reference.preview(reference.Params(**named("v01")), scene=folder, poses=tmp_path)
+
+
+# ---------------------------------------------------------------------------------------------- the stage's artifact
+
+
+@pytest.fixture
+def wall(tmp_path):
+    """The folders that the stage is handed, of the wall with a square before it; a2's hole is to be invented."""
+    made_poses, fitted, labels = small.write(tmp_path, 1.6)
+    small.write_photos(tmp_path / "scene", made_poses, small.CAMERAS)
+    sets = {}
+    for name, camera in small.CAMERAS.items():
+        mask, unseen = small.true_mask(camera, 1.6), small.true_never_seen(camera, 1.6)
+        sets[name] = MaskSet(mask, mask, unseen, unseen)
+        photo = np.where(mask[..., None], np.uint8([230, 26, 26]), small.photo(camera))
+        io.save_image(made_poses / "images" / f"{name}.png", photo)
+    io.save_mask_sets(tmp_path / "masks", sets)
+    io.save_labels(tmp_path / "masks" / "labels.npy", labels)
+    io.save_json(tmp_path / "masks" / "facts.json", {"best_reference": "a2"})
+    return {"scene": tmp_path / "scene", "poses": made_poses, "fit": fitted, "masks": tmp_path / "masks"}
+
+
+COMMON = {"inpainter": "exemplar", "masks": "none", "test": list(small.TEST)}
+
+
+def completed(wall, out: Path, **params):
+    out.mkdir()
+    reference.run(reference.Params(**COMMON, **params), out, **wall)
+    return {r.camera.name: r for r in io.load_references(out, io.load_scene(wall["poses"]))}
+
+
+def test_a_reference_from_another_tool_ends_near_the_clean_one(wall, tmp_path):
+    truth, mask = small.photo(small.CAMERAS["a2"]), small.true_mask(small.CAMERAS["a2"], 1.6)
+    io.save_image(wall["scene"] / "clean.png", truth)
+    Image.fromarray(from_another_tool(truth, quality=95)).save(wall["scene"] / "far.jpg", quality=80)
+    clean_one = completed(wall, tmp_path / "clean", **named("a2", "clean.png"))["a2"]
+    assert np.array_equal(clean_one.image, truth) and clean_one.depth is None
+    far = completed(wall, tmp_path / "far", **named("a2", "far.jpg"))["a2"]
+    assert psnr(far.image, truth, mask) > 33 and np.array_equal(far.mask, clean_one.mask)
+    away = cv2.dilate(mask.astype(np.uint8), np.ones((9, 9))) == 0
+    assert np.array_equal(far.image[away], truth[away]), "the photograph elsewhere"
+    io.save_image(wall["scene"] / "other.png", pattern(5, (small.WIDTH, small.HEIGHT)))
+    with pytest.raises(ValueError, match=r"other\.png: does not fit its view 'a2'.*only \d+%.*another view"):
+        completed(wall, tmp_path / "other", **named("a2", "other.png"))
+
+
+def test_depth_of_a_reference_reaches_its_artifact(wall, tmp_path):
+    truth = small.photo(small.CAMERAS["a2"])
+    io.save_image(wall["scene"] / "clean.png", truth)
+    depth = np.add.outer(np.zeros(2 * small.HEIGHT), np.linspace(1000, 60000, 2 * small.WIDTH))
+    save_png16(wall["scene"] / "depth.png", depth)
+    found = completed(wall, tmp_path / "out", **named("a2", "clean.png", depth="depth.png"))["a2"]
+    assert (
+        found.depth.shape == found.mask.shape
+        and np.corrcoef(found.depth.ravel(), depth[1::2, 1::2].ravel())[0, 1] > 0.999
+    )
+
+
+def test_what_is_to_be_painted_is_laid_out_and_a_painting_comes_back(wall, tmp_path):
+    first = completed(wall, tmp_path / "first")
+    assert list(first) == ["a2"]
+    laid_out = tmp_path / "first" / "to_paint"
+    lines = [line.split() for line in (laid_out / "ranked.txt").read_text().splitlines() if line[0] != "#"]
+    assert lines[0][0] == "1." and lines[0][2] == "100%" and len(lines) == 1, "one view sees all of so flat a hole"
+    view = lines[0][1]
+    shown, mask = io.load_image(laid_out / f"{view}.png"), io.load_mask(laid_out / f"{view}_mask.png")
+    photo, hidden = small.photo(small.CAMERAS[view]), small.true_mask(small.CAMERAS[view], 1.6)
+    assert (
+        np.array_equal(mask, small.true_never_seen(small.CAMERAS[view], 1.6)) and (shown[mask] == painting.GREY).all()
+    )
+    assert np.array_equal(shown[~hidden], photo[~hidden]) and psnr(shown, photo, hidden & ~mask) > 20
+
+    shutil.copytree(laid_out, wall["scene"] / "painted", ignore=shutil.ignore_patterns("*.txt"))
+    painted = np.where(mask[..., None], photo, shown)
+    io.save_image(wall["scene"] / "painted" / f"{view}.png", painted)
+    again = completed(wall, tmp_path / "again")
+    assert list(again) == [view] and np.array_equal(again[view].image, painted)
+    assert f"1. {view}  100%  (painted)" in (tmp_path / "again" / "to_paint" / "ranked.txt").read_text()
+
+
+def test_views_are_ranked_by_what_they_cover_beyond_those_before():
+    """Three cameras at a wall: two see the same piece of it, the third another, of which its border cuts off a part."""
+
+    def hole(name: str, x: float, columns: slice) -> painting.Hole:
+        camera = small.camera(name, x)
+        pixels = np.zeros((small.HEIGHT, small.WIDTH), bool)
+        pixels[20:40, columns] = True
+        return painting.Hole(camera, pixels, np.full(pixels.shape, small.WALL))
+
+    holes = {"a": hole("a", 0.0, slice(10, 40)), "b": hole("b", 0.0, slice(12, 36)), "c": hole("c", 2.0, slice(10, 25))}
+    found = painting.ranked(holes, [], 3)
+    assert [each.view for each in found] == ["a", "c"]
+    assert [each.share for each in found] == pytest.approx([54 / 69, 15 / 69])
+    assert [each.view for each in painting.ranked(holes, ["b"], 3)] == ["b", "c", "a"]
+
+
+# ------------------------------------------------------------------------------------------ what reruns, and what stays
+
+
+def capture(folder: Path) -> Path:
+    """A scene on disk: the wall with a red square before it, masks of the square."""
+    cameras = {name: small.CAMERAS[name] for name in small.TRAIN}
+    truth = some_truth()
+    points = np.stack([*(a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 20), np.linspace(-0.7, 0.7, 14))),
+                       np.full(280, small.WALL)], -1)  # fmt: skip
+    shown = type(truth)({n: c.world_to_camera for n, c in cameras.items()}, points, truth.model)
+    folder.mkdir()
+    write_transforms(folder, shown)
+    for name, camera in cameras.items():
+        mask = small.true_mask(camera, 1.4)
+        io.save_image(
+            folder / f"images/{name}.png", np.where(mask[..., None], np.uint8([230, 26, 26]), small.photo(camera))
+        )
+        io.save_mask(folder / f"masks/{name}.png", mask)
+    return folder
+
+
+SMALL = "poses.refine=false fit.iterations=20 fit.budget=1000 masks.invent=consistent masks.hull=1"
+
+
+def test_a_new_reference_reruns_nothing_before_its_stage(tmp_path):
+    folder = capture(tmp_path / "wall")
+    request = Request(ROOT, tmp_path / "runs", str(folder), profile="laptop", set=SMALL)
+
+    def words() -> dict[str, str]:
+        job = prepare_job(request)
+        return {stage: each.word for stage, each in plan(job, job.pipeline.closure("reference")).items()}
+
+    def only_the_reference_changed() -> bool:
+        return words() == {"poses": "cached", "fit": "cached", "masks": "cached", "reference": "run"}
+
+    run_scene(request, "reference")
+    home = tmp_path / "runs" / "wall"
+    laid_out = sorted(path.name for path in (home / "to_paint").iterdir())
+    assert "ranked.txt" in laid_out and any(name.endswith("_mask.png") for name in laid_out)
+    write_pictures(folder, ["lying about", "truth/a0"])
+    np.save(folder / "lying about.npy", np.zeros(3))
+    assert set(words().values()) == {"cached"}
+
+    view = laid_out[0].split(".")[0].removesuffix("_mask")
+    shown, mask = (io.load_image(home / "to_paint" / f"{view}{end}.png") for end in ("", "_mask"))
+    photo = small.photo(small.CAMERAS[view])
+    io.save_image(folder / "painted" / f"{view}.png", np.where(mask > 0, photo, shown))
+    assert only_the_reference_changed()
+    run_scene(request, "reference")
+    (found,) = io.load_references(home / "reference", io.load_scene(home / "poses"))
+    assert found.camera.name == view and psnr(found.image, photo, found.mask) > 40
+    assert (home / "to_paint" / "ranked.txt").is_file()
+
+    (folder / "scene.yaml").write_text(yaml.safe_dump(named("a0", "truth/a0.png")))
+    assert only_the_reference_changed()
+    io.save_image(folder / "images" / "a4.png", small.photo(small.CAMERAS["a4"]))
+    assert words()["poses"] == "run", "a photograph is none of these"
+    clean(request)
+    assert not home.exists() and (folder / "painted" / f"{view}.png").is_file()
+
+
+def test_a_photograph_that_is_also_a_reference_still_counts_for_poses(tmp_path):
+    folder = prepare(tmp_path / "s", "transforms", some_truth())
+    write_pictures(folder, ["ref"])
+    (folder / "scene.yaml").write_text("")
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    read = poses.scene_files(poses.Params(), folder, files)
+    assert folder / "images/v00.png" in read and folder / "masks/v00.png" in read and folder / "transforms.json" in read
+    assert folder / "ref.png" not in read and folder / "scene.yaml" not in read
+    of_reference = reference.scene_files(reference.Params(**named("v00", "images/v00.png")), folder, files)
+    assert of_reference == [folder / "images/v00.png"]
+    scene, _ = run(folder)
+    assert len(scene.cameras) == 6
