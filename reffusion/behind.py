@@ -224,6 +224,31 @@ def estimated(
     return refined, f"estimated, and aligned to {misfit:.1%} of the known disparity"
 
 
+def brought(
+    view: Seen,
+    guide: np.ndarray,
+    depth: np.ndarray,
+    points: np.ndarray,
+    how: Completion,
+    solvers: SolverLog = SILENT,
+) -> tuple[np.ndarray, str]:
+    """A depth map that came with the picture, brought to the scene, [H, W] float64 disparity; and how, in words.
+
+    Args:
+        depth: [H, W] depth or disparity of any scale and offset, NaN where it says nothing: there the surroundings
+            are continued.
+    Raises:
+        ValueError: see `alignment.align_either`.
+    """
+    aligned, space = alignment.align_either(depth, view.depth, view.known)
+    solved, said = 1.0 / np.where(np.isfinite(aligned), aligned, 1.0), f"by the depth map that came along, as {space}"
+    silent = ~np.isfinite(aligned)
+    if (silent & view.hole).any():
+        rest, how_rest = continued(view, guide, points, how, solvers)
+        solved, said = np.where(silent, rest, solved), f"{said}; where it says nothing, {how_rest}"
+    return solved, said
+
+
 def visible_points(
     points: np.ndarray, camera: Camera, pixels: np.ndarray, disparity: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -88,9 +88,7 @@ def _samples(centre: np.ndarray, reach: float, views: Sequence[Witness], seed: i
     """[S, 3] points of the surfaces that views show around their masks, within reach."""
     draws, found = np.random.default_rng(trace.seed_for(seed, "surfaces around")), [np.zeros((0, 3))]
     for view in views[:: max(1, len(views) // VIEWS)]:
-        # Where nearest and farthest agree no depth edge mixes two surfaces.
-        plain = (view.nearest > 0) & (view.farthest < 1.06 * view.nearest)
-        rows, columns = np.nonzero(grown(view.hidden, RING) & ~view.hidden & plain)
+        rows, columns = np.nonzero(grown(view.hidden, RING) & ~view.hidden & (view.depth > 0))
         if len(rows):
             chosen = draws.choice(len(rows), min(SAMPLES, len(rows)), replace=False)
             found.append(geometry.unproject(view.depth, view.camera)[rows[chosen], columns[chosen]])

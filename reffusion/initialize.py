@@ -67,7 +67,8 @@ def depth_behind(
     """The scene without the object in one view: depth [H, W] float64, as rendered where that is known, else made up;
     the same made up everywhere; and how in words.
 
-    With an estimate that is the paper's way (`behind.estimated`), else the surroundings are continued.
+    By the reference's own depth map where it brings one; with an estimate, the paper's way (`behind.estimated`); else
+    the surroundings are continued.
 
     Args:
         remaining: the Gaussians left.
@@ -87,7 +88,9 @@ def depth_behind(
     view = behind.seen(drawn, reference.camera, hole, hidden, how, continued, outer)
     solvers = SolverLog(log, reference.camera.name, *behind.points_around(view, points, how))
     try:
-        if estimate is None:
+        if reference.depth is not None:
+            solved, said = behind.brought(view, reference.image, reference.depth, points, how, solvers)
+        elif estimate is None:
             solved, said = behind.continued(view, reference.image, points, how, solvers)
         else:
             solved, said = behind.estimated(view, reference.image, estimate, how, solvers)

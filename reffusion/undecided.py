@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import torch
 
-from reffusion import geometry, splat
+from reffusion import splat
 from reffusion.continuation import Plane
 from reffusion.types import Camera, Gaussians
-from reffusion.witness import OPAQUE, SURFACE, Witness, smoothed_normals, votes, with_photographed_depth, without_slivers
+from reffusion.witness import OPAQUE, SURFACE, Witness, smoothed_surface, votes, with_photographed_depth, without_slivers
 
 BEFORE = 0.97  # of the depth shown: a continuation must be nearer than that to hide it
 BESIDE = 0.03  # of the image's width: how far around a plane's patch it is compared with what is shown
@@ -62,8 +62,7 @@ def behind(
     rows, columns = np.nonzero(asked & (alpha > OPAQUE))
     undecided = asked.copy()
     if len(rows):
-        points = geometry.unproject(depth, camera)[rows, columns]
-        normals = smoothed_normals(depth, camera)[rows, columns]
+        points, normals = (each[rows, columns] for each in smoothed_surface(depth, camera))
         undecided[rows, columns] = votes(points, views, normals).seen < witnesses
     depth = with_photographed_depth(depth, camera, views)
     hides, reach = np.zeros_like(asked), np.full(asked.shape, np.inf)

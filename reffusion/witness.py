@@ -16,6 +16,7 @@ from reffusion.types import Camera, Gaussians
 OPAQUE = 0.9  # alpha from which a pixel shows a surface
 SURFACE = 0.02  # relative depth, to either side, within which a point lies on the surface that a view shows
 FREE = 0.03  # relative depth by which a view must look past a point to say that nothing is there
+ROUGH = 0.006  # of the image's width: how far around a pixel the range of a view's depth is taken
 MARGIN = 0.004  # of the image's width: a view says nothing so near to its mask, where object and background mix
 
 
@@ -52,9 +53,10 @@ def witnesses(
     for camera in cameras:
         drawn = splat.render(gaussians, camera, sh_degree=0)
         depth = torch.where(drawn.alpha > OPAQUE, drawn.depth, 0).cpu().numpy().astype(np.float32)
-        nearest = cv2.erode(np.where(depth > 0, depth, np.float32(np.inf)), np.ones((3, 3), np.uint8))
+        around = np.ones((2 * pixels(ROUGH, camera.width) + 1,) * 2, np.uint8)
+        nearest = cv2.erode(np.where(depth > 0, depth, np.float32(np.inf)), around)
         wide = widened(hidden[camera.name], margin)
-        found.append(Witness(camera, depth, np.where(depth > 0, nearest, 0), cv2.dilate(depth, np.ones((3, 3))), wide))
+        found.append(Witness(camera, depth, np.where(depth > 0, nearest, 0), cv2.dilate(depth, around), wide))
     return found
 
 
@@ -69,9 +71,14 @@ def with_photographed_depth(depth: np.ndarray, camera: Camera, views: Sequence[W
     return depth
 
 
+def pixels(fraction: float, width: int) -> int:
+    """A share of the image's width in pixels, at least 1."""
+    return max(1, round(fraction * width))
+
+
 def widened(mask: np.ndarray, fraction: float) -> np.ndarray:
     """The mask, bool [H, W], and all pixels within `fraction` of the image's width."""
-    reach = max(1, round(fraction * mask.shape[1]))
+    reach = pixels(fraction, mask.shape[1])
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     return cv2.dilate(mask.astype(np.uint8), disk) > 0
 
@@ -116,9 +123,11 @@ def votes(points: np.ndarray, views: Sequence[Witness], normals: np.ndarray | No
     return Votes(seen, free, hidden)
 
 
-def smoothed_normals(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """[H, W, 3] unit normals of a rendered depth map [H, W], towards the camera, without the splats' own roughness."""
-    return surface_normals(cv2.medianBlur(depth.astype(np.float32), 5).astype(np.float64), camera)
+def smoothed_surface(depth: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """World points and unit normals towards the camera, [H, W, 3] both, of a rendered depth map [H, W], without the
+    splats' own roughness."""
+    smooth = cv2.medianBlur(depth.astype(np.float32), 5).astype(np.float64)
+    return geometry.unproject(smooth, camera), surface_normals(smooth, camera)
 
 
 @torch.no_grad()
@@ -150,9 +159,10 @@ def debris(
 
 
 def without_slivers(mask: np.ndarray, fraction: float = MARGIN) -> np.ndarray:
-    """The mask, bool [H, W], without what is narrower than twice `fraction` of the image's width: depth edges."""
-    reach = max(1, round(fraction * mask.shape[1]))
+    """The mask, bool [H, W], evened out by what most of its neighbours say, and without what is narrower than twice
+    `fraction` of the image's width: depth edges."""
+    reach = pixels(fraction, mask.shape[1])
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
-    padded = np.pad(mask.astype(np.uint8), reach, mode="edge")
-    opened = cv2.morphologyEx(padded, cv2.MORPH_OPEN, disk)[reach:-reach, reach:-reach] > 0
-    return mask & opened
+    most = cv2.blur(mask.astype(np.float32), disk.shape, borderType=cv2.BORDER_REPLICATE) > 0.5
+    padded = np.pad(most.astype(np.uint8), reach, mode="edge")
+    return cv2.morphologyEx(padded, cv2.MORPH_OPEN, disk)[reach:-reach, reach:-reach] > 0
