@@ -111,7 +111,8 @@ def seen(
         depth, alpha = np.where(outer > 0, outer, depth), np.where(outer > 0, 1.0, alpha)
     known = (alpha > how.explained) & (depth > 0) & ~grown(hole, how.margin)
     anchored = hole & np.isfinite(continued) if continued is not None else np.zeros_like(hole)
-    return Seen(camera, np.where(anchored, continued, depth) if anchored.any() else depth, known, hole, hidden, anchored)
+    depth = np.where(anchored, continued, depth) if anchored.any() else depth
+    return Seen(camera, depth, known, hole, hidden, anchored)
 
 
 def continued(

@@ -71,7 +71,7 @@ def _pairs(index: np.ndarray, ahead: tuple[int, int]) -> tuple[np.ndarray, np.nd
 
 
 def _pieces(disparity: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """int [H, W]: the known pixels' connected pieces without jumps, 1, 2, ... from the largest; 0: none, or too small."""
+    """int [H, W]: the known pixels' connected pieces without jumps, 1, 2, ... from the largest on; 0: too small."""
     index = np.full(known.shape, -1)
     index[known] = np.arange(known.sum())
     values, rows, columns = disparity[known], [], []

@@ -12,7 +12,15 @@ import torch
 from reffusion import splat
 from reffusion.continuation import Plane
 from reffusion.types import Camera, Gaussians
-from reffusion.witness import OPAQUE, SURFACE, Witness, smoothed_surface, votes, with_photographed_depth, without_slivers
+from reffusion.witness import (
+    OPAQUE,
+    SURFACE,
+    Witness,
+    smoothed_surface,
+    votes,
+    with_photographed_depth,
+    without_slivers,
+)
 
 BEFORE = 0.97  # of the depth shown: a continuation must be nearer than that to hide it
 BESIDE = 0.03  # of the image's width: how far around a plane's patch it is compared with what is shown

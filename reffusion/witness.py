@@ -27,7 +27,8 @@ class Witness:
     Attributes:
         camera: the view.
         depth: [H, W] float32 of the surface shown, 0 where the view shows nothing opaque.
-        nearest, farthest: [H, W] float32, its range in  the 3 x 3 pixels around each: about the same but at depth edges.
+        nearest, farthest: [H, W] float32, its range around each pixel: about the same on a smooth surface, wide at
+            depth edges and where the surface is rough, like grass.
         hidden: bool [H, W], where it shows the object, and a margin around.
     """
 

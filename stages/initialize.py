@@ -7,7 +7,6 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-
 WARN_FROM = 0.01  # share of C that shows nothing, from which a view is named
 
 
@@ -103,20 +102,21 @@ def run(
     log = trace.Trace(out) if references else None
     for each in sorted(references, key=lambda r: (r.camera.name != best, -int(r.mask.sum()))):
         gaussians, new = filled(params, out, gaussians, new, each, around, network, log)
-    if references and params.further:
+    true = true_pictures(reference, references, around) if params.start == "reference" else []
+    if true and params.further:
         gaussians, new, further = completed_further(params, out, gaussians, new, around, poses, fit)
-        references = [*references, *further]
+        true += further
     if params.start == "random" and any(each.invent.any() for each in sets.values()):
         added = at_random(params, removed, gaussians, scene, sets, poses)
         gaussians = gaussians.zipped(added, lambda a, b: torch.cat([a, b]))
         new = torch.cat([new, torch.ones(len(added), dtype=torch.bool)])
-    if references and params.settle:
-        gaussians = settled(params, out, gaussians, references, around, poses, fit)
+    if true and params.settle:
+        gaussians = settled(params, out, gaussians, true, around, poses, fit)
     io.save_ply(out / "gaussians.ply", gaussians)
     io.save_labels(out / "labels.npy", new)
-    uncovered = {name: initialize.uncovered(gaussians, scene.cameras[name], sets[name].consistent) for name in scene.train}
+    uncovered = {each.name: initialize.uncovered(gaussians, each, sets[each.name].consistent) for each in train}
     facts = {"new_gaussians": int(new.sum()), "removed_gaussians": int(labels.sum()), "haze": int(haze.sum())}
-    facts |= {"references": [each.camera.name for each in references], "uncovered": uncovered}
+    facts |= {"completed": [each.camera.name for each in true], "uncovered": uncovered}
     facts["uncovered_share"] = sum(uncovered.values()) / max(len(uncovered), 1)
     io.save_json(out / "facts.json", facts)
     if bare := [f"{name} ({share:.1%})" for name, share in uncovered.items() if share > WARN_FROM]:
@@ -130,7 +130,9 @@ def surroundings(params: Params, scene, gaussians, labels, sets):
     hidden = {name: each.consistent & (name not in scene.clean) for name, each in sets.items()}
     train = [scene.cameras[name] for name in scene.train]
     views = witness.witnesses(gaussians, train, hidden)
-    planes = continuation.planes_around(*masks.extent(gaussians.means[labels]), views, params.seed) if labels.any() else []
+    planes = []
+    if labels.any():
+        planes = continuation.planes_around(*masks.extent(gaussians.means[labels]), views, params.seed)
     return initialize.Surroundings(train, {n: sets[n].consistent for n in sets}, views, planes, scene.points)
 
 
@@ -164,7 +166,15 @@ def filled(params: Params, out: Path, gaussians, new, reference, around, network
     remaining = gaussians.map(lambda p: p[~new])
     continued = undecided.behind(remaining, camera, hidden, around.views, around.planes).continued
     depth, made_up, said = initialize.depth_behind(
-        remaining, reference, hole, hidden, around.points, how, estimate_of(network, reference), log, continued,
+        remaining,
+        reference,
+        hole,
+        hidden,
+        around.points,
+        how,
+        estimate_of(network, reference),
+        log,
+        continued,
         around.photographed(camera),
     )
     print(f"depth of reference {camera.name}: {said}")
@@ -174,6 +184,19 @@ def filled(params: Params, out: Path, gaussians, new, reference, around, network
     views = [(each, around.hidden[each.name]) for each in around.cameras]
     gap = initialize.seen_through(gaussians, camera, made_up, hidden & ~pixels, views, params.seen_through)
     return initialize.placed(gaussians, new, reference, made_up, gap, sheets)
+
+
+def true_pictures(reference: Path, references: list, around) -> list:
+    """The references, each standing for all of which it knows more than the Gaussians do: a picture that the scene
+    brings for all of C, one that was completed here for what was invented."""
+    from dataclasses import replace
+
+    from reffusion import io
+
+    facts = reference / "facts.json"
+    given = io.load_json(facts)["given"] if facts.exists() else []
+    whole = lambda each: replace(each, mask=each.mask | around.hidden[each.camera.name])
+    return [whole(each) if each.camera.name in given else each for each in references]
 
 
 def completed_further(params: Params, out: Path, gaussians, new, around, poses: Path, fit: Path):
@@ -201,18 +224,14 @@ def completed_further(params: Params, out: Path, gaussians, new, around, poses: 
 
 def settled(params: Params, out: Path, gaussians, references, around, poses: Path, fit: Path):
     """The Gaussians after `params.settle` steps of reconstruction; see `reffusion.settle`."""
-    from dataclasses import replace
-
     from reffusion import exposure
     from reffusion.settle import Known, settle
 
     names = [camera.name for camera in around.cameras]
     photos = exposure.load_views(poses, fit, names)
     hidden = {view.camera.name: view.hidden for view in around.views}
-    # A reference is true all over C, and not only where it was asked.
-    whole = [replace(each, mask=around.hidden[each.camera.name]) for each in references]
     (out / "settle").mkdir(exist_ok=True)
-    known = Known(around.cameras, photos, hidden, whole)
+    known = Known(around.cameras, photos, hidden, references)
     return settle(gaussians, known, params.settle, params.seed, out / "settle")
 
 

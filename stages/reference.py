@@ -93,6 +93,7 @@ def run(params: Params, out: Path, *, scene: Path, poses: Path, fit: Path, masks
     else:
         references = [inpainted(params, out, placed, poses, fit, masks)]
     io.save_references(out, references)
+    io.save_json(out / "facts.json", {"given": [each.camera.name for each in references] if given else []})
     if params.reference is None:
         lay_out(out / TO_PAINT, [each.view for each in given], placed, poses, fit, masks)
 

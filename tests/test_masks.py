@@ -125,7 +125,8 @@ def test_what_stands_inside_every_mask_is_the_object_although_it_was_outvoted(tm
     found = {}
     for hull in (0.9, 1.0):
         (tmp_path / str(hull)).mkdir()
-        _, _, found[hull], truth = classify(tmp_path / str(hull), NEAR, Params(gap=0.1, hull=hull, debris=False), masks=given)
+        params = Params(gap=0.1, hull=hull, debris=False)
+        _, _, found[hull], truth = classify(tmp_path / str(hull), NEAR, params, masks=given)
     lost = truth & ~found[1.0]
     assert lost.sum() >= 4, "the vote alone leaves the spot standing"
     assert found[0.9][lost].all()

@@ -81,7 +81,7 @@ def test_the_table_goes_on_under_the_box_and_ends_at_its_edge(views):
     table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.height))
     assert abs(table.normal[2]) > 0.999 and abs(table.height) < 0.01
     view = camera("new", 15.0, 1.6)
-    depth, hidden, on_table = drawn(view)
+    depth, _, on_table = drawn(view)
     at = table.depth(view)
     goes_on = table.on(table.goes_on, at, view)
     place = geometry.unproject(np.where(np.isfinite(at), at, 1.0), view)
