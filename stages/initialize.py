@@ -90,7 +90,7 @@ def run(
     network = monocular.load_network(params.depth_model) if params.depth_model and references else None
     sets = io.load_mask_sets(masks, scene.cameras)
     around = surroundings(params, scene, gaussians, labels, sets) if references else None
-    removed = gaussians.map(lambda p: p[labels])
+    removed = gaussians.map(lambda p: p[labels & ~debris_of(masks, labels)])
     gaussians = gaussians.map(lambda p: p[~labels])
     new = torch.zeros(len(gaussians), dtype=torch.bool)
     train = [scene.cameras[name] for name in scene.train]
@@ -102,7 +102,7 @@ def run(
     log = trace.Trace(out) if references else None
     for each in sorted(references, key=lambda r: (r.camera.name != best, -int(r.mask.sum()))):
         gaussians, new = filled(params, out, gaussians, new, each, around, network, log)
-    true = true_pictures(reference, references, around) if params.start == "reference" else []
+    true = true_pictures(reference, references, around) if references and params.start == "reference" else []
     if true and params.further:
         gaussians, new, further = completed_further(params, out, gaussians, new, around, poses, fit)
         true += further
@@ -121,6 +121,16 @@ def run(
     io.save_json(out / "facts.json", facts)
     if bare := [f"{name} ({share:.1%})" for name, share in uncovered.items() if share > WARN_FROM]:
         print(f"uncovered in {len(bare)} views: {', '.join(bare)}: complete another view and add it to the references")
+
+
+def debris_of(masks: Path, labels):
+    """bool [N]: of what goes, what was not the object."""
+    import torch
+
+    from reffusion import io
+
+    path = masks / "debris.npy"
+    return io.load_labels(path) if path.exists() else torch.zeros_like(labels)
 
 
 def surroundings(params: Params, scene, gaussians, labels, sets):

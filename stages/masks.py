@@ -78,7 +78,9 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
     hidden = {name: empty[name] if name in scene.clean else consistent[name] for name in scene.cameras}
     views = witness.witnesses(gaussians, train, hidden)
     if params.debris and raw:
-        labels |= witness.debris(gaussians, labels, views, hidden)
+        debris = witness.debris(gaussians, labels, views, hidden)
+        io.save_labels(out / "debris.npy", debris.cpu())
+        labels |= debris
     fill = region if params.invent in ("region", "auto") else None
     sets = classified(params, scene, gaussians, labels, raw, consistent, views, fill)
     undecided = share_undecided(sets, scene.train)

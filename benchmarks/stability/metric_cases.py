@@ -9,7 +9,7 @@ import torch
 
 from benchmarks.stability.cases import EPS32, EPS64, EXACT, UNCLEAR, Case, largest, unclear
 from benchmarks.stability.splatting import camera, cloud
-from reffusion import masks, metrics
+from reffusion import continuation, masks, metrics, undecided, witness
 from reffusion.lpips import Lpips
 from reffusion.optimize import reconstruction_loss
 from reffusion.ssim import C1
@@ -145,12 +145,14 @@ def in_no_view() -> float:
 
 
 def nothing_remains() -> float:
-    """Every Gaussian is the object: views of what remains show nothing, and nothing of it is seen elsewhere."""
+    """Every Gaussian is the object: nobody saw anything, so all is undecided and nothing goes on; how many pixels and
+    votes say otherwise."""
     nobody = cloud().map(lambda p: p[:0])
-    disparity, explained = masks.remaining_view(nobody, torch.zeros(0), NAMED[0])
-    hidden = {view.name: FULL for view in NAMED}
-    count = masks.seen_elsewhere(disparity, FULL, NAMED[0], NAMED, hidden, {v.name: disparity for v in NAMED})
-    return float(np.abs(disparity).max() + np.abs(explained).max() + count.sum())
+    views = witness.witnesses(nobody, NAMED, {view.name: FULL for view in NAMED})
+    planes = continuation.planes_around(np.zeros(3), 1.0, views)
+    found = undecided.behind(nobody, NAMED[0], FULL, views, planes)
+    said = witness.votes(np.zeros((1, 3)), views)
+    return float((~found.undecided).sum() + np.isfinite(found.continued).sum() + said.seen.sum() + said.free.sum())
 
 
 def tidied() -> float:
@@ -187,7 +189,7 @@ CASES = (
     Case("masks contradicting", "Gaussians labelled, and unequal votes", EXACT, contradicting),
     Case("mask present in one view", "Gaussians labelled wrongly", EXACT, in_one_view),
     Case("mask in no view", UNCLEAR, EXACT, in_no_view),
-    Case("masks full, nothing remains", "largest disparity, evidence or count", EXACT, nothing_remains),
+    Case("masks full, nothing remains", "pixels and votes that say something", EXACT, nothing_remains),
     Case("masks empty and full, tidied", "pixels changed", EXACT, tidied),
     Case("masks empty and full, views and boxes", WRONG, EXACT, views_of_masks),
 )  # fmt: skip
