@@ -121,6 +121,7 @@ def continued(
     points: np.ndarray,
     how: Completion,
     solvers: SolverLog = SILENT,
+    farthest: bool = False,
 ) -> tuple[np.ndarray, str]:
     """The scene's own disparity, [H, W] float64, continued through the hole; and how in words.
 
@@ -132,6 +133,7 @@ def continued(
         guide: [H, W, 3] uint8 or [0, 1], or what gives it when it is needed; the view's picture without the object.
         points: [P, 3] sparse points of the scene; P = 0 allowed.
         solvers: are told of what each solver finds.
+        farthest: of several surfaces around the hole only the farthest goes on: for a hole through which one looks.
     Raises:
         Degenerate: too little is known around the hole.
     """
@@ -143,6 +145,9 @@ def continued(
     plate = Plate(how.ring, how.stiffness, how.edge, how.unknowns)
     given = view.known | view.anchored
     surfaces = shared_out(view.disparity, given & grown(view.hole, how.ring), view.hole, guide)
+    if surfaces.max() > 1 and farthest:
+        given = view.anchored | (given & (surfaces == _farthest(view, surfaces, given)))
+        return complete(view.disparity, given, guide, plate), f"{said}: the farthest of {surfaces.max()} surfaces"
     if surfaces.max() > 1:
         layered, said = _layered(view, given, surfaces, guide, plate), f"{said}: {surfaces.max()} surfaces continued"
         solvers.solved("completion", layered)
@@ -155,6 +160,13 @@ def continued(
     share = view.anchored.sum() / max(view.hole.sum(), 1)
     onward = f", planes that go on in {share:.0%} of the hole" if share else ""
     return np.where(view.anchored, view.disparity, refined), f"{said}: continued smoothly instead{onward}"
+
+
+def _farthest(view: Seen, surfaces: np.ndarray, given: np.ndarray) -> int:
+    """The surface of the smallest median disparity."""
+    median = lambda surface: float(np.median(view.disparity[given & ~view.anchored & (surfaces == surface)]))
+    present = [k for k in range(1, surfaces.max() + 1) if (given & ~view.anchored & (surfaces == k)).any()]
+    return min(present, key=median)
 
 
 def _layered(view: Seen, given: np.ndarray, surfaces: np.ndarray, guide: np.ndarray, plate: Plate) -> np.ndarray:

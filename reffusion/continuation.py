@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from scipy import ndimage
 
@@ -22,6 +23,7 @@ TRIALS = 300  # draws of three samples for each plane
 LEAST_SHARE = 0.1  # of the samples that a plane must explain
 MOST = 5  # planes
 CELLS = 160  # a side of a plane's map
+LARGE = 0.05  # of the largest patch of seen cells: smaller ones are no part of the plane
 TOUCHING = 0.25  # share of an unknown patch's border that must be seen for the plane to go on into it
 
 
@@ -117,6 +119,20 @@ def _best_plane(points: np.ndarray, near: float, draws: np.random.Generator) -> 
     return normal, float(height), int((np.abs(points @ normal - height) < near).sum())
 
 
+def _hull(seen: np.ndarray) -> np.ndarray:
+    """bool [CELLS, CELLS], the convex hull of the large patches of seen cells: a surface ends where the prolongations
+    of its visible borders do."""
+    solid = cv2.morphologyEx(seen.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    patches, count = ndimage.label(solid)
+    areas = np.bincount(patches.ravel(), minlength=count + 1)
+    areas[0] = 0
+    rows, columns = np.nonzero((areas >= LARGE * max(areas.max(), 1))[patches])
+    hull = np.zeros(seen.shape, np.uint8)
+    if len(rows):
+        cv2.fillConvexPoly(hull, cv2.convexHull(np.stack([columns, rows], 1).astype(np.int32)), 1)
+    return hull > 0
+
+
 def _mapped(normal: np.ndarray, height: float, centre: np.ndarray, reach: float, views: Sequence[Witness]) -> Plane:
     """The plane with its map: a patch of it that nobody saw, because the object was in the way, and that touches what
     was seen of it, is where it goes on; where views look through it, it does not."""
@@ -139,5 +155,6 @@ def _mapped(normal: np.ndarray, height: float, centre: np.ndarray, reach: float,
         border = ndimage.binary_dilation(inside, iterations=2) & ~inside
         if inside.sum() >= 4 and seen[border].mean() > TOUCHING:
             goes_on |= inside
+    goes_on &= _hull(seen)
     within = goes_on | (ndimage.binary_fill_holes(seen | goes_on) & ~seen & (said.hidden > 0).reshape(shape))
     return Plane(normal, height, origin, along, pitch, goes_on, within)

@@ -25,7 +25,7 @@ def undecided_views(
         hidden = around.hidden[camera.name]
         behind = undecided.behind(gaussians, camera, hidden, around.views, around.planes, given=new)
         # Without a true picture a made-up surface is worse than what stands there, but for holes and planes.
-        wanted = behind.undecided & (np.isfinite(behind.continued) | (behind.alpha <= OPAQUE))
+        wanted = behind.undecided & (behind.alpha <= OPAQUE)
         speck, gap = 0.01 * camera.width, 0.02 * camera.width
         found[camera.name] = masks.tidy(wanted, speck, gap) & behind.undecided
     return found

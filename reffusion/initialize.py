@@ -63,6 +63,7 @@ def depth_behind(
     log: trace.Trace | None = None,
     continued: np.ndarray | None = None,
     outer: np.ndarray | None = None,
+    farthest: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """The scene without the object in one view: depth [H, W] float64, as rendered where that is known, else made up;
     the same made up everywhere; and how in words.
@@ -79,7 +80,7 @@ def depth_behind(
         how: parameters.
         estimate: [H, W] a depth model's answer to the reference, disparity up to scale and offset; None: there is none.
         log: gets a series for each solver (docs/traces.md).
-        continued, outer: see `behind.seen`.
+        continued, outer: see `behind.seen`. farthest: see `behind.continued`.
 
     Raises:
         ValueError: naming the view, where too little is known around the hole, or the estimate does not fit.
@@ -91,7 +92,7 @@ def depth_behind(
         if reference.depth is not None:
             solved, said = behind.brought(view, reference.image, reference.depth, points, how, solvers)
         elif estimate is None:
-            solved, said = behind.continued(view, reference.image, points, how, solvers)
+            solved, said = behind.continued(view, reference.image, points, how, solvers, farthest)
         else:
             solved, said = behind.estimated(view, reference.image, estimate, how, solvers)
         # Beyond infinity there is nothing: the farthest depth that can be told stands in.

@@ -122,10 +122,13 @@ def label_view(gaussians: Gaussians, labels: Tensor, camera: Camera) -> np.ndarr
 
 
 def extent(means: Tensor) -> tuple[np.ndarray, float]:
-    """Middle [3] and radius, float64, of most of the points [N, 3], N at least 1."""
+    """Middle [3] and radius, float64, of what most of the points [N, 3] stand on, N at least 1.
+
+    From medians: a tenth of the labels may be wrong, and lie as far away as the sky.
+    """
     points = means.detach().double().cpu().numpy()
     centre = np.median(points, 0)
-    return centre, float(np.percentile(np.linalg.norm(points - centre, axis=1), 95))
+    return centre, 1.5 * float(np.median(np.linalg.norm(points - centre, axis=1)))
 
 
 def tidy(mask: np.ndarray, speck: float, gap: float) -> np.ndarray:

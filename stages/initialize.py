@@ -89,8 +89,9 @@ def run(
     references = io.load_references(completed, scene) if completed else []
     network = monocular.load_network(params.depth_model) if params.depth_model and references else None
     sets = io.load_mask_sets(masks, scene.cameras)
-    around = surroundings(params, scene, gaussians, labels, sets) if references else None
-    removed = gaussians.map(lambda p: p[labels & ~debris_of(masks, labels)])
+    thing = labels & ~debris_of(masks, labels)
+    around = surroundings(params, scene, gaussians, thing, sets) if references else None
+    removed = gaussians.map(lambda p: p[thing])
     gaussians = gaussians.map(lambda p: p[~labels])
     new = torch.zeros(len(gaussians), dtype=torch.bool)
     train = [scene.cameras[name] for name in scene.train]
@@ -133,7 +134,7 @@ def debris_of(masks: Path, labels):
     return io.load_labels(path) if path.exists() else torch.zeros_like(labels)
 
 
-def surroundings(params: Params, scene, gaussians, labels, sets):
+def surroundings(params: Params, scene, gaussians, thing, sets):
     """What the photographs say of the space around the object, and the planes that go on into what they do not."""
     from reffusion import continuation, initialize, masks, witness
 
@@ -141,8 +142,8 @@ def surroundings(params: Params, scene, gaussians, labels, sets):
     train = [scene.cameras[name] for name in scene.train]
     views = witness.witnesses(gaussians, train, hidden)
     planes = []
-    if labels.any():
-        planes = continuation.planes_around(*masks.extent(gaussians.means[labels]), views, params.seed)
+    if thing.any():
+        planes = continuation.planes_around(*masks.extent(gaussians.means[thing]), views, params.seed)
     return initialize.Surroundings(train, {n: sets[n].consistent for n in sets}, views, planes, scene.points)
 
 
@@ -164,7 +165,7 @@ def at_random(params: Params, removed, remaining, scene, sets, poses: Path):
     return scatter.gaussians_at(points, remaining.sh.shape[1], remaining.antialiased, draw)
 
 
-def filled(params: Params, out: Path, gaussians, new, reference, around, network, log):
+def filled(params: Params, out: Path, gaussians, new, reference, around, network, log, farthest=False):
     """The Gaussians with those of one reference, on what is still empty in its mask, and the labels."""
     from dataclasses import fields
 
@@ -186,6 +187,7 @@ def filled(params: Params, out: Path, gaussians, new, reference, around, network
         log,
         continued,
         around.photographed(camera),
+        farthest,
     )
     print(f"depth of reference {camera.name}: {said}")
     io.save_exr(out / "depth" / f"{camera.name}.exr", depth.astype("float32"))
@@ -226,7 +228,7 @@ def completed_further(params: Params, out: Path, gaussians, new, around, poses: 
         reference = Reference(camera, picture, mask)
         print(f"further view {camera.name}: {mask.sum() / hidden.sum():.1%} of the mask is shown by nothing else")
         io.save_image(out / "further" / f"{camera.name}.png", picture)
-        gaussians, new = filled(params, out, gaussians, new, reference, around, None, None)
+        gaussians, new = filled(params, out, gaussians, new, reference, around, None, None, farthest=True)
         further.append(reference)
         found |= coverage.undecided_views(gaussians, new, around, [c for c in around.cameras if found[c.name].any()])
     return gaussians, new, further

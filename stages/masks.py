@@ -77,12 +77,13 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
     )
     hidden = {name: empty[name] if name in scene.clean else consistent[name] for name in scene.cameras}
     views = witness.witnesses(gaussians, train, hidden)
+    planes = continuations(params, gaussians, labels, views)
     if params.debris and raw:
         debris = witness.debris(gaussians, labels, views, hidden)
         io.save_labels(out / "debris.npy", debris.cpu())
         labels |= debris
     fill = region if params.invent in ("region", "auto") else None
-    sets = classified(params, scene, gaussians, labels, raw, consistent, views, fill)
+    sets = classified(params, scene, gaussians.map(lambda p: p[~labels]), raw, consistent, views, planes, fill)
     undecided = share_undecided(sets, scene.train)
     if params.invent != "consistent" and fill is None and undecided <= params.negligible:
         sets = {name: replace(each, invent=empty[name]) for name, each in sets.items()}
@@ -126,25 +127,23 @@ def drawn(params: Params, gaussians: Gaussians, labels: Tensor, cameras: dict[st
 def classified(
     params: Params,
     scene: Scene,
-    gaussians: Gaussians,
-    labels: Tensor,
+    remaining: Gaussians,
     raw: dict[str, np.ndarray],
     consistent: dict[str, np.ndarray],
     views: list[Witness],
+    planes: list[Plane],
     fill: dict | None,
 ) -> dict[str, MaskSet]:
     """The masks of each view: what other views show behind the object is decided, and is not invented.
 
-    `labels`: [N] bool, what goes; `fill`: the region that is made up whatever anyone saw, or None.
+    `fill`: the region that is made up whatever anyone saw, or None.
     """
     import numpy as np
 
     from reffusion import masks, trace, undecided
     from reffusion.types import MaskSet
 
-    remaining, names = gaussians.map(lambda p: p[~labels]), list(scene.cameras)
-    planes = continuations(params, gaussians, labels, views)
-    sets = {}
+    names, sets = list(scene.cameras), {}
     for k in trace.progress(len(names), "masks"):
         name, camera = names[k], scene.cameras[names[k]]
         found = undecided.behind(remaining, camera, consistent[name], views, planes, witnesses=params.witnesses)
@@ -158,7 +157,7 @@ def classified(
 
 
 def continuations(params: Params, gaussians: Gaussians, labels: Tensor, views: list[Witness]) -> list[Plane]:
-    """The planes around what goes; none where nothing does."""
+    """The planes around the object; none where there is none."""
     from reffusion.continuation import planes_around
     from reffusion.masks import extent
 
