@@ -151,7 +151,8 @@ def run(
     initial, masked, holes = start(params, scene, reference, initialize)
     prior, text = adapted_prior(params, personalize)
     estimator = depth_estimator(params, scene.points) if params.depth_weight > 0 else None
-    sights, (perceptual, lifting) = load_sights(params, scene, poses, fit, masks, lift), lift_choices(params)
+    sights = load_sights(params, scene, poses, fit, masks, lift, initialize / "tainted")
+    perceptual, lifting = lift_choices(params)
     if params.sds_weight > 0 and params.sds_within < 180:
         print(within(params, initial.means[masked], sights, holes), flush=True)
     with memory.blamed("distill.memory_gb", params.memory_gb):
@@ -199,8 +200,13 @@ def adapted_prior(params: Params, personalize: Path | None) -> tuple:
     return recomputing(prior) if params.checkpointing else prior, text
 
 
-def load_sights(params: Params, scene, poses: Path, fit: Path, masks: Path, lift: Path | None = None) -> list:
-    """The training views with the pixels that may supervise, those to repaint, and their pictures inpainted in 2D."""
+def load_sights(
+    params: Params, scene, poses: Path, fit: Path, masks: Path, lift: Path | None = None, tainted: Path | None = None
+) -> list:
+    """The training views with the pixels that may supervise, those to repaint, and their pictures inpainted in 2D.
+
+    `tainted`: a folder of masks, of pixels that the object had shadowed; they may not supervise.
+    """
     import torch
 
     from reffusion import exposure, io
@@ -216,6 +222,8 @@ def load_sights(params: Params, scene, poses: Path, fit: Path, masks: Path, lift
         # A view with nothing to invent shows the truth, or at least what other views saw: nothing is distilled there.
         repaint = repaint & pixels.invent.any() & (not clean)
         supervises = ~pixels.consistent | clean
+        if tainted and (tainted / f"{name}.png").exists():
+            supervises &= ~io.load_mask(tainted / f"{name}.png")
         lifted = place(painted[name]) / 255 if name in painted else None
         photo = place(photos[name]) / 255
         sights.append(Sight(scene.cameras[name], photo, place(supervises), place(repaint), clean, lifted))

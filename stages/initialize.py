@@ -104,6 +104,8 @@ def run(
     for each in sorted(references, key=lambda r: (r.camera.name != best, -int(r.mask.sum()))):
         gaussians, new = filled(params, out, gaussians, new, each, around, network, log)
     true = true_pictures(reference, references, around) if references and params.start == "reference" else []
+    if true and params.settle:
+        true, around = without_shadows(out, true, gaussians, around, poses, fit)
     if true and params.further:
         gaussians, new, further = completed_further(params, out, gaussians, new, around, poses, fit)
         true += further
@@ -209,6 +211,37 @@ def true_pictures(reference: Path, references: list, around) -> list:
     given = io.load_json(facts)["given"] if facts.exists() else []
     whole = lambda each: replace(each, mask=each.mask | around.hidden[each.camera.name])
     return [whole(each) if each.camera.name in given else each for each in references]
+
+
+def without_shadows(out: Path, true: list, gaussians, around, poses: Path, fit: Path):
+    """The references, standing also for what the object had tainted, and the surroundings where the photographs say
+    nothing there; writes tainted/<view>.png where there is something."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from reffusion import exposure, inpaint, io, splat, taint
+    from reffusion.witness import with_photographed_depth
+
+    marks = {camera.name: np.zeros((camera.height, camera.width), bool) for camera in around.cameras}
+    pictures = []
+    for each in true:
+        name = each.camera.name
+        photo, hidden = exposure.load_views(poses, fit, [name])[name], around.hidden[name]
+        found = taint.tainted(each.image, inpaint.background(gaussians, each.camera, photo, hidden), hidden)
+        if found.any():
+            print(f"reference {name}: beside the hole {found.sum()} px differ from what is seen, a shadow perhaps")
+            depth = splat.render(gaussians, each.camera, sh_degree=0).depth.double().numpy()
+            depth = with_photographed_depth(depth, each.camera, around.views)
+            carried = taint.carried(found, depth, each.camera, around.views)
+            marks = {view: mask | carried[view] for view, mask in marks.items()}
+        pictures.append(replace(each, mask=each.mask | found))
+    if not any(mask.any() for mask in marks.values()):
+        return true, around
+    for name, mask in marks.items():
+        io.save_mask(out / "tainted" / f"{name}.png", mask)
+    views = [replace(view, hidden=view.hidden | marks[view.camera.name]) for view in around.views]
+    return pictures, replace(around, views=views)
 
 
 def completed_further(params: Params, out: Path, gaussians, new, around, poses: Path, fit: Path):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from reffusion import geometry
+from reffusion import geometry, taint
 from reffusion.behind import Completion, Seen, continued
 from reffusion.continuation import planes_around
 from reffusion.initialize import with_gloss
@@ -143,3 +143,21 @@ def test_new_gaussians_shine_as_their_neighbours_do():
     torch.testing.assert_close(lit.sh[fresh, 3], torch.full((10, 3), 0.25))
     assert torch.equal(lit.sh[:, 0], scene.sh[:, 0]) and torch.equal(lit.sh[~fresh], scene.sh[~fresh])
     assert with_gloss(scene, torch.zeros_like(fresh), 16) is scene
+
+
+def test_a_shadow_beside_the_mask_is_found_and_carried_into_other_views(views):
+    view, other = views[0], views[1]
+    depth, hidden, on_table = drawn(view.camera)
+    place = geometry.unproject(depth, view.camera)
+    shadow = on_table & ~hidden & (np.hypot(place[..., 0] - 0.5, place[..., 1] - 0.5) < 0.3)
+    grain = np.random.default_rng(0).integers(-12, 13, (SIZE, SIZE, 1))
+    truth = np.clip(np.full((SIZE, SIZE, 3), 140) + grain, 0, 255).astype(np.uint8)
+    photo = np.where(shadow[..., None], (truth * 0.6).astype(np.uint8), truth)
+    photo[5:25, 5:25] = 40  # something else that differs, far from the mask
+    found = taint.tainted(truth, photo, hidden)
+    assert (found & shadow).sum() > 0.9 * (shadow & ~view.hidden).sum() and not found[5:25, 5:25].any()
+    assert not taint.tainted(truth, truth, hidden).any()
+    there = geometry.unproject(drawn(other.camera)[0], other.camera)
+    same = drawn(other.camera)[2] & (np.hypot(there[..., 0] - 0.5, there[..., 1] - 0.5) < 0.25) & ~other.hidden
+    carried = taint.carried(found, depth, view.camera, [other])["a1"]
+    assert carried[same].mean() > 0.9 and not carried[~drawn(other.camera)[2]].mean() > 0.02
