@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import torch
 
-from reffusion import geometry, splat
+from reffusion import geometry, paint2d, splat
 from reffusion.surfels import surface_normals
 from reffusion.types import Camera, Gaussians
 
@@ -78,10 +78,8 @@ def pixels(fraction: float, width: int) -> int:
 
 
 def widened(mask: np.ndarray, fraction: float) -> np.ndarray:
-    """The mask, bool [H, W], and all pixels within `fraction` of the image's width."""
-    reach = pixels(fraction, mask.shape[1])
-    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
-    return cv2.dilate(mask.astype(np.uint8), disk) > 0
+    """The mask, bool [H, W], and all pixels within `fraction` of the image's width, at least the next."""
+    return paint2d.widened(mask, pixels(fraction, mask.shape[1]) / mask.shape[1])
 
 
 @dataclass(frozen=True)

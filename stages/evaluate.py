@@ -71,7 +71,7 @@ def run(
     and test views without a picture are rendered and not scored. `reference`, `personalize` and `lift` give their
     seconds only.
     """
-    from reffusion import consistency, io, lpips, metrics, paint2d, sight, trace
+    from reffusion import consistency, io, lpips, metrics, paint2d, trace
 
     needs = {"poses": poses, "fit": fit, "masks": masks, "reference": reference, "personalize": personalize}
     needs |= {"lift": lift, "initialize": initialize, "distill": distill}
@@ -82,8 +82,7 @@ def run(
     gaussians = {s: io.load_ply(needs[s] / "gaussians.ply").map(lambda p: p.to(params.device)) for s in made}
     result, captured, counts = made[-1], gaussians["fit"], {stage: len(value) for stage, value in gaussians.items()}
     names, kind = views_of(scene)
-    seen_by = sight.witnesses(*captured_by(scene, captured, poses, masks)) if kind == "test" else []
-    unseen = {name: sight.unseen(captured, scene.cameras[name], seen_by) for name in names if seen_by}
+    unseen = unseen_in(scene, captured, poses, masks) if kind == "test" else {}
     # Brought Gaussians may know more than these views do.
     if params.beyond and reaches_beyond(unseen) and not (poses / "gaussians.ply").exists():
         gaussians |= finished(scene, gaussians, result)
@@ -187,6 +186,14 @@ def views_of(scene: Scene) -> tuple[tuple[str, ...], str]:
         return scene.test, "test"
     eighth = scene.train[::8]
     return (eighth, "training, every 8th") if len(eighth) >= 8 else (scene.train, "training")
+
+
+def unseen_in(scene: Scene, captured: Gaussians, poses: Path, masks: Path | None) -> dict[str, np.ndarray]:
+    """Test view -> bool [H, W], pixels that show what no training view saw."""
+    from reffusion import sight
+
+    seen_by = sight.witnesses(*captured_by(scene, captured, poses, masks))
+    return {name: sight.unseen(captured, scene.cameras[name], seen_by) for name in scene.test}
 
 
 def reaches_beyond(unseen: dict[str, np.ndarray]) -> bool:

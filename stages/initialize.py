@@ -245,8 +245,8 @@ def without_shadows(out: Path, true: list, gaussians, around, poses: Path, fit: 
 
 
 def completed_further(params: Params, out: Path, gaussians, new, around, poses: Path, fit: Path):
-    """Views completed by pieces of themselves, one after another, the one that shows most that nothing covers first;
-    the Gaussians with what they show, the labels, and the views."""
+    """Views completed in 2D by Telea, one after another, the one with most that nothing covers first; the Gaussians
+    with what they show, the labels, and the views."""
     from reffusion import coverage, exposure, inpaint, io, paint2d
     from reffusion.types import Reference
 
@@ -269,15 +269,16 @@ def completed_further(params: Params, out: Path, gaussians, new, around, poses: 
 
 def settled(params: Params, out: Path, gaussians, references, around, poses: Path, fit: Path):
     """The Gaussians after `params.settle` steps of reconstruction; see `reffusion.settle`."""
-    from reffusion import exposure
+    from reffusion import exposure, trace
     from reffusion.settle import Known, settle
 
-    names = [camera.name for camera in around.cameras]
-    photos = exposure.load_views(poses, fit, names)
+    photos = exposure.load_views(poses, fit, [camera.name for camera in around.cameras])
     hidden = {view.camera.name: view.hidden for view in around.views}
-    (out / "settle").mkdir(exist_ok=True)
-    known = Known(around.cameras, photos, hidden, references)
-    return settle(gaussians, known, params.settle, params.seed, out / "settle")
+    work = out / ".settle"  # hidden: its trace tells seconds, which are no part of the artifact's content
+    work.mkdir(exist_ok=True)
+    done = settle(gaussians, Known(around.cameras, photos, hidden, references), params.settle, params.seed, work)
+    trace.clear_checkpoint(work)
+    return done
 
 
 def completion(params: Params):

@@ -208,3 +208,24 @@ def test_the_reference_is_reproduced_by_matched_colors():
     assert error(matched) < 0.5 * error(new)
     kept = rules.match_colors(new, ~labels, picture, everything, view, 5)
     assert torch.equal(kept.sh, new.sh)
+
+
+def test_settling_moves_the_gaussians_and_leaves_no_checkpoint(scene, tmp_path):
+    """Twice the same, as many as before, nearer to the photographs; what it needs to resume goes when it is done."""
+    found = {}
+    for name, steps in (("none", 0), ("first", 40), ("again", 40)):
+        out = tmp_path / name
+        out.mkdir()
+        given = references(scene, out / "r", "a2")
+        initialize.run(initialize.Params(settle=steps, gloss=8, further=2), out, **scene, reference=given)
+        found[name] = io.load_ply(out / "gaussians.ply")
+        visible = [path.name for path in out.rglob("*") if ".settle" not in path.parts]
+        assert not list(out.rglob("checkpoint*")) and "settle" not in visible
+    assert len(found["none"]) == len(found["first"])
+    assert torch.equal(found["first"].means, found["again"].means)
+    view = small.CAMERAS["a4"]
+    error = {
+        name: float((splat.render(g, view).color - torch.from_numpy(small.photo(view)) / 255).abs().mean())
+        for name, g in found.items()
+    }
+    assert error["first"] < error["none"]
