@@ -15,6 +15,7 @@ from reffusion.solverlog import SILENT, SolverLog
 from reffusion.types import Camera, Rendering
 
 ENOUGH_POINTS = 50  # fewer sparse points around the hole, and the rendered depth is asked instead
+SWEPT = 3  # times as many pixels whose depth was swept take part in the search for planes
 BEHIND = 1.03  # relative depth from which a sparse point is hidden by what is rendered
 STRETCH = 1.15  # a surface continued beyond the disparities that are seen of it, by so much at most
 FARTHEST = 2.0  # times the farthest known depth: beyond it lies infinity, of which nothing is known
@@ -69,6 +70,7 @@ class Seen:
         known: bool [H, W], the pixels whose depth is the scene's: covered, and not beside the hole.
         hole: bool [H, W], the pixels to be filled. hidden: bool [H, W], C: where the object stood.
         anchored: bool [H, W], pixels of the hole whose `depth` is that of a plane which goes on there.
+        told: bool [H, W], pixels whose `depth` other photographs agree on (`reffusion.sweep`); None: not asked.
     """
 
     camera: Camera
@@ -77,6 +79,7 @@ class Seen:
     hole: np.ndarray
     hidden: np.ndarray
     anchored: np.ndarray
+    told: np.ndarray | None = None
 
     @property
     def disparity(self) -> np.ndarray:
@@ -99,12 +102,14 @@ def seen(
     how: Completion,
     continued: np.ndarray | None = None,
     outer: np.ndarray | None = None,
+    told: np.ndarray | None = None,
 ) -> Seen:
     """The depth of a rendering, known where it is covered, but for the hole and a margin around it.
 
     Args:
         continued: [H, W] depth of planes that go on in the hole, inf where none does (`undecided.Behind`).
         outer: [H, W] depth that is better known than the rendering's, above 0 where there is one.
+        told: bool [H, W], see `Seen`.
     """
     depth, alpha = (t.detach().double().cpu().numpy() for t in (drawn.depth, drawn.alpha))
     if outer is not None:
@@ -112,7 +117,7 @@ def seen(
     known = (alpha > how.explained) & (depth > 0) & ~grown(hole, how.margin)
     anchored = hole & np.isfinite(continued) if continued is not None else np.zeros_like(hole)
     depth = np.where(anchored, continued, depth) if anchored.any() else depth
-    return Seen(camera, depth, known, hole, hidden, anchored)
+    return Seen(camera, depth, known, hole, hidden, anchored, told)
 
 
 def continued(
@@ -146,8 +151,8 @@ def continued(
     given = view.known | view.anchored
     surfaces = shared_out(view.disparity, given & grown(view.hole, how.ring), view.hole, guide)
     if surfaces.max() > 1 and farthest:
-        given = view.anchored | (given & (surfaces == _farthest(view, surfaces, given)))
-        return complete(view.disparity, given, guide, plate), f"{said}: the farthest of {surfaces.max()} surfaces"
+        far = complete(view.disparity, given & (surfaces == _farthest(view, surfaces, given)), guide, plate)
+        return np.where(view.anchored, view.disparity, far), f"{said}: the farthest of {surfaces.max()} surfaces"
     if surfaces.max() > 1:
         layered, said = _layered(view, given, surfaces, guide, plate), f"{said}: {surfaces.max()} surfaces continued"
         solvers.solved("completion", layered)
@@ -201,6 +206,12 @@ def _planar(view: Seen, points: np.ndarray, how: Completion) -> tuple[planes.Pla
         rows, columns = np.nonzero(_around(view, how) & view.known)
         values, source = view.disparity[rows, columns], "rendered depth"
         pixels = np.stack([columns, rows], 1) + 0.5
+    elif view.told is not None:
+        rows, columns = np.nonzero(_around(view, how) & view.known & view.told)
+        kept = slice(None, None, max(1, len(rows) // (SWEPT * len(values))))
+        rows, columns, source = rows[kept], columns[kept], "sparse points and photographs compared"
+        values = np.concatenate([values, view.disparity[rows, columns]])
+        pixels = np.concatenate([pixels, np.stack([columns, rows], 1) + 0.5])
     draws = trace.generator(how.seed, "planes", view.camera.name)
     planar = planes.planar_model(pixels, values, view.hole.shape, draws, tolerance=how.planar_tolerance)
     return planar, f"{planar.planes} planes explain {planar.explained:.0%} of {len(values)} {source}"

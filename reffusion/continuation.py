@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -24,6 +24,10 @@ LEAST_SHARE = 0.1  # of the samples that a plane must explain
 MOST = 5  # planes
 CELLS = 160  # a side of a plane's map
 LARGE = 0.05  # of the largest patch of seen cells: smaller ones are no part of the plane
+WITHIN = (0.05, 0.03, 0.015, 0.015)  # relative depth within which a view's pixels belong to a plane, step by step
+ENOUGH = 200  # pixels that must
+FAR = 0.08  # relative depth: a plane that would move farther anywhere in the hole stays where it is
+STAYS = 0.05  # weight of the plane as it was, within the hole, against what is around
 TOUCHING = 0.25  # share of an unknown patch's border that must be seen for the plane to go on into it
 
 
@@ -84,6 +88,37 @@ def planes_around(centre: np.ndarray, radius: float, views: Sequence[Witness], s
         found.append(_mapped(normal, height, centre, REACH * radius, views))
         free &= np.abs(samples @ normal - height) >= 1.5 * near
     return found
+
+
+def aligned(plane: Plane, depth: np.ndarray, camera: Camera, hole: np.ndarray) -> Plane:
+    """The plane moved onto what one view knows of it around a hole; as it is where that is little.
+
+    Args:
+        depth: [H, W], known well where above 0. hole: bool [H, W], where the plane may have to go on: there it stays
+            where it is as far as what is around does not say more.
+    """
+    at = plane.depth(camera)
+    known = (depth > 0) & np.isfinite(at)
+    rows, columns = np.nonzero(known | (hole & np.isfinite(at)))
+    x, y = (columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy
+    design, prior = np.stack([x, y, np.ones_like(x)], 1), 1 / at[rows, columns]
+    told, values = known[rows, columns], np.where(known, 1 / np.maximum(depth, 1e-12), 0)[rows, columns]
+    found = np.linalg.lstsq(design, prior, rcond=None)[0] if len(rows) >= 3 else np.zeros(3)
+    for within in WITHIN:
+        off = np.abs(values / np.maximum(design @ found, 1e-12) - 1)
+        mine = told & (off < within)
+        if mine.sum() < ENOUGH:
+            return plane
+        weight = np.where(mine, 1 / mine.sum(), np.where(told, 0.0, STAYS / max((~told).sum(), 1))) / prior**2
+        scaled = design * np.sqrt(weight)[:, None]
+        found = np.linalg.lstsq(scaled, np.where(mine, values, prior) * np.sqrt(weight), rcond=None)[0]
+    normal = found @ camera.world_to_camera[:3, :3]
+    length = np.linalg.norm(normal)
+    normal, height = normal / length, (1 + normal @ camera.center) / length
+    moved = replace(plane, normal=normal, height=float(height))
+    there = hole & np.isfinite(at)
+    far = np.abs(moved.depth(camera)[there] / at[there] - 1).max() if there.any() else 0.0
+    return moved if far < FAR else plane
 
 
 def _samples(centre: np.ndarray, reach: float, views: Sequence[Witness], seed: int) -> np.ndarray:

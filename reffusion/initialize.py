@@ -7,16 +7,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
-from reffusion import behind, geometry, splat, trace
+from reffusion import behind, continuation, geometry, gloss, splat, sweep, trace
 from reffusion.behind import Completion
 from reffusion.continuation import Plane
 from reffusion.solverlog import SolverLog
 from reffusion.splat.conventions import SH0
 from reffusion.surfels import surface_gaussians
 from reffusion.types import Camera, Gaussians, Reference
-from reffusion.witness import Witness, with_photographed_depth
+from reffusion.witness import Witness, widened, with_photographed_depth
+
+SWEPT = 0.1  # of the image's width: how far around a hole depth is found by comparing photographs
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class Sheets:
         under_spread, under_opacity: the second's. Wider Gaussians than the first's leave no gaps between them, which a
             nearer view would show as a grid; what that blurs the colours of the first make up for.
         color_steps: corrections of the colours, see `match_colors`.
-        gloss: neighbours that lend their view-dependent colour, see `with_gloss`; 0: the new ones have none.
+        gloss: whether they change with the direction as what is around them does, see `reffusion.gloss`.
     """
 
     spread: float
@@ -48,7 +49,7 @@ class Sheets:
     under_spread: float
     under_opacity: float
     color_steps: int
-    gloss: int = 0
+    gloss: bool = False
 
 
 @torch.no_grad()
@@ -63,6 +64,7 @@ def depth_behind(
     log: trace.Trace | None = None,
     continued: np.ndarray | None = None,
     outer: np.ndarray | None = None,
+    told: np.ndarray | None = None,
     farthest: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """The scene without the object in one view: depth [H, W] float64, as rendered where that is known, else made up;
@@ -80,13 +82,13 @@ def depth_behind(
         how: parameters.
         estimate: [H, W] a depth model's answer to the reference, disparity up to scale and offset; None: there is none.
         log: gets a series for each solver (docs/traces.md).
-        continued, outer: see `behind.seen`. farthest: see `behind.continued`.
+        continued, outer, told: see `behind.seen`. farthest: see `behind.continued`.
 
     Raises:
         ValueError: naming the view, where too little is known around the hole, or the estimate does not fit.
     """
     drawn = splat.render(remaining, reference.camera, sh_degree=0)
-    view = behind.seen(drawn, reference.camera, hole, hidden, how, continued, outer)
+    view = behind.seen(drawn, reference.camera, hole, hidden, how, continued, outer, told)
     solvers = SolverLog(log, reference.camera.name, *behind.points_around(view, points, how))
     try:
         if reference.depth is not None:
@@ -151,13 +153,14 @@ class Surroundings:
 
     Attributes:
         cameras: the training views.
-        hidden: view name -> bool [H, W], C.
+        hidden: view name -> bool [H, W], C. photos: view name -> uint8 [H, W, 3], exposed as the Gaussians are.
         views: the training views as witnesses. planes: those that go on into what nobody saw.
         points: [P, 3] sparse points of the scene.
     """
 
     cameras: Sequence[Camera]
     hidden: Mapping[str, np.ndarray]
+    photos: Mapping[str, np.ndarray]
     views: Sequence[Witness]
     planes: Sequence[Plane]
     points: np.ndarray
@@ -166,6 +169,18 @@ class Surroundings:
         """[H, W] depth that a training view shows outside its mask; 0 elsewhere."""
         nothing = np.zeros((camera.height, camera.width))
         return with_photographed_depth(nothing, camera, self.views)
+
+    def compared(self, camera: Camera, hole: np.ndarray) -> tuple[Surroundings, np.ndarray]:
+        """The same, but around a hole of a training view depth and planes are where the photographs agree best; and
+        bool [H, W], where they tell."""
+        depth = self.photographed(camera)
+        ring = widened(hole | self.hidden[camera.name], SWEPT) & ~hole & (depth > 0)
+        swept = sweep.swept(self.photos[camera.name], depth, ring, camera, self.views, self.photos)
+        told = swept > 0
+        better = lambda view: replace(view, depth=np.where(told, swept, view.depth).astype(view.depth.dtype))
+        views = [better(view) if view.camera.name == camera.name else view for view in self.views]
+        planes = [continuation.aligned(plane, swept, camera, hole) for plane in self.planes]
+        return replace(self, views=views, planes=planes), told
 
 
 @torch.no_grad()
@@ -189,40 +204,25 @@ def surface(
 
 
 def placed(
-    gaussians: Gaussians, new: torch.Tensor, reference: Reference, depth: np.ndarray, pixels: np.ndarray, how: Sheets
+    gaussians: Gaussians,
+    new: torch.Tensor,
+    reference: Reference,
+    depth: np.ndarray,
+    pixels: np.ndarray,
+    around: Surroundings,
+    how: Sheets,
 ) -> tuple[Gaussians, torch.Tensor]:
     """The Gaussians with a surface that shows these pixels of the reference, bool [H, W], and the labels of the new."""
     added = surface(reference.image, depth, pixels, reference.camera, gaussians.sh.shape[1], how)
     together = gaussians.zipped(added, lambda a, b: torch.cat([a, b]))
     fresh = torch.arange(len(together)) >= len(gaussians)
     if how.gloss:
-        together = with_gloss(together, fresh, how.gloss)
+        camera, known = reference.camera, around.photographed(reference.camera)
+        hole = pixels | around.hidden[camera.name]
+        change = gloss.change_around(reference.image, known, hole, camera, around.views, around.photos)
+        together = gloss.lent(together, fresh, camera, change, around.views)
     together = match_colors(together, fresh, reference.image, pixels, reference.camera, how.color_steps)
     return together, torch.cat([new, fresh[len(new) :]])
-
-
-@torch.no_grad()
-def with_gloss(gaussians: Gaussians, fresh: torch.Tensor, neighbours: int) -> Gaussians:
-    """The fresh Gaussians with the mean view-dependent colour of their nearest old neighbours.
-
-    One picture tells how a surface looks from one side. A wet table or a leaf in the sun is brighter from another, and
-    what is new would stand out there as a patch; what stands around it knows.
-
-    Args:
-        fresh: [N] bool. neighbours: how many are averaged, by opacity and size.
-    """
-    lenders = torch.nonzero(~fresh & (gaussians.opacity_logits > 0))[:, 0]  # opacity above one half
-    if gaussians.sh.shape[1] == 1 or len(lenders) < neighbours or not fresh.any():
-        return gaussians
-    tree = cKDTree(gaussians.means[lenders].cpu().numpy())
-    _, index = tree.query(gaussians.means[fresh].cpu().numpy(), k=neighbours)
-    nearest = lenders[torch.from_numpy(index)]
-    size = gaussians.log_scales.exp().sort(1).values[:, 1:].prod(1)
-    weight = (gaussians.opacity_logits.sigmoid() * size)[nearest]
-    weight = weight / weight.sum(1, keepdim=True)
-    sh = gaussians.sh.clone()
-    sh[fresh, 1:] = (gaussians.sh[nearest, 1:] * weight[..., None, None]).sum(1)
-    return replace(gaussians, sh=sh)
 
 
 @torch.no_grad()

@@ -17,6 +17,7 @@ from reffusion.witness import (
     SURFACE,
     Witness,
     smoothed_surface,
+    surface_range,
     votes,
     with_photographed_depth,
     without_slivers,
@@ -24,6 +25,7 @@ from reffusion.witness import (
 
 BEFORE = 0.97  # of the depth shown: a continuation must be nearer than that to hide it
 BESIDE = 0.03  # of the image's width: how far around a plane's patch it is compared with what is shown
+ROUGHEST = 0.06  # of the depth: a wider range around a pixel is no rough surface, but a depth edge
 AGREES = 0.3  # share of these pixels that must lie on the plane
 
 
@@ -94,4 +96,8 @@ def _grows_out_of(patch: np.ndarray, at: np.ndarray, depth: np.ndarray, known: n
     reach = max(3, round(BESIDE * patch.shape[1]))
     beside = cv2.dilate(patch.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
     beside &= known & np.isfinite(at)
-    return bool(beside.any()) and float((np.abs(depth[beside] / at[beside] - 1) < SURFACE).mean()) > AGREES
+    if not beside.any():
+        return False
+    nearest, farthest = surface_range(depth)
+    lies = (at > nearest * (1 - SURFACE)) & (at < farthest * (1 + SURFACE)) & (np.abs(at - depth) < ROUGHEST * depth)
+    return float(lies[beside].mean()) > AGREES

@@ -27,8 +27,7 @@ class Witness:
     Attributes:
         camera: the view.
         depth: [H, W] float32 of the surface shown, 0 where the view shows nothing opaque.
-        nearest, farthest: [H, W] float32, its range around each pixel: about the same on a smooth surface, wide at
-            depth edges and where the surface is rough, like grass.
+        nearest, farthest: [H, W] float32, see `surface_range`.
         hidden: bool [H, W], where it shows the object, and a margin around.
     """
 
@@ -54,11 +53,17 @@ def witnesses(
     for camera in cameras:
         drawn = splat.render(gaussians, camera, sh_degree=0)
         depth = torch.where(drawn.alpha > OPAQUE, drawn.depth, 0).cpu().numpy().astype(np.float32)
-        around = np.ones((2 * pixels(ROUGH, camera.width) + 1,) * 2, np.uint8)
-        nearest = cv2.erode(np.where(depth > 0, depth, np.float32(np.inf)), around)
         wide = widened(hidden[camera.name], margin)
-        found.append(Witness(camera, depth, np.where(depth > 0, nearest, 0), cv2.dilate(depth, around), wide))
+        found.append(Witness(camera, depth, *surface_range(depth), wide))
     return found
+
+
+def surface_range(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The nearest and the farthest depth around each pixel of depth [H, W], 0 where unknown: about the same on a smooth
+    surface, wide at depth edges and where the surface is rough, like grass."""
+    around = np.ones((2 * pixels(ROUGH, depth.shape[1]) + 1,) * 2, np.uint8)
+    nearest = cv2.erode(np.where(depth > 0, depth, np.inf).astype(np.float32), around)
+    return np.where(depth > 0, nearest, 0), cv2.dilate(depth.astype(np.float32), around)
 
 
 def with_photographed_depth(depth: np.ndarray, camera: Camera, views: Sequence[Witness]) -> np.ndarray:

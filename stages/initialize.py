@@ -58,7 +58,8 @@ class Params(BaseModel):
     depth_align: Literal["l2", "robust"] = Field("l2", description="fit of its scale and offset on known pixels")
     color_steps: int = Field(5, ge=0, description="corrections of their colours until the reference is reproduced")
     # PAPER leaves open: the new Gaussians' view-dependent colour. The reference shows one side only.
-    gloss: int = Field(0, ge=0, description="old neighbours that lend new Gaussians theirs; 0: they have none")
+    sweep: bool = Field(False, description="depth around the hole is found anew by comparing the photographs")
+    gloss: bool = Field(False, description="they change with the direction as the surfaces around them do")
     # PAPER leaves open: what the reference's camera does not see of the hole.
     further: int = Field(0, ge=0, description="most views completed beside the references, until nothing is uncovered")
     settle: int = Field(0, ge=0, description="steps of reconstruction after filling; 0: none")
@@ -90,7 +91,7 @@ def run(
     network = monocular.load_network(params.depth_model) if params.depth_model and references else None
     sets = io.load_mask_sets(masks, scene.cameras)
     thing = labels & ~debris_of(masks, labels)
-    around = surroundings(params, scene, gaussians, thing, sets) if references else None
+    around = surroundings(params, scene, gaussians, thing, sets, poses, fit) if references else None
     removed = gaussians.map(lambda p: p[thing])
     gaussians = gaussians.map(lambda p: p[~labels])
     new = torch.zeros(len(gaussians), dtype=torch.bool)
@@ -105,16 +106,16 @@ def run(
         gaussians, new = filled(params, out, gaussians, new, each, around, network, log)
     true = true_pictures(reference, references, around) if references and params.start == "reference" else []
     if true and params.settle:
-        true, around = without_shadows(out, true, gaussians, around, poses, fit)
+        true, around = without_shadows(out, true, gaussians, around)
     if true and params.further:
-        gaussians, new, further = completed_further(params, out, gaussians, new, around, poses, fit)
+        gaussians, new, further = completed_further(params, out, gaussians, new, around)
         true += further
     if params.start == "random" and any(each.invent.any() for each in sets.values()):
         added = at_random(params, removed, gaussians, scene, sets, poses)
         gaussians = gaussians.zipped(added, lambda a, b: torch.cat([a, b]))
         new = torch.cat([new, torch.ones(len(added), dtype=torch.bool)])
     if true and params.settle:
-        gaussians = settled(params, out, gaussians, true, around, poses, fit)
+        gaussians = settled(params, out, gaussians, true, around)
     io.save_ply(out / "gaussians.ply", gaussians)
     io.save_labels(out / "labels.npy", new)
     uncovered = {each.name: initialize.uncovered(gaussians, each, sets[each.name].consistent) for each in train}
@@ -136,9 +137,9 @@ def debris_of(masks: Path, labels):
     return io.load_labels(path) if path.exists() else torch.zeros_like(labels)
 
 
-def surroundings(params: Params, scene, gaussians, thing, sets):
+def surroundings(params: Params, scene, gaussians, thing, sets, poses: Path, fit: Path):
     """What the photographs say of the space around the object, and the planes that go on into what they do not."""
-    from reffusion import continuation, initialize, masks, witness
+    from reffusion import continuation, exposure, initialize, masks, witness
 
     hidden = {name: each.consistent & (name not in scene.clean) for name, each in sets.items()}
     train = [scene.cameras[name] for name in scene.train]
@@ -146,7 +147,8 @@ def surroundings(params: Params, scene, gaussians, thing, sets):
     planes = []
     if thing.any():
         planes = continuation.planes_around(*masks.extent(gaussians.means[thing]), views, params.seed)
-    return initialize.Surroundings(train, {n: sets[n].consistent for n in sets}, views, planes, scene.points)
+    photos = exposure.load_views(poses, fit, scene.train)
+    return initialize.Surroundings(train, {n: sets[n].consistent for n in sets}, photos, views, planes, scene.points)
 
 
 def at_random(params: Params, removed, remaining, scene, sets, poses: Path):
@@ -177,7 +179,8 @@ def filled(params: Params, out: Path, gaussians, new, reference, around, network
     sheets, how, hidden = initialize.Sheets(**sheets), completion(params), around.hidden[reference.camera.name]
     hole = initialize.to_fill(gaussians, new, reference, hidden, params.covered)
     remaining = gaussians.map(lambda p: p[~new])
-    continued = undecided.behind(remaining, camera, hidden, around.views, around.planes).continued
+    near, told = around.compared(camera, hole) if params.sweep else (around, None)
+    continued = undecided.behind(remaining, camera, hidden, near.views, near.planes).continued
     depth, made_up, said = initialize.depth_behind(
         remaining,
         reference,
@@ -188,16 +191,17 @@ def filled(params: Params, out: Path, gaussians, new, reference, around, network
         estimate_of(network, reference),
         log,
         continued,
-        around.photographed(camera),
+        near.photographed(camera),
+        told,
         farthest,
     )
     print(f"depth of reference {camera.name}: {said}")
     io.save_exr(out / "depth" / f"{camera.name}.exr", depth.astype("float32"))
     pixels = behind.grown(hole, params.overlap)
-    gaussians, new = initialize.placed(gaussians, new, reference, depth, pixels, sheets)
+    gaussians, new = initialize.placed(gaussians, new, reference, depth, pixels, around, sheets)
     views = [(each, around.hidden[each.name]) for each in around.cameras]
     gap = initialize.seen_through(gaussians, camera, made_up, hidden & ~pixels, views, params.seen_through)
-    return initialize.placed(gaussians, new, reference, made_up, gap, sheets)
+    return initialize.placed(gaussians, new, reference, made_up, gap, around, sheets)
 
 
 def true_pictures(reference: Path, references: list, around) -> list:
@@ -213,22 +217,24 @@ def true_pictures(reference: Path, references: list, around) -> list:
     return [whole(each) if each.camera.name in given else each for each in references]
 
 
-def without_shadows(out: Path, true: list, gaussians, around, poses: Path, fit: Path):
+def without_shadows(out: Path, true: list, gaussians, around):
     """The references, standing also for what the object had tainted, and the surroundings where the photographs say
     nothing there; writes tainted/<view>.png where there is something."""
     from dataclasses import replace
 
     import numpy as np
 
-    from reffusion import exposure, inpaint, io, splat, taint
+    from reffusion import inpaint, io, splat, taint
     from reffusion.witness import with_photographed_depth
 
     marks = {camera.name: np.zeros((camera.height, camera.width), bool) for camera in around.cameras}
     pictures = []
     for each in true:
         name = each.camera.name
-        photo, hidden = exposure.load_views(poses, fit, [name])[name], around.hidden[name]
-        found = taint.tainted(each.image, inpaint.background(gaussians, each.camera, photo, hidden), hidden)
+        hidden = around.hidden[name]
+        found = taint.tainted(
+            each.image, inpaint.background(gaussians, each.camera, around.photos[name], hidden), hidden
+        )
         if found.any():
             print(f"reference {name}: beside the hole {found.sum()} px differ from what is seen, a shadow perhaps")
             depth = splat.render(gaussians, each.camera, sh_degree=0).depth.double().numpy()
@@ -244,19 +250,19 @@ def without_shadows(out: Path, true: list, gaussians, around, poses: Path, fit: 
     return pictures, replace(around, views=views)
 
 
-def completed_further(params: Params, out: Path, gaussians, new, around, poses: Path, fit: Path):
+def completed_further(params: Params, out: Path, gaussians, new, around):
     """Views completed in 2D by Telea, one after another, the one with most that nothing covers first; the Gaussians
     with what they show, the labels, and the views."""
-    from reffusion import coverage, exposure, inpaint, io, paint2d
+    from reffusion import coverage, inpaint, io, paint2d
     from reffusion.types import Reference
 
-    photos, further = exposure.load_views(poses, fit, [camera.name for camera in around.cameras]), []
+    further: list[Reference] = []
     found = coverage.undecided_views(gaussians, new, around, around.cameras)
     haze = coverage.haze(gaussians, new, around, found, params.leak)
     gaussians, new = gaussians.map(lambda p: p[~haze]), new[~haze]
     while len(further) < params.further and (camera := coverage.barest(around, found)):
         mask, hidden = found[camera.name], around.hidden[camera.name]
-        base = inpaint.background(gaussians, camera, photos[camera.name], hidden)
+        base = inpaint.background(gaussians, camera, around.photos[camera.name], hidden)
         picture = paint2d.telea(base, mask | hidden & paint2d.widened(mask, coverage.RIM))
         reference = Reference(camera, picture, mask)
         print(f"further view {camera.name}: {mask.sum() / hidden.sum():.1%} of the mask is shown by nothing else")
@@ -267,16 +273,15 @@ def completed_further(params: Params, out: Path, gaussians, new, around, poses: 
     return gaussians, new, further
 
 
-def settled(params: Params, out: Path, gaussians, references, around, poses: Path, fit: Path):
+def settled(params: Params, out: Path, gaussians, references, around):
     """The Gaussians after `params.settle` steps of reconstruction; see `reffusion.settle`."""
-    from reffusion import exposure, trace
+    from reffusion import trace
     from reffusion.settle import Known, settle
 
-    photos = exposure.load_views(poses, fit, [camera.name for camera in around.cameras])
     hidden = {view.camera.name: view.hidden for view in around.views}
     work = out / ".settle"  # hidden: its trace tells seconds, which are no part of the artifact's content
     work.mkdir(exist_ok=True)
-    done = settle(gaussians, Known(around.cameras, photos, hidden, references), params.settle, params.seed, work)
+    done = settle(gaussians, Known(around.cameras, around.photos, hidden, references), params.settle, params.seed, work)
     trace.clear_checkpoint(work)
     return done
 

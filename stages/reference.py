@@ -140,8 +140,8 @@ def taken_over(given: list[GivenReference], scene: Scene, poses: Path, fit: Path
 
 def fitted(given: GivenReference, sets: MaskSet, scene: Scene, poses: Path, fit: Path) -> Reference:
     """One of them, registered to its photograph: as it is where it is the photograph outside the object, else only the
-    hole of it and a blended rim."""
-    from reffusion import exposure, io, registration
+    hole of it, its shadow and a blended rim."""
+    from reffusion import exposure, io, registration, taint
     from reffusion.types import Reference
 
     lenses, upright = io.load_lenses(poses)
@@ -160,7 +160,8 @@ def fitted(given: GivenReference, sets: MaskSet, scene: Scene, poses: Path, fit:
         image, inside = io.load_straight(given, lens, upright, found.moved)
         image = registration.recolored(image, found.gain, found.offset)
         margin, blend = (share * camera.width for share in (MARGIN, BLEND))
-        image = registration.cut_in(image, photo, hidden, inside, margin, blend)
+        hole = hidden | taint.tainted(image, photo, hidden) & inside
+        image = registration.cut_in(image, photo, hole, inside, margin, blend)
     if (share := inside[sets.invent].mean()) < WHOLE:
         raise ValueError(f"{given.path}: shows only {share:.0%} of the hole in '{given.view}'; crop less")
     image = image if given.painted else exposure.normalised(image, fit, given.view)

@@ -3,14 +3,12 @@
 import cv2
 import numpy as np
 import pytest
-import torch
 
 from reffusion import geometry, taint
 from reffusion.behind import Completion, Seen, continued
 from reffusion.continuation import planes_around
-from reffusion.initialize import with_gloss
 from reffusion.layers import shared_out
-from reffusion.types import Camera, Gaussians
+from reffusion.types import Camera
 from reffusion.witness import Witness, votes, without_slivers
 
 TOP, FLOOR, EDGE, BOX, HIGH = 0.0, -1.0, 1.0, 0.3, 0.5  # z of table top and floor; half sides; height of the box
@@ -126,23 +124,6 @@ def test_depth_steps_where_the_picture_has_an_edge():
     assert "2 surfaces" in said
     error = np.abs(found / disparity - 1)[hole]
     assert np.quantile(error, 0.95) < 0.01
-
-
-def test_new_gaussians_shine_as_their_neighbours_do():
-    """A surface brighter from the left: what is new takes that over, and keeps its own constant colour."""
-    count, fresh = 200, torch.arange(200) >= 190
-    generator = torch.Generator().manual_seed(0)
-    sh = torch.zeros(count, 4, 3)
-    sh[:, 0] = torch.rand(count, 3, generator=generator)
-    sh[~fresh, 3] = 0.25
-    scene = Gaussians(
-        torch.rand(count, 3, generator=generator), torch.zeros(count, 4), torch.full((count, 3), -4.0),
-        torch.full((count,), 3.0), sh,
-    )  # fmt: skip
-    lit = with_gloss(scene, fresh, 16)
-    torch.testing.assert_close(lit.sh[fresh, 3], torch.full((10, 3), 0.25))
-    assert torch.equal(lit.sh[:, 0], scene.sh[:, 0]) and torch.equal(lit.sh[~fresh], scene.sh[~fresh])
-    assert with_gloss(scene, torch.zeros_like(fresh), 16) is scene
 
 
 def test_a_shadow_beside_the_mask_is_found_and_carried_into_other_views(views):

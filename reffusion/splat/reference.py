@@ -170,8 +170,13 @@ def rotations(quaternions: Tensor) -> Tensor:
 def colors(gaussians: Gaussians, camera: Camera, degree: int) -> Tensor:
     """[N, 3] colours seen from the camera, max(0, 0.5 + sum_k Y_k(direction) sh_k)."""
     center = torch.as_tensor(camera.center, dtype=gaussians.means.dtype, device=gaussians.means.device)
-    offsets = gaussians.means - center
-    x, y, z = (offsets / offsets.norm(dim=1, keepdim=True).clamp_min(1e-30)).unbind(1)
+    weights = harmonics(gaussians.means - center, degree)
+    return torch.clamp_min(0.5 + (weights[:, :, None] * gaussians.sh[:, : weights.shape[1]]).sum(1), 0)
+
+
+def harmonics(ways: Tensor, degree: int) -> Tensor:
+    """[..., (degree + 1)^2], the spherical harmonics of 3DGS in the directions [..., 3], of any length."""
+    x, y, z = (ways / ways.norm(dim=-1, keepdim=True).clamp_min(1e-30)).unbind(-1)
     basis = [torch.full_like(x, SH0)]
     if degree >= 1:
         basis += [-SH1 * y, SH1 * z, -SH1 * x]
@@ -182,8 +187,7 @@ def colors(gaussians: Gaussians, camera: Camera, degree: int) -> Tensor:
         basis += [SH3[0] * y * (3 * x * x - y * y), SH3[1] * x * y * z, SH3[2] * y * (4 * z * z - x * x - y * y)]
         basis += [SH3[3] * z * (2 * z * z - 3 * x * x - 3 * y * y), SH3[4] * x * (4 * z * z - x * x - y * y)]
         basis += [SH3[5] * z * (x * x - y * y), SH3[6] * x * (x * x - 3 * y * y)]
-    weights = torch.stack(basis, 1)
-    return torch.clamp_min(0.5 + (weights[:, :, None] * gaussians.sh[:, : weights.shape[1]]).sum(1), 0)
+    return torch.stack(basis, -1)
 
 
 def blending_weights(projected: Projected, pixels: Tensor) -> tuple[Tensor, Tensor]:
