@@ -18,6 +18,7 @@ ENOUGH_POINTS = 50  # fewer sparse points around the hole, and the rendered dept
 SWEPT = 3  # times as many pixels whose depth was swept take part in the search for planes
 BEHIND = 1.03  # relative depth from which a sparse point is hidden by what is rendered
 STRETCH = 1.15  # a surface continued beyond the disparities that are seen of it, by so much at most
+TELLS = 0.5  # share of a hole into which planes go on, from which planes that meet are not asked
 FARTHEST = 2.0  # times the farthest known depth: beyond it lies infinity, of which nothing is known
 
 
@@ -144,7 +145,9 @@ def continued(
     """
     planar, said = _planar(view, points, how)
     solvers.solved("planes", planar.disparity)
-    if planar.explained >= how.planar_share:
+    # Planes that meet would hide what goes on behind a post or a stone: what is known of the space itself comes first.
+    space_tells = planar.planes > 1 and view.anchored.sum() > TELLS * view.hole.sum()
+    if planar.explained >= how.planar_share and not space_tells:
         return planar.disparity, said
     guide = guide() if callable(guide) else guide
     plate = Plate(how.ring, how.stiffness, how.edge, how.unknowns)

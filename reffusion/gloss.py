@@ -19,7 +19,7 @@ from reffusion import geometry
 from reffusion.splat.conventions import SH0
 from reffusion.splat.reference import harmonics
 from reffusion.types import Camera, Gaussians
-from reffusion.witness import SURFACE, Witness, pixels, widened
+from reffusion.witness import Witness, pixels, seen_by, widened
 
 RING = 0.1  # of the image's width: how far around the hole the surface is looked at
 AWAY = 0.006  # of it: and how far from the object's blurred rim
@@ -70,12 +70,8 @@ def change_around(
     here = _soft(picture, ~hole)[rows, columns]
     brighter, shown = np.zeros((len(points), len(views), 3)), np.zeros((len(points), len(views)), bool)
     for number, view in enumerate(views):
-        uv, z = geometry.project(points, view.camera)
-        masked, inside = geometry.sample_nearest(widened(view.hidden, AWAY), uv)
-        nearest, _ = geometry.sample_nearest(view.nearest, uv)
-        farthest, _ = geometry.sample_nearest(view.farthest, uv)
-        on = (nearest > 0) & (z > nearest * (1 - SURFACE)) & (z < farthest * (1 + SURFACE))
-        shown[:, number] = inside & ~masked & on
+        uv, _ = geometry.project(points, view.camera)
+        shown[:, number] = seen_by(replace(view, hidden=widened(view.hidden, AWAY)), points)
         there, _ = geometry.sample_nearest(_soft(photos[view.camera.name], ~view.hidden), uv)
         change = there - here
         brighter[:, number] = np.where(shown[:, number, None], change, 0.0)

@@ -26,7 +26,7 @@ from reffusion.witness import (
 BEFORE = 0.97  # of the depth shown: a continuation must be nearer than that to hide it
 BESIDE = 0.03  # of the image's width: how far around a plane's patch it is compared with what is shown
 ROUGHEST = 0.06  # of the depth: a wider range around a pixel is no rough surface, but a depth edge
-AGREES = 0.3  # share of these pixels that must lie on the plane
+AGREES = 0.45  # share of these pixels that must lie on the plane
 
 
 @dataclass(frozen=True)

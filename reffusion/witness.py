@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from reffusion import geometry, paint2d, splat
+from reffusion.splat.reference import colors
 from reffusion.surfels import surface_normals
 from reffusion.types import Camera, Gaussians
 
@@ -17,6 +18,8 @@ OPAQUE = 0.9  # alpha from which a pixel shows a surface
 SURFACE = 0.02  # relative depth, to either side, within which a point lies on the surface that a view shows
 FREE = 0.03  # relative depth by which a view must look past a point to say that nothing is there
 ROUGH = 0.006  # of the image's width: how far around a pixel the range of a view's depth is taken
+TONE = 10.0  # levels of 255 beyond those that a view shows around a point, from which a Gaussian has another colour
+UNLIKE = 0.5  # share of the views that show a surface there, in which it must, to be debris
 MARGIN = 0.004  # of the image's width: a view says nothing so near to its mask, where object and background mix
 
 
@@ -116,15 +119,24 @@ def votes(points: np.ndarray, views: Sequence[Witness], normals: np.ndarray | No
         uv, z = geometry.project(points, view.camera)
         masked, inside = geometry.sample_nearest(view.hidden, uv)
         nearest, _ = geometry.sample_nearest(view.nearest, uv)
-        farthest, _ = geometry.sample_nearest(view.farthest, uv)
         shown = inside & ~masked & (z > 0) & (nearest > 0)
-        on = shown & (z > nearest * (1 - SURFACE)) & (z < farthest * (1 + SURFACE))
+        on = seen_by(view, points)
         if normals is not None:
             on &= ((view.camera.center - points) * normals).sum(-1) > 0
         seen += on
         free += shown & (nearest > z * (1 + FREE))
         hidden += inside & masked & (z > 0)
     return Votes(seen, free, hidden)
+
+
+def seen_by(view: Witness, points: np.ndarray) -> np.ndarray:
+    """bool [P]: the view shows a surface at the points [P, 3], not before and not behind them."""
+    uv, z = geometry.project(points, view.camera)
+    masked, inside = geometry.sample_nearest(view.hidden, uv)
+    nearest, _ = geometry.sample_nearest(view.nearest, uv)
+    farthest, _ = geometry.sample_nearest(view.farthest, uv)
+    shown = inside & ~masked & (z > 0) & (nearest > 0)
+    return shown & (z > nearest * (1 - SURFACE)) & (z < farthest * (1 + SURFACE))
 
 
 def smoothed_surface(depth: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -136,16 +148,21 @@ def smoothed_surface(depth: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.
 
 @torch.no_grad()
 def debris(
-    gaussians: Gaussians, labels: torch.Tensor, views: Sequence[Witness], hidden: Mapping[str, np.ndarray]
+    gaussians: Gaussians,
+    labels: torch.Tensor,
+    views: Sequence[Witness],
+    hidden: Mapping[str, np.ndarray],
+    photos: Mapping[str, np.ndarray],
 ) -> torch.Tensor:
     """bool [N]: Gaussians that the masks' removal brings to light and no photograph supports.
 
     They stand within the object or in its shadow, where the fit had no say: without the object they show more inside
-    the masks than they ever did outside; and where other views look, there is no surface, or a free sight.
+    the masks than they ever did outside; and where other views look, there is no surface, or a free sight, or one of
+    other colours.
 
     Args:
         gaussians: N of them, the object included. labels: [N] bool, the object's.
-        hidden: view name -> bool [H, W], C.
+        hidden: view name -> bool [H, W], C. photos: view name -> uint8 [H, W, 3], exposed as the Gaussians are.
     """
     remaining = gaussians.map(lambda p: p[~labels])
     uncovered, outside = torch.zeros(len(remaining)), torch.zeros(len(remaining))
@@ -155,10 +172,25 @@ def debris(
         photographed = torch.from_numpy(~view.hidden)[..., None].to(gaussians.means.dtype)
         outside += splat.accumulate(gaussians, view.camera, photographed)[:, 0].cpu()[~labels.cpu()]
     suspects = torch.nonzero((uncovered > 0.5) & (uncovered > outside))[:, 0]
-    said = votes(remaining.means[suspects].double().cpu().numpy(), views)
-    unsupported = torch.from_numpy(said.seen <= said.free)
+    asked = remaining.map(lambda p: p[suspects.to(p.device)])
+    said = votes(asked.means.double().cpu().numpy(), views)
+    unsupported = (said.seen <= said.free) | (unlike(asked, views, photos) > UNLIKE * said.seen)
     found, rest = torch.zeros_like(labels), torch.nonzero(~labels)[:, 0]
-    found[rest[suspects[unsupported].to(rest.device)]] = True
+    found[rest[suspects[torch.from_numpy(unsupported)].to(rest.device)]] = True
+    return found
+
+
+def unlike(gaussians: Gaussians, views: Sequence[Witness], photos: Mapping[str, np.ndarray]) -> np.ndarray:
+    """[N], how many of the views that show a surface at a Gaussian show other colours there than its own."""
+    points, found = gaussians.means.double().cpu().numpy(), np.zeros(len(gaussians), np.int64)
+    for view in views:
+        own = colors(gaussians, view.camera, gaussians.sh_degree).cpu().numpy() * 255
+        photo = photos[view.camera.name]
+        around = np.ones((2 * pixels(ROUGH, view.camera.width) + 1,) * 2, np.uint8)
+        uv, _ = geometry.project(points, view.camera)
+        darkest, lightest = (geometry.sample_nearest(of(photo, around), uv)[0] for of in (cv2.erode, cv2.dilate))
+        other = ((own < darkest - TONE) | (own > lightest.astype(float) + TONE)).any(-1)
+        found += other & seen_by(view, points)
     return found
 
 

@@ -51,7 +51,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
     import numpy as np
     import torch
 
-    from reffusion import io, masks, witness
+    from reffusion import exposure, io, masks, witness
 
     scene, gaussians = io.load_scene(poses), io.load_ply(fit / "gaussians.ply")
     train = [scene.cameras[name] for name in scene.train]
@@ -79,7 +79,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
     views = witness.witnesses(gaussians, train, hidden)
     planes = continuations(params, gaussians, labels, views)
     if params.debris and raw:
-        debris = witness.debris(gaussians, labels, views, hidden)
+        debris = witness.debris(gaussians, labels, views, hidden, exposure.load_views(poses, fit, scene.train))
         io.save_labels(out / "debris.npy", debris.cpu())
         labels |= debris
     fill = region if params.invent in ("region", "auto") else None
