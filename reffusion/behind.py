@@ -18,7 +18,8 @@ ENOUGH_POINTS = 50  # fewer sparse points around the hole, and the rendered dept
 SWEPT = 3  # times as many pixels whose depth was swept take part in the search for planes
 BEHIND = 1.03  # relative depth from which a sparse point is hidden by what is rendered
 STRETCH = 1.15  # a surface continued beyond the disparities that are seen of it, by so much at most
-TELLS = 0.5  # share of a hole into which planes go on, from which planes that meet are not asked
+REFUTED = 0.05  # share of the hole in which planes that meet are wrong, from which they are not taken
+NEARER = 1.03  # relative disparity by which they are, before a plane that goes on
 FARTHEST = 2.0  # times the farthest known depth: beyond it lies infinity, of which nothing is known
 
 
@@ -72,6 +73,7 @@ class Seen:
         hole: bool [H, W], the pixels to be filled. hidden: bool [H, W], C: where the object stood.
         anchored: bool [H, W], pixels of the hole whose `depth` is that of a plane which goes on there.
         told: bool [H, W], pixels whose `depth` other photographs agree on (`reffusion.sweep`); None: not asked.
+        looked_past: depth [H, W] -> bool [H, W], where other views look past such a surface; None: not asked.
     """
 
     camera: Camera
@@ -81,6 +83,7 @@ class Seen:
     hidden: np.ndarray
     anchored: np.ndarray
     told: np.ndarray | None = None
+    looked_past: Callable[[np.ndarray], np.ndarray] | None = None
 
     @property
     def disparity(self) -> np.ndarray:
@@ -104,13 +107,14 @@ def seen(
     continued: np.ndarray | None = None,
     outer: np.ndarray | None = None,
     told: np.ndarray | None = None,
+    looked_past: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> Seen:
     """The depth of a rendering, known where it is covered, but for the hole and a margin around it.
 
     Args:
         continued: [H, W] depth of planes that go on in the hole, inf where none does (`undecided.Behind`).
         outer: [H, W] depth that is better known than the rendering's, above 0 where there is one.
-        told: bool [H, W], see `Seen`.
+        told, looked_past: see `Seen`.
     """
     depth, alpha = (t.detach().double().cpu().numpy() for t in (drawn.depth, drawn.alpha))
     if outer is not None:
@@ -118,7 +122,7 @@ def seen(
     known = (alpha > how.explained) & (depth > 0) & ~grown(hole, how.margin)
     anchored = hole & np.isfinite(continued) if continued is not None else np.zeros_like(hole)
     depth = np.where(anchored, continued, depth) if anchored.any() else depth
-    return Seen(camera, depth, known, hole, hidden, anchored, told)
+    return Seen(camera, depth, known, hole, hidden, anchored, told, looked_past)
 
 
 def continued(
@@ -145,10 +149,11 @@ def continued(
     """
     planar, said = _planar(view, points, how)
     solvers.solved("planes", planar.disparity)
-    # Planes that meet would hide what goes on behind a post or a stone: what is known of the space itself comes first.
-    space_tells = planar.planes > 1 and view.anchored.sum() > TELLS * view.hole.sum()
-    if planar.explained >= how.planar_share and not space_tells:
-        return planar.disparity, said
+    if planar.explained >= how.planar_share:
+        wrong = _refuted(view, planar.disparity)
+        if wrong <= REFUTED:
+            return planar.disparity, said
+        said = f"{said}, but would hide what is known of the space in {wrong:.0%} of the hole"
     guide = guide() if callable(guide) else guide
     plate = Plate(how.ring, how.stiffness, how.edge, how.unknowns)
     given = view.known | view.anchored
@@ -190,6 +195,17 @@ def _layered(view: Seen, given: np.ndarray, surfaces: np.ndarray, guide: np.ndar
         found[part] = done[part].clip(low / STRETCH, high * STRETCH)
     rest = ~given & (found <= 0)
     return np.where(rest, complete(found, found > 0, guide, plate), found) if rest.any() else found
+
+
+def _refuted(view: Seen, disparity: np.ndarray) -> float:
+    """The share of the hole in which a surface of this disparity hides a plane that goes on, or other views look past
+    it: the planes of a post and of the ground meet in front of the ground behind the post."""
+    if not view.hole.any():
+        return 0.0
+    wrong = view.anchored & (disparity > view.disparity * NEARER)
+    if view.looked_past is not None:
+        wrong |= view.looked_past(1 / np.maximum(disparity, view.least_disparity))
+    return float(wrong[view.hole].mean())
 
 
 def points_around(view: Seen, points: np.ndarray, how: Completion) -> tuple[np.ndarray, np.ndarray]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +15,7 @@ from reffusion.solverlog import SolverLog
 from reffusion.splat.conventions import SH0
 from reffusion.surfels import surface_gaussians
 from reffusion.types import Camera, Gaussians, Reference
-from reffusion.witness import Witness, widened, with_photographed_depth
+from reffusion.witness import Witness, votes, widened, with_photographed_depth
 
 SWEPT = 0.1  # of the image's width: how far around a hole depth is found by comparing photographs
 
@@ -65,6 +65,7 @@ def depth_behind(
     continued: np.ndarray | None = None,
     outer: np.ndarray | None = None,
     told: np.ndarray | None = None,
+    looked_past: Callable[[np.ndarray], np.ndarray] | None = None,
     farthest: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """The scene without the object in one view: depth [H, W] float64, as rendered where that is known, else made up;
@@ -82,13 +83,13 @@ def depth_behind(
         how: parameters.
         estimate: [H, W] a depth model's answer to the reference, disparity up to scale and offset; None: there is none.
         log: gets a series for each solver (docs/traces.md).
-        continued, outer, told: see `behind.seen`. farthest: see `behind.continued`.
+        continued, outer, told, looked_past: see `behind.seen`. farthest: see `behind.continued`.
 
     Raises:
         ValueError: naming the view, where too little is known around the hole, or the estimate does not fit.
     """
     drawn = splat.render(remaining, reference.camera, sh_degree=0)
-    view = behind.seen(drawn, reference.camera, hole, hidden, how, continued, outer, told)
+    view = behind.seen(drawn, reference.camera, hole, hidden, how, continued, outer, told, looked_past)
     solvers = SolverLog(log, reference.camera.name, *behind.points_around(view, points, how))
     try:
         if reference.depth is not None:
@@ -169,6 +170,11 @@ class Surroundings:
         """[H, W] depth that a training view shows outside its mask; 0 elsewhere."""
         nothing = np.zeros((camera.height, camera.width))
         return with_photographed_depth(nothing, camera, self.views)
+
+    def looked_past(self, camera: Camera, depth: np.ndarray) -> np.ndarray:
+        """bool [H, W], where other views look past a surface at this depth of a view, and few show it."""
+        said = votes(geometry.unproject(depth, camera).reshape(-1, 3), self.views)
+        return ((said.free >= 2) & (said.free > said.seen)).reshape(depth.shape)
 
     def compared(self, camera: Camera, hole: np.ndarray) -> tuple[Surroundings, np.ndarray]:
         """The same, but around a hole of a training view depth and planes are where the photographs agree best; and

@@ -19,6 +19,7 @@ SURFACE = 0.02  # relative depth, to either side, within which a point lies on t
 FREE = 0.03  # relative depth by which a view must look past a point to say that nothing is there
 ROUGH = 0.006  # of the image's width: how far around a pixel the range of a view's depth is taken
 TONE = 10.0  # levels of 255 beyond those that a view shows around a point, from which a Gaussian has another colour
+UNEVEN = 1.05  # farthest over nearest depth around a point from which a surface is rough
 UNLIKE = 0.5  # share of the views that show a surface there, in which it must, to be debris
 MARGIN = 0.004  # of the image's width: a view says nothing so near to its mask, where object and background mix
 
@@ -181,7 +182,10 @@ def debris(
 
 
 def unlike(gaussians: Gaussians, views: Sequence[Witness], photos: Mapping[str, np.ndarray]) -> np.ndarray:
-    """[N], how many of the views that show a surface at a Gaussian show other colours there than its own."""
+    """[N], how many of the views that show a surface at a Gaussian show other colours there than its own.
+
+    Only rough surfaces are asked: on a smooth one its place tells enough, and its colour changes with the direction.
+    """
     points, found = gaussians.means.double().cpu().numpy(), np.zeros(len(gaussians), np.int64)
     for view in views:
         own = colors(gaussians, view.camera, gaussians.sh_degree).cpu().numpy() * 255
@@ -190,7 +194,8 @@ def unlike(gaussians: Gaussians, views: Sequence[Witness], photos: Mapping[str, 
         uv, _ = geometry.project(points, view.camera)
         darkest, lightest = (geometry.sample_nearest(of(photo, around), uv)[0] for of in (cv2.erode, cv2.dilate))
         other = ((own < darkest - TONE) | (own > lightest.astype(float) + TONE)).any(-1)
-        found += other & seen_by(view, points)
+        nearest, farthest = (geometry.sample_nearest(of, uv)[0] for of in (view.nearest, view.farthest))
+        found += other & seen_by(view, points) & (farthest > nearest * UNEVEN)
     return found
 
 

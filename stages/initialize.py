@@ -193,6 +193,7 @@ def filled(params: Params, out: Path, gaussians, new, reference, around, network
         continued,
         near.photographed(camera),
         told,
+        (lambda depth: near.looked_past(camera, depth)) if params.sweep else None,
         farthest,
     )
     print(f"depth of reference {camera.name}: {said}")
