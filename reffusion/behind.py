@@ -15,6 +15,7 @@ from reffusion.solverlog import SILENT, SolverLog
 from reffusion.types import Camera, Rendering
 
 ENOUGH_POINTS = 50  # fewer sparse points around the hole, and the rendered depth is asked instead
+SURE = 0.8  # share of the sparse points that planes explain, from which nothing else is asked
 SWEPT = 3  # times as many pixels whose depth was swept take part in the search for planes
 BEHIND = 1.03  # relative depth from which a sparse point is hidden by what is rendered
 STRETCH = 1.15  # a surface continued beyond the disparities that are seen of it, by so much at most
@@ -219,21 +220,31 @@ def _around(view: Seen, how: Completion) -> np.ndarray:
 
 
 def _planar(view: Seen, points: np.ndarray, how: Completion) -> tuple[planes.PlanarModel, str]:
-    """Planes through the surroundings; and how many explain how much."""
+    """Planes through the surroundings; and how many explain how much.
+
+    Sparse points where they are enough; where planes explain most of them, but not all, so that it is their noise that
+    decides, also the pixels whose depth was swept.
+    """
     (pixels, values), source = points_around(view, points, how), "sparse points"
-    if len(values) < ENOUGH_POINTS:
+    sparse = len(values) >= ENOUGH_POINTS
+    if not sparse:
         rows, columns = np.nonzero(_around(view, how) & view.known)
         values, source = view.disparity[rows, columns], "rendered depth"
         pixels = np.stack([columns, rows], 1) + 0.5
-    elif view.told is not None:
+    planar = _planes_through(view, pixels, values, how)
+    if sparse and view.told is not None and planar.explained < SURE:
         rows, columns = np.nonzero(_around(view, how) & view.known & view.told)
         kept = slice(None, None, max(1, len(rows) // (SWEPT * len(values))))
         rows, columns, source = rows[kept], columns[kept], "sparse points and photographs compared"
         values = np.concatenate([values, view.disparity[rows, columns]])
         pixels = np.concatenate([pixels, np.stack([columns, rows], 1) + 0.5])
-    draws = trace.generator(how.seed, "planes", view.camera.name)
-    planar = planes.planar_model(pixels, values, view.hole.shape, draws, tolerance=how.planar_tolerance)
+        planar = _planes_through(view, pixels, values, how)
     return planar, f"{planar.planes} planes explain {planar.explained:.0%} of {len(values)} {source}"
+
+
+def _planes_through(view: Seen, pixels: np.ndarray, values: np.ndarray, how: Completion) -> planes.PlanarModel:
+    draws = trace.generator(how.seed, "planes", view.camera.name)
+    return planes.planar_model(pixels, values, view.hole.shape, draws, tolerance=how.planar_tolerance)
 
 
 def estimated(

@@ -23,13 +23,15 @@ from reffusion.witness import Witness, pixels, seen_by, widened
 
 RING = 0.1  # of the image's width: how far around the hole the surface is looked at
 AWAY = 0.006  # of it: and how far from the object's blurred rim
-SOFT = 0.01  # of it: blur under which colours are compared
+SOFT = 0.015  # of it: blur under which brightness is compared
+BROAD = 0.03  # of it: blur under which two places are of one stuff; not the same, or the dark would seem to brighten
 MOST = 3000  # points around that are kept
 NEIGHBOURS = 200  # of a new Gaussian, among them
 ALIKE = 0.08  # difference of colour, in [0, 1], at which a neighbour counts by 0.6: wood and steel shine unlike
+FAINT = 0.012  # of [0, 1]: a mean change up to which a surface is matte
 ENOUGH = 0.05  # share of the neighbours, by weight, that a view must show to tell of the change
 GUESSED = 0.3  # weight of a view that does not tell, against one that does
-STIFF = 0.001  # weight of no change against a view: where few views tell, little is made up
+STIFF = 0.002  # weight of no change against a view: where few views tell, little is made up
 
 
 @dataclass(frozen=True)
@@ -37,11 +39,13 @@ class Change:
     """How surfaces around a hole change from a completed view to V others.
 
     Attributes:
-        points: [R, 3] on these surfaces. colors: [R, 3] in the completed view, in [0, 1].
+        broad: [H, W, 3] float32, the completed view, blurred, in [0, 1].
+        points: [R, 3] on these surfaces. colors: [R, 3], of broad.
         brighter: [R, V, 3], what each view adds to these, as shine is added; 0 where it does not show them.
         shown: bool [R, V], where it does.
     """
 
+    broad: np.ndarray
     points: np.ndarray
     colors: np.ndarray
     brighter: np.ndarray
@@ -67,20 +71,20 @@ def change_around(
     kept = np.linspace(0, len(rows) - 1, min(MOST, len(rows))).round().astype(int)
     rows, columns = rows[kept], columns[kept]
     points = geometry.unproject(np.where(depth > 0, depth, 1.0), camera)[rows, columns]
-    here = _soft(picture, ~hole)[rows, columns]
+    here, broad = _soft(picture, ~hole, SOFT)[rows, columns], _soft(picture, np.ones_like(hole), BROAD)
     brighter, shown = np.zeros((len(points), len(views), 3)), np.zeros((len(points), len(views)), bool)
     for number, view in enumerate(views):
         uv, _ = geometry.project(points, view.camera)
         shown[:, number] = seen_by(replace(view, hidden=widened(view.hidden, AWAY)), points)
-        there, _ = geometry.sample_nearest(_soft(photos[view.camera.name], ~view.hidden), uv)
+        there, _ = geometry.sample_nearest(_soft(photos[view.camera.name], ~view.hidden, SOFT), uv)
         change = there - here
         brighter[:, number] = np.where(shown[:, number, None], change, 0.0)
-    return Change(points, here, brighter, shown)
+    return Change(broad, points, broad[rows, columns], brighter, shown)
 
 
-def _soft(image: np.ndarray, known: np.ndarray) -> np.ndarray:
+def _soft(image: np.ndarray, known: np.ndarray, blur: float) -> np.ndarray:
     """[H, W, 3] float32 in [0, 1], blurred, of known pixels only."""
-    sigma, weight = pixels(SOFT, known.shape[1]), known.astype(np.float32)
+    sigma, weight = pixels(blur, known.shape[1]), known.astype(np.float32)
     total = cv2.GaussianBlur(weight, (0, 0), sigma)
     blurred = cv2.GaussianBlur(image.astype(np.float32) / 255 * weight[..., None], (0, 0), sigma)
     return blurred / np.maximum(total, 1e-3)[..., None]
@@ -99,8 +103,8 @@ def lent(
     if degree == 0 or not len(chosen) or len(around.points) < NEIGHBOURS:
         return gaussians
     means, base = gaussians.means[chosen].double(), gaussians.sh[chosen, 0].double()
-    own = (0.5 + SH0 * base).clamp(0, 1)
-    brighter, known = _carried(means.numpy(), own.numpy(), around)
+    own, _ = geometry.sample_nearest(around.broad, geometry.project(means.numpy(), camera)[0])
+    brighter, known = _carried(means.numpy(), own, around)
     brighter, weight = _told_by_the_nearest(brighter, known, around.points.mean(0), views)
     ahead = harmonics(means - torch.from_numpy(camera.center), degree)[..., 1:]
     size = ahead.shape[-1]
@@ -133,7 +137,8 @@ def _carried(means: np.ndarray, own: np.ndarray, around: Change) -> tuple[np.nda
     of_all = lambda values: (weights @ values).reshape(len(means), -1, 3) / np.maximum(share, 1e-12)[..., None]
     mean, square = of_all(flat), of_all(flat**2)
     # A mirror shows something else at every point: where neighbours differ, little is to be learnt of them.
-    agreed = (mean**2).sum(-1) / np.maximum(square.sum(-1), 1e-12)
+    size = (mean**2).sum(-1)
+    agreed = size / np.maximum(square.sum(-1), 1e-12) * np.maximum(1 - 3 * FAINT**2 / np.maximum(size, 1e-12), 0)
     return mean * agreed[..., None], share > ENOUGH
 
 
