@@ -155,9 +155,11 @@ def test_what_is_painted_on_the_new_surface_stays_in_place_from_the_other_side()
     depth, picture = floor(view)
     reference = Reference(view, (picture * 255).round().astype(np.uint8), np.ones(depth.shape, bool))
     nothing = surface_gaussians(picture, depth, np.zeros(depth.shape, bool), view, sh_count=1)
-    errors = []
+    around, errors = rules.Surroundings([], {}, {}, [], [], np.zeros((0, 3))), []
     for how in (replace(SHEETS, opacity=0.95, sunk=0.0, spread=0.4), SHEETS):
-        drawn, _ = rules.placed(nothing, torch.zeros(0, dtype=torch.bool), reference, depth, reference.mask, how)
+        drawn, _ = rules.placed(
+            nothing, torch.zeros(0, dtype=torch.bool), reference, depth, reference.mask, around, how
+        )
         inner = (slice(14, 26), slice(14, 34))
         here, there = (splat.render(drawn, v).color.numpy() - floor(v)[1] for v in (view, opposite))
         assert np.abs(here[inner]).mean() < 0.02
@@ -217,7 +219,9 @@ def test_settling_moves_the_gaussians_and_leaves_no_checkpoint(scene, tmp_path):
         out = tmp_path / name
         out.mkdir()
         given = references(scene, out / "r", "a2")
-        initialize.run(initialize.Params(settle=steps, gloss=8, further=2), out, **scene, reference=given)
+        initialize.run(
+            initialize.Params(settle=steps, gloss=True, sweep=True, further=2), out, **scene, reference=given
+        )
         found[name] = io.load_ply(out / "gaussians.ply")
         visible = [path.name for path in out.rglob("*") if ".settle" not in path.parts]
         assert not list(out.rglob("checkpoint*")) and "settle" not in visible

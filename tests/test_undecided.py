@@ -3,13 +3,14 @@
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from reffusion import geometry, taint
 from reffusion.behind import Completion, Seen, continued
 from reffusion.continuation import planes_around
 from reffusion.layers import shared_out
-from reffusion.types import Camera
-from reffusion.witness import Witness, votes, without_slivers
+from reffusion.types import Camera, Gaussians
+from reffusion.witness import Witness, surface_range, unlike, votes, without_slivers
 
 TOP, FLOOR, EDGE, BOX, HIGH = 0.0, -1.0, 1.0, 0.3, 0.5  # z of table top and floor; half sides; height of the box
 SIZE, FOCAL = 160, 150.0
@@ -142,3 +143,19 @@ def test_a_shadow_beside_the_mask_is_found_and_carried_into_other_views(views):
     same = drawn(other.camera)[2] & (np.hypot(there[..., 0] - 0.5, there[..., 1] - 0.5) < 0.25) & ~other.hidden
     carried = taint.carried(found, depth, view.camera, [other])["a1"]
     assert carried[same].mean() > 0.9 and not carried[~drawn(other.camera)[2]].mean() > 0.02
+
+
+def test_what_has_other_colours_than_gravel_is_debris():
+    """Before rough ground nearly everything counts as seen; a teal splinter of the object does not belong there."""
+    view = camera("v", 0, 2.0)
+    depth, _, _ = drawn(view)
+    rough = (depth * (1 + 0.1 * np.random.default_rng(0).random(depth.shape))).astype(np.float32)
+    witness = Witness(view, rough, *surface_range(rough), np.zeros_like(rough, bool))
+    photo = np.random.default_rng(1).integers(90, 160, (*rough.shape, 3)).astype(np.uint8)
+    place = geometry.unproject(rough.astype(float), view)[80:84, 80]
+    sh = torch.zeros(4, 1, 3)
+    sh[2:, 0] = torch.tensor([-1.2, 0.6, 0.6])  # teal; the others are grey
+    parts = torch.tensor(place).float(), torch.zeros(4, 4), torch.full((4, 3), -4.0), torch.zeros(4), sh
+    assert unlike(Gaussians(*parts), [witness], {"v": photo}).tolist() == [0, 0, 1, 1]
+    smooth = Witness(view, depth.astype(np.float32), *surface_range(np.full_like(depth, depth[80, 80])), witness.hidden)
+    assert not unlike(Gaussians(*parts), [smooth], {"v": photo}).any()
