@@ -13,21 +13,21 @@ from reffusion.types import Camera, Gaussians
 from reffusion.witness import OPAQUE
 
 RIM = 0.006  # of the picture's width, repainted around what is undecided too, as far as it is no photograph
-ENOUGH = 0.004  # share of a view's C under which what is undecided is left to its neighbours
+ENOUGH = 0.001  # share of a view's C under which what is open is left to its neighbours
 
 
 def undecided_views(
     gaussians: Gaussians, new: Tensor, around: Surroundings, cameras: Sequence[Camera]
 ) -> dict[str, np.ndarray]:
-    """View name -> bool [H, W], pixels of C that neither the new Gaussians nor another photograph show."""
+    """View name -> bool [H, W], pixels of C that nothing covers."""
     found = {}
     for camera in cameras:
         hidden = around.hidden[camera.name]
         behind = undecided.behind(gaussians, camera, hidden, around.views, around.planes, given=new)
-        # Without a true picture a made-up surface is worse than what stands there, but for holes and planes.
-        wanted = behind.undecided & (behind.alpha <= OPAQUE)
+        # Without a true picture a made-up surface is worse than what stands there, but for holes.
+        wanted = hidden & (behind.alpha <= OPAQUE)
         speck, gap = 0.01 * camera.width, 0.02 * camera.width
-        found[camera.name] = masks.tidy(wanted, speck, gap) & behind.undecided
+        found[camera.name] = masks.tidy(wanted, speck, gap) & hidden
     return found
 
 

@@ -252,8 +252,8 @@ def without_shadows(out: Path, true: list, gaussians, around):
 
 
 def completed_further(params: Params, out: Path, gaussians, new, around):
-    """Views completed in 2D by Telea, one after another, the one with most that nothing covers first; the Gaussians
-    with what they show, the labels, and the views."""
+    """Views put together from pieces of themselves, the one with most that nothing covers first; the Gaussians with
+    what they show, the labels, and the views."""
     from reffusion import coverage, inpaint, io, paint2d
     from reffusion.types import Reference
 
@@ -264,9 +264,9 @@ def completed_further(params: Params, out: Path, gaussians, new, around):
     while len(further) < params.further and (camera := coverage.barest(around, found)):
         mask, hidden = found[camera.name], around.hidden[camera.name]
         base = inpaint.background(gaussians, camera, around.photos[camera.name], hidden)
-        picture = paint2d.telea(base, mask | hidden & paint2d.widened(mask, coverage.RIM))
+        picture = paint2d.exemplar(base, mask | hidden & paint2d.widened(mask, coverage.RIM))
         reference = Reference(camera, picture, mask)
-        print(f"further view {camera.name}: {mask.sum() / hidden.sum():.1%} of the mask is shown by nothing else")
+        print(f"further view {camera.name}: {mask.sum() / hidden.sum():.1%} of the mask is covered by nothing")
         io.save_image(out / "further" / f"{camera.name}.png", picture)
         gaussians, new = filled(params, out, gaussians, new, reference, around, None, None, farthest=True)
         further.append(reference)
