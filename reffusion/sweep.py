@@ -18,7 +18,7 @@ from reffusion.witness import Witness, pixels
 
 NEIGHBOURS = 6
 LEAST, MOST = 4.0, 35.0  # degrees between a neighbour and the view, as seen from the surface
-REACH, STEPS = 0.06, 31  # relative disparity to either side that is tried, in so many steps
+REACH, STEPS = 0.03, 21  # relative disparity to either side that is tried, in so many steps
 WINDOW = 0.024  # of the image's width: what is compared
 SMOOTH = 0.02  # of it: the median of the depth that is corrected, so that roughness does not tear the window
 TEXTURE = 2.5  # levels of 255: deviation in a window from which anything can be told

@@ -254,6 +254,8 @@ def without_shadows(out: Path, true: list, gaussians, around):
 def completed_further(params: Params, out: Path, gaussians, new, around):
     """Views put together from pieces of themselves, the one with most that nothing covers first; the Gaussians with
     what they show, the labels, and the views."""
+    import numpy as np
+
     from reffusion import coverage, inpaint, io, paint2d
     from reffusion.types import Reference
 
@@ -267,8 +269,13 @@ def completed_further(params: Params, out: Path, gaussians, new, around):
         picture = paint2d.exemplar(base, mask | hidden & paint2d.widened(mask, coverage.RIM))
         reference = Reference(camera, picture, mask)
         print(f"further view {camera.name}: {mask.sum() / hidden.sum():.1%} of the mask is covered by nothing")
+        try:
+            gaussians, new = filled(params, out, gaussians, new, reference, around, None, None, farthest=True)
+        except ValueError as error:  # a sliver at the border of a view: others may show it better
+            print(f"left as it is: {error}")
+            found[camera.name] = np.zeros_like(mask)
+            continue
         io.save_image(out / "further" / f"{camera.name}.png", picture)
-        gaussians, new = filled(params, out, gaussians, new, reference, around, None, None, farthest=True)
         further.append(reference)
         found |= coverage.undecided_views(gaussians, new, around, [c for c in around.cameras if found[c.name].any()])
     return gaussians, new, further
