@@ -27,6 +27,7 @@ SOFT = 0.015  # of it: blur under which brightness is compared
 BROAD = 0.03  # of it: blur under which two places are of one stuff; not the same, or the dark would seem to brighten
 MOST = 3000  # points around that are kept
 NEIGHBOURS = 200  # of a new Gaussian, among them
+AT_ONCE = 20_000  # new Gaussians: their neighbours, in all views, take a GB at 200 views
 ALIKE = 0.08  # difference of colour, in [0, 1], at which a neighbour counts by 0.6: wood and steel shine unlike
 FAINT = 0.012  # of [0, 1]: a mean change up to which a surface is matte
 ENOUGH = 0.05  # share of the neighbours, by weight, that a view must show to tell of the change
@@ -99,10 +100,18 @@ def lent(
     Each takes the mean change of its neighbours in every view, near and alike in colour; the harmonics are least
     squares to them. Towards `camera`, from which the new were made, they keep their colour.
     """
-    degree, chosen = gaussians.sh_degree, torch.nonzero(fresh)[:, 0]
-    if degree == 0 or not len(chosen) or len(around.points) < NEIGHBOURS:
+    chosen = torch.nonzero(fresh)[:, 0]
+    if gaussians.sh_degree == 0 or not len(chosen) or len(around.points) < NEIGHBOURS:
         return gaussians
-    means, base = gaussians.means[chosen].double(), gaussians.sh[chosen, 0].double()
+    sh = gaussians.sh.clone()
+    for part in chosen.split(AT_ONCE):
+        sh[part] = _harmonics_of(gaussians.map(lambda p, part=part: p[part]), camera, around, views)
+    return replace(gaussians, sh=sh)
+
+
+def _harmonics_of(fresh: Gaussians, camera: Camera, around: Change, views: Sequence[Witness]) -> torch.Tensor:
+    """[N, K, 3], those of `lent`."""
+    degree, means, base = fresh.sh_degree, fresh.means.double(), fresh.sh[:, 0].double()
     own, _ = geometry.sample_nearest(around.broad, geometry.project(means.numpy(), camera)[0])
     brighter, known = _carried(means.numpy(), own, around)
     brighter, weight = _told_by_the_nearest(brighter, known, around.points.mean(0), views)
@@ -116,10 +125,8 @@ def lent(
         normal += weighted[:, :, None] * apart[:, None]
         right += weighted[:, :, None] * brighter[:, number, None]
     rest = torch.linalg.solve(normal, right)
-    lit = gaussians.sh.clone()
-    lit[chosen, 0] = (base - (ahead[..., None] * rest).sum(1) / SH0).to(lit.dtype)
-    lit[chosen, 1:] = rest.to(lit.dtype)
-    return replace(gaussians, sh=lit)
+    constant = base - (ahead[..., None] * rest).sum(1) / SH0
+    return torch.cat([constant[:, None], rest], 1).to(fresh.sh.dtype)
 
 
 def _carried(means: np.ndarray, own: np.ndarray, around: Change) -> tuple[np.ndarray, np.ndarray]:
