@@ -64,6 +64,26 @@ class Completion:
 
 
 @dataclass(frozen=True)
+class Hints:
+    """What else is known of a view's depth; None where it was not asked.
+
+    Attributes:
+        continued: [H, W] depth of planes that go on in the hole, inf where none does (`undecided.Behind`).
+        outer: [H, W] depth that is better known than the rendering's, above 0 where there is one.
+        told: bool [H, W], pixels of `outer` that other photographs agree on (`reffusion.sweep`).
+        looked_past: depth [H, W] -> bool [H, W], where other views look past such a surface.
+    """
+
+    continued: np.ndarray | None = None
+    outer: np.ndarray | None = None
+    told: np.ndarray | None = None
+    looked_past: Callable[[np.ndarray], np.ndarray] | None = None
+
+
+NO_HINTS = Hints()
+
+
+@dataclass(frozen=True)
 class Seen:
     """What one view shows of the scene's depth.
 
@@ -73,8 +93,7 @@ class Seen:
         known: bool [H, W], the pixels whose depth is the scene's: covered, and not beside the hole.
         hole: bool [H, W], the pixels to be filled. hidden: bool [H, W], C: where the object stood.
         anchored: bool [H, W], pixels of the hole whose `depth` is that of a plane which goes on there.
-        told: bool [H, W], pixels whose `depth` other photographs agree on (`reffusion.sweep`); None: not asked.
-        looked_past: depth [H, W] -> bool [H, W], where other views look past such a surface; None: not asked.
+        hints: what else is known.
     """
 
     camera: Camera
@@ -83,8 +102,7 @@ class Seen:
     hole: np.ndarray
     hidden: np.ndarray
     anchored: np.ndarray
-    told: np.ndarray | None = None
-    looked_past: Callable[[np.ndarray], np.ndarray] | None = None
+    hints: Hints = NO_HINTS
 
     @property
     def disparity(self) -> np.ndarray:
@@ -105,25 +123,17 @@ def seen(
     hole: np.ndarray,
     hidden: np.ndarray,
     how: Completion,
-    continued: np.ndarray | None = None,
-    outer: np.ndarray | None = None,
-    told: np.ndarray | None = None,
-    looked_past: Callable[[np.ndarray], np.ndarray] | None = None,
+    hints: Hints = NO_HINTS,
 ) -> Seen:
-    """The depth of a rendering, known where it is covered, but for the hole and a margin around it.
-
-    Args:
-        continued: [H, W] depth of planes that go on in the hole, inf where none does (`undecided.Behind`).
-        outer: [H, W] depth that is better known than the rendering's, above 0 where there is one.
-        told, looked_past: see `Seen`.
-    """
+    """The depth of a rendering, known where it is covered, but for the hole and a margin around it."""
     depth, alpha = (t.detach().double().cpu().numpy() for t in (drawn.depth, drawn.alpha))
+    continued, outer = hints.continued, hints.outer
     if outer is not None:
         depth, alpha = np.where(outer > 0, outer, depth), np.where(outer > 0, 1.0, alpha)
     known = (alpha > how.explained) & (depth > 0) & ~grown(hole, how.margin)
     anchored = hole & np.isfinite(continued) if continued is not None else np.zeros_like(hole)
     depth = np.where(anchored, continued, depth) if anchored.any() else depth
-    return Seen(camera, depth, known, hole, hidden, anchored, told, looked_past)
+    return Seen(camera, depth, known, hole, hidden, anchored, hints)
 
 
 def continued(
@@ -204,8 +214,8 @@ def _refuted(view: Seen, disparity: np.ndarray) -> float:
     if not view.hole.any():
         return 0.0
     wrong = view.anchored & (disparity > view.disparity * NEARER)
-    if view.looked_past is not None:
-        wrong |= view.looked_past(1 / np.maximum(disparity, view.least_disparity))
+    if view.hints.looked_past is not None:
+        wrong |= view.hints.looked_past(1 / np.maximum(disparity, view.least_disparity))
     return float(wrong[view.hole].mean())
 
 
@@ -232,8 +242,8 @@ def _planar(view: Seen, points: np.ndarray, how: Completion) -> tuple[planes.Pla
         values, source = view.disparity[rows, columns], "rendered depth"
         pixels = np.stack([columns, rows], 1) + 0.5
     planar = _planes_through(view, pixels, values, how)
-    if sparse and view.told is not None and planar.explained < SURE:
-        rows, columns = np.nonzero(_around(view, how) & view.known & view.told)
+    if sparse and view.hints.told is not None and planar.explained < SURE:
+        rows, columns = np.nonzero(_around(view, how) & view.known & view.hints.told)
         kept = slice(None, None, max(1, len(rows) // (SWEPT * len(values))))
         rows, columns, source = rows[kept], columns[kept], "sparse points and photographs compared"
         values = np.concatenate([values, view.disparity[rows, columns]])

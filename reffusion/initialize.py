@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
 from reffusion import behind, continuation, geometry, gloss, splat, sweep, trace
-from reffusion.behind import Completion
+from reffusion.behind import NO_HINTS, Completion, Hints
 from reffusion.continuation import Plane
 from reffusion.solverlog import SolverLog
 from reffusion.splat.conventions import SH0
@@ -62,10 +62,7 @@ def depth_behind(
     how: Completion,
     estimate: np.ndarray | None = None,
     log: trace.Trace | None = None,
-    continued: np.ndarray | None = None,
-    outer: np.ndarray | None = None,
-    told: np.ndarray | None = None,
-    looked_past: Callable[[np.ndarray], np.ndarray] | None = None,
+    hints: Hints = NO_HINTS,
     farthest: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """The scene without the object in one view: depth [H, W] float64, as rendered where that is known, else made up;
@@ -83,13 +80,13 @@ def depth_behind(
         how: parameters.
         estimate: [H, W] a depth model's answer to the reference, disparity up to scale and offset; None: there is none.
         log: gets a series for each solver (docs/traces.md).
-        continued, outer, told, looked_past: see `behind.seen`. farthest: see `behind.continued`.
+        hints: what else is known of its depth. farthest: see `behind.continued`.
 
     Raises:
         ValueError: naming the view, where too little is known around the hole, or the estimate does not fit.
     """
     drawn = splat.render(remaining, reference.camera, sh_degree=0)
-    view = behind.seen(drawn, reference.camera, hole, hidden, how, continued, outer, told, looked_past)
+    view = behind.seen(drawn, reference.camera, hole, hidden, how, hints)
     solvers = SolverLog(log, reference.camera.name, *behind.points_around(view, points, how))
     try:
         if reference.depth is not None:

@@ -181,20 +181,11 @@ def filled(params: Params, out: Path, gaussians, new, reference, around, network
     remaining = gaussians.map(lambda p: p[~new])
     near, told = around.compared(camera, hole) if params.sweep else (around, None)
     continued = undecided.behind(remaining, camera, hidden, near.views, near.planes).continued
+    past = (lambda depth: near.looked_past(camera, depth)) if params.sweep else None
+    hints = behind.Hints(continued, near.photographed(camera), told, past)
+    estimate = estimate_of(network, reference)
     depth, made_up, said = initialize.depth_behind(
-        remaining,
-        reference,
-        hole,
-        hidden,
-        around.points,
-        how,
-        estimate_of(network, reference),
-        log,
-        continued,
-        near.photographed(camera),
-        told,
-        (lambda depth: near.looked_past(camera, depth)) if params.sweep else None,
-        farthest,
+        remaining, reference, hole, hidden, around.points, how, estimate, log, hints, farthest
     )
     print(f"depth of reference {camera.name}: {said}")
     io.save_exr(out / "depth" / f"{camera.name}.exr", depth.astype("float32"))
