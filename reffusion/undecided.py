@@ -53,7 +53,6 @@ def behind(
     views: Sequence[Witness],
     planes: Sequence[Plane],
     *,
-    given: torch.Tensor | None = None,
     witnesses: int = 1,
 ) -> Behind:
     """A pixel of C is decided if its ray meets no continuation of a surface before one that another view shows,
@@ -62,29 +61,26 @@ def behind(
     Args:
         remaining: the M Gaussians without the object.
         hidden: bool [H, W], C of that view.
-        given: [M] bool, Gaussians made of completed pictures: what they show is decided.
         witnesses: views that must show the point; 0: the rest alone decides.
     """
-    labels = torch.zeros(len(remaining), dtype=torch.bool) if given is None else given
-    drawn = splat.render(remaining, camera, features=labels[:, None].to(remaining.means), sh_degree=0)
+    drawn = splat.render(remaining, camera, sh_degree=0)
     depth, alpha = (t.double().cpu().numpy() for t in (drawn.depth, drawn.alpha))
-    asked = hidden & (drawn.features[..., 0].cpu().numpy() <= 0.5 * np.maximum(alpha, 1e-6))
-    rows, columns = np.nonzero(asked & (alpha > OPAQUE))
-    undecided = asked.copy()
+    rows, columns = np.nonzero(hidden & (alpha > OPAQUE))
+    undecided = hidden.copy()
     if len(rows):
         points, normals = (each[rows, columns] for each in smoothed_surface(depth, camera))
         undecided[rows, columns] = votes(points, views, normals).seen < witnesses
     depth = with_photographed_depth(depth, camera, views)
-    hides, reach = np.zeros_like(asked), np.full(asked.shape, np.inf)
+    hides, reach = np.zeros_like(hidden), np.full(hidden.shape, np.inf)
     for plane in planes:
         at = plane.depth(camera)
-        before = asked & (at < BEFORE * np.where(depth > 0, depth, np.inf)) & plane.on(plane.goes_on, at, camera)
+        before = hidden & (at < BEFORE * np.where(depth > 0, depth, np.inf)) & plane.on(plane.goes_on, at, camera)
         # Where nothing is known the plane goes on too, but not behind something that stands before it.
         beneath = undecided & ((at < depth / BEFORE) | (alpha <= OPAQUE)) & plane.on(plane.within, at, camera)
         if _grows_out_of(before | beneath, at, depth, ~hidden & (alpha > OPAQUE)):
             hides |= before
             reach = np.where(before | beneath, np.minimum(reach, at), reach)
-    undecided = without_slivers(undecided | hides) & asked
+    undecided = without_slivers(undecided | hides) & hidden
     return Behind(undecided, np.where(undecided, reach, np.inf), depth, alpha)
 
 

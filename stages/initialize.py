@@ -251,7 +251,7 @@ def completed_further(params: Params, out: Path, gaussians, new, around):
     from reffusion.types import Reference
 
     further: list[Reference] = []
-    found = coverage.undecided_views(gaussians, new, around, around.cameras)
+    found = coverage.open_pixels(gaussians, around, around.cameras)
     haze = coverage.haze(gaussians, new, around, found, params.leak)
     gaussians, new = gaussians.map(lambda p: p[~haze]), new[~haze]
     while len(further) < params.further and (camera := coverage.barest(around, found)):
@@ -268,7 +268,7 @@ def completed_further(params: Params, out: Path, gaussians, new, around):
             continue
         io.save_image(out / "further" / f"{camera.name}.png", picture)
         further.append(reference)
-        found |= coverage.undecided_views(gaussians, new, around, [c for c in around.cameras if found[c.name].any()])
+        found |= coverage.open_pixels(gaussians, around, [c for c in around.cameras if found[c.name].any()])
     return gaussians, new, further
 
 
