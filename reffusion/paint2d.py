@@ -14,6 +14,8 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
+from reffusion import shiftmap
+
 MULTIPLE = 8  # LaMa halves a picture three times
 FSR_SIDE = 160  # px: FSR's time grows with the hole's area, and what it adds on larger pictures is blurred alike
 TELEA_RADIUS = 5  # px
@@ -111,9 +113,9 @@ def exemplar(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
         return image.copy()
     if not hasattr(cv2, "xphoto"):
         raise ValueError("this OpenCV has no xphoto module; `pip install opencv-contrib-python-headless`")
-    known, painted = np.where(hole, 0, 255).astype(np.uint8), np.zeros_like(image)
+    known = np.where(hole, 0, 255).astype(np.uint8)
     lab = cv2.cvtColor(_blanked(image, hole), cv2.COLOR_RGB2Lab)
-    cv2.xphoto.inpaint(lab, known, painted, cv2.xphoto.INPAINT_SHIFTMAP)
+    painted = shiftmap.completed(lab, known)
     unreached = hole & ~painted.any(2)  # zeros are no colour: grey has a = b = 128
     picture = _inside(image, cv2.cvtColor(painted, cv2.COLOR_Lab2RGB), hole)
     return telea(picture, unreached) if unreached.any() else picture

@@ -274,15 +274,12 @@ def completed_further(params: Params, out: Path, gaussians, new, around):
 
 def settled(params: Params, out: Path, gaussians, references, around):
     """The Gaussians after `params.settle` steps of reconstruction; see `reffusion.settle`."""
-    import shutil
-
     from reffusion import trace
     from reffusion.settle import Known, settle
 
     hidden = {view.camera.name: view.hidden for view in around.views}
     work = out / ".settle"  # hidden: its trace tells seconds, which are no part of the artifact's content
-    shutil.rmtree(work, ignore_errors=True)  # begun anew after a kill: half a minute, and the same to the last bit
-    work.mkdir()
+    work.mkdir(exist_ok=True)
     done = settle(gaussians, Known(around.cameras, around.photos, hidden, references), params.settle, params.seed, work)
     trace.clear_checkpoint(work)
     return done

@@ -29,8 +29,9 @@ OWN_FILES = (
     "reffusion/weights.py",
     "reffusion/download.py",
     "reffusion/sfm.py",
+    "reffusion/shiftmap.py",
     COMPILER,
-)  # weights, databases, kernels
+)  # weights, databases, pipes, kernels
 PURE = (
     "geometry",
     "alignment",
