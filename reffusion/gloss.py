@@ -65,8 +65,11 @@ def change_around(
 
     Args:
         picture: [H, W, 3] uint8, the completed view; depth: [H, W] of the surfaces it shows, 0 where unknown.
-        hole: bool [H, W]. camera: the view. views: V witnesses. photos: their pictures, uint8, exposed alike.
+        hole: bool [H, W]. camera: the view, one of the photographed. views: V witnesses. photos: their pictures, uint8,
+            exposed alike.
     """
+    # Around the hole photographs are compared: a reference may show in the light what they show in the object's shadow.
+    picture = np.where(hole[..., None], picture, photos[camera.name])
     ring = widened(hole, RING) & ~widened(hole, AWAY) & (depth > 0)
     rows, columns = np.nonzero(ring)
     kept = np.linspace(0, len(rows) - 1, min(MOST, len(rows))).round().astype(int)

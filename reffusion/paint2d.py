@@ -113,12 +113,22 @@ def exemplar(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
         return image.copy()
     if not hasattr(cv2, "xphoto"):
         raise ValueError("this OpenCV has no xphoto module; `pip install opencv-contrib-python-headless`")
+    near = _context(hole)  # time grows with the picture, and what is far away is seldom alike
     known = np.where(hole, 0, 255).astype(np.uint8)
     lab = cv2.cvtColor(_blanked(image, hole), cv2.COLOR_RGB2Lab)
-    painted = shiftmap.completed(lab, known)
+    painted = np.zeros_like(lab)
+    painted[near] = shiftmap.completed(lab[near], known[near])
     unreached = hole & ~painted.any(2)  # zeros are no colour: grey has a = b = 128
     picture = _inside(image, cv2.cvtColor(painted, cv2.COLOR_Lab2RGB), hole)
     return telea(picture, unreached) if unreached.any() else picture
+
+
+def _context(hole: np.ndarray) -> tuple[slice, slice]:
+    """The rows and columns of the hole's box and as much again to every side, of the picture's quarter at least."""
+    spans = [np.flatnonzero(hole.any(axis)) for axis in (1, 0)]
+    sides = [span[-1] + 1 - span[0] for span in spans]
+    reach = max(*sides, max(hole.shape) // 4)
+    return tuple(slice(max(span[0] - reach, 0), span[-1] + 1 + reach) for span in spans)
 
 
 def telea(image: np.ndarray, hole: np.ndarray) -> np.ndarray:

@@ -55,9 +55,8 @@ def settle(gaussians: Gaussians, known: Known, steps: int, seed: int, folder: Pa
     """
     views, images = list(known.cameras), dict(known.photos)
     weights = {name: (~mask).astype(np.float32) for name, mask in known.hidden.items()}
-    copies = round(REFERENCE_SHARE / (1 - REFERENCE_SHARE) * len(views) / max(len(known.references), 1))
-    for number, reference in enumerate(known.references):
-        for copy in range(max(1, copies)):
+    for number, (reference, turns) in enumerate(zip(known.references, turns_of(known), strict=True)):
+        for copy in range(turns):
             name = f"{reference.camera.name} completed {number}.{copy}"
             views.append(replace(reference.camera, name=name))
             images[name], weights[name] = reference.image, reference.mask.astype(np.float32)
@@ -72,3 +71,11 @@ def settle(gaussians: Gaussians, known: Known, steps: int, seed: int, folder: Pa
         betas=BETAS,
     )
     return fit(views, images, gaussians, settings, folder=folder, weights=weights)
+
+
+def turns_of(known: Known) -> list[int]:
+    """How often each completed view is looked at while each photograph is once: by how much of it was completed, so
+    that a few pixels of a further view do not cost the reference its turns."""
+    sizes = [int(reference.mask.sum()) for reference in known.references]
+    turns = REFERENCE_SHARE / (1 - REFERENCE_SHARE) * len(known.cameras)
+    return [max(1, round(turns * size / max(sum(sizes), 1))) for size in sizes]

@@ -191,8 +191,12 @@ def filled(params: Params, out: Path, gaussians, new, reference, around, network
     io.save_exr(out / "depth" / f"{camera.name}.exr", depth.astype("float32"))
     pixels = behind.grown(hole, params.overlap)
     gaussians, new = initialize.placed(gaussians, new, reference, depth, pixels, around, sheets)
+    if farthest:  # what is open still is asked for view by view
+        return gaussians, new
     views = [(each, around.hidden[each.name]) for each in around.cameras]
     gap = initialize.seen_through(gaussians, camera, made_up, hidden & ~pixels, views, params.seen_through)
+    if not gap.any():
+        return gaussians, new
     return initialize.placed(gaussians, new, reference, made_up, gap, around, sheets)
 
 

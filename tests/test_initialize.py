@@ -9,6 +9,7 @@ import torch
 
 from reffusion import behind, geometry, io, splat
 from reffusion import initialize as rules
+from reffusion.settle import Known, turns_of
 from reffusion.surfels import surface_gaussians, surface_normals
 from reffusion.types import Camera, Reference
 from stages import initialize, masks
@@ -233,3 +234,18 @@ def test_settling_moves_the_gaussians_and_leaves_no_checkpoint(scene, tmp_path):
         for name, g in found.items()
     }
     assert error["first"] < error["none"]
+
+
+def test_a_few_pixels_of_a_further_view_do_not_cost_the_reference_its_turns():
+    view = small.CAMERAS["a4"]
+    picture, large, few = (
+        small.photo(view),
+        np.zeros((view.height, view.width), bool),
+        np.zeros((view.height, view.width), bool),
+    )
+    large[10:40, 10:40], few[0, :3] = True, True
+    shown = lambda *masks: Known([view] * 40, {}, {}, [Reference(view, picture, mask) for mask in masks])
+    assert turns_of(shown(large)) == [20]
+    assert turns_of(shown(large, few, few, few)) == [20, 1, 1, 1]
+    assert turns_of(shown(large, large)) == [10, 10]
+    assert turns_of(shown()) == []

@@ -132,6 +132,15 @@ def test_a_matte_surface_stays_matte(views):
     torch.testing.assert_close(lit.sh, fresh.sh, atol=0.01, rtol=0)
 
 
+def test_a_shadow_that_a_reference_does_not_show_is_no_shine(views):
+    light = {view.name: photograph(view) for view in CAMERAS}
+    photos = {name: (photo * 0.6).astype(np.uint8) for name, photo in light.items()}
+    fresh = new_gaussians(1)
+    around = gloss.change_around(light["v0"], ground(CAMERAS[0])[0], HOLE, CAMERAS[0], views, photos)
+    lit = gloss.lent(fresh, torch.ones(len(fresh), dtype=torch.bool), CAMERAS[0], around, views)
+    torch.testing.assert_close(lit.sh, fresh.sh, atol=0.01, rtol=0)
+
+
 def test_nothing_is_lent_where_nothing_is_known_or_harmonics_are_flat(views):
     photos = {view.name: photograph(view, shines=True) for view in CAMERAS}
     flat, fresh = new_gaussians(0), new_gaussians(1)
