@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy import ndimage
+from scipy import ndimage, sparse
+from scipy.sparse.linalg import spsolve
 
 from reffusion import geometry, trace
 from reffusion.behind import grown
 from reffusion.types import Camera
-from reffusion.witness import Witness, votes
+from reffusion.witness import SURFACE, Witness, votes
 
 REACH = 2.5  # radii of the object around its middle within which surfaces are looked for
 RING = 0.12  # of the image's width: how far around the masks surfaces are sampled
@@ -28,6 +29,8 @@ WITHIN = (0.05, 0.03, 0.015, 0.015)  # relative depth within which a view's pixe
 ENOUGH = 200  # pixels that must
 FAR = 0.08  # relative depth: a plane that would move farther anywhere in the hole stays where it is
 STAYS = 0.05  # weight of the plane as it was, within the hole, against what is around
+ACROSS = 0.9  # cosine of the angle between two planes under which they cross
+RIM = 1  # cells
 TOUCHING = 0.25  # share of an unknown patch's border that must be seen for the plane to go on into it
 
 
@@ -41,6 +44,7 @@ class Plane:
         goes_on: bool [CELLS, CELLS], unknown cells into which the plane continues.
         within: bool [CELLS, CELLS], these and what they enclose with what is seen of the plane: mirrored light makes a
             polished part look like a pit.
+        free: bool [CELLS, CELLS], where views look through it: there it is not.
     """
 
     normal: np.ndarray
@@ -50,6 +54,7 @@ class Plane:
     pitch: float
     goes_on: np.ndarray
     within: np.ndarray
+    free: np.ndarray
 
     def depth(self, camera: Camera) -> np.ndarray:
         """[H, W] camera z where a view's rays meet the plane; inf where they do not."""
@@ -79,15 +84,19 @@ def planes_around(centre: np.ndarray, radius: float, views: Sequence[Witness], s
         centre: [3], the middle of what is removed. radius: of most of it.
     """
     samples = _samples(centre, REACH * radius, views, seed)
-    near, free, found = TOLERANCE * radius, np.ones(len(samples), bool), []
+    near, free = TOLERANCE * radius, np.ones(len(samples), bool)
+    found: list[tuple[np.ndarray, float]] = []
     draws = np.random.default_rng(trace.seed_for(seed, "planes around"))
     while free.sum() >= max(50, LEAST_SHARE * len(samples)) and len(found) < MOST:
         normal, height, support = _best_plane(samples[free], near, draws)
         if support < LEAST_SHARE * len(samples):
             break
-        found.append(_mapped(normal, height, centre, REACH * radius, views))
+        found.append((normal, height))
         free &= np.abs(samples @ normal - height) >= 1.5 * near
-    return found
+    away = [np.linalg.norm(view.camera.center - centre) for view in views]
+    band = max(1.5 * near, SURFACE * float(np.median(away))) if found else 0.0
+    crossing = lambda normal: [other for other in found if abs(other[0] @ normal) < ACROSS]
+    return [_mapped(*plane, crossing(plane[0]), band, centre, REACH * radius, views) for plane in found]
 
 
 def aligned(plane: Plane, depth: np.ndarray, camera: Camera, hole: np.ndarray) -> Plane:
@@ -168,9 +177,45 @@ def _hull(seen: np.ndarray) -> np.ndarray:
     return hull > 0
 
 
-def _mapped(normal: np.ndarray, height: float, centre: np.ndarray, reach: float, views: Sequence[Witness]) -> Plane:
+def _between(unknown: np.ndarray, seen: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """[CELLS, CELLS] in [0, 1], on the unknown cells the harmonic function that is 1 where they meet seen cells and 0
+    where they meet free ones: at a half the borders that are visible go on through them, straight where they can."""
+    unknown = unknown | (ndimage.binary_dilation(unknown, iterations=2 * RIM + 1) & ~seen & ~free)
+    index = np.full(unknown.shape, -1)
+    index[unknown] = np.arange(unknown.sum())
+    centre, total = index[unknown], np.zeros(int(unknown.sum()))
+    right, links = np.zeros_like(total), []
+    for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
+        moved = lambda cells, axis=axis, step=step: np.roll(np.pad(cells, 1), step, axis)[1:-1, 1:-1][unknown]
+        next_seen, next_free = moved(seen), moved(free)
+        next_one = np.roll(np.pad(index, 1, constant_values=-1), step, axis)[1:-1, 1:-1][unknown]
+        linked = next_one >= 0
+        total += next_seen | next_free | linked
+        right += next_seen
+        links.append(sparse.coo_matrix((np.ones(linked.sum()), (centre[linked], next_one[linked])), (len(total),) * 2))
+    bound = right.any() and total.any()
+    found = np.zeros(unknown.shape)
+    if bound:
+        found[unknown] = spsolve((sparse.diags(total + 1e-9) - sum(links)).tocsc(), right)
+    return found
+
+
+def _mapped(
+    normal: np.ndarray,
+    height: float,
+    others: Sequence[tuple[np.ndarray, float]],
+    band: float,
+    centre: np.ndarray,
+    reach: float,
+    views: Sequence[Witness],
+) -> Plane:
     """The plane with its map: a patch of it that nobody saw, because the object was in the way, and that touches what
-    was seen of it, is where it goes on; where views look through it, it does not."""
+    was seen of it, is where it goes on; where views look through it, it does not.
+
+    Args:
+        others: normals and heights of planes that cross it. band: distance from these up to which a view that seems to
+            show the one may show the other.
+    """
     first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
     along = np.stack([first / np.linalg.norm(first), np.cross(normal, first / np.linalg.norm(first))])
     origin, pitch = centre - (centre @ normal - height) * normal, 2 * reach / CELLS
@@ -183,13 +228,19 @@ def _mapped(normal: np.ndarray, height: float, centre: np.ndarray, reach: float,
     seen = ((said.seen >= 1) & (said.seen >= said.free)).reshape(shape)
     free = ((said.free >= 2) & (said.free > said.seen)).reshape(shape)
     unknown = ~seen & ~free & (said.hidden > 0).reshape(shape)
+    # The rim of what is seen or free is blurred by the masks' margin and tells nothing, and so does a crossing.
+    crossed = np.any([np.abs(points @ other - high) < band for other, high in others], 0) & np.ones(shape, bool)
+    square = np.ones((2 * RIM + 1,) * 2, np.uint8)
+    solid = cv2.morphologyEx((seen & ~crossed).astype(np.uint8), cv2.MORPH_OPEN, square) > 0
     patches, count = ndimage.label(unknown)
-    goes_on = np.zeros(shape, bool)
+    goes_on, ends = np.zeros((2, *shape), bool)
     for patch in range(1, count + 1):
         inside = patches == patch
         border = ndimage.binary_dilation(inside, iterations=2) & ~inside
         if inside.sum() >= 4 and seen[border].mean() > TOUCHING:
-            goes_on |= inside
+            beyond = _between(inside, solid, free) < 0.5
+            goes_on |= inside & ~beyond
+            ends |= inside & beyond
     goes_on &= _hull(seen)
-    within = goes_on | (ndimage.binary_fill_holes(seen | goes_on) & ~seen & (said.hidden > 0).reshape(shape))
-    return Plane(normal, height, origin, along, pitch, goes_on, within)
+    within = goes_on | (ndimage.binary_fill_holes(seen | goes_on) & ~seen & ~ends & (said.hidden > 0).reshape(shape))
+    return Plane(normal, height, origin, along, pitch, goes_on, within, free)

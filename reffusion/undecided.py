@@ -26,7 +26,7 @@ from reffusion.witness import (
 BEFORE = 0.97  # of the depth shown: a continuation must be nearer than that to hide it
 BESIDE = 0.03  # of the image's width: how far around a plane's patch it is compared with what is shown
 ROUGHEST = 0.06  # of the depth: a wider range around a pixel is no rough surface, but a depth edge
-AGREES = 0.45  # share of these pixels that must lie on the plane
+AGREES = 0.5  # share of these pixels that must lie on the plane
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,8 @@ def behind(
         before = hidden & (at < BEFORE * np.where(depth > 0, depth, np.inf)) & plane.on(plane.goes_on, at, camera)
         # Where nothing is known the plane goes on too, but not behind something that stands before it.
         beneath = undecided & ((at < depth / BEFORE) | (alpha <= OPAQUE)) & plane.on(plane.within, at, camera)
-        if _grows_out_of(before | beneath, at, depth, ~hidden & (alpha > OPAQUE)):
+        told = ~hidden & (alpha > OPAQUE) & ~plane.on(plane.free, at, camera)
+        if _grows_out_of(before | beneath, at, depth, told):
             hides |= before
             reach = np.where(before | beneath, np.minimum(reach, at), reach)
     undecided = without_slivers(undecided | hides) & hidden

@@ -29,13 +29,15 @@ def camera(name: str, azimuth: float, height: float, away: float = 3.5) -> Camer
     return Camera(name, SIZE, SIZE, FOCAL, FOCAL, SIZE / 2, SIZE / 2, pose)
 
 
-def drawn(view: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Depth [H, W] of table and floor, whether the ray meets the box first, whether the table shows without it."""
+def drawn(view: Camera, notched: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Depth [H, W] of table and floor, whether the ray meets the box first, whether the table shows without it; one
+    that is notched lacks a quarter, up to the middle of the box."""
     rays = geometry.pixel_rays(view) @ view.world_to_camera[:3, :3]
     to = lambda z: (z - view.center[2]) / rays[..., 2]
     at = lambda t: view.center + rays * t[..., None]
     table, floor = to(TOP), to(FLOOR)
     on_table = (table > 0) & (np.abs(at(table)[..., :2]) <= EDGE).all(-1)
+    on_table &= ~(notched & (at(table)[..., :2] > 0).all(-1))
     floor = np.where(floor > 0, floor, 20.0)
     depth = np.where(on_table & (table < floor), table, floor)
     low, high = np.array([-BOX, -BOX, 0.0]), np.array([BOX, BOX, HIGH])
@@ -44,8 +46,8 @@ def drawn(view: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return depth, (enter < leave) & (leave > 0) & (enter < depth), on_table & (table < floor)
 
 
-def witness(view: Camera) -> Witness:
-    depth, hidden, _ = drawn(view)
+def witness(view: Camera, notched: bool = False) -> Witness:
+    depth, hidden, _ = drawn(view, notched)
     kernel = np.ones((3, 3))
     wide = cv2.dilate(hidden.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     return Witness(view, depth, cv2.erode(depth, kernel), cv2.dilate(depth, kernel), wide)
@@ -89,6 +91,20 @@ def test_the_table_goes_on_under_the_box_and_ends_at_its_edge(views):
     assert goes_on[footprint].mean() > 0.95
     assert not (goes_on & beyond).any()
     np.testing.assert_allclose(at[footprint], depth[footprint], rtol=0.01)
+
+
+def test_borders_that_are_visible_go_on_under_the_box():
+    """The box hides the inner corner of an L-shaped table: what is beyond the line between its visible edges is free,
+    though the convex hull of the table has it."""
+    views = [witness(camera(f"a{k}", 30 * k, 1.6), notched=True) for k in range(12)]
+    planes = planes_around(np.array([0.0, 0.0, HIGH / 2]), 0.45, views)
+    table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.height))
+    steps = (np.arange(len(table.goes_on)) + 0.5 - len(table.goes_on) / 2) * table.pitch
+    points = table.origin + steps[:, None, None] * table.along[0] + steps[None, :, None] * table.along[1]
+    across, under = points[..., :2].sum(-1), (np.abs(points[..., :2]) < 0.9 * BOX).all(-1)
+    assert table.goes_on[under & (across < 0.7 * BOX)].mean() > 0.95
+    assert table.goes_on[under & (across > 1.3 * BOX)].mean() < 0.05
+    assert table.within[under & (across > 1.3 * BOX)].mean() < 0.05
 
 
 def test_slivers_go_and_patches_stay():
