@@ -15,6 +15,7 @@ from typing import Any
 from reffusion import io
 from reffusion.io.traces import load_trace
 from report import curves, page, scenes, sheet
+from report.pictures import wall
 from report.results import load_receipts
 
 ORDER = ("poses", "fit", "masks", "reference", "lift", "personalize", "initialize", "distill", "evaluate")
@@ -99,7 +100,7 @@ def make(home: Path) -> Path:
     seconds = sum(receipt["seconds"] for receipt in job.receipts.values())
     done = f"{page.duration(seconds)} in {len(job.receipts)} stages"
     parts = [page.heading(title, 1), page.paragraph(f"{done}. {outcome(job)}")]
-    parts += pictures(job, out) + whole(job, out) + stages(job, out)
+    parts += pictures(job, out) + further(job, out) + whole(job, out) + stages(job, out)
     parts += left_out(job) + receipts(job) + artifacts(job, out)
     path = out / "index.html"
     path.write_text(page.document(title, parts), encoding="utf-8")
@@ -127,6 +128,21 @@ def pictures(job: Job, out: Path) -> list[str]:
     except ValueError as error:
         return [page.heading("Pictures"), page.paragraph(f"None yet: {error}")]
     return [page.heading("Pictures"), page.picture(path, "views of the scene")]
+
+
+def further(job: Job, out: Path) -> list[str]:
+    """The views that were completed beside the references, and why."""
+    folder = job.folders.get("initialize", Path())
+    facts = folder / "facts.json"
+    shares = io.load_json(facts).get("further", {}) if facts.is_file() else {}
+    if not shares:
+        return []
+    shown = [io.load_image(folder / "further" / f"{view}.png") for view in shares]
+    titles = [f"{view}: {share:.1%} of its mask was open" for view, share in shares.items()]
+    io.save_image(out / "further.png", wall(shown, titles))
+    said = "No reference shows what was open there: these views were put together from pieces of themselves."
+    parts = [page.heading("Further views"), page.paragraph(said)]
+    return [*parts, page.picture(out / "further.png", "views completed beside the references")]
 
 
 def whole(job: Job, out: Path) -> list[str]:

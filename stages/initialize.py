@@ -72,6 +72,12 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list:
     return [weights.of_model(params.depth_model, "float32")] if params.depth_model else []
 
 
+def preview(params: Params, **_: Path | None) -> list[str]:
+    if not (params.further and params.start == "reference"):
+        return []
+    return [f"completes up to {params.further} further views from pieces of themselves: what no reference shows"]
+
+
 def run(
     params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, reference: Path | None, lift: Path | None = None
 ) -> None:
@@ -107,6 +113,7 @@ def run(
     true = true_pictures(reference, references, around) if references and params.start == "reference" else []
     if true and params.settle:
         true, around = without_shadows(out, true, gaussians, around)
+    further = []
     if true and params.further:
         gaussians, new, further = completed_further(params, out, gaussians, new, around)
         true += further
@@ -121,6 +128,9 @@ def run(
     uncovered = {each.name: initialize.uncovered(gaussians, each, sets[each.name].consistent) for each in train}
     facts = {"new_gaussians": int(new.sum()), "removed_gaussians": int(labels.sum()), "haze": int(haze.sum())}
     facts |= {"completed": [each.camera.name for each in true], "uncovered": uncovered}
+    facts["further"] = {
+        each.camera.name: float(each.mask.sum() / sets[each.camera.name].consistent.sum()) for each in further
+    }
     facts["uncovered_share"] = sum(uncovered.values()) / max(len(uncovered), 1)
     io.save_json(out / "facts.json", facts)
     if bare := [f"{name} ({share:.1%})" for name, share in uncovered.items() if share > WARN_FROM]:
@@ -278,14 +288,15 @@ def completed_further(params: Params, out: Path, gaussians, new, around):
 
 def settled(params: Params, out: Path, gaussians, references, around):
     """The Gaussians after `params.settle` steps of reconstruction; see `reffusion.settle`."""
-    from reffusion import trace
+    import shutil
+
     from reffusion.settle import Known, settle
 
     hidden = {view.camera.name: view.hidden for view in around.views}
     work = out / ".settle"  # hidden: its trace tells seconds, which are no part of the artifact's content
     work.mkdir(exist_ok=True)
     done = settle(gaussians, Known(around.cameras, around.photos, hidden, references), params.settle, params.seed, work)
-    trace.clear_checkpoint(work)
+    shutil.rmtree(work)
     return done
 
 
