@@ -224,8 +224,8 @@ def true_pictures(reference: Path, references: list, around) -> list:
 
 
 def without_shadows(out: Path, true: list, gaussians, around):
-    """The references, standing also for what the object had tainted, and the surroundings where the photographs say
-    nothing there; writes tainted/<view>.png where there is something."""
+    """The references, standing also for what the object had tainted, and the surroundings with photographs in their
+    light; these say nothing where it is not known. Writes tainted/<view>.png where there is something."""
     from dataclasses import replace
 
     import numpy as np
@@ -234,26 +234,29 @@ def without_shadows(out: Path, true: list, gaussians, around):
     from reffusion.witness import with_photographed_depth
 
     marks = {camera.name: np.zeros((camera.height, camera.width), bool) for camera in around.cameras}
+    silent, photos = dict(marks), dict(around.photos)
     pictures = []
     for each in true:
         name = each.camera.name
         hidden = around.hidden[name]
-        found = taint.tainted(
-            each.image, inpaint.background(gaussians, each.camera, around.photos[name], hidden), hidden
-        )
-        if found.any():
-            print(f"reference {name}: beside the hole {found.sum()} px differ from what is seen, a shadow perhaps")
-            depth = splat.render(gaussians, each.camera, sh_degree=0).depth.double().numpy()
-            depth = with_photographed_depth(depth, each.camera, around.views)
-            carried = taint.carried(found, depth, each.camera, around.views)
-            marks = {view: mask | carried[view] for view, mask in marks.items()}
+        shown = inpaint.background(gaussians, each.camera, photos[name], hidden)
+        found = taint.tainted(each.image, shown, hidden)
         pictures.append(replace(each, mask=each.mask | found))
+        if not found.any():
+            continue
+        print(f"reference {name}: beside the hole {found.sum()} px differ from what is seen, a shadow perhaps")
+        depth = splat.render(gaussians, each.camera, sh_degree=0).depth.double().numpy()
+        depth = with_photographed_depth(depth, each.camera, around.views)
+        brighter = taint.light(each.image, shown)
+        for view, (mask, light) in taint.carried(found, brighter, depth, each.camera, around.views).items():
+            photos[view] = np.where(mask[..., None], taint.relit(photos[view], light), photos[view])
+            marks[view], silent[view] = marks[view] | mask, silent[view] | (mask & np.isnan(light).any(-1))
     if not any(mask.any() for mask in marks.values()):
         return true, around
     for name, mask in marks.items():
         io.save_mask(out / "tainted" / f"{name}.png", mask)
-    views = [replace(view, hidden=view.hidden | marks[view.camera.name]) for view in around.views]
-    return pictures, replace(around, views=views)
+    views = [replace(view, hidden=view.hidden | silent[view.camera.name]) for view in around.views]
+    return pictures, replace(around, views=views, photos=photos)
 
 
 def completed_further(params: Params, out: Path, gaussians, new, around):

@@ -157,8 +157,14 @@ def test_a_shadow_beside_the_mask_is_found_and_carried_into_other_views(views):
     assert not taint.tainted(truth, truth, hidden).any()
     there = geometry.unproject(drawn(other.camera)[0], other.camera)
     same = drawn(other.camera)[2] & (np.hypot(there[..., 0] - 0.5, there[..., 1] - 0.5) < 0.25) & ~other.hidden
-    carried = taint.carried(found, depth, view.camera, [other])["a1"]
+    carried, light = taint.carried(found, taint.light(truth, photo), depth, view.camera, [other])["a1"]
     assert carried[same].mean() > 0.9 and not carried[~drawn(other.camera)[2]].mean() > 0.02
+    lit = np.clip(np.full((SIZE, SIZE, 3), 140) + np.random.default_rng(1).integers(-12, 13, (SIZE, SIZE, 1)), 0, 255)
+    core = drawn(other.camera)[2] & (np.hypot(there[..., 0] - 0.5, there[..., 1] - 0.5) < 0.2) & ~other.hidden
+    again = taint.relit((lit * 0.6).astype(np.uint8), light)
+    assert np.abs(again[core].astype(float) - lit[core]).mean() < 4 and np.abs(lit[core] * 0.4).mean() > 50
+    outside = ~cv2.dilate(carried.astype(np.uint8), np.ones((9, 9))).astype(bool)
+    assert (again[outside] == (lit * 0.6).astype(np.uint8)[outside]).all(), "where nothing is known it stays as it is"
 
 
 def test_what_has_other_colours_than_gravel_is_debris():
