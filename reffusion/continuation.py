@@ -63,15 +63,18 @@ class Plane:
             depth = (self.height - camera.center @ self.normal) / (rays @ self.normal)
         return np.where(np.isfinite(depth) & (depth > 0), depth, np.inf)
 
-    def on(self, cells_meant: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
-        """bool [H, W]: where the rays meet the plane, at `depth`, in one of the cells meant (bool [CELLS, CELLS])."""
-        rays, ahead = geometry.pixel_rays(camera) @ camera.world_to_camera[:3, :3], np.isfinite(depth)
-        depth = np.where(ahead, depth, 1.0)
-        place = (camera.center + rays * depth[..., None] - self.origin) @ self.along.T / self.pitch
+    def on(self, cells_meant: np.ndarray, depth: np.ndarray, camera: Camera, asked: np.ndarray) -> np.ndarray:
+        """bool [H, W]: pixels of those asked, bool [H, W], whose rays meet the plane, at `depth`, in one of the cells
+        meant (bool [CELLS, CELLS])."""
+        asked = asked & np.isfinite(depth)
+        rays = geometry.pixel_rays(camera)[asked] @ camera.world_to_camera[:3, :3]
+        place = (camera.center + rays * depth[asked, None] - self.origin) @ self.along.T / self.pitch
         cells = np.floor(place + CELLS / 2).astype(np.int64)
-        ahead &= ((cells >= 0) & (cells < CELLS)).all(-1)
-        row, column = (np.where(ahead, cells[..., axis], 0) for axis in (0, 1))
-        return ahead & cells_meant[row, column]
+        inside = ((cells >= 0) & (cells < CELLS)).all(-1)
+        row, column = np.where(inside[:, None], cells, 0).T
+        found = np.zeros_like(asked)
+        found[asked] = inside & cells_meant[row, column]
+        return found
 
 
 def planes_around(centre: np.ndarray, radius: float, views: Sequence[Witness], seed: int = 0) -> list[Plane]:

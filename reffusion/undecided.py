@@ -74,25 +74,27 @@ def behind(
     hides, reach = np.zeros_like(hidden), np.full(hidden.shape, np.inf)
     for plane in planes:
         at = plane.depth(camera)
-        before = hidden & (at < BEFORE * np.where(depth > 0, depth, np.inf)) & plane.on(plane.goes_on, at, camera)
+        before = plane.on(plane.goes_on, at, camera, hidden & (at < BEFORE * np.where(depth > 0, depth, np.inf)))
         # Where nothing is known the plane goes on too, but not behind something that stands before it.
-        beneath = undecided & ((at < depth / BEFORE) | (alpha <= OPAQUE)) & plane.on(plane.within, at, camera)
-        told = ~hidden & (alpha > OPAQUE) & ~plane.on(plane.free, at, camera)
-        if _grows_out_of(before | beneath, at, depth, told):
+        beneath = plane.on(plane.within, at, camera, undecided & ((at < depth / BEFORE) | (alpha <= OPAQUE)))
+        if _grows_out_of(before | beneath, plane, at, camera, depth, ~hidden & (alpha > OPAQUE)):
             hides |= before
             reach = np.where(before | beneath, np.minimum(reach, at), reach)
     undecided = without_slivers(undecided | hides) & hidden
     return Behind(undecided, np.where(undecided, reach, np.inf), depth, alpha)
 
 
-def _grows_out_of(patch: np.ndarray, at: np.ndarray, depth: np.ndarray, known: np.ndarray) -> bool:
-    """Does the plane lie at the rendered depth around the patch of it (bool [H, W])? One that only cuts through what
-    stands there does not."""
+def _grows_out_of(
+    patch: np.ndarray, plane: Plane, at: np.ndarray, camera: Camera, depth: np.ndarray, known: np.ndarray
+) -> bool:
+    """Does the plane, at depth `at`, lie at the rendered depth around the patch of it (bool [H, W])? One that only cuts
+    through what stands there does not. Where views look through the plane, nothing is compared."""
     if not patch.any():
         return False
     reach = max(3, round(BESIDE * patch.shape[1]))
     beside = cv2.dilate(patch.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
     beside &= known & np.isfinite(at)
+    beside &= ~plane.on(plane.free, at, camera, beside)
     if not beside.any():
         return False
     nearest, farthest = surface_range(depth)

@@ -186,6 +186,7 @@ def filled(params: Params, out: Path, gaussians, new, reference, around, network
     from reffusion import behind, initialize, io, undecided
 
     camera, sheets = reference.camera, {f.name: getattr(params, f.name) for f in fields(initialize.Sheets)}
+    sheets["gloss"] &= not farthest  # a sliver tells nothing of shine
     sheets, how, hidden = initialize.Sheets(**sheets), completion(params), around.hidden[reference.camera.name]
     hole = initialize.to_fill(gaussians, new, reference, hidden, params.covered)
     remaining = gaussians.map(lambda p: p[~new])

@@ -84,7 +84,7 @@ def test_the_table_goes_on_under_the_box_and_ends_at_its_edge(views):
     view = camera("new", 15.0, 1.6)
     depth, _, on_table = drawn(view)
     at = table.depth(view)
-    goes_on = table.on(table.goes_on, at, view)
+    goes_on = table.on(table.goes_on, at, view, np.ones_like(on_table))
     place = geometry.unproject(np.where(np.isfinite(at), at, 1.0), view)
     footprint = on_table & (np.abs(place[..., :2]) < BOX - 0.05).all(-1)
     beyond = ~(np.abs(place[..., :2]) < EDGE + 0.05).all(-1)
