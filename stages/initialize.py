@@ -274,7 +274,9 @@ def completed_further(params: Params, out: Path, gaussians, new, around):
     gaussians, new = gaussians.map(lambda p: p[~haze]), new[~haze]
     while len(further) < params.further and (camera := coverage.barest(around, found)):
         mask, hidden = found[camera.name], around.hidden[camera.name]
-        base = inpaint.background(gaussians, camera, around.photos[camera.name], hidden)
+        # Just outside C a photograph may still show the object's rim, which would be repeated.
+        rimmed = paint2d.widened(hidden, coverage.RIM)
+        base = inpaint.background(gaussians, camera, around.photos[camera.name], rimmed)
         picture = paint2d.exemplar(base, mask | hidden & paint2d.widened(mask, coverage.RIM))
         reference = Reference(camera, picture, mask)
         print(f"further view {camera.name}: {mask.sum() / hidden.sum():.1%} of the mask is covered by nothing")

@@ -1,4 +1,4 @@
-"""Who may import whom, who may open files: the rules of README's tree, read from the sources."""
+"""Who may import whom, who may open files: read from the sources."""
 
 from __future__ import annotations
 
