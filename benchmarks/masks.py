@@ -67,7 +67,7 @@ def with_masks(poses: Path, given: dict[str, np.ndarray], folder: Path) -> Path:
 def iou(found: list[np.ndarray], truth: list[np.ndarray]) -> float:
     """Of all views together, without the true border's surroundings."""
     square = np.ones((2 * BORDER + 1,) * 2, np.uint8)
-    both, either = 0, 0
+    both = either = 0
     for made, true in zip(found, truth, strict=True):
         grown, shrunk = (change(true.astype(np.uint8), square) > 0 for change in (cv2.dilate, cv2.erode))
         counts = ~grown | shrunk
@@ -80,10 +80,9 @@ def scores(made: Path, scene: Scene, truth: dict[str, dict[str, np.ndarray]]) ->
     """Kind of mask -> IoU of the training views together, of the middle and of the worst."""
     sets, found = io.load_mask_sets(made, scene.train), {}
     for kind, true in truth.items():
-        pairs = [([getattr(sets[name], kind)], [true[name]]) for name in scene.train]
-        each = [iou(*pair) for pair in pairs]
-        together = iou(*([pair[side][0] for pair in pairs] for side in (0, 1)))
-        found[kind] = {"together": together, "median": float(np.median(each)), "worst": min(each)}
+        own, asked = [getattr(sets[name], kind) for name in scene.train], [true[name] for name in scene.train]
+        each = [iou([mask], [wanted]) for mask, wanted in zip(own, asked, strict=True)]
+        found[kind] = {"together": iou(own, asked), "median": float(np.median(each)), "worst": min(each)}
     return found
 
 

@@ -30,7 +30,7 @@ ENOUGH = 200  # pixels that must
 FAR = 0.08  # relative depth: a plane that would move farther anywhere in the hole stays where it is
 STAYS = 0.05  # weight of the plane as it was, within the hole, against what is around
 ACROSS = 0.9  # cosine of the angle between two planes under which they cross
-RIM = 1  # cells
+RIM = 1  # cells on either side: what is seen in a thinner strip is blurred by the masks' margin
 TOUCHING = 0.25  # share of an unknown patch's border that must be seen for the plane to go on into it
 
 
@@ -196,9 +196,8 @@ def _between(unknown: np.ndarray, seen: np.ndarray, free: np.ndarray) -> np.ndar
         total += next_seen | next_free | linked
         right += next_seen
         links.append(sparse.coo_matrix((np.ones(linked.sum()), (centre[linked], next_one[linked])), (len(total),) * 2))
-    bound = right.any() and total.any()
     found = np.zeros(unknown.shape)
-    if bound:
+    if right.any():
         found[unknown] = spsolve((sparse.diags(total + 1e-9) - sum(links)).tocsc(), right)
     return found
 
@@ -231,7 +230,7 @@ def _mapped(
     seen = ((said.seen >= 1) & (said.seen >= said.free)).reshape(shape)
     free = ((said.free >= 2) & (said.free > said.seen)).reshape(shape)
     unknown = ~seen & ~free & (said.hidden > 0).reshape(shape)
-    # The rim of what is seen or free is blurred by the masks' margin and tells nothing, and so does a crossing.
+    # Neither a thin rim nor a crossing tells where the plane goes on to.
     crossed = np.any([np.abs(points @ other - high) < band for other, high in others], 0) & np.ones(shape, bool)
     square = np.ones((2 * RIM + 1,) * 2, np.uint8)
     solid = cv2.morphologyEx((seen & ~crossed).astype(np.uint8), cv2.MORPH_OPEN, square) > 0

@@ -53,7 +53,7 @@ def carried(
     taint: np.ndarray, brighter: np.ndarray, depth: np.ndarray, camera: Camera, views: Sequence[Witness]
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """View name -> the same places of the scene in other views, as far as they show there, bool [H, W]; and their
-    light, [H, W, 3], NaN where it is not known.
+    light, [H, W, 3], NaN elsewhere and where it is not known.
 
     Args:
         taint: bool [H, W]; brighter: [H, W, 3], `light`; depth: [H, W] of the surface, above 0 where it is known;
@@ -73,9 +73,10 @@ def carried(
         mask[at[:, 1], at[:, 0]] = True
         np.add.at(total, (at[:, 1], at[:, 0]), values[there])
         total = cv2.GaussianBlur(total, (0, 0), pixels(SOFT, shape[1]))
-        known = total[..., 3:] > SPARSE
+        mask = widened(mask, WIDER) if mask.any() else mask
+        known = mask[..., None] & (total[..., 3:] > SPARSE)
         own = np.where(known, total[..., :3] / np.where(known, total[..., 3:], 1), np.nan)
-        found[view.camera.name] = (widened(mask, WIDER) if mask.any() else mask, own)
+        found[view.camera.name] = mask, own
     return found
 
 

@@ -73,6 +73,7 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list:
 
 
 def preview(params: Params, **_: Path | None) -> list[str]:
+    """What the stage will do, as far as that is known before it looks."""
     if not (params.further and params.start == "reference"):
         return []
     return [f"completes up to {params.further} further views from pieces of themselves: what no reference shows"]
@@ -250,7 +251,7 @@ def without_shadows(out: Path, true: list, gaussians, around):
         depth = with_photographed_depth(depth, each.camera, around.views)
         brighter = taint.light(each.image, shown)
         for view, (mask, light) in taint.carried(found, brighter, depth, each.camera, around.views).items():
-            photos[view] = np.where(mask[..., None], taint.relit(photos[view], light), photos[view])
+            photos[view] = taint.relit(photos[view], light)
             marks[view], silent[view] = marks[view] | mask, silent[view] | (mask & np.isnan(light).any(-1))
     if not any(mask.any() for mask in marks.values()):
         return true, around
