@@ -22,9 +22,13 @@ import yaml
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT)]
 
-from reffusion import io, metrics, splat, trace  # noqa: E402
-from reffusion.optimize import GaussianOptimizer  # noqa: E402
-from reffusion.steps import job_of, step_of  # noqa: E402
+from reffusion import trace  # noqa: E402
+from reffusion.distill.steps import job_of, step_of  # noqa: E402
+from reffusion.gaussians.optimize import GaussianOptimizer  # noqa: E402
+from reffusion.io.arrays import load_json, save_json
+from reffusion.io.scene import load_scene
+from reffusion.score import metrics
+from reffusion.splat import rasterizer
 from report import charts  # noqa: E402
 from stages import distill as stage  # noqa: E402
 from stages import evaluate  # noqa: E402
@@ -67,7 +71,7 @@ def test_views(run: Path) -> list[tuple]:
     Raises:
         ValueError: none has a truth and a mask.
     """
-    scene, found = io.load_scene(run / "poses"), []
+    scene, found = load_scene(run / "poses"), []
     for name in scene.test:
         camera = scene.cameras[name]
         truth = evaluate.truth_of(camera, run / "poses")
@@ -84,7 +88,7 @@ def scored(gaussians, views: list[tuple]) -> dict[str, float]:
     """Means of `SCORES` of 8-bit renders, as `evaluate` gives them."""
     rows = []
     for camera, truth, box in views:
-        picture = (splat.render(gaussians, camera).color.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+        picture = (rasterizer.render(gaussians, camera).color.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
         rows.append(metrics.score(box.crop(picture), box.crop(truth)))
     return {name: float(np.mean([row[name.removesuffix("_box")] for row in rows])) for name in SCORES}
 
@@ -92,7 +96,7 @@ def scored(gaussians, views: list[tuple]) -> dict[str, float]:
 def curve(overrides: dict, run: Path, start: Path, views: list[tuple]) -> list[dict[str, float]]:
     """Lines {"seconds", "iteration", the scores} of one attempt."""
     params = profile(overrides)
-    scene = io.load_scene(run / "poses")
+    scene = load_scene(run / "poses")
     initial, masked, holes = stage.start(params, scene, run / "reference", start)
     adapted = run / "personalize" if overrides.get(BASE, True) else None
     prior, text = stage.adapted_prior(params, adapted)
@@ -100,7 +104,7 @@ def curve(overrides: dict, run: Path, start: Path, views: list[tuple]) -> list[d
     settings = stage.settings(params)
     job = job_of(sights, holes, prior, text, None, settings, initial, masked)
     optimizer = GaussianOptimizer(initial, masked, settings.rates, settings.masked_pace, epsilon=settings.epsilon)
-    splat.render(optimizer.gaussians, holes[0][0]).color.sum().backward()  # compiles, before the clock starts
+    rasterizer.render(optimizer.gaussians, holes[0][0]).color.sum().backward()  # compiles, before the clock starts
     optimizer.forget_gradients()
     with tempfile.TemporaryDirectory() as folder:
         log = trace.Trace(Path(folder))
@@ -144,11 +148,11 @@ def main() -> None:
             raise ValueError(f"{given.run / need} is missing: run `make scene={given.run.name} all` first")
     given.out.mkdir(parents=True, exist_ok=True)
     file, views = given.out / "attempts.json", test_views(given.run)
-    curves = io.load_json(file) if file.exists() else {}
+    curves = load_json(file) if file.exists() else {}
     for name in given.only or ATTEMPTS:
         if name not in curves:
             curves[name] = curve(ATTEMPTS[name], given.run, given.start or given.run / "initialize", views)
-            io.save_json(file, curves)
+            save_json(file, curves)
         last = curves[name][-1]
         print(f"{name:44}", {s: round(last[s], 4) for s in SCORES}, f"{last['seconds']:.0f} s", flush=True)
     draw(curves, given.out / "attempts.png", str(given.start or given.run))

@@ -23,7 +23,7 @@ import judging  # noqa: E402
 import placing  # noqa: E402
 from placing import Place  # noqa: E402
 
-from reffusion import io  # noqa: E402
+from reffusion.io.images import save_image  # noqa: E402
 
 CHOOSE = (
     Place("table", "garden", "frame_00097", (180, 270), 0.16, 50, 34, 8),
@@ -71,7 +71,7 @@ def measured(place: Place, captures: Path, options: drawing.Options, out: Path, 
     """The place's row of the table; its sheet is saved."""
     scene, untouched = made(place, captures, options, out)
     run, ceiling = (judging.Run.at(job(folder, out / "runs", profile)) for folder in (scene, untouched))
-    io.save_image(out / f"{scene.name}.png", judging.sheet(run, ceiling))
+    save_image(out / f"{scene.name}.png", judging.sheet(run, ceiling))
     return {"place": scene.name, **judging.scores(run, ceiling)}
 
 

@@ -19,7 +19,7 @@ from scipy.sparse.linalg import cg, spsolve
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from reffusion import alignment, bilateral, depth
+from reffusion.depth import alignment, bilateral, completion
 
 HEIGHT, WIDTH = 48, 64
 SPREADS = 10.0 ** np.arange(0, 12)  # offsets, in units of the data's spread
@@ -71,7 +71,7 @@ def solver() -> dict[str, tuple[float, list[tuple[float, float]]]]:
     return found
 
 
-def completion() -> tuple[float, list[tuple[float, float, float]]]:
+def completed() -> tuple[float, list[tuple[float, float, float]]]:
     """(condition number, [offset in spreads, error of the disparity's own system, error of the library's completion]).
 
     A plane with a hole, solved by the same factorisation; errors in the hole, relative to the plane's spread.
@@ -80,20 +80,20 @@ def completion() -> tuple[float, list[tuple[float, float, float]]]:
     known = confidence > 0
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] / WIDTH
     tilted, found = columns - 0.6 * rows, []
-    plate = depth.Plate(ring=2.0)  # so that the whole map takes part, as in the absolute form
-    factors = depth.factored(depth.system_of(known.astype(float), None, np.ones(known.shape, bool), plate))
+    plate = completion.Plate(ring=2.0)  # so that the whole map takes part, as in the absolute form
+    factors = completion.factored(completion.system_of(known.astype(float), None, np.ones(known.shape, bool), plate))
     for offset in SPREADS:
         truth = tilted + offset * np.ptp(tilted)
         absolute = factors.solve(np.where(known, truth, 0.0).ravel()).reshape(truth.shape)
-        ours = depth.complete(truth, known, plate=plate)
+        ours = completion.complete(truth, known, plate=plate)
         error = lambda x, truth=truth: float(np.abs(x - truth)[~known].max() / np.ptp(tilted))
         found.append((offset, error(absolute), error(ours)))
-    return depth.condition(known.astype(float), plate=plate), found
+    return completion.condition(known.astype(float), plate=plate), found
 
 
 def report(say: Callable[[str], None]) -> tuple:
     """Measure all three, saying the numbers."""
-    lines, systems, (number, maps) = aligned(), solver(), completion()
+    lines, systems, (number, maps) = aligned(), solver(), completed()
     say("alignment: offset / spread, condition (plain), error plain, error centred and scaled (condition 1)")
     for row in lines:
         say("  {:8.0e} {:10.1e} {:10.1e} {:10.1e}".format(*row))

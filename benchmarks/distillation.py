@@ -26,13 +26,12 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 from prior import Case, scene_cases, tensors  # noqa: E402
 
-from reffusion import (  # noqa: E402
-    diffusion,
-    io,
-    lora,
-    trace,
-)
-from reffusion.prior import Prior, load_prior  # noqa: E402
+from reffusion import seeding
+from reffusion.io.arrays import save_json
+from reffusion.io.images import load_image
+from reffusion.io.scene import load_scene
+from reffusion.prior import diffusion, lora
+from reffusion.prior.model import Prior, load_prior  # noqa: E402
 
 TIMESTEPS = (20, 100, 300, 600, 850)
 NOISES = 4  # draws; with g's two halves from different ones, their noise does not pass for agreement
@@ -63,7 +62,7 @@ def gradient(prior, pictures: Tensor, holes: Tensor, timestep: int, text: Tensor
     for half in range(2):
         guesses = torch.zeros_like(latents)
         for k in range(NOISES // 2):
-            noise = torch.randn(latents.shape, generator=trace.generator(0, "distillation", timestep, half, k))
+            noise = torch.randn(latents.shape, generator=seeding.generator(0, "distillation", timestep, half, k))
             noisy = diffusion.add_noise(prior, latents, noise, t)
             guesses += diffusion.predict(prior, noisy, t, condition, text)[1] / (NOISES // 2)
         halves.append(diffusion.decode(prior, latents) - diffusion.decode(prior, guesses))
@@ -106,11 +105,11 @@ def measured(models: dict[str, Prior], run: Path) -> list[dict]:
 
 def rendered_cases(run: Path, folder: str, size: int) -> dict[str, list[Case]]:
     """`scene_cases` with evaluate's renders in place of the truth."""
-    scene = io.load_scene(run / "poses")
+    scene = load_scene(run / "poses")
     found = run / "evaluate" / folder
     if not found.is_dir():
         raise ValueError(f"{found} is missing: run `make scene={run.name} all` first")
-    shown = {name: io.load_image(found / f"{name}.png") for name in scene.test}
+    shown = {name: load_image(found / f"{name}.png") for name in scene.test}
     return scene_cases(run, size, shown)
 
 
@@ -154,7 +153,7 @@ def main() -> None:
         "personalized": lora.merged(load_prior(given.prior), given.run / "personalize"),
     }
     rows = measured(models, given.run)
-    io.save_json(given.out / "distillation.json", rows)
+    save_json(given.out / "distillation.json", rows)
     draw(rows, given.out / "distillation.png")
     print(given.out / "distillation.png")
 

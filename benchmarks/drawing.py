@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import placing
 
-from reffusion import io
+from reffusion.io.images import load_image, save_image
 
 SAMPLES = 3  # rays a side of a pixel
 DARKEST, SQUARES = 0.45, 3  # of the object's light; of its pattern, over half an edge
@@ -146,16 +146,16 @@ def write(place: placing.Place, capture: placing.Photographs, options: Options, 
         camera, photo = capture.cameras[name], _photograph(capture, name)
         color, cover = draw(view, camera, thing, tints)
         mask = (cover > 0).astype(np.uint8) * 255
-        io.save_image(out / f"truth/{name}.png", photo)
+        save_image(out / f"truth/{name}.png", photo)
         if name in views.test:
-            io.save_image(out / f"images/{name}.png", photo)
-            io.save_image(out / f"test_masks/{name}.png", mask)
+            save_image(out / f"images/{name}.png", photo)
+            save_image(out / f"test_masks/{name}.png", mask)
             continue
         light = light_left(view, camera, thing, options.shadow)[..., None] if options.shadow else 1.0
         both = photo / 255.0 * light * (1 - cover[..., None]) + color
-        io.save_image(out / f"images/{name}.png", (both * 255 + 0.5).clip(0, 255).astype(np.uint8))
+        save_image(out / f"images/{name}.png", (both * 255 + 0.5).clip(0, 255).astype(np.uint8))
         given = roughened(mask, options.rough, random) if options.rough else mask
-        io.save_image(out / f"masks/{name}.png", given)
+        save_image(out / f"masks/{name}.png", given)
     _write_meta(capture, views, out)
     lines = ["masks: masks", "test_masks: test_masks", f"test: {_listed(views.test)}"]
     if options.reference:
@@ -183,7 +183,7 @@ def _write_meta(capture: placing.Photographs, views: placing.Views, out: Path) -
 
 def _photograph(capture: placing.Photographs, name: str) -> np.ndarray:
     path = capture.folder / capture.frames[name]["file_path"]
-    photo = io.load_image(path)
+    photo = load_image(path)
     if photo.shape[:2] != (capture.height, capture.width):
         raise ValueError(f"{path} is {photo.shape[1]}x{photo.shape[0]} px, transforms.json says "
                          f"{capture.width}x{capture.height}")  # fmt: skip

@@ -20,12 +20,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from reffusion import crops, denoising, diffusion, lora, memory, weights
-from reffusion.confinement import Distillation, Sight, sds_term
-from reffusion.personalize import Training, train_step
-from reffusion.prior import Prior, make_prior, recomputing, without_text
-from reffusion.trace import generator
+from reffusion.distill.confinement import Distillation, Sight, sds_term
+from reffusion.prior import crops, denoising, diffusion, lora, memory
+from reffusion.prior.model import Prior, make_prior, recomputing, without_text
+from reffusion.prior.personalize import Training, train_step
+from reffusion.seeding import generator
 from reffusion.types import Camera, Gaussians
+from reffusion.weights import published
 
 TINY = Path(__file__).resolve().parent.parent / "priors" / "tiny"
 
@@ -332,8 +333,10 @@ def main() -> None:
     with memory.blamed("--size", options.size):
         report = run(shape, getattr(torch, options.dtype), options)
     (options.out / "full_size.json").write_text(json.dumps(report, indent=1) + "\n")
-    if not options.toy and report["parameters"] != weights.PUBLISHED[weights.SD2].parameters:
-        raise SystemExit(f"error: reffusion/weights.py states another number of parameters: {report['parameters']}")
+    if not options.toy and report["parameters"] != published.PUBLISHED[published.SD2].parameters:
+        raise SystemExit(
+            f"error: reffusion/weights/local.py states another number of parameters: {report['parameters']}"
+        )
 
 
 if __name__ == "__main__":

@@ -19,7 +19,10 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 from holes import gradient_energy  # noqa: E402
 
-from reffusion import io, metrics  # noqa: E402
+from reffusion.io.arrays import load_json, save_json
+from reffusion.io.images import load_image, save_image
+from reffusion.io.scene import load_scene
+from reffusion.score import metrics  # noqa: E402
 from report.sheet import enlarged, evenly, framed, stage_folder  # noqa: E402
 from stages import evaluate  # noqa: E402
 
@@ -37,7 +40,7 @@ def measured(run: Path) -> dict:
     """
     if not (run / "evaluate" / "metrics.json").exists():
         raise ValueError(f"{run / 'evaluate/metrics.json'} is missing: run `make scene={run.name} all` first")
-    scored, scene = io.load_json(run / "evaluate/metrics.json"), io.load_scene(stage_folder(run, "poses"))
+    scored, scene = load_json(run / "evaluate/metrics.json"), load_scene(stage_folder(run, "poses"))
     if not scored["views"]["psnr_box"]:
         raise ValueError(f"{run}: no test view has ground truth and a mask")
     energies: dict[str, list[tuple[float, float]]] = {"truth": [], **{way: [] for way in WAYS}}
@@ -47,7 +50,7 @@ def measured(run: Path) -> dict:
         box = np.zeros_like(mask)
         box[top:bottom, left:right] = True
         pictures = {"truth": evaluate.truth_of(scene.cameras[name], stage_folder(run, "poses"))}
-        pictures |= {way: io.load_image(run / "evaluate" / folder / f"{name}.png") for way, folder in WAYS.items()}
+        pictures |= {way: load_image(run / "evaluate" / folder / f"{name}.png") for way, folder in WAYS.items()}
         for way, picture in pictures.items():
             energies[way].append((gradient_energy(picture, box), gradient_energy(picture, mask)))
     total = {way: np.mean(values, 0) for way, values in energies.items()}
@@ -75,19 +78,19 @@ def table(runs: dict[str, dict], shares: dict[str, dict[str, float]]) -> str:
 
 def never_seen(run: Path, scene: Path | None) -> dict[str, float]:
     """By `masks`, over the training views; by the generator's rays, over training and test views."""
-    share = {"by masks": round(io.load_json(stage_folder(run, "masks") / "facts.json")["undecided_share"], 3)}
-    facts = io.load_json(scene / "truth/facts.json")["undecided_share"] if scene else {}
+    share = {"by masks": round(load_json(stage_folder(run, "masks") / "facts.json")["undecided_share"], 3)}
+    facts = load_json(scene / "truth/facts.json")["undecided_share"] if scene else {}
     return share | {f"by rays, {kind} views": round(value, 3) for kind, value in facts.items() if value is not None}
 
 
 def sheet(run: Path, path: Path) -> None:
     """`VIEWS` test views as rows: the fit with the object, initialization, result, truth; cut to the mask's box."""
-    scene = io.load_scene(stage_folder(run, "poses"))
+    scene = load_scene(stage_folder(run, "poses"))
     names, rows = evenly(list(scene.test), VIEWS), []
     for name in names:
         camera = scene.cameras[name]
         folders = ("renders_fit", *WAYS.values())
-        pictures = [io.load_image(run / "evaluate" / folder / f"{name}.png") for folder in folders]
+        pictures = [load_image(run / "evaluate" / folder / f"{name}.png") for folder in folders]
         pictures.append(evaluate.truth_of(camera, stage_folder(run, "poses")))
         left, top, right, bottom = metrics.mask_box(
             evaluate.mask_of(camera, stage_folder(run, "poses"), stage_folder(run, "masks")), 0.3
@@ -95,7 +98,7 @@ def sheet(run: Path, path: Path) -> None:
         rows.append([enlarged(picture[top:bottom, left:right], ENLARGE) for picture in pictures])
     height, width = (max(cell.shape[axis] for row in rows for cell in row) for axis in (0, 1))
     room = [[np.pad(c, ((0, height - c.shape[0]), (0, width - c.shape[1]), (0, 0))) for c in row] for row in rows]
-    io.save_image(path, framed(room, ["fit", *WAYS, "truth"], names))
+    save_image(path, framed(room, ["fit", *WAYS, "truth"], names))
 
 
 def main() -> None:
@@ -109,7 +112,7 @@ def main() -> None:
     text = table(runs, {first.name: never_seen(first, given.scene)})
     for run in given.runs:
         sheet(run, given.out / f"{run.name}.png")
-    io.save_json(given.out / "gain.json", runs)
+    save_json(given.out / "gain.json", runs)
     (given.out / "gain.md").write_text(text, encoding="utf-8")
     print(text)
 

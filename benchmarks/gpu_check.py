@@ -24,18 +24,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reffusion import crops, denoising, diffusion, memory, monocular, splat, trace, weights
-from reffusion.adversary import Adversarial, Adversary
-from reffusion.behind import Completion, Seen
-from reffusion.confinement import Distillation, adversarial_term, reconstruction_term, reference_term
-from reffusion.depth_term import DepthRegularization, Estimator, by_network, depth_term
-from reffusion.fit import fit
-from reffusion.fit_step import Settings
+from reffusion import trace
+from reffusion.depth import monocular
+from reffusion.depth.behind import Completion, Seen
+from reffusion.distill.adversary import Adversarial, Adversary
+from reffusion.distill.confinement import Distillation, adversarial_term, reconstruction_term, reference_term
+from reffusion.distill.depth_term import DepthRegularization, Estimator, by_network, depth_term
+from reffusion.fit.reconstruction import fit
+from reffusion.fit.step import Settings
 from reffusion.geometry import Degenerate
-from reffusion.personalize import train_step
-from reffusion.prior import Prior, load_prior, without_text
-from reffusion.trace import generator
+from reffusion.prior import crops, denoising, diffusion, memory
+from reffusion.prior.model import Prior, load_prior, without_text
+from reffusion.prior.personalize import train_step
+from reffusion.seeding import generator
+from reffusion.splat import rasterizer
 from reffusion.types import PARAMETERS, Camera, Gaussians
+from reffusion.weights import local, published
 
 LIMIT = 480.0  # seconds
 VALUES, GRADIENTS = 2e-3, 1e-2  # most a pixel may differ from the oracle, and a gradient relative to its norm
@@ -84,7 +88,7 @@ def against_oracle(count: int = 400, width: int = 200) -> dict[str, Any]:
 
     def drawn(gaussians: Gaussians, impl: str) -> tuple[Tensor, dict[str, Tensor]]:
         leaf = gaussians.map(lambda p: p.clone().requires_grad_(True))
-        picture = splat.render(leaf, camera, impl=impl).color
+        picture = rasterizer.render(leaf, camera, impl=impl).color
         (picture * pull.to(picture)).sum().backward()
         return picture.detach().cpu().double(), {n: getattr(leaf, n).grad.cpu().double() for n in PARAMETERS}
 
@@ -159,8 +163,8 @@ def depth_estimator(sizes: Sizes, device: str) -> tuple[Estimator, str]:
     """Depth Anything V2 Small, published or with random weights, of which the sign that fits the scene is taken."""
     from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
 
-    if sizes == PAPER and weights.locate(weights.DEPTH_ANYTHING) is not None:
-        network, source = monocular.load_network(weights.DEPTH_ANYTHING, device), weights.DEPTH_ANYTHING
+    if sizes == PAPER and local.locate(published.DEPTH_ANYTHING) is not None:
+        network, source = monocular.load_network(published.DEPTH_ANYTHING, device), published.DEPTH_ANYTHING
     else:
         backbone = Dinov2Config(
             hidden_size=384, num_hidden_layers=12, num_attention_heads=6, image_size=518 if sizes == PAPER else 56,
@@ -187,8 +191,8 @@ def depth_estimator(sizes: Sizes, device: str) -> tuple[Estimator, str]:
 
 def ready(shape: full_size.Shape, device: str, dtype: torch.dtype) -> tuple[Prior, str]:
     """The published weights where they are here and of this shape, else random ones."""
-    if shape == full_size.SD2 and weights.locate(weights.SD2) is not None:
-        return load_prior(weights.SD2, device, dtype), weights.SD2
+    if shape == full_size.SD2 and local.locate(published.SD2) is not None:
+        return load_prior(published.SD2, device, dtype), published.SD2
     return full_size.build(shape, dtype, device), "random"
 
 
@@ -215,7 +219,7 @@ def fitted_scene(sizes: Sizes, device: str, out: Path) -> dict[str, Any]:
         pose[0, 3] = 0.3 * (k / max(sizes.views - 1, 1) - 0.5)
         camera = Camera(f"v{k}", base.width, base.height, base.fx, base.fy, base.cx, base.cy, pose)
         with torch.no_grad():
-            color = splat.render(truth, camera).color.clamp(0, 1)
+            color = rasterizer.render(truth, camera).color.clamp(0, 1)
         cameras.append(camera)
         images[camera.name] = (color * 255).round().to(torch.uint8).cpu().numpy()
     noise = torch.randn(truth.means.shape, generator=generator(0, "start")).to(device)
@@ -225,7 +229,7 @@ def fitted_scene(sizes: Sizes, device: str, out: Path) -> dict[str, Any]:
 
     def psnr(gaussians: Gaussians) -> float:
         with torch.no_grad():
-            color = splat.render(gaussians, cameras[0]).color.clamp(0, 1).cpu()
+            color = rasterizer.render(gaussians, cameras[0]).color.clamp(0, 1).cpu()
         error = (color - torch.from_numpy(images[cameras[0].name]) / 255).square().mean()
         return float(-10 * error.log10())
 

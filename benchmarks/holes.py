@@ -19,13 +19,11 @@ sys.path[:0] = [str(ROOT), str(ROOT / "priors" / "tiny")]
 
 import images  # noqa: E402
 
-from reffusion import (  # noqa: E402
-    diffusion,
-    io,
-    metrics,
-    trace,
-)
-from reffusion.prior import Prior  # noqa: E402
+from reffusion import seeding
+from reffusion.io.images import save_image
+from reffusion.prior import diffusion
+from reffusion.prior.model import Prior  # noqa: E402
+from reffusion.score import metrics
 
 SIDE = 64  # px, of the held-out pictures
 SEED = 20  # of the held-out set; training and its own validation use others
@@ -50,7 +48,7 @@ def held_out(count: int, seed: int = SEED) -> list[Case]:
     for index in range(count):
         picture, caption = images.image(seed, index, held_out=True)
         truth = cv2.resize(picture, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
-        rng = np.random.default_rng(trace.seed_for(seed, "hole", index))
+        rng = np.random.default_rng(seeding.seed_for(seed, "hole", index))
         hole = images.silhouettes(rng, SIDE)
         while not COVER[0] <= hole.mean() <= COVER[1]:
             hole = images.silhouettes(rng, SIDE)
@@ -136,7 +134,7 @@ def painted(
     for first in range(0, len(cases), BATCH):
         pictures, holes = tensors(cases[first : first + BATCH])
         text = diffusion.embed_text(prior, [prompt]).detach().expand(len(pictures), -1, -1)
-        noise = trace.generator(seed, "sample", first)
+        noise = seeding.generator(seed, "sample", first)
         filled = diffusion.sample(prior, pictures * (1 - holes), holes, text, steps, noise)
         filled = ((pictures * (1 - holes) + filled * holes).permute(0, 2, 3, 1) + 1) * 127.5
         done += list(filled.round().clamp(0, 255).to(torch.uint8).numpy())
@@ -147,4 +145,4 @@ def save_row(path: Path, case: Case, pictures: list[np.ndarray]) -> None:
     """Hole, pictures and truth side by side."""
     path.parent.mkdir(parents=True, exist_ok=True)
     hollow = np.where(case.hole[..., None], np.uint8(128), case.truth)
-    io.save_image(path, np.concatenate([hollow, *pictures, case.truth], 1))
+    save_image(path, np.concatenate([hollow, *pictures, case.truth], 1))

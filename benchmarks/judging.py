@@ -9,7 +9,13 @@ import cv2
 import numpy as np
 from holes import gradient_energy
 
-from reffusion import io, metrics, paint2d, splat
+from reffusion.io.arrays import load_json
+from reffusion.io.images import load_image
+from reffusion.io.ply import load_ply
+from reffusion.io.scene import load_scene
+from reffusion.paint import paint2d
+from reffusion.score import metrics
+from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Scene
 from stages import evaluate
 
@@ -31,15 +37,15 @@ class Run:
 
     @classmethod
     def at(cls, folder: Path) -> Run:
-        return cls(folder, io.load_scene(folder / "poses"), io.load_json(folder / "evaluate/metrics.json"))
+        return cls(folder, load_scene(folder / "poses"), load_json(folder / "evaluate/metrics.json"))
 
     def picture(self, name: str, kind: str = "renders") -> np.ndarray:
         """uint8 [H, W, 3], a test view as evaluate drew it."""
-        return io.load_image(self.folder / "evaluate" / kind / f"{name}.png")
+        return load_image(self.folder / "evaluate" / kind / f"{name}.png")
 
     def truth(self, name: str) -> np.ndarray:
         """uint8 [H, W, 3], a test view's photograph."""
-        return io.load_image(self.folder / f"poses/images/{name}.png")
+        return load_image(self.folder / f"poses/images/{name}.png")
 
     def mask(self, name: str) -> np.ndarray:
         """bool [H, W]: where the object is: the test mask of a test view, else the consistent mask."""
@@ -48,7 +54,7 @@ class Run:
 
     def gaussians(self) -> Gaussians:
         """The result."""
-        return io.load_ply(self.folder / self.metrics["result"] / "gaussians.ply")
+        return load_ply(self.folder / self.metrics["result"] / "gaussians.ply")
 
 
 def scores(run: Run, ceiling: Run) -> dict[str, dict[str, float | None] | float | None]:
@@ -119,7 +125,7 @@ def uncovered(gaussians: Gaussians, camera: Camera, mask: np.ndarray, truth: np.
     if not mask.any():
         return None
     with torch.no_grad():
-        drawing = splat.render(gaussians, camera)
+        drawing = rasterizer.render(gaussians, camera)
     bare = drawing.alpha.cpu().numpy() < THIN
     if truth is not None:
         bare |= (drawing.color.cpu().numpy().max(2) < BLACK) & (truth.max(2) / 255.0 > LIT)

@@ -20,7 +20,11 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from reffusion import io, lens, trace
+from reffusion import seeding
+from reffusion.capture import lens
+from reffusion.io.arrays import load_json
+from reffusion.io.images import load_mask, save_mask
+from reffusion.io.scene import load_mask_sets, load_raw_masks, load_scene
 from reffusion.types import Camera, Scene
 from stages import masks as masks_stage
 
@@ -31,13 +35,13 @@ LARGEST, MISSING = 0.02, 0.1  # of the image's width; share of the views
 
 def true_never_seen(scene_folder: Path, cameras: list[Camera]) -> dict[str, np.ndarray]:
     """View name -> bool [H, W], the generator's never-seen pixels, read through its lens as `poses` reads pictures."""
-    truth = io.load_json(scene_folder / "truth/cameras.json")
+    truth = load_json(scene_folder / "truth/cameras.json")
     size = (truth["width"], truth["height"])
     photo = lens.Lens(*size, truth["f"], truth["f"], truth["cx"], truth["cy"], radial=(truth["k1"],))
     shown = {}
     for camera in cameras:
         pinhole = lens.Lens(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-        mask = io.load_mask(scene_folder / f"truth/never_seen/{camera.name}.png", size[::-1])
+        mask = load_mask(scene_folder / f"truth/never_seen/{camera.name}.png", size[::-1])
         shown[camera.name] = lens.undistort_mask(mask, lens.sampling_map(photo, pinhole))
     return shown
 
@@ -60,7 +64,7 @@ def with_masks(poses: Path, given: dict[str, np.ndarray], folder: Path) -> Path:
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(poses, folder, ignore=shutil.ignore_patterns("masks"))
     for name, mask in given.items():
-        io.save_mask(folder / "masks" / f"{name}.png", mask)
+        save_mask(folder / "masks" / f"{name}.png", mask)
     return folder
 
 
@@ -78,7 +82,7 @@ def iou(found: list[np.ndarray], truth: list[np.ndarray]) -> float:
 
 def scores(made: Path, scene: Scene, truth: dict[str, dict[str, np.ndarray]]) -> dict[str, dict[str, float]]:
     """Kind of mask -> IoU of the training views together, of the middle and of the worst."""
-    sets, found = io.load_mask_sets(made, scene.train), {}
+    sets, found = load_mask_sets(made, scene.train), {}
     for kind, true in truth.items():
         own, asked = [getattr(sets[name], kind) for name in scene.train], [true[name] for name in scene.train]
         each = [iou([mask], [wanted]) for mask, wanted in zip(own, asked, strict=True)]
@@ -88,14 +92,14 @@ def scores(made: Path, scene: Scene, truth: dict[str, dict[str, np.ndarray]]) ->
 
 def measure(scene_folder: Path, run: Path, out: Path, seed: int) -> dict[str, dict[str, dict[str, float]]]:
     """Kind of input -> kind of mask -> mean and worst IoU; the masks made are kept in `out`."""
-    scene = io.load_scene(run / "poses")
-    exact = io.load_raw_masks(run / "poses", scene.train)
+    scene = load_scene(run / "poses")
+    exact = load_raw_masks(run / "poses", scene.train)
     cameras = [scene.cameras[name] for name in scene.train]
     truth = {"consistent": exact, "undecided": true_never_seen(scene_folder, cameras)}
-    random = np.random.default_rng(trace.seed_for(seed, "perturbed masks"))
+    random = np.random.default_rng(seeding.seed_for(seed, "perturbed masks"))
     kept = random.permutation(len(scene.train))[round(MISSING * len(scene.train)) :]
     noisy = {scene.train[k]: perturbed(exact[scene.train[k]], random) for k in sorted(kept)}
-    params = masks_stage.Params(**io.load_json(run / "masks/receipt.json")["params"])
+    params = masks_stage.Params(**load_json(run / "masks/receipt.json")["params"])
     results = {}
     for kind, given in (("exact", exact), ("perturbed", noisy)):
         made = out / kind

@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from reffusion import io
+from reffusion.io.arrays import load_json
+from reffusion.io.ply import load_points
 
 MARGIN = 20  # px from the picture's border within which the object's axis must not come
 SLACK = 1.06  # depth over the nearest points' up to which a point is of the surface in front
@@ -122,7 +123,7 @@ def load(folder: Path) -> Photographs:
     """ValueError where transforms.json or the points are missing."""
     if not (folder / "transforms.json").exists():
         raise ValueError(f"{folder} holds no transforms.json: it is no nerfstudio capture")
-    meta = io.load_json(folder / "transforms.json")
+    meta = load_json(folder / "transforms.json")
     frames = {Path(frame["file_path"]).stem: frame for frame in meta.pop("frames")}
     frames = {name: frame for name, frame in frames.items() if (folder / frame["file_path"]).exists()}
     cloud = folder / meta.get("ply_file_path", "sparse_pc.ply")
@@ -132,7 +133,7 @@ def load(folder: Path) -> Photographs:
     cameras = {name: np.array(frame["transform_matrix"], float) @ OPENGL for name, frame in frames.items()}
     distortion = np.array([meta.get(key, 0.0) for key in ("k1", "k2", "p1", "p2")])
     size = int(meta["w"]), int(meta["h"])
-    return Photographs(folder, meta, intrinsics, distortion, *size, frames, cameras, io.load_points(cloud)[0])
+    return Photographs(folder, meta, intrinsics, distortion, *size, frames, cameras, load_points(cloud)[0])
 
 
 def save_meta(capture: Photographs, names: list[str], path: Path) -> None:

@@ -34,14 +34,13 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 from holes import COLUMNS, SEED, Case, held_out, hole_scores, means, painted, save_row, tensors  # noqa: E402
 
-from reffusion import (  # noqa: E402
-    diffusion,
-    io,
-    lora,
-    trace,
-)
-from reffusion.prior import Prior, load_prior  # noqa: E402
-from reffusion.sds import window_around  # noqa: E402
+from reffusion import seeding, trace
+from reffusion.io.arrays import load_json, save_json
+from reffusion.io.images import load_image, save_image
+from reffusion.io.scene import load_references, load_scene
+from reffusion.prior import diffusion, lora
+from reffusion.prior.model import Prior, load_prior  # noqa: E402
+from reffusion.prior.windows import window_around  # noqa: E402
 from stages import evaluate  # noqa: E402
 from stages import personalize as stage  # noqa: E402
 
@@ -107,7 +106,7 @@ def scene_cases(run: Path, size: int, pictures: dict[str, np.ndarray] | None = N
     Raises:
         ValueError: the scene has no test view with a mask.
     """
-    scene = io.load_scene(run / "poses")
+    scene = load_scene(run / "poses")
     found = {}
     for name in scene.test:
         truth = evaluate.truth_of(scene.cameras[name], run / "poses")
@@ -118,11 +117,11 @@ def scene_cases(run: Path, size: int, pictures: dict[str, np.ndarray] | None = N
         raise ValueError(f"{run / 'poses'}: no test view shows the scene without the object; take another scene")
     places = np.linspace(0, len(found) - 1, min(VIEWS, len(found))).round().astype(int)
     chosen = [list(found.values())[place] for place in places]
-    given = io.load_references(run / "reference", scene)[0]
+    given = load_references(run / "reference", scene)[0]
     own = _reduced(Case(given.image, given.mask, given.camera.name), size)
     whole, windows = [_reduced(case, size) for case in chosen], []
     for case in chosen:
-        top, left = window_around(torch.from_numpy(case.hole), size, trace.generator(SEED, "window", case.kind))
+        top, left = window_around(torch.from_numpy(case.hole), size, seeding.generator(SEED, "window", case.kind))
         here = (slice(top, top + size), slice(left, left + size))
         windows.append(Case(np.ascontiguousarray(case.truth[here]), np.ascontiguousarray(case.hole[here]), case.kind))
     return {
@@ -158,7 +157,7 @@ def by_timestep(prior: Prior, cases: list[Case], prompt: str) -> dict[str, list[
         t = torch.full((len(cases),), timestep)
         drawn = []
         for index in range(NOISES):
-            noise = torch.randn(clean.shape, generator=trace.generator(SEED, "noise", timestep, index))
+            noise = torch.randn(clean.shape, generator=seeding.generator(SEED, "noise", timestep, index))
             drawn.append(diffusion.predict(prior, diffusion.add_noise(prior, clean, noise, t), t, condition, text)[1])
         guesses = torch.stack(drawn)
         result["error"].append(float((guesses - clean).square().mean(0)[inside].mean()))
@@ -170,18 +169,18 @@ def with_picture(reference: Path, picture: Path, folder: Path) -> Path:
     """A copy of the stage's folder in which every reference shows `picture` instead, at its size; masks stay."""
     shutil.copytree(reference, folder)
     for path in (folder / "references").glob("*.png"):
-        height, width = io.load_image(path).shape[:2]
-        io.save_image(path, cv2.resize(io.load_image(picture), (width, height), interpolation=cv2.INTER_AREA))
+        height, width = load_image(path).shape[:2]
+        save_image(path, cv2.resize(load_image(picture), (width, height), interpolation=cv2.INTER_AREA))
     return folder
 
 
 def learnt(params: stage.Params, needs: dict[str, Path], folder: Path) -> tuple[Prior, list[dict]]:
     """The prior personalized in `folder`, and the trace of that; what was begun there with these parameters goes on."""
     settings, made = params.model_dump(mode="json"), folder / "settings.json"
-    if not made.exists() or io.load_json(made) != settings:
+    if not made.exists() or load_json(made) != settings:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-        io.save_json(made, settings)
+        save_json(made, settings)
     if not (folder / lora.LORA_FILE).exists():
         stage.run(params, folder, **needs)
     return lora.merged(load_prior(params.prior), folder), trace.read_trace(folder / "trace.jsonl")
@@ -309,7 +308,7 @@ def main() -> None:
         result["personalization"] = personalization(
             params, given.run, given.seeds, given.wrong_reference, given.steps, given.sampler, given.out
         )
-    io.save_json(given.out / "prior.json", result)
+    save_json(given.out / "prior.json", result)
     print(given.out / "prior.json")
 
 

@@ -23,7 +23,14 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from reffusion import io, metrics, paint2d, splat, trace
+from reffusion import trace
+from reffusion.io.arrays import load_json, load_labels, save_json
+from reffusion.io.images import load_image, save_image
+from reffusion.io.ply import load_ply
+from reffusion.io.scene import load_scene
+from reffusion.paint import paint2d
+from reffusion.score import metrics
+from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Scene
 from stages import evaluate
 from stages import fit as fit_stage
@@ -54,15 +61,15 @@ class Run:
 
 def fit_unmasked(run: Run, out: Path) -> Gaussians:
     """(a): the run's own fit but of unmasked pixels, as the variant `masked`; kept in `out` for that fit."""
-    receipt = io.load_json(run.fit / "receipt.json")
+    receipt = load_json(run.fit / "receipt.json")
     of = {"fit": receipt["key"], "poses": receipt["needs"]["poses"]}
-    if (out / "of.json").exists() and io.load_json(out / "of.json") == of:
-        return io.load_ply(out / "gaussians.ply")
+    if (out / "of.json").exists() and load_json(out / "of.json") == of:
+        return load_ply(out / "gaussians.ply")
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
     fit_stage.run(fit_stage.Params(**receipt["params"] | {"pixels": "unmasked"}), out, poses=run.poses)
-    io.save_json(out / "of.json", of)
-    return io.load_ply(out / "gaussians.ply")
+    save_json(out / "of.json", of)
+    return load_ply(out / "gaussians.ply")
 
 
 def drawer(gaussians: Gaussians) -> Callable[[Camera], np.ndarray]:
@@ -71,7 +78,7 @@ def drawer(gaussians: Gaussians) -> Callable[[Camera], np.ndarray]:
 
     def draw(camera: Camera) -> np.ndarray:
         with torch.no_grad():
-            color = splat.render(gaussians, camera).color.clamp(0, 1).cpu().numpy()
+            color = rasterizer.render(gaussians, camera).color.clamp(0, 1).cpu().numpy()
         return np.round(color * 255).astype(np.uint8)
 
     return draw
@@ -79,12 +86,12 @@ def drawer(gaussians: Gaussians) -> Callable[[Camera], np.ndarray]:
 
 def competitors(run: Run, out: Path) -> dict[str, Callable[[Camera], np.ndarray]]:
     """Name -> camera of a test view -> uint8 [H, W, 3]; ours first."""
-    whole = io.load_ply(run.fit / "gaussians.ply")
-    labels = io.load_labels(run.masks / "labels.npy")
+    whole = load_ply(run.fit / "gaussians.ply")
+    labels = load_labels(run.masks / "labels.npy")
     draw_whole = drawer(whole)
 
     def saved(folder: str) -> Callable[[Camera], np.ndarray]:
-        return lambda camera: io.load_image(run.evaluate / folder / f"{camera.name}.png")
+        return lambda camera: load_image(run.evaluate / folder / f"{camera.name}.png")
 
     def telea(camera: Camera) -> np.ndarray:
         return paint2d.telea(draw_whole(camera), evaluate.mask_of(camera, run.poses, run.masks))
@@ -99,7 +106,7 @@ def competitors(run: Run, out: Path) -> dict[str, Callable[[Camera], np.ndarray]
 def compare(run: Run, scene: Scene, out: Path) -> dict[str, dict[str, float | None]]:
     """Name -> means over the test views of every column of `metrics.COLUMNS` but LPIPS; saves a few pictures."""
     ways = competitors(run, out)
-    dilation = io.load_json(run.evaluate / "metrics.json")["protocol"]["box_dilation"]
+    dilation = load_json(run.evaluate / "metrics.json")["protocol"]["box_dilation"]
     rows: dict[str, list[dict[str, float | None]]] = {name: [] for name in ways}
     shown = {scene.test[round(k)] for k in np.linspace(0, len(scene.test) - 1, SHEET)}
     for k in trace.progress(len(scene.test), "compare"):
@@ -113,7 +120,7 @@ def compare(run: Run, scene: Scene, out: Path) -> dict[str, dict[str, float | No
             rows[name].append(metrics.score_view(picture, truth, box))
         if camera.name in shown:
             sheet = metrics.side_by_side([truth, *pictures.values()], box)
-            io.save_image(out / f"{camera.name}.png", sheet)
+            save_image(out / f"{camera.name}.png", sheet)
     columns = [c for c in metrics.COLUMNS if not c.startswith("lpips")]
     return {name: {c: metrics.mean([row[c] for row in rows[name]]) for c in columns} for name in ways}
 
@@ -156,7 +163,7 @@ def main() -> int:
     given = parser.parse_args()
     name = given.scene.resolve().name
     run, out = Run.at(given.run or Path("runs") / name), given.out or Path("runs/removal") / name
-    scene = io.load_scene(run.poses)
+    scene = load_scene(run.poses)
     if not scene.test:
         raise ValueError(f"{given.scene} has no test views: nothing to compare with")
     out.mkdir(parents=True, exist_ok=True)

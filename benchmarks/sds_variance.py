@@ -27,16 +27,14 @@ from torch import Tensor
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from reffusion import (  # noqa: E402
-    diffusion,
-    io,
-    lora,
-    sds,
-    splat,
-    trace,
-)
-from reffusion.crops import PROMPTS  # noqa: E402
-from reffusion.prior import Prior, load_prior  # noqa: E402
+from reffusion import seeding
+from reffusion.io.arrays import load_json, save_json
+from reffusion.io.ply import load_ply
+from reffusion.io.scene import load_mask_sets, load_scene
+from reffusion.prior import diffusion, lora, windows
+from reffusion.prior.crops import PROMPTS  # noqa: E402
+from reffusion.prior.model import Prior, load_prior  # noqa: E402
+from reffusion.splat import rasterizer
 
 VIEWS = 6
 NOISES = 8
@@ -55,20 +53,20 @@ def inputs(run: Path, prior: Prior) -> dict[str, tuple[Tensor, Tensor]]:
     for stage in ("poses", "masks", "initialize"):
         if not (run / stage).is_dir():
             raise ValueError(f"{run / stage} is missing: run `make scene={run.name} initialize` first")
-    scene, gaussians = io.load_scene(run / "poses"), io.load_ply(run / "initialize" / "gaussians.ply")
-    sets = io.load_mask_sets(run / "masks", scene.train)
+    scene, gaussians = load_scene(run / "poses"), load_ply(run / "initialize" / "gaussians.ply")
+    sets = load_mask_sets(run / "masks", scene.train)
     names = [name for name in scene.train if sets[name].invent.any() and name not in scene.clean]
     if not names:
         raise ValueError(f"{run / 'masks'}: nothing is to be invented, so nothing is distilled")
     places = np.linspace(0, len(names) - 1, min(VIEWS, len(names))).round().astype(int)
     size, pictures, holes = prior.native_size, [], []
     for name in (names[place] for place in places):
-        view = splat.render(gaussians, scene.cameras[name]).color.clamp(0, 1).permute(2, 0, 1) * 2 - 1
-        view = sds.enlarged(view, size)
-        hole = sds.enlarged(torch.from_numpy(sets[name].invent).to(view)[None], size)[0] > 1e-4
-        windows = [sds.window_around(hole, size, trace.generator(SEED, "sds variance", name))]
-        pictures.append(sds.two_scales(view, windows, size))
-        holes.append(sds.two_scale_masks(hole, windows, size))
+        view = rasterizer.render(gaussians, scene.cameras[name]).color.clamp(0, 1).permute(2, 0, 1) * 2 - 1
+        view = windows.enlarged(view, size)
+        hole = windows.enlarged(torch.from_numpy(sets[name].invent).to(view)[None], size)[0] > 1e-4
+        picked = [windows.window_around(hole, size, seeding.generator(SEED, "sds variance", name))]
+        pictures.append(windows.two_scales(view, picked, size))
+        holes.append(windows.two_scale_masks(hole, picked, size))
     pictures, holes = torch.stack(pictures, 1), torch.stack(holes, 1)  # [scale, view, ...]
     return {scale: (pictures[k], holes[k]) for k, scale in enumerate(SCALES)}
 
@@ -82,7 +80,7 @@ def gradients(prior: Prior, pictures: Tensor, holes: Tensor, prompt: str) -> Ten
     for part in TIMESTEPS:
         t = torch.full((len(latents),), round(part * (prior.timesteps - 1)))
         for k in range(NOISES):
-            noise = torch.randn(latents.shape, generator=trace.generator(SEED, "sds variance", int(t[0]), k))
+            noise = torch.randn(latents.shape, generator=seeding.generator(SEED, "sds variance", int(t[0]), k))
             clean = diffusion.predict(prior, diffusion.add_noise(prior, latents, noise, t), t, condition, text)[1]
             found.append((latents - clean)[inside])
     return torch.stack(found).view(len(TIMESTEPS), NOISES, -1)
@@ -142,11 +140,11 @@ def main() -> None:
     adapted = given.run / "personalize"
     if not adapted.is_dir():
         raise ValueError(f"{adapted} is missing: run `make scene={given.run.name} personalize` first")
-    base = given.prior or io.load_json(adapted / "receipt.json")["params"]["prior"]
+    base = given.prior or load_json(adapted / "receipt.json")["params"]["prior"]
     models = {"before": load_prior(base), "after": lora.merged(load_prior(base), adapted)}
     found, out = measured(models, given.run), given.out or given.run / "sds-variance"
     out.mkdir(parents=True, exist_ok=True)
-    io.save_json(out / "sds_variance.json", {"prior": base, "timesteps": TIMESTEPS, **found})
+    save_json(out / "sds_variance.json", {"prior": base, "timesteps": TIMESTEPS, **found})
     print(table(found))
     print(out / "sds_variance.json")
 

@@ -34,14 +34,14 @@ from typing import NamedTuple
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 # Before torch: it tells torch's idle threads not to spin, which costs the second thread all of its gain.
-from reffusion import splat  # isort: skip
+from reffusion.splat import rasterizer  # isort: skip
 
 import numba
 import numpy as np
 import torch
 
+from reffusion.kernels import vectors as v
 from reffusion.splat import cpu, forward
-from reffusion.splat import vectors as v
 from reffusion.splat.layout import ROWS
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
@@ -106,7 +106,7 @@ def prepare(size: str) -> Case:
     count, width, height = map(int, match.groups())
     camera = Camera("bench", width, height, 1.1 * width, 1.1 * width, width / 2, height / 2, np.eye(4))
     gaussians = scene(count, camera)
-    pairs = splat.accumulate(gaussians, camera, torch.ones(height, width, 1), count=True).sum().item()
+    pairs = rasterizer.accumulate(gaussians, camera, torch.ones(height, width, 1), count=True).sum().item()
     return Case(gaussians, camera, round(pairs), visited_lanes(gaussians, camera), [], [])
 
 
@@ -126,7 +126,7 @@ def step(case: Case, clock) -> tuple[float, float]:
     """Milliseconds of one forward and one backward pass."""
     leaves = case.gaussians.map(lambda tensor: tensor.detach().requires_grad_())
     start = clock()
-    drawn = splat.render(leaves, case.camera)
+    drawn = rasterizer.render(leaves, case.camera)
     middle = clock()
     images = drawn.color, drawn.depth, drawn.alpha
     torch.autograd.grad(images, [getattr(leaves, n) for n in PARAMETERS], [torch.ones_like(i) for i in images])

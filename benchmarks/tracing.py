@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from reffusion import trace  # noqa: E402
-from reffusion.fit import FIRST_MOMENT  # noqa: E402
+from reffusion.fit.reconstruction import FIRST_MOMENT  # noqa: E402
 from stages import distill, fit, personalize  # noqa: E402
 
 STAGES = {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
@@ -21,20 +20,6 @@ from reffusion.io.traces import read_trace
 CHECKPOINT = "checkpoint.pt"
 LENGTH = "length.json"  # the number of steps that fit into a time budget
 TRIAL = 4  # steps by which a stage measures its speed
-
-
-def seed_for(seed: int, *labels: object) -> int:
-    """A 63-bit seed that depends on every label: `seed_for(0, "sds", iteration)`.
-
-    Drawing each step's randomness from its own seed makes a resumed run equal to an unbroken one.
-    """
-    text = repr((seed, *labels)).encode()
-    return int.from_bytes(hashlib.blake2b(text, digest_size=8).digest(), "little") >> 1
-
-
-def generator(seed: int, *labels: object, device: str = "cpu") -> torch.Generator:
-    """A fresh generator on `device` for this seed and these labels."""
-    return torch.Generator(device).manual_seed(seed_for(seed, *labels))
 
 
 def save_checkpoint(folder: Path, state: dict[str, Any]) -> None:

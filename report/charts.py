@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from reffusion import io
+from reffusion.io.images import save_image
 from report.paired import Difference, pareto
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def figure(height: float, rows: int = 1, columns: int = 1, **options) -> tuple[F
 
 def save(drawn: Figure, path: Path) -> None:
     drawn.canvas.draw()
-    io.save_image(path, np.asarray(drawn.canvas.buffer_rgba())[..., :3].copy())
+    save_image(path, np.asarray(drawn.canvas.buffer_rgba())[..., :3].copy())
 
 
 def write(axes: Axes, text: str, at, offset=(0, 0), colour: str = INK, ha: str = "left", va: str = "center") -> None:

@@ -9,7 +9,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from reffusion import io
+from reffusion.io.arrays import load_json
 from report import charts, page, pictures
 from report.results import AGAINST, BETTER, FULL, OUTSIDE, SCORES, Comparison, Run, differences, load, rows, save_csv
 
@@ -178,7 +178,7 @@ def notes(comparison: Comparison) -> list[str]:
 def ways(run: Run) -> list[str]:
     """Which inpainter and which distance a method used, as metrics.json or the facts.json of its stages say."""
     paths = [folder / "facts.json" for folder in run.folders.values()]
-    said = [run.metrics, *(io.load_json(path) for path in paths if path.is_file())]
+    said = [run.metrics, *(load_json(path) for path in paths if path.is_file())]
     found = {words: facts[key] for facts in said for key, words in WAYS.items() if facts.get(key)}
     return [f"{run.method}: " + ", ".join(f"{words} {name}" for words, name in found.items()) + "."] if found else []
 

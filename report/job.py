@@ -8,17 +8,14 @@ from __future__ import annotations
 
 import argparse
 import os
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from reffusion import io
-from reffusion.io.traces import load_trace
+from reffusion.io.arrays import load_json
+from reffusion.io.images import load_image, save_image
 from report import curves, page, scenes, sheet
+from report.loading import Job, load_job
 from report.pictures import wall
-from report.results import load_receipts
 
-ORDER = ("poses", "fit", "masks", "reference", "lift", "personalize", "initialize", "distill", "evaluate")
 WORDS = {
     "skip": "left\u00a0out", "provided": "brought", "cached": "done", "run": "to\u00a0run", "stale": "to\u00a0run",
     "missing": "cannot\u00a0run", "undecided": "undecided",
@@ -34,59 +31,6 @@ RESULTS = {
     "personalize/pytorch_lora_weights.safetensors": "LoRA of the prior",
     "fit/gaussians.ply": "the scene with the object, normalised frame",
 }
-
-
-@dataclass(frozen=True)
-class Job:
-    """What lies on the disk for a scene.
-
-    Attributes:
-        home: runs/<scene>, or runs/<scene>@<variant>.
-        plan: stage -> word, reason, notes, as the runner wrote them to plan.json; or empty, see `load_plan`.
-        folders: stage -> its artifact, in order; a variant's may lie with the scene's own run.
-        receipts: stage -> receipt.json.
-        traces: stage -> series -> lines.
-        unread: why a trace could not be read, in words.
-        metrics: metrics.json, or empty.
-    """
-
-    home: Path
-    plan: dict[str, dict[str, Any]]
-    folders: dict[str, Path]
-    receipts: dict[str, dict[str, Any]]
-    traces: dict[str, dict[str, curves.Lines]]
-    unread: tuple[str, ...]
-    metrics: dict[str, Any]
-
-
-def load_job(home: Path) -> Job:
-    """Raises ValueError where no stage has been done."""
-    plan = load_plan(home)
-    names = list(plan or ORDER)
-    places = {s: home.parent / plan[s]["folder"] if plan and plan[s]["folder"] else None for s in plan}
-    found = {stage: places.get(stage) or sheet.stage_folder(home, stage) for stage in names}
-    left_out = {stage for stage, said in plan.items() if said["word"] == "skip"}
-    folders = {s: f for s, f in found.items() if s not in left_out and (f / "receipt.json").exists()}
-    if not folders:
-        raise ValueError(f"{home}: no stage has been done; run `make scene={home.name} all` first")
-    traces, unread = {}, []
-    for stage, folder in folders.items():
-        if folder.name == stage and (folder / "trace.jsonl").exists():
-            try:
-                traces[stage] = load_trace(folder / "trace.jsonl", stage)
-            except ValueError as error:
-                unread.append(str(error))
-    metrics = folders.get("evaluate", Path()) / "metrics.json"
-    scores = io.load_json(metrics) if metrics.is_file() else {}
-    return Job(home, plan, folders, load_receipts(folders), traces, tuple(unread), scores)
-
-
-def load_plan(home: Path) -> dict[str, dict[str, Any]]:
-    """plan.json's stages; empty where there is none, or a stage was done after it was written."""
-    path = home / "plan.json"
-    if not path.exists() or any(r.stat().st_mtime > path.stat().st_mtime for r in home.glob("*/receipt.json")):
-        return {}
-    return io.load_json(path)["stages"]
 
 
 def make(home: Path) -> Path:
@@ -134,12 +78,12 @@ def further(job: Job, out: Path) -> list[str]:
     """The views that were completed beside the references, and why."""
     folder = job.folders.get("initialize", Path())
     facts = folder / "facts.json"
-    shares = io.load_json(facts).get("further", {}) if facts.is_file() else {}
+    shares = load_json(facts).get("further", {}) if facts.is_file() else {}
     if not shares:
         return []
-    shown = [io.load_image(folder / "further" / f"{view}.png") for view in shares]
+    shown = [load_image(folder / "further" / f"{view}.png") for view in shares]
     titles = [f"{view}: {share:.1%} of its mask was open" for view, share in shares.items()]
-    io.save_image(out / "further.png", wall(shown, titles))
+    save_image(out / "further.png", wall(shown, titles))
     said = "No reference shows what was open there: these views were put together from pieces of themselves."
     parts = [page.heading("Further views"), page.paragraph(said)]
     return [*parts, page.picture(out / "further.png", "views completed beside the references")]

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from reffusion import io
+from reffusion.io.arrays import load_json
+from reffusion.io.images import load_image, save_image
 from report.results import FULL, Comparison, Run
 from report.sheet import GAP, enlarged, evenly
 
@@ -29,7 +30,7 @@ def sheets(comparison: Comparison, out: Path, count: int = 3) -> dict[str, Path]
         cells = _cells(runs, first, view)
         if cells:
             made[view] = out / f"{view}.png"
-            io.save_image(made[view], wall([picture for _, picture in cells], [title for title, _ in cells]))
+            save_image(made[view], wall([picture for _, picture in cells], [title for title, _ in cells]))
     return made
 
 
@@ -38,12 +39,12 @@ def _cells(runs: list[Run], first: Run, view: str) -> list[tuple[str, np.ndarray
     photo, views = poses / "images" / f"{view}.png", poses / "views.json"
     cells = []
     if photo.exists() and views.exists():
-        shows_object = view not in io.load_json(views)["test"] or (poses / "masks" / photo.name).exists()
-        cells.append(("ground truth" if not shows_object else "photograph, with the object", io.load_image(photo)))
+        shows_object = view not in load_json(views)["test"] or (poses / "masks" / photo.name).exists()
+        cells.append(("ground truth" if not shows_object else "photograph, with the object", load_image(photo)))
     for run in runs:
         path = run.folders["evaluate"] / "renders" / f"{view}.png"
         if path.exists():
-            cells.append((_title(run, view), io.load_image(path)))
+            cells.append((_title(run, view), load_image(path)))
     return [(title, crop(picture, first.views[view])) for title, picture in cells]
 
 

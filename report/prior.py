@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from reffusion import io
+from reffusion.io.arrays import load_json
+from reffusion.io.images import load_image, save_image
 from report.sheet import enlarged, framed
 
 ENLARGE = 3  # whole factor; held-out pictures are 64 px
@@ -33,7 +34,7 @@ def make(folder: Path) -> Path:
     """
     if not (folder / "prior.json").exists():
         raise ValueError(f"{folder / 'prior.json'} is missing; run `python benchmarks/prior.py --out {folder}` first")
-    measured = io.load_json(folder / "prior.json")
+    measured = load_json(folder / "prior.json")
     lines = [f"# {measured['prior']}, measured", ""]
     if "inpainting" in measured:
         lines += [inpainting_table(measured["inpainting"]["scores"])]
@@ -57,9 +58,9 @@ def make(folder: Path) -> Path:
 def sheet(folder: Path, name: str, columns: list[str]) -> list[str]:
     """Put the rows of pictures in folder/name together as folder/name.png; the page's lines for it."""
     paths = sorted((folder / name).glob("*.png"))
-    rows = [np.split(io.load_image(path), len(columns), 1) for path in paths]
+    rows = [np.split(load_image(path), len(columns), 1) for path in paths]
     cells = [[enlarged(picture, ENLARGE) for picture in row] for row in rows]
-    io.save_image(folder / f"{name}.png", framed(cells, columns, [path.stem for path in paths]))
+    save_image(folder / f"{name}.png", framed(cells, columns, [path.stem for path in paths]))
     return [f"## {SHEETS[name]}", "", f"![]({name}.png)", ""]
 
 
@@ -152,7 +153,7 @@ def charts(personal: dict[str, Any], path: Path) -> None:
         axes.set(title=f"{title}, unseen views", xlabel="timestep", ylim=(0, None))
     others[0].legend(fontsize="small")
     canvas.draw()
-    io.save_image(path, np.asarray(canvas.buffer_rgba())[..., :3].copy())
+    save_image(path, np.asarray(canvas.buffer_rgba())[..., :3].copy())
 
 
 def main() -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from reffusion import io
+from reffusion.io.arrays import load_json
 from report.paired import Difference, paired
 
 FULL = "full"
@@ -65,7 +65,7 @@ def load(home: Path) -> Comparison:
     path = home / "compare.json"
     if not path.exists():
         raise ValueError(f"{path}: no such file; run `make scene={home.name} compare` first")
-    record = io.load_json(path)
+    record = load_json(path)
     runs = {(run["method"], run["scene"]): load_run(run, home.parent) for run in record["runs"]}
     return Comparison(home, tuple(record["scenes"]), tuple(record["methods"]), runs)
 
@@ -81,7 +81,7 @@ def load_run(record: dict[str, Any], runs: Path) -> Run:
         record.get("error", ""),
         folders,
         load_receipts(folders),
-        io.load_json(metrics) if metrics.is_file() else {},
+        load_json(metrics) if metrics.is_file() else {},
         load_views(evaluate / "per_view.csv"),
     )
 
@@ -89,7 +89,7 @@ def load_run(record: dict[str, Any], runs: Path) -> Run:
 def load_receipts(folders: dict[str, Path]) -> dict[str, dict[str, Any]]:
     """Stage -> receipt. A stage that the scene's own file stands for has another's folder, which counts once."""
     paths = {stage: folder / "receipt.json" for stage, folder in folders.items() if folder.name == stage}
-    return {stage: io.load_json(path) for stage, path in paths.items() if path.is_file()}
+    return {stage: load_json(path) for stage, path in paths.items() if path.is_file()}
 
 
 def load_views(path: Path) -> dict[str, dict[str, float]]:

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from report import curves, page
-
-if TYPE_CHECKING:
-    from report.job import Job
+from report.loading import Job
 
 COLUMNS = ("stage", "quantity", "scenes", "quartile_1", "median", "quartile_3")
 WHOLE = "whole job"

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from reffusion import io
+from reffusion.io.arrays import load_json
+from reffusion.io.images import load_image, save_image
 
 GAP = 6  # px between pictures
 TITLES = {
@@ -39,13 +40,13 @@ def make(scene_dir: Path, out: Path, *, views: list[str] | int = 3, scale: int |
     names = evenly(there, views) if isinstance(views, int) else views
     if unknown := [name for name in names if name not in there]:
         raise ValueError(f"{evaluate / 'renders'} has no {', '.join(unknown)}; it has {there[0]} ... {there[-1]}")
-    test = io.load_json(poses / "views.json")["test"]
+    test = load_json(poses / "views.json")["test"]
     rows = [pictures_of(evaluate, poses if name in test else None, name) for name in names]
     columns = [key for key in TITLES if any(key in row for row in rows)]
     width = max(picture.shape[1] for row in rows for picture in row.values())
     scale = scale or max(1, round(480 / width))
     cells = [[enlarged(row.get(key), scale) for key in columns] for row in rows]
-    io.save_image(out, framed(cells, [TITLES[key] for key in columns], names))
+    save_image(out, framed(cells, [TITLES[key] for key in columns], names))
     return out
 
 
@@ -66,7 +67,7 @@ def pictures_of(evaluate: Path, poses: Path | None, name: str) -> dict[str, np.n
     paths = {key: evaluate / key / f"{name}.png" for key in TITLES}
     if poses:
         paths["truth"] = poses / "images" / f"{name}.png"
-    return {key: io.load_image(path) for key, path in paths.items() if path.exists()}
+    return {key: load_image(path) for key, path in paths.items() if path.exists()}
 
 
 def enlarged(picture: np.ndarray | None, scale: int) -> np.ndarray | None:

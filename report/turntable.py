@@ -8,7 +8,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from reffusion import flight, io, splat
+from reffusion.io.ply import load_ply
+from reffusion.io.scene import load_scene
+from reffusion.splat import rasterizer
+from report import flight
 
 FRAMES, RATE = 144, 24  # six seconds
 # In a .webm: what browsers play and OpenCV's wheels write, with a complaint about the tag that means nothing.
@@ -27,15 +30,15 @@ def make(home: Path, frames: int = FRAMES) -> Path:
     finished = home / "evaluate" / "scene.ply"
     if not finished.exists():
         raise ValueError(f"{finished} is missing; `make scene={home.name.split('@')[0]} all` makes it")
-    scene = io.load_scene(home.with_name(home.name.split("@")[0]) / "poses")
-    gaussians = io.load_ply(finished, scene.similarity)
+    scene = load_scene(home.with_name(home.name.split("@")[0]) / "poses")
+    gaussians = load_ply(finished, scene.similarity)
     train = [scene.cameras[name] for name in scene.train]
     path, cameras = home / "turntable.webm", flight.around(train, scene.points, frames)
     film = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*CODEC), RATE, (cameras[0].width, cameras[0].height))
     if not film.isOpened():
         raise ValueError(f"{path}: this OpenCV writes no {CODEC} video; `pip install opencv-contrib-python-headless`")
     for camera in cameras:
-        picture = (splat.render(gaussians, camera).color.clamp(0, 1) * 255).round().byte().numpy()
+        picture = (rasterizer.render(gaussians, camera).color.clamp(0, 1) * 255).round().byte().numpy()
         film.write(np.ascontiguousarray(picture[..., ::-1]))
     film.release()
     return path

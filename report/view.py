@@ -16,8 +16,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reffusion import flight, io, splat
+from reffusion.io.arrays import load_json, load_labels
+from reffusion.io.ply import load_ply
+from reffusion.io.scene import load_scene, load_views
+from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Scene, Similarity
+from report import flight
 from report.sheet import stage_folder
 
 PORT = 8080
@@ -53,15 +57,15 @@ def layers(home: Path, similarity: Similarity) -> dict[str, Layer]:
     finished = home / "evaluate"
     if not (finished / "scene.ply").exists():
         raise ValueError(f"{finished / 'scene.ply'} is missing; {_how(home)} makes it")
-    used = {stage for stage, key in io.load_json(finished / "receipt.json")["needs"].items() if key}
-    result = io.load_ply(finished / "scene.ply", similarity)
+    used = {stage for stage, key in load_json(finished / "receipt.json")["needs"].items() if key}
+    result = load_ply(finished / "scene.ply", similarity)
     found = {}
     for stage, title in (("distill", "result"), ("initialize", "before distillation"), ("fit", "as photographed")):
         folder = stage_folder(home, stage)
         if stage in used:
             labels, title = folder / "labels.npy", title if found else "result"
-            gaussians = io.load_ply(folder / "gaussians.ply") if found else result
-            added = io.load_labels(labels) if labels.exists() else torch.zeros(len(gaussians), dtype=torch.bool)
+            gaussians = load_ply(folder / "gaussians.ply") if found else result
+            added = load_labels(labels) if labels.exists() else torch.zeros(len(gaussians), dtype=torch.bool)
             found[title] = Layer(gaussians, added)
     return found
 
@@ -86,7 +90,7 @@ def camera_of(place: Any, height: int) -> Camera:
 def picture(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     """uint8 [H, W, 3]."""
     with TURN:
-        return (splat.render(gaussians, camera).color.clamp(0, 1) * 255).round().byte().numpy()
+        return (rasterizer.render(gaussians, camera).color.clamp(0, 1) * 255).round().byte().numpy()
 
 
 def go_to(place: Any, camera: Camera, target: np.ndarray) -> None:
@@ -119,14 +123,14 @@ class Window:
         poses = home.with_name(home.name.split("@")[0]) / "poses"
         if not poses.is_dir():
             raise ValueError(f"{poses} is missing; {_how(home)} makes it")
-        scene = io.load_scene(poses)
+        scene = load_scene(poses)
         self.layers = layers(home, scene.similarity)
         self.shown = next(iter(self.layers.values())).gaussians
         self.asked: dict[int, threading.Event] = {}
         self.open = True
         self.server = viser.ViserServer(host="127.0.0.1", port=port, label=home.name, verbose=False)
         self._choices()
-        self._cameras(scene, io.load_views(poses, scene.train))
+        self._cameras(scene, load_views(poses, scene.train))
         self.server.on_client_connect(self._visit)
         self.server.on_client_disconnect(lambda client: self._ask(client.client_id))
 

@@ -56,7 +56,7 @@ class Job:
         params: stage -> every parameter.
         broken: stages without parameters here, because their file is missing or is no stage -> what is wrong.
         weights: stage -> names of the parameters that name weights.
-        needed: stage -> the weights it works with, as it says of itself (reffusion.weights.Need).
+        needed: stage -> the weights it works with, as it says of itself (reffusion.weights.local.Need).
     """
 
     root: Path

@@ -26,7 +26,7 @@ class Params(BaseModel):
         180, gt=0, le=180, description="degrees between a view and the nearest reference up to which it is distilled"
     )
     patches: int = Field(2, ge=0, description="local patches beside the whole view")
-    # PAPER leaves open: timesteps, w(t), normalisation, guidance, reduction: see reffusion.sds. threestudio's here.
+    # PAPER leaves open: timesteps, w(t), normalisation, guidance, reduction: see distill.sds. threestudio's here.
     t_low: float = Field(0.02, ge=0, le=1, description="lowest timestep, as a part of the schedule")
     t_high: float = Field(0.98, ge=0, le=1, description="highest timestep")
     weighting: Literal["x0", "sigma2", "one"] = Field("sigma2", description="w(t) of the SDS gradient")
@@ -121,11 +121,11 @@ class Params(BaseModel):
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list:
     """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
-    from reffusion import weights
+    from reffusion.weights import local
 
-    found = [weights.of_model(params.prior, params.dtype)] if params.sds_weight > 0 or params.depth_weight > 0 else []
+    found = [local.of_model(params.prior, params.dtype)] if params.sds_weight > 0 or params.depth_weight > 0 else []
     estimates = params.depth_weight > 0 and params.depth_model
-    return found + ([weights.of_model(params.depth_model, "float32")] if estimates else [])
+    return found + ([local.of_model(params.depth_model, "float32")] if estimates else [])
 
 
 def run(
@@ -144,10 +144,14 @@ def run(
     from dataclasses import replace
 
     began = time.monotonic()
-    from reffusion import io, memory, trace
-    from reffusion.distill import distill
+    from reffusion import trace
+    from reffusion.distill.optimization import distill
+    from reffusion.io.arrays import load_json, save_json, save_labels
+    from reffusion.io.ply import save_ply
+    from reffusion.io.scene import load_scene
+    from reffusion.prior import memory
 
-    scene = io.load_scene(poses)
+    scene = load_scene(poses)
     initial, masked, holes = start(params, scene, reference, initialize)
     prior, text = adapted_prior(params, personalize)
     estimator = depth_estimator(params, scene.points) if params.depth_weight > 0 else None
@@ -162,10 +166,10 @@ def run(
         made = lambda folder, steps: distill(*given, replace(chosen, iterations=steps), folder, estimator)
         steps = trace.affordable(out, params.iterations, params.seconds, lambda: time.monotonic() - began, made)
         gaussians, masked = made(out, steps)
-    io.save_ply(out / "gaussians.ply", gaussians.map(lambda p: p.cpu()))
-    io.save_labels(out / "labels.npy", masked.cpu())
-    painted = io.load_json(lift / "facts.json")["inpainter"] if lift else None
-    io.save_json(out / "facts.json", {"inpainter": painted, "perceptual": perceptual})
+    save_ply(out / "gaussians.ply", gaussians.map(lambda p: p.cpu()))
+    save_labels(out / "labels.npy", masked.cpu())
+    painted = load_json(lift / "facts.json")["inpainter"] if lift else None
+    save_json(out / "facts.json", {"inpainter": painted, "perceptual": perceptual})
     trace.clear_checkpoint(out)
 
 
@@ -173,12 +177,14 @@ def start(params: Params, scene, reference: Path, initialize: Path) -> tuple:
     """The initialization's Gaussians and labels, and (camera, image, hole) of each reference, on the device."""
     import torch
 
-    from reffusion import io
+    from reffusion.io.arrays import load_labels
+    from reffusion.io.ply import load_ply
+    from reffusion.io.scene import load_references
 
-    initial = io.load_ply(initialize / "gaussians.ply").map(lambda p: p.to(params.device))
-    masked = io.load_labels(initialize / "labels.npy").to(params.device)
+    initial = load_ply(initialize / "gaussians.ply").map(lambda p: p.to(params.device))
+    masked = load_labels(initialize / "labels.npy").to(params.device)
     place = lambda array: torch.from_numpy(array).to(params.device)
-    holes = [(r.camera, place(r.image) / 255, place(r.mask)) for r in io.load_references(reference, scene)]
+    holes = [(r.camera, place(r.image) / 255, place(r.mask)) for r in load_references(reference, scene)]
     return initial, masked, holes
 
 
@@ -186,9 +192,9 @@ def adapted_prior(params: Params, personalize: Path | None) -> tuple:
     """The prior with what it learnt, without its text encoder, and the prompts' embeddings; None, None if unused."""
     import torch
 
-    from reffusion import diffusion, lora
-    from reffusion.crops import PROMPTS
-    from reffusion.prior import load_prior, recomputing, without_text
+    from reffusion.prior import diffusion, lora
+    from reffusion.prior.crops import PROMPTS
+    from reffusion.prior.model import load_prior, recomputing, without_text
 
     if not (params.sds_weight > 0 or params.depth_weight > 0):
         return None, None
@@ -209,12 +215,14 @@ def load_sights(
     """
     import torch
 
-    from reffusion import exposure, io
-    from reffusion.confinement import Sight
+    from reffusion.distill.confinement import Sight
+    from reffusion.fit import exposure
+    from reffusion.io.images import load_mask
+    from reffusion.io.scene import load_mask_sets, load_views
 
-    photos, sets = exposure.load_views(poses, fit, scene.train), io.load_mask_sets(masks, scene.train)
+    photos, sets = exposure.load_views(poses, fit, scene.train), load_mask_sets(masks, scene.train)
     place = lambda array: torch.from_numpy(array).to(params.device)
-    painted = io.load_views(lift, [n for n in scene.train if (lift / "images" / f"{n}.png").exists()]) if lift else {}
+    painted = load_views(lift, [n for n in scene.train if (lift / "images" / f"{n}.png").exists()]) if lift else {}
     sights = []
     for name in scene.train:
         clean, pixels = name in scene.clean, sets[name]
@@ -223,7 +231,7 @@ def load_sights(
         repaint = repaint & pixels.invent.any() & (not clean)
         supervises = ~pixels.consistent | clean
         if tainted and (tainted / f"{name}.png").exists():
-            supervises &= ~io.load_mask(tainted / f"{name}.png")
+            supervises &= ~load_mask(tainted / f"{name}.png")
         lifted = place(painted[name]) / 255 if name in painted else None
         photo = place(photos[name]) / 255
         sights.append(Sight(scene.cameras[name], photo, place(supervises), place(repaint), clean, lifted))
@@ -232,7 +240,7 @@ def load_sights(
 
 def within(params: Params, means, sights: list, holes: list) -> str:
     """How many of the views that could be distilled are."""
-    from reffusion.steps import near_a_reference
+    from reffusion.distill.steps import near_a_reference
 
     painted = [sight for sight in sights if sight.repaint.any()]
     near = near_a_reference(painted, [camera for camera, _, _ in holes], means, params.sds_within)
@@ -244,8 +252,8 @@ def lift_choices(params: Params) -> tuple:
 
     Raises ValueError where LPIPS weights are there but broken.
     """
-    from reffusion import perceptual
-    from reffusion.lift import Lift
+    from reffusion.distill import perceptual
+    from reffusion.distill.lift import Lift
 
     if not params.lift_weight:
         return None, None
@@ -259,9 +267,9 @@ def lift_choices(params: Params) -> tuple:
 def settings(params: Params, lift=None):
     from dataclasses import fields
 
-    from reffusion.adversary import Adversarial
-    from reffusion.confinement import Distillation
-    from reffusion.distill import Settings
+    from reffusion.distill.adversary import Adversarial
+    from reffusion.distill.confinement import Distillation
+    from reffusion.distill.optimization import Settings
 
     shape = params.rate * params.rate_shape
     pace = {"means": shape, "quaternions": shape, "log_scales": shape, "sh": params.rate}
@@ -297,8 +305,8 @@ def settings(params: Params, lift=None):
 
 
 def depth_settings(params: Params):
-    from reffusion.behind import Completion
-    from reffusion.depth_term import DepthRegularization
+    from reffusion.depth.behind import Completion
+    from reffusion.distill.depth_term import DepthRegularization
 
     return DepthRegularization(
         params.depth_weight,
@@ -316,7 +324,8 @@ def depth_estimator(params: Params, points):
     """The depth term's estimator: by a network where one is named, else the scene's own depth continued."""
     from functools import partial
 
-    from reffusion import depth_term, monocular
+    from reffusion.depth import monocular
+    from reffusion.distill import depth_term
 
     how = depth_settings(params).how
     if not params.depth_model:

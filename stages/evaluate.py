@@ -10,9 +10,9 @@ from pydantic import BaseModel, ConfigDict, Field
 if TYPE_CHECKING:
     import numpy as np
 
-    from reffusion.consistency import Shown
-    from reffusion.lpips import Lpips
-    from reffusion.metrics import Box
+    from reffusion.score.consistency import Shown
+    from reffusion.score.lpips import Lpips
+    from reffusion.score.metrics import Box
     from reffusion.types import Camera, Gaussians, Scene
 
 FOLDERS = {"fit": "renders_fit", "initialize": "renders_initialize", "distill": "renders"}
@@ -46,9 +46,9 @@ class Params(BaseModel):
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list:
     """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
-    from reffusion import weights
+    from reffusion.weights import local
 
-    return weights.of_lpips(params.lpips_weights)
+    return local.of_lpips(params.lpips_weights)
 
 
 def run(
@@ -71,15 +71,21 @@ def run(
     and test views without a picture are rendered and not scored. `reference`, `personalize` and `lift` give their
     seconds only.
     """
-    from reffusion import consistency, io, lpips, metrics, paint2d, trace
+    from reffusion import trace
+    from reffusion.io.arrays import save_json
+    from reffusion.io.images import save_image
+    from reffusion.io.ply import load_ply, save_ply
+    from reffusion.io.scene import load_scene
+    from reffusion.paint import paint2d
+    from reffusion.score import consistency, lpips, metrics
 
     needs = {"poses": poses, "fit": fit, "masks": masks, "reference": reference, "personalize": personalize}
     needs |= {"lift": lift, "initialize": initialize, "distill": distill}
-    scene = io.load_scene(poses)
+    scene = load_scene(poses)
     loaded = {net: lpips.load(net, params.lpips_weights) for net in ("vgg", "alex")}
     models = {net: model for net, (model, _) in loaded.items() if model}
     made = [stage for stage in FOLDERS if needs[stage]]
-    gaussians = {s: io.load_ply(needs[s] / "gaussians.ply").map(lambda p: p.to(params.device)) for s in made}
+    gaussians = {s: load_ply(needs[s] / "gaussians.ply").map(lambda p: p.to(params.device)) for s in made}
     result, captured, counts = made[-1], gaussians["fit"], {stage: len(value) for stage, value in gaussians.items()}
     names, kind = views_of(scene)
     unseen = unseen_in(scene, captured, poses, masks) if kind == "test" else {}
@@ -97,20 +103,20 @@ def run(
             wide = paint2d.widened(shown.mask, params.widen)
             depth = consistency.depth_through(shown.depth, wide)
             shown = shown._replace(picture=painter.paint(shown.picture, wide), depth=depth)
-        io.save_image(out / "renders" / file, shown.picture)
+        save_image(out / "renders" / file, shown.picture)
         if before:
             rows[-1] |= dict(zip(CONSISTENCY, consistency.difference(before, shown), strict=True))
         before, truth = shown, truth_of(camera, poses) if kind == "test" else None
         box = metrics.mask_box(shown.mask, params.box_dilation)
         panels = [p for p in (pictures["fit"], truth, shown.picture) if p is not None]
-        io.save_image(out / "side_by_side" / file, metrics.side_by_side(panels, box))
+        save_image(out / "side_by_side" / file, metrics.side_by_side(panels, box))
         margin = paint2d.widened(shown.mask, params.outside_margin)
         held_out = (poses / "masks" / file).exists()  # a test view whose photograph shows the object
         given = (truth, box, models, margin, held_out, unseen.get(camera.name))
         rows.append(row_of(shown, pictures.get("initialize"), *given))
 
     (out / "per_view.csv").write_text(metrics.table(rows))
-    io.save_ply(out / "scene.ply", gaussians[result], similarity=scene.similarity)
+    save_ply(out / "scene.ply", gaussians[result], similarity=scene.similarity)
     summary = {
         **metrics.summary(rows),
         "rendered": f"{len(names)} {kind} views",
@@ -122,7 +128,7 @@ def run(
         "seconds": seconds(needs),
         "protocol": protocol(params, rows, models),
     }
-    io.save_json(out / "metrics.json", summary)
+    save_json(out / "metrics.json", summary)
 
 
 def row_of(
@@ -137,7 +143,7 @@ def row_of(
 ) -> dict[str, Any]:
     """A view's line of per_view.csv: its box, and its scores and the initialization's where there is a truth; see
     `metrics.score_view`, whose `mask`, `shows_object` and `unseen` the last three are."""
-    from reffusion import metrics
+    from reffusion.score import metrics
 
     camera = shown.camera
     row = {"view": camera.name, "width": camera.width, "height": camera.height} | dict.fromkeys(CONSISTENCY)
@@ -154,7 +160,7 @@ def row_of(
 def consistency_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """{"consistency", "consistency_share"}: means over the pairs of neighbours; {"pairs"}: how many could be compared;
     {"protocol"}."""
-    from reffusion import consistency, metrics
+    from reffusion.score import consistency, metrics
 
     difference, share = ([row[name] for row in rows] for name in CONSISTENCY)
     return {
@@ -167,7 +173,7 @@ def consistency_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 def protocol(params: Params, rows: list[dict[str, Any]], models: dict[str, Lpips]) -> dict[str, Any]:
     """All that the numbers depend on, in words and versions."""
-    from reffusion import metrics, sight
+    from reffusion.score import metrics, sight
 
     return {
         **metrics.PROTOCOL,
@@ -190,7 +196,7 @@ def views_of(scene: Scene) -> tuple[tuple[str, ...], str]:
 
 def unseen_in(scene: Scene, captured: Gaussians, poses: Path, masks: Path | None) -> dict[str, np.ndarray]:
     """Test view -> bool [H, W], pixels that show what no training view saw."""
-    from reffusion import sight
+    from reffusion.score import sight
 
     seen_by = sight.witnesses(*captured_by(scene, captured, poses, masks))
     return {name: sight.unseen(captured, scene.cameras[name], seen_by) for name in scene.test}
@@ -205,7 +211,7 @@ def reaches_beyond(unseen: dict[str, np.ndarray]) -> bool:
 
 def finished(scene: Scene, gaussians: dict[str, Gaussians], result: str) -> dict[str, Gaussians]:
     """Stage -> its Gaussians completed by what lies beyond the capture: of the result, and of the initialization."""
-    from reffusion import beyond
+    from reffusion.score import beyond
 
     stages = [stage for stage in ("initialize", result) if stage in gaussians]
     cameras = [scene.cameras[name] for name in scene.train]
@@ -225,21 +231,22 @@ def drawn(gaussians: Gaussians, camera: Camera, path: Path) -> np.ndarray:
     """Render to `path`, and give back what the file holds: scores are of the 8-bit picture that anyone can open."""
     import torch
 
-    from reffusion import io, splat
+    from reffusion.io.images import load_image, save_image
+    from reffusion.splat import rasterizer
 
     with torch.no_grad():
-        io.save_image(path, splat.render(gaussians, camera).color.cpu().numpy())
-    return io.load_image(path)
+        save_image(path, rasterizer.render(gaussians, camera).color.cpu().numpy())
+    return load_image(path)
 
 
 def truth_of(camera: Camera, poses: Path) -> np.ndarray | None:
     """uint8 [H, W, 3], the view's own picture; None where the scene has none. ValueError where its size is wrong."""
-    from reffusion import io
+    from reffusion.io.images import load_image
 
     path = poses / "images" / f"{camera.name}.png"
     if not path.exists():
         return None
-    image = io.load_image(path)
+    image = load_image(path)
     if image.shape[:2] != (camera.height, camera.width):
         raise ValueError(
             f"{path}: {image.shape[1]}x{image.shape[0]} px, its camera {camera.width}x{camera.height}; run poses again"
@@ -252,12 +259,12 @@ def mask_of(camera: Camera, poses: Path, masks: Path | None) -> np.ndarray:
     mask, else empty. Where there are test masks, every variant is so scored in the same box."""
     import numpy as np
 
-    from reffusion import io
+    from reffusion.io.images import load_mask
 
     size, file = (camera.height, camera.width), f"{camera.name}.png"
     given = [poses / "test_masks" / file, *([masks / "consistent" / file] if masks else []), poses / "masks" / file]
     found = [path for path in given if path.exists()]
-    return io.load_mask(found[0], size) if found else np.zeros(size, bool)
+    return load_mask(found[0], size) if found else np.zeros(size, bool)
 
 
 def view_of(gaussians: Gaussians, camera: Camera, picture: np.ndarray, mask: np.ndarray) -> Shown:
@@ -265,26 +272,27 @@ def view_of(gaussians: Gaussians, camera: Camera, picture: np.ndarray, mask: np.
     import numpy as np
     import torch
 
-    from reffusion import consistency, splat
+    from reffusion.score import consistency
+    from reffusion.splat import rasterizer
 
     with torch.no_grad():
-        drawing = splat.render(gaussians, camera, sh_degree=0)
+        drawing = rasterizer.render(gaussians, camera, sh_degree=0)
     depth, alpha = drawing.depth.double().cpu().numpy(), drawing.alpha.cpu().numpy()
     return consistency.Shown(camera, picture, np.where(alpha > consistency.SOLID, depth, 0.0), mask)
 
 
 def used(painter: str | None, distill: Path | None) -> dict[str, str | None]:
     """{"inpainter", "perceptual"}: what painted in 2D and what compared patches, None where nothing did."""
-    from reffusion import io
+    from reffusion.io.arrays import load_json
 
     facts = distill / "facts.json" if distill else None
-    said = io.load_json(facts) if facts and facts.exists() else {}
+    said = load_json(facts) if facts and facts.exists() else {}
     return {"inpainter": painter or said.get("inpainter"), "perceptual": said.get("perceptual")}
 
 
 def seconds(needs: dict[str, Path | None]) -> dict[str, float]:
     """Stage -> seconds of its run, from the receipts that are there."""
-    from reffusion import io
+    from reffusion.io.arrays import load_json
 
     receipts = {stage: folder / "receipt.json" for stage, folder in needs.items() if folder}
-    return {stage: io.load_json(path).get("seconds") for stage, path in receipts.items() if path.exists()}
+    return {stage: load_json(path).get("seconds") for stage, path in receipts.items() if path.exists()}

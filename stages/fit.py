@@ -71,17 +71,20 @@ def run(params: Params, out: Path, *, poses: Path) -> None:
     import time
     from dataclasses import replace
 
-    from reffusion import io, paint2d, trace
-    from reffusion.fit import fit
+    from reffusion import trace
+    from reffusion.fit.reconstruction import fit
+    from reffusion.io.ply import load_ply, save_ply
+    from reffusion.io.scene import load_scene, load_views
+    from reffusion.paint import paint2d
 
     if (poses / "gaussians.ply").exists() and params.pixels == "all":
-        io.save_ply(out / "gaussians.ply", io.load_ply(poses / "gaussians.ply"))
+        save_ply(out / "gaussians.ply", load_ply(poses / "gaussians.ply"))
         return
-    began, scene = time.monotonic(), io.load_scene(poses)
+    began, scene = time.monotonic(), load_scene(poses)
     params = supported(params, scene)
     held_out = scene.train[params.holdout // 2 :: params.holdout] if params.holdout else ()
     cameras = [scene.cameras[name] for name in scene.train if name not in held_out]
-    images, chosen = io.load_views(poses, scene.train), settings(params, cameras)
+    images, chosen = load_views(poses, scene.train), settings(params, cameras)
     hidden = hidden_pixels(poses, scene) if params.pixels == "unmasked" else {}
     images |= {name: paint2d.telea(images[name], mask) for name, mask in hidden.items()}  # flow looks at them too
     if (out / trace.CHECKPOINT).exists():  # of what it starts from only the degree and the device still matter
@@ -103,13 +106,13 @@ def run(params: Params, out: Path, *, poses: Path) -> None:
         held_out=[scene.cameras[name] for name in held_out],
         spent=spent(),
     )
-    io.save_ply(out / "gaussians.ply", gaussians.map(lambda p: p.cpu()))
+    save_ply(out / "gaussians.ply", gaussians.map(lambda p: p.cpu()))
     trace.clear_checkpoint(out)
 
 
 def supported(params: Params, scene: Scene) -> Params:
     """The parameters with no higher degree of spherical harmonics than the training views determine."""
-    from reffusion import support
+    from reffusion.capture import support
 
     if not params.sh_supported:
         return params
@@ -121,9 +124,9 @@ def supported(params: Params, scene: Scene) -> Params:
 
 def hidden_pixels(poses: Path, scene: Scene) -> dict[str, np.ndarray]:
     """View name -> bool [H, W], its raw mask; none for a view without one, or one marked clean."""
-    from reffusion import io
+    from reffusion.io.scene import load_raw_masks
 
-    masks = io.load_raw_masks(poses, [name for name in scene.train if name not in scene.clean])
+    masks = load_raw_masks(poses, [name for name in scene.train if name not in scene.clean])
     if not masks:
         raise ValueError(f"{poses / 'masks'}: fit.pixels is 'unmasked', but the scene has no masks")
     return masks
@@ -142,14 +145,15 @@ def start_points(
     """
     import numpy as np
 
-    from reffusion import masks, stereo
+    from reffusion.capture import stereo
+    from reffusion.masks import voting
 
     points, colors = scene.points, scene.point_colors
     if params.flow_cell:
         found, found_colors = stereo.dense_points(cameras, images, params.flow_cell)
         print(f"{len(found)} points by optical flow beside {len(points)}", flush=True)
         points, colors = np.concatenate([points, found]), np.concatenate([colors, found_colors])
-    keep = ~masks.points_inside(points, cameras, hidden)
+    keep = ~voting.points_inside(points, cameras, hidden)
     return points[keep], colors[keep]
 
 
@@ -157,10 +161,10 @@ def start(params: Params, points: np.ndarray, colors: np.ndarray, budget: int) -
     """The Gaussians to start from, on the device to compute on."""
     from dataclasses import replace
 
-    from reffusion import trace
-    from reffusion.start import initial_gaussians
+    from reffusion import seeding
+    from reffusion.fit.start import initial_gaussians
 
-    noise = trace.generator(params.seed, "start")
+    noise = seeding.generator(params.seed, "start")
     first = initial_gaussians(points, colors, params.sh_degree, budget, noise, params.start_opacity, params.start_size)
     return replace(first.map(lambda p: p.to(params.device)), antialiased=params.antialiased)
 
@@ -169,8 +173,8 @@ def settings(params: Params, cameras: list):
     """The fit's settings for these views: a larger picture has room for more Gaussians."""
     from dataclasses import fields
 
-    from reffusion.fit_step import Settings
-    from reffusion.optimize import Rates
+    from reffusion.fit.step import Settings
+    from reffusion.gaussians.optimize import Rates
 
     shared = {f.name: getattr(params, f.name) for f in fields(Settings) if f.name not in ("rates", "budget")}
     pixels = sum(camera.width * camera.height for camera in cameras) / len(cameras)

@@ -16,7 +16,7 @@ class Params(BaseModel):
     start: Literal["reference", "lift", "random", "nothing"] = Field(
         "reference",
         description="what fills the hole: the reference on its depth; instead (baselines) the picture that the stage "
-        "lift painted of the best view, Gaussians at random (reffusion.scatter), or nothing: it only removes",
+        "lift painted of the best view, Gaussians at random (initialize.scatter), or nothing: it only removes",
     )
     random_gaussians: int = Field(0, ge=0, description="their number, started at random; 0: as many as were removed")
     leak: float = Field(1.0, gt=0, description="weight in undecided over other pixels from which Gaussians are haze")
@@ -67,9 +67,9 @@ class Params(BaseModel):
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list:
     """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
-    from reffusion import weights
+    from reffusion.weights import local
 
-    return [weights.of_model(params.depth_model, "float32")] if params.depth_model else []
+    return [local.of_model(params.depth_model, "float32")] if params.depth_model else []
 
 
 def preview(params: Params, **_: Path | None) -> list[str]:
@@ -84,19 +84,24 @@ def run(
 ) -> None:
     import torch
 
-    from reffusion import initialize, io, monocular, trace
-    from reffusion import masks as voting
+    from reffusion import trace
+    from reffusion.depth import monocular
+    from reffusion.initialize import filling
+    from reffusion.io.arrays import load_json, load_labels, save_json, save_labels
+    from reffusion.io.ply import load_ply, save_ply
+    from reffusion.io.scene import load_mask_sets, load_references, load_scene
+    from reffusion.masks import voting
 
-    gaussians, labels = io.load_ply(fit / "gaussians.ply"), io.load_labels(masks / "labels.npy")
+    gaussians, labels = load_ply(fit / "gaussians.ply"), load_labels(masks / "labels.npy")
     if len(labels) != len(gaussians):
         raise ValueError(f"{masks}: {len(labels)} labels for {len(gaussians)} Gaussians of {fit}: run masks again")
-    scene = io.load_scene(poses)
+    scene = load_scene(poses)
     if params.start == "lift" and lift is None:
         raise ValueError("initialize.start is 'lift', but the stage lift was left out: set distill.lift_weight")
     completed = {"reference": reference, "lift": lift}.get(params.start)
-    references = io.load_references(completed, scene) if completed else []
+    references = load_references(completed, scene) if completed else []
     network = monocular.load_network(params.depth_model) if params.depth_model and references else None
-    sets = io.load_mask_sets(masks, scene.cameras)
+    sets = load_mask_sets(masks, scene.cameras)
     thing = labels & ~debris_of(masks, labels)
     around = surroundings(params, scene, gaussians, thing, sets, poses, fit) if references else None
     removed = gaussians.map(lambda p: p[thing])
@@ -107,7 +112,7 @@ def run(
     if params.start != "nothing":  # where nothing is put in its place, haze is better than a black hole
         haze = voting.leaking(gaussians, train, {c.name: sets[c.name].undecided for c in train}, params.leak)
     gaussians, new = gaussians.map(lambda p: p[~haze]), new[~haze]
-    best = io.load_json(masks / "facts.json")["best_reference"]
+    best = load_json(masks / "facts.json")["best_reference"]
     log = trace.Trace(out) if references else None
     for each in sorted(references, key=lambda r: (r.camera.name != best, -int(r.mask.sum()))):
         gaussians, new = filled(params, out, gaussians, new, each, around, network, log)
@@ -124,16 +129,16 @@ def run(
         new = torch.cat([new, torch.ones(len(added), dtype=torch.bool)])
     if true and params.settle:
         gaussians = settled(params, out, gaussians, true, around)
-    io.save_ply(out / "gaussians.ply", gaussians)
-    io.save_labels(out / "labels.npy", new)
-    uncovered = {each.name: initialize.uncovered(gaussians, each, sets[each.name].consistent) for each in train}
+    save_ply(out / "gaussians.ply", gaussians)
+    save_labels(out / "labels.npy", new)
+    uncovered = {each.name: filling.uncovered(gaussians, each, sets[each.name].consistent) for each in train}
     facts = {"new_gaussians": int(new.sum()), "removed_gaussians": int(labels.sum()), "haze": int(haze.sum())}
     facts |= {"completed": [each.camera.name for each in true], "uncovered": uncovered}
     facts["further"] = {
         each.camera.name: float(each.mask.sum() / sets[each.camera.name].consistent.sum()) for each in further
     }
     facts["uncovered_share"] = sum(uncovered.values()) / max(len(uncovered), 1)
-    io.save_json(out / "facts.json", facts)
+    save_json(out / "facts.json", facts)
     if bare := [f"{name} ({share:.1%})" for name, share in uncovered.items() if share > WARN_FROM]:
         print(f"uncovered in {len(bare)} views: {', '.join(bare)}: complete another view and add it to the references")
 
@@ -142,41 +147,45 @@ def debris_of(masks: Path, labels):
     """bool [N]: of what goes, what was not the object."""
     import torch
 
-    from reffusion import io
+    from reffusion.io.arrays import load_labels
 
     path = masks / "debris.npy"
-    return io.load_labels(path) if path.exists() else torch.zeros_like(labels)
+    return load_labels(path) if path.exists() else torch.zeros_like(labels)
 
 
 def surroundings(params: Params, scene, gaussians, thing, sets, poses: Path, fit: Path):
     """What the photographs say of the space around the object, and the planes that go on into what they do not."""
-    from reffusion import continuation, exposure, initialize, masks, witness
+    from reffusion.fit import exposure
+    from reffusion.initialize import filling
+    from reffusion.masks import continuation, voting, witness
 
     hidden = {name: each.consistent & (name not in scene.clean) for name, each in sets.items()}
     train = [scene.cameras[name] for name in scene.train]
     views = witness.witnesses(gaussians, train, hidden)
     planes = []
     if thing.any():
-        planes = continuation.planes_around(*masks.extent(gaussians.means[thing]), views, params.seed)
+        planes = continuation.planes_around(*voting.extent(gaussians.means[thing]), views, params.seed)
     photos = exposure.load_views(poses, fit, scene.train)
-    return initialize.Surroundings(train, {n: sets[n].consistent for n in sets}, photos, views, planes, scene.points)
+    return filling.Surroundings(train, {n: sets[n].consistent for n in sets}, photos, views, planes, scene.points)
 
 
 def at_random(params: Params, removed, remaining, scene, sets, poses: Path):
     """Gaussians at random in the region of the hole: that of the removed ones, or the box that the scene names."""
-    from reffusion import io, scatter, trace
+    from reffusion import seeding
+    from reffusion.initialize import scatter
+    from reffusion.io.arrays import load_json
 
     region, train = poses / "region.json", [scene.cameras[name] for name in scene.train]
     if region.exists():
-        box = scatter.box_around(**io.load_json(region))
+        box = scatter.box_around(**load_json(region))
     elif len(removed):
         box = scatter.box_of(removed.means.double().numpy())
     else:
         raise ValueError("initialize.start is 'random', but no Gaussian was removed: nothing says where the hole is")
     invents = {camera.name: sets[camera.name].invent for camera in train if sets[camera.name].invent.any()}
     count = params.random_gaussians or max(len(removed), scatter.FEWEST)
-    points = scatter.points_in(box, count, train, invents, trace.generator(params.seed, "initialize", "random"))
-    draw = trace.generator(params.seed, "initialize", "random colours")
+    points = scatter.points_in(box, count, train, invents, seeding.generator(params.seed, "initialize", "random"))
+    draw = seeding.generator(params.seed, "initialize", "random colours")
     return scatter.gaussians_at(points, remaining.sh.shape[1], remaining.antialiased, draw)
 
 
@@ -184,32 +193,35 @@ def filled(params: Params, out: Path, gaussians, new, reference, around, network
     """The Gaussians with those of one reference, on what is still empty in its mask, and the labels."""
     from dataclasses import fields
 
-    from reffusion import behind, initialize, io, undecided
+    from reffusion.depth import behind
+    from reffusion.initialize import filling
+    from reffusion.io.images import save_exr
+    from reffusion.masks import undecided
 
-    camera, sheets = reference.camera, {f.name: getattr(params, f.name) for f in fields(initialize.Sheets)}
+    camera, sheets = reference.camera, {f.name: getattr(params, f.name) for f in fields(filling.Sheets)}
     sheets["gloss"] &= not farthest  # a sliver tells nothing of shine
-    sheets, how, hidden = initialize.Sheets(**sheets), completion(params), around.hidden[reference.camera.name]
-    hole = initialize.to_fill(gaussians, new, reference, hidden, params.covered)
+    sheets, how, hidden = filling.Sheets(**sheets), completion(params), around.hidden[reference.camera.name]
+    hole = filling.to_fill(gaussians, new, reference, hidden, params.covered)
     remaining = gaussians.map(lambda p: p[~new])
     near, told = around.compared(camera, hole) if params.sweep else (around, None)
     continued = undecided.behind(remaining, camera, hidden, near.views, near.planes).continued
     past = (lambda depth: near.looked_past(camera, depth)) if params.sweep else None
     hints = behind.Hints(continued, near.photographed(camera), told, past)
     estimate = estimate_of(network, reference)
-    depth, made_up, said = initialize.depth_behind(
+    depth, made_up, said = filling.depth_behind(
         remaining, reference, hole, hidden, around.points, how, estimate, log, hints, farthest
     )
     print(f"depth of reference {camera.name}: {said}")
-    io.save_exr(out / "depth" / f"{camera.name}.exr", depth.astype("float32"))
+    save_exr(out / "depth" / f"{camera.name}.exr", depth.astype("float32"))
     pixels = behind.grown(hole, params.overlap)
-    gaussians, new = initialize.placed(gaussians, new, reference, depth, pixels, around, sheets)
+    gaussians, new = filling.placed(gaussians, new, reference, depth, pixels, around, sheets)
     if farthest:  # what is open still is asked for view by view
         return gaussians, new
     views = [(each, around.hidden[each.name]) for each in around.cameras]
-    gap = initialize.seen_through(gaussians, camera, made_up, hidden & ~pixels, views, params.seen_through)
+    gap = filling.seen_through(gaussians, camera, made_up, hidden & ~pixels, views, params.seen_through)
     if not gap.any():
         return gaussians, new
-    return initialize.placed(gaussians, new, reference, made_up, gap, around, sheets)
+    return filling.placed(gaussians, new, reference, made_up, gap, around, sheets)
 
 
 def true_pictures(reference: Path, references: list, around) -> list:
@@ -217,10 +229,10 @@ def true_pictures(reference: Path, references: list, around) -> list:
     brings for all of C, one that was completed here for what was invented."""
     from dataclasses import replace
 
-    from reffusion import io
+    from reffusion.io.arrays import load_json
 
     facts = reference / "facts.json"
-    given = io.load_json(facts)["given"] if facts.exists() else []
+    given = load_json(facts)["given"] if facts.exists() else []
     whole = lambda each: replace(each, mask=each.mask | around.hidden[each.camera.name])
     return [whole(each) if each.camera.name in given else each for each in references]
 
@@ -232,8 +244,11 @@ def without_shadows(out: Path, true: list, gaussians, around):
 
     import numpy as np
 
-    from reffusion import inpaint, io, splat, taint
-    from reffusion.witness import with_photographed_depth
+    from reffusion.io.images import save_mask
+    from reffusion.masks import taint
+    from reffusion.masks.witness import with_photographed_depth
+    from reffusion.prior import inpaint
+    from reffusion.splat import rasterizer
 
     marks = {camera.name: np.zeros((camera.height, camera.width), bool) for camera in around.cameras}
     silent, photos = dict(marks), dict(around.photos)
@@ -247,7 +262,7 @@ def without_shadows(out: Path, true: list, gaussians, around):
         if not found.any():
             continue
         print(f"reference {name}: beside the hole {found.sum()} px differ from what is seen, a shadow perhaps")
-        depth = splat.render(gaussians, each.camera, sh_degree=0).depth.double().numpy()
+        depth = rasterizer.render(gaussians, each.camera, sh_degree=0).depth.double().numpy()
         depth = with_photographed_depth(depth, each.camera, around.views)
         brighter = taint.light(each.image, shown)
         for view, (mask, light) in taint.carried(found, brighter, depth, each.camera, around.views).items():
@@ -256,7 +271,7 @@ def without_shadows(out: Path, true: list, gaussians, around):
     if not any(mask.any() for mask in marks.values()):
         return true, around
     for name, mask in marks.items():
-        io.save_mask(out / "tainted" / f"{name}.png", mask)
+        save_mask(out / "tainted" / f"{name}.png", mask)
     views = [replace(view, hidden=view.hidden | silent[view.camera.name]) for view in around.views]
     return pictures, replace(around, views=views, photos=photos)
 
@@ -266,7 +281,10 @@ def completed_further(params: Params, out: Path, gaussians, new, around):
     what they show, the labels, and the views."""
     import numpy as np
 
-    from reffusion import coverage, inpaint, io, paint2d
+    from reffusion.initialize import coverage
+    from reffusion.io.images import save_image
+    from reffusion.paint import paint2d
+    from reffusion.prior import inpaint
     from reffusion.types import Reference
 
     further: list[Reference] = []
@@ -287,17 +305,17 @@ def completed_further(params: Params, out: Path, gaussians, new, around):
             print(f"left as it is: {error}")
             found[camera.name] = np.zeros_like(mask)
             continue
-        io.save_image(out / "further" / f"{camera.name}.png", picture)
+        save_image(out / "further" / f"{camera.name}.png", picture)
         further.append(reference)
         found |= coverage.open_pixels(gaussians, around, [c for c in around.cameras if found[c.name].any()])
     return gaussians, new, further
 
 
 def settled(params: Params, out: Path, gaussians, references, around):
-    """The Gaussians after `params.settle` steps of reconstruction; see `reffusion.settle`."""
+    """The Gaussians after `params.settle` steps of reconstruction; see `reffusion.initialize.settle`."""
     import shutil
 
-    from reffusion.settle import Known, settle
+    from reffusion.initialize.settle import Known, settle
 
     hidden = {view.camera.name: view.hidden for view in around.views}
     work = out / ".settle"  # hidden: its trace tells seconds, which are no part of the artifact's content
@@ -311,7 +329,7 @@ def completion(params: Params):
     """How depth is found behind the object."""
     from dataclasses import fields
 
-    from reffusion.behind import Completion
+    from reffusion.depth.behind import Completion
 
     named = {f.name: getattr(params, f.name) for f in fields(Completion) if f.name != "robust"}
     return Completion(**named, robust=params.depth_align == "robust")
@@ -321,7 +339,7 @@ def estimate_of(network, reference):
     """The depth model's answer to the reference, [H, W] disparity up to scale and offset; None without a model."""
     import torch
 
-    from reffusion import monocular
+    from reffusion.depth import monocular
 
     if network is None:
         return None

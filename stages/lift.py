@@ -39,9 +39,9 @@ class Params(BaseModel):
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list:
     """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
-    from reffusion import weights
+    from reffusion.weights import local
 
-    return [weights.of_model(params.prior, params.dtype)] if params.inpainter == "diffusion" else []
+    return [local.of_model(params.prior, params.dtype)] if params.inpainter == "diffusion" else []
 
 
 def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path) -> None:
@@ -49,13 +49,20 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path) -> No
 
     Views that an earlier try finished are not painted again.
     """
-    from reffusion import exposure, inpaint, io, paint2d, trace
+    from reffusion import trace
+    from reffusion.fit import exposure
+    from reffusion.io.arrays import load_json, load_labels, save_json
+    from reffusion.io.images import load_image, save_image
+    from reffusion.io.ply import load_ply
+    from reffusion.io.scene import load_mask_sets, load_scene, save_references
+    from reffusion.paint import paint2d
+    from reffusion.prior import inpaint
     from reffusion.types import Reference
 
-    scene, facts = io.load_scene(poses), io.load_json(masks / "facts.json")
+    scene, facts = load_scene(poses), load_json(masks / "facts.json")
     best, asked = facts["best_reference"], facts["invent_views"]
     names = sorted({best, *asked[:: params.every]} - scene.clean)
-    gaussians, labels = io.load_ply(fit / "gaussians.ply"), io.load_labels(masks / "labels.npy")
+    gaussians, labels = load_ply(fit / "gaussians.ply"), load_labels(masks / "labels.npy")
     remaining = gaussians.map(lambda p: p[~labels])
     painter, paint = painter_of(params)
     print(f"2D inpainter: {painter}", flush=True)
@@ -63,22 +70,24 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path) -> No
         name, path = names[k], out / "images" / f"{names[k]}.png"
         if path.exists():
             continue
-        photo, pixels = exposure.load_views(poses, fit, [name])[name], io.load_mask_sets(masks, [name])[name]
+        photo, pixels = exposure.load_views(poses, fit, [name])[name], load_mask_sets(masks, [name])[name]
         base = inpaint.background(remaining, scene.cameras[name], photo, pixels.consistent)
         writing = path.with_name(f".{path.name}")
-        io.save_image(writing, paint(base, paint2d.widened(pixels.invent, params.widen), name))
+        save_image(writing, paint(base, paint2d.widened(pixels.invent, params.widen), name))
         writing.rename(path)  # a kill leaves no half picture
-    image, mask = io.load_image(out / "images" / f"{best}.png"), io.load_mask_sets(masks, [best])[best].invent
-    io.save_references(out, [Reference(scene.cameras[best], image, mask)])
-    io.save_json(out / "facts.json", {"inpainter": painter, "views": len(names)})
+    image, mask = load_image(out / "images" / f"{best}.png"), load_mask_sets(masks, [best])[best].invent
+    save_references(out, [Reference(scene.cameras[best], image, mask)])
+    save_json(out / "facts.json", {"inpainter": painter, "views": len(names)})
 
 
 def painter_of(params: Params) -> tuple[str, Callable]:
     """The inpainter's name, and (image [H, W, 3] uint8, hole [H, W] bool, name of the view) -> uint8 [H, W, 3]."""
     import torch
 
-    from reffusion import inpaint, paint2d, trace
-    from reffusion.prior import load_prior
+    from reffusion import seeding
+    from reffusion.paint import paint2d
+    from reffusion.prior import inpaint
+    from reffusion.prior.model import load_prior
 
     if params.inpainter == "deterministic":
         painter = paint2d.load(params.lama, params.device)
@@ -91,7 +100,7 @@ def painter_of(params: Params) -> tuple[str, Callable]:
             torch.from_numpy(image).permute(2, 0, 1) / 127.5 - 1,
             torch.from_numpy(hole),
             prompt=params.prompt,
-            seeds=[trace.seed_for(params.seed, "lift", name)],
+            seeds=[seeding.seed_for(params.seed, "lift", name)],
             steps=params.steps,
             start=params.start,
             guidance=params.guidance,

@@ -13,10 +13,10 @@ if TYPE_CHECKING:
     import numpy as np
     from torch import Tensor
 
-    from reffusion.continuation import Plane
-    from reffusion.masks import Votes
+    from reffusion.masks.continuation import Plane
+    from reffusion.masks.voting import Votes
+    from reffusion.masks.witness import Witness
     from reffusion.types import Camera, Gaussians, MaskSet, Scene
-    from reffusion.witness import Witness
 
 
 class Params(BaseModel):
@@ -51,12 +51,16 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
     import numpy as np
     import torch
 
-    from reffusion import exposure, io, masks, witness
+    from reffusion.fit import exposure
+    from reffusion.io.arrays import load_json, save_json, save_labels
+    from reffusion.io.ply import load_ply
+    from reffusion.io.scene import load_raw_masks, load_scene, save_mask_sets
+    from reffusion.masks import voting, witness
 
-    scene, gaussians = io.load_scene(poses), io.load_ply(fit / "gaussians.ply")
+    scene, gaussians = load_scene(poses), load_ply(fit / "gaussians.ply")
     train = [scene.cameras[name] for name in scene.train]
-    region = io.load_json(poses / "region.json") if (poses / "region.json").exists() else None
-    raw = io.load_raw_masks(poses, scene.train)
+    region = load_json(poses / "region.json") if (poses / "region.json").exists() else None
+    raw = load_raw_masks(poses, scene.train)
     empty = {name: np.zeros((camera.height, camera.width), bool) for name, camera in scene.cameras.items()}
     ballots = raw | {name: empty[name] for name in scene.clean}
     if params.invent == "region" and region is None:
@@ -65,14 +69,14 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
         raise ValueError(f"{poses}: neither masks nor a region say what is to be changed: add masks, or a region")
 
     # Observation outside the masks is measured by weight, whatever the votes count.
-    seen = masks.cast_votes(gaussians, train, ballots or empty, mode="weight")
+    seen = voting.cast_votes(gaussians, train, ballots or empty, mode="weight")
     if raw:
         labels = voted(params, gaussians, train, ballots, seen)
     else:
-        labels = masks.inside_box(gaussians, region["center"], region["size"])
+        labels = voting.inside_box(gaussians, region["center"], region["size"])
     consistent = drawn(params, gaussians, labels, scene.cameras)
     # What stands where (almost) every view sees the object can only be the object, whatever it was painted with.
-    labels |= masks.hidden_inside(
+    labels |= voting.hidden_inside(
         gaussians, train, {n: consistent[n] for n in scene.train if n not in scene.clean}, share=params.hull
     )
     hidden = {name: empty[name] if name in scene.clean else consistent[name] for name in scene.cameras}
@@ -80,15 +84,15 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
     planes = continuations(params, gaussians, labels, views)
     if params.debris and raw:
         debris = witness.debris(gaussians, labels, views, hidden, exposure.load_views(poses, fit, scene.train))
-        io.save_labels(out / "debris.npy", debris.cpu())
+        save_labels(out / "debris.npy", debris.cpu())
         labels |= debris
     fill = region if params.invent in ("region", "auto") else None
     sets = classified(params, scene, gaussians.map(lambda p: p[~labels]), raw, consistent, views, planes, fill)
     undecided = share_undecided(sets, scene.train)
     if params.invent != "consistent" and fill is None and undecided <= params.negligible:
         sets = {name: replace(each, invent=empty[name]) for name, each in sets.items()}
-    io.save_labels(out / "labels.npy", labels.cpu())
-    io.save_mask_sets(out, sets)
+    save_labels(out / "labels.npy", labels.cpu())
+    save_mask_sets(out, sets)
     invents = {name: each.invent for name, each in sets.items()}
     facts = {
         "masked_gaussians": int(torch.count_nonzero(labels)),
@@ -98,29 +102,29 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
         "consistent_pixels": pixels_of("consistent", sets, scene.train),
         "undecided_share": undecided,
         "invent_views": [name for name in scene.train if invents[name].any()],
-        "best_reference": masks.best_view(invents, scene.train),
+        "best_reference": voting.best_view(invents, scene.train),
     }
-    io.save_json(out / "facts.json", facts)
+    save_json(out / "facts.json", facts)
 
 
 def voted(
     params: Params, gaussians: Gaussians, train: list[Camera], ballots: dict[str, np.ndarray], seen: Votes
 ) -> Tensor:
     """Labels [N] bool by the masks of the views that vote; `seen`: the votes by weight."""
-    from reffusion import masks
+    from reffusion.masks import voting
 
-    votes = seen if params.vote == "weight" else masks.cast_votes(gaussians, train, ballots, mode=params.vote)
-    labels = masks.label_gaussians(votes, params.tau)
+    votes = seen if params.vote == "weight" else voting.cast_votes(gaussians, train, ballots, mode=params.vote)
+    labels = voting.label_gaussians(votes, params.tau)
     # What hardly any view sees (buried in the object, or in the wall behind it) votes by where it stands.
     unseen = seen.masked + seen.unmasked <= params.buried
-    return labels | (unseen & masks.hidden_inside(gaussians, train, ballots))
+    return labels | (unseen & voting.hidden_inside(gaussians, train, ballots))
 
 
 def drawn(params: Params, gaussians: Gaussians, labels: Tensor, cameras: dict[str, Camera]) -> dict[str, np.ndarray]:
     """The labels rendered back into each view: its consistent mask C, bool [H, W]."""
-    from reffusion import masks
+    from reffusion.masks import voting
 
-    shares = {name: masks.label_view(gaussians, labels, camera) for name, camera in cameras.items()}
+    shares = {name: voting.label_view(gaussians, labels, camera) for name, camera in cameras.items()}
     return {name: tidied(params, share > params.tau_rendered) for name, share in shares.items()}
 
 
@@ -140,7 +144,8 @@ def classified(
     """
     import numpy as np
 
-    from reffusion import masks, trace, undecided
+    from reffusion import trace
+    from reffusion.masks import undecided, voting
     from reffusion.types import MaskSet
 
     names, sets = list(scene.cameras), {}
@@ -151,23 +156,23 @@ def classified(
         invent = consistent[name] & (name not in scene.clean) if params.invent == "consistent" else unknown
         if fill is not None:
             disparity = np.divide(1.0, found.depth, out=np.zeros_like(found.depth), where=found.depth > 0)
-            invent = masks.box_silhouette(**fill, camera=camera, disparity=disparity)
+            invent = voting.box_silhouette(**fill, camera=camera, disparity=disparity)
         sets[name] = MaskSet(raw.get(name, np.zeros_like(unknown)), consistent[name], unknown, invent)
     return sets
 
 
 def continuations(params: Params, gaussians: Gaussians, labels: Tensor, views: list[Witness]) -> list[Plane]:
     """The planes around the object; none where there is none."""
-    from reffusion.continuation import planes_around
-    from reffusion.masks import extent
+    from reffusion.masks.continuation import planes_around
+    from reffusion.masks.voting import extent
 
     return planes_around(*extent(gaussians.means[labels]), views, params.seed) if labels.any() else []
 
 
 def tidied(params: Params, mask: np.ndarray) -> np.ndarray:
-    from reffusion import masks
+    from reffusion.masks import voting
 
-    return masks.tidy(mask, params.speck * mask.shape[1], params.gap * mask.shape[1])
+    return voting.tidy(mask, params.speck * mask.shape[1], params.gap * mask.shape[1])
 
 
 def pixels_of(kind: str, sets: dict[str, MaskSet], names: Sequence[str]) -> int:

@@ -33,7 +33,7 @@ class Params(BaseModel):
     clip: float = Field(1.0, gt=0, description="largest norm of the gradient")
     warm_up: int = Field(0, ge=0, description="steps of linear warm-up")
     schedule: Literal["constant", "cosine"] = Field("constant", description="learning rate after the warm-up")
-    # PAPER leaves open: how samples are drawn (reffusion.crops.Sampling says where the figures come from).
+    # PAPER leaves open: how samples are drawn (reffusion.prior.crops.Sampling says where the figures come from).
     local_share: float = Field(0.5, ge=0, le=1, description="share of the reference's samples that are local crops")
     scene_crops: float = Field(0.0, ge=0, lt=1, description="share of samples from unmasked crops of the scene's views")
     hole_share: float = Field(0.0, ge=0, le=1, description="share of the reference's samples whose mask is its hole")
@@ -58,9 +58,9 @@ class Params(BaseModel):
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list:
     """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
-    from reffusion import weights
+    from reffusion.weights import local
 
-    return [weights.of_model(params.prior, params.dtype)]
+    return [local.of_model(params.prior, params.dtype)]
 
 
 def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, reference: Path) -> None:
@@ -70,18 +70,20 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, refer
     began = time.monotonic()
     import torch
 
-    from reffusion import crops, denoising, io, lora, memory, trace
-    from reffusion.personalize import personalize
-    from reffusion.prior import load_prior, recomputing
+    from reffusion import trace
+    from reffusion.io.scene import load_references, load_scene
+    from reffusion.prior import crops, denoising, lora, memory
+    from reffusion.prior.model import load_prior, recomputing
+    from reffusion.prior.personalize import personalize
 
     if not params.steps:
         raise ValueError("personalize.steps is 0: there is nothing to learn, leave the stage out")
-    scene = io.load_scene(poses)
+    scene = load_scene(poses)
     prior = load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
     prior = recomputing(prior) if params.checkpointing else prior
     references = [
         crops.picture(torch.from_numpy(r.image), torch.from_numpy(r.mask), prior.native_size)
-        for r in io.load_references(reference, scene)
+        for r in load_references(reference, scene)
     ]
     sampling, training = settings(params, prior.native_size)
     views = []
@@ -111,8 +113,8 @@ def settings(params: Params, native: int) -> tuple:
     """How samples are drawn, and how LoRA is trained on them; `native`: the prior's size in pixels."""
     from dataclasses import fields
 
-    from reffusion.crops import Sampling
-    from reffusion.personalize import Training
+    from reffusion.prior.crops import Sampling
+    from reffusion.prior.personalize import Training
 
     sampling = Sampling(
         params.local_share,
@@ -132,9 +134,11 @@ def scene_views(scene, poses: Path, fit: Path, masks: Path, size: int) -> list:
     """The training views as pictures whose consistent mask must not be used (nothing of it in a clean view)."""
     import torch
 
-    from reffusion import crops, exposure, io
+    from reffusion.fit import exposure
+    from reffusion.io.scene import load_mask_sets
+    from reffusion.prior import crops
 
-    photos, sets = exposure.load_views(poses, fit, scene.train), io.load_mask_sets(masks, scene.train)
+    photos, sets = exposure.load_views(poses, fit, scene.train), load_mask_sets(masks, scene.train)
     return [
         crops.picture(torch.from_numpy(photos[n]), torch.from_numpy(sets[n].consistent & (n not in scene.clean)), size)
         for n in scene.train

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 if TYPE_CHECKING:
-    from reffusion.io import Capture, Roles
+    from reffusion.capture.layouts.capture import Capture
+    from reffusion.capture.roles import Roles
     from reffusion.types import Scene
 
 STRICT = ConfigDict(extra="forbid", frozen=True)
@@ -40,7 +41,7 @@ class Params(BaseModel):
     region: Region | None = Field(None, description="3D box that holds the object, or is to be filled")
     longest: int = Field(1600, ge=16, description="larger image side in px; smaller pictures stay as they are")
     # PAPER leaves open: pictures that are blurred or were enlarged. It takes 1600 px; half of them may show as much.
-    detail: float = Field(0.0, ge=0, description="pictures of less are halved, see reffusion.support; 0: never")
+    detail: float = Field(0.0, ge=0, description="pictures of less are halved, see reffusion.capture.support; 0: never")
     refine: bool = Field(False, description="adjust cameras, the principal point of each view too, that flow belies")
     least_points: int = Field(100, ge=0, description="with fewer sparse points, some of optical flow are added to them")
     more_points: int = Field(10_000, ge=1, description="how many at most; random ones, where flow finds too few")
@@ -63,7 +64,7 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
 
 def preview(params: Params, scene: Path) -> list[str]:
     """What the stage will do, from headers alone. ValueError where it would refuse."""
-    from reffusion import lens
+    from reffusion.capture import lens
 
     capture, roles = _read(params, scene)
     notes = [f"{len(roles.train)} training and {len(roles.test)} test views, {len(roles.masks)} masks"]
@@ -80,20 +81,25 @@ def preview(params: Params, scene: Path) -> list[str]:
 
 
 def run(params: Params, out: Path, *, scene: Path) -> None:
-    from reffusion import frame, io, trace
+    from reffusion import seeding, trace
+    from reffusion.capture import frame
+    from reffusion.capture.undistorted import check_masks, save_lenses, save_undistorted
+    from reffusion.io.arrays import save_json
+    from reffusion.io.ply import load_ply, save_ply
+    from reffusion.io.scene import load_views, save_scene
 
     capture, roles = _read(params, scene)
     for warning in (*capture.warnings, *roles.warnings):
         warnings.warn(warning, stacklevel=1)
-    io.check_masks(roles.masks)
+    check_masks(roles.masks)
     if capture.poses is None:
         capture = _place(params, out, capture)
         roles = roles.among(set(capture.pictures))
     views, longest = sorted({*roles.train, *roles.test}), _supported_size(params, capture, roles)
     lenses, pinholes = {}, {}
     for k in trace.progress(len(views), "poses"):
-        lenses[views[k]], pinholes[views[k]] = io.save_undistorted(out, views[k], capture, roles, longest)
-    io.save_lenses(out, lenses, capture.upright)
+        lenses[views[k]], pinholes[views[k]] = save_undistorted(out, views[k], capture, roles, longest)
+    save_lenses(out, lenses, capture.upright)
     shutil.rmtree(out / "sfm", ignore_errors=True)
     normalised = frame.normalised(capture.poses, pinholes, roles.train, roles.test, roles.clean)
     if params.refine and params.gaussians is None:  # Gaussians that the scene brings were fitted with its cameras
@@ -102,28 +108,27 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
         normalised = _with_flow_points(params, normalised, out)
     if len(normalised.points) < max(params.least_points, 1):
         ranges = frame.ranges_of(capture.poses, pinholes) * normalised.similarity.scale
-        draws = trace.generator(params.seed, "poses", "random points")
-        normalised = frame.filled_up(
-            normalised, ranges, params.more_points, draws, lambda v: io.load_views(out, [v])[v]
-        )
-    io.save_scene(out, normalised)
+        draws = seeding.generator(params.seed, "poses", "random points")
+        normalised = frame.filled_up(normalised, ranges, params.more_points, draws, lambda v: load_views(out, [v])[v])
+    save_scene(out, normalised)
     similarity = normalised.similarity
     if params.gaussians is not None:
-        io.save_ply(out / "gaussians.ply", io.load_ply(scene / params.gaussians, similarity))
+        save_ply(out / "gaussians.ply", load_ply(scene / params.gaussians, similarity))
     if params.region is not None:
         center = similarity.apply(params.region.center).tolist()
         size = [side * similarity.scale for side in params.region.size]
-        io.save_json(out / "region.json", {"center": center, "size": size})
+        save_json(out / "region.json", {"center": center, "size": size})
 
 
 def _supported_size(params: Params, capture: Capture, roles: Roles) -> int:
     """The larger image side that the training views' pictures support, at most `longest`."""
-    from reffusion import io, support
+    from reffusion.capture import support
+    from reffusion.capture.undistorted import load_at
 
     if params.detail == 0:
         return params.longest
     chosen = roles.train[:: max(1, len(roles.train) // 8)]
-    images = [io.load_at(capture.pictures[name], params.longest, capture.upright) for name in chosen]
+    images = [load_at(capture.pictures[name], params.longest, capture.upright) for name in chosen]
     if not support.enlarged(images, params.detail):
         return params.longest
     side = max(images[0].shape[:2])
@@ -133,15 +138,16 @@ def _supported_size(params: Params, capture: Capture, roles: Roles) -> int:
 
 def _refined(scene: Scene, out: Path) -> Scene:
     """The scene with cameras that agree with optical flow; test views too, as they are in structure from motion."""
-    from reffusion import io
-    from reffusion.refine import refined
+    from reffusion.capture.refine import refined
+    from reffusion.io.arrays import save_json
+    from reffusion.io.scene import load_views
 
-    found = refined(list(scene.cameras.values()), io.load_views(out, scene.cameras))
+    found = refined(list(scene.cameras.values()), load_views(out, scene.cameras))
     if found.after is None:
         print(f"cameras as given: the views miss each other by {found.before:.2f} px", flush=True)
     else:
         print(f"cameras adjusted: views missed each other by {found.before:.2f} px, now {found.after:.2f}", flush=True)
-    io.save_json(out / "refine.json", {"before": found.before, "after": found.after})
+    save_json(out / "refine.json", {"before": found.before, "after": found.after})
     return replace(scene, cameras=found.cameras)
 
 
@@ -150,15 +156,17 @@ def _with_flow_points(params: Params, scene: Scene, out: Path) -> Scene:
     import numpy as np
     import torch
 
-    from reffusion import io, stereo, trace
+    from reffusion import seeding
+    from reffusion.capture import stereo
+    from reffusion.io.scene import load_views
 
     cameras = [scene.cameras[name] for name in scene.train]
     pixels = sum(camera.width * camera.height for camera in cameras)
     cell = max(2, round((pixels / params.more_points / 4) ** 0.5))  # most views' points were seen by another already
-    points, colors = stereo.dense_points(cameras, io.load_views(out, scene.train), cell)
+    points, colors = stereo.dense_points(cameras, load_views(out, scene.train), cell)
     kept = np.arange(len(points))
     if len(points) > params.more_points:
-        draws = trace.generator(params.seed, "poses", "flow points")
+        draws = seeding.generator(params.seed, "poses", "flow points")
         kept = torch.randperm(len(points), generator=draws)[: params.more_points].numpy()
     return replace(
         scene,
@@ -169,12 +177,14 @@ def _with_flow_points(params: Params, scene: Scene, out: Path) -> Scene:
 
 def _place(params: Params, out: Path, capture: Capture) -> Capture:
     """The capture with poses by structure from motion, its pictures upright and at their final size."""
-    from reffusion import io, sfm
+    from reffusion.capture import sfm
+    from reffusion.capture.undistorted import load_at
+    from reffusion.io.images import save_image
 
     work = out / "sfm"
     prepared = {name: work / "images" / f"{name}.png" for name in capture.pictures}
     for name, path in prepared.items():
-        io.save_image(path, io.load_at(capture.pictures[name], params.longest, upright=True))
+        save_image(path, load_at(capture.pictures[name], params.longest, upright=True))
     poses = sfm.solve(prepared, capture.pictures, work / "colmap", params.seed)
     lost = sorted(set(prepared) - set(poses.lenses))
     if lost:
@@ -184,10 +194,11 @@ def _place(params: Params, out: Path, capture: Capture) -> Capture:
 
 def _read(params: Params, scene: Path) -> tuple[Capture, Roles]:
     """The capture and its views' roles, checked before any work."""
-    from reffusion import io
+    from reffusion.capture.load import load_capture
+    from reffusion.capture.roles import load_roles
 
-    capture = io.load_capture(scene, params.layout, params.images)
-    roles = io.load_roles(
+    capture = load_capture(scene, params.layout, params.images)
+    roles = load_roles(
         scene,
         capture,
         masks=params.masks,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 if TYPE_CHECKING:
-    from reffusion.io import GivenReference
+    from reffusion.capture.given import GivenReference
     from reffusion.types import MaskSet, Reference, Scene
 
 PAINTED = "painted"  # folder of the scene: <view>.png and <view>_depth.*, made over what lies in to_paint
@@ -61,10 +61,10 @@ class Params(BaseModel):
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list:
     """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml, and its folders."""
-    from reffusion import weights
+    from reffusion.weights import local
 
     given = params.reference is not None or PAINTED in brings or params.inpainter == "exemplar"
-    return [] if given else [weights.of_model(params.prior, params.dtype)]
+    return [] if given else [local.of_model(params.prior, params.dtype)]
 
 
 def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
@@ -85,15 +85,16 @@ def preview(params: Params, *, scene: Path, poses: Path | None = None, **_: Path
 
 
 def run(params: Params, out: Path, *, scene: Path, poses: Path, fit: Path, masks: Path) -> None:
-    from reffusion import io
+    from reffusion.io.arrays import save_json
+    from reffusion.io.scene import load_scene, save_references
 
-    placed, given = io.load_scene(poses), _given(params, scene, poses)
+    placed, given = load_scene(poses), _given(params, scene, poses)
     if given:
         references = taken_over(given, placed, poses, fit, masks)
     else:
         references = [inpainted(params, out, placed, poses, fit, masks)]
-    io.save_references(out, references)
-    io.save_json(out / "facts.json", {"given": [each.camera.name for each in references] if given else []})
+    save_references(out, references)
+    save_json(out / "facts.json", {"given": [each.camera.name for each in references] if given else []})
     if params.reference is None:
         lay_out(out / TO_PAINT, [each.view for each in given], placed, poses, fit, masks)
 
@@ -108,14 +109,17 @@ def _given(params: Params, scene: Path, poses: Path | None) -> list[GivenReferen
     painted = sorted(p for p in (scene / PAINTED).glob("[!.]*") if p.is_file())
     if not painted and params.reference is None:
         return []
-    from reffusion import io
+    from reffusion.capture.given import load_given
+    from reffusion.capture.load import load_capture
+    from reffusion.capture.roles import load_roles
+    from reffusion.capture.undistorted import load_lenses
 
-    capture = io.load_capture(scene, params.layout, params.images)
+    capture = load_capture(scene, params.layout, params.images)
     usual = {"masks": params.masks, "test_masks": params.test_masks, "train": params.train, "test": params.test}
-    roles = io.load_roles(scene, capture, **usual, region=True)
+    roles = load_roles(scene, capture, **usual, region=True)
     named = [(each.view, each.image, each.depth, each.undistorted) for each in _named(params)]
-    given = io.load_given(scene, capture, roles, named, painted)
-    placed = io.load_lenses(poses)[0] if poses else capture.pictures
+    given = load_given(scene, capture, roles, named, painted)
+    placed = load_lenses(poses)[0] if poses else capture.pictures
     for each in given:
         if each.view not in placed:
             raise ValueError(f"{each.path}: its view '{each.view}' could not be placed; make it for another view")
@@ -124,11 +128,11 @@ def _given(params: Params, scene: Path, poses: Path | None) -> list[GivenReferen
 
 def taken_over(given: list[GivenReference], scene: Scene, poses: Path, fit: Path, masks: Path) -> list[Reference]:
     """The scene's own references, each standing for the invent mask of its view, and exposed as its photograph is."""
-    from reffusion import io
+    from reffusion.io.scene import load_mask_sets
 
     references = []
     for each in given:
-        sets = io.load_mask_sets(masks, [each.view])[each.view]
+        sets = load_mask_sets(masks, [each.view])[each.view]
         if sets.invent.any():
             references.append(fitted(each, sets, scene, poses, fit))
         else:
@@ -141,14 +145,18 @@ def taken_over(given: list[GivenReference], scene: Scene, poses: Path, fit: Path
 def fitted(given: GivenReference, sets: MaskSet, scene: Scene, poses: Path, fit: Path) -> Reference:
     """One of them, registered to its photograph: as it is where it is the photograph outside the object, else only the
     hole of it, its shadow and a blended rim."""
-    from reffusion import exposure, io, registration, taint
+    from reffusion.capture.undistorted import load_lenses, load_straight, load_straight_depth
+    from reffusion.fit import exposure
+    from reffusion.io.scene import load_views
+    from reffusion.masks import taint
+    from reffusion.paint import registration
     from reffusion.types import Reference
 
-    lenses, upright = io.load_lenses(poses)
+    lenses, upright = load_lenses(poses)
     camera, lens = scene.cameras[given.view], lenses[given.view]
-    views = exposure.load_views(poses, fit, [given.view]) if given.painted else io.load_views(poses, [given.view])
+    views = exposure.load_views(poses, fit, [given.view]) if given.painted else load_views(poses, [given.view])
     photo, hidden = views[given.view], sets.raw | sets.consistent | sets.invent
-    image, inside = io.load_straight(given, lens, upright)
+    image, inside = load_straight(given, lens, upright)
     found = registration.register(image, photo, hidden)
     if not found.fits:
         raise ValueError(
@@ -157,7 +165,7 @@ def fitted(given: GivenReference, sets: MaskSet, scene: Scene, poses: Path, fit:
         )
     print(f"reference {given.view}: {found}", flush=True)
     if not found.untouched:
-        image, inside = io.load_straight(given, lens, upright, found.moved)
+        image, inside = load_straight(given, lens, upright, found.moved)
         image = registration.recolored(image, found.gain, found.offset)
         margin, blend = (share * camera.width for share in (MARGIN, BLEND))
         hole = hidden | taint.tainted(image, photo, hidden) & inside
@@ -165,28 +173,34 @@ def fitted(given: GivenReference, sets: MaskSet, scene: Scene, poses: Path, fit:
     if (share := inside[sets.invent].mean()) < WHOLE:
         raise ValueError(f"{given.path}: shows only {share:.0%} of the hole in '{given.view}'; crop less")
     image = image if given.painted else exposure.normalised(image, fit, given.view)
-    depth = io.load_straight_depth(given, lens, upright, found.moved)
+    depth = load_straight_depth(given, lens, upright, found.moved)
     return Reference(camera, image, sets.invent & inside, depth)
 
 
 def lay_out(folder: Path, painted: list[str], scene: Scene, poses: Path, fit: Path, masks: Path) -> None:
     """Write what people can paint: <view>.png and <view>_mask.png of the views that cover most of what has to be
     invented, those painted already first, and ranked.txt."""
-    from reffusion import exposure, inpaint, io, painting
+    from reffusion.fit import exposure
+    from reffusion.io.arrays import load_labels, save_text
+    from reffusion.io.images import save_image, save_mask
+    from reffusion.io.ply import load_ply
+    from reffusion.io.scene import load_mask_sets
+    from reffusion.paint import painting
+    from reffusion.prior import inpaint
 
-    sets = io.load_mask_sets(masks, scene.train)
-    keep = ~io.load_labels(masks / "labels.npy")
-    remaining = io.load_ply(fit / "gaussians.ply").map(lambda p: p[keep])
+    sets = load_mask_sets(masks, scene.train)
+    keep = ~load_labels(masks / "labels.npy")
+    remaining = load_ply(fit / "gaussians.ply").map(lambda p: p[keep])
     hidden, invent = ({n: getattr(each, kind) for n, each in sets.items()} for kind in ("consistent", "invent"))
     holes = painting.holes(remaining, [scene.cameras[name] for name in scene.train], hidden, invent)
     views = painting.ranked(holes, painted, VIEWS_TO_PAINT)
     for name in (each.view for each in views):
         photo = exposure.load_views(poses, fit, [name])[name]
         known = inpaint.background(remaining, scene.cameras[name], photo, hidden[name])
-        io.save_image(folder / f"{name}.png", painting.to_paint(known, invent[name]))
-        io.save_mask(folder / f"{name}_mask.png", invent[name])
+        save_image(folder / f"{name}.png", painting.to_paint(known, invent[name]))
+        save_mask(folder / f"{name}_mask.png", invent[name])
     if views:
-        io.save_text(folder / "ranked.txt", painting.words(views, painted))
+        save_text(folder / "ranked.txt", painting.words(views, painted))
         names = ", ".join(f"{each.view} ({each.share:.0%})" for each in views)
         print(f"to be painted by hand, and what each covers more: {names}; see {TO_PAINT}/ranked.txt", flush=True)
 
@@ -194,15 +208,19 @@ def lay_out(folder: Path, painted: list[str], scene: Scene, poses: Path, fit: Pa
 def inpainted(params: Params, out: Path, scene, poses: Path, fit: Path, masks: Path):
     """A picture of the view that `masks` found best: the photo outside C, the remaining Gaussians' render in C where
     other views saw the background, the inpainter's own in I."""
-    from reffusion import exposure, inpaint, io
+    from reffusion.fit import exposure
+    from reffusion.io.arrays import load_json, load_labels
+    from reffusion.io.ply import load_ply
+    from reffusion.io.scene import load_mask_sets
+    from reffusion.prior import inpaint
     from reffusion.types import Reference
 
-    name = io.load_json(masks / "facts.json")["best_reference"]
+    name = load_json(masks / "facts.json")["best_reference"]
     if params.choose is not None and params.choose >= params.candidates:
         raise ValueError(f"reference.choose is {params.choose}, but candidates are counted 0..{params.candidates - 1}")
-    camera, pixels = scene.cameras[name], io.load_mask_sets(masks, [name])[name]
-    keep = ~io.load_labels(masks / "labels.npy")
-    remaining = io.load_ply(fit / "gaussians.ply").map(lambda p: p[keep])
+    camera, pixels = scene.cameras[name], load_mask_sets(masks, [name])[name]
+    keep = ~load_labels(masks / "labels.npy")
+    remaining = load_ply(fit / "gaussians.ply").map(lambda p: p[keep])
     photo = exposure.load_views(poses, fit, [name])[name]
     base = inpaint.background(remaining, camera, photo, pixels.consistent)
     if params.inpainter == "exemplar":
@@ -213,7 +231,7 @@ def inpainted(params: Params, out: Path, scene, poses: Path, fit: Path, masks: P
 def from_itself(base, consistent, invent):
     """The picture [H, W, 3] uint8 with I, and the part of C at its rim, put together from pieces of the rest: what is
     left of the object's blurred edge there would be continued into the hole."""
-    from reffusion import paint2d
+    from reffusion.paint import paint2d
 
     return paint2d.exemplar(base, invent | consistent & paint2d.widened(invent, RIM))
 
@@ -222,8 +240,10 @@ def from_prior(params: Params, out: Path, name: str, base, invent):
     """The picture [H, W, 3] uint8 with I painted by the prior; also writes the sheet of candidates."""
     import torch
 
-    from reffusion import inpaint, io, memory
-    from reffusion.prior import load_prior
+    from reffusion.io.arrays import save_json
+    from reffusion.io.images import save_image
+    from reffusion.prior import inpaint, memory
+    from reffusion.prior.model import load_prior
 
     prior = load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
     prior = memory.fitted(prior, params.memory_gb, "reference.memory_gb")
@@ -243,6 +263,6 @@ def from_prior(params: Params, out: Path, name: str, base, invent):
     chosen = int(seams.argmin()) if params.choose is None else params.choose
     images = (candidates.permute(0, 2, 3, 1) + 1) / 2
     sheet = torch.cat([*images], dim=1).clamp(0, 1)
-    io.save_image(out / "candidates.png", sheet.numpy())
-    io.save_json(out / "candidates.json", {"view": name, "seams": seams.tolist(), "chosen": chosen})
+    save_image(out / "candidates.png", sheet.numpy())
+    save_json(out / "candidates.json", {"view": name, "seams": seams.tolist(), "chosen": chosen})
     return (images[chosen].clamp(0, 1) * 255).round().to(torch.uint8).numpy()

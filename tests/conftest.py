@@ -33,8 +33,8 @@ def text(prior):
     """[3, L, D], hidden states of the global, the local and the empty prompt."""
     import torch
 
-    from reffusion.crops import PROMPTS
-    from reffusion.diffusion import embed_text
+    from reffusion.prior.crops import PROMPTS
+    from reffusion.prior.diffusion import embed_text
 
     with torch.no_grad():
         return embed_text(prior, list(PROMPTS))

@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from reffusion import io, lens
+from reffusion.capture import lens
 from reffusion.io import colmap
+from reffusion.io.images import save_image
+from reffusion.io.scene import load_scene
 from stages import poses
 
 WIDTH, HEIGHT = 96, 72
@@ -51,7 +53,7 @@ def some_truth(model=PINHOLE, views=6, scale=1.0, offset=(0.0, 0.0, 0.0)) -> Tru
 
 def write_pictures(folder: Path, names, size=(WIDTH, HEIGHT), ending=".png") -> None:
     for k, name in enumerate(names):
-        io.save_image(folder / f"{name}{ending}", np.full((size[1], size[0], 3), 40 + k, np.uint8))
+        save_image(folder / f"{name}{ending}", np.full((size[1], size[0], 3), 40 + k, np.uint8))
 
 
 def write_masks(folder: Path, names, size=(WIDTH, HEIGHT), value=255) -> None:
@@ -127,7 +129,7 @@ def run(folder: Path, **params):
     out = folder.parent / (folder.name + "_out")
     out.mkdir(exist_ok=True)
     poses.run(poses.Params(**params), out, scene=folder)
-    return io.load_scene(out), out
+    return load_scene(out), out
 
 
 def reprojection_error(scene, truth: Truth) -> float:

@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 from diffusers import UNet2DConditionModel
 
-from reffusion.prior import Prior, make_prior, pipeline
+from reffusion.prior.model import Prior, make_prior, pipeline
 
 TINY = Path(__file__).resolve().parent.parent / "priors" / "tiny"
 

@@ -3,9 +3,13 @@
 import numpy as np
 import torch
 
-from reffusion import geometry, io
-from reffusion.lens import Lens
-from reffusion.surfels import surface_gaussians
+from reffusion import geometry
+from reffusion.capture.lens import Lens
+from reffusion.capture.undistorted import save_lenses
+from reffusion.gaussians.surfels import surface_gaussians
+from reffusion.io.images import load_image, save_image, save_mask
+from reffusion.io.ply import save_ply
+from reffusion.io.scene import save_scene
 from reffusion.types import Camera, Scene, Similarity
 
 WALL, HALF, RIM = 2.0, 0.17, 0.015  # depth of the wall; half the side of the square, and its soft rim; scene units
@@ -86,23 +90,23 @@ def write(folder, square_at: float, masks=None, clean=()):
     points = points[~hidden_everywhere(points, square_at)]
     scene = Scene(dict(CAMERAS), TRAIN, TEST, frozenset(clean), points, np.zeros((len(points), 3), np.uint8),
                   Similarity(1.0, np.zeros(3)))  # fmt: skip
-    io.save_scene(poses, scene)
+    save_scene(poses, scene)
     for name, view in CAMERAS.items():
-        io.save_image(poses / "images" / f"{name}.png", photo(view))
+        save_image(poses / "images" / f"{name}.png", photo(view))
     for name, mask in masks.items():
-        io.save_mask(poses / "masks" / f"{name}.png", mask)
+        save_mask(poses / "masks" / f"{name}.png", mask)
     fit.mkdir(parents=True, exist_ok=True)
     everything, labels = gaussians(square_at)
-    io.save_ply(fit / "gaussians.ply", everything)
+    save_ply(fit / "gaussians.ply", everything)
     return poses, fit, labels
 
 
 def write_photos(scene, poses, cameras) -> None:
     """The scene's own folder that the pictures of a `poses` folder could be from, and what undistorting them takes."""
     for name in cameras:
-        io.save_image(scene / "images" / f"{name}.png", io.load_image(poses / "images" / f"{name}.png"))
+        save_image(scene / "images" / f"{name}.png", load_image(poses / "images" / f"{name}.png"))
     lenses = {n: Lens(c.width, c.height, c.fx, c.fy, c.cx, c.cy) for n, c in cameras.items()}
-    io.save_lenses(poses, lenses, upright=False)
+    save_lenses(poses, lenses, upright=False)
 
 
 def iou(a: np.ndarray, b: np.ndarray) -> float:

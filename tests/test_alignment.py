@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from reffusion.alignment import align, align_depth
+from reffusion.depth.alignment import align, align_depth
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e4])

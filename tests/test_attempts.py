@@ -8,7 +8,11 @@ import pytest
 import small_scene as small
 import torch
 
-from reffusion import io, metrics, splat
+from reffusion.io.images import save_image, save_mask
+from reffusion.io.ply import load_ply
+from reffusion.io.scene import load_mask_sets, save_references
+from reffusion.score import metrics
+from reffusion.splat import rasterizer
 from reffusion.types import Reference
 from stages import distill, initialize, masks
 
@@ -31,12 +35,12 @@ def run(tmp_path_factory):
     folders = {"poses": poses, "fit": fitted, "masks": home / "masks", "reference": home / "reference"}
     masks.run(masks.Params(), home / "masks", poses=poses, fit=fitted)
     view = small.CAMERAS["a2"]
-    invent = io.load_mask_sets(home / "masks", ["a2"])["a2"].invent
-    io.save_references(home / "reference", [Reference(view, small.photo(view), invent)])
+    invent = load_mask_sets(home / "masks", ["a2"])["a2"].invent
+    save_references(home / "reference", [Reference(view, small.photo(view), invent)])
     initialize.run(initialize.Params(), home / "initialize", **folders)
     for name in small.TEST:
-        io.save_image(poses / "images" / f"{name}.png", small.photo(small.CAMERAS[name]))
-        io.save_mask(poses / "test_masks" / f"{name}.png", small.true_mask(small.CAMERAS[name], NEAR))
+        save_image(poses / "images" / f"{name}.png", small.photo(small.CAMERAS[name]))
+        save_mask(poses / "test_masks" / f"{name}.png", small.true_mask(small.CAMERAS[name], NEAR))
     return home
 
 
@@ -57,15 +61,15 @@ def test_a_curve_begins_at_the_initialization_and_ends_where_the_stage_ends(run,
     needs = {name: run / name for name in benchmark.NEEDS}
     distill.run(benchmark.profile(NO_PRIOR), tmp_path, personalize=None, **needs)
     for folder, line in ((run / "initialize", lines[0]), (tmp_path, lines[1])):
-        expected = benchmark.scored(io.load_ply(folder / "gaussians.ply"), views)
+        expected = benchmark.scored(load_ply(folder / "gaussians.ply"), views)
         assert {name: line[name] for name in benchmark.SCORES} == pytest.approx(expected, rel=1e-4)
 
 
 def test_scores_are_those_of_the_box(run):
-    gaussians = io.load_ply(run / "initialize" / "gaussians.ply")
+    gaussians = load_ply(run / "initialize" / "gaussians.ply")
     camera, truth, box = benchmark.test_views(run)[0]
     with torch.no_grad():
-        picture = (splat.render(gaussians, camera).color.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+        picture = (rasterizer.render(gaussians, camera).color.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
     expected = metrics.score_view(picture, truth, box, {}, np.zeros(truth.shape[:2], bool), False)
     found = benchmark.scored(gaussians, [(camera, truth, box)])
     assert found == pytest.approx({name: expected[name] for name in benchmark.SCORES})

@@ -5,7 +5,12 @@ import pytest
 import small_scene
 import torch
 
-from reffusion import beyond, io, metrics, sight, splat
+from reffusion.io.arrays import load_json
+from reffusion.io.images import save_image
+from reffusion.io.ply import load_ply
+from reffusion.io.scene import load_scene, save_scene
+from reffusion.score import beyond, metrics, sight
+from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
 TRAIN = [small_scene.CAMERAS[name] for name in small_scene.TRAIN]
@@ -16,7 +21,7 @@ def wall() -> Gaussians:
 
 
 def picture(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    return splat.render(gaussians, camera).color.clamp(0, 1).numpy()
+    return rasterizer.render(gaussians, camera).color.clamp(0, 1).numpy()
 
 
 def turned(degrees: float) -> Camera:
@@ -45,10 +50,10 @@ def test_beyond_the_capture_the_picture_goes_on_softly_and_seen_pixels_stay():
     for camera in TRAIN:
         assert np.abs(picture(done, camera) - picture(scene, camera)).max() < 0.02
     away = turned(75)
-    assert splat.render(scene, away).alpha.numpy().mean() < 0.5  # black, most of it
-    drawn = splat.render(done, away)
+    assert rasterizer.render(scene, away).alpha.numpy().mean() < 0.5  # black, most of it
+    drawn = rasterizer.render(done, away)
     assert drawn.alpha.min() > 0.95
-    open_ = splat.render(scene, away).alpha.numpy() < 0.01
+    open_ = rasterizer.render(scene, away).alpha.numpy() < 0.01
     colors = drawn.color.numpy()[open_]
     seen = np.concatenate([picture(scene, camera).reshape(-1, 3) for camera in TRAIN])
     assert (colors > seen.min(0) - 0.05).all() and (colors < seen.max(0) + 0.05).all()
@@ -151,19 +156,19 @@ def test_evaluate_counts_the_unseen_apart_and_shows_no_black(tmp_path):
     from stages import evaluate
 
     poses, fit, _ = small_scene.write(tmp_path, 1.0)
-    scene = io.load_scene(poses)
+    scene = load_scene(poses)
     aside = small_scene.camera("t0", 1.0)
     cameras = scene.cameras | {"t0": aside}
-    io.save_scene(poses, type(scene)(**{**scene.__dict__, "cameras": cameras}))
-    io.save_image(poses / "images" / "t0.png", small_scene.photo(aside))
+    save_scene(poses, type(scene)(**{**scene.__dict__, "cameras": cameras}))
+    save_image(poses / "images" / "t0.png", small_scene.photo(aside))
     for name in ("on", "off"):
         (tmp_path / name).mkdir()
         evaluate.run(evaluate.Params(beyond=name == "on"), tmp_path / name, poses=poses, fit=fit)
-    on, off = (io.load_json(tmp_path / name / "metrics.json") for name in ("on", "off"))
+    on, off = (load_json(tmp_path / name / "metrics.json") for name in ("on", "off"))
     assert on["mean"]["unseen_share"] == off["mean"]["unseen_share"] > 0.1
     assert on["mean"]["psnr_outside_seen"] > off["mean"]["psnr_outside_seen"] - 0.05
     assert "unseen_share" in (tmp_path / "on" / "per_view.csv").read_text().splitlines()[0]
     assert "unseen_share" in on["protocol"]["seen"]
     away = turned(75)
-    covered = [splat.render(io.load_ply(tmp_path / name / "scene.ply"), away).alpha.min() for name in ("on", "off")]
+    covered = [rasterizer.render(load_ply(tmp_path / name / "scene.ply"), away).alpha.min() for name in ("on", "off")]
     assert covered[0] > 0.9 and covered[1] < 0.01

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from report import compare as page
-from report import curves, job, pictures, results, scenes
+from report import curves, job, loading, pictures, results, scenes
 from report.paired import half_width, paired, pareto
 from runner.compare import compare
 from runner.job import Request
@@ -392,7 +392,7 @@ def test_report_with_pieces_missing(home):
 
 
 def test_report_of_many_scenes(home):
-    jobs = [job.load_job(path) for path in (home, home.with_name("toy@better"), home.with_name("toy@twin"))]
+    jobs = [loading.load_job(path) for path in (home, home.with_name("toy@better"), home.with_name("toy@twin"))]
     path = scenes.make(jobs, home.parent / "report")
     rows = [line.split(",") for line in (path.parent / "stages.csv").read_text().splitlines()]
     found = {(stage, quantity): [float(value) for value in values] for stage, quantity, *values in rows[1:]}

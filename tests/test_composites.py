@@ -20,7 +20,9 @@ import drawing  # noqa: E402
 import judging  # noqa: E402
 import placing  # noqa: E402
 
-from reffusion import io, lens  # noqa: E402
+from reffusion.capture import lens  # noqa: E402
+from reffusion.io.images import load_image, load_mask, save_image
+from reffusion.io.ply import save_points
 
 WIDTH, HEIGHT = 96, 72
 LENS = {"fl_x": 80.0, "fl_y": 82.0, "cx": 47.0, "cy": 36.5, "k1": 0.05, "k2": -0.03, "p1": 0.002, "p2": -0.001}
@@ -48,12 +50,12 @@ def captures(tmp_path_factory) -> Path:
         matrix = camera_at(angle) @ placing.OPENGL
         frames.append({"file_path": f"images/v{k:02d}.png", "transform_matrix": matrix.tolist()})
         photo = random.integers(60, 200, (HEIGHT, WIDTH, 3), np.uint8)
-        io.save_image(folder / f"small/images/v{k:02d}.png", photo)
+        save_image(folder / f"small/images/v{k:02d}.png", photo)
     frames.append({"file_path": "images/lost.png", "transform_matrix": np.eye(4).tolist()})
     meta = {"w": WIDTH, "h": HEIGHT, "camera_model": "OPENCV", **LENS, "frames": frames}
     (folder / "small/transforms.json").write_text(json.dumps(meta))
     ground = random.uniform(-1.5, 1.5, (4000, 3)) * [1, 0, 1]
-    io.save_points(folder / "small/sparse_pc.ply", ground, np.full((4000, 3), 128, np.uint8))
+    save_points(folder / "small/sparse_pc.ply", ground, np.full((4000, 3), 128, np.uint8))
     return folder
 
 
@@ -63,7 +65,7 @@ def scene_of(captures: Path, out: Path, place=PLACE, **options) -> Path:
 
 
 def masks(scene: Path, folder: str = "masks") -> dict[str, np.ndarray]:
-    return {path.stem: io.load_mask(path) for path in sorted((scene / folder).glob("*.png"))}
+    return {path.stem: load_mask(path) for path in sorted((scene / folder).glob("*.png"))}
 
 
 def through_lens(capture: placing.Photographs, name: str, points: np.ndarray) -> np.ndarray:
@@ -112,7 +114,7 @@ def test_only_masked_pixels_of_training_photographs_change(captures, tmp_path):
     assert yes["reference"]["view"] in train
     for name in (*train, *test):
         photo, truth, before = (
-            io.load_image(folder / f"{name}.png")
+            load_image(folder / f"{name}.png")
             for folder in (scene / "images", scene / "truth", captures / "small/images")
         )
         assert np.array_equal(truth, before)
@@ -126,11 +128,11 @@ def test_a_shadow_darkens_the_ground_outside_the_masks(captures, tmp_path):
     shaded = scene_of(captures, tmp_path / "shaded", shadow=0.6)
     for name, mask in masks(plain).items():
         assert np.array_equal(mask, masks(shaded)[name])
-        before, after = (io.load_image(s / f"images/{name}.png")[~mask].astype(int) for s in (plain, shaded))
+        before, after = (load_image(s / f"images/{name}.png")[~mask].astype(int) for s in (plain, shaded))
         assert (after <= before).all()
         assert (after < 0.6 * before).any(1).sum() > 10
     for name in masks(plain, "test_masks"):
-        assert np.array_equal(*(io.load_image(s / f"images/{name}.png") for s in (plain, shaded)))
+        assert np.array_equal(*(load_image(s / f"images/{name}.png") for s in (plain, shaded)))
 
 
 def test_rough_masks_are_wrong_by_no_more_than_they_may(captures, tmp_path):
@@ -142,7 +144,7 @@ def test_rough_masks_are_wrong_by_no_more_than_they_may(captures, tmp_path):
         assert not (found & (cv2.dilate(mask.astype(np.uint8), far) == 0)).any()
         assert not ((cv2.erode(mask.astype(np.uint8), far) > 0) & ~found).any()
         wrong += (found != mask).any()
-        assert np.array_equal(*(io.load_image(s / f"images/{name}.png") for s in (plain, rough)))
+        assert np.array_equal(*(load_image(s / f"images/{name}.png") for s in (plain, rough)))
     assert wrong >= 4
     exact = masks(plain, "test_masks")
     assert all(np.array_equal(mask, exact[name]) for name, mask in masks(rough, "test_masks").items())
@@ -155,7 +157,7 @@ def test_the_untouched_scene_has_the_same_views_and_nothing_to_remove(captures, 
     assert yaml.safe_load((untouched / "scene.yaml").read_text())["masks"] == "none"
     assert (untouched / "transforms.json").read_text() == (scene / "transforms.json").read_text()
     for name in masks(scene):
-        same = io.load_image(untouched / f"images/{name}.png"), io.load_image(scene / f"truth/{name}.png")
+        same = load_image(untouched / f"images/{name}.png"), load_image(scene / f"truth/{name}.png")
         assert np.array_equal(*same)
     composites.made(PLACE, captures, options, tmp_path)
     assert (untouched / "scene.yaml").stat().st_mtime_ns == told

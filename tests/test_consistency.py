@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from reffusion import consistency
-from reffusion.consistency import Shown
+from reffusion.score import consistency
+from reffusion.score.consistency import Shown
 from reffusion.types import Camera
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import yaml
 
-from reffusion import io
 from reffusion.io import colmap
+from reffusion.io.images import load_image, load_mask
 
 
 @pytest.fixture(scope="module")
@@ -63,13 +63,13 @@ def test_layout_is_spin_nerfs(generate, mini):
     assert len(names) == kind.test + kind.train
     assert stems(mini / "images_4/label") == train
     assert stems(mini / "images_4/test_label") == [f"out_{k:05d}" for k in range(kind.test)]
-    label = io.load_image(mini / f"images_4/label/{train[0]}.png")
+    label = load_image(mini / f"images_4/label/{train[0]}.png")
     assert label.shape[:2] == (kind.height, kind.width)
     assert set(np.unique(label)) == {0, 1}
     scene = yaml.safe_load((mini / "scene.yaml").read_text())
     assert set(scene) == {"reference", "profile"} and scene["profile"] == "laptop"
     assert scene["reference"]["view"] in train
-    assert io.load_image(mini / scene["reference"]["image"]).shape == (kind.height, kind.width, 3)
+    assert load_image(mini / scene["reference"]["image"]).shape == (kind.height, kind.width, 3)
     demo = generate.KINDS["demo"]
     assert (demo.test, demo.train) == (40, 60)
 
@@ -103,7 +103,7 @@ def test_sparse_points_lie_on_what_the_training_views_show(mini):
     model = colmap.load_model_points(mini / "sparse/0/points3D.bin")
     errors = {0: [], 6: []}
     for name in stems(mini / "images_4/label"):
-        image = io.load_image(mini / f"images_4/{name}.png").astype(float)
+        image = load_image(mini / f"images_4/{name}.png").astype(float)
         uv, _ = through_lens(truth, name, model.positions)
         for shift, found in errors.items():
             column, row = np.floor(uv + np.array([shift, 0])).astype(int).T
@@ -115,8 +115,8 @@ def test_sparse_points_lie_on_what_the_training_views_show(mini):
 
 def test_only_masked_pixels_change_when_the_object_goes(generate, mini):
     view = yaml.safe_load((mini / "scene.yaml").read_text())["reference"]["view"]
-    photo, reference = io.load_image(mini / f"images_4/{view}.png"), io.load_image(mini / "reference.png")
-    mask = io.load_mask(mini / f"images_4/label/{view}.png")
+    photo, reference = load_image(mini / f"images_4/{view}.png"), load_image(mini / "reference.png")
+    mask = load_mask(mini / f"images_4/label/{view}.png")
     assert np.array_equal(photo[~mask], reference[~mask])
     assert (photo[mask] != reference[mask]).any(1).mean() > 0.9
 
@@ -134,8 +134,8 @@ def test_test_views_are_without_the_object(generate, mini):
     middle = np.argmin(np.linalg.norm(train[:, 13:] - train[:, 13:].mean(0), axis=1))
     world = photographs.exposed(world, train[middle], kind)
     for k, name in enumerate(stems(mini / "images_4")[: kind.test]):
-        photo = io.load_image(mini / f"images_4/{name}.png")
-        mask = io.load_mask(mini / f"images_4/test_label/out_{k:05d}.png")
+        photo = load_image(mini / f"images_4/{name}.png")
+        mask = load_mask(mini / f"images_4/test_label/out_{k:05d}.png")
         with_object, _ = photographs.shoot(world, test[k], kind, True)
         assert np.array_equal(photo[~mask], with_object[~mask])
         assert (photo[mask] != with_object[mask]).any(1).mean() > 0.9
@@ -151,10 +151,10 @@ def test_never_seen_pixels_are_never_seen(generate, mini):
     furniture, target = generate.furnish(0, kind)
     world, frame = generate.bake(furniture, 0, kind), generate.scene_frame(0)
     cameras = photographs.path(0, kind, target, kind.test, "test")
-    training = {name: io.load_mask(mini / f"images_4/label/{name}.png") for name in stems(mini / "images_4/label")}
+    training = {name: load_mask(mini / f"images_4/label/{name}.png") for name in stems(mini / "images_4/label")}
     for k, name in enumerate(stems(mini / "images_4")[: kind.test]):
-        mask = io.load_mask(mini / f"images_4/test_label/out_{k:05d}.png")
-        never = io.load_mask(mini / f"truth/never_seen/{name}.png")
+        mask = load_mask(mini / f"images_4/test_label/out_{k:05d}.png")
+        never = load_mask(mini / f"truth/never_seen/{name}.png")
         assert not (never & ~mask).any()
         points, _ = raycast.surface_points(world.solids, cameras[k], photographs.pixel_centers(mask), False)
         back, _ = through_lens(truth, name, frame.points(points))

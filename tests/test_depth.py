@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from reffusion import bilateral, depth, planes
-from reffusion.depth import Plate
-from reffusion.trace import generator
+from reffusion.depth import bilateral, completion, planes
+from reffusion.depth.completion import Plate
+from reffusion.seeding import generator
 
 ROWS, COLUMNS = np.mgrid[:48, :64].astype(float)
 PLANE = 0.4 + 0.003 * COLUMNS - 0.002 * ROWS
@@ -27,21 +27,21 @@ def hidden(disparity, hole, filler=9.0):
 @pytest.mark.parametrize("hole", [INNER, INNER | ((ROWS < 20) & (COLUMNS > 30)), COLUMNS > 10])
 def test_a_plane_is_continued_to_rounding(hole, textured):
     guide = np.random.default_rng(0).random((48, 64, 3)) if textured else None
-    completed = depth.complete(hidden(PLANE, hole), ~hole, guide)
+    completed = completion.complete(hidden(PLANE, hole), ~hole, guide)
     np.testing.assert_allclose(completed, PLANE, rtol=1e-12)
 
 
 def test_known_pixels_are_returned_as_they_are():
     noisy = PLANE + 0.01 * np.random.default_rng(0).normal(size=PLANE.shape)
-    completed = depth.complete(noisy, ~INNER)
+    completed = completion.complete(noisy, ~INNER)
     assert (completed == noisy)[~INNER].all()
     assert np.abs(completed - PLANE)[INNER].max() < 0.03
 
 
 def test_a_crease_that_the_guide_shows_is_continued():
     disparity, picture = corner()
-    with_guide = np.abs(depth.complete(hidden(disparity, INNER), ~INNER, picture) - disparity)[INNER]
-    without = np.abs(depth.complete(hidden(disparity, INNER), ~INNER) - disparity)[INNER]
+    with_guide = np.abs(completion.complete(hidden(disparity, INNER), ~INNER, picture) - disparity)[INNER]
+    without = np.abs(completion.complete(hidden(disparity, INNER), ~INNER) - disparity)[INNER]
     assert with_guide.max() < 2e-3 < 0.02 < without.max()
 
 
@@ -50,20 +50,20 @@ def test_two_holes_do_not_disturb_each_other():
     hole = left & (COLUMNS > 6) & (ROWS > 10) & (ROWS < 30) | right
     disparity = np.where(COLUMNS > 40, 1.0 + 0.01 * ROWS, PLANE)
     np.testing.assert_allclose(
-        depth.complete(hidden(disparity, hole), ~hole, plate=Plate(ring=0.04)), disparity, rtol=1e-10
+        completion.complete(hidden(disparity, hole), ~hole, plate=Plate(ring=0.04)), disparity, rtol=1e-10
     )
 
 
 def test_the_coarse_path_agrees_with_the_fine_one():
     disparity = PLANE + 0.01 * np.sin(COLUMNS / 15) * np.cos(ROWS / 20)
-    fine = depth.complete(disparity, ~INNER)
-    coarse = depth.complete(disparity, ~INNER, plate=Plate(most_unknowns=400))
+    fine = completion.complete(disparity, ~INNER)
+    coarse = completion.complete(disparity, ~INNER, plate=Plate(most_unknowns=400))
     assert np.abs(fine - coarse).max() < 3e-4
-    np.testing.assert_allclose(depth.complete(PLANE, ~INNER, plate=Plate(most_unknowns=400)), PLANE, rtol=1e-12)
+    np.testing.assert_allclose(completion.complete(PLANE, ~INNER, plate=Plate(most_unknowns=400)), PLANE, rtol=1e-12)
 
 
 def test_nothing_to_complete_is_a_copy():
-    completed = depth.complete(PLANE, np.ones(PLANE.shape))
+    completed = completion.complete(PLANE, np.ones(PLANE.shape))
     assert (completed == PLANE).all() and completed is not PLANE
 
 
@@ -73,16 +73,16 @@ def test_too_few_known_pixels_are_refused(known):
     for pixel in known:
         confidence[pixel] = 1.0
     with pytest.raises(ValueError, match="fix no plane"):
-        depth.complete(PLANE, confidence)
+        completion.complete(PLANE, confidence)
 
 
 def test_bad_arrays_are_refused():
     with pytest.raises(ValueError, match="not finite on known"):
-        depth.complete(np.where(INNER, PLANE, np.nan), np.ones(PLANE.shape))
+        completion.complete(np.where(INNER, PLANE, np.nan), np.ones(PLANE.shape))
     with pytest.raises(ValueError, match="guide is"):
-        depth.complete(PLANE, ~INNER, np.zeros((4, 4, 3)))
+        completion.complete(PLANE, ~INNER, np.zeros((4, 4, 3)))
     with pytest.raises(ValueError, match="not negative"):
-        depth.complete(PLANE, -1.0 * INNER)
+        completion.complete(PLANE, -1.0 * INNER)
     with pytest.raises(ValueError, match="no pixel of positive confidence"):
         bilateral.solve(PLANE, np.zeros(PLANE.shape), np.zeros((48, 64, 3), np.uint8))
 

@@ -6,17 +6,20 @@ import numpy as np
 import pytest
 import torch
 
-from reffusion import behind, depth_term, inpaint
-from reffusion import distill as D
-from reffusion.alignment import align
-from reffusion.behind import Completion
-from reffusion.confinement import Sight
-from reffusion.depth_term import DepthRegularization
+from reffusion.depth import behind
+from reffusion.depth.alignment import align
+from reffusion.depth.behind import Completion
+from reffusion.distill import depth_term
+from reffusion.distill import optimization as D
+from reffusion.distill.confinement import Sight
+from reffusion.distill.depth_term import DepthRegularization
+from reffusion.gaussians.optimize import GaussianOptimizer, Rates
+from reffusion.gaussians.surfels import surface_gaussians
 from reffusion.geometry import Degenerate
-from reffusion.optimize import GaussianOptimizer, Rates
-from reffusion.splat import render
-from reffusion.surfels import surface_gaussians
-from reffusion.trace import generator, load_checkpoint, read_trace
+from reffusion.prior import inpaint
+from reffusion.seeding import generator
+from reffusion.splat.rasterizer import render
+from reffusion.trace import load_checkpoint, read_trace
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
 WIDTH, HEIGHT, FOCAL = 32, 24, 30.0

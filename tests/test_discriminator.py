@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from reffusion.adversary import Adversarial, Adversary
-from reffusion.confinement import patches_around
-from reffusion.discriminator import (
+from reffusion.distill.adversary import Adversarial, Adversary
+from reffusion.distill.confinement import patches_around
+from reffusion.distill.discriminator import (
     Critic,
     binomial,
     critic_loss,
@@ -17,8 +17,8 @@ from reffusion.discriminator import (
     gradient_penalty,
     with_deviation,
 )
-from reffusion.sds import window_around, windows_around
-from reffusion.trace import generator
+from reffusion.prior.windows import window_around, windows_around
+from reffusion.seeding import generator
 
 SMALL = Adversarial(patches=16, size=8, width=8, rate=3e-3)
 

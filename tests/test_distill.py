@@ -9,10 +9,9 @@ import torch
 from small_prior import save_small_prior
 from small_scene import write_photos
 
-from reffusion import distill as D
-from reffusion import inpaint, io, splat
-from reffusion.adversary import Adversarial, Adversary
-from reffusion.confinement import (
+from reffusion.distill import optimization as D
+from reffusion.distill.adversary import Adversarial, Adversary
+from reffusion.distill.confinement import (
     Distillation,
     Sight,
     adversarial_term,
@@ -22,10 +21,17 @@ from reffusion.confinement import (
     sds_term,
     strays,
 )
-from reffusion.optimize import Rates
-from reffusion.splat import render
-from reffusion.steps import near_a_reference
-from reffusion.trace import generator, load_checkpoint, read_trace
+from reffusion.distill.steps import near_a_reference
+from reffusion.gaussians.optimize import Rates
+from reffusion.io.arrays import load_labels, save_json, save_labels
+from reffusion.io.images import load_image, load_mask, save_image
+from reffusion.io.ply import load_ply, save_ply
+from reffusion.io.scene import load_mask_sets, load_references, load_scene, save_mask_sets, save_scene
+from reffusion.prior import inpaint
+from reffusion.seeding import generator
+from reffusion.splat import rasterizer
+from reffusion.splat.rasterizer import render
+from reffusion.trace import load_checkpoint, read_trace
 from reffusion.types import PARAMETERS, Camera, Gaussians, MaskSet, Scene, Similarity
 
 WIDTH, HEIGHT = 36, 28
@@ -258,7 +264,7 @@ def test_distillation_may_reach_the_background_too_but_not_what_does_not_show(pr
     plain = replace(SETTINGS, adversarial=None, densify_every=0, reference_weight=0.0, region_every=100, iterations=2)
     settings, view = replace(plain, reconstruction_every=0, sds_reaches="all"), sight("a")
     moved = changed(start, run(tmp_path / "all", prior, text, settings, [view])[0])
-    shown = splat.accumulate(start, view.camera, torch.ones(*hole().shape, 1))[:, 0] > 0
+    shown = rasterizer.accumulate(start, view.camera, torch.ones(*hole().shape, 1))[:, 0] > 0
     assert (moved & masked).any() and (moved & ~masked).any() and not (moved & ~shown).any()
 
 
@@ -280,7 +286,7 @@ def test_photographs_may_reach_the_masked_gaussians_that_show_outside_the_hole(t
     start, masked = wall()
     plain = replace(SETTINGS, adversarial=None, densify_every=0, sds_weight=0.0, reference_weight=0.0, region_every=100)
     view = sight("a")
-    outside = splat.accumulate(start, view.camera, (~hole())[..., None].float())[:, 0] > 0
+    outside = rasterizer.accumulate(start, view.camera, (~hole())[..., None].float())[:, 0] > 0
     assert (masked & outside).any() and (masked & ~outside).any()
     for reaches in ("unmasked", "shown"):
         settings = replace(plain, iterations=2, reconstruction_reaches=reaches)
@@ -409,17 +415,17 @@ def folders(tmp_path):
     paths = {name: tmp_path / name for name in names}
     for path in paths.values():
         path.mkdir()
-    io.save_scene(paths["poses"], scene)
+    save_scene(paths["poses"], scene)
     for name, view in cameras.items():
-        io.save_image(paths["poses"] / "images" / f"{name}.png", render(gaussians, view).color.clamp(0, 1).numpy())
+        save_image(paths["poses"] / "images" / f"{name}.png", render(gaussians, view).color.clamp(0, 1).numpy())
     write_photos(paths["scene"], paths["poses"], cameras)
     pixels = hole().numpy()
-    io.save_mask_sets(paths["masks"], {name: MaskSet(pixels, pixels, pixels, pixels) for name in cameras})
-    io.save_json(paths["masks"] / "facts.json", {"best_reference": "b"})
-    io.save_labels(paths["masks"] / "labels.npy", masked)
-    io.save_labels(paths["initialize"] / "labels.npy", masked)
+    save_mask_sets(paths["masks"], {name: MaskSet(pixels, pixels, pixels, pixels) for name in cameras})
+    save_json(paths["masks"] / "facts.json", {"best_reference": "b"})
+    save_labels(paths["masks"] / "labels.npy", masked)
+    save_labels(paths["initialize"] / "labels.npy", masked)
     for stage in ("fit", "initialize"):
-        io.save_ply(paths[stage] / "gaussians.ply", gaussians)
+        save_ply(paths[stage] / "gaussians.ply", gaussians)
     save_small_prior(tmp_path / "prior")
     return paths | {"prior": str(tmp_path / "prior")}
 
@@ -431,13 +437,13 @@ def pick(folders, *names):
 def test_stages_chain_through_files_with_the_scenes_own_reference(folders):
     from stages import distill, personalize, reference
 
-    given = io.load_image(folders["poses"] / "images" / "a.png")
-    io.save_image(folders["scene"] / "done" / "a.png", given)
+    given = load_image(folders["poses"] / "images" / "a.png")
+    save_image(folders["scene"] / "done" / "a.png", given)
     params = reference.Params(prior="nowhere/at-all", reference={"view": "a", "image": "done/a.png"})
     assert "reference a:" in reference.preview(params, scene=folders["scene"])[0]
     reference.run(params, folders["reference"], **pick(folders, "scene", "poses", "fit", "masks"))
-    assert (io.load_image(folders["reference"] / "references" / "a.png") == given).all()
-    assert (io.load_mask(folders["reference"] / "masks" / "a.png") == hole().numpy()).all()
+    assert (load_image(folders["reference"] / "references" / "a.png") == given).all()
+    assert (load_mask(folders["reference"] / "masks" / "a.png") == hole().numpy()).all()
 
     learning = personalize.Params(prior=folders["prior"], steps=2, batch=2, scene_crops=0.3, size=8)
     personalize.run(learning, folders["personalize"], **pick(folders, "poses", "fit", "masks", "reference"))
@@ -446,8 +452,8 @@ def test_stages_chain_through_files_with_the_scenes_own_reference(folders):
     needs = pick(folders, "poses", "fit", "masks", "reference", "personalize", "initialize")
     critic = {"adversarial_patches": 4, "adversarial_size": 8, "adversarial_width": 4}
     distill.run(distill.Params(prior=folders["prior"], iterations=2, **critic), folders["distill"], **needs)
-    result = io.load_ply(folders["distill"] / "gaussians.ply")
-    labels = io.load_labels(folders["distill"] / "labels.npy")
+    result = load_ply(folders["distill"] / "gaussians.ply")
+    labels = load_labels(folders["distill"] / "labels.npy")
     assert len(result) == len(labels) and labels.any()
     for stage in ("personalize", "distill"):
         assert read_trace(folders[stage] / "trace.jsonl") and not (folders[stage] / "checkpoint.pt").exists()
@@ -458,10 +464,10 @@ def test_reference_inpaints_the_best_view_and_keeps_all_else(folders):
 
     params = reference.Params(prior=folders["prior"], candidates=2, steps=2)
     reference.run(params, folders["reference"], **pick(folders, "scene", "poses", "fit", "masks"))
-    (found,) = io.load_references(folders["reference"], io.load_scene(folders["poses"]))
-    photo = io.load_image(folders["poses"] / "images" / "b.png")
+    (found,) = load_references(folders["reference"], load_scene(folders["poses"]))
+    photo = load_image(folders["poses"] / "images" / "b.png")
     assert found.camera.name == "b" and (found.image[~found.mask] == photo[~found.mask]).all()
-    assert io.load_image(folders["reference"] / "candidates.png").shape == (HEIGHT, 2 * WIDTH, 3)
+    assert load_image(folders["reference"] / "candidates.png").shape == (HEIGHT, 2 * WIDTH, 3)
     record = json.loads((folders["reference"] / "candidates.json").read_text())
     assert record["chosen"] == int(np.argmin(record["seams"]))
     with pytest.raises(ValueError, match="choose"):
@@ -477,7 +483,7 @@ def test_a_reference_made_of_pieces_of_itself_needs_no_prior(folders, tmp_path):
     (note,) = reference.preview(params, scene=folders["scene"])
     assert "a vase" in note and "not read" in note
     reference.run(params, folders["reference"], **pick(folders, "scene", "poses", "fit", "masks"))
-    (found,) = io.load_references(folders["reference"], io.load_scene(folders["poses"]))
-    photo = io.load_image(folders["poses"] / "images" / "b.png")
-    rim = io.load_mask_sets(folders["masks"], ["b"])["b"].consistent
+    (found,) = load_references(folders["reference"], load_scene(folders["poses"]))
+    photo = load_image(folders["poses"] / "images" / "b.png")
+    rim = load_mask_sets(folders["masks"], ["b"])["b"].consistent
     assert found.mask.any() and (found.image[~found.mask & ~rim] == photo[~found.mask & ~rim]).all()

@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from reffusion import beyond, io, metrics, sight, trace
-from reffusion.paint2d import widened
+from reffusion import seeding
+from reffusion.io.arrays import load_json, save_json
+from reffusion.io.images import load_image, save_image, save_mask
+from reffusion.io.ply import load_ply, save_ply
+from reffusion.io.scene import load_scene, save_mask_sets, save_scene
+from reffusion.paint.paint2d import widened
+from reffusion.score import beyond, metrics, sight
 from reffusion.types import Camera, Gaussians, MaskSet, Scene, Similarity
 from report import sheet
 from stages import evaluate
@@ -25,7 +30,7 @@ def camera(name, shift):
 
 
 def blobs(count, seed=0):
-    generator = trace.generator(seed, "blobs")
+    generator = seeding.generator(seed, "blobs")
     draw = lambda *shape: torch.rand(*shape, generator=generator)
     means = torch.cat([draw(count, 2) * 1.6 - 0.8, 1.5 + draw(count, 1)], 1)
     return Gaussians(means, draw(count, 4) - 0.5, draw(count, 3) - 3.2, 3 * draw(count), draw(count, 4, 3) - 0.5)
@@ -46,20 +51,20 @@ def write_stages(home):
     )
     made = {name: home / name for name in ("poses", "fit", "masks", "reference", "initialize", "distill")}
     rng = np.random.default_rng(0)
-    io.save_scene(made["poses"], scene)
+    save_scene(made["poses"], scene)
     for name in names:
-        io.save_image(made["poses"] / "images" / f"{name}.png", rng.random((HEIGHT, WIDTH, 3)))
+        save_image(made["poses"] / "images" / f"{name}.png", rng.random((HEIGHT, WIDTH, 3)))
     mask, empty = np.zeros((HEIGHT, WIDTH), bool), np.zeros((HEIGHT, WIDTH), bool)
     mask[10:30, 5:35] = True
-    io.save_mask(made["poses"] / "test_masks" / "view0.png", mask)
-    io.save_mask(made["poses"] / "test_masks" / "view1.png", empty)
+    save_mask(made["poses"] / "test_masks" / "view0.png", mask)
+    save_mask(made["poses"] / "test_masks" / "view1.png", empty)
     other = np.zeros_like(mask)
     other[4:24, 20:48] = True
-    io.save_mask_sets(made["masks"], {name: MaskSet(empty, other, empty, empty) for name in names})
+    save_mask_sets(made["masks"], {name: MaskSet(empty, other, empty, empty) for name in names})
     for stage, count in (("fit", 60), ("initialize", 40), ("distill", 50)):
-        io.save_ply(made[stage] / "gaussians.ply", blobs(count))
+        save_ply(made[stage] / "gaussians.ply", blobs(count))
     for stage, seconds in (("fit", 12.5), ("distill", 3.0)):
-        io.save_json(made[stage] / "receipt.json", {"seconds": seconds})
+        save_json(made[stage] / "receipt.json", {"seconds": seconds})
     return made
 
 
@@ -87,18 +92,18 @@ def done(tmp_path_factory):
 
 def test_scores_are_those_of_the_saved_pictures(done):
     out = done / "evaluate"
-    summary = io.load_json(out / "metrics.json")
-    cameras = io.load_scene(done / "poses").cameras
+    summary = load_json(out / "metrics.json")
+    cameras = load_scene(done / "poses").cameras
     boxes = {"view0": metrics.Box(2, 8, 38, 32), "view1": None, "view2": metrics.Box(17, 2, 48, 26)}
-    train = [cameras[name] for name in io.load_scene(done / "poses").train]
-    fit = io.load_ply(done / "fit" / "gaussians.ply")
+    train = [cameras[name] for name in load_scene(done / "poses").train]
+    fit = load_ply(done / "fit" / "gaussians.ply")
     hidden = {camera.name: evaluate.mask_of(camera, done / "poses", done / "masks") for camera in train}
     seen_by = sight.witnesses(fit, train, hidden)
     for kind, renders in (("mean", "renders"), ("initialize", "renders_initialize")):
         rows = [
             metrics.score_view(
-                io.load_image(out / renders / f"{name}.png"),
-                io.load_image(done / "poses" / "images" / f"{name}.png"),
+                load_image(out / renders / f"{name}.png"),
+                load_image(done / "poses" / "images" / f"{name}.png"),
                 box,
                 mask=widened(evaluate.mask_of(cameras[name], done / "poses", done / "masks"), 0.01),
                 unseen=sight.unseen(fit, cameras[name], seen_by),
@@ -119,12 +124,12 @@ def test_scores_are_those_of_the_saved_pictures(done):
     assert table[0]["left"] == "2" and table[1]["left"] == "" and table[1]["psnr_box"] == ""
     box_scores = [float(row["psnr_box"]) for row in table if row["psnr_box"]]
     assert np.mean(box_scores) == pytest.approx(summary["mean"]["psnr_box"])
-    assert io.load_image(out / "side_by_side" / "view0.png").shape == (HEIGHT, 3 * WIDTH + 8, 3)
+    assert load_image(out / "side_by_side" / "view0.png").shape == (HEIGHT, 3 * WIDTH + 8, 3)
 
 
 def test_the_scene_is_exported_in_its_own_frame(done):
-    exported, result = io.load_ply(done / "evaluate" / "scene.ply"), io.load_ply(done / "distill" / "gaussians.ply")
-    scene = io.load_scene(done / "poses")
+    exported, result = load_ply(done / "evaluate" / "scene.ply"), load_ply(done / "distill" / "gaussians.ply")
+    scene = load_scene(done / "poses")
     result = beyond.completed(result, [scene.cameras[name] for name in scene.train])
     back = SIMILARITY.apply(exported.means.double().numpy())
     # 500 km away a float of the scene's own frame is worth 0.03 units, 6e-4 of the normalised frame.
@@ -135,8 +140,8 @@ def test_the_scene_is_exported_in_its_own_frame(done):
 
 def test_an_identical_view_is_infinite_in_the_table_and_capped_in_the_mean(done, tmp_path, folders):
     for view in ("view0", "view1", "view2"):
-        picture = io.load_image(done / "evaluate" / "renders" / f"{view}.png")
-        io.save_image(folders["poses"] / "images" / f"{view}.png", picture)
+        picture = load_image(done / "evaluate" / "renders" / f"{view}.png")
+        save_image(folders["poses"] / "images" / f"{view}.png", picture)
     summary = run(tmp_path / "again", folders)
     assert summary["mean"]["psnr_full"] == summary["mean"]["psnr_box"] == metrics.PSNR_CAP
     assert summary["mean"]["flip_full"] == 0.0 and summary["mean"]["ssim_box"] == pytest.approx(1.0)
@@ -159,16 +164,16 @@ def test_nothing_removed_scores_the_fit_on_the_full_image(tmp_path, folders):
 
 
 def test_without_test_views_the_training_cameras_are_rendered_and_not_scored(tmp_path, folders):
-    scene = io.load_scene(folders["poses"])
+    scene = load_scene(folders["poses"])
     every = tuple(scene.cameras)
     untested = Scene(scene.cameras, every, (), scene.clean, scene.points, scene.point_colors, scene.similarity)
-    io.save_scene(folders["poses"], untested)
+    save_scene(folders["poses"], untested)
     out = tmp_path / "out"
     summary = run(out, folders)
     assert summary["rendered"] == "8 training views"
     assert set(summary["mean"].values()) == {None} and set(summary["views"].values()) == {0}
     assert sorted(path.stem for path in (out / "renders").iterdir()) == list(every)
-    assert io.load_image(out / "side_by_side" / "view0.png").shape[1] == 2 * WIDTH + 4
+    assert load_image(out / "side_by_side" / "view0.png").shape[1] == 2 * WIDTH + 4
     assert len((out / "per_view.csv").read_text().splitlines()) == 9
 
 
@@ -183,7 +188,7 @@ def test_a_test_view_without_picture_is_rendered_and_one_of_another_size_refused
     picture.unlink()
     summary = run(tmp_path / "out", folders)
     assert summary["views"]["psnr_full"] == 2 and (tmp_path / "out" / "renders" / "view1.png").exists()
-    io.save_image(picture, np.zeros((HEIGHT, WIDTH + 1, 3)))
+    save_image(picture, np.zeros((HEIGHT, WIDTH + 1, 3)))
     with pytest.raises(ValueError, match=r"view1.png: 49x36 px, its camera 48x36"):
         run(tmp_path / "again", folders)
 
@@ -198,7 +203,7 @@ def test_a_held_out_view_that_shows_the_object_is_scored_outside_its_mask_only(t
     assert row["view"] == "view0" and row["psnr_box"] == "" and row["left"] == "2"
     mask = np.zeros((HEIGHT, WIDTH), bool)
     mask[8:32, 3:37] = True  # 2 px wider, a disk at its corners
-    picture, truth = (io.load_image(p / "view0.png") for p in (tmp_path / "out/renders", folders["poses"] / "images"))
+    picture, truth = (load_image(p / "view0.png") for p in (tmp_path / "out/renders", folders["poses"] / "images"))
     nearly = metrics.outside(picture, truth, mask)
     assert float(row["psnr_outside"]) == pytest.approx(nearly["psnr_outside"], abs=0.05)
     assert summary["protocol"]["outside_margin"] == 0.05
@@ -206,8 +211,8 @@ def test_a_held_out_view_that_shows_the_object_is_scored_outside_its_mask_only(t
 
 def test_the_contact_sheet_shows_each_picture_enlarged_without_blur(done, tmp_path):
     path = sheet.make(done, tmp_path / "sheet.png", views=["view0", "view2"], scale=3)
-    picture = io.load_image(path)
-    ours = np.kron(io.load_image(done / "evaluate" / "renders" / "view2.png"), np.ones((3, 3, 1), np.uint8))
+    picture = load_image(path)
+    ours = np.kron(load_image(done / "evaluate" / "renders" / "view2.png"), np.ones((3, 3, 1), np.uint8))
     bottom, right = (size - sheet.GAP for size in picture.shape[:2])
     assert (picture[bottom - 3 * HEIGHT : bottom, right - 3 * WIDTH : right] == ours).all()
 

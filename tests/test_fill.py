@@ -6,7 +6,7 @@ import torch
 from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import spsolve
 
-from reffusion.fill import extended
+from reffusion.prior.fill import extended
 
 
 def disc(height, width, radius):

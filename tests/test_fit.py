@@ -8,13 +8,18 @@ import numpy as np
 import pytest
 import torch
 
-from reffusion import exposure, fit_step, io, trace
-from reffusion import fit as fitting
-from reffusion.fit import fit
-from reffusion.fit_step import Settings
-from reffusion.optimize import Rates
-from reffusion.splat import render
-from reffusion.start import initial_gaussians
+from reffusion import seeding, trace
+from reffusion.fit import exposure, step
+from reffusion.fit import reconstruction as fitting
+from reffusion.fit.reconstruction import fit
+from reffusion.fit.start import initial_gaussians
+from reffusion.fit.step import Settings
+from reffusion.gaussians.optimize import Rates
+from reffusion.io.arrays import load_json
+from reffusion.io.images import save_image
+from reffusion.io.ply import load_ply, save_ply
+from reffusion.io.scene import load_views, save_scene
+from reffusion.splat.rasterizer import render
 from reffusion.types import PARAMETERS, Camera, Gaussians, Scene, Similarity
 
 WIDTH, HEIGHT = 22, 16
@@ -46,7 +51,7 @@ def normalised(camera: Camera, similarity: Similarity) -> Camera:
 
 def truth() -> Gaussians:
     draw = lambda *shape: torch.randn(*shape, generator=generator)
-    generator = trace.generator(5, "truth")
+    generator = seeding.generator(5, "truth")
     return Gaussians(draw(40, 3) * 0.2, draw(40, 4), -2.5 + 0.3 * draw(40, 3), 2 + draw(40), draw(40, 1, 3))
 
 
@@ -58,7 +63,7 @@ def photos(cameras) -> dict[str, np.ndarray]:
 def start(points=None, degree: int = 1) -> Gaussians:
     points = truth().means.numpy().astype(np.float64) if points is None else points
     colors = np.full((len(points), 3), 128, np.uint8)
-    return initial_gaussians(points, colors, degree, 1000, trace.generator(0))
+    return initial_gaussians(points, colors, degree, 1000, seeding.generator(0))
 
 
 def run(folder, cameras=None, initial=None, settings=SETTINGS, **given) -> Gaussians:
@@ -108,7 +113,7 @@ def test_a_resumed_fit_is_the_unbroken_one_bit_for_bit(tmp_path, monkeypatch, se
     drop = lambda lines: [{k: v for k, v in line.items() if k != "seconds"} for line in lines]
     assert drop(broken) == drop(whole)
     if settings.exposure:
-        first, second = (io.load_json(tmp_path / k / exposure.FILE) for k in ("unbroken", "resumed"))
+        first, second = (load_json(tmp_path / k / exposure.FILE) for k in ("unbroken", "resumed"))
         assert first == second
 
 
@@ -120,8 +125,8 @@ def test_exposures_are_found_and_taken_out_again(tmp_path):
     poses = tmp_path / "poses"
     for camera, gain in zip(cameras, gains, strict=True):
         changed = (pictures[camera.name] * np.array([gain, 1.0, 2 - gain]) + 8 * (gain - 1)).clip(0, 255)
-        io.save_image(poses / "images" / f"{camera.name}.png", changed.round().astype(np.uint8))
-    shown = io.load_views(poses, [c.name for c in cameras]) | {held.name: pictures[held.name]}
+        save_image(poses / "images" / f"{camera.name}.png", changed.round().astype(np.uint8))
+    shown = load_views(poses, [c.name for c in cameras]) | {held.name: pictures[held.name]}
     settings = replace(SETTINGS, iterations=2000, densify_until=0.3, reset_every=0, random_background=False)
     scores = []
     for on in (False, True):
@@ -132,7 +137,7 @@ def test_exposures_are_found_and_taken_out_again(tmp_path):
     assert scores[1] > scores[0] + 2
     away = lambda views: np.mean([np.abs(v.astype(float) - pictures[n]).mean() for n, v in views.items()])
     names = [c.name for c in cameras]
-    assert away(exposure.load_views(poses, tmp_path / "True", names)) < 0.3 * away(io.load_views(poses, names))
+    assert away(exposure.load_views(poses, tmp_path / "True", names)) < 0.3 * away(load_views(poses, names))
     for view, image in exposure.load_views(poses, tmp_path / "False", names).items():
         assert np.array_equal(image, shown[view])
     assert exposure.normalised(pictures[held.name], tmp_path / "True", held.name) is pictures[held.name]
@@ -140,9 +145,9 @@ def test_exposures_are_found_and_taken_out_again(tmp_path):
 
 def test_exposures_stay_the_identity_on_average():
     exposures = exposure.Exposures(["a", "b", "c"])
-    for step in range(5):
+    for k in range(5):
         (exposures.apply(torch.full((2, 2, 3), 0.5), "a") - 1).square().sum().backward()
-        exposures.step(step / 5)
+        exposures.step(k / 5)
     matrices = exposures.state_dict()["matrices"]
     mean = torch.stack(list(matrices.values())).mean(0)
     torch.testing.assert_close(mean, torch.eye(3, 4), atol=1e-6, rtol=0)
@@ -197,7 +202,7 @@ def test_what_is_not_finite_stops_and_is_named(tmp_path, monkeypatch, broken):
     def burst(image, target, weights=None, share=0.2):
         return image.sum() * float("inf")
 
-    monkeypatch.setattr(fit_step, "reconstruction_loss", burst)
+    monkeypatch.setattr(step, "reconstruction_loss", burst)
     with pytest.raises(FloatingPointError, match=r"step 0, view 'view\d': the reconstruction loss"):
         run(tmp_path)
 
@@ -219,15 +224,15 @@ def test_wrong_input_is_refused_before_any_work(tmp_path):
 def test_the_start_has_the_points_colours_and_spacing():
     grid = np.stack(np.meshgrid(*[np.arange(4) * 0.1] * 3), -1).reshape(-1, 3)
     colors = np.tile(np.array([[10, 128, 250]], np.uint8), (64, 1))
-    gaussians = initial_gaussians(grid, colors, 2, 1000, trace.generator(0))
+    gaussians = initial_gaussians(grid, colors, 2, 1000, seeding.generator(0))
     assert torch.allclose(gaussians.log_scales.exp(), torch.tensor(0.1), rtol=1e-5)
     assert torch.allclose(0.5 + 0.28209479 * gaussians.sh[:, 0], torch.tensor([10, 128, 250]) / 255, atol=1e-6)
     assert torch.allclose(gaussians.opacity_logits.sigmoid(), torch.tensor(0.1))
     assert gaussians.sh.shape == (64, 9, 3) and torch.all(gaussians.sh[:, 1:] == 0)
-    assert len(initial_gaussians(grid, colors, 0, 20, trace.generator(0))) == 20
+    assert len(initial_gaussians(grid, colors, 0, 20, seeding.generator(0))) == 20
     with pytest.raises(ValueError, match="at least 4; the scene has 3"):
-        initial_gaussians(grid[:3], colors[:3], 0, 9, trace.generator(0))
-    coincident = initial_gaussians(np.zeros((5, 3)), colors[:5], 0, 9, trace.generator(0))
+        initial_gaussians(grid[:3], colors[:3], 0, 9, seeding.generator(0))
+    coincident = initial_gaussians(np.zeros((5, 3)), colors[:5], 0, 9, seeding.generator(0))
     assert torch.isfinite(coincident.log_scales).all()
 
 
@@ -241,9 +246,9 @@ def write_scene(folder) -> None:
         points=points, point_colors=np.full((len(points), 3), 128, np.uint8),
         similarity=Similarity(1.0, np.zeros(3)),
     )  # fmt: skip
-    io.save_scene(folder, scene)
+    save_scene(folder, scene)
     for name in scene.train:  # the test view has no picture here: reading it would fail
-        io.save_image(folder / "images" / f"{name}.png", pictures[name])
+        save_image(folder / "images" / f"{name}.png", pictures[name])
 
 
 def test_the_stage_writes_its_artifact_and_never_reads_test_views(tmp_path):
@@ -254,7 +259,7 @@ def test_the_stage_writes_its_artifact_and_never_reads_test_views(tmp_path):
     out.mkdir()
     params = stage.Params(iterations=10, budget=150, sh_degree=1, holdout=4)
     stage.run(params, out, poses=poses)
-    fitted = io.load_ply(out / "gaussians.ply")
+    fitted = load_ply(out / "gaussians.ply")
     assert 0 < len(fitted) <= 150 and fitted.sh_degree == 1
     assert "psnr_held_out" in trace.read_trace(out / "trace.jsonl")[-1]
     assert trace.load_checkpoint(out) is None
@@ -262,7 +267,7 @@ def test_the_stage_writes_its_artifact_and_never_reads_test_views(tmp_path):
 
 
 def test_the_stage_starts_from_flow_points_of_the_views_it_fits(tmp_path, capsys, monkeypatch):
-    from reffusion import stereo
+    from reffusion.capture import stereo
     from stages import fit as stage
 
     write_scene(tmp_path / "poses")
@@ -272,7 +277,7 @@ def test_the_stage_starts_from_flow_points_of_the_views_it_fits(tmp_path, capsys
     (tmp_path / "out").mkdir()
     stage.run(params, tmp_path / "out", poses=tmp_path / "poses")
     found = int(re.search(r"(\d+) points by optical flow beside 120", capsys.readouterr().out)[1])
-    fitted = io.load_ply(tmp_path / "out" / "gaussians.ply")
+    fitted = load_ply(tmp_path / "out" / "gaussians.ply")
     assert found > 0 and len(fitted) == 120 + found and fitted.antialiased
     assert len(seen) == 1 and {c.name for c in seen[0]} == {"view1", "view2", "view4"}, "not the held-out view"
 
@@ -296,7 +301,7 @@ def test_the_stage_takes_over_a_scene_of_gaussians(tmp_path):
     poses, out = tmp_path / "poses", tmp_path / "out"
     write_scene(poses)
     out.mkdir()
-    io.save_ply(poses / "gaussians.ply", truth())
+    save_ply(poses / "gaussians.ply", truth())
     stage.run(stage.Params(), out, poses=poses)
-    assert torch.equal(io.load_ply(out / "gaussians.ply").means, truth().means)
+    assert torch.equal(load_ply(out / "gaussians.ply").means, truth().means)
     assert "no optimisation" in stage.preview(stage.Params(), poses=poses)[0]

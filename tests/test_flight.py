@@ -6,9 +6,11 @@ import pytest
 import small_scene
 import torch
 
-from reffusion import flight, geometry, io
+from reffusion import geometry
+from reffusion.io.ply import save_ply
+from reffusion.io.scene import save_scene
 from reffusion.types import Camera, Scene, Similarity
-from report import turntable
+from report import flight, turntable
 
 
 def ring(count: int, radius: float, height: float = 0.3) -> list[Camera]:
@@ -56,11 +58,11 @@ def test_the_video_shows_the_result_of_a_variant_in_the_scenes_poses(tmp_path):
     train = {name: small_scene.CAMERAS[name] for name in small_scene.TRAIN}
     points = gaussians.means.double().numpy()[~labels.numpy()]
     scene = Scene(train, small_scene.TRAIN, (), frozenset(), points, np.zeros((len(points), 3), np.uint8), similarity)
-    io.save_scene(tmp_path / "x" / "poses", scene)
+    save_scene(tmp_path / "x" / "poses", scene)
     with pytest.raises(ValueError, match="make scene=x all"):
         turntable.make(tmp_path / "x@no_sds")
     wall = gaussians.map(lambda p: p[~labels])
-    io.save_ply(tmp_path / "x@no_sds" / "evaluate" / "scene.ply", wall, similarity=similarity)
+    save_ply(tmp_path / "x@no_sds" / "evaluate" / "scene.ply", wall, similarity=similarity)
     film, frames = cv2.VideoCapture(str(turntable.make(tmp_path / "x@no_sds", frames=6))), []
     while (read := film.read())[0]:
         frames.append(read[1])

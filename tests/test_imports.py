@@ -13,36 +13,35 @@ ROOT = Path(__file__).resolve().parent.parent
 OWN = {"reffusion", "stages", "runner", "report"}
 # A heavy or special dependency enters in one module; transformers in one for each kind of network.
 DOORS = {
-    "pycolmap": ("reffusion/sfm.py",),
-    "diffusers": ("reffusion/prior.py",),
-    "peft": ("reffusion/lora.py",),
-    "transformers": ("reffusion/prior.py", "reffusion/monocular.py"),
-    "huggingface_hub": ("reffusion/download.py",),
+    "pycolmap": ("reffusion/capture/sfm.py",),
+    "diffusers": ("reffusion/prior/model.py",),
+    "peft": ("reffusion/prior/lora.py",),
+    "transformers": ("reffusion/prior/model.py", "reffusion/depth/monocular.py"),
+    "huggingface_hub": ("reffusion/weights/download.py",),
 }
 OPENERS = {"open", "read_text", "write_text", "read_bytes", "write_bytes", "imread", "imwrite", "imsave", "savez"}
-MAY_OPEN = ("reffusion/io/", "reffusion/trace.py")
-COMPILER = "reffusion/splat/compiled.py"
+MAY_OPEN = ("reffusion/io/", "reffusion/capture/", "reffusion/trace.py")
+COMPILER = "reffusion/kernels/compiled.py"
 OWN_FILES = (
-    "reffusion/prior.py",
-    "reffusion/lora.py",
-    "reffusion/lpips.py",
-    "reffusion/weights.py",
-    "reffusion/download.py",
-    "reffusion/sfm.py",
-    "reffusion/shiftmap.py",
+    "reffusion/prior/model.py",
+    "reffusion/prior/lora.py",
+    "reffusion/score/lpips.py",
+    "reffusion/weights/local.py",
+    "reffusion/weights/download.py",
+    "reffusion/capture/sfm.py",
+    "reffusion/paint/shiftmap.py",
     COMPILER,
 )  # weights, databases, pipes, kernels
 PURE = (
     "geometry",
-    "alignment",
-    "surfels",
-    "splat/",
-    "sds",
-    "ssim",
-    "densify",
-    "discriminator",
-    "depth_term",
     "types",
+    "depth/alignment",
+    "splat/",
+    "gaussians/",
+    "distill/sds",
+    "distill/discriminator",
+    "distill/depth_term",
+    "prior/windows",
 )  # tensors and plain numbers only
 
 
@@ -112,8 +111,8 @@ def test_library(path):
 @pytest.mark.parametrize("path", sources("report"), ids=named)
 def test_report_reads_through_io(path):
     own = {name for name in imports(path) if name.split(".")[0] in OWN - {"report"}}
-    draws = named(path) in ("report/turntable.py", "report/view.py")
-    drawing = ("reffusion.flight", "reffusion.splat", "reffusion.types") if draws else ()
+    draws = named(path) in ("report/flight.py", "report/turntable.py", "report/view.py")
+    drawing = ("reffusion.splat.rasterizer", "reffusion.types") if draws else ()
     assert all(name.startswith(("reffusion.io", *drawing)) for name in own), own
 
 

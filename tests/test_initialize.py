@@ -7,10 +7,16 @@ import pytest
 import small_scene as small
 import torch
 
-from reffusion import behind, geometry, io, splat
-from reffusion import initialize as rules
-from reffusion.settle import Known, turns_of
-from reffusion.surfels import surface_gaussians, surface_normals
+from reffusion import geometry
+from reffusion.depth import behind
+from reffusion.gaussians.surfels import surface_gaussians, surface_normals
+from reffusion.initialize import filling as rules
+from reffusion.initialize.settle import Known, turns_of
+from reffusion.io.arrays import load_json, load_labels, save_labels
+from reffusion.io.images import load_exr
+from reffusion.io.ply import load_ply
+from reffusion.io.scene import load_mask_sets, save_references
+from reffusion.splat import rasterizer
 from reffusion.types import Camera, Reference
 from stages import initialize, masks
 
@@ -28,41 +34,39 @@ def scene(tmp_path_factory):
 
 
 def references(scene, folder, *names):
-    sets = io.load_mask_sets(scene["masks"], names)
-    io.save_references(
-        folder, [Reference(small.CAMERAS[n], small.photo(small.CAMERAS[n]), sets[n].invent) for n in names]
-    )
+    sets = load_mask_sets(scene["masks"], names)
+    save_references(folder, [Reference(small.CAMERAS[n], small.photo(small.CAMERAS[n]), sets[n].invent) for n in names])
     return folder
 
 
 @pytest.mark.parametrize("how", [{}, {"planar_share": 2.0}], ids=["planes", "smooth"])
 def test_the_hidden_wall_is_rebuilt_where_it_was(scene, tmp_path, how):
     initialize.run(initialize.Params(**how), tmp_path, **scene, reference=references(scene, tmp_path / "r", "a2"))
-    gaussians, new = io.load_ply(tmp_path / "gaussians.ply"), io.load_labels(tmp_path / "labels.npy")
-    before, removed = io.load_ply(scene["fit"] / "gaussians.ply"), io.load_labels(scene["masks"] / "labels.npy")
-    haze = io.load_json(tmp_path / "facts.json")["haze"]
+    gaussians, new = load_ply(tmp_path / "gaussians.ply"), load_labels(tmp_path / "labels.npy")
+    before, removed = load_ply(scene["fit"] / "gaussians.ply"), load_labels(scene["masks"] / "labels.npy")
+    haze = load_json(tmp_path / "facts.json")["haze"]
     assert len(gaussians) == len(new) and int((~new).sum()) == len(before) - int(removed.sum()) - haze
     sheet = small.WALL / small.FOCAL * initialize.Params().sunk  # the second one lies so far behind the wall
     behind = gaussians.means[new][:, 2] - small.WALL
     assert (torch.minimum(behind.abs(), (behind - sheet).abs()) < 0.03).all() and (behind.abs() < 0.03).any()
-    depth = io.load_exr(tmp_path / "depth" / "a2.exr")
+    depth = load_exr(tmp_path / "depth" / "a2.exr")
     assert np.abs(depth - small.WALL).max() < 0.04
     for name in small.TEST:
         view = small.CAMERAS[name]
-        drawn = splat.render(gaussians, view)
+        drawn = rasterizer.render(gaussians, view)
         inner = small.true_mask(view, NEAR)
         error = np.abs(drawn.color.numpy() - small.photo(view) / 255)[inner]
         assert error.mean() < 0.03 and drawn.alpha.numpy()[inner].min() > 0.85
-    assert io.load_json(tmp_path / "facts.json")["uncovered_share"] < 0.15
+    assert load_json(tmp_path / "facts.json")["uncovered_share"] < 0.15
 
 
 def test_without_references_it_only_removes(scene, tmp_path):
     initialize.run(initialize.Params(), tmp_path, **scene, reference=None)
-    labels = io.load_labels(scene["masks"] / "labels.npy")
-    before, after = io.load_ply(scene["fit"] / "gaussians.ply"), io.load_ply(tmp_path / "gaussians.ply")
-    haze = io.load_json(tmp_path / "facts.json")["haze"]
+    labels = load_labels(scene["masks"] / "labels.npy")
+    before, after = load_ply(scene["fit"] / "gaussians.ply"), load_ply(tmp_path / "gaussians.ply")
+    haze = load_json(tmp_path / "facts.json")["haze"]
     assert len(after) == len(before) - int(labels.sum()) - haze and haze < 0.01 * len(before)
-    assert not io.load_labels(tmp_path / "labels.npy").any()
+    assert not load_labels(tmp_path / "labels.npy").any()
 
 
 def test_a_second_reference_fills_only_what_the_first_left(scene, tmp_path):
@@ -71,14 +75,14 @@ def test_a_second_reference_fills_only_what_the_first_left(scene, tmp_path):
         out = tmp_path / "".join(names)
         out.mkdir()
         initialize.run(initialize.Params(), out, **scene, reference=references(scene, out / "r", *names))
-        counts.append(int(io.load_labels(out / "labels.npy").sum()))
+        counts.append(int(load_labels(out / "labels.npy").sum()))
     assert counts[0] <= counts[1] < 1.5 * counts[0]
 
 
 def test_labels_of_another_fit_are_refused(scene, tmp_path):
     wrong = tmp_path / "masks"
     wrong.mkdir()
-    io.save_labels(wrong / "labels.npy", np.zeros(3, bool))
+    save_labels(wrong / "labels.npy", np.zeros(3, bool))
     with pytest.raises(ValueError, match="3 labels for"):
         initialize.run(initialize.Params(), tmp_path, **(scene | {"masks": wrong}), reference=None)
 
@@ -118,7 +122,7 @@ def test_the_new_surface_shows_no_holes_nearer_by_or_from_the_side(degrees, clos
     pose[:3, :3] = [[np.cos(a), 0, -np.sin(a)], [0, 1, 0], [np.sin(a), 0, np.cos(a)]]
     pose[:3, 3] = np.array([0, 0, 2 / closer]) - pose[:3, :3] @ (0, 0, 2.0)
     other = Camera("w", 16, 16, small.FOCAL, small.FOCAL, 8, 8, pose)
-    assert splat.render(surface, other).alpha.min() > 0.8
+    assert rasterizer.render(surface, other).alpha.min() > 0.8
 
 
 @pytest.mark.parametrize("degrees", [0.0, 40.0, 60.0])
@@ -126,7 +130,7 @@ def test_no_grid_shows_from_four_times_nearer(degrees):
     disparity, view, _ = slanted(degrees)
     white, whole = np.full((*disparity.shape, 3), 255, np.uint8), np.ones(disparity.shape, bool)
     near = view.cropped(view.width // 2 - 8, view.height // 2 - 8, 16, 16).resized(64, 64)
-    alpha = splat.render(rules.surface(white, 1 / disparity, whole, view, 1, SHEETS), near).alpha
+    alpha = rasterizer.render(rules.surface(white, 1 / disparity, whole, view, 1, SHEETS), near).alpha
     assert alpha.min() > 0.9 and alpha.std() < 0.02
 
 
@@ -162,7 +166,7 @@ def test_what_is_painted_on_the_new_surface_stays_in_place_from_the_other_side()
             nothing, torch.zeros(0, dtype=torch.bool), reference, depth, reference.mask, around, how
         )
         inner = (slice(14, 26), slice(14, 34))
-        here, there = (splat.render(drawn, v).color.numpy() - floor(v)[1] for v in (view, opposite))
+        here, there = (rasterizer.render(drawn, v).color.numpy() - floor(v)[1] for v in (view, opposite))
         assert np.abs(here[inner]).mean() < 0.02
         errors.append(np.sqrt((there[inner] ** 2).mean()))
     assert errors[1] < 0.6 * errors[0]
@@ -181,8 +185,8 @@ def test_bad_depth_is_refused():
 def test_what_haze_left_open_is_filled_too(scene, tmp_path):
     """The rim of the hole that the mask leaves to the remaining Gaussians, with these taken away."""
     view = small.CAMERAS["a2"]
-    sets = io.load_mask_sets(scene["masks"], ["a2"])["a2"]
-    gaussians, labels = io.load_ply(scene["fit"] / "gaussians.ply"), io.load_labels(scene["masks"] / "labels.npy")
+    sets = load_mask_sets(scene["masks"], ["a2"])["a2"]
+    gaussians, labels = load_ply(scene["fit"] / "gaussians.ply"), load_labels(scene["masks"] / "labels.npy")
     remaining = gaussians.map(lambda p: p[~labels])
     reference = Reference(view, small.photo(view), np.zeros_like(sets.invent))
     asked = rules.to_fill(remaining, torch.zeros(len(remaining), dtype=torch.bool), reference, sets.consistent, 0.9)
@@ -206,7 +210,7 @@ def test_the_reference_is_reproduced_by_matched_colors():
     everything = np.ones(depth.shape, bool)
     new = surface_gaussians(picture, depth, everything, view, sh_count=1, spread=0.4)
     labels = torch.ones(len(new), dtype=torch.bool)
-    error = lambda g: np.abs(splat.render(g, view).color.numpy() - picture / 255)[4:-4, 4:-4].mean()
+    error = lambda g: np.abs(rasterizer.render(g, view).color.numpy() - picture / 255)[4:-4, 4:-4].mean()
     matched = rules.match_colors(new, labels, picture, everything, view, 5)
     assert error(matched) < 0.5 * error(new)
     kept = rules.match_colors(new, ~labels, picture, everything, view, 5)
@@ -223,14 +227,14 @@ def test_settling_moves_the_gaussians_and_leaves_no_checkpoint(scene, tmp_path):
         initialize.run(
             initialize.Params(settle=steps, gloss=True, sweep=True, further=2), out, **scene, reference=given
         )
-        found[name] = io.load_ply(out / "gaussians.ply")
+        found[name] = load_ply(out / "gaussians.ply")
         visible = [path.name for path in out.rglob("*") if ".settle" not in path.parts]
         assert not list(out.rglob("checkpoint*")) and "settle" not in visible
     assert len(found["none"]) == len(found["first"])
     assert torch.equal(found["first"].means, found["again"].means)
     view = small.CAMERAS["a4"]
     error = {
-        name: float((splat.render(g, view).color - torch.from_numpy(small.photo(view)) / 255).abs().mean())
+        name: float((rasterizer.render(g, view).color - torch.from_numpy(small.photo(view)) / 255).abs().mean())
         for name, g in found.items()
     }
     assert error["first"] < error["none"]

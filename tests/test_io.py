@@ -12,8 +12,21 @@ import torch
 from PIL import Image
 from plyfile import PlyData
 
-from reffusion import io
 from reffusion.io import colmap
+from reffusion.io.arrays import load_json, load_labels, save_json, save_labels
+from reffusion.io.images import image_size, load_exr, load_image, load_mask, save_exr, save_image, save_mask
+from reffusion.io.ply import load_ply, load_points, save_ply, save_points
+from reffusion.io.scene import (
+    load_mask_sets,
+    load_raw_masks,
+    load_references,
+    load_scene,
+    load_test_masks,
+    load_views,
+    save_mask_sets,
+    save_references,
+    save_scene,
+)
 from reffusion.types import Camera, Gaussians, MaskSet, Reference, Scene, Similarity
 
 
@@ -53,49 +66,49 @@ def test_io_costs_no_torch():
 
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_a_ply_says_how_it_is_meant_to_be_drawn(tmp_path, antialiased):
-    io.save_ply(tmp_path / "g.ply", replace(some_gaussians(3, 1), antialiased=antialiased))
-    assert io.load_ply(tmp_path / "g.ply").antialiased == antialiased
+    save_ply(tmp_path / "g.ply", replace(some_gaussians(3, 1), antialiased=antialiased))
+    assert load_ply(tmp_path / "g.ply").antialiased == antialiased
     header = (tmp_path / "g.ply").read_bytes().split(b"end_header")[0]
     assert (b"comment antialiased" in header) == antialiased
 
 
 def test_images_round_trip_and_floats_are_rounded(tmp_path):
     pixels = np.random.default_rng(0).integers(0, 256, (5, 9, 3)).astype(np.uint8)
-    io.save_image(tmp_path / "deep" / "x.png", pixels)
-    assert np.array_equal(io.load_image(tmp_path / "deep" / "x.png"), pixels)
-    assert io.image_size(tmp_path / "deep" / "x.png") == (9, 5)
-    io.save_image(tmp_path / "f.png", pixels / np.float32(255))
-    assert np.array_equal(io.load_image(tmp_path / "f.png"), pixels)
-    io.save_image(tmp_path / "clip.png", np.array([[[-1.0, 0.5, 2.0]]]))
-    assert io.load_image(tmp_path / "clip.png").tolist() == [[[0, 128, 255]]]
+    save_image(tmp_path / "deep" / "x.png", pixels)
+    assert np.array_equal(load_image(tmp_path / "deep" / "x.png"), pixels)
+    assert image_size(tmp_path / "deep" / "x.png") == (9, 5)
+    save_image(tmp_path / "f.png", pixels / np.float32(255))
+    assert np.array_equal(load_image(tmp_path / "f.png"), pixels)
+    save_image(tmp_path / "clip.png", np.array([[[-1.0, 0.5, 2.0]]]))
+    assert load_image(tmp_path / "clip.png").tolist() == [[[0, 128, 255]]]
 
 
 @pytest.mark.parametrize("mode", ["L", "RGBA", "P", "LA"])
 def test_images_of_every_kind_become_rgb(tmp_path, mode):
     Image.new("RGB", (4, 3), (102, 102, 102)).convert(mode).save(tmp_path / "x.png")
-    assert np.array_equal(io.load_image(tmp_path / "x.png"), np.full((3, 4, 3), 102))
+    assert np.array_equal(load_image(tmp_path / "x.png"), np.full((3, 4, 3), 102))
 
 
 def test_orientation_is_obeyed_only_on_request(tmp_path):
     exif = Image.Exif()
     exif[0x0112] = 6
     Image.new("RGB", (40, 20)).save(tmp_path / "x.jpg", exif=exif)
-    assert io.load_image(tmp_path / "x.jpg").shape == (20, 40, 3) and io.image_size(tmp_path / "x.jpg") == (40, 20)
-    assert io.load_image(tmp_path / "x.jpg", upright=True).shape == (40, 20, 3)
-    assert io.image_size(tmp_path / "x.jpg", upright=True) == (20, 40)
+    assert load_image(tmp_path / "x.jpg").shape == (20, 40, 3) and image_size(tmp_path / "x.jpg") == (40, 20)
+    assert load_image(tmp_path / "x.jpg", upright=True).shape == (40, 20, 3)
+    assert image_size(tmp_path / "x.jpg", upright=True) == (20, 40)
 
 
 def test_unreadable_pictures_are_named(tmp_path):
     (tmp_path / "text.png").write_text("no picture")
     pixels = np.random.default_rng(0).integers(0, 256, (50, 50, 3)).astype(np.uint8)
-    io.save_image(tmp_path / "whole.png", pixels)
+    save_image(tmp_path / "whole.png", pixels)
     (tmp_path / "cut.png").write_bytes((tmp_path / "whole.png").read_bytes()[:2000])
     Image.fromarray(np.zeros((4, 4), np.uint16)).save(tmp_path / "deep.png")
     for name in ("text.png", "cut.png", "absent.png", "deep.png"):
         with pytest.raises(ValueError, match=name):
-            io.load_image(tmp_path / name)
+            load_image(tmp_path / name)
     with pytest.raises(ValueError, match="not finite"):
-        io.save_image(tmp_path / "nan.png", np.full((2, 2, 3), np.nan))
+        save_image(tmp_path / "nan.png", np.full((2, 2, 3), np.nan))
 
 
 def test_masks_of_every_kind(tmp_path):
@@ -110,61 +123,61 @@ def test_masks_of_every_kind(tmp_path):
     palette.putpalette([0, 0, 0] * 3 + [200, 0, 0])
     palette.save(tmp_path / "palette.png")
     Image.fromarray(one.astype(np.uint16) * 65535).save(tmp_path / "deep.png")
-    io.save_mask(tmp_path / "ours.png", truth)
+    save_mask(tmp_path / "ours.png", truth)
     for path in tmp_path.glob("*.png"):
-        assert np.array_equal(io.load_mask(path), truth), path.name
-    io.save_mask(tmp_path / "empty.png", np.zeros((3, 3), bool))
-    assert not io.load_mask(tmp_path / "empty.png").any()
+        assert np.array_equal(load_mask(path), truth), path.name
+    save_mask(tmp_path / "empty.png", np.zeros((3, 3), bool))
+    assert not load_mask(tmp_path / "empty.png").any()
 
 
 def test_mask_with_other_values_is_refused(tmp_path):
     Image.fromarray(np.array([[0, 1, 7]], np.uint8)).save(tmp_path / "odd.png")
     with pytest.raises(ValueError, match=r"odd\.png.*7"):
-        io.load_mask(tmp_path / "odd.png")
+        load_mask(tmp_path / "odd.png")
 
 
 def test_masks_are_resized_by_nearest_neighbour(tmp_path):
     truth = np.zeros((8, 8), bool)
     truth[2:4, 4:8] = True
-    io.save_mask(tmp_path / "x.png", truth)
-    assert np.array_equal(io.load_mask(tmp_path / "x.png", (16, 24)), truth.repeat(2, 0).repeat(3, 1))
-    assert np.array_equal(io.load_mask(tmp_path / "x.png", (4, 4)), truth[::2, ::2])
+    save_mask(tmp_path / "x.png", truth)
+    assert np.array_equal(load_mask(tmp_path / "x.png", (16, 24)), truth.repeat(2, 0).repeat(3, 1))
+    assert np.array_equal(load_mask(tmp_path / "x.png", (4, 4)), truth[::2, ::2])
 
 
 def test_exr_keeps_every_bit(tmp_path):
     depth = np.random.default_rng(0).normal(size=(7, 11)).astype(np.float32) * 1e6
     depth[0, 0] = 0.0
-    io.save_exr(tmp_path / "sub" / "depth.exr", depth)
-    assert np.array_equal(io.load_exr(tmp_path / "sub" / "depth.exr"), depth)
+    save_exr(tmp_path / "sub" / "depth.exr", depth)
+    assert np.array_equal(load_exr(tmp_path / "sub" / "depth.exr"), depth)
 
 
 def test_json_and_labels(tmp_path):
     value = {"a": 0.1 + 0.2, "b": [1, None, "ü"]}
-    io.save_json(tmp_path / "x.json", value)
-    assert io.load_json(tmp_path / "x.json") == value
+    save_json(tmp_path / "x.json", value)
+    assert load_json(tmp_path / "x.json") == value
     with pytest.raises(ValueError):
-        io.save_json(tmp_path / "y.json", {"a": float("nan")})
+        save_json(tmp_path / "y.json", {"a": float("nan")})
     (tmp_path / "bad.json").write_text("{")
     with pytest.raises(ValueError, match=r"bad\.json"):
-        io.load_json(tmp_path / "bad.json")
+        load_json(tmp_path / "bad.json")
     labels = torch.rand(10) < 0.5
-    io.save_labels(tmp_path / "labels.npy", labels)
-    assert torch.equal(io.load_labels(tmp_path / "labels.npy"), labels)
+    save_labels(tmp_path / "labels.npy", labels)
+    assert torch.equal(load_labels(tmp_path / "labels.npy"), labels)
     with pytest.raises(ValueError, match="bool"):
-        io.save_labels(tmp_path / "labels.npy", torch.zeros(3))
+        save_labels(tmp_path / "labels.npy", torch.zeros(3))
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_ply_round_trip_is_exact(tmp_path, degree):
     gaussians = some_gaussians(5, degree)
-    io.save_ply(tmp_path / "g.ply", gaussians)
-    again = io.load_ply(tmp_path / "g.ply")
+    save_ply(tmp_path / "g.ply", gaussians)
+    again = load_ply(tmp_path / "g.ply")
     again.zipped(gaussians, lambda a, b: torch.testing.assert_close(a, b, rtol=0, atol=0))
 
 
 def test_ply_is_the_layout_that_viewers_expect(tmp_path):
     gaussians = some_gaussians(4, 3)
-    io.save_ply(tmp_path / "g.ply", gaussians)
+    save_ply(tmp_path / "g.ply", gaussians)
     vertex = PlyData.read(str(tmp_path / "g.ply"))["vertex"]
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     names += [f"f_rest_{i}" for i in range(45)] + ["opacity"]
@@ -179,12 +192,12 @@ def test_ply_is_the_layout_that_viewers_expect(tmp_path):
 
 def test_ply_goes_back_to_the_scenes_frame(tmp_path):
     gaussians, near = some_gaussians(50, 1), Similarity(0.25, np.array([1.0, -2.0, 3.0]))
-    io.save_ply(tmp_path / "g.ply", gaussians, near)
+    save_ply(tmp_path / "g.ply", gaussians, near)
     vertex = PlyData.read(str(tmp_path / "g.ply"))["vertex"]
     assert vertex["x"].dtype == np.float32
     np.testing.assert_allclose(vertex["y"], gaussians.means[:, 1].numpy() * 4 - 2, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(vertex["scale_0"], gaussians.log_scales[:, 0].numpy() + np.log(4), rtol=1e-6)
-    again = io.load_ply(tmp_path / "g.ply", near)
+    again = load_ply(tmp_path / "g.ply", near)
     torch.testing.assert_close(again.means, gaussians.means, rtol=0, atol=1e-6)
     torch.testing.assert_close(again.log_scales, gaussians.log_scales, rtol=1e-6, atol=1e-6)
     assert torch.equal(again.sh, gaussians.sh)
@@ -192,33 +205,33 @@ def test_ply_goes_back_to_the_scenes_frame(tmp_path):
 
 def test_ply_of_a_geo_referenced_scene_loses_nothing(tmp_path):
     gaussians, far = some_gaussians(50, 0), Similarity(1.0, np.array([4e6, 5e6, 300.0]))
-    io.save_ply(tmp_path / "g.ply", gaussians, far)
-    torch.testing.assert_close(io.load_ply(tmp_path / "g.ply", far).means, gaussians.means, rtol=0, atol=1e-6)
+    save_ply(tmp_path / "g.ply", gaussians, far)
+    torch.testing.assert_close(load_ply(tmp_path / "g.ply", far).means, gaussians.means, rtol=0, atol=1e-6)
 
 
 def test_wrong_ply_files_are_named(tmp_path):
-    io.save_points(tmp_path / "points.ply", np.zeros((3, 3)), np.zeros((3, 3), np.uint8))
+    save_points(tmp_path / "points.ply", np.zeros((3, 3)), np.zeros((3, 3), np.uint8))
     (tmp_path / "text.ply").write_text("hello")
     nan = some_gaussians(3, 0)
     nan.means[1] = float("nan")
-    io.save_ply(tmp_path / "nan.ply", nan)
+    save_ply(tmp_path / "nan.ply", nan)
     for name, why in (("points.ply", "f_dc_0"), ("text.ply", "PLY"), ("nan.ply", "means"), ("no.ply", "no such file")):
         with pytest.raises(ValueError, match=rf"{name}.*{why}"):
-            io.load_ply(tmp_path / name)
+            load_ply(tmp_path / name)
 
 
 def test_points_round_trip(tmp_path):
     points = np.random.default_rng(0).normal(size=(6, 3)) * 1e6
     colors = np.arange(18, dtype=np.uint8).reshape(6, 3)
-    io.save_points(tmp_path / "p.ply", points, colors)
-    again = io.load_points(tmp_path / "p.ply")
+    save_points(tmp_path / "p.ply", points, colors)
+    again = load_points(tmp_path / "p.ply")
     assert np.array_equal(again[0], points) and np.array_equal(again[1], colors)
 
 
 def test_scene_round_trip_in_full_precision(tmp_path):
     scene = some_scene()
-    io.save_scene(tmp_path, scene)
-    again = io.load_scene(tmp_path)
+    save_scene(tmp_path, scene)
+    again = load_scene(tmp_path)
     assert list(again.cameras) == ["a", "b", "c"] and (again.train, again.test) == (scene.train, scene.test)
     assert again.clean == scene.clean and again.similarity.scale == scene.similarity.scale
     assert np.array_equal(again.similarity.offset, scene.similarity.offset)
@@ -228,7 +241,7 @@ def test_scene_round_trip_in_full_precision(tmp_path):
         assert np.array_equal(again.cameras[name].intrinsics, camera.intrinsics)
     (tmp_path / "sparse" / "0" / "images.bin").unlink()
     with pytest.raises(ValueError, match=r"images\.bin"):
-        io.load_scene(tmp_path)
+        load_scene(tmp_path)
 
 
 def test_quaternions_survive_half_turns():
@@ -246,7 +259,7 @@ def test_our_model_is_read_by_colmap(tmp_path):
     import pycolmap
 
     scene = some_scene()
-    io.save_scene(tmp_path, scene)
+    save_scene(tmp_path, scene)
     model = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
     assert {i.name for i in model.images.values()} == {"a.png", "b.png", "c.png"}
     for image in model.images.values():
@@ -260,31 +273,31 @@ def test_mask_sets_and_references(tmp_path):
     generator, scene = np.random.default_rng(0), some_scene()
     draw = lambda: generator.random((8, 12)) < 0.5
     sets = {name: MaskSet(draw(), draw(), draw(), draw()) for name in scene.cameras}
-    io.save_mask_sets(tmp_path, sets)
-    again = io.load_mask_sets(tmp_path, scene.cameras)
+    save_mask_sets(tmp_path, sets)
+    again = load_mask_sets(tmp_path, scene.cameras)
     for name, mask_set in sets.items():
         for kind in ("raw", "consistent", "undecided", "invent"):
             assert np.array_equal(getattr(again[name], kind), getattr(mask_set, kind))
     image = generator.integers(0, 256, (8, 12, 3)).astype(np.uint8)
-    io.save_references(tmp_path / "reference", [Reference(scene.cameras["b"], image, draw())])
-    (reference,) = io.load_references(tmp_path / "reference", scene)
+    save_references(tmp_path / "reference", [Reference(scene.cameras["b"], image, draw())])
+    (reference,) = load_references(tmp_path / "reference", scene)
     assert reference.camera is scene.cameras["b"] and np.array_equal(reference.image, image) and reference.depth is None
     depth = np.where(draw(), np.nan, generator.random((8, 12))).astype(np.float32)
-    io.save_references(tmp_path / "deep", [Reference(scene.cameras["b"], image, draw(), depth)])
-    (deep,) = io.load_references(tmp_path / "deep", scene)
+    save_references(tmp_path / "deep", [Reference(scene.cameras["b"], image, draw(), depth)])
+    (deep,) = load_references(tmp_path / "deep", scene)
     assert np.array_equal(deep.depth, depth, equal_nan=True)
-    io.save_exr(tmp_path / "deep" / "depth" / "b.exr", depth[:4])
+    save_exr(tmp_path / "deep" / "depth" / "b.exr", depth[:4])
     with pytest.raises(ValueError, match=r"b\.png.*its depth must have their view's size"):
-        io.load_references(tmp_path / "deep", scene)
-    io.save_image(tmp_path / "reference" / "references" / "z.png", image)
+        load_references(tmp_path / "deep", scene)
+    save_image(tmp_path / "reference" / "references" / "z.png", image)
     with pytest.raises(ValueError, match=r"z\.png.*no view"):
-        io.load_references(tmp_path / "reference", scene)
+        load_references(tmp_path / "reference", scene)
 
 
 def test_views_and_masks_of_a_poses_folder(tmp_path):
     image, mask = np.full((4, 6, 3), 7, np.uint8), np.eye(4, 6, dtype=bool)
-    io.save_image(tmp_path / "images" / "a.png", image)
-    io.save_mask(tmp_path / "masks" / "a.png", mask)
-    io.save_mask(tmp_path / "test_masks" / "t.png", mask)
-    assert np.array_equal(io.load_views(tmp_path, ["a"])["a"], image)
-    assert list(io.load_raw_masks(tmp_path, ["a", "b"])) == ["a"] and list(io.load_test_masks(tmp_path)) == ["t"]
+    save_image(tmp_path / "images" / "a.png", image)
+    save_mask(tmp_path / "masks" / "a.png", mask)
+    save_mask(tmp_path / "test_masks" / "t.png", mask)
+    assert np.array_equal(load_views(tmp_path, ["a"])["a"], image)
+    assert list(load_raw_masks(tmp_path, ["a", "b"])) == ["a"] and list(load_test_masks(tmp_path)) == ["t"]

@@ -12,7 +12,9 @@ import pytest
 import small_scene as small
 import yaml
 
-from reffusion import io, support
+from reffusion.capture import support
+from reffusion.io.arrays import load_json
+from reffusion.io.scene import load_mask_sets, load_scene
 from stages import fit, masks
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -41,9 +43,9 @@ def test_a_scene_whose_background_is_seen_imports_no_diffusion(tmp_path):
     command = [sys.executable, "-c", STAGES, str(tmp_path), " ".join(UNUSED)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
-    assert io.load_json(tmp_path / "masks/facts.json")["invent_pixels"] == 0
+    assert load_json(tmp_path / "masks/facts.json")["invent_pixels"] == 0
     assert done.stdout.splitlines()[-1] == "[]"
-    assert io.load_json(tmp_path / "evaluate/metrics.json")["result"] == "initialize"
+    assert load_json(tmp_path / "evaluate/metrics.json")["result"] == "initialize"
 
 
 def test_the_pipeline_leaves_diffusion_out_where_nothing_is_to_be_invented():
@@ -60,7 +62,7 @@ def test_few_unseen_pixels_are_negligible_and_it_can_be_forced(tmp_path):
         out = tmp_path / "-".join(map(str, params.values()))
         out.mkdir()
         masks.run(masks.Params(**params), out, poses=poses, fit=fitted)
-        return io.load_mask_sets(out, small.TRAIN).values(), io.load_json(out / "facts.json")
+        return load_mask_sets(out, small.TRAIN).values(), load_json(out / "facts.json")
 
     sets, facts = classified(negligible=0.0)
     assert 0 < facts["undecided_share"] < 0.1 and facts["invent_pixels"] > 0
@@ -98,6 +100,6 @@ def test_no_more_harmonics_than_views():
 
 def test_fit_takes_the_degree_that_the_views_support(tmp_path):
     poses, _, _ = small.write(tmp_path, 0.8)  # five training views
-    scene = io.load_scene(poses)
+    scene = load_scene(poses)
     assert fit.supported(fit.Params(), scene).sh_degree == 1
     assert fit.supported(fit.Params(sh_supported=False), scene).sh_degree == 3

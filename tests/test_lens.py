@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from small_capture import FISHEYE, HEIGHT, OPENCV, PINHOLE, RADIAL, WIDTH, Truth, prepare, run, some_truth
 
-from reffusion import io, lens
+from reffusion.capture import lens
+from reffusion.io.images import save_image, save_mask
+from reffusion.io.scene import load_raw_masks, load_views
 
 
 def splat_dots(truth: Truth, name: str) -> np.ndarray:
@@ -29,10 +31,10 @@ def test_a_dot_grid_undistorts_onto_the_pinhole(tmp_path, model):
     directions = {}
     for name in truth.world_to_camera:
         image, directions[name] = splat_dots(truth, name)
-        io.save_image(folder / "images" / f"{name}.png", image)
+        save_image(folder / "images" / f"{name}.png", image)
     scene, out = run(folder)
     found = 0
-    for name, image in io.load_views(out, scene.train).items():
+    for name, image in load_views(out, scene.train).items():
         camera = scene.cameras[name]
         for u, v in directions[name] * (camera.fx, camera.fy) + (camera.cx, camera.cy):
             left, top = int(u) - 2, int(v) - 2
@@ -56,10 +58,10 @@ def test_masks_follow_the_image_through_the_lens(tmp_path):
     columns, rows = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     image = np.uint8(128 + 120 * np.sin(columns / 6) * np.sin(rows / 5))
     for name in truth.world_to_camera:
-        io.save_image(folder / "images" / f"{name}.png", np.repeat(image[..., None], 3, 2))
-        io.save_mask(folder / "masks" / f"{name}.png", image >= 160)
+        save_image(folder / "images" / f"{name}.png", np.repeat(image[..., None], 3, 2))
+        save_mask(folder / "masks" / f"{name}.png", image >= 160)
     scene, out = run(folder)
-    images, masks = io.load_views(out, scene.train), io.load_raw_masks(out, scene.train)
+    images, masks = load_views(out, scene.train), load_raw_masks(out, scene.train)
     for name in scene.train:
         difference = (images[name][..., 0] >= 160) ^ masks[name]
         assert difference.sum() < 0.04 * masks[name].sum()

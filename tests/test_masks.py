@@ -5,7 +5,10 @@ import pytest
 import small_scene as small
 import torch
 
-from reffusion import geometry, io, masks
+from reffusion import geometry
+from reffusion.io.arrays import load_json, load_labels, save_json
+from reffusion.io.scene import load_mask_sets
+from reffusion.masks import voting
 from reffusion.types import Gaussians
 from stages.masks import Params, run
 
@@ -17,8 +20,8 @@ def classify(tmp_path, square_at, params=None, **scene):
     out = tmp_path / "masks"
     out.mkdir()
     run(params or Params(), out, poses=poses, fit=fit)
-    found = io.load_labels(out / "labels.npy")
-    return io.load_mask_sets(out, small.CAMERAS), io.load_json(out / "facts.json"), found, labels
+    found = load_labels(out / "labels.npy")
+    return load_mask_sets(out, small.CAMERAS), load_json(out / "facts.json"), found, labels
 
 
 def ball(z, opacity=0.9, scale=0.1):
@@ -33,35 +36,37 @@ def test_a_vote_is_the_blending_weight_inside_and_outside_the_mask():
     both = front.zipped(back, lambda a, b: torch.cat([a, b]))
     left = np.zeros((small.HEIGHT, small.WIDTH), bool)
     left[:, : small.WIDTH // 2] = True
-    votes = masks.cast_votes(both, [view], {"v": left}, mode="weight")
+    votes = voting.cast_votes(both, [view], {"v": left}, mode="weight")
     np.testing.assert_allclose(votes.masked, votes.unmasked, rtol=1e-4)  # symmetric about the middle
-    alone = masks.cast_votes(front, [view], {"v": left}, mode="weight")
+    alone = voting.cast_votes(front, [view], {"v": left}, mode="weight")
     np.testing.assert_allclose(votes.masked[0], alone.masked[0], rtol=1e-5)  # nothing stands before the front one
-    assert votes.masked[1] < masks.cast_votes(back, [view], {"v": left}, mode="weight").masked[0]
-    counts = masks.cast_votes(both, [view], {"v": left}, mode="count")
+    assert votes.masked[1] < voting.cast_votes(back, [view], {"v": left}, mode="weight").masked[0]
+    counts = voting.cast_votes(both, [view], {"v": left}, mode="count")
     assert counts.masked[1] == round(float(counts.masked[1])) and counts.masked[1] > votes.masked[1]
 
 
 @pytest.mark.parametrize("tau", [0.5, 1.0, 2.0])
 def test_the_label_needs_a_ratio_above_tau(tau):
-    votes = masks.Votes(torch.tensor([tau * 3, tau * 3 + 1e-3, 0.0, 1.0, 0.0]), torch.tensor([3.0, 3.0, 0.0, 0.0, 1.0]))
-    assert masks.label_gaussians(votes, tau).tolist() == [False, True, False, True, False]
+    votes = voting.Votes(
+        torch.tensor([tau * 3, tau * 3 + 1e-3, 0.0, 1.0, 0.0]), torch.tensor([3.0, 3.0, 0.0, 0.0, 1.0])
+    )
+    assert voting.label_gaussians(votes, tau).tolist() == [False, True, False, True, False]
 
 
 def test_views_without_a_mask_do_not_vote_and_empty_masks_do():
     views = [small.camera("v", 0.0), small.camera("w", 0.0)]
     full, empty = np.ones((small.HEIGHT, small.WIDTH), bool), np.zeros((small.HEIGHT, small.WIDTH), bool)
-    alone = masks.cast_votes(ball(1.0), views, {"v": full})
-    assert masks.label_gaussians(alone).all() and alone.unmasked == 0
-    both = masks.cast_votes(ball(1.0), views, {"v": full, "w": empty})
-    assert both.masked == both.unmasked > 0 and not masks.label_gaussians(both).any()  # a tie is no majority
+    alone = voting.cast_votes(ball(1.0), views, {"v": full})
+    assert voting.label_gaussians(alone).all() and alone.unmasked == 0
+    both = voting.cast_votes(ball(1.0), views, {"v": full, "w": empty})
+    assert both.masked == both.unmasked > 0 and not voting.label_gaussians(both).any()  # a tie is no majority
 
 
 def test_wrong_masks_are_refused():
     with pytest.raises(ValueError, match="none of the training views has a mask"):
-        masks.cast_votes(ball(1.0), [small.camera("v", 0.0)], {"other": np.ones((small.HEIGHT, small.WIDTH), bool)})
+        voting.cast_votes(ball(1.0), [small.camera("v", 0.0)], {"other": np.ones((small.HEIGHT, small.WIDTH), bool)})
     with pytest.raises(ValueError, match="mask of view v"):
-        masks.cast_votes(ball(1.0), [small.camera("v", 0.0)], {"v": np.ones((4, 4), bool)})
+        voting.cast_votes(ball(1.0), [small.camera("v", 0.0)], {"v": np.ones((4, 4), bool)})
 
 
 def test_gaussians_that_nobody_sees_go_with_what_surrounds_them():
@@ -70,7 +75,7 @@ def test_gaussians_that_nobody_sees_go_with_what_surrounds_them():
     aside = ball(1.0).map(lambda p: p.clone())
     aside.means[0, 0] = 0.5
     nowhere = ball(-1.0)
-    assert [bool(masks.hidden_inside(g, views, ballots)) for g in (ball(1.0), aside, nowhere)] == [True, False, False]
+    assert [bool(voting.hidden_inside(g, views, ballots)) for g in (ball(1.0), aside, nowhere)] == [True, False, False]
 
 
 def test_tidy_removes_specks_and_closes_gaps():
@@ -79,10 +84,10 @@ def test_tidy_removes_specks_and_closes_gaps():
     whole = mask.copy()
     mask[10, 10] = False
     mask[35, 35] = True
-    assert (masks.tidy(mask, 3, 3) == whole).all()
-    assert (masks.tidy(mask, 0, 0) == mask).all()
+    assert (voting.tidy(mask, 3, 3) == whole).all()
+    assert (voting.tidy(mask, 0, 0) == mask).all()
     mask[12:20, 12:20] = False
-    assert not masks.tidy(mask, 3, 3)[15, 15]
+    assert not voting.tidy(mask, 3, 3)[15, 15]
 
 
 def test_consistent_and_undecided_masks_match_the_truth(tmp_path):
@@ -157,10 +162,10 @@ def test_a_region_alone_marks_and_fills(tmp_path):
         run(Params(), tmp_path, poses=poses, fit=fit)
     with pytest.raises(ValueError, match=r"region\.json is missing"):
         run(Params(invent="region"), tmp_path, poses=poses, fit=fit)
-    io.save_json(poses / "region.json", {"center": [0, 0, NEAR], "size": [0.5, 0.5, 0.1]})
+    save_json(poses / "region.json", {"center": [0, 0, NEAR], "size": [0.5, 0.5, 0.1]})
     run(Params(), tmp_path, poses=poses, fit=fit)
-    sets = io.load_mask_sets(tmp_path, small.CAMERAS)
-    assert (io.load_labels(tmp_path / "labels.npy") == labels).all()
+    sets = load_mask_sets(tmp_path, small.CAMERAS)
+    assert (load_labels(tmp_path / "labels.npy") == labels).all()
     rows, columns = np.nonzero(sets["a2"].invent)
     half = 0.25 / (NEAR - 0.05) * small.FOCAL
     assert all(abs((side.max() - side.min() + 1) / 2 - half) <= 1 for side in (rows, columns))
@@ -169,19 +174,19 @@ def test_a_region_alone_marks_and_fills(tmp_path):
 def test_a_box_behind_the_surface_has_no_silhouette():
     view = small.camera("v", 0.0)
     wall = np.full((small.HEIGHT, small.WIDTH), 1 / small.WALL)
-    visible = masks.box_silhouette([0, 0, 1.5], [0.2] * 3, view, wall)
+    visible = voting.box_silhouette([0, 0, 1.5], [0.2] * 3, view, wall)
     assert visible[36, 48] and not visible[2, 2]
-    assert not masks.box_silhouette([0, 0, 1.5], [0.2] * 3, view, np.full(wall.shape, 1 / 1.2)).any()
-    assert not masks.box_silhouette([0, 0, -1.5], [0.2] * 3, view, wall).any()
+    assert not voting.box_silhouette([0, 0, 1.5], [0.2] * 3, view, np.full(wall.shape, 1 / 1.2)).any()
+    assert not voting.box_silhouette([0, 0, -1.5], [0.2] * 3, view, wall).any()
 
 
 def test_the_best_view_has_the_largest_mask_clear_of_the_border():
     blank = np.zeros((20, 30), bool)
     small_one, large, cut = blank.copy(), blank.copy(), blank.copy()
     small_one[5:8, 5:8] = large[5:12, 5:12] = cut[:15, :15] = True
-    assert masks.best_view({"s": small_one, "l": large, "c": cut}, ["c", "s", "l"]) == "l"
-    assert masks.best_view({"s": blank, "c": cut}, ["s", "c"]) == "c"
-    assert masks.best_view({"s": blank}, ["s"]) is None
+    assert voting.best_view({"s": small_one, "l": large, "c": cut}, ["c", "s", "l"]) == "l"
+    assert voting.best_view({"s": blank, "c": cut}, ["s", "c"]) == "c"
+    assert voting.best_view({"s": blank}, ["s"]) is None
 
 
 def test_haze_shows_mostly_where_nobody_saw():
@@ -190,4 +195,4 @@ def test_haze_shows_mostly_where_nobody_saw():
     aside = blob.map(lambda p: p.clone())
     aside.means[0, 0] = 0.4
     both = blob.zipped(aside, lambda a, b: torch.cat([a, b]))
-    assert masks.leaking(both, [view], {"v": inside}).tolist() == [True, False]
+    assert voting.leaking(both, [view], {"v": inside}).tolist() == [True, False]

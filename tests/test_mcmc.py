@@ -8,10 +8,10 @@ import pytest
 import torch
 from test_fit import SETTINGS, ring_of_cameras, run, start, truth
 
-from reffusion import mcmc
-from reffusion.optimize import GaussianOptimizer
-from reffusion.splat import render
-from reffusion.trace import generator
+from reffusion.gaussians import mcmc
+from reffusion.gaussians.optimize import GaussianOptimizer
+from reffusion.seeding import generator
+from reffusion.splat.rasterizer import render
 from reffusion.types import PARAMETERS
 
 

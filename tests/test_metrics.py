@@ -9,8 +9,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from reffusion import lpips, metrics
-from reffusion.metrics import Box, mask_box
+from reffusion.score import lpips, metrics
+from reffusion.score.metrics import Box, mask_box
 
 
 def pair(height, width, seed=0, noise=0.1):

@@ -4,17 +4,25 @@ import numpy as np
 import pytest
 import torch
 
-from reffusion import trace
-from reffusion.densify import SHRINK, densify, prune, rotate, split
-from reffusion.optimize import GaussianOptimizer, Rates, Update, _adam, _adam_cpu, confine, reconstruction_loss
-from reffusion.splat import render
-from reffusion.ssim import dssim, dssim_torch
+from reffusion import seeding
+from reffusion.gaussians.densify import SHRINK, densify, prune, rotate, split
+from reffusion.gaussians.optimize import (
+    GaussianOptimizer,
+    Rates,
+    Update,
+    _adam,
+    _adam_cpu,
+    confine,
+    reconstruction_loss,
+)
+from reffusion.gaussians.ssim import dssim, dssim_torch
+from reffusion.splat.rasterizer import render
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
 
 def random_gaussians(count: int, degree: int = 1, seed: int = 0, scale: float = 0.05) -> Gaussians:
     draw = lambda *shape: torch.randn(*shape, generator=generator)
-    generator = trace.generator(seed, "test")
+    generator = seeding.generator(seed, "test")
     return Gaussians(
         means=draw(count, 3) * 0.2,
         quaternions=draw(count, 4),
@@ -31,7 +39,7 @@ def camera(width: int = 24, height: int = 18) -> Camera:
 
 
 def pictures(height: int = 23, width: int = 31, channels: int = 3):
-    generator = trace.generator(1, "pictures")
+    generator = seeding.generator(1, "pictures")
     image = torch.rand(height, width, channels, generator=generator)
     target = (image + 0.2 * torch.randn(image.shape, generator=generator)).clamp(0, 1)
     return image, target, torch.rand(height, width, generator=generator) > 0.4
@@ -145,7 +153,7 @@ def test_confine_leaves_the_picture_alone():
 def pretend_gradients(optimizer: GaussianOptimizer, step: int) -> None:
     for name in PARAMETERS:
         parameter = getattr(optimizer.gaussians, name)
-        parameter.grad = torch.randn(parameter.shape, generator=trace.generator(step, name))
+        parameter.grad = torch.randn(parameter.shape, generator=seeding.generator(step, name))
 
 
 def test_adam_is_torch_adam_where_all_are_visible():
@@ -171,12 +179,12 @@ def test_adam_is_torch_adam_where_all_are_visible():
 
 
 def test_plain_and_compiled_adam_agree():
-    generator = trace.generator(3, "adam")
+    generator = seeding.generator(3, "adam")
     steps, visible = torch.arange(1500, dtype=torch.int32) % 40, torch.rand(1500, generator=generator) > 0.3
     masked, unbias = torch.rand(1500, generator=generator) > 0.5, list(1 + torch.rand(2, 40, generator=generator))
     results = []
     for adam, dtype in ((_adam, torch.float64), (_adam_cpu, torch.float32)):
-        generator = trace.generator(3, "parameters")
+        generator = seeding.generator(3, "parameters")
         updates = []
         for width in (1, 3, 27):
             rows = [torch.randn(1500, width, generator=generator).to(dtype) for _ in range(4)]
@@ -262,7 +270,7 @@ def test_labels_and_moments_follow_through_clone_split_and_prune():
     pretend_gradients(optimizer, 0)
     optimizer.step(0.0)
     kept = optimizer.state_dict()
-    grown = densify(optimizer, 2e-4, 0.02, 100, trace.generator(0, "split"))
+    grown = densify(optimizer, 2e-4, 0.02, 100, seeding.generator(0, "split"))
     # order now: 0 1 2 4, clone of 0, two children of 3
     assert grown == 2 and len(optimizer.gaussians) == 7
     assert optimizer.masked.tolist() == [True, False, True, False, True, True, True]
@@ -290,17 +298,17 @@ def test_labels_and_moments_follow_through_clone_split_and_prune():
 
 def test_the_budget_takes_the_steepest():
     optimizer = observed(random_gaussians(4, scale=0.001), [3e-4, 9e-4, 1e-4, 5e-4])
-    assert densify(optimizer, 2e-4, 0.01, 6, trace.generator(0)) == 2
+    assert densify(optimizer, 2e-4, 0.01, 6, seeding.generator(0)) == 2
     assert torch.equal(optimizer.gaussians.means[4:], optimizer.gaussians.means[[1, 3]])
     optimizer.slope_sum += 1
     optimizer.slope_count += 1
-    assert densify(optimizer, 2e-4, 0.01, 6, trace.generator(0)) == 0
+    assert densify(optimizer, 2e-4, 0.01, 6, seeding.generator(0)) == 0
 
 
 def test_split_keeps_the_picture_roughly():
     parent = random_gaussians(12, seed=4, scale=0.1)
     parent.opacity_logits[:] = 0.0
-    children = split(parent, trace.generator(0, "split"))
+    children = split(parent, seeding.generator(0, "split"))
     before = render(parent, camera(48, 36), impl="reference")
     after = render(children, camera(48, 36), impl="reference")
     error = (before.color - after.color).square().mean()
@@ -313,7 +321,7 @@ def test_split_draws_from_the_gaussian_itself():
     one = random_gaussians(1, seed=2)
     one.log_scales[0] = torch.log(torch.tensor([0.5, 0.1, 0.02]))
     many = one.map(lambda p: p.repeat(4000, *[1] * (p.ndim - 1)))
-    offsets = split(many, trace.generator(1)).means - one.means
+    offsets = split(many, seeding.generator(1)).means - one.means
     basis = rotate(one.quaternions.expand(3, 4), torch.eye(3)).T
     truth = basis @ torch.diag(torch.tensor([0.5, 0.1, 0.02]) ** 2) @ basis.T
     assert (torch.cov(offsets.T) - truth).abs().max() < 0.05 * truth.abs().max()

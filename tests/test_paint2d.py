@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from reffusion import paint2d, perceptual
-from reffusion.trace import generator
+from reffusion.distill import perceptual
+from reffusion.paint import paint2d
+from reffusion.seeding import generator
 
 HEIGHT, WIDTH = 37, 50
 

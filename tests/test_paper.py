@@ -87,8 +87,8 @@ def test_constants_of_the_library():
     sys.path.insert(0, str(ROOT / "benchmarks"))
     import full_size
 
-    from reffusion import crops, lora
-    from reffusion.optimize import reconstruction_loss
+    from reffusion.gaussians.optimize import reconstruction_loss
+    from reffusion.prior import crops, lora
 
     assert crops.PROMPTS == ("A photo of sks", "A photo of sks, cropped", "")
     assert 8 * full_size.SD2.unet["sample_size"] == 512

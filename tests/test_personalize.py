@@ -6,10 +6,11 @@ import pytest
 import torch
 from small_prior import small_prior
 
-from reffusion import crops, denoising, diffusion, lora
-from reffusion import personalize as P
-from reffusion.crops import Sampling
-from reffusion.trace import generator, load_checkpoint, read_trace
+from reffusion.prior import crops, denoising, diffusion, lora
+from reffusion.prior import personalize as P
+from reffusion.prior.crops import Sampling
+from reffusion.seeding import generator
+from reffusion.trace import load_checkpoint, read_trace
 
 NATIVE, SIZE = 16, 12
 TRAINING = P.Training(

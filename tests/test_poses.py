@@ -31,7 +31,14 @@ from small_capture import (
     write_poses_bounds,
 )
 
-from reffusion import frame, io, lens
+from reffusion.capture import frame, lens
+from reffusion.capture.load import load_capture
+from reffusion.capture.roles import load_roles
+from reffusion.capture.undistorted import load_lenses
+from reffusion.io.arrays import load_json
+from reffusion.io.images import image_size
+from reffusion.io.ply import load_ply, save_ply, save_points
+from reffusion.io.scene import load_raw_masks, load_scene, load_test_masks, load_views
 from reffusion.types import Gaussians
 from stages import poses
 
@@ -45,7 +52,7 @@ def test_every_layout_keeps_the_projection(tmp_path, layout, model):
     scene, out = run(prepare(tmp_path / "s", layout, truth))
     assert reprojection_error(scene, truth) < 1e-3
     assert sorted(scene.cameras) == sorted(truth.world_to_camera) == list(scene.train) and not scene.test
-    assert len(io.load_raw_masks(out, scene.train)) == 6
+    assert len(load_raw_masks(out, scene.train)) == 6
     if layout.startswith(("llff", "colmap")):
         np.testing.assert_allclose(scene.similarity.invert(scene.points[:60]), truth.points, atol=1e-9)
 
@@ -111,10 +118,10 @@ def test_spin_nerf_split_and_masks(tmp_path, mask_value):
     spin_nerf(tmp_path / "s", mask_value, (WIDTH, HEIGHT + 3))
     scene, out = run(tmp_path / "s")
     assert scene.test == ("v00", "v01") and scene.train == ("v02", "v03", "v04", "v05")
-    assert sorted(io.load_raw_masks(out, scene.cameras)) == list(scene.train)
-    labels = io.load_test_masks(out)
+    assert sorted(load_raw_masks(out, scene.cameras)) == list(scene.train)
+    labels = load_test_masks(out)
     assert sorted(labels) == ["v00", "v01"]
-    for mask in (*labels.values(), *io.load_raw_masks(out, scene.train).values()):
+    for mask in (*labels.values(), *load_raw_masks(out, scene.train).values()):
         assert mask.shape == (HEIGHT, WIDTH) and 0.04 < mask.mean() < 0.1
     assert set(np.unique(np.array(Image.open(out / "masks" / "v02.png")))) == {0, 255}
 
@@ -125,15 +132,15 @@ def test_spin_nerf_with_a_missing_training_mask(tmp_path):
     with pytest.warns(UserWarning, match="1 training views have no mask: v04"):
         scene, out = run(tmp_path / "s")
     assert scene.test == ("v00", "v01") and "v04" in scene.train
-    assert "v04" not in io.load_raw_masks(out, scene.train)
+    assert "v04" not in load_raw_masks(out, scene.train)
 
 
 def test_splits_from_scene_yaml(tmp_path):
     prepare(tmp_path / "s", "transforms", some_truth(views=9))
     scene, out = run(tmp_path / "s", test="every 4", clean=["v01"])
     assert scene.test == ("v00", "v04", "v08") and len(scene.train) == 6 and scene.clean == {"v01"}
-    assert sorted(io.load_test_masks(out)) == list(scene.test)
-    assert sorted(io.load_raw_masks(out, scene.test)) == list(scene.test)  # the object is in these views
+    assert sorted(load_test_masks(out)) == list(scene.test)
+    assert sorted(load_raw_masks(out, scene.test)) == list(scene.test)  # the object is in these views
     scene, _ = run(tmp_path / "s", train=["v03", "v01", "v02.png"], test=["v05"])
     assert scene.train == ("v01", "v02", "v03") and scene.test == ("v05",) and len(scene.cameras) == 4
 
@@ -161,7 +168,7 @@ def test_transforms_variants(tmp_path):
         each["file_path"] = "./" + each["file_path"].removesuffix(".png")
     record["ply_file_path"], record["applied_transform"] = "some.ply", [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
     (folder / "transforms.json").write_text(json.dumps(record))
-    io.save_points(folder / "some.ply", truth.points, np.zeros((60, 3), np.uint8))
+    save_points(folder / "some.ply", truth.points, np.zeros((60, 3), np.uint8))
     scene, _ = run(folder, least_points=0)
     assert reprojection_error(scene, truth) < 1e-3
     np.testing.assert_allclose(scene.similarity.invert(scene.points), truth.points, atol=1e-9)
@@ -171,10 +178,10 @@ def test_large_pictures_are_brought_to_the_longest_side(tmp_path):
     truth = some_truth(OPENCV)
     folder = prepare(tmp_path / "s", "colmap", truth)
     scene, out = run(folder, longest=48)
-    assert io.image_size(out / "images" / "v00.png") == (48, 36)
+    assert image_size(out / "images" / "v00.png") == (48, 36)
     big = replace(scene, cameras={n: c.resized(WIDTH, HEIGHT) for n, c in scene.cameras.items()})
     assert reprojection_error(big, truth) < 1e-3
-    assert io.load_raw_masks(out, ["v00"])["v00"].shape == (36, 48)
+    assert load_raw_masks(out, ["v00"])["v00"].shape == (36, 48)
 
 
 @pytest.mark.parametrize("brings", ["points", "bounds", "nothing"])
@@ -224,7 +231,7 @@ def test_what_the_scene_brings_comes_into_the_normalised_frame(tmp_path):
     folder = prepare(tmp_path / "s", "colmap", truth)
     means = torch.from_numpy(truth.points).float()
     gaussians = Gaussians(means, torch.ones(60, 4), torch.zeros(60, 3), torch.zeros(60), torch.zeros(60, 4, 3))
-    io.save_ply(folder / "given.ply", gaussians)
+    save_ply(folder / "given.ply", gaussians)
     given = yaml.safe_load(
         """
         gaussians: given.ply
@@ -233,11 +240,11 @@ def test_what_the_scene_brings_comes_into_the_normalised_frame(tmp_path):
     )
     scene, out = run(folder, **given)
     similarity = scene.similarity
-    np.testing.assert_allclose(io.load_ply(out / "gaussians.ply").means, similarity.apply(truth.points), atol=1e-5)
-    region = io.load_json(out / "region.json")
+    np.testing.assert_allclose(load_ply(out / "gaussians.ply").means, similarity.apply(truth.points), atol=1e-5)
+    region = load_json(out / "region.json")
     np.testing.assert_allclose(region["center"], similarity.apply(np.array([50.0, 0.0, 0.0])))
     np.testing.assert_allclose(region["size"], np.array([1.0, 2.0, 3.0]) * similarity.scale)
-    lenses, upright = io.load_lenses(out)
+    lenses, upright = load_lenses(out)
     assert set(lenses.values()) == {truth.lens} and list(lenses) == sorted(truth.world_to_camera) and not upright
 
 
@@ -271,18 +278,18 @@ def capture(name: str) -> Path:
 def real(tmp_path: Path, name: str, **params):
     (tmp_path / "out").mkdir(parents=True)
     poses.run(poses.Params(**params), tmp_path / "out", scene=capture(name))
-    return io.load_scene(tmp_path / "out"), tmp_path / "out"
+    return load_scene(tmp_path / "out"), tmp_path / "out"
 
 
 def test_statue(tmp_path):
-    found = io.load_capture(capture("statue"))
+    found = load_capture(capture("statue"))
     assert (
         len(found.pictures) == 29 and found.brought_by.name == "poses_bounds.npy" and len(found.poses.points) == 15881
     )
     assert next(iter(found.poses.lenses.values())).model == "PINHOLE" and not found.warnings
     names = ["IMG_2707", "IMG_2716", "IMG_2736"]
     scene, out = real(tmp_path, "statue", train=names)
-    masks = io.load_raw_masks(out, names)
+    masks = load_raw_masks(out, names)
     assert all(0.03 < mask.mean() < 0.3 and mask.shape == (378, 504) for mask in masks.values())
     # The statue's points, by the masks, agree from view to view: the poses and the points share a frame.
     inside = np.ones(len(scene.points), bool)
@@ -301,12 +308,12 @@ def test_statue(tmp_path):
 
 def test_bear(tmp_path):
     with pytest.raises(ValueError, match="no mask at all"):
-        io.load_roles(capture("bear"), io.load_capture(capture("bear")))
+        load_roles(capture("bear"), load_capture(capture("bear")))
     names = ["frame_00001", "frame_00030", "frame_00060", "frame_00090"]
     scene, out = real(tmp_path, "bear", masks="none", train=names[:3], test=names[3:])
     assert len(scene.points) == 34174 and scene.test == ("frame_00090",)
     shares = []
-    for name, image in io.load_views(out, names).items():
+    for name, image in load_views(out, names).items():
         camera = scene.cameras[name]
         at = scene.points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
         uv = (at[:, :2] / at[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)).astype(int)
@@ -329,10 +336,10 @@ def test_fox(tmp_path):
 
 def test_statue_has_its_cameras_adjusted(tmp_path, monkeypatch):
     """Its phone's stabiliser moved the lens: far things miss near ones by a third of a pixel at 252 x 189."""
-    monkeypatch.setattr("reffusion.refine.TRACKS", 4000)
+    monkeypatch.setattr("reffusion.capture.refine.TRACKS", 4000)
     plain, _ = real(tmp_path / "plain", "statue", longest=252)
     scene, out = real(tmp_path / "adjusted", "statue", longest=252, refine=True)
-    said = io.load_json(out / "refine.json")
+    said = load_json(out / "refine.json")
     assert said["before"] > 0.15 and said["after"] < 0.6 * said["before"]
     shifts = [scene.cameras[n].cy - plain.cameras[n].cy for n in scene.train]
     assert np.ptp(shifts) > 0.5 and scene.similarity.scale == plain.similarity.scale

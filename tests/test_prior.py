@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from reffusion import diffusion, fill, lora
-from reffusion.prior import CONDITIONING, load_prior, make_prior
-from reffusion.trace import generator
+from reffusion.prior import diffusion, fill, lora
+from reffusion.prior.model import CONDITIONING, load_prior, make_prior
+from reffusion.seeding import generator
 
 TINY = Path(__file__).resolve().parent.parent / "priors" / "tiny"
 

@@ -16,7 +16,8 @@ import holes  # noqa: E402
 import images  # noqa: E402
 import prior as benchmark  # noqa: E402
 
-from reffusion import io, metrics  # noqa: E402
+from reffusion.io.images import load_image, save_image
+from reffusion.score import metrics  # noqa: E402
 from report import prior as page  # noqa: E402
 
 
@@ -69,11 +70,11 @@ def test_holes_are_objects_of_a_fair_size(cases):
 
 def test_a_wrong_reference_has_another_picture_and_the_same_holes(tmp_path):
     for folder, value in (("references", 90), ("masks", 255)):
-        io.save_image(tmp_path / "given" / folder / "a.png", np.full((6, 8, 3), value, np.uint8))
-    io.save_image(tmp_path / "other.png", np.full((30, 40, 3), 200, np.uint8))
+        save_image(tmp_path / "given" / folder / "a.png", np.full((6, 8, 3), value, np.uint8))
+    save_image(tmp_path / "other.png", np.full((30, 40, 3), 200, np.uint8))
     made = benchmark.with_picture(tmp_path / "given", tmp_path / "other.png", tmp_path / "made")
-    assert io.load_image(made / "references/a.png").shape == (6, 8, 3)
-    assert (io.load_image(made / "references/a.png") == 200).all()
+    assert load_image(made / "references/a.png").shape == (6, 8, 3)
+    assert (load_image(made / "references/a.png") == 200).all()
     assert (made / "masks/a.png").read_bytes() == (tmp_path / "given/masks/a.png").read_bytes()
 
 
@@ -94,7 +95,7 @@ def measured(folder: Path) -> None:
     levels = {"error": [0.1, 0.4], "variance": [0.2, 0.3], "samples": row}
     for name, columns in (("inpainting", 4), ("reference", 4), ("whole", 4), ("window", 4)):
         for index in range(2):
-            io.save_image(folder / name / f"{index}.png", np.full((8, 8 * columns, 3), 90 * index, np.uint8))
+            save_image(folder / name / f"{index}.png", np.full((8, 8 * columns, 3), 90 * index, np.uint8))
     (folder / "prior.json").write_text(json.dumps({
         "prior": "a/prior",
         "inpainting": {"columns": ["hole", "Telea", "a/prior", "truth"],
@@ -124,7 +125,7 @@ def test_the_page_holds_every_table_and_picture(tmp_path):
     assert "| whole, wrong | 20.00 (20.00 to 20.00) |" in text
     linked = [line[4:-1] for line in text.splitlines() if line.startswith("![](")]
     assert sorted(linked) == ["charts.png", "inpainting.png", "reference.png", "whole.png", "window.png"]
-    assert all(io.load_image(tmp_path / name).shape[1] > 90 for name in linked)
+    assert all(load_image(tmp_path / name).shape[1] > 90 for name in linked)
 
 
 def test_without_a_measurement_the_page_says_what_to_run(tmp_path):

@@ -16,10 +16,11 @@ sys.path.insert(0, str(ROOT / "benchmarks"))
 import full_size as F  # noqa: E402
 import gpu_check  # noqa: E402
 
-from reffusion import crops, denoising, diffusion, inpaint, lora, memory, weights  # noqa: E402
-from reffusion.personalize import train_step  # noqa: E402
-from reffusion.prior import load_prior, pipeline, recomputing, without_text  # noqa: E402
-from reffusion.trace import generator  # noqa: E402
+from reffusion.prior import crops, denoising, diffusion, inpaint, lora, memory
+from reffusion.prior.model import load_prior, pipeline, recomputing, without_text  # noqa: E402
+from reffusion.prior.personalize import train_step  # noqa: E402
+from reffusion.seeding import generator  # noqa: E402
+from reffusion.weights import published  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -214,8 +215,8 @@ def test_running_out_of_memory_names_the_param():
 
 
 def test_published_sizes_are_those_of_the_published_configurations():
-    assert F.count(F.SD2) == weights.PUBLISHED[weights.SD2].parameters
-    assert F.count(F.SDXL) == weights.PUBLISHED[weights.SDXL].parameters
+    assert F.count(F.SD2) == published.PUBLISHED[published.SD2].parameters
+    assert F.count(F.SDXL) == published.PUBLISHED[published.SDXL].parameters
 
 
 def test_memory_is_counted_without_computing():

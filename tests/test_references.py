@@ -14,8 +14,14 @@ import yaml
 from PIL import Image
 from small_capture import HEIGHT, OPENCV, WIDTH, prepare, run, some_truth, write_pictures, write_transforms
 
-from reffusion import alignment, io, lens, painting, registration
-from reffusion.io import GivenReference
+from reffusion.capture import lens
+from reffusion.capture.given import GivenReference, load_depth
+from reffusion.capture.undistorted import load_straight, load_straight_depth, save_lenses
+from reffusion.depth import alignment
+from reffusion.io.arrays import save_json, save_labels
+from reffusion.io.images import load_image, load_mask, save_exr, save_image, save_mask
+from reffusion.io.scene import load_references, load_scene, save_mask_sets
+from reffusion.paint import painting, registration
 from reffusion.types import MaskSet
 from runner.execute import clean, run_scene
 from runner.job import Request
@@ -126,17 +132,17 @@ def test_a_moved_reference_is_read_once_through_the_lens(tmp_path):
     """Distorted, cropped, resized: straight again, as the photograph's own undistorted picture."""
     shot = lens.from_colmap(OPENCV[0], WIDTH, HEIGHT, OPENCV[1])
     image = pattern(3, (WIDTH, HEIGHT))
-    io.save_image(tmp_path / "whole.png", image)
-    whole, inside = io.load_straight(GivenReference("v", tmp_path / "whole.png"), shot, False)
-    still, _ = io.load_straight(GivenReference("v", tmp_path / "whole.png"), shot, False, np.eye(2, 3))
+    save_image(tmp_path / "whole.png", image)
+    whole, inside = load_straight(GivenReference("v", tmp_path / "whole.png"), shot, False)
+    still, _ = load_straight(GivenReference("v", tmp_path / "whole.png"), shot, False, np.eye(2, 3))
     assert inside.all() and np.abs(whole.astype(int) - still).max() <= 1
     depth = np.tile(np.linspace(1, 2, WIDTH), (HEIGHT, 1))
     np.save(tmp_path / "depth.npy", depth)
     given = GivenReference("v", tmp_path / "whole.png", tmp_path / "depth.npy")
-    straight = io.load_straight_depth(given, shot, False)
+    straight = load_straight_depth(given, shot, False)
     where = lens.sampling_map(shot, lens.without_distortion(shot))
     np.testing.assert_allclose(straight, 1 + (where[..., 0] - 0.5) / (WIDTH - 1), atol=0.6 / WIDTH)
-    shifted = io.load_straight_depth(given, shot.pinhole, False, np.array([[1.0, 0, 4], [0, 1, 0]]))
+    shifted = load_straight_depth(given, shot.pinhole, False, np.array([[1.0, 0, 4], [0, 1, 0]]))
     np.testing.assert_allclose(shifted[:, :-4], depth[:, 4:], rtol=1e-6)
     assert np.isnan(shifted[:, -4:]).all()
 
@@ -152,7 +158,7 @@ DEPTHS = {
     "disparity.png": lambda path, z: save_png16(path, 60000 / z * z.min()),
     "depth.png": lambda path, z: save_png16(path, 5000 + 20000 * (z - z.min())),
     "depth.npy": lambda path, z: np.save(path, 37.0 * z),
-    "affine disparity.exr": lambda path, z: io.save_exr(path, 4.0 / z - 1),
+    "affine disparity.exr": lambda path, z: save_exr(path, 4.0 / z - 1),
 }
 
 
@@ -165,7 +171,7 @@ def test_depth_of_any_kind_is_brought_to_the_scenes(tmp_path, kind):
     known[20:40, 30:50] = False
     DEPTHS[kind](tmp_path / kind.split()[-1], z)
     seen = np.where(rng.random(z.shape) < 0.2, 1.5 * z, z)  # a fifth of what is seen is something else
-    aligned, space = alignment.align_either(io.load_depth(tmp_path / kind.split()[-1]), np.where(known, seen, 0), known)
+    aligned, space = alignment.align_either(load_depth(tmp_path / kind.split()[-1]), np.where(known, seen, 0), known)
     np.testing.assert_allclose(aligned, z, rtol=2e-3)
     assert space == ("disparity" if "disparity" in kind else "depth")
 
@@ -193,7 +199,7 @@ def test_depth_that_says_nothing_of_the_scene_is_refused():
 def test_what_is_no_depth_map_is_refused(tmp_path, name, write, message):
     write(tmp_path / name)
     with pytest.raises(ValueError, match=rf"{name}.*{message}"):
-        io.load_depth(tmp_path / name)
+        load_depth(tmp_path / name)
 
 
 # ------------------------------------------------------------------------------------- refusals, before any work
@@ -250,7 +256,7 @@ def test_paintings_stand_for_named_references_and_masks_beside_them_are_passed_o
 def test_a_view_that_was_not_placed_is_told(tmp_path):
     folder = prepare(tmp_path / "s", "transforms", some_truth())
     write_pictures(folder, ["ref"])
-    io.save_lenses(tmp_path, {"v00": some_truth().lens}, False)
+    save_lenses(tmp_path, {"v00": some_truth().lens}, False)
     with pytest.raises(ValueError, match=r"ref\.png: its view 'v01' could not be placed"):
         reference.preview(reference.Params(**named("v01")), scene=folder, poses=tmp_path)
 
@@ -268,10 +274,10 @@ def wall(tmp_path):
         mask, unseen = small.true_mask(camera, 1.6), small.true_never_seen(camera, 1.6)
         sets[name] = MaskSet(mask, mask, unseen, unseen)
         photo = np.where(mask[..., None], np.uint8([230, 26, 26]), small.photo(camera))
-        io.save_image(made_poses / "images" / f"{name}.png", photo)
-    io.save_mask_sets(tmp_path / "masks", sets)
-    io.save_labels(tmp_path / "masks" / "labels.npy", labels)
-    io.save_json(tmp_path / "masks" / "facts.json", {"best_reference": "a2"})
+        save_image(made_poses / "images" / f"{name}.png", photo)
+    save_mask_sets(tmp_path / "masks", sets)
+    save_labels(tmp_path / "masks" / "labels.npy", labels)
+    save_json(tmp_path / "masks" / "facts.json", {"best_reference": "a2"})
     return {"scene": tmp_path / "scene", "poses": made_poses, "fit": fitted, "masks": tmp_path / "masks"}
 
 
@@ -281,12 +287,12 @@ COMMON = {"inpainter": "exemplar", "masks": "none", "test": list(small.TEST)}
 def completed(wall, out: Path, **params):
     out.mkdir()
     reference.run(reference.Params(**COMMON, **params), out, **wall)
-    return {r.camera.name: r for r in io.load_references(out, io.load_scene(wall["poses"]))}
+    return {r.camera.name: r for r in load_references(out, load_scene(wall["poses"]))}
 
 
 def test_a_reference_from_another_tool_ends_near_the_clean_one(wall, tmp_path):
     truth, mask = small.photo(small.CAMERAS["a2"]), small.true_mask(small.CAMERAS["a2"], 1.6)
-    io.save_image(wall["scene"] / "clean.png", truth)
+    save_image(wall["scene"] / "clean.png", truth)
     Image.fromarray(from_another_tool(truth, quality=95)).save(wall["scene"] / "far.jpg", quality=80)
     clean_one = completed(wall, tmp_path / "clean", **named("a2", "clean.png"))["a2"]
     assert np.array_equal(clean_one.image, truth) and clean_one.depth is None
@@ -294,14 +300,14 @@ def test_a_reference_from_another_tool_ends_near_the_clean_one(wall, tmp_path):
     assert psnr(far.image, truth, mask) > 33 and np.array_equal(far.mask, clean_one.mask)
     away = cv2.dilate(mask.astype(np.uint8), np.ones((9, 9))) == 0
     assert np.array_equal(far.image[away], truth[away]), "the photograph elsewhere"
-    io.save_image(wall["scene"] / "other.png", pattern(5, (small.WIDTH, small.HEIGHT)))
+    save_image(wall["scene"] / "other.png", pattern(5, (small.WIDTH, small.HEIGHT)))
     with pytest.raises(ValueError, match=r"other\.png: does not fit its view 'a2'.*only \d+%.*another view"):
         completed(wall, tmp_path / "other", **named("a2", "other.png"))
 
 
 def test_depth_of_a_reference_reaches_its_artifact(wall, tmp_path):
     truth = small.photo(small.CAMERAS["a2"])
-    io.save_image(wall["scene"] / "clean.png", truth)
+    save_image(wall["scene"] / "clean.png", truth)
     depth = np.add.outer(np.zeros(2 * small.HEIGHT), np.linspace(1000, 60000, 2 * small.WIDTH))
     save_png16(wall["scene"] / "depth.png", depth)
     found = completed(wall, tmp_path / "out", **named("a2", "clean.png", depth="depth.png"))["a2"]
@@ -318,7 +324,7 @@ def test_what_is_to_be_painted_is_laid_out_and_a_painting_comes_back(wall, tmp_p
     lines = [line.split() for line in (laid_out / "ranked.txt").read_text().splitlines() if line[0] != "#"]
     assert lines[0][0] == "1." and lines[0][2] == "100%" and len(lines) == 1, "one view sees all of so flat a hole"
     view = lines[0][1]
-    shown, mask = io.load_image(laid_out / f"{view}.png"), io.load_mask(laid_out / f"{view}_mask.png")
+    shown, mask = load_image(laid_out / f"{view}.png"), load_mask(laid_out / f"{view}_mask.png")
     photo, hidden = small.photo(small.CAMERAS[view]), small.true_mask(small.CAMERAS[view], 1.6)
     assert (
         np.array_equal(mask, small.true_never_seen(small.CAMERAS[view], 1.6)) and (shown[mask] == painting.GREY).all()
@@ -327,7 +333,7 @@ def test_what_is_to_be_painted_is_laid_out_and_a_painting_comes_back(wall, tmp_p
 
     shutil.copytree(laid_out, wall["scene"] / "painted", ignore=shutil.ignore_patterns("*.txt"))
     painted = np.where(mask[..., None], photo, shown)
-    io.save_image(wall["scene"] / "painted" / f"{view}.png", painted)
+    save_image(wall["scene"] / "painted" / f"{view}.png", painted)
     again = completed(wall, tmp_path / "again")
     assert list(again) == [view] and np.array_equal(again[view].image, painted)
     assert f"1. {view}  100%  (painted)" in (tmp_path / "again" / "to_paint" / "ranked.txt").read_text()
@@ -363,10 +369,10 @@ def capture(folder: Path) -> Path:
     write_transforms(folder, shown)
     for name, camera in cameras.items():
         mask = small.true_mask(camera, 1.4)
-        io.save_image(
+        save_image(
             folder / f"images/{name}.png", np.where(mask[..., None], np.uint8([230, 26, 26]), small.photo(camera))
         )
-        io.save_mask(folder / f"masks/{name}.png", mask)
+        save_mask(folder / f"masks/{name}.png", mask)
     return folder
 
 
@@ -393,18 +399,18 @@ def test_a_new_reference_reruns_nothing_before_its_stage(tmp_path):
     assert set(words().values()) == {"cached"}
 
     view = laid_out[0].split(".")[0].removesuffix("_mask")
-    shown, mask = (io.load_image(home / "to_paint" / f"{view}{end}.png") for end in ("", "_mask"))
+    shown, mask = (load_image(home / "to_paint" / f"{view}{end}.png") for end in ("", "_mask"))
     photo = small.photo(small.CAMERAS[view])
-    io.save_image(folder / "painted" / f"{view}.png", np.where(mask > 0, photo, shown))
+    save_image(folder / "painted" / f"{view}.png", np.where(mask > 0, photo, shown))
     assert only_the_reference_changed()
     run_scene(request, "reference")
-    (found,) = io.load_references(home / "reference", io.load_scene(home / "poses"))
+    (found,) = load_references(home / "reference", load_scene(home / "poses"))
     assert found.camera.name == view and psnr(found.image, photo, found.mask) > 40
     assert (home / "to_paint" / "ranked.txt").is_file()
 
     (folder / "scene.yaml").write_text(yaml.safe_dump(named("a0", "truth/a0.png")))
     assert only_the_reference_changed()
-    io.save_image(folder / "images" / "a4.png", small.photo(small.CAMERAS["a4"]))
+    save_image(folder / "images" / "a4.png", small.photo(small.CAMERAS["a4"]))
     assert words()["poses"] == "run", "a photograph is none of these"
     clean(request)
     assert not home.exists() and (folder / "painted" / f"{view}.png").is_file()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from reffusion import refine
+from reffusion.capture import refine
 from reffusion.types import Camera
 
 WIDTH, HEIGHT, FOCAL = 216, 162, 200.0

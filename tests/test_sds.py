@@ -3,17 +3,9 @@
 import pytest
 import torch
 
-from reffusion.sds import (
-    draw_timesteps,
-    enlarged,
-    sds_gradient,
-    sds_loss,
-    two_scale_masks,
-    two_scales,
-    unfaded,
-    window_around,
-)
-from reffusion.trace import generator
+from reffusion.distill.sds import draw_timesteps, sds_gradient, sds_loss, unfaded
+from reffusion.prior.windows import enlarged, two_scale_masks, two_scales, window_around
+from reffusion.seeding import generator
 
 ABAR = torch.cos(torch.linspace(0.05, 1.5, 100, dtype=torch.float64)) ** 2
 MEAN, VARIANCE = 0.7, 0.25

@@ -13,13 +13,15 @@ sys.path.insert(0, str(ROOT / "benchmarks"))
 
 import sds_variance as benchmark  # noqa: E402
 
-from reffusion import io, trace  # noqa: E402
+from reffusion import seeding  # noqa: E402
+from reffusion.io.ply import save_ply
+from reffusion.io.scene import save_mask_sets, save_scene
 from reffusion.types import Camera, Gaussians, MaskSet, Scene, Similarity  # noqa: E402
 
 
 def test_variance_is_split_into_that_of_noise_and_that_of_timesteps():
     """Means 0, 1, ..., 4 at five timesteps (variance 2.5), noise of variance 4 around them."""
-    draw = trace.generator(0, "variances")
+    draw = seeding.generator(0, "variances")
     means = torch.arange(5.0)[:, None, None]
     found = benchmark.variances(means + 2 * torch.randn(5, 8, 20_000, generator=draw))
     assert found["over_noise"] == pytest.approx(4, rel=0.01) and found["noise"] == pytest.approx([4] * 5, rel=0.03)
@@ -37,7 +39,7 @@ def test_without_noise_and_without_a_pull_nothing_is_left():
 
 def small_run(home, invent):
     """A wall in front of three views; `invent`: bool [H, W], the hole in each."""
-    draw = trace.generator(0, "wall")
+    draw = seeding.generator(0, "wall")
     means = torch.rand(80, 3, generator=draw) * torch.tensor([1.6, 1.2, 0.1]) - torch.tensor([0.8, 0.6, -1.5])
     wall = Gaussians(
         means, torch.zeros(80, 4), torch.full((80, 3), -2.0), torch.full((80,), 2.0), torch.zeros(80, 1, 3)
@@ -46,9 +48,9 @@ def small_run(home, invent):
     cameras = {name: Camera(name, width, height, 40.0, 40.0, width / 2, height / 2, np.eye(4)) for name in names}
     still = Similarity(1.0, np.zeros(3))
     scene = Scene(cameras, names, (), frozenset({"c"}), np.zeros((1, 3)), np.zeros((1, 3), np.uint8), still)
-    io.save_scene(home / "poses", scene)
-    io.save_ply(home / "initialize" / "gaussians.ply", wall)
-    io.save_mask_sets(home / "masks", dict.fromkeys(names, MaskSet(*[invent] * 4)))
+    save_scene(home / "poses", scene)
+    save_ply(home / "initialize" / "gaussians.ply", wall)
+    save_mask_sets(home / "masks", dict.fromkeys(names, MaskSet(*[invent] * 4)))
     return home
 
 

@@ -12,7 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reffusion import io, sfm
+from reffusion.capture import sfm
+from reffusion.capture.layouts.capture import Poses
+from reffusion.capture.load import load_capture
+from reffusion.io.images import save_image, save_mask
+from reffusion.io.scene import load_raw_masks, load_scene
 from stages import poses
 
 ROOT = Path(__file__).parents[1]
@@ -87,7 +91,7 @@ def assert_accepted(scene, truth: dict[str, np.ndarray]) -> None:
 def run(folder: Path, out: Path, **params):
     out.mkdir()
     poses.run(poses.Params(**params), out, scene=folder)
-    return io.load_scene(out)
+    return load_scene(out)
 
 
 def test_a_walk_past_a_corner(tmp_path):
@@ -96,10 +100,10 @@ def test_a_walk_past_a_corner(tmp_path):
     textures = np.stack([noise(generator) for _ in range(3)])
     folder = tmp_path / "s"
     for name, pose in truth.items():
-        io.save_image(folder / f"{name}.png", draw_corner(pose, textures))
-    io.save_image(folder / "stray.png", noise(generator)[:150, :200].astype(np.uint8))
+        save_image(folder / f"{name}.png", draw_corner(pose, textures))
+    save_image(folder / "stray.png", noise(generator)[:150, :200].astype(np.uint8))
     for name in (*truth, "stray"):
-        io.save_mask(folder / "masks" / f"{name}.png", np.eye(150, 200, dtype=bool))
+        save_mask(folder / "masks" / f"{name}.png", np.eye(150, 200, dtype=bool))
     with pytest.warns(UserWarning, match="1 views were not placed and are left out: stray"):
         scene = run(folder, tmp_path / "out")
     assert sorted(scene.cameras) == sorted(truth) == list(scene.train)
@@ -107,7 +111,7 @@ def test_a_walk_past_a_corner(tmp_path):
     again = sfm.solve(*2 * [{n: folder / f"{n}.png" for n in truth}], tmp_path / "work", seed=0)
     once_more = sfm.solve(*2 * [{n: folder / f"{n}.png" for n in truth}], tmp_path / "work", seed=0)
     assert all(np.array_equal(again.world_to_camera[n], once_more.world_to_camera[n]) for n in truth)
-    assert len(scene.points) > 300 and "stray" not in io.load_raw_masks(tmp_path / "out", ["stray"])
+    assert len(scene.points) > 300 and "stray" not in load_raw_masks(tmp_path / "out", ["stray"])
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
         "images", "lenses.json", "masks", "sparse", "transform.json", "views.json",
     ]  # fmt: skip
@@ -115,7 +119,7 @@ def test_a_walk_past_a_corner(tmp_path):
 
 def test_views_that_do_not_belong_together_are_named(tmp_path):
     for name in ("a", "b", "c"):
-        io.save_image(tmp_path / "s" / "images" / f"{name}.jpg", np.full((60, 80, 3), 90, np.uint8))
+        save_image(tmp_path / "s" / "images" / f"{name}.jpg", np.full((60, 80, 3), 90, np.uint8))
     with pytest.raises(ValueError, match=r"placed 0 of 3 views.*not a, b, c\. Take more photos"):
         run(tmp_path / "s", tmp_path / "out", masks="none")
 
@@ -148,7 +152,7 @@ def test_bear(tmp_path):
     """A dozen neighbouring photographs against the poses they came with (which are COLMAP's own, from 96)."""
     if not (CAPTURES / "bear").is_dir():
         pytest.skip("the capture bear is not in ../shared/data")
-    brought = io.load_capture(CAPTURES / "bear")
+    brought = load_capture(CAPTURES / "bear")
     names = sorted(brought.pictures)[:24:2]
     (tmp_path / "s" / "images").mkdir(parents=True)
     for name in names:
@@ -158,7 +162,7 @@ def test_bear(tmp_path):
     assert_accepted(scene, {name: about_the_middle(brought.poses, name) for name in names})
 
 
-def about_the_middle(given: io.Poses, name: str) -> np.ndarray:
+def about_the_middle(given: Poses, name: str) -> np.ndarray:
     """The pose [4, 4] turned so that it looks along the ray through the middle of its picture.
 
     bear's pictures are crops, their principal point 17 px off the middle. Structure from motion keeps it in the

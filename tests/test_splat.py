@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from reffusion import splat
-from reffusion.splat import reference
+from reffusion.splat import rasterizer, reference
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
 BLOCKS = (*PARAMETERS, "features", "background", "probe")
@@ -48,7 +47,7 @@ def differentiate(gaussians, view, impl, dtype, channels=3, sh_degree=None):
     gaussians = gaussians.map(leaf)
     features, background = leaf(random(len(gaussians), channels)), leaf(torch.tensor([0.2, 0.3, 0.4]))
     probe = leaf(torch.zeros(len(gaussians), 2))
-    drawn = splat.render(
+    drawn = rasterizer.render(
         gaussians,
         view,
         features=features,
@@ -107,8 +106,8 @@ def test_inside_the_cloud():
 
 def test_cropped_view():
     view = camera(64, 48)
-    whole = splat.render(cloud(100, -3.0), view).color
-    part = splat.render(cloud(100, -3.0), view.cropped(17, 9, 32, 24)).color
+    whole = rasterizer.render(cloud(100, -3.0), view).color
+    part = rasterizer.render(cloud(100, -3.0), view.cropped(17, 9, 32, 24)).color
     assert_close(part, whole[9:33, 17:49], 1e-2, 0, "crop")  # the Jacobian's clamp depends on the window
     assert_same(cloud(100, -3.0), view.cropped(17, 9, 32, 24))
 
@@ -152,7 +151,7 @@ def test_antialiased_adds_up_to_the_same_from_any_distance(impl):
         view.world_to_camera[2, 3] = distance
         size = 100 * math.exp(-3) / distance
         true = 2 * math.pi * opacity * size**2
-        total = splat.render(replace(one, antialiased=True), view, impl=impl).alpha.sum().item()
+        total = rasterizer.render(replace(one, antialiased=True), view, impl=impl).alpha.sum().item()
         # what the 1/255 cut takes away is 1/255 of the peak's integral
         faint = 2 * math.pi * (size**2 + 0.3) / 255
         assert total == pytest.approx(true, abs=faint + 0.01 * true), distance
@@ -169,7 +168,7 @@ def test_reference_against_finite_differences(antialiased):
     features, weights = random(12, 3), [random(8, 9, 3), random(8, 9), random(8, 9), random(8, 9, 3)]
 
     def loss(changed: dict[str, torch.Tensor]) -> float:
-        drawn = splat.render(
+        drawn = rasterizer.render(
             replace(gaussians, **{k: v for k, v in changed.items() if k in PARAMETERS}),
             view,
             features=changed.get("features", features),
@@ -198,7 +197,7 @@ def test_probe_is_the_gradient_of_the_2d_mean():
 
     def loss(shift: float) -> float:
         probe = torch.tensor([[shift, 0.0]]).double().repeat(60, 1)
-        drawn = splat.render(
+        drawn = rasterizer.render(
             gaussians.map(torch.Tensor.double),
             view,
             features=features,
@@ -219,7 +218,7 @@ def test_same_bits_for_any_number_of_threads():
         for threads in (1, 2, 5):
             torch.set_num_threads(threads)
             drawn, gradients = differentiate(gaussians, view, "cpu", torch.float32)
-            results.append([*drawn, *gradients.values(), splat.accumulate(gaussians, view, values)])
+            results.append([*drawn, *gradients.values(), rasterizer.accumulate(gaussians, view, values)])
     finally:
         torch.set_num_threads(before)
     for other in results[1:]:
@@ -250,7 +249,7 @@ def test_equal_depths_are_drawn_by_index():
     gaussians.sh[:, 0] = torch.tensor([-2.0, 2.0, -2.0])
     gaussians.sh[0, 0] = torch.tensor([2.0, -2.0, -2.0])
     for impl in ("cpu", "reference"):
-        red, green, blue = splat.render(gaussians, camera(20, 20), impl=impl).color[10, 10]
+        red, green, blue = rasterizer.render(gaussians, camera(20, 20), impl=impl).color[10, 10]
         assert red > 0.8 and green < 0.2 and blue < 0.2
 
 
@@ -259,7 +258,7 @@ def test_zero_quaternion_is_the_identity():
     zero = replace(gaussians, quaternions=torch.zeros(30, 4))
     identity = replace(gaussians, quaternions=torch.tensor([1.0, 0, 0, 0]).repeat(30, 1))
     for impl in ("cpu", "reference"):
-        drawn = [splat.render(g, camera(20, 20), impl=impl).color for g in (zero, identity)]
+        drawn = [rasterizer.render(g, camera(20, 20), impl=impl).color for g in (zero, identity)]
         assert torch.equal(*drawn)
     assert_same(zero, camera(20, 20))
 
@@ -267,7 +266,7 @@ def test_zero_quaternion_is_the_identity():
 def test_order_and_length_of_quaternions_do_not_matter_to_values():
     gaussians = cloud(30, -2.0)
     longer = replace(gaussians, quaternions=gaussians.quaternions * 1e-18)
-    drawn = [splat.render(g, camera(20, 20)).color for g in (gaussians, longer)]
+    drawn = [rasterizer.render(g, camera(20, 20)).color for g in (gaussians, longer)]
     assert_close(*drawn, 1e-5, 0, "quaternion length")
 
 
@@ -308,20 +307,20 @@ def test_nothing_to_draw(impl):
     behind = replace(cloud(4, -2.0), means=torch.tensor(view.center * 2, dtype=torch.float32).repeat(4, 1))
     for gaussians in (behind, cloud(0, -2.0)):
         features = torch.ones(len(gaussians), 2, requires_grad=True)
-        drawn = splat.render(gaussians, view, features=features, background=background, impl=impl)
+        drawn = rasterizer.render(gaussians, view, features=features, background=background, impl=impl)
         assert torch.equal(drawn.color, background.expand(3, 5, 3))
         assert not drawn.depth.any() and not drawn.alpha.any() and not drawn.radii.any()
         assert drawn.features.shape == (3, 5, 2) and not drawn.features.any()
         (drawn.features.sum() + drawn.depth.sum()).backward()
         assert features.grad is None or not features.grad.any()
-        assert not splat.accumulate(gaussians, view, torch.ones(3, 5, 1), impl=impl).any()
+        assert not rasterizer.accumulate(gaussians, view, torch.ones(3, 5, 1), impl=impl).any()
 
 
 def test_a_finished_pixel_stays_finished():
     """Opaque sheets: transmittance never falls under 1e-4 and what lies behind changes nothing."""
     view, count = camera(16, 16), 60
     gaussians = replace(cloud(count, 0.0), opacity_logits=torch.full((count,), 3.0))
-    assert splat.render(gaussians, view).alpha.max() <= 1 - 1e-4 + 1e-6
+    assert rasterizer.render(gaussians, view).alpha.max() <= 1 - 1e-4 + 1e-6
     assert_same(gaussians, view)
 
 
@@ -338,32 +337,32 @@ def test_deep_faint_stack():
 def test_accumulate_is_the_gradient_of_features():
     gaussians, view, values = cloud(200, -2.5), camera(45, 40), torch.rand(40, 45, 2)
     features = torch.zeros(200, 2, requires_grad=True)
-    splat.render(gaussians, view, features=features).features.backward(values)
-    gathered = splat.accumulate(gaussians, view, values)
+    rasterizer.render(gaussians, view, features=features).features.backward(values)
+    gathered = rasterizer.accumulate(gaussians, view, values)
     assert_close(gathered, features.grad, 1e-6, 1e-6, "accumulate")
     for count in (False, True):
-        exact = splat.accumulate(
+        exact = rasterizer.accumulate(
             gaussians.map(torch.Tensor.double), view, values.double(), impl="reference", count=count
         )
-        assert_close(splat.accumulate(gaussians, view, values, count=count), exact, 2e-6, 0, count)
+        assert_close(rasterizer.accumulate(gaussians, view, values, count=count), exact, 2e-6, 0, count)
 
 
 def test_counts_are_whole_numbers_of_blended_pixels():
     gaussians, view = cloud(50, -2.0), camera(45, 40)
-    counts = splat.accumulate(gaussians, view, torch.ones(40, 45, 1), count=True)[:, 0]
+    counts = rasterizer.accumulate(gaussians, view, torch.ones(40, 45, 1), count=True)[:, 0]
     assert torch.equal(counts, counts.round()) and counts.max() > 20
     projected, _ = reference.project(gaussians.map(torch.Tensor.double), view, None)
     assert set(torch.nonzero(counts)[:, 0].tolist()) <= set(projected.order.tolist())
 
 
 def test_rendering_without_gradients_keeps_nothing():
-    drawn = splat.render(cloud(10, -2.0), camera(9, 9))
+    drawn = rasterizer.render(cloud(10, -2.0), camera(9, 9))
     assert not drawn.color.requires_grad and drawn.color.grad_fn is None
 
 
 def test_background_and_alpha_agree():
     gaussians, view = cloud(40, -2.5), camera(25, 25)
-    black, white = (splat.render(gaussians, view, background=torch.full((3,), b)) for b in (0.0, 1.0))
+    black, white = (rasterizer.render(gaussians, view, background=torch.full((3,), b)) for b in (0.0, 1.0))
     assert_close(white.color - black.color, (1 - black.alpha)[..., None].expand(-1, -1, 3), 1e-6, 0, "background")
 
 
@@ -380,17 +379,17 @@ def test_background_and_alpha_agree():
 )
 def test_bad_input_is_named(change, message):
     with pytest.raises(ValueError, match=message):
-        splat.render(cloud(10, -2.0), camera(4, 4), **change)
+        rasterizer.render(cloud(10, -2.0), camera(4, 4), **change)
 
 
 def test_bad_gaussians_are_named():
     gaussians = cloud(10, -2.0)
     with pytest.raises(ValueError, match="sh is"):
-        splat.render(replace(gaussians, sh=torch.zeros(10, 7, 3)), camera(4, 4))
+        rasterizer.render(replace(gaussians, sh=torch.zeros(10, 7, 3)), camera(4, 4))
     with pytest.raises(ValueError, match="log_scales has shape"):
-        splat.render(replace(gaussians, log_scales=torch.zeros(9, 3)), camera(4, 4))
+        rasterizer.render(replace(gaussians, log_scales=torch.zeros(9, 3)), camera(4, 4))
     with pytest.raises(ValueError, match="takes float32"):
-        splat.render(gaussians.map(torch.Tensor.double), camera(4, 4), impl="cpu")
+        rasterizer.render(gaussians.map(torch.Tensor.double), camera(4, 4), impl="cpu")
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA GPU")
@@ -399,11 +398,11 @@ def test_cuda_equals_reference(antialiased):
     gaussians = replace(cloud(300, -3.2), opacity_logits=torch.linspace(-5, 4, 300))  # alpha stays under 0.99
     gaussians = replace(gaussians, antialiased=antialiased)
     view, cuda = camera(61, 47), gaussians.map(torch.Tensor.cuda)
-    exact = splat.render(gaussians.map(torch.Tensor.double), view, impl="reference")
-    drawn = splat.render(cuda, view)
+    exact = rasterizer.render(gaussians.map(torch.Tensor.double), view, impl="reference")
+    drawn = rasterizer.render(cuda, view)
     for name in ("color", "depth", "alpha"):
         assert_close(getattr(drawn, name).cpu(), getattr(exact, name), 1e-4, 0, name)
     for count in (False, True):
         values = torch.rand(47, 61, 2)
-        gathered = splat.accumulate(cuda, view, values.cuda(), count=count)
-        assert_close(gathered.cpu(), splat.accumulate(gaussians, view, values, count=count), 1e-3, 0, count)
+        gathered = rasterizer.accumulate(cuda, view, values.cuda(), count=count)
+        assert_close(gathered.cpu(), rasterizer.accumulate(gaussians, view, values, count=count), 1e-3, 0, count)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from reffusion import stereo
+from reffusion.capture import stereo
 from reffusion.types import Camera
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 150.0

@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from reffusion import continuation, geometry, gloss, sweep
+from reffusion import geometry
+from reffusion.initialize import gloss, sweep
+from reffusion.masks import continuation
+from reffusion.masks.witness import Witness, surface_range, widened
 from reffusion.splat.conventions import SH0
 from reffusion.splat.reference import colors, harmonics
 from reffusion.types import Camera, Gaussians
-from reffusion.witness import Witness, surface_range, widened
 
 SIZE, FOCAL = 160, 180.0
 HOLE = np.zeros((SIZE, SIZE), bool)

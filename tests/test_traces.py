@@ -15,10 +15,13 @@ from small_prior import save_small_prior
 
 from benchmarks.kernels import gate
 from benchmarks.kernels.points import Diagram, Point, recommendation
-from reffusion import distill as distilling
-from reffusion import fit as fitting
-from reffusion import io, trace
-from reffusion import personalize as personalizing
+from reffusion import trace
+from reffusion.distill import optimization as distilling
+from reffusion.fit import reconstruction as fitting
+from reffusion.io.ply import load_ply
+from reffusion.io.scene import load_mask_sets, save_references
+from reffusion.io.traces import MAIN, load_trace, main_quantity
+from reffusion.prior import personalize as personalizing
 from reffusion.types import PARAMETERS, Reference
 from runner.budget import seconds_of, shared_out
 from runner.pipeline import Refused, layered, load_pipeline, load_scene_file
@@ -41,9 +44,9 @@ def ready(tmp_path_factory):
         (home / name).mkdir()
     masks.run(masks.Params(), home / "masks", poses=poses, fit=fitted)
     view = small.CAMERAS["a2"]
-    io.save_references(
+    save_references(
         folders["reference"],
-        [Reference(view, small.photo(view), io.load_mask_sets(home / "masks", ["a2"])["a2"].invent)],
+        [Reference(view, small.photo(view), load_mask_sets(home / "masks", ["a2"])["a2"].invent)],
     )
     initialize.run(initialize.Params(planar_share=2.0), home / "initialize", **folders)  # no planes: both solvers
     save_small_prior(home / "prior")
@@ -68,7 +71,7 @@ def run(stage: str, ready, out: Path, **changed) -> Path:
 def result(folder: Path) -> list[torch.Tensor]:
     """The numbers a stage made; the header of a file of LoRA weights is not the same in every run."""
     if (folder / "gaussians.ply").exists():
-        gaussians = io.load_ply(folder / "gaussians.ply")
+        gaussians = load_ply(folder / "gaussians.ply")
         return [getattr(gaussians, name) for name in PARAMETERS]
     weights = load_file(folder / "pytorch_lora_weights.safetensors")
     return [weights[name] for name in sorted(weights)]
@@ -88,22 +91,22 @@ def lines(folder: Path) -> list[dict]:
 
 @pytest.mark.parametrize("stage", ["fit", "personalize", "distill"])
 def test_a_stages_trace_follows_the_schema(ready, tmp_path, stage):
-    series = io.load_trace(run(stage, ready, tmp_path / stage) / "trace.jsonl", stage)
+    series = load_trace(run(stage, ready, tmp_path / stage) / "trace.jsonl", stage)
     found = series.pop("")
-    assert not series and found[0]["iteration"] == 0 and io.main_quantity(stage, found) == io.MAIN[stage][0]
+    assert not series and found[0]["iteration"] == 0 and main_quantity(stage, found) == MAIN[stage][0]
     steps = {"fit": 40, "personalize": 10, "distill": 8}[stage]
     assert found[-1]["iteration"] == found[-1]["of"] == found[-1]["kept"] == steps
     assert found[-1]["reason"] == "finished" and all("reason" not in line for line in found[:-1])
-    assert len(found) >= 5 and all(io.MAIN[stage][0] in line for line in found)
+    assert len(found) >= 5 and all(MAIN[stage][0] in line for line in found)
 
 
 def test_fit_without_held_out_views_is_judged_by_views_before_their_step(ready, tmp_path):
-    found = io.load_trace(run("fit", ready, tmp_path / "fit", holdout=0) / "trace.jsonl", "fit")[""]
-    assert io.main_quantity("fit", found) == "psnr" and "psnr" not in found[0] and "psnr" in found[1]
+    found = load_trace(run("fit", ready, tmp_path / "fit", holdout=0) / "trace.jsonl", "fit")[""]
+    assert main_quantity("fit", found) == "psnr" and "psnr" not in found[0] and "psnr" in found[1]
 
 
 def test_the_solvers_of_initialize_are_traced_against_points_they_do_not_get(ready):
-    series = io.load_trace(ready.home / "initialize" / "trace.jsonl", "initialize")
+    series = load_trace(ready.home / "initialize" / "trace.jsonl", "initialize")
     assert set(series) == {"planes a2", "completion a2", "bilateral a2"}
     steps = series["bilateral a2"]
     assert len(steps) > 3 and steps[-1]["reason"] == "converged"
@@ -127,9 +130,9 @@ def test_what_does_not_follow_the_schema_is_refused_by_line(tmp_path, wrong, sai
     good = {"seconds": 2.0, "iteration": 1, "psnr": 20.0}
     (tmp_path / "trace.jsonl").write_text(f'{json.dumps(good)}\n{json.dumps(wrong)}\n{{"seconds": 9')
     with pytest.raises(ValueError, match=f"trace.jsonl: line 2: .*{said}"):
-        io.load_trace(tmp_path / "trace.jsonl", "fit")
+        load_trace(tmp_path / "trace.jsonl", "fit")
     with pytest.raises(ValueError, match="no such file"):
-        io.load_trace(tmp_path / "none.jsonl", "fit")
+        load_trace(tmp_path / "none.jsonl", "fit")
 
 
 def test_the_clock_stands_while_something_is_measured(tmp_path, monkeypatch):

@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 import torch
 
-from reffusion import geometry, taint
-from reffusion.behind import Completion, Seen, continued
-from reffusion.continuation import planes_around
-from reffusion.layers import shared_out
+from reffusion import geometry
+from reffusion.depth.behind import Completion, Seen, continued
+from reffusion.depth.layers import shared_out
+from reffusion.masks import taint
+from reffusion.masks.continuation import planes_around
+from reffusion.masks.witness import Witness, surface_range, unlike, votes, without_slivers
 from reffusion.types import Camera, Gaussians
-from reffusion.witness import Witness, surface_range, unlike, votes, without_slivers
 
 TOP, FLOOR, EDGE, BOX, HIGH = 0.0, -1.0, 1.0, 0.3, 0.5  # z of table top and floor; half sides; height of the box
 SIZE, FOCAL = 160, 150.0

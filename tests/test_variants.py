@@ -15,9 +15,16 @@ from small_capture import some_truth
 from small_prior import save_small_prior
 from test_distill import hole, leaves, reached, sight, wall
 
-from reffusion import distill as D
-from reffusion import io, paint2d, perceptual, scatter, trace
-from reffusion.lift import Lift, lift_term
+from reffusion import seeding, trace
+from reffusion.distill import optimization as D
+from reffusion.distill import perceptual
+from reffusion.distill.lift import Lift, lift_term
+from reffusion.initialize import scatter
+from reffusion.io.arrays import load_json, load_labels
+from reffusion.io.images import load_image, load_mask, save_image
+from reffusion.io.ply import load_ply, save_ply
+from reffusion.io.scene import load_mask_sets, load_raw_masks, load_references, load_scene, save_references
+from reffusion.paint import paint2d
 from reffusion.types import PARAMETERS, Reference
 from runner.job import Job, Request, prepare
 from runner.pipeline import load_pipeline
@@ -130,7 +137,7 @@ MSE, PATCHES = Lift(1.0), Lift(1.0, perceptual.multi_scale_dssim, 20)
 
 def lifted(name="a", shift=0.0):
     view = sight(name, shift)
-    return replace(view, lifted=torch.rand(view.photo.shape, generator=trace.generator(4, name)))
+    return replace(view, lifted=torch.rand(view.photo.shape, generator=seeding.generator(4, name)))
 
 
 @pytest.mark.parametrize("how", [MSE, PATCHES], ids=["mse", "patches"])
@@ -138,7 +145,7 @@ def test_lifted_pictures_reach_the_gaussians_they_may_and_no_other(how):
     start, masked = wall()
     for allowed in (masked, torch.ones_like(masked)):
         gaussians = leaves(start)
-        loss, rendering = lift_term(gaussians, allowed, lifted(), how, trace.generator(1))
+        loss, rendering = lift_term(gaussians, allowed, lifted(), how, seeding.generator(1))
         loss.backward()
         got = reached(gaussians)
         assert not got[~allowed].any() and (got & masked & (rendering.radii > 0)).any()
@@ -147,11 +154,11 @@ def test_lifted_pictures_reach_the_gaussians_they_may_and_no_other(how):
 
 def test_the_squared_error_is_that_of_the_holes_pixels():
     (gaussians, masked), view = wall(), lifted()
-    loss, rendering = lift_term(gaussians, masked, view, MSE, trace.generator(1))
+    loss, rendering = lift_term(gaussians, masked, view, MSE, seeding.generator(1))
     expected = ((rendering.color - view.lifted)[hole()] ** 2).mean()
     assert float(loss) == pytest.approx(float(expected))
     outside = torch.where(hole()[..., None], view.lifted, float("nan"))
-    again, _ = lift_term(gaussians, masked, replace(view, lifted=outside), MSE, trace.generator(1))
+    again, _ = lift_term(gaussians, masked, replace(view, lifted=outside), MSE, seeding.generator(1))
     assert float(again) == float(loss), "pixels outside the hole were looked at"
 
 
@@ -219,29 +226,29 @@ def initialized(scene, out, start, **needs):
     out.mkdir()
     needs = {"reference": None, **needs}
     initialize.run(initialize.Params(start=start), out, **scene, **needs)
-    return io.load_ply(out / "gaussians.ply"), io.load_labels(out / "labels.npy")
+    return load_ply(out / "gaussians.ply"), load_labels(out / "labels.npy")
 
 
 def test_lift_paints_the_hole_of_every_view_and_names_the_painter(scene, painted):
-    sets, facts = io.load_mask_sets(scene["masks"], small.TRAIN), io.load_json(painted / "facts.json")
+    sets, facts = load_mask_sets(scene["masks"], small.TRAIN), load_json(painted / "facts.json")
     assert facts["views"] == 5 and facts["inpainter"].startswith("OpenCV")
     for name in small.TRAIN:
-        view, found = small.CAMERAS[name], io.load_image(painted / "images" / f"{name}.png")
+        view, found = small.CAMERAS[name], load_image(painted / "images" / f"{name}.png")
         outside = ~sets[name].consistent & ~paint2d.widened(sets[name].invent, lift.Params().widen)
         assert (found[outside] == small.photo(view)[outside]).all()
         # The square before the wall is red; what is painted continues the wall.
         error = np.abs(found.astype(int) - small.photo(view))[sets[name].invent]
         assert error.mean() < 30, name
-    (best,) = io.load_references(painted, io.load_scene(scene["poses"]))
-    assert best.camera.name == io.load_json(scene["masks"] / "facts.json")["best_reference"]
+    (best,) = load_references(painted, load_scene(scene["poses"]))
+    assert best.camera.name == load_json(scene["masks"] / "facts.json")["best_reference"]
 
 
 def test_lift_goes_on_where_it_was_killed(scene, painted, tmp_path):
     marked = np.full((small.HEIGHT, small.WIDTH, 3), 7, np.uint8)
-    io.save_image(tmp_path / "images" / "a0.png", marked)
+    save_image(tmp_path / "images" / "a0.png", marked)
     (tmp_path / "images" / ".a1.png").write_bytes(b"half a picture")
     lift.run(lift.Params(), tmp_path, **scene)
-    assert (io.load_image(tmp_path / "images" / "a0.png") == marked).all()
+    assert (load_image(tmp_path / "images" / "a0.png") == marked).all()
     for name in ("a1", "a4"):
         file = Path("images") / f"{name}.png"
         assert (tmp_path / file).read_bytes() == (painted / file).read_bytes()
@@ -252,21 +259,21 @@ def test_lift_by_diffusion(scene, tmp_path):
     params = lift.Params(inpainter="diffusion", prior=str(tmp_path / "prior"), steps=1, every=5)
     (tmp_path / "out").mkdir()
     lift.run(params, tmp_path / "out", **scene)
-    facts = io.load_json(tmp_path / "out" / "facts.json")
+    facts = load_json(tmp_path / "out" / "facts.json")
     assert facts["inpainter"].startswith("diffusion by") and facts["views"] <= 2
 
 
 def test_nothing_is_filled_where_nothing_shall_be(scene, tmp_path):
     gaussians, new = initialized(scene, tmp_path / "nothing", "nothing", reference=tmp_path / "never read")
-    labels = io.load_labels(scene["masks"] / "labels.npy")
+    labels = load_labels(scene["masks"] / "labels.npy")
     assert not new.any() and labels.any()
-    assert (gaussians.means == io.load_ply(scene["fit"] / "gaussians.ply").means[~labels]).all()
+    assert (gaussians.means == load_ply(scene["fit"] / "gaussians.ply").means[~labels]).all()
 
 
 def test_random_gaussians_fill_the_region_of_the_hole_by_their_seed(scene, tmp_path):
     gaussians, new = initialized(scene, tmp_path / "random", "random")
-    removed = io.load_json(tmp_path / "random" / "facts.json")["removed_gaussians"]
-    debris = int(io.load_labels(scene["masks"] / "debris.npy").sum())
+    removed = load_json(tmp_path / "random" / "facts.json")["removed_gaussians"]
+    debris = int(load_labels(scene["masks"] / "debris.npy").sum())
     assert int(new.sum()) == max(removed - debris, scatter.FEWEST)
     at = gaussians.means[new]
     # Removed were the square and what of the wall it hides from all views.
@@ -295,8 +302,8 @@ def test_the_chain_of_lifted_pictures(scene, painted, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"set distill.lift_weight"):
         initialized(scene, tmp_path / "without", "lift")
     reference = tmp_path / "reference"
-    mask = io.load_mask_sets(scene["masks"], ["a2"])["a2"].invent
-    io.save_references(reference, [Reference(small.CAMERAS["a2"], small.photo(small.CAMERAS["a2"]), mask)])
+    mask = load_mask_sets(scene["masks"], ["a2"])["a2"].invent
+    save_references(reference, [Reference(small.CAMERAS["a2"], small.photo(small.CAMERAS["a2"]), mask)])
     chain = scene | {"reference": reference, "personalize": None, "initialize": tmp_path / "initialize"}
     for name in ("XDG_CACHE_HOME", "TORCH_HOME"):
         monkeypatch.setenv(name, str(tmp_path / "nothing"))  # as on a machine without weights
@@ -306,7 +313,7 @@ def test_the_chain_of_lifted_pictures(scene, painted, tmp_path, monkeypatch):
         out = tmp_path / loss
         out.mkdir()
         distill.run(params, out, **chain, lift=painted)
-        facts = io.load_json(out / "facts.json")
+        facts = load_json(out / "facts.json")
         said = facts["perceptual"] and facts["perceptual"].split(" (")[0]
         assert facts["inpainter"].startswith("OpenCV") and said == perceptual_name
         assert trace.read_trace(out / "trace.jsonl")[-1]["lift"] > 0
@@ -315,7 +322,7 @@ def test_the_chain_of_lifted_pictures(scene, painted, tmp_path, monkeypatch):
     evaluate.run(
         evaluate.Params(), out, **scene, initialize=chain["initialize"], distill=tmp_path / "mse", lift=painted
     )
-    summary = io.load_json(out / "metrics.json")
+    summary = load_json(out / "metrics.json")
     assert summary["inpainter"].startswith("OpenCV") and summary["perceptual"] is None
     assert summary["result"] == "distill" and summary["mean"]["psnr_box"] > 20
     assert summary["consistency"]["pairs"] == 1 and summary["consistency"]["consistency"] < 0.05
@@ -326,16 +333,16 @@ def test_rendered_views_inpainted_in_2d(scene, tmp_path):
     (tmp_path / "inpainted").mkdir()
     evaluate.run(evaluate.Params(), tmp_path / "fit", **scene)
     evaluate.run(evaluate.Params(inpaint=True), tmp_path / "inpainted", **scene)
-    before, after = (io.load_json(tmp_path / n / "metrics.json") for n in ("fit", "inpainted"))
+    before, after = (load_json(tmp_path / n / "metrics.json") for n in ("fit", "inpainted"))
     assert before["inpainter"] is None and after["inpainter"].startswith("OpenCV") and after["result"] == "fit"
     assert after["mean"]["psnr_box"] > before["mean"]["psnr_box"] + 5, "the red square is still there"
     for name in small.TEST:
-        pictures = [io.load_image(tmp_path / n / "renders" / f"{name}.png") for n in ("fit", "inpainted")]
-        mask = io.load_mask(scene["masks"] / "consistent" / f"{name}.png")
+        pictures = [load_image(tmp_path / n / "renders" / f"{name}.png") for n in ("fit", "inpainted")]
+        mask = load_mask(scene["masks"] / "consistent" / f"{name}.png")
         mask = paint2d.widened(mask, evaluate.Params().widen)
         assert (pictures[0][~mask] == pictures[1][~mask]).all() and (pictures[0][mask] != pictures[1][mask]).any()
-    raw = io.load_image(tmp_path / "inpainted" / "renders_fit" / "t0.png")
-    assert (raw == io.load_image(tmp_path / "fit" / "renders" / "t0.png")).all()
+    raw = load_image(tmp_path / "inpainted" / "renders_fit" / "t0.png")
+    assert (raw == load_image(tmp_path / "fit" / "renders" / "t0.png")).all()
 
 
 def test_the_masked_fit_never_sees_a_masked_pixel(scene, tmp_path):
@@ -344,16 +351,16 @@ def test_the_masked_fit_never_sees_a_masked_pixel(scene, tmp_path):
     found = []
     for seed in (0, 1):
         poses = small.write(tmp_path / f"scene{seed}", NEAR)[0]
-        for name, mask in io.load_raw_masks(poses, small.TRAIN).items():
+        for name, mask in load_raw_masks(poses, small.TRAIN).items():
             noise = np.random.default_rng(seed).integers(0, 256, (*mask.shape, 3), np.uint8)
             picture = np.where(mask[..., None], noise, small.photo(small.CAMERAS[name]))
-            io.save_image(poses / "images" / f"{name}.png", picture)
+            save_image(poses / "images" / f"{name}.png", picture)
         out = tmp_path / f"fit{seed}"
         out.mkdir()
         fit.run(params, out, poses=poses)
         found.append((out / "gaussians.ply").read_bytes())
     assert found[0] == found[1]
-    means = io.load_ply(out / "gaussians.ply").means
+    means = load_ply(out / "gaussians.ply").means
     assert (means[:, 2] > 1.85).float().mean() > 0.95, "Gaussians stand where the object was"
 
 
@@ -361,13 +368,13 @@ def test_a_masked_fit_needs_masks_and_fits_a_scene_that_brings_gaussians(scene, 
     poses = small.write(tmp_path, NEAR, masks={})[0]
     with pytest.raises(ValueError, match=r"fit.pixels is 'unmasked', but the scene has no masks"):
         fit.run(fit.Params(iterations=1, pixels="unmasked"), tmp_path, poses=poses)
-    io.save_ply(poses / "gaussians.ply", small.gaussians(NEAR)[0])
+    save_ply(poses / "gaussians.ply", small.gaussians(NEAR)[0])
     assert fit.preview(fit.Params(), poses=poses) and not fit.preview(fit.Params(pixels="unmasked"), poses=poses)
 
 
 def test_the_box_is_the_test_masks_whatever_was_left_out(scene, tmp_path):
-    view, given = small.CAMERAS["a1"], io.load_mask(scene["masks"] / "consistent" / "a1.png")
-    raw = io.load_raw_masks(scene["poses"], ["a1"])["a1"]
+    view, given = small.CAMERAS["a1"], load_mask(scene["masks"] / "consistent" / "a1.png")
+    raw = load_raw_masks(scene["poses"], ["a1"])["a1"]
     assert (evaluate.mask_of(view, scene["poses"], scene["masks"]) == given).all()
     assert (evaluate.mask_of(view, scene["poses"], None) == raw).all()
     assert not evaluate.mask_of(small.CAMERAS["t0"], scene["poses"], None).any()

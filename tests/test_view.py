@@ -9,7 +9,11 @@ import pytest
 import small_scene
 import torch
 
-from reffusion import io, splat
+from reffusion.io.arrays import save_json, save_labels
+from reffusion.io.images import save_image
+from reffusion.io.ply import save_ply
+from reffusion.io.scene import save_scene
+from reffusion.splat import rasterizer
 from reffusion.types import Scene, Similarity
 from report import view
 
@@ -24,16 +28,16 @@ def finished(home, needs):
     points = gaussians.means.double().numpy()
     scene = Scene(train, small_scene.TRAIN, (), frozenset(), points, np.zeros((len(points), 3), np.uint8), SIMILARITY)
     poses = home.with_name(home.name.split("@")[0]) / "poses"
-    io.save_scene(poses, scene)
+    save_scene(poses, scene)
     for name in small_scene.TRAIN:
-        io.save_image(poses / "images" / f"{name}.png", small_scene.photo(train[name]))
+        save_image(poses / "images" / f"{name}.png", small_scene.photo(train[name]))
     for stage in ("fit", "initialize", "distill"):
-        io.save_ply(home / stage / "gaussians.ply", gaussians)
+        save_ply(home / stage / "gaussians.ply", gaussians)
         if stage != "fit":
-            io.save_labels(home / stage / "labels.npy", labels)
+            save_labels(home / stage / "labels.npy", labels)
     shown = gaussians if needs["distill"] else gaussians.map(lambda p: p[~labels])
-    io.save_ply(home / "evaluate" / "scene.ply", shown, similarity=SIMILARITY)
-    io.save_json(home / "evaluate" / "receipt.json", {"needs": needs})
+    save_ply(home / "evaluate" / "scene.ply", shown, similarity=SIMILARITY)
+    save_json(home / "evaluate" / "receipt.json", {"needs": needs})
     return gaussians, labels
 
 
@@ -51,7 +55,7 @@ def test_a_visitor_who_stands_at_a_view_sees_that_view():
         seen = view.camera_of(visitor(centred), centred.height)
         assert (seen.width, seen.height) == (centred.width, centred.height)
         assert np.allclose(seen.world_to_camera, centred.world_to_camera)
-        expected = (splat.render(gaussians, centred).color.clamp(0, 1) * 255).round().byte().numpy()
+        expected = (rasterizer.render(gaussians, centred).color.clamp(0, 1) * 255).round().byte().numpy()
         assert np.abs(view.picture(gaussians, seen).astype(int) - expected).max() <= 1
 
 

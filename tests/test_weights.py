@@ -15,8 +15,8 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from reffusion import download, weights
-from reffusion.prior import load_prior
+from reffusion.prior.model import load_prior
+from reffusion.weights import download, local, published
 
 ROOT = Path(__file__).resolve().parent.parent
 TINY = ROOT / "priors" / "tiny"
@@ -64,32 +64,32 @@ def cached(tmp_path, name="acme/paint", state="0123abc", main=True) -> Path:
 
 def test_an_id_is_found_in_the_hub_cache_and_loaded_without_a_network(caches):
     entry = cached(caches)
-    assert weights.locate("acme/paint") == entry / "snapshots" / "0123abc"
+    assert local.locate("acme/paint") == entry / "snapshots" / "0123abc"
     prior = load_prior("acme/paint")
     assert prior.native_size == 64 and load_prior(entry).native_size == 64
 
 
 def test_the_state_that_main_names_is_taken(caches):
     entry = cached(caches, main=False)
-    assert weights.locate("acme/paint") == entry / "snapshots" / "0123abc"  # the only one
+    assert local.locate("acme/paint") == entry / "snapshots" / "0123abc"  # the only one
     (entry / "snapshots" / "0456def").mkdir()
-    assert weights.locate("acme/paint") is None
+    assert local.locate("acme/paint") is None
     (entry / "refs").mkdir()
     (entry / "refs" / "main").write_text("0456def\n")
-    assert weights.locate("acme/paint").name == "0456def"
+    assert local.locate("acme/paint").name == "0456def"
 
 
 def test_an_id_is_found_as_a_folder_here_and_in_the_projects_cache(caches):
     mine = copied(caches / "cache" / "reffusion" / "acme" / "paint")
-    assert weights.locate("acme/paint") == mine
+    assert local.locate("acme/paint") == mine
     here = copied(caches / "elsewhere" / "acme" / "paint")
-    assert weights.locate("acme/paint").resolve() == here
+    assert local.locate("acme/paint").resolve() == here
 
 
 def test_the_hubs_own_variables_are_read(caches, monkeypatch):
-    assert weights.hub_cache() == caches / "hub" / "hub"
+    assert local.hub_cache() == caches / "hub" / "hub"
     monkeypatch.setenv("HF_HUB_CACHE", str(caches / "other"))
-    assert weights.hub_cache() == caches / "other"
+    assert local.hub_cache() == caches / "other"
 
 
 def test_what_is_not_here_is_told_at_once_with_the_alternatives(caches):
@@ -98,7 +98,7 @@ def test_what_is_not_here_is_told_at_once_with_the_alternatives(caches):
     ):
         load_prior("priors/tiny")
     with pytest.raises(ValueError, match=r"run `make weights`.*stable-diffusion-v1-5/stable-diffusion-inpainting"):
-        load_prior(weights.SD2)
+        load_prior(published.SD2)
     for wrong in (caches / "absent", "./absent", "three/part/name", "~/absent"):
         with pytest.raises(ValueError, match="no such folder"):
             load_prior(wrong)
@@ -171,22 +171,22 @@ def test_a_lost_shard_is_named(caches):
     index = folder / "unet" / "diffusion_pytorch_model.safetensors.index.json"
     index.write_text(json.dumps({"weight_map": {"a": "diffusion_pytorch_model-00001-of-00002.safetensors"}}))
     with pytest.raises(ValueError, match=r"00001-of-00002.safetensors is missing"):
-        weights.check(folder)
+        local.check(folder)
 
 
 def test_what_a_stage_needs(caches):
-    need = weights.of_model(weights.SD2, "float16")
+    need = local.of_model(published.SD2, "float16")
     assert "not on this machine" in need.problem and need.fetched and 2.5e9 < need.bytes < 2.7e9
     folder = copied(caches / "good")
-    assert weights.of_model(str(folder), "float32").problem is None
+    assert local.of_model(str(folder), "float32").problem is None
     shutil.rmtree(folder / "unet")
-    broken = weights.of_model(str(folder), "float32")
+    broken = local.of_model(str(folder), "float32")
     assert "lacks unet" in broken.problem and not broken.fetched
-    names = {need.name: need for need in weights.of_lpips(None)}
+    names = {need.name: need for need in local.of_lpips(None)}
     assert all(need.problem and need.optional for need in names.values()) and len(names) == 4
     (caches / "cache" / "reffusion" / "lpips").mkdir(parents=True)
     (caches / "cache" / "reffusion" / "lpips" / "alex.pth").write_bytes(b"x")
-    assert {n.name for n in weights.of_lpips(None) if not n.problem} == {"alex.pth"}
+    assert {n.name for n in local.of_lpips(None) if not n.problem} == {"alex.pth"}
 
 
 # ------------------------------------------------------------------------------------------------------------- fetching
@@ -326,7 +326,7 @@ class Hub(http.server.BaseHTTPRequestHandler):
 
 FETCH = """
 import sys
-from reffusion import download
+from reffusion.weights import download
 for name in sys.argv[1:]:
     try:
         print(download.model(name, True))
@@ -350,7 +350,7 @@ def test_a_model_is_fetched_from_the_hub_and_its_refusals_are_told_apart(tmp_pat
     threading.Thread(target=server.serve_forever, daemon=True).start()
     try:
         said = fetched(
-            "acme/paint", "acme/gated", "acme/gone", weights.SD2,
+            "acme/paint", "acme/gated", "acme/gone", published.SD2,
             HF_ENDPOINT=f"http://127.0.0.1:{server.server_port}", HF_HOME=str(tmp_path),
         )  # fmt: skip
     finally:
@@ -359,8 +359,8 @@ def test_a_model_is_fetched_from_the_hub_and_its_refusals_are_told_apart(tmp_pat
     folder, gated, gone, moved = said
     monkeypatch.delenv("HF_HUB_CACHE", raising=False)
     monkeypatch.setenv("HF_HOME", str(tmp_path))
-    assert weights.locate("acme/paint") == Path(folder)
-    weights.check(Path(folder))
+    assert local.locate("acme/paint") == Path(folder)
+    local.check(Path(folder))
     assert "acme/gated is gated: accept its terms" in gated and "hf auth login" in gated
     assert "acme/gone: the hub has no such model" in gone
     assert "the hub has no such model" in moved and "stable-diffusion-v1-5/stable-diffusion-inpainting" in moved

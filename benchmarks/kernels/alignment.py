@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.kernels.points import Diagram, Point, cpu_seconds
-from reffusion import trace
-from reffusion.alignment import align
+from reffusion import seeding
+from reffusion.depth.alignment import align
 
 SIZE = 120 * 160
 SHARES = (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
@@ -17,7 +17,7 @@ SEEDS = 5
 def maps(share: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(estimate, target, truth), [SIZE] each: truth is affine in the estimate; a share of the target is displaced by up
     to its whole range, upwards, as things in front of a wall displace its disparity."""
-    random = np.random.default_rng(trace.seed_for(seed, "alignment", share))
+    random = np.random.default_rng(seeding.seed_for(seed, "alignment", share))
     estimate = random.uniform(0.2, 1.0, SIZE)
     truth = 2.5 * estimate + 0.3
     target = truth + NOISE * truth.std() * random.standard_normal(SIZE)

@@ -8,7 +8,8 @@ from collections.abc import Callable
 import numpy as np
 
 from benchmarks.kernels.points import Diagram, Point, cpu_seconds
-from reffusion import bilateral, depth, trace
+from reffusion import seeding, trace
+from reffusion.depth import bilateral, completion
 
 HEIGHT, WIDTH = 180, 240
 CELLS = (4.0, 8.0, 16.0, 32.0)  # px
@@ -19,7 +20,7 @@ NOISE = 0.01
 def picture(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """(truth, target, confidence, guide, part): [H, W] disparity of three slanted planes that meet; the same, noisy;
     0 in a round hole over their creases, else 1; a picture whose colours change where the planes do; the plane."""
-    random = np.random.default_rng(trace.seed_for(seed, "solvers"))
+    random = np.random.default_rng(seeding.seed_for(seed, "solvers"))
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] / WIDTH
     planes = np.stack([0.5 + 0.3 * columns, 0.95 - 0.5 * columns, 0.05 + 1.1 * rows])
     truth, part = planes.max(0), planes.argmax(0)
@@ -79,8 +80,8 @@ def completion_diagram() -> Diagram:
     points = []
     for curve, shown in (("with the picture", guide), ("without", None)):
         for most in UNKNOWNS:
-            plate = depth.Plate(ring=0.08, most_unknowns=most)
-            work = lambda plate=plate, shown=shown: depth.complete(target, confidence, shown, plate)
+            plate = completion.Plate(ring=0.08, most_unknowns=most)
+            work = lambda plate=plate, shown=shown: completion.complete(target, confidence, shown, plate)
             error = float(np.sqrt(np.mean((work() - truth)[hole] ** 2)) / truth.std())
             points.append(Point(curve, f"{most} unknowns", most, error, cpu_seconds(work)))
     return Diagram(

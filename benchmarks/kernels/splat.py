@@ -13,8 +13,7 @@ import numpy as np
 import torch
 
 from benchmarks.kernels.points import Diagram, Point, cpu_seconds
-from reffusion import splat
-from reffusion.splat import reference
+from reffusion.splat import rasterizer, reference
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -45,7 +44,7 @@ def scene(sigma: float, seed: int = 0) -> Gaussians:
 def step(gaussians: Gaussians, impl: str) -> tuple[torch.Tensor, list[torch.Tensor]]:
     """Colour, and the gradients of a fixed function of it by all parameters."""
     leaves = gaussians.map(lambda p: p.detach().clone().requires_grad_())
-    color = splat.render(leaves, VIEW, impl=impl).color
+    color = rasterizer.render(leaves, VIEW, impl=impl).color
     rows, columns = torch.meshgrid(torch.arange(VIEW.height), torch.arange(VIEW.width), indexing="ij")
     pattern = torch.sin(0.3 * rows + 0.2 * columns).to(color)[..., None]
     gradients = torch.autograd.grad((pattern * color).sum(), [getattr(leaves, name) for name in PARAMETERS])
@@ -87,7 +86,8 @@ def cutoff_diagram() -> Diagram:
     """What skipping faint contributions costs, in the oracle: the error against skipping none, and the work left."""
     gaussians, original = scene(3.0), reference.MIN_ALPHA
     draw = lambda: step(gaussians, "reference")
-    pairs = lambda: float(splat.accumulate(gaussians, VIEW, torch.ones(VIEW.height, VIEW.width, 1, dtype=torch.float64),
+    ones = torch.ones(VIEW.height, VIEW.width, 1, dtype=torch.float64)
+    pairs = lambda: float(rasterizer.accumulate(gaussians, VIEW, ones,
                                            impl="reference", count=True).sum())  # fmt: skip
     points = []
     try:
@@ -145,7 +145,8 @@ def measured() -> dict[str, tuple[float, float]]:
 
 
 if __name__ == "__main__":
-    from reffusion.splat import compiled, layout
+    from reffusion.kernels import compiled
+    from reffusion.splat import layout
 
     layout.TILE_HEIGHT = int(sys.argv[1])  # before the kernels, which take it as a constant, are imported
     compiled._cache_folder = lambda: Path(sys.argv[2]) / "kernels"  # the usual folder knows the sources only

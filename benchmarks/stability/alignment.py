@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from benchmarks.stability.cases import EPS64, EXACT, UNCLEAR, Case, largest, unclear
-from reffusion import alignment
+from reffusion.depth import alignment
 
 NOISE = 1e-3  # of the estimate's spread
 PIXELS = 2000

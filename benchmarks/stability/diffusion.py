@@ -10,9 +10,11 @@ from torch import Tensor
 
 from benchmarks.stability.cases import EPS32, EXACT, UNCLEAR, Case, largest, unclear
 from benchmarks.stability.splatting import camera, cloud
-from reffusion import diffusion, discriminator, sds, trace
-from reffusion.confinement import Distillation, Sight, sds_term
-from reffusion.prior import Prior, load_prior
+from reffusion import seeding
+from reffusion.distill import discriminator, sds
+from reffusion.distill.confinement import Distillation, Sight, sds_term
+from reffusion.prior import diffusion, windows
+from reffusion.prior.model import Prior, load_prior
 from reffusion.types import PARAMETERS
 
 TINY = Path(__file__).resolve().parents[2] / "priors" / "tiny"
@@ -34,11 +36,11 @@ def prompts() -> Tensor:
 
 
 def normal(*shape: int, label: str = "") -> Tensor:
-    return torch.randn(*shape, generator=trace.generator(0, "stability", label))
+    return torch.randn(*shape, generator=seeding.generator(0, "stability", label))
 
 
 def images(label: str = "") -> Tensor:
-    return torch.rand(1, 3, SIZE, SIZE, generator=trace.generator(0, "images", label)) * 2 - 1
+    return torch.rand(1, 3, SIZE, SIZE, generator=seeding.generator(0, "images", label)) * 2 - 1
 
 
 @torch.no_grad()
@@ -145,24 +147,24 @@ def nothing_hidden() -> float:
 
 def window_of_nothing() -> float:
     nothing = torch.zeros(20, 30, dtype=torch.bool)
-    return unclear(lambda: sds.window_around(nothing, 8, trace.generator(0)), "empty mask")
+    return unclear(lambda: windows.window_around(nothing, 8, seeding.generator(0)), "empty mask")
 
 
 def scene_gradient(low: float, high: float, guidance: float) -> float:
     """Score distillation of a scene that is to be repainted as a whole: numbers that are not finite."""
     view, gaussians = camera(24, 18), cloud().map(lambda p: p.clone().requires_grad_())
     everything = torch.ones(18, 24, dtype=torch.bool)
-    sight = Sight(view, torch.rand(18, 24, 3, generator=trace.generator(0)), ~everything, everything, clean=False)
+    sight = Sight(view, torch.rand(18, 24, 3, generator=seeding.generator(0)), ~everything, everything, clean=False)
     settings = Distillation(patches=1, low=low, high=high, guidance=guidance)
     masked = torch.ones(len(gaussians), dtype=torch.bool)
-    loss, _ = sds_term(gaussians, masked, sight, model(), prompts(), settings, trace.generator(1))
+    loss, _ = sds_term(gaussians, masked, sight, model(), prompts(), settings, seeding.generator(1))
     loss.backward()
     return float(sum((~torch.isfinite(getattr(gaussians, name).grad)).sum() for name in PARAMETERS))
 
 
 def one_step_painted() -> float:
     """Painting in one step, everything masked: pixels outside [-1, 1] or no numbers."""
-    full, draws = torch.ones(1, 1, SIZE, SIZE), trace.generator(0)
+    full, draws = torch.ones(1, 1, SIZE, SIZE), seeding.generator(0)
     found = diffusion.sample(model(), images(), full, prompts()[:1], 1, draws, 100.0, prompts()[2:])
     return float((~(found.abs() <= 1)).sum())
 
@@ -201,15 +203,15 @@ def sure_generator() -> float:
 
 @cache
 def critic() -> discriminator.Critic:
-    return discriminator.Critic(16, 8, trace.generator(0, "critic"))
+    return discriminator.Critic(16, 8, seeding.generator(0, "critic"))
 
 
 def flat_critic() -> float:
     """A critic of weights zero has no slope: its penalty is 0, and so are the gradients of the penalty."""
-    flat = discriminator.Critic(16, 8, trace.generator(0))
+    flat = discriminator.Critic(16, 8, seeding.generator(0))
     for weight in flat.parameters():
         weight.data.zero_()
-    patches = torch.rand(4, 3, 16, 16, generator=trace.generator(1)).requires_grad_()
+    patches = torch.rand(4, 3, 16, 16, generator=seeding.generator(1)).requires_grad_()
     penalty = discriminator.gradient_penalty(flat(patches), patches)
     slopes = torch.autograd.grad(penalty, list(flat.parameters()), allow_unused=True)
     found = [penalty.item(), *(slope.abs().max().item() for slope in slopes if slope is not None)]

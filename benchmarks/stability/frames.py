@@ -12,13 +12,16 @@ import torch
 from plyfile import PlyData
 
 from benchmarks.stability.cases import EPS32, EPS64, Case, largest
-from reffusion import frame, io, trace
-from reffusion.fit import fit
-from reffusion.fit_step import Settings
-from reffusion.lens import Lens
-from reffusion.optimize import Rates
-from reffusion.splat import render
-from reffusion.start import initial_gaussians
+from reffusion import seeding
+from reffusion.capture import frame
+from reffusion.capture.lens import Lens
+from reffusion.fit.reconstruction import fit
+from reffusion.fit.start import initial_gaussians
+from reffusion.fit.step import Settings
+from reffusion.gaussians.optimize import Rates
+from reffusion.io.ply import load_ply, save_ply
+from reffusion.io.scene import load_scene, save_scene
+from reffusion.splat.rasterizer import render
 from reffusion.types import Camera, Gaussians, Scene, Similarity
 
 WIDTH, HEIGHT, VIEWS = 24, 18, 5
@@ -28,7 +31,7 @@ EXPORTED = 1e-5  # of the extent: what `io.save_ply` promises of positions
 
 def truth() -> Gaussians:
     """What the pictures show: sixty coloured Gaussians in a box of extent 1."""
-    random = trace.generator(0, "stability", "truth")
+    random = seeding.generator(0, "stability", "truth")
     uniform = lambda *shape: torch.rand(*shape, generator=random)
     return Gaussians(
         uniform(60, 3) - 0.5, torch.randn(60, 4, generator=random), math.log(0.06) + 0.8 * (uniform(60, 3) - 0.5),
@@ -72,7 +75,7 @@ def fitted(extent: float, offset: float, rate: float = 1.0) -> tuple[Scene, Gaus
     pictures = photographs()
     rates = Rates(means=2e-3, means_last=2e-4, log_scales=1.5e-2, sh_dc=1.5e-2)
     settings = Settings(60, sh_degree=0, random_background=False, densify_from=1.0, rates=faster(rates, rate))
-    start = initial_gaussians(scene.points, scene.point_colors, 0, 1000, trace.generator(0))
+    start = initial_gaussians(scene.points, scene.point_colors, 0, 1000, seeding.generator(0))
     with tempfile.TemporaryDirectory() as folder:
         gaussians = fit(cameras, pictures, start, settings, folder=Path(folder))
     error = np.mean([(render(gaussians, c).color.clamp(0, 1).numpy() - pictures[c.name] / 255.0) ** 2 for c in cameras])
@@ -112,7 +115,7 @@ def exported(extent: float, offset: float) -> np.ndarray:
     """The vertices of the fit's .ply in the scene's own frame."""
     scene, gaussians, _ = fitted(extent, offset)
     with tempfile.TemporaryDirectory() as folder:
-        io.save_ply(Path(folder) / "scene.ply", gaussians, similarity=scene.similarity)
+        save_ply(Path(folder) / "scene.ply", gaussians, similarity=scene.similarity)
         return PlyData.read(str(Path(folder) / "scene.ply"), mmap=False)["vertex"].data.copy()
 
 
@@ -136,8 +139,8 @@ def picture_of_export(extent: float, offset: float) -> float:
     """Largest difference of a picture of the export, brought back into the normalised frame, from the fit's."""
     scene, gaussians, _ = fitted(extent, offset)
     with tempfile.TemporaryDirectory() as folder:
-        io.save_ply(Path(folder) / "scene.ply", gaussians, similarity=scene.similarity)
-        again = io.load_ply(Path(folder) / "scene.ply", similarity=scene.similarity)
+        save_ply(Path(folder) / "scene.ply", gaussians, similarity=scene.similarity)
+        again = load_ply(Path(folder) / "scene.ply", similarity=scene.similarity)
     view = scene.cameras["v1"]
     return (render(again, view).color - render(gaussians, view).color).abs().max().item()
 
@@ -146,8 +149,8 @@ def scene_file_off(extent: float, offset: float) -> float:
     """Error of points that went through the saved scene and its similarity, in extents."""
     scene = normalised(extent, offset)
     with tempfile.TemporaryDirectory() as folder:
-        io.save_scene(Path(folder), scene)
-        again = io.load_scene(Path(folder))
+        save_scene(Path(folder), scene)
+        again = load_scene(Path(folder))
     true = extent * truth().means.double().numpy() + extent * offset * FAR
     return float(np.abs(again.similarity.invert(again.points) - true).max() / extent)
 

@@ -9,10 +9,11 @@ import torch
 
 from benchmarks.stability.cases import EPS32, EPS64, EXACT, UNCLEAR, Case, largest, unclear
 from benchmarks.stability.splatting import camera, cloud
-from reffusion import continuation, masks, metrics, undecided, witness
-from reffusion.lpips import Lpips
-from reffusion.optimize import reconstruction_loss
-from reffusion.ssim import C1
+from reffusion.gaussians.optimize import reconstruction_loss
+from reffusion.gaussians.ssim import C1
+from reffusion.masks import continuation, undecided, voting, witness
+from reffusion.score import metrics
+from reffusion.score.lpips import Lpips
 
 VIEWS = [camera(12, 10), camera(12, 10, 1.2), camera(12, 10, 1.5)]
 NAMED = [type(view)(f"v{k}", *list(vars(view).values())[1:8]) for k, view in enumerate(VIEWS)]
@@ -114,11 +115,11 @@ def loss_of_one_pixel() -> float:
 
 def labelled(given: dict[str, np.ndarray]) -> float:
     """How many of the Gaussians that a view sees are labelled as the object."""
-    return float(masks.label_gaussians(masks.cast_votes(cloud(), NAMED, given)).sum())
+    return float(voting.label_gaussians(voting.cast_votes(cloud(), NAMED, given)).sum())
 
 
 def seen() -> int:
-    votes = masks.cast_votes(cloud(), NAMED, {view.name: FULL for view in NAMED})
+    votes = voting.cast_votes(cloud(), NAMED, {view.name: FULL for view in NAMED})
     return int((votes.masked > 0).sum())
 
 
@@ -130,18 +131,18 @@ def all_full() -> float:
 def contradicting() -> float:
     """One camera under two names, masked in one and not in the other: a tie, which stays unmasked (tau = 1)."""
     twice = [NAMED[0], type(NAMED[0])("other", *list(vars(NAMED[0]).values())[1:8])]
-    votes = masks.cast_votes(cloud(), twice, {NAMED[0].name: FULL, "other": EMPTY})
-    return float(masks.label_gaussians(votes).sum() + (votes.masked != votes.unmasked).sum())
+    votes = voting.cast_votes(cloud(), twice, {NAMED[0].name: FULL, "other": EMPTY})
+    return float(voting.label_gaussians(votes).sum() + (votes.masked != votes.unmasked).sum())
 
 
 def in_one_view() -> float:
     """A mask in one view of three: the others do not vote, so all that this view sees is the object."""
-    votes = masks.cast_votes(cloud(), NAMED, {"v1": FULL})
-    return float((votes.unmasked > 0).sum() + (masks.label_gaussians(votes) != (votes.masked > 0)).sum())
+    votes = voting.cast_votes(cloud(), NAMED, {"v1": FULL})
+    return float((votes.unmasked > 0).sum() + (voting.label_gaussians(votes) != (votes.masked > 0)).sum())
 
 
 def in_no_view() -> float:
-    return unclear(lambda: masks.cast_votes(cloud(), NAMED, {}), "none of the training views has a mask")
+    return unclear(lambda: voting.cast_votes(cloud(), NAMED, {}), "none of the training views has a mask")
 
 
 def nothing_remains() -> float:
@@ -157,15 +158,15 @@ def nothing_remains() -> float:
 
 def tidied() -> float:
     """Empty and full masks stay what they are, whatever counts as a speck or a gap."""
-    changed = [(masks.tidy(mask, 5.0, 5.0) != mask).sum() for mask in (EMPTY, FULL)]
+    changed = [(voting.tidy(mask, 5.0, 5.0) != mask).sum() for mask in (EMPTY, FULL)]
     return float(sum(changed))
 
 
 def views_of_masks() -> float:
     """The view to complete: none of empty masks, one of full ones; boxes likewise; how many are wrong."""
     names = [view.name for view in NAMED]
-    none = masks.best_view(dict.fromkeys(names, EMPTY), names), metrics.mask_box(EMPTY)
-    some = masks.best_view(dict.fromkeys(names, FULL), names), metrics.mask_box(FULL)
+    none = voting.best_view(dict.fromkeys(names, EMPTY), names), metrics.mask_box(EMPTY)
+    some = voting.best_view(dict.fromkeys(names, FULL), names), metrics.mask_box(FULL)
     return float(sum(x is not None for x in none) + sum(x is None for x in some) + (some[1] != (0, 0, 12, 10)))
 
 

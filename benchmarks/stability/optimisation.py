@@ -15,16 +15,18 @@ import torch
 from benchmarks.stability import frames
 from benchmarks.stability.cases import EPS32, EXACT, Case, largest
 from benchmarks.stability.splatting import camera, cloud
-from reffusion import io, mcmc, trace
-from reffusion.confinement import Sight
-from reffusion.densify import densify, prune
-from reffusion.distill import Settings as Distilling
-from reffusion.distill import distill
-from reffusion.fit import fit
-from reffusion.fit_step import Settings
-from reffusion.optimize import GaussianOptimizer, Rates
-from reffusion.splat import render
-from reffusion.start import initial_gaussians
+from reffusion import seeding, trace
+from reffusion.distill.confinement import Sight
+from reffusion.distill.optimization import Settings as Distilling
+from reffusion.distill.optimization import distill
+from reffusion.fit.reconstruction import fit
+from reffusion.fit.start import initial_gaussians
+from reffusion.fit.step import Settings
+from reffusion.gaussians import mcmc
+from reffusion.gaussians.densify import densify, prune
+from reffusion.gaussians.optimize import GaussianOptimizer, Rates
+from reffusion.io.ply import load_ply, save_ply
+from reffusion.splat.rasterizer import render
 from reffusion.types import PARAMETERS, Gaussians
 
 STOPS = "neither recovered nor stopped by name, or wrote NaN"
@@ -51,7 +53,7 @@ def named(error: FloatingPointError, term: str) -> bool:
 def too_fast(factor: float) -> float:
     """A fit at so many times the usual rates ends above where it began, or says in which step which term failed."""
     scene = frames.normalised(1.0, 0.0)
-    start = initial_gaussians(scene.points, scene.point_colors, 0, 1000, trace.generator(0))
+    start = initial_gaussians(scene.points, scene.point_colors, 0, 1000, seeding.generator(0))
     usual = Rates(means=2e-3, means_last=2e-4, log_scales=1.5e-2, sh_dc=1.5e-2)
     settings = Settings(60, sh_degree=0, random_background=False, densify_every=10, rates=frames.faster(usual, factor))
     with tempfile.TemporaryDirectory() as name:
@@ -94,11 +96,11 @@ def nobody_left() -> float:
     picture = render(optimizer.gaussians, view, background=torch.full((3,), 0.25))
     picture.color.sum().backward()
     optimizer.step(0.5, visible=picture.radii > 0)
-    grown = densify(optimizer, 0.0, 0.01, 100, trace.generator(0))
-    moved = mcmc.relocate(optimizer, 0.5, trace.generator(0))
+    grown = densify(optimizer, 0.0, 0.01, 100, seeding.generator(0))
+    moved = mcmc.relocate(optimizer, 0.5, seeding.generator(0))
     with tempfile.TemporaryDirectory() as folder:
-        io.save_ply(Path(folder) / "none.ply", optimizer.gaussians)
-        again = len(io.load_ply(Path(folder) / "none.ply"))
+        save_ply(Path(folder) / "none.ply", optimizer.gaussians)
+        again = len(load_ply(Path(folder) / "none.ply"))
     good = removed == 8, (picture.color == 0.25).all(), not picture.alpha.any(), grown == moved == again == 0
     return float(sum(not x for x in good))
 
@@ -106,7 +108,7 @@ def nobody_left() -> float:
 def fit_of_nobody() -> float:
     """A fit whose pruning takes everything says so, with the step."""
     scene = frames.normalised(1.0, 0.0)
-    start = initial_gaussians(scene.points, scene.point_colors, 0, 1000, trace.generator(0))
+    start = initial_gaussians(scene.points, scene.point_colors, 0, 1000, seeding.generator(0))
     settings = Settings(
         8, sh_degree=0, densify_from=0.0, densify_until=1.0, densify_every=4, least_opacity=1.1, slope=math.inf
     )

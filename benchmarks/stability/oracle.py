@@ -13,8 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from reffusion import splat
-from reffusion.splat import reference
+from reffusion.splat import rasterizer, reference
 from reffusion.splat.conventions import MAX_ALPHA
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
@@ -50,7 +49,7 @@ def draw(gaussians: Gaussians, camera: Camera, impl: str, seed: int = 0, far: fl
     features, background, probe = leaf(normal(count, CHANNELS)), leaf(normal(3)), leaf(torch.zeros(count, 2))
     extras = {"features": features, "background": background, "probe": probe}
     if impl == "cpu":
-        drawn = splat.render(gaussians, camera, impl="cpu", **extras)
+        drawn = rasterizer.render(gaussians, camera, impl="cpu", **extras)
         images, radii = {name: getattr(drawn, name) for name in IMAGES}, drawn.radii
     else:
         images, radii = _drawn_with(blended, gaussians, camera, **extras)
@@ -66,7 +65,7 @@ def blended_pixels(gaussians: Gaussians, camera: Camera) -> Tensor:
     """bool [H * W, N]: which Gaussians the compiled kernel blends into which pixels. For small images."""
     pixels = camera.width * camera.height
     each = torch.eye(pixels).reshape(camera.height, camera.width, pixels)
-    return splat.accumulate(gaussians, camera, each, impl="cpu", count=True).T > 0
+    return rasterizer.accumulate(gaussians, camera, each, impl="cpu", count=True).T > 0
 
 
 def _drawn_with(blended: Tensor, gaussians: Gaussians, camera: Camera, features, background, probe):
@@ -105,7 +104,7 @@ def errors(gaussians: Gaussians, camera: Camera, relative: float, seed: int = 0)
     gradient counts times its length, as a rotation: otherwise the shortest one would drown all others.
     """
     # Depths count in units of the farthest, so that the terms of every sum are of order one, as the floor has them.
-    far = max(1.0, splat.render(gaussians, camera, impl="cpu").depth.max().item())
+    far = max(1.0, rasterizer.render(gaussians, camera, impl="cpu").depth.max().item())
     fast, exact = (draw(gaussians, camera, impl, seed, far) for impl in ("cpu", "reference"))
     if not torch.equal(fast.radii, exact.radii):
         return {"radii": float("inf")}

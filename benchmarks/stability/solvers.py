@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.stability.cases import EPS64, EXACT, UNCLEAR, Case, largest, unclear
-from reffusion import bilateral, depth
-from reffusion.planes import planar_model
-from reffusion.trace import generator
+from reffusion.depth import bilateral, completion
+from reffusion.depth.planes import planar_model
+from reffusion.seeding import generator
 
 ROWS, COLUMNS = np.mgrid[:40, :56].astype(float)
 PLANE = 0.4 + 0.003 * COLUMNS - 0.002 * ROWS
@@ -30,12 +30,12 @@ def only(*pixels: tuple[int, int]) -> np.ndarray:
 def plane_error(hole: np.ndarray, guide: np.ndarray | None = None, unit: float = 1.0, offset: float = 0.0) -> float:
     """A plane behind the hole, in this unit and this many units from zero: largest relative error."""
     disparity = unit * (PLANE + offset)
-    completed = depth.complete(np.where(hole, 9.0 * unit, disparity), ~hole, guide)
+    completed = completion.complete(np.where(hole, 9.0 * unit, disparity), ~hole, guide)
     return float(np.abs(completed / disparity - 1.0).max())
 
 
 def nothing_known_to_complete() -> float:
-    return unclear(lambda: depth.complete(PLANE, np.zeros(PLANE.shape)), "fix no plane")
+    return unclear(lambda: completion.complete(PLANE, np.zeros(PLANE.shape)), "fix no plane")
 
 
 def nothing_known_to_solve() -> float:
@@ -43,7 +43,7 @@ def nothing_known_to_solve() -> float:
 
 
 def one_pixel_to_complete() -> float:
-    return unclear(lambda: depth.complete(PLANE, only((3, 3))), "1 known pixels", "fix no plane")
+    return unclear(lambda: completion.complete(PLANE, only((3, 3))), "1 known pixels", "fix no plane")
 
 
 def one_pixel_to_solve() -> float:
@@ -88,7 +88,7 @@ def unseen_by_any() -> float:
 
 def hole_everywhere_but_a_rim() -> float:
     """Only the outermost pixels of one side are known: a band, which fixes a plane only where it is two wide."""
-    return unclear(lambda: depth.complete(PLANE, COLUMNS < 1), "fix no plane")
+    return unclear(lambda: completion.complete(PLANE, COLUMNS < 1), "fix no plane")
 
 
 def rooms_of_constant_disparity() -> float:
@@ -102,7 +102,7 @@ def rooms_of_constant_disparity() -> float:
 def condition_of_completion() -> float:
     """Condition number of the completion's system, hole of 17 px: stiffness times the fourth power of what a plate
     leaves free."""
-    return depth.condition((~HOLE).astype(float))
+    return completion.condition((~HOLE).astype(float))
 
 
 def condition_of_solver() -> float:

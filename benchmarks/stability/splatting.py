@@ -12,7 +12,8 @@ import torch
 
 from benchmarks.stability import oracle
 from benchmarks.stability.cases import EPS32, EXACT, Case, largest
-from reffusion import densify, splat
+from reffusion.gaussians import densify
+from reffusion.splat import rasterizer
 from reffusion.splat.conventions import NEAR
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
@@ -50,7 +51,7 @@ def in_camera(points: list[list[float]], view: Camera) -> torch.Tensor:
 def error(change: Callable[[Gaussians], Gaussians], view: Camera | None = None) -> float:
     """The worst block's; infinite where nothing is drawn, which would say nothing."""
     gaussians, view = change(cloud()), view or camera()
-    drawn = splat.render(gaussians, view, impl="cpu").alpha.max() > 0
+    drawn = rasterizer.render(gaussians, view, impl="cpu").alpha.max() > 0
     return oracle.worst(gaussians, view, RELATIVE) if drawn else math.inf
 
 
@@ -107,7 +108,7 @@ def on_the_near_plane() -> float:
     below, above = np.nextafter(np.float32(NEAR), np.float32(0)), np.nextafter(np.float32(NEAR), np.float32(1))
     depths = torch.tensor([below, np.float32(NEAR), above, 0.0, -NEAR, -1.0])
     gaussians = replace(scaled(1e-3, cloud(6)), means=torch.stack([0 * depths, 0 * depths, depths], 1))
-    kept = splat.render(gaussians, view, impl="cpu").radii > 0
+    kept = rasterizer.render(gaussians, view, impl="cpu").radii > 0
     return float((kept != (depths.double() >= NEAR)).sum())
 
 
@@ -173,8 +174,8 @@ def wide_image() -> float:
     """
     view = camera(8192, 2)
     view, gaussians = replace(view, fx=4000.0, fy=4000.0), cloud(12)
-    fast = splat.render(gaussians, view, impl="cpu").color.double()
-    exact = splat.render(gaussians.map(torch.Tensor.double), view, impl="reference").color
+    fast = rasterizer.render(gaussians, view, impl="cpu").color.double()
+    exact = rasterizer.render(gaussians.map(torch.Tensor.double), view, impl="reference").color
     return ((fast - exact).norm() / exact.norm()).item()
 
 

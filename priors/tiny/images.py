@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from surfaces import Field, blend, noise_tile, random_texture
 
-from reffusion.trace import seed_for
+from reffusion.seeding import seed_for
 
 SIZE = 128  # px, side of one training image; crops are taken from it
 SUPERSAMPLE = 2

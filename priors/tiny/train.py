@@ -25,11 +25,12 @@ from diffusers import StableDiffusionInpaintPipeline, UNet2DConditionModel  # no
 from torch import Tensor, nn  # noqa: E402
 from transformers import CLIPTextModel  # noqa: E402
 
-from reffusion import fill  # noqa: E402
-from reffusion.denoising import spread_timesteps  # noqa: E402
-from reffusion.io import save_json  # noqa: E402
-from reffusion.prior import CONDITIONING  # noqa: E402
-from reffusion.trace import generator, load_checkpoint, save_checkpoint, seed_for  # noqa: E402
+from reffusion.io.arrays import save_json  # noqa: E402
+from reffusion.prior import fill  # noqa: E402
+from reffusion.prior.denoising import spread_timesteps  # noqa: E402
+from reffusion.prior.model import CONDITIONING  # noqa: E402
+from reffusion.seeding import generator, seed_for  # noqa: E402
+from reffusion.trace import load_checkpoint, save_checkpoint
 
 POOL = 500  # images held in memory
 FRESH = 2  # steps for each new image, which takes the place of the oldest; making one costs a twentieth of a step

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .arrays import load_json, save_json
-from .colmap import ModelCamera, ModelImage, load_cameras, load_images, load_model_points, save_model
-from .images import load_exr, load_image, load_mask, save_exr, save_image, save_mask
+from reffusion.io.arrays import load_json, save_json
+from reffusion.io.colmap import ModelCamera, ModelImage, load_cameras, load_images, load_model_points, save_model
+from reffusion.io.images import load_exr, load_image, load_mask, save_exr, save_image, save_mask
 
 if TYPE_CHECKING:
     from reffusion.types import MaskSet, Reference, Scene

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from reffusion.splat.compiled import inlined, kernel, room, share
+from reffusion.kernels.compiled import inlined, kernel, room, share
+from reffusion.kernels.memory import load, prefetch, splat_at, store, store_totals, total
+from reffusion.kernels.vectors import LANES, fma, fnma, select, some, splat
 from reffusion.splat.forward import (
     AT_CUT,
     AT_MAX_ALPHA,
@@ -40,8 +42,6 @@ from reffusion.splat.layout import (
     TILE_HEIGHT,
     TILE_WIDTH,
 )
-from reffusion.splat.memory import load, prefetch, splat_at, store, store_totals, total
-from reffusion.splat.vectors import LANES, fma, fnma, select, some, splat
 
 _UPSTREAM = (
     6  # vectors of a step before those of features: transmittance, remainder, upstream gradients of r, g, b, depth

@@ -9,7 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from reffusion.splat.compiled import inlined, kernel, room, share
+from reffusion.kernels.compiled import inlined, kernel, room, share
+from reffusion.kernels.memory import prefetch, store_whole
+from reffusion.kernels.vectors import LANES, ceiling, maximum, minimum, ramp, root, select, splat, take_ticket
 from reffusion.splat.layout import (
     AHEAD,
     ANCHOR_U,
@@ -34,8 +36,6 @@ from reffusion.splat.layout import (
     WHITEN_X,
     WHITEN_Y,
 )
-from reffusion.splat.memory import prefetch, store_whole
-from reffusion.splat.vectors import LANES, ceiling, maximum, minimum, ramp, root, select, splat, take_ticket
 
 _F = np.float32
 _ROOM = 16  # pairs to a footprint that room is made for at first; untouched room costs nothing

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from reffusion.kernels.compiled import room, share
 from reffusion.splat import backward, binning, footprints, forward
-from reffusion.splat.compiled import room, share
 from reffusion.splat.layout import FOOTPRINT
 from reffusion.splat.projection import view_numbers
 from reffusion.types import Camera, Gaussians, Rendering
@@ -33,7 +33,7 @@ class View(NamedTuple):
 def render(
     gaussians: Gaussians, camera: Camera, features: Tensor | None, background: Tensor, degree: int, probe: Tensor | None
 ) -> Rendering:
-    """See `reffusion.splat.render`."""
+    """See `reffusion.splat.rasterizer.render`."""
     color, depth, alpha, blended, radii = _Splat.apply(
         gaussians.means,
         gaussians.quaternions,
@@ -51,7 +51,7 @@ def render(
 
 
 def accumulate(gaussians: Gaussians, camera: Camera, values: Tensor, count: bool) -> Tensor:
-    """See `reffusion.splat.accumulate`."""
+    """See `reffusion.splat.rasterizer.accumulate`."""
     parameters = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.opacity_logits, gaussians.sh)
     no_probe = np.empty((0, 2), np.float32)
     view = look([_array(p) for p in parameters], gaussians.antialiased, no_probe, camera, 0)

@@ -44,7 +44,7 @@ def require_gpu(means: Tensor) -> None:
 def render(
     gaussians: Gaussians, camera: Camera, features: Tensor | None, background: Tensor, degree: int, probe: Tensor | None
 ) -> Rendering:
-    """See `reffusion.splat.render`."""
+    """See `reffusion.splat.rasterizer.render`."""
     if len(gaussians) == 0:
         return _empty(camera, features, background)
     import gsplat
@@ -80,7 +80,7 @@ def render(
 
 
 def accumulate(gaussians: Gaussians, camera: Camera, values: Tensor, count: bool) -> Tensor:
-    """See `reffusion.splat.accumulate`. Weighted sums are the gradient of blended features."""
+    """See `reffusion.splat.rasterizer.accumulate`. Weighted sums are the gradient of blended features."""
     size = len(gaussians), values.shape[-1]
     if 0 in size:
         return values.new_zeros(size)

@@ -4,9 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
+from reffusion.kernels.compiled import inlined, kernel
+from reffusion.kernels.memory import (
+    load,
+    load_column,
+    load_columns,
+    load_mask,
+    store,
+    store_column,
+    store_columns,
+    store_whole,
+)
+from reffusion.kernels.vectors import LANES, maximum, minimum, narrow, select, some, splat, take_ticket, widen
 from reffusion.splat import harmonics, projection
 from reffusion.splat.binning import ellipse
-from reffusion.splat.compiled import inlined, kernel
 from reffusion.splat.layout import (
     ANCHOR_U,
     ANCHOR_V,
@@ -31,17 +42,6 @@ from reffusion.splat.layout import (
     WHITEN_X,
     WHITEN_Y,
 )
-from reffusion.splat.memory import (
-    load,
-    load_column,
-    load_columns,
-    load_mask,
-    store,
-    store_column,
-    store_columns,
-    store_whole,
-)
-from reffusion.splat.vectors import LANES, maximum, minimum, narrow, select, some, splat, take_ticket, widen
 
 
 def padded(count: int) -> int:

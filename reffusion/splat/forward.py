@@ -4,7 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from reffusion.splat.compiled import inlined, kernel, room, share
+from reffusion.kernels.compiled import inlined, kernel, room, share
+from reffusion.kernels.memory import load, prefetch, splat_at, store
+from reffusion.kernels.vectors import (
+    EXP2,
+    LANES,
+    ROUND,
+    fma,
+    fnma,
+    minimum,
+    select,
+    some,
+    splat,
+    take_ticket,
+    times_power,
+)
 from reffusion.splat.conventions import MAX_ALPHA, MIN_TRANSMITTANCE
 from reffusion.splat.layout import (
     AHEAD,
@@ -26,20 +40,6 @@ from reffusion.splat.layout import (
     TILE_WIDTH,
     WHITEN_X,
     WHITEN_Y,
-)
-from reffusion.splat.memory import load, prefetch, splat_at, store
-from reffusion.splat.vectors import (
-    EXP2,
-    LANES,
-    ROUND,
-    fma,
-    fnma,
-    minimum,
-    select,
-    some,
-    splat,
-    take_ticket,
-    times_power,
 )
 
 STEP_ROWS = LANES // TILE_WIDTH  # rows of a vector

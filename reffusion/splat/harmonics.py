@@ -5,10 +5,10 @@ The direction is that from the camera to the Gaussian.
 
 from __future__ import annotations
 
-from reffusion.splat.compiled import inlined
+from reffusion.kernels.compiled import inlined
+from reffusion.kernels.memory import load, store
+from reffusion.kernels.vectors import LANES, fma, maximum, narrow, root, splat
 from reffusion.splat.conventions import SH0, SH1, SH2, SH3
-from reffusion.splat.memory import load, store
-from reffusion.splat.vectors import LANES, fma, maximum, narrow, root, splat
 
 
 @inlined

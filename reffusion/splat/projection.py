@@ -10,18 +10,11 @@ import math
 
 import numpy as np
 
-from reffusion.splat.compiled import inlined
-from reffusion.splat.conventions import (
-    JACOBIAN_MARGIN,
-    LOW_PASS,
-    MAX_PIXELS,
-    MAX_VARIANCE,
-    MIN_ALPHA,
-    NEAR,
-)
+from reffusion.kernels.compiled import inlined
+from reffusion.kernels.memory import load, load_column
+from reffusion.kernels.vectors import LANES, ceiling, exp2, log2, maximum, minimum, root, select, widen
+from reffusion.splat.conventions import JACOBIAN_MARGIN, LOW_PASS, MAX_PIXELS, MAX_VARIANCE, MIN_ALPHA, NEAR
 from reffusion.splat.layout import GRAD_DEPTH, SUM_G, SUM_U, SUM_UU, SUM_UV, SUM_V, SUM_VV
-from reffusion.splat.memory import load, load_column
-from reffusion.splat.vectors import LANES, ceiling, exp2, log2, maximum, minimum, root, select, widen
 from reffusion.types import Camera
 
 _LOG2_E = 1.4426950408889634

@@ -52,7 +52,7 @@ class Projected(NamedTuple):
 def render(
     gaussians: Gaussians, camera: Camera, features: Tensor | None, background: Tensor, degree: int, probe: Tensor | None
 ) -> Rendering:
-    """See `reffusion.splat.render`."""
+    """See `reffusion.splat.rasterizer.render`."""
     projected, radii = project(gaussians, camera, probe)
     order = projected.order
     columns = [colors(gaussians, camera, degree)[order], projected.depths[:, None]]
@@ -77,7 +77,7 @@ def render(
 
 
 def accumulate(gaussians: Gaussians, camera: Camera, values: Tensor, count: bool) -> Tensor:
-    """See `reffusion.splat.accumulate`."""
+    """See `reffusion.splat.rasterizer.accumulate`."""
     projected, _ = project(gaussians, camera, None)
     gathered = values.new_zeros(len(projected.order), values.shape[-1])
     flat = values.reshape(camera.height * camera.width, -1)

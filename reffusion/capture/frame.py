@@ -1,0 +1,188 @@
+"""The normalised frame: which similarity brings a scene to it, and points for scenes that bring few."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from reffusion.capture.lens import Lens
+
+if TYPE_CHECKING:
+    from torch import Generator
+
+    from reffusion.capture.layouts.capture import Poses
+    from reffusion.types import Camera, Scene, Similarity
+
+
+def depth_ranges(
+    world_to_camera: np.ndarray, lenses: Sequence[Lens], points: np.ndarray, bounds: np.ndarray | None
+) -> np.ndarray:
+    """Near, typical and far camera depth of every view, [V, 3] float64 in the scene's units, all positive.
+
+    From the points inside the view (1st, 50th and 99th percentile) where there are at least 10; else from the
+    LLFF bounds (typical: the mean in disparity); else from where the optical axes meet (a third and four times of
+    it are near and far); where the axes are parallel or meet behind, from three times the cameras' spread.
+
+    Args:
+        world_to_camera: [V, 4, 4]. points: [P, 3]. bounds: [V, 2] near and far, or None.
+
+    Raises:
+        ValueError: where nothing tells the depth: no points, no bounds, and all cameras at one place.
+    """
+    guess = _depths_of_axes(world_to_camera) if bounds is None else None
+    ranges = np.empty((len(lenses), 3))
+    for k, (pose, lens) in enumerate(zip(world_to_camera, lenses, strict=True)):
+        z = depths_in_view(points, pose, lens)
+        if len(z) >= 10:
+            ranges[k] = np.percentile(z, (1, 50, 99))
+        elif bounds is not None:
+            near, far = bounds[k]
+            ranges[k] = near, 2.0 / (1.0 / near + 1.0 / far), far
+        else:
+            ranges[k] = np.nan if np.isnan(guess[k]) else guess[k] * np.array([1 / 3, 1.0, 4.0])
+    known = ~np.isnan(ranges[:, 1])
+    if not known.any():
+        raise ValueError("no points, no bounds and all cameras at one place: nothing tells how far the scene is")
+    ranges[~known] = np.median(ranges[known], axis=0)
+    return ranges
+
+
+def depths_in_view(points: np.ndarray, world_to_camera: np.ndarray, lens: Lens) -> np.ndarray:
+    """Camera depths [Q] of the points [P, 3] that fall inside the picture (distortion ignored)."""
+    at = points @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
+    at = at[at[:, 2] > 0]
+    uv = at[:, :2] / at[:, 2:] * (lens.fx, lens.fy) + (lens.cx, lens.cy)
+    return at[((uv >= 0) & (uv <= (lens.width, lens.height))).all(axis=1), 2]
+
+
+def camera_centers(world_to_camera: np.ndarray) -> np.ndarray:
+    """[V, 3] from [V, 4, 4]."""
+    return -np.einsum("vji,vj->vi", world_to_camera[:, :3, :3], world_to_camera[:, :3, 3])
+
+
+def _depths_of_axes(world_to_camera: np.ndarray) -> np.ndarray:
+    """[V] depth of the point nearest to all optical axes; NaN where the cameras' places do not tell it."""
+    centers, axes = camera_centers(world_to_camera), world_to_camera[:, 2, :3]
+    away = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    middle = centers.mean(axis=0)
+    matrix = away.mean(axis=0)
+    meeting = middle
+    if np.linalg.eigvalsh(matrix)[0] > 1e-3:  # mean squared sine of about 2 degrees between the axes
+        meeting = middle + np.linalg.solve(matrix, np.einsum("vij,vj->i", away, centers - middle) / len(centers))
+    depths = np.einsum("vi,vi->v", meeting - centers, axes)
+    spread = np.sqrt(((centers - middle) ** 2).sum(axis=1).mean())
+    if np.median(depths) > 0.2 * spread:
+        return np.maximum(depths, 0.2 * np.median(depths))
+    return np.full(len(centers), 3.0 * spread if spread > 0 else np.nan)
+
+
+def normalising(world_to_camera: np.ndarray, typical: np.ndarray) -> Similarity:
+    """The similarity into the normalised frame: the scene's middle at 0, its typical distance from the cameras 1.
+
+    The scale is one over the median of the views' typical depths [V]; the offset is the median, axis by axis, of
+    what the views look at: the point at typical depth on each optical axis. So for photos from one side the object
+    is near the origin and the cameras about 1 away; for photos all around they stand on a ring of radius about 1.
+    Scaling or moving the scene changes nothing in the normalised frame; all of it is float64, so a geo-referenced
+    offset of a million extents still leaves ten digits. There is no rotation.
+    """
+    from reffusion.types import Similarity
+
+    looked_at = camera_centers(world_to_camera) + typical[:, None] * world_to_camera[:, 2, :3]
+    return Similarity(float(1.0 / np.median(typical)), np.median(looked_at, axis=0))
+
+
+def normalise_pose(world_to_camera: np.ndarray, similarity: Similarity) -> np.ndarray:
+    """[4, 4] in the scene's own frame -> [4, 4] in the normalised frame."""
+    pose = world_to_camera.copy()
+    pose[:3, 3] = similarity.scale * (world_to_camera[:3, :3] @ similarity.offset + world_to_camera[:3, 3])
+    return pose
+
+
+def ranges_of(poses: Poses, pinholes: Mapping[str, Lens]) -> np.ndarray:
+    """`depth_ranges` [V, 3] of the views that have a pinhole, in its order, in the scene's units."""
+    bounds = np.array([poses.bounds[name] for name in pinholes]) if poses.bounds else None
+    return depth_ranges(_stacked(poses, pinholes), list(pinholes.values()), poses.points, bounds)
+
+
+def _stacked(poses: Poses, names: Mapping[str, Lens]) -> np.ndarray:
+    return np.stack([poses.world_to_camera[name] for name in names])
+
+
+def normalised(
+    poses: Poses, pinholes: Mapping[str, Lens], train: Sequence[str], test: Sequence[str], clean: frozenset[str]
+) -> Scene:
+    """Cameras and points in the normalised frame (`normalising`). `pinholes`: view name -> undistorted lens."""
+    from reffusion.types import Camera, Scene
+
+    similarity = normalising(_stacked(poses, pinholes), ranges_of(poses, pinholes)[:, 1])
+    cameras = {
+        name: Camera(
+            name,
+            pinhole.width,
+            pinhole.height,
+            pinhole.fx,
+            pinhole.fy,
+            pinhole.cx,
+            pinhole.cy,
+            normalise_pose(poses.world_to_camera[name], similarity),
+        )
+        for name, pinhole in sorted(pinholes.items())
+    }
+    return Scene(cameras, tuple(train), tuple(test), clean, similarity.apply(poses.points), poses.colors, similarity)
+
+
+def filled_up(
+    scene: Scene, ranges: np.ndarray, count: int, generator: Generator, image_of: Callable[[str], np.ndarray]
+) -> Scene:
+    """The scene with `count` random points more, coloured by the picture they were drawn in.
+
+    Args:
+        ranges: [V, 3] near, typical and far depths in the normalised frame.
+        image_of: view name -> uint8 [H, W, 3].
+    """
+    names = list(scene.cameras)
+    points, views, pixels = random_points(list(scene.cameras.values()), ranges, count, generator)
+    colors = np.zeros((len(points), 3), np.uint8)
+    for k in np.unique(views):
+        mine = views == k
+        colors[mine] = image_of(names[k])[pixels[mine, 1], pixels[mine, 0]]
+    return replace(
+        scene,
+        points=np.concatenate([scene.points, points]),
+        point_colors=np.concatenate([scene.point_colors, colors]),
+    )
+
+
+def random_points(
+    cameras: Sequence[Camera], ranges: np.ndarray, count: int, generator: Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`count` points in the views' frusta, uniform over pixels and in disparity between near and far.
+
+    Four times as many are drawn and those that a second view sees too go first, so that few float before a lens.
+
+    Returns:
+        points [count, 3]; the view each was drawn in, int [count]; its pixel there, (column, row), int [count, 2].
+    """
+    import torch
+
+    from reffusion.geometry import project
+
+    views = np.arange(4 * count) % len(cameras)
+    u = torch.rand((4 * count, 3), generator=generator, dtype=torch.float64).numpy()
+    of_view = lambda pick: np.array([pick(camera) for camera in cameras], np.float64)[views]
+    size, focal = of_view(lambda c: (c.width, c.height)), of_view(lambda c: (c.fx, c.fy))
+    near, far = ranges[views, 0], ranges[views, 2]
+    pixels = u[:, :2] * size
+    z = 1.0 / (u[:, 2] / near + (1.0 - u[:, 2]) / far)
+    at = np.concatenate([(pixels - of_view(lambda c: (c.cx, c.cy))) / focal * z[:, None], z[:, None]], axis=1)
+    pose = of_view(lambda c: c.world_to_camera)
+    points = np.einsum("nji,nj->ni", pose[:, :3, :3], at - pose[:, :3, 3])
+    seen = np.zeros(len(points), int)
+    for camera in cameras:
+        uv, depth = project(points, camera)
+        seen += (depth > 0) & ((uv >= 0) & (uv <= (camera.width, camera.height))).all(axis=1)
+    chosen = np.sort(np.argsort(seen < 2, kind="stable")[:count])
+    return points[chosen], views[chosen], np.minimum(pixels[chosen].astype(int), size[chosen].astype(int) - 1)

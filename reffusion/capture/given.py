@@ -1,0 +1,151 @@
+"""Completed views that a scene brings: named in its scene.yaml, or painted into its folder `painted`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, UnidentifiedImageError
+
+from reffusion.capture.layouts.capture import ENDINGS, Capture
+from reffusion.capture.roles import Roles, check_proportions, known
+from reffusion.io.images import image_size, load_exr
+
+DEPTHS = (".npy", ".exr", ".png", ".tif", ".tiff")
+PROPORTIONS = 0.1  # how far a reference's may be from its view's: people crop
+
+
+@dataclass(frozen=True)
+class GivenReference:
+    """A completed view that the scene brings.
+
+    Attributes:
+        view: its name.
+        path: the picture; another size than the photograph's, and slightly other proportions, are made up for.
+        depth: its depth or disparity, over the picture; or None.
+        undistorted: the picture was painted over an undistorted image, not over the photograph.
+        painted: it lies in `painted`, over what `reference` wrote to be painted: the view's exposure is taken out.
+    """
+
+    view: str
+    path: Path
+    depth: Path | None = None
+    undistorted: bool = False
+    painted: bool = False
+
+
+def load_given(
+    folder: Path,
+    capture: Capture,
+    roles: Roles,
+    named: Sequence[tuple[str, str, str | None, bool]],
+    painted: Sequence[Path],
+) -> list[GivenReference]:
+    """The references, sorted by view; a painting stands for one that scene.yaml names for the same view.
+
+    Args:
+        named: (view, picture, depth or None, painted over an undistorted image?), files relative to the scene.
+        painted: the files of the folder `painted`: <view>.png, and <view>_depth.* where there is one.
+
+    Raises:
+        ValueError: naming the file and the remedy: an unknown view, a test view, a view that is for neither, two for a
+            view, a missing file, other proportions than the view's, a depth map of another kind.
+    """
+    folder = Path(folder)
+    found: dict[str, GivenReference] = {}
+    for view, image, depth, undistorted in named:
+        name = known(view, capture, "reference")
+        if name in found:
+            raise ValueError(f"scene.yaml: reference: two for the view '{name}'; keep one")
+        found[name] = GivenReference(name, folder / image, depth and folder / depth, undistorted)
+    for given in _paintings(painted, capture):
+        found[given.view] = given
+    for given in found.values():
+        _check(given, capture, roles)
+    return sorted(found.values(), key=lambda given: given.view)
+
+
+def _paintings(files: Sequence[Path], capture: Capture) -> list[GivenReference]:
+    """The paintings with their depth maps; masks that were copied along are passed over."""
+    pictures, depths = {}, {}
+    for path in files:
+        of = {end: path.stem.removesuffix(end) for end in ("_depth", "_mask") if path.stem.endswith(end)}
+        if path.stem not in capture.pictures and of.get("_depth") in capture.pictures:
+            kind, name = depths, of["_depth"]
+        elif path.stem not in capture.pictures and of.get("_mask") in capture.pictures:
+            continue
+        elif path.suffix.lower() in ENDINGS:
+            kind, name = pictures, path.stem
+        else:
+            raise ValueError(f"{path}: no picture; a painting is called <view>.png, its depth <view>_depth.png or .exr")
+        if name not in capture.pictures:
+            raise ValueError(f"{path}: no view is called '{name}'; call the painting like its view, or remove it")
+        if name in kind:
+            raise ValueError(f"{path}: there is {kind[name].name} too; keep one for the view '{name}'")
+        kind[name] = path
+    for name in depths.keys() - pictures.keys():
+        raise ValueError(f"{depths[name]}: a depth map without a painting; add {name}.png, or remove it")
+    return [GivenReference(name, path, depths.get(name), True, True) for name, path in pictures.items()]
+
+
+def _check(given: GivenReference, capture: Capture, roles: Roles) -> None:
+    where = "" if given.painted else "; correct `reference` in scene.yaml"
+    for path in (given.path, given.depth):
+        if path is not None and not path.is_file():
+            raise ValueError(f"{path}: no such file{where}")
+    if given.view in roles.test:
+        raise ValueError(
+            f"{given.path}: '{given.view}' is a test view, and scored: a reference would train it; "
+            "make it for a training view, or take the view out of `test` in scene.yaml"
+        )
+    if given.view not in roles.train:
+        raise ValueError(
+            f"{given.path}: '{given.view}' is neither a training nor a test view; "
+            "name it in `train` in scene.yaml, or make the reference for another view"
+        )
+    check_proportions(given.path, given.view, capture, PROPORTIONS, "reference")
+    if given.depth is not None:
+        if given.depth.suffix.lower() not in DEPTHS:
+            raise ValueError(f"{given.depth}: a depth map is a 16-bit .png, a .npy or an .exr; convert it")
+        if given.depth.suffix.lower() not in (".npy", ".exr"):
+            image_size(given.depth)
+
+
+def load_depth(path: Path) -> np.ndarray:
+    """float32 [h, w], a map of depth or disparity in any unit; NaN where it says nothing (not finite; 0 in a picture).
+
+    Raises:
+        ValueError: naming the file, where it is unreadable, not of one channel, 8-bit, empty or constant.
+    """
+    path = Path(path)
+    values = _values(path)
+    if values.ndim == 3 and values.shape[2] == 1:
+        values = values[..., 0]
+    if values.ndim != 2 or not np.issubdtype(values.dtype, np.number) or np.iscomplexobj(values):
+        raise ValueError(f"{path}: {values.dtype} {list(values.shape)}; a depth map is one number for each pixel")
+    empty = (values == 0) if np.issubdtype(values.dtype, np.integer) else np.zeros(values.shape, bool)
+    with np.errstate(over="ignore"):
+        values = values.astype(np.float32)
+    values[empty | ~np.isfinite(values)] = np.nan
+    if np.isnan(values).mean() > 0.9:
+        raise ValueError(f"{path}: nine tenths of it are 0 or not finite; a depth map needs values over the whole view")
+    if np.nanmin(values) == np.nanmax(values):
+        raise ValueError(f"{path}: all its values are {np.nanmin(values):g}; that is no depth map")
+    return values
+
+
+def _values(path: Path) -> np.ndarray:
+    if path.suffix.lower() == ".exr":
+        return load_exr(path)
+    try:
+        if path.suffix.lower() == ".npy":
+            return np.load(path, allow_pickle=False)
+        with Image.open(path) as image:
+            mode, values = image.mode, np.array(image)
+    except (OSError, ValueError, EOFError, SyntaxError, UnidentifiedImageError) as error:
+        raise ValueError(f"{path}: not a readable depth map ({error})") from error
+    if mode[0] not in "IF":
+        raise ValueError(f"{path}: {mode} pixels of 8 bits are too coarse for depth; write 16-bit grey, .npy or .exr")
+    return values

@@ -1,0 +1,121 @@
+"""What every layout is read into, and what their readers share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from reffusion.capture.lens import Lens
+from reffusion.io.images import image_size
+
+ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+NO_POINTS = (np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Cameras in the scene's own frame.
+
+    Attributes:
+        lenses: view name -> lens at the size of the view's picture file.
+        world_to_camera: view name -> [4, 4] float64, rigid; the camera looks along +z, x right, y down.
+        points, colors: [P, 3] float64 and uint8; P may be 0.
+        bounds: view name -> (near, far) depths; empty where the layout has none.
+    """
+
+    lenses: dict[str, Lens]
+    world_to_camera: dict[str, np.ndarray]
+    points: np.ndarray
+    colors: np.ndarray
+    bounds: dict[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Capture:
+    """What a folder holds.
+
+    Attributes:
+        layout: llff, colmap, transforms or photos.
+        pictures: view name -> picture file, sorted by name; all of them have poses, if any has.
+        poses: None where they must be found by structure from motion.
+        brought_by: the file the poses come from, for messages; None without poses.
+        image_folder: where the pictures lie (masks are looked for beside them).
+        left_out: names of views that have a picture but no pose, or a pose but no picture.
+        warnings: what the user should know, each one sentence.
+    """
+
+    layout: str
+    pictures: dict[str, Path]
+    poses: Poses | None
+    brought_by: Path | None
+    image_folder: Path
+    left_out: frozenset[str]
+    warnings: tuple[str, ...]
+
+    @property
+    def upright(self) -> bool:
+        """Whether the camera's orientation tag is obeyed: given poses refer to the stored pixels instead."""
+        return self.layout == "photos"
+
+
+def pictures_in(folder: Path) -> dict[str, Path]:
+    """View name (file name without ending) -> picture, sorted by name. ValueError where two share a name."""
+    files = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in ENDINGS and not p.name.startswith(".")]
+    return unique((p.stem, p) for p in files)
+
+
+def unique(named: Iterable[tuple[str, Path]]) -> dict[str, Path]:
+    """A dictionary sorted by name; ValueError where a name comes twice."""
+    result: dict[str, Path] = {}
+    for name, path in named:
+        if name in result:
+            raise ValueError(f"{path}: the view name '{name}' is also that of {result[name]}; rename one of them")
+        result[name] = path
+    return dict(sorted(result.items()))
+
+
+def image_folder_of(folder: Path, images: str | None, usual: tuple[str, ...]) -> Path:
+    """The named folder; or the first usual one that holds pictures, one with a `label` folder inside first."""
+    if images is not None:
+        return folder / images
+    there = [folder / name for name in usual if (folder / name).is_dir() and pictures_in(folder / name)]
+    if not there:
+        raise ValueError(f"{folder}: no pictures in {', '.join(usual)}; name their folder as `images` in scene.yaml")
+    return next((path for path in there if (path / "label").is_dir()), there[0])
+
+
+def fitted(lens: Lens, picture: Path) -> Lens:
+    """The lens at the size of the picture file; ValueError where the two have different proportions."""
+    width, height = image_size(picture)
+    if abs(width * lens.height - height * lens.width) > 0.02 * width * lens.height:
+        raise ValueError(
+            f"{picture}: {width}x{height} px, but its camera is for {lens.width}x{lens.height}; "
+            "other proportions: the picture was cropped or turned after its pose was found"
+        )
+    return lens.resized(width, height)
+
+
+def rigid(matrix: np.ndarray, name: str, source: Path) -> np.ndarray:
+    """[4, 4] with the nearest rotation; ValueError where it is not finite, mirrored, sheared or a scaling."""
+    if not np.isfinite(matrix).all():
+        raise ValueError(f"{source}: the pose of '{name}' is not finite; remove the view or solve its pose again")
+    u, stretch, v = np.linalg.svd(matrix[:3, :3])
+    if np.linalg.det(u @ v) < 0 or stretch[0] > 1.02 * stretch[2]:
+        raise ValueError(f"{source}: the pose of '{name}' is no rotation; solve its pose again")
+    result = np.eye(4)
+    result[:3, :3], result[:3, 3] = u @ v, matrix[:3, 3]
+    return result
+
+
+def inverse(pose: np.ndarray) -> np.ndarray:
+    result = np.eye(4)
+    result[:3, :3], result[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
+    return result
+
+
+def counted(what: str, names: list[str]) -> str | None:
+    """`17 of the ... : a, b, c`, or None for no names."""
+    return f"{len(names)} {what}: {', '.join(names)}" if names else None

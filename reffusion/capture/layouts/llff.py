@@ -1,0 +1,127 @@
+"""LLFF's poses_bounds.npy, as SPIn-NeRF's scenes have it; a COLMAP model beside it wins, or helps where incomplete."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from reffusion.capture.frame import depths_in_view
+from reffusion.capture.layouts.capture import (
+    NO_POINTS,
+    Capture,
+    Poses,
+    fitted,
+    image_folder_of,
+    inverse,
+    pictures_in,
+    rigid,
+)
+from reffusion.capture.layouts.colmap import from_model, model_folder
+from reffusion.capture.lens import Lens, from_colmap
+from reffusion.io.colmap import load_cameras, load_model_points, model_file
+
+
+def read(folder: Path, images: str | None) -> Capture:
+    """See `load_capture`."""
+    source = folder / "poses_bounds.npy"
+    usual = ("images_4", "images_2", "images_8", "images")
+    image_folder = image_folder_of(folder, images, usual)
+    model = model_folder(folder)
+    if model is not None:  # exact poses, the lens's distortion and the points
+        return from_model(folder, model, image_folder, "llff")
+    if not source.is_file():
+        raise ValueError(f"{source}: missing, and there is no complete COLMAP model in {folder / 'sparse/0'}")
+    pictures = pictures_in(image_folder)
+    rows = _poses_bounds(source)
+    if len(rows) != len(pictures):
+        raise ValueError(
+            f"{source}: {len(rows)} poses, but {image_folder} holds {len(pictures)} pictures; "
+            "one pose a picture is needed, in order of the sorted names"
+        )
+    lenses, poses, bounds = {}, {}, {}
+    for row, (name, path) in zip(rows, pictures.items(), strict=True):
+        columns, (height, width, focal) = row[:15].reshape(3, 5), row[[4, 9, 14]]
+        lens = Lens(
+            round(width), round(height), float(focal), float(focal), width / 2, height / 2, model="SIMPLE_PINHOLE"
+        )
+        lenses[name] = fitted(lens, path)
+        camera_to_world = np.eye(4)
+        # LLFF's columns are down, right, backwards.
+        camera_to_world[:3] = np.stack([columns[:, 1], columns[:, 0], -columns[:, 2], columns[:, 3]], axis=1)
+        poses[name] = inverse(rigid(camera_to_world, name, source))
+        bounds[name] = float(row[15]), float(row[16])
+    warnings, partial = [], folder / "sparse" / "0"
+    lenses = _lens_of_partial_model(partial, lenses, pictures, warnings)
+    points = _points_of_partial_model(partial, lenses, poses, bounds, warnings)
+    brought = Poses(lenses, poses, *points, bounds)
+    return Capture("llff", pictures, brought, source, image_folder, frozenset(), tuple(warnings))
+
+
+def _poses_bounds(source: Path) -> np.ndarray:
+    """[V, 17] float64, checked."""
+    try:
+        rows = np.load(source, allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{source}: not a readable array ({error})") from error
+    if rows.ndim != 2 or rows.shape[1] != 17:
+        raise ValueError(f"{source}: {list(rows.shape)}, expected [views, 17] as LLFF writes it")
+    rows = rows.astype(np.float64)
+    if not np.isfinite(rows).all():
+        bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+        raise ValueError(f"{source}: rows {bad.tolist()} are not finite; solve these poses again")
+    if (rows[:, [4, 9, 14, 15]] <= 0).any() or (rows[:, 16] <= rows[:, 15]).any():
+        raise ValueError(f"{source}: sizes, focal lengths and bounds must be positive, and far greater than near")
+    return rows
+
+
+def _lens_of_partial_model(
+    model: Path, lenses: dict[str, Lens], pictures: dict[str, Path], warnings: list[str]
+) -> dict[str, Lens]:
+    """The lens of a model that lacks its images, where it holds one camera that agrees with poses_bounds.npy."""
+    file = model_file(model, "cameras") if model.is_dir() else None
+    cameras = list(load_cameras(file).values()) if file else []
+    if len(cameras) != 1:
+        return lenses
+    exact = from_colmap(cameras[0].model, cameras[0].width, cameras[0].height, cameras[0].params)
+    replaced = {name: fitted(exact, path) for name, path in pictures.items()}
+    ratio = np.median([replaced[name].fx / lens.fx for name, lens in lenses.items()])
+    if abs(ratio - 1) > 0.02:
+        warnings.append(f"{file}: its focal length is {ratio:.3f} times that of poses_bounds.npy and is not used")
+        return lenses
+    return replaced
+
+
+def _points_of_partial_model(
+    model: Path,
+    lenses: dict[str, Lens],
+    poses: dict[str, np.ndarray],
+    bounds: dict[str, tuple[float, float]],
+    warnings: list[str],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Its points where they are in the frame of the poses, else none.
+
+    By tracks, where as many images are seen in them as there are poses: of the observations, 95% must lie in front
+    of and inside the view that made them, its views taken in order of their ids. Without: in the median view at
+    least a fifth of the points must lie inside the picture and, half of those, between near and far.
+    """
+    file = model_file(model, "points3D") if model.is_dir() else None
+    if file is None:
+        return NO_POINTS
+    found = load_model_points(file)
+    identities = np.unique(found.track_images)
+    shares, needed = [], 0.2
+    if len(identities) == len(poses):
+        needed = 0.95
+        for identity, name in zip(identities, sorted(poses), strict=True):
+            seen = found.positions[found.track_points[found.track_images == identity]]
+            shares.append(len(depths_in_view(seen, poses[name], lenses[name])) / len(seen))
+    else:
+        for name, (near, far) in bounds.items():
+            z = depths_in_view(found.positions, poses[name], lenses[name])
+            inside = ((z > 0.8 * near) & (z < 1.25 * far)).sum()
+            shares.append(len(z) / max(len(found.positions), 1) if 2 * inside >= max(len(z), 1) else 0.0)
+    if np.median(shares) < needed:
+        warnings.append(f"{file}: its points are not in the frame of poses_bounds.npy and are not used")
+        return NO_POINTS
+    return found.positions, found.colors

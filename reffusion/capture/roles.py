@@ -1,0 +1,231 @@
+"""What each view of a capture is for: training, test or clean; which mask belongs to it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from difflib import get_close_matches
+from pathlib import Path
+
+from reffusion.capture.layouts.capture import Capture, pictures_in
+from reffusion.io.images import image_size
+
+LEAST_TRAINING_VIEWS = 3
+NONE = "none"
+
+
+@dataclass(frozen=True)
+class Roles:
+    """Names are sorted.
+
+    Attributes:
+        train, test, clean: names of views.
+        masks: where a photograph shows the object: of training views, and of test views that show it too.
+        test_masks: where a test view shows the object, or would show it; what its box comes from.
+        warnings: what is odd.
+    """
+
+    train: tuple[str, ...]
+    test: tuple[str, ...]
+    clean: frozenset[str]
+    masks: dict[str, Path]
+    test_masks: dict[str, Path]
+    warnings: tuple[str, ...]
+
+    def among(self, names: set[str]) -> Roles:
+        """Without the views that are not in `names` (those that structure from motion could not place).
+
+        Raises:
+            ValueError: where fewer than 3 training views are left.
+        """
+        kept = lambda values: {name: value for name, value in values.items() if name in names}
+        roles = replace(
+            self,
+            train=tuple(n for n in self.train if n in names),
+            test=tuple(n for n in self.test if n in names),
+            clean=self.clean & names,
+            masks=kept(self.masks),
+            test_masks=kept(self.test_masks),
+        )
+        _check_enough(roles.train)
+        return roles
+
+
+def load_roles(
+    folder: Path,
+    capture: Capture,
+    *,
+    masks: str | None = None,
+    test_masks: str | None = None,
+    train: Sequence[str] | str | None = None,
+    test: Sequence[str] | str | None = None,
+    clean: Sequence[str] = (),
+    region: bool = False,
+) -> Roles:
+    """The roles of the capture's views, from scene.yaml's keys and the folder's usual places.
+
+    Test views: those named; else, where the folder has test masks (`<images>/test_label`), the views without a
+    mask, or where some training masks are missing the first ones in order of names; else none. Training views:
+    those named, else all others. A view that is neither is left out of the scene.
+
+    Args:
+        masks: folder of masks; "none" for a scene without; None looks into <images>/label, masks, mask, label.
+        test_masks: folder of the test views' masks, named like the views or in their order; "none"; None looks.
+        train, test: names, or "every 8" (the first of each eight in order of names), or None.
+        region: the scene names a 3D region, so it may lack masks.
+
+    Raises:
+        ValueError: naming the file and the remedy: a mask for no picture, of other proportions (over 10%), no mask
+            at all, an unknown view, a view for both training and test, fewer than 3 training views.
+    """
+    folder = Path(folder)
+    mask_files = _mask_files(folder, capture, masks, region)
+    label_files = _test_mask_files(folder, capture, test_masks)
+    train_named, test_named = (_chosen(value, capture, key) for key, value in (("train", train), ("test", test)))
+    labelled = None if label_files is None else _labelled(capture, mask_files, label_files, test_named)
+    train_named, test_views = _parted(train_named, test_named, labelled, capture)
+    clean_views = frozenset(known(name, capture, "clean") for name in clean)
+    if clean_views - set(train_named):
+        raise ValueError(f"scene.yaml: clean: {', '.join(sorted(clean_views - set(train_named)))} is no training view")
+    # Test views with masks of their own among the training masks show the object: held out, but without a truth inside.
+    held_out = {name: path for name, path in mask_files.items() if name in set(test_views)}
+    beside = dict(held_out)
+    if label_files is not None and labelled is not None:
+        labels = {n: p for n, p in zip(labelled, label_files, strict=True) if n in set(test_views)}
+        beside |= labels
+        held_out = {name: path for name, path in held_out.items() if name not in labels}
+    kept = {name: path for name, path in mask_files.items() if name in set(train_named)}
+    for name, path in (*kept.items(), *beside.items()):
+        check_proportions(path, name, capture, 0.10, "mask")
+    bare = [name for name in train_named if name not in kept and name not in clean_views]
+    warning = f"{len(bare)} training views have no mask: {', '.join(bare)}" if kept and bare else None
+    return Roles(
+        tuple(train_named),
+        tuple(test_views),
+        clean_views,
+        dict(sorted((kept | held_out).items())),
+        beside,
+        (warning,) if warning else (),
+    )
+
+
+def known(name: str, capture: Capture, key: str) -> str:
+    """The view of that name, an ending allowed; ValueError with the nearest names where there is none."""
+    for candidate in (name, Path(name).stem):
+        if candidate in capture.pictures:
+            return candidate
+    near = get_close_matches(name, capture.pictures, 3, 0.0)
+    raise ValueError(f"scene.yaml: {key}: there is no view '{name}'; views are named like {', '.join(near)}")
+
+
+def _parted(
+    train: list[str] | None, test: list[str] | None, labelled: list[str] | None, capture: Capture
+) -> tuple[list[str], list[str]]:
+    """Training and test views from those named, None where they are not, and those that test masks tell of."""
+    test_views = test if test is not None else (labelled or [])
+    if train is None:
+        train = [name for name in capture.pictures if name not in set(test_views)]
+    elif test is None:
+        test_views = [name for name in test_views if name not in set(train)]
+    both = sorted(set(train) & set(test_views))
+    if both:
+        raise ValueError(f"scene.yaml: {', '.join(both)} in both train and test; a view is for one of them")
+    _check_enough(train)
+    return train, test_views
+
+
+def _check_enough(train: Sequence[str]) -> None:
+    if len(train) < LEAST_TRAINING_VIEWS:
+        raise ValueError(
+            f"{len(train)} training view{'' if len(train) == 1 else 's'} ({', '.join(train) or 'none'}): "
+            f"at least {LEAST_TRAINING_VIEWS} are needed; add pictures, or correct train and test in scene.yaml"
+        )
+
+
+def _chosen(value: Sequence[str] | str | None, capture: Capture, key: str) -> list[str] | None:
+    """Names in sorted order from a list or from "every N"."""
+    if value is None:
+        return None
+    if isinstance(value, str):
+        match = re.fullmatch(r"every ([1-9][0-9]*)", value.strip())
+        if match is None:
+            raise ValueError(f"scene.yaml: {key}: '{value}' is neither a list of views nor like 'every 8'")
+        return list(capture.pictures)[:: int(match[1])]
+    names = sorted(known(name, capture, key) for name in value)
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ValueError(f"scene.yaml: {key}: {', '.join(twice)} named twice")
+    return names
+
+
+def _mask_files(folder: Path, capture: Capture, masks: str | None, region: bool) -> dict[str, Path]:
+    """View name -> mask, each mask checked to have its picture."""
+    if masks is not None and masks.lower() == NONE:
+        return {}
+    if masks is None:
+        usual = (capture.image_folder / "label", folder / "masks", folder / "mask", folder / "label")
+        found = next((p for p in usual if p.is_dir() and p != capture.image_folder and pictures_in(p)), None)
+    else:
+        found = folder / masks
+        if not found.is_dir() or not pictures_in(found):
+            raise ValueError(f"{found}: no masks there; correct `masks` in scene.yaml")
+    if found is None:
+        if region:
+            return {}
+        raise ValueError(
+            f"{folder}: no mask at all (looked for {', '.join(str(p.relative_to(folder)) for p in usual)}); add a mask "
+            "for each picture, name their folder as `masks` or a box as `region` in scene.yaml, or say `masks: none` "
+            "to fit and render only"
+        )
+    result = {}
+    for stem, path in pictures_in(found).items():
+        # COLMAP's masks are called <picture with its ending>.png
+        name = next((n for n in (stem, Path(stem).stem) if n in capture.pictures or n in capture.left_out), None)
+        if name is None:
+            raise ValueError(f"{path}: a mask for no picture; name it like its picture, or remove it")
+        if name in capture.pictures:
+            if name in result:
+                raise ValueError(f"{path}: '{name}' has another mask, {result[name]}; remove one")
+            result[name] = path
+    return dict(sorted(result.items()))
+
+
+def _test_mask_files(folder: Path, capture: Capture, test_masks: str | None) -> list[Path] | None:
+    """The test views' masks in order of their names, or None."""
+    if test_masks is not None and test_masks.lower() == NONE:
+        return None
+    found = capture.image_folder / "test_label" if test_masks is None else folder / test_masks
+    files = list(pictures_in(found).values()) if found.is_dir() else []
+    if not files and test_masks is not None:
+        raise ValueError(f"{found}: no masks there; correct `test_masks` in scene.yaml")
+    return files or None
+
+
+def _labelled(capture: Capture, masks: dict[str, Path], labels: list[Path], test_named: list[str] | None) -> list[str]:
+    """The views that the test masks stand for, one for each, in their order."""
+    if all(path.stem in capture.pictures for path in labels):
+        return [path.stem for path in labels]
+    without = [name for name in capture.pictures if name not in masks]
+    first = list(capture.pictures)[: len(labels)]
+    for candidate in (without, first):
+        if len(candidate) == len(labels) and not set(candidate) & masks.keys():
+            return candidate
+    if test_named is not None and len(test_named) == len(labels):
+        return test_named
+    raise ValueError(
+        f"{labels[0].parent}: {len(labels)} test masks, but {len(without)} views have no training mask and the first "
+        f"{len(labels)} in order of names are not all among them; name the test views as `test` in scene.yaml, or the "
+        "masks like their views"
+    )
+
+
+def check_proportions(path: Path, name: str, capture: Capture, tolerance: float, what: str) -> None:
+    """ValueError where a picture's sides are not in the proportion of its view's, by more than `tolerance`."""
+    width, height = image_size(path, upright=capture.upright and what == "reference")
+    of_width, of_height = image_size(capture.pictures[name], upright=capture.upright)
+    if abs(width * of_height - height * of_width) > tolerance * width * of_height:
+        raise ValueError(
+            f"{path}: {width}x{height} px, but its view '{name}' has {of_width}x{of_height}; "
+            f"make the {what} over the whole picture, in its proportions"
+        )

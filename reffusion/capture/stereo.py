@@ -1,0 +1,255 @@
+"""Dense matches between views: optical flow to the neighbours, triangulated where several agree.
+
+Sparse points come from corners that a matcher was sure of. Where there are none, in foliage, on a far front, in the
+sky, 3DGS has to grow Gaussians out of far-off ones, and in a short run does not arrive. Flow gives points everywhere
+in seconds; the cameras decide which of its vectors are right, and the vectors in turn show cameras that are not
+(`reffusion.capture.refine`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+
+from reffusion.types import Camera
+
+NEIGHBOURS = 4
+TURN = np.cos(np.radians(40))  # views whose axes differ by more are not compared
+ROUND_TRIP = 1.5  # px that flow there and back may miss
+RESIDUAL = 1.5  # px between a point's image and where flow saw it
+PLAIN = 0.7  # deviation of grey, of 255, in a window of 9 px under which nothing can be matched
+NOISE = 0.3  # px of deviation, assumed of flow; it says which depths cannot be told from infinity
+FARTHEST = 20.0  # frame units; what lies beyond, sky too, is put there
+ALIKE = 0.1  # relative difference of depth under which two views' points show the same surface
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Where a view's neighbours show what its pixels show.
+
+    Attributes:
+        view: its name; pixels: [P, 2] float64 coordinates (x, y) in it.
+        others: names of K neighbours; places: [K, P, 2] coordinates in them; seen: [K, P] bool, whether flow there and
+            back agree, so that the place means anything.
+    """
+
+    view: str
+    pixels: np.ndarray
+    others: tuple[str, ...]
+    places: np.ndarray
+    seen: np.ndarray
+
+
+def dense_points(
+    cameras: Sequence[Camera], images: Mapping[str, np.ndarray], cell: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """A point for each `cell` x `cell` pixels of the first view, and of every further one where none is yet.
+
+    Args:
+        cameras: undistorted views in the normalised frame; with fewer than two there are no points.
+        images: view name -> uint8 [H, W, 3].
+        cell: px, at least 1.
+
+    Returns:
+        points [P, 3] float64 and their colours [P, 3] uint8.
+    """
+    by_name = {camera.name: camera for camera in cameras}
+    points, colors = np.empty((0, 3)), [np.empty((0, 3), np.uint8)]
+    for matches in match(cameras, cameras, images, cell):
+        camera = by_name[matches.view]
+        depth, known = triangulate(matches, by_name)
+        depth = np.minimum(depth, FARTHEST)
+        fresh = known & ~_covered(camera, points, matches.pixels, depth, cell)
+        pixels, depth = matches.pixels[fresh], depth[fresh]
+        columns, rows = pixels.astype(int).T
+        points = np.concatenate([points, unproject(camera, pixels, depth)])
+        colors.append(cv2.blur(images[camera.name], (cell, cell))[rows, columns])
+    return points, np.concatenate(colors)
+
+
+# ---------------------------------------------------------------------------------------------- flow
+
+
+def match(
+    chosen: Sequence[Camera], cameras: Sequence[Camera], images: Mapping[str, np.ndarray], cell: int
+) -> Iterator[Matches]:
+    """Matches of the `chosen` views, one pixel for each cell, with their neighbours among `cameras`; in their order."""
+    gray = {camera.name: cv2.cvtColor(images[camera.name], cv2.COLOR_RGB2GRAY) for camera in cameras}
+    around = {camera.name: tuple(other.name for other in neighbours(camera, cameras)) for camera in chosen}
+    pairs = list(dict.fromkeys(tuple(sorted((name, other))) for name in around for other in around[name]))
+    found = {}
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        both_ways = pool.map(lambda pair: _both_ways(gray[pair[0]], gray[pair[1]], cell), pairs)
+        for (one, other), (there, back) in zip(pairs, both_ways, strict=True):
+            found[one, other], found[other, one] = there, back
+    for camera in chosen:
+        pixels = _pixels(gray[camera.name], cell).reshape(-1, 2)
+        places, seen = np.empty((len(around[camera.name]), *pixels.shape)), np.empty((0, len(pixels)), bool)
+        if len(places):
+            places, seen = map(
+                np.stack, zip(*(found[camera.name, other] for other in around[camera.name]), strict=True)
+            )
+        yield Matches(camera.name, pixels, around[camera.name], places, seen)
+
+
+def neighbours(camera: Camera, cameras: Sequence[Camera]) -> list[Camera]:
+    """The `NEIGHBOURS` nearest views, from another place, that look about the same way."""
+    away = {other.name: float(np.linalg.norm(other.center - camera.center)) for other in cameras}
+    axis = camera.world_to_camera[2, :3]
+    others = [o for o in cameras if away[o.name] > 1e-6 and o.world_to_camera[2, :3] @ axis > TURN]
+    return sorted(others, key=lambda other: away[other.name])[:NEIGHBOURS]
+
+
+def _pixels(gray: np.ndarray, cell: int) -> np.ndarray:
+    """[h, w, 2], the pixel (x, y) looked at in each cell."""
+    rows, columns = np.arange(cell // 2, gray.shape[0], cell), np.arange(cell // 2, gray.shape[1], cell)
+    return np.stack(np.meshgrid(columns, rows), -1) + 0.5
+
+
+def _both_ways(one: np.ndarray, other: np.ndarray, cell: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """For each of two pictures, the places [P, 2] of its pixels in the other, and whether they mean anything [P]."""
+    matcher = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    there, back = matcher.calc(one, other, None), matcher.calc(other, one, None)
+    return [_followed(one, there, back, cell), _followed(other, back, there, cell)]
+
+
+def _followed(gray: np.ndarray, there: np.ndarray, back: np.ndarray, cell: int) -> tuple[np.ndarray, np.ndarray]:
+    pixels = _pixels(gray, cell)
+    columns, rows = pixels.astype(int).transpose(2, 0, 1)
+    moved = there[rows, columns]
+    at = (pixels + moved - 0.5).astype(np.float32)
+    # beyond the border no way back agrees
+    returned = cv2.remap(back, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(1e6,) * 4)
+    agree = np.linalg.norm(moved + returned, axis=-1) < ROUND_TRIP
+    seen = (_deviation(gray)[rows, columns] > PLAIN) & agree
+    return (pixels + moved).reshape(-1, 2), seen.reshape(-1)
+
+
+def _deviation(gray: np.ndarray) -> np.ndarray:
+    """[H, W] standard deviation in a window around each pixel."""
+    wide = gray.astype(np.float32)
+    return np.sqrt(np.maximum(cv2.blur(wide**2, (9, 9)) - cv2.blur(wide, (9, 9)) ** 2, 0))
+
+
+# ---------------------------------------------------------------------------------------------- depth
+
+
+def triangulate(matches: Matches, cameras: Mapping[str, Camera]) -> tuple[np.ndarray, np.ndarray]:
+    """Depths of a view's pixels from where other views see the same things.
+
+    A point at inverse depth r on a pixel's ray (whose z is 1) is R ray + r t, up to scale, in another view: its way
+    from the place where flow saw it, times its depth there, is linear in r. Each view proposes its own r; the proposal
+    that most views agree with, within `RESIDUAL` px, is refined by least squares over those.
+
+    Args:
+        cameras: view name -> camera, of the view and its neighbours.
+
+    Returns:
+        depth [P], very large where no parallax is seen; and [P] bool, whether at least two views agree on it (one, if
+        there is only one).
+    """
+    count = len(matches.pixels)
+    if not matches.others:
+        return np.full(count, np.inf), np.zeros(count, bool)
+    lines = _lines(matches, cameras)
+    inverse, votes = np.zeros(count), np.full(count, -1)
+    for line in lines:
+        proposal = _closest([line], [1.0])[0]
+        agree = sum(_agrees(line, proposal) & seen for line, seen in zip(lines, matches.seen, strict=True))
+        inverse, votes = np.where(agree > votes, proposal, inverse), np.maximum(votes, agree)
+    for _ in range(2):
+        agree = [_agrees(line, inverse) & seen for line, seen in zip(lines, matches.seen, strict=True)]
+        weights = [a / np.maximum(_depth_there(line, inverse), 1e-3) ** 2 for line, a in zip(lines, agree, strict=True)]
+        inverse, square = _closest(lines, weights)
+    known = (np.sum(agree, 0) >= min(2, len(lines))) & (inverse > -2 * NOISE / np.sqrt(square))
+    return 1 / np.maximum(inverse, 1e-9), known
+
+
+def misses(matches: Matches, cameras: Mapping[str, Camera], depth: np.ndarray) -> np.ndarray:
+    """[K, P, 2] px from where flow saw a pixel's point to where the neighbours' cameras put it; not a number where they
+    have it behind them."""
+    found = []
+    for line in _lines(matches, cameras):
+        z = _depth_there(line, 1 / depth)
+        z = np.where(z > 1e-3, z, np.nan)
+        found.append((line.slope / depth[:, None] + line.offset) / z[:, None])
+    return np.array(found).reshape(len(matches.others), len(depth), 2)
+
+
+class _Line(NamedTuple):
+    """Seen from another view, a point at inverse depth r is (slope r + offset) / (z + shift r) px from its place."""
+
+    slope: np.ndarray  # [P, 2]
+    offset: np.ndarray  # [P, 2]
+    z: np.ndarray  # [P]
+    shift: float
+
+
+def _lines(matches: Matches, cameras: Mapping[str, Camera]) -> list[_Line]:
+    camera, lines = cameras[matches.view], []
+    ray = _rays(camera, matches.pixels)
+    for name, place in zip(matches.others, matches.places, strict=True):
+        other = cameras[name]
+        turn = other.world_to_camera[:3, :3] @ camera.world_to_camera[:3, :3].T
+        shift = other.world_to_camera[:3, 3] - turn @ camera.world_to_camera[:3, 3]
+        focal, turned = np.array([other.fx, other.fy]), ray @ turn.T
+        goal = (place - np.array([other.cx, other.cy])) / focal
+        slope, offset = (shift[:2] - goal * shift[2]) * focal, (turned[:, :2] - goal * turned[:, 2:]) * focal
+        lines.append(_Line(slope, offset, turned[:, 2], float(shift[2])))
+    return lines
+
+
+def _depth_there(line: _Line, inverse: np.ndarray) -> np.ndarray:
+    """Depth in the other view, in units of that in this one."""
+    return line.z + line.shift * inverse
+
+
+def _agrees(line: _Line, inverse: np.ndarray) -> np.ndarray:
+    z = _depth_there(line, inverse)
+    miss_x, miss_y = np.abs(line.slope * inverse[:, None] + line.offset).T  # numpy reduces an axis of 2 slowly
+    return (z > 1e-3) & (np.maximum(miss_x, miss_y) < RESIDUAL * z)
+
+
+def _closest(lines: Sequence[_Line], weights: Sequence) -> tuple[np.ndarray, np.ndarray]:
+    """The inverse depth of the least weighted sum of squares, and what it is divided by."""
+    square = sum(_dot(line.slope, line.slope) * weight for line, weight in zip(lines, weights, strict=True))
+    square = np.maximum(square, 1e-12)
+    return -sum(_dot(line.slope, line.offset) * w for line, w in zip(lines, weights, strict=True)) / square, square
+
+
+def _dot(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    return one[:, 0] * other[:, 0] + one[:, 1] * other[:, 1]
+
+
+# ---------------------------------------------------------------------------------------------- points
+
+
+def _covered(camera: Camera, points: np.ndarray, pixels: np.ndarray, depth: np.ndarray, cell: int) -> np.ndarray:
+    """[P] whether some of the points already show what a pixel shows: in its cell, at about its depth or before it."""
+    local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    local = local[local[:, 2] > 1e-3]
+    column = np.floor((local[:, 0] / local[:, 2] * camera.fx + camera.cx) / cell)
+    row = np.floor((local[:, 1] / local[:, 2] * camera.fy + camera.cy) / cell)
+    wide, high = -(-camera.width // cell), -(-camera.height // cell)
+    inside = (column >= 0) & (column < wide) & (row >= 0) & (row < high)
+    grid = np.full((high, wide), np.inf)
+    np.minimum.at(grid, (row[inside].astype(int), column[inside].astype(int)), local[inside, 2])
+    nearest = grid[(pixels[:, 1] // cell).astype(int), (pixels[:, 0] // cell).astype(int)]
+    return nearest < depth * (1 + ALIKE)
+
+
+def unproject(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """[P, 3] the points at these depths behind these pixels [P, 2]."""
+    local = _rays(camera, pixels) * depth[:, None] - camera.world_to_camera[:3, 3]
+    return local @ camera.world_to_camera[:3, :3]
+
+
+def _rays(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    x, y = (pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy
+    return np.stack([x, y, np.ones_like(x)], 1)

@@ -1,0 +1,96 @@
+"""The adversarial term's critic through a run (RefFusion section 4.3): what it is, how it learns, how it is kept."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from reffusion import seeding
+from reffusion.distill.discriminator import Critic, Form, critic_loss, generator_loss, gradient_penalty
+
+
+@dataclass(frozen=True)
+class Adversarial:
+    """The adversarial term. The defaults are the paper's, and GANeRF's where it is silent.
+
+    Attributes:
+        weight: lambda.
+        start: part of the run in [0, 1] before which neither the critic learns nor its verdict counts.
+        patches: real ones in a step, and as many fake ones; a multiple of 4.
+        size: their side in pixels of the view: 8, 16, 32, ...
+        width: the critic's channels at that size, doubled with each halving up to 512.
+        form: of the generator's loss.
+        penalty: weight of half the R1 penalty; 0 leaves it out.
+        penalized: the patches at which the critic's slope is penalised.
+        rate: RMSprop's step size.
+        reaches: the Gaussians whose spherical harmonics get the gradient.
+    """
+
+    weight: float = 0.03
+    start: float = 0.0
+    patches: int = 64
+    size: int = 64
+    width: int = 512
+    form: Form = "non-saturating"
+    penalty: float = 0.2
+    penalized: Literal["real", "fake"] = "fake"
+    rate: float = 1e-3
+    reaches: Literal["masked", "all"] = "masked"
+
+
+class Adversary:
+    """A critic and its optimiser. Patches are [P, 3, size, size] in [-1, 1].
+
+    Args:
+        seed: of the critic's first weights.
+    """
+
+    def __init__(self, choices: Adversarial, seed: int, device: torch.device | str = "cpu"):
+        self.choices = choices
+        self.critic = Critic(choices.size, choices.width, seeding.generator(seed, "adversary")).to(device)
+        self._optimizer = torch.optim.RMSprop(self.critic.parameters(), lr=choices.rate)
+
+    def learn(self, real: Tensor, fake: Tensor) -> dict[str, float]:
+        """One step of the critic. No gradient reaches the patches' makers.
+
+        Returns:
+            critic_loss, and critic_slope: the R1 penalty before its weight, the mean of ||dD / d patch||^2.
+        Raises:
+            FloatingPointError: the loss or its gradient is not finite; the critic is as it was.
+        """
+        patches = {"real": real.detach(), "fake": fake.detach()}
+        side = self.choices.penalized
+        patches[side] = patches[side].clone().requires_grad_(self.choices.penalty > 0)
+        scores = {name: self.critic(each) for name, each in patches.items()}
+        loss = critic_loss(scores["real"], scores["fake"])
+        said, total = {"critic_loss": float(loss.detach())}, loss
+        if self.choices.penalty > 0:
+            slope = gradient_penalty(scores[side], patches[side])
+            said["critic_slope"], total = float(slope.detach()), loss + 0.5 * self.choices.penalty * slope
+        if not torch.isfinite(total):
+            raise FloatingPointError(f"the critic's loss is {said}")
+        self._optimizer.zero_grad()
+        total.backward()
+        for name, weights in self.critic.named_parameters():
+            if not torch.isfinite(weights.grad.sum()):
+                raise FloatingPointError(f"the gradient of the critic's {name} is not finite")
+        self._optimizer.step()
+        return said
+
+    def loss(self, fake: Tensor) -> Tensor:
+        """The generator's loss, differentiable in the patches; the critic's weights get no gradient."""
+        self.critic.requires_grad_(False)
+        scores = self.critic(fake)
+        self.critic.requires_grad_(True)
+        return generator_loss(scores, self.choices.form)
+
+    def state_dict(self) -> dict[str, Any]:
+        """What `load_state_dict` continues from, bit for bit."""
+        return {"critic": self.critic.state_dict(), "optimizer": self._optimizer.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.critic.load_state_dict(state["critic"])
+        self._optimizer.load_state_dict(state["optimizer"])

@@ -1,0 +1,272 @@
+"""The terms of distillation and the Gaussians each may reach (RefFusion section 4.3), and the region they belong to.
+
+term             pixels                                        Gaussians
+reconstruction   outside the consistent mask; all if clean     unmasked (or all that show there); all if clean
+SDS              whole view and patches, the hole repainted    masked (or all)
+depth            the hole (reffusion.distill.depth_term)               masked, all but spherical harmonics
+adversarial      patches around the hole                       masked (or all), spherical harmonics only
+reference        the reference's hole (not in the paper)       masked (or all)
+lift             the hole, or patches around it (a baseline's) masked
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from reffusion.distill.adversary import Adversary
+from reffusion.distill.discriminator import gathered
+from reffusion.distill.sds import Weighting, draw_timesteps, sds_gradient, sds_loss
+from reffusion.gaussians.optimize import confine, reconstruction_loss
+from reffusion.prior import diffusion
+from reffusion.prior.model import Prior
+from reffusion.prior.windows import enlarged, two_scale_masks, two_scales, window_around, windows_around
+from reffusion.splat.rasterizer import render
+from reffusion.types import PARAMETERS, Camera, Gaussians, Rendering
+
+
+@dataclass(frozen=True)
+class Sight:
+    """A training view as distillation uses it.
+
+    Attributes:
+        camera: the view.
+        photo: [H, W, 3] float32 in [0, 1].
+        supervises: [H, W] bool, the pixels whose photo may be reconstructed: outside C, all of a clean view.
+        repaint: [H, W] bool, what is made up, and the UNet repaints; empty where the view is not distilled.
+        clean: the object is absent from this view.
+        lifted: [H, W, 3] float32 in [0, 1], the view inpainted in 2D; None where it was not.
+    """
+
+    camera: Camera
+    photo: Tensor
+    supervises: Tensor
+    repaint: Tensor
+    clean: bool
+    lifted: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class Distillation:
+    """The choices within the SDS term; see `reffusion.distill.sds.sds_gradient` for those the paper leaves open.
+
+    Attributes:
+        patches: local patches beside the whole view (paper: 2; 0 leaves the local term out).
+        low, high: range of the timesteps, as parts of the schedule.
+        weighting, unit_rms, keep_contrast: of the gradient.
+        hole_only: drop the gradient at latents that are not repainted.
+        guidance: the paper's a.
+        reduction: sum or mean over the elements of a latent.
+    """
+
+    patches: int = 2
+    low: float = 0.02
+    high: float = 0.98
+    weighting: Weighting = "sigma2"
+    unit_rms: bool = False
+    hole_only: bool = False
+    keep_contrast: bool = False
+    guidance: float = 7.5
+    reduction: Literal["sum", "mean"] = "sum"
+
+
+def reconstruction_term(
+    gaussians: Gaussians, masked: Tensor, sight: Sight, probe: Tensor | None = None
+) -> tuple[Tensor, Rendering]:
+    """(1 - 0.2) L1 + 0.2 D-SSIM where the photo may supervise; the gradient reaches unmasked Gaussians only.
+
+    In a clean view it reaches all: what is seen there behind the object is true.
+    """
+    select = torch.ones_like(masked) if sight.clean else ~masked
+    rendering = render(confine(gaussians, select), sight.camera, probe=probe)
+    return reconstruction_loss(rendering.color, sight.photo, sight.supervises), rendering
+
+
+def reference_term(
+    gaussians: Gaussians, masked: Tensor, camera: Camera, image: Tensor, hole: Tensor
+) -> tuple[Tensor, Rendering]:
+    """The same loss on the reference's hole; the gradient reaches masked Gaussians only.
+
+    PAPER leaves open: whether the reference supervises directly; it only initialises and personalises there.
+
+    Args:
+        image: [H, W, 3] in [0, 1], the reference. hole: [H, W] bool, the pixels it stands for.
+    """
+    rendering = render(confine(gaussians, masked), camera)
+    return reconstruction_loss(rendering.color, image, hole), rendering
+
+
+def sds_term(
+    gaussians: Gaussians,
+    masked: Tensor,
+    sight: Sight,
+    prior: Prior,
+    text: Tensor,
+    settings: Distillation,
+    generator: torch.Generator,
+    probe: Tensor | None = None,
+) -> tuple[Tensor, Rendering]:
+    """L_global + mean(L_local) of one view, all samples in one UNet batch; it reaches masked Gaussians only.
+
+    PAPER leaves open: what conditions the UNet. The photo where it is trusted, elsewhere the render itself (background
+    that other views saw through the object), the hole blanked; without gradient.
+
+    Args:
+        sight: with at least one pixel to repaint.
+        text: [3, L, D], the hidden states of the global, the local and the empty prompt.
+        generator: on the CPU; windows, timesteps and noise come from it.
+        probe: [N, 2], see `splat.render`; its gradient is zero for unmasked Gaussians too.
+    Raises:
+        FloatingPointError: the prior's answer is not finite.
+    """
+    size = prior.native_size
+    reached = None if probe is None else probe * masked[:, None]
+    rendering = render(confine(gaussians, masked), sight.camera, probe=reached)
+    view = enlarged(rendering.color.permute(2, 0, 1) * 2 - 1, size)
+    shown = torch.where(sight.supervises[..., None], sight.photo, rendering.color.detach())
+    shown = enlarged(shown.permute(2, 0, 1) * 2 - 1, size)
+    hole = enlarged(sight.repaint.to(view)[None], size)[0] > 1e-4
+
+    windows = [window_around(hole.cpu(), size, generator) for _ in range(settings.patches)]
+    masks = two_scale_masks(hole, windows, size)
+    condition = diffusion.conditioning(prior, two_scales(shown, windows, size), masks)
+    latents = diffusion.encode(prior, two_scales(view, windows, size))
+    prompts = torch.cat([text[:1], text[1:2].expand(settings.patches, -1, -1)])
+    empty = text[2:].expand(len(latents), -1, -1)
+
+    count = len(latents)
+    timesteps = draw_timesteps(count, prior.timesteps, settings.low, settings.high, generator).to(latents.device)
+    noise = torch.randn(latents.shape, generator=generator).to(latents)
+    gradient = sds_gradient(
+        latents,
+        lambda noisy, t: diffusion.guided(prior, noisy, t, condition, prompts, empty, settings.guidance),
+        timesteps,
+        noise,
+        prior.alphas_cumprod,
+        weighting=settings.weighting,
+        unit_rms=settings.unit_rms,
+        keep_contrast=settings.keep_contrast,
+        mask=condition[:, :1] if settings.hole_only else None,
+    )
+    if not torch.isfinite(gradient).all():
+        raise FloatingPointError(f"the prior's answer at timesteps {timesteps.tolist()} is not finite")
+    return sds_loss(latents, gradient, settings.reduction), rendering
+
+
+def adversarial_term(
+    gaussians: Gaussians,
+    masked: Tensor,
+    sight: Sight,
+    image: Tensor,
+    hole: Tensor,
+    adversary: Adversary,
+    generator: torch.Generator,
+) -> tuple[Tensor, Rendering, dict[str, float]]:
+    """The critic learns to tell a reference's patches from a view's, then says what it makes of the view's.
+
+    The gradient reaches the spherical harmonics of masked Gaussians only, or of all where the adversary says so.
+
+    PAPER leaves open: how the patches are drawn. A masked pixel first, as for SDS (`sds.window_around`); all fake ones
+    in one training view, another in each step; all real ones in one reference. A view or reference that is smaller
+    than a patch is enlarged until one fits.
+
+    Args:
+        sight: with at least one pixel to repaint: patches lie around those.
+        image: [H, W, 3] in [0, 1], a reference. hole: [H, W] bool, what it stands for, at least one pixel.
+        adversary: its critic takes a step.
+        generator: on the CPU; the windows come from it.
+    Returns:
+        The generator's loss, the rendering, and what to log.
+    Raises:
+        FloatingPointError: see `Adversary.learn`.
+    """
+    choices = adversary.choices
+    reached = torch.ones_like(masked) if choices.reaches == "all" else masked
+    shaded = replace(gaussians.map(Tensor.detach), sh=confine(gaussians, reached).sh)
+    rendering = render(shaded, sight.camera)
+    real = patches_around(image, hole, choices.patches, choices.size, generator)
+    fake = patches_around(rendering.color, sight.repaint, choices.patches, choices.size, generator)
+    said = adversary.learn(real, fake)
+    loss = adversary.loss(fake)
+    return loss, rendering, {"adversarial": float(loss.detach()), **said}
+
+
+def patches_around(image: Tensor, mask: Tensor, count: int, size: int, generator: torch.Generator) -> Tensor:
+    """[count, 3, size, size] in [-1, 1]: patches of [H, W, 3] in [0, 1] that show a masked pixel; differentiable."""
+    view = enlarged(image.permute(2, 0, 1) * 2 - 1, size)
+    mask = enlarged(mask.to(view)[None], size)[0] > 1e-4
+    return gathered(view, windows_around(mask.cpu(), size, count, generator), size)
+
+
+def gradient_norms(gaussians: Gaussians, masked: Tensor) -> Tensor:
+    """[M]: for each masked Gaussian the norm of the gradient gathered so far, over all of its parameters."""
+    total = torch.zeros(int(masked.sum()), device=masked.device)
+    for name in PARAMETERS:
+        gradient = getattr(gaussians, name).grad
+        if gradient is not None:
+            total += gradient[masked].reshape(len(total), -1).square().sum(1)
+    return total.sqrt()
+
+
+@dataclass(frozen=True)
+class Region:
+    """The part of space the masked Gaussians belong to, as voxels of a grid around them.
+
+    Attributes:
+        origin: [3], the grid's lowest corner. voxel: its pitch.
+        home: [X, Y, Z] bool, within reach of a masked Gaussian of the initialization.
+        foreign: [X, Y, Z] bool, held by masked Gaussians of the initialization and by no unmasked one.
+    """
+
+    origin: Tensor
+    voxel: float
+    home: Tensor
+    foreign: Tensor
+
+
+def region_of(means: Tensor, masked: Tensor, resolution: int = 32, reach: int = 2) -> Region:
+    """The region of an initialization.
+
+    PAPER leaves open: the region whose border Gaussians must not cross. The masked Gaussians of the initialization
+    stand on the surfaces to be invented, so they mark it: `resolution` voxels along the diagonal of their box, and
+    `reach` voxels around each as the room they may move in.
+
+    Args:
+        means: [N, 3]; masked: [N] bool with at least one True.
+    """
+    inside = means[masked]
+    low, high = inside.amin(0), inside.amax(0)
+    voxel = max(float((high - low).norm()) / resolution, 1e-6)
+    origin = low - (reach + 0.5) * voxel
+    shape = [int(n) + 1 for n in ((high - origin) / voxel + reach + 0.5).long()]
+
+    def occupied(points: Tensor) -> Tensor:
+        grid = torch.zeros(shape, dtype=torch.bool, device=means.device)
+        cells, within = _cells(points, origin, voxel, shape)
+        grid[tuple(cells[within].T)] = True
+        return grid
+
+    def grown(grid: Tensor, cells: int) -> Tensor:
+        return F.max_pool3d(grid.float()[None], 2 * cells + 1, stride=1, padding=cells)[0] > 0
+
+    core, others = occupied(inside), occupied(means[~masked])
+    return Region(origin, voxel, grown(core, reach), core & ~grown(others, 1))
+
+
+def strays(region: Region, means: Tensor, masked: Tensor) -> Tensor:
+    """[N] bool: masked Gaussians that have left the region, unmasked ones that have entered it; both are pruned."""
+    cells, within = _cells(means, region.origin, region.voxel, region.home.shape)
+    home, foreign = torch.zeros_like(masked), torch.zeros_like(masked)
+    home[within] = region.home[tuple(cells[within].T)]
+    foreign[within] = region.foreign[tuple(cells[within].T)]
+    return torch.where(masked, ~home, foreign)
+
+
+def _cells(points: Tensor, origin: Tensor, voxel: float, shape) -> tuple[Tensor, Tensor]:
+    """([N, 3] long grid cells, [N] bool inside the grid)."""
+    cells = ((points - origin) / voxel).floor().long()
+    return cells, ((cells >= 0) & (cells < torch.tensor(list(shape), device=cells.device))).all(1)

@@ -1,0 +1,90 @@
+"""Exposure compensation: each view's own affine map of colours, fitted with the scene (as 3DGS's code does).
+
+A phone re-exposes while it walks round. Without compensation Gaussians take the mean, or colours that change with the
+direction; with it they have one exposure, and the photographs are brought to that one wherever they are used later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+FILE = "exposures.json"
+RATE, RATE_LAST = 1e-2, 1e-3  # Adam's step size at the start and at the end
+_IDENTITY = torch.eye(3, 4)
+
+
+class Exposures:
+    """A [3, 4] matrix for each view: photo = matrix[:, :3] @ colour + matrix[:, 3].
+
+    All matrices times one, and all colours times its inverse, would be the same pictures; so their mean is kept at the
+    identity. PAPER leaves open: any exposure.
+    """
+
+    def __init__(self, names: Iterable[str], device: torch.device | str = "cpu"):
+        self._matrices = {name: _IDENTITY.to(device).clone().requires_grad_() for name in names}
+        # a parameter for each view: Adam leaves those alone that got no gradient, and counts each one's steps
+        self._adam = torch.optim.Adam(list(self._matrices.values()), lr=RATE, eps=1e-15)
+
+    def apply(self, color: Tensor, name: str) -> Tensor:
+        """[H, W, 3] as the view's camera exposed it; differentiable in the colours and in the exposure."""
+        matrix = self._matrices[name]
+        return color @ matrix[:, :3].T + matrix[:, 3]
+
+    @torch.no_grad()
+    def step(self, progress: float) -> None:
+        """Move the exposures that got a gradient; `progress` in [0, 1] of the run sets the step size."""
+        for group in self._adam.param_groups:
+            group["lr"] = RATE ** (1 - progress) * RATE_LAST**progress
+        self._adam.step()
+        self._adam.zero_grad(set_to_none=True)
+        shift = torch.stack(list(self._matrices.values())).mean(0)
+        shift -= _IDENTITY.to(shift)
+        for matrix in self._matrices.values():
+            matrix -= shift
+
+    def state_dict(self) -> dict:
+        """What `load_state_dict` continues from, bit for bit."""
+        return {"matrices": {n: m.detach().clone() for n, m in self._matrices.items()}, "adam": self._adam.state_dict()}
+
+    def load_state_dict(self, state: dict) -> None:
+        with torch.no_grad():
+            for name, matrix in self._matrices.items():
+                matrix.copy_(state["matrices"][name])
+        self._adam.load_state_dict(state["adam"])
+
+    def save(self, folder: Path) -> None:
+        from reffusion.io.arrays import save_json
+
+        save_json(folder / FILE, {name: matrix.detach().cpu().tolist() for name, matrix in self._matrices.items()})
+
+
+def load_views(poses: Path, fit: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
+    """View name -> uint8 [H, W, 3], `normalised`."""
+    from reffusion.io import scene
+
+    return {name: normalised(image, fit, name) for name, image in scene.load_views(poses, names).items()}
+
+
+def normalised(image: np.ndarray, fit: Path, name: str) -> np.ndarray:
+    """uint8 [H, W, 3] as the Gaussians of the folder `fit` are exposed: with the exposure that was fitted to the view
+    `name` taken out, and clipped to [0, 255]; as it is where none was fitted (always so for test views).
+
+    Raises:
+        ValueError: the exposure cannot be inverted.
+    """
+    from reffusion.io.arrays import load_json
+
+    path = Path(fit) / FILE
+    matrices = load_json(path) if path.exists() else {}
+    if name not in matrices:
+        return image
+    matrix = np.array(matrices[name])
+    if abs(np.linalg.det(matrix[:, :3])) < 1e-3:
+        raise ValueError(f"{path}: the exposure of view '{name}' cannot be undone; fit again without `fit.exposure`")
+    colors = (image / 255.0 - matrix[:, 3]) @ np.linalg.inv(matrix[:, :3]).T
+    return np.round(colors.clip(0, 1) * 255).astype(np.uint8)

@@ -1,0 +1,57 @@
+"""The views in the order in which a fit takes them, each prepared while the step before it runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from reffusion import seeding
+from reffusion.types import Camera
+
+
+def samples(
+    cameras: Sequence[Camera],
+    images: Mapping[str, np.ndarray],
+    weights: Mapping[str, np.ndarray],
+    steps: range,
+    seed: int,
+) -> Iterator[tuple[Camera, Tensor, Tensor | None]]:
+    """What each of the steps sees, prepared by a thread of its own while the step before it runs."""
+
+    def prepared(i: int) -> tuple[Camera, Tensor, Tensor | None]:
+        camera = cameras[_view(i, len(cameras), seed)]
+        return sample(camera, images[camera.name], weights.get(camera.name))
+
+    with ThreadPoolExecutor(1, thread_name_prefix="fit") as ahead:
+        coming = ahead.submit(prepared, steps.start)
+        for i in steps:
+            ready = coming.result()
+            coming = ahead.submit(prepared, min(i + 1, steps.stop - 1))
+            yield ready
+
+
+def _view(iteration: int, count: int, seed: int) -> int:
+    """Every view once an epoch, in an order of the epoch's own."""
+    order = torch.randperm(count, generator=seeding.generator(seed, "views", iteration // count))
+    return int(order[iteration % count])
+
+
+def sample(camera: Camera, image: np.ndarray, weights: np.ndarray | None) -> tuple[Camera, Tensor, Tensor | None]:
+    """The view as the step sees it: camera, image in [0, 1], weights."""
+    counts = None if weights is None else torch.from_numpy(np.asarray(weights, np.float32))
+    return camera, torch.from_numpy(image).float() / 255, counts
+
+
+def check_sizes(cameras: Sequence[Camera], images: Mapping[str, np.ndarray], weights: Mapping[str, np.ndarray]) -> None:
+    """ValueError naming a view without an image, or whose image or mask is not of its camera's size."""
+    for camera in cameras:
+        for kind, array in (("image", images.get(camera.name)), ("mask", weights.get(camera.name))):
+            if array is None and kind == "image":
+                raise ValueError(f"view '{camera.name}': no image was given")
+            if array is not None and array.shape[:2] != (camera.height, camera.width):
+                size = f"{array.shape[1]}x{array.shape[0]}"
+                raise ValueError(f"view '{camera.name}': {kind} is {size}, camera is {camera.width}x{camera.height}")

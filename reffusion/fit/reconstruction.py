@@ -1,0 +1,206 @@
+"""3DGS optimisation of a whole scene from its training views: what `fit` runs, and any baseline that masks pixels."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from reffusion import trace
+from reffusion.fit.exposure import Exposures
+from reffusion.fit.feed import check_sizes, sample, samples
+from reffusion.fit.step import Settings, adapt, degree_at, squared_error, step
+from reffusion.gaussians.optimize import GaussianOptimizer
+from reffusion.splat.rasterizer import render
+from reffusion.types import PARAMETERS, Camera, Gaussians
+
+FIRST_MOMENT = 16  # of the trace, after the start: measuring held-out views takes as long as several steps
+
+
+def fit(
+    cameras: Sequence[Camera],
+    images: Mapping[str, np.ndarray],
+    initial: Gaussians,
+    settings: Settings,
+    *,
+    folder: Path,
+    weights: Mapping[str, np.ndarray] | None = None,
+    held_out: Sequence[Camera] = (),
+    spent: float = 0.0,
+    impl: str = "auto",
+) -> Gaussians:
+    """Optimise `initial` until its renders look like the views; resumes from `folder`'s checkpoint, bit for bit.
+
+    Args:
+        cameras: the views to fit, at least one.
+        images: view name -> uint8 [H, W, 3], for `cameras` and `held_out`.
+        initial: the Gaussians to start from; the work is done on their device. Where there is a checkpoint, only their
+            degree, device and way of being drawn still matter.
+        folder: gets trace.jsonl (loss, psnr of the steps since the last line, gaussians, and psnr_held_out, during
+            whose measurement the clock stands), checkpoints, and exposures.json where they are fitted.
+        weights: view name -> [H, W], how much each pixel counts; pixels of weight 0, and they alone, influence nothing.
+            A view without an entry counts as a whole.
+        held_out: views that are only measured.
+        spent: seconds that making `initial` took; the trace counts from there.
+        impl: `splat.render`'s.
+
+    Raises:
+        ValueError: no view, or an image or mask of another size than its camera; before any work.
+        FloatingPointError: a loss, gradient or parameter became infinite or NaN; names the step and the view.
+    """
+    weights = weights or {}
+    _refuse_misfits(cameras, held_out, images, weights)
+    run = _Run.begun(initial, cameras, settings, trace.load_checkpoint(folder), spent)
+    optimizer, exposures = run.optimizer, run.exposures
+    log = trace.Trace(folder, run.seconds, run.iteration + 1 if run.iteration else 0)
+    centers = torch.tensor(np.stack([camera.center for camera in cameras]), dtype=torch.float32)
+    saved_at, measured = time.monotonic(), (held_out, images, settings, impl)
+    if run.iteration == 0:
+        _write_line(log, run, *measured)
+
+    for i, (camera, target, counts) in zip(
+        trace.progress(settings.iterations, "fit", run.iteration),
+        samples(cameras, images, weights, range(run.iteration, settings.iterations), settings.seed),
+        strict=False,  # it may stop early
+    ):
+        target, counts = _move(target, optimizer), _move(counts, optimizer)
+        run.count(*step(optimizer, exposures, camera, target, counts, settings, i, impl))
+        adapt(optimizer, centers, run.started_with, settings, run.iteration)
+        if not len(optimizer.gaussians):
+            raise ValueError(f"fit, step {i}: pruning left no Gaussian: lower `least_opacity`, or raise `largest`")
+        where = f"step {i}, view '{camera.name}'"
+        if run.patience.due(run.iteration, settings.iterations, first=FIRST_MOMENT):
+            _check_finite(optimizer.gaussians, where)
+            if _write_line(log, run, *measured):
+                break
+        if time.monotonic() - saved_at > settings.checkpoint_seconds and run.iteration < settings.iterations:
+            _check_finite(optimizer.gaussians, where)
+            trace.save_checkpoint(folder, run.state_dict() | {"seconds": log.seconds})
+            saved_at = time.monotonic()
+    if exposures is not None:
+        exposures.save(folder)
+    return optimizer.gaussians.map(Tensor.detach)
+
+
+def _refuse_misfits(
+    cameras: Sequence[Camera],
+    held_out: Sequence[Camera],
+    images: Mapping[str, np.ndarray],
+    weights: Mapping[str, np.ndarray],
+) -> None:
+    if not cameras:
+        raise ValueError("a fit needs at least one view")
+    check_sizes(cameras, images, weights)
+    check_sizes(held_out, images, {})
+
+
+@dataclass
+class _Run:
+    """What a fit continues from.
+
+    Attributes:
+        started_with: Gaussians at the start. iteration, seconds: done and spent so far.
+        loss, error, steps: sums over the steps since the last line of the trace, and their number.
+    """
+
+    optimizer: GaussianOptimizer
+    exposures: Exposures | None
+    patience: trace.Patience
+    started_with: int
+    seconds: float
+    iteration: int = 0
+    loss: float = 0.0
+    error: float = 0.0
+    steps: int = 0
+
+    _NUMBERS = ("started_with", "seconds", "iteration", "loss", "error", "steps")
+
+    @classmethod
+    def begun(
+        cls,
+        initial: Gaussians,
+        cameras: Sequence[Camera],
+        settings: Settings,
+        state: dict[str, Any] | None,
+        spent: float,
+    ) -> _Run:
+        """From the start, or from a checkpoint's state."""
+        exposures = Exposures((camera.name for camera in cameras), initial.means.device) if settings.exposure else None
+        optimizer = GaussianOptimizer(initial, rates=settings.rates, betas=settings.betas)
+        run = cls(optimizer, exposures, trace.Patience(settings.patience, settings.stop_gain), len(initial), spent)
+        if state is not None:
+            optimizer.load_state_dict(state["optimizer"])
+            run.patience.load_state_dict(state["patience"])
+            if exposures is not None:
+                exposures.load_state_dict(state["exposures"])
+            for name in cls._NUMBERS:
+                setattr(run, name, state[name])
+        return run
+
+    def count(self, loss: float, error: float) -> None:
+        """One step more, of this loss and mean squared error."""
+        self.iteration, self.steps = self.iteration + 1, self.steps + 1
+        self.loss, self.error = self.loss + loss, self.error + error
+
+    def state_dict(self) -> dict[str, Any]:
+        state = {"optimizer": self.optimizer.state_dict(), "patience": self.patience.state_dict()}
+        state["exposures"] = self.exposures and self.exposures.state_dict()
+        return state | {name: getattr(self, name) for name in self._NUMBERS}
+
+
+def _write_line(
+    log: trace.Trace,
+    run: _Run,
+    held_out: Sequence[Camera],
+    images: Mapping[str, np.ndarray],
+    settings: Settings,
+    impl: str,
+) -> dict[str, Any]:
+    """A line of the trace, written with the clock stopped; what it says of the end, {} while the fit goes on."""
+    with log.paused():
+        line = _summary(run, held_out, images, settings, impl)
+        end = _end(run, line, settings) if run.iteration else {}
+        log.log(run.iteration, **line, **end)
+    run.loss, run.error, run.steps = 0.0, 0.0, 0
+    return end
+
+
+def _end(run: _Run, line: Mapping[str, float], settings: Settings) -> dict[str, Any]:
+    """What this line of the trace says of the end, {} while the fit goes on. Its result is always the last state."""
+    main = line.get("psnr_held_out", line["psnr"])
+    end = run.patience.ends(run.iteration, settings.iterations, main, settings.densify_until)
+    return end and end | {"kept": run.iteration}
+
+
+def _move(tensor: Tensor | None, optimizer: GaussianOptimizer) -> Tensor | None:
+    return None if tensor is None else tensor.to(optimizer.masked.device, non_blocking=True)
+
+
+def _summary(
+    run: _Run, held_out: Sequence[Camera], images: Mapping[str, np.ndarray], settings: Settings, impl: str
+) -> dict[str, Any]:
+    """A line of the trace; without steps since the last line there is no loss and no training PSNR."""
+    line: dict[str, Any] = {"gaussians": len(run.optimizer.gaussians)}
+    if run.steps:
+        line = {"loss": run.loss / run.steps, "psnr": trace.decibels(run.error / run.steps)} | line
+    if not held_out:
+        return line
+    degree, gaussians = degree_at(settings, run.iteration), run.optimizer.gaussians.map(Tensor.detach)
+    psnr = []
+    for camera in held_out:
+        image = render(gaussians, camera, impl=impl, sh_degree=degree).color.clamp(0, 1)
+        target = _move(sample(camera, images[camera.name], None)[1], run.optimizer)
+        psnr.append(trace.decibels(squared_error(image, target, None)))
+    return line | {"psnr_held_out": sum(psnr) / len(psnr)}
+
+
+def _check_finite(gaussians: Gaussians, where: str) -> None:
+    for name in PARAMETERS:
+        if not torch.isfinite(getattr(gaussians, name).detach()).all():
+            raise FloatingPointError(f"fit, {where}: the Gaussians' {name} are not finite")

@@ -1,0 +1,330 @@
+"""The reconstruction loss, the paper's confinement, and Adam over a set of Gaussians whose number changes.
+
+Shared by `fit` and `distill`. Everything here takes tensors and plain numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from reffusion.gaussians.ssim import dssim
+from reffusion.kernels.compiled import FREE_ROUNDING, kernel, share
+from reffusion.kernels.vectors import take_ticket
+from reffusion.types import PARAMETERS, Gaussians
+
+_CHUNK = 512  # rows that a thread takes at once
+_jit = partial(kernel, fastmath=FREE_ROUNDING)
+
+
+def reconstruction_loss(image: Tensor, target: Tensor, weights: Tensor | None = None, share: float = 0.2) -> Tensor:
+    """(1 - share) L1 + share D-SSIM, 3DGS's photometric loss with share 0.2 (D-SSIM = 1 - SSIM).
+
+    Args:
+        image, target: [H, W, C] in [0, 1]; the gradient reaches `image` only.
+        weights: [H, W], bool or in [0, 1]: how much a pixel counts; None: all alike. A pixel of weight 0 influences
+            neither the value nor any other pixel's gradient, and its own gradient is 0 (see `gaussians.ssim`).
+            PAPER leaves open: what a masked loss is divided by. All pixels of the image, so that a pixel pulls
+            equally hard in every view; a view masked as a whole gives 0.
+    """
+    return (1 - share) * _l1(image, target.detach(), weights) + share * dssim(image, target, weights)
+
+
+def _l1(image: Tensor, target: Tensor, weights: Tensor | None) -> Tensor:
+    difference = (image - target).abs()
+    if weights is None:
+        return difference.mean()
+    weights = weights.to(image.dtype)[..., None]
+    return torch.where(weights > 0, weights * difference, 0.0).mean()
+
+
+def confine(gaussians: Gaussians, select: Tensor) -> Gaussians:
+    """The same Gaussians, but a gradient reaches only the rows where `select` [N] bool is True: elsewhere exactly 0."""
+
+    def confined(parameter: Tensor) -> Tensor:
+        return torch.where(select.view(-1, *[1] * (parameter.ndim - 1)), parameter, parameter.detach())
+
+    return gaussians.map(confined)
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Adam's step sizes: 3DGS's values, for the normalised frame, in which cameras stand about 1 from the scene.
+
+    Attributes:
+        means: for positions at the start, in units of the frame; it falls exponentially to `means_last`.
+        means_last: for positions at the end.
+        quaternions, log_scales, opacity_logits: of the like-named parameters.
+        sh_dc: for the constant spherical harmonic.
+        sh_rest: for the others.
+    """
+
+    means: float = 1.6e-4
+    means_last: float = 1.6e-6
+    quaternions: float = 1e-3
+    log_scales: float = 5e-3
+    opacity_logits: float = 0.05
+    sh_dc: float = 2.5e-3
+    sh_rest: float = 2.5e-3 / 20
+
+    def at(self, progress: float, gaussians: Gaussians) -> dict[str, Tensor]:
+        """Step size per parameter and column, at `progress` in [0, 1] of the run."""
+        constant = lambda value, count: torch.full((count,), value)
+        sh = constant(self.sh_rest, gaussians.sh.shape[1] * 3)
+        sh[:3] = self.sh_dc
+        return {
+            "means": constant(self.means ** (1 - progress) * self.means_last**progress, 3),
+            "quaternions": constant(self.quaternions, 4),
+            "log_scales": constant(self.log_scales, 3),
+            "opacity_logits": constant(self.opacity_logits, 1),
+            "sh": sh,
+        }
+
+
+class GaussianOptimizer:
+    """Adam over Gaussians that can be added, removed and relabelled.
+
+    Each Gaussian counts its own steps, so one born late starts Adam afresh, bias correction included. In a
+    step only the Gaussians said to be visible move: moments of the others wait (as in Taming 3DGS), for a Gaussian that
+    no pixel sees has no gradient to average.
+
+    Attributes:
+        gaussians: the parameters, leaves that require a gradient. A new object after each change of number.
+        masked: [N] bool, the Gaussians' labels; they follow through `select` and `append`.
+        masked_pace: parameter -> factor on the step sizes of masked Gaussians; 1 where it names none.
+        slope_sum, slope_count: [N], what `observe` has gathered since `forget_slopes`; they follow likewise.
+    """
+
+    _COUNTERS = ("masked", "_steps", "slope_sum", "slope_count")
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        masked: Tensor | None = None,
+        rates: Rates | None = None,
+        masked_pace: Mapping[str, float] | None = None,
+        betas: tuple[float, float] = (0.9, 0.999),
+        epsilon: float = 1e-15,
+    ):
+        self.rates, self.betas, self.epsilon = rates or Rates(), betas, epsilon
+        self.masked_pace = dict(masked_pace or {})
+        self.masked = torch.zeros(len(gaussians), dtype=torch.bool) if masked is None else masked.clone()
+        self.masked = self.masked.to(gaussians.means.device)
+        self.gaussians = gaussians.map(_leaf)
+        self._first = gaussians.map(_zeros)
+        self._second = gaussians.map(_zeros)
+        self._steps = torch.zeros(len(gaussians), dtype=torch.int32, device=self.masked.device)
+        self.forget_slopes()
+
+    def observe(self, probe_gradient: Tensor, radii: Tensor, width: int, height: int) -> None:
+        """Gather one view's screen-space gradients, by which `densify` chooses.
+
+        3DGS measures in normalised device coordinates, where the image spans [-1, 1]: one unit is half the image. A
+        gradient by pixels therefore counts `width / 2` and `height / 2` times, and since the loss is a mean over
+        pixels the result depends neither on the image's size nor on the scene's.
+
+        Args:
+            probe_gradient: [N, 2], d loss / d (2D mean in pixels), as `splat.render`'s probe receives it.
+            radii: [N], 0 where the Gaussian was not drawn.
+            width, height: of the rendered image, in pixels.
+        """
+        seen = radii > 0
+        slope = torch.hypot(probe_gradient[:, 0] * (width / 2), probe_gradient[:, 1] * (height / 2))
+        self.slope_sum += torch.where(seen, slope, 0.0)
+        self.slope_count += seen
+
+    def forget_slopes(self) -> None:
+        self.slope_sum = torch.zeros_like(self._steps, dtype=torch.float32)
+        self.slope_count = torch.zeros_like(self._steps)
+
+    def step(self, progress: float, visible: Tensor | None = None, sh_degree: int | None = None) -> None:
+        """One Adam step along the gradients gathered since the last, which are then forgotten.
+
+        Args:
+            progress: in [0, 1], the part of the run that is done; it sets the step size of the means.
+            visible: [N] bool, the Gaussians to move, e.g. `rendering.radii > 0`; None moves all.
+            sh_degree: the highest degree that was drawn up to now, where that is not all; the others lie still.
+
+        Raises:
+            FloatingPointError: a gradient is not finite; says of which parameter. Nothing has been changed then.
+        """
+        gradients = {name: getattr(self.gaussians, name).grad for name in PARAMETERS}
+        for name, gradient in gradients.items():
+            # A sum is finite only if every term is, and costs no array of flags.
+            if gradient is not None and not torch.isfinite(gradient.sum()):
+                raise FloatingPointError(f"the gradient of the Gaussians' {name} is not finite")
+        if not len(self.masked):
+            return self.forget_gradients()
+        if visible is None:
+            visible = torch.ones_like(self.masked)
+        self._steps += visible
+        unbias = [table.to(self._steps.device) for table in _unbiasing(self.betas, 1 + int(self._steps.max()) // 1024)]
+        rates = self.rates.at(progress, self.gaussians)
+        updates = []
+        for name, gradient in gradients.items():
+            if gradient is not None:
+                rows = (_rows(t) for t in (*(getattr(g, name) for g in self._states()), gradient))
+                moving = rates[name] if name != "sh" or sh_degree is None else rates[name][: 3 * (sh_degree + 1) ** 2]
+                updates.append(Update(*rows, moving, self.masked_pace.get(name, 1.0)))
+        update = _adam_cpu if self.masked.device.type == "cpu" else _adam
+        update(updates, self._steps, visible, self.masked, *unbias, *self.betas, self.epsilon)
+        self.forget_gradients()
+
+    def _states(self) -> tuple[Gaussians, Gaussians, Gaussians]:
+        return self.gaussians, self._first, self._second
+
+    def forget_gradients(self) -> None:
+        for name in PARAMETERS:
+            getattr(self.gaussians, name).grad = None
+
+    def select(self, keep: Tensor) -> None:
+        """Keep the rows that `keep` ([N] bool, or indices [M]) names; labels and moments with them."""
+        self._replace(lambda p: p[keep])
+        for name in self._COUNTERS:
+            setattr(self, name, getattr(self, name)[keep])
+
+    def append(self, gaussians: Gaussians, masked: Tensor) -> None:
+        """Add Gaussians after the present ones, with labels `masked` [M] bool and empty moments."""
+        self.gaussians = self.gaussians.zipped(gaussians, lambda a, b: _leaf(torch.cat([a, b])))
+        empty = gaussians.map(_zeros)
+        self._first = self._first.zipped(empty, lambda a, b: torch.cat([a, b]))
+        self._second = self._second.zipped(empty, lambda a, b: torch.cat([a, b]))
+        for name in self._COUNTERS:
+            old = getattr(self, name)
+            setattr(self, name, torch.cat([old, masked if name == "masked" else old.new_zeros(len(gaussians))]))
+
+    def restart(self, rows: Tensor) -> None:
+        """Let Adam start afresh for the Gaussians `rows` ([M] indices): they stand elsewhere now."""
+        for moments in (self._first, self._second):
+            for name in PARAMETERS:
+                getattr(moments, name)[rows] = 0
+        self._steps[rows] = 0
+
+    def cap_opacity(self, limit: float) -> None:
+        """3DGS's opacity reset: no Gaussian is more opaque than `limit` in (0, 1); what is needed grows back.
+
+        Adam's moments of the opacity are emptied: they tell of a slope that is no longer there.
+        """
+        with torch.no_grad():
+            self.gaussians.opacity_logits.clamp_(max=float(np.log(limit / (1 - limit))))
+            self._first.opacity_logits.zero_()
+            self._second.opacity_logits.zero_()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Tensors from which `load_state_dict` continues bit for bit."""
+        parts = {"parameters": self.gaussians, "first": self._first, "second": self._second}
+        state: dict[str, Any] = {
+            part: {name: getattr(g, name).detach().clone() for name in PARAMETERS} for part, g in parts.items()
+        }
+        return state | {name: getattr(self, name).clone() for name in self._COUNTERS}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a `state_dict`, of any number of Gaussians."""
+        self.gaussians = Gaussians(**state["parameters"], antialiased=self.gaussians.antialiased).map(_leaf)
+        self._first = Gaussians(**state["first"]).map(torch.clone)
+        self._second = Gaussians(**state["second"]).map(torch.clone)
+        for name in self._COUNTERS:
+            setattr(self, name, state[name].clone())
+
+    def _replace(self, function) -> None:
+        self.gaussians = self.gaussians.map(lambda p: _leaf(function(p)))
+        self._first, self._second = self._first.map(function), self._second.map(function)
+
+
+@lru_cache(maxsize=4)
+def _unbiasing(betas: tuple[float, float], kilo: int) -> list[Tensor]:
+    """1 / (1 - beta^t) for t = 0 (which is never used) to 1024 `kilo` - 1, for each beta."""
+    t = torch.arange(1024 * kilo, dtype=torch.float64).clamp(min=1)
+    return [(1 / (1 - beta**t)).float() for beta in betas]
+
+
+def _leaf(parameter: Tensor) -> Tensor:
+    return parameter.detach().clone().contiguous().requires_grad_()
+
+
+def _zeros(parameter: Tensor) -> Tensor:
+    return torch.zeros_like(parameter, requires_grad=False, memory_format=torch.contiguous_format)
+
+
+def _rows(parameter: Tensor) -> Tensor:
+    return parameter.detach().contiguous().view(parameter.shape[0], -1)
+
+
+class Update(NamedTuple):
+    """What a step of Adam needs for one parameter.
+
+    Attributes:
+        parameter, first, second: it and its two moments [N, D], changed in place; gradient: [N, D].
+        rates: step sizes [d] of the first d columns; the others stay. masked_pace: the factor on them in masked rows.
+    """
+
+    parameter: Tensor
+    first: Tensor
+    second: Tensor
+    gradient: Tensor
+    rates: Tensor
+    masked_pace: float
+
+
+@torch.no_grad()
+def _adam(updates: list[Update], steps, visible, masked, unbias1, unbias2, beta1, beta2, epsilon) -> None:
+    """One Adam step on the visible rows; `unbias` [T] is 1 / (1 - beta^t), `steps` [N] each row's t."""
+    rows = visible.nonzero()[:, 0]
+    first_unbias, second_unbias = unbias1[steps[rows], None], unbias2[steps[rows], None]
+    for *tables, rates, masked_pace in updates:
+        parameter, first, second, gradient = (table[:, : len(rates)] for table in tables)
+        g = gradient[rows]
+        m = first[rows].lerp_(g, 1 - beta1)
+        v = second[rows].mul_(beta2).addcmul_(g, g, value=1 - beta2)
+        first[rows], second[rows] = m, v
+        pace = torch.where(masked[rows], masked_pace, 1.0)[:, None]
+        parameter[rows] -= rates.to(g) * pace * first_unbias * m / ((v * second_unbias).sqrt() + epsilon)
+
+
+def _adam_cpu(updates: list[Update], steps, visible, masked, unbias1, unbias2, beta1, beta2, epsilon) -> None:
+    """`_adam` in one pass over memory, for float32."""
+    if not updates:
+        return
+    columns = [tuple(t.numpy() for t in kind) for kind in list(zip(*updates, strict=True))[:5]]
+    paces = np.array([update.masked_pace for update in updates], np.float32)
+    rows = tuple(t.numpy() for t in (steps, visible, masked, unbias1, unbias2))
+    share(_adam_kernel, *columns, paces, rows, (np.float32(beta1), np.float32(beta2), np.float32(epsilon)))
+
+
+@_jit
+def _adam_kernel(tickets, parameters, firsts, seconds, gradients, rates, paces, rows, numbers):
+    count = len(rows[0])
+    chunks = (count + _CHUNK - 1) // _CHUNK
+    while True:
+        ticket = take_ticket(tickets)
+        if ticket >= chunks * len(parameters):
+            return
+        kind, start = ticket // chunks, ticket % chunks * _CHUNK
+        tables = parameters[kind], firsts[kind], seconds[kind], gradients[kind]
+        _adam_rows(start, min(start + _CHUNK, count), tables, rates[kind], paces[kind], rows, numbers)
+
+
+@_jit
+def _adam_rows(begin, end, tables, rates, masked_pace, rows, numbers):
+    parameter, first, second, gradient = tables
+    steps, visible, masked, unbias1, unbias2 = rows
+    beta1, beta2, epsilon = numbers
+    new1, new2 = np.float32(1) - beta1, np.float32(1) - beta2
+    least = np.float32(1e-30)  # below it a first moment would soon be denormal, on which processors are slow
+    for i in range(begin, end):
+        if not visible[i]:
+            continue
+        pace, over = unbias1[steps[i]] * (masked_pace if masked[i] else np.float32(1)), unbias2[steps[i]]
+        for j in range(len(rates)):
+            g = gradient[i, j]
+            a = beta1 * first[i, j] + new1 * g
+            a = np.float32(0) if abs(a) < least else a
+            b = beta2 * second[i, j] + new2 * g * g
+            first[i, j], second[i, j] = a, b
+            parameter[i, j] -= pace * rates[j] * a / (np.sqrt(b * over) + epsilon)

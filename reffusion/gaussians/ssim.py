@@ -1,0 +1,248 @@
+"""Structural similarity over windows from which masked pixels are left out, differentiable in the first image.
+
+Windows as in 3DGS: Gaussian, 11 x 11, sigma 1.5. The local statistics are *normalised convolutions*: sums run over
+the pixels that count and are divided by the window's weight there. A pixel of weight 0 is thus in no window, and
+neither are the pixels outside the image (3DGS counts those as black). The other way, setting both images equal where
+masked, would paint an edge that both share into the windows around a mask and so flatter them.
+
+`dssim` runs a numba kernel on float32 CPU tensors and plain torch everywhere else; both are the same formula.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache, partial
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from reffusion.kernels.compiled import FREE_ROUNDING, kernel, room, share
+from reffusion.kernels.vectors import take_ticket
+
+RADIUS, SIGMA = 5, 1.5
+C1, C2 = 0.01**2, 0.03**2
+
+
+def _window() -> np.ndarray:
+    taps = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2)
+    return taps / taps.sum()
+
+
+def dssim(image: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
+    """Mean of weights * (1 - SSIM) over pixels and channels; its gradient reaches `image` only.
+
+    Args:
+        image, target: [H, W, C] in [0, 1].
+        weights: [H, W], bool or in [0, 1]; where it is 0 the pixel influences nothing, whatever it holds. None: all 1.
+
+    Returns:
+        A scalar in [0, 2], the sum divided by H * W * C: a pixel weighs the same in every view, however large its mask.
+    """
+    if weights is not None:
+        weights = weights.to(image.dtype)
+        counts = (weights > 0)[..., None]
+        image, target = torch.where(counts, image, 0.0), torch.where(counts, target, 0.0)
+    if image.device.type == "cpu" and image.dtype == torch.float32:
+        return _FastDssim.apply(image, target.detach(), weights)
+    return dssim_torch(image, target.detach(), weights)
+
+
+def dssim_torch(image: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
+    """`dssim` in plain torch, any device and type, for finite inputs; the formula to read, and the kernel's oracle."""
+    if weights is None:
+        weights = torch.ones_like(image[..., 0])
+    weights = weights[..., None]
+    window = torch.as_tensor(_window(), dtype=image.dtype, device=image.device)
+
+    def windowed(field: Tensor) -> Tensor:
+        planes = field.permute(2, 0, 1)[:, None]
+        planes = F.conv2d(planes, window.view(1, 1, 1, -1), padding=(0, RADIUS))
+        return F.conv2d(planes, window.view(1, 1, -1, 1), padding=(RADIUS, 0))[:, 0].permute(1, 2, 0)
+
+    total = windowed(weights)
+    total = torch.where(weights > 0, total, 1.0)
+    mean = lambda field: windowed(weights * field) / total
+    mu_x, mu_y = mean(image), mean(target)
+    covariance = mean(image * target) - mu_x * mu_y
+    variances = mean(image**2 + target**2) - mu_x**2 - mu_y**2
+    similarity = (2 * mu_x * mu_y + C1) * (2 * covariance + C2) / ((mu_x**2 + mu_y**2 + C1) * (variances + C2))
+    return (weights * (1 - similarity)).sum() / image.numel()
+
+
+class _FastDssim(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, image: Tensor, target: Tensor, weights: Tensor | None) -> Tensor:
+        height, width, channels = image.shape
+        flat = lambda t: t.detach().contiguous().numpy().reshape(height, width * channels)
+        if weights is None:
+            weight_rows, norm_rows = _unmasked_rows(height, width, channels)
+        else:
+            weight_rows, norm_rows = _rows(weights.contiguous().numpy(), channels)
+        images = flat(image), flat(target), weight_rows
+        fields, partials, sums = _padded(4, images[0]), _padded(3, images[0]), np.empty(height)
+        share(_filter_products, *images, channels, fields)
+        share(_compare, fields, weight_rows, norm_rows, channels, sums, partials)
+        if ctx.needs_input_grad[0]:
+            gradient = room(*images[0].shape)
+            share(_gather_gradient, partials, *images, gradient)
+            ctx.gradient = torch.from_numpy(gradient).view(height, width, channels)
+        return image.new_tensor(float(sums.sum()) / image.numel())
+
+    @staticmethod
+    def backward(ctx, upstream: Tensor):
+        return ctx.gradient * (upstream / ctx.gradient.numel()), None, None
+
+
+def _padded(count: int, image: np.ndarray) -> np.ndarray:
+    """`count` fields like `image`, to be written, with 5 rows of zeros above and below."""
+    fields = room(count, image.shape[0] + 2 * RADIUS, image.shape[1])
+    fields[:, :RADIUS], fields[:, -RADIUS:] = 0, 0
+    return fields
+
+
+def _rows(weights: np.ndarray, channels: int) -> tuple[np.ndarray, np.ndarray]:
+    """The weights [H, W], and their window sums (1 where a pixel does not count, so that nothing divides by 0), each
+    `channels` times over: [H, W * C]."""
+    norm = np.where(weights > 0, _filtered(weights, 1), np.float32(1))
+    return np.repeat(weights, channels, 1), np.repeat(norm, channels, 1)
+
+
+@lru_cache(maxsize=8)
+def _unmasked_rows(height: int, width: int, channels: int) -> tuple[np.ndarray, np.ndarray]:
+    return _rows(np.ones((height, width), np.float32), channels)
+
+
+# The kernels hold an image as H rows of W * C numbers, so that each inner loop runs along memory. Rows of a field are
+# filtered along the row first, then columns; both are symmetric, so each is its own adjoint (borders count as 0).
+# Threads share out rows.
+_K0, _K1, _K2, _K3, _K4, _K5 = (np.float32(k) for k in _window()[RADIUS:])
+_jit = partial(kernel, fastmath=FREE_ROUNDING)
+
+
+@_jit
+def _along_row(padded, out, n, step):
+    """out[j] = the window's sum around padded[5 * step + j]."""
+    a0, a1, a2, a3 = padded[:n], padded[step:], padded[2 * step :], padded[3 * step :]
+    a4, a5, a6, a7 = padded[4 * step :], padded[5 * step :], padded[6 * step :], padded[7 * step :]
+    a8, a9, a10 = padded[8 * step :], padded[9 * step :], padded[10 * step :]
+    for j in range(n):
+        out[j] = (
+            _K0 * a5[j]
+            + _K1 * (a4[j] + a6[j])
+            + _K2 * (a3[j] + a7[j])
+            + _K3 * (a2[j] + a8[j])
+            + _K4 * (a1[j] + a9[j])
+            + _K5 * (a0[j] + a10[j])
+        )
+
+
+@_jit
+def _down_column(rows, i, out, n):
+    """out[j] = the window's sum around rows[i + 5, j]; `rows` has 5 empty rows above and below."""
+    r0, r1, r2, r3 = rows[i], rows[i + 1], rows[i + 2], rows[i + 3]
+    r4, r5, r6, r7 = rows[i + 4], rows[i + 5], rows[i + 6], rows[i + 7]
+    r8, r9, r10 = rows[i + 8], rows[i + 9], rows[i + 10]
+    for j in range(n):
+        out[j] = (
+            _K0 * r5[j]
+            + _K1 * (r4[j] + r6[j])
+            + _K2 * (r3[j] + r7[j])
+            + _K3 * (r2[j] + r8[j])
+            + _K4 * (r1[j] + r9[j])
+            + _K5 * (r0[j] + r10[j])
+        )
+
+
+@_jit
+def _filtered(field, channels):
+    height, n = field.shape
+    rows = np.zeros((height + 2 * RADIUS, n), np.float32)
+    padded = np.zeros(n + 2 * RADIUS * channels, np.float32)
+    out = np.empty((height, n), np.float32)
+    for i in range(height):
+        padded[RADIUS * channels : RADIUS * channels + n] = field[i]
+        _along_row(padded, rows[i + RADIUS], n, channels)
+    for i in range(height):
+        _down_column(rows, i, out[i], n)
+    return out
+
+
+@_jit
+def _filter_products(tickets, x, y, weights, channels, fields):
+    """fields [4, H + 10, W * C] = weights * (x, y, x^2 + y^2, x y), filtered along each row."""
+    height, n = x.shape
+    lead = RADIUS * channels
+    padded = np.zeros((4, n + 2 * lead), np.float32)
+    p0, p1, p2, p3 = padded[0, lead:], padded[1, lead:], padded[2, lead:], padded[3, lead:]
+    while True:
+        i = take_ticket(tickets)
+        if i >= height:
+            return
+        xi, yi, wi = x[i], y[i], weights[i]
+        for j in range(n):
+            a, b, w = xi[j], yi[j], wi[j]
+            p0[j] = w * a
+            p1[j] = w * b
+            p2[j] = w * (a * a + b * b)
+            p3[j] = w * a * b
+        for f in range(4):
+            _along_row(padded[f], fields[f, i + RADIUS], n, channels)
+
+
+@_jit
+def _compare(tickets, fields, weights, norm, channels, sums, partials):
+    """Sum of weights * (1 - SSIM) of each row, and its partials by the windowed fields, filtered along the row.
+
+    Writes sums [H] float64 and partials [3, H + 10, W * C]: by the means of x, of x^2 + y^2 and of x y.
+    """
+    height, n = weights.shape
+    lead = RADIUS * channels
+    column, padded = np.empty((4, n), np.float32), np.zeros((3, n + 2 * lead), np.float32)
+    m0, m1, m2, m3 = column[0], column[1], column[2], column[3]
+    d0, d1, d2 = padded[0, lead:], padded[1, lead:], padded[2, lead:]
+    c1, c2, one, two = np.float32(C1), np.float32(C2), np.float32(1), np.float32(2)
+    while True:
+        i = take_ticket(tickets)
+        if i >= height:
+            return
+        for f in range(4):
+            _down_column(fields[f], i, column[f], n)
+        wi, ni = weights[i], norm[i]
+        total = np.float32(0)
+        for j in range(n):
+            inverse = one / ni[j]
+            mx, my = m0[j] * inverse, m1[j] * inverse
+            squares, product = m2[j] * inverse, m3[j] * inverse
+            light = two * mx * my + c1
+            structure = two * (product - mx * my) + c2
+            brightness = mx * mx + my * my
+            contrast = squares - brightness + c2
+            brightness += c1
+            over = one / (brightness * contrast)
+            similarity = light * structure * over
+            total += wi[j] * (one - similarity)
+            part = -wi[j] * inverse
+            d0[j] = part * two * over * (my * (structure - light) + mx * similarity * (brightness - contrast))
+            d1[j] = part * -similarity * brightness * over
+            d2[j] = part * two * light * over
+        sums[i] = total
+        for f in range(3):
+            _along_row(padded[f], partials[f, i + RADIUS], n, channels)
+
+
+@_jit
+def _gather_gradient(tickets, partials, x, y, weights, gradient):
+    """gradient [H, W * C] = d(sum of weights * (1 - SSIM)) / dx."""
+    height, n = x.shape
+    column, two = np.empty((3, n), np.float32), np.float32(2)
+    c0, c1, c2 = column[0], column[1], column[2]
+    while True:
+        i = take_ticket(tickets)
+        if i >= height:
+            return
+        for f in range(3):
+            _down_column(partials[f], i, column[f], n)
+        xi, yi, wi, out = x[i], y[i], weights[i], gradient[i]
+        for j in range(n):
+            out[j] = wi[j] * (c0[j] + two * xi[j] * c1[j] + yi[j] * c2[j])

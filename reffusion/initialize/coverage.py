@@ -1,0 +1,46 @@
+"""What no reference shows: the pixels still open after filling, and the view to complete next."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from reffusion.initialize.filling import Surroundings
+from reffusion.masks import voting
+from reffusion.masks.witness import OPAQUE
+from reffusion.splat import rasterizer
+from reffusion.types import Camera, Gaussians
+
+RIM = 0.006  # of the picture's width, repainted around what is open too, as far as it is no photograph
+ENOUGH = 0.001  # share of a view's C under which what is open is left to its neighbours
+
+
+@torch.no_grad()
+def open_pixels(gaussians: Gaussians, around: Surroundings, cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
+    """View name -> bool [H, W], pixels of C that nothing covers.
+
+    Only these are made up: without a true picture a made-up surface is worse than what stands there, undecided or not.
+    """
+    found = {}
+    for camera in cameras:
+        hidden = around.hidden[camera.name]
+        alpha = rasterizer.render(gaussians, camera, sh_degree=0).alpha.cpu().numpy()
+        speck, gap = 0.01 * camera.width, 0.02 * camera.width
+        found[camera.name] = voting.tidy(hidden & (alpha <= OPAQUE), speck, gap) & hidden
+    return found
+
+
+def haze(
+    gaussians: Gaussians, new: Tensor, around: Surroundings, found: Mapping[str, np.ndarray], leak: float
+) -> Tensor:
+    """bool [N]: old Gaussians that show mostly where nothing else covers C."""
+    return voting.leaking(gaussians, around.cameras, found, leak) & ~new
+
+
+def barest(around: Surroundings, found: Mapping[str, np.ndarray]) -> Camera | None:
+    """The view with the most open pixels; None where in each they are too few to count."""
+    bare = [c for c in around.cameras if found[c.name].sum() > ENOUGH * max(around.hidden[c.name].sum(), 1)]
+    return max(bare, key=lambda camera: int(found[camera.name].sum()), default=None)

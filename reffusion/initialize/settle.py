@@ -1,0 +1,81 @@
+"""After filling: all Gaussians are fitted once more, briefly, to what is known of the scene without the object."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from reffusion.fit.reconstruction import fit
+from reffusion.fit.step import Settings
+from reffusion.gaussians.optimize import Rates
+from reffusion.types import Camera, Gaussians, Reference
+
+# Between those of a fit's start and end: the scene is there, but what the object's Gaussians left behind must move.
+RATES = Rates(
+    means=4e-4,
+    means_last=2e-5,
+    quaternions=2e-3,
+    log_scales=5e-3,
+    opacity_logits=0.05,
+    sh_dc=5e-3,
+    sh_rest=5e-4,
+)
+REFERENCE_SHARE = 1 / 3  # of the steps that look at a completed view
+BETAS = (0.8, 0.99)  # a short run is better off with a short memory
+
+
+@dataclass(frozen=True)
+class Known:
+    """The pictures to settle to.
+
+    Attributes:
+        cameras: the training views.
+        photos: view name -> uint8 [H, W, 3].
+        hidden: view name -> bool [H, W], where the photograph shows the object, and a margin around.
+        references: completed views, each true within its mask.
+    """
+
+    cameras: Sequence[Camera]
+    photos: Mapping[str, np.ndarray]
+    hidden: Mapping[str, np.ndarray]
+    references: Sequence[Reference]
+
+
+def settle(gaussians: Gaussians, known: Known, steps: int, seed: int, folder: Path) -> Gaussians:
+    """The Gaussians after `steps` of reconstruction, as many as before and in their order; resumes from `folder`.
+
+    The photographs supervise outside the masks, completed views where they were completed. What is left of the
+    object's blurred rim, and what hid in its shadow, is so put right; surfaces old and new grow together at the seam.
+
+    Raises:
+        FloatingPointError: see `fit`.
+    """
+    views, images = list(known.cameras), dict(known.photos)
+    weights = {name: (~mask).astype(np.float32) for name, mask in known.hidden.items()}
+    for number, (reference, turns) in enumerate(zip(known.references, turns_of(known), strict=True)):
+        for copy in range(turns):
+            name = f"{reference.camera.name} completed {number}.{copy}"
+            views.append(replace(reference.camera, name=name))
+            images[name], weights[name] = reference.image, reference.mask.astype(np.float32)
+    settings = Settings(
+        iterations=steps,
+        seed=seed,
+        sh_degree=gaussians.sh_degree,
+        sh_every=0.0,
+        densify_until=0.0,
+        reset_every=0.0,
+        rates=RATES,
+        betas=BETAS,
+    )
+    return fit(views, images, gaussians, settings, folder=folder, weights=weights)
+
+
+def turns_of(known: Known) -> list[int]:
+    """How often each completed view is looked at while each photograph is once: by how much of it was completed, so
+    that a few pixels of a further view do not cost the reference its turns."""
+    sizes = [int(reference.mask.sum()) for reference in known.references]
+    turns = REFERENCE_SHARE / (1 - REFERENCE_SHARE) * len(known.cameras)
+    return [max(1, round(turns * size / max(sum(sizes), 1))) for size in sizes]

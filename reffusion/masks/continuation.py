@@ -1,0 +1,248 @@
+"""Planes that stand around a hole, and where each goes on into space that no photograph shows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from scipy import ndimage, sparse
+from scipy.sparse.linalg import spsolve
+
+from reffusion import geometry, seeding
+from reffusion.depth.behind import grown
+from reffusion.masks.witness import SURFACE, Witness, votes
+from reffusion.types import Camera
+
+REACH = 2.5  # radii of the object around its middle within which surfaces are looked for
+RING = 0.12  # of the image's width: how far around the masks surfaces are sampled
+VIEWS = 12  # views that are sampled
+SAMPLES = 1500  # of each
+TOLERANCE = 0.08  # of the object's radius: distance within which a sample belongs to a plane
+TRIALS = 300  # draws of three samples for each plane
+LEAST_SHARE = 0.1  # of the samples that a plane must explain
+MOST = 5  # planes
+CELLS = 160  # a side of a plane's map
+LARGE = 0.05  # of the largest patch of seen cells: smaller ones are no part of the plane
+WITHIN = (0.05, 0.03, 0.015, 0.015)  # relative depth within which a view's pixels belong to a plane, step by step
+ENOUGH = 200  # pixels that must
+FAR = 0.08  # relative depth: a plane that would move farther anywhere in the hole stays where it is
+STAYS = 0.05  # weight of the plane as it was, within the hole, against what is around
+ACROSS = 0.9  # cosine of the angle between two planes under which they cross
+RIM = 1  # cells on either side: what is seen in a thinner strip is blurred by the masks' margin
+TOUCHING = 0.25  # share of an unknown patch's border that must be seen for the plane to go on into it
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A plane in the world, and a map of what is known on it.
+
+    Attributes:
+        normal: [3], of unit length. height: normal . x on the plane.
+        origin: [3] on the plane, the map's middle. along: [2, 3], the map's axes. pitch: side of a cell.
+        goes_on: bool [CELLS, CELLS], unknown cells into which the plane continues.
+        within: bool [CELLS, CELLS], these and what they enclose with what is seen of the plane: mirrored light makes a
+            polished part look like a pit.
+        free: bool [CELLS, CELLS], where views look through it: there it is not.
+    """
+
+    normal: np.ndarray
+    height: float
+    origin: np.ndarray
+    along: np.ndarray
+    pitch: float
+    goes_on: np.ndarray
+    within: np.ndarray
+    free: np.ndarray
+
+    def depth(self, camera: Camera) -> np.ndarray:
+        """[H, W] camera z where a view's rays meet the plane; inf where they do not."""
+        rays = geometry.pixel_rays(camera) @ camera.world_to_camera[:3, :3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth = (self.height - camera.center @ self.normal) / (rays @ self.normal)
+        return np.where(np.isfinite(depth) & (depth > 0), depth, np.inf)
+
+    def on(self, cells_meant: np.ndarray, depth: np.ndarray, camera: Camera, asked: np.ndarray) -> np.ndarray:
+        """bool [H, W]: pixels of those asked, bool [H, W], whose rays meet the plane, at `depth`, in one of the cells
+        meant (bool [CELLS, CELLS])."""
+        asked = asked & np.isfinite(depth)
+        rays = geometry.pixel_rays(camera)[asked] @ camera.world_to_camera[:3, :3]
+        place = (camera.center + rays * depth[asked, None] - self.origin) @ self.along.T / self.pitch
+        cells = np.floor(place + CELLS / 2).astype(np.int64)
+        inside = ((cells >= 0) & (cells < CELLS)).all(-1)
+        row, column = np.where(inside[:, None], cells, 0).T
+        found = np.zeros_like(asked)
+        found[asked] = inside & cells_meant[row, column]
+        return found
+
+
+def planes_around(centre: np.ndarray, radius: float, views: Sequence[Witness], seed: int = 0) -> list[Plane]:
+    """The planes around what is removed, those with the most samples first.
+
+    Found in the world, from the surfaces that several views show around their masks: one view's depth alone is rough,
+    and a plane seen at a slant by one is seen well by another.
+
+    Args:
+        centre: [3], the middle of what is removed. radius: of most of it.
+    """
+    samples = _samples(centre, REACH * radius, views, seed)
+    near, free = TOLERANCE * radius, np.ones(len(samples), bool)
+    found: list[tuple[np.ndarray, float]] = []
+    draws = np.random.default_rng(seeding.seed_for(seed, "planes around"))
+    while free.sum() >= max(50, LEAST_SHARE * len(samples)) and len(found) < MOST:
+        normal, height, support = _best_plane(samples[free], near, draws)
+        if support < LEAST_SHARE * len(samples):
+            break
+        found.append((normal, height))
+        free &= np.abs(samples @ normal - height) >= 1.5 * near
+    away = [np.linalg.norm(view.camera.center - centre) for view in views]
+    band = max(1.5 * near, SURFACE * float(np.median(away))) if found else 0.0
+    crossing = lambda normal: [other for other in found if abs(other[0] @ normal) < ACROSS]
+    return [_mapped(*plane, crossing(plane[0]), band, centre, REACH * radius, views) for plane in found]
+
+
+def aligned(plane: Plane, depth: np.ndarray, camera: Camera, hole: np.ndarray) -> Plane:
+    """The plane moved onto what one view knows of it around a hole; as it is where that is little.
+
+    Args:
+        depth: [H, W], known well where above 0. hole: bool [H, W], where the plane may have to go on: there it stays
+            where it is as far as what is around does not say more.
+    """
+    at = plane.depth(camera)
+    known = (depth > 0) & np.isfinite(at)
+    rows, columns = np.nonzero(known | (hole & np.isfinite(at)))
+    x, y = (columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy
+    design, prior = np.stack([x, y, np.ones_like(x)], 1), 1 / at[rows, columns]
+    told, values = known[rows, columns], np.where(known, 1 / np.maximum(depth, 1e-12), 0)[rows, columns]
+    found = np.linalg.lstsq(design, prior, rcond=None)[0] if len(rows) >= 3 else np.zeros(3)
+    for within in WITHIN:
+        off = np.abs(values / np.maximum(design @ found, 1e-12) - 1)
+        mine = told & (off < within)
+        if mine.sum() < ENOUGH:
+            return plane
+        weight = np.where(mine, 1 / mine.sum(), np.where(told, 0.0, STAYS / max((~told).sum(), 1))) / prior**2
+        scaled = design * np.sqrt(weight)[:, None]
+        found = np.linalg.lstsq(scaled, np.where(mine, values, prior) * np.sqrt(weight), rcond=None)[0]
+    normal = found @ camera.world_to_camera[:3, :3]
+    length = np.linalg.norm(normal)
+    normal, height = normal / length, (1 + normal @ camera.center) / length
+    moved = replace(plane, normal=normal, height=float(height))
+    there = hole & np.isfinite(at)
+    far = np.abs(moved.depth(camera)[there] / at[there] - 1).max() if there.any() else 0.0
+    return moved if far < FAR else plane
+
+
+def _samples(centre: np.ndarray, reach: float, views: Sequence[Witness], seed: int) -> np.ndarray:
+    """[S, 3] points of the surfaces that views show around their masks, within reach."""
+    draws, found = np.random.default_rng(seeding.seed_for(seed, "surfaces around")), [np.zeros((0, 3))]
+    for view in views[:: max(1, len(views) // VIEWS)]:
+        rows, columns = np.nonzero(grown(view.hidden, RING) & ~view.hidden & (view.depth > 0))
+        if len(rows):
+            chosen = draws.choice(len(rows), min(SAMPLES, len(rows)), replace=False)
+            found.append(geometry.unproject(view.depth, view.camera)[rows[chosen], columns[chosen]])
+    points = np.concatenate(found)
+    return points[np.linalg.norm(points - centre, axis=1) < reach]
+
+
+def _best_plane(points: np.ndarray, near: float, draws: np.random.Generator) -> tuple[np.ndarray, float, int]:
+    """Normal, height and support of the plane through three of the points that most are near to, fitted to its own."""
+    first, second, third = (points[draws.integers(len(points), size=TRIALS)] for _ in range(3))
+    normals = np.cross(second - first, third - first)
+    length = np.linalg.norm(normals, axis=1)
+    normals = normals[length > 1e-12] / length[length > 1e-12, None]
+    if not len(normals):
+        return np.array([0.0, 0.0, 1.0]), 0.0, 0
+    heights = (normals * first[length > 1e-12]).sum(1)
+    support = (np.abs(points @ normals.T - heights) < near).sum(0)
+    normal, height = normals[support.argmax()], heights[support.argmax()]
+    for _ in range(5):
+        own = points[np.abs(points @ normal - height) < near]
+        if len(own) < 3:
+            break
+        middle = own.mean(0)
+        normal = np.linalg.svd(own - middle, full_matrices=False)[2][2]
+        height = float(middle @ normal)
+    return normal, float(height), int((np.abs(points @ normal - height) < near).sum())
+
+
+def _hull(seen: np.ndarray) -> np.ndarray:
+    """bool [CELLS, CELLS], the convex hull of the large patches of seen cells: a surface ends where the prolongations
+    of its visible borders do."""
+    solid = cv2.morphologyEx(seen.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    patches, count = ndimage.label(solid)
+    areas = np.bincount(patches.ravel(), minlength=count + 1)
+    areas[0] = 0
+    rows, columns = np.nonzero((areas >= LARGE * max(areas.max(), 1))[patches])
+    hull = np.zeros(seen.shape, np.uint8)
+    if len(rows):
+        cv2.fillConvexPoly(hull, cv2.convexHull(np.stack([columns, rows], 1).astype(np.int32)), 1)
+    return hull > 0
+
+
+def _between(unknown: np.ndarray, seen: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """[CELLS, CELLS] in [0, 1], on the unknown cells the harmonic function that is 1 where they meet seen cells and 0
+    where they meet free ones: at a half the borders that are visible go on through them, straight where they can."""
+    unknown = unknown | (ndimage.binary_dilation(unknown, iterations=2 * RIM + 1) & ~seen & ~free)
+    index = np.full(unknown.shape, -1)
+    index[unknown] = np.arange(unknown.sum())
+    centre, total = index[unknown], np.zeros(int(unknown.sum()))
+    right, links = np.zeros_like(total), []
+    for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
+        moved = lambda cells, axis=axis, step=step: np.roll(np.pad(cells, 1), step, axis)[1:-1, 1:-1][unknown]
+        next_seen, next_free = moved(seen), moved(free)
+        next_one = np.roll(np.pad(index, 1, constant_values=-1), step, axis)[1:-1, 1:-1][unknown]
+        linked = next_one >= 0
+        total += next_seen | next_free | linked
+        right += next_seen
+        links.append(sparse.coo_matrix((np.ones(linked.sum()), (centre[linked], next_one[linked])), (len(total),) * 2))
+    found = np.zeros(unknown.shape)
+    if right.any():
+        found[unknown] = spsolve((sparse.diags(total + 1e-9) - sum(links)).tocsc(), right)
+    return found
+
+
+def _mapped(
+    normal: np.ndarray,
+    height: float,
+    others: Sequence[tuple[np.ndarray, float]],
+    band: float,
+    centre: np.ndarray,
+    reach: float,
+    views: Sequence[Witness],
+) -> Plane:
+    """The plane with its map: a patch of it that nobody saw, because the object was in the way, and that touches what
+    was seen of it, is where it goes on; where views look through it, it does not.
+
+    Args:
+        others: normals and heights of planes that cross it. band: distance from these up to which a view that seems to
+            show the one may show the other.
+    """
+    first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    along = np.stack([first / np.linalg.norm(first), np.cross(normal, first / np.linalg.norm(first))])
+    origin, pitch = centre - (centre @ normal - height) * normal, 2 * reach / CELLS
+    steps = (np.arange(CELLS) + 0.5 - CELLS / 2) * pitch
+    points = origin + steps[:, None, None] * along[0] + steps[None, :, None] * along[1]
+    # On the object's side: a table's underside, seen from below, is not the top under the object.
+    facing = normal if centre @ normal > height else -normal
+    said = votes(points.reshape(-1, 3), views, np.broadcast_to(facing, (CELLS * CELLS, 3)))
+    shape = (CELLS, CELLS)
+    seen = ((said.seen >= 1) & (said.seen >= said.free)).reshape(shape)
+    free = ((said.free >= 2) & (said.free > said.seen)).reshape(shape)
+    unknown = ~seen & ~free & (said.hidden > 0).reshape(shape)
+    # Neither a thin rim nor a crossing tells where the plane goes on to.
+    crossed = np.any([np.abs(points @ other - high) < band for other, high in others], 0) & np.ones(shape, bool)
+    square = np.ones((2 * RIM + 1,) * 2, np.uint8)
+    solid = cv2.morphologyEx((seen & ~crossed).astype(np.uint8), cv2.MORPH_OPEN, square) > 0
+    patches, count = ndimage.label(unknown)
+    goes_on, ends = np.zeros((2, *shape), bool)
+    for patch in range(1, count + 1):
+        inside = patches == patch
+        border = ndimage.binary_dilation(inside, iterations=2) & ~inside
+        if inside.sum() >= 4 and seen[border].mean() > TOUCHING:
+            beyond = _between(inside, solid, free) < 0.5
+            goes_on |= inside & ~beyond
+            ends |= inside & beyond
+    goes_on &= _hull(seen)
+    within = goes_on | (ndimage.binary_fill_holes(seen | goes_on) & ~seen & ~ends & (said.hidden > 0).reshape(shape))
+    return Plane(normal, height, origin, along, pitch, goes_on, within, free)

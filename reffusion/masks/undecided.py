@@ -1,0 +1,102 @@
+"""Which pixels behind an object are decided: there other photographs show what is to be seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+
+from reffusion.masks.continuation import Plane
+from reffusion.masks.witness import (
+    OPAQUE,
+    SURFACE,
+    Witness,
+    smoothed_surface,
+    surface_range,
+    votes,
+    with_photographed_depth,
+    without_slivers,
+)
+from reffusion.splat import rasterizer
+from reffusion.types import Camera, Gaussians
+
+BEFORE = 0.97  # of the depth shown: a continuation must be nearer than that to hide it
+BESIDE = 0.03  # of the image's width: how far around a plane's patch it is compared with what is shown
+ROUGHEST = 0.06  # of the depth: a wider range around a pixel is no rough surface, but a depth edge
+AGREES = 0.5  # share of these pixels that must lie on the plane
+
+
+@dataclass(frozen=True)
+class Behind:
+    """What one view shows with the object gone.
+
+    Attributes:
+        undecided: bool [H, W], inside C: no photograph tells what is to be seen there.
+        continued: [H, W], depth of the plane that goes on there; inf where none does, or outside `undecided`.
+        depth, alpha: [H, W] float64, as rendered; outside the mask the photographed depth.
+    """
+
+    undecided: np.ndarray
+    continued: np.ndarray
+    depth: np.ndarray
+    alpha: np.ndarray
+
+
+@torch.no_grad()
+def behind(
+    remaining: Gaussians,
+    camera: Camera,
+    hidden: np.ndarray,
+    views: Sequence[Witness],
+    planes: Sequence[Plane],
+    *,
+    witnesses: int = 1,
+) -> Behind:
+    """A pixel of C is decided if its ray meets no continuation of a surface before one that another view shows,
+    unmasked, at that depth and from the same side.
+
+    Args:
+        remaining: the M Gaussians without the object.
+        hidden: bool [H, W], C of that view.
+        witnesses: views that must show the point; 0: the rest alone decides.
+    """
+    drawn = rasterizer.render(remaining, camera, sh_degree=0)
+    depth, alpha = (t.double().cpu().numpy() for t in (drawn.depth, drawn.alpha))
+    rows, columns = np.nonzero(hidden & (alpha > OPAQUE))
+    undecided = hidden.copy()
+    if len(rows):
+        points, normals = (each[rows, columns] for each in smoothed_surface(depth, camera))
+        undecided[rows, columns] = votes(points, views, normals).seen < witnesses
+    depth = with_photographed_depth(depth, camera, views)
+    hides, reach = np.zeros_like(hidden), np.full(hidden.shape, np.inf)
+    for plane in planes:
+        at = plane.depth(camera)
+        before = plane.on(plane.goes_on, at, camera, hidden & (at < BEFORE * np.where(depth > 0, depth, np.inf)))
+        # Where nothing is known the plane goes on too, but not behind something that stands before it.
+        beneath = plane.on(plane.within, at, camera, undecided & ((at < depth / BEFORE) | (alpha <= OPAQUE)))
+        if _grows_out_of(before | beneath, plane, at, camera, depth, ~hidden & (alpha > OPAQUE)):
+            hides |= before
+            reach = np.where(before | beneath, np.minimum(reach, at), reach)
+    undecided = without_slivers(undecided | hides) & hidden
+    return Behind(undecided, np.where(undecided, reach, np.inf), depth, alpha)
+
+
+def _grows_out_of(
+    patch: np.ndarray, plane: Plane, at: np.ndarray, camera: Camera, depth: np.ndarray, known: np.ndarray
+) -> bool:
+    """Does the plane, at depth `at`, lie at the rendered depth around the patch of it (bool [H, W])? One that only cuts
+    through what stands there does not. Where views look through the plane, nothing is compared."""
+    if not patch.any():
+        return False
+    reach = max(3, round(BESIDE * patch.shape[1]))
+    beside = cv2.dilate(patch.astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
+    beside &= known & np.isfinite(at)
+    beside &= ~plane.on(plane.free, at, camera, beside)
+    if not beside.any():
+        return False
+    nearest, farthest = surface_range(depth)
+    lies = (at > nearest * (1 - SURFACE)) & (at < farthest * (1 + SURFACE)) & (np.abs(at - depth) < ROUGHEST * depth)
+    return float(lies[beside].mean()) > AGREES

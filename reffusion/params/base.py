@@ -1,0 +1,61 @@
+"""What all parameters have in common: no unknown names, no changes, and what two stages are both told."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Decay = Annotated[float, Field(ge=0, lt=1)]  # part of a running mean that the next step keeps
+Device = Literal["cpu", "cuda"]
+Dtype = Literal["float32", "bfloat16", "float16"]
+
+# Of a Field's json_schema_extra. WEIGHTS: names a folder of weights, whose content is part of the artifact's key.
+# UNKEYED: changes nothing of the result, and is no part of the key.
+WEIGHTS: dict[str, Any] = {"weights": True}
+UNKEYED: dict[str, Any] = {"keyed": False}
+
+PRIOR = "sd2-community/stable-diffusion-2-inpainting"
+
+
+class Settings(BaseModel):
+    """A frozen set of parameters. Unknown names are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+def prior_field() -> Any:
+    return Field(
+        PRIOR,
+        description="inpainting prior: a diffusers folder, or the name of one on the hub",
+        json_schema_extra=WEIGHTS,
+    )
+
+
+def depth_model_field() -> Any:
+    return Field(
+        None,
+        description="depth model: a transformers folder, or the name of one on the hub; none: the surroundings' own "
+        "depth is continued",
+        json_schema_extra=WEIGHTS,
+    )
+
+
+def memory_field() -> Any:
+    return Field(0.0, ge=0, description="GB that the prior may take; batches are split to fit; 0: no limit")
+
+
+def seconds_field() -> Any:
+    return Field(0.0, ge=0, description="the stage's share of a time budget: as many steps as fit; 0: all")
+
+
+def checkpoint_field() -> Any:
+    return Field(10.0, gt=0, description="seconds of work between checkpoints", json_schema_extra=UNKEYED)
+
+
+class Sampler(Settings):
+    """How a picture is painted by the prior (`reffusion.prior.inpaint`)."""
+
+    steps: int = Field(50, ge=1, description="sampler steps from pure noise")
+    start: float = Field(0.6, gt=0, le=1, description="where refinement at each finer level starts, 1 = pure noise")
+    guidance: float = Field(0.0, ge=0, description="the paper's a; libraries' guidance scale is 1 + a")

@@ -1,0 +1,31 @@
+"""Parameters of the stage `initialize`."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from reffusion.params.base import Settings, depth_model_field
+
+
+class Depth(Settings):
+    """How the depth of a reference's hole is found."""
+
+    # PAPER leaves open: the depth model, and whether its alignment is plain or robust.
+    model: str | None = depth_model_field()
+    sweep: bool = Field(False, description="depth around the hole is found anew by comparing the photographs")
+
+
+class Params(Settings):
+    start: Literal["reference", "lift", "random", "nothing"] = Field(
+        "reference",
+        description="what fills the hole: the reference on its depth; instead (baselines) the picture that the stage "
+        "lift painted of the best view, Gaussians at random (initialize.scatter), or nothing: it only removes",
+    )
+    depth: Depth = Depth()
+    # PAPER leaves open: the new Gaussians' view-dependent colour. The reference shows one side only.
+    gloss: bool = Field(False, description="they change with the direction as the surfaces around them do")
+    # PAPER leaves open: what the reference's camera does not see of the hole.
+    further: int = Field(0, ge=0, description="most views completed beside the references, until nothing is uncovered")
+    settle: int = Field(0, ge=0, description="steps of reconstruction after filling; 0: none")

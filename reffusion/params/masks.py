@@ -1,0 +1,26 @@
+"""Parameters of the stage `masks`."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from reffusion.params.base import Settings
+
+
+class Params(Settings):
+    vote: Literal["weight", "count"] = Field(
+        "weight", description="what a contribution counts: its blending weight, or 1 (the paper's word is 'count')"
+    )
+    tau: float = Field(1.0, gt=0, description="masked from this ratio of masked to unmasked contributions (paper: 1)")
+    tau_rendered: float = Field(0.3, gt=0, lt=1, description="C is where the rendered label exceeds it (paper: 0.3)")
+    hull: float = Field(
+        0.9, ge=0, le=1, description="masked too: centres inside C in more than this share of the views; 1 = none"
+    )
+    debris: bool = Field(True, description="masked too: what the removal brings to light and no photograph supports")
+    # PAPER leaves open: it always invents. So few pixels are rims of masks and crannies, not worth a diffusion model.
+    negligible: float = Field(0.005, ge=0, lt=1, description="share of C up to which undecided pixels are left alone")
+    invent: Literal["auto", "undecided", "consistent", "region"] = Field(
+        "auto", description="what is made up; auto = the scene's 3D region where it names one, else undecided pixels"
+    )

@@ -1,0 +1,34 @@
+"""Parameters of the stage `reference`."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from reffusion.params.base import Device, Dtype, Sampler, Settings, memory_field, prior_field
+
+
+class Given(Settings):
+    """A completed view that the scene brings."""
+
+    view: str = Field(description="name of the view it completes")
+    image: str = Field(description="picture, relative to the scene; of another size or cropped a little is fine")
+    depth: str | None = Field(None, description="its depth or disparity, any scale: 16-bit .png, .npy or .exr")
+    undistorted: bool = Field(False, description="painted over `poses`' own undistorted image, not over the photo")
+
+
+class Params(Settings):
+    reference: Given | list[Given] | None = Field(None, description="completed views that the scene brings")
+    inpainter: Literal["diffusion", "exemplar"] = Field(
+        "diffusion", description="the prior; or pieces of the picture itself, sharp, with nothing new in them"
+    )
+    prior: str = prior_field()
+    prompt: str = Field("", description="what the invented region shows, for a prior that reads")
+    candidates: int = Field(4, ge=1, description="pictures to choose from")
+    choose: int | None = Field(None, ge=0, description="the candidate to take; None takes the one of the lowest seam")
+    sampler: Sampler = Sampler()
+    seed: int = Field(0, description="of the first candidate; the others count up")
+    device: Device = "cpu"
+    dtype: Dtype = "float32"
+    memory_gb: float = memory_field()

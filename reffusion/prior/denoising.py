@@ -1,0 +1,89 @@
+"""What personalization lowers: the prior's own denoising loss, over the whole image of a sample."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from reffusion.prior import diffusion, lora
+from reffusion.prior.crops import GLOBAL, LOCAL, PROMPTS, Picture, Samples
+from reffusion.prior.model import Prior
+from reffusion.prior.windows import two_scale_masks, two_scales, window_around
+from reffusion.seeding import generator as seeded
+
+
+def spread_timesteps(count: int, steps: int, generator: torch.Generator) -> Tensor:
+    """[count] long, each uniform in [0, steps), one in each of `count` equal parts: batches differ less."""
+    places = torch.randperm(count, generator=generator) + torch.rand(1, generator=generator)
+    return (places * (steps / count)).long().clamp(max=steps - 1)
+
+
+def latent_shape(prior: Prior, size: int) -> tuple[int, int, int]:
+    """(C, h, w) of the latents of a size x size image."""
+    side = size // prior.factor
+    return prior.vae.config.latent_channels, side, side
+
+
+def denoising_error(
+    prior: Prior, samples: Samples, timesteps: Tensor, noise: Tensor, outside_weight: float = 1.0
+) -> tuple[Tensor, Tensor]:
+    """([B], [B]): mean squared error of the prior's own target over the whole image, and of the clean latent.
+
+    The target is what the network was trained to predict: eps, or v = a eps - s z. PAPER leaves open: the target
+    (its prior predicts eps) and whether the loss covers the whole image or the mask; as in RealFill it covers all.
+
+    Args:
+        timesteps: [B] long.
+        noise: [B, C, h, w] standard normal, shaped as the latents.
+        outside_weight: of latents that are given anyway; those to repaint have weight 1. The mean is over the weights.
+    """
+    images, masks = samples.images.to(prior.device), samples.masks.to(prior.device)
+    timesteps, noise = timesteps.to(prior.device), noise.to(prior.device)
+    with torch.no_grad():
+        latents = diffusion.encode(prior, images)
+        condition = diffusion.conditioning(prior, images, masks)
+        noisy = diffusion.add_noise(prior, latents, noise, timesteps)
+        target = diffusion.training_target(prior, latents, noise, timesteps)
+    text = diffusion.embed_text(prior, list(PROMPTS))[samples.prompts.to(prior.device)]
+    output = diffusion.raw_prediction(prior, noisy, timesteps, condition, text)
+    weight = torch.where(condition[:, :1] > 0.5, 1.0, outside_weight)  # the mask comes first
+    error = (weight * (output - target).square()).mean((1, 2, 3)) / weight.mean((1, 2, 3))
+    # z_t is given, so both targets are linear in the clean latent: an error of 1 in it is one of a/s in eps, 1/s in v.
+    alpha_bar = diffusion.abar(prior, timesteps).flatten()
+    odds = alpha_bar if prior.prediction_type == "epsilon" else 1.0
+    return error, (1 - alpha_bar) * error / odds
+
+
+def held_out_samples(references: Sequence[Picture], size: int, seed: int) -> Samples:
+    """The reference's own hole: the whole view and a crop. Same for equal seeds."""
+    draw = seeded(seed, "personalize", "held out")
+    first = references[0]
+    windows = [window_around(first.region, size, draw)]
+    masks = two_scale_masks(first.region, windows, size)
+    return Samples(two_scales(first.image, windows, size), masks, torch.tensor([GLOBAL, LOCAL]))
+
+
+def one_sample(prior: Prior, references: Sequence[Picture], seed: int) -> None:
+    """Loss and gradient of one sample: what `memory.fitted` measures."""
+    sample = Samples(*(tensor[:1] for tensor in held_out_samples(references, prior.native_size, seed)))
+    noise = torch.zeros(1, *latent_shape(prior, prior.native_size))
+    denoising_error(prior, sample, torch.zeros(1, dtype=torch.long), noise)[0].sum().backward()
+
+
+@torch.no_grad()
+def held_out_error(prior: Prior, samples: Samples, seed: int) -> dict[str, float]:
+    """{"target_mse", "clean_latent_mse"} at three fixed timesteps with fixed noise: comparable through the training.
+
+    It costs a small model about a step of training.
+    """
+    lora.set_dropout(prior, False)
+    errors = []
+    for level in (0.2, 0.55, 0.9):
+        timesteps = torch.full((len(samples.prompts),), round(level * (prior.timesteps - 1)))
+        draw = seeded(seed, "personalize", "held out", level)
+        noise = torch.randn(len(samples.prompts), *latent_shape(prior, samples.images.shape[-1]), generator=draw)
+        errors.append(torch.stack(denoising_error(prior, samples, timesteps, noise)))
+    target, clean = torch.stack(errors).mean((0, 2)).tolist()
+    return {"target_mse": target, "clean_latent_mse": clean}

@@ -1,0 +1,156 @@
+"""LPIPS (Zhang et al., 2018), version 0.1, from weights that lie on this machine; nothing is downloaded or made up.
+
+Two files a network: the backbone as torchvision saves it (keys `features.N.weight`), and the published linear
+weights (keys `lin0.model.1.weight`). Where either is absent the metric is unavailable, with a reason.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from pathlib import Path
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from reffusion.weights.local import lpips_folders
+
+Net = Literal["alex", "vgg"]
+
+BACKBONE_FILES = {"alex": "alexnet-*.pth", "vgg": "vgg16-*.pth"}  # torchvision's names; a hash follows the dash
+LINEAR_FILES = {"alex": "alex.pth", "vgg": "vgg.pth"}
+SMALLEST = {"alex": 31, "vgg": 16}  # px a side: anything smaller leaves the deepest layer without a single cell
+
+# Layers of torchvision's `features`: (channels, kernel, stride, padding) a convolution with its ReLU, "pool" a maximum.
+_ALEX = [(64, 11, 4, 2), "pool", (192, 5, 1, 2), "pool", (384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1)]
+_VGG = [
+    *[(64, 3, 1, 1)] * 2,
+    "pool",
+    *[(128, 3, 1, 1)] * 2,
+    "pool",
+    *[(256, 3, 1, 1)] * 3,
+    "pool",
+    *[(512, 3, 1, 1)] * 3,
+    "pool",
+    *[(512, 3, 1, 1)] * 3,
+]
+_LAYERS = {"alex": _ALEX, "vgg": _VGG}
+_POOL = {"alex": (3, 2), "vgg": (2, 2)}
+TAPS = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}  # indices in `features` of the ReLUs compared
+WIDTHS = {"alex": (64, 192, 384, 256, 256), "vgg": (64, 128, 256, 512, 512)}
+
+
+class Lpips(nn.Module):
+    """The distance of one network. Build it with `from_states` or `load`.
+
+    Attributes:
+        net: "alex" or "vgg" (16 layers).
+        features: the backbone under torchvision's indices.
+        linear: five non-negative weights, [C_l] each.
+        files: what was read: file name -> first 16 digits of its SHA-256 (empty when built from states).
+    """
+
+    def __init__(self, net: Net):
+        super().__init__()
+        self.net, self.files = net, {}
+        layers, channels = [], 3
+        for layer in _LAYERS[net]:
+            if layer == "pool":
+                layers.append(nn.MaxPool2d(*_POOL[net]))
+            else:
+                width, kernel, stride, padding = layer
+                layers += [nn.Conv2d(channels, width, kernel, stride, padding), nn.ReLU()]
+                channels = width
+        self.features = nn.Sequential(*layers)
+        self.linear = nn.ParameterList(torch.zeros(width) for width in WIDTHS[net])
+        # ImageNet's mean and deviation, seen from [-1, 1].
+        self.register_buffer("shift", torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1))
+        self.register_buffer("scale", torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1))
+        self.requires_grad_(False).eval()
+
+    def forward(self, first: Tensor, second: Tensor) -> Tensor:
+        """Distance [B] of two batches [B, 3, H, W] in [-1, 1]: sum over layers of the mean over cells of
+        w_l · (f_l(first) - f_l(second))², features of unit length over channels.
+
+        Raises ValueError when the shapes differ or an image is smaller than `SMALLEST[net]` a side.
+        """
+        if first.shape != second.shape or first.dim() != 4 or first.shape[1] != 3:
+            raise ValueError(f"LPIPS compares two [B, 3, H, W]; got {tuple(first.shape)} and {tuple(second.shape)}")
+        height, width = first.shape[2:]
+        if min(height, width) < SMALLEST[self.net]:
+            raise ValueError(
+                f"LPIPS ({self.net}) needs at least {SMALLEST[self.net]} px a side; the image is {width}x{height} px"
+            )
+        pairs = zip(self.activations(first), self.activations(second), self.linear, strict=True)
+        return sum(((a - b).square() * weight.view(1, -1, 1, 1)).sum(1).mean((1, 2)) for a, b, weight in pairs)
+
+    def activations(self, images: Tensor) -> list[Tensor]:
+        """The five tapped layers, each cell's channels at unit length."""
+        x, tapped = (images - self.shift) / self.scale, []
+        for index, layer in enumerate(self.features):
+            x = layer(x)
+            if index in TAPS[self.net]:
+                tapped.append(x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10))
+        return tapped
+
+
+def from_states(net: Net, backbone: dict[str, Tensor], linear: dict[str, Tensor]) -> Lpips:
+    """The metric from two state dicts: torchvision's (its classifier is ignored) and the linear weights'.
+
+    Raises ValueError naming the first key that is missing or of another shape.
+    """
+    model = Lpips(net)
+    wanted = {f"features.{key}": value for key, value in model.features.state_dict(keep_vars=True).items()}
+    wanted_linear = {f"lin{i}.model.1.weight": weight for i, weight in enumerate(model.linear)}
+    for state, targets, shape in [
+        (backbone, wanted, lambda p: p.shape),
+        (linear, wanted_linear, lambda p: (1, len(p), 1, 1)),
+    ]:
+        for key, parameter in targets.items():
+            if key not in state:
+                raise ValueError(f"LPIPS ({net}): the weights have no `{key}`")
+            if tuple(state[key].shape) != tuple(shape(parameter)):
+                raise ValueError(
+                    f"LPIPS ({net}): `{key}` has shape {tuple(state[key].shape)}, not {tuple(shape(parameter))}"
+                )
+            parameter.data.copy_(state[key].reshape(parameter.shape))
+    return model
+
+
+def load(net: Net, folder: str | Path | None = None) -> tuple[Lpips | None, str | None]:
+    """(metric, None), or (None, why it is unavailable).
+
+    Raises ValueError for a file that is there but broken: wrong keys or shapes, or other content than the hash
+    in its name says. A damaged file is an error to mend, not an unavailable metric.
+    """
+    places = lpips_folders(folder)
+    found = {}
+    for role, pattern in [("backbone", BACKBONE_FILES[net]), ("linear weights", LINEAR_FILES[net])]:
+        paths = [path for place in places for path in sorted(place.glob(pattern))]
+        if not paths:
+            looked = ", ".join(_short(place) for place in places)
+            return None, f"no {role} for LPIPS ({net}): run `make weights`, or put {pattern} into one of {looked}"
+        found[role] = paths[0]
+    hashes = {path: _sha256(path) for path in found.values()}
+    stated = found["backbone"].stem.rpartition("-")[2]
+    if re.fullmatch("[0-9a-f]{8}", stated) and not hashes[found["backbone"]].startswith(stated):
+        raise ValueError(f"{found['backbone']} is not the file its name says (hash {stated}): download it again")
+    try:
+        states = [torch.load(path, map_location="cpu", weights_only=True) for path in found.values()]
+        model = from_states(net, *states)
+    except Exception as error:
+        raise ValueError(f"LPIPS weights {', '.join(map(str, found.values()))} cannot be used: {error}") from error
+    model.files = {path.name: digest[:16] for path, digest in hashes.items()}
+    return model, None
+
+
+def _sha256(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _short(path: Path) -> str:
+    """`~/...` where it lies at home, so that no user's name enters a result file."""
+    home = Path.home()
+    return f"~/{path.relative_to(home)}" if path.is_relative_to(home) else str(path)
