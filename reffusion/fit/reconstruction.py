@@ -15,8 +15,9 @@ from torch import Tensor
 from reffusion import trace
 from reffusion.fit.exposure import Exposures
 from reffusion.fit.feed import check_sizes, sample, samples
-from reffusion.fit.step import Settings, adapt, degree_at, squared_error, step
-from reffusion.gaussians.optimize import GaussianOptimizer
+from reffusion.fit.step import adapt, degree_at, rates_of, squared_error, step
+from reffusion.gaussians.optimize import GaussianOptimizer, Rates
+from reffusion.params.fit import Params
 from reffusion.splat.rasterizer import render
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
@@ -27,11 +28,12 @@ def fit(
     cameras: Sequence[Camera],
     images: Mapping[str, np.ndarray],
     initial: Gaussians,
-    settings: Settings,
+    settings: Params,
     *,
     folder: Path,
     weights: Mapping[str, np.ndarray] | None = None,
     held_out: Sequence[Camera] = (),
+    rates: Rates | None = None,
     spent: float = 0.0,
     impl: str = "auto",
 ) -> Gaussians:
@@ -47,6 +49,7 @@ def fit(
         weights: view name -> [H, W], how much each pixel counts; pixels of weight 0, and they alone, influence nothing.
             A view without an entry counts as a whole.
         held_out: views that are only measured.
+        rates: Adam's step sizes where they are not those of `settings.lr`.
         spent: seconds that making `initial` took; the trace counts from there.
         impl: `splat.render`'s.
 
@@ -56,7 +59,8 @@ def fit(
     """
     weights = weights or {}
     _refuse_misfits(cameras, held_out, images, weights)
-    run = _Run.begun(initial, cameras, settings, trace.load_checkpoint(folder), spent)
+    rates = rates or rates_of(settings.lr)
+    run = _Run.begun(initial, cameras, settings, rates, trace.load_checkpoint(folder), spent)
     optimizer, exposures = run.optimizer, run.exposures
     log = trace.Trace(folder, run.seconds, run.iteration + 1 if run.iteration else 0)
     centers = torch.tensor(np.stack([camera.center for camera in cameras]), dtype=torch.float32)
@@ -67,18 +71,19 @@ def fit(
     for i, (camera, target, counts) in zip(
         trace.progress(settings.iterations, "fit", run.iteration),
         samples(cameras, images, weights, range(run.iteration, settings.iterations), settings.seed),
-        strict=False,  # it may stop early
+        strict=True,
     ):
         target, counts = _move(target, optimizer), _move(counts, optimizer)
         run.count(*step(optimizer, exposures, camera, target, counts, settings, i, impl))
         adapt(optimizer, centers, run.started_with, settings, run.iteration)
         if not len(optimizer.gaussians):
-            raise ValueError(f"fit, step {i}: pruning left no Gaussian: lower `least_opacity`, or raise `largest`")
+            raise ValueError(
+                f"fit, step {i}: pruning left no Gaussian: lower densify.prune_opa, or raise densify.prune_scale3d"
+            )
         where = f"step {i}, view '{camera.name}'"
-        if run.patience.due(run.iteration, settings.iterations, first=FIRST_MOMENT):
+        if trace.log_spaced(run.iteration, settings.iterations, first=FIRST_MOMENT):
             _check_finite(optimizer.gaussians, where)
-            if _write_line(log, run, *measured):
-                break
+            _write_line(log, run, *measured)
         if time.monotonic() - saved_at > settings.checkpoint_seconds and run.iteration < settings.iterations:
             _check_finite(optimizer.gaussians, where)
             trace.save_checkpoint(folder, run.state_dict() | {"seconds": log.seconds})
@@ -111,7 +116,6 @@ class _Run:
 
     optimizer: GaussianOptimizer
     exposures: Exposures | None
-    patience: trace.Patience
     started_with: int
     seconds: float
     iteration: int = 0
@@ -126,17 +130,17 @@ class _Run:
         cls,
         initial: Gaussians,
         cameras: Sequence[Camera],
-        settings: Settings,
+        settings: Params,
+        rates: Rates,
         state: dict[str, Any] | None,
         spent: float,
     ) -> _Run:
         """From the start, or from a checkpoint's state."""
         exposures = Exposures((camera.name for camera in cameras), initial.means.device) if settings.exposure else None
-        optimizer = GaussianOptimizer(initial, rates=settings.rates, betas=settings.betas)
-        run = cls(optimizer, exposures, trace.Patience(settings.patience, settings.stop_gain), len(initial), spent)
+        optimizer = GaussianOptimizer(initial, rates=rates, betas=settings.lr.betas)
+        run = cls(optimizer, exposures, len(initial), spent)
         if state is not None:
             optimizer.load_state_dict(state["optimizer"])
-            run.patience.load_state_dict(state["patience"])
             if exposures is not None:
                 exposures.load_state_dict(state["exposures"])
             for name in cls._NUMBERS:
@@ -149,8 +153,7 @@ class _Run:
         self.loss, self.error = self.loss + loss, self.error + error
 
     def state_dict(self) -> dict[str, Any]:
-        state = {"optimizer": self.optimizer.state_dict(), "patience": self.patience.state_dict()}
-        state["exposures"] = self.exposures and self.exposures.state_dict()
+        state = {"optimizer": self.optimizer.state_dict(), "exposures": self.exposures and self.exposures.state_dict()}
         return state | {name: getattr(self, name) for name in self._NUMBERS}
 
 
@@ -159,23 +162,13 @@ def _write_line(
     run: _Run,
     held_out: Sequence[Camera],
     images: Mapping[str, np.ndarray],
-    settings: Settings,
+    settings: Params,
     impl: str,
-) -> dict[str, Any]:
-    """A line of the trace, written with the clock stopped; what it says of the end, {} while the fit goes on."""
+) -> None:
+    """A line of the trace, written with the clock stopped."""
     with log.paused():
-        line = _summary(run, held_out, images, settings, impl)
-        end = _end(run, line, settings) if run.iteration else {}
-        log.log(run.iteration, **line, **end)
+        log.log(run.iteration, **_summary(run, held_out, images, settings, impl))
     run.loss, run.error, run.steps = 0.0, 0.0, 0
-    return end
-
-
-def _end(run: _Run, line: Mapping[str, float], settings: Settings) -> dict[str, Any]:
-    """What this line of the trace says of the end, {} while the fit goes on. Its result is always the last state."""
-    main = line.get("psnr_held_out", line["psnr"])
-    end = run.patience.ends(run.iteration, settings.iterations, main, settings.densify_until)
-    return end and end | {"kept": run.iteration}
 
 
 def _move(tensor: Tensor | None, optimizer: GaussianOptimizer) -> Tensor | None:
@@ -183,7 +176,7 @@ def _move(tensor: Tensor | None, optimizer: GaussianOptimizer) -> Tensor | None:
 
 
 def _summary(
-    run: _Run, held_out: Sequence[Camera], images: Mapping[str, np.ndarray], settings: Settings, impl: str
+    run: _Run, held_out: Sequence[Camera], images: Mapping[str, np.ndarray], settings: Params, impl: str
 ) -> dict[str, Any]:
     """A line of the trace; without steps since the last line there is no loss and no training PSNR."""
     line: dict[str, Any] = {"gaussians": len(run.optimizer.gaussians)}

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from reffusion.fit.reconstruction import fit
-from reffusion.fit.step import Settings
 from reffusion.gaussians.optimize import Rates
+from reffusion.params.fit import Densify, LearningRates, Params, SphericalHarmonics
 from reffusion.types import Camera, Gaussians, Reference
 
 # Between those of a fit's start and end: the scene is there, but what the object's Gaussians left behind must move.
@@ -60,17 +60,14 @@ def settle(gaussians: Gaussians, known: Known, steps: int, seed: int, folder: Pa
             name = f"{reference.camera.name} completed {number}.{copy}"
             views.append(replace(reference.camera, name=name))
             images[name], weights[name] = reference.image, reference.mask.astype(np.float32)
-    settings = Settings(
+    settings = Params(
         iterations=steps,
         seed=seed,
-        sh_degree=gaussians.sh_degree,
-        sh_every=0.0,
-        densify_until=0.0,
-        reset_every=0.0,
-        rates=RATES,
-        betas=BETAS,
+        sh=SphericalHarmonics(degree=gaussians.sh_degree, every=0.0),
+        densify=Densify(stop=0.0, reset_every=0.0),
+        lr=LearningRates(betas=BETAS),
     )
-    return fit(views, images, gaussians, settings, folder=folder, weights=weights)
+    return fit(views, images, gaussians, settings, folder=folder, weights=weights, rates=RATES)
 
 
 def turns_of(known: Known) -> list[int]:
