@@ -21,24 +21,20 @@ from reffusion import trace
 from stages import fit
 
 ROOT = Path(__file__).parents[1]
-SAMPLING = {"densify_by": "mcmc", "opacity_weight": 0.01, "scale_weight": 0.01, "densify_every": 25}
-SAMPLING |= {"densify_until": 0.6}
 VARIANTS = {
     "laptop": {},
     "laptop, half the steps": {"iterations": 1000},
     "laptop, twice the steps": {"iterations": 4000},
-    "laptop, twice the steps and Gaussians": {"iterations": 4000, "per_pixel": 0.8},
-    "sampling": SAMPLING,
-    "sampling, twice the steps": {**SAMPLING, "iterations": 4000},
-    "sparse points only": {"flow_cell": 0},
+    "laptop, twice the steps and Gaussians": {"iterations": 4000, "densify.per_pixel": 0.8},
+    "sparse points only": {"init.flow_cell": 0},
     "antialiased": {"antialiased": True},
     "exposure": {"exposure": True},
     "3DGS's rates": {
-        "means_rate": 1.6e-4,
-        "scales_rate": 5e-3,
-        "rotations_rate": 1e-3,
-        "color_rate": 2.5e-3,
-        "sh_rate": 1.25e-4,
+        "lr.means": 1.6e-4,
+        "lr.scales": 5e-3,
+        "lr.quats": 1e-3,
+        "lr.sh0": 2.5e-3,
+        "lr.shN": 1.25e-4,
     },
 }
 
@@ -46,7 +42,7 @@ VARIANTS = {
 def parameters(profile: str, overrides: dict[str, object], every: int) -> fit.Params:
     """The profile's parameters of `fit` with these in their place; ValueError naming an unknown one."""
     given = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"][profile].get("fit", {})
-    return fit.Params(**{**given, **overrides, "holdout": every})
+    return fit.Params(**given).changed({**overrides, "holdout": every})
 
 
 def curve(poses: Path, out: Path, params: fit.Params) -> list[dict[str, float]]:

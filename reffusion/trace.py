@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from math import floor, inf, isfinite, log2, log10
+from math import floor, isfinite, log2, log10
 from pathlib import Path
 from typing import Any
 
@@ -83,64 +83,10 @@ class Trace:
             record = {"seconds": round(self.seconds, 4), "iteration": iteration, **errors}
             with open(self.path, "a") as file:
                 file.write(json.dumps(record) + "\n")
-        if 0 < iteration < errors.get("of", 0):
-            saved = (errors["of"] - iteration) * record["seconds"] / iteration
-            print(f"ends after {iteration} of {errors['of']} steps: {errors['reason']}; {saved:.0f} s saved")
-
-
-class Patience:
-    """Ends a stage whose error has stopped improving (docs/traces.md).
-
-    Attributes:
-        moments: twentieths of the run in a row without a gain after which the stage ends; 0: never.
-        gain: dB that count as one.
-        drop: dB under the best from which on the stage ends, at any moment; 0: never.
-        best, best_at: the best value so far and its iteration.
-    """
-
-    def __init__(self, moments: int = 0, gain: float = 0.0, drop: float = 0.0):
-        self.moments, self.gain, self.drop = moments, gain, drop
-        self.best, self.best_at, self._mark, self._waited = -inf, -1, -inf, 0
-
-    @property
-    def watching(self) -> bool:
-        return self.moments > 0 or self.drop > 0
-
-    def due(self, iteration: int, last: int, per_octave: int = 2, first: int = 1) -> bool:
-        """Is this a moment to measure? The log-spaced ones, and where patience counts, each twentieth of the run."""
-        return log_spaced(iteration, last, per_octave, first) or (self.moments > 0 and twentieth(iteration, last))
-
-    def ends(self, iteration: int, last: int, value: float, start: float = 0.0) -> dict[str, Any]:
-        """What the line of this moment says of the end, {} while the stage goes on.
-
-        Args:
-            value: the main quantity in dB, more is better. last: the planned number of iterations.
-            start: part of the run before which nothing is counted.
-        """
-        reason = "finished" if iteration == last else ""
-        if iteration >= start * last:
-            if value > self.best:
-                self.best, self.best_at = value, iteration
-            elif 0 < self.drop < self.best - value:
-                reason = "fell"
-            if twentieth(iteration, last):
-                gained = value >= self._mark + self.gain and value > self._mark
-                self._mark, self._waited = (value, 0) if gained else (self._mark, self._waited + 1)
-                if 0 < self.moments <= self._waited and not reason:
-                    reason = "no gain"
-        if not reason:
-            return {}
-        return {"of": last, "kept": iteration if reason == "finished" else self.best_at, "reason": reason}
-
-    def state_dict(self) -> dict[str, float]:
-        return {"best": self.best, "best_at": self.best_at, "mark": self._mark, "waited": self._waited}
-
-    def load_state_dict(self, state: dict[str, float]) -> None:
-        self.best, self.best_at, self._mark, self._waited = (state[k] for k in ("best", "best_at", "mark", "waited"))
 
 
 def decibels(squared_error: float) -> float:
-    """-10 log10 of a mean squared error, at most 100: so that errors and PSNR gain alike."""
+    """-10 log10 of a mean squared error, at most 100."""
     return -10 * log10(max(squared_error, 1e-10))
 
 
@@ -150,11 +96,6 @@ def log_spaced(iteration: int, last: int, per_octave: int = 2, first: int = 1) -
         return True
     step = lambda i: floor(log2(i) * per_octave)
     return iteration >= first and step(iteration) != step(iteration - 1)
-
-
-def twentieth(iteration: int, last: int) -> bool:
-    """True where a twentieth of the run has been completed."""
-    return iteration > 0 and 20 * iteration // last != 20 * (iteration - 1) // last
 
 
 def affordable(

@@ -23,7 +23,6 @@ from reffusion.types import Camera, Gaussians, Scene
 
 
 def run(params: Params, out: Path, *, poses: Path) -> None:
-
     if (poses / "gaussians.ply").exists() and params.pixels == "all":
         save_ply(out / "gaussians.ply", load_ply(poses / "gaussians.ply"))
         return
@@ -40,7 +39,7 @@ def run(params: Params, out: Path, *, poses: Path) -> None:
         points, colors = start_points(params, scene, cameras, images, hidden)
     views = (cameras, images, start(params, points, colors))
     weights = {name: (~mask).astype("float32") for name, mask in hidden.items()}
-    spent, lasting = lambda: time.monotonic() - began, lambda steps: params.model_copy(update={"iterations": steps})
+    spent, lasting = lambda: time.monotonic() - began, lambda steps: params.changed({"iterations": steps})
     tried = lambda folder, steps: fit(*views, lasting(steps), folder=folder, weights=weights)
     steps = trace.affordable(out, params.iterations, params.seconds, spent, tried)
     gaussians = fit(
@@ -57,18 +56,16 @@ def run(params: Params, out: Path, *, poses: Path) -> None:
 
 def supported(params: Params, scene: Scene) -> Params:
     """The parameters with no higher degree of spherical harmonics than the training views determine."""
-
     most = params.sh.degree
     degree, views = support.harmonics(scene.points, [scene.cameras[name] for name in scene.train], most)
     if degree == most:
         return params
     print(f"spherical harmonics of degree {degree}: a typical point is in {views} views", flush=True)
-    return params.model_copy(update={"sh": params.sh.model_copy(update={"degree": degree})})
+    return params.changed({"sh.degree": degree})
 
 
 def hidden_pixels(poses: Path, scene: Scene) -> dict[str, np.ndarray]:
     """View name -> bool [H, W], its raw mask; none for a view without one, or one marked clean."""
-
     masks = load_raw_masks(poses, [name for name in scene.train if name not in scene.clean])
     if not masks:
         raise ValueError(f"{poses / 'masks'}: fit.pixels is 'unmasked', but the scene has no masks")
@@ -111,4 +108,4 @@ def capped(params: Params, cameras: list[Camera]) -> Params:
         return params
     pixels = sum(camera.width * camera.height for camera in cameras) / len(cameras)
     most = min(densify.cap_max, max(4, round(densify.per_pixel * pixels)))
-    return params.model_copy(update={"densify": densify.model_copy(update={"cap_max": most})})
+    return params.changed({"densify.cap_max": most})

@@ -13,20 +13,23 @@ from reffusion.fit import exposure, step
 from reffusion.fit import reconstruction as fitting
 from reffusion.fit.reconstruction import fit
 from reffusion.fit.start import initial_gaussians
-from reffusion.fit.step import Settings
-from reffusion.gaussians.optimize import Rates
 from reffusion.io.arrays import load_json
 from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_views, save_scene
+from reffusion.params.fit import Densify, LearningRates, Params, SphericalHarmonics
 from reffusion.splat.rasterizer import render
 from reffusion.types import PARAMETERS, Camera, Gaussians, Scene, Similarity
+from stages import fit as stage
+from stages.plan import fit as plan
 
 WIDTH, HEIGHT = 22, 16
-SETTINGS = Settings(
-    iterations=24, sh_degree=1, sh_every=0.25, densify_from=0.2, densify_until=0.8, densify_every=6, slope=1e-4,
-    budget=120, reset_every=0.5, random_background=True, rates=Rates(means=2e-3, means_last=2e-4),
-)  # fmt: skip
+SETTINGS = Params(
+    iterations=24,
+    sh=SphericalHarmonics(degree=1, every=0.25),
+    densify=Densify(start=0.2, stop=0.8, every=6, grow_grad2d=1e-4, cap_max=120, reset_every=0.5),
+    lr=LearningRates(means=2e-3),
+)
 
 
 def ring_of_cameras(count: int = 5, scale: float = 1.0, offset=(0.0, 0.0, 0.0)) -> list[Camera]:
@@ -75,7 +78,7 @@ def run(folder, cameras=None, initial=None, settings=SETTINGS, **given) -> Gauss
 def test_it_learns_and_says_so(tmp_path):
     held = ring_of_cameras()[2:3]
     cameras = [c for c in ring_of_cameras() if c.name != held[0].name]
-    settings = replace(SETTINGS, iterations=240, reset_every=0, random_background=False)
+    settings = SETTINGS.changed({"iterations": 240, "densify.reset_every": 0, "random_background": False})
     fitted = run(tmp_path, cameras, settings=settings, held_out=held)
     lines = [json.loads(line) for line in (tmp_path / "trace.jsonl").read_text().splitlines()]
     assert lines[-1]["iteration"] == 240 and lines[-1]["gaussians"] == len(fitted)
@@ -90,7 +93,7 @@ class Killed(Exception):
     pass
 
 
-@pytest.mark.parametrize("settings", [SETTINGS, replace(SETTINGS, exposure=True)], ids=["plain", "exposure"])
+@pytest.mark.parametrize("settings", [SETTINGS, SETTINGS.changed({"exposure": True})], ids=["plain", "exposure"])
 def test_a_resumed_fit_is_the_unbroken_one_bit_for_bit(tmp_path, monkeypatch, settings):
     unbroken = run(tmp_path / "unbroken", settings=settings)
     adapt, folder = fitting.adapt, tmp_path / "resumed"
@@ -103,7 +106,7 @@ def test_a_resumed_fit_is_the_unbroken_one_bit_for_bit(tmp_path, monkeypatch, se
 
         monkeypatch.setattr(fitting, "adapt", killing)
         with pytest.raises(Killed):
-            run(folder, settings=replace(settings, checkpoint_seconds=0.0))
+            run(folder, settings=settings.changed({"checkpoint_seconds": 1e-9}))
         assert trace.load_checkpoint(folder)["iteration"] == moment - 1
     monkeypatch.setattr(fitting, "adapt", adapt)
     resumed = run(folder, initial=start(truth().means.numpy()[:5].astype(np.float64)), settings=settings)
@@ -127,12 +130,13 @@ def test_exposures_are_found_and_taken_out_again(tmp_path):
         changed = (pictures[camera.name] * np.array([gain, 1.0, 2 - gain]) + 8 * (gain - 1)).clip(0, 255)
         save_image(poses / "images" / f"{camera.name}.png", changed.round().astype(np.uint8))
     shown = load_views(poses, [c.name for c in cameras]) | {held.name: pictures[held.name]}
-    settings = replace(SETTINGS, iterations=2000, densify_until=0.3, reset_every=0, random_background=False)
+    values = {"iterations": 2000, "densify.stop": 0.3, "densify.reset_every": 0, "random_background": False}
+    settings = SETTINGS.changed(values)
     scores = []
     for on in (False, True):
         folder = tmp_path / str(on)
         folder.mkdir()
-        fit(cameras, shown, start(), replace(settings, exposure=on), folder=folder, held_out=[held])
+        fit(cameras, shown, start(), settings.changed({"exposure": on}), folder=folder, held_out=[held])
         scores.append(trace.read_trace(folder / "trace.jsonl")[-1]["psnr_held_out"])
     assert scores[1] > scores[0] + 2
     away = lambda views: np.mean([np.abs(v.astype(float) - pictures[n]).mean() for n, v in views.items()])
@@ -156,7 +160,7 @@ def test_exposures_stay_the_identity_on_average():
 
 def test_seeds_matter_and_repeat(tmp_path):
     first, again = run(tmp_path / "a"), run(tmp_path / "b")
-    other = run(tmp_path / "c", settings=replace(SETTINGS, seed=1))
+    other = run(tmp_path / "c", settings=SETTINGS.changed({"seed": 1}))
     assert torch.equal(first.means, again.means)
     assert len(other) != len(first) or not torch.equal(first.means, other.means)
 
@@ -252,28 +256,26 @@ def write_scene(folder) -> None:
 
 
 def test_the_stage_writes_its_artifact_and_never_reads_test_views(tmp_path):
-    from stages import fit as stage
-
     poses, out = tmp_path / "poses", tmp_path / "out"
     write_scene(poses)
     out.mkdir()
-    params = stage.Params(iterations=10, budget=150, sh_degree=1, holdout=4)
+    params = stage.Params().changed({"iterations": 10, "densify.cap_max": 150, "sh.degree": 1, "holdout": 4})
     stage.run(params, out, poses=poses)
     fitted = load_ply(out / "gaussians.ply")
     assert 0 < len(fitted) <= 150 and fitted.sh_degree == 1
     assert "psnr_held_out" in trace.read_trace(out / "trace.jsonl")[-1]
     assert trace.load_checkpoint(out) is None
-    assert stage.preview(params, poses=poses) == []
+    assert plan.preview(params, poses=poses) == []
 
 
 def test_the_stage_starts_from_flow_points_of_the_views_it_fits(tmp_path, capsys, monkeypatch):
     from reffusion.capture import stereo
-    from stages import fit as stage
 
     write_scene(tmp_path / "poses")
     seen, find = [], stereo.dense_points
     monkeypatch.setattr(stereo, "dense_points", lambda cameras, *rest: seen.append(cameras) or find(cameras, *rest))
-    params = stage.Params(iterations=3, budget=500, sh_degree=0, flow_cell=2, holdout=4, antialiased=True)
+    values = {"iterations": 3, "densify.cap_max": 500, "sh.degree": 0, "init.flow_cell": 2, "holdout": 4}
+    params = stage.Params(antialiased=True).changed(values)
     (tmp_path / "out").mkdir()
     stage.run(params, tmp_path / "out", poses=tmp_path / "poses")
     found = int(re.search(r"(\d+) points by optical flow beside 120", capsys.readouterr().out)[1])
@@ -283,25 +285,21 @@ def test_the_stage_starts_from_flow_points_of_the_views_it_fits(tmp_path, capsys
 
 
 def test_larger_pictures_have_room_for_more_gaussians():
-    from stages import fit as stage
-
     cameras = ring_of_cameras()
     pixels = cameras[0].width * cameras[0].height
-    budget = lambda cameras, **params: stage.settings(stage.Params(**params), cameras).budget
+    budget = lambda cameras, **densify: stage.capped(stage.Params(densify=Densify(**densify)), cameras).densify.cap_max
     assert budget(cameras, per_pixel=0.25) == round(0.25 * pixels)
     doubled = [camera.resized(2 * camera.width, 2 * camera.height) for camera in cameras]
     assert budget(doubled, per_pixel=0.25) == pixels
-    assert budget(doubled, per_pixel=0.25, budget=100) == 100
-    assert budget(cameras, budget=1234) == 1234
+    assert budget(doubled, per_pixel=0.25, cap_max=100) == 100
+    assert budget(cameras, cap_max=1234) == 1234
 
 
 def test_the_stage_takes_over_a_scene_of_gaussians(tmp_path):
-    from stages import fit as stage
-
     poses, out = tmp_path / "poses", tmp_path / "out"
     write_scene(poses)
     out.mkdir()
     save_ply(poses / "gaussians.ply", truth())
     stage.run(stage.Params(), out, poses=poses)
     assert torch.equal(load_ply(out / "gaussians.ply").means, truth().means)
-    assert "no optimisation" in stage.preview(stage.Params(), poses=poses)[0]
+    assert "no optimisation" in plan.preview(stage.Params(), poses=poses)[0]

@@ -30,6 +30,7 @@ from runner.job import Job, Request, prepare
 from runner.pipeline import load_pipeline
 from runner.plan import Decision, decide
 from stages import distill, evaluate, fit, initialize, lift, masks
+from stages.plan import fit as plan_fit
 
 ROOT = Path(__file__).resolve().parent.parent
 NEAR = 1.7
@@ -347,7 +348,8 @@ def test_rendered_views_inpainted_in_2d(scene, tmp_path):
 
 def test_the_masked_fit_never_sees_a_masked_pixel(scene, tmp_path):
     """Photographs with noise where they are masked, and another object's colour, give the same Gaussians to the bit."""
-    params = fit.Params(iterations=12, pixels="unmasked", sh_degree=0, flow_cell=6, budget=1500, densify_every=4)
+    values = {"iterations": 12, "sh.degree": 0, "init.flow_cell": 6, "densify.cap_max": 1500, "densify.every": 4}
+    params = fit.Params(pixels="unmasked").changed(values)
     found = []
     for seed in (0, 1):
         poses = small.write(tmp_path / f"scene{seed}", NEAR)[0]
@@ -369,7 +371,8 @@ def test_a_masked_fit_needs_masks_and_fits_a_scene_that_brings_gaussians(scene, 
     with pytest.raises(ValueError, match=r"fit.pixels is 'unmasked', but the scene has no masks"):
         fit.run(fit.Params(iterations=1, pixels="unmasked"), tmp_path, poses=poses)
     save_ply(poses / "gaussians.ply", small.gaussians(NEAR)[0])
-    assert fit.preview(fit.Params(), poses=poses) and not fit.preview(fit.Params(pixels="unmasked"), poses=poses)
+    assert plan_fit.preview(fit.Params(), poses=poses)
+    assert not plan_fit.preview(fit.Params(pixels="unmasked"), poses=poses)
 
 
 def test_the_box_is_the_test_masks_whatever_was_left_out(scene, tmp_path):

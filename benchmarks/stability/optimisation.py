@@ -21,11 +21,10 @@ from reffusion.distill.optimization import Settings as Distilling
 from reffusion.distill.optimization import distill
 from reffusion.fit.reconstruction import fit
 from reffusion.fit.start import initial_gaussians
-from reffusion.fit.step import Settings
-from reffusion.gaussians import mcmc
 from reffusion.gaussians.densify import densify, prune
 from reffusion.gaussians.optimize import GaussianOptimizer, Rates
 from reffusion.io.ply import load_ply, save_ply
+from reffusion.params.fit import Densify, Params, SphericalHarmonics
 from reffusion.splat.rasterizer import render
 from reffusion.types import PARAMETERS, Gaussians
 
@@ -55,11 +54,12 @@ def too_fast(factor: float) -> float:
     scene = frames.normalised(1.0, 0.0)
     start = initial_gaussians(scene.points, scene.point_colors, 0, 1000, seeding.generator(0))
     usual = Rates(means=2e-3, means_last=2e-4, log_scales=1.5e-2, sh_dc=1.5e-2)
-    settings = Settings(60, sh_degree=0, random_background=False, densify_every=10, rates=frames.faster(usual, factor))
+    settings = Params(iterations=60, random_background=False).changed({"sh.degree": 0, "densify.every": 10})
+    rates = frames.faster(usual, factor)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         try:
-            found = fit(list(scene.cameras.values()), frames.photographs(), start, settings, folder=folder)
+            found = fit(list(scene.cameras.values()), frames.photographs(), start, settings, folder=folder, rates=rates)
         except FloatingPointError as error:
             return float(not (named(error, "reconstruction") and written(folder)))
         finite = all(torch.isfinite(getattr(found, n)).all() for n in PARAMETERS)
@@ -97,11 +97,10 @@ def nobody_left() -> float:
     picture.color.sum().backward()
     optimizer.step(0.5, visible=picture.radii > 0)
     grown = densify(optimizer, 0.0, 0.01, 100, seeding.generator(0))
-    moved = mcmc.relocate(optimizer, 0.5, seeding.generator(0))
     with tempfile.TemporaryDirectory() as folder:
         save_ply(Path(folder) / "none.ply", optimizer.gaussians)
         again = len(load_ply(Path(folder) / "none.ply"))
-    good = removed == 8, (picture.color == 0.25).all(), not picture.alpha.any(), grown == moved == again == 0
+    good = removed == 8, (picture.color == 0.25).all(), not picture.alpha.any(), grown == again == 0
     return float(sum(not x for x in good))
 
 
@@ -109,9 +108,8 @@ def fit_of_nobody() -> float:
     """A fit whose pruning takes everything says so, with the step."""
     scene = frames.normalised(1.0, 0.0)
     start = initial_gaussians(scene.points, scene.point_colors, 0, 1000, seeding.generator(0))
-    settings = Settings(
-        8, sh_degree=0, densify_from=0.0, densify_until=1.0, densify_every=4, least_opacity=1.1, slope=math.inf
-    )
+    densify = Densify(start=0.0, stop=1.0, every=4, prune_opa=0.999, grow_grad2d=math.inf)
+    settings = Params(iterations=8, sh=SphericalHarmonics(degree=0), densify=densify)
     with tempfile.TemporaryDirectory() as folder:
         try:
             fit(list(scene.cameras.values()), frames.photographs(), start, settings, folder=Path(folder))

@@ -77,9 +77,8 @@ def fit(
         run.count(*step(optimizer, exposures, camera, target, counts, settings, i, impl))
         adapt(optimizer, centers, run.started_with, settings, run.iteration)
         if not len(optimizer.gaussians):
-            raise ValueError(
-                f"fit, step {i}: pruning left no Gaussian: lower densify.prune_opa, or raise densify.prune_scale3d"
-            )
+            remedy = "lower densify.prune_opa, or raise densify.prune_scale3d"
+            raise ValueError(f"fit, step {i}: pruning left no Gaussian: {remedy}")
         where = f"step {i}, view '{camera.name}'"
         if trace.log_spaced(run.iteration, settings.iterations, first=FIRST_MOMENT):
             _check_finite(optimizer.gaussians, where)

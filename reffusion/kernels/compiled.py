@@ -28,8 +28,8 @@ _CACHE = "splat-"  # folders of machine code in __pycache__, one per state of th
 
 @functools.cache
 def _cache_folder() -> Path:
-    """Machine code is kept by the content of all files of `_ROOMS`: numba itself looks only at the one file of a function,
-    and would go on using a constant or a callee that has changed elsewhere."""
+    """Machine code is kept by the content of all files of `_ROOMS`: numba itself looks only at the one file of a
+    function, and would go on using a constant or a callee that has changed elsewhere."""
     library = Path(__file__).parents[1]
     sources = [path for room in _ROOMS for path in sorted((library / room).glob("*.py"))]
     digest = hashlib.blake2b(b"".join(path.read_bytes() for path in sources), digest_size=8).hexdigest()

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -22,6 +23,17 @@ class Settings(BaseModel):
     """A frozen set of parameters. Unknown names are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    def changed(self, values: Mapping[str, Any]) -> Self:
+        """These settings with other values at dotted names, `{"sh.degree": 2}`; all checked anew."""
+        nested = self.model_dump()
+        for name, value in values.items():
+            *way, last = name.split(".")
+            place = nested
+            for step in way:
+                place = place[step]
+            place[last] = value
+        return type(self).model_validate(nested)
 
 
 def prior_field() -> Any:
