@@ -4,59 +4,31 @@ invent mask."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+import numpy as np
+import torch
+from torch import Tensor
 
-if TYPE_CHECKING:
-    import numpy as np
-    from torch import Tensor
+from reffusion import trace
+from reffusion.fit import exposure
+from reffusion.io.arrays import load_json, save_json, save_labels
+from reffusion.io.ply import load_ply
+from reffusion.io.scene import load_raw_masks, load_scene, save_mask_sets
+from reffusion.masks import undecided, voting, witness
+from reffusion.masks.continuation import Plane, planes_around
+from reffusion.masks.voting import Votes, extent
+from reffusion.masks.witness import Witness
+from reffusion.params.masks import Params
+from reffusion.types import Camera, Gaussians, MaskSet, Scene
 
-    from reffusion.masks.continuation import Plane
-    from reffusion.masks.voting import Votes
-    from reffusion.masks.witness import Witness
-    from reffusion.types import Camera, Gaussians, MaskSet, Scene
-
-
-class Params(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    vote: Literal["weight", "count"] = Field(
-        "weight", description="what a contribution counts: its blending weight, or 1 (the paper's word is 'count')"
-    )
-    tau: float = Field(1.0, gt=0, description="masked from this ratio of masked to unmasked contributions (paper: 1)")
-    tau_rendered: float = Field(0.3, gt=0, lt=1, description="C is where the rendered label exceeds it (paper: 0.3)")
-    buried: float = Field(
-        0.1, ge=0, description="blending weight in all views up to which a Gaussian votes by where it stands"
-    )
-    hull: float = Field(
-        0.9, ge=0, le=1, description="masked too: centres inside C in more than this share of the views; 1 = none"
-    )
-    debris: bool = Field(True, description="masked too: what the removal brings to light and no photograph supports")
-    witnesses: int = Field(1, ge=0, description="training views that must show a pixel's background; 0 = not asked")
-    speck: float = Field(0.01, ge=0, description="islands of a mask below this diameter go, / image width")
-    gap: float = Field(0.02, ge=0, description="holes in a mask below this diameter close, / image width")
-    # PAPER leaves open: it always invents. So few pixels are rims of masks and crannies, not worth a diffusion model.
-    negligible: float = Field(0.005, ge=0, lt=1, description="share of C up to which undecided pixels are left alone")
-    invent: Literal["auto", "undecided", "consistent", "region"] = Field(
-        "auto", description="what is made up; auto = the scene's 3D region where it names one, else undecided pixels"
-    )
-    seed: int = Field(0, description="of the draws that find planes")
+BURIED = 0.1  # blending weight in all views up to which a Gaussian votes by where it stands
+SPECK, GAP = 0.01, 0.02  # of the image's width: islands of a mask below this diameter go, holes in it close
+SEED = 0  # of the draws that find planes
 
 
 def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
-    from dataclasses import replace
-
-    import numpy as np
-    import torch
-
-    from reffusion.fit import exposure
-    from reffusion.io.arrays import load_json, save_json, save_labels
-    from reffusion.io.ply import load_ply
-    from reffusion.io.scene import load_raw_masks, load_scene, save_mask_sets
-    from reffusion.masks import voting, witness
-
     scene, gaussians = load_scene(poses), load_ply(fit / "gaussians.ply")
     train = [scene.cameras[name] for name in scene.train]
     region = load_json(poses / "region.json") if (poses / "region.json").exists() else None
@@ -111,21 +83,17 @@ def voted(
     params: Params, gaussians: Gaussians, train: list[Camera], ballots: dict[str, np.ndarray], seen: Votes
 ) -> Tensor:
     """Labels [N] bool by the masks of the views that vote; `seen`: the votes by weight."""
-    from reffusion.masks import voting
-
     votes = seen if params.vote == "weight" else voting.cast_votes(gaussians, train, ballots, mode=params.vote)
     labels = voting.label_gaussians(votes, params.tau)
     # What hardly any view sees (buried in the object, or in the wall behind it) votes by where it stands.
-    unseen = seen.masked + seen.unmasked <= params.buried
+    unseen = seen.masked + seen.unmasked <= BURIED
     return labels | (unseen & voting.hidden_inside(gaussians, train, ballots))
 
 
 def drawn(params: Params, gaussians: Gaussians, labels: Tensor, cameras: dict[str, Camera]) -> dict[str, np.ndarray]:
     """The labels rendered back into each view: its consistent mask C, bool [H, W]."""
-    from reffusion.masks import voting
-
     shares = {name: voting.label_view(gaussians, labels, camera) for name, camera in cameras.items()}
-    return {name: tidied(params, share > params.tau_rendered) for name, share in shares.items()}
+    return {name: tidied(share > params.tau_rendered) for name, share in shares.items()}
 
 
 def classified(
@@ -142,17 +110,11 @@ def classified(
 
     `fill`: the region that is made up whatever anyone saw, or None.
     """
-    import numpy as np
-
-    from reffusion import trace
-    from reffusion.masks import undecided, voting
-    from reffusion.types import MaskSet
-
     names, sets = list(scene.cameras), {}
     for k in trace.progress(len(names), "masks"):
         name, camera = names[k], scene.cameras[names[k]]
-        found = undecided.behind(remaining, camera, consistent[name], views, planes, witnesses=params.witnesses)
-        unknown = tidied(params, found.undecided) & consistent[name] & (name not in scene.clean)
+        found = undecided.behind(remaining, camera, consistent[name], views, planes)
+        unknown = tidied(found.undecided) & consistent[name] & (name not in scene.clean)
         invent = consistent[name] & (name not in scene.clean) if params.invent == "consistent" else unknown
         if fill is not None:
             disparity = np.divide(1.0, found.depth, out=np.zeros_like(found.depth), where=found.depth > 0)
@@ -163,21 +125,14 @@ def classified(
 
 def continuations(params: Params, gaussians: Gaussians, labels: Tensor, views: list[Witness]) -> list[Plane]:
     """The planes around the object; none where there is none."""
-    from reffusion.masks.continuation import planes_around
-    from reffusion.masks.voting import extent
-
-    return planes_around(*extent(gaussians.means[labels]), views, params.seed) if labels.any() else []
+    return planes_around(*extent(gaussians.means[labels]), views, SEED) if labels.any() else []
 
 
-def tidied(params: Params, mask: np.ndarray) -> np.ndarray:
-    from reffusion.masks import voting
-
-    return voting.tidy(mask, params.speck * mask.shape[1], params.gap * mask.shape[1])
+def tidied(mask: np.ndarray) -> np.ndarray:
+    return voting.tidy(mask, SPECK * mask.shape[1], GAP * mask.shape[1])
 
 
 def pixels_of(kind: str, sets: dict[str, MaskSet], names: Sequence[str]) -> int:
-    import numpy as np
-
     return int(sum(np.count_nonzero(getattr(sets[name], kind)) for name in names))
 
 

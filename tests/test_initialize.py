@@ -1,6 +1,6 @@
 """New Gaussians lie on the hidden surface, show the reference, and leave no holes."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +9,7 @@ import torch
 
 from reffusion import geometry
 from reffusion.depth import behind
+from reffusion.depth.behind import Completion
 from reffusion.gaussians.surfels import surface_gaussians, surface_normals
 from reffusion.initialize import filling as rules
 from reffusion.initialize.settle import Known, turns_of
@@ -21,7 +22,7 @@ from reffusion.types import Camera, Reference
 from stages import initialize, masks
 
 NEAR = 1.7
-SHEETS = rules.Sheets(**{f.name: getattr(initialize.Params(), f.name) for f in fields(rules.Sheets)})
+SHEETS = rules.Sheets()
 
 
 @pytest.fixture(scope="module")
@@ -40,13 +41,14 @@ def references(scene, folder, *names):
 
 
 @pytest.mark.parametrize("how", [{}, {"planar_share": 2.0}], ids=["planes", "smooth"])
-def test_the_hidden_wall_is_rebuilt_where_it_was(scene, tmp_path, how):
-    initialize.run(initialize.Params(**how), tmp_path, **scene, reference=references(scene, tmp_path / "r", "a2"))
+def test_the_hidden_wall_is_rebuilt_where_it_was(scene, tmp_path, monkeypatch, how):
+    monkeypatch.setattr(initialize, "HOW", Completion(**how))
+    initialize.run(initialize.Params(), tmp_path, **scene, reference=references(scene, tmp_path / "r", "a2"))
     gaussians, new = load_ply(tmp_path / "gaussians.ply"), load_labels(tmp_path / "labels.npy")
     before, removed = load_ply(scene["fit"] / "gaussians.ply"), load_labels(scene["masks"] / "labels.npy")
     haze = load_json(tmp_path / "facts.json")["haze"]
     assert len(gaussians) == len(new) and int((~new).sum()) == len(before) - int(removed.sum()) - haze
-    sheet = small.WALL / small.FOCAL * initialize.Params().sunk  # the second one lies so far behind the wall
+    sheet = small.WALL / small.FOCAL * SHEETS.sunk  # the second one lies so far behind the wall
     behind = gaussians.means[new][:, 2] - small.WALL
     assert (torch.minimum(behind.abs(), (behind - sheet).abs()) < 0.03).all() and (behind.abs() < 0.03).any()
     depth = load_exr(tmp_path / "depth" / "a2.exr")
@@ -225,7 +227,7 @@ def test_settling_moves_the_gaussians_and_leaves_no_checkpoint(scene, tmp_path):
         out.mkdir()
         given = references(scene, out / "r", "a2")
         initialize.run(
-            initialize.Params(settle=steps, gloss=True, sweep=True, further=2), out, **scene, reference=given
+            initialize.Params(settle=steps, gloss=True, depth={"sweep": True}, further=2), out, **scene, reference=given
         )
         found[name] = load_ply(out / "gaussians.ply")
         visible = [path.name for path in out.rglob("*") if ".settle" not in path.parts]

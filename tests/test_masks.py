@@ -10,6 +10,7 @@ from reffusion.io.arrays import load_json, load_labels, save_json
 from reffusion.io.scene import load_mask_sets
 from reffusion.masks import voting
 from reffusion.types import Gaussians
+from stages import masks as stage
 from stages.masks import Params, run
 
 NEAR, FAR = 1.7, 0.8  # a square close to the wall hides part of it from all views; a distant one next to nothing
@@ -119,7 +120,7 @@ def test_a_missing_and_a_contradicting_mask_are_outvoted(tmp_path):
     assert not sets["a0"].raw.any()
 
 
-def test_what_stands_inside_every_mask_is_the_object_although_it_was_outvoted(tmp_path):
+def test_what_stands_inside_every_mask_is_the_object_although_it_was_outvoted(tmp_path, monkeypatch):
     """All masks leave out the same spot of the object, as a bright reflection is left out: C closes over it."""
     rows, columns = np.mgrid[: small.HEIGHT, : small.WIDTH] + 0.5
     given = {}
@@ -127,10 +128,11 @@ def test_what_stands_inside_every_mask_is_the_object_although_it_was_outvoted(tm
         (at,), _ = geometry.project(np.array([[0.0, 0.0, NEAR]]), small.CAMERAS[name])
         spot = np.hypot(columns - at[0], rows - at[1]) < 2.5
         given[name] = small.true_mask(small.CAMERAS[name], NEAR) & ~spot
+    monkeypatch.setattr(stage, "GAP", 0.1)
     found = {}
     for hull in (0.9, 1.0):
         (tmp_path / str(hull)).mkdir()
-        params = Params(gap=0.1, hull=hull, debris=False)
+        params = Params(hull=hull, debris=False)
         _, _, found[hull], truth = classify(tmp_path / str(hull), NEAR, params, masks=given)
     lost = truth & ~found[1.0]
     assert lost.sum() >= 4, "the vote alone leaves the spot standing"

@@ -16,6 +16,7 @@ from small_prior import save_small_prior
 from benchmarks.kernels import gate
 from benchmarks.kernels.points import Diagram, Point, recommendation
 from reffusion import trace
+from reffusion.depth.behind import Completion
 from reffusion.distill import optimization as distilling
 from reffusion.fit import reconstruction as fitting
 from reffusion.io.ply import load_ply
@@ -48,7 +49,9 @@ def ready(tmp_path_factory):
         folders["reference"],
         [Reference(view, small.photo(view), load_mask_sets(home / "masks", ["a2"])["a2"].invent)],
     )
-    initialize.run(initialize.Params(planar_share=2.0), home / "initialize", **folders)  # no planes: both solvers
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(initialize, "HOW", Completion(planar_share=2.0))  # no planes: both solvers
+        initialize.run(initialize.Params(), home / "initialize", **folders)
     save_small_prior(home / "prior")
     return SimpleNamespace(home=home, prior=str(home / "prior"), **folders)
 

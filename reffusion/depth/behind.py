@@ -27,7 +27,7 @@ FARTHEST = 2.0  # times the farthest known depth: beyond it lies infinity, of wh
 
 @dataclass(frozen=True)
 class Completion:
-    """How depth is found behind the object; the fields are stages/initialize.py's parameters, and its values.
+    """How depth is found behind the object.
 
     PAPER leaves open: the depth model. Without one the surroundings are continued, by two hypotheses: planes that meet
     (rooms), taken where they explain the surroundings, else the smooth completion.

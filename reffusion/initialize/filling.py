@@ -36,7 +36,9 @@ class Sheets:
     PAPER leaves open: scale and opacity of the initial Gaussians.
 
     Attributes:
-        spread, thickness, grazing: see `surface_gaussians`.
+        spread: standard deviation of new Gaussians, pixels of the reference.
+        thickness: their deviation along the normal over that within the surface.
+        grazing: least cosine to the view at which they are stretched.
         opacity: of the first sheet.
         sunk: how far behind it the second lies, in pixels (0: there is none).
         under_spread, under_opacity: the second's. Wider Gaussians than the first's leave no gaps between them, which a
@@ -45,14 +47,14 @@ class Sheets:
         gloss: whether they change with the direction as what is around them does, see `reffusion.initialize.gloss`.
     """
 
-    spread: float
-    thickness: float
-    grazing: float
-    opacity: float
-    sunk: float
-    under_spread: float
-    under_opacity: float
-    color_steps: int
+    spread: float = 0.3
+    thickness: float = 0.1
+    grazing: float = 0.15
+    opacity: float = 0.4
+    sunk: float = 1.0
+    under_spread: float = 0.6
+    under_opacity: float = 0.8
+    color_steps: int = 5
     gloss: bool = False
 
 
