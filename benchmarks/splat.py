@@ -113,7 +113,7 @@ def prepare(size: str) -> Case:
 def visited_lanes(gaussians: Gaussians, camera: Camera) -> int:
     """Slots of the tile lists, as far as they are used."""
     parameters = [getattr(gaussians, name).numpy() for name in PARAMETERS]
-    view = cpu.look(parameters, gaussians.antialiased, np.empty((0, 2), np.float32), camera, 0)
+    view = cpu.project_and_bin(parameters, gaussians.antialiased, np.empty((0, 2), np.float32), camera, 0)
     nothing, black = np.empty((len(gaussians), 0), np.float32), np.zeros(3, np.float32)
     used = forward.blend(view.footprints, nothing, black, view.bins, camera.width, camera.height)[-1]
     rows = view.bins.entries[:, ROWS]

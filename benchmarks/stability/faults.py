@@ -30,10 +30,10 @@ FAULTS = (
     Fault("a sign in the gradient", "reffusion.splat.cpu", "_to_parameters",
           "return [array[:count] for array in out]", "return [-out[0][:count], *(array[:count] for array in out[1:])]",
           "scales 1 of the extent"),
-    Fault("a wrong order of equal depths", "reffusion.splat.cpu", "look",
+    Fault("a wrong order of equal depths", "reffusion.splat.cpu", "project_and_bin",
           "order = binning.depth_order(radii[:count], drawn)",
           "order = binning.depth_order(radii[:count], drawn)[::-1].copy()", "equal depths, drawn by index"),
-    Fault("a dropped clamp of the Jacobian", "reffusion.splat.cpu", "look",
+    Fault("a dropped clamp of the Jacobian", "reffusion.splat.cpu", "project_and_bin",
           "numbers = (array.reshape(-1) for array in parameters), view_numbers(camera, antialiased)",
           "numbers = (array.reshape(-1) for array in parameters), view_numbers(camera, antialiased) + "
           "1e9 * np.repeat([0, -1, 1, -1, 1, 0], [16, 1, 1, 1, 1, 3])", "needles from 1e4 extents away"),

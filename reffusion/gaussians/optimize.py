@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from reffusion.gaussians.ssim import dssim
-from reffusion.kernels.compiled import FREE_ROUNDING, kernel, share
+from reffusion.kernels.compiled import FREE_ROUNDING, kernel, parallel_for
 from reffusion.kernels.vectors import take_ticket
 from reffusion.types import PARAMETERS, Gaussians
 
@@ -33,7 +33,7 @@ def reconstruction_loss(image: Tensor, target: Tensor, weights: Tensor | None = 
             PAPER leaves open: what a masked loss is divided by. All pixels of the image, so that a pixel pulls
             equally hard in every view; a view masked as a whole gives 0.
     """
-    return (1 - share) * _l1(image, target.detach(), weights) + share * dssim(image, target, weights)
+    return (1 - parallel_for) * _l1(image, target.detach(), weights) + parallel_for * dssim(image, target, weights)
 
 
 def _l1(image: Tensor, target: Tensor, weights: Tensor | None) -> Tensor:
@@ -294,7 +294,7 @@ def _adam_cpu(updates: list[Update], steps, visible, masked, unbias1, unbias2, b
     columns = [tuple(t.numpy() for t in kind) for kind in list(zip(*updates, strict=True))[:5]]
     paces = np.array([update.masked_pace for update in updates], np.float32)
     rows = tuple(t.numpy() for t in (steps, visible, masked, unbias1, unbias2))
-    share(_adam_kernel, *columns, paces, rows, (np.float32(beta1), np.float32(beta2), np.float32(epsilon)))
+    parallel_for(_adam_kernel, *columns, paces, rows, (np.float32(beta1), np.float32(beta2), np.float32(epsilon)))
 
 
 @_jit

@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from reffusion.kernels.compiled import FREE_ROUNDING, kernel, room, share
+from reffusion.kernels.compiled import FREE_ROUNDING, empty_aligned, kernel, parallel_for
 from reffusion.kernels.vectors import take_ticket
 
 RADIUS, SIGMA = 5, 1.5
@@ -81,11 +81,11 @@ class _FastDssim(torch.autograd.Function):
             weight_rows, norm_rows = _rows(weights.contiguous().numpy(), channels)
         images = flat(image), flat(target), weight_rows
         fields, partials, sums = _padded(4, images[0]), _padded(3, images[0]), np.empty(height)
-        share(_filter_products, *images, channels, fields)
-        share(_compare, fields, weight_rows, norm_rows, channels, sums, partials)
+        parallel_for(_filter_products, *images, channels, fields)
+        parallel_for(_compare, fields, weight_rows, norm_rows, channels, sums, partials)
         if ctx.needs_input_grad[0]:
-            gradient = room(*images[0].shape)
-            share(_gather_gradient, partials, *images, gradient)
+            gradient = empty_aligned(*images[0].shape)
+            parallel_for(_gather_gradient, partials, *images, gradient)
             ctx.gradient = torch.from_numpy(gradient).view(height, width, channels)
         return image.new_tensor(float(sums.sum()) / image.numel())
 
@@ -96,7 +96,7 @@ class _FastDssim(torch.autograd.Function):
 
 def _padded(count: int, image: np.ndarray) -> np.ndarray:
     """`count` fields like `image`, to be written, with 5 rows of zeros above and below."""
-    fields = room(count, image.shape[0] + 2 * RADIUS, image.shape[1])
+    fields = empty_aligned(count, image.shape[0] + 2 * RADIUS, image.shape[1])
     fields[:, :RADIUS], fields[:, -RADIUS:] = 0, 0
     return fields
 

@@ -31,7 +31,7 @@ def _cache_folder() -> Path:
     """Machine code is kept by the content of all files of `_ROOMS`: numba itself looks only at the one file of a
     function, and would go on using a constant or a callee that has changed elsewhere."""
     library = Path(__file__).parents[1]
-    sources = [path for room in _ROOMS for path in sorted((library / room).glob("*.py"))]
+    sources = [path for empty_aligned in _ROOMS for path in sorted((library / empty_aligned).glob("*.py"))]
     digest = hashlib.blake2b(b"".join(path.read_bytes() for path in sources), digest_size=8).hexdigest()
     return Path(__file__).parent / "__pycache__" / (_CACHE + digest)
 
@@ -58,7 +58,7 @@ def inlined(function: Callable) -> Callable:
     return numba.njit(forceinline=True, error_model="numpy")(function)
 
 
-def room(*shape: int) -> np.ndarray:
+def empty_aligned(*shape: int) -> np.ndarray:
     """Uninitialised float32 from a cache line's border on, where possible in memory given out before that nobody holds.
 
     Arrays of megabytes are otherwise made of fresh pages each time, and clearing those costs a good part of a step.
@@ -103,7 +103,7 @@ def threads() -> int:
     return torch.get_num_threads()
 
 
-def share(function: Callable, *arguments, gaussians: int = FEW) -> None:
+def parallel_for(function: Callable, *arguments, gaussians: int = FEW) -> None:
     """Call `function(tickets, *arguments)` on every thread at once; they draw tickets until the work is gone.
 
     `tickets` [2] int64: a counter to draw from with `vectors.take_ticket`, and the number of threads. What a piece of

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from reffusion.kernels.compiled import inlined, kernel, room, share
+from reffusion.kernels.compiled import empty_aligned, inlined, kernel, parallel_for
 from reffusion.kernels.memory import load, prefetch, splat_at, store, store_totals, total
 from reffusion.kernels.vectors import LANES, fma, fnma, select, some, splat
 from reffusion.splat.forward import (
@@ -62,9 +62,9 @@ def blend_backward(footprints, features, bins, used, images, transmittance, grad
         [I] bool, which of them mean anything: a pair that no pixel takes has none.
     """
     columns = record_columns(features.shape[1])
-    records, written = room(len(bins.entries), columns), np.zeros(len(bins.entries), np.bool_)
+    records, written = empty_aligned(len(bins.entries), columns), np.zeros(len(bins.entries), np.bool_)
     inputs = footprints, or_none(features), bins, used, *images, transmittance, *gradients
-    share(_blend_backward, *inputs, records, written)
+    parallel_for(_blend_backward, *inputs, records, written)
     return records, written
 
 
@@ -229,7 +229,7 @@ def gather_values(footprints, bins, values, count):
     """
     columns = -(-values.shape[2] // 16) * 16
     records, written = np.zeros((len(bins.entries), columns), np.float32), np.zeros(len(bins.entries), np.bool_)
-    share(_gather_values, footprints, bins, values, count, records, written)
+    parallel_for(_gather_values, footprints, bins, values, count, records, written)
     return records, written
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from reffusion.kernels.compiled import inlined, kernel, room, share
+from reffusion.kernels.compiled import empty_aligned, inlined, kernel, parallel_for
 from reffusion.kernels.memory import prefetch, store_whole
 from reffusion.kernels.vectors import LANES, ceiling, maximum, minimum, ramp, root, select, splat, take_ticket
 from reffusion.splat.layout import (
@@ -105,15 +105,15 @@ def bin_footprints(footprints, order, count: int, width: int, height: int) -> Bi
     part = -(-len(order) // CHUNKS) * _ROOM
     while True:
         first_slots, places = np.zeros(count + 1, np.int64), np.zeros((CHUNKS, tiles), np.int64)
-        pairs, needed = room(CHUNKS, part, 2).view(np.int32), np.zeros(CHUNKS, np.int64)
-        share(_find_pairs, footprints, order, width, height, places, first_slots, pairs, needed, gaussians=count)
+        pairs, needed = empty_aligned(CHUNKS, part, 2).view(np.int32), np.zeros(CHUNKS, np.int64)
+        parallel_for(_find_pairs, footprints, order, width, height, places, first_slots, pairs, needed, gaussians=count)
         if needed.max() <= part:
             break
         part = needed.max()
     total = _counts_to_places(first_slots, places)
     starts = np.append(places[0], total)
-    entries = room(total, ENTRY).view(np.int32)
-    share(_fill_lists, order, places, first_slots, pairs, entries, gaussians=count)
+    entries = empty_aligned(total, ENTRY).view(np.int32)
+    parallel_for(_fill_lists, order, places, first_slots, pairs, entries, gaussians=count)
     return Bins(starts, entries, first_slots)
 
 

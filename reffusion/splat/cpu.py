@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from reffusion.kernels.compiled import room, share
+from reffusion.kernels.compiled import empty_aligned, parallel_for
 from reffusion.splat import backward, binning, footprints, forward
 from reffusion.splat.layout import FOOTPRINT
 from reffusion.splat.projection import view_numbers
@@ -54,10 +54,10 @@ def accumulate(gaussians: Gaussians, camera: Camera, values: Tensor, count: bool
     """See `reffusion.splat.rasterizer.accumulate`."""
     parameters = (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.opacity_logits, gaussians.sh)
     no_probe = np.empty((0, 2), np.float32)
-    view = look([_array(p) for p in parameters], gaussians.antialiased, no_probe, camera, 0)
+    view = project_and_bin([_array(p) for p in parameters], gaussians.antialiased, no_probe, camera, 0)
     records, written = backward.gather_values(view.footprints, view.bins, _array(values), count)
     gathered = np.empty((footprints.padded(len(gaussians)), values.shape[-1]), np.float32)
-    share(footprints.add_all_records, records, written, view.bins.first_slots, gathered)
+    parallel_for(footprints.add_all_records, records, written, view.bins.first_slots, gathered)
     return torch.from_numpy(gathered[: len(gaussians)])
 
 
@@ -65,14 +65,16 @@ def _array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().contiguous().numpy()
 
 
-def look(parameters: list[np.ndarray], antialiased: bool, probe: np.ndarray, camera: Camera, degree: int) -> View:
+def project_and_bin(
+    parameters: list[np.ndarray], antialiased: bool, probe: np.ndarray, camera: Camera, degree: int
+) -> View:
     """Project, sort and bin; `parameters` in the order of `types.PARAMETERS`."""
     count, width = len(parameters[0]), 3 * parameters[4].shape[1]
     rows = footprints.padded(count)
-    drawn, radii = room(rows * FOOTPRINT), np.zeros(rows, np.int32)
+    drawn, radii = empty_aligned(rows * FOOTPRINT), np.zeros(rows, np.int32)
     flat, numbers = (array.reshape(-1) for array in parameters), view_numbers(camera, antialiased)
     arguments = width, degree, probe.reshape(-1), numbers, camera.center, drawn, radii
-    share(footprints.draw, *flat, *arguments, gaussians=count)
+    parallel_for(footprints.draw, *flat, *arguments, gaussians=count)
     order = binning.depth_order(radii[:count], drawn)
     return View(drawn, radii, binning.bin_footprints(drawn, order, count, camera.width, camera.height))
 
@@ -85,7 +87,7 @@ class _Splat(torch.autograd.Function):
         ctx, means, quaternions, log_scales, opacity_logits, sh, features, background, probe, camera, degree, antialias
     ):
         parameters = [_array(t) for t in (means, quaternions, log_scales, opacity_logits, sh)]
-        view = look(parameters, antialias, _array(probe), camera, degree)
+        view = project_and_bin(parameters, antialias, _array(probe), camera, degree)
         color, depth, alpha, blended, transmittance, used = forward.blend(
             view.footprints, _array(features), _array(background), view.bins, camera.width, camera.height
         )
@@ -123,9 +125,9 @@ def _to_parameters(
     """Gradients of the parameters, in the order of `types.PARAMETERS`, of the features and of the probe."""
     count, rows = len(parameters[0]), footprints.padded(len(parameters[0]))
     shapes = [(rows, *array.shape[1:]) for array in parameters] + [(rows, channels), (rows if want_probe else 0, 2)]
-    out = [room(*shape) for shape in shapes]
+    out = [empty_aligned(*shape) for shape in shapes]
     flat_out = [array.reshape(-1) for array in out]
-    share(
+    parallel_for(
         footprints.draw_backward,
         records.reshape(-1),
         written,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from reffusion.kernels.compiled import inlined, kernel, room, share
+from reffusion.kernels.compiled import empty_aligned, inlined, kernel, parallel_for
 from reffusion.kernels.memory import load, prefetch, splat_at, store
 from reffusion.kernels.vectors import (
     EXP2,
@@ -69,11 +69,15 @@ def blend(footprints, features, background, bins, width, height):
         color [H, W, 3], depth [H, W], alpha [H, W], features [H, W, C], transmittance [H, W], all float32, and used
         [tiles] int64: how many of a tile's list were looked at before all its pixels were finished.
     """
-    color, blended = room(height, width, 3), room(height, width, features.shape[1])
-    depth, alpha, transmittance = room(height, width), room(height, width), room(height, width)
+    color, blended = empty_aligned(height, width, 3), empty_aligned(height, width, features.shape[1])
+    depth, alpha, transmittance = (
+        empty_aligned(height, width),
+        empty_aligned(height, width),
+        empty_aligned(height, width),
+    )
     used = np.empty(len(bins.starts) - 1, np.int64)
     outputs = color, depth, alpha, blended, transmittance, used
-    share(_blend, footprints, or_none(features), background, bins, *outputs)
+    parallel_for(_blend, footprints, or_none(features), background, bins, *outputs)
     return outputs
 
 
@@ -85,9 +89,9 @@ def or_none(features):
 @kernel
 def aligned(vectors):
     """Room for so many vectors, on a cache line's border."""
-    room = np.empty(vectors * LANES + 16, np.float32)
-    first = (-room.ctypes.data // 4) % 16
-    return room[first : first + vectors * LANES]
+    empty_aligned = np.empty(vectors * LANES + 16, np.float32)
+    first = (-empty_aligned.ctypes.data // 4) % 16
+    return empty_aligned[first : first + vectors * LANES]
 
 
 @kernel
