@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import ast
+import graphlib
+import importlib
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from pydantic import BaseModel
 
 ROOT = Path(__file__).resolve().parent.parent
 OWN = {"reffusion", "stages", "runner", "report"}
@@ -90,14 +94,64 @@ def test_runner_knows_nothing_of_3d(path):
 
 @pytest.mark.parametrize("path", sources("stages"), ids=named)
 def test_stages_import_the_library_only(path):
-    assert outsiders(path, {"reffusion", "numpy", "torch", "pydantic"}) == set()
-    assert "argparse" not in imports(path)
+    names = imports(path)
+    assert outsiders(path, {"reffusion", "numpy", "torch"}) == set() and "argparse" not in names
+    assert imports(path, top_only=True) == names, "imports stand at the top"
 
 
-@pytest.mark.parametrize("path", sources("stages"), ids=named)
-def test_importing_a_stage_is_light(path):
-    """So that `plan` answers at once: numpy, torch and the library are imported inside functions."""
-    assert outsiders(path, {"pydantic"}, top_only=True) == set()
+@pytest.mark.parametrize("stage", [path.stem for path in sources("stages/plan") if path.stem != "__init__"])
+def test_what_is_told_before_a_stage_runs_needs_nothing_heavy(stage):
+    """So that `plan` answers at once."""
+    code = f"import sys, stages.plan.{stage}; print(*sorted(set(sys.argv[1:]) & set(sys.modules)))"
+    command = [sys.executable, "-c", code, "torch", "scipy", "numba", "cv2", "diffusers", "transformers"]
+    assert subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip() == ""
+
+
+def test_no_module_imports_itself_by_a_detour():
+    """Neither do the packages of the library: what lies below knows nothing of what lies above."""
+    paths = sources("reffusion", "stages", "runner", "report")
+    modules = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in paths}
+    owner = lambda name: name if name in modules else name.rpartition(".")[0]
+    needs = {name: {owner(other) for other in imports(path)} & set(modules) for name, path in modules.items()}
+    tuple(graphlib.TopologicalSorter(needs).static_order())  # CycleError tells the circle
+    room = lambda name: ".".join(name.split(".")[: 2 if name.count(".") > 1 else 3])
+    library = {name: others for name, others in needs.items() if name.startswith("reffusion.")}
+    rooms: dict[str, set[str]] = {}
+    for name, others in library.items():
+        rooms.setdefault(room(name), set()).update({room(other) for other in others} - {room(name)})
+    tuple(graphlib.TopologicalSorter(rooms).static_order())
+
+
+def test_a_folder_is_seen_at_a_glance():
+    """Faces are empty, so that what a stage depends on is what it imports; at most 16 modules lie side by side."""
+    for folder in {path.parent for path in sources("reffusion")}:
+        modules = [path for path in folder.glob("*.py") if path.stem != "__init__"]
+        assert len(modules) <= 16, f"{folder}: {len(modules)} modules"
+        assert folder.name == "reffusion" or not (folder / "__init__.py").read_text().strip(), folder
+
+
+KERNELS = ("reffusion/kernels/", "reffusion/splat/", "reffusion/gaussians/optimize.py", "reffusion/gaussians/ssim.py")
+
+
+@pytest.mark.parametrize("path", sources("reffusion", "stages", "runner", "report"), ids=named)
+def test_files_and_functions_are_short(path):
+    """But compiled kernels."""
+    if named(path).startswith(KERNELS):
+        return
+    text = path.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 300
+    functions = [n for n in ast.walk(ast.parse(text)) if isinstance(n, ast.FunctionDef)]
+    assert not [f.name for f in functions if f.end_lineno - f.lineno >= 60]
+
+
+def test_parameters_are_few():
+    def leaves(model: type[BaseModel]) -> int:
+        kinds = [field.annotation for field in model.model_fields.values()]
+        return sum(leaves(k) if isinstance(k, type) and issubclass(k, BaseModel) else 1 for k in kinds)
+
+    stages = [path.stem for path in sources("stages") if path.parent.name == "stages" and path.stem != "__init__"]
+    assert len(stages) == 9
+    assert sum(leaves(importlib.import_module(f"reffusion.params.{stage}").Params) for stage in stages) <= 150
 
 
 @pytest.mark.parametrize("path", sources("reffusion"), ids=named)

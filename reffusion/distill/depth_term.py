@@ -76,7 +76,7 @@ def by_network(network: Callable[[Tensor], Tensor], how: Completion) -> Estimato
     def estimator(view: Seen, picture: Callable[[], np.ndarray]) -> np.ndarray:
         painted = picture()
         estimate = network(torch.from_numpy(painted).float().permute(2, 0, 1)).double().cpu().numpy()
-        return behind.estimated(view, painted, estimate, how)[0]
+        return estimate.estimated(view, painted, estimate, how)[0]
 
     return estimator
 

@@ -59,8 +59,8 @@ def fit(
     """
     weights = weights or {}
     _refuse_misfits(cameras, held_out, images, weights)
-    rates = rates or rates_of(settings.lr)
-    run = _Run.begun(initial, cameras, settings, rates, trace.load_checkpoint(folder), spent)
+    state = trace.load_checkpoint(folder)
+    run = _Run.begun(initial, cameras, settings, rates or rates_of(settings.lr), state, spent)
     optimizer, exposures = run.optimizer, run.exposures
     log = trace.Trace(folder, run.seconds, run.iteration + 1 if run.iteration else 0)
     centers = torch.tensor(np.stack([camera.center for camera in cameras]), dtype=torch.float32)
@@ -73,18 +73,15 @@ def fit(
         samples(cameras, images, weights, range(run.iteration, settings.iterations), settings.seed),
         strict=True,
     ):
-        target, counts = _move(target, optimizer), _move(counts, optimizer)
-        run.count(*step(optimizer, exposures, camera, target, counts, settings, i, impl))
+        seen = camera, _move(target, optimizer), _move(counts, optimizer)
+        run.count(*step(optimizer, exposures, *seen, settings, i, impl))
         adapt(optimizer, centers, run.started_with, settings, run.iteration)
-        if not len(optimizer.gaussians):
-            remedy = "lower densify.prune_opa, or raise densify.prune_scale3d"
-            raise ValueError(f"fit, step {i}: pruning left no Gaussian: {remedy}")
-        where = f"step {i}, view '{camera.name}'"
-        if trace.log_spaced(run.iteration, settings.iterations, first=FIRST_MOMENT):
-            _check_finite(optimizer.gaussians, where)
+        line_due = trace.log_spaced(run.iteration, settings.iterations, first=FIRST_MOMENT)
+        save_due = time.monotonic() - saved_at > settings.checkpoint_seconds and run.iteration < settings.iterations
+        _check(optimizer.gaussians, i, camera, values=line_due or save_due)
+        if line_due:
             _write_line(log, run, *measured)
-        if time.monotonic() - saved_at > settings.checkpoint_seconds and run.iteration < settings.iterations:
-            _check_finite(optimizer.gaussians, where)
+        if save_due:
             trace.save_checkpoint(folder, run.state_dict() | {"seconds": log.seconds})
             saved_at = time.monotonic()
     if exposures is not None:
@@ -192,7 +189,11 @@ def _summary(
     return line | {"psnr_held_out": sum(psnr) / len(psnr)}
 
 
-def _check_finite(gaussians: Gaussians, where: str) -> None:
-    for name in PARAMETERS:
+def _check(gaussians: Gaussians, step: int, camera: Camera, values: bool) -> None:
+    """Refuse to go on without Gaussians, or, where `values` are looked at, with some that are not finite."""
+    if not len(gaussians):
+        remedy = "lower densify.prune_opa, or raise densify.prune_scale3d"
+        raise ValueError(f"fit, step {step}: pruning left no Gaussian: {remedy}")
+    for name in PARAMETERS if values else ():
         if not torch.isfinite(getattr(gaussians, name).detach()).all():
-            raise FloatingPointError(f"fit, {where}: the Gaussians' {name} are not finite")
+            raise FloatingPointError(f"fit, step {step}, view '{camera.name}': the Gaussians' {name} are not finite")

@@ -33,7 +33,7 @@ def reconstruction_loss(image: Tensor, target: Tensor, weights: Tensor | None = 
             PAPER leaves open: what a masked loss is divided by. All pixels of the image, so that a pixel pulls
             equally hard in every view; a view masked as a whole gives 0.
     """
-    return (1 - parallel_for) * _l1(image, target.detach(), weights) + parallel_for * dssim(image, target, weights)
+    return (1 - share) * _l1(image, target.detach(), weights) + share * dssim(image, target, weights)
 
 
 def _l1(image: Tensor, target: Tensor, weights: Tensor | None) -> Tensor:

@@ -96,11 +96,11 @@ def depth_behind(
     solvers = SolverLog(log, reference.camera.name, *behind.points_around(view, points, how))
     try:
         if reference.depth is not None:
-            solved, said = behind.brought(view, reference.image, reference.depth, points, how, solvers)
+            solved, said = estimate.brought(view, reference.image, reference.depth, points, how, solvers)
         elif estimate is None:
             solved, said = behind.continued(view, reference.image, points, how, solvers, farthest)
         else:
-            solved, said = behind.estimated(view, reference.image, estimate, how, solvers)
+            solved, said = estimate.estimated(view, reference.image, estimate, how, solvers)
         # Beyond infinity there is nothing: the farthest depth that can be told stands in.
         made_up = 1.0 / np.maximum(solved, view.least_disparity)
     except ValueError as error:

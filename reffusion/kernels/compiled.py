@@ -31,7 +31,7 @@ def _cache_folder() -> Path:
     """Machine code is kept by the content of all files of `_ROOMS`: numba itself looks only at the one file of a
     function, and would go on using a constant or a callee that has changed elsewhere."""
     library = Path(__file__).parents[1]
-    sources = [path for empty_aligned in _ROOMS for path in sorted((library / empty_aligned).glob("*.py"))]
+    sources = [path for room in _ROOMS for path in sorted((library / room).glob("*.py"))]
     digest = hashlib.blake2b(b"".join(path.read_bytes() for path in sources), digest_size=8).hexdigest()
     return Path(__file__).parent / "__pycache__" / (_CACHE + digest)
 

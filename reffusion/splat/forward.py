@@ -89,9 +89,9 @@ def or_none(features):
 @kernel
 def aligned(vectors):
     """Room for so many vectors, on a cache line's border."""
-    empty_aligned = np.empty(vectors * LANES + 16, np.float32)
-    first = (-empty_aligned.ctypes.data // 4) % 16
-    return empty_aligned[first : first + vectors * LANES]
+    room = np.empty(vectors * LANES + 16, np.float32)
+    first = (-room.ctypes.data // 4) % 16
+    return room[first : first + vectors * LANES]
 
 
 @kernel
