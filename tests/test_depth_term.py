@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from reffusion.depth import behind, estimate
+from reffusion.depth import behind, estimates
 from reffusion.depth.alignment import align
 from reffusion.depth.behind import Completion
 from reffusion.distill import depth_term
@@ -92,7 +92,7 @@ def test_the_target_does_not_depend_on_the_estimates_unit(unit):
     """An estimate that is right but for scale and offset gives the wall, in whatever unit it comes."""
     view = replace(shown(), depth=1 / WALL)
     guide = np.full((HEIGHT, WIDTH, 3), 0.5)
-    disparity, _ = estimate.estimated(view, guide, unit * (40 * WALL - 7), HOW)
+    disparity, _ = estimates.estimated(view, guide, unit * (40 * WALL - 7), HOW)
     target, compared = depth_term.depth_target(view, disparity, np.ones_like(HOLE))
     assert (compared == HOLE).all()
     np.testing.assert_allclose(target[HOLE], 1 / WALL[HOLE], rtol=1e-9)
@@ -105,7 +105,7 @@ def test_a_robust_alignment_lets_go_of_what_is_wrong():
     estimate[:, :4] += 3.0
     errors = []
     for robust in (False, True):
-        disparity, _ = estimate.estimated(view, guide, estimate, replace(HOW, robust=robust))
+        disparity, _ = estimates.estimated(view, guide, estimate, replace(HOW, robust=robust))
         errors.append(np.abs(disparity / WALL - 1)[HOLE].mean())
     assert errors[1] < 0.3 * errors[0]
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reffusion.depth import behind
+from reffusion.depth import behind, estimates
 from reffusion.depth.behind import Completion, Seen
 from reffusion.distill.confinement import Sight
 from reffusion.gaussians.optimize import confine
@@ -76,7 +76,7 @@ def by_network(network: Callable[[Tensor], Tensor], how: Completion) -> Estimato
     def estimator(view: Seen, picture: Callable[[], np.ndarray]) -> np.ndarray:
         painted = picture()
         estimate = network(torch.from_numpy(painted).float().permute(2, 0, 1)).double().cpu().numpy()
-        return estimate.estimated(view, painted, estimate, how)[0]
+        return estimates.estimated(view, painted, estimate, how)[0]
 
     return estimator
 

@@ -40,18 +40,16 @@ def fit(
     """Optimise `initial` until its renders look like the views; resumes from `folder`'s checkpoint, bit for bit.
 
     Args:
-        cameras: the views to fit, at least one.
         images: view name -> uint8 [H, W, 3], for `cameras` and `held_out`.
         initial: the Gaussians to start from; the work is done on their device. Where there is a checkpoint, only their
             degree, device and way of being drawn still matter.
-        folder: gets trace.jsonl (loss, psnr of the steps since the last line, gaussians, and psnr_held_out, during
-            whose measurement the clock stands), checkpoints, and exposures.json where they are fitted.
+        folder: gets trace.jsonl (loss, psnr of the steps since the last line, gaussians, psnr_held_out), checkpoints,
+            and exposures.json where they are fitted.
         weights: view name -> [H, W], how much each pixel counts; pixels of weight 0, and they alone, influence nothing.
             A view without an entry counts as a whole.
         held_out: views that are only measured.
         rates: Adam's step sizes where they are not those of `settings.lr`.
         spent: seconds that making `initial` took; the trace counts from there.
-        impl: `splat.render`'s.
 
     Raises:
         ValueError: no view, or an image or mask of another size than its camera; before any work.
@@ -67,7 +65,6 @@ def fit(
     saved_at, measured = time.monotonic(), (held_out, images, settings, impl)
     if run.iteration == 0:
         _write_line(log, run, *measured)
-
     for i, (camera, target, counts) in zip(
         trace.progress(settings.iterations, "fit", run.iteration),
         samples(cameras, images, weights, range(run.iteration, settings.iterations), settings.seed),

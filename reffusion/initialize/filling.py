@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from reffusion import geometry, trace
-from reffusion.depth import behind
+from reffusion.depth import behind, estimates
 from reffusion.depth.behind import NO_HINTS, Completion, Hints
 from reffusion.depth.solverlog import SolverLog
 from reffusion.gaussians.surfels import surface_gaussians
@@ -74,7 +74,7 @@ def depth_behind(
     """The scene without the object in one view: depth [H, W] float64, as rendered where that is known, else made up;
     the same made up everywhere; and how in words.
 
-    By the reference's own depth map where it brings one; with an estimate, the paper's way (`behind.estimated`); else
+    By the reference's own depth map where it brings one; with an estimate, the paper's way (`estimates.estimated`); else
     the surroundings are continued.
 
     Args:
@@ -96,11 +96,11 @@ def depth_behind(
     solvers = SolverLog(log, reference.camera.name, *behind.points_around(view, points, how))
     try:
         if reference.depth is not None:
-            solved, said = estimate.brought(view, reference.image, reference.depth, points, how, solvers)
+            solved, said = estimates.brought(view, reference.image, reference.depth, points, how, solvers)
         elif estimate is None:
             solved, said = behind.continued(view, reference.image, points, how, solvers, farthest)
         else:
-            solved, said = estimate.estimated(view, reference.image, estimate, how, solvers)
+            solved, said = estimates.estimated(view, reference.image, estimate, how, solvers)
         # Beyond infinity there is nothing: the farthest depth that can be told stands in.
         made_up = 1.0 / np.maximum(solved, view.least_disparity)
     except ValueError as error:
