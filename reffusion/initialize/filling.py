@@ -74,7 +74,7 @@ def depth_behind(
     """The scene without the object in one view: depth [H, W] float64, as rendered where that is known, else made up;
     the same made up everywhere; and how in words.
 
-    By the reference's own depth map where it brings one; with an estimate, the paper's way (`estimates.estimated`); else
+    By the reference's own depth map where it brings one; with an estimate, the paper's way (`estimates`); else
     the surroundings are continued.
 
     Args:
