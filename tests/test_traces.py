@@ -30,8 +30,11 @@ from stages import distill, fit, initialize, masks, personalize
 ROOT = Path(__file__).resolve().parent.parent
 NEAR = 1.7
 FIT = {"iterations": 40, "sh_degree": 0, "budget": 500, "holdout": 3, "densify_until": 0.3}
-PERSONALIZE = {"steps": 10, "batch": 2, "rank": 2, "alpha": 4, "size": 16, "lr_unet": 1e-3}
-DISTILL = {"iterations": 8, "sds_weight": 0, "adversarial_weight": 0, "depth_weight": 0, "reference_weight": 1}
+PERSONALIZE = {
+    "steps": 10, "optimizer": {"batch": 2, "lr_unet": 1e-3}, "lora": {"rank": 2, "alpha": 4}, "samples": {"size": 16},
+}  # fmt: skip
+OFF = {"weight": 0}
+DISTILL = {"iterations": 8, "sds": OFF, "adversarial": OFF, "depth": OFF, "reference": {"weight": 1}}
 
 
 @pytest.fixture(scope="module")
@@ -246,7 +249,7 @@ def test_a_budget_is_shared_out_and_gives_way_to_what_is_said_by_name(tmp_path):
     shares = {name: share["seconds"] for name, share in shared_out(pipeline, {}, 1000.0).items()}
     assert set(shares) == {"fit", "personalize", "distill"}
     assert shares == {name: pytest.approx(1000 * part) for name, part in pipeline.budget.items()}
-    less = shared_out(pipeline, {"distill": {"sds_weight": 0, "depth_weight": 0}}, 1000.0)
+    less = shared_out(pipeline, {"distill": {"sds": {"weight": 0}, "depth": {"weight": 0}}}, 1000.0)
     assert "personalize" not in less and sum(s["seconds"] for s in less.values()) == pytest.approx(sum(shares.values()))
     assert less["fit"]["seconds"] / less["distill"]["seconds"] == pytest.approx(shares["fit"] / shares["distill"])
     (tmp_path / "scene.yaml").write_text("budget: 5m\nstages: {fit: {seconds: 7}}\n")
@@ -289,11 +292,11 @@ def test_a_budget_shortens_a_stage_and_its_schedule(ready, tmp_path, stage):
     assert same(out, asked)
 
 
-@pytest.mark.parametrize("stage", [fit, personalize])
+@pytest.mark.parametrize("made", [lambda b: fit.Params(betas=b), lambda b: personalize.Params(optimizer={"betas": b})])
 @pytest.mark.parametrize("betas", [(1.0, 0.999), (0.9, -0.1), (0.9, 1.5)])
-def test_betas_are_parts(stage, betas):
+def test_betas_are_parts(made, betas):
     with pytest.raises(ValidationError, match=r"less than 1|greater than or equal to 0"):
-        stage.Params(betas=betas)
+        made(betas)
 
 
 # -------------------------------------------------------------------------------------------------------- the gate
