@@ -190,21 +190,17 @@ def test_moments_depend_on_the_iteration_only():
 
 KILLED = {
     "fit": (fitting, "step", 6),
-    "personalize": (personalizing, "train_step", 6),
+    "personalize": (personalizing, "train_step", 4),
     "distill": (distilling, "step_of", 1),
 }
 
 
 @pytest.mark.parametrize("stage", list(KILLED))
-def test_an_early_end_is_the_same_after_a_kill(ready, tmp_path, monkeypatch, stage):
-    """No step gains 60 dB, so each stage ends at its third counted twentieth; a kill between two of them changes
-    nothing, and the result is the state that the last line names."""
+def test_a_stage_gives_the_same_after_a_kill(ready, tmp_path, monkeypatch, stage):
     module, name, position = KILLED[stage]
-    patient = {"patience": 2, "stop_gain": 60.0, "checkpoint_seconds": 1e-9}
-    whole = run(stage, ready, tmp_path / "whole", **patient)
-    last = lines(whole)[-1]
-    assert last["reason"] == "no gain" and last["iteration"] < last["of"] and last["kept"] <= last["iteration"]
-    real, moment = getattr(module, name), last["iteration"] - 1
+    often = {"checkpoint_seconds": 1e-9}
+    whole = run(stage, ready, tmp_path / "whole", **often)
+    real, moment = getattr(module, name), lines(whole)[-1]["of"] // 2
 
     def killing(*given):
         if given[position] == moment:
@@ -213,18 +209,12 @@ def test_an_early_end_is_the_same_after_a_kill(ready, tmp_path, monkeypatch, sta
 
     monkeypatch.setattr(module, name, killing)
     with pytest.raises(KeyboardInterrupt):
-        run(stage, ready, tmp_path / "broken", **patient)
+        run(stage, ready, tmp_path / "broken", **often)
+    assert (tmp_path / "broken" / trace.CHECKPOINT).exists()
     monkeypatch.setattr(module, name, real)
-    broken = run(stage, ready, tmp_path / "broken", **patient)
+    broken = run(stage, ready, tmp_path / "broken", **often)
     assert same(broken, whole)
     assert not (broken / trace.CHECKPOINT).exists()
-
-
-def test_an_early_end_of_distillation_gives_its_best_state(ready, tmp_path):
-    """With huge steps every state is worse than the start."""
-    out = run("distill", ready, tmp_path, rate=300.0, patience=2, stop_gain=0.1, region_every=1000)
-    assert lines(out)[-1]["kept"] == 0 and lines(out)[-1]["reason"] == "no gain"
-    assert all(torch.equal(a, b) for a, b in zip(result(ready.home / "initialize"), result(out), strict=True))
 
 
 # ---------------------------------------------------------------------------------------------------- time budgets
