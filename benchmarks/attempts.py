@@ -23,12 +23,13 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT)]
 
 from reffusion import trace  # noqa: E402
+from reffusion.distill.optimization import masked_factors  # noqa: E402
 from reffusion.distill.steps import job_of, step_of  # noqa: E402
 from reffusion.gaussians.optimize import GaussianOptimizer  # noqa: E402
-from reffusion.io.arrays import load_json, save_json
-from reffusion.io.scene import load_scene
-from reffusion.score import metrics
-from reffusion.splat import rasterizer
+from reffusion.io.arrays import load_json, save_json  # noqa: E402
+from reffusion.io.scene import load_scene  # noqa: E402
+from reffusion.score import metrics  # noqa: E402
+from reffusion.splat import rasterizer  # noqa: E402
 from report import charts  # noqa: E402
 from stages import distill as stage  # noqa: E402
 from stages import evaluate  # noqa: E402
@@ -38,31 +39,34 @@ VIEWS = 10  # test views, evenly over all
 SCORES = ("psnr_box", "ssim_box", "flip_box")
 NEEDS = ("poses", "fit", "masks", "reference", "initialize")
 BASE = "personalize"  # a key that is none of distill's: False takes the prior as it is
-FREE = {"epsilon": 1e-15, "rate": 1.0, "rate_opacity": 1.0}  # 3DGS's full steps for masked Gaussians
+FREE = {"lr": {"epsilon": 1e-15, "masked": 1.0, "opacities": 1.0}}  # 3DGS's full steps for masked Gaussians
 # What differs from the laptop profile.
 ATTEMPTS: dict[str, dict] = {
     "the profile": {},
-    "no SDS": {"sds_weight": 0},
+    "no SDS": {"sds": {"weight": 0}},
     "prior not personalized": {BASE: False},
-    "a tenth of the weight": {"sds_weight": 0.03},
-    "ten times the weight": {"sds_weight": 3},
-    "every view": {"sds_within": 180},
-    "contrast not kept": {"keep_contrast": False},
-    "two windows as well": {"patches": 2},
-    "two windows, a tenth of the weight": {"patches": 2, "sds_weight": 0.03},
-    "timesteps under 0.3": {"t_high": 0.3},
-    "all timesteps": {"t_high": 0.98},
+    "a tenth of the weight": {"sds": {"weight": 0.03}},
+    "ten times the weight": {"sds": {"weight": 3}},
+    "every view": {"sds": {"within": 180}},
+    "contrast not kept": {"sds": {"keep_contrast": False}},
+    "two windows as well": {"sds": {"patches": 2}},
+    "two windows, a tenth of the weight": {"sds": {"patches": 2, "weight": 0.03}},
+    "timesteps under 0.3": {"sds": {"t_high": 0.3}},
+    "all timesteps": {"sds": {"t_high": 0.98}},
     "free steps": FREE,
-    "free steps, all timesteps": FREE | {"t_high": 0.98},
-    "free steps, all timesteps, not personalized": FREE | {"t_high": 0.98, BASE: False},
-    "free steps, no SDS": FREE | {"sds_weight": 0},
+    "free steps, all timesteps": FREE | {"sds": {"t_high": 0.98}},
+    "free steps, all timesteps, not personalized": FREE | {"sds": {"t_high": 0.98}, BASE: False},
+    "free steps, no SDS": FREE | {"sds": {"weight": 0}},
 }
 
 
 def profile(overrides: dict) -> stage.Params:
     """The laptop profile's parameters of `distill`, changed."""
     values = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"]["distill"]
-    return stage.Params(**values | {name: value for name, value in overrides.items() if name != BASE})
+    for name, value in overrides.items():
+        if name != BASE:
+            values[name] = values.get(name, {}) | value if isinstance(value, dict) else value
+    return stage.Params(**values)
 
 
 def test_views(run: Path) -> list[tuple]:
@@ -100,10 +104,9 @@ def curve(overrides: dict, run: Path, start: Path, views: list[tuple]) -> list[d
     initial, masked, holes = stage.start(params, scene, run / "reference", start)
     adapted = run / "personalize" if overrides.get(BASE, True) else None
     prior, text = stage.adapted_prior(params, adapted)
-    sights = stage.load_sights(params, scene, run / "poses", run / "fit", run / "masks")
-    settings = stage.settings(params)
-    job = job_of(sights, holes, prior, text, None, settings, initial, masked)
-    optimizer = GaussianOptimizer(initial, masked, settings.rates, settings.masked_pace, epsilon=settings.epsilon)
+    seen = stage.train_views(params, scene, run / "poses", run / "fit", run / "masks")
+    job = job_of(seen, holes, prior, text, params, initial, masked)
+    optimizer = GaussianOptimizer(initial, masked, None, masked_factors(params.lr), epsilon=params.lr.epsilon)
     rasterizer.render(optimizer.gaussians, holes[0][0]).color.sum().backward()  # compiles, before the clock starts
     optimizer.forget_gradients()
     with tempfile.TemporaryDirectory() as folder:

@@ -20,10 +20,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from reffusion.distill.confinement import Distillation, Sight, sds_term
+from reffusion.distill.confinement import TrainView, sds_term
+from reffusion.params.distill import Sds
+from reffusion.params.personalize import Optimizer, Params
 from reffusion.prior import crops, denoising, diffusion, lora, memory
 from reffusion.prior.model import Prior, make_prior, recomputing, without_text
-from reffusion.prior.personalize import Training, train_step
+from reffusion.prior.personalize import WEIGHT_DECAY, train_step
 from reffusion.seeding import generator
 from reffusion.types import Camera, Gaussians
 from reffusion.weights import published
@@ -196,21 +198,19 @@ def reference(size: int) -> crops.Picture:
     return crops.picture(image.to(torch.uint8), hole, size)
 
 
-def trainer(prior: Prior, batch: int) -> tuple[dict[str, list], torch.optim.Optimizer, Training]:
+def trainer(prior: Prior, batch: int) -> tuple[dict[str, list], torch.optim.Optimizer, Params]:
     """The paper's LoRA on a prior: rank 8, alpha 16, dropout 0.1 on the attention layers; AdamW."""
-    trained = lora.add(prior, rank=8, alpha=16, dropout=0.1, layers="attention", seed=0)
-    groups = [{"params": trained["unet"], "lr": 2e-4}, {"params": trained["text"], "lr": 4e-5}]
-    training = Training(
-        steps=2000, lr_unet=2e-4, lr_text=4e-5, batch=batch, accumulate=1, weight_decay=1e-2, betas=(0.9, 0.999),
-        clip=1.0, warm_up=0, schedule="constant", size=prior.native_size, seed=0, checkpoint_seconds=1e9,
-    )  # fmt: skip
-    return trained, torch.optim.AdamW(groups, weight_decay=training.weight_decay), training
+    training = Params(optimizer=Optimizer(batch=batch))
+    chosen, rates = training.lora, training.optimizer
+    trained = lora.add(prior, chosen.rank, chosen.alpha, chosen.dropout, chosen.layers, training.seed)
+    groups = [{"params": trained["unet"], "lr": rates.lr_unet}, {"params": trained["text"], "lr": rates.lr_text}]
+    return trained, torch.optim.AdamW(groups, betas=rates.betas, weight_decay=WEIGHT_DECAY), training
 
 
 def personalization_step(prior: Prior, picture: crops.Picture, batch: int, folder: Path) -> dict[str, float]:
     """One optimiser step, and the LoRA saved in `folder`."""
     trained, optimizer, training = trainer(prior, batch)
-    loss = train_step(prior, optimizer, [picture], [], crops.Sampling(), training, 0)
+    loss = train_step(prior, optimizer, [picture], training, 0)
     lora.set_dropout(prior, False)
     lora.save(prior, folder)
     moved = {f"lora_{part}": sum(float(p.detach().abs().sum()) for p in of) for part, of in trained.items()}
@@ -228,18 +228,18 @@ def epsilon(prior: Prior) -> torch.Tensor:
     return diffusion.raw_prediction(prior, noisy, at, condition, diffusion.embed_text(prior, [crops.PROMPTS[0]])).cpu()
 
 
-def sight(size: int, device: str) -> Sight:
+def train_view(size: int, device: str) -> TrainView:
     """A view of `size` rows, a quarter wider, whose middle is to be repainted."""
     width = size + size // 4
     camera = Camera("view", width, size, width, width, width / 2, size / 2, np.eye(4))
     hole = torch.zeros(size, width, dtype=torch.bool)
     hole[size // 3 : 2 * size // 3, size // 2 : size] = True
     photo = torch.rand(size, width, 3, generator=generator(0, "photo"))
-    return Sight(camera, photo.to(device), ~hole.to(device), hole.to(device), False)
+    return TrainView(camera, photo.to(device), ~hole.to(device), hole.to(device), False)
 
 
 def gaussians(number: int, device: str, degree: int = 3) -> Gaussians:
-    """Random ones that fill the view of `sight`."""
+    """Random ones that fill the view of `train_view`."""
     draw = generator(0, "gaussians")
     rand = lambda *shape: torch.rand(*shape, generator=draw)
     means = torch.cat([rand(number, 2) * 2.4 - 1.2, 2 + rand(number, 1)], 1)
@@ -250,11 +250,11 @@ def gaussians(number: int, device: str, degree: int = 3) -> Gaussians:
 
 
 def sds_step(
-    prior: Prior, text: torch.Tensor, view: Sight, scene: Gaussians, settings: Distillation, step: int = 0
+    prior: Prior, text: torch.Tensor, view: TrainView, scene: Gaussians, sds: Sds, step: int = 0
 ) -> dict[str, float]:
     """One SDS term of the library, and its backward pass into the Gaussians."""
     masked = torch.ones(len(scene), dtype=torch.bool, device=scene.means.device)
-    loss, _ = sds_term(scene, masked, view, prior, text, settings, generator(0, "sds", step))
+    loss, _ = sds_term(scene, masked, view, prior, text, sds, generator(0, "sds", step))
     (1e-3 * loss).backward()
     norm = float(scene.sh.grad.norm())
     if not (np.isfinite(norm) and norm > 0):
@@ -301,9 +301,8 @@ def run(shape: Shape, dtype: torch.dtype, options: argparse.Namespace) -> dict[s
         text = timed(report, "embed prompts", lambda: diffusion.embed_text(prior, list(crops.PROMPTS)))
     prior = without_text(prior)
     gc.collect()
-    settings = Distillation(patches=options.patches)
-    scene = gaussians(options.gaussians, "cpu")
-    timed(report, "SDS step", lambda: sds_step(prior, text, sight(size, "cpu"), scene, settings))
+    sds, scene = Sds(patches=options.patches), gaussians(options.gaussians, "cpu")
+    timed(report, "SDS step", lambda: sds_step(prior, text, train_view(size, "cpu"), scene, sds))
     return report
 
 

@@ -27,12 +27,13 @@ from torch import Tensor
 from reffusion import trace
 from reffusion.depth import monocular
 from reffusion.depth.behind import Completion, Seen
-from reffusion.distill.adversary import Adversarial, Adversary
-from reffusion.distill.confinement import Distillation, adversarial_term, reconstruction_term, reference_term
-from reffusion.distill.depth_term import DepthRegularization, Estimator, by_network, depth_term
+from reffusion.distill.adversary import Adversary
+from reffusion.distill.confinement import adversarial_term, reconstruction_term, reference_term
+from reffusion.distill.depth_term import Estimator, by_network, depth_term
 from reffusion.fit.reconstruction import fit
 from reffusion.fit.step import Settings
 from reffusion.geometry import Degenerate
+from reffusion.params.distill import Adversarial, Depth, Sds
 from reffusion.prior import crops, denoising, diffusion, memory
 from reffusion.prior.model import Prior, load_prior, without_text
 from reffusion.prior.personalize import train_step
@@ -105,7 +106,7 @@ def against_oracle(count: int = 400, width: int = 200) -> dict[str, Any]:
 def losses(shape: full_size.Shape, sizes: Sizes, device: str, out: Path) -> dict[str, dict[str, Any]]:
     """Each term alone: forward and backward."""
     half = device == "cuda"
-    view, scene = full_size.sight(sizes.rows, device), full_size.gaussians(sizes.gaussians, device)
+    view, scene = full_size.train_view(sizes.rows, device), full_size.gaussians(sizes.gaussians, device)
     masked = torch.rand(len(scene), generator=generator(0, "labels")) < 0.1
     masked = masked.to(device)
 
@@ -136,7 +137,7 @@ def losses(shape: full_size.Shape, sizes: Sizes, device: str, out: Path) -> dict
     prior = without_text(prior)
 
     def distilled() -> dict[str, float]:
-        said = full_size.sds_step(prior, text, view, scene, Distillation())
+        said = full_size.sds_step(prior, text, view, scene, Sds())
         for name in PARAMETERS:
             getattr(scene, name).grad = None
         return said
@@ -145,8 +146,8 @@ def losses(shape: full_size.Shape, sizes: Sizes, device: str, out: Path) -> dict
     estimator, whose = depth_estimator(sizes, device)
 
     def depths() -> dict[str, float]:
-        choices, draw = DepthRegularization(), generator(0, "depth")
-        loss, _ = depth_term(scene, masked, view, prior, text, choices, draw, estimator)
+        chosen, draw = Depth(), generator(0, "depth")
+        loss, _ = depth_term(scene, masked, view, prior, text, chosen, Sds().guidance, draw, estimator)
         term(loss)
         return {"loss": float(loss.detach())}
 
@@ -179,14 +180,14 @@ def depth_estimator(sizes: Sizes, device: str) -> tuple[Estimator, str]:
     tries = [by_network(lambda image, sign=sign: sign * monocular.disparity(network, image), Completion())
              for sign in (1, -1)]  # fmt: skip
 
-    def estimator(view: Seen, picture: Callable[[], np.ndarray]) -> np.ndarray:
+    def disparity(view: Seen, picture: Callable[[], np.ndarray]) -> np.ndarray:
         painted = picture()
         try:
-            return tries[0](view, lambda: painted)
+            return tries[0].disparity(view, lambda: painted)
         except Degenerate:
-            return tries[1](view, lambda: painted)
+            return tries[1].disparity(view, lambda: painted)
 
-    return estimator, source
+    return Estimator(tries[0].how, disparity), source
 
 
 def ready(shape: full_size.Shape, device: str, dtype: torch.dtype) -> tuple[Prior, str]:
@@ -201,7 +202,7 @@ def personalization(prior: Prior, sizes: Sizes, device: str, out: Path) -> dict[
     picture = full_size.reference(prior.native_size)
     trained, optimizer, training = full_size.trainer(prior, sizes.batch)
     prior = memory.fitted(prior, 20.0, "personalize.memory_gb", lambda p: denoising.one_sample(p, [picture], 0))
-    step = lambda: {"loss": train_step(prior, optimizer, [picture], [], crops.Sampling(), training, 0)}
+    step = lambda: {"loss": train_step(prior, optimizer, [picture], training, 0)}
     said = measured(step, device, sizes.repeats)
     moved = sum(float(p.detach().abs().sum()) for p in trained["text"])
     return said | {"batch": sizes.batch, "rows_in_one_pass": prior.rows_graded, "lora_text": moved}
@@ -215,7 +216,7 @@ def fitted_scene(sizes: Sizes, device: str, out: Path) -> dict[str, Any]:
     truth = full_size.gaussians(sizes.gaussians, device, degree=1).map(Tensor.detach)
     cameras, images = [], {}
     for k in range(sizes.views):
-        base, pose = full_size.sight(sizes.rows, "cpu").camera, np.eye(4)
+        base, pose = full_size.train_view(sizes.rows, "cpu").camera, np.eye(4)
         pose[0, 3] = 0.3 * (k / max(sizes.views - 1, 1) - 0.5)
         camera = Camera(f"v{k}", base.width, base.height, base.fx, base.fy, base.cx, base.cy, pose)
         with torch.no_grad():

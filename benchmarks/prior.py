@@ -34,11 +34,11 @@ sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
 from holes import COLUMNS, SEED, Case, held_out, hole_scores, means, painted, save_row, tensors  # noqa: E402
 
-from reffusion import seeding, trace
-from reffusion.io.arrays import load_json, save_json
-from reffusion.io.images import load_image, save_image
-from reffusion.io.scene import load_references, load_scene
-from reffusion.prior import diffusion, lora
+from reffusion import seeding, trace  # noqa: E402
+from reffusion.io.arrays import load_json, save_json  # noqa: E402
+from reffusion.io.images import load_image, save_image  # noqa: E402
+from reffusion.io.scene import load_references, load_scene  # noqa: E402
+from reffusion.prior import diffusion, lora  # noqa: E402
 from reffusion.prior.model import Prior, load_prior  # noqa: E402
 from reffusion.prior.windows import window_around  # noqa: E402
 from stages import evaluate  # noqa: E402
@@ -139,9 +139,15 @@ def _reduced(case: Case, size: int) -> Case:
 
 
 def profile(prior: str, settings: dict) -> stage.Params:
-    """The laptop profile's parameters of `personalize` for a prior; `settings` come last."""
+    """The laptop profile's parameters of `personalize` for a prior; `settings`, by dotted names, come last."""
     values = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"]["personalize"]
-    return stage.Params(**values | {"prior": prior} | settings)
+    for name, value in {"prior": prior, **settings}.items():
+        *groups, last = name.split(".")
+        place = values
+        for group in groups:
+            place = place.setdefault(group, {})
+        place[last] = value
+    return stage.Params(**values)
 
 
 @torch.no_grad()
@@ -282,7 +288,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of personalization, one after the other")
     parser.add_argument("--sampler", type=int, default=50, help="steps in which a personalized prior paints")
     parser.add_argument("--wrong-reference", type=Path, help="a picture, or runs/<another scene>, to measure beside it")
-    parser.add_argument("--set", type=setting, nargs="*", default=[], help="personalization's: steps=500 rank=32")
+    parser.add_argument("--set", type=setting, nargs="*", default=[], help="personalization's: steps=500 lora.rank=32")
     parser.add_argument("--out", type=Path, default=Path("runs/prior-report"))
     parser.add_argument("--threads", type=int, default=2)
     return parser.parse_args()

@@ -5,17 +5,19 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import torch
+from small_params import altered
 
 from reffusion.depth import behind, estimates
 from reffusion.depth.alignment import align
 from reffusion.depth.behind import Completion
 from reffusion.distill import depth_term
 from reffusion.distill import optimization as D
-from reffusion.distill.confinement import Sight
-from reffusion.distill.depth_term import DepthRegularization
+from reffusion.distill.confinement import TrainView
+from reffusion.distill.depth_term import Estimator
 from reffusion.gaussians.optimize import GaussianOptimizer, Rates
 from reffusion.gaussians.surfels import surface_gaussians
 from reffusion.geometry import Degenerate
+from reffusion.params.distill import Depth, Params
 from reffusion.prior import inpaint
 from reffusion.seeding import generator
 from reffusion.splat.rasterizer import render
@@ -29,7 +31,7 @@ WALL = 0.5 + 0.004 * (COLUMNS + 0.5 - WIDTH / 2) - 0.002 * (ROWS + 0.5 - HEIGHT 
 HOLE = (np.abs(COLUMNS + 0.5 - WIDTH / 2) < 7) & (np.abs(ROWS + 0.5 - HEIGHT / 2) < 6)
 NO_POINTS = np.zeros((0, 3))
 HOW = Completion(ring=0.2)
-SETTINGS = DepthRegularization(steps=2, how=HOW)
+DEPTH = Depth(steps=2)
 
 
 def wall(moved: float = 1.0):
@@ -46,17 +48,18 @@ def wall(moved: float = 1.0):
     return moved_ones, masked
 
 
-def sight(hole=HOLE):
+def train_view(hole=HOLE):
     hole = torch.from_numpy(hole)
-    return Sight(VIEW, torch.zeros(HEIGHT, WIDTH, 3), ~hole, hole, False)
+    return TrainView(VIEW, torch.zeros(HEIGHT, WIDTH, 3), ~hole, hole, False)
 
 
 def leaves(gaussians):
     return gaussians.map(lambda p: p.clone().requires_grad_())
 
 
-def term(gaussians, masked, estimator, prior=None, text=None, settings=SETTINGS, view=None):
-    return depth_term.depth_term(gaussians, masked, view or sight(), prior, text, settings, generator(1), estimator)
+def term(gaussians, masked, estimator, prior=None, text=None, view=None, **more):
+    given = view or train_view(), prior, text, DEPTH, 7.5, generator(1), estimator
+    return depth_term.depth_term(gaussians, masked, *given, **more)
 
 
 def shown(moved=1.0, how=HOW):
@@ -144,7 +147,7 @@ def test_a_surface_that_is_right_has_no_loss_and_one_that_is_not_is_pulled_the_r
 def test_the_loss_is_in_units_of_the_extent():
     gaussians, masked = wall(0.9)
     estimator = depth_term.by_continuation(NO_POINTS, HOW)
-    once, thrice = (float(term(gaussians, masked, estimator, settings=replace(SETTINGS, extent=e))[0]) for e in (1, 3))
+    once, thrice = (float(term(gaussians, masked, estimator, extent=e)[0]) for e in (1, 3))
     assert once == pytest.approx(9 * thrice)
 
 
@@ -190,9 +193,9 @@ def test_the_gradient_agrees_with_finite_differences_in_float64():
     )
     masked = torch.arange(count) % 3 > 0
     hole = (np.abs(COLUMNS + 0.5 - WIDTH / 2) < 4) & (np.abs(ROWS + 0.5 - HEIGHT / 2) < 4)
-    settings = replace(SETTINGS, how=replace(HOW, explained=0.2))
+    estimator = Estimator(replace(HOW, explained=0.2), lambda *_: WALL)
     gaussians = leaves(few)
-    loss, drawn = term(gaussians, masked, lambda *_: WALL, settings=settings, view=sight(hole))
+    loss, drawn = term(gaussians, masked, estimator, view=train_view(hole))
     loss.backward()
     compared = torch.from_numpy(hole) & (drawn.alpha > 0.2)
     assert compared.sum() > 30
@@ -227,7 +230,7 @@ def test_estimates_that_fit_nothing_are_degenerate(estimate, reason, prior, text
 
 
 def test_views_without_known_or_drawn_pixels_are_degenerate(prior, text):
-    everywhere = sight(np.ones_like(HOLE))
+    everywhere = train_view(np.ones_like(HOLE))
     for estimator, reason in ((giving(WALL), "few pixels"), (depth_term.by_continuation(NO_POINTS, HOW), "no plane")):
         with pytest.raises(Degenerate) as caught:
             term(*wall(), estimator, prior, text, view=everywhere)
@@ -235,14 +238,13 @@ def test_views_without_known_or_drawn_pixels_are_degenerate(prior, text):
     gaussians, masked = wall()
     around = gaussians.map(lambda p: p[~masked])
     with pytest.raises(Degenerate) as caught:
-        inner = sight((np.abs(COLUMNS + 0.5 - WIDTH / 2) < 2) & (np.abs(ROWS + 0.5 - HEIGHT / 2) < 2))
+        inner = train_view((np.abs(COLUMNS + 0.5 - WIDTH / 2) < 2) & (np.abs(ROWS + 0.5 - HEIGHT / 2) < 2))
         term(around, masked[~masked], depth_term.by_continuation(NO_POINTS, HOW), view=inner)
     assert caught.value.reason == "nothing compared"
 
 
 def test_a_view_larger_than_asked_for_is_rendered_smaller():
-    settings = replace(SETTINGS, longest=WIDTH // 2)
-    _, drawn = term(*wall(), depth_term.by_continuation(NO_POINTS, HOW), settings=settings)
+    _, drawn = term(*wall(), depth_term.by_continuation(NO_POINTS, HOW), longest=WIDTH // 2)
     assert drawn.depth.shape == (HEIGHT // 2, WIDTH // 2)
 
 
@@ -295,9 +297,10 @@ def test_the_estimator_sees_the_repainted_view(prior, text):
 # ------------------------------------------------------------------------------------------ in distillation
 
 
-RUN = D.Settings(
-    6, sds_weight=0.0, depth=replace(SETTINGS, weight=0.5, every=2), reconstruction_every=0, checkpoint_seconds=1e-9
-)
+RUN = Params(
+    iterations=6, sds={"weight": 0}, depth=altered(DEPTH, weight=0.5, every=2), adversarial={"weight": 0},
+    reconstruction={"every": 0}, checkpoint_seconds=1e-9,
+)  # fmt: skip
 
 
 def distilled(folder, prior, text, estimator, settings=RUN):
@@ -306,7 +309,7 @@ def distilled(folder, prior, text, estimator, settings=RUN):
     with torch.no_grad():
         image = render(gaussians, VIEW).color.clamp(0, 1)
     holes = [(VIEW, image, torch.from_numpy(HOLE))]
-    return D.distill(gaussians, masked, [sight()], holes, prior, text, settings, folder, estimator)
+    return D.distill(gaussians, masked, [train_view()], holes, prior, text, settings, folder, estimator)
 
 
 def lines(folder):
@@ -342,7 +345,7 @@ def test_skipped_views_are_counted_by_reason_and_move_nothing(prior, text, tmp_p
 
 
 def test_an_estimate_that_is_not_finite_names_step_and_view(prior, text, tmp_path):
-    nowhere = lambda view, picture: np.full(WALL.shape, np.nan)
+    nowhere = Estimator(HOW, lambda view, picture: np.full(WALL.shape, np.nan))
     with pytest.raises(FloatingPointError, match="step 0, depth, view 'a'"):
         distilled(tmp_path, prior, text, nowhere)
     with pytest.raises(ValueError, match="estimator"):
@@ -354,4 +357,4 @@ def test_both_stages_find_depth_alike():
 
     params = initialize.Params()
     shared = {f.name: getattr(params, f.name) for f in fields(Completion) if f.name != "robust"}
-    assert Completion(**shared) == Completion() == distill.depth_settings(distill.Params()).how
+    assert Completion(**shared) == Completion() == distill.depth_estimator(Params(), NO_POINTS).how

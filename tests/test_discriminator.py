@@ -1,12 +1,11 @@
 """The patch critic against closed forms, float64 and finite differences; that it learns, and pulls the right way."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
+from small_params import altered
 
-from reffusion.distill.adversary import Adversarial, Adversary
+from reffusion.distill.adversary import Adversary
 from reffusion.distill.confinement import patches_around
 from reffusion.distill.discriminator import (
     Critic,
@@ -17,10 +16,11 @@ from reffusion.distill.discriminator import (
     gradient_penalty,
     with_deviation,
 )
+from reffusion.params.distill import Adversarial
 from reffusion.prior.windows import window_around, windows_around
 from reffusion.seeding import generator
 
-SMALL = Adversarial(patches=16, size=8, width=8, rate=3e-3)
+SMALL, RATE = Adversarial(patches=16, size=8, width=8), 3e-3
 
 
 def noise(*shape, label=0, dtype=torch.float32):
@@ -213,7 +213,7 @@ def textures(count, fine, label):
 @pytest.mark.parametrize("penalized", ["real", "fake"])
 @pytest.mark.parametrize("form", ["non-saturating", "saturating"])
 def test_the_critic_separates_two_textures_and_its_slope_leads_to_the_real_one(penalized, form):
-    adversary = Adversary(replace(SMALL, form=form, penalized=penalized), seed=0)
+    adversary = Adversary(altered(SMALL, form=form, penalized=penalized), seed=0, rate=RATE)
     said = [adversary.learn(textures(16, True, (step, 0)), textures(16, False, (step, 1))) for step in range(20)]
     assert said[-1]["critic_loss"] < 0.3 < 1 < said[0]["critic_loss"] and said[-1]["critic_slope"] > 0
     real, fake = textures(16, True, "r"), textures(16, False, "f")
@@ -233,7 +233,7 @@ def test_the_critic_separates_two_textures_and_its_slope_leads_to_the_real_one(p
 def test_the_penalty_holds_the_critics_slope_down():
     slopes = {}
     for penalty in (0.0, 10.0):
-        adversary = Adversary(replace(SMALL, penalty=penalty, penalized="real"), seed=0)
+        adversary = Adversary(altered(SMALL, penalty=penalty, penalized="real"), seed=0, rate=RATE)
         for step in range(15):
             said = adversary.learn(textures(16, True, (step, 0)), textures(16, False, (step, 1)))
         assert ("critic_slope" in said) == (penalty > 0)
@@ -243,7 +243,7 @@ def test_the_penalty_holds_the_critics_slope_down():
 
 
 def test_generator_loss_leaves_the_critics_weights_alone_and_learning_leaves_the_patches():
-    adversary, fake = Adversary(SMALL, seed=0), noise(16, 3, 8, 8).requires_grad_()
+    adversary, fake = Adversary(SMALL, seed=0, rate=RATE), noise(16, 3, 8, 8).requires_grad_()
     before = [weights.detach().clone() for weights in adversary.critic.parameters()]
     adversary.loss(fake).backward()
     assert fake.grad.ne(0).any() and all(weights.grad is None for weights in adversary.critic.parameters())
@@ -257,9 +257,9 @@ def test_an_adversary_continues_from_its_state_bit_for_bit():
     def trained(adversary, steps):
         return [adversary.learn(textures(16, True, (s, 0)), textures(16, False, (s, 1))) for s in steps]
 
-    whole = Adversary(SMALL, seed=3)
+    whole = Adversary(SMALL, seed=3, rate=RATE)
     said = trained(whole, range(6))
-    first, second = Adversary(SMALL, seed=3), Adversary(SMALL, seed=4)
+    first, second = Adversary(SMALL, seed=3, rate=RATE), Adversary(SMALL, seed=4, rate=RATE)
     trained(first, range(3))
     second.load_state_dict(first.state_dict())
     assert trained(second, range(3, 6)) == said[3:]
@@ -268,7 +268,7 @@ def test_an_adversary_continues_from_its_state_bit_for_bit():
 
 
 def test_a_patch_that_is_no_number_stops_the_critic_before_it_changes():
-    adversary = Adversary(SMALL, seed=0)
+    adversary = Adversary(SMALL, seed=0, rate=RATE)
     before = [weights.detach().clone() for weights in adversary.critic.parameters()]
     with pytest.raises(FloatingPointError, match="critic's loss"):
         adversary.learn(noise(16, 3, 8, 8), torch.full((16, 3, 8, 8), float("nan")))

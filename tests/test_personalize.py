@@ -4,19 +4,19 @@ from dataclasses import replace
 
 import pytest
 import torch
+from small_params import altered
 from small_prior import small_prior
 
+from reffusion.params.personalize import Params, Samples
 from reffusion.prior import crops, denoising, diffusion, lora
 from reffusion.prior import personalize as P
-from reffusion.prior.crops import Sampling
 from reffusion.seeding import generator
 from reffusion.trace import load_checkpoint, read_trace
 
 NATIVE, SIZE = 16, 12
-TRAINING = P.Training(
-    steps=4, lr_unet=1e-3, lr_text=1e-4, batch=2, accumulate=1, weight_decay=1e-2, betas=(0.9, 0.999), clip=1.0,
-    warm_up=0, schedule="constant", size=SIZE, seed=0, checkpoint_seconds=1e9,
-)  # fmt: skip
+TRAINING = Params(
+    steps=4, optimizer={"lr_unet": 1e-3, "lr_text": 1e-4, "batch": 2}, samples={"size": SIZE}, checkpoint_seconds=1e9
+)
 
 
 @pytest.fixture
@@ -40,13 +40,13 @@ def test_pictures_are_enlarged_until_a_crop_fits():
 
 
 def test_rectangle_masks_repaint_something_and_keep_within_their_sides():
-    once = Sampling(rectangles=(1, 1), side=(0.25, 0.5), inverted_share=0.0)
+    once = {"rectangles": (1, 1), "side": (0.25, 0.5), "inverted_share": 0.0}
     for seed in range(50):
-        mask = crops.rectangle_mask(64, once, generator(seed))[0]
+        mask = crops.rectangle_mask(64, generator(seed), **once)[0]
         rows, columns = mask.any(1).sum(), mask.any(0).sum()
         assert set(mask.unique().tolist()) == {0.0, 1.0} and mask.sum() == rows * columns
         assert 16 <= rows <= 32 and 16 <= columns <= 32
-    inverted = [float(crops.rectangle_mask(64, Sampling(), generator(seed)).mean()) for seed in range(200)]
+    inverted = [float(crops.rectangle_mask(64, generator(seed)).mean()) for seed in range(200)]
     assert min(inverted) < 0.1 and max(inverted) > 0.9 and 0.4 < sum(inverted) / 200 < 0.6
 
 
@@ -66,8 +66,8 @@ def test_samples_masked_by_the_hole_show_it_where_it_is(local_share, size):
     """The striped picture with its hole painted white: mask and white pixels must be the same."""
     source = striped()
     source = crops.Picture(torch.where(source.region, 1.0, source.image.clamp(max=0)), source.region)
-    sampling = Sampling(local_share=local_share, hole_share=1.0, empty_share=0.0)
-    samples = crops.draw_samples([source], [], NATIVE, size, 40, sampling, generator(5))
+    chosen = Samples(local_share=local_share, hole_share=1.0)
+    samples = crops.draw_samples([source], NATIVE, size, 40, chosen, generator(5), empty_share=0.0)
     white = samples.images[:, :1]
     assert (samples.masks.flatten(1).sum(1) > 0).all()
     assert (white[samples.masks == 0] <= 1e-5).all()
@@ -75,36 +75,18 @@ def test_samples_masked_by_the_hole_show_it_where_it_is(local_share, size):
         assert torch.equal(white == 1, samples.masks == 1)
 
 
-def test_clear_windows_are_all_windows_without_masked_pixels():
-    region = torch.rand(20, 23, generator=generator(1)) > 0.97
-    clear = {tuple(w) for w in crops.clear_windows(region, 6).tolist()}
-    for top in range(15):
-        for left in range(18):
-            assert ((top, left) in clear) == (not region[top : top + 6, left : left + 6].any())
-
-
-def test_scene_crops_never_show_a_masked_pixel():
-    view = striped()
-    poisoned = torch.where(view.region, float("nan"), view.image)
-    sampling = Sampling(scene_share=1.0, empty_share=0.0)
-    clear = crops.clear_views([crops.Picture(poisoned, view.region)], 16)
-    samples = crops.draw_samples([view], clear, NATIVE, 16, 40, sampling, generator(2))
-    assert torch.isfinite(samples.images).all() and (samples.prompts == crops.LOCAL).all()
-    full = crops.Picture(poisoned, torch.ones_like(view.region))
-    assert crops.clear_views([full], 16) == []
-    without = crops.draw_samples([view], [], NATIVE, 16, 4, sampling, generator(2))
-    assert torch.isfinite(without.images).all(), "the reference alone where no view has a free window"
-
-
 def test_local_samples_show_the_hole_in_full_resolution_and_prompts_follow():
     view = striped()
-    local = crops.draw_samples([view], [], NATIVE, SIZE, 10, Sampling(local_share=1.0, empty_share=0.0), generator(3))
+    drawn = lambda count, size, share, empty: crops.draw_samples(
+        [view], NATIVE, size, count, Samples(local_share=share), generator(3), empty_share=empty
+    )
+    local = drawn(10, SIZE, 1.0, 0.0)
     windows = view.image.unfold(1, SIZE, 1).unfold(2, SIZE, 1).permute(1, 2, 0, 3, 4).flatten(0, 1)
     for image in local.images:
         assert (windows == image).all((1, 2, 3)).any(), "not a crop of the reference"
-    whole = crops.draw_samples([view], [], NATIVE, NATIVE, 10, Sampling(local_share=0.0, empty_share=0.0), generator(3))
+    whole = drawn(10, NATIVE, 0.0, 0.0)
     assert (local.prompts == crops.LOCAL).all() and (whole.prompts == crops.GLOBAL).all()
-    mixed = crops.draw_samples([view], [], NATIVE, SIZE, 300, Sampling(empty_share=0.2), generator(3)).prompts
+    mixed = drawn(300, SIZE, 0.5, 0.2).prompts
     shares = torch.bincount(mixed, minlength=3) / 300
     torch.testing.assert_close(shares, torch.tensor([0.4, 0.4, 0.2]), atol=0.09, rtol=0)
 
@@ -112,7 +94,7 @@ def test_local_samples_show_the_hole_in_full_resolution_and_prompts_follow():
 @pytest.mark.parametrize("kind", ["epsilon", "v_prediction"])
 def test_loss_is_the_priors_own_and_its_clean_latent_error_is_predicts(tiny, kind):
     prior, draw = replace(tiny, prediction_type=kind), generator(4)
-    samples = crops.draw_samples([striped()], [], NATIVE, SIZE, 3, Sampling(), draw)
+    samples = crops.draw_samples([striped()], NATIVE, SIZE, 3, Samples(), draw)
     t, noise = torch.tensor([10, 500, 950]), torch.randn(3, 4, SIZE, SIZE, generator=draw)
     with torch.no_grad():
         error, clean = denoising.denoising_error(prior, samples, t, noise)
@@ -128,7 +110,7 @@ def test_loss_is_the_priors_own_and_its_clean_latent_error_is_predicts(tiny, kin
 
 def test_what_a_mask_leaves_to_be_seen_counts_by_its_weight(tiny):
     draw = generator(5)
-    samples = crops.draw_samples([striped()], [], NATIVE, SIZE, 3, Sampling(), draw)
+    samples = crops.draw_samples([striped()], NATIVE, SIZE, 3, Samples(), draw)
     t, noise = torch.tensor([10, 500, 950]), torch.randn(3, 4, SIZE, SIZE, generator=draw)
     with torch.no_grad():
         latents = diffusion.encode(tiny, samples.images)
@@ -152,8 +134,8 @@ def test_learning_rate_warms_up_and_falls():
 
 def test_training_learns_the_reference_and_logs_it(tiny, tmp_path):
     trained = lora.add(tiny, 8, 16, 0.1, "attention+conv", 0)
-    training = replace(TRAINING, steps=60, batch=4, lr_unet=4e-3)
-    P.personalize(tiny, trained, [striped()], [], Sampling(), training, tmp_path)
+    training = altered(TRAINING, steps=60, optimizer={"batch": 4, "lr_unet": 4e-3})
+    P.personalize(tiny, trained, [striped()], training, tmp_path)
     records = read_trace(tmp_path / "trace.jsonl")
     assert [records[0]["iteration"], records[-1]["iteration"]] == [0, 60]
     assert records[-1]["target_mse"] < 0.9 * records[0]["target_mse"]
@@ -165,8 +147,8 @@ def test_interrupted_training_resumes_to_the_same_weights(tmp_path, monkeypatch)
     def trained(folder):
         prior = small_prior()
         trained = lora.add(prior, 4, 8, 0.1, "attention", 0)
-        training = replace(TRAINING, accumulate=2, schedule="cosine", warm_up=2, checkpoint_seconds=1e-9)
-        P.personalize(prior, trained, [striped()], [], Sampling(), training, folder)
+        training = altered(TRAINING, optimizer={"schedule": "cosine", "warm_up": 2}, checkpoint_seconds=1e-9)
+        P.personalize(prior, trained, [striped()], training, folder)
         return lora.state(prior)
 
     (tmp_path / "whole").mkdir()
@@ -195,7 +177,7 @@ def test_a_number_that_is_none_stops_the_training_and_names_the_step(tiny, tmp_p
     trained = lora.add(tiny, 4, 8, 0.0, "attention", 0)
     broken = replace(striped(), image=torch.full((3, 70, 90), float("nan")))
     with pytest.raises(FloatingPointError, match="step 0"):
-        P.personalize(tiny, trained, [broken], [], Sampling(), TRAINING, tmp_path)
+        P.personalize(tiny, trained, [broken], TRAINING, tmp_path)
     assert all(torch.isfinite(w).all() for w in lora.state(tiny).values())
     with pytest.raises(ValueError, match="native 16 px"):
-        P.personalize(tiny, trained, [striped()], [], Sampling(), replace(TRAINING, size=128), tmp_path)
+        P.personalize(tiny, trained, [striped()], altered(TRAINING, samples={"size": 128}), tmp_path)

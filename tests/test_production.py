@@ -16,7 +16,7 @@ sys.path.insert(0, str(ROOT / "benchmarks"))
 import full_size as F  # noqa: E402
 import gpu_check  # noqa: E402
 
-from reffusion.prior import crops, denoising, diffusion, inpaint, lora, memory
+from reffusion.prior import crops, denoising, diffusion, inpaint, lora, memory  # noqa: E402
 from reffusion.prior.model import load_prior, pipeline, recomputing, without_text  # noqa: E402
 from reffusion.prior.personalize import train_step  # noqa: E402
 from reffusion.seeding import generator  # noqa: E402
@@ -104,7 +104,7 @@ def test_a_training_step_in_parts_is_the_same_step():
             for layer in part.modules():
                 layer.p = 0.0 if isinstance(layer, torch.nn.Dropout) else getattr(layer, "p", None)
         prior = replace(prior, rows_graded=rows)
-        loss = train_step(prior, optimizer, [F.reference(32)], [], crops.Sampling(), training, 0)
+        loss = train_step(prior, optimizer, [F.reference(32)], training, 0)
         after.append((loss, [p.detach().clone() for part in trained.values() for p in part]))
     assert after[0][0] == pytest.approx(after[1][0], rel=1e-5)
     # Adam's first step has the size of the learning rate; where a gradient is all but 0 its sign is a rounding's.

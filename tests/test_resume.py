@@ -24,7 +24,7 @@ KILLS = int(os.environ.get("RESUME_KILLS", "3"))
 STAGES = ("fit", "masks", "reference", "personalize", "initialize", "distill", "evaluate")
 IN_TURN = ("fit", "distill", "personalize", "masks", "evaluate", "initialize", "reference")  # those that resume first
 SMALL = (
-    "fit.iterations=120 fit.checkpoint_seconds=0.2 personalize.steps=16 personalize.batch=2 personalize.scene_crops=0 "
+    "fit.iterations=120 fit.checkpoint_seconds=0.2 personalize.steps=16 personalize.optimizer.batch=2 "
     "personalize.checkpoint_seconds=0.2 distill.iterations=40 distill.checkpoint_seconds=0.2"
 )
 

@@ -66,18 +66,6 @@ def test_weightings_differ_by_a_function_of_the_timestep_only():
         sds_gradient(latents, ideal, t, noise, ABAR, weighting="w")
 
 
-def test_unit_rms_is_per_sample_and_over_the_hole():
-    t, draw = torch.tensor([5, 90]), generator(3)
-    latents, noise = torch.randn(2, 2, 4, 6, 6, generator=draw, dtype=torch.float64)
-    mask = torch.zeros(2, 1, 6, 6, dtype=torch.float64)
-    mask[:, :, 2:5] = 1
-    gradient = sds_gradient(latents, ideal, t, noise, ABAR, unit_rms=True, mask=mask)
-    assert (gradient[:, :, :2] == 0).all() and (gradient[:, :, 5:] == 0).all()
-    torch.testing.assert_close(gradient[:, :, 2:5].square().mean((1, 2, 3)), torch.ones(2, dtype=torch.float64))
-    blank = sds_gradient(latents, ideal, t, noise, ABAR, unit_rms=True, mask=torch.zeros_like(mask))
-    assert (blank == 0).all()
-
-
 def faded(factor, shift=0.2):
     """(x0, z, mask): x0 has `factor` of z's contrast inside the mask and a mean of its own; outside, other noise."""
     z, other = torch.randn(2, 3, 4, 8, 8, generator=generator(9), dtype=torch.float64)
@@ -159,6 +147,17 @@ def test_two_scales_gradient_reaches_every_pixel_and_matches_differences():
         step[0, row, column] = 1e-6
         numeric = (value(image + step) - value(image - step)) / 2e-6
         torch.testing.assert_close(gradient[0, row, column], numeric.detach(), rtol=1e-6, atol=1e-9)
+
+
+def test_a_mask_keeps_the_gradient_inside_it_and_drops_the_rest():
+    t, draw = torch.tensor([5, 90]), generator(3)
+    latents, noise = torch.randn(2, 2, 4, 6, 6, generator=draw, dtype=torch.float64)
+    mask = torch.zeros(2, 1, 6, 6, dtype=torch.float64)
+    mask[:, :, 2:5] = 1
+    whole = sds_gradient(latents, ideal, t, noise, ABAR)
+    inside = sds_gradient(latents, ideal, t, noise, ABAR, mask=mask)
+    assert (inside == whole * mask).all() and (whole != 0).any()
+    assert (sds_gradient(latents, ideal, t, noise, ABAR, mask=torch.zeros_like(mask)) == 0).all()
 
 
 def test_a_reduced_mask_covers_every_masked_pixel():

@@ -31,8 +31,11 @@ from stages import distill, fit, initialize, masks, personalize
 ROOT = Path(__file__).resolve().parent.parent
 NEAR = 1.7
 FIT = {"iterations": 40, "sh.degree": 0, "densify.cap_max": 500, "holdout": 3, "densify.stop": 0.3}
-PERSONALIZE = {"steps": 10, "batch": 2, "rank": 2, "alpha": 4, "size": 16, "lr_unet": 1e-3}
-DISTILL = {"iterations": 8, "sds_weight": 0, "adversarial_weight": 0, "depth_weight": 0, "reference_weight": 1}
+PERSONALIZE = {
+    "steps": 10, "optimizer": {"batch": 2, "lr_unet": 1e-3}, "lora": {"rank": 2, "alpha": 4}, "samples": {"size": 16},
+}  # fmt: skip
+OFF = {"weight": 0}
+DISTILL = {"iterations": 8, "sds": OFF, "adversarial": OFF, "depth": OFF, "reference": {"weight": 1}}
 
 
 @pytest.fixture(scope="module")
@@ -169,21 +172,17 @@ def test_moments_depend_on_the_iteration_only():
 
 KILLED = {
     "fit": (fitting, "step", 6),
-    "personalize": (personalizing, "train_step", 6),
+    "personalize": (personalizing, "train_step", 4),
     "distill": (distilling, "step_of", 1),
 }
 
 
 @pytest.mark.parametrize("stage", list(KILLED))
-def test_an_early_end_is_the_same_after_a_kill(ready, tmp_path, monkeypatch, stage):
-    """No step gains 60 dB, so each stage ends at its third counted twentieth; a kill between two of them changes
-    nothing, and the result is the state that the last line names."""
+def test_a_stage_gives_the_same_after_a_kill(ready, tmp_path, monkeypatch, stage):
     module, name, position = KILLED[stage]
-    patient = {"patience": 2, "stop_gain": 60.0, "checkpoint_seconds": 1e-9}
-    whole = run(stage, ready, tmp_path / "whole", **patient)
-    last = lines(whole)[-1]
-    assert last["reason"] == "no gain" and last["iteration"] < last["of"] and last["kept"] <= last["iteration"]
-    real, moment = getattr(module, name), last["iteration"] - 1
+    often = {"checkpoint_seconds": 1e-9}
+    whole = run(stage, ready, tmp_path / "whole", **often)
+    real, moment = getattr(module, name), lines(whole)[-1]["of"] // 2
 
     def killing(*given):
         if given[position] == moment:
@@ -192,18 +191,12 @@ def test_an_early_end_is_the_same_after_a_kill(ready, tmp_path, monkeypatch, sta
 
     monkeypatch.setattr(module, name, killing)
     with pytest.raises(KeyboardInterrupt):
-        run(stage, ready, tmp_path / "broken", **patient)
+        run(stage, ready, tmp_path / "broken", **often)
+    assert (tmp_path / "broken" / trace.CHECKPOINT).exists()
     monkeypatch.setattr(module, name, real)
-    broken = run(stage, ready, tmp_path / "broken", **patient)
+    broken = run(stage, ready, tmp_path / "broken", **often)
     assert same(broken, whole)
     assert not (broken / trace.CHECKPOINT).exists()
-
-
-def test_an_early_end_of_distillation_gives_its_best_state(ready, tmp_path):
-    """With huge steps every state is worse than the start."""
-    out = run("distill", ready, tmp_path, rate=300.0, patience=2, stop_gain=0.1, region_every=1000)
-    assert lines(out)[-1]["kept"] == 0 and lines(out)[-1]["reason"] == "no gain"
-    assert all(torch.equal(a, b) for a, b in zip(result(ready.home / "initialize"), result(out), strict=True))
 
 
 # ---------------------------------------------------------------------------------------------------- time budgets
@@ -228,7 +221,7 @@ def test_a_budget_is_shared_out_and_gives_way_to_what_is_said_by_name(tmp_path):
     shares = {name: share["seconds"] for name, share in shared_out(pipeline, {}, 1000.0).items()}
     assert set(shares) == {"fit", "personalize", "distill"}
     assert shares == {name: pytest.approx(1000 * part) for name, part in pipeline.budget.items()}
-    less = shared_out(pipeline, {"distill": {"sds_weight": 0, "depth_weight": 0}}, 1000.0)
+    less = shared_out(pipeline, {"distill": {"sds": {"weight": 0}, "depth": {"weight": 0}}}, 1000.0)
     assert "personalize" not in less and sum(s["seconds"] for s in less.values()) == pytest.approx(sum(shares.values()))
     assert less["fit"]["seconds"] / less["distill"]["seconds"] == pytest.approx(shares["fit"] / shares["distill"])
     (tmp_path / "scene.yaml").write_text("budget: 5m\nstages: {fit: {seconds: 7}}\n")
@@ -271,11 +264,11 @@ def test_a_budget_shortens_a_stage_and_its_schedule(ready, tmp_path, stage):
     assert same(out, asked)
 
 
-@pytest.mark.parametrize("stage", [fit, personalize])
+@pytest.mark.parametrize("made", [lambda b: fit.Params(betas=b), lambda b: personalize.Params(optimizer={"betas": b})])
 @pytest.mark.parametrize("betas", [(1.0, 0.999), (0.9, -0.1), (0.9, 1.5)])
-def test_betas_are_parts(stage, betas):
+def test_betas_are_parts(made, betas):
     with pytest.raises(ValidationError, match=r"less than 1|greater than or equal to 0"):
-        stage.Params(betas=betas)
+        made(betas)
 
 
 # -------------------------------------------------------------------------------------------------------- the gate

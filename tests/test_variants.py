@@ -12,19 +12,21 @@ import small_scene as small
 import torch
 from small_capture import prepare as write_capture
 from small_capture import some_truth
+from small_params import altered
 from small_prior import save_small_prior
-from test_distill import hole, leaves, reached, sight, wall
+from test_distill import OFF, PLAIN, hole, leaves, reached, train_view, wall
 
 from reffusion import seeding, trace
 from reffusion.distill import optimization as D
 from reffusion.distill import perceptual
-from reffusion.distill.lift import Lift, lift_term
+from reffusion.distill.lift import lift_term
 from reffusion.initialize import scatter
 from reffusion.io.arrays import load_json, load_labels
 from reffusion.io.images import load_image, load_mask, save_image
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_mask_sets, load_raw_masks, load_references, load_scene, save_references
 from reffusion.paint import paint2d
+from reffusion.params.distill import Lift
 from reffusion.types import PARAMETERS, Reference
 from runner.job import Job, Request, prepare
 from runner.pipeline import load_pipeline
@@ -118,11 +120,20 @@ def test_the_papers_terms_are_the_papers_at_the_laptops_size(tmp_path):
     scene, runs = write_capture(tmp_path / "scene", "llff", some_truth()), tmp_path / "runs"
     terms = prepare(Request(ROOT, runs, str(scene), profile="paper-terms")).params
     laptop = prepare(Request(ROOT, runs, str(scene), profile="laptop")).params
-    size = {"prior", "iterations", "depth_steps", "adversarial_patches", "adversarial_size", "adversarial_width"}
-    paper = distill.Params().model_dump(mode="json")
-    assert {name for name, value in terms["distill"].items() if value != paper[name]} == size
-    assert all(terms["distill"][name] == laptop["distill"][name] for name in size)
+    size = {"prior", "iterations", "depth.steps", *(f"adversarial.{name}" for name in ("patches", "size", "width"))}
+    paper, ours, theirs = (
+        single(p) for p in (distill.Params().model_dump(mode="json"), terms["distill"], laptop["distill"])
+    )
+    assert {name for name, value in ours.items() if value != paper[name]} == size
+    assert all(ours[name] == theirs[name] for name in size)
     assert {stage for stage in terms if terms[stage] != laptop[stage]} == {"personalize", "initialize", "distill"}
+
+
+def single(params):
+    """Parameters by their dotted names."""
+    groups = {name: value for name, value in params.items() if isinstance(value, dict)}
+    inner = {f"{name}.{each}": value for name, group in groups.items() for each, value in group.items()}
+    return {name: value for name, value in params.items() if name not in groups} | inner
 
 
 def test_the_papers_profile_takes_every_variant(capture):
@@ -133,11 +144,11 @@ def test_the_papers_profile_takes_every_variant(capture):
 
 # ------------------------------------------------------------------------------------------ what the terms may reach
 
-MSE, PATCHES = Lift(1.0), Lift(1.0, perceptual.multi_scale_dssim, 20)
+MSE, PATCHES = Lift(weight=1), Lift(weight=1, loss="perceptual", patch=20)
 
 
 def lifted(name="a", shift=0.0):
-    view = sight(name, shift)
+    view = train_view(name, shift)
     return replace(view, lifted=torch.rand(view.photo.shape, generator=seeding.generator(4, name)))
 
 
@@ -146,7 +157,8 @@ def test_lifted_pictures_reach_the_gaussians_they_may_and_no_other(how):
     start, masked = wall()
     for allowed in (masked, torch.ones_like(masked)):
         gaussians = leaves(start)
-        loss, rendering = lift_term(gaussians, allowed, lifted(), how, seeding.generator(1))
+        given = lifted(), how, perceptual.multi_scale_dssim, seeding.generator(1)
+        loss, rendering = lift_term(gaussians, allowed, *given)
         loss.backward()
         got = reached(gaussians)
         assert not got[~allowed].any() and (got & masked & (rendering.radii > 0)).any()
@@ -155,11 +167,11 @@ def test_lifted_pictures_reach_the_gaussians_they_may_and_no_other(how):
 
 def test_the_squared_error_is_that_of_the_holes_pixels():
     (gaussians, masked), view = wall(), lifted()
-    loss, rendering = lift_term(gaussians, masked, view, MSE, seeding.generator(1))
+    loss, rendering = lift_term(gaussians, masked, view, MSE, None, seeding.generator(1))
     expected = ((rendering.color - view.lifted)[hole()] ** 2).mean()
     assert float(loss) == pytest.approx(float(expected))
     outside = torch.where(hole()[..., None], view.lifted, float("nan"))
-    again, _ = lift_term(gaussians, masked, replace(view, lifted=outside), MSE, seeding.generator(1))
+    again, _ = lift_term(gaussians, masked, replace(view, lifted=outside), MSE, None, seeding.generator(1))
     assert float(again) == float(loss), "pixels outside the hole were looked at"
 
 
@@ -167,39 +179,48 @@ def moved(start, ended):
     return torch.stack([(getattr(ended, n) != getattr(start, n)).flatten(1).any(1) for n in PARAMETERS[:3]]).any(0)
 
 
-def run_distill(folder, views, **settings):
+@pytest.fixture
+def every_step(monkeypatch):
+    """Gaussians that changed region are looked for after every step."""
+    monkeypatch.setattr(D, "REGION_EVERY", 1)
+
+
+def run_distill(folder, views, **changes):
     folder.mkdir()
-    settings = D.Settings(**{"iterations": 3, "sds_weight": 0.0, "region_every": 1, **settings})
-    (start, masked), holes = wall(), [(sight().camera, sight().photo, hole())]
+    settings = altered(PLAIN, **{"iterations": 3, "sds": OFF, "checkpoint_seconds": 10, **changes})
+    (start, masked), holes = wall(), [(train_view().camera, train_view().photo, hole())]
     ended, labels = D.distill(start, masked, views, holes, None, None, settings, folder)
     return start, ended, masked, labels
 
 
-def test_distillation_carries_lifted_pictures_to_masked_gaussians_only(tmp_path):
+def test_distillation_carries_lifted_pictures_to_masked_gaussians_only(tmp_path, every_step):
     views = [lifted("a"), lifted("b", 0.1)]
-    start, ended, masked, _ = run_distill(tmp_path / "x", views, lift=MSE, reconstruction_every=0)
+    chosen = {"lift": {"weight": 1}, "reconstruction": {"every": 0}}
+    start, ended, masked, _ = run_distill(tmp_path / "x", views, **chosen)
     assert moved(start, ended)[masked].any() and not moved(start, ended)[~masked].any()
     assert trace.read_trace(tmp_path / "x" / "trace.jsonl")[-1]["lift"] > 0
     with pytest.raises(ValueError, match="pictures of the stage lift"):
-        run_distill(tmp_path / "y", [sight()], lift=MSE)
+        run_distill(tmp_path / "y", [train_view()], lift={"weight": 1})
+    with pytest.raises(ValueError, match="needs a distance"):
+        run_distill(tmp_path / "z", views, lift={"weight": 1, "loss": "perceptual"})
 
 
 @pytest.mark.parametrize("confined", [True, False])
-def test_without_confinement_every_term_reaches_all_gaussians(tmp_path, confined):
-    views = [sight("a"), sight("b", 0.1)]
-    photographs = {"confined": confined, "reference_weight": 0.0}
+def test_without_confinement_every_term_reaches_all_gaussians(tmp_path, every_step, confined):
+    views = [train_view("a"), train_view("b", 0.1)]
+    photographs = {"confined": confined}
     start, ended, masked, labels = run_distill(tmp_path / "photographs", views, **photographs)
     assert moved(start, ended)[~masked].any() and moved(start, ended)[masked].any() != confined
-    reference = {"confined": confined, "reference_weight": 1.0, "reconstruction_every": 0}
+    reference = {"confined": confined, "reference": {"weight": 1}, "reconstruction": {"every": 0}}
     start, ended, masked, _ = run_distill(tmp_path / "reference", views, **reference)
     assert moved(start, ended)[masked].any() and moved(start, ended)[~masked].any() != confined
     assert (labels == masked).all()
 
 
 @pytest.mark.parametrize("reaches", ["masked", "all"])
-def test_the_references_pixels_may_move_the_background_in_the_hole_too(tmp_path, reaches):
-    chosen = {"reference_reaches": reaches, "reference_weight": 1.0, "reconstruction_every": 0}
-    start, ended, masked, _ = run_distill(tmp_path / reaches, [sight("a")], **chosen)
+def test_the_references_pixels_may_move_the_background_in_the_hole_too(tmp_path, every_step, reaches):
+    chosen = {"reference": {"weight": 1, "reaches": reaches}, "reconstruction": {"every": 0}}
+    start, ended, masked, _ = run_distill(tmp_path / reaches, [train_view("a")], **chosen)
     assert moved(start, ended)[masked].any() and moved(start, ended)[~masked].any() == (reaches == "all")
 
 
@@ -309,8 +330,8 @@ def test_the_chain_of_lifted_pictures(scene, painted, tmp_path, monkeypatch):
     for name in ("XDG_CACHE_HOME", "TORCH_HOME"):
         monkeypatch.setenv(name, str(tmp_path / "nothing"))  # as on a machine without weights
     for loss, perceptual_name in (("mse", None), ("perceptual", "multi-scale D-SSIM")):
-        without = {"sds_weight": 0, "adversarial_weight": 0, "depth_weight": 0}
-        params = distill.Params(iterations=4, lift_weight=1, lift_loss=loss, lift_patch=24, **without)
+        without = {"sds": OFF, "adversarial": OFF, "depth": OFF}
+        params = distill.Params(iterations=4, lift={"weight": 1, "loss": loss, "patch": 24}, **without)
         out = tmp_path / loss
         out.mkdir()
         distill.run(params, out, **chain, lift=painted)

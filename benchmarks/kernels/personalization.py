@@ -51,15 +51,18 @@ def diagram(run: Path, out: Path) -> Diagram:
     usual = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"]["personalize"]
     given = {name: run / name for name in ("poses", "fit", "masks", "reference")}
     choices = [("steps", {"steps": n}) for n in STEPS]
-    choices += [("rank, 200 steps", {"steps": 200, "rank": n, "alpha": n}) for n in RANKS]
-    choices += [("learning rate, 200 steps", {"steps": 200, "lr_unet": r, "lr_text": r / 5}) for r in RATES]
+    choices += [("rank, 200 steps", {"steps": 200, "lora": {"rank": n, "alpha": n}}) for n in RANKS]
+    rates = [{"lr_unet": r, "lr_text": r / 5} for r in RATES]
+    choices += [("learning rate, 200 steps", {"steps": 200, "optimizer": rate}) for rate in rates]
     points = []
     for curve, changed in choices:
-        name = ", ".join(f"{key} {value:g}" for key, value in changed.items() if key not in ("alpha", "lr_text"))
+        grouped = {name: usual[name] | value for name, value in changed.items() if isinstance(value, dict)}
+        single = {"steps": changed["steps"]} | changed.get("lora", {}) | changed.get("optimizer", {})
+        name = ", ".join(f"{key} {value:g}" for key, value in single.items() if key not in ("alpha", "lr_text"))
         folder = out / "personalization" / name.replace(", ", "_").replace(" ", "")
         if not (folder / "pytorch_lora_weights.safetensors").exists():  # an interrupted one goes on
             folder.mkdir(parents=True, exist_ok=True)
-            personalize.run(personalize.Params(**{**usual, **changed}), folder, **given)
+            personalize.run(personalize.Params(**{**usual, **changed, **grouped}), folder, **given)
         last = trace.read_trace(folder / "trace.jsonl")[-1]
         points.append(Point(curve, name, 0.0, last["clean_latent_mse"], last["seconds"]))
     return Diagram(

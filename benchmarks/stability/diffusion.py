@@ -12,7 +12,8 @@ from benchmarks.stability.cases import EPS32, EXACT, UNCLEAR, Case, largest, unc
 from benchmarks.stability.splatting import camera, cloud
 from reffusion import seeding
 from reffusion.distill import discriminator, sds
-from reffusion.distill.confinement import Distillation, Sight, sds_term
+from reffusion.distill.confinement import TrainView, sds_term
+from reffusion.params.distill import Sds
 from reffusion.prior import diffusion, windows
 from reffusion.prior.model import Prior, load_prior
 from reffusion.types import PARAMETERS
@@ -122,11 +123,10 @@ def distilled(t: int, dtype: torch.dtype) -> float:
 
 
 def empty_gradient() -> float:
-    """Distillation of an empty mask, normalised to unit size: zero, not 0 / 0."""
+    """Distillation of an empty mask."""
     latents, noise, abar = normal(2, 4, 8, 8), normal(2, 4, 8, 8, label="noise"), model().alphas_cumprod
-    found = sds.sds_gradient(
-        latents, lambda z, _: (z, z), torch.tensor([3, 700]), noise, abar, unit_rms=True, mask=torch.zeros(2, 1, 8, 8)
-    )
+    times, nothing = torch.tensor([3, 700]), torch.zeros(2, 1, 8, 8)
+    found = sds.sds_gradient(latents, lambda z, _: (z, z), times, noise, abar, keep_contrast=True, mask=nothing)
     return found.abs().max().item()
 
 
@@ -154,10 +154,10 @@ def scene_gradient(low: float, high: float, guidance: float) -> float:
     """Score distillation of a scene that is to be repainted as a whole: numbers that are not finite."""
     view, gaussians = camera(24, 18), cloud().map(lambda p: p.clone().requires_grad_())
     everything = torch.ones(18, 24, dtype=torch.bool)
-    sight = Sight(view, torch.rand(18, 24, 3, generator=seeding.generator(0)), ~everything, everything, clean=False)
-    settings = Distillation(patches=1, low=low, high=high, guidance=guidance)
+    whole = TrainView(view, torch.rand(18, 24, 3, generator=seeding.generator(0)), ~everything, everything, clean=False)
+    chosen = Sds(patches=1, t_high=high, guidance=guidance)
     masked = torch.ones(len(gaussians), dtype=torch.bool)
-    loss, _ = sds_term(gaussians, masked, sight, model(), prompts(), settings, seeding.generator(1))
+    loss, _ = sds_term(gaussians, masked, whole, model(), prompts(), chosen, seeding.generator(1), t_low=low)
     loss.backward()
     return float(sum((~torch.isfinite(getattr(gaussians, name).grad)).sum() for name in PARAMETERS))
 
@@ -248,7 +248,7 @@ CASES = (
          guidance_to_nowhere),
     Case("mask empty, conditioning", "difference from the picture's latents", EXACT, nothing_hidden),
     Case("mask full, conditioning", "what of the picture is seen", EXACT, nothing_shines_through),
-    Case("mask empty, gradient of unit size", "largest number", EXACT, empty_gradient),
+    Case("mask empty, gradient", "largest number", EXACT, empty_gradient),
     Case("mask empty, window", UNCLEAR, EXACT, window_of_nothing),
     Case("mask full, timestep 0, guidance 100, scene", SDS, EXACT, partial(scene_gradient, 0.0, 1e-9, 100.0)),
     Case("mask full, timestep T-1, guidance 0, scene", SDS, EXACT, partial(scene_gradient, 1 - 1e-9, 1.0, 0.0)),

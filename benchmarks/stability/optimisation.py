@@ -16,14 +16,14 @@ from benchmarks.stability import frames
 from benchmarks.stability.cases import EPS32, EXACT, Case, largest
 from benchmarks.stability.splatting import camera, cloud
 from reffusion import seeding, trace
-from reffusion.distill.confinement import Sight
-from reffusion.distill.optimization import Settings as Distilling
+from reffusion.distill.confinement import TrainView
 from reffusion.distill.optimization import distill
 from reffusion.fit.reconstruction import fit
 from reffusion.fit.start import initial_gaussians
 from reffusion.gaussians.densify import densify, prune
 from reffusion.gaussians.optimize import GaussianOptimizer, Rates
 from reffusion.io.ply import load_ply, save_ply
+from reffusion.params import distill as distilling
 from reffusion.params.fit import Densify, Params, SphericalHarmonics
 from reffusion.splat.rasterizer import render
 from reffusion.types import PARAMETERS, Gaussians
@@ -73,16 +73,14 @@ def too_fast_distillation(factor: float) -> float:
     start = replace(fitted, sh=torch.where(masked[:, None, None], 0.0, fitted.sh))
     pictures = {name: torch.from_numpy(p).float() / 255 for name, p in frames.photographs().items()}
     whole = torch.ones(frames.HEIGHT, frames.WIDTH, dtype=torch.bool)
-    sights = [Sight(view, pictures[n], whole, ~whole, clean=False) for n, view in scene.cameras.items()]
-    settings = Distilling(
-        40, sds_weight=0.0, reference_weight=1.0, rates=frames.faster(Rates(means=2e-3), factor), epsilon=1e-6
-    )
+    views = [TrainView(view, pictures[n], whole, ~whole, clean=False) for n, view in scene.cameras.items()]
+    off, rates = {"weight": 0}, frames.faster(Rates(means=2e-3), factor)
+    settings = distilling.Params(iterations=40, sds=off, depth=off, adversarial=off, reference={"weight": 1}, lr={"epsilon": 1e-6})
+    holes = [(scene.cameras["v2"], pictures["v2"], whole)]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         try:
-            found, _ = distill(
-                start, masked, sights, [(scene.cameras["v2"], pictures["v2"], whole)], None, None, settings, folder
-            )
+            found, _ = distill(start, masked, views, holes, None, None, settings, folder, rates=rates)
         except FloatingPointError as error:
             return float(not (named(error, "re") and written(folder)))
         finite = all(torch.isfinite(getattr(found, n)).all() for n in PARAMETERS)

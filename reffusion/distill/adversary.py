@@ -2,43 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from reffusion import seeding
-from reffusion.distill.discriminator import Critic, Form, critic_loss, generator_loss, gradient_penalty
+from reffusion.distill.discriminator import Critic, critic_loss, generator_loss, gradient_penalty
+from reffusion.params.distill import Adversarial
 
-
-@dataclass(frozen=True)
-class Adversarial:
-    """The adversarial term. The defaults are the paper's, and GANeRF's where it is silent.
-
-    Attributes:
-        weight: lambda.
-        start: part of the run in [0, 1] before which neither the critic learns nor its verdict counts.
-        patches: real ones in a step, and as many fake ones; a multiple of 4.
-        size: their side in pixels of the view: 8, 16, 32, ...
-        width: the critic's channels at that size, doubled with each halving up to 512.
-        form: of the generator's loss.
-        penalty: weight of half the R1 penalty; 0 leaves it out.
-        penalized: the patches at which the critic's slope is penalised.
-        rate: RMSprop's step size.
-        reaches: the Gaussians whose spherical harmonics get the gradient.
-    """
-
-    weight: float = 0.03
-    start: float = 0.0
-    patches: int = 64
-    size: int = 64
-    width: int = 512
-    form: Form = "non-saturating"
-    penalty: float = 0.2
-    penalized: Literal["real", "fake"] = "fake"
-    rate: float = 1e-3
-    reaches: Literal["masked", "all"] = "masked"
+RATE = 1e-3  # PAPER leaves open: the critic's step size; GANeRF's, of RMSprop
 
 
 class Adversary:
@@ -46,12 +19,13 @@ class Adversary:
 
     Args:
         seed: of the critic's first weights.
+        rate: RMSprop's step size.
     """
 
-    def __init__(self, choices: Adversarial, seed: int, device: torch.device | str = "cpu"):
+    def __init__(self, choices: Adversarial, seed: int, device: torch.device | str = "cpu", rate: float = RATE):
         self.choices = choices
         self.critic = Critic(choices.size, choices.width, seeding.generator(seed, "adversary")).to(device)
-        self._optimizer = torch.optim.RMSprop(self.critic.parameters(), lr=choices.rate)
+        self._optimizer = torch.optim.RMSprop(self.critic.parameters(), lr=rate)
 
     def learn(self, real: Tensor, fake: Tensor) -> dict[str, float]:
         """One step of the critic. No gradient reaches the patches' makers.

@@ -3,8 +3,8 @@
 term             pixels                                        Gaussians
 reconstruction   outside the consistent mask; all if clean     unmasked (or all that show there); all if clean
 SDS              whole view and patches, the hole repainted    masked (or all)
-depth            the hole (reffusion.distill.depth_term)               masked, all but spherical harmonics
-adversarial      patches around the hole                       masked (or all), spherical harmonics only
+depth            the hole (`depth_term`)                       masked, all but spherical harmonics
+adversarial      patches around the hole                       masked, spherical harmonics only
 reference        the reference's hole (not in the paper)       masked (or all)
 lift             the hole, or patches around it (a baseline's) masked
 """
@@ -12,7 +12,6 @@ lift             the hole, or patches around it (a baseline's) masked
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -20,17 +19,20 @@ from torch import Tensor
 
 from reffusion.distill.adversary import Adversary
 from reffusion.distill.discriminator import gathered
-from reffusion.distill.sds import Weighting, draw_timesteps, sds_gradient, sds_loss
+from reffusion.distill.sds import draw_timesteps, sds_gradient, sds_loss
 from reffusion.gaussians.optimize import confine, reconstruction_loss
+from reffusion.params.distill import Sds
 from reffusion.prior import diffusion
 from reffusion.prior.model import Prior
 from reffusion.prior.windows import enlarged, two_scale_masks, two_scales, window_around, windows_around
 from reffusion.splat.rasterizer import render
 from reffusion.types import PARAMETERS, Camera, Gaussians, Rendering
 
+T_LOW = 0.02  # PAPER leaves open: SDS's lowest timestep, as a part of the schedule; threestudio's
+
 
 @dataclass(frozen=True)
-class Sight:
+class TrainView:
     """A training view as distillation uses it.
 
     Attributes:
@@ -50,40 +52,16 @@ class Sight:
     lifted: Tensor | None = None
 
 
-@dataclass(frozen=True)
-class Distillation:
-    """The choices within the SDS term; see `reffusion.distill.sds.sds_gradient` for those the paper leaves open.
-
-    Attributes:
-        patches: local patches beside the whole view (paper: 2; 0 leaves the local term out).
-        low, high: range of the timesteps, as parts of the schedule.
-        weighting, unit_rms, keep_contrast: of the gradient.
-        hole_only: drop the gradient at latents that are not repainted.
-        guidance: the paper's a.
-        reduction: sum or mean over the elements of a latent.
-    """
-
-    patches: int = 2
-    low: float = 0.02
-    high: float = 0.98
-    weighting: Weighting = "sigma2"
-    unit_rms: bool = False
-    hole_only: bool = False
-    keep_contrast: bool = False
-    guidance: float = 7.5
-    reduction: Literal["sum", "mean"] = "sum"
-
-
 def reconstruction_term(
-    gaussians: Gaussians, masked: Tensor, sight: Sight, probe: Tensor | None = None
+    gaussians: Gaussians, masked: Tensor, view: TrainView, probe: Tensor | None = None
 ) -> tuple[Tensor, Rendering]:
     """(1 - 0.2) L1 + 0.2 D-SSIM where the photo may supervise; the gradient reaches unmasked Gaussians only.
 
     In a clean view it reaches all: what is seen there behind the object is true.
     """
-    select = torch.ones_like(masked) if sight.clean else ~masked
-    rendering = render(confine(gaussians, select), sight.camera, probe=probe)
-    return reconstruction_loss(rendering.color, sight.photo, sight.supervises), rendering
+    select = torch.ones_like(masked) if view.clean else ~masked
+    rendering = render(confine(gaussians, select), view.camera, probe=probe)
+    return reconstruction_loss(rendering.color, view.photo, view.supervises), rendering
 
 
 def reference_term(
@@ -103,12 +81,13 @@ def reference_term(
 def sds_term(
     gaussians: Gaussians,
     masked: Tensor,
-    sight: Sight,
+    view: TrainView,
     prior: Prior,
     text: Tensor,
-    settings: Distillation,
+    sds: Sds,
     generator: torch.Generator,
     probe: Tensor | None = None,
+    t_low: float = T_LOW,
 ) -> tuple[Tensor, Rendering]:
     """L_global + mean(L_local) of one view, all samples in one UNet batch; it reaches masked Gaussians only.
 
@@ -116,51 +95,51 @@ def sds_term(
     that other views saw through the object), the hole blanked; without gradient.
 
     Args:
-        sight: with at least one pixel to repaint.
+        view: with at least one pixel to repaint.
         text: [3, L, D], the hidden states of the global, the local and the empty prompt.
         generator: on the CPU; windows, timesteps and noise come from it.
         probe: [N, 2], see `splat.render`; its gradient is zero for unmasked Gaussians too.
+        t_low: lowest timestep, as a part of the schedule.
     Raises:
         FloatingPointError: the prior's answer is not finite.
     """
     size = prior.native_size
     reached = None if probe is None else probe * masked[:, None]
-    rendering = render(confine(gaussians, masked), sight.camera, probe=reached)
-    view = enlarged(rendering.color.permute(2, 0, 1) * 2 - 1, size)
-    shown = torch.where(sight.supervises[..., None], sight.photo, rendering.color.detach())
+    rendering = render(confine(gaussians, masked), view.camera, probe=reached)
+    drawn = enlarged(rendering.color.permute(2, 0, 1) * 2 - 1, size)
+    shown = torch.where(view.supervises[..., None], view.photo, rendering.color.detach())
     shown = enlarged(shown.permute(2, 0, 1) * 2 - 1, size)
-    hole = enlarged(sight.repaint.to(view)[None], size)[0] > 1e-4
+    hole = enlarged(view.repaint.to(drawn)[None], size)[0] > 1e-4
 
-    windows = [window_around(hole.cpu(), size, generator) for _ in range(settings.patches)]
+    windows = [window_around(hole.cpu(), size, generator) for _ in range(sds.patches)]
     masks = two_scale_masks(hole, windows, size)
     condition = diffusion.conditioning(prior, two_scales(shown, windows, size), masks)
-    latents = diffusion.encode(prior, two_scales(view, windows, size))
-    prompts = torch.cat([text[:1], text[1:2].expand(settings.patches, -1, -1)])
+    latents = diffusion.encode(prior, two_scales(drawn, windows, size))
+    prompts = torch.cat([text[:1], text[1:2].expand(sds.patches, -1, -1)])
     empty = text[2:].expand(len(latents), -1, -1)
 
     count = len(latents)
-    timesteps = draw_timesteps(count, prior.timesteps, settings.low, settings.high, generator).to(latents.device)
+    timesteps = draw_timesteps(count, prior.timesteps, t_low, sds.t_high, generator).to(latents.device)
     noise = torch.randn(latents.shape, generator=generator).to(latents)
     gradient = sds_gradient(
         latents,
-        lambda noisy, t: diffusion.guided(prior, noisy, t, condition, prompts, empty, settings.guidance),
+        lambda noisy, t: diffusion.guided(prior, noisy, t, condition, prompts, empty, sds.guidance),
         timesteps,
         noise,
         prior.alphas_cumprod,
-        weighting=settings.weighting,
-        unit_rms=settings.unit_rms,
-        keep_contrast=settings.keep_contrast,
-        mask=condition[:, :1] if settings.hole_only else None,
+        weighting=sds.weighting,
+        keep_contrast=sds.keep_contrast,
+        mask=condition[:, :1] if sds.hole_only else None,
     )
     if not torch.isfinite(gradient).all():
         raise FloatingPointError(f"the prior's answer at timesteps {timesteps.tolist()} is not finite")
-    return sds_loss(latents, gradient, settings.reduction), rendering
+    return sds_loss(latents, gradient, sds.reduction), rendering
 
 
 def adversarial_term(
     gaussians: Gaussians,
     masked: Tensor,
-    sight: Sight,
+    view: TrainView,
     image: Tensor,
     hole: Tensor,
     adversary: Adversary,
@@ -168,14 +147,14 @@ def adversarial_term(
 ) -> tuple[Tensor, Rendering, dict[str, float]]:
     """The critic learns to tell a reference's patches from a view's, then says what it makes of the view's.
 
-    The gradient reaches the spherical harmonics of masked Gaussians only, or of all where the adversary says so.
+    The gradient reaches the spherical harmonics of masked Gaussians only.
 
     PAPER leaves open: how the patches are drawn. A masked pixel first, as for SDS (`sds.window_around`); all fake ones
     in one training view, another in each step; all real ones in one reference. A view or reference that is smaller
     than a patch is enlarged until one fits.
 
     Args:
-        sight: with at least one pixel to repaint: patches lie around those.
+        view: with at least one pixel to repaint: patches lie around those.
         image: [H, W, 3] in [0, 1], a reference. hole: [H, W] bool, what it stands for, at least one pixel.
         adversary: its critic takes a step.
         generator: on the CPU; the windows come from it.
@@ -185,11 +164,10 @@ def adversarial_term(
         FloatingPointError: see `Adversary.learn`.
     """
     choices = adversary.choices
-    reached = torch.ones_like(masked) if choices.reaches == "all" else masked
-    shaded = replace(gaussians.map(Tensor.detach), sh=confine(gaussians, reached).sh)
-    rendering = render(shaded, sight.camera)
+    shaded = replace(gaussians.map(Tensor.detach), sh=confine(gaussians, masked).sh)
+    rendering = render(shaded, view.camera)
     real = patches_around(image, hole, choices.patches, choices.size, generator)
-    fake = patches_around(rendering.color, sight.repaint, choices.patches, choices.size, generator)
+    fake = patches_around(rendering.color, view.repaint, choices.patches, choices.size, generator)
     said = adversary.learn(real, fake)
     loss = adversary.loss(fake)
     return loss, rendering, {"adversarial": float(loss.detach()), **said}
@@ -257,7 +235,7 @@ def region_of(means: Tensor, masked: Tensor, resolution: int = 32, reach: int = 
     return Region(origin, voxel, grown(core, reach), core & ~grown(others, 1))
 
 
-def strays(region: Region, means: Tensor, masked: Tensor) -> Tensor:
+def changed_region(region: Region, means: Tensor, masked: Tensor) -> Tensor:
     """[N] bool: masked Gaussians that have left the region, unmasked ones that have entered it; both are pruned."""
     cells, within = _cells(means, region.origin, region.voxel, region.home.shape)
     home, foreign = torch.zeros_like(masked), torch.zeros_like(masked)

@@ -4,7 +4,8 @@ says it does."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,49 +13,34 @@ from torch import Tensor
 
 from reffusion.depth import behind, estimates
 from reffusion.depth.behind import Completion, Seen
-from reffusion.distill.confinement import Sight
+from reffusion.distill.confinement import TrainView
 from reffusion.gaussians.optimize import confine
 from reffusion.geometry import Degenerate
+from reffusion.params.distill import Depth
 from reffusion.prior.inpaint import repaint
 from reffusion.prior.model import Prior
 from reffusion.splat.rasterizer import render
 from reffusion.types import Gaussians, Rendering
 
-# (what a view shows, the view's picture with the hole repainted, painted when it is asked for) -> disparity [H, W] of
-# the scene; Degenerate where it cannot be told.
-Estimator = Callable[[Seen, Callable[[], np.ndarray]], np.ndarray]
+# PAPER leaves open: the range of the "random timestep" from which a view is repainted, as parts of the schedule, and
+# the size that is painted. Its prior's 512 px are all that a depth model sees of a view.
+T_LOW, T_HIGH = 0.02, 0.98
+LEVELS, FINEST = 0, 0.6  # finer sizes, and the timestep from which they would start at most: see `inpaint.repaint`
+LONGEST = 800  # px, the side at which a larger view is rendered: estimators see no more
+EXTENT = 1.0  # PAPER leaves open: the unit of the loss; the scene's extent, 1 in the normalised frame
 
 
-@dataclass(frozen=True)
-class DepthRegularization:
-    """The choices within the depth term.
-
-    PAPER leaves open: the timestep, the sampler, the guidance, at which size the view is painted, and the unit.
+class Estimator(NamedTuple):
+    """What finds the depth of a view.
 
     Attributes:
-        weight: lambda; above 0.
-        every: steps between two with this term.
-        low, high: range of the timestep from which the view is repainted, as parts of the schedule.
-        steps: sampler steps from pure noise; a later start takes its share of them.
-        levels: finer sizes that are painted after the whole view at the prior's native size, see `inpaint.repaint`.
-        finest: timestep from which these start at most.
-        guidance: the paper's a.
-        longest: side in pixels that the view is rendered at where it is larger: estimators see no more.
-        extent: of the scene, the unit of the loss; 1 in the normalised frame.
         how: which rendered depth is known.
+        disparity: (what a view shows, the view's picture with the hole repainted, painted when it is asked for) ->
+            disparity [H, W] of the scene; Degenerate where it cannot be told.
     """
 
-    weight: float = 0.0625
-    every: int = 8
-    low: float = 0.02
-    high: float = 0.98
-    steps: int = 20
-    levels: int = 0
-    finest: float = 0.6
-    guidance: float = 7.5
-    longest: int = 800
-    extent: float = 1.0
-    how: Completion = field(default_factory=Completion)
+    how: Completion
+    disparity: Callable[[Seen, Callable[[], np.ndarray]], np.ndarray]
 
 
 def by_continuation(points: np.ndarray, how: Completion) -> Estimator:
@@ -63,7 +49,7 @@ def by_continuation(points: np.ndarray, how: Completion) -> Estimator:
     Args:
         points: [P, 3] sparse points of the scene.
     """
-    return lambda view, picture: behind.continued(view, picture, points, how)[0]
+    return Estimator(how, lambda view, picture: behind.continued(view, picture, points, how)[0])
 
 
 def by_network(network: Callable[[Tensor], Tensor], how: Completion) -> Estimator:
@@ -73,23 +59,27 @@ def by_network(network: Callable[[Tensor], Tensor], how: Completion) -> Estimato
         network: [3, H, W] in [0, 1] -> [H, W] disparity up to scale and offset.
     """
 
-    def estimator(view: Seen, picture: Callable[[], np.ndarray]) -> np.ndarray:
+    def disparity(view: Seen, picture: Callable[[], np.ndarray]) -> np.ndarray:
         painted = picture()
         estimate = network(torch.from_numpy(painted).float().permute(2, 0, 1)).double().cpu().numpy()
         return estimates.estimated(view, painted, estimate, how)[0]
 
-    return estimator
+    return Estimator(how, disparity)
 
 
 def depth_term(
     gaussians: Gaussians,
     masked: Tensor,
-    sight: Sight,
+    view: TrainView,
     prior: Prior,
     text: Tensor,
-    settings: DepthRegularization,
+    depth: Depth,
+    guidance: float,
     generator: torch.Generator,
     estimator: Estimator,
+    *,
+    longest: int = LONGEST,
+    extent: float = EXTENT,
 ) -> tuple[Tensor, Rendering]:
     """Mean squared difference of rendered and estimated depth in the hole, over the extent squared; it reaches the
     geometry of masked Gaussians only.
@@ -97,32 +87,32 @@ def depth_term(
     The view is rendered, its hole repainted from a random timestep, and the depth of that picture estimated.
 
     Args:
-        sight: with at least one pixel to repaint.
+        view: with at least one pixel to repaint.
         text: [3, L, D], the hidden states of the global, the local and the empty prompt.
+        guidance: the paper's a.
         generator: on the CPU; timestep and noise come from it.
     Raises:
         Degenerate: nothing is to be compared in this view, or its estimate cannot be brought to the scene.
         FloatingPointError: an estimate is not finite.
     """
-    camera, hole, hidden = _within(settings.longest, sight)
+    camera, hole, hidden = _within(longest, view)
     reached = confine(replace(gaussians, sh=gaussians.sh.detach()), masked)
     rendering = render(reached, camera)
-    view = behind.seen(rendering, camera, hole.cpu().numpy(), hidden.cpu().numpy(), settings.how)
+    seen = behind.seen(rendering, camera, hole.cpu().numpy(), hidden.cpu().numpy(), estimator.how)
     alpha = rendering.alpha.detach().cpu().numpy()
 
     def picture() -> np.ndarray:
-        start = settings.low + (settings.high - settings.low) * float(torch.rand((), generator=generator))
+        start = T_LOW + (T_HIGH - T_LOW) * float(torch.rand((), generator=generator))
         shown = rendering.color.detach().clamp(0, 1).permute(2, 0, 1) * 2 - 1
         painted = repaint(
             prior, shown, hole, text, generator,
-            start=max(start, 1 / prior.timesteps), finest=settings.finest, levels=settings.levels,
-            steps=settings.steps, guidance=settings.guidance,
+            start=max(start, 1 / prior.timesteps), finest=FINEST, levels=LEVELS, steps=depth.steps, guidance=guidance,
         )  # fmt: skip
         return (painted.permute(1, 2, 0).cpu().numpy() + 1) / 2
 
-    target, compared = depth_target(view, estimator(view, picture), alpha > settings.how.explained)
+    target, compared = depth_target(seen, estimator.disparity(seen, picture), alpha > estimator.how.explained)
     place = lambda array: torch.from_numpy(array).to(rendering.depth.device)
-    return depth_loss(rendering.depth, place(target), place(compared), settings.extent), rendering
+    return depth_loss(rendering.depth, place(target), place(compared), extent), rendering
 
 
 def depth_target(view: Seen, disparity: np.ndarray, covered: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -154,9 +144,9 @@ def depth_loss(depth: Tensor, target: Tensor, compared: Tensor, extent: float) -
     return ((depth[compared] - target[compared].to(depth.dtype)) / extent).square().mean()
 
 
-def _within(longest: int, sight: Sight):
+def _within(longest: int, view: TrainView):
     """(camera, hole, hidden), the view's longer side at most `longest` pixels."""
-    camera, hole, hidden = sight.camera, sight.repaint, ~sight.supervises
+    camera, hole, hidden = view.camera, view.repaint, ~view.supervises
     factor = longest / max(camera.width, camera.height)
     if factor >= 1:
         return camera, hole, hidden

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,32 +11,40 @@ import torch
 from torch import Tensor
 
 from reffusion import seeding, trace
-from reffusion.distill.confinement import Sight, region_of, strays
+from reffusion.distill.confinement import TrainView, changed_region, region_of
 from reffusion.distill.depth_term import Estimator
-from reffusion.distill.steps import Job, Settings, job_of, step_of
+from reffusion.distill.perceptual import Distance
+from reffusion.distill.steps import Job, job_of, step_of
 from reffusion.gaussians.densify import densify, prune
-from reffusion.gaussians.optimize import GaussianOptimizer
+from reffusion.gaussians.optimize import GaussianOptimizer, Rates
+from reffusion.params.distill import Densify, LearningRates, Params
 from reffusion.prior.model import Prior
 from reffusion.splat.rasterizer import render
-from reffusion.types import PARAMETERS, Camera, Gaussians
+from reffusion.types import Camera, Gaussians
+
+SPLIT_ABOVE = 0.01  # standard deviation from which a Gaussian is split, not cloned
+LEAST_OPACITY = 0.005  # fainter Gaussians are pruned when others are added
+REGION_EVERY = 50  # steps between prunings of Gaussians that changed region
 
 
 def distill(
     initial: Gaussians,
     masked: Tensor,
-    sights: Sequence[Sight],
+    views: Sequence[TrainView],
     holes: Sequence[tuple[Camera, Tensor, Tensor]],
     prior: Prior | None,
     text: Tensor | None,
-    settings: Settings,
+    settings: Params,
     folder: Path,
     estimator: Estimator | None = None,
+    distance: Distance | None = None,
+    rates: Rates | None = None,
 ) -> tuple[Gaussians, Tensor]:
     """Optimise an initialization; resumes from `folder`'s checkpoint, bit for bit on the CPU.
 
     Args:
         initial, masked: the Gaussians and their labels [N] bool; everything else is on their device.
-        sights: the training views; only those with pixels to repaint are distilled and judged by the critic.
+        views: the training views; only those with pixels to repaint are distilled and judged by the critic.
         holes: (camera, image [H, W, 3] in [0, 1], hole [H, W] bool) of each reference.
         prior: adapted to the reference; None where there is neither SDS nor the depth term.
         text: [3, L, D], hidden states of the global, the local and the empty prompt.
@@ -46,14 +54,16 @@ def distill(
             term's value), depth_skipped_<reason> (how often it was left out so far), adversarial (the generator's
             loss), critic_loss, critic_slope (R1 before its weight), gaussians, masked_gaussians.
         estimator: of the depth term; None where there is none.
+        distance: of patches, for the perceptual loss of lifted pictures.
+        rates: Adam's step sizes; None: 3DGS's.
     Returns:
         The Gaussians, detached, and their labels.
     Raises:
         FloatingPointError: a value or gradient is not finite; names step, term and view.
         ValueError: a term lacks what it needs: a prior, an estimator, a hole in a reference.
     """
-    job = job_of(sights, holes, prior, text, estimator, settings, initial, masked)
-    optimizer = GaussianOptimizer(initial, masked, settings.rates, settings.masked_pace, epsilon=settings.epsilon)
+    job = job_of(views, holes, prior, text, settings, initial, masked, estimator, distance)
+    optimizer = GaussianOptimizer(initial, masked, rates, masked_factors(settings.lr), epsilon=settings.lr.epsilon)
     region = region_of(initial.means, masked) if settings.confined and masked.any() else None
     run = _Run.begun(optimizer, job, trace.load_checkpoint(folder))
     log = trace.Trace(folder, run.seconds, run.step + bool(run.step))  # a line is numbered by the steps done
@@ -63,19 +73,24 @@ def distill(
     for step in trace.progress(settings.iterations, "distill", run.step):
         line = step_of(optimizer, step, job)
         run.step = done = step + 1
-        if settings.densify_every and done % settings.densify_every == 0:
-            _densify(optimizer, settings, done)
-        if region is not None and (done % settings.region_every == 0 or done == settings.iterations):
-            optimizer.select(~strays(region, optimizer.gaussians.means.detach(), optimizer.masked))
-        if run.patience.due(done, settings.iterations, per_octave=4):
-            end = _write_line(log, run, line)
-            if end and end["reason"] != "finished":
-                best = {name: run.best[name] for name in PARAMETERS}
-                return replace(optimizer.gaussians, **best), run.best["masked"]
+        if settings.densify.every and done % settings.densify.every == 0:
+            if done <= settings.densify.stop * settings.iterations:
+                _densify(optimizer, settings.densify, seeding.generator(settings.seed, "distill", "densify", done))
+        if region is not None and (done % REGION_EVERY == 0 or done == settings.iterations):
+            optimizer.select(~changed_region(region, optimizer.gaussians.means.detach(), optimizer.masked))
+        if trace.log_spaced(done, settings.iterations, per_octave=4):
+            _write_line(log, run, line)
         if log.seconds - run.seconds > settings.checkpoint_seconds:
             run.seconds = log.seconds
             trace.save_checkpoint(folder, run.state_dict())
     return optimizer.gaussians.map(Tensor.detach), optimizer.masked
+
+
+def masked_factors(lr: LearningRates) -> dict[str, float]:
+    """Parameter -> factor on the step sizes of masked Gaussians."""
+    shape = lr.masked * lr.shape
+    factors = {"means": shape, "quaternions": shape, "log_scales": shape, "sh": lr.masked}
+    return factors | {"opacity_logits": lr.masked * lr.opacities}
 
 
 @dataclass
@@ -83,29 +98,24 @@ class _Run:
     """What a distillation continues from.
 
     Attributes:
-        best: the Gaussians' parameters and labels where reference_psnr was best; None where an early end is not asked.
         step, seconds: steps done so far; seconds spent at the last checkpoint.
     """
 
     optimizer: GaussianOptimizer
     job: Job
-    patience: trace.Patience
-    best: dict[str, Tensor] | None = None
     step: int = 0
     seconds: float = 0.0
 
     @classmethod
     def begun(cls, optimizer: GaussianOptimizer, job: Job, state: dict[str, Any] | None) -> _Run:
         """From the start, or from a checkpoint's state."""
-        settings = job.settings
-        run = cls(optimizer, job, trace.Patience(settings.patience, settings.stop_gain, settings.stop_drop))
+        run = cls(optimizer, job)
         if state is not None:
             optimizer.load_state_dict(state["optimizer"])
             if job.adversary is not None:
                 job.adversary.load_state_dict(state["adversary"])
             job.tally.update(state["tally"])
-            run.patience.load_state_dict(state["patience"])
-            run.step, run.seconds, run.best = state["step"], state["seconds"], state["best"]
+            run.step, run.seconds = state["step"], state["seconds"]
         return run
 
     def state_dict(self) -> dict[str, Any]:
@@ -114,47 +124,33 @@ class _Run:
             "optimizer": self.optimizer.state_dict(),
             "adversary": None if adversary is None else adversary.state_dict(),
             "tally": self.job.tally,
-            "patience": self.patience.state_dict(),
             "step": self.step,
             "seconds": self.seconds,
-            "best": self.best,
         }
 
 
-def _write_line(log: trace.Trace, run: _Run, line: dict[str, float]) -> dict[str, Any]:
-    """A line of the trace, written with the clock stopped; what it says of the end, {} while the work goes on."""
-    optimizer, job = run.optimizer, run.job
+def _write_line(log: trace.Trace, run: _Run, line: dict[str, float]) -> None:
+    """A line of the trace, written with the clock stopped."""
+    optimizer, job, last = run.optimizer, run.job, run.job.settings.iterations
+    end = {"of": last, "kept": last, "reason": "finished"} if run.step == last else {}
     with log.paused():
         psnr = reference_psnr(optimizer.gaussians, job.holes)
-        end = run.patience.ends(run.step, job.settings.iterations, psnr)
         log.log(run.step, reference_psnr=psnr, **line, **job.tally, **_counts(optimizer), **end)
-        if run.patience.watching and run.patience.best_at == run.step:
-            run.best = _copy(optimizer)
-    return end
 
 
 def _counts(optimizer: GaussianOptimizer) -> dict[str, int]:
     return {"gaussians": len(optimizer.masked), "masked_gaussians": int(optimizer.masked.sum())}
 
 
-def _copy(optimizer: GaussianOptimizer) -> dict[str, Tensor]:
-    """The Gaussians' parameters and labels as they are now."""
-    tensors = {name: getattr(optimizer.gaussians, name) for name in PARAMETERS} | {"masked": optimizer.masked}
-    return {name: tensor.detach().clone() for name, tensor in tensors.items()}
-
-
-def _densify(optimizer: GaussianOptimizer, settings: Settings, done: int) -> None:
-    """Clone or split masked Gaussians that are pulled hard on the screen; only they have been observed."""
-    if done > settings.densify_until * settings.iterations or not optimizer.masked.any():
+def _densify(optimizer: GaussianOptimizer, chosen: Densify, noise: torch.Generator) -> None:
+    """Clone or split the share of the masked Gaussians pulled hardest on the screen; only they have been observed."""
+    if not optimizer.masked.any():
         return
     slopes = (optimizer.slope_sum / optimizer.slope_count.clamp(min=1))[optimizer.masked]
-    threshold = settings.densify_slope
-    if settings.densify_rule == "share":
-        threshold = float(slopes.kthvalue(max(1, round((1 - settings.densify_share) * len(slopes)))).values)
+    threshold = float(slopes.kthvalue(max(1, round((1 - chosen.share) * len(slopes)))).values)
     threshold = max(threshold, torch.finfo(slopes.dtype).tiny)  # what is not pulled at all stays single
-    noise = seeding.generator(settings.seed, "distill", "densify", done)
-    densify(optimizer, threshold, settings.split_above, settings.budget, noise)
-    prune(optimizer, settings.least_opacity, float("inf"))
+    densify(optimizer, threshold, SPLIT_ABOVE, chosen.cap_max, noise)
+    prune(optimizer, LEAST_OPACITY, float("inf"))
 
 
 @torch.no_grad()

@@ -16,15 +16,13 @@ SCALES = 3
 SMALLEST = 11  # px a side, SSIM's window
 
 
-def load(weights: str | None = None, device: str = "cpu") -> tuple[str, Distance]:
+def load(device: str = "cpu") -> tuple[str, Distance]:
     """The name of the distance, and the distance: LPIPS (vgg), else the multi-scale D-SSIM.
 
-    Args:
-        weights: a folder to look for LPIPS weights in first, see `reffusion.score.lpips.folders`.
     Raises:
         ValueError: LPIPS weights that are there but broken.
     """
-    model, missing = lpips.load("vgg", weights)
+    model, missing = lpips.load("vgg")
     if model is None:
         return f"multi-scale D-SSIM ({missing})", multi_scale_dssim
     model = model.to(device)

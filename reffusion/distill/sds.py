@@ -53,14 +53,13 @@ def sds_gradient(
     alphas_cumprod: Tensor,
     *,
     weighting: Weighting = "sigma2",
-    unit_rms: bool = False,
     keep_contrast: bool = False,
     mask: Tensor | None = None,
 ) -> Tensor:
     """w(t) (eps_theta(z_t, t) - eps), one noise for each latent; the UNet's Jacobian left out (DreamFusion eq. 3).
 
-    PAPER leaves open: w(t), and the factor a of dz_t/dz, which is taken into w. In every case
-    eps_theta - eps = (a / s) (z - x0_theta), so the weightings differ only by a function of t:
+    PAPER leaves open: w(t), the factor a of dz_t/dz, which is taken into w, and any normalisation (none here). In
+    every case eps_theta - eps = (a / s) (z - x0_theta), so the weightings differ only by a function of t:
       "sigma2"  s^2 (eps_theta - eps), DreamFusion's and threestudio's;
       "x0"      z - x0_theta, i.e. w = s / a: bounded at both ends of the schedule;
       "one"     eps_theta - eps; with v-prediction, noise dominates it near t = 0.
@@ -71,7 +70,6 @@ def sds_gradient(
         timesteps: [B] long.
         noise: [B, C, h, w], standard normal.
         alphas_cumprod: [T], alpha_bar of every timestep.
-        unit_rms: divide each sample by its own root mean square. PAPER leaves open: any normalisation.
         keep_contrast: x0_theta is taken `unfaded`. Not in the paper.
         mask: [B, 1, h, w], 1 where the gradient is kept; None keeps it everywhere.
             PAPER leaves open: it distils the whole view; only masked Gaussians receive the gradient in any case.
@@ -96,10 +94,6 @@ def sds_gradient(
             raise ValueError(f"weighting must be x0, sigma2 or one, got {weighting!r}")
         if mask is not None:
             gradient = gradient * mask
-        if unit_rms:
-            kept = torch.ones_like(gradient) if mask is None else mask.expand_as(gradient)
-            energy = gradient.square().sum((1, 2, 3), keepdim=True) / kept.sum((1, 2, 3), keepdim=True).clamp_min(1)
-            gradient = gradient / energy.sqrt().clamp_min(1e-8)
         return gradient
 
 

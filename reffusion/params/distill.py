@@ -29,7 +29,7 @@ class Sds(Settings):
     within: float = Field(
         180, gt=0, le=180, description="degrees between a view and the nearest reference up to which it is distilled"
     )
-    # PAPER leaves open: timesteps, w(t), normalisation, guidance, reduction: see distill.sds. threestudio's here.
+    # PAPER leaves open: timesteps, w(t), normalisation, guidance, reduction: see `distill.sds`. threestudio's here.
     t_high: float = Field(0.98, ge=0, le=1, description="highest timestep")
     weighting: Literal["x0", "sigma2", "one"] = Field("sigma2", description="w(t) of the SDS gradient")
     hole_only: bool = Field(False, description="drop the gradient at latents that are not repainted")
@@ -126,7 +126,11 @@ class Params(Settings):
     densify: Densify = Densify()
     # PAPER leaves open: which mask m is. Its text repaints the consistent mask; the invent mask keeps true background.
     repaint: Literal["invent", "consistent"] = Field("invent", description="the pixels the UNet repaints")
-    confined: bool = Field(True, description="each term reaches its own Gaussians; false (an ablation): all of them")
+    confined: bool = Field(
+        True,
+        description="each term reaches its own Gaussians; false (an ablation): all of them, and none is pruned for "
+        "changing region",
+    )
     seed: int = Field(0, description="of views, windows, timesteps, noise, splits and the critic's first weights")
     device: Device = "cpu"
     dtype: Dtype = Field("float32", description="of the prior's weights")

@@ -26,8 +26,8 @@ class Lora(Settings):
 
 
 class Optimizer(Settings):
-    """AdamW. PAPER leaves open: batch, accumulation, weight decay, clipping, schedule. RealFill's batch 16 here, decay
-    1e-2 and clip 1 (`reffusion.prior.personalize`)."""
+    """AdamW. PAPER leaves open: batch, accumulation, weight decay, clipping, schedule. RealFill's batch 16 here; decay
+    and clip in `reffusion.prior.personalize`."""
 
     lr_unet: float = Field(2e-4, gt=0, description="learning rate of the UNet's LoRA")
     lr_text: float = Field(4e-5, gt=0, description="learning rate of the text encoder's LoRA")
@@ -40,13 +40,15 @@ class Optimizer(Settings):
 class Samples(Settings):
     """How samples are drawn from the reference.
 
-    PAPER leaves open: all of it but that there are local and global ones (`reffusion.prior.crops` says where the other
-    figures come from).
+    PAPER leaves open: all of it but that there are local and global ones; the rest is in `reffusion.prior.crops`.
     """
 
     size: int = Field(0, ge=0, description="side of a sample in pixels; 0: the prior's native size (paper)")
     local_share: float = Field(0.5, ge=0, le=1, description="share of the samples that are local crops")
-    hole_share: float = Field(0.0, ge=0, le=1, description="share of the samples whose mask is the reference's hole")
+    # The hole is the mask of the job; rectangles leave most of it to be seen, and a short training does not get beyond.
+    hole_share: float = Field(
+        0.0, ge=0, le=1, description="share of the samples whose mask is the reference's hole (paper: 0)"
+    )
     # What is given is soon denoised well; at weight 1 the hole, a small part of a sample, learns from what is left.
     outside_weight: float = Field(1.0, gt=0, le=1, description="weight in the loss of what a mask leaves to be seen")
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from reffusion.prior import diffusion, lora
-from reffusion.prior.crops import GLOBAL, LOCAL, PROMPTS, Picture, Samples
+from reffusion.prior.crops import GLOBAL, LOCAL, PROMPTS, Batch, Picture
 from reffusion.prior.model import Prior
 from reffusion.prior.windows import two_scale_masks, two_scales, window_around
 from reffusion.seeding import generator as seeded
@@ -27,7 +27,7 @@ def latent_shape(prior: Prior, size: int) -> tuple[int, int, int]:
 
 
 def denoising_error(
-    prior: Prior, samples: Samples, timesteps: Tensor, noise: Tensor, outside_weight: float = 1.0
+    prior: Prior, samples: Batch, timesteps: Tensor, noise: Tensor, outside_weight: float = 1.0
 ) -> tuple[Tensor, Tensor]:
     """([B], [B]): mean squared error of the prior's own target over the whole image, and of the clean latent.
 
@@ -56,24 +56,24 @@ def denoising_error(
     return error, (1 - alpha_bar) * error / odds
 
 
-def held_out_samples(references: Sequence[Picture], size: int, seed: int) -> Samples:
+def held_out_samples(references: Sequence[Picture], size: int, seed: int) -> Batch:
     """The reference's own hole: the whole view and a crop. Same for equal seeds."""
     draw = seeded(seed, "personalize", "held out")
     first = references[0]
     windows = [window_around(first.region, size, draw)]
     masks = two_scale_masks(first.region, windows, size)
-    return Samples(two_scales(first.image, windows, size), masks, torch.tensor([GLOBAL, LOCAL]))
+    return Batch(two_scales(first.image, windows, size), masks, torch.tensor([GLOBAL, LOCAL]))
 
 
 def one_sample(prior: Prior, references: Sequence[Picture], seed: int) -> None:
     """Loss and gradient of one sample: what `memory.fitted` measures."""
-    sample = Samples(*(tensor[:1] for tensor in held_out_samples(references, prior.native_size, seed)))
+    sample = Batch(*(tensor[:1] for tensor in held_out_samples(references, prior.native_size, seed)))
     noise = torch.zeros(1, *latent_shape(prior, prior.native_size))
     denoising_error(prior, sample, torch.zeros(1, dtype=torch.long), noise)[0].sum().backward()
 
 
 @torch.no_grad()
-def held_out_error(prior: Prior, samples: Samples, seed: int) -> dict[str, float]:
+def held_out_error(prior: Prior, samples: Batch, seed: int) -> dict[str, float]:
     """{"target_mse", "clean_latent_mse"} at three fixed timesteps with fixed noise: comparable through the training.
 
     It costs a small model about a step of training.
