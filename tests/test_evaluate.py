@@ -98,7 +98,7 @@ def test_scores_are_those_of_the_saved_pictures(done):
     train = [cameras[name] for name in load_scene(done / "poses").train]
     fit = load_ply(done / "fit" / "gaussians.ply")
     hidden = {camera.name: evaluate.mask_of(camera, done / "poses", done / "masks") for camera in train}
-    seen_by = sight.witnesses(fit, train, hidden)
+    seen_by = sight.seen_views(fit, train, hidden)
     for kind, renders in (("mean", "renders"), ("initialize", "renders_initialize")):
         rows = [
             metrics.score_view(
