@@ -25,7 +25,7 @@ def quantities(stage: str, lines: Lines) -> list[str]:
     there = {name for line in lines for name, value in line.items() if isinstance(value, int | float)}
     main = [name for name in MAIN.get(stage, ()) if name in there][:1]
     others = [name for name, quantity in QUANTITIES.items() if name in there and quantity.better and name not in main]
-    strange = sorted(there - {"seconds", "iteration", "of", "kept", *QUANTITIES}) if not (main or others) else []
+    strange = sorted(there - {"seconds", "iteration", "reason", *QUANTITIES}) if not (main or others) else []
     return [name for name in (*main, *others, *strange) if name not in LEFT_OUT][:PANELS]
 
 

@@ -20,7 +20,6 @@ WORDS = {
     "skip": "left\u00a0out", "provided": "brought", "cached": "done", "run": "to\u00a0run", "stale": "to\u00a0run",
     "missing": "cannot\u00a0run", "undecided": "undecided",
 }  # fmt: skip
-ENDS = {"no gain": "no gain any more", "fell": "the error had risen", "converged": "converged", "finished": ""}
 RESULTS = {
     "evaluate/scene.ply": "the result as Gaussians, in the scene's own frame",
     "evaluate/renders": "renders of the result",
@@ -127,23 +126,8 @@ def stages(job: Job, out: Path) -> list[str]:
         path = out / f"{stage}.png"
         if names := curves.stage_chart(stage, series, path):
             parts += [page.heading(f"{stage}: error against seconds"), page.picture(path, ", ".join(names))]
-            parts += [page.paragraph(ended, quiet=True)] if (ended := end(series)) else []
     parts += [page.paragraph(f"Not drawn: {why}", quiet=True) for why in job.unread]
     return parts
-
-
-def end(series: dict[str, curves.Lines]) -> str:
-    """How a stage ended, where its trace says so: steps done and planned, the reason, what was kept."""
-    last = series.get("", [{}])[-1] if series.get("") else {}
-    if "reason" not in last:
-        return ""
-    text = f"{last['iteration']} of {last['of']} steps"
-    if last["iteration"] < last["of"]:
-        text += f", stopped early: {ENDS.get(last['reason'], last['reason'])}"
-        if last["iteration"]:  # what the others would have taken, at the same pace
-            saved = last["seconds"] / last["iteration"] * (last["of"] - last["iteration"])
-            text += f", which saved about {page.duration(saved)}"
-    return text + (f"; the state of step {last['kept']} was kept." if last["kept"] != last["iteration"] else ".")
 
 
 def left_out(job: Job) -> list[str]:

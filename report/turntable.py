@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from reffusion.io.images import to_uint8
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_scene
 from reffusion.splat import rasterizer
@@ -38,7 +39,7 @@ def make(home: Path, frames: int = FRAMES) -> Path:
     if not film.isOpened():
         raise ValueError(f"{path}: this OpenCV writes no {CODEC} video; `pip install opencv-contrib-python-headless`")
     for camera in cameras:
-        picture = (rasterizer.render(gaussians, camera).color.clamp(0, 1) * 255).round().byte().numpy()
+        picture = to_uint8(rasterizer.render(gaussians, camera).color.numpy())
         film.write(np.ascontiguousarray(picture[..., ::-1]))
     film.release()
     return path

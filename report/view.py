@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from reffusion.io.arrays import load_json, load_labels
+from reffusion.io.images import to_uint8
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_scene, load_views
 from reffusion.splat import rasterizer
@@ -90,7 +91,7 @@ def camera_of(place: Any, height: int) -> Camera:
 def picture(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     """uint8 [H, W, 3]."""
     with TURN:
-        return (rasterizer.render(gaussians, camera).color.clamp(0, 1) * 255).round().byte().numpy()
+        return to_uint8(rasterizer.render(gaussians, camera).color.numpy())
 
 
 def go_to(place: Any, camera: Camera, target: np.ndarray) -> None:

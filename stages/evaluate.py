@@ -3,52 +3,48 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field
+import numpy as np
+import torch
 
-if TYPE_CHECKING:
-    import numpy as np
-
-    from reffusion.score.consistency import Shown
-    from reffusion.score.lpips import Lpips
-    from reffusion.score.metrics import Box
-    from reffusion.types import Camera, Gaussians, Scene
+from reffusion import trace
+from reffusion.io.arrays import load_json, save_json
+from reffusion.io.images import load_image, load_mask, save_image
+from reffusion.io.ply import load_ply, save_ply
+from reffusion.io.scene import load_scene
+from reffusion.paint import paint2d
+from reffusion.paint.paint2d import Painter
+from reffusion.params.evaluate import Params
+from reffusion.score import beyond, consistency, lpips, metrics, rows, sight
+from reffusion.score.consistency import Shown
+from reffusion.splat import rasterizer
+from reffusion.types import Camera, Gaussians, Scene
 
 FOLDERS = {"fit": "renders_fit", "initialize": "renders_initialize", "distill": "renders"}
 LEAST_UNSEEN = 0.005  # mean share of a test view's pixels from which the scene is closed by a backdrop
-CONSISTENCY = ("consistency", "consistency_share")
 
 
-class Params(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    box_dilation: float = Field(
-        0.1, ge=0.0, description="each side of the mask's box moves outwards by this share of the box's extent"
-    )
-    outside_margin: float = Field(
-        0.01, ge=0, description="how much wider than the mask is left out of the scores outside it, / image width"
-    )
-    lpips_weights: str | None = Field(
-        None,
-        description="folder with LPIPS weights, looked into before ~/.cache/reffusion/lpips and torch hub's cache",
-        json_schema_extra={"weights": True},
-    )
-    inpaint: bool = Field(False, description="a baseline: each rendered view is inpainted in 2D inside its mask")
-    widen: float = Field(0.0, ge=0, description="how much wider than the mask it is inpainted, / image width")
-    lama: str | None = Field(
-        None,
-        description="folder with LaMa's TorchScript file, for that; none: OpenCV's FSR, else Telea",
-        json_schema_extra={"weights": True},
-    )
-    beyond: bool = Field(True, description="what no training view saw is closed by a soft backdrop, scene.ply's too")
-    device: Literal["cpu", "cuda"] = Field("cpu", description="where the views are rendered")
+class Work(NamedTuple):
+    """What every view is drawn with and compared with.
 
+    Attributes:
+        out, poses, masks: folders; masks may be None.
+        gaussians: stage -> what is rendered of it.
+        result: the stage whose Gaussians are the result.
+        painter: what inpaints the rendered views; None where nothing does.
+        tested: the views are test views, and scored where they have a picture.
+        unseen: test view -> bool [H, W], pixels that no training view saw.
+    """
 
-def needed_weights(params: Params, brings: frozenset[str]) -> list:
-    """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
-    from reffusion.weights import local
-
-    return local.of_lpips(params.lpips_weights)
+    out: Path
+    poses: Path
+    masks: Path | None
+    gaussians: dict[str, Gaussians]
+    result: str
+    painter: Painter | None
+    tested: bool
+    unseen: dict[str, np.ndarray]
 
 
 def run(
@@ -71,119 +67,79 @@ def run(
     and test views without a picture are rendered and not scored. `reference`, `personalize` and `lift` give their
     seconds only.
     """
-    from reffusion import trace
-    from reffusion.io.arrays import save_json
-    from reffusion.io.images import save_image
-    from reffusion.io.ply import load_ply, save_ply
-    from reffusion.io.scene import load_scene
-    from reffusion.paint import paint2d
-    from reffusion.score import consistency, lpips, metrics
-
     needs = {"poses": poses, "fit": fit, "masks": masks, "reference": reference, "personalize": personalize}
     needs |= {"lift": lift, "initialize": initialize, "distill": distill}
     scene = load_scene(poses)
     loaded = {net: lpips.load(net, params.lpips_weights) for net in ("vgg", "alex")}
     models = {net: model for net, (model, _) in loaded.items() if model}
-    made = [stage for stage in FOLDERS if needs[stage]]
-    gaussians = {s: load_ply(needs[s] / "gaussians.ply").map(lambda p: p.to(params.device)) for s in made}
-    result, captured, counts = made[-1], gaussians["fit"], {stage: len(value) for stage, value in gaussians.items()}
     names, kind = views_of(scene)
-    unseen = unseen_in(scene, captured, poses, masks) if kind == "test" else {}
-    # Brought Gaussians may know more than these views do.
-    if params.beyond and reaches_beyond(unseen) and not (poses / "gaussians.ply").exists():
-        gaussians |= finished(scene, gaussians, result)
-    painter = paint2d.load(params.lama, params.device) if params.inpaint else None
-
-    rows, before = [], None
+    work, counts = prepared(params, scene, out, needs, tested=kind == "test")
+    scored, before = [], None
     for index in trace.progress(len(names), "evaluate"):
-        camera, file = scene.cameras[names[index]], f"{names[index]}.png"
-        pictures = {stage: drawn(gaussians[stage], camera, out / FOLDERS[stage] / file) for stage in gaussians}
-        shown = view_of(gaussians[result], camera, pictures[result], mask_of(camera, poses, masks))
-        if painter:
-            wide = paint2d.widened(shown.mask, params.widen)
-            depth = consistency.depth_through(shown.depth, wide)
-            shown = shown._replace(picture=painter.paint(shown.picture, wide), depth=depth)
-        save_image(out / "renders" / file, shown.picture)
+        camera = scene.cameras[names[index]]
+        shown, pictures = rendered(work, camera)
         if before:
-            rows[-1] |= dict(zip(CONSISTENCY, consistency.difference(before, shown), strict=True))
-        before, truth = shown, truth_of(camera, poses) if kind == "test" else None
-        box = metrics.mask_box(shown.mask, params.box_dilation)
-        panels = [p for p in (pictures["fit"], truth, shown.picture) if p is not None]
-        save_image(out / "side_by_side" / file, metrics.side_by_side(panels, box))
-        margin = paint2d.widened(shown.mask, params.outside_margin)
-        held_out = (poses / "masks" / file).exists()  # a test view whose photograph shows the object
-        given = (truth, box, models, margin, held_out, unseen.get(camera.name))
-        rows.append(row_of(shown, pictures.get("initialize"), *given))
+            rows.add_consistency(scored[-1], before, shown)
+        before, truth = shown, truth_for(work, camera)
+        save_side_by_side(out, pictures["fit"], truth.picture, shown)
+        scored.append(rows.row_of(shown, pictures.get("initialize"), truth, models))
 
-    (out / "per_view.csv").write_text(metrics.table(rows))
-    save_ply(out / "scene.ply", gaussians[result], similarity=scene.similarity)
+    (out / "per_view.csv").write_text(metrics.table(scored))
+    save_ply(out / "scene.ply", work.gaussians[work.result], similarity=scene.similarity)
     summary = {
-        **metrics.summary(rows),
+        **metrics.summary(scored),
         "rendered": f"{len(names)} {kind} views",
-        "result": result,
-        "consistency": consistency_of(rows),
-        **used(painter and painter.name, distill),
+        "result": work.result,
+        "consistency": rows.consistency_of(scored),
+        **used(work.painter and work.painter.name, distill),
         "lpips_unavailable": "; ".join(reason for _, reason in loaded.values() if reason) or None,
-        "gaussians": counts,  # as the stages left them
+        "gaussians": counts,
         "seconds": seconds(needs),
-        "protocol": protocol(params, rows, models),
+        "protocol": rows.protocol(scored, models),
     }
     save_json(out / "metrics.json", summary)
 
 
-def row_of(
-    shown: Shown,
-    initial: np.ndarray | None,
-    truth: np.ndarray | None,
-    box: Box | None,
-    models: dict[str, Lpips],
-    margin: np.ndarray,
-    held_out: bool,
-    unseen: np.ndarray | None,
-) -> dict[str, Any]:
-    """A view's line of per_view.csv: its box, and its scores and the initialization's where there is a truth; see
-    `metrics.score_view`, whose `mask`, `shows_object` and `unseen` the last three are."""
-    from reffusion.score import metrics
-
-    camera = shown.camera
-    row = {"view": camera.name, "width": camera.width, "height": camera.height} | dict.fromkeys(CONSISTENCY)
-    row |= dict(zip(("left", "top", "right", "bottom"), box or (None,) * 4, strict=True))
-    if truth is not None:
-        given = truth, box, models, margin, held_out, unseen
-        row |= metrics.score_view(shown.picture, *given)
-        if initial is not None:
-            scores = metrics.score_view(initial, *given)
-            row |= {f"initialize_{column}": value for column, value in scores.items()}
-    return row
+def prepared(
+    params: Params, scene: Scene, out: Path, needs: dict[str, Path | None], tested: bool
+) -> tuple[Work, dict[str, int]]:
+    """What the views are drawn with, and how many Gaussians each stage left."""
+    poses, masks = needs["poses"], needs["masks"]
+    made = [stage for stage in FOLDERS if needs[stage]]
+    gaussians = {s: load_ply(needs[s] / "gaussians.ply").map(lambda p: p.to(params.device)) for s in made}
+    result, captured, counts = made[-1], gaussians["fit"], {stage: len(value) for stage, value in gaussians.items()}
+    unseen = unseen_in(scene, captured, poses, masks) if tested else {}
+    # Brought Gaussians may know more than these views do.
+    if params.beyond and reaches_beyond(unseen) and not (poses / "gaussians.ply").exists():
+        gaussians |= finished(scene, gaussians, result)
+    painter = paint2d.load(params.lama, params.device) if params.inpaint else None
+    return Work(out, poses, masks, gaussians, result, painter, tested, unseen), counts
 
 
-def consistency_of(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """{"consistency", "consistency_share"}: means over the pairs of neighbours; {"pairs"}: how many could be compared;
-    {"protocol"}."""
-    from reffusion.score import consistency, metrics
+def rendered(work: Work, camera: Camera) -> tuple[Shown, dict[str, np.ndarray]]:
+    """The view as the result shows it, saved; and stage -> uint8 [H, W, 3], its own rendering, saved too."""
+    file = f"{camera.name}.png"
+    pictures = {s: drawn(gaussians, camera, work.out / FOLDERS[s] / file) for s, gaussians in work.gaussians.items()}
+    mask = mask_of(camera, work.poses, work.masks)
+    shown = view_of(work.gaussians[work.result], camera, pictures[work.result], mask)
+    if work.painter:
+        picture = work.painter.paint(shown.picture, shown.mask)
+        shown = shown._replace(picture=picture, depth=consistency.depth_through(shown.depth, shown.mask))
+    save_image(work.out / "renders" / file, shown.picture)
+    return shown, pictures
 
-    difference, share = ([row[name] for row in rows] for name in CONSISTENCY)
-    return {
-        "consistency": metrics.mean(difference),
-        "consistency_share": metrics.mean(share),
-        "pairs": sum(value is not None for value in difference),
-        "protocol": consistency.PROTOCOL,
-    }
+
+def truth_for(work: Work, camera: Camera) -> rows.Truth:
+    """What the view is compared with; its photograph shows the object where it has a mask among the training views'."""
+    picture = truth_of(camera, work.poses) if work.tested else None
+    shows_object = (work.poses / "masks" / f"{camera.name}.png").exists()
+    return rows.Truth(picture, shows_object, work.unseen.get(camera.name))
 
 
-def protocol(params: Params, rows: list[dict[str, Any]], models: dict[str, Lpips]) -> dict[str, Any]:
-    """All that the numbers depend on, in words and versions."""
-    from reffusion.score import metrics, sight
-
-    return {
-        **metrics.PROTOCOL,
-        "seen": sight.PROTOCOL,
-        "box_dilation": params.box_dilation,
-        "outside_margin": params.outside_margin,
-        "resolution": sorted({f"{row['width']}x{row['height']}" for row in rows}),
-        "lpips_weights": {name: digest for model in models.values() for name, digest in model.files.items()},
-        "versions": metrics.versions(),
-    }
+def save_side_by_side(out: Path, fit: np.ndarray, truth: np.ndarray | None, shown: Shown) -> None:
+    panels = [p for p in (fit, truth, shown.picture) if p is not None]
+    picture = metrics.side_by_side(panels, metrics.mask_box(shown.mask))
+    save_image(out / "side_by_side" / f"{shown.camera.name}.png", picture)
 
 
 def views_of(scene: Scene) -> tuple[tuple[str, ...], str]:
@@ -196,23 +152,17 @@ def views_of(scene: Scene) -> tuple[tuple[str, ...], str]:
 
 def unseen_in(scene: Scene, captured: Gaussians, poses: Path, masks: Path | None) -> dict[str, np.ndarray]:
     """Test view -> bool [H, W], pixels that show what no training view saw."""
-    from reffusion.score import sight
-
-    seen_by = sight.witnesses(*captured_by(scene, captured, poses, masks))
+    seen_by = sight.seen_views(*captured_by(scene, captured, poses, masks))
     return {name: sight.unseen(captured, scene.cameras[name], seen_by) for name in scene.test}
 
 
 def reaches_beyond(unseen: dict[str, np.ndarray]) -> bool:
     """Do the test views show enough that no training view saw for a backdrop to be worth it? Without any: perhaps."""
-    import numpy as np
-
     return not unseen or float(np.mean([each.mean() for each in unseen.values()])) > LEAST_UNSEEN
 
 
 def finished(scene: Scene, gaussians: dict[str, Gaussians], result: str) -> dict[str, Gaussians]:
     """Stage -> its Gaussians completed by what lies beyond the capture: of the result, and of the initialization."""
-    from reffusion.score import beyond
-
     stages = [stage for stage in ("initialize", result) if stage in gaussians]
     cameras = [scene.cameras[name] for name in scene.train]
     return {stage: beyond.completed(gaussians[stage], cameras) for stage in dict.fromkeys(stages)}
@@ -221,7 +171,7 @@ def finished(scene: Scene, gaussians: dict[str, Gaussians], result: str) -> dict
 def captured_by(
     scene: Scene, captured: Gaussians, poses: Path, masks: Path | None
 ) -> tuple[Gaussians, list[Camera], dict[str, np.ndarray]]:
-    """What `sight.witnesses` takes: the fit, the training views, and where those show the object."""
+    """What `sight.seen_views` takes: the fit, the training views, and where those show the object."""
     cameras = [scene.cameras[name] for name in scene.train]
     hidden = {camera.name: mask_of(camera, poses, masks) for camera in cameras if camera.name not in scene.clean}
     return captured, cameras, hidden
@@ -229,11 +179,6 @@ def captured_by(
 
 def drawn(gaussians: Gaussians, camera: Camera, path: Path) -> np.ndarray:
     """Render to `path`, and give back what the file holds: scores are of the 8-bit picture that anyone can open."""
-    import torch
-
-    from reffusion.io.images import load_image, save_image
-    from reffusion.splat import rasterizer
-
     with torch.no_grad():
         save_image(path, rasterizer.render(gaussians, camera).color.cpu().numpy())
     return load_image(path)
@@ -241,8 +186,6 @@ def drawn(gaussians: Gaussians, camera: Camera, path: Path) -> np.ndarray:
 
 def truth_of(camera: Camera, poses: Path) -> np.ndarray | None:
     """uint8 [H, W, 3], the view's own picture; None where the scene has none. ValueError where its size is wrong."""
-    from reffusion.io.images import load_image
-
     path = poses / "images" / f"{camera.name}.png"
     if not path.exists():
         return None
@@ -257,10 +200,6 @@ def truth_of(camera: Camera, poses: Path) -> np.ndarray | None:
 def mask_of(camera: Camera, poses: Path, masks: Path | None) -> np.ndarray:
     """bool [H, W]: the view's test mask, else its consistent mask, else (a variant without the stage masks) its raw
     mask, else empty. Where there are test masks, every variant is so scored in the same box."""
-    import numpy as np
-
-    from reffusion.io.images import load_mask
-
     size, file = (camera.height, camera.width), f"{camera.name}.png"
     given = [poses / "test_masks" / file, *([masks / "consistent" / file] if masks else []), poses / "masks" / file]
     found = [path for path in given if path.exists()]
@@ -269,12 +208,6 @@ def mask_of(camera: Camera, poses: Path, masks: Path | None) -> np.ndarray:
 
 def view_of(gaussians: Gaussians, camera: Camera, picture: np.ndarray, mask: np.ndarray) -> Shown:
     """The view with its rendered depth, for the comparison with its neighbour."""
-    import numpy as np
-    import torch
-
-    from reffusion.score import consistency
-    from reffusion.splat import rasterizer
-
     with torch.no_grad():
         drawing = rasterizer.render(gaussians, camera, sh_degree=0)
     depth, alpha = drawing.depth.double().cpu().numpy(), drawing.alpha.cpu().numpy()
@@ -292,7 +225,5 @@ def used(painter: str | None, distill: Path | None) -> dict[str, str | None]:
 
 def seconds(needs: dict[str, Path | None]) -> dict[str, float]:
     """Stage -> seconds of its run, from the receipts that are there."""
-    from reffusion.io.arrays import load_json
-
     receipts = {stage: folder / "receipt.json" for stage, folder in needs.items() if folder}
     return {stage: load_json(path).get("seconds") for stage, path in receipts.items() if path.exists()}

@@ -5,7 +5,7 @@ import torch
 
 from reffusion import geometry
 from reffusion.capture.lens import Lens
-from reffusion.capture.undistorted import save_lenses
+from reffusion.capture.lenses import save_lenses
 from reffusion.gaussians.surfels import surface_gaussians
 from reffusion.io.images import load_image, save_image, save_mask
 from reffusion.io.ply import save_ply

@@ -96,8 +96,8 @@ def test_a_scene_without_training_views_or_gaussians_is_left_alone():
 # --- what was seen
 
 
-def seen_by(scene: Gaussians, masks=None) -> list[sight.Witness]:
-    return sight.witnesses(scene, TRAIN, masks or {})
+def seen_by(scene: Gaussians, masks=None) -> list[sight.SeenView]:
+    return sight.seen_views(scene, TRAIN, masks or {})
 
 
 def test_a_view_that_everything_saw_has_nothing_unseen():

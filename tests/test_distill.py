@@ -431,11 +431,12 @@ def pick(folders, *names):
 
 def test_stages_chain_through_files_with_the_scenes_own_reference(folders):
     from stages import distill, personalize, reference
+    from stages.plan import reference as plan
 
     given = load_image(folders["poses"] / "images" / "a.png")
     save_image(folders["scene"] / "done" / "a.png", given)
     params = reference.Params(prior="nowhere/at-all", reference={"view": "a", "image": "done/a.png"})
-    assert "reference a:" in reference.preview(params, scene=folders["scene"])[0]
+    assert "reference a:" in plan.preview(params, **pick(folders, "scene", "poses"))[0]
     reference.run(params, folders["reference"], **pick(folders, "scene", "poses", "fit", "masks"))
     assert (load_image(folders["reference"] / "references" / "a.png") == given).all()
     assert (load_mask(folders["reference"] / "masks" / "a.png") == hole().numpy()).all()
@@ -457,7 +458,7 @@ def test_stages_chain_through_files_with_the_scenes_own_reference(folders):
 def test_reference_inpaints_the_best_view_and_keeps_all_else(folders):
     from stages import reference
 
-    params = reference.Params(prior=folders["prior"], candidates=2, steps=2)
+    params = reference.Params(prior=folders["prior"], candidates=2, sampler={"steps": 2})
     reference.run(params, folders["reference"], **pick(folders, "scene", "poses", "fit", "masks"))
     (found,) = load_references(folders["reference"], load_scene(folders["poses"]))
     photo = load_image(folders["poses"] / "images" / "b.png")
@@ -472,10 +473,11 @@ def test_reference_inpaints_the_best_view_and_keeps_all_else(folders):
 
 def test_a_reference_made_of_pieces_of_itself_needs_no_prior(folders, tmp_path):
     from stages import reference
+    from stages.plan import reference as plan
 
     params = reference.Params(inpainter="exemplar", prior="no/such-model", prompt="a vase")
-    assert not reference.needed_weights(params, frozenset())
-    (note,) = reference.preview(params, scene=folders["scene"])
+    assert not plan.needed_weights(params, frozenset())
+    (note,) = plan.preview(params, scene=folders["scene"])
     assert "a vase" in note and "not read" in note
     reference.run(params, folders["reference"], **pick(folders, "scene", "poses", "fit", "masks"))
     (found,) = load_references(folders["reference"], load_scene(folders["poses"]))

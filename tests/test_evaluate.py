@@ -14,7 +14,7 @@ from reffusion.io.images import load_image, save_image, save_mask
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_scene, save_mask_sets, save_scene
 from reffusion.paint.paint2d import widened
-from reffusion.score import beyond, metrics, sight
+from reffusion.score import beyond, metrics, rows, sight
 from reffusion.types import Camera, Gaussians, MaskSet, Scene, Similarity
 from report import sheet
 from stages import evaluate
@@ -98,9 +98,9 @@ def test_scores_are_those_of_the_saved_pictures(done):
     train = [cameras[name] for name in load_scene(done / "poses").train]
     fit = load_ply(done / "fit" / "gaussians.ply")
     hidden = {camera.name: evaluate.mask_of(camera, done / "poses", done / "masks") for camera in train}
-    seen_by = sight.witnesses(fit, train, hidden)
+    seen_by = sight.seen_views(fit, train, hidden)
     for kind, renders in (("mean", "renders"), ("initialize", "renders_initialize")):
-        rows = [
+        scored = [
             metrics.score_view(
                 load_image(out / renders / f"{name}.png"),
                 load_image(done / "poses" / "images" / f"{name}.png"),
@@ -111,7 +111,7 @@ def test_scores_are_those_of_the_saved_pictures(done):
             for name, box in boxes.items()
         ]
         for column in metrics.COLUMNS:
-            assert summary[kind][column] == metrics.mean([row[column] for row in rows]), (kind, column)
+            assert summary[kind][column] == metrics.mean([row[column] for row in scored]), (kind, column)
     assert summary["mean"]["psnr_box"] != summary["initialize"]["psnr_box"]
     assert summary["views"]["psnr_box"] == 2 and summary["views"]["psnr_full"] == 3
     assert summary["mean"]["lpips_vgg_box"] is None and "vgg16-*.pth" in summary["lpips_unavailable"]
@@ -193,10 +193,11 @@ def test_a_test_view_without_picture_is_rendered_and_one_of_another_size_refused
         run(tmp_path / "again", folders)
 
 
-def test_a_held_out_view_that_shows_the_object_is_scored_outside_its_mask_only(tmp_path, folders):
+def test_a_held_out_view_that_shows_the_object_is_scored_outside_its_mask_only(tmp_path, monkeypatch, folders):
     shutil.copytree(folders["poses"] / "test_masks", folders["poses"] / "masks")
     (folders["poses"] / "masks" / "view1.png").unlink()
-    summary = run(tmp_path / "out", folders, outside_margin=0.05)
+    monkeypatch.setattr(rows, "OUTSIDE_MARGIN", 0.05)
+    summary = run(tmp_path / "out", folders)
     assert summary["views"]["psnr_outside"] == 3 and summary["views"]["psnr_full"] == 2  # view0 shows the object
     with open(tmp_path / "out" / "per_view.csv") as file:
         row = next(csv.DictReader(file))

@@ -47,7 +47,6 @@ CONSTANTS = {
     "lambda of the adversarial loss": ("distill.adversarial.weight", 0.03),
     "patches of the critic": ("distill.adversarial.patches", 64),
     "their side, px": ("distill.adversarial.size", 64),
-    "dilation of the mask's box": ("evaluate.box_dilation", 0.1),
 }
 
 
@@ -87,8 +86,10 @@ def test_constants_of_the_library():
 
     from reffusion.gaussians.optimize import reconstruction_loss
     from reffusion.prior import crops, lora
+    from reffusion.score import metrics
 
     assert crops.PROMPTS == ("A photo of sks", "A photo of sks, cropped", "")
+    assert metrics.BOX_DILATION == 0.1
     assert 8 * full_size.SD2.unet["sample_size"] == 512
     assert set(lora.TEXT_ATTENTION) == {"q_proj", "k_proj", "v_proj", "out_proj"}
     assert set(lora.ATTENTION) == {"to_q", "to_k", "to_v", "to_out.0"}

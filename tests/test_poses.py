@@ -32,15 +32,16 @@ from small_capture import (
 )
 
 from reffusion.capture import frame, lens
+from reffusion.capture.lenses import load_lenses
 from reffusion.capture.load import load_capture
 from reffusion.capture.roles import load_roles
-from reffusion.capture.undistorted import load_lenses
 from reffusion.io.arrays import load_json
 from reffusion.io.images import image_size
 from reffusion.io.ply import load_ply, save_ply, save_points
 from reffusion.io.scene import load_raw_masks, load_scene, load_test_masks, load_views
 from reffusion.types import Gaussians
 from stages import poses
+from stages.plan import poses as plan
 
 CAPTURES = Path(__file__).parents[2] / "shared" / "data"
 
@@ -85,7 +86,7 @@ def test_llff_copies_renamed_by_number_are_matched_in_order(tmp_path):
 
 
 @pytest.mark.parametrize("shifted", [False, True])
-def test_points_without_images_bin_are_taken_only_in_the_right_frame(tmp_path, shifted):
+def test_points_without_images_bin_are_taken_only_in_the_right_frame(tmp_path, monkeypatch, shifted):
     truth = some_truth()
     folder = prepare(tmp_path / "s", "llff+bin", truth)
     (folder / "sparse/0/images.bin").unlink()
@@ -97,7 +98,8 @@ def test_points_without_images_bin_are_taken_only_in_the_right_frame(tmp_path, s
             scene, _ = run(folder)
         assert len(scene.points) == 10_000
     else:
-        scene, _ = run(folder, least_points=0)
+        monkeypatch.setattr(poses, "LEAST_POINTS", 1)
+        scene, _ = run(folder)
         np.testing.assert_allclose(scene.similarity.invert(scene.points), truth.points, atol=1e-9)
 
 
@@ -157,7 +159,7 @@ def test_frames_without_a_picture_are_named_in_one_warning(tmp_path):
     assert len(scene.cameras) == 4
 
 
-def test_transforms_variants(tmp_path):
+def test_transforms_variants(tmp_path, monkeypatch):
     truth = some_truth()
     folder = prepare(tmp_path / "s", "transforms", truth)
     record = json.loads((folder / "transforms.json").read_text())
@@ -169,7 +171,8 @@ def test_transforms_variants(tmp_path):
     record["ply_file_path"], record["applied_transform"] = "some.ply", [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
     (folder / "transforms.json").write_text(json.dumps(record))
     save_points(folder / "some.ply", truth.points, np.zeros((60, 3), np.uint8))
-    scene, _ = run(folder, least_points=0)
+    monkeypatch.setattr(poses, "LEAST_POINTS", 1)
+    scene, _ = run(folder)
     assert reprojection_error(scene, truth) < 1e-3
     np.testing.assert_allclose(scene.similarity.invert(scene.points), truth.points, atol=1e-9)
 
@@ -185,13 +188,14 @@ def test_large_pictures_are_brought_to_the_longest_side(tmp_path):
 
 
 @pytest.mark.parametrize("brings", ["points", "bounds", "nothing"])
-def test_normalisation_knows_no_units_and_no_offset(tmp_path, brings):
+def test_normalisation_knows_no_units_and_no_offset(tmp_path, monkeypatch, brings):
     """A scene a thousand times larger, a million extents away, has the same normalised numbers."""
+    monkeypatch.setattr(poses, "LEAST_POINTS", 1)
     found = []
     for k, (scale, offset) in enumerate([(1.0, (0.0, 0.0, 0.0)), (1000.0, (4e9, -3e9, 1e9))]):
         truth = some_truth(scale=scale, offset=offset)
         layout = {"points": "colmap", "bounds": "llff", "nothing": "transforms"}[brings]
-        found.append(run(prepare(tmp_path / f"s{k}", layout, truth), least_points=0)[0])
+        found.append(run(prepare(tmp_path / f"s{k}", layout, truth))[0])
     for name, camera in found[0].cameras.items():
         np.testing.assert_allclose(found[1].cameras[name].world_to_camera, camera.world_to_camera, atol=2e-6)
     centers = np.stack([camera.center for camera in found[0].cameras.values()])
@@ -210,12 +214,13 @@ def test_depth_falls_back_where_nothing_tells_it():
         frame.depth_ranges(np.stack([np.eye(4)] * 4), pinholes, nothing, None)
 
 
-def test_random_points_are_seen_seeded_and_coloured(tmp_path):
+def test_random_points_are_seen_seeded_and_coloured(tmp_path, monkeypatch):
     truth = some_truth()
     folder = prepare(tmp_path / "s", "transforms", truth)
-    scene, _ = run(folder, more_points=500)
-    again, _ = run(folder, more_points=500)
-    other, _ = run(folder, more_points=500, seed=1)
+    monkeypatch.setattr(poses, "MORE_POINTS", 500)
+    (scene, _), (again, _) = run(folder), run(folder)
+    monkeypatch.setattr(poses, "SEED", 1)
+    other, _ = run(folder)
     assert np.array_equal(scene.points, again.points) and not np.array_equal(scene.points, other.points)
     seen = np.zeros(500, int)
     for camera in scene.cameras.values():
@@ -250,18 +255,18 @@ def test_what_the_scene_brings_comes_into_the_normalised_frame(tmp_path):
 
 def test_preview_is_light_and_says_what_will_happen(tmp_path):
     spin_nerf(tmp_path / "s")
-    notes = poses.preview(poses.Params(), tmp_path / "s")
+    notes = plan.preview(poses.Params(), tmp_path / "s")
     assert notes[0] == "4 training and 2 test views, 4 masks"
     assert notes[1] == f"SfM left out: {Path('sparse/0/images.bin')} brings poses"
     assert notes[2].startswith("undistortion: SIMPLE_RADIAL k1=0.05 moves the border by up to ")
     prepare(tmp_path / "t", "transforms", some_truth())
-    assert "undistortion left out: the lens is a pinhole" in poses.preview(poses.Params(), tmp_path / "t")
+    assert "undistortion left out: the lens is a pinhole" in plan.preview(poses.Params(), tmp_path / "t")
     write_pictures(tmp_path / "p", ["a", "b", "c"])
     write_masks(tmp_path / "p" / "masks", ["a", "b", "c"])
-    assert "SfM: 3 photos bring no poses" in poses.preview(poses.Params(), tmp_path / "p")
+    assert "SfM: 3 photos bring no poses" in plan.preview(poses.Params(), tmp_path / "p")
     code = (
-        "import sys, pathlib, stages.poses as p; assert 'numpy' not in sys.modules; "
-        "p.preview(p.Params(), pathlib.Path(sys.argv[1])); sys.exit('torch' in sys.modules or 'cv2' in sys.modules)"
+        "import sys, pathlib, stages.plan.poses as p; p.preview(p.Params(), pathlib.Path(sys.argv[1])); "
+        "sys.exit(bool({'torch', 'cv2', 'scipy'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", code, str(tmp_path / "s")]).returncode == 0
 
@@ -330,7 +335,7 @@ def test_fox(tmp_path):
     camera = scene.cameras["0001"]
     assert (camera.width, camera.height) == (135, 240)
     assert 100 < len(scene.points) <= 10_000, "it brings none, these are of flow"
-    notes = poses.preview(poses.Params(masks="none", test="every 8"), capture("fox"))
+    notes = plan.preview(poses.Params(masks="none", test="every 8"), capture("fox"))
     assert "43 training and 7 test views, 0 masks" in notes and any("OPENCV k1=0.05784" in n for n in notes)
 
 

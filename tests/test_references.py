@@ -16,7 +16,8 @@ from small_capture import HEIGHT, OPENCV, WIDTH, prepare, run, some_truth, write
 
 from reffusion.capture import lens
 from reffusion.capture.given import GivenReference, load_depth
-from reffusion.capture.undistorted import load_straight, load_straight_depth, save_lenses
+from reffusion.capture.lenses import save_lenses
+from reffusion.capture.straight import load_straight, load_straight_depth
 from reffusion.depth import alignment
 from reffusion.io.arrays import save_json, save_labels
 from reffusion.io.images import load_image, load_mask, save_exr, save_image, save_mask
@@ -26,8 +27,11 @@ from reffusion.types import MaskSet
 from runner.execute import clean, run_scene
 from runner.job import Request
 from runner.job import prepare as prepare_job
+from runner.keys import Hashes, code_of
 from runner.plan import plan
 from stages import poses, reference
+from stages.plan import poses as plan_poses
+from stages.plan import reference as plan_reference
 
 ROOT = Path(__file__).resolve().parent.parent
 SIZE = (160, 120)
@@ -231,34 +235,81 @@ REFUSALS = [
 ]
 
 
-@pytest.mark.parametrize(("params", "painted", "message"), [r[1:] for r in REFUSALS], ids=[r[0] for r in REFUSALS])
-def test_references_are_refused_before_any_work(tmp_path, params, painted, message):
-    folder = prepare(tmp_path / "s", "transforms", some_truth())
+def with_references(folder: Path, painted=()) -> Path:
+    """A capture with the files that `REFUSALS` names."""
+    prepare(folder, "transforms", some_truth())
     write_pictures(folder, ["ref"])
     write_pictures(folder, ["tall"], (HEIGHT, WIDTH))
     (folder / "note.txt").write_text("")
     for name in painted:
         (folder / "painted").mkdir(exist_ok=True)
         shutil.copy(folder / "ref.png", folder / "painted" / name)
+    return folder
+
+
+@pytest.mark.parametrize(("params", "painted", "message"), [r[1:] for r in REFUSALS], ids=[r[0] for r in REFUSALS])
+def test_references_are_refused_before_any_work(tmp_path, params, painted, message):
+    folder = with_references(tmp_path / "s", painted)
     with pytest.raises(ValueError, match=message):
-        reference.preview(reference.Params(**params), scene=folder)
+        plan_poses.preview(poses.Params(**params), folder)
+
+
+# A view that `poses` did not place may be the capture's all the same: what is said of it is said by `poses`' preview.
+UNPLACED = {
+    "unknown view": r"ref\.png: its view 'q' could not be placed.*v0",
+    "neither": r"ref\.png: its view 'v01' could not be placed, or is neither a training",
+    "painting of no view": r"painted/zebra\.png: its view 'zebra' could not be placed",
+}
+
+
+@pytest.mark.parametrize(("name", "params", "painted", "message"), REFUSALS, ids=[r[0] for r in REFUSALS])
+def test_references_are_refused_by_what_poses_wrote(tmp_path, name, params, painted, message):
+    folder = with_references(tmp_path / "s", painted)
+    asked = params.get("reference")
+    _, placed = run(folder, **{key: value for key, value in params.items() if key != "reference"})
+    for layout in ("images", "masks"):
+        shutil.rmtree(folder / layout)  # nothing of the capture is looked at
+    (folder / "transforms.json").unlink()
+    with pytest.raises(ValueError, match=UNPLACED.get(name, message)):
+        plan_reference.preview(reference.Params(reference=asked), scene=folder, poses=placed)
+    needs = {"scene": folder, "poses": placed, "fit": tmp_path, "masks": tmp_path}
+    with pytest.raises(ValueError, match=UNPLACED.get(name, message)):
+        reference.run(reference.Params(reference=asked), tmp_path / "out", **needs)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_stage_reads_nothing_of_the_capture(tmp_path):
+    """So mending a reader of captures reruns `poses` at most."""
+    code = code_of(ROOT, "reference", Hashes(tmp_path / "hashes.json"))
+    readers = ("reffusion/capture/layouts/", "reffusion/capture/load.py", "reffusion/capture/roles.py")
+    assert "reffusion/capture/given.py" in code and not [path for path in code if path.startswith(readers)]
+    assert any(path.startswith(readers) for path in code_of(ROOT, "poses", Hashes(tmp_path / "hashes.json")))
 
 
 def test_paintings_stand_for_named_references_and_masks_beside_them_are_passed_over(tmp_path):
     folder = prepare(tmp_path / "s", "transforms", some_truth())
     write_pictures(folder, ["ref", "painted/v01", "painted/v01_mask", "painted/v03", "painted/v03_depth"])
-    params = reference.Params(reference=[{"view": "v01", "image": "ref.png"}, {"view": "v02", "image": "ref.png"}])
-    (note,) = reference.preview(params, scene=folder)
+    named_too = [{"view": "v01", "image": "ref.png"}, {"view": "v02", "image": "ref.png"}]
+    assert "v01 (painted), v02, v03 (painted)" in plan_poses.preview(poses.Params(reference=named_too), folder)[-1]
+    params = reference.Params(reference=named_too)
+    (note,) = plan_reference.preview(params, scene=folder)
+    assert note == "takes over the scene's reference: no diffusion here"
+    _, placed = run(folder)
+    (note,) = plan_reference.preview(params, scene=folder, poses=placed)
     assert "v01 (painted), v02, v03 (painted)" in note
-    assert not reference.needed_weights(reference.Params(), frozenset({"painted"}))
+    assert not plan_reference.needed_weights(reference.Params(), frozenset({"painted"}))
 
 
 def test_a_view_that_was_not_placed_is_told(tmp_path):
     folder = prepare(tmp_path / "s", "transforms", some_truth())
     write_pictures(folder, ["ref"])
     save_lenses(tmp_path, {"v00": some_truth().lens}, False)
+    save_json(tmp_path / "views.json", {"train": ["v00"], "test": [], "clean": []})
     with pytest.raises(ValueError, match=r"ref\.png: its view 'v01' could not be placed"):
-        reference.preview(reference.Params(**named("v01")), scene=folder, poses=tmp_path)
+        plan_reference.preview(reference.Params(**named("v01")), scene=folder, poses=tmp_path)
+    write_pictures(folder, ["painted/v00", "painted/v01_mask"])  # a mask that was copied along
+    (note,) = plan_reference.preview(reference.Params(), scene=folder, poses=tmp_path)
+    assert "v00 (painted)" in note
 
 
 # ---------------------------------------------------------------------------------------------- the stage's artifact
@@ -281,7 +332,7 @@ def wall(tmp_path):
     return {"scene": tmp_path / "scene", "poses": made_poses, "fit": fitted, "masks": tmp_path / "masks"}
 
 
-COMMON = {"inpainter": "exemplar", "masks": "none", "test": list(small.TEST)}
+COMMON = {"inpainter": "exemplar"}
 
 
 def completed(wall, out: Path, **params):
@@ -421,10 +472,10 @@ def test_a_photograph_that_is_also_a_reference_still_counts_for_poses(tmp_path):
     write_pictures(folder, ["ref"])
     (folder / "scene.yaml").write_text("")
     files = sorted(path for path in folder.rglob("*") if path.is_file())
-    read = poses.scene_files(poses.Params(), folder, files)
+    read = plan_poses.scene_files(poses.Params(), folder, files)
     assert folder / "images/v00.png" in read and folder / "masks/v00.png" in read and folder / "transforms.json" in read
     assert folder / "ref.png" not in read and folder / "scene.yaml" not in read
-    of_reference = reference.scene_files(reference.Params(**named("v00", "images/v00.png")), folder, files)
+    of_reference = plan_reference.scene_files(reference.Params(**named("v00", "images/v00.png")), folder, files)
     assert of_reference == [folder / "images/v00.png"]
     scene, _ = run(folder)
     assert len(scene.cameras) == 6

@@ -75,7 +75,9 @@ def too_fast_distillation(factor: float) -> float:
     whole = torch.ones(frames.HEIGHT, frames.WIDTH, dtype=torch.bool)
     views = [TrainView(view, pictures[n], whole, ~whole, clean=False) for n, view in scene.cameras.items()]
     off, rates = {"weight": 0}, frames.faster(Rates(means=2e-3), factor)
-    settings = distilling.Params(iterations=40, sds=off, depth=off, adversarial=off, reference={"weight": 1}, lr={"epsilon": 1e-6})
+    settings = distilling.Params(
+        iterations=40, sds=off, depth=off, adversarial=off, reference={"weight": 1}, lr={"epsilon": 1e-6}
+    )
     holes = [(scene.cameras["v2"], pictures["v2"], whole)]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from reffusion.capture.layouts.capture import ENDINGS, Capture
-from reffusion.capture.roles import Roles, check_proportions, known
-from reffusion.io.images import image_size, load_exr
+from reffusion.capture.views import Views, check_proportions, known_for, not_placed
+from reffusion.io.images import ENDINGS, image_size, load_exr
+from reffusion.params.reference import Given
 
+PAINTED = "painted"  # folder of the scene: <view>.png and <view>_depth.*
 DEPTHS = (".npy", ".exr", ".png", ".tif", ".tiff")
 PROPORTIONS = 0.1  # how far a reference's may be from its view's: people crop
 
@@ -36,18 +37,19 @@ class GivenReference:
     painted: bool = False
 
 
-def load_given(
-    folder: Path,
-    capture: Capture,
-    roles: Roles,
-    named: Sequence[tuple[str, str, str | None, bool]],
-    painted: Sequence[Path],
-) -> list[GivenReference]:
-    """The references, sorted by view; a painting stands for one that scene.yaml names for the same view.
+def listed(asked: Given | Sequence[Given] | None) -> list[Given]:
+    """What the parameter `reference` names, as a list."""
+    return [] if asked is None else [asked] if isinstance(asked, Given) else list(asked)
 
-    Args:
-        named: (view, picture, depth or None, painted over an undistorted image?), files relative to the scene.
-        painted: the files of the folder `painted`: <view>.png, and <view>_depth.* where there is one.
+
+def paintings_in(folder: Path) -> list[Path]:
+    """The files of the scene's folder `painted`."""
+    return sorted(path for path in (Path(folder) / PAINTED).glob("[!.]*") if path.is_file())
+
+
+def load_given(folder: Path, views: Views, asked: Given | Sequence[Given] | None) -> list[GivenReference]:
+    """The references that scene.yaml names (`asked`) and those in `painted`, <view>.png, with <view>_depth.* where
+    there is one; sorted by view. A painting stands for one that scene.yaml names for the same view.
 
     Raises:
         ValueError: naming the file and the remedy: an unknown view, a test view, a view that is for neither, two for a
@@ -55,32 +57,41 @@ def load_given(
     """
     folder = Path(folder)
     found: dict[str, GivenReference] = {}
-    for view, image, depth, undistorted in named:
-        name = known(view, capture, "reference")
+    for each in listed(asked):
+        path = folder / each.image
+        name = known_for(path, each.view, views, "reference")
         if name in found:
             raise ValueError(f"scene.yaml: reference: two for the view '{name}'; keep one")
-        found[name] = GivenReference(name, folder / image, depth and folder / depth, undistorted)
-    for given in _paintings(painted, capture):
+        depth = None if each.depth is None else folder / each.depth
+        found[name] = GivenReference(name, path, depth, each.undistorted)
+    for given in _paintings(paintings_in(folder), views):
         found[given.view] = given
     for given in found.values():
-        _check(given, capture, roles)
+        _check(given, views)
     return sorted(found.values(), key=lambda given: given.view)
 
 
-def _paintings(files: Sequence[Path], capture: Capture) -> list[GivenReference]:
+def words(given: Sequence[GivenReference]) -> str:
+    """Their views for people."""
+    return ", ".join(each.view + (" (painted)" if each.painted else "") for each in given)
+
+
+def _paintings(files: Sequence[Path], views: Views) -> list[GivenReference]:
     """The paintings with their depth maps; masks that were copied along are passed over."""
     pictures, depths = {}, {}
     for path in files:
         of = {end: path.stem.removesuffix(end) for end in ("_depth", "_mask") if path.stem.endswith(end)}
-        if path.stem not in capture.pictures and of.get("_depth") in capture.pictures:
+        if path.stem not in views.names and of.get("_depth") in views.names:
             kind, name = depths, of["_depth"]
-        elif path.stem not in capture.pictures and of.get("_mask") in capture.pictures:
+        elif path.stem not in views.names and (of.get("_mask") in views.names or (views.placed and "_mask" in of)):
             continue
         elif path.suffix.lower() in ENDINGS:
             kind, name = pictures, path.stem
         else:
             raise ValueError(f"{path}: no picture; a painting is called <view>.png, its depth <view>_depth.png or .exr")
-        if name not in capture.pictures:
+        if name not in views.names and views.placed:
+            raise not_placed(path, name, views)
+        if name not in views.names:
             raise ValueError(f"{path}: no view is called '{name}'; call the painting like its view, or remove it")
         if name in kind:
             raise ValueError(f"{path}: there is {kind[name].name} too; keep one for the view '{name}'")
@@ -90,22 +101,22 @@ def _paintings(files: Sequence[Path], capture: Capture) -> list[GivenReference]:
     return [GivenReference(name, path, depths.get(name), True, True) for name, path in pictures.items()]
 
 
-def _check(given: GivenReference, capture: Capture, roles: Roles) -> None:
+def _check(given: GivenReference, views: Views) -> None:
     where = "" if given.painted else "; correct `reference` in scene.yaml"
     for path in (given.path, given.depth):
         if path is not None and not path.is_file():
             raise ValueError(f"{path}: no such file{where}")
-    if given.view in roles.test:
+    if given.view in views.test:
         raise ValueError(
             f"{given.path}: '{given.view}' is a test view, and scored: a reference would train it; "
             "make it for a training view, or take the view out of `test` in scene.yaml"
         )
-    if given.view not in roles.train:
+    if given.view not in views.train:
         raise ValueError(
             f"{given.path}: '{given.view}' is neither a training nor a test view; "
             "name it in `train` in scene.yaml, or make the reference for another view"
         )
-    check_proportions(given.path, given.view, capture, PROPORTIONS, "reference")
+    check_proportions(given.path, given.view, views.size_of(given.view), PROPORTIONS, "reference", views.upright)
     if given.depth is not None:
         if given.depth.suffix.lower() not in DEPTHS:
             raise ValueError(f"{given.depth}: a depth map is a 16-bit .png, a .npy or an .exr; convert it")

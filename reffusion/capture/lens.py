@@ -6,6 +6,7 @@ Directions are [..., 2] camera x/z and y/z (x right, y down); pixels as in CONVE
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -202,6 +203,13 @@ def sampling_map(lens: Lens, pinhole: Lens) -> np.ndarray:
     columns, rows = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
     directions = np.stack([(columns - pinhole.cx) / pinhole.fx, (rows - pinhole.cy) / pinhole.fy], axis=-1)
     return to_pixels(directions, lens)
+
+
+@lru_cache(maxsize=4)
+def undoing(lens: Lens) -> tuple[Lens, np.ndarray | None]:
+    """The pinhole that replaces the lens, and where to read (`sampling_map`); no map where nothing moves."""
+    pinhole = without_distortion(lens)
+    return pinhole, None if pinhole == lens.pinhole else sampling_map(lens, pinhole)
 
 
 def undistort_image(image: np.ndarray, where: np.ndarray) -> np.ndarray:

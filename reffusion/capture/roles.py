@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from pathlib import Path
 
 from reffusion.capture.layouts.capture import Capture, pictures_in
+from reffusion.capture.views import Views, check_proportions, known
 from reffusion.io.images import image_size
 
 LEAST_TRAINING_VIEWS = 3
@@ -85,7 +85,7 @@ def load_roles(
     train_named, test_named = (_chosen(value, capture, key) for key, value in (("train", train), ("test", test)))
     labelled = None if label_files is None else _labelled(capture, mask_files, label_files, test_named)
     train_named, test_views = _parted(train_named, test_named, labelled, capture)
-    clean_views = frozenset(known(name, capture, "clean") for name in clean)
+    clean_views = frozenset(known(name, capture.pictures, "clean") for name in clean)
     if clean_views - set(train_named):
         raise ValueError(f"scene.yaml: clean: {', '.join(sorted(clean_views - set(train_named)))} is no training view")
     # Test views with masks of their own among the training masks show the object: held out, but without a truth inside.
@@ -97,7 +97,7 @@ def load_roles(
         held_out = {name: path for name, path in held_out.items() if name not in labels}
     kept = {name: path for name, path in mask_files.items() if name in set(train_named)}
     for name, path in (*kept.items(), *beside.items()):
-        check_proportions(path, name, capture, 0.10, "mask")
+        check_proportions(path, name, _size_of(name, capture), 0.10, "mask")
     bare = [name for name in train_named if name not in kept and name not in clean_views]
     warning = f"{len(bare)} training views have no mask: {', '.join(bare)}" if kept and bare else None
     return Roles(
@@ -110,13 +110,13 @@ def load_roles(
     )
 
 
-def known(name: str, capture: Capture, key: str) -> str:
-    """The view of that name, an ending allowed; ValueError with the nearest names where there is none."""
-    for candidate in (name, Path(name).stem):
-        if candidate in capture.pictures:
-            return candidate
-    near = get_close_matches(name, capture.pictures, 3, 0.0)
-    raise ValueError(f"scene.yaml: {key}: there is no view '{name}'; views are named like {', '.join(near)}")
+def views_of(capture: Capture, roles: Roles) -> Views:
+    """The capture's views, for what people bring for them."""
+    return Views(capture.pictures, roles.train, roles.test, lambda name: _size_of(name, capture), capture.upright)
+
+
+def _size_of(name: str, capture: Capture) -> tuple[int, int]:
+    return image_size(capture.pictures[name], upright=capture.upright)
 
 
 def _parted(
@@ -152,7 +152,7 @@ def _chosen(value: Sequence[str] | str | None, capture: Capture, key: str) -> li
         if match is None:
             raise ValueError(f"scene.yaml: {key}: '{value}' is neither a list of views nor like 'every 8'")
         return list(capture.pictures)[:: int(match[1])]
-    names = sorted(known(name, capture, key) for name in value)
+    names = sorted(known(name, capture.pictures, key) for name in value)
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise ValueError(f"scene.yaml: {key}: {', '.join(twice)} named twice")
@@ -218,14 +218,3 @@ def _labelled(capture: Capture, masks: dict[str, Path], labels: list[Path], test
         f"{len(labels)} in order of names are not all among them; name the test views as `test` in scene.yaml, or the "
         "masks like their views"
     )
-
-
-def check_proportions(path: Path, name: str, capture: Capture, tolerance: float, what: str) -> None:
-    """ValueError where a picture's sides are not in the proportion of its view's, by more than `tolerance`."""
-    width, height = image_size(path, upright=capture.upright and what == "reference")
-    of_width, of_height = image_size(capture.pictures[name], upright=capture.upright)
-    if abs(width * of_height - height * of_width) > tolerance * width * of_height:
-        raise ValueError(
-            f"{path}: {width}x{height} px, but its view '{name}' has {of_width}x{of_height}; "
-            f"make the {what} over the whole picture, in its proportions"
-        )

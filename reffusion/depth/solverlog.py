@@ -33,7 +33,7 @@ class SolverLog:
         """Tell of a solver's result, disparity [H, W]."""
         if self.log is not None:
             with self.log.paused():
-                end = {"of": iterations, "kept": iterations, "reason": "converged"}
+                end = {"reason": "converged"}
                 self.log.log(iterations, series=f"{solver} {self.view}", **self._error(solved), **end)
 
     def _error(self, solved: np.ndarray) -> dict[str, float]:

@@ -132,7 +132,7 @@ class _Run:
 def _write_line(log: trace.Trace, run: _Run, line: dict[str, float]) -> None:
     """A line of the trace, written with the clock stopped."""
     optimizer, job, last = run.optimizer, run.job, run.job.settings.iterations
-    end = {"of": last, "kept": last, "reason": "finished"} if run.step == last else {}
+    end = {"reason": "finished"} if run.step == last else {}
     with log.paused():
         psnr = reference_psnr(optimizer.gaussians, job.holes)
         log.log(run.step, reference_psnr=psnr, **line, **job.tally, **_counts(optimizer), **end)

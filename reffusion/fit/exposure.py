@@ -13,6 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from reffusion.io.images import to_uint8
+
 FILE = "exposures.json"
 RATE, RATE_LAST = 1e-2, 1e-3  # Adam's step size at the start and at the end
 _IDENTITY = torch.eye(3, 4)
@@ -87,4 +89,4 @@ def normalised(image: np.ndarray, fit: Path, name: str) -> np.ndarray:
     if abs(np.linalg.det(matrix[:, :3])) < 1e-3:
         raise ValueError(f"{path}: the exposure of view '{name}' cannot be undone; fit again without `fit.exposure`")
     colors = (image / 255.0 - matrix[:, 3]) @ np.linalg.inv(matrix[:, :3]).T
-    return np.round(colors.clip(0, 1) * 255).astype(np.uint8)
+    return to_uint8(colors)

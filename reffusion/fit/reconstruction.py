@@ -160,7 +160,8 @@ def _write_line(
 ) -> None:
     """A line of the trace, written with the clock stopped."""
     with log.paused():
-        log.log(run.iteration, **_summary(run, held_out, images, settings, impl))
+        end = {"reason": "finished"} if run.iteration == settings.iterations else {}
+        log.log(run.iteration, **_summary(run, held_out, images, settings, impl), **end)
     run.loss, run.error, run.steps = 0.0, 0.0, 0
 
 

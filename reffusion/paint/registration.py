@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from reffusion.io.images import to_uint8
+
 COARSEST = 40  # px, the shorter side at the coarsest level: a shift of a tenth of the picture is 4 px there
 ITERATIONS = 30
 STILL = 0.02  # px: a step that moves no corner further is the last of its level
@@ -113,7 +115,7 @@ def warped(picture: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 def recolored(picture: np.ndarray, gain: np.ndarray, offset: np.ndarray) -> np.ndarray:
     """uint8 [H, W, 3] with the colours of the photograph."""
-    return np.round((picture / 255.0 * gain + offset).clip(0, 1) * 255).astype(np.uint8)
+    return to_uint8(picture / 255.0 * gain + offset)
 
 
 def cut_in(

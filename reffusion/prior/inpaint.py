@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from reffusion.io.images import to_uint8
 from reffusion.prior import diffusion
 from reffusion.prior.model import Prior
 from reffusion.seeding import generator as seeded
@@ -26,8 +27,18 @@ def background(remaining: Gaussians, camera: Camera, photo: np.ndarray, consiste
         remaining: the Gaussians without the object's.
         photo: uint8 [H, W, 3]. consistent: C, bool [H, W].
     """
-    drawn = rasterizer.render(remaining, camera).color.clamp(0, 1).cpu().numpy()
-    return np.where(consistent[..., None], np.round(drawn * 255).astype(np.uint8), photo)
+    drawn = rasterizer.render(remaining, camera).color.cpu().numpy()
+    return np.where(consistent[..., None], to_uint8(drawn), photo)
+
+
+def as_input(picture: np.ndarray) -> Tensor:
+    """uint8 [H, W, 3] as `paint` takes it: float32 [3, H, W] in [-1, 1]."""
+    return torch.from_numpy(picture).permute(2, 0, 1) / 127.5 - 1
+
+
+def as_picture(painted: Tensor) -> np.ndarray:
+    """[3, H, W] in [-1, 1] -> uint8 [H, W, 3]."""
+    return to_uint8((painted.permute(1, 2, 0).cpu().numpy() + 1) / 2)
 
 
 def resized(image: Tensor, height: int, width: int) -> Tensor:

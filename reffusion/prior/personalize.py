@@ -64,7 +64,7 @@ def personalize(
     held_out = held_out_samples(references, prior.native_size, settings.seed)
 
     def measure(step: int) -> None:
-        end = {"of": steps, "kept": steps, "reason": "finished"} if step == steps else {}
+        end = {"reason": "finished"} if step == steps else {}
         with log.paused():
             log.log(step, **held_out_error(prior, held_out, settings.seed), **end)
 

@@ -21,6 +21,7 @@ PIXELS_PER_DEGREE = 67.0  # FLIP's own default: 0.7 m away from a 0.7 m wide 4K 
 SSIM_WINDOW = 11  # px
 SSIM_SIGMA = 1.5  # px
 LIBRARIES = ("torch", "numpy", "scikit-image", "flip-evaluator")
+BOX_DILATION = 0.1  # each side of the mask's box moves outwards by this share of the box's extent
 PSNR_CAP = 100.0  # dB, what an identical image counts in a mean
 
 COLUMNS = (
@@ -73,7 +74,7 @@ class Box(NamedTuple):
         return array[self.top : self.bottom, self.left : self.right]
 
 
-def mask_box(mask: np.ndarray, dilation: float = 0.1) -> Box | None:
+def mask_box(mask: np.ndarray, dilation: float = BOX_DILATION) -> Box | None:
     """The bounding box of a bool mask [H, W], each side moved outwards by `dilation` of the box's extent.
 
     Rounded outwards and clipped to the image. None for an empty mask.

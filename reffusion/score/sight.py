@@ -28,7 +28,7 @@ PROTOCOL = (
 )
 
 
-class Witness(NamedTuple):
+class SeenView(NamedTuple):
     """A training view, small.
 
     Attributes:
@@ -42,7 +42,7 @@ class Witness(NamedTuple):
     hidden: np.ndarray
 
 
-def witnesses(gaussians: Gaussians, cameras: Sequence[Camera], masks: Mapping[str, np.ndarray]) -> list[Witness]:
+def seen_views(gaussians: Gaussians, cameras: Sequence[Camera], masks: Mapping[str, np.ndarray]) -> list[SeenView]:
     """The training views as a fit shows them.
 
     Args:
@@ -57,24 +57,24 @@ def witnesses(gaussians: Gaussians, cameras: Sequence[Camera], masks: Mapping[st
             centers = np.stack(np.meshgrid(*(np.arange(n) + 0.5 for n in (small.width, small.height))), -1)
             scale = np.array([camera.width / small.width, camera.height / small.height])
             hidden, _ = geometry.sample_nearest(masks[camera.name], centers * scale)
-        found.append(Witness(small, _depth(gaussians, small)[0], hidden))
+        found.append(SeenView(small, _depth(gaussians, small)[0], hidden))
     return found
 
 
-def unseen(gaussians: Gaussians, camera: Camera, seen_by: Sequence[Witness]) -> np.ndarray:
-    """bool [H, W]: the pixels of a view at which it shows what none of the witnesses saw; see `PROTOCOL`.
+def unseen(gaussians: Gaussians, camera: Camera, seen_by: Sequence[SeenView]) -> np.ndarray:
+    """bool [H, W]: the pixels of a view at which it shows what none of the training views saw; see `PROTOCOL`.
 
     Args:
-        gaussians: the fit that the witnesses were made of.
+        gaussians: the fit that the training views were drawn of.
     """
     depth, alpha = _depth(gaussians, camera)
     open_, points = depth > 0, geometry.unproject(np.where(depth > 0, depth, 1.0), camera)
     missed = np.ones(depth.shape, bool)
     # From the nearest on: it has seen most, and only the rest is looked for in the others.
-    for witness in sorted(seen_by, key=lambda w: float(np.linalg.norm(w.camera.center - camera.center))):
-        uv, z = geometry.project(points[open_], witness.camera)
-        surface, framed = geometry.sample_nearest(witness.depth, uv)
-        hidden, _ = geometry.sample_nearest(witness.hidden, uv)
+    for view in sorted(seen_by, key=lambda v: float(np.linalg.norm(v.camera.center - camera.center))):
+        uv, z = geometry.project(points[open_], view.camera)
+        surface, framed = geometry.sample_nearest(view.depth, uv)
+        hidden, _ = geometry.sample_nearest(view.hidden, uv)
         found = framed & ~hidden & (z < (1 + TOLERANCE) * surface)
         rows, columns = (index[found] for index in np.nonzero(open_))
         missed[rows, columns] = open_[rows, columns] = False

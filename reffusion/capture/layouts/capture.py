@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from reffusion.capture.lens import Lens
-from reffusion.io.images import image_size
+from reffusion.io.images import ENDINGS, image_size
 
-ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 NO_POINTS = (np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
 
 

@@ -8,7 +8,6 @@ import numpy as np
 
 from reffusion.capture.frame import depths_in_view
 from reffusion.capture.layouts.capture import (
-    ENDINGS,
     NO_POINTS,
     Capture,
     Poses,
@@ -20,7 +19,7 @@ from reffusion.capture.layouts.capture import (
 )
 from reffusion.capture.lens import Lens
 from reffusion.io.arrays import load_json
-from reffusion.io.images import image_size
+from reffusion.io.images import ENDINGS, image_size
 from reffusion.io.ply import load_points
 
 MODELS = (

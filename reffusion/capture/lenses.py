@@ -1,0 +1,32 @@
+"""lenses.json of a `poses` folder: what undistorting a picture of its views takes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+
+from reffusion.capture.lens import Lens
+from reffusion.io.arrays import load_json, save_json
+
+LENSES = "lenses.json"
+
+
+def save_lenses(poses_dir: Path, lenses: Mapping[str, Lens], upright: bool) -> None:
+    """Write lenses.json: the lenses at the size of the undistorted pictures."""
+    views = {name: asdict(lens) for name, lens in lenses.items()}
+    save_json(Path(poses_dir) / LENSES, {"upright": upright, "views": views})
+
+
+def load_lenses(poses_dir: Path) -> tuple[dict[str, Lens], bool]:
+    """View name -> its photograph's lens, at the size of the undistorted picture; is the orientation tag obeyed?"""
+    path = Path(poses_dir) / LENSES
+    if not path.is_file():
+        raise ValueError(f"{path}: missing; {poses_dir} is no finished `poses` folder")
+    read = load_json(path)
+    tuples = ("radial", "denominator", "tangential")
+    views = {
+        name: Lens(**{key: tuple(value) if key in tuples else value for key, value in fields.items()})
+        for name, fields in read["views"].items()
+    }
+    return views, read["upright"]

@@ -1,0 +1,28 @@
+"""A scene folder read as the parameters of `poses` say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from reffusion.capture.layouts.capture import Capture
+from reffusion.capture.load import load_capture
+from reffusion.capture.roles import Roles, load_roles
+from reffusion.params.poses import Params
+
+
+def read_scene(params: Params, scene: Path) -> tuple[Capture, Roles]:
+    """The capture and its views' roles; ValueError naming the file and the remedy where one is wrong."""
+    capture = load_capture(scene, params.layout, params.images)
+    roles = load_roles(
+        scene,
+        capture,
+        masks=params.masks,
+        test_masks=params.test_masks,
+        train=params.train,
+        test=params.test,
+        clean=params.clean,
+        region=params.region is not None,
+    )
+    if params.gaussians is not None and not (scene / params.gaussians).is_file():
+        raise ValueError(f"{scene / params.gaussians}: no such file; correct `gaussians` in scene.yaml")
+    return capture, roles

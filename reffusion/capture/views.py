@@ -1,0 +1,83 @@
+"""The views of a scene, as far as what people bring for them is checked: their names, roles and sizes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+
+from reffusion.capture.lenses import load_lenses
+from reffusion.io.arrays import load_json
+from reffusion.io.images import image_size
+
+
+@dataclass(frozen=True)
+class Views:
+    """Those of a capture (`reffusion.capture.roles.views_of`), or those that `poses` placed (`placed_views`).
+
+    Attributes:
+        names: all of them.
+        train, test: those that are for either.
+        size_of: name -> (width, height) of its picture.
+        upright: the camera's orientation tag is obeyed.
+        placed: they are what `poses` wrote, so a view that is not among them may be the capture's all the same.
+    """
+
+    names: Collection[str]
+    train: Collection[str]
+    test: Collection[str]
+    size_of: Callable[[str], tuple[int, int]]
+    upright: bool
+    placed: bool = False
+
+
+def placed_views(poses_dir: Path) -> Views:
+    """The views of a finished `poses` folder, at the sizes of its undistorted pictures."""
+    lenses, upright = load_lenses(poses_dir)
+    roles = load_json(Path(poses_dir) / "views.json")
+    size_of = lambda name: (lenses[name].width, lenses[name].height)
+    return Views(lenses, roles["train"], roles["test"], size_of, upright, placed=True)
+
+
+def known(name: str, names: Collection[str], key: str) -> str:
+    """The view of that name, an ending allowed; ValueError with the nearest names where there is none."""
+    if found := _found(name, names):
+        return found
+    raise ValueError(f"scene.yaml: {key}: there is no view '{name}'; views are named like {_near(name, names)}")
+
+
+def known_for(path: Path, name: str, views: Views, key: str) -> str:
+    """`known`, of the view that the file at `path` is made for."""
+    if not views.placed:
+        return known(name, views.names, key)
+    if found := _found(name, views.names):
+        return found
+    raise not_placed(path, name, views)
+
+
+def not_placed(path: Path, name: str, views: Views) -> ValueError:
+    return ValueError(
+        f"{path}: its view '{name}' could not be placed, or is neither a training nor a test view; "
+        f"make it for another view: they are named like {_near(name, views.names)}"
+    )
+
+
+def _found(name: str, names: Collection[str]) -> str | None:
+    return next((candidate for candidate in (name, Path(name).stem) if candidate in names), None)
+
+
+def _near(name: str, names: Collection[str]) -> str:
+    return ", ".join(get_close_matches(name, names, 3, 0.0))
+
+
+def check_proportions(
+    path: Path, name: str, of_size: tuple[int, int], tolerance: float, what: str, upright: bool = False
+) -> None:
+    """ValueError where a picture's sides are not in the proportion of its view's, by more than `tolerance`."""
+    (width, height), (of_width, of_height) = image_size(path, upright), of_size
+    if abs(width * of_height - height * of_width) > tolerance * width * of_height:
+        raise ValueError(
+            f"{path}: {width}x{height} px, but its view '{name}' has {of_width}x{of_height}; "
+            f"make the {what} over the whole picture, in its proportions"
+        )

@@ -1,0 +1,11 @@
+"""What `lift` says before it runs."""
+
+from __future__ import annotations
+
+from reffusion.params.lift import Params
+from reffusion.weights import local
+
+
+def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
+    """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
+    return [local.of_model(params.prior, "float32")] if params.inpainter == "diffusion" else []

@@ -1,0 +1,54 @@
+"""What `poses` says before it runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from reffusion.capture import lens
+from reffusion.capture.given import PAINTED, load_given, words
+from reffusion.capture.layouts.capture import Capture
+from reffusion.capture.reading import read_scene
+from reffusion.capture.roles import views_of
+from reffusion.params.poses import Params
+
+# pictures count where they are photographs or masks; depth maps belong to references
+NOT_READ = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".npy", ".exr")
+
+
+def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
+    """Of the scene's files those that this stage reads, and what it reads elsewhere: the photographs and masks, and
+    all that is neither a picture nor a depth map. So a new reference, wherever it lies, reruns nothing here."""
+    others = [path for path in files if path.parent != scene or path.name != "scene.yaml"]
+    try:
+        capture, roles = read_scene(params, scene)
+    except ValueError:  # `preview` refuses it
+        return others
+    read = {*capture.pictures.values(), *roles.masks.values(), *roles.test_masks.values()}
+    read |= {scene / params.gaussians} if params.gaussians is not None else set()
+    kept = [path for path in others if path.suffix.lower() not in NOT_READ or path.name == "poses_bounds.npy"]
+    return sorted(read | {path for path in kept if path.parent != scene / PAINTED})
+
+
+def preview(params: Params, scene: Path) -> list[str]:
+    """What the stage will do, from headers alone. ValueError where it would refuse, or where a reference that the scene
+    brings, read by a later stage, belongs to none of its views."""
+    capture, roles = read_scene(params, scene)
+    given = load_given(scene, views_of(capture, roles), params.reference)
+    notes = [f"{len(roles.train)} training and {len(roles.test)} test views, {len(roles.masks)} masks"]
+    notes += _of_poses(capture, scene)
+    notes += [f"the scene brings a reference of {words(given)}"] if given else []
+    return [*notes, *capture.warnings, *roles.warnings]
+
+
+def _of_poses(capture: Capture, scene: Path) -> list[str]:
+    """Where the poses come from, and what their lenses take."""
+    if capture.poses is None:
+        return [f"SfM: {len(capture.pictures)} photos bring no poses"]
+    shifts = {each: lens.largest_shift(each) for each in set(capture.poses.lenses.values())}
+    worst = max(shifts, key=shifts.__getitem__)
+    moved = f"{worst.coefficients()} moves the border by up to {shifts[worst]:.1f} px"
+    pinhole = shifts[worst] <= lens.PINHOLE_ENOUGH
+    return [
+        f"SfM left out: {capture.brought_by.relative_to(scene)} brings poses",
+        "undistortion left out: the lens is a pinhole" if pinhole else f"undistortion: {moved}",
+    ]

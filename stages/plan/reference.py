@@ -1,0 +1,34 @@
+"""What `reference` says before it runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from reffusion.capture.given import PAINTED, listed, load_given, paintings_in, words
+from reffusion.capture.views import placed_views
+from reffusion.params.reference import Params
+from reffusion.weights import local
+
+
+def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
+    """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml, and its folders."""
+    given = params.reference is not None or PAINTED in brings or params.inpainter == "exemplar"
+    return [] if given else [local.of_model(params.prior, params.dtype)]
+
+
+def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
+    """Of the scene's files those that this stage reads, and what it reads elsewhere."""
+    named = {scene / name for each in listed(params.reference) for name in (each.image, each.depth) if name}
+    return sorted({path for path in named if path.is_file()} | {p for p in files if p.parent == scene / PAINTED})
+
+
+def preview(params: Params, *, scene: Path, poses: Path | None = None, **_: Path | None) -> list[str]:
+    """What the stage will do. ValueError where it would refuse a reference for its name, its file or its view, as far
+    as that can be told: against the views that `poses` placed (before it has run, `poses` checks the capture's)."""
+    if listed(params.reference) or paintings_in(scene):
+        views = words(load_given(scene, placed_views(poses), params.reference)) if poses else ""
+        return [f"takes over the scene's reference{views and ' ' + views}: no diffusion here"]
+    if params.inpainter == "diffusion":
+        return []
+    unread = f"; the prompt '{params.prompt}' is not read, reference.inpainter=diffusion would" if params.prompt else ""
+    return [f"completes the reference from pieces of itself: no diffusion here{unread}"]
