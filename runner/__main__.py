@@ -8,12 +8,14 @@ import signal
 import sys
 from pathlib import Path
 
+from runner import Failed, Refused
+from runner.batch import batch, show_results
 from runner.child import INTERRUPTED
 from runner.compare import compare
-from runner.execute import Failed, batch, clean, run_scene, show_results, write_json
-from runner.job import Request, prepare
-from runner.pipeline import Refused
+from runner.execute import clean, run_scene
+from runner.files import write_json
 from runner.plan import as_record, plan, table
+from runner.resolve import Request, resolve
 from runner.weights import weights
 
 SOME_FAILED = 3  # compare: done, but for some variants
@@ -28,7 +30,7 @@ def main() -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # told to end: as Ctrl-C
     try:
         if arguments.command == "plan":
-            job = prepare(request)
+            job = resolve(request)
             decisions = plan(job, job.pipeline.closure(arguments.stage))
             if arguments.record:
                 job.home.mkdir(parents=True, exist_ok=True)

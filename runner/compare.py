@@ -9,9 +9,11 @@ import time
 from dataclasses import replace
 from typing import Any
 
-from runner.execute import Failed, run_scene, say, shown, write_json
-from runner.job import Request, prepare
-from runner.pipeline import Pipeline, Refused, find_scene, load_pipeline, unknown
+from runner import Failed, Refused, say
+from runner.execute import run_scene
+from runner.files import shown, write_json
+from runner.pipeline import Pipeline, find_scene, load_pipeline, unknown
+from runner.resolve import Memory, Request, resolve_all
 
 FULL = "full"  # what the scene's own run, without a variant, is called beside them
 RECORD = "compare.json"
@@ -39,7 +41,9 @@ def compare(request: Request, only: str = "", seeds: int = 1) -> int:
         for scene in scenes
         for method in methods
     }
-    _check(requests, scenes)
+    memory = Memory(request.runs)
+    # Wrong parameters of any variant, or of any scene, are refused before the first stage runs.
+    resolve_all([r for (scene, method), r in requests.items() if scene == scenes[0] or method == FULL], memory)
     names = {scene: find_scene(scene, request.root).name for scene in scenes}
     runs = [{"scene": names[scene], "method": method, "state": WAITING} for scene, method in requests]
     record = {"scene": names[scenes[0]], "scenes": list(names.values()), "methods": methods, "runs": runs}
@@ -50,7 +54,7 @@ def compare(request: Request, only: str = "", seeds: int = 1) -> int:
         write_json(home / RECORD, record)
         minutes = (time.monotonic() - began) / 60
         say(f"\ncompare: {run['method']} on {run['scene']}, {number} of {len(runs)}, {minutes:.0f} min so far")
-        run |= _done(asked)
+        run |= _done(asked, memory)
     write_json(home / RECORD, record)
     failed = [run for run in runs if run["state"] == FAILED]
     say("")
@@ -60,10 +64,10 @@ def compare(request: Request, only: str = "", seeds: int = 1) -> int:
     return len(failed)
 
 
-def _done(request: Request) -> dict[str, Any]:
+def _done(request: Request, memory: Memory) -> dict[str, Any]:
     """Run one; its state, and stage -> the artifact's folder below runs/, null where the stage is left out."""
     try:
-        stages = run_scene(request, "all")
+        stages = run_scene(request, "all", memory)
     except (Refused, Failed) as error:
         print(f"error: {error}", file=sys.stderr, flush=True)
         return {"state": FAILED, "error": str(error)}
@@ -90,10 +94,3 @@ def _scenes(request: Request, seeds: int) -> list[str]:
         except Refused as error:
             raise Refused(f"seeds={seeds} asks for the scenes {scenes[0]} to {scenes[-1]}: {error}") from None
     return scenes
-
-
-def _check(requests: dict[tuple[str, str], Request], scenes: list[str]) -> None:
-    """Refuse wrong parameters of any variant, or of any scene, before the first stage runs."""
-    for (scene, method), request in requests.items():
-        if scene == scenes[0] or method == FULL:
-            prepare(request)

@@ -1,99 +1,29 @@
-"""Runs what a plan asks for: a fresh process a stage, and folders that are renamed into place."""
+"""The third step: does what a plan asks for, in a fresh process a stage, and renames folders into place."""
 
 from __future__ import annotations
 
-import csv
-import fcntl
 import functools
 import importlib.metadata
 import json
-import os
 import platform
 import shutil
 import signal
 import subprocess
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from runner.handout import hand_out
-from runner.job import Job, Request, child, prepare, source_of
-from runner.pipeline import SCENE, Refused
-from runner.plan import MACHINE, RECEIPT, Decision, decide, expected_seconds, partial_folder, plan, receipt, table
+from runner import Failed, Refused, say
+from runner.describe import child
+from runner.files import RECEIPT, discard, hand_out, locked, put_in_place, receipt, recover, shown, write_json
+from runner.pipeline import SCENE
+from runner.plan import MACHINE, Decision, decide, expected_seconds, partial_folder, plan, table
+from runner.resolve import Job, Memory, Request, resolve, source_of
 
 PACKAGES = ("reffusion", "numpy", "torch", "numba", "diffusers", "transformers", "peft", "pycolmap", "gsplat")
 GRACE = 20.0  # seconds an interrupted stage has to end by itself
-
-
-class Failed(Exception):
-    """A stage could not do its work, told in one line."""
-
-
-def say(text: str) -> None:
-    print(text, flush=True)
-
-
-# ---------------------------------------------------------------------------------------------- locks and renamings
-
-
-@contextmanager
-def locked(runs: Path, name: str, shared: bool = False, wait: bool = True) -> Iterator[int]:
-    """Hold `runs/.locks/<name>`; yields its file descriptor. The system frees it when all who hold it have ended."""
-    path = runs / ".locks" / name
-    path.parent.mkdir(parents=True, exist_ok=True)
-    mode = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
-    with open(path, "a+") as file:
-        try:
-            fcntl.flock(file, mode | fcntl.LOCK_NB)
-        except BlockingIOError:
-            file.seek(0)
-            holder = f"{name} is in use by process {file.read().strip() or '?'}"
-            if not wait:
-                raise Refused(f"{holder}; stop it, or wait for its end") from None
-            say(f"{holder}: waiting for its end")
-            fcntl.flock(file, mode)
-        if not shared:
-            file.truncate(0)
-            file.write(f"{os.getpid()}\n")
-            file.flush()
-        yield file.fileno()
-
-
-def put_in_place(partial: Path, place: Path) -> None:
-    """Swap a finished folder in. Killed between the two renamings, `recover` brings the old one back."""
-    old = place.with_name(f".old-{place.name}")
-    if place.exists():
-        discard(old)
-        place.rename(old)
-    partial.rename(place)
-    discard(old)
-
-
-def recover(home: Path) -> None:
-    """Undo or finish the swap in which a runner was killed."""
-    for old in home.glob(".old-*"):
-        place = home / old.name.removeprefix(".old-")
-        if place.exists() or not (old / RECEIPT).exists():
-            discard(old)
-        else:
-            old.rename(place)
-
-
-def discard(folder: Path) -> None:
-    """Delete a folder, its receipt first: what is left of it after a kill is never taken for an artifact."""
-    if folder.exists():
-        (folder / RECEIPT).unlink(missing_ok=True)
-        shutil.rmtree(folder)
-
-
-def write_json(path: Path, content: Any) -> None:
-    partial = path.with_name(path.name + ".writing")
-    partial.write_text(json.dumps(content, indent=1) + "\n")
-    os.replace(partial, path)
 
 
 # ------------------------------------------------------------------------------------------------------- one stage
@@ -119,6 +49,7 @@ def run_stage(job: Job, stage: str, decision: Decision, earlier: dict[str, Decis
     for other in job.home.glob(f".partial-{stage}-*"):
         discard(other)
     job.hashes.save()
+    job.memory.answers.clear()  # time has passed: what stages said of themselves may not hold any more
     return replace(decision, word="cached", reason="made now", path=place, settled=True)
 
 
@@ -187,6 +118,7 @@ def _receipt(
         "scene": job.name,
         "key": decision.inputs.key,
         **asdict(decision.inputs),
+        "profile": job.profile,
         "output": job.hashes.folder(folder),
         "versions": {"python": platform.python_version(), **_installed()},
         "platform": platform.platform(),
@@ -213,12 +145,12 @@ def _installed() -> dict[str, str]:
 # ------------------------------------------------------------------------------------------------------- one scene
 
 
-def run_scene(request: Request, target: str) -> dict[str, Path | None]:
+def run_scene(request: Request, target: str, memory: Memory | None = None) -> dict[str, Path | None]:
     """Bring `target` and what it needs up to date; stage -> its artifact's folder, None where it is left out.
 
     Raises Refused before any work, Failed where a stage fails.
     """
-    job = prepare(request)
+    job = resolve(request, memory)
     stages = job.pipeline.closure(target)
     with ExitStack() as held:
         if job.home != job.base:
@@ -266,74 +198,3 @@ def clean(request: Request) -> None:
             if (request.runs / each).exists():
                 shutil.rmtree(request.runs / each)
                 say(f"removed {shown(request.runs / each)}")
-
-
-# -------------------------------------------------------------------------------------------------------- results
-
-
-def _mean(evaluate: Path | None, of: str = "mean") -> dict[str, float | None]:
-    return json.loads((evaluate / "metrics.json").read_text()).get(of, {}) if evaluate else {}
-
-
-def show_results(stage: str, folder: Path | None) -> None:
-    """Where the results are; after `evaluate` the mean metrics too, those of the initialization beside them."""
-    if folder is None:
-        return
-    if stage == "evaluate":
-        initial = _mean(folder, "initialize")
-        for name, value in _mean(folder).items():
-            before = _number(initial.get(name))
-            say(
-                f"  {name:<16} {_number(value) or 'not available':<14}"
-                + (f" initialization {before}" if before else "")
-            )
-    names = (p.name + ("/" if p.is_dir() else "") for p in sorted(folder.iterdir()) if p.name != RECEIPT)
-    say(f"results in {shown(folder)}/: {', '.join(names)}")
-
-
-def _number(value: Any) -> str:
-    return f"{value:.4f}" if isinstance(value, float) else "" if value is None else str(value)
-
-
-def batch(request: Request, folder: Path) -> int:
-    """Every scene in `folder`, one after another; a table in runs/results.{csv,md}. Returns how many failed."""
-    scenes = sorted(p for p in folder.iterdir() if p.is_dir() and p.name[0] not in "._") if folder.is_dir() else []
-    if not scenes:
-        raise Refused(f"data={folder}: no folders of scenes there")
-    rows: dict[str, dict[str, float | None]] = {}
-    failed: dict[str, str] = {}
-    for scene in scenes:
-        try:
-            rows[scene.name] = _mean(run_scene(replace(request, scene=str(scene)), "all").get("evaluate"))
-        except (Refused, Failed) as error:
-            failed[scene.name] = str(error)
-            print(f"error: {error}", file=sys.stderr, flush=True)
-    suffix = f"@{request.variant}" if request.variant else ""
-    _write_table(request.runs / f"results{suffix}", rows, failed)
-    for name, reason in failed.items():
-        say(f"failed: {name}: {reason}")
-    say(f"{len(rows)} of {len(scenes)} scenes done; table: {shown(request.runs)}/results{suffix}.csv and .md")
-    return len(failed)
-
-
-def _write_table(stem: Path, rows: dict[str, dict[str, float | None]], failed: dict[str, str]) -> None:
-    """A row a scene, and the mean over the scenes that have a value."""
-    names = list(dict.fromkeys(name for row in rows.values() for name in row))
-    lines = [[scene, "done", *(_number(row.get(name)) for name in names)] for scene, row in rows.items()]
-    lines += [[scene, "failed", *("" for _ in names)] for scene in failed]
-    means = []
-    for name in names:
-        values = [row[name] for row in rows.values() if isinstance(row.get(name), int | float)]
-        means.append(_number(sum(values) / len(values)) if values else "")  # type: ignore[arg-type]
-    lines.append([f"mean of {len(rows)}", "", *means])
-    header = ["scene", "state", *names]
-    stem.parent.mkdir(parents=True, exist_ok=True)
-    with open(f"{stem}.csv", "w", newline="") as file:
-        csv.writer(file).writerows([header, *lines])
-    text = [" | ".join(cells) for cells in (header, ["---"] * len(header), *lines)]
-    Path(f"{stem}.md").write_text("".join(f"| {line} |\n" for line in text))
-
-
-def shown(path: Path) -> str:
-    """A path as people type it: from the current folder where it lies below."""
-    return os.path.relpath(path) if path.is_relative_to(Path.cwd()) else str(path)

@@ -1,11 +1,9 @@
-"""`pipeline.yaml` and `scene.yaml`: their models, and the parameters that follow from them."""
+"""`pipeline.yaml` and `scene.yaml`: what they say, checked."""
 
 from __future__ import annotations
 
 import difflib
-import os
 import re
-import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,14 +11,12 @@ from typing import Annotated, Any
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from runner import Refused
+
 SCENE = "scene"  # the need that stands for the scene's own folder
-AUTO = "auto"
+LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the one in C takes a tenth of the time
 
-Overrides = dict[str, dict[str, Any]]  # stage -> parameter -> value
-
-
-class Refused(Exception):
-    """What the user can put right, told in one line before any work."""
+Overrides = dict[str, dict[str, Any]]  # stage -> parameter, or group of parameters -> value
 
 
 class Strict(BaseModel):
@@ -143,9 +139,10 @@ def unknown(kind: str, name: object, known: Any) -> str:
     return f"unknown {kind} {name!r}; " + (f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}")
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Raises Refused where it is not valid, or holds no `key: value` lines."""
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = yaml.load(path.read_text(encoding="utf-8"), LOADER)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise Refused(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
     if content is None:
@@ -167,7 +164,7 @@ def load_pipeline(root: Path) -> Pipeline:
     if not path.is_file():
         raise Refused(f"{path}: no such file; the runner's --root is the folder that holds it")
     try:
-        return Pipeline.model_validate(_read_yaml(path))
+        return Pipeline.model_validate(read_yaml(path))
     except ValidationError as error:
         raise Refused(f"{path}: {_first_error(error)}") from None
 
@@ -193,7 +190,7 @@ class SceneFile:
 
 def load_scene_file(folder: Path, pipeline: Pipeline) -> SceneFile:
     path = folder / "scene.yaml"
-    content = _read_yaml(path) if path.is_file() else {}
+    content = read_yaml(path) if path.is_file() else {}
     keys = [key for names in pipeline.scene_keys.values() for key in names]
     for key in content:
         if key not in (*keys, "profile", "budget", "stages"):
@@ -206,56 +203,6 @@ def load_scene_file(folder: Path, pipeline: Pipeline) -> SceneFile:
             raise Refused(f"{path}: stages: {unknown('stage', stage, pipeline.stages)}")
     brings = {key: value for key, value in content.items() if key in keys and value is not None}
     return SceneFile(path, content.get("profile"), brings, stages, content.get("budget"))
-
-
-def parse_set(text: str, pipeline: Pipeline) -> Overrides:
-    """`fit.iterations=500 distill.seed=3`; the values are read as YAML."""
-    overrides: Overrides = {}
-    for word in shlex.split(text):
-        match = re.fullmatch(r"(\w+)\.(\w+)=(.*)", word, flags=re.DOTALL)
-        if not match:
-            raise Refused(f"set: {word!r} is not of the form stage.parameter=value")
-        stage, name, value = match.groups()
-        if stage not in pipeline.stages:
-            raise Refused(f"set: {unknown('stage', stage, pipeline.stages)}")
-        try:
-            overrides.setdefault(stage, {})[name] = yaml.safe_load(value)
-        except yaml.YAMLError:
-            raise Refused(f"set: the value of {stage}.{name} is not valid YAML: {value!r}") from None
-    return overrides
-
-
-@dataclass(frozen=True)
-class Layers:
-    """Parameters as they were asked for, and who asked: stage -> parameter -> (value, file)."""
-
-    values: Overrides
-    origin: dict[str, dict[str, str]]
-
-
-def layered(
-    pipeline: Pipeline, scene: SceneFile, profile: str, variant: str | None, asked: Overrides, shares: Overrides
-) -> Layers:
-    """Later layers win: stage defaults in pipeline.yaml, profile, shares of a budget, scene.yaml, variant, `set=`."""
-    brought = {
-        stage: {k: scene.brings[k] for k in keys if k in scene.brings} for stage, keys in pipeline.scene_keys.items()
-    }
-    layers = [
-        ("pipeline.yaml", {name: stage.params for name, stage in pipeline.stages.items()}),
-        (f"pipeline.yaml: profile {profile}", pipeline.profiles[profile]),
-        ("budget", shares),
-        (str(scene.path), brought),
-        (f"{scene.path}: stages", scene.stages),
-        (f"pipeline.yaml: variant {variant}", pipeline.variants.get(variant or "", {})),
-        ("set", asked),
-    ]
-    values: Overrides = {name: {} for name in pipeline.stages}
-    origin: dict[str, dict[str, str]] = {name: {} for name in pipeline.stages}
-    for label, layer in layers:
-        for stage, params in layer.items():
-            values[stage].update(params)
-            origin[stage].update(dict.fromkeys(params, label))
-    return Layers(values, origin)
 
 
 def find_scene(text: str, root: Path) -> Path:
@@ -271,29 +218,3 @@ def find_scene(text: str, root: Path) -> Path:
         f"unknown scene {text!r}: there is no folder data/{text}, nor one at that path; "
         f"known: {', '.join(known) or 'none'} (`make demo` makes one)"
     )
-
-
-def choose_profile(asked: str | None, scene: SceneFile, pinned: list[Path], pipeline: Pipeline) -> tuple[str, str]:
-    """The profile asked for, else scene.yaml's, else the one this scene was run with, else by the machine; and why."""
-    origin = "profile" if asked else f"{scene.path}: profile"
-    why = "asked for" if asked else f"{scene.path.name} says so"
-    profile = asked or scene.profile or AUTO
-    if profile == AUTO:
-        for path in pinned:
-            if path.is_file():
-                origin, profile, why = str(path), path.read_text().strip(), "this scene was run with it"
-                break
-        else:
-            origin, profile, why = "profile", "laptop", "no CUDA driver on this machine"
-            if has_cuda():
-                profile, why = "paper", "this machine has a CUDA driver"
-    if profile not in pipeline.profiles:
-        raise Refused(f"{origin}: {unknown('profile', profile, [AUTO, *pipeline.profiles])}")
-    return profile, why
-
-
-def has_cuda() -> bool:
-    """Is there an NVIDIA driver, and is a device visible? Asked of the system, so that torch need not be imported."""
-    if os.environ.get("CUDA_VISIBLE_DEVICES", "unset") in ("", "-1"):
-        return False
-    return any(Path(p).exists() for p in ("/proc/driver/nvidia/version", "/dev/nvidia0", "/usr/lib/wsl/lib/libcuda.so"))

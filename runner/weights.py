@@ -6,9 +6,10 @@ import json
 import sys
 from typing import Any
 
-from runner.job import Request, brought, child, described_stages, prepare
-from runner.pipeline import Refused, SceneFile, choose_profile, layered, load_pipeline, parse_set
+from runner.describe import Described, child, described, questions
+from runner.pipeline import SceneFile, load_pipeline
 from runner.plan import amount
+from runner.resolve import Request, brought, resolve, settled
 
 
 def weights(request: Request, offline: bool) -> int:
@@ -16,11 +17,11 @@ def weights(request: Request, offline: bool) -> int:
 
     Returns how many that a stage cannot do without are missing in the end.
     """
-    profile, why, params, needed, brings = _asked(request)
+    profile, why, stages, brings = _asked(request)
     users: dict[str, list[str]] = {}
     needs: dict[str, dict[str, Any]] = {}
-    for stage, of_stage in needed.items():
-        for need in of_stage:
+    for stage, each in stages.items():
+        for need in each.needed:
             users.setdefault(need["name"], []).append(stage)
             needs.setdefault(need["name"], need)
     missing = [need for need in needs.values() if need["problem"]]
@@ -32,27 +33,23 @@ def weights(request: Request, offline: bool) -> int:
     for need in missing:
         if not need["fetched"]:
             print(f"error: {need['problem']}", file=sys.stderr)
-    unknown = " and what has no known size" if any(need["bytes"] is None for need in to_fetch) else ""
-    print(f"to fetch: about {amount(sum(need['bytes'] or 0 for need in to_fetch))}{unknown}", flush=True)
+    unsized = " and what has no known size" if any(need["bytes"] is None for need in to_fetch) else ""
+    print(f"to fetch: about {amount(sum(need['bytes'] or 0 for need in to_fetch))}{unsized}", flush=True)
     broken = len(missing) - len(to_fetch)
     if offline or not to_fetch:
         return broken + sum(not need["optional"] for need in to_fetch)
     process = child(request.root, "fetch")
-    process.communicate(json.dumps({stage: {"params": params[stage], "brings": brings} for stage in needed}))
+    asked = {stage: {"params": each.params, "brings": brings} for stage, each in stages.items()}
+    process.communicate(json.dumps(asked))
     return broken + process.returncode
 
 
-def _asked(request: Request) -> tuple[str, str, dict[str, Any], dict[str, list[dict[str, Any]]], list[str]]:
-    """(profile, why, params of each stage, weights of each stage, what the scene brings)."""
+def _asked(request: Request) -> tuple[str, str, dict[str, Described], list[str]]:
+    """(profile, why, the stages' words, what the scene brings)."""
     if request.scene:
-        job = prepare(request)
-        return job.profile, job.why, job.params, job.needed, brought(job.brings, job.folder)
+        job = resolve(request)
+        return job.profile, job.why, job.stages, brought(job.brings, job.folder)
     pipeline = load_pipeline(request.root)
-    if request.variant and request.variant not in pipeline.variants:
-        raise Refused(f"unknown variant {request.variant!r}; known: {', '.join(pipeline.variants) or 'none'}")
-    scene = SceneFile(request.root / "scene.yaml", None, {}, {})
-    profile, why = choose_profile(request.profile, scene, [], pipeline)
-    layers = layered(pipeline, scene, profile, request.variant, parse_set(request.set, pipeline), {})
-    described, _ = described_stages(request.root, pipeline, layers, [])
-    params = {stage: answer["params"] for stage, answer in described.items()}
-    return profile, why, params, {stage: answer["needed"] for stage, answer in described.items()}, []
+    profile, why, layers = settled(request, pipeline, SceneFile(request.root / "scene.yaml", None, {}, {}), [])
+    stages, _ = described(request.root, pipeline, layers, questions(request.root, pipeline, layers, []))
+    return profile, why, stages, []

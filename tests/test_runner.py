@@ -13,12 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from runner import execute
+from runner import Refused, batch, execute
 from runner.execute import Failed, run_scene
-from runner.job import Request, prepare
 from runner.keys import fingerprint
-from runner.pipeline import Refused
 from runner.plan import plan, table
+from runner.resolve import Request, resolve
 
 REPO = Path(__file__).resolve().parent.parent
 
@@ -159,7 +158,7 @@ def request(root: Path, scene: str = "toy", **options) -> Request:
 
 def words(root: Path, **options) -> dict[str, str]:
     """Stage -> "word reason" as planned."""
-    job = prepare(request(root, **options))
+    job = resolve(request(root, **options))
     return {s: f"{d.word} {d.reason}".strip() for s, d in plan(job, job.pipeline.closure("all")).items()}
 
 
@@ -241,7 +240,7 @@ def test_fresh_plan(fresh):
     assert said["poses"] == said["fit"] == "run no artifact yet"
     assert said["masks"].startswith("undecided left out if the scene has no masks")
     assert said["distill"].startswith("undecided") and said["evaluate"].startswith("run")
-    job = prepare(request(fresh))
+    job = resolve(request(fresh))
     assert "reads one number" in table(job, plan(job, ["poses"]))
     assert not (fresh / "runs").exists() or not (fresh / "runs/toy").exists()  # plan leaves nothing but hashes
 
@@ -362,9 +361,10 @@ def test_a_models_card_and_its_training_script_are_no_weights(root):
 def test_weights_profile_and_hand_edits(root, capsys):
     (root / "weights/model.bin").write_text("v")
     assert words(root)["distill"] == "run weights prior changed"
-    assert words(root, profile="paper")["poses"] == "run profile laptop -> paper"
-    assert words(root, profile=None) == words(root)  # pinned by the first run
     (root / "weights/model.bin").write_text("w")
+    paper = words(root, profile="paper")  # its name is nothing that an artifact depends on; what it sets is
+    assert paper["poses"] == "cached" and paper["fit"] == "run param rate 2 -> 1"
+    assert words(root, profile=None) == words(root)  # pinned by the first run
     (root / "runs/toy/fit/gaussians.ply").write_text("11")
     assert words(root)["fit"] == "cached its files were changed by hand since"
     assert ran(capsys, root) == ["masks", "distill", "evaluate"]
@@ -426,7 +426,7 @@ def test_variants_share_what_they_do_not_change(root, capsys):
     assert sorted(p.name for p in (root / "runs/toy@strong").iterdir() if p.is_dir()) == ["distill", "evaluate"]
     assert result(root, "toy@strong") == 50.0 and result(root) == 10.0
     assert set(words(root, variant="same").values()) == {"cached shared with toy"}
-    execute.show_results("evaluate", run_scene(request(root, variant="same"), "all")["evaluate"])
+    batch.show_results("evaluate", run_scene(request(root, variant="same"), "all")["evaluate"])
     assert "runs/toy/evaluate/: metrics.json" in capsys.readouterr().out
 
 
@@ -557,7 +557,7 @@ def test_a_cache_made_on_a_gpu_holds_without_one(root, monkeypatch):
 def test_two_folders_of_one_name(root, tmp_path):
     write(tmp_path, {"elsewhere/toy/number.txt": "4"})
     with pytest.raises(Refused, match=r"two scenes are called 'toy': .*data/toy.*elsewhere/toy"):
-        prepare(request(root, scene=str(tmp_path / "elsewhere/toy")))
+        resolve(request(root, scene=str(tmp_path / "elsewhere/toy")))
     shutil.rmtree(root / "data/toy")  # moved, not doubled
     assert set(words(root, scene=str(tmp_path / "elsewhere/toy")).values()) == {"cached"}
 
@@ -576,7 +576,7 @@ def test_clean(root):
 
 def test_batch_goes_on_after_a_failed_scene(root, capsys):
     write(root, {"data/bad/number.txt": "1", "data/bad/broken": "", "data/wide/number.txt": "6"})
-    assert execute.batch(request(root, scene=""), root / "data") == 1
+    assert batch.batch(request(root, scene=""), root / "data") == 1
     output = capsys.readouterr().out
     assert "failed: bad: poses: " in output and "2 of 3 scenes done" in output
     lines = (root / "runs/results.csv").read_text().split()
