@@ -3,13 +3,12 @@
 - resolve.py: a request becomes a job, in which all is settled: scene, profile, parameters of all stages, folders.
   - pipeline.py: pipeline.yaml and scene.yaml: models, clear refusals.
   - layers.py: parameters, layer over layer, and a time budget shared out over stages.
-  - describe.py: what stages say of themselves, asked of a process that imports them.
 - plan.py: one word and a reason for each stage, from what lies on the disk.
   - keys.py: what an artifact depends on, as hashes: contents of folders, code, parameters.
 - execute.py: does it: a fresh process a stage, folders renamed into place, receipts.
   - files.py: locks, swaps, and copies that people work with.
 - child.py: the other side: the process in which stages are imported.
-- compare.py, batch.py, weights.py: many runs, and what must be downloaded before one.
+- compare.py: many runs.
 """
 
 

@@ -1,7 +1,5 @@
 """python -m runner plan|run|compare|batch|weights|clean --scene NAME: what the Makefile calls."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import signal
@@ -9,14 +7,12 @@ import sys
 from pathlib import Path
 
 from runner import Failed, Refused
-from runner.batch import batch, show_results
 from runner.child import INTERRUPTED
-from runner.compare import compare
-from runner.execute import clean, run_scene
+from runner.compare import batch, compare, show_results
+from runner.execute import clean, run_scene, weights
 from runner.files import write_json
 from runner.plan import as_record, plan, table
 from runner.resolve import Request, resolve
-from runner.weights import weights
 
 SOME_FAILED = 3  # compare: done, but for some variants
 

@@ -5,8 +5,6 @@ What can be told of a stage before it runs (Params, needed_weights, preview, sce
 where there is such a file, which imports nothing heavy, else in stages/<stage>.py itself.
 """
 
-from __future__ import annotations
-
 import ast
 import faulthandler
 import importlib
@@ -40,38 +38,30 @@ def _module(path: Path) -> Any:
     return importlib.import_module(".".join(path.with_suffix("").parts))
 
 
-# --------------------------------------------------------------------------------------------------------- describing
-
-
 def describe() -> None:
     """Standard input: a list of {"stage", "params": asked for, "takes": names of needs, "needs": their paths (for a
     preview), "brings": keys of scene.yaml and its folders, "scene": its folder}; standard output: `_describe` of each.
     """
     questions = json.load(sys.stdin)
     answer_to, sys.stdout = sys.stdout, sys.stderr  # whatever a module prints must not mix with the answer
-    json.dump([_describe(**question) for question in questions], answer_to)
+    json.dump([_describe(question) for question in questions], answer_to)
 
 
-def _describe(
-    stage: str,
-    params: dict[str, Any],
-    takes: list[str],
-    needs: dict[str, str | None] | None = None,
-    brings: list[str] | None = None,
-    scene: str | None = None,
-) -> dict[str, Any]:
-    """What `describe.Described` holds: where `brings` is given with the weights that are needed, where `scene` is with
-    the files of the scene it reads, where `needs` is with its preview; or {"broken": why}; or {"errors": of params}."""
+def _describe(asked: dict[str, Any]) -> dict[str, Any]:
+    """What `resolve.Described` holds: where `brings` is given with the weights that are needed, where `scene` is with
+    the files of the scene it reads; where `needs` is the preview's "notes" or "refusal"; or {"broken": why}; or
+    {"errors": in the params, "known": names}."""
+    stage, needs, brings, scene = (asked.get(name) for name in ("stage", "needs", "brings", "scene"))
     path = _described_in(stage)
     try:
         planned = _module(path)
         path = Path(f"stages/{stage}.py")
-        _check_run(path, takes)
+        _check_run(path, asked["takes"])
     except Exception as error:
         return {"broken": f"{path}: {_one_line(error)}"}
     fields = dict(_fields(planned.Params))
     try:
-        resolved = planned.Params(**params)
+        resolved = planned.Params(**asked["params"])
     except ValidationError as error:
         return {"errors": [_error(e, planned.Params) for e in error.errors()], "known": list(fields)}
     marks = {name: extra for name, extra in fields.items() if isinstance(extra, dict)}
@@ -96,19 +86,14 @@ def _describe(
 
 
 def _check_run(path: Path, takes: list[str]) -> None:
-    """ValueError where `run` could not be handed its needs; read from the source, for a stage may import much."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    run = next((n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == "run"), None)
-    if not run:
-        raise ValueError("it has no function `run`")
-    plain, named = [a.arg for a in (*run.args.posonlyargs, *run.args.args)], [a.arg for a in run.args.kwonlyargs]
-    given = {*plain[:2], *takes}
-    optional = {*plain[len(plain) - len(run.args.defaults) :]}
-    optional |= {name for name, default in zip(named, run.args.kw_defaults, strict=True) if default}
-    for name in sorted({*plain, *named} - given - optional):
-        raise ValueError(f"run() asks for {name!r}, which pipeline.yaml does not name among its needs")
-    for name in sorted(given - {*plain, *named}) if not run.args.kwarg else ():
-        raise ValueError(f"run() takes no {name!r}, which pipeline.yaml names among its needs")
+    """ValueError where `run` is not made for these needs; read from its source, for a stage may import much."""
+    named = {n.name: n.args for n in ast.parse(path.read_text(encoding="utf-8")).body if isinstance(n, ast.FunctionDef)}
+    run = named["run"]
+    plain, needs = [a.arg for a in run.args][2:], [a.arg for a in run.kwonlyargs]
+    free = {*plain[len(plain) - len(run.defaults) :], *(n for n, d in zip(needs, run.kw_defaults, strict=True) if d)}
+    wrong = {*plain, *needs} - free - {*takes} or (set() if run.kwarg else {*takes} - {*plain, *needs})
+    if wrong:
+        raise ValueError(f"run() and pipeline.yaml do not agree on its needs: {', '.join(sorted(wrong))}")
 
 
 def _fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -144,9 +129,6 @@ def _one_line(error: BaseException) -> str:
     return text if isinstance(error, ValueError) and text else f"{type(error).__name__}: {text}"
 
 
-# ------------------------------------------------------------------------------------------------------------ fetching
-
-
 def fetch() -> int:
     """Get the weights that stages need and that are not here, each once. Standard input: {stage: {"params", "brings"}}.
 
@@ -167,9 +149,6 @@ def fetch() -> int:
             failed += 1
             print(f"error: {_one_line(error)}", file=sys.stderr, flush=True)
     return failed
-
-
-# ------------------------------------------------------------------------------------------------------------- running
 
 
 def run() -> int:

@@ -1,7 +1,5 @@
 """The third step: does what a plan asks for, in a fresh process a stage, and renames folders into place."""
 
-from __future__ import annotations
-
 import functools
 import importlib.metadata
 import json
@@ -9,6 +7,7 @@ import platform
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, replace
@@ -16,17 +15,14 @@ from pathlib import Path
 from typing import Any
 
 from runner import Failed, Refused, say
-from runner.describe import child
 from runner.files import RECEIPT, discard, hand_out, locked, put_in_place, receipt, recover, shown, write_json
+from runner.keys import Inputs
 from runner.pipeline import SCENE
-from runner.plan import MACHINE, Decision, decide, expected_seconds, partial_folder, plan, table
-from runner.resolve import Job, Memory, Request, resolve, source_of
+from runner.plan import MACHINE, Decision, amount, decide, expected_seconds, partial_folder, plan, table
+from runner.resolve import Job, Memory, Request, child, resolve
 
 PACKAGES = ("reffusion", "numpy", "torch", "numba", "diffusers", "transformers", "peft", "pycolmap", "gsplat")
 GRACE = 20.0  # seconds an interrupted stage has to end by itself
-
-
-# ------------------------------------------------------------------------------------------------------- one stage
 
 
 def run_stage(job: Job, stage: str, decision: Decision, earlier: dict[str, Decision], lock: int) -> Decision:
@@ -42,7 +38,7 @@ def run_stage(job: Job, stage: str, decision: Decision, earlier: dict[str, Decis
         say(f"{stage}: {decision.reason}" + (f"; about {seconds:.0f} s" if seconds is not None else ""))
         result = _in_child(job, stage, partial, earlier, lock)
         say(f"{stage}: done in {result['seconds']:.1f} s, {result['peak_memory_mb']} MB")
-        write_json(partial / RECEIPT, _receipt(job, stage, decision, partial, resumed, result))
+        write_json(partial / RECEIPT, _receipt(job, stage, decision.inputs, partial, resumed, result))
     for line in hand_out(partial, place, job.home, job.pipeline.stages[stage].hands_out):
         say(line)
     put_in_place(partial, place)
@@ -55,7 +51,7 @@ def run_stage(job: Job, stage: str, decision: Decision, earlier: dict[str, Decis
 
 def copied_from_variant(job: Job, stage: str, key: str, to: Path) -> str | None:
     """Where another variant of the scene has done this very work, copy it; that variant's folder, or None."""
-    for home in sorted(job.runs.glob(f"{job.name}@*")):
+    for home in sorted(job.runs.glob(f"{job.base.name}@*")):
         if home != job.home and (receipt(home / stage) or {}).get("key") == key:
             with suppress(Refused), locked(job.runs, home.name, shared=True, wait=False):
                 copy, found = job.home / f".copying-{stage}", receipt(home / stage)
@@ -72,21 +68,14 @@ def _in_child(job: Job, stage: str, partial: Path, earlier: dict[str, Decision],
     result, log = job.home / f".result-{stage}.json", job.home / f"{stage}.log"
     result.unlink(missing_ok=True)
     needs = {need: job.folder if need == SCENE else earlier[need].path for need in job.pipeline.stages[stage].takes}
-    task = {
-        "stage": stage,
-        "params": job.params[stage],
-        "out": str(partial),
-        "needs": {need: path and str(path) for need, path in needs.items()},
-        "log": str(log),
-        "result": str(result),
-        "lock": lock,
-    }
+    task = {"stage": stage, "params": job.params[stage], "out": partial, "log": log, "result": result, "lock": lock}
+    told = json.dumps(task | {"needs": needs}, default=str)
     # A process group of its own: Ctrl-C reaches it once, from here.
     process = child(job.root, "run", pass_fds=(lock,), process_group=0)
     assert process.stdin
     try:
         with suppress(BrokenPipeError):  # a child that is gone already has its code below
-            process.stdin.write(json.dumps(task) + "\n")
+            process.stdin.write(told + "\n")
             process.stdin.flush()  # and left open: the child ends when this process does
         code = process.wait()
     except KeyboardInterrupt:
@@ -110,23 +99,21 @@ def _in_child(job: Job, stage: str, partial: Path, earlier: dict[str, Decision],
 
 
 def _receipt(
-    job: Job, stage: str, decision: Decision, folder: Path, resumed: bool, result: dict[str, Any]
+    job: Job, stage: str, inputs: Inputs, folder: Path, resumed: bool, result: dict[str, Any]
 ) -> dict[str, Any]:
-    assert decision.inputs
     return {
         "stage": stage,
-        "scene": job.name,
-        "key": decision.inputs.key,
-        **asdict(decision.inputs),
+        "scene": job.base.name,
+        "key": inputs.key,
+        **asdict(inputs),
         "profile": job.profile,
         "output": job.hashes.folder(folder),
         "versions": {"python": platform.python_version(), **_installed()},
         "platform": platform.platform(),
         "machine": MACHINE,
         "device": job.params[stage].get("device", "cpu"),
-        "seconds": result["seconds"],
+        **result,
         "resumed": resumed,  # then `seconds` is the last try's only
-        "peak_memory_mb": result["peak_memory_mb"],
         "date": time.strftime("%FT%T%z"),
     }
 
@@ -135,14 +122,9 @@ def _receipt(
 def _installed() -> dict[str, str]:
     found = {}
     for name in PACKAGES:
-        try:
+        with suppress(importlib.metadata.PackageNotFoundError):
             found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue
     return found
-
-
-# ------------------------------------------------------------------------------------------------------- one scene
 
 
 def run_scene(request: Request, target: str, memory: Memory | None = None) -> dict[str, Path | None]:
@@ -154,15 +136,16 @@ def run_scene(request: Request, target: str, memory: Memory | None = None) -> di
     stages = job.pipeline.closure(target)
     with ExitStack() as held:
         if job.home != job.base:
-            held.enter_context(locked(job.runs, job.name, shared=True))
-        lock = held.enter_context(locked(job.runs, job.label))
+            held.enter_context(locked(job.runs, job.base.name, shared=True))
+        lock = held.enter_context(locked(job.runs, job.home.name))
         job.home.mkdir(parents=True, exist_ok=True)
         recover(job.home)
         planned = plan(job, stages)
         say(table(job, planned))
         refuse_missing(job, planned)
         (job.home / "profile").write_text(job.profile + "\n")
-        (job.home / "source").write_text(source_of(job.folder, job.root) + "\n")
+        inside = job.folder.is_relative_to(job.root)  # then as seen from there
+        (job.home / "source").write_text(f"{job.folder.relative_to(job.root) if inside else job.folder}\n")
         done: dict[str, Decision] = {}
         for position, stage in enumerate(stages):
             done[stage] = decide(job, stage, done)
@@ -180,17 +163,14 @@ def run_scene(request: Request, target: str, memory: Memory | None = None) -> di
 def refuse_missing(job: Job, planned: dict[str, Decision]) -> None:
     for stage, decision in planned.items():
         if decision.word == "missing":
-            raise Refused(f"{job.label}: {stage}: {decision.reason}")
+            raise Refused(f"{job.home.name}: {stage}: {decision.reason}")
 
 
 def clean(request: Request) -> None:
     """Remove what was computed for a scene with its variants, or for one variant. Works for a scene that is gone."""
     name = Path(request.scene).name
-    names = (
-        [f"{name}@{request.variant}"]
-        if request.variant
-        else [name, *sorted(p.name for p in request.runs.glob(f"{name}@*"))]
-    )
+    names = [name, *sorted(p.name for p in request.runs.glob(f"{name}@*"))]
+    names = [f"{name}@{request.variant}"] if request.variant else names
     with ExitStack() as held:
         for each in names:
             held.enter_context(locked(request.runs, each, wait=False))
@@ -198,3 +178,32 @@ def clean(request: Request) -> None:
             if (request.runs / each).exists():
                 shutil.rmtree(request.runs / each)
                 say(f"removed {shown(request.runs / each)}")
+
+
+def weights(request: Request, offline: bool) -> int:
+    """Show the weights of all stages, of a scene where one is named, and fetch what is missing unless `offline`.
+
+    Returns how many that a stage cannot do without are missing in the end.
+    """
+    job = resolve(request, scene=bool(request.scene))
+    all_needs = [(stage, need) for stage, each in job.stages.items() for need in each.needed]
+    needs = {need["name"]: need for _, need in all_needs}
+    users = {name: ", ".join(stage for stage, need in all_needs if need["name"] == name) for name in needs}
+    missing = [need for need in needs.values() if need["problem"]]
+    to_fetch = [need for need in missing if need["fetched"]]
+    print(f"weights of profile {job.profile} ({job.why})")
+    for name, need in needs.items():
+        state = "here" if not need["problem"] else "to fetch" if need["fetched"] else "broken"
+        print(f"  {state:<9} {amount(need['bytes']):>12}  {name}  ({users[name]})")
+    for need in missing:
+        if not need["fetched"]:
+            print(f"error: {need['problem']}", file=sys.stderr)
+    unsized = " and what has no known size" if any(need["bytes"] is None for need in to_fetch) else ""
+    print(f"to fetch: about {amount(sum(need['bytes'] or 0 for need in to_fetch))}{unsized}", flush=True)
+    broken = len(missing) - len(to_fetch)
+    if offline or not to_fetch:
+        return broken + sum(not need["optional"] for need in to_fetch)
+    process = child(request.root, "fetch")
+    asked = {stage: {"params": each.params, "brings": job.brought} for stage, each in job.stages.items()}
+    process.communicate(json.dumps(asked))
+    return broken + process.returncode

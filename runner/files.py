@@ -1,7 +1,5 @@
 """Folders on the disk: their files, locks, swaps that survive a kill, and copies that people work with."""
 
-from __future__ import annotations
-
 import fcntl
 import json
 import os
@@ -46,9 +44,6 @@ def receipt(folder: Path) -> dict[str, Any] | None:
 def shown(path: Path) -> str:
     """A path as people type it: from the current folder where it lies below."""
     return os.path.relpath(path) if path.is_relative_to(Path.cwd()) else str(path)
-
-
-# ---------------------------------------------------------------------------------------------- locks and renamings
 
 
 @contextmanager
@@ -101,18 +96,11 @@ def discard(folder: Path) -> None:
         shutil.rmtree(folder)
 
 
-# ------------------------------------------------------------------------------------------- copies to work with
-
-
 def hand_out(made: Path, before: Path, home: Path, names: tuple[str, ...]) -> Iterator[str]:
     """Copy the folders `names` of an artifact to `home`; yields what there is to say, a line each.
 
-    A file that was handed out before and is no longer made goes; one that a person changed or added stays as it is.
-
-    Args:
-        made: the new artifact.
-        before: the artifact that it replaces, there or not: what was handed out of it.
-        home: runs/<scene>.
+    A file that was handed out `before`, of the artifact that is replaced, and is no longer `made` goes; one that a
+    person changed or added stays as it is.
     """
     for name in names:
         for path in list(files_below(home / name)):

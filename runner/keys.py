@@ -1,7 +1,5 @@
 """What an artifact depends on, as hashes."""
 
-from __future__ import annotations
-
 import ast
 import hashlib
 import json
@@ -54,7 +52,7 @@ class Hashes:
 
     def module(self, path: Path, root: Path) -> tuple[str, list[Path]]:
         """The fingerprint of a Python file, and those files below `root` that its imports run."""
-        fingerprint, names = self._remember("module", path, _read_module)
+        names, fingerprint = self._remember("module", path, _read_module)
         if (path, fingerprint) not in self._runs:
             self._runs[path, fingerprint] = list(_run_by(names, path, root))
         return fingerprint, self._runs[path, fingerprint]
@@ -88,15 +86,8 @@ def _file_digest(path: Path) -> str:
         return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=10)).hexdigest()
 
 
-# ------------------------------------------------------------------------------------------------------------- code
-
-
-def fingerprint(source: str) -> str:
+def fingerprint(tree: ast.Module) -> str:
     """A hash of Python code that comments, docstrings, layout and descriptions of fields do not change."""
-    return _fingerprint(ast.parse(source))
-
-
-def _fingerprint(tree: ast.Module) -> str:
     for node in ast.walk(tree):
         body = getattr(node, "body", None)
         if isinstance(body, list):
@@ -111,8 +102,7 @@ def _read_module(path: Path) -> list[Any]:
         tree = ast.parse(path.read_text(encoding="utf-8"))
     except SyntaxError as error:
         raise Refused(f"{path}:{error.lineno}: not valid Python: {error.msg}") from None
-    names = sorted(set(_imported(tree)))
-    return [_fingerprint(tree), names]
+    return [sorted(set(_imported(tree))), fingerprint(tree)]  # which changes the tree
 
 
 def _imported(tree: ast.AST) -> Iterator[str]:
@@ -156,26 +146,15 @@ def code_of(root: Path, stage: str, hashes: Hashes) -> dict[str, str]:
     return {path.relative_to(root).as_posix(): found[path] for path in sorted(found)}
 
 
-# ----------------------------------------------------------------------------------------------------------- inputs
-
-
 @dataclass(frozen=True)
 class Inputs:
-    """All that an artifact depends on; kept in its receipt, so that a rerun can say what changed.
+    """All that an artifact depends on; kept in its receipt, so that a rerun can say what changed."""
 
-    Attributes:
-        params: every parameter of the stage, resolved.
-        needs: need -> hash of its content, None where it was left out.
-        weights: parameter -> hash of the weights folder it names, or the name itself where that is not a folder here.
-        code: file -> fingerprint.
-        unkeyed: parameters that nothing in the artifact depends on.
-    """
-
-    params: dict[str, Any]
-    needs: dict[str, str | None]
-    weights: dict[str, str]
-    code: dict[str, str]
-    unkeyed: tuple[str, ...] = ()
+    params: dict[str, Any]  # every parameter of the stage, resolved
+    needs: dict[str, str | None]  # need -> hash of its content, None where it was left out
+    weights: dict[str, str]  # parameter -> hash of the folder it names, or the name itself where that is none here
+    code: dict[str, str]  # file -> fingerprint
+    unkeyed: tuple[str, ...] = ()  # parameters that nothing in the artifact depends on
 
     @property
     def key(self) -> str:

@@ -1,7 +1,5 @@
 """Parameters as they are asked for: layer over layer, and a time budget shared out over stages (docs/traces.md)."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from collections.abc import Collection
@@ -15,23 +13,12 @@ from runner.keys import leaves
 from runner.pipeline import Overrides, Pipeline, SceneFile, unknown
 
 SHARE = "seconds"  # the parameter of a stage that is its share of the budget
-_UNITS = {"h": 3600.0, "m": 60.0, "s": 1.0}
 
 
 def merged(below: dict[str, Any], above: dict[str, Any], whole: Collection[str] = ()) -> dict[str, Any]:
     """`above` over `below`. A mapping over a mapping merges, but for those called `whole`; all else replaces."""
     both = {k for k, v in above.items() if isinstance(v, dict) and isinstance(below.get(k), dict)}.difference(whole)
     return below | {k: merged(below[k], v) if k in both else v for k, v in above.items()}
-
-
-def at(params: dict[str, Any], name: str) -> Any:
-    """The value of a dotted name. Raises KeyError where there is none."""
-    value: Any = params
-    for part in name.split("."):
-        if not isinstance(value, dict):
-            raise KeyError(name)
-        value = value[part]
-    return value
 
 
 def parse_set(text: str, pipeline: Pipeline) -> Overrides:
@@ -95,19 +82,13 @@ def layered(
     return Layers(values, each)
 
 
-# ----------------------------------------------------------------------------------------------------- a time budget
-
-
 def seconds_of(text: object, origin: str) -> float:
     """`5m`, `90s`, `1h30m`, `2.5m`, or plain seconds; Refused, naming `origin`, for anything else."""
-    words = str(text).strip().lower()
-    parts = re.findall(r"(\d+(?:\.\d+)?)([hms])", words)
-    if re.fullmatch(r"\d+(\.\d+)?", words):
-        seconds = float(words)
-    elif parts and "".join(number + unit for number, unit in parts) == words:
-        seconds = sum(float(number) * _UNITS[unit] for number, unit in parts)
-    else:
-        seconds = 0.0
+    number = r"(\d+(?:\.\d+)?)"
+    found = re.fullmatch(rf"(?:{number}h)?(?:{number}m)?(?:{number}s)?|{number}", str(text).strip().lower())
+    seconds = (
+        sum(float(n or 0) * unit for n, unit in zip(found.groups(), (3600, 60, 1, 1), strict=True)) if found else 0
+    )
     if seconds <= 0:
         raise Refused(f"{origin}: budget {text!r} is no time; write it like 5m, 90s or 1h30m")
     return seconds
@@ -122,7 +103,7 @@ def shared_out(pipeline: Pipeline, values: Overrides, seconds: float) -> Overrid
     if not pipeline.budget:
         raise Refused("pipeline.yaml: a budget is asked for, and there is no table `budget` that shares it out")
     asked = {f"{stage}.{name}": value for stage in values for name, value in leaves(values[stage]).items()}
-    holds = lambda c: c.param is not None and all(asked.get(param, ...) == c.equals for param in c.params)
+    holds = lambda c: c.param and all(asked.get(param, ...) == c.equals for param in c.param)
     stays = [name for name in pipeline.budget if not any(holds(c) for c in pipeline.stages[name].left_out)]
     if not stays:
         return {}

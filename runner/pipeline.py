@@ -1,15 +1,13 @@
 """`pipeline.yaml` and `scene.yaml`: what they say, checked."""
 
-from __future__ import annotations
-
 import difflib
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_validator
 
 from runner import Refused
 
@@ -19,42 +17,32 @@ LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the one in C takes a t
 Overrides = dict[str, dict[str, Any]]  # stage -> parameter, or group of parameters -> value
 
 
-class Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+class Strict(BaseModel, extra="forbid", frozen=True):
+    """As all of pipeline.yaml: a name that is not known is refused."""
 
 
 class Condition(Strict):
-    """A reason to leave a stage out: one question, whose answer is yes.
-
-    `fact: <stage>.<name>`, of an earlier stage's facts.json, is `equals`; or so is `param: <stage>.<name>`, a parameter
-    of any stage, or each of a list of them; or the folder `empty: <stage>/<folder>` of an earlier artifact is without
-    a file.
-    Ignored where the scene brings the key `unless`.
-    """
+    """A reason to leave a stage out: one question, by `fact`, `param` or `empty`, whose answer is yes."""
 
     because: str
-    fact: str | None = None
-    param: str | tuple[str, ...] | None = None
+    fact: str | None = None  # <stage>.<name>: of an earlier stage's facts.json, is `equals`
+    # <stage>.<name>, or a list of them: parameters of any stage, each `equals`
+    param: Annotated[tuple[str, ...], BeforeValidator(lambda said: (said,) if isinstance(said, str) else said)] = ()
     equals: Any = None
-    empty: str | None = None
-    unless: str | None = None
+    empty: str | None = None  # <stage>/<folder>: of an earlier artifact, is without a file
+    unless: str | None = None  # ignored where the scene brings this key
 
     @model_validator(mode="after")
-    def _one_question(self) -> Condition:
-        if [self.fact, self.param, self.empty].count(None) != 2:
+    def _one_question(self) -> Self:
+        if sum(map(bool, (self.fact, self.param, self.empty))) != 1:
             raise ValueError("a condition has one of `fact`, `param`, `empty`")
         return self
 
     @property
     def names(self) -> tuple[str, str]:
         """The stage the question is about, and the name of the fact, parameter or folder."""
-        stage, name = re.split(r"[./]", self.fact or self.empty or self.params[0], maxsplit=1)
+        stage, name = re.split(r"[./]", self.fact or self.empty or self.param[0], maxsplit=1)
         return stage, name
-
-    @property
-    def params(self) -> tuple[str, ...]:
-        """The parameters asked about."""
-        return (self.param,) if isinstance(self.param, str) else self.param or ()
 
     @property
     def waits_for(self) -> tuple[str, ...]:
@@ -100,7 +88,7 @@ class Pipeline(Strict):
     budget: dict[str, Annotated[float, Field(gt=0)]] = {}
 
     @model_validator(mode="after")
-    def _names_are_known(self) -> Pipeline:
+    def _names_are_known(self) -> Self:
         earlier = [SCENE]
         for name, stage in self.stages.items():
             named = [*stage.takes, *(need for c in stage.left_out for need in c.waits_for)]
@@ -152,12 +140,6 @@ def read_yaml(path: Path) -> dict[str, Any]:
     return content
 
 
-def _first_error(error: ValidationError) -> str:
-    first = error.errors()[0]
-    where = ".".join(str(part) for part in first["loc"])
-    return f"{where}: {first['msg']}" if where else first["msg"].removeprefix("Value error, ")
-
-
 def load_pipeline(root: Path) -> Pipeline:
     """Raises Refused where pipeline.yaml is missing, ill-formed, or names a stage that is not there."""
     path = root / "pipeline.yaml"
@@ -166,24 +148,18 @@ def load_pipeline(root: Path) -> Pipeline:
     try:
         return Pipeline.model_validate(read_yaml(path))
     except ValidationError as error:
-        raise Refused(f"{path}: {_first_error(error)}") from None
+        first = error.errors()[0]
+        where = "".join(f"{part}." for part in first["loc"])[:-1]
+        raise Refused(f"{path}: {where + ': ' if where else ''}{first['msg'].removeprefix('Value error, ')}") from None
 
 
 @dataclass(frozen=True)
 class SceneFile:
-    """What a scene's optional scene.yaml says.
+    """What a scene's optional scene.yaml says."""
 
-    Attributes:
-        path: the file, present or not.
-        profile: its `profile`, or None.
-        budget: its `budget`, or None.
-        brings: the keys, with values, that describe the scene.
-        stages: parameters of stages.
-    """
-
-    path: Path
+    path: Path  # the file, present or not
     profile: str | None
-    brings: dict[str, Any]
+    brings: dict[str, Any]  # the keys, with values, that describe the scene
     stages: Overrides
     budget: Any = None
 

@@ -1,7 +1,5 @@
 """The second step: one word and a reason for each stage, from what lies on the disk; nothing heavy is imported."""
 
-from __future__ import annotations
-
 import json
 import os
 import platform
@@ -11,12 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from runner import Refused
-from runner.describe import ask
 from runner.files import RECEIPT, files_below, receipt
-from runner.keys import Inputs, changes, code_changes, code_of
-from runner.layers import at
+from runner.keys import Inputs, changes, code_changes, code_of, leaves
 from runner.pipeline import SCENE, Condition
-from runner.resolve import Job, has_cuda
+from runner.resolve import Job, ask, has_cuda
 
 MACHINE = platform.node()
 TO_DO = ("run", "stale", "undecided")
@@ -24,23 +20,14 @@ TO_DO = ("run", "stale", "undecided")
 
 @dataclass(frozen=True)
 class Decision:
-    """The word for a stage.
-
-    Attributes:
-        word: run, cached, provided, skip, missing, stale or undecided.
-        reason: why, in words.
-        path: the artifact's folder as it stands; None where there is none or the stage is left out.
-        settled: True where this artifact (or its absence) is final.
-        inputs: what the artifact depends on, where that is known.
-        notes: what the stage says of itself beforehand.
-    """
+    """The word for a stage: run, cached, provided, skip, missing, stale or undecided."""
 
     word: str
     reason: str
-    path: Path | None = None
-    settled: bool = False
-    inputs: Inputs | None = None
-    notes: tuple[str, ...] = ()
+    path: Path | None = None  # the artifact as it stands; None where there is none or the stage is left out
+    settled: bool = False  # this artifact, or its absence, is final
+    inputs: Inputs | None = None  # what the artifact depends on, where that is known
+    notes: tuple[str, ...] = ()  # what the stage says of itself beforehand
 
 
 def decide(job: Job, stage: str, earlier: dict[str, Decision]) -> Decision:
@@ -90,7 +77,7 @@ def _holds(job: Job, condition: Condition, earlier: dict[str, Decision]) -> bool
     if condition.unless and condition.unless in job.brings:
         return False
     if condition.param:
-        return all(_is(job, param, condition.equals) for param in condition.params)
+        return all(_is(job, param, condition.equals) for param in condition.param)
     source = earlier[stage]
     if source.word == "skip":
         return False
@@ -106,10 +93,10 @@ def _holds(job: Job, condition: Condition, earlier: dict[str, Decision]) -> bool
 
 def _is(job: Job, param: str, value: Any) -> bool:
     """Has `<stage>.<name>` this value?"""
-    try:
-        return at(job.params, param) == value
-    except KeyError:
-        raise Refused(f"{job.root / 'pipeline.yaml'}: a condition asks for {param}, which is not there") from None
+    params = leaves(job.params)
+    if param not in params:
+        raise Refused(f"{job.root / 'pipeline.yaml'}: a condition asks for {param}, which is not there")
+    return params[param] == value
 
 
 def _there(job: Job, stage: str) -> Path | None:
@@ -119,7 +106,7 @@ def _there(job: Job, stage: str) -> Path | None:
 def _weights(job: Job, stage: str) -> Iterator[tuple[str, str, Path | None]]:
     """Parameter that names weights, its value, and the local folder this is, or None for the id of published ones."""
     for param in job.stages[stage].weights:
-        if name := at(job.params[stage], param):
+        if name := leaves(job.params[stage])[param]:
             path = job.root / Path(name).expanduser()
             local = path.exists() or name.startswith(("/", ".", "~")) or name.count("/") != 1
             yield param, name, path if local or (job.root / name.split("/")[0]).is_dir() else None
@@ -154,7 +141,7 @@ def _compare(job: Job, stage: str, inputs: Inputs) -> Decision:
     receipts = [(place, found, changes(found, inputs)) for place in places if (found := receipt(place))]
     for place, found, differs in receipts:
         if not differs:
-            said = [] if place.parent == job.home else [f"shared with {job.name}"]
+            said = [] if place.parent == job.home else [f"shared with {job.base.name}"]
             if job.hashes.folder(place) != found["output"]:
                 said.append("its files were changed by hand since")
             return Decision("cached", "; ".join(said), place, True, inputs)
@@ -200,9 +187,6 @@ def _listed(said: list[str], most: int = 3) -> str:
     return ", ".join(said[:most]) + rest
 
 
-# -------------------------------------------------------------------------------------------------------- the plan
-
-
 def plan(job: Job, stages: list[str], done: dict[str, Decision] | None = None) -> dict[str, Decision]:
     """The words for `stages`, in order; `done` holds those already settled. Asks the stages for their notes."""
     decisions = dict(done or {})
@@ -237,7 +221,7 @@ def _previewed(job: Job, stage: str, decisions: dict[str, Decision]) -> dict[str
 
 def table(job: Job, decisions: dict[str, Decision]) -> str:
     """The profile and why; a line a stage: word, stage, expected time, reason, notes; what there is to download."""
-    lines = [f"{job.label} (profile {job.profile}: {job.why})"]
+    lines = [f"{job.home.name} (profile {job.profile}: {job.why})"]
     for stage, decision in decisions.items():
         seconds = expected_seconds(job, stage) if decision.word in TO_DO else None
         time = f"~{seconds:.0f} s" if seconds is not None else ""
@@ -252,21 +236,14 @@ def table(job: Job, decisions: dict[str, Decision]) -> str:
 
 def as_record(job: Job, decisions: dict[str, Decision]) -> dict[str, Any]:
     """The same for plan.json, which the report reads: stage -> word, reason, notes, artifact's folder below runs/."""
-    stages = {
-        stage: {
-            "word": decision.word,
-            "reason": decision.reason,
-            "notes": list(decision.notes),
-            "folder": decision.path and os.path.relpath(decision.path, job.runs),
-        }
-        for stage, decision in decisions.items()
-    }
-    return {"profile": job.profile, "stages": stages}
+    folder = lambda path: path and os.path.relpath(path, job.runs)
+    words = lambda d: {"word": d.word, "reason": d.reason, "notes": list(d.notes), "folder": folder(d.path)}
+    return {"profile": job.profile, "stages": {stage: words(decision) for stage, decision in decisions.items()}}
 
 
 def expected_seconds(job: Job, stage: str) -> float | None:
     """What the stage last took for this scene, or a variant of it, on this machine with this profile."""
-    places = [job.runs / job.name, *job.runs.glob(f"{job.name}@*")]
+    places = [job.runs / job.base.name, *job.runs.glob(f"{job.base.name}@*")]
     found = [r for place in places if (r := receipt(place / stage))]
     here = [r for r in found if r["machine"] == MACHINE and r["profile"] == job.profile]
     return max(here, key=lambda r: r["date"])["seconds"] if here else None

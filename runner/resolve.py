@@ -1,20 +1,21 @@
 """The first step: a request becomes a job, in which everything is settled and checked."""
 
-from __future__ import annotations
-
+import json
 import os
-from collections.abc import Iterable
+import re
+import subprocess
+import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from runner import Refused
-from runner.describe import Described, ask, described, questions
 from runner.keys import Hashes
 from runner.layers import Layers, layered, parse_set, seconds_of, shared_out
-from runner.pipeline import Pipeline, SceneFile, find_scene, load_pipeline, load_scene_file, unknown
+from runner.pipeline import SCENE, Pipeline, SceneFile, find_scene, load_pipeline, load_scene_file, read_yaml, unknown
 
 AUTO = "auto"  # the profile that this machine can do
+RENAMED = Path("runner", "renamed.yaml")  # old dotted name of a parameter: the new one, or what became of it
 
 
 @dataclass(frozen=True)
@@ -40,45 +41,40 @@ class Memory:
 
 
 @dataclass(frozen=True)
-class Job:
-    """One scene with everything about it resolved and checked.
+class Described:
+    """What a stage says of itself."""
 
-    Attributes:
-        folder: of the scene.
-        home: runs/<scene>, or runs/<scene>@<variant>.
-        why: what made the choice of the profile.
-        brings: the keys of scene.yaml that have values.
-        stages: stage -> its parameters, and what else it says of itself.
-        broken: stages that are not among these, because their file is missing or is no stage -> what is wrong.
-    """
+    params: dict[str, Any]  # every parameter, groups nested
+    weights: tuple[str, ...] = ()  # dotted names of the parameters that name weights
+    unkeyed: tuple[str, ...] = ()  # and of those that change nothing in the artifact
+    needed: tuple[dict[str, Any], ...] = ()  # the weights it works with: reffusion.weights.Need
+    reads: tuple[str, ...] | None = None  # the files of the scene that it reads; None for all of them
+
+
+@dataclass(frozen=True)
+class Job:
+    """One scene with everything about it resolved and checked."""
 
     root: Path
     runs: Path
-    folder: Path
-    home: Path
+    folder: Path  # of the scene; the root where there is none
+    home: Path  # runs/<scene>, or runs/<scene>@<variant>
+    base: Path  # runs/<scene>: what a variant shares lies there
     pipeline: Pipeline
+    layers: Layers  # the parameters that were asked for
     profile: str
-    why: str
+    why: str  # what made the choice of the profile
     trust: bool
-    brings: frozenset[str]
+    brings: frozenset[str]  # the keys of scene.yaml that have values
     memory: Memory
     stages: dict[str, Described] = field(default_factory=dict)
-    broken: dict[str, str] = field(default_factory=dict)
+    broken: dict[str, str] = field(default_factory=dict)  # stages that cannot be described -> what is wrong
 
     @property
-    def name(self) -> str:
-        """The scene's."""
-        return self.folder.name
-
-    @property
-    def label(self) -> str:
-        """The scene's name with its variant's."""
-        return self.home.name
-
-    @property
-    def base(self) -> Path:
-        """runs/<scene>: what a variant shares lies there."""
-        return self.runs / self.name
+    def brought(self) -> list[str]:
+        """What the scene brings of itself: the keys of its scene.yaml, and the names of its folders."""
+        folders = self.folder.iterdir() if self.folder != self.root else ()
+        return sorted({*self.brings, *(path.name for path in folders if path.is_dir())})
 
     @property
     def hashes(self) -> Hashes:
@@ -90,49 +86,39 @@ class Job:
         return {stage: each.params for stage, each in self.stages.items()}
 
 
-def resolve(request: Request, memory: Memory | None = None) -> Job:
-    """Read and check everything a request names. Raises Refused with one line that says what would fix it."""
-    return resolve_all([request], memory or Memory(request.runs))[0]
+def resolve(request: Request, memory: Memory | None = None, scene: bool = True) -> Job:
+    """Read and check everything a request names; without `scene` that of no scene in particular.
+
+    Raises Refused with one line that says what would fix it.
+    """
+    return resolve_all([request], memory or Memory(request.runs), scene)[0]
 
 
-def resolve_all(requests: list[Request], memory: Memory) -> list[Job]:
-    """The same for each, with one process that asks the stages for all."""
-    drafts = [_draft(request, memory) for request in requests]
-    asked = [questions(j.root, j.pipeline, layers, brought(j.brings, j.folder), j.folder) for j, layers in drafts]
-    if requests:
-        ask(requests[0].root, [question for each in asked for question in each], memory.answers)
-    jobs = []
-    for (job, layers), own in zip(drafts, asked, strict=True):
-        stages, broken = described(job.root, job.pipeline, layers, own, memory.answers)
-        jobs.append(replace(job, stages=stages, broken=broken))
-    return jobs
+def resolve_all(requests: list[Request], memory: Memory, scene: bool = True) -> list[Job]:
+    """The same for several of one root, whose stages are asked all at once."""
+    drafts = [_draft(request, memory, scene) for request in requests]
+    ask(requests[0].root, [question for job in drafts for question in _questions(job)], memory.answers)
+    return [_described(job) for job in drafts]
 
 
-def _draft(request: Request, memory: Memory) -> tuple[Job, Layers]:
-    """A job that does not know its stages yet, and the parameters that are asked for."""
-    root, runs = request.root, request.runs
-    pipeline = load_pipeline(root)
-    folder = find_scene(request.scene, root)
-    scene = load_scene_file(folder, pipeline)
-    base = runs / folder.name
-    home = base.with_name(f"{base.name}@{request.variant}") if request.variant else base
-    profile, why, layers = settled(request, pipeline, scene, [home / "profile", base / "profile"])
+def _draft(request: Request, memory: Memory, scene: bool) -> Job:
+    """A job that does not know its stages yet."""
+    root, runs, variant, pipeline = request.root, request.runs, request.variant, load_pipeline(request.root)
+    folder = find_scene(request.scene, root) if scene else None
+    found = load_scene_file(folder, pipeline) if folder else SceneFile(root / "scene.yaml", None, {}, {})
+    if variant and variant not in pipeline.variants:
+        raise Refused(f"{root / 'pipeline.yaml'}: {unknown('variant', variant, pipeline.variants)}")
+    base = runs / (folder.name if folder else "")
+    home = base.with_name(f"{base.name}@{variant}") if variant else base
     _one_folder_a_name(base, folder, root)
-    keys = frozenset(scene.brings)
-    return Job(root, runs, folder, home, pipeline, profile, why, request.trust, keys, memory), layers
-
-
-def settled(request: Request, pipeline: Pipeline, scene: SceneFile, pinned: list[Path]) -> tuple[str, str, Layers]:
-    """The profile, why it was chosen, and the parameters that are asked for, shares of a budget among them."""
-    if request.variant and request.variant not in pipeline.variants:
-        raise Refused(f"{request.root / 'pipeline.yaml'}: {unknown('variant', request.variant, pipeline.variants)}")
-    profile, why = choose_profile(request.profile, scene, pinned, pipeline)
-    given = (pipeline, scene, profile, request.variant, parse_set(request.set, pipeline))
+    profile, why = choose_profile(request.profile, found, [home / "profile", base / "profile"], pipeline)
+    given = (pipeline, found, profile, variant, parse_set(request.set, pipeline))
     layers = layered(*given, {})
-    if request.budget or scene.budget is not None:
-        origin, text = ("budget", request.budget) if request.budget else (str(scene.path), scene.budget)
+    if request.budget or found.budget is not None:
+        origin, text = ("budget", request.budget) if request.budget else (str(found.path), found.budget)
         layers = layered(*given, shared_out(pipeline, layers.values, seconds_of(text, origin)))
-    return profile, why, layers
+    keys = frozenset(found.brings)
+    return Job(root, runs, folder or root, home, base, pipeline, layers, profile, why, request.trust, keys, memory)
 
 
 def choose_profile(asked: str | None, scene: SceneFile, pinned: list[Path], pipeline: Pipeline) -> tuple[str, str]:
@@ -158,22 +144,70 @@ def has_cuda() -> bool:
     return any(Path(p).exists() for p in ("/proc/driver/nvidia/version", "/dev/nvidia0", "/usr/lib/wsl/lib/libcuda.so"))
 
 
-def source_of(folder: Path, root: Path) -> str:
-    """How runs/<scene>/source names a scene's folder: from the root where it lies inside."""
-    return folder.relative_to(root).as_posix() if folder.is_relative_to(root) else str(folder)
+def _one_folder_a_name(base: Path, folder: Path | None, root: Path) -> None:
+    before = root / (base / "source").read_text().strip() if (base / "source").is_file() else folder
+    if folder and before != folder and before.is_dir():
+        raise Refused(
+            f"two scenes are called {folder.name!r}: {base} was made from {before}, and {folder} is asked for; "
+            f"rename one folder, or make room with `make scene={before} clean`"
+        )
 
 
-def _one_folder_a_name(base: Path, folder: Path, root: Path) -> None:
-    record = base / "source"
-    if record.is_file():
-        before = root / record.read_text().strip()
-        if before != folder and before.is_dir():
-            raise Refused(
-                f"two scenes are called {folder.name!r}: {base} was made from {before}, and {folder} is asked for; "
-                f"rename one folder, or make room with `make scene={before} clean`"
-            )
+def child(root: Path, *arguments: str, **options: Any) -> subprocess.Popen[str]:
+    """A fresh process that may import stages: `python -m runner.child <arguments>` with `root` first on its path."""
+    here = Path(__file__).resolve().parent.parent
+    path = os.pathsep.join(filter(None, [str(root), str(here), os.environ.get("PYTHONPATH", "")]))
+    command, environment = [sys.executable, "-m", "runner.child", *arguments], {**os.environ, "PYTHONPATH": path}
+    return subprocess.Popen(command, cwd=root, env=environment, stdin=subprocess.PIPE, text=True, **options)
 
 
-def brought(keys: Iterable[str], folder: Path) -> list[str]:
-    """What a scene brings of itself: the keys of its scene.yaml, and the names of its folders."""
-    return sorted({*keys, *(path.name for path in folder.iterdir() if path.is_dir())})
+def ask(root: Path, questions: list[dict[str, Any]], answers: dict[str, Any] | None = None) -> list[dict[str, Any]]:
+    """The answer to each: see `child.describe`. What is in `answers` already is not asked again; what is new joins."""
+    answers = {} if answers is None else answers
+    names = [json.dumps(question) for question in questions]
+    if new := [name for name in dict.fromkeys(names) if name not in answers]:
+        process = child(root, "describe", stdout=subprocess.PIPE)
+        said, _ = process.communicate(f"[{','.join(new)}]")
+        if process.returncode:
+            raise Refused("the stages could not be asked for their parameters (see above)")
+        answers.update(zip(new, json.loads(said), strict=True))
+    return [answers[name] for name in names]
+
+
+def _questions(job: Job) -> list[dict[str, Any]]:
+    """What the stages that have a file are asked: see `child.describe`."""
+    here = [(name, spec) for name, spec in job.pipeline.stages.items() if (job.root / f"stages/{name}.py").is_file()]
+    folder = None if job.folder == job.root else str(job.folder)
+    common = lambda name: {"stage": name, "params": job.layers.values[name], "brings": job.brought}
+    return [common(name) | {"takes": s.takes, "scene": folder if SCENE in s.takes else None} for name, s in here]
+
+
+def _described(job: Job) -> Job:
+    """The job with its stages. Raises Refused for the first parameter that is wrong."""
+    broken = {name: f"stages/{name}.py: no such file, and pipeline.yaml names it" for name in job.pipeline.stages}
+    asked, stages = _questions(job), {}
+    for question, answer in zip(asked, ask(job.root, asked, job.memory.answers), strict=True):
+        stage = question["stage"]
+        for error in answer.get("errors", ()):
+            origin = job.layers.origin(stage, error["where"])
+            raise Refused(f"{origin}: {_refusal(job.root, stage, error, answer['known'])}")
+        if "broken" in answer:
+            broken[stage] = answer["broken"]
+        else:
+            stages[stage] = Described(**answer)
+            del broken[stage]
+    return replace(job, stages=stages, broken=broken)
+
+
+def _refusal(root: Path, stage: str, error: dict[str, Any], known: list[str]) -> str:
+    """What is wrong with a parameter; one that had this name once is told its new one."""
+    old = f"{stage}.{error['where']}"
+    if not error["unknown"]:
+        return f"{old} = {error['value']}: {error['message']}"
+    renamed = read_yaml(root / RENAMED) if (root / RENAMED).is_file() else {}
+    while old and old not in renamed:
+        old = old.rpartition(".")[0]
+    if not old:
+        return f"stage {stage}: {unknown('parameter', error['where'], known)}"
+    new = renamed[old] or "it is gone"
+    return f"unknown parameter {old}; " + (f"it is {new} now" if re.fullmatch(r"\w+(\.\w+)+", new) else new)

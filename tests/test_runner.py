@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import shutil
@@ -13,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from runner import Refused, batch, execute
+from runner import Refused, compare, execute
 from runner.execute import Failed, run_scene
 from runner.keys import fingerprint
 from runner.plan import plan, table
@@ -92,6 +93,7 @@ def run(params: Params, out: Path, *, poses: Path) -> None:
     checkpoint.unlink()
 """,
     "stages/masks.py": """
+import ast
 import json
 from pathlib import Path
 from pydantic import BaseModel, ConfigDict
@@ -117,6 +119,7 @@ def run(params: Params, out: Path, *, fit: Path, masks: Path) -> None:
     (out / "gaussians.ply").write_text(str(int((fit / "gaussians.ply").read_text()) * params.gain))
 """,
     "stages/evaluate.py": """
+import ast
 import json
 from pathlib import Path
 from pydantic import BaseModel, ConfigDict
@@ -344,9 +347,9 @@ def test_code_edits(root, capsys):
 
 def test_fingerprint():
     same = ["def f(a):\n    return a", 'def f(a):\n    "Doc."\n    # why\n    return a', "def f( a ):\n\n  return (a)"]
-    assert len({fingerprint(text) for text in same}) == 1
-    assert fingerprint("def f(a):\n    return a or 1") != fingerprint(same[0])
-    assert fingerprint("x = '''a'''") != fingerprint("x = '''b'''")
+    assert len({fingerprint(ast.parse(text)) for text in same}) == 1
+    assert fingerprint(ast.parse("def f(a):\n    return a or 1")) != fingerprint(ast.parse(same[0]))
+    assert fingerprint(ast.parse("x = '''a'''")) != fingerprint(ast.parse("x = '''b'''"))
 
 
 def test_a_models_card_and_its_training_script_are_no_weights(root):
@@ -426,7 +429,7 @@ def test_variants_share_what_they_do_not_change(root, capsys):
     assert sorted(p.name for p in (root / "runs/toy@strong").iterdir() if p.is_dir()) == ["distill", "evaluate"]
     assert result(root, "toy@strong") == 50.0 and result(root) == 10.0
     assert set(words(root, variant="same").values()) == {"cached shared with toy"}
-    batch.show_results("evaluate", run_scene(request(root, variant="same"), "all")["evaluate"])
+    compare.show_results("evaluate", run_scene(request(root, variant="same"), "all")["evaluate"])
     assert "runs/toy/evaluate/: metrics.json" in capsys.readouterr().out
 
 
@@ -576,7 +579,7 @@ def test_clean(root):
 
 def test_batch_goes_on_after_a_failed_scene(root, capsys):
     write(root, {"data/bad/number.txt": "1", "data/bad/broken": "", "data/wide/number.txt": "6"})
-    assert batch.batch(request(root, scene=""), root / "data") == 1
+    assert compare.batch(request(root, scene=""), root / "data") == 1
     output = capsys.readouterr().out
     assert "failed: bad: poses: " in output and "2 of 3 scenes done" in output
     lines = (root / "runs/results.csv").read_text().split()
@@ -617,7 +620,7 @@ class Need:
 
 
 def test_weights_that_are_missing_are_told_before_any_work_and_fetched(fresh, capsys):
-    from runner.weights import weights
+    from runner.execute import weights
 
     source = fresh / "stages" / "distill.py"
     source.write_text(source.read_text() + WEIGHTS)
