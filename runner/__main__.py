@@ -29,7 +29,6 @@ def main() -> int:
             job = resolve(request)
             decisions = plan(job, job.pipeline.closure(arguments.stage))
             if arguments.record:
-                job.home.mkdir(parents=True, exist_ok=True)
                 write_json(job.home / "plan.json", as_record(job, decisions))
             else:
                 print(table(job, decisions))

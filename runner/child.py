@@ -99,12 +99,9 @@ def _check_run(path: Path, takes: list[str]) -> None:
 def _fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Dotted name and extra of each parameter, those of groups after one another."""
     for name, info in model.model_fields.items():
+        yield prefix + name, info.json_schema_extra
         if _is_group(info.annotation):
-            if info.json_schema_extra:
-                yield prefix + name, info.json_schema_extra
             yield from _fields(info.annotation, f"{prefix}{name}.")
-        else:
-            yield prefix + name, info.json_schema_extra
 
 
 def _is_group(annotation: Any) -> bool:
@@ -130,10 +127,8 @@ def _one_line(error: BaseException) -> str:
 
 
 def fetch() -> int:
-    """Get the weights that stages need and that are not here, each once. Standard input: {stage: {"params", "brings"}}.
-
-    Returns how many could not be had; each is told on standard error, and the others are fetched all the same.
-    """
+    """Get the weights that stages need and that are not here, each once; how many could not be had, which are told on
+    standard error. Standard input: {stage: {"params", "brings"}}."""
     wanted = {}
     for stage, asked in json.load(sys.stdin).items():
         planned = _module(_described_in(stage))

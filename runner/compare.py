@@ -32,11 +32,8 @@ def compare(request: Request, only: str = "", seeds: int = 1) -> int:
         raise Refused(f"variant={request.variant}: compare runs all variants; variants={request.variant} picks some")
     methods = [FULL, *_chosen(only, load_pipeline(request.root))]
     scenes = _scenes(request, seeds)
-    requests = {
-        (scene, method): replace(request, scene=scene, variant=None if method == FULL else method)
-        for scene in scenes
-        for method in methods
-    }
+    asks = lambda scene, method: replace(request, scene=scene, variant=None if method == FULL else method)
+    requests = {(scene, method): asks(scene, method) for scene in scenes for method in methods}
     memory = Memory(request.runs)
     # Wrong parameters of any variant, or of any scene, are refused before the first stage runs.
     resolve_all([r for (scene, method), r in requests.items() if scene == scenes[0] or method == FULL], memory)
@@ -44,7 +41,6 @@ def compare(request: Request, only: str = "", seeds: int = 1) -> int:
     runs = [{"scene": names[scene], "method": method, "state": WAITING} for scene, method in requests]
     record = {"scene": names[scenes[0]], "scenes": list(names.values()), "methods": methods, "runs": runs}
     home = request.runs / record["scene"]
-    home.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
     for number, (run, asked) in enumerate(zip(runs, requests.values(), strict=True), 1):
         write_json(home / RECORD, record)
@@ -75,9 +71,8 @@ def _chosen(only: str, pipeline: Pipeline) -> list[str]:
     if FULL in pipeline.variants:
         raise Refused(f"pipeline.yaml: a variant is called {FULL!r}, which is what compare calls the whole method")
     asked = [name for name in re.split(r"[,\s]+", only) if name and name != FULL]
-    for name in asked:
-        if name not in pipeline.variants:
-            raise Refused(f"variants: {unknown('variant', name, pipeline.variants)}")
+    for name in (name for name in asked if name not in pipeline.variants):
+        raise Refused(f"variants: {unknown('variant', name, pipeline.variants)}")
     return list(dict.fromkeys(asked)) if only else list(pipeline.variants)
 
 

@@ -36,9 +36,9 @@ def run_stage(job: Job, stage: str, decision: Decision, earlier: dict[str, Decis
         partial.mkdir(parents=True, exist_ok=True)
         seconds = expected_seconds(job, stage)
         say(f"{stage}: {decision.reason}" + (f"; about {seconds:.0f} s" if seconds is not None else ""))
-        result = _in_child(job, stage, partial, earlier, lock)
+        result = {"resumed": resumed} | _in_child(job, stage, partial, earlier, lock)  # the last try's seconds only
         say(f"{stage}: done in {result['seconds']:.1f} s, {result['peak_memory_mb']} MB")
-        write_json(partial / RECEIPT, _receipt(job, stage, decision.inputs, partial, resumed, result))
+        write_json(partial / RECEIPT, _receipt(job, stage, decision.inputs, partial, result))
     for line in hand_out(partial, place, job.home, job.pipeline.stages[stage].hands_out):
         say(line)
     put_in_place(partial, place)
@@ -98,9 +98,7 @@ def _in_child(job: Job, stage: str, partial: Path, earlier: dict[str, Decision],
     raise Failed(f"{stage}: {answer.get('error', how + hint)} (all of it in {shown(log)})")
 
 
-def _receipt(
-    job: Job, stage: str, inputs: Inputs, folder: Path, resumed: bool, result: dict[str, Any]
-) -> dict[str, Any]:
+def _receipt(job: Job, stage: str, inputs: Inputs, folder: Path, result: dict[str, Any]) -> dict[str, Any]:
     return {
         "stage": stage,
         "scene": job.base.name,
@@ -113,7 +111,6 @@ def _receipt(
         "machine": MACHINE,
         "device": job.params[stage].get("device", "cpu"),
         **result,
-        "resumed": resumed,  # then `seconds` is the last try's only
         "date": time.strftime("%FT%T%z"),
     }
 
@@ -174,17 +171,14 @@ def clean(request: Request) -> None:
     with ExitStack() as held:
         for each in names:
             held.enter_context(locked(request.runs, each, wait=False))
-        for each in names:
-            if (request.runs / each).exists():
-                shutil.rmtree(request.runs / each)
-                say(f"removed {shown(request.runs / each)}")
+        for folder in filter(Path.exists, (request.runs / each for each in names)):
+            shutil.rmtree(folder)
+            say(f"removed {shown(folder)}")
 
 
 def weights(request: Request, offline: bool) -> int:
-    """Show the weights of all stages, of a scene where one is named, and fetch what is missing unless `offline`.
-
-    Returns how many that a stage cannot do without are missing in the end.
-    """
+    """Show the weights of all stages, of a scene where one is named, and fetch what is missing unless `offline`; how
+    many that a stage cannot do without are missing in the end."""
     job = resolve(request, scene=bool(request.scene))
     all_needs = [(stage, need) for stage, each in job.stages.items() for need in each.needed]
     needs = {need["name"]: need for _, need in all_needs}

@@ -28,6 +28,7 @@ def files_below(folder: Path) -> Iterator[Path]:
 
 
 def write_json(path: Path, content: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(path.name + ".writing")
     partial.write_text(json.dumps(content, indent=1) + "\n")
     os.replace(partial, path)

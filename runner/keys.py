@@ -34,18 +34,18 @@ class Hashes:
     def __init__(self, path: Path):
         self.path = path
         try:
-            self._known: dict[str, Any] = json.loads(path.read_text())
+            self.known: dict[str, Any] = json.loads(path.read_text())
         except (OSError, ValueError):
-            self._known = {}
-        self._saved = len(self._known)
+            self.known = {}
+        self._saved = len(self.known)
         self._runs: dict[tuple[Path, str], list[Path]] = {}  # a module with its fingerprint -> see `module`
 
     def _remember(self, kind: str, path: Path, compute: Any) -> Any:
         stat = os.stat(path)
         name = f"{kind} {stat.st_dev} {stat.st_ino} {stat.st_size} {stat.st_mtime_ns}"
-        if name not in self._known:
-            self._known[name] = compute(path)
-        return self._known[name]
+        if name not in self.known:
+            self.known[name] = compute(path)
+        return self.known[name]
 
     def file(self, path: Path) -> str:
         return self._remember("file", path, _file_digest)
@@ -71,19 +71,30 @@ class Hashes:
         return self.files(folder, (path for path in files_below(folder) if path.suffix not in NOT_WEIGHTS))
 
     def save(self) -> None:
-        if len(self._known) == self._saved:
+        if len(self.known) == self._saved:
             return
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        kept = dict(list(self._known.items())[-self.LIMIT :])
+        kept = dict(list(self.known.items())[-self.LIMIT :])
         partial = self.path.with_name(f"{self.path.name}.{os.getpid()}")
         partial.write_text(json.dumps(kept))
         os.replace(partial, self.path)
-        self._saved = len(self._known)
+        self._saved = len(self.known)
 
 
 def _file_digest(path: Path) -> str:
     with open(path, "rb") as file:
         return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=10)).hexdigest()
+
+
+def outside(value: Any, folder: Path) -> Iterator[Path]:
+    """Files and folders named anywhere in `value`, relative to the scene, that the scene's folder does not hold."""
+    if isinstance(value, dict | list):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from outside(part, folder)
+    elif isinstance(value, str) and value and "\0" not in value and len(value) < 1024:
+        path = (folder / value).resolve()
+        if ("/" in value or os.sep in value) and not path.is_relative_to(folder) and path.exists():
+            yield path
 
 
 def fingerprint(tree: ast.Module) -> str:
@@ -131,13 +142,13 @@ def _run_by(names: Iterable[str], path: Path, root: Path) -> Iterator[Path]:
                 yield from (p for p in (place.with_suffix(".py"), place / "__init__.py") if p.is_file())
 
 
-def code_of(root: Path, stage: str, hashes: Hashes) -> dict[str, str]:
+def code_of(root: Path, stage: str, hashes: Hashes, folder: str = "stages") -> dict[str, str]:
     """File -> fingerprint, of stages/<stage>.py and of each module of ours that it imports, directly or not.
 
     What describes a stage beforehand (stages/plan/<stage>.py) is not part of it, unless the stage itself imports it.
     """
     found: dict[Path, str] = {}
-    waiting = [root / "stages" / f"{stage}.py"]
+    waiting = [root / folder / f"{stage}.py"]
     while waiting:
         path = waiting.pop()
         if path not in found:

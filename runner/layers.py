@@ -63,9 +63,8 @@ def layered(
     Groups of parameters merge. What goes by a key of scene.yaml is a value, also where it is a mapping (`reference:
     {view, image, depth}`), and is replaced whole.
     """
-    brought = {
-        stage: {k: scene.brings[k] for k in keys if k in scene.brings} for stage, keys in pipeline.scene_keys.items()
-    }
+    keys, brings = pipeline.scene_keys, scene.brings
+    brought = {stage: {key: brings[key] for key in keys[stage] if key in brings} for stage in keys}
     each = (
         ("pipeline.yaml", {name: stage.params for name, stage in pipeline.stages.items()}),
         (f"pipeline.yaml: profile {profile}", pipeline.profiles[profile]),
@@ -78,7 +77,7 @@ def layered(
     values: Overrides = {name: {} for name in pipeline.stages}
     for _, layer in each:
         for stage, params in layer.items():
-            values[stage] = merged(values[stage], params, pipeline.scene_keys.get(stage, ()))
+            values[stage] = merged(values[stage], params, keys.get(stage, ()))
     return Layers(values, each)
 
 
@@ -86,20 +85,15 @@ def seconds_of(text: object, origin: str) -> float:
     """`5m`, `90s`, `1h30m`, `2.5m`, or plain seconds; Refused, naming `origin`, for anything else."""
     number = r"(\d+(?:\.\d+)?)"
     found = re.fullmatch(rf"(?:{number}h)?(?:{number}m)?(?:{number}s)?|{number}", str(text).strip().lower())
-    seconds = (
-        sum(float(n or 0) * unit for n, unit in zip(found.groups(), (3600, 60, 1, 1), strict=True)) if found else 0
-    )
+    parts = zip(found.groups(), (3600, 60, 1, 1), strict=True) if found else ()
+    seconds = sum(float(number or 0) * unit for number, unit in parts)
     if seconds <= 0:
         raise Refused(f"{origin}: budget {text!r} is no time; write it like 5m, 90s or 1h30m")
     return seconds
 
 
 def shared_out(pipeline: Pipeline, values: Overrides, seconds: float) -> Overrides:
-    """stage -> {"seconds": its share}. The shares of stages that a parameter leaves out go to the others.
-
-    Args:
-        values: the parameters as they were asked for, by which stages are left out.
-    """
+    """stage -> {"seconds": its share}. The shares of stages that `values`, as asked for, leave out go to others."""
     if not pipeline.budget:
         raise Refused("pipeline.yaml: a budget is asked for, and there is no table `budget` that shares it out")
     asked = {f"{stage}.{name}": value for stage in values for name, value in leaves(values[stage]).items()}

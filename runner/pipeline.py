@@ -133,11 +133,9 @@ def read_yaml(path: Path) -> dict[str, Any]:
         content = yaml.load(path.read_text(encoding="utf-8"), LOADER)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise Refused(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
-    if content is None:
-        return {}
-    if not isinstance(content, dict):
+    if not isinstance(content, dict | None):
         raise Refused(f"{path}: expected `key: value` lines, found a {type(content).__name__}")
-    return content
+    return content or {}
 
 
 def load_pipeline(root: Path) -> Pipeline:
@@ -168,15 +166,14 @@ def load_scene_file(folder: Path, pipeline: Pipeline) -> SceneFile:
     path = folder / "scene.yaml"
     content = read_yaml(path) if path.is_file() else {}
     keys = [key for names in pipeline.scene_keys.values() for key in names]
-    for key in content:
-        if key not in (*keys, "profile", "budget", "stages"):
-            raise Refused(f"{path}: {unknown('key', key, [*keys, 'profile', 'budget', 'stages'])}")
+    known = [*keys, "profile", "budget", "stages"]
+    for key in (key for key in content if key not in known):
+        raise Refused(f"{path}: {unknown('key', key, known)}")
     stages = content.get("stages") or {}
     if not isinstance(stages, dict) or not all(isinstance(v, dict) for v in stages.values()):
         raise Refused(f"{path}: stages: expected {{stage: {{parameter: value}}}}")
-    for stage in stages:
-        if stage not in pipeline.stages:
-            raise Refused(f"{path}: stages: {unknown('stage', stage, pipeline.stages)}")
+    for stage in (stage for stage in stages if stage not in pipeline.stages):
+        raise Refused(f"{path}: stages: {unknown('stage', stage, pipeline.stages)}")
     brings = {key: value for key, value in content.items() if key in keys and value is not None}
     return SceneFile(path, content.get("profile"), brings, stages, content.get("budget"))
 

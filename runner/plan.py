@@ -10,7 +10,7 @@ from typing import Any
 
 from runner import Refused
 from runner.files import RECEIPT, files_below, receipt
-from runner.keys import Inputs, changes, code_changes, code_of, leaves
+from runner.keys import Inputs, changes, code_changes, code_of, leaves, outside
 from runner.pipeline import SCENE, Condition
 from runner.resolve import Job, ask, has_cuda
 
@@ -118,21 +118,10 @@ def _inputs(job: Job, stage: str, needs: dict[str, Path | None], code: dict[str,
         hashes[SCENE] = job.hashes.files(job.folder, map(Path, own.reads))
     elif SCENE in job.pipeline.stages[stage].takes:
         hashes[SCENE] = job.hashes.folder(job.folder, leave_out=("scene.yaml",))
-        for path in _outside(own.params, job.folder):
+        for path in outside(own.params, job.folder):
             hashes[str(path)] = job.hashes.folder(path) if path.is_dir() else job.hashes.file(path)
     weights = {param: job.hashes.weights(folder) if folder else name for param, name, folder in _weights(job, stage)}
     return Inputs(own.params, hashes, weights, code, own.unkeyed)
-
-
-def _outside(value: Any, folder: Path) -> Iterator[Path]:
-    """Files and folders named anywhere in `value`, relative to the scene, that the scene's folder does not hold."""
-    if isinstance(value, dict | list):
-        for part in value.values() if isinstance(value, dict) else value:
-            yield from _outside(part, folder)
-    elif isinstance(value, str) and value and "\0" not in value and len(value) < 1024:
-        path = (folder / value).resolve()
-        if ("/" in value or os.sep in value) and not path.is_relative_to(folder) and path.exists():
-            yield path
 
 
 def _compare(job: Job, stage: str, inputs: Inputs) -> Decision:

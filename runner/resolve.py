@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from runner import Refused
-from runner.keys import Hashes
+from runner.files import files_below
+from runner.keys import Hashes, code_of, digest, outside
 from runner.layers import Layers, layered, parse_set, seconds_of, shared_out
 from runner.pipeline import SCENE, Pipeline, SceneFile, find_scene, load_pipeline, load_scene_file, read_yaml, unknown
 
@@ -97,8 +98,9 @@ def resolve(request: Request, memory: Memory | None = None, scene: bool = True) 
 def resolve_all(requests: list[Request], memory: Memory, scene: bool = True) -> list[Job]:
     """The same for several of one root, whose stages are asked all at once."""
     drafts = [_draft(request, memory, scene) for request in requests]
-    ask(requests[0].root, [question for job in drafts for question in _questions(job)], memory.answers)
-    return [_described(job) for job in drafts]
+    asked = [_questions(job) for job in drafts]
+    ask(requests[0].root, [question for each in asked for question in each], memory.answers)
+    return [_described(job, questions) for job, questions in zip(drafts, asked, strict=True)]
 
 
 def _draft(request: Request, memory: Memory, scene: bool) -> Job:
@@ -176,17 +178,33 @@ def ask(root: Path, questions: list[dict[str, Any]], answers: dict[str, Any] | N
 
 def _questions(job: Job) -> list[dict[str, Any]]:
     """What the stages that have a file are asked: see `child.describe`."""
-    here = [(name, spec) for name, spec in job.pipeline.stages.items() if (job.root / f"stages/{name}.py").is_file()]
-    folder = None if job.folder == job.root else str(job.folder)
-    common = lambda name: {"stage": name, "params": job.layers.values[name], "brings": job.brought}
-    return [common(name) | {"takes": s.takes, "scene": folder if SCENE in s.takes else None} for name, s in here]
+    questions = []
+    for name, spec in job.pipeline.stages.items():
+        if (job.root / "stages" / f"{name}.py").is_file():
+            question = {"stage": name, "params": job.layers.values[name], "brings": job.brought, "takes": spec.takes}
+            if SCENE in spec.takes and job.folder != job.root:
+                question["state"] = _state(job, name)
+                question["scene"] = None if question["state"] in job.hashes.known else str(job.folder)
+            questions.append(question)
+    return questions
 
 
-def _described(job: Job) -> Job:
+def _state(job: Job, stage: str) -> str | None:
+    """A name for all that decides which files of the scene a stage reads, which may take it a second to find out; None
+    where files elsewhere may have a say."""
+    params, plan = job.layers.values[stage], "stages/plan"
+    if any(outside(params, job.folder)):
+        return None
+    code = code_of(job.root, stage, job.hashes, plan if (job.root / plan / f"{stage}.py").is_file() else "stages")
+    files = [(str(path), (stat := path.stat()).st_size, stat.st_mtime_ns) for path in files_below(job.folder)]
+    return "reads " + digest(json.dumps([stage, params, code, files]))
+
+
+def _described(job: Job, questions: list[dict[str, Any]]) -> Job:
     """The job with its stages. Raises Refused for the first parameter that is wrong."""
     broken = {name: f"stages/{name}.py: no such file, and pipeline.yaml names it" for name in job.pipeline.stages}
-    asked, stages = _questions(job), {}
-    for question, answer in zip(asked, ask(job.root, asked, job.memory.answers), strict=True):
+    stages = {}
+    for question, answer in zip(questions, ask(job.root, questions, job.memory.answers), strict=True):
         stage = question["stage"]
         for error in answer.get("errors", ()):
             origin = job.layers.origin(stage, error["where"])
@@ -194,7 +212,10 @@ def _described(job: Job) -> Job:
         if "broken" in answer:
             broken[stage] = answer["broken"]
         else:
-            stages[stage] = Described(**answer)
+            state, reads = question.get("state"), answer.get("reads")
+            if state and reads is not None:
+                job.hashes.known[state] = reads
+            stages[stage] = Described(**answer | {"reads": job.hashes.known.get(state, reads)})
             del broken[stage]
     return replace(job, stages=stages, broken=broken)
 
