@@ -1,12 +1,24 @@
-"""The tiny runner: it knows files, hashes and YAML, and nothing of 3D.
+"""The tiny runner: it knows files, hashes and YAML, and nothing of 3D. Its way is resolve -> plan -> execute.
 
-- pipeline.py: pipeline.yaml and scene.yaml: models, layers of parameters, clear refusals.
-- budget.py: a time budget, shared out over stages.
-- keys.py: what an artifact depends on, as hashes: contents of folders, code, parameters.
-- job.py: a request with everything about it resolved and checked.
+- resolve.py: a request becomes a job, in which all is settled: scene, profile, parameters of all stages, folders.
+  - pipeline.py: pipeline.yaml and scene.yaml: models, clear refusals.
+  - layers.py: parameters, layer over layer, and a time budget shared out over stages.
 - plan.py: one word and a reason for each stage, from what lies on the disk.
-- compare.py: a scene's own run and every variant of it.
-- execute.py: locks, fresh processes, folders renamed into place, receipts, batches.
-- weights.py: what weights a profile needs, their sizes, and their download.
+  - keys.py: what an artifact depends on, as hashes: contents of folders, code, parameters.
+- execute.py: does it: a fresh process a stage, folders renamed into place, receipts.
+  - files.py: locks, swaps, and copies that people work with.
 - child.py: the other side: the process in which stages are imported.
+- compare.py: many runs.
 """
+
+
+class Refused(Exception):
+    """What the user can put right, told in one line before any work."""
+
+
+class Failed(Exception):
+    """A stage could not do its work, told in one line."""
+
+
+def say(text: str) -> None:
+    print(text, flush=True)

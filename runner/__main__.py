@@ -1,20 +1,18 @@
 """python -m runner plan|run|compare|batch|weights|clean --scene NAME: what the Makefile calls."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import signal
 import sys
 from pathlib import Path
 
+from runner import Failed, Refused
 from runner.child import INTERRUPTED
-from runner.compare import compare
-from runner.execute import Failed, batch, clean, run_scene, show_results, write_json
-from runner.job import Request, prepare
-from runner.pipeline import Refused
+from runner.compare import batch, compare, show_results
+from runner.execute import clean, run_scene, weights
+from runner.files import write_json
 from runner.plan import as_record, plan, table
-from runner.weights import weights
+from runner.resolve import Request, resolve
 
 SOME_FAILED = 3  # compare: done, but for some variants
 
@@ -28,10 +26,9 @@ def main() -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # told to end: as Ctrl-C
     try:
         if arguments.command == "plan":
-            job = prepare(request)
+            job = resolve(request)
             decisions = plan(job, job.pipeline.closure(arguments.stage))
             if arguments.record:
-                job.home.mkdir(parents=True, exist_ok=True)
                 write_json(job.home / "plan.json", as_record(job, decisions))
             else:
                 print(table(job, decisions))

@@ -1,11 +1,13 @@
 """The process in which stages are imported: `describe` reads their parameters, `fetch` gets the weights they name,
-`run` does a stage's work."""
+`run` does a stage's work.
 
-from __future__ import annotations
+What can be told of a stage before it runs (Params, needed_weights, preview, scene_files) lies in stages/plan/<stage>.py
+where there is such a file, which imports nothing heavy, else in stages/<stage>.py itself.
+"""
 
+import ast
 import faulthandler
 import importlib
-import inspect
 import json
 import os
 import resource
@@ -14,65 +16,68 @@ import sys
 import threading
 import time
 import traceback
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
-from runner.keys import files_below
+from runner.files import files_below
 
 INTERRUPTED = 130
 
 
+def _described_in(stage: str) -> Path:
+    """The file that describes a stage, as seen from the root, in which this process is started."""
+    path = Path(f"stages/plan/{stage}.py")
+    return path if path.is_file() else Path(f"stages/{stage}.py")
+
+
+def _module(path: Path) -> Any:
+    return importlib.import_module(".".join(path.with_suffix("").parts))
+
+
 def describe() -> None:
-    """Standard input: {stage: {"params": asked for, "takes": names of needs, "needs": their paths (for a preview),
-    "brings": keys of scene.yaml and its folders, "scene": its folder}}; standard output: `_describe` of each.
-
-    Costs the import of pydantic and of the stage modules, which import nothing heavy at their top, and what a stage
-    needs to tell which files of the scene it reads.
+    """Standard input: a list of {"stage", "params": asked for, "takes": names of needs, "needs": their paths (for a
+    preview), "brings": keys of scene.yaml and its folders, "scene": its folder}; standard output: `_describe` of each.
     """
-    question = json.load(sys.stdin)
+    questions = json.load(sys.stdin)
     answer_to, sys.stdout = sys.stdout, sys.stderr  # whatever a module prints must not mix with the answer
-    json.dump({name: _describe(name, **asked) for name, asked in question.items()}, answer_to)
+    json.dump([_describe(question) for question in questions], answer_to)
 
 
-def _describe(
-    name: str,
-    params: dict[str, Any],
-    takes: list[str],
-    needs: dict[str, str | None] | None = None,
-    brings: list[str] | None = None,
-    scene: str | None = None,
-) -> dict[str, Any]:
-    """All parameters, the names of those that name weights, and where `brings` is given the weights themselves; where
-    `scene` is, the files of the scene it "reads" (None: all); or errors in them; or why the stage is "broken"."""
+def _describe(asked: dict[str, Any]) -> dict[str, Any]:
+    """What `resolve.Described` holds: where `brings` is given with the weights that are needed, where `scene` is with
+    the files of the scene it reads; where `needs` is the preview's "notes" or "refusal"; or {"broken": why}; or
+    {"errors": in the params, "known": names}."""
+    stage, needs, brings, scene = (asked.get(name) for name in ("stage", "needs", "brings", "scene"))
+    path = _described_in(stage)
     try:
-        stage = importlib.import_module(f"stages.{name}")
-        inspect.signature(stage.run).bind(None, None, **dict.fromkeys(takes))
+        planned = _module(path)
+        path = Path(f"stages/{stage}.py")
+        _check_run(path, asked["takes"])
     except Exception as error:
-        return {"broken": f"stages/{name}.py: {_one_line(error)}"}
-    fields = stage.Params.model_fields
-    marked = {field: info.json_schema_extra for field, info in fields.items()}
-    answer: dict[str, Any] = {
-        "params": {}, "errors": [], "known": list(fields), "notes": [], "refusal": None, "broken": None, "needed": [],
-        "reads": None,
-        "weights": [field for field, extra in marked.items() if isinstance(extra, dict) and extra.get("weights")],
-    }  # fmt: skip
+        return {"broken": f"{path}: {_one_line(error)}"}
+    fields = dict(_fields(planned.Params))
     try:
-        resolved = stage.Params(**params)
+        resolved = planned.Params(**asked["params"])
     except ValidationError as error:
-        answer["errors"] = [_error(e) for e in error.errors()]
-        return answer
-    answer["params"] = resolved.model_dump(mode="json")
-    if brings is not None and hasattr(stage, "needed_weights"):
-        answer["needed"] = [asdict(need) for need in stage.needed_weights(resolved, frozenset(brings))]
-    if scene is not None and hasattr(stage, "scene_files"):
-        files = stage.scene_files(resolved, Path(scene), list(files_below(Path(scene))))
+        return {"errors": [_error(e, planned.Params) for e in error.errors()], "known": list(fields)}
+    marks = {name: extra for name, extra in fields.items() if isinstance(extra, dict)}
+    answer: dict[str, Any] = {
+        "params": resolved.model_dump(mode="json"),
+        "weights": [name for name, extra in marks.items() if extra.get("weights")],
+        "unkeyed": [name for name, extra in marks.items() if extra.get("keyed") is False],
+    }
+    if brings is not None and hasattr(planned, "needed_weights"):
+        answer["needed"] = [asdict(need) for need in planned.needed_weights(resolved, frozenset(brings))]
+    if scene is not None and hasattr(planned, "scene_files"):
+        files = planned.scene_files(resolved, Path(scene), list(files_below(Path(scene))))
         answer["reads"] = sorted(str(path) for path in files)
-    if needs is not None and hasattr(stage, "preview"):
+    if needs is not None and hasattr(planned, "preview"):
         try:
-            answer["notes"] = list(stage.preview(resolved, **{n: p and Path(p) for n, p in needs.items()}))
+            answer["notes"] = list(planned.preview(resolved, **{n: p and Path(p) for n, p in needs.items()}))
         except ValueError as error:
             answer["refusal"] = _one_line(error)
         except Exception as error:
@@ -80,16 +85,55 @@ def _describe(
     return answer
 
 
-def fetch() -> int:
-    """Get the weights that stages need and that are not here, each once. Standard input: {stage: {"params", "brings"}}.
+def _check_run(path: Path, takes: list[str]) -> None:
+    """ValueError where `run` is not made for these needs; read from its source, for a stage may import much."""
+    named = {n.name: n.args for n in ast.parse(path.read_text(encoding="utf-8")).body if isinstance(n, ast.FunctionDef)}
+    run = named["run"]
+    plain, needs = [a.arg for a in run.args][2:], [a.arg for a in run.kwonlyargs]
+    free = {*plain[len(plain) - len(run.defaults) :], *(n for n, d in zip(needs, run.kw_defaults, strict=True) if d)}
+    wrong = {*plain, *needs} - free - {*takes} or (set() if run.kwarg else {*takes} - {*plain, *needs})
+    if wrong:
+        raise ValueError(f"run() and pipeline.yaml do not agree on its needs: {', '.join(sorted(wrong))}")
 
-    Returns how many could not be had; each is told on standard error, and the others are fetched all the same.
-    """
+
+def _fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted name and extra of each parameter, those of groups after one another."""
+    for name, info in model.model_fields.items():
+        yield prefix + name, info.json_schema_extra
+        if _is_group(info.annotation):
+            yield from _fields(info.annotation, f"{prefix}{name}.")
+
+
+def _is_group(annotation: Any) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
+
+
+def _error(error: Any, model: type[BaseModel]) -> dict[str, Any]:
+    """`where` it is, dotted; `unknown`: it is a name that no group has, with what is in it where it is a mapping."""
+    where, value, group = [str(part) for part in error["loc"]], error["input"], model
+    for part in where[:-1]:
+        group = _is_group(group) and part in group.model_fields and group.model_fields[part].annotation
+    unknown = error["type"] == "extra_forbidden" and _is_group(group)
+    while unknown and isinstance(value, dict) and value:
+        name, value = next(iter(value.items()))
+        where.append(str(name))
+    message = error["msg"].removeprefix("Value error, ")
+    return {"where": ".".join(where) or "?", "unknown": unknown, "value": repr(value), "message": message}
+
+
+def _one_line(error: BaseException) -> str:
+    text = " ".join(str(error).split())
+    return text if isinstance(error, ValueError) and text else f"{type(error).__name__}: {text}"
+
+
+def fetch() -> int:
+    """Get the weights that stages need and that are not here, each once; how many could not be had, which are told on
+    standard error. Standard input: {stage: {"params", "brings"}}."""
     wanted = {}
-    for name, asked in json.load(sys.stdin).items():
-        stage = importlib.import_module(f"stages.{name}")
-        if hasattr(stage, "needed_weights"):
-            needs = stage.needed_weights(stage.Params(**asked["params"]), frozenset(asked["brings"]))
+    for stage, asked in json.load(sys.stdin).items():
+        planned = _module(_described_in(stage))
+        if hasattr(planned, "needed_weights"):
+            needs = planned.needed_weights(planned.Params(**asked["params"]), frozenset(asked["brings"]))
             wanted |= {need.name: need for need in needs if need.problem and need.fetched}
     failed = 0
     for need in wanted.values():
@@ -100,22 +144,6 @@ def fetch() -> int:
             failed += 1
             print(f"error: {_one_line(error)}", file=sys.stderr, flush=True)
     return failed
-
-
-def _error(error: Any) -> dict[str, Any]:
-    where = [str(part) for part in error["loc"]] or ["?"]
-    return {
-        "param": where[0],
-        "where": ".".join(where),
-        "unknown": error["type"] == "extra_forbidden" and len(where) == 1,
-        "value": repr(error["input"]),
-        "message": error["msg"].removeprefix("Value error, "),
-    }
-
-
-def _one_line(error: BaseException) -> str:
-    text = " ".join(str(error).split())
-    return text if isinstance(error, ValueError) and text else f"{type(error).__name__}: {text}"
 
 
 def run() -> int:
@@ -132,9 +160,10 @@ def run() -> int:
         faulthandler.enable(log)
         log.write(f"{time.strftime('%F %T')} {job['stage']} {json.dumps(job['params'])}\n")
         try:
+            params = _module(_described_in(job["stage"])).Params(**job["params"])
             stage = importlib.import_module(f"stages.{job['stage']}")
             needs = {name: path and Path(path) for name, path in job["needs"].items()}
-            stage.run(stage.Params(**job["params"]), Path(job["out"]), **needs)
+            stage.run(params, Path(job["out"]), **needs)
             result = {"seconds": round(time.perf_counter() - began, 2), "peak_memory_mb": _peak_memory_mb()}
         except KeyboardInterrupt:
             return INTERRUPTED

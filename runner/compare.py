@@ -1,17 +1,20 @@
-"""The full method and every variant of pipeline.yaml, on a scene or on several, and a record of where each lies."""
+"""Many runs: `compare`, the full method and every variant on a scene or several; `batch`, every scene of a folder."""
 
-from __future__ import annotations
-
+import csv
+import json
 import os
 import re
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
-from runner.execute import Failed, run_scene, say, shown, write_json
-from runner.job import Request, prepare
-from runner.pipeline import Pipeline, Refused, find_scene, load_pipeline, unknown
+from runner import Failed, Refused, say
+from runner.execute import run_scene
+from runner.files import RECEIPT, shown, write_json
+from runner.pipeline import Pipeline, find_scene, load_pipeline, unknown
+from runner.resolve import Memory, Request, resolve_all
 
 FULL = "full"  # what the scene's own run, without a variant, is called beside them
 RECORD = "compare.json"
@@ -22,35 +25,30 @@ def compare(request: Request, only: str = "", seeds: int = 1) -> int:
     """Bring the full method and the variants up to date, and write runs/<scene>/compare.json; how many failed.
 
     What is cached is not run again, so the same command goes on after a kill. A variant that fails stops no other.
-
-    Args:
-        only: names of variants, with commas or blanks between; empty for all of pipeline.yaml.
-        seeds: on so many scenes: X, X-1, ..., X-<seeds - 1>.
-
-    Raises:
-        Refused: before any work, where a variant, a scene or a parameter is not right.
+    `only` names variants, with commas or blanks between (all where empty); `seeds` counts scenes: X, X-1, X-2 ...
+    Raises Refused before any work, where a variant, a scene or a parameter is not right.
     """
     if request.variant:
         raise Refused(f"variant={request.variant}: compare runs all variants; variants={request.variant} picks some")
     methods = [FULL, *_chosen(only, load_pipeline(request.root))]
     scenes = _scenes(request, seeds)
-    requests = {
-        (scene, method): replace(request, scene=scene, variant=None if method == FULL else method)
-        for scene in scenes
-        for method in methods
-    }
-    _check(requests, scenes)
+    asks = lambda scene, method: replace(request, scene=scene, variant=None if method == FULL else method)
+    requests = {(scene, method): asks(scene, method) for scene in scenes for method in methods}
+    memory = Memory(request.runs)
+    # Wrong parameters of any variant, or of any scene, are refused before the first stage runs.
+    resolve_all([r for (scene, method), r in requests.items() if scene == scenes[0] or method == FULL], memory)
     names = {scene: find_scene(scene, request.root).name for scene in scenes}
     runs = [{"scene": names[scene], "method": method, "state": WAITING} for scene, method in requests]
     record = {"scene": names[scenes[0]], "scenes": list(names.values()), "methods": methods, "runs": runs}
     home = request.runs / record["scene"]
-    home.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
     for number, (run, asked) in enumerate(zip(runs, requests.values(), strict=True), 1):
         write_json(home / RECORD, record)
         minutes = (time.monotonic() - began) / 60
         say(f"\ncompare: {run['method']} on {run['scene']}, {number} of {len(runs)}, {minutes:.0f} min so far")
-        run |= _done(asked)
+        stages, error = _tried(asked, memory)
+        where = {stage: path and os.path.relpath(path, request.runs) for stage, path in stages.items()}
+        run |= {"state": FAILED, "error": error} if error else {"state": DONE, "stages": where}
     write_json(home / RECORD, record)
     failed = [run for run in runs if run["state"] == FAILED]
     say("")
@@ -60,23 +58,21 @@ def compare(request: Request, only: str = "", seeds: int = 1) -> int:
     return len(failed)
 
 
-def _done(request: Request) -> dict[str, Any]:
-    """Run one; its state, and stage -> the artifact's folder below runs/, null where the stage is left out."""
+def _tried(request: Request, memory: Memory) -> tuple[dict[str, Path | None], str | None]:
+    """Run one: stage -> its artifact, and what went wrong."""
     try:
-        stages = run_scene(request, "all")
+        return run_scene(request, "all", memory), None
     except (Refused, Failed) as error:
         print(f"error: {error}", file=sys.stderr, flush=True)
-        return {"state": FAILED, "error": str(error)}
-    return {"state": DONE, "stages": {s: path and os.path.relpath(path, request.runs) for s, path in stages.items()}}
+        return {}, str(error)
 
 
 def _chosen(only: str, pipeline: Pipeline) -> list[str]:
     if FULL in pipeline.variants:
         raise Refused(f"pipeline.yaml: a variant is called {FULL!r}, which is what compare calls the whole method")
     asked = [name for name in re.split(r"[,\s]+", only) if name and name != FULL]
-    for name in asked:
-        if name not in pipeline.variants:
-            raise Refused(f"variants: {unknown('variant', name, pipeline.variants)}")
+    for name in (name for name in asked if name not in pipeline.variants):
+        raise Refused(f"variants: {unknown('variant', name, pipeline.variants)}")
     return list(dict.fromkeys(asked)) if only else list(pipeline.variants)
 
 
@@ -92,8 +88,59 @@ def _scenes(request: Request, seeds: int) -> list[str]:
     return scenes
 
 
-def _check(requests: dict[tuple[str, str], Request], scenes: list[str]) -> None:
-    """Refuse wrong parameters of any variant, or of any scene, before the first stage runs."""
-    for (scene, method), request in requests.items():
-        if scene == scenes[0] or method == FULL:
-            prepare(request)
+def _mean(evaluate: Path | None, of: str = "mean") -> dict[str, float | None]:
+    return json.loads((evaluate / "metrics.json").read_text()).get(of, {}) if evaluate else {}
+
+
+def show_results(stage: str, folder: Path | None) -> None:
+    """Where the results are; after `evaluate` the mean metrics too, those of the initialization beside them."""
+    if folder is None:
+        return
+    if stage == "evaluate":
+        initial = _mean(folder, "initialize")
+        for name, value in _mean(folder).items():
+            before = f" initialization {_number(initial[name])}" if initial.get(name) is not None else ""
+            say(f"  {name:<16} {_number(value) or 'not available':<14}{before}")
+    names = (p.name + ("/" if p.is_dir() else "") for p in sorted(folder.iterdir()) if p.name != RECEIPT)
+    say(f"results in {shown(folder)}/: {', '.join(names)}")
+
+
+def _number(value: Any) -> str:
+    return f"{value:.4f}" if isinstance(value, float) else "" if value is None else str(value)
+
+
+def batch(request: Request, folder: Path) -> int:
+    """Every scene in `folder`, one after another; a table in runs/results.{csv,md}. Returns how many failed."""
+    scenes = sorted(p for p in folder.iterdir() if p.is_dir() and p.name[0] not in "._") if folder.is_dir() else []
+    if not scenes:
+        raise Refused(f"data={folder}: no folders of scenes there")
+    rows: dict[str, dict[str, float | None]] = {}
+    failed: dict[str, str] = {}
+    memory = Memory(request.runs)
+    for scene in scenes:
+        stages, error = _tried(replace(request, scene=str(scene)), memory)
+        if error:
+            failed[scene.name] = error
+        else:
+            rows[scene.name] = _mean(stages.get("evaluate"))
+    suffix = f"@{request.variant}" if request.variant else ""
+    _write_table(request.runs / f"results{suffix}", rows, failed)
+    for name, reason in failed.items():
+        say(f"failed: {name}: {reason}")
+    say(f"{len(rows)} of {len(scenes)} scenes done; table: {shown(request.runs)}/results{suffix}.csv and .md")
+    return len(failed)
+
+
+def _write_table(stem: Path, rows: dict[str, dict[str, float | None]], failed: dict[str, str]) -> None:
+    """A row a scene, and the mean over the scenes that have a value."""
+    names = list(dict.fromkeys(name for row in rows.values() for name in row))
+    lines = [[scene, "done", *(_number(row.get(name)) for name in names)] for scene, row in rows.items()]
+    lines += [[scene, "failed", *("" for _ in names)] for scene in failed]
+    there = [[row[name] for row in rows.values() if isinstance(row.get(name), int | float)] for name in names]
+    lines.append([f"mean of {len(rows)}", "", *(_number(sum(v) / len(v)) if v else "" for v in there)])
+    header = ["scene", "state", *names]
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    with open(f"{stem}.csv", "w", newline="") as file:
+        csv.writer(file).writerows([header, *lines])
+    text = [" | ".join(cells) for cells in (header, ["---"] * len(header), *lines)]
+    Path(f"{stem}.md").write_text("".join(f"| {line} |\n" for line in text))

@@ -1,20 +1,19 @@
 """What an artifact depends on, as hashes."""
 
-from __future__ import annotations
-
 import ast
 import hashlib
 import json
 import os
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from runner.pipeline import Refused
+from runner import Refused
+from runner.files import RECEIPT, files_below
 
-LIBRARY = "reffusion"  # the package whose modules count as a stage's code
-NOT_CONTENT = ("receipt.json", "trace.jsonl", "checkpoint.pt", "checkpoint.pt.writing")
+OWN = ("reffusion", "stages")  # the packages whose modules count as a stage's code where it imports them
+NOT_CONTENT = (RECEIPT, "trace.jsonl", "checkpoint.pt", "checkpoint.pt.writing")
 NOT_WEIGHTS = (".md", ".py", ".png", ".jpg")  # a model's card, its pictures, the scripts that trained it
 
 
@@ -35,30 +34,33 @@ class Hashes:
     def __init__(self, path: Path):
         self.path = path
         try:
-            self._known: dict[str, Any] = json.loads(path.read_text())
+            self.known: dict[str, Any] = json.loads(path.read_text())
         except (OSError, ValueError):
-            self._known = {}
-        self._saved = len(self._known)
+            self.known = {}
+        self._saved = len(self.known)
+        self._runs: dict[tuple[Path, str], list[Path]] = {}  # a module with its fingerprint -> see `module`
 
     def _remember(self, kind: str, path: Path, compute: Any) -> Any:
-        stat = path.stat()
+        stat = os.stat(path)
         name = f"{kind} {stat.st_dev} {stat.st_ino} {stat.st_size} {stat.st_mtime_ns}"
-        if name not in self._known:
-            self._known[name] = compute(path)
-        return self._known[name]
+        if name not in self.known:
+            self.known[name] = compute(path)
+        return self.known[name]
 
     def file(self, path: Path) -> str:
         return self._remember("file", path, _file_digest)
 
-    def module(self, path: Path) -> tuple[str, list[str]]:
-        """The fingerprint of a Python file and the dotted names it imports (`.name`: relative)."""
-        fingerprint, names = self._remember("code", path, _read_module)
-        return fingerprint, names
+    def module(self, path: Path, root: Path) -> tuple[str, list[Path]]:
+        """The fingerprint of a Python file, and those files below `root` that its imports run."""
+        names, fingerprint = self._remember("module", path, _read_module)
+        if (path, fingerprint) not in self._runs:
+            self._runs[path, fingerprint] = list(_run_by(names, path, root))
+        return fingerprint, self._runs[path, fingerprint]
 
     def folder(self, folder: Path, leave_out: tuple[str, ...] = NOT_CONTENT) -> str:
         """Names and contents of all files below `folder`, but hidden ones and those at its top in `leave_out`."""
-        files = (path for path in files_below(folder) if path.relative_to(folder).as_posix() not in leave_out)
-        return self.files(folder, files)
+        top = {str(folder / name) for name in leave_out}
+        return self.files(folder, (path for path in files_below(folder) if str(path) not in top))
 
     def files(self, folder: Path, files: Iterable[Path]) -> str:
         """Names as seen from `folder` and contents of these files, in this order."""
@@ -66,31 +68,17 @@ class Hashes:
 
     def weights(self, folder: Path) -> str:
         """Of a model's folder: what a library may read of it. Writing in its card reruns nothing."""
-        files = (path for path in files_below(folder) if path.suffix not in NOT_WEIGHTS)
-        return digest(*(part for path in files for part in (path.relative_to(folder).as_posix(), self.file(path))))
+        return self.files(folder, (path for path in files_below(folder) if path.suffix not in NOT_WEIGHTS))
 
     def save(self) -> None:
-        if len(self._known) == self._saved:
+        if len(self.known) == self._saved:
             return
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        kept = dict(list(self._known.items())[-self.LIMIT :])
+        kept = dict(list(self.known.items())[-self.LIMIT :])
         partial = self.path.with_name(f"{self.path.name}.{os.getpid()}")
         partial.write_text(json.dumps(kept))
         os.replace(partial, self.path)
-        self._saved = len(self._known)
-
-
-def files_below(folder: Path) -> Iterator[Path]:
-    """Files, sorted, links followed, hidden names left out."""
-    seen = set()
-    for place, folders, names in os.walk(folder, followlinks=True):
-        real = os.path.realpath(place)
-        folders[:] = [] if real in seen else sorted(f for f in folders if not f.startswith(".") and f != "__pycache__")
-        seen.add(real)
-        for name in sorted(names):
-            path = Path(place, name)
-            if not name.startswith(".") and path.is_file():
-                yield path
+        self._saved = len(self.known)
 
 
 def _file_digest(path: Path) -> str:
@@ -98,12 +86,19 @@ def _file_digest(path: Path) -> str:
         return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=10)).hexdigest()
 
 
-def fingerprint(source: str) -> str:
+def outside(value: Any, folder: Path) -> Iterator[Path]:
+    """Files and folders named anywhere in `value`, relative to the scene, that the scene's folder does not hold."""
+    if isinstance(value, dict | list):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from outside(part, folder)
+    elif isinstance(value, str) and value and "\0" not in value and len(value) < 1024:
+        path = (folder / value).resolve()
+        if ("/" in value or os.sep in value) and not path.is_relative_to(folder) and path.exists():
+            yield path
+
+
+def fingerprint(tree: ast.Module) -> str:
     """A hash of Python code that comments, docstrings, layout and descriptions of fields do not change."""
-    return _fingerprint(ast.parse(source))
-
-
-def _fingerprint(tree: ast.Module) -> str:
     for node in ast.walk(tree):
         body = getattr(node, "body", None)
         if isinstance(body, list):
@@ -118,87 +113,91 @@ def _read_module(path: Path) -> list[Any]:
         tree = ast.parse(path.read_text(encoding="utf-8"))
     except SyntaxError as error:
         raise Refused(f"{path}:{error.lineno}: not valid Python: {error.msg}") from None
-    names = sorted(set(_imported(tree)))
-    return [_fingerprint(tree), names]
+    return [sorted(set(_imported(tree))), fingerprint(tree)]  # which changes the tree
 
 
-def _imported(tree: ast.Module) -> Iterator[str]:
-    """Every imported name that may be a module, also those imported inside functions."""
-    for node in ast.walk(tree):
+def _imported(tree: ast.AST) -> Iterator[str]:
+    """Every imported name that may be a module (`.name`: relative), also those imported inside functions, but for
+    those under `if TYPE_CHECKING`, which are never run."""
+    for node in ast.iter_child_nodes(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             module = "." * node.level + (node.module or "")
             yield module
             yield from (module + ("" if module.endswith(".") else ".") + alias.name for alias in node.names)
+        elif not (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)):
+            yield from _imported(node)
 
 
-def _absolute(name: str, path: Path, root: Path) -> str:
-    """The dotted name of an import as written in the file at `path`."""
-    level = len(name) - len(name.lstrip("."))
-    if not level:
-        return name
-    package = path.relative_to(root).parts[:-level]
-    return ".".join((*package, *filter(None, name.lstrip(".").split("."))))
-
-
-def code_of(root: Path, stage: str, hashes: Hashes) -> dict[str, str]:
-    """File -> fingerprint, of stages/<stage>.py and of each `reffusion` module it imports, directly or not."""
-    found: dict[str, str] = {}
-    waiting = [root / "stages" / f"{stage}.py"]
-    while waiting:
-        path = waiting.pop()
-        name = path.relative_to(root).as_posix()
-        if name in found:
-            continue
-        found[name], imported = hashes.module(path)
-        for dotted in imported:
-            parts = _absolute(dotted, path, root).split(".")
-            if parts[0] != LIBRARY:
-                continue
+def _run_by(names: Iterable[str], path: Path, root: Path) -> Iterator[Path]:
+    """The files of our own packages that importing `names` in the file at `path` runs."""
+    for name in names:
+        level = len(name) - len(name.lstrip("."))
+        package = path.relative_to(root).parts[:-level] if level else ()
+        parts = (*package, *filter(None, name.lstrip(".").split(".")))
+        if parts and parts[0] in OWN:
             for depth in range(1, len(parts) + 1):  # importing a.b.c runs a and a.b too
                 place = root.joinpath(*parts[:depth])
-                waiting += [p for p in (place.with_suffix(".py"), place / "__init__.py") if p.is_file()]
-    return dict(sorted(found.items()))
+                yield from (p for p in (place.with_suffix(".py"), place / "__init__.py") if p.is_file())
+
+
+def code_of(root: Path, stage: str, hashes: Hashes, folder: str = "stages") -> dict[str, str]:
+    """File -> fingerprint, of stages/<stage>.py and of each module of ours that it imports, directly or not.
+
+    What describes a stage beforehand (stages/plan/<stage>.py) is not part of it, unless the stage itself imports it.
+    """
+    found: dict[Path, str] = {}
+    waiting = [root / folder / f"{stage}.py"]
+    while waiting:
+        path = waiting.pop()
+        if path not in found:
+            found[path], imported = hashes.module(path, root)
+            waiting += imported
+    return {path.relative_to(root).as_posix(): found[path] for path in sorted(found)}
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """All that an artifact depends on; kept in its receipt, so that a rerun can say what changed.
+    """All that an artifact depends on; kept in its receipt, so that a rerun can say what changed."""
 
-    Attributes:
-        params: every parameter of the stage, resolved.
-        profile: the profile's name.
-        needs: need -> hash of its content, None where it was left out.
-        weights: parameter -> hash of the weights folder it names, or the name itself where that is not a folder here.
-        code: file -> fingerprint.
-    """
-
-    params: dict[str, Any]
-    profile: str
-    needs: dict[str, str | None]
-    weights: dict[str, str]
-    code: dict[str, str]
+    params: dict[str, Any]  # every parameter of the stage, resolved
+    needs: dict[str, str | None]  # need -> hash of its content, None where it was left out
+    weights: dict[str, str]  # parameter -> hash of the folder it names, or the name itself where that is none here
+    code: dict[str, str]  # file -> fingerprint
+    unkeyed: tuple[str, ...] = ()  # parameters that nothing in the artifact depends on
 
     @property
     def key(self) -> str:
-        return digest(json.dumps(asdict(self), sort_keys=True))
+        return digest(json.dumps([self.keyed(self.params), self.needs, self.weights, self.code], sort_keys=True))
+
+    def keyed(self, params: dict[str, Any]) -> dict[str, Any]:
+        """Dotted name -> value, of those parameters that count."""
+        inside = tuple(f"{name}." for name in self.unkeyed)
+        return {n: v for n, v in leaves(params).items() if n not in self.unkeyed and not n.startswith(inside)}
+
+
+def leaves(params: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Dotted name -> value, of all that is no mapping itself."""
+    found = {}
+    for name, value in params.items():
+        inner = isinstance(value, dict) and value
+        found |= leaves(value, f"{prefix}{name}.") if inner else {f"{prefix}{name}": value}
+    return found
 
 
 def changes(old: dict[str, Any], new: Inputs) -> list[str]:
     """What differs between a receipt and the inputs of today, in words; code comes last."""
-    said = []
-    if old["profile"] != new.profile:
-        said.append(f"profile {old['profile']} -> {new.profile}")
-    for name in sorted({*old["params"], *new.params}):
-        if name not in new.params:
+    said, before, after = [], new.keyed(old["params"]), new.keyed(new.params)
+    for name in sorted({*before, *after}):
+        if name not in after:
             said.append(f"param {name} is gone")
-        elif name not in old["params"]:
+        elif name not in before:
             said.append(f"param {name} is new")
-        elif (before := old["params"][name]) != new.params[name]:
-            said.append(f"param {name} {_short(before)} -> {_short(new.params[name])}")
-    for kind, before, after in (("need", old["needs"], new.needs), ("weights", old["weights"], new.weights)):
-        said += [f"{kind} {name} changed" for name in sorted({*before, *after}) if before.get(name) != after.get(name)]
+        elif before[name] != after[name]:
+            said.append(f"param {name} {_short(before[name])} -> {_short(after[name])}")
+    for kind, then, now in (("need", old["needs"], new.needs), ("weights", old["weights"], new.weights)):
+        said += [f"{kind} {name} changed" for name in sorted({*then, *now}) if then.get(name) != now.get(name)]
     return said + code_changes(old, new)
 
 

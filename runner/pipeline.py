@@ -1,64 +1,48 @@
-"""`pipeline.yaml` and `scene.yaml`: their models, and the parameters that follow from them."""
-
-from __future__ import annotations
+"""`pipeline.yaml` and `scene.yaml`: what they say, checked."""
 
 import difflib
-import os
 import re
-import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_validator
+
+from runner import Refused
 
 SCENE = "scene"  # the need that stands for the scene's own folder
-AUTO = "auto"
+LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the one in C takes a tenth of the time
 
-Overrides = dict[str, dict[str, Any]]  # stage -> parameter -> value
-
-
-class Refused(Exception):
-    """What the user can put right, told in one line before any work."""
+Overrides = dict[str, dict[str, Any]]  # stage -> parameter, or group of parameters -> value
 
 
-class Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+class Strict(BaseModel, extra="forbid", frozen=True):
+    """As all of pipeline.yaml: a name that is not known is refused."""
 
 
 class Condition(Strict):
-    """A reason to leave a stage out: one question, whose answer is yes.
-
-    `fact: <stage>.<name>`, of an earlier stage's facts.json, is `equals`; or so is `param: <stage>.<name>`, a parameter
-    of any stage, or each of a list of them; or the folder `empty: <stage>/<folder>` of an earlier artifact is without
-    a file.
-    Ignored where the scene brings the key `unless`.
-    """
+    """A reason to leave a stage out: one question, by `fact`, `param` or `empty`, whose answer is yes."""
 
     because: str
-    fact: str | None = None
-    param: str | tuple[str, ...] | None = None
+    fact: str | None = None  # <stage>.<name>: of an earlier stage's facts.json, is `equals`
+    # <stage>.<name>, or a list of them: parameters of any stage, each `equals`
+    param: Annotated[tuple[str, ...], BeforeValidator(lambda said: (said,) if isinstance(said, str) else said)] = ()
     equals: Any = None
-    empty: str | None = None
-    unless: str | None = None
+    empty: str | None = None  # <stage>/<folder>: of an earlier artifact, is without a file
+    unless: str | None = None  # ignored where the scene brings this key
 
     @model_validator(mode="after")
-    def _one_question(self) -> Condition:
-        if [self.fact, self.param, self.empty].count(None) != 2:
+    def _one_question(self) -> Self:
+        if sum(map(bool, (self.fact, self.param, self.empty))) != 1:
             raise ValueError("a condition has one of `fact`, `param`, `empty`")
         return self
 
     @property
     def names(self) -> tuple[str, str]:
         """The stage the question is about, and the name of the fact, parameter or folder."""
-        stage, name = re.split(r"[./]", self.fact or self.empty or self.params[0], maxsplit=1)
+        stage, name = re.split(r"[./]", self.fact or self.empty or self.param[0], maxsplit=1)
         return stage, name
-
-    @property
-    def params(self) -> tuple[str, ...]:
-        """The parameters asked about."""
-        return (self.param,) if isinstance(self.param, str) else self.param or ()
 
     @property
     def waits_for(self) -> tuple[str, ...]:
@@ -104,7 +88,7 @@ class Pipeline(Strict):
     budget: dict[str, Annotated[float, Field(gt=0)]] = {}
 
     @model_validator(mode="after")
-    def _names_are_known(self) -> Pipeline:
+    def _names_are_known(self) -> Self:
         earlier = [SCENE]
         for name, stage in self.stages.items():
             named = [*stage.takes, *(need for c in stage.left_out for need in c.waits_for)]
@@ -143,22 +127,15 @@ def unknown(kind: str, name: object, known: Any) -> str:
     return f"unknown {kind} {name!r}; " + (f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}")
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Raises Refused where it is not valid, or holds no `key: value` lines."""
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = yaml.load(path.read_text(encoding="utf-8"), LOADER)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise Refused(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
-    if content is None:
-        return {}
-    if not isinstance(content, dict):
+    if not isinstance(content, dict | None):
         raise Refused(f"{path}: expected `key: value` lines, found a {type(content).__name__}")
-    return content
-
-
-def _first_error(error: ValidationError) -> str:
-    first = error.errors()[0]
-    where = ".".join(str(part) for part in first["loc"])
-    return f"{where}: {first['msg']}" if where else first["msg"].removeprefix("Value error, ")
+    return content or {}
 
 
 def load_pipeline(root: Path) -> Pipeline:
@@ -167,95 +144,38 @@ def load_pipeline(root: Path) -> Pipeline:
     if not path.is_file():
         raise Refused(f"{path}: no such file; the runner's --root is the folder that holds it")
     try:
-        return Pipeline.model_validate(_read_yaml(path))
+        return Pipeline.model_validate(read_yaml(path))
     except ValidationError as error:
-        raise Refused(f"{path}: {_first_error(error)}") from None
+        first = error.errors()[0]
+        where = "".join(f"{part}." for part in first["loc"])[:-1]
+        raise Refused(f"{path}: {where + ': ' if where else ''}{first['msg'].removeprefix('Value error, ')}") from None
 
 
 @dataclass(frozen=True)
 class SceneFile:
-    """What a scene's optional scene.yaml says.
+    """What a scene's optional scene.yaml says."""
 
-    Attributes:
-        path: the file, present or not.
-        profile: its `profile`, or None.
-        budget: its `budget`, or None.
-        brings: the keys, with values, that describe the scene.
-        stages: parameters of stages.
-    """
-
-    path: Path
+    path: Path  # the file, present or not
     profile: str | None
-    brings: dict[str, Any]
+    brings: dict[str, Any]  # the keys, with values, that describe the scene
     stages: Overrides
     budget: Any = None
 
 
 def load_scene_file(folder: Path, pipeline: Pipeline) -> SceneFile:
     path = folder / "scene.yaml"
-    content = _read_yaml(path) if path.is_file() else {}
+    content = read_yaml(path) if path.is_file() else {}
     keys = [key for names in pipeline.scene_keys.values() for key in names]
-    for key in content:
-        if key not in (*keys, "profile", "budget", "stages"):
-            raise Refused(f"{path}: {unknown('key', key, [*keys, 'profile', 'budget', 'stages'])}")
+    known = [*keys, "profile", "budget", "stages"]
+    for key in (key for key in content if key not in known):
+        raise Refused(f"{path}: {unknown('key', key, known)}")
     stages = content.get("stages") or {}
     if not isinstance(stages, dict) or not all(isinstance(v, dict) for v in stages.values()):
         raise Refused(f"{path}: stages: expected {{stage: {{parameter: value}}}}")
-    for stage in stages:
-        if stage not in pipeline.stages:
-            raise Refused(f"{path}: stages: {unknown('stage', stage, pipeline.stages)}")
+    for stage in (stage for stage in stages if stage not in pipeline.stages):
+        raise Refused(f"{path}: stages: {unknown('stage', stage, pipeline.stages)}")
     brings = {key: value for key, value in content.items() if key in keys and value is not None}
     return SceneFile(path, content.get("profile"), brings, stages, content.get("budget"))
-
-
-def parse_set(text: str, pipeline: Pipeline) -> Overrides:
-    """`fit.iterations=500 distill.seed=3`; the values are read as YAML."""
-    overrides: Overrides = {}
-    for word in shlex.split(text):
-        match = re.fullmatch(r"(\w+)\.(\w+)=(.*)", word, flags=re.DOTALL)
-        if not match:
-            raise Refused(f"set: {word!r} is not of the form stage.parameter=value")
-        stage, name, value = match.groups()
-        if stage not in pipeline.stages:
-            raise Refused(f"set: {unknown('stage', stage, pipeline.stages)}")
-        try:
-            overrides.setdefault(stage, {})[name] = yaml.safe_load(value)
-        except yaml.YAMLError:
-            raise Refused(f"set: the value of {stage}.{name} is not valid YAML: {value!r}") from None
-    return overrides
-
-
-@dataclass(frozen=True)
-class Layers:
-    """Parameters as they were asked for, and who asked: stage -> parameter -> (value, file)."""
-
-    values: Overrides
-    origin: dict[str, dict[str, str]]
-
-
-def layered(
-    pipeline: Pipeline, scene: SceneFile, profile: str, variant: str | None, asked: Overrides, shares: Overrides
-) -> Layers:
-    """Later layers win: stage defaults in pipeline.yaml, profile, shares of a budget, scene.yaml, variant, `set=`."""
-    brought = {
-        stage: {k: scene.brings[k] for k in keys if k in scene.brings} for stage, keys in pipeline.scene_keys.items()
-    }
-    layers = [
-        ("pipeline.yaml", {name: stage.params for name, stage in pipeline.stages.items()}),
-        (f"pipeline.yaml: profile {profile}", pipeline.profiles[profile]),
-        ("budget", shares),
-        (str(scene.path), brought),
-        (f"{scene.path}: stages", scene.stages),
-        (f"pipeline.yaml: variant {variant}", pipeline.variants.get(variant or "", {})),
-        ("set", asked),
-    ]
-    values: Overrides = {name: {} for name in pipeline.stages}
-    origin: dict[str, dict[str, str]] = {name: {} for name in pipeline.stages}
-    for label, layer in layers:
-        for stage, params in layer.items():
-            values[stage].update(params)
-            origin[stage].update(dict.fromkeys(params, label))
-    return Layers(values, origin)
 
 
 def find_scene(text: str, root: Path) -> Path:
@@ -271,29 +191,3 @@ def find_scene(text: str, root: Path) -> Path:
         f"unknown scene {text!r}: there is no folder data/{text}, nor one at that path; "
         f"known: {', '.join(known) or 'none'} (`make demo` makes one)"
     )
-
-
-def choose_profile(asked: str | None, scene: SceneFile, pinned: list[Path], pipeline: Pipeline) -> tuple[str, str]:
-    """The profile asked for, else scene.yaml's, else the one this scene was run with, else by the machine; and why."""
-    origin = "profile" if asked else f"{scene.path}: profile"
-    why = "asked for" if asked else f"{scene.path.name} says so"
-    profile = asked or scene.profile or AUTO
-    if profile == AUTO:
-        for path in pinned:
-            if path.is_file():
-                origin, profile, why = str(path), path.read_text().strip(), "this scene was run with it"
-                break
-        else:
-            origin, profile, why = "profile", "laptop", "no CUDA driver on this machine"
-            if has_cuda():
-                profile, why = "paper", "this machine has a CUDA driver"
-    if profile not in pipeline.profiles:
-        raise Refused(f"{origin}: {unknown('profile', profile, [AUTO, *pipeline.profiles])}")
-    return profile, why
-
-
-def has_cuda() -> bool:
-    """Is there an NVIDIA driver, and is a device visible? Asked of the system, so that torch need not be imported."""
-    if os.environ.get("CUDA_VISIBLE_DEVICES", "unset") in ("", "-1"):
-        return False
-    return any(Path(p).exists() for p in ("/proc/driver/nvidia/version", "/dev/nvidia0", "/usr/lib/wsl/lib/libcuda.so"))

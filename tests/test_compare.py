@@ -18,9 +18,9 @@ import pytest
 from report import compare as page
 from report import curves, job, loading, pictures, results, scenes
 from report.paired import half_width, paired, pareto
+from runner import Refused
 from runner.compare import compare
-from runner.job import Request
-from runner.pipeline import Refused
+from runner.resolve import Request
 
 REPO = Path(__file__).resolve().parent.parent
 FILES = {

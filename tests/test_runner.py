@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import shutil
@@ -13,12 +14,12 @@ from pathlib import Path
 
 import pytest
 
-from runner import execute
+from runner import Refused, compare, execute
+from runner import resolve as resolving
 from runner.execute import Failed, run_scene
-from runner.job import Request, prepare
-from runner.keys import fingerprint
-from runner.pipeline import Refused
+from runner.keys import Hashes, code_of, fingerprint
 from runner.plan import plan, table
+from runner.resolve import Request, resolve
 
 REPO = Path(__file__).resolve().parent.parent
 
@@ -93,6 +94,7 @@ def run(params: Params, out: Path, *, poses: Path) -> None:
     checkpoint.unlink()
 """,
     "stages/masks.py": """
+import ast
 import json
 from pathlib import Path
 from pydantic import BaseModel, ConfigDict
@@ -118,6 +120,7 @@ def run(params: Params, out: Path, *, fit: Path, masks: Path) -> None:
     (out / "gaussians.ply").write_text(str(int((fit / "gaussians.ply").read_text()) * params.gain))
 """,
     "stages/evaluate.py": """
+import ast
 import json
 from pathlib import Path
 from pydantic import BaseModel, ConfigDict
@@ -159,7 +162,7 @@ def request(root: Path, scene: str = "toy", **options) -> Request:
 
 def words(root: Path, **options) -> dict[str, str]:
     """Stage -> "word reason" as planned."""
-    job = prepare(request(root, **options))
+    job = resolve(request(root, **options))
     return {s: f"{d.word} {d.reason}".strip() for s, d in plan(job, job.pipeline.closure("all")).items()}
 
 
@@ -241,7 +244,7 @@ def test_fresh_plan(fresh):
     assert said["poses"] == said["fit"] == "run no artifact yet"
     assert said["masks"].startswith("undecided left out if the scene has no masks")
     assert said["distill"].startswith("undecided") and said["evaluate"].startswith("run")
-    job = prepare(request(fresh))
+    job = resolve(request(fresh))
     assert "reads one number" in table(job, plan(job, ["poses"]))
     assert not (fresh / "runs").exists() or not (fresh / "runs/toy").exists()  # plan leaves nothing but hashes
 
@@ -345,9 +348,9 @@ def test_code_edits(root, capsys):
 
 def test_fingerprint():
     same = ["def f(a):\n    return a", 'def f(a):\n    "Doc."\n    # why\n    return a', "def f( a ):\n\n  return (a)"]
-    assert len({fingerprint(text) for text in same}) == 1
-    assert fingerprint("def f(a):\n    return a or 1") != fingerprint(same[0])
-    assert fingerprint("x = '''a'''") != fingerprint("x = '''b'''")
+    assert len({fingerprint(ast.parse(text)) for text in same}) == 1
+    assert fingerprint(ast.parse("def f(a):\n    return a or 1")) != fingerprint(ast.parse(same[0]))
+    assert fingerprint(ast.parse("x = '''a'''")) != fingerprint(ast.parse("x = '''b'''"))
 
 
 def test_a_models_card_and_its_training_script_are_no_weights(root):
@@ -362,9 +365,10 @@ def test_a_models_card_and_its_training_script_are_no_weights(root):
 def test_weights_profile_and_hand_edits(root, capsys):
     (root / "weights/model.bin").write_text("v")
     assert words(root)["distill"] == "run weights prior changed"
-    assert words(root, profile="paper")["poses"] == "run profile laptop -> paper"
-    assert words(root, profile=None) == words(root)  # pinned by the first run
     (root / "weights/model.bin").write_text("w")
+    paper = words(root, profile="paper")  # its name is nothing that an artifact depends on; what it sets is
+    assert paper["poses"] == "cached" and paper["fit"] == "run param rate 2 -> 1"
+    assert words(root, profile=None) == words(root)  # pinned by the first run
     (root / "runs/toy/fit/gaussians.ply").write_text("11")
     assert words(root)["fit"] == "cached its files were changed by hand since"
     assert ran(capsys, root) == ["masks", "distill", "evaluate"]
@@ -426,7 +430,7 @@ def test_variants_share_what_they_do_not_change(root, capsys):
     assert sorted(p.name for p in (root / "runs/toy@strong").iterdir() if p.is_dir()) == ["distill", "evaluate"]
     assert result(root, "toy@strong") == 50.0 and result(root) == 10.0
     assert set(words(root, variant="same").values()) == {"cached shared with toy"}
-    execute.show_results("evaluate", run_scene(request(root, variant="same"), "all")["evaluate"])
+    compare.show_results("evaluate", run_scene(request(root, variant="same"), "all")["evaluate"])
     assert "runs/toy/evaluate/: metrics.json" in capsys.readouterr().out
 
 
@@ -557,7 +561,7 @@ def test_a_cache_made_on_a_gpu_holds_without_one(root, monkeypatch):
 def test_two_folders_of_one_name(root, tmp_path):
     write(tmp_path, {"elsewhere/toy/number.txt": "4"})
     with pytest.raises(Refused, match=r"two scenes are called 'toy': .*data/toy.*elsewhere/toy"):
-        prepare(request(root, scene=str(tmp_path / "elsewhere/toy")))
+        resolve(request(root, scene=str(tmp_path / "elsewhere/toy")))
     shutil.rmtree(root / "data/toy")  # moved, not doubled
     assert set(words(root, scene=str(tmp_path / "elsewhere/toy")).values()) == {"cached"}
 
@@ -576,7 +580,7 @@ def test_clean(root):
 
 def test_batch_goes_on_after_a_failed_scene(root, capsys):
     write(root, {"data/bad/number.txt": "1", "data/bad/broken": "", "data/wide/number.txt": "6"})
-    assert execute.batch(request(root, scene=""), root / "data") == 1
+    assert compare.batch(request(root, scene=""), root / "data") == 1
     output = capsys.readouterr().out
     assert "failed: bad: poses: " in output and "2 of 3 scenes done" in output
     lines = (root / "runs/results.csv").read_text().split()
@@ -617,7 +621,7 @@ class Need:
 
 
 def test_weights_that_are_missing_are_told_before_any_work_and_fetched(fresh, capsys):
-    from runner.weights import weights
+    from runner.execute import weights
 
     source = fresh / "stages" / "distill.py"
     source.write_text(source.read_text() + WEIGHTS)
@@ -641,3 +645,221 @@ def test_weights_that_are_missing_are_told_before_any_work_and_fetched(fresh, ca
     assert weights(asked, offline=False) == 0
     assert "to fetch: about 0 bytes" in capsys.readouterr().out
     assert not words(fresh)["distill"].startswith("missing")
+
+
+# ------------------------------------------------------------------------------------------------- nested parameters
+
+NESTED = """
+from pathlib import Path
+from pydantic import BaseModel, ConfigDict, Field
+
+class Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+class Lora(Part):
+    rank: int = Field(4, ge=1)
+    model: str = Field("weights", json_schema_extra={"weights": True})
+
+class Sds(Part):
+    weight: float = 1.0
+    lora: Lora = Lora()
+
+class Params(Part):
+    gain: int = 1
+    sds: Sds = Sds()
+    extra: str | dict | list | None = None
+    checkpoint_seconds: float = Field(60.0, json_schema_extra={"keyed": False})
+
+def run(params: Params, out: Path, *, fit: Path, masks: Path) -> None:
+    (out / "gaussians.ply").write_text(str(int((fit / "gaussians.ply").read_text()) * params.gain))
+"""
+NESTING = {
+    "stages/distill.py": NESTED,
+    "pipeline.yaml": FILES["pipeline.yaml"]
+    .replace("{param: distill.gain, equals: 0", "{param: distill.sds.weight, equals: 0")
+    .replace("poses: [shift, gaussians]", "poses: [shift, gaussians], distill: [extra]")
+    .replace("laptop: {fit: {rate: 2}}", "laptop: {fit: {rate: 2}, distill: {sds: {weight: 0.5, lora: {rank: 8}}}}")
+    .replace("same: {}", "same: {}, ranked: {distill: {sds: {lora: {rank: 2}}}}"),
+}
+
+
+def params_of(root: Path, stage: str = "distill", **options) -> dict:
+    return resolve(request(root, **options)).params[stage]
+
+
+def test_groups_merge_layer_over_layer(fresh):
+    write(
+        fresh, {**NESTING, "data/toy/scene.yaml": "extra: {view: a, depth: b}\nstages: {distill: {sds: {weight: 2}}}"}
+    )
+    model = {"model": "weights"}
+    assert params_of(fresh)["sds"] == {"weight": 2.0, "lora": {"rank": 8, **model}}
+    assert params_of(fresh, variant="ranked")["sds"] == {"weight": 2.0, "lora": {"rank": 2, **model}}
+    said = params_of(fresh, variant="ranked", set="distill.sds.lora.rank=3 distill.sds.weight=4 distill.gain=2")
+    assert said["sds"] == {"weight": 4.0, "lora": {"rank": 3, **model}} and said["gain"] == 2
+    assert params_of(fresh)["extra"] == {"view": "a", "depth": "b"}
+    assert params_of(fresh, set="distill.extra='{view: c}'")["extra"] == {"view": "c"}  # a value of the scene, no group
+    assert params_of(fresh, set="distill.extra=[1,2]")["extra"] == [1, 2]
+
+
+def test_nested_parameters_rerun_and_leave_out_by_their_dotted_names(fresh, capsys):
+    write(fresh, NESTING)
+    ran(capsys, fresh)
+    said = words(fresh, set="distill.sds.lora.rank=9 distill.sds.weight=3")
+    assert said["distill"] == "run param sds.lora.rank 8 -> 9, param sds.weight 0.5 -> 3.0"
+    assert words(fresh, set="distill.sds.weight=0")["distill"] == "skip no gain"
+    lost = words(fresh, set="distill.sds.lora.model=./none")["distill"]
+    assert lost.startswith("missing distill.sds.lora.model: no weights at ")
+    (fresh / "weights/model.bin").write_text("v")
+    assert words(fresh)["distill"] == "run weights sds.lora.model changed"
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ("distill.sds.wieght=1", r"set: stage distill: unknown parameter 'sds.wieght'; did you mean 'sds.weight'\?"),
+        ("distill.sds_weight=1", r"set: stage distill: unknown parameter 'sds_weight'; did you mean 'sds.weight'\?"),
+        ("distill.sdss.weight=1", r"set: stage distill: unknown parameter 'sdss.weight'; did you mean 'sds.weight'\?"),
+        ("distill.sds.lora.rank=0", r"set: distill.sds.lora.rank = 0: .*greater than or equal to 1"),
+        ("distill.sds=1", r"set: distill.sds = 1: "),
+        ("distill.sds.=1", r"is not of the form stage.parameter=value"),
+    ],
+)
+def test_wrong_nested_parameters_are_named_with_their_layer(fresh, asked, message):
+    write(fresh, NESTING)
+    with pytest.raises(Refused, match=message):
+        resolve(request(fresh, set=asked))
+
+
+def test_the_layer_that_asked_last_is_named(fresh):
+    write(fresh, {**NESTING, "data/toy/scene.yaml": "stages: {distill: {sds: {weight: much}}}"})
+    with pytest.raises(Refused, match=r"toy/scene.yaml: stages: distill.sds.weight = 'much'"):
+        resolve(request(fresh, set="distill.sds.lora.rank=3"))
+    with pytest.raises(Refused, match=r"set: distill.sds.weight = 'more'"):
+        resolve(request(fresh, set="distill.sds.weight=more"))
+
+
+def test_an_old_name_is_told_its_new_one(fresh):
+    old = "distill.sds_weight: distill.sds.weight\ndistill.lora: distill.sds.lora\ndistill.gone: ''\nfit.was: no use\n"
+    write(fresh, {**NESTING, "runner/renamed.yaml": old})
+    for asked, message in {
+        "distill.sds_weight=1": "unknown parameter distill.sds_weight; it is distill.sds.weight now",
+        "distill.lora.rank=1": "unknown parameter distill.lora; it is distill.sds.lora now",
+        "distill.gone=1": "unknown parameter distill.gone; it is gone",
+        "fit.was=1": "unknown parameter fit.was; no use",
+        "fit.rat=1": "stage fit: unknown parameter 'rat'; did you mean 'rate'?",
+    }.items():
+        with pytest.raises(Refused) as caught:
+            resolve(request(fresh, set=asked))
+        assert str(caught.value) == f"set: {message}"
+    write(fresh, {"data/toy/scene.yaml": "stages: {distill: {sds_weight: 1}}"})
+    with pytest.raises(Refused, match=r"scene.yaml: stages: unknown parameter distill.sds_weight; it is distill.sds"):
+        resolve(request(fresh))
+
+
+# -------------------------------------------------------------------------------------------------------------- keys
+
+
+def test_a_parameter_that_is_no_part_of_the_key_reruns_nothing(fresh, capsys):
+    write(fresh, NESTING)
+    ran(capsys, fresh)
+    assert set(words(fresh, set="distill.checkpoint_seconds=5").values()) == {"cached"}
+    receipt = json.loads((fresh / "runs/toy/distill/receipt.json").read_text())
+    assert receipt["params"]["checkpoint_seconds"] == 60.0 and receipt["unkeyed"] == ["checkpoint_seconds"]
+
+
+def test_profiles_that_set_the_same_share_artifacts_and_old_receipts_hold(root, capsys):
+    edit(root / "pipeline.yaml", "paper: {}", "paper: {fit: {rate: 2}}")
+    assert set(words(root, profile="paper").values()) == {"cached"}
+    for path in (root / "runs/toy").glob("*/receipt.json"):  # as written when the profile was part of the key
+        found = json.loads(path.read_text())
+        del found["unkeyed"]
+        path.write_text(json.dumps(found | {"key": "0" * 20}))
+    assert ran(capsys, root, profile="paper") == []
+    assert words(root, set="fit.rate=3")["fit"] == "run param rate 2 -> 3"
+
+
+# ------------------------------------------------------------------------------------------ where a stage is described
+
+PLANNED = {
+    "stages/plan/__init__.py": "",
+    "stages/plan/fit.py": """
+from pydantic import BaseModel, ConfigDict, Field
+
+class Params(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    iterations: int = Field(3, ge=1)
+    rate: int = 1
+
+def preview(params, poses):
+    return [f"{params.iterations} steps"]
+""",
+    "stages/fit.py": """
+import heavy
+from typing import TYPE_CHECKING
+from reffusion.optimize import step
+if TYPE_CHECKING:
+    from stages.plan.fit import Params
+
+def run(params: "Params", out, *, poses):
+    number = 0
+    for _ in range(params.iterations):
+        number = step(number, params.rate)
+    (out / "gaussians.ply").write_text(str(number + int((poses / "number.txt").read_text())))
+""",
+    "heavy.py": "import os\nopen(os.environ['HEAVY'], 'a').write('x')\n",
+}
+
+
+def test_a_stage_is_described_in_its_plan_module_and_that_is_no_part_of_its_code(fresh, capsys, monkeypatch):
+    imported = fresh / "imported.txt"
+    monkeypatch.setenv("HEAVY", str(imported))
+    write(fresh, PLANNED)
+    run_scene(request(fresh), "poses")
+    job = resolve(request(fresh))
+    assert "3 steps" in table(job, plan(job, ["poses", "fit"])) and not imported.exists()
+    assert "fit" in ran(capsys, fresh) and imported.read_text() == "x"  # by the process that does the work
+    assert result(fresh) == 10.0
+    code = json.loads((fresh / "runs/toy/fit/receipt.json").read_text())["code"]
+    assert "stages/fit.py" in code and not any("plan" in name for name in code)
+    edit(fresh / "stages/plan/fit.py", 'steps"]', 'steps of"]')
+    assert set(words(fresh).values()) == {"cached"}
+    edit(fresh / "stages/plan/fit.py", "rate: int = 1", "rate: int = 1\n    slope: int = 1")
+    assert words(fresh)["fit"] == "run param slope is new"
+    edit(fresh / "stages/fit.py", "import heavy", "import heavy\nfrom stages.plan import fit")
+    assert "stages/plan/fit.py" in code_of(fresh, "fit", Hashes(fresh / "hashes"))  # now it is imported
+
+
+def test_a_run_that_does_not_fit_its_needs_is_refused_without_importing_it(fresh, monkeypatch):
+    monkeypatch.setenv("HEAVY", str(fresh / "imported.txt"))
+    write(fresh, PLANNED)
+    edit(fresh / "stages/fit.py", "*, poses", "*, poses, masks")
+    with pytest.raises(Refused, match=r"stages/fit.py: run\(\) and pipeline.yaml do not agree on its needs: masks"):
+        run_scene(request(fresh), "fit")
+    assert not (fresh / "imported.txt").exists()
+
+
+# ------------------------------------------------------------------------------------------------------------- asking
+
+
+def test_stages_are_asked_once_for_the_same_inputs(root, capsys, monkeypatch):
+    started, child = [], resolving.child
+    monkeypatch.setattr(resolving, "child", lambda *given, **how: started.append(given) or child(*given, **how))
+    assert compare.compare(request(root), "full,same") == 0
+    assert len(started) == 1 and ": done in" not in capsys.readouterr().out
+    edit(root / "data/toy/number.txt", "4", "5")
+    assert compare.compare(request(root), "full,same") == 0
+    described = [given for given in started[1:] if given[1] == "describe"]
+    assert len(described) > 1  # after a stage has run, what they said may not hold
+
+
+def test_which_files_a_stage_reads_is_asked_again_only_where_something_changed(root):
+    reads = "def scene_files(params, scene, files):\n    {}\n    return files\n\ndef preview("
+    edit(root / "stages/poses.py", "def preview(", reads.format("open('asked.txt', 'a').write('x')"))
+    for _ in range(2):
+        words(root)
+    assert (root / "asked.txt").read_text() == "x"
+    write(root, {"data/toy/new.txt": ""})
+    assert words(root)["poses"].startswith("run need scene changed") and (root / "asked.txt").read_text() == "xx"
+    edit(root / "stages/poses.py", "return files", "return files[:1]")
+    words(root)
+    assert (root / "asked.txt").read_text() == "xxx"

@@ -27,9 +27,9 @@ from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_mask_sets, load_raw_masks, load_references, load_scene, save_references
 from reffusion.params.distill import Lift
 from reffusion.types import PARAMETERS, Reference
-from runner.job import Job, Request, prepare
 from runner.pipeline import load_pipeline
 from runner.plan import Decision, decide
+from runner.resolve import Job, Request, resolve
 from stages import distill, evaluate, fit, initialize, lift, masks
 from stages.plan import fit as plan_fit
 
@@ -73,7 +73,7 @@ def capture(tmp_path_factory):
     """A small scene, and runs/ as its own run would leave it, as far as the runner looks."""
     home = tmp_path_factory.mktemp("variants")
     scene, runs = write_capture(home / "scene", "llff", some_truth()), home / "runs"
-    job, said = prepare(Request(ROOT, runs, str(scene), profile="laptop")), {}
+    job, said = resolve(Request(ROOT, runs, str(scene), profile="laptop")), {}
     for stage in job.pipeline.stages:
         said[stage] = decide(job, stage, said)
         if said[stage].word == "run":
@@ -99,7 +99,7 @@ def test_every_variant_has_a_plan_here():
 @pytest.mark.parametrize("variant", PLANS)
 def test_a_variant_runs_what_it_changes_and_shares_the_rest(capture, variant):
     scene, runs = capture
-    said = decisions(prepare(Request(ROOT, runs, str(scene), profile="laptop", variant=variant)))
+    said = decisions(resolve(Request(ROOT, runs, str(scene), profile="laptop", variant=variant)))
     runs_here, left_out = PLANS[variant]
     assert {s for s, d in said.items() if d.word == "skip"} == {*left_out, *({"lift"} - set(runs_here))}
     assert {s for s, d in said.items() if d.word in ("run", "stale", "undecided")} == set(runs_here)
@@ -112,13 +112,13 @@ def test_a_variant_runs_what_it_changes_and_shares_the_rest(capture, variant):
 def test_with_the_papers_terms_every_ablation_leaves_something_out(tmp_path, variant):
     scene = write_capture(tmp_path / "scene", "llff", some_truth())
     request = Request(ROOT, tmp_path / "runs", str(scene), profile="paper-terms")
-    assert prepare(request).params != prepare(replace(request, variant=variant)).params
+    assert resolve(request).params != resolve(replace(request, variant=variant)).params
 
 
 def test_the_papers_terms_are_the_papers_at_the_laptops_size(tmp_path):
     scene, runs = write_capture(tmp_path / "scene", "llff", some_truth()), tmp_path / "runs"
-    terms = prepare(Request(ROOT, runs, str(scene), profile="paper-terms")).params
-    laptop = prepare(Request(ROOT, runs, str(scene), profile="laptop")).params
+    terms = resolve(Request(ROOT, runs, str(scene), profile="paper-terms")).params
+    laptop = resolve(Request(ROOT, runs, str(scene), profile="laptop")).params
     size = {"prior", "iterations", "depth.steps", *(f"adversarial.{name}" for name in ("patches", "size", "width"))}
     paper, ours, theirs = (
         single(p) for p in (distill.Params().model_dump(mode="json"), terms["distill"], laptop["distill"])
@@ -138,7 +138,7 @@ def single(params):
 def test_the_papers_profile_takes_every_variant(capture):
     scene, runs = capture
     for variant in ("lift_perceptual_diffusion", "sds_plain"):
-        prepare(Request(ROOT, runs, str(scene), profile="paper", variant=variant))
+        resolve(Request(ROOT, runs, str(scene), profile="paper", variant=variant))
 
 
 # ------------------------------------------------------------------------------------------ what the terms may reach

@@ -1,0 +1,234 @@
+"""The first step: a request becomes a job, in which everything is settled and checked."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from runner import Refused
+from runner.files import files_below
+from runner.keys import Hashes, code_of, digest, outside
+from runner.layers import Layers, layered, parse_set, seconds_of, shared_out
+from runner.pipeline import SCENE, Pipeline, SceneFile, find_scene, load_pipeline, load_scene_file, read_yaml, unknown
+
+AUTO = "auto"  # the profile that this machine can do
+RENAMED = Path("runner", "renamed.yaml")  # old dotted name of a parameter: the new one, or what became of it
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the command line asks for. Texts are as given; None where not given."""
+
+    root: Path
+    runs: Path
+    scene: str
+    profile: str | None = None
+    variant: str | None = None
+    trust: bool = False
+    set: str = ""
+    budget: str | None = None
+
+
+class Memory:
+    """What the jobs of one command share: hashes of files, and `answers` of stages, until a stage has run."""
+
+    def __init__(self, runs: Path):
+        self.hashes = Hashes(runs / ".hashes.json")
+        self.answers: dict[str, Any] = {}
+
+
+@dataclass(frozen=True)
+class Described:
+    """What a stage says of itself."""
+
+    params: dict[str, Any]  # every parameter, groups nested
+    weights: tuple[str, ...] = ()  # dotted names of the parameters that name weights
+    unkeyed: tuple[str, ...] = ()  # and of those that change nothing in the artifact
+    needed: tuple[dict[str, Any], ...] = ()  # the weights it works with: reffusion.weights.Need
+    reads: tuple[str, ...] | None = None  # the files of the scene that it reads; None for all of them
+
+
+@dataclass(frozen=True)
+class Job:
+    """One scene with everything about it resolved and checked."""
+
+    root: Path
+    runs: Path
+    folder: Path  # of the scene; the root where there is none
+    home: Path  # runs/<scene>, or runs/<scene>@<variant>
+    base: Path  # runs/<scene>: what a variant shares lies there
+    pipeline: Pipeline
+    layers: Layers  # the parameters that were asked for
+    profile: str
+    why: str  # what made the choice of the profile
+    trust: bool
+    brings: frozenset[str]  # the keys of scene.yaml that have values
+    memory: Memory
+    stages: dict[str, Described] = field(default_factory=dict)
+    broken: dict[str, str] = field(default_factory=dict)  # stages that cannot be described -> what is wrong
+
+    @property
+    def brought(self) -> list[str]:
+        """What the scene brings of itself: the keys of its scene.yaml, and the names of its folders."""
+        folders = self.folder.iterdir() if self.folder != self.root else ()
+        return sorted({*self.brings, *(path.name for path in folders if path.is_dir())})
+
+    @property
+    def hashes(self) -> Hashes:
+        return self.memory.hashes
+
+    @property
+    def params(self) -> dict[str, dict[str, Any]]:
+        """stage -> every parameter."""
+        return {stage: each.params for stage, each in self.stages.items()}
+
+
+def resolve(request: Request, memory: Memory | None = None, scene: bool = True) -> Job:
+    """Read and check everything a request names; without `scene` that of no scene in particular.
+
+    Raises Refused with one line that says what would fix it.
+    """
+    return resolve_all([request], memory or Memory(request.runs), scene)[0]
+
+
+def resolve_all(requests: list[Request], memory: Memory, scene: bool = True) -> list[Job]:
+    """The same for several of one root, whose stages are asked all at once."""
+    drafts = [_draft(request, memory, scene) for request in requests]
+    asked = [_questions(job) for job in drafts]
+    ask(requests[0].root, [question for each in asked for question in each], memory.answers)
+    return [_described(job, questions) for job, questions in zip(drafts, asked, strict=True)]
+
+
+def _draft(request: Request, memory: Memory, scene: bool) -> Job:
+    """A job that does not know its stages yet."""
+    root, runs, variant, pipeline = request.root, request.runs, request.variant, load_pipeline(request.root)
+    folder = find_scene(request.scene, root) if scene else None
+    found = load_scene_file(folder, pipeline) if folder else SceneFile(root / "scene.yaml", None, {}, {})
+    if variant and variant not in pipeline.variants:
+        raise Refused(f"{root / 'pipeline.yaml'}: {unknown('variant', variant, pipeline.variants)}")
+    base = runs / (folder.name if folder else "")
+    home = base.with_name(f"{base.name}@{variant}") if variant else base
+    _one_folder_a_name(base, folder, root)
+    profile, why = choose_profile(request.profile, found, [home / "profile", base / "profile"], pipeline)
+    given = (pipeline, found, profile, variant, parse_set(request.set, pipeline))
+    layers = layered(*given, {})
+    if request.budget or found.budget is not None:
+        origin, text = ("budget", request.budget) if request.budget else (str(found.path), found.budget)
+        layers = layered(*given, shared_out(pipeline, layers.values, seconds_of(text, origin)))
+    keys = frozenset(found.brings)
+    return Job(root, runs, folder or root, home, base, pipeline, layers, profile, why, request.trust, keys, memory)
+
+
+def choose_profile(asked: str | None, scene: SceneFile, pinned: list[Path], pipeline: Pipeline) -> tuple[str, str]:
+    """The profile asked for, else scene.yaml's, else the one this scene was run with, else by the machine; and why."""
+    origin = "profile" if asked else f"{scene.path}: profile"
+    why = "asked for" if asked else f"{scene.path.name} says so"
+    profile = asked or scene.profile or AUTO
+    if profile == AUTO:
+        origin, profile, why = "profile", "laptop", "no CUDA driver on this machine"
+        if record := next((path for path in pinned if path.is_file()), None):
+            origin, profile, why = str(record), record.read_text().strip(), "this scene was run with it"
+        elif has_cuda():
+            profile, why = "paper", "this machine has a CUDA driver"
+    if profile not in pipeline.profiles:
+        raise Refused(f"{origin}: {unknown('profile', profile, [AUTO, *pipeline.profiles])}")
+    return profile, why
+
+
+def has_cuda() -> bool:
+    """Is there an NVIDIA driver, and is a device visible? Asked of the system, so that torch need not be imported."""
+    if os.environ.get("CUDA_VISIBLE_DEVICES", "unset") in ("", "-1"):
+        return False
+    return any(Path(p).exists() for p in ("/proc/driver/nvidia/version", "/dev/nvidia0", "/usr/lib/wsl/lib/libcuda.so"))
+
+
+def _one_folder_a_name(base: Path, folder: Path | None, root: Path) -> None:
+    before = root / (base / "source").read_text().strip() if (base / "source").is_file() else folder
+    if folder and before != folder and before.is_dir():
+        raise Refused(
+            f"two scenes are called {folder.name!r}: {base} was made from {before}, and {folder} is asked for; "
+            f"rename one folder, or make room with `make scene={before} clean`"
+        )
+
+
+def child(root: Path, *arguments: str, **options: Any) -> subprocess.Popen[str]:
+    """A fresh process that may import stages: `python -m runner.child <arguments>` with `root` first on its path."""
+    here = Path(__file__).resolve().parent.parent
+    path = os.pathsep.join(filter(None, [str(root), str(here), os.environ.get("PYTHONPATH", "")]))
+    command, environment = [sys.executable, "-m", "runner.child", *arguments], {**os.environ, "PYTHONPATH": path}
+    return subprocess.Popen(command, cwd=root, env=environment, stdin=subprocess.PIPE, text=True, **options)
+
+
+def ask(root: Path, questions: list[dict[str, Any]], answers: dict[str, Any] | None = None) -> list[dict[str, Any]]:
+    """The answer to each: see `child.describe`. What is in `answers` already is not asked again; what is new joins."""
+    answers = {} if answers is None else answers
+    names = [json.dumps(question) for question in questions]
+    if new := [name for name in dict.fromkeys(names) if name not in answers]:
+        process = child(root, "describe", stdout=subprocess.PIPE)
+        said, _ = process.communicate(f"[{','.join(new)}]")
+        if process.returncode:
+            raise Refused("the stages could not be asked for their parameters (see above)")
+        answers.update(zip(new, json.loads(said), strict=True))
+    return [answers[name] for name in names]
+
+
+def _questions(job: Job) -> list[dict[str, Any]]:
+    """What the stages that have a file are asked: see `child.describe`."""
+    questions = []
+    for name, spec in job.pipeline.stages.items():
+        if (job.root / "stages" / f"{name}.py").is_file():
+            question = {"stage": name, "params": job.layers.values[name], "brings": job.brought, "takes": spec.takes}
+            if SCENE in spec.takes and job.folder != job.root:
+                question["state"] = _state(job, name)
+                question["scene"] = None if question["state"] in job.hashes.known else str(job.folder)
+            questions.append(question)
+    return questions
+
+
+def _state(job: Job, stage: str) -> str | None:
+    """A name for all that decides which files of the scene a stage reads, which may take it a second to find out; None
+    where files elsewhere may have a say."""
+    params, plan = job.layers.values[stage], "stages/plan"
+    if any(outside(params, job.folder)):
+        return None
+    code = code_of(job.root, stage, job.hashes, plan if (job.root / plan / f"{stage}.py").is_file() else "stages")
+    files = [(str(path), (stat := path.stat()).st_size, stat.st_mtime_ns) for path in files_below(job.folder)]
+    return "reads " + digest(json.dumps([stage, params, code, files]))
+
+
+def _described(job: Job, questions: list[dict[str, Any]]) -> Job:
+    """The job with its stages. Raises Refused for the first parameter that is wrong."""
+    broken = {name: f"stages/{name}.py: no such file, and pipeline.yaml names it" for name in job.pipeline.stages}
+    stages = {}
+    for question, answer in zip(questions, ask(job.root, questions, job.memory.answers), strict=True):
+        stage = question["stage"]
+        for error in answer.get("errors", ()):
+            origin = job.layers.origin(stage, error["where"])
+            raise Refused(f"{origin}: {_refusal(job.root, stage, error, answer['known'])}")
+        if "broken" in answer:
+            broken[stage] = answer["broken"]
+        else:
+            state, reads = question.get("state"), answer.get("reads")
+            if state and reads is not None:
+                job.hashes.known[state] = reads
+            stages[stage] = Described(**answer | {"reads": job.hashes.known.get(state, reads)})
+            del broken[stage]
+    return replace(job, stages=stages, broken=broken)
+
+
+def _refusal(root: Path, stage: str, error: dict[str, Any], known: list[str]) -> str:
+    """What is wrong with a parameter; one that had this name once is told its new one."""
+    old = f"{stage}.{error['where']}"
+    if not error["unknown"]:
+        return f"{old} = {error['value']}: {error['message']}"
+    renamed = read_yaml(root / RENAMED) if (root / RENAMED).is_file() else {}
+    while old and old not in renamed:
+        old = old.rpartition(".")[0]
+    if not old:
+        return f"stage {stage}: {unknown('parameter', error['where'], known)}"
+    new = renamed[old] or "it is gone"
+    return f"unknown parameter {old}; " + (f"it is {new} now" if re.fullmatch(r"\w+(\.\w+)+", new) else new)
