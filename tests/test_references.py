@@ -25,10 +25,10 @@ from reffusion.io.scene import load_references, load_scene, save_mask_sets
 from reffusion.paint import painting, registration
 from reffusion.types import MaskSet
 from runner.execute import clean, run_scene
-from runner.job import Request
-from runner.job import prepare as prepare_job
 from runner.keys import Hashes, code_of
 from runner.plan import plan
+from runner.resolve import Request
+from runner.resolve import resolve as prepare_job
 from stages import poses, reference
 from stages.plan import poses as plan_poses
 from stages.plan import reference as plan_reference
@@ -427,7 +427,7 @@ def capture(folder: Path) -> Path:
     return folder
 
 
-SMALL = "poses.refine=false fit.iterations=20 fit.budget=1000 masks.invent=consistent masks.hull=1"
+SMALL = "poses.refine=false fit.iterations=20 fit.densify.cap_max=1000 masks.invent=consistent masks.hull=1"
 
 
 def test_a_new_reference_reruns_nothing_before_its_stage(tmp_path):

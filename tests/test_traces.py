@@ -10,7 +10,6 @@ import pytest
 import small_scene as small
 import torch
 from pydantic import ValidationError
-from runner.budget import seconds_of, shared_out
 from safetensors.torch import load_file
 from small_prior import save_small_prior
 
@@ -25,6 +24,7 @@ from reffusion.io.scene import load_mask_sets, save_references
 from reffusion.io.traces import MAIN, load_trace, main_quantity
 from reffusion.prior import personalize as personalizing
 from reffusion.types import PARAMETERS, Reference
+from runner.layers import seconds_of, shared_out
 from runner.pipeline import Refused, layered, load_pipeline, load_scene_file
 from stages import distill, fit, initialize, masks, personalize
 
