@@ -151,14 +151,14 @@ prior: setup
 # Personalizes on the demo's reference, which is made first where it is missing.
 prior-report: data/demo/.generated setup
 	@$(PY) -m runner run reference --scene demo --profile laptop
-	$(PY) benchmarks/prior.py --steps 1 4 12 --run runs/demo --out runs/prior-report
+	$(PY) -m benchmarks.studies.prior --steps 1 4 12 --run runs/demo --out runs/prior-report
 	$(PY) -m report.prior runs/prior-report
 
 # On any scene; what it lacks of personalization and initialization is made first.
 sds-variance: ready
 	@$(PY) -m runner run personalize --scene '$(scene)' $(options)
 	@$(PY) -m runner run initialize --scene '$(scene)' $(options)
-	$(PY) benchmarks/sds_variance.py --run '$(or $(runs),runs)/$(notdir $(abspath $(scene)))'
+	$(PY) -m benchmarks.studies.sds_variance --run '$(or $(runs),runs)/$(notdir $(abspath $(scene)))'
 
 # Two processes of one thread each, whole files to each: kernels that are compiled for one test serve the next.
 test: $(VENV)/.ready-dev
@@ -169,11 +169,11 @@ lint: $(VENV)/.ready-dev
 
 # slow=1 adds the splatting of 100,000 Gaussians and more, and personalization (an hour).
 bench: $(VENV)/.ready
-	$(PY) benchmarks/precision.py --out '$(or $(runs),runs)/bench' $(if $(gate),--gate) $(if $(slow),--slow)
-	$(if $(slow),$(PY) benchmarks/splat.py)
+	$(PY) -m benchmarks.bench --out '$(or $(runs),runs)/bench' $(if $(gate),--gate) $(if $(slow),--slow)
+	$(if $(slow),$(PY) -m benchmarks.bench.large)
 
 stability: $(VENV)/.ready-dev
 	$(PY) -m benchmarks.stability --out '$(or $(runs),runs)/stability.json'
 
 gpu-check: $(VENV)/.ready
-	$(PY) benchmarks/gpu_check.py --out $(or $(runs),runs)/gpu-check
+	$(PY) -m benchmarks.gpu.check --out $(or $(runs),runs)/gpu-check

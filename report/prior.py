@@ -1,4 +1,4 @@
-"""What `benchmarks/prior.py` measured, as a page: tables, charts and sheets of pictures.
+"""What `benchmarks/studies/prior.py` measured, as a page: tables, charts and sheets of pictures.
 
 python -m report.prior runs/prior-report
 """
@@ -33,7 +33,7 @@ def make(folder: Path) -> Path:
         ValueError: nothing was measured there yet.
     """
     if not (folder / "prior.json").exists():
-        raise ValueError(f"{folder / 'prior.json'} is missing; run `python benchmarks/prior.py --out {folder}` first")
+        raise ValueError(f"{folder / 'prior.json'}: missing; first `python -m benchmarks.studies.prior --out {folder}`")
     measured = load_json(folder / "prior.json")
     lines = [f"# {measured['prior']}, measured", ""]
     if "inpainting" in measured:
@@ -158,7 +158,7 @@ def charts(personal: dict[str, Any], path: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="report.prior", description=__doc__.split("\n")[0])
-    parser.add_argument("folder", type=Path, help="what benchmarks/prior.py wrote to")
+    parser.add_argument("folder", type=Path, help="what benchmarks/studies/prior.py wrote to")
     try:
         print(make(parser.parse_args().folder))
     except ValueError as error:

@@ -1,6 +1,5 @@
 """Ways of distilling, error against seconds: every setting is one of the stage's, and a curve is that of the stage."""
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +7,7 @@ import pytest
 import small_scene as small
 import torch
 
+from benchmarks.studies import attempts as benchmark
 from reffusion.io.images import save_image, save_mask
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets, save_references
@@ -17,9 +17,6 @@ from reffusion.types import Reference
 from stages import distill, initialize, masks
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT / "benchmarks"))
-
-import attempts as benchmark  # noqa: E402
 
 NEAR = 1.7
 NO_PRIOR = {"sds": {"weight": 0}, "iterations": 4}

@@ -12,17 +12,12 @@ import numpy as np
 import pytest
 import yaml
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT / "benchmarks")]
-
-import composites  # noqa: E402
-import drawing  # noqa: E402
-import judging  # noqa: E402
-import placing  # noqa: E402
-
-from reffusion.capture import lens  # noqa: E402
+from benchmarks.studies import composites, drawing, judging, placing
+from reffusion.capture import lens
 from reffusion.io.images import load_image, load_mask, save_image
 from reffusion.io.ply import save_points
+
+ROOT = Path(__file__).resolve().parent.parent
 
 WIDTH, HEIGHT = 96, 72
 LENS = {"fl_x": 80.0, "fl_y": 82.0, "cx": 47.0, "cy": 36.5, "k1": 0.05, "k2": -0.03, "p1": 0.002, "p2": -0.001}

@@ -1,16 +1,13 @@
 """What distillation gains: the energy of gradients against the truth's, the table, the scene's own run of a variant."""
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT / "benchmarks")]
+from benchmarks.studies import gain, holes
 
-import gain  # noqa: E402
-import holes  # noqa: E402
+ROOT = Path(__file__).resolve().parent.parent
 
 
 def row(**values) -> dict[str, float]:

@@ -1,11 +1,10 @@
-"""The paper profile holds the constants of the paper (DESIGN section 3), each where it is said to be."""
+"""The profile `paper` holds the constants of the paper, and of 3DGS, each where it is said to be."""
 
 from pathlib import Path
 
 import pytest
 
-from runner.job import described_stages
-from runner.pipeline import SceneFile, layered, load_pipeline
+from runner.resolve import Request, resolve
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -53,11 +52,7 @@ CONSTANTS = {
 @pytest.fixture(scope="module")
 def params():
     """stage -> parameters of the paper profile, without a scene."""
-    pipeline = load_pipeline(ROOT)
-    layers = layered(pipeline, SceneFile(ROOT / "scene.yaml", None, {}, {}), "paper", None, {}, {})
-    described, broken = described_stages(ROOT, pipeline, layers, [])
-    assert not broken
-    return {stage: answer["params"] for stage, answer in described.items()}
+    return resolve(Request(ROOT, ROOT / "runs", "", profile="paper"), scene=False).params
 
 
 @pytest.mark.parametrize("what", CONSTANTS)
@@ -77,13 +72,10 @@ def test_work_is_on_the_gpu_within_24_gb_in_half_precision(params):
 
 
 def test_constants_of_the_library():
-    import sys
 
     import torch
 
-    sys.path.insert(0, str(ROOT / "benchmarks"))
-    import full_size
-
+    from benchmarks.gpu import full_size
     from reffusion.gaussians.optimize import reconstruction_loss
     from reffusion.prior import crops, lora
     from reffusion.score import metrics

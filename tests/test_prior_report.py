@@ -2,23 +2,20 @@
 
 import argparse
 import json
-import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path[:0] = [str(ROOT / "benchmarks"), str(ROOT / "priors" / "tiny")]
-
-import holes  # noqa: E402
-import images  # noqa: E402
-import prior as benchmark  # noqa: E402
-
+from benchmarks.studies import holes
+from benchmarks.studies import prior as benchmark
+from priors.tiny import images
 from reffusion.io.images import load_image, save_image
-from reffusion.score import metrics  # noqa: E402
-from report import prior as page  # noqa: E402
+from reffusion.score import metrics
+from report import prior as page
+
+ROOT = Path(__file__).resolve().parent.parent
 
 
 @pytest.fixture(scope="module")
@@ -129,5 +126,5 @@ def test_the_page_holds_every_table_and_picture(tmp_path):
 
 
 def test_without_a_measurement_the_page_says_what_to_run(tmp_path):
-    with pytest.raises(ValueError, match=r"benchmarks/prior\.py"):
+    with pytest.raises(ValueError, match=r"python -m benchmarks\.studies\.prior"):
         page.make(tmp_path)

@@ -9,12 +9,9 @@ import safetensors.torch
 import torch
 from small_prior import save_small_prior
 
-TINY = Path(__file__).resolve().parent.parent / "priors" / "tiny"
-sys.path.insert(0, str(TINY))
+from priors.tiny import build, images, train
 
-import build  # noqa: E402
-import images  # noqa: E402
-import train  # noqa: E402
+TINY = Path(__file__).resolve().parent.parent / "priors" / "tiny"
 
 
 def test_images_depend_on_seed_and_number_only():

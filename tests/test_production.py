@@ -10,17 +10,15 @@ from pathlib import Path
 import pytest
 import torch
 
+from benchmarks.gpu import check as gpu_check
+from benchmarks.gpu import full_size as F
+from reffusion.prior import crops, denoising, diffusion, inpaint, lora, memory
+from reffusion.prior.model import load_prior, pipeline, recomputing, without_text
+from reffusion.prior.personalize import train_step
+from reffusion.seeding import generator
+from reffusion.weights import published
+
 ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT / "benchmarks"))
-
-import full_size as F  # noqa: E402
-import gpu_check  # noqa: E402
-
-from reffusion.prior import crops, denoising, diffusion, inpaint, lora, memory  # noqa: E402
-from reffusion.prior.model import load_prior, pipeline, recomputing, without_text  # noqa: E402
-from reffusion.prior.personalize import train_step  # noqa: E402
-from reffusion.seeding import generator  # noqa: E402
-from reffusion.weights import published  # noqa: E402
 
 
 @pytest.fixture(scope="module")

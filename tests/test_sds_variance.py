@@ -1,6 +1,5 @@
 """The variance of the SDS gradient: its parts against draws of known variance, and on a small run."""
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -8,15 +7,13 @@ import pytest
 import torch
 from small_prior import small_prior
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT / "benchmarks"))
-
-import sds_variance as benchmark  # noqa: E402
-
-from reffusion import seeding  # noqa: E402
+from benchmarks.studies import sds_variance as benchmark
+from reffusion import seeding
 from reffusion.io.ply import save_ply
 from reffusion.io.scene import save_mask_sets, save_scene
-from reffusion.types import Camera, Gaussians, MaskSet, Scene, Similarity  # noqa: E402
+from reffusion.types import Camera, Gaussians, MaskSet, Scene, Similarity
+
+ROOT = Path(__file__).resolve().parent.parent
 
 
 def test_variance_is_split_into_that_of_noise_and_that_of_timesteps():

@@ -2,13 +2,10 @@
 
 import json
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.stability import __main__ as command
 from benchmarks.stability import all_cases, random_scenes, run

@@ -13,8 +13,8 @@ from pydantic import ValidationError
 from safetensors.torch import load_file
 from small_prior import save_small_prior
 
-from benchmarks.kernels import gate
-from benchmarks.kernels.points import Diagram, Point, recommendation
+from benchmarks.bench import gate
+from benchmarks.bench.points import Diagram, Point, recommendation
 from reffusion import trace
 from reffusion.depth.behind import Completion
 from reffusion.distill import optimization as distilling
@@ -284,7 +284,7 @@ def as_measured(baselines: dict) -> list[Diagram]:
 
 
 def test_the_gate_sees_a_planted_regression():
-    baselines = gate.load(ROOT / "benchmarks" / "baselines.json")
+    baselines = gate.load(ROOT / "benchmarks" / "bench" / "baselines.json")
     diagrams, unit = as_measured(baselines), baselines["machine_unit"]
     assert gate.regressions(diagrams, unit, baselines) == []
     assert gate.regressions(diagrams, 2 * unit, baselines) == [], "a machine half as fast may take twice as long"

@@ -11,8 +11,8 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from surfaces import Field, blend, noise_tile, random_texture
 
+from priors.tiny.surfaces import Field, blend, noise_tile, random_texture
 from reffusion.seeding import seed_for
 
 SIZE = 128  # px, side of one training image; crops are taken from it

@@ -14,23 +14,21 @@ import sys
 import time
 from pathlib import Path
 
-HERE = Path(__file__).resolve().parent
-sys.path[:0] = [str(HERE.parent.parent), str(HERE)]
+import numpy as np
+import torch
+from diffusers import StableDiffusionInpaintPipeline, UNet2DConditionModel
+from torch import Tensor, nn
+from transformers import CLIPTextModel
 
-import build  # noqa: E402
-import images  # noqa: E402
-import numpy as np  # noqa: E402
-import torch  # noqa: E402
-from diffusers import StableDiffusionInpaintPipeline, UNet2DConditionModel  # noqa: E402
-from torch import Tensor, nn  # noqa: E402
-from transformers import CLIPTextModel  # noqa: E402
-
-from reffusion.io.arrays import save_json  # noqa: E402
-from reffusion.prior import fill  # noqa: E402
-from reffusion.prior.denoising import spread_timesteps  # noqa: E402
-from reffusion.prior.model import CONDITIONING  # noqa: E402
-from reffusion.seeding import generator, seed_for  # noqa: E402
+from priors.tiny import build, images
+from reffusion.io.arrays import save_json
+from reffusion.prior import fill
+from reffusion.prior.denoising import spread_timesteps
+from reffusion.prior.model import CONDITIONING
+from reffusion.seeding import generator, seed_for
 from reffusion.trace import load_checkpoint, save_checkpoint
+
+HERE = Path(__file__).resolve().parent
 
 POOL = 500  # images held in memory
 FRESH = 2  # steps for each new image, which takes the place of the oldest; making one costs a twentieth of a step

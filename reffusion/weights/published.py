@@ -12,7 +12,7 @@ class Published:
     """A model of the hub.
 
     Attributes:
-        parameters: how many numbers it has in all: counted on its published configuration (benchmarks/full_size.py).
+        parameters: how many numbers it has in all: counted on its configuration (benchmarks/gpu/full_size.py).
         instead: other models that do the same work.
     """
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from holes import gradient_energy
 
+from benchmarks.studies.holes import gradient_energy
 from reffusion.io.arrays import load_json
 from reffusion.io.images import load_image
 from reffusion.io.ply import load_ply

@@ -1,4 +1,4 @@
-"""What a prior can do, in figures and pictures: `python benchmarks/prior.py --priors priors/tiny --run runs/demo`.
+"""What a prior can do, in figures and pictures: `python -m benchmarks.studies.prior --run runs/demo`.
 
   inpainting    held-out pictures of 64 px, a silhouette cut out of each, against OpenCV's Telea and Navier-Stokes:
                 PSNR, SSIM, FLIP and gradient energy inside the hole; every prior named, from the same noise
@@ -29,20 +29,18 @@ import numpy as np
 import torch
 import yaml
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
+from benchmarks.studies.holes import COLUMNS, SEED, Case, held_out, hole_scores, means, painted, save_row, tensors
+from reffusion import seeding, trace
+from reffusion.io.arrays import load_json, save_json
+from reffusion.io.images import load_image, save_image
+from reffusion.io.scene import load_references, load_scene
+from reffusion.prior import diffusion, lora
+from reffusion.prior.model import Prior, load_prior
+from reffusion.prior.windows import window_around
+from stages import evaluate
+from stages import personalize as stage
 
-from holes import COLUMNS, SEED, Case, held_out, hole_scores, means, painted, save_row, tensors  # noqa: E402
-
-from reffusion import seeding, trace  # noqa: E402
-from reffusion.io.arrays import load_json, save_json  # noqa: E402
-from reffusion.io.images import load_image, save_image  # noqa: E402
-from reffusion.io.scene import load_references, load_scene  # noqa: E402
-from reffusion.prior import diffusion, lora  # noqa: E402
-from reffusion.prior.model import Prior, load_prior  # noqa: E402
-from reffusion.prior.windows import window_around  # noqa: E402
-from stages import evaluate  # noqa: E402
-from stages import personalize as stage  # noqa: E402
+ROOT = Path(__file__).resolve().parents[2]
 
 TELEA_RADIUS = 5  # px, of both rivals
 TIMESTEPS = (20, 100, 250, 400, 550, 700, 850, 980)

@@ -1,4 +1,4 @@
-"""What distillation gains over its initialization: `python benchmarks/gain.py runs/demo-wide runs/demo-wide@no_sds`.
+"""What distillation gains: `python -m benchmarks.studies.gain runs/demo-wide runs/demo-wide@no_sds`.
 
 For each run, over its test views: the scores in the mask's box that evaluate gave to result and initialization, and the
 gradient energy of both in that box and inside the mask itself, in units of the truth's. Under 1 is too smooth, over 1
@@ -14,17 +14,15 @@ from pathlib import Path
 
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
-
-from holes import gradient_energy  # noqa: E402
-
+from benchmarks.studies.holes import gradient_energy
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.images import load_image, save_image
 from reffusion.io.scene import load_scene
-from reffusion.score import metrics  # noqa: E402
-from report.sheet import enlarged, evenly, framed, stage_folder  # noqa: E402
-from stages import evaluate  # noqa: E402
+from reffusion.score import metrics
+from report.sheet import enlarged, evenly, framed, stage_folder
+from stages import evaluate
+
+ROOT = Path(__file__).resolve().parents[2]
 
 WAYS = {"initialization": "renders_initialize", "result": "renders"}
 SCORES = {"psnr_box": 2, "ssim_box": 4, "flip_box": 4}  # column of metrics.json, digits

@@ -1,4 +1,4 @@
-"""An object that is not there, drawn into photographs: the scenes of `benchmarks/composites.py`.
+"""An object that is not there, drawn into photographs: the scenes of `benchmarks/studies/composites.py`.
 
 The object is drawn before everything: a place is good only where nothing should hide it. Photographs that are not drawn
 into stay as they are, so behind the object the truth is exact.
@@ -13,8 +13,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import placing
 
+from benchmarks.studies import placing
 from reffusion.io.images import load_image, save_image
 
 SAMPLES = 3  # rays a side of a pixel

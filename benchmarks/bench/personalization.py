@@ -6,7 +6,7 @@ from pathlib import Path
 
 import yaml
 
-from benchmarks.kernels.points import Diagram, Point
+from benchmarks.bench.points import Diagram, Point
 
 ROOT = Path(__file__).resolve().parents[2]
 # LOG.md, 2026-11-21, entry 4: demo, whole view at 64 px painted from pure noise, CPU seconds of one thread

@@ -1,4 +1,4 @@
-"""Work-precision diagrams of the kernels: `python benchmarks/precision.py --out runs/bench` (`make bench`).
+"""Work-precision diagrams of the kernels: `python -m benchmarks.bench --out runs/bench` (`make bench`).
 
   footprint, cutoff   the float32 rasterizer against its float64 oracle; what skipping faint contributions costs
   bilateral           the fast bilateral solver, along its iterations, by cell size
@@ -9,8 +9,8 @@
   personalization     (--slow) LoRA over steps, rank and learning rate; needs runs/demo with its stage `reference`
 
 Prints which setting each diagram recommends and why; writes a PNG for each and precision.json (every point: error and
-seconds of CPU time on one thread). --gate compares with benchmarks/baselines.json and ends with code 1 where a point is
-worse: in error beyond rounding, in time beyond twice the baseline, both counted in units of the machine's speed.
+seconds of CPU time on one thread). --gate compares with baselines.json beside this file and ends with code 1 where a
+point is worse: in error beyond rounding, in time beyond twice the baseline, both in units of the machine's speed.
 """
 
 from __future__ import annotations
@@ -21,19 +21,17 @@ import os
 import sys
 from pathlib import Path
 
-os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = "1"  # read when numpy and torch are loaded
-
 import torch
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
+from benchmarks.bench import alignment, gate, personalization, solvers, splat
+from benchmarks.bench.draw import draw
+from benchmarks.bench.points import recommendation
 
-from benchmarks.kernels import alignment, gate, personalization, solvers, splat  # noqa: E402
-from benchmarks.kernels.draw import draw  # noqa: E402
-from benchmarks.kernels.points import recommendation  # noqa: E402
+os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = "1"  # read when numpy and torch are loaded
+ROOT = Path(__file__).resolve().parents[2]
 
 RETRIES = 2  # measurements more of what the gate stopped
-BASELINES = ROOT / "benchmarks" / "baselines.json"
+BASELINES = Path(__file__).with_name("baselines.json")
 QUICK = {
     "footprint": splat.footprint_diagram,
     "cutoff": splat.cutoff_diagram,

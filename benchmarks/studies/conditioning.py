@@ -1,4 +1,4 @@
-"""What the form of a linear system buys: `python benchmarks/conditioning.py [--out docs/images/conditioning.png]`.
+"""What the form of a linear system buys: `python -m benchmarks.studies.conditioning`.
 
 Work-precision diagrams of the three systems behind depth: the alignment (plain normal equations against centred and
 scaled ones), the bilateral solver (conjugate gradients with Jacobi's preconditioning and without), and the completion
@@ -8,7 +8,6 @@ scaled ones), the bilateral solver (conjugate gradients with Jacobi's preconditi
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,8 +15,6 @@ from pathlib import Path
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import cg, spsolve
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from reffusion.depth import alignment, bilateral, completion
 

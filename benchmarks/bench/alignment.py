@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.kernels.points import Diagram, Point, cpu_seconds
+from benchmarks.bench.points import Diagram, Point, cpu_seconds
 from reffusion import seeding
 from reffusion.depth.alignment import align
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from benchmarks.kernels.points import Diagram, Point, cpu_seconds
+from benchmarks.bench.points import Diagram, Point, cpu_seconds
 from reffusion import seeding, trace
 from reffusion.depth import bilateral, completion
 

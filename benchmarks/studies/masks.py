@@ -1,4 +1,4 @@
-"""Consistent and undecided masks against ray-cast truth: `python benchmarks/masks.py --scene data/demo`.
+"""Consistent and undecided masks against ray-cast truth: `python -m benchmarks.studies.masks --scene data/demo`.
 
 Runs the `masks` stage, with the parameters of the scene's own run and on its own fit, twice: on the exact masks, and on
 masks each dilated, eroded or shifted at random by up to 2 % of the image's width, a tenth of them missing. Prints the
@@ -17,8 +17,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from reffusion import seeding
 from reffusion.capture import lens

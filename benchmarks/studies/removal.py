@@ -1,4 +1,4 @@
-"""Object removal against what one would do without it: `python benchmarks/removal.py --scene data/demo`.
+"""Object removal against what one would do without it: `python -m benchmarks.studies.removal --scene data/demo`.
 
 Over the test views, in the mask's box and on the full image, with evaluate's own code and protocol:
   ours          evaluate's renders
@@ -20,8 +20,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from reffusion import trace
 from reffusion.io.arrays import load_json, load_labels, save_json

@@ -1,4 +1,4 @@
-"""How fast the CPU splatting is: `python benchmarks/splat.py [--sizes 100000@512x384 ...] [--repeats 9] [--threads 2]`.
+"""CPU splatting: `python -m benchmarks.bench.large [--sizes 100000@512x384 ...] [--repeats 9] [--threads 2]`.
 
 A step is one rendering (colour, depth, alpha) and its backward pass. Times are medians of one thread's CPU time, all
 sizes taken in turn; thread scaling is wall clock. Columns:
@@ -30,8 +30,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 # Before torch: it tells torch's idle threads not to spin, which costs the second thread all of its gain.
 from reffusion.splat import rasterizer  # isort: skip
@@ -160,14 +158,14 @@ def first_image() -> tuple[float, float]:
     """CPU seconds from starting Python to the first small image, kernels and bytecode in the cache; and of that, what
     starting Python and importing torch alone take."""
     image = (
-        "import sys; sys.path.insert(0, 'benchmarks'); import splat as b; import numpy as np; "
+        "import benchmarks.bench.large as b; import numpy as np; "
         "view = b.Camera('v', 64, 48, 70.0, 70.0, 32.0, 24.0, np.eye(4)); b.splat.render(b.scene(100, view), view)"
     )
     cached = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
 
     def seconds(code: str) -> float:
         before = os.times()
-        subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[1], env=cached)
+        subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[2], env=cached)
         after = os.times()
         return after.children_user + after.children_system - before.children_user - before.children_system
 

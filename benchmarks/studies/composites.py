@@ -1,4 +1,4 @@
-"""The benchmark on real captures: `python benchmarks/composites.py --places dino-ground`.
+"""The benchmark on real captures: `python -m benchmarks.studies.composites --places dino-ground`.
 
 An object that is not there is drawn into the training photographs of a nerfstudio capture; the untouched photographs
 are the exact truth of what it hides. For each place: the scene, the job on it (given the true reference, unless
@@ -15,15 +15,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
+from benchmarks.studies import drawing, judging, placing
+from benchmarks.studies.placing import Place
+from reffusion.io.images import save_image
 
-import drawing  # noqa: E402
-import judging  # noqa: E402
-import placing  # noqa: E402
-from placing import Place  # noqa: E402
-
-from reffusion.io.images import save_image  # noqa: E402
+ROOT = Path(__file__).resolve().parents[2]
 
 CHOOSE = (
     Place("table", "garden", "frame_00097", (180, 270), 0.16, 50, 34, 8),

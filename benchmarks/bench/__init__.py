@@ -1,4 +1,4 @@
-"""Work-precision diagrams of the kernels: what `benchmarks/precision.py` measures, draws and holds to its baselines.
+"""Work-precision diagrams of the kernels: measured, drawn and held to their baselines.
 
 - points.py: a measured point, a diagram, the choice of a default.
 - splat.py: the rasterizer against its float64 oracle.

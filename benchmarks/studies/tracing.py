@@ -1,4 +1,4 @@
-"""What tracing costs: `python benchmarks/tracing.py --run runs/demo`.
+"""What tracing costs: `python -m benchmarks.studies.tracing --run runs/demo`.
 
 Pairs of runs of `fit`, `personalize` and `distill` with the laptop profile, one with its trace, one that measures at
 its end only, in turn; CPU time, so that what others do on the machine counts little. Moments are log-spaced, so a short
@@ -17,12 +17,11 @@ from types import ModuleType
 
 import yaml
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
+from reffusion import trace
+from reffusion.fit.reconstruction import FIRST_MOMENT
+from stages import distill, fit, personalize
 
-from reffusion import trace  # noqa: E402
-from reffusion.fit.reconstruction import FIRST_MOMENT  # noqa: E402
-from stages import distill, fit, personalize  # noqa: E402
+ROOT = Path(__file__).resolve().parents[2]
 
 STAGES = {
     "fit": (fit, "iterations", ("poses",), (2, FIRST_MOMENT)),

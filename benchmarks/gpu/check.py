@@ -5,7 +5,7 @@
   machine, else random ones of the same shapes. Seconds a step (the median of three) and peak memory.
 - A fit at 1600 px: images a second, and that it gets better.
 
-    python benchmarks/gpu_check.py --out runs/gpu-check      (--toy: all but gsplat, small, on the CPU)
+    python -m benchmarks.gpu.check --out runs/gpu-check      (--toy: all but gsplat, small, on the CPU)
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import full_size
 import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.gpu import full_size
 from reffusion import trace
 from reffusion.depth import monocular
 from reffusion.depth.behind import Completion, Seen

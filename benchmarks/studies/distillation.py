@@ -1,4 +1,4 @@
-"""What score distillation could gain at best, and from where on: `python benchmarks/distillation.py --run runs/demo`.
+"""What distillation could gain at best: `python -m benchmarks.studies.distillation --run runs/demo`.
 
 In holes of test views, whole and in windows, a picture x of known error e = x - truth is given to the prior, and the
 SDS gradient g = E[z - x0(z_t)] over the noise is measured, in pixels. Against e it has a cosine c; a step along the
@@ -21,17 +21,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
-
-from prior import Case, scene_cases, tensors  # noqa: E402
-
+from benchmarks.studies.prior import Case, scene_cases, tensors
 from reffusion import seeding
 from reffusion.io.arrays import save_json
 from reffusion.io.images import load_image
 from reffusion.io.scene import load_scene
 from reffusion.prior import diffusion, lora
-from reffusion.prior.model import Prior, load_prior  # noqa: E402
+from reffusion.prior.model import Prior, load_prior
+
+ROOT = Path(__file__).resolve().parents[2]
 
 TIMESTEPS = (20, 100, 300, 600, 850)
 NOISES = 4  # draws; with g's two halves from different ones, their noise does not pass for agreement

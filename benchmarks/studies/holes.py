@@ -1,11 +1,10 @@
-"""Holes to fill, and how well one was filled: what `benchmarks/prior.py` and its neighbours measure with.
+"""Holes to fill, and how well one was filled: what `benchmarks/studies/prior.py` and its neighbours measure with.
 
 Held-out pictures come from the prior's own generators under seeds that no training uses. Every draw is seeded.
 """
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,16 +13,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "priors" / "tiny")]
-
-import images  # noqa: E402
-
+from priors.tiny import images
 from reffusion import seeding
 from reffusion.io.images import save_image
 from reffusion.prior import diffusion
-from reffusion.prior.model import Prior  # noqa: E402
+from reffusion.prior.model import Prior
 from reffusion.score import metrics
+
+ROOT = Path(__file__).resolve().parents[2]
 
 SIDE = 64  # px, of the held-out pictures
 SEED = 20  # of the held-out set; training and its own validation use others

@@ -1,4 +1,4 @@
-"""Ways of distilling, error against seconds: `python benchmarks/attempts.py --run runs/demo`.
+"""Ways of distilling, error against seconds: `python -m benchmarks.studies.attempts --run runs/demo`.
 
 From one initialization, each setting of `ATTEMPTS` runs for the laptop profile's number of steps; at some of them the
 Gaussians are rendered from test views, with the clock stopped, and scored in the mask's box. The initialization is the
@@ -19,20 +19,19 @@ import numpy as np
 import torch
 import yaml
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT)]
+from reffusion import trace
+from reffusion.distill.optimization import masked_factors
+from reffusion.distill.steps import job_of, step_of
+from reffusion.gaussians.optimize import GaussianOptimizer
+from reffusion.io.arrays import load_json, save_json
+from reffusion.io.scene import load_scene
+from reffusion.score import metrics
+from reffusion.splat import rasterizer
+from report import charts
+from stages import distill as stage
+from stages import evaluate
 
-from reffusion import trace  # noqa: E402
-from reffusion.distill.optimization import masked_factors  # noqa: E402
-from reffusion.distill.steps import job_of, step_of  # noqa: E402
-from reffusion.gaussians.optimize import GaussianOptimizer  # noqa: E402
-from reffusion.io.arrays import load_json, save_json  # noqa: E402
-from reffusion.io.scene import load_scene  # noqa: E402
-from reffusion.score import metrics  # noqa: E402
-from reffusion.splat import rasterizer  # noqa: E402
-from report import charts  # noqa: E402
-from stages import distill as stage  # noqa: E402
-from stages import evaluate  # noqa: E402
+ROOT = Path(__file__).resolve().parents[2]
 
 MOMENTS = (0, 5, 10, 20, 40, 75, 110, 150)  # steps done
 VIEWS = 10  # test views, evenly over all

@@ -1,6 +1,6 @@
 """The variance of a scene's SDS gradient over noise and timesteps, before and after personalization.
 
-`python benchmarks/sds_variance.py --run runs/demo`, or `make scene=X sds-variance`: on any scene, with ground truth or
+`python -m benchmarks.studies.sds_variance`, or `make scene=X sds-variance`: on any scene, with ground truth or
 without, once `initialize` and `personalize` are done. Training views with something to invent are rendered from the
 initialization and given to the prior as distillation gives them: whole, and in a window around the hole. The gradient
 is g = z - x0(z_t), that of `weighting: x0`; any other weighting multiplies it by a function of t alone. In the hole's
@@ -24,17 +24,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-
 from reffusion import seeding
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets, load_scene
 from reffusion.prior import diffusion, lora, windows
-from reffusion.prior.crops import PROMPTS  # noqa: E402
-from reffusion.prior.model import Prior, load_prior  # noqa: E402
+from reffusion.prior.crops import PROMPTS
+from reffusion.prior.model import Prior, load_prior
 from reffusion.splat import rasterizer
+
+ROOT = Path(__file__).resolve().parents[2]
 
 VIEWS = 6
 NOISES = 8

@@ -1,4 +1,4 @@
-"""PSNR of held-out views against seconds of fitting: `python benchmarks/fit.py --run runs/demo --out runs/fit/demo`.
+"""PSNR of held-out views against seconds of fitting: `python -m benchmarks.studies.fit --run runs/demo`.
 
 Fits the scene of a finished `poses` stage with the laptop profile's parameters and with variants of them, every 8th
 training view held out and only measured, the clock stopped meanwhile; making the points to start from counts. Writes
@@ -10,17 +10,14 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from pathlib import Path
 
 import yaml
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
 from reffusion import trace
 from stages import fit
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 VARIANTS = {
     "laptop": {},
     "laptop, half the steps": {"iterations": 1000},

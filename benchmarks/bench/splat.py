@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.kernels.points import Diagram, Point, cpu_seconds
+from benchmarks.bench.points import Diagram, Point, cpu_seconds
 from reffusion.splat import rasterizer, reference
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
@@ -119,7 +119,7 @@ def tile_diagram() -> Diagram:
     for height in TILES:
         with tempfile.TemporaryDirectory() as cache:
             environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-            command = [sys.executable, "-m", "benchmarks.kernels.splat", str(height), cache]
+            command = [sys.executable, "-m", "benchmarks.bench.splat", str(height), cache]
             answer = subprocess.run(command, cwd=ROOT, env=environment, check=True, stdout=subprocess.PIPE, text=True)
         for curve, (error, seconds) in json.loads(answer.stdout.splitlines()[-1]).items():
             points.append(Point(curve, f"{height} px", height, error, seconds))

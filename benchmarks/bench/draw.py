@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from benchmarks.kernels.points import Diagram
+from benchmarks.bench.points import Diagram
 
 
 def draw(diagram: Diagram, path: Path) -> None:

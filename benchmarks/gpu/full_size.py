@@ -3,7 +3,7 @@
 The configurations below are the published ones, written down as facts; the steps are the library's own. Also checked:
 the LoRA that was trained, saved and merged into a fresh model of the same weights gives the trained model's epsilon.
 
-    python benchmarks/full_size.py --dtype bfloat16 --out runs/full-size      (--toy: the same at a small size)
+    python -m benchmarks.gpu.full_size --dtype bfloat16 --out runs/full-size      (--toy: the same at a small size)
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.kernels.points import Diagram, cpu_seconds
+from benchmarks.bench.points import Diagram, cpu_seconds
 
 SLOWER = 2.0  # factor on a baseline's time, in machine units: repeats on one machine differ by up to 1.6
 LEAST_SECONDS = 2e-3  # differences of less are noise
