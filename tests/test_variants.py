@@ -320,7 +320,7 @@ def test_scattered_points_lie_where_the_holes_are():
 def test_the_chain_of_lifted_pictures(scene, painted, tmp_path, monkeypatch):
     """The hole of the wall filled from pictures inpainted one by one: nearer to the wall than to nothing."""
     assert initialized(scene, tmp_path / "initialize", "lift", lift=painted)[1].any()
-    with pytest.raises(ValueError, match=r"set distill.lift_weight"):
+    with pytest.raises(ValueError, match=r"set distill.lift.weight"):
         initialized(scene, tmp_path / "without", "lift")
     reference = tmp_path / "reference"
     mask = load_mask_sets(scene["masks"], ["a2"])["a2"].invent
