@@ -484,3 +484,13 @@ def test_a_reference_made_of_pieces_of_itself_needs_no_prior(folders, tmp_path):
     photo = load_image(folders["poses"] / "images" / "b.png")
     rim = load_mask_sets(folders["masks"], ["b"])["b"].consistent
     assert found.mask.any() and (found.image[~found.mask & ~rim] == photo[~found.mask & ~rim]).all()
+
+
+def test_weights_are_asked_for_by_the_terms_that_use_them():
+    from stages.plan import distill as plan
+
+    names = lambda **changes: [n.name for n in plan.needed_weights(altered(plan.Params(), **changes), frozenset())]
+    prior = Params().prior
+    assert names() == names(sds=OFF) == names(depth=OFF) == [prior] and names(sds=OFF, depth=OFF) == []
+    assert names(depth={"model": "a/network"}) == [prior, "a/network"]
+    assert names(depth={"model": "a/network", "weight": 0}) == [prior]
