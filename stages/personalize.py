@@ -17,7 +17,7 @@ from reffusion.prior.personalize import personalize
 MEMORY = "personalize.memory_gb"  # what an error names
 
 
-def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, reference: Path) -> None:
+def run(params: Params, out: Path, *, poses: Path, reference: Path) -> None:
     began = time.monotonic()
     if not params.steps:
         raise ValueError("personalize.steps is 0: there is nothing to learn, leave the stage out")

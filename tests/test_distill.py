@@ -442,7 +442,7 @@ def test_stages_chain_through_files_with_the_scenes_own_reference(folders):
     assert (load_mask(folders["reference"] / "masks" / "a.png") == hole().numpy()).all()
 
     learning = personalize.Params(prior=folders["prior"], steps=2, optimizer={"batch": 2}, samples={"size": 8})
-    personalize.run(learning, folders["personalize"], **pick(folders, "poses", "fit", "masks", "reference"))
+    personalize.run(learning, folders["personalize"], **pick(folders, "poses", "reference"))
     assert (folders["personalize"] / "pytorch_lora_weights.safetensors").exists()
 
     needs = pick(folders, "poses", "fit", "masks", "reference", "personalize", "initialize")

@@ -67,7 +67,12 @@ def run(stage: str, ready, out: Path, **changed) -> Path:
         return out
     needs = {"poses": ready.poses, "fit": ready.fit, "masks": ready.masks, "reference": ready.reference}
     if stage == "personalize":
-        personalize.run(personalize.Params(**{**PERSONALIZE, "prior": ready.prior, **changed}), out, **needs)
+        personalize.run(
+            personalize.Params(**{**PERSONALIZE, "prior": ready.prior, **changed}),
+            out,
+            poses=ready.poses,
+            reference=ready.reference,
+        )
     else:
         needs |= {"personalize": None, "initialize": ready.home / "initialize"}
         distill.run(distill.Params(**{**DISTILL, **changed}), out, **needs)

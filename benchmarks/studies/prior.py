@@ -48,7 +48,7 @@ NOISES = 4  # draws for the variance of the SDS gradient
 VIEWS = 6  # unseen views
 SHOWN = 12  # held-out pictures on the sheet
 PROMPTS = {"reference": "A photo of sks", "whole": "A photo of sks", "window": "A photo of sks, cropped"}
-LEARNS = ("poses", "fit", "masks", "reference")  # what personalization needs of a run
+LEARNS = ("poses", "reference")  # what personalization needs of a run
 
 # ---------------------------------------------------------------------------------------------- inpainting
 
