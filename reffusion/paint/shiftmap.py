@@ -1,12 +1,14 @@
 """OpenCV's shift maps, in a process of their own: `python -m reffusion.paint.shiftmap`.
 
-An .npz on stdin, an .npy on stdout. OpenCV (5.0) seems to read memory there that it has not written: within a
-long-lived process the same picture was completed in several ways. In a fresh process it never was.
+An .npz on stdin, an .npy on stdout. OpenCV (5.0) reads memory there that it has not written: the same picture was
+completed in several ways, within a long-lived process, and in fresh ones by the length of their environment. So the
+process is a fresh one whose memory is handed out as zeros (glibc's `MALLOC_PERTURB_`).
 """
 
 from __future__ import annotations
 
 import io
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -26,7 +28,8 @@ def completed(lab: np.ndarray, known: np.ndarray) -> np.ndarray:
     np.savez(sent, lab=lab, known=known)
     command = [sys.executable, "-m", "reffusion.paint.shiftmap"]
     root = Path(__file__).resolve().parents[2]
-    done = subprocess.run(command, input=sent.getvalue(), capture_output=True, cwd=root)
+    zeroed = {**os.environ, "MALLOC_PERTURB_": "255"}  # the complement of each byte: 0
+    done = subprocess.run(command, input=sent.getvalue(), capture_output=True, cwd=root, env=zeroed)
     if done.returncode:
         raise RuntimeError(f"shift maps failed: {done.stderr.decode(errors='replace').strip()[-300:]}")
     return np.load(io.BytesIO(done.stdout))
