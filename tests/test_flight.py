@@ -68,5 +68,5 @@ def test_the_video_shows_the_result_of_a_variant_in_the_scenes_poses(tmp_path):
         frames.append(read[1])
     assert len(frames) == 6 and frames[0].shape == (small_scene.HEIGHT, small_scene.WIDTH, 3)
     first = flight.around(list(train.values()), points, 6)[0]
-    drawn = turntable.splat.render(wall, first).color
+    drawn = turntable.rasterizer.render(wall, first).color
     assert (torch.from_numpy(frames[0][..., ::-1].copy()) / 255 - drawn).abs().mean() < 0.03, "but for compression"

@@ -18,7 +18,8 @@ import sys
 sys.path.insert(0, "tests")
 import numba
 import test_splat as t
-from reffusion.splat.rasterizer import forward, vectors
+from reffusion.kernels import vectors
+from reffusion.splat import forward
 
 assert vectors.LANES == 8
 for options in ({"channels": 0}, {"channels": 2, "sh_degree": 1}):
