@@ -2,6 +2,7 @@
 
 import difflib
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -97,7 +98,12 @@ class Pipeline(Strict):
                 if need not in earlier:
                     raise ValueError(f"stage {name} names {need!r}, which is not a stage before it")
             earlier.append(name)
-        tables = {"scene_keys": self.scene_keys, "budget": self.budget, **self.profiles, **self.variants}
+        tables: dict[str, Iterable[str]] = {
+            "scene_keys": self.scene_keys,
+            "budget": self.budget,
+            **self.profiles,
+            **self.variants,
+        }
         for label, layer in tables.items():
             for stage in layer:
                 if stage not in self.stages:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import re
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -35,7 +35,7 @@ _VGG = [
     "pool",
     *[(512, 3, 1, 1)] * 3,
 ]
-_LAYERS = {"alex": _ALEX, "vgg": _VGG}
+_LAYERS: dict[str, list[Any]] = {"alex": _ALEX, "vgg": _VGG}
 _POOL = {"alex": (3, 2), "vgg": (2, 2)}
 TAPS = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}  # indices in `features` of the ReLUs compared
 WIDTHS = {"alex": (64, 192, 384, 256, 256), "vgg": (64, 128, 256, 512, 512)}
