@@ -26,8 +26,7 @@ def compare(request: Request, only: str = "", seeds: int = 1) -> int:
 
     What is cached is not run again, so the same command goes on after a kill. A variant that fails stops no other.
     `only` names variants, with commas or blanks between (all where empty); `seeds` counts scenes: X, X-1, X-2 ...
-    Raises Refused before any work, where a variant, a scene or a parameter is not right.
-    """
+    Raises Refused before any work, where a variant, a scene or a parameter is not right."""
     if request.variant:
         raise Refused(f"variant={request.variant}: compare runs all variants; variants={request.variant} picks some")
     methods = [FULL, *_chosen(only, load_pipeline(request.root))]

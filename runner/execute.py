@@ -127,8 +127,7 @@ def _installed() -> dict[str, str]:
 def run_scene(request: Request, target: str, memory: Memory | None = None) -> dict[str, Path | None]:
     """Bring `target` and what it needs up to date; stage -> its artifact's folder, None where it is left out.
 
-    Raises Refused before any work, Failed where a stage fails.
-    """
+    Raises Refused before any work, Failed where a stage fails."""
     job = resolve(request, memory)
     stages = job.pipeline.closure(target)
     with ExitStack() as held:

@@ -101,8 +101,7 @@ def hand_out(made: Path, before: Path, home: Path, names: tuple[str, ...]) -> It
     """Copy the folders `names` of an artifact to `home`; yields what there is to say, a line each.
 
     A file that was handed out `before`, of the artifact that is replaced, and is no longer `made` goes; one that a
-    person changed or added stays as it is.
-    """
+    person changed or added stays as it is."""
     for name in names:
         for path in list(files_below(home / name)):
             if any(_same(path, artifact / path.relative_to(home)) for artifact in (before, made)):

@@ -145,8 +145,7 @@ def _run_by(names: Iterable[str], path: Path, root: Path) -> Iterator[Path]:
 def code_of(root: Path, stage: str, hashes: Hashes, folder: str = "stages") -> dict[str, str]:
     """File -> fingerprint, of stages/<stage>.py and of each module of ours that it imports, directly or not.
 
-    What describes a stage beforehand (stages/plan/<stage>.py) is not part of it, unless the stage itself imports it.
-    """
+    What describes a stage beforehand (stages/plan/<stage>.py) is not part of it, unless the stage itself imports it."""
     found: dict[Path, str] = {}
     waiting = [root / folder / f"{stage}.py"]
     while waiting:

@@ -61,8 +61,7 @@ def layered(
     """Later layers win: stage defaults in pipeline.yaml, profile, shares of a budget, scene.yaml, variant, `set=`.
 
     Groups of parameters merge. What goes by a key of scene.yaml is a value, also where it is a mapping (`reference:
-    {view, image, depth}`), and is replaced whole.
-    """
+    {view, image, depth}`), and is replaced whole."""
     keys, brings = pipeline.scene_keys, scene.brings
     brought = {stage: {key: brings[key] for key in keys[stage] if key in brings} for stage in keys}
     each = (

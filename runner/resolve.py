@@ -90,8 +90,7 @@ class Job:
 def resolve(request: Request, memory: Memory | None = None, scene: bool = True) -> Job:
     """Read and check everything a request names; without `scene` that of no scene in particular.
 
-    Raises Refused with one line that says what would fix it.
-    """
+    Raises Refused with one line that says what would fix it."""
     return resolve_all([request], memory or Memory(request.runs), scene)[0]
 
 
