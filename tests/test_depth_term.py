@@ -1,6 +1,6 @@
 """The depth term: alignment, target, gradient and whom it reaches, convergence, views that tell nothing, resume."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -355,6 +355,4 @@ def test_an_estimate_that_is_not_finite_names_step_and_view(prior, text, tmp_pat
 def test_both_stages_find_depth_alike():
     from stages import distill, initialize
 
-    params = initialize.Params()
-    shared = {f.name: getattr(params, f.name) for f in fields(Completion) if f.name != "robust"}
-    assert Completion(**shared) == Completion() == distill.depth_estimator(Params(), NO_POINTS).how
+    assert initialize.HOW == Completion() == distill.depth_estimator(Params(), NO_POINTS).how

@@ -31,9 +31,9 @@ from reffusion.distill.adversary import Adversary
 from reffusion.distill.confinement import adversarial_term, reconstruction_term, reference_term
 from reffusion.distill.depth_term import Estimator, by_network, depth_term
 from reffusion.fit.reconstruction import fit
-from reffusion.fit.step import Settings
 from reffusion.geometry import Degenerate
 from reffusion.params.distill import Adversarial, Depth, Sds
+from reffusion.params.fit import Densify, Params, SphericalHarmonics
 from reffusion.prior import crops, denoising, diffusion, memory
 from reffusion.prior.model import Prior, load_prior, without_text
 from reffusion.prior.personalize import train_step
@@ -235,7 +235,8 @@ def fitted_scene(sizes: Sizes, device: str, out: Path) -> dict[str, Any]:
         return float(-10 * error.log10())
 
     before = psnr(start)
-    settings = Settings(iterations=sizes.fit_steps, sh_degree=1, densify_until=0.0, budget=2 * sizes.gaussians)
+    densify, sh = Densify(stop=0.0, cap_max=2 * sizes.gaussians), SphericalHarmonics(degree=1)
+    settings = Params(iterations=sizes.fit_steps, sh=sh, densify=densify)
     trace.clear_checkpoint(out)  # of a check that was stopped
     began = time.perf_counter()
     after = psnr(fit(cameras, images, start, settings, folder=out))

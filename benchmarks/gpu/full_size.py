@@ -30,7 +30,7 @@ from reffusion.seeding import generator
 from reffusion.types import Camera, Gaussians
 from reffusion.weights import published
 
-TINY = Path(__file__).resolve().parent.parent / "priors" / "tiny"
+TINY = Path(__file__).resolve().parents[2] / "priors" / "tiny"
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,10 @@ from reffusion.capture import frame
 from reffusion.capture.lens import Lens
 from reffusion.fit.reconstruction import fit
 from reffusion.fit.start import initial_gaussians
-from reffusion.fit.step import Settings
 from reffusion.gaussians.optimize import Rates
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_scene, save_scene
+from reffusion.params.fit import Densify, Params, SphericalHarmonics
 from reffusion.splat.rasterizer import render
 from reffusion.types import Camera, Gaussians, Scene, Similarity
 
@@ -74,10 +74,11 @@ def fitted(extent: float, offset: float, rate: float = 1.0) -> tuple[Scene, Gaus
     cameras = list(scene.cameras.values())
     pictures = photographs()
     rates = Rates(means=2e-3, means_last=2e-4, log_scales=1.5e-2, sh_dc=1.5e-2)
-    settings = Settings(60, sh_degree=0, random_background=False, densify_from=1.0, rates=faster(rates, rate))
+    still = {"sh": SphericalHarmonics(degree=0), "densify": Densify(start=1.0)}
+    settings = Params(iterations=60, random_background=False, **still)
     start = initial_gaussians(scene.points, scene.point_colors, 0, 1000, seeding.generator(0))
     with tempfile.TemporaryDirectory() as folder:
-        gaussians = fit(cameras, pictures, start, settings, folder=Path(folder))
+        gaussians = fit(cameras, pictures, start, settings, folder=Path(folder), rates=faster(rates, rate))
     error = np.mean([(render(gaussians, c).color.clamp(0, 1).numpy() - pictures[c.name] / 255.0) ** 2 for c in cameras])
     return scene, gaussians, float(-10 * math.log10(error))
 
