@@ -21,7 +21,7 @@ from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_mask_sets, load_references, load_scene
 from reffusion.masks import continuation, taint, undecided, voting, witness
 from reffusion.masks.witness import with_photographed_depth
-from reffusion.paint import paint2d
+from reffusion.paint import margin, pieces
 from reffusion.params.initialize import Params
 from reffusion.prior import inpaint
 from reffusion.splat import rasterizer
@@ -199,9 +199,9 @@ def completed_further(params: Params, out: Path, gaussians, new, around):
     while len(further) < params.further and (camera := coverage.barest(around, found)):
         mask, hidden = found[camera.name], around.hidden[camera.name]
         # Just outside C a photograph may still show the object's rim, which would be repeated.
-        rimmed = paint2d.widened(hidden, coverage.RIM)
+        rimmed = margin.widened(hidden, coverage.RIM)
         base = inpaint.background(gaussians, camera, around.photos[camera.name], rimmed)
-        picture = paint2d.exemplar(base, mask | hidden & paint2d.widened(mask, coverage.RIM))
+        picture = pieces.exemplar(base, mask | hidden & margin.widened(mask, coverage.RIM))
         reference = Reference(camera, picture, mask)
         print(f"further view {camera.name}: {mask.sum() / hidden.sum():.1%} of the mask is covered by nothing")
         try:

@@ -17,7 +17,7 @@ from reffusion.io.images import save_image, save_mask
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets, load_scene, load_views, save_references
 from reffusion.masks import taint
-from reffusion.paint import paint2d, painting, registration
+from reffusion.paint import margin, painting, pieces, registration
 from reffusion.params.reference import Params
 from reffusion.prior import inpaint, memory
 from reffusion.prior.model import load_prior
@@ -124,7 +124,7 @@ def inpainted(params: Params, out: Path, scene: Scene, poses: Path, fit: Path, m
 def from_itself(base: np.ndarray, consistent: np.ndarray, invent: np.ndarray) -> np.ndarray:
     """The picture [H, W, 3] uint8 with I, and the part of C at its rim, put together from pieces of the rest: what is
     left of the object's blurred edge there would be continued into the hole."""
-    return paint2d.exemplar(base, invent | consistent & paint2d.widened(invent, RIM))
+    return pieces.exemplar(base, invent | consistent & margin.widened(invent, RIM))
 
 
 def from_prior(params: Params, out: Path, name: str, base: np.ndarray, invent: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from reffusion.io.arrays import load_json, save_json
 from reffusion.io.images import load_image, save_image, save_mask
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_scene, save_mask_sets, save_scene
-from reffusion.paint.paint2d import widened
+from reffusion.paint.margin import widened
 from reffusion.score import beyond, metrics, rows, sight
 from reffusion.types import Camera, Gaussians, MaskSet, Scene, Similarity
 from report import sheet

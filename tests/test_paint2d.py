@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from reffusion.distill import perceptual
-from reffusion.paint import paint2d
+from reffusion.paint import margin, paint2d, pieces
 from reffusion.seeding import generator
 
 HEIGHT, WIDTH = 37, 50
@@ -40,7 +40,7 @@ def hole():
 def painters(folder):
     torch.jit.script(Mean()).save(folder / "any-name.pt")
     return [paint2d.load(folder), paint2d.load(folder / "any-name.pt"), paint2d.load(),
-            paint2d.Painter("telea", paint2d.telea), paint2d.Painter("exemplar", paint2d.exemplar)]  # fmt: skip
+            paint2d.Painter("telea", paint2d.telea), paint2d.Painter("exemplar", pieces.exemplar)]  # fmt: skip
 
 
 def test_only_the_hole_changes_and_its_content_does_not_count(tmp_path):
@@ -60,7 +60,7 @@ def test_a_pattern_is_continued_by_exemplars_as_sharp_as_it_is():
     mask = np.zeros((96, 128), bool)
     mask[30:61, 45:84] = True
     wrong = lambda painted: np.abs(painted[mask].astype(int) - board[mask]).mean()
-    assert wrong(paint2d.exemplar(board, mask)) < 0.2 * 70 < wrong(paint2d.telea(board, mask))
+    assert wrong(pieces.exemplar(board, mask)) < 0.2 * 70 < wrong(paint2d.telea(board, mask))
 
 
 @pytest.mark.parametrize("kind", ["a pixel", "specks", "at the border", "nearly all"])
@@ -74,14 +74,14 @@ def test_exemplars_fill_every_hole(kind):
         mask[20:, :30] = True
     else:
         mask[8:] = True
-    painted = paint2d.exemplar(image, mask)
+    painted = pieces.exemplar(image, mask)
     assert (painted[~mask] == image[~mask]).all() and painted[mask].min() >= 20, "no pixel is left black"
 
 
 def test_a_mask_is_widened_by_a_share_of_the_width():
-    wide = paint2d.widened(hole(), 0.04)  # 2 px
+    wide = margin.widened(hole(), 0.04)  # 2 px
     assert (wide[10:26, 25]).all() and not wide[9, 25] and not wide[26, 25] and wide[18, 13] and not wide[18, 12]
-    assert (paint2d.widened(hole(), 0) == hole()).all() and not paint2d.widened(np.zeros_like(hole()), 0.1).any()
+    assert (margin.widened(hole(), 0) == hole()).all() and not margin.widened(np.zeros_like(hole()), 0.1).any()
 
 
 def test_a_smooth_picture_is_continued():

@@ -11,7 +11,7 @@ import torch
 
 from reffusion import geometry
 from reffusion.gaussians.surfels import surface_normals
-from reffusion.paint import paint2d
+from reffusion.paint import margin
 from reffusion.splat import rasterizer
 from reffusion.splat.reference import colors
 from reffusion.types import Camera, Gaussians
@@ -90,7 +90,7 @@ def pixels(fraction: float, width: int) -> int:
 
 def widened(mask: np.ndarray, fraction: float) -> np.ndarray:
     """The mask, bool [H, W], and all pixels within `fraction` of the image's width, at least the next."""
-    return paint2d.widened(mask, pixels(fraction, mask.shape[1]) / mask.shape[1])
+    return margin.widened(mask, pixels(fraction, mask.shape[1]) / mask.shape[1])
 
 
 @dataclass(frozen=True)

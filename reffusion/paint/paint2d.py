@@ -1,4 +1,4 @@
-"""Deterministic 2D inpainting: LaMa from weights that lie on this machine, else what OpenCV has; by exemplars, too.
+"""Deterministic 2D inpainting: LaMa from weights that lie on this machine, else what OpenCV has.
 
 Nothing is downloaded, and what was used is named: a table of results must say whether LaMa or its stand-in painted.
 """
@@ -13,8 +13,6 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
-
-from reffusion.paint import shiftmap
 
 MULTIPLE = 8  # LaMa halves a picture three times
 FSR_SIDE = 160  # px: FSR's time grows with the hole's area, and what it adds on larger pictures is blurred alike
@@ -56,14 +54,6 @@ def load(folder: str | Path | None = None, device: str = "cpu") -> Painter:
     return Painter(f"LaMa ({files[0].name})", lambda image, hole: lama(module, image, hole, device))
 
 
-def widened(mask: np.ndarray, fraction: float) -> np.ndarray:
-    """The mask, bool [H, W], and all pixels within `fraction` of the image's width. At the rim of a mask the object's
-    blurred edge remains, and an inpainter would continue it into the hole."""
-    reach = round(fraction * mask.shape[1])
-    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
-    return cv2.dilate(mask.astype(np.uint8), disk) > 0
-
-
 @torch.no_grad()
 def lama(module: torch.nn.Module, image: np.ndarray, hole: np.ndarray, device: str = "cpu") -> np.ndarray:
     """One forward pass. The module takes a picture [1, 3, H, W] in [0, 1] and a mask [1, 1, H, W], 1 = hole, both of
@@ -74,14 +64,14 @@ def lama(module: torch.nn.Module, image: np.ndarray, hole: np.ndarray, device: s
     """
     height, width = hole.shape
     beyond = (0, -width % MULTIPLE, 0, -height % MULTIPLE)
-    shown = torch.from_numpy(_blanked(image, hole)).to(device).permute(2, 0, 1)[None] / 255
+    shown = torch.from_numpy(blanked(image, hole)).to(device).permute(2, 0, 1)[None] / 255
     mask = torch.from_numpy(hole).to(device, torch.float32)[None, None]
     shown, mask = (F.pad(tensor, beyond, mode="replicate") for tensor in (shown, mask))
     answer = module(shown, mask)
     if answer.shape != shown.shape or not torch.isfinite(answer).all():
         raise ValueError(f"LaMa: the module's answer to {list(shown.shape)} is {list(answer.shape)}, or not finite")
     picture = (answer[0, :, :height, :width].clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy()
-    return _inside(image, picture, hole)
+    return inside(image, picture, hole)
 
 
 def fsr(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
@@ -92,49 +82,19 @@ def fsr(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
     size = tuple(max(1, round(side * factor)) for side in hole.shape[::-1])
     # Weights keep the blank inside of the hole from darkening the pixels around it.
     weight = cv2.resize((~hole).astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    small = cv2.resize(_blanked(image, hole).astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(blanked(image, hole).astype(np.float32), size, interpolation=cv2.INTER_AREA)
     small = np.round(small / np.maximum(weight, 1e-3)[..., None]).clip(0, 255).astype(np.uint8)
     known = np.where(weight < 1 - 1e-4, 0, 255).astype(np.uint8)
     small[known == 0] = 0
     painted = np.zeros_like(small)
     cv2.xphoto.inpaint(small, known, painted, cv2.xphoto.INPAINT_FSR_FAST)
-    return _inside(image, cv2.resize(painted, hole.shape[::-1], interpolation=cv2.INTER_CUBIC), hole)
-
-
-def exemplar(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    """OpenCV's shift maps (after He and Sun, Statistics of Patch Offsets for Image Completion, 2012): the hole is put
-    together from pieces of the picture moved by the offsets at which it resembles itself most. As sharp as the
-    picture; it repeats what is there and invents nothing. Pixels that no offset reaches are filled by `telea`.
-
-    Raises:
-        ValueError: this OpenCV has no xphoto module.
-    """
-    if not hole.any():  # OpenCV would crash
-        return image.copy()
-    if not hasattr(cv2, "xphoto"):
-        raise ValueError("this OpenCV has no xphoto module; `pip install opencv-contrib-python-headless`")
-    near = _context(hole)  # time grows with the picture, and what is far away is seldom alike
-    known = np.where(hole, 0, 255).astype(np.uint8)
-    lab = cv2.cvtColor(_blanked(image, hole), cv2.COLOR_RGB2Lab)
-    painted = np.zeros_like(lab)
-    painted[near] = shiftmap.completed(lab[near], known[near])
-    unreached = hole & ~painted.any(2)  # zeros are no colour: grey has a = b = 128
-    picture = _inside(image, cv2.cvtColor(painted, cv2.COLOR_Lab2RGB), hole)
-    return telea(picture, unreached) if unreached.any() else picture
-
-
-def _context(hole: np.ndarray) -> tuple[slice, slice]:
-    """The rows and columns of the hole's box and as much again to every side, of the picture's quarter at least."""
-    spans = [np.flatnonzero(hole.any(axis)) for axis in (1, 0)]
-    sides = [span[-1] + 1 - span[0] for span in spans]
-    reach = max(*sides, max(hole.shape) // 4)
-    return tuple(slice(max(span[0] - reach, 0), span[-1] + 1 + reach) for span in spans)
+    return inside(image, cv2.resize(painted, hole.shape[::-1], interpolation=cv2.INTER_CUBIC), hole)
 
 
 def telea(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
     """OpenCV's fast marching (Telea, 2004)."""
-    painted = cv2.inpaint(_blanked(image, hole), hole.astype(np.uint8), TELEA_RADIUS, cv2.INPAINT_TELEA)
-    return _inside(image, painted, hole)
+    painted = cv2.inpaint(blanked(image, hole), hole.astype(np.uint8), TELEA_RADIUS, cv2.INPAINT_TELEA)
+    return inside(image, painted, hole)
 
 
 _TELEA = Painter(f"OpenCV Telea, radius {TELEA_RADIUS} px", telea)
@@ -149,9 +109,11 @@ def _fsr_works() -> bool:
         return False
 
 
-def _blanked(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
+def blanked(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
+    """The picture with zeros in the hole."""
     return np.where(hole[..., None], np.uint8(0), image)
 
 
-def _inside(image: np.ndarray, painted: np.ndarray, hole: np.ndarray) -> np.ndarray:
+def inside(image: np.ndarray, painted: np.ndarray, hole: np.ndarray) -> np.ndarray:
+    """What was painted in the hole, the picture elsewhere."""
     return np.where(hole[..., None], painted, image)

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from reffusion.paint.paint2d import widened
+from reffusion.paint.margin import widened
 from reffusion.score import consistency, metrics, sight
 from reffusion.score.consistency import Shown
 from reffusion.score.lpips import Lpips
