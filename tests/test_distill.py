@@ -235,7 +235,7 @@ def test_interrupted_distillation_resumes_to_the_same_gaussians(prior, text, tmp
 
 def test_densification_takes_a_share_whatever_the_weight(prior, text, tmp_path, monkeypatch):
     """The SDS gradient has no scale of its own."""
-    monkeypatch.setattr(D, "LEAST_OPACITY", 0.0)
+    monkeypatch.setattr(D, "PRUNE_OPA", 0.0)
 
     def grown(name, weight, every):
         densify = {"every": every, "share": 0.25}

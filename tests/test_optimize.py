@@ -189,7 +189,7 @@ def test_plain_and_compiled_adam_agree():
         for width in (1, 3, 27):
             rows = [torch.randn(1500, width, generator=generator).to(dtype) for _ in range(4)]
             rows[2].abs_().add_(0.1)
-            updates.append(Update(*rows, torch.rand(width, generator=generator), masked_pace=1 / width))
+            updates.append(Update(*rows, torch.rand(width, generator=generator), masked_factor=1 / width))
         adam(updates, steps, visible, masked, *unbias, 0.875, 1 - 2**-10, 1e-15)  # exact in float32, too
         results.append([tensor.float() for update in updates for tensor in update[:3]])
     for plain, compiled in zip(*results, strict=True):
@@ -257,8 +257,8 @@ def test_state_continues_bit_for_bit():
 
 def observed(gaussians: Gaussians, slopes: list[float], masked=None) -> GaussianOptimizer:
     optimizer = GaussianOptimizer(gaussians, masked)
-    optimizer.slope_sum = torch.tensor(slopes) * 4
-    optimizer.slope_count = torch.full((len(slopes),), 4, dtype=torch.int32)
+    optimizer.grad2d_sum = torch.tensor(slopes) * 4
+    optimizer.grad2d_count = torch.full((len(slopes),), 4, dtype=torch.int32)
     return optimizer
 
 
@@ -293,15 +293,15 @@ def test_labels_and_moments_follow_through_clone_split_and_prune():
     assert prune(optimizer, 0.005, 10.0) == 3
     assert optimizer.masked.tolist() == [False, True, True, True]
     assert torch.equal(optimizer.state_dict()["first"]["means"][:2], kept["first"]["means"][[1, 2]])
-    assert len(optimizer.slope_sum) == len(optimizer.slope_count) == 4
+    assert len(optimizer.grad2d_sum) == len(optimizer.grad2d_count) == 4
 
 
 def test_the_budget_takes_the_steepest():
     optimizer = observed(random_gaussians(4, scale=0.001), [3e-4, 9e-4, 1e-4, 5e-4])
     assert densify(optimizer, 2e-4, 0.01, 6, seeding.generator(0)) == 2
     assert torch.equal(optimizer.gaussians.means[4:], optimizer.gaussians.means[[1, 3]])
-    optimizer.slope_sum += 1
-    optimizer.slope_count += 1
+    optimizer.grad2d_sum += 1
+    optimizer.grad2d_count += 1
     assert densify(optimizer, 2e-4, 0.01, 6, seeding.generator(0)) == 0
 
 
@@ -337,7 +337,7 @@ def test_slopes_do_not_depend_on_the_image_size():
         seen = render(optimizer.gaussians, camera(width, width * 3 // 4), impl="reference", probe=probe)
         (seen.color - 0.3).square().mean().backward()
         optimizer.observe(probe.grad, seen.radii, width, width * 3 // 4)
-        slopes.append(optimizer.slope_sum)
+        slopes.append(optimizer.grad2d_sum)
     assert torch.allclose(slopes[0], slopes[1], rtol=0.05, atol=0.02 * float(slopes[0].max()))
 
 

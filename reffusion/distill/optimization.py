@@ -22,8 +22,8 @@ from reffusion.prior.model import Prior
 from reffusion.splat.rasterizer import render
 from reffusion.types import Camera, Gaussians
 
-SPLIT_ABOVE = 0.01  # standard deviation from which a Gaussian is split, not cloned
-LEAST_OPACITY = 0.005  # fainter Gaussians are pruned when others are added
+GROW_SCALE3D = 0.01  # standard deviation from which a Gaussian is split, not cloned
+PRUNE_OPA = 0.005  # fainter Gaussians are pruned when others are added
 REGION_EVERY = 50  # steps between prunings of Gaussians that changed region
 
 
@@ -146,11 +146,11 @@ def _densify(optimizer: GaussianOptimizer, chosen: Densify, noise: torch.Generat
     """Clone or split the share of the masked Gaussians pulled hardest on the screen; only they have been observed."""
     if not optimizer.masked.any():
         return
-    slopes = (optimizer.slope_sum / optimizer.slope_count.clamp(min=1))[optimizer.masked]
-    threshold = float(slopes.kthvalue(max(1, round((1 - chosen.share) * len(slopes)))).values)
-    threshold = max(threshold, torch.finfo(slopes.dtype).tiny)  # what is not pulled at all stays single
-    densify(optimizer, threshold, SPLIT_ABOVE, chosen.cap_max, noise)
-    prune(optimizer, LEAST_OPACITY, float("inf"))
+    pulls = (optimizer.grad2d_sum / optimizer.grad2d_count.clamp(min=1))[optimizer.masked]
+    threshold = float(pulls.kthvalue(max(1, round((1 - chosen.share) * len(pulls)))).values)
+    threshold = max(threshold, torch.finfo(pulls.dtype).tiny)  # what is not pulled at all stays single
+    densify(optimizer, threshold, GROW_SCALE3D, chosen.cap_max, noise)
+    prune(optimizer, PRUNE_OPA, float("inf"))
 
 
 @torch.no_grad()

@@ -17,37 +17,41 @@ SHRINK = 1.6  # 3DGS: the two children of a split are 0.8 * 2 times smaller
 
 
 def densify(
-    optimizer: GaussianOptimizer, slope: float, split_above: float | Tensor, budget: int, generator: torch.Generator
+    optimizer: GaussianOptimizer,
+    grow_grad2d: float,
+    grow_scale3d: float | Tensor,
+    cap_max: int,
+    generator: torch.Generator,
 ) -> int:
-    """Clone the small and split the large Gaussians whose mean observed gradient is at least `slope`.
+    """Clone the small and split the large Gaussians whose mean observed gradient is at least `grow_grad2d`.
 
     A clone is a copy at the same place, which moves off as it gathers other moments; a split draws two children from
     the Gaussian itself. Children inherit the label. The observed gradients are forgotten.
 
     Args:
-        slope: in units of normalised device coordinates (see `GaussianOptimizer.observe`); 3DGS: 2e-4.
-        split_above: the largest standard deviation above which a Gaussian is split, not cloned; one for all or [N].
+        grow_grad2d: in units of normalised device coordinates (see `GaussianOptimizer.observe`); 3DGS: 2e-4.
+        grow_scale3d: the largest standard deviation above which a Gaussian is split, not cloned; one for all or [N].
             3DGS: 0.01.
-        budget: no more Gaussians than this; if there are more candidates, those of the steepest slope are taken.
+        cap_max: no more Gaussians than this; if there are more candidates, those of the largest are taken.
         generator: of the split's noise.
 
     Returns:
         By how many the number grew.
     """
-    mean_slope = optimizer.slope_sum / optimizer.slope_count.clamp(min=1)
-    room = max(0, min(budget - len(mean_slope), int((mean_slope >= slope).sum())))
+    grad2d = optimizer.grad2d_sum / optimizer.grad2d_count.clamp(min=1)
+    room = max(0, min(cap_max - len(grad2d), int((grad2d >= grow_grad2d).sum())))
     chosen = torch.zeros_like(optimizer.masked)
-    chosen[mean_slope.topk(room).indices] = True
+    chosen[grad2d.topk(room).indices] = True
 
     gaussians = optimizer.gaussians.map(Tensor.detach)
-    large = gaussians.log_scales.exp().amax(dim=1) > split_above
+    large = gaussians.log_scales.exp().amax(dim=1) > grow_scale3d
     to_clone, to_split = chosen & ~large, chosen & large
     clones = gaussians.map(lambda p: p[to_clone])
     children = split(gaussians.map(lambda p: p[to_split]), generator)
     labels = torch.cat([optimizer.masked[to_clone], optimizer.masked[to_split].repeat(2)])
     optimizer.append(clones.zipped(children, lambda a, b: torch.cat([a, b])), labels)
     optimizer.select(torch.cat([~to_split, torch.ones_like(labels)]))
-    optimizer.forget_slopes()
+    optimizer.forget_grad2d()
     return room
 
 
@@ -78,8 +82,8 @@ def rotate(quaternions: Tensor, vectors: Tensor) -> Tensor:
     return vectors + w * across + torch.linalg.cross(axis, across)
 
 
-def prune(optimizer: GaussianOptimizer, least_opacity: float, largest: float | Tensor) -> int:
-    """Remove the Gaussians fainter than `least_opacity` or with a standard deviation above `largest` (or its row).
+def prune(optimizer: GaussianOptimizer, prune_opa: float, prune_scale3d: float | Tensor) -> int:
+    """Remove the Gaussians fainter than `prune_opa` or with a standard deviation above `prune_scale3d` (or its row).
 
     PAPER leaves open: 3DGS also removes what covers more than 20 pixels of a view; that is a size in pixels, takes
     whole walls with it in small images, and is left out here.
@@ -89,7 +93,7 @@ def prune(optimizer: GaussianOptimizer, least_opacity: float, largest: float | T
     """
     gaussians = optimizer.gaussians
     with torch.no_grad():
-        keep = (gaussians.opacity_logits.sigmoid() >= least_opacity) & (gaussians.log_scales.exp().amax(1) <= largest)
+        keep = (gaussians.opacity_logits.sigmoid() >= prune_opa) & (gaussians.log_scales.exp().amax(1) <= prune_scale3d)
     if not keep.all():
         optimizer.select(keep)
     return int((~keep).sum())

@@ -97,30 +97,30 @@ class GaussianOptimizer:
     Attributes:
         gaussians: the parameters, leaves that require a gradient. A new object after each change of number.
         masked: [N] bool, the Gaussians' labels; they follow through `select` and `append`.
-        masked_pace: parameter -> factor on the step sizes of masked Gaussians; 1 where it names none.
-        slope_sum, slope_count: [N], what `observe` has gathered since `forget_slopes`; they follow likewise.
+        masked_factors: parameter -> factor on the step sizes of masked Gaussians; 1 where it names none.
+        grad2d_sum, grad2d_count: [N], what `observe` has gathered since `forget_grad2d`; they follow likewise.
     """
 
-    _COUNTERS = ("masked", "_steps", "slope_sum", "slope_count")
+    _COUNTERS = ("masked", "_steps", "grad2d_sum", "grad2d_count")
 
     def __init__(
         self,
         gaussians: Gaussians,
         masked: Tensor | None = None,
         rates: Rates | None = None,
-        masked_pace: Mapping[str, float] | None = None,
+        masked_factors: Mapping[str, float] | None = None,
         betas: tuple[float, float] = (0.9, 0.999),
         epsilon: float = 1e-15,
     ):
         self.rates, self.betas, self.epsilon = rates or Rates(), betas, epsilon
-        self.masked_pace = dict(masked_pace or {})
+        self.masked_factors = dict(masked_factors or {})
         self.masked = torch.zeros(len(gaussians), dtype=torch.bool) if masked is None else masked.clone()
         self.masked = self.masked.to(gaussians.means.device)
         self.gaussians = gaussians.map(_leaf)
         self._first = gaussians.map(_zeros)
         self._second = gaussians.map(_zeros)
         self._steps = torch.zeros(len(gaussians), dtype=torch.int32, device=self.masked.device)
-        self.forget_slopes()
+        self.forget_grad2d()
 
     def observe(self, probe_gradient: Tensor, radii: Tensor, width: int, height: int) -> None:
         """Gather one view's screen-space gradients, by which `densify` chooses.
@@ -135,13 +135,13 @@ class GaussianOptimizer:
             width, height: of the rendered image, in pixels.
         """
         seen = radii > 0
-        slope = torch.hypot(probe_gradient[:, 0] * (width / 2), probe_gradient[:, 1] * (height / 2))
-        self.slope_sum += torch.where(seen, slope, 0.0)
-        self.slope_count += seen
+        grad2d = torch.hypot(probe_gradient[:, 0] * (width / 2), probe_gradient[:, 1] * (height / 2))
+        self.grad2d_sum += torch.where(seen, grad2d, 0.0)
+        self.grad2d_count += seen
 
-    def forget_slopes(self) -> None:
-        self.slope_sum = torch.zeros_like(self._steps, dtype=torch.float32)
-        self.slope_count = torch.zeros_like(self._steps)
+    def forget_grad2d(self) -> None:
+        self.grad2d_sum = torch.zeros_like(self._steps, dtype=torch.float32)
+        self.grad2d_count = torch.zeros_like(self._steps)
 
     def step(self, progress: float, visible: Tensor | None = None, sh_degree: int | None = None) -> None:
         """One Adam step along the gradients gathered since the last, which are then forgotten.
@@ -171,7 +171,7 @@ class GaussianOptimizer:
             if gradient is not None:
                 rows = (_rows(t) for t in (*(getattr(g, name) for g in self._states()), gradient))
                 moving = rates[name] if name != "sh" or sh_degree is None else rates[name][: 3 * (sh_degree + 1) ** 2]
-                updates.append(Update(*rows, moving, self.masked_pace.get(name, 1.0)))
+                updates.append(Update(*rows, moving, self.masked_factors.get(name, 1.0)))
         update = _adam_cpu if self.masked.device.type == "cpu" else _adam
         update(updates, self._steps, visible, self.masked, *unbias, *self.betas, self.epsilon)
         self.forget_gradients()
@@ -261,7 +261,7 @@ class Update(NamedTuple):
 
     Attributes:
         parameter, first, second: it and its two moments [N, D], changed in place; gradient: [N, D].
-        rates: step sizes [d] of the first d columns; the others stay. masked_pace: the factor on them in masked rows.
+        rates: step sizes [d] of the first d columns; the others stay. masked_factor: the factor on them in masked rows.
     """
 
     parameter: Tensor
@@ -269,7 +269,7 @@ class Update(NamedTuple):
     second: Tensor
     gradient: Tensor
     rates: Tensor
-    masked_pace: float
+    masked_factor: float
 
 
 @torch.no_grad()
@@ -277,14 +277,14 @@ def _adam(updates: list[Update], steps, visible, masked, unbias1, unbias2, beta1
     """One Adam step on the visible rows; `unbias` [T] is 1 / (1 - beta^t), `steps` [N] each row's t."""
     rows = visible.nonzero()[:, 0]
     first_unbias, second_unbias = unbias1[steps[rows], None], unbias2[steps[rows], None]
-    for *tables, rates, masked_pace in updates:
+    for *tables, rates, masked_factor in updates:
         parameter, first, second, gradient = (table[:, : len(rates)] for table in tables)
         g = gradient[rows]
         m = first[rows].lerp_(g, 1 - beta1)
         v = second[rows].mul_(beta2).addcmul_(g, g, value=1 - beta2)
         first[rows], second[rows] = m, v
-        pace = torch.where(masked[rows], masked_pace, 1.0)[:, None]
-        parameter[rows] -= rates.to(g) * pace * first_unbias * m / ((v * second_unbias).sqrt() + epsilon)
+        factor = torch.where(masked[rows], masked_factor, 1.0)[:, None]
+        parameter[rows] -= rates.to(g) * factor * first_unbias * m / ((v * second_unbias).sqrt() + epsilon)
 
 
 def _adam_cpu(updates: list[Update], steps, visible, masked, unbias1, unbias2, beta1, beta2, epsilon) -> None:
@@ -292,13 +292,13 @@ def _adam_cpu(updates: list[Update], steps, visible, masked, unbias1, unbias2, b
     if not updates:
         return
     columns = [tuple(t.numpy() for t in kind) for kind in list(zip(*updates, strict=True))[:5]]
-    paces = np.array([update.masked_pace for update in updates], np.float32)
+    factors = np.array([update.masked_factor for update in updates], np.float32)
     rows = tuple(t.numpy() for t in (steps, visible, masked, unbias1, unbias2))
-    parallel_for(_adam_kernel, *columns, paces, rows, (np.float32(beta1), np.float32(beta2), np.float32(epsilon)))
+    parallel_for(_adam_kernel, *columns, factors, rows, (np.float32(beta1), np.float32(beta2), np.float32(epsilon)))
 
 
 @_jit
-def _adam_kernel(tickets, parameters, firsts, seconds, gradients, rates, paces, rows, numbers):
+def _adam_kernel(tickets, parameters, firsts, seconds, gradients, rates, factors, rows, numbers):
     count = len(rows[0])
     chunks = (count + _CHUNK - 1) // _CHUNK
     while True:
@@ -307,11 +307,11 @@ def _adam_kernel(tickets, parameters, firsts, seconds, gradients, rates, paces, 
             return
         kind, start = ticket // chunks, ticket % chunks * _CHUNK
         tables = parameters[kind], firsts[kind], seconds[kind], gradients[kind]
-        _adam_rows(start, min(start + _CHUNK, count), tables, rates[kind], paces[kind], rows, numbers)
+        _adam_rows(start, min(start + _CHUNK, count), tables, rates[kind], factors[kind], rows, numbers)
 
 
 @_jit
-def _adam_rows(begin, end, tables, rates, masked_pace, rows, numbers):
+def _adam_rows(begin, end, tables, rates, masked_factor, rows, numbers):
     parameter, first, second, gradient = tables
     steps, visible, masked, unbias1, unbias2 = rows
     beta1, beta2, epsilon = numbers
@@ -320,11 +320,11 @@ def _adam_rows(begin, end, tables, rates, masked_pace, rows, numbers):
     for i in range(begin, end):
         if not visible[i]:
             continue
-        pace, over = unbias1[steps[i]] * (masked_pace if masked[i] else np.float32(1)), unbias2[steps[i]]
+        factor, over = unbias1[steps[i]] * (masked_factor if masked[i] else np.float32(1)), unbias2[steps[i]]
         for j in range(len(rates)):
             g = gradient[i, j]
             a = beta1 * first[i, j] + new1 * g
             a = np.float32(0) if abs(a) < least else a
             b = beta2 * second[i, j] + new2 * g * g
             first[i, j], second[i, j] = a, b
-            parameter[i, j] -= pace * rates[j] * a / (np.sqrt(b * over) + epsilon)
+            parameter[i, j] -= factor * rates[j] * a / (np.sqrt(b * over) + epsilon)
