@@ -95,12 +95,12 @@ def test_refusals_name_what_is_wrong(tmp_path, folder):
     with pytest.raises(ValueError, match="clip_text_model"):
         monocular.load_network(TINY / "text_encoder")
     (tmp_path / "config.json").write_text("{}")
-    with pytest.raises(ValueError, match="leave `depth_model` empty"):
+    with pytest.raises(ValueError, match=r"leave `depth\.model` empty"):
         monocular.load_network(tmp_path)
     shutil.copy(folder / "config.json", tmp_path)
-    with pytest.raises(ValueError, match="leave `depth_model` empty"):
+    with pytest.raises(ValueError, match=r"leave `depth\.model` empty"):
         monocular.load_network(tmp_path)  # a configuration without weights
-    with pytest.raises(ValueError, match="leave `depth_model` empty"):
+    with pytest.raises(ValueError, match=r"leave `depth\.model` empty"):
         monocular.load_network("nobody/nothing-at-all")
 
 

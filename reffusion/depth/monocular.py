@@ -48,7 +48,7 @@ def load_network(source: str | Path, device: str = "cpu") -> DepthNetwork:
     from transformers import AutoConfig, AutoModelForDepthEstimation
     from transformers.utils import logging as transformers_logging
 
-    cure = "Name a local folder, or leave `depth_model` empty: depth is then continued from the surroundings"
+    cure = "Name a local folder, or leave `depth.model` empty: depth is then continued from the surroundings"
     try:
         folder = local.locate(source)
         if folder is None:

@@ -67,7 +67,8 @@ def reconstruction_term(
 def reference_term(
     gaussians: Gaussians, masked: Tensor, camera: Camera, image: Tensor, hole: Tensor
 ) -> tuple[Tensor, Rendering]:
-    """The same loss on the reference's hole; the gradient reaches masked Gaussians only.
+    """The same loss on the reference's hole; the gradient reaches the Gaussians of `masked` only: the labels, or all
+    that show there where `reference.reaches` says so.
 
     PAPER leaves open: whether the reference supervises directly; it only initialises and personalises there.
 
@@ -89,7 +90,8 @@ def sds_term(
     probe: Tensor | None = None,
     t_low: float = T_LOW,
 ) -> tuple[Tensor, Rendering]:
-    """L_global + mean(L_local) of one view, all samples in one UNet batch; it reaches masked Gaussians only.
+    """L_global + mean(L_local) of one view, all samples in one UNet batch; it reaches the Gaussians of
+    `masked` only: the labels, or all that show there where `sds.reaches` says so.
 
     PAPER leaves open: what conditions the UNet. The photo where it is trusted, elsewhere the render itself (background
     that other views saw through the object), the hole blanked; without gradient.
