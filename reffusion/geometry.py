@@ -59,6 +59,11 @@ def unproject(depth: np.ndarray, camera: Camera) -> np.ndarray:
     return (pixel_rays(camera) * depth[..., None] - pose[:3, 3]) @ pose[:3, :3]
 
 
+def reciprocal(values: np.ndarray) -> np.ndarray:
+    """1 / values where they are positive, else 0: disparity of depth, and depth of disparity."""
+    return np.divide(1.0, values, out=np.zeros_like(values), where=values > 0)
+
+
 def sample_nearest(image: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The pixels of `image` [H, W, ...] that contain uv [..., 2], and which uv lie inside the image (bool [...]).
 

@@ -19,3 +19,9 @@ def seed_for(seed: int, *labels: object) -> int:
 def generator(seed: int, *labels: object, device: str = "cpu") -> torch.Generator:
     """A fresh generator on `device` for this seed and these labels."""
     return torch.Generator(device).manual_seed(seed_for(seed, *labels))
+
+
+def in_epochs(turn: int, count: int, seed: int, *labels: object) -> int:
+    """Which of `count` things has its turn: each once an epoch, in an order of the epoch's own."""
+    order = torch.randperm(count, generator=generator(seed, *labels, turn // count))
+    return int(order[turn % count])

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reffusion import trace
+from reffusion import geometry, trace
 from reffusion.fit import exposure
 from reffusion.io.arrays import load_json, save_json, save_labels
 from reffusion.io.ply import load_ply
@@ -117,7 +117,7 @@ def classified(
         unknown = tidied(found.undecided) & consistent[name] & (name not in scene.clean)
         invent = consistent[name] & (name not in scene.clean) if params.invent == "consistent" else unknown
         if fill is not None:
-            disparity = np.divide(1.0, found.depth, out=np.zeros_like(found.depth), where=found.depth > 0)
+            disparity = geometry.reciprocal(found.depth)
             invent = voting.box_silhouette(**fill, camera=camera, disparity=disparity)
         sets[name] = MaskSet(raw.get(name, np.zeros_like(unknown)), consistent[name], unknown, invent)
     return sets

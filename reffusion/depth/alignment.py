@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 import torch
 
-from reffusion import seeding
+from reffusion import geometry, seeding
 from reffusion.geometry import Degenerate
 
 Space = Literal["depth", "disparity"]
@@ -195,7 +195,7 @@ def align_depth(
     """
     depth = np.asarray(depth, np.float64)
     weights = np.asarray(known, np.float64) * (depth > 0)
-    target = depth if space == "depth" else np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0)
+    target = depth if space == "depth" else geometry.reciprocal(depth)
     fitted = align(estimate, target, weights, robust=robust)
     known_values = np.asarray(estimate, np.float64)[weights > 0]
     rise = fitted.scale * np.ptp(known_values)  # none, to rounding, where the scene's depth is constant: it stays so

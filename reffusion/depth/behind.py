@@ -108,7 +108,7 @@ class Seen:
     @property
     def disparity(self) -> np.ndarray:
         """[H, W] float64; 0 where there is no depth."""
-        return np.divide(1.0, self.depth, out=np.zeros_like(self.depth), where=self.depth > 0)
+        return geometry.reciprocal(self.depth)
 
     @property
     def least_disparity(self) -> float:

@@ -222,9 +222,7 @@ def _reconstruction(optimizer: GaussianOptimizer, step: int, job: Job) -> _Done:
 
 
 def _drawn(views: Sequence[TrainView], turn: int, seed: int, label: str) -> TrainView:
-    """Every view once an epoch, in an order of the epoch's own."""
-    order = torch.randperm(len(views), generator=seeding.generator(seed, "distill", label, turn // len(views)))
-    return views[int(order[turn % len(views)])]
+    return views[seeding.in_epochs(turn, len(views), seed, "distill", label)]
 
 
 @contextmanager

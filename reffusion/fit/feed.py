@@ -23,7 +23,7 @@ def samples(
     """What each of the steps sees, prepared by a thread of its own while the step before it runs."""
 
     def prepared(i: int) -> tuple[Camera, Tensor, Tensor | None]:
-        camera = cameras[_view(i, len(cameras), seed)]
+        camera = cameras[seeding.in_epochs(i, len(cameras), seed, "views")]
         return sample(camera, images[camera.name], weights.get(camera.name))
 
     with ThreadPoolExecutor(1, thread_name_prefix="fit") as ahead:
@@ -32,12 +32,6 @@ def samples(
             ready = coming.result()
             coming = ahead.submit(prepared, min(i + 1, steps.stop - 1))
             yield ready
-
-
-def _view(iteration: int, count: int, seed: int) -> int:
-    """Every view once an epoch, in an order of the epoch's own."""
-    order = torch.randperm(count, generator=seeding.generator(seed, "views", iteration // count))
-    return int(order[iteration % count])
 
 
 def sample(camera: Camera, image: np.ndarray, weights: np.ndarray | None) -> tuple[Camera, Tensor, Tensor | None]:
