@@ -146,7 +146,7 @@ weights: setup
 	@$(PY) -m runner weights $(if $(scene),--scene '$(scene)') $(if $(offline),--offline) $(options)
 
 prior: setup
-	$(PY) priors/tiny/train.py --start priors/tiny $(if $(steps),--steps '$(steps)')
+	$(PY) -m priors.tiny.train --start priors/tiny $(if $(steps),--steps '$(steps)')
 
 # Personalizes on the demo's reference, which is made first where it is missing.
 prior-report: data/demo/.generated setup

@@ -1,5 +1,6 @@
 """Training the embedded prior: pictures and steps depend on the seed alone; the code is exact, resumes are too."""
 
+import subprocess
 import sys
 from pathlib import Path
 
@@ -11,7 +12,14 @@ from small_prior import save_small_prior
 
 from priors.tiny import build, images, train
 
-TINY = Path(__file__).resolve().parent.parent / "priors" / "tiny"
+ROOT = Path(__file__).resolve().parent.parent
+TINY = ROOT / "priors" / "tiny"
+
+
+def test_the_makefiles_command_starts():
+    (command,) = [line.split() for line in (ROOT / "Makefile").read_text().splitlines() if "train --start" in line]
+    started = [sys.executable, *command[1:3], "--help"]
+    assert "--steps" in subprocess.run(started, cwd=ROOT, capture_output=True, text=True, check=True).stdout
 
 
 def test_images_depend_on_seed_and_number_only():

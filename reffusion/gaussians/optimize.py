@@ -199,13 +199,6 @@ class GaussianOptimizer:
             old = getattr(self, name)
             setattr(self, name, torch.cat([old, masked if name == "masked" else old.new_zeros(len(gaussians))]))
 
-    def restart(self, rows: Tensor) -> None:
-        """Let Adam start afresh for the Gaussians `rows` ([M] indices): they stand elsewhere now."""
-        for moments in (self._first, self._second):
-            for name in PARAMETERS:
-                getattr(moments, name)[rows] = 0
-        self._steps[rows] = 0
-
     def cap_opacity(self, limit: float) -> None:
         """3DGS's opacity reset: no Gaussian is more opaque than `limit` in (0, 1); what is needed grows back.
 
