@@ -59,8 +59,9 @@ def test_names_are_unique_and_enough():
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
-def test_fault_is_caught(fault):
+def test_fault_is_caught_and_gone_again(fault):
     assert caught(fault)
+    assert run(CASES[fault.caught_by]).ok
 
 
 def test_command_writes_the_table_and_fails_by_exit_code(tmp_path, monkeypatch, capsys):

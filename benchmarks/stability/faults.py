@@ -1,99 +1,109 @@
 """Faults planted in the code, each with the case that must catch it: what the suite is worth.
 
-A fault is an edit of one function's source, put into its module while the case runs.
+A fault is made of the right function and put in its place, wherever it was imported, while the case runs.
 """
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Iterator
-from contextlib import contextmanager
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from functools import partial
 from importlib import import_module
-from textwrap import dedent
-from typing import NamedTuple
+from math import log10
+from types import ModuleType
+from typing import Any, NamedTuple
+from unittest.mock import patch
+
+import numpy as np
+import torch
+import torch.nn.functional as F
 
 from benchmarks.stability import all_cases, run
+from reffusion.depth.alignment import Alignment
 
 
 class Fault(NamedTuple):
-    """What is wrong, where, the text that is changed and into what, and the case that catches it."""
+    """What is wrong, module and name of what is replaced, right function (or constant) -> wrong one, who catches it."""
 
     name: str
     module: str
     function: str
-    right: str
-    wrong: str
+    wrong: Callable[[Any], Any]
     caught_by: str
+
+
+def then(change: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Right function -> one that changes its result."""
+    return lambda right: lambda *given: change(right(*given))
+
+
+def log_of_sigmoid(real: torch.Tensor, fake: torch.Tensor) -> torch.Tensor:
+    return -torch.log(torch.sigmoid(real)).mean() - torch.log(torch.sigmoid(-fake)).mean()
 
 
 FAULTS = (
     Fault("a sign in the gradient", "reffusion.splat.cpu", "_to_parameters",
-          "return [array[:count] for array in out]", "return [-out[0][:count], *(array[:count] for array in out[1:])]",
-          "scales 1 of the extent"),
-    Fault("a wrong order of equal depths", "reffusion.splat.cpu", "project_and_bin",
-          "order = binning.depth_order(radii[:count], drawn)",
-          "order = binning.depth_order(radii[:count], drawn)[::-1].copy()", "equal depths, drawn by index"),
-    Fault("a dropped clamp of the Jacobian", "reffusion.splat.cpu", "project_and_bin",
-          "numbers = (array.reshape(-1) for array in parameters), view_numbers(camera, antialiased)",
-          "numbers = (array.reshape(-1) for array in parameters), view_numbers(camera, antialiased) + "
-          "1e9 * np.repeat([0, -1, 1, -1, 1, 0], [16, 1, 1, 1, 1, 3])", "needles from 1e4 extents away"),
-    Fault("squares that underflow", "reffusion.gaussians.densify", "rotate",
-          "quaternions.abs().amax(1, keepdim=True).clamp_min(torch.finfo(quaternions.dtype).tiny)", "1.0",
+          then(lambda gradients: [-gradients[0], *gradients[1:]]), "scales 1 of the extent"),
+    Fault("a wrong order of depths", "reffusion.splat.binning", "depth_order",
+          then(lambda order: order[::-1].copy()), "equal depths, drawn by index"),
+    Fault("a dropped clamp of the Jacobian", "reffusion.splat.projection", "view_numbers",
+          then(lambda numbers: np.r_[numbers[:16], -1e9, 1e9, -1e9, 1e9, numbers[20:]]),
+          "needles from 1e4 extents away"),
+    Fault("squares that underflow", "reffusion.gaussians.densify", "unit", lambda right: partial(F.normalize, dim=1),
           "quaternions of length 1e-20, splitting"),
     Fault("an alignment that is not centred", "reffusion.depth.alignment", "_weighted_line",
-          "x_mean, y_mean = (w @ x) / total, (w @ y) / total", "x_mean, y_mean = 0.0, 0.0",
-          "alignment, four pixels"),
-    Fault("no consensus before the reweighting", "reffusion.depth.alignment", "_robust_line",
-          "_consensus(x, y, w, draws) or (plain, 1.0)", "(plain, 1.0)", "alignment, 90% outliers"),
+          lambda right: lambda x, y, w: Alignment((w @ (x * y)) / (w @ x**2), 0.0, 0.0), "alignment, four pixels"),
+    Fault("no consensus before the reweighting", "reffusion.depth.alignment", "_consensus",
+          lambda right: lambda x, y, w, draws: None, "alignment, 90% outliers"),
     Fault("an unsafe logarithm in PSNR", "reffusion.score.metrics", "psnr",
-          "-10.0 * log10(error) if error > 0 else inf", "-10.0 * log10(error)", "metrics of identical images"),
+          then(lambda decibels: -10 * log10(10 ** (-decibels / 10))), "metrics of identical images"),
     Fault("an unsafe logarithm in the critic's loss", "reffusion.distill.discriminator", "critic_loss",
-          "-F.logsigmoid(real).mean() - F.logsigmoid(-fake).mean()",
-          "-torch.log(torch.sigmoid(real)).mean() - torch.log(torch.sigmoid(-fake)).mean()",
-          "discriminator logits +-1e4, critic"),
+          lambda right: log_of_sigmoid, "discriminator logits +-1e4, critic"),
     Fault("a mean over nothing where a mask is empty", "reffusion.distill.sds", "unfaded",
-          "mask.sum((2, 3), keepdim=True).clamp(min=1)", "mask.sum((2, 3), keepdim=True)", "mask empty, gradient"),
+          lambda right: lambda x0, latents, mask: right(x0, latents, mask) * (mask.sum() / mask.sum()),
+          "mask empty, gradient"),
     Fault("1 - alpha bar in half precision", "reffusion.distill.sds", "sds_gradient",
-          "alpha_bar = alphas_cumprod[timesteps]", "alpha_bar = alphas_cumprod.to(latents)[timesteps]",
+          lambda right: lambda z, denoise, t, noise, alphas, weighting: right(
+              z, denoise, t, noise, alphas.to(z), weighting=weighting),
           "timestep 0, half precision, score distillation"),
     Fault("guidance of a instead of 1 + a", "reffusion.prior.diffusion", "guided",
-          "return (1 + guidance) * eps", "return guidance * eps", "guidance 100, equal prompts"),
+          lambda right: lambda *given: (right(*given)[0] - right(*given[:-1], 0)[0], right(*given)[1]),
+          "guidance 100, equal prompts"),
     Fault("a tie that masks", "reffusion.masks.voting", "label_gaussians",
-          "votes.masked > tau * votes.unmasked", "votes.masked >= tau * votes.unmasked", "masks contradicting"),
-    Fault("a completion that is not about a plane", "reffusion.depth.completion", "_complete_region",
-          "plane = fit_plane(disparity, known * confidence)", "plane = np.zeros_like(disparity)",
-          "completion, hole over three borders"),
-    Fault("a missing epsilon where no confidence reaches", "reffusion.depth.bilateral", "system_of",
-          "unreached = 1e-9 * mass", "unreached = 0.0 * mass", "solver, two known pixels"),
-    Fault("an offset that is taken off twice", "reffusion.capture.frame", "normalise_pose",
-          "similarity.offset + world_to_camera", "similarity.offset - world_to_camera",
+          lambda right: lambda votes, tau=1.0: votes.masked >= tau * votes.unmasked, "masks contradicting"),
+    Fault("a completion that is not about a plane", "reffusion.depth.planes", "fit_plane",
+          lambda right: lambda disparity, weights: np.zeros_like(disparity), "completion, hole over three borders"),
+    Fault("a missing epsilon where no confidence reaches", "reffusion.depth.bilateral", "UNREACHED", lambda right: 0.0,
+          "solver, two known pixels"),
+    Fault("an offset that is added, not taken off", "reffusion.capture.frame", "normalise_pose",
+          lambda right: lambda pose, similarity: right(pose, replace(similarity, offset=-similarity.offset)),
           "offset 1e6 of the extent, normalised"),
-    Fault("positions of an export in float32 always", "reffusion.io.ply", "save_ply",
-          '"f8" if rounding * similarity.scale > 1e-5 else "f4"', '"f4"',
+    Fault("positions of an export in float32 always", "reffusion.io.ply", "_write",
+          lambda right: lambda path, table, comments: right(
+              path, table.astype([(name, "f4") for name in table.dtype.names]), comments),
           "offset 1e6 of the extent, exported positions"),
-    Fault("a gradient that nobody looks at", "reffusion.gaussians.optimize", "step",
-          "not torch.isfinite(gradient.sum())", "False", "gradients that are not numbers"),
+    Fault("a gradient that nobody looks at", "reffusion.gaussians.optimize", "refuse_not_finite",
+          lambda right: lambda gradients: None, "gradients that are not numbers"),
 )  # fmt: skip
 
 
 @contextmanager
 def planted(fault: Fault) -> Iterator[None]:
-    """The function with the fault in its place, while in the context; ValueError where the text is not there."""
-    module = import_module(fault.module)
-    owner = module if hasattr(module, fault.function) else module.GaussianOptimizer
-    before = getattr(owner, fault.function)
-    source = dedent(inspect.getsource(before))
-    if source.count(fault.right) != 1:
-        raise ValueError(f"{fault.module}.{fault.function} holds {source.count(fault.right)} times: {fault.right}")
-    names = dict(before.__globals__)
-    edited = "from __future__ import annotations\n" + source.replace(fault.right, fault.wrong)
-    exec(compile(edited, "<fault>", "exec"), names)
-    right = before.__code__
-    before.__code__ = names[fault.function].__code__  # the function itself, for who imported it by name
-    try:
+    """The fault in the place of what is right, under every name that a loaded module has for it, while in the context.
+
+    A module that is first loaded in the context would keep the fault: run the case once before. A compiled kernel keeps
+    what it was compiled with: plant no fault inside one.
+    """
+    right = getattr(import_module(fault.module), fault.function)
+    wrong = fault.wrong(right)
+    modules = [module for module in list(sys.modules.values()) if isinstance(module, ModuleType)]
+    places = [(module, name) for module in modules for name, value in vars(module).items() if value is right]
+    with ExitStack() as put_back:
+        for module, name in places:
+            put_back.enter_context(patch.object(module, name, wrong))
         yield
-    finally:
-        before.__code__ = right
 
 
 def caught(fault: Fault) -> bool:

@@ -12,6 +12,8 @@ from scipy.sparse.linalg import cg
 from reffusion.depth.completion import check_maps, extremes_ratio, unit_range
 from reffusion.geometry import Degenerate
 
+UNREACHED = 1e-9  # confidence of every pixel beside its own: cells without data are regular, and 0
+
 
 @dataclass(frozen=True)
 class Solver:
@@ -122,8 +124,7 @@ def system_of(
     cell, coordinates = _grid(guide, solver)
     gather = lambda values: np.bincount(cell, values.ravel(), minlength=len(coordinates))
     mass = gather(np.ones(confidence.shape))
-    unreached = 1e-9 * mass  # cells without data: regular, and 0
-    data = sparse.diags(gather(confidence) + unreached)
+    data = sparse.diags(gather(confidence) + UNREACHED * mass)
     system = solver.smoothness * _laplacian(_blur(coordinates), mass, solver.rounds) + data
     return system.tocsr(), cell
 

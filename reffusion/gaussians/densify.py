@@ -74,12 +74,17 @@ def split(gaussians: Gaussians, generator: torch.Generator) -> Gaussians:
 
 def rotate(quaternions: Tensor, vectors: Tensor) -> Tensor:
     """[M, 3] vectors turned by wxyz quaternions [M, 4] of any length (zero: not turned)."""
-    # First by the largest entry: the squares of short ones would vanish.
-    quaternions = quaternions / quaternions.abs().amax(1, keepdim=True).clamp_min(torch.finfo(quaternions.dtype).tiny)
-    quaternions = torch.nn.functional.normalize(quaternions, dim=1)
+    quaternions = unit(quaternions)
     w, axis = quaternions[:, :1], quaternions[:, 1:]
     across = 2 * torch.linalg.cross(axis, vectors)
     return vectors + w * across + torch.linalg.cross(axis, across)
+
+
+def unit(quaternions: Tensor) -> Tensor:
+    """[M, 4] of length 1; zero stays zero."""
+    # First by the largest entry: the squares of short ones would vanish.
+    quaternions = quaternions / quaternions.abs().amax(1, keepdim=True).clamp_min(torch.finfo(quaternions.dtype).tiny)
+    return torch.nn.functional.normalize(quaternions, dim=1)
 
 
 def prune(optimizer: GaussianOptimizer, prune_opa: float, prune_scale3d: float | Tensor) -> int:

@@ -155,10 +155,7 @@ class GaussianOptimizer:
             FloatingPointError: a gradient is not finite; says of which parameter. Nothing has been changed then.
         """
         gradients = {name: getattr(self.gaussians, name).grad for name in PARAMETERS}
-        for name, gradient in gradients.items():
-            # A sum is finite only if every term is, and costs no array of flags.
-            if gradient is not None and not torch.isfinite(gradient.sum()):
-                raise FloatingPointError(f"the gradient of the Gaussians' {name} is not finite")
+        refuse_not_finite(gradients)
         if not len(self.masked):
             return self.forget_gradients()
         if visible is None:
@@ -228,6 +225,14 @@ class GaussianOptimizer:
     def _replace(self, function) -> None:
         self.gaussians = self.gaussians.map(lambda p: _leaf(function(p)))
         self._first, self._second = self._first.map(function), self._second.map(function)
+
+
+def refuse_not_finite(gradients: Mapping[str, Tensor | None]) -> None:
+    """FloatingPointError that names the parameter where a gradient is NaN or infinite."""
+    for name, gradient in gradients.items():
+        # A sum is finite only if every term is, and costs no array of flags.
+        if gradient is not None and not torch.isfinite(gradient.sum()):
+            raise FloatingPointError(f"the gradient of the Gaussians' {name} is not finite")
 
 
 @lru_cache(maxsize=4)
