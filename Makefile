@@ -26,6 +26,7 @@ export GOMP_SPINCOUNT ?= 30000
 PYTHON ?= python3
 VENV ?= .venv
 PY := $(VENV)/bin/python
+RUN := $(VENV)/bin/reffusion
 STAGES := poses fit masks reference lift personalize initialize distill evaluate
 
 options = $(if $(profile),--profile '$(profile)') $(if $(variant),--variant '$(variant)') \
@@ -108,56 +109,56 @@ named:
 ready: named setup $(made:%=data/%/.generated)
 
 all $(STAGES): ready
-	@$(PY) -m runner run $@ --scene '$(scene)' $(options)
+	@$(RUN) run $@ --scene '$(scene)' $(options)
 
 plan: ready
-	@$(PY) -m runner plan --scene '$(scene)' $(options)
+	@$(RUN) plan --scene '$(scene)' $(options)
 
 .PHONY: compare report
 # On the demo scenes of other seeds too. A variant that fails (3) stops no other: the table is drawn, then make fails.
 others = $(if $(made),$(foreach n,$(shell seq 1 $$(( $(or $(seeds),1) - 1 ))),data/$(made)-$(n)/.generated))
 compare: ready $(others)
-	@$(PY) -m runner compare --scene '$(scene)' $(options) $(if $(variants),--variants '$(variants)') \
+	@$(RUN) compare --scene '$(scene)' $(options) $(if $(variants),--variants '$(variants)') \
 		$(if $(seeds),--seeds '$(seeds)'); status=$$?; test $$status = 0 || test $$status = 3 || exit $$status; \
-		$(PY) -m report.compare --scene '$(scene)' $(if $(runs),--runs '$(runs)') && exit $$status
+		$(RUN) compare-page --scene '$(scene)' $(if $(runs),--runs '$(runs)') && exit $$status
 
 report: $(if $(scene),ready,setup)
 ifneq ($(scene),)
-	@$(PY) -m runner plan --record --scene '$(scene)' $(options)
-	@$(PY) -m report.job --scene '$(scene)' $(if $(variant),--variant '$(variant)') $(if $(runs),--runs '$(runs)')
+	@$(RUN) plan --record --scene '$(scene)' $(options)
+	@$(RUN) report --scene '$(scene)' $(if $(variant),--variant '$(variant)') $(if $(runs),--runs '$(runs)')
 else
-	@$(PY) -m report.job --data '$(data)' $(if $(variant),--variant '$(variant)') $(if $(runs),--runs '$(runs)')
+	@$(RUN) report --data '$(data)' $(if $(variant),--variant '$(variant)') $(if $(runs),--runs '$(runs)')
 endif
 
 view: named $(VENV)/.ready-view
-	@$(PY) -m report.view --scene '$(scene)' $(if $(variant),--variant '$(variant)') $(if $(runs),--runs '$(runs)') \
+	@$(RUN) view --scene '$(scene)' $(if $(variant),--variant '$(variant)') $(if $(runs),--runs '$(runs)') \
 		$(if $(port),--port '$(port)')
 
 turntable: named setup
-	@$(PY) -m report.turntable --scene '$(scene)' $(if $(variant),--variant '$(variant)') $(if $(runs),--runs '$(runs)')
+	@$(RUN) turntable --scene '$(scene)' $(if $(variant),--variant '$(variant)') $(if $(runs),--runs '$(runs)')
 
 clean: named setup
-	@$(PY) -m runner clean --scene '$(scene)' $(options)
+	@$(RUN) clean --scene '$(scene)' $(options)
 
 batch: setup
-	@$(PY) -m runner batch --data '$(data)' $(options)
+	@$(RUN) batch --data '$(data)' $(options)
 
 weights: setup
-	@$(PY) -m runner weights $(if $(scene),--scene '$(scene)') $(if $(offline),--offline) $(options)
+	@$(RUN) weights $(if $(scene),--scene '$(scene)') $(if $(offline),--offline) $(options)
 
 prior: setup
 	$(PY) -m priors.tiny.train --start priors/tiny $(if $(steps),--steps '$(steps)')
 
 # Personalizes on the demo's reference, which is made first where it is missing.
 prior-report: data/demo/.generated setup
-	@$(PY) -m runner run reference --scene demo --profile laptop
+	@$(RUN) run reference --scene demo --profile laptop
 	$(PY) -m benchmarks.studies.prior --steps 1 4 12 --run runs/demo --out runs/prior-report
 	$(PY) -m report.prior runs/prior-report
 
 # On any scene; what it lacks of personalization and initialization is made first.
 sds-variance: ready
-	@$(PY) -m runner run personalize --scene '$(scene)' $(options)
-	@$(PY) -m runner run initialize --scene '$(scene)' $(options)
+	@$(RUN) run personalize --scene '$(scene)' $(options)
+	@$(RUN) run initialize --scene '$(scene)' $(options)
 	$(PY) -m benchmarks.studies.sds_variance --run '$(or $(runs),runs)/$(notdir $(abspath $(scene)))'
 
 # Two processes of one thread each, whole files to each: kernels that are compiled for one test serve the next.

@@ -226,7 +226,7 @@ def html(comparison: Comparison, table: list[dict], drawn: dict[str, Path | None
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="report.compare", description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(prog="reffusion compare-page", description=__doc__.split("\n")[0])
     parser.add_argument("--scene", type=Path, required=True, help="its name, or the path of its folder")
     parser.add_argument("--runs", type=Path, default=Path("runs"))
     arguments = parser.parse_args()

@@ -170,7 +170,7 @@ def artifacts(job: Job, out: Path) -> list[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="report.job", description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(prog="reffusion report", description=__doc__.split("\n")[0])
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--scene", type=Path, help="its name, or the path of its folder")
     what.add_argument("--data", type=Path, help="a folder of scenes")

@@ -99,7 +99,7 @@ def framed(cells: list[list[np.ndarray | None]], titles: list[str], names: list[
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="report.sheet", description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(prog="reffusion sheet", description=__doc__.split("\n")[0])
     parser.add_argument("scene", type=Path, help="runs/<scene>")
     parser.add_argument("--views", nargs="+", default=["3"], help="how many views, or their names")
     parser.add_argument("--scale", type=int, help="whole factor of enlargement (default: to about 480 px)")

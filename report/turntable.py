@@ -46,7 +46,7 @@ def make(home: Path, frames: int = FRAMES) -> Path:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="report.turntable", description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(prog="reffusion turntable", description=__doc__.split("\n")[0])
     parser.add_argument("--scene", type=Path, required=True, help="its name, or the path of its folder")
     parser.add_argument("--variant", default="", help="of the scene")
     parser.add_argument("--runs", type=Path, default=Path("runs"))

@@ -120,7 +120,7 @@ class Window:
         try:
             import viser
         except ImportError:
-            raise ValueError("the viewer needs viser: `make scene=X view`, or `pip install '.[view]'`") from None
+            raise ValueError("the viewer needs viser: `make scene=X view`, or `pip install viser`") from None
         poses = home.with_name(home.name.split("@")[0]) / "poses"
         if not poses.is_dir():
             raise ValueError(f"{poses} is missing; {_how(home)} makes it")
@@ -204,7 +204,7 @@ def _quaternion(rotation: np.ndarray) -> np.ndarray:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="report.view", description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(prog="reffusion view", description=__doc__.split("\n")[0])
     parser.add_argument("--scene", type=Path, required=True, help="its name, or the path of its folder")
     parser.add_argument("--variant", default="", help="of the scene")
     parser.add_argument("--runs", type=Path, default=Path("runs"))

@@ -1,4 +1,4 @@
-"""python -m runner plan|run|compare|batch|weights|clean --scene NAME: what the Makefile calls."""
+"""reffusion plan|run|compare|batch|weights|clean --scene NAME: what the Makefile calls (or python -m runner)."""
 
 import argparse
 import os
@@ -10,7 +10,7 @@ from runner import Failed, Refused
 from runner.child import INTERRUPTED
 from runner.compare import batch, compare, show_results
 from runner.execute import clean, run_scene, weights
-from runner.files import write_json
+from runner.files import workplace, write_json
 from runner.plan import as_record, plan, table
 from runner.resolve import Request, resolve
 
@@ -20,7 +20,7 @@ SOME_FAILED = 3  # compare: done, but for some variants
 def main() -> int:
     arguments = _parser().parse_args()
     root = arguments.root.resolve()
-    runs = (arguments.runs or root / "runs").resolve()
+    runs = (arguments.runs or workplace(root) / "runs").resolve()
     asked = (arguments.scene, arguments.profile, arguments.variant, arguments.trust, arguments.set, arguments.budget)
     request = Request(root, runs, *asked)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # told to end: as Ctrl-C
@@ -56,7 +56,8 @@ def main() -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="runner", description=__doc__)
+    others = "pages of what was made: reffusion report|compare-page|view|turntable|sheet, each with --help"
+    parser = argparse.ArgumentParser(prog="reffusion", description=__doc__, epilog=others)
     parser.add_argument("command", choices=["plan", "run", "compare", "batch", "weights", "clean"])
     parser.add_argument("stage", nargs="?", default="all", help="run this stage and what it needs; `all` (default)")
     parser.add_argument("--scene", default="", help="a name under data/, or a path")
@@ -71,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--offline", action="store_true", help="weights: only say what is missing")
     parser.add_argument("--set", default="", help="stage.parameter=value ...")
     parser.add_argument("--root", type=Path, default=Path(__file__).parent.parent, help="where pipeline.yaml is")
-    parser.add_argument("--runs", type=Path, help="where artifacts go; root/runs")
+    parser.add_argument("--runs", type=Path, help="where artifacts go; root/runs, installed ./runs")
     return parser
 
 

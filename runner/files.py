@@ -14,6 +14,17 @@ from runner import Refused, say
 RECEIPT = "receipt.json"
 
 
+def installed(root: Path) -> bool:
+    """Is `root` the folder `app` inside an installed package `reffusion`, and not a checkout, where both lie side by
+    side?"""
+    return root.parts[-2:] == ("reffusion", "app") and not (root / "reffusion").is_dir()
+
+
+def workplace(root: Path) -> Path:
+    """Where data/ and runs/ are: a checkout's root; the current folder where an installed version is used."""
+    return Path.cwd() if installed(root) else root
+
+
 def files_below(folder: Path) -> Iterator[Path]:
     """Files, sorted, links followed, hidden names left out."""
     seen = set()

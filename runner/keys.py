@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from runner import Refused
-from runner.files import RECEIPT, files_below
+from runner.files import RECEIPT, files_below, installed
 
 OWN = ("reffusion", "stages")  # the packages whose modules count as a stage's code where it imports them
 NOT_CONTENT = (RECEIPT, "trace.jsonl", "checkpoint.pt", "checkpoint.pt.writing")
@@ -130,15 +130,26 @@ def _imported(tree: ast.AST) -> Iterator[str]:
             yield from _imported(node)
 
 
+def _base(root: Path, library: bool) -> Path:
+    """The folder that modules are named from: the root, but for those of the library where it is installed, for it
+    then holds the root."""
+    return root.parents[1] if library and installed(root) else root
+
+
+def _named(path: Path, root: Path) -> Path:
+    return path.relative_to(_base(root, not path.is_relative_to(root)))
+
+
 def _run_by(names: Iterable[str], path: Path, root: Path) -> Iterator[Path]:
     """The files of our own packages that importing `names` in the file at `path` runs."""
     for name in names:
         level = len(name) - len(name.lstrip("."))
-        package = path.relative_to(root).parts[:-level] if level else ()
+        package = _named(path, root).parts[:-level] if level else ()
         parts = (*package, *filter(None, name.lstrip(".").split(".")))
         if parts and parts[0] in OWN:
+            base = _base(root, parts[0] == "reffusion")
             for depth in range(1, len(parts) + 1):  # importing a.b.c runs a and a.b too
-                place = root.joinpath(*parts[:depth])
+                place = base.joinpath(*parts[:depth])
                 yield from (p for p in (place.with_suffix(".py"), place / "__init__.py") if p.is_file())
 
 
@@ -153,7 +164,7 @@ def code_of(root: Path, stage: str, hashes: Hashes, folder: str = "stages") -> d
         if path not in found:
             found[path], imported = hashes.module(path, root)
             waiting += imported
-    return {path.relative_to(root).as_posix(): found[path] for path in sorted(found)}
+    return {_named(path, root).as_posix(): found[path] for path in sorted(found)}
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import yaml
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_validator
 
 from runner import Refused
+from runner.files import installed, workplace
 
 SCENE = "scene"  # the need that stands for the scene's own folder
 LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the one in C takes a tenth of the time
@@ -186,14 +187,16 @@ def load_scene_file(folder: Path, pipeline: Pipeline) -> SceneFile:
 
 def find_scene(text: str, root: Path) -> Path:
     """The folder meant by `scene=`: a name under data/, or a path."""
-    for folder in (root / "data" / text, Path(text).expanduser()):
+    data = workplace(root) / "data"
+    for folder in (data / text, Path(text).expanduser()):
         if text and folder.is_dir():
             folder = folder.resolve()
             if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.\-+]*", folder.name):
                 raise Refused(f"{folder}: a scene is called by its folder's name; use letters, digits and _ . - + only")
             return folder
-    known = sorted(p.name for p in (root / "data").glob("[!._]*/")) if (root / "data").is_dir() else []
+    known = sorted(p.name for p in data.glob("[!._]*/")) if data.is_dir() else []
+    demo = "`make demo` makes one" if not installed(root) else "`make demo` in a checkout of the project makes one"
     raise Refused(
         f"unknown scene {text!r}: there is no folder data/{text}, nor one at that path; "
-        f"known: {', '.join(known) or 'none'} (`make demo` makes one)"
+        f"known: {', '.join(known) or 'none'} ({demo})"
     )

@@ -162,6 +162,10 @@ def test_library(path):
         assert package not in names or named(path) in doors, f"only {' and '.join(doors)} import {package}"
 
 
+def test_the_command_starts_at_once():
+    assert outsiders(ROOT / "reffusion" / "command.py", set()) == set()
+
+
 @pytest.mark.parametrize("path", sources("report"), ids=named)
 def test_report_reads_through_io(path):
     own = {name for name in imports(path) if name.split(".")[0] in OWN - {"report"}}

@@ -1,0 +1,36 @@
+"""The command `reffusion`, for any folder: `reffusion plan|run|... --scene X` is the runner, `reffusion view|...` a
+module of report/. `python -m reffusion.command` is the same.
+
+Nothing but the standard library is imported here, so that the command starts at once.
+"""
+
+import runpy
+import sys
+from pathlib import Path
+
+REPORTS = {
+    "report": "report.job",
+    "compare-page": "report.compare",
+    "view": "report.view",
+    "turntable": "report.turntable",
+    "sheet": "report.sheet",
+}  # every other word is the runner's
+
+
+def root() -> Path:
+    """Where pipeline.yaml, stages/, runner/ and report/ are: in this package's `app` where it is installed, beside the
+    package in a checkout."""
+    here = Path(__file__).resolve().parent
+    return here / "app" if (here / "app").is_dir() else here.parent
+
+
+def main() -> None:
+    module = REPORTS.get(" ".join(sys.argv[1:2]), "runner")
+    if module != "runner":
+        del sys.argv[1]
+    sys.path.insert(0, str(root()))  # never this folder itself: its `io` and `types` would hide Python's own
+    runpy.run_module(module, run_name="__main__", alter_sys=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,107 @@
+"""The wheel: one package, that works from any folder as a checkout does."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from runner.keys import Hashes, code_of
+from runner.pipeline import load_pipeline
+
+ROOT = Path(__file__).resolve().parent.parent
+FOLDERS = ("reffusion", "stages", "runner", "report")
+BUILD = "import sys, setuptools.build_meta as build; build.build_wheel(sys.argv[1])"
+
+
+@pytest.fixture(scope="module")
+def unpacked(tmp_path_factory) -> Path:
+    """A folder with what the wheel would put among Python's packages."""
+    pytest.importorskip("setuptools", "77", reason="building a wheel needs setuptools 77 or later")
+    copy, out = tmp_path_factory.mktemp("copy"), tmp_path_factory.mktemp("out")  # building leaves folders behind
+    for name in (*FOLDERS, "priors"):
+        shutil.copytree(ROOT / name, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "pipeline.yaml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, copy)
+    for name in ("data/mine/photo.py", "tests/test_it.py", "runs/mine/note.json"):  # what must stay out
+        (copy / name).parent.mkdir(parents=True)
+        (copy / name).touch()
+    subprocess.run([sys.executable, "-c", BUILD, str(out)], cwd=copy, check=True, capture_output=True)
+    (wheel,) = out.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        assert len(set(archive.namelist())) == len(archive.namelist())
+        archive.extractall(out)
+    wheel.unlink()
+    return out
+
+
+def write_capture(folder: Path) -> None:
+    """Four photographs of 32 x 24 px from a row of cameras, and masks."""
+    (folder / "images").mkdir(parents=True)
+    (folder / "masks").mkdir()
+    frames = []
+    for k in range(4):
+        pose = [[1, 0, 0, 0.1 * k], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+        frames.append({"file_path": f"images/v{k}.png", "transform_matrix": pose})
+        Image.new("RGB", (32, 24), (40 + k, 80, 120)).save(folder / "images" / f"v{k}.png")
+        Image.new("L", (32, 24), 255).save(folder / "masks" / f"v{k}.png")
+    lens = {"w": 32, "h": 24, "fl_x": 30.0, "fl_y": 30.0, "cx": 16.0, "cy": 12.0}
+    (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
+
+
+def command(unpacked: Path, folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """`reffusion <arguments>` in a folder that has nothing to do with the project."""
+    environment = {**os.environ, "PYTHONPATH": str(unpacked)}
+    whole = [sys.executable, "-m", "reffusion.command", *arguments]
+    return subprocess.run(whole, cwd=folder, env=environment, capture_output=True, text=True)
+
+
+def test_all_is_in_one_package(unpacked):
+    assert sorted(path.suffix or path.name for path in unpacked.iterdir()) == [".dist-info", "reffusion"]
+    app = unpacked / "reffusion" / "app"
+    assert {path.name for path in app.iterdir()} == {"pipeline.yaml", "priors", *FOLDERS[1:]}
+    ours = [path for name in FOLDERS for path in (ROOT / name).rglob("*") if path.suffix in (".py", ".yaml")]
+    ours += [path for path in (ROOT / "priors" / "tiny").rglob("*") if path.suffix in (".json", ".safetensors")]
+    for path in ours:
+        inside = path.relative_to(ROOT)
+        there = unpacked if inside.parts[0] == "reffusion" else app
+        assert (there / inside).read_bytes() == path.read_bytes()
+    entries = next(unpacked.glob("*.dist-info/entry_points.txt")).read_text()
+    assert "reffusion = reffusion.command:main" in entries
+
+
+def test_stages_depend_on_the_same_code(unpacked, tmp_path):
+    """So that what a checkout made is taken, and what a new version does differently is made again."""
+    app, hashes = unpacked / "reffusion" / "app", Hashes(tmp_path / "hashes.json")
+    for stage in load_pipeline(ROOT).stages:
+        for folder in ("stages", "stages/plan"):
+            code = code_of(ROOT, stage, hashes, folder)
+            assert f"reffusion/params/{stage}.py" in code
+            assert code_of(app, stage, hashes, folder) == code
+
+
+def test_plan_in_any_folder(unpacked, tmp_path):
+    """data/ and runs/ are in the folder where the command is given."""
+    write_capture(tmp_path / "data" / "row")
+    done = command(unpacked, tmp_path, "plan", "--scene", "row", "--profile", "laptop")
+    assert done.returncode == 0, done.stderr
+    assert "run       poses" in done.stdout and "run       fit" in done.stdout and "4 masks" in done.stdout
+    assert (tmp_path / "runs").is_dir() and not (unpacked / "reffusion" / "app" / "runs").exists()
+
+
+def test_a_demo_scene_needs_a_checkout(unpacked, tmp_path):
+    done = command(unpacked, tmp_path, "run", "--scene", "demo")
+    assert done.returncode == 1 and len(done.stderr.splitlines()) == 1
+    assert "no folder data/demo" in done.stderr and "`make demo` in a checkout" in done.stderr
+
+
+def test_reports_are_commands_too(unpacked, tmp_path):
+    done = command(unpacked, tmp_path, "report", "--scene", "nothing")
+    assert done.returncode == 1 and "no stage has been done" in done.stderr and "Traceback" not in done.stderr
