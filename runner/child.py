@@ -48,9 +48,9 @@ def describe() -> None:
 
 
 def _describe(asked: dict[str, Any]) -> dict[str, Any]:
-    """What `resolve.Described` holds: where `brings` is given with the weights that are needed, where `scene` is with
-    the files of the scene it reads; where `needs` is the preview's "notes" or "refusal"; or {"broken": why}; or
-    {"errors": in the params, "known": names}."""
+    """What `resolve.Described` holds, where `scene` is given with the files of it that are read; where `brings` is the
+    weights that are "needed"; where `needs` is the preview's "notes" or "refusal"; or {"broken": why}; or {"errors": in
+    the params, "known": names}."""
     stage, needs, brings, scene = (asked.get(name) for name in ("stage", "needs", "brings", "scene"))
     path = _described_in(stage)
     try:

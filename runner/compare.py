@@ -13,8 +13,9 @@ from typing import Any
 from runner import Failed, Refused, say
 from runner.execute import run_scene
 from runner.files import RECEIPT, shown, write_json
+from runner.keys import HASHES, Hashes
 from runner.pipeline import Pipeline, find_scene, load_pipeline, unknown
-from runner.resolve import Memory, Request, resolve_all
+from runner.resolve import Request, resolve_all
 
 FULL = "full"  # what the scene's own run, without a variant, is called beside them
 RECORD = "compare.json"
@@ -33,9 +34,9 @@ def compare(request: Request, only: str = "", seeds: int = 1) -> int:
     scenes = _scenes(request, seeds)
     asks = lambda scene, method: replace(request, scene=scene, variant=None if method == FULL else method)
     requests = {(scene, method): asks(scene, method) for scene in scenes for method in methods}
-    memory = Memory(request.runs)
+    hashes = Hashes(request.runs / HASHES)
     # Wrong parameters of any variant, or of any scene, are refused before the first stage runs.
-    resolve_all([r for (scene, method), r in requests.items() if scene == scenes[0] or method == FULL], memory)
+    resolve_all([r for (scene, method), r in requests.items() if scene == scenes[0] or method == FULL], hashes)
     names = {scene: find_scene(scene, request.root).name for scene in scenes}
     runs = [{"scene": names[scene], "method": method, "state": WAITING} for scene, method in requests]
     record = {"scene": names[scenes[0]], "scenes": list(names.values()), "methods": methods, "runs": runs}
@@ -45,7 +46,7 @@ def compare(request: Request, only: str = "", seeds: int = 1) -> int:
         write_json(home / RECORD, record)
         minutes = (time.monotonic() - began) / 60
         say(f"\ncompare: {run['method']} on {run['scene']}, {number} of {len(runs)}, {minutes:.0f} min so far")
-        stages, error = _tried(asked, memory)
+        stages, error = _tried(asked, hashes)
         where = {stage: path and os.path.relpath(path, request.runs) for stage, path in stages.items()}
         run |= {"state": FAILED, "error": error} if error else {"state": DONE, "stages": where}
     write_json(home / RECORD, record)
@@ -57,10 +58,10 @@ def compare(request: Request, only: str = "", seeds: int = 1) -> int:
     return len(failed)
 
 
-def _tried(request: Request, memory: Memory) -> tuple[dict[str, Path | None], str | None]:
+def _tried(request: Request, hashes: Hashes) -> tuple[dict[str, Path | None], str | None]:
     """Run one: stage -> its artifact, and what went wrong."""
     try:
-        return run_scene(request, "all", memory), None
+        return run_scene(request, "all", hashes), None
     except (Refused, Failed) as error:
         print(f"error: {error}", file=sys.stderr, flush=True)
         return {}, str(error)
@@ -115,9 +116,9 @@ def batch(request: Request, folder: Path) -> int:
         raise Refused(f"data={folder}: no folders of scenes there")
     rows: dict[str, dict[str, float | None]] = {}
     failed: dict[str, str] = {}
-    memory = Memory(request.runs)
+    hashes = Hashes(request.runs / HASHES)
     for scene in scenes:
-        stages, error = _tried(replace(request, scene=str(scene)), memory)
+        stages, error = _tried(replace(request, scene=str(scene)), hashes)
         if error:
             failed[scene.name] = error
         else:

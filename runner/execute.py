@@ -16,10 +16,10 @@ from typing import Any
 
 from runner import Failed, Refused, say
 from runner.files import RECEIPT, discard, hand_out, locked, put_in_place, receipt, recover, shown, write_json
-from runner.keys import Inputs
+from runner.keys import Hashes, Inputs
 from runner.pipeline import SCENE
 from runner.plan import MACHINE, Decision, amount, decide, expected_seconds, partial_folder, plan, table
-from runner.resolve import Job, Memory, Request, child, resolve
+from runner.resolve import Job, Request, ask, child, resolve
 
 PACKAGES = ("reffusion", "numpy", "torch", "numba", "diffusers", "transformers", "peft", "pycolmap", "gsplat")
 GRACE = 20.0  # seconds an interrupted stage has to end by itself
@@ -45,7 +45,6 @@ def run_stage(job: Job, stage: str, decision: Decision, earlier: dict[str, Decis
     for other in job.home.glob(f".partial-{stage}-*"):
         discard(other)
     job.hashes.save()
-    job.memory.answers.clear()  # time has passed: what stages said of themselves may not hold any more
     return replace(decision, word="cached", reason="made now", path=place, settled=True)
 
 
@@ -124,11 +123,11 @@ def _installed() -> dict[str, str]:
     return found
 
 
-def run_scene(request: Request, target: str, memory: Memory | None = None) -> dict[str, Path | None]:
+def run_scene(request: Request, target: str, hashes: Hashes | None = None) -> dict[str, Path | None]:
     """Bring `target` and what it needs up to date; stage -> its artifact's folder, None where it is left out.
 
     Raises Refused before any work, Failed where a stage fails."""
-    job = resolve(request, memory)
+    job = resolve(request, hashes)
     stages = job.pipeline.closure(target)
     with ExitStack() as held:
         if job.home != job.base:
@@ -179,7 +178,8 @@ def weights(request: Request, offline: bool) -> int:
     """Show the weights of all stages, of a scene where one is named, and fetch what is missing unless `offline`; how
     many that a stage cannot do without are missing in the end."""
     job = resolve(request, scene=bool(request.scene))
-    all_needs = [(stage, need) for stage, each in job.stages.items() for need in each.needed]
+    answers = zip(job.stages, ask(job.root, list(map(job.question, job.stages))), strict=True)
+    all_needs = [(stage, need) for stage, answer in answers for need in answer.get("needed", ())]
     needs = {need["name"]: need for _, need in all_needs}
     users = {name: ", ".join(stage for stage, need in all_needs if need["name"] == name) for name in needs}
     missing = [need for need in needs.values() if need["problem"]]
@@ -197,6 +197,5 @@ def weights(request: Request, offline: bool) -> int:
     if offline or not to_fetch:
         return broken + sum(not need["optional"] for need in to_fetch)
     process = child(request.root, "fetch")
-    asked = {stage: {"params": each.params, "brings": job.brought} for stage, each in job.stages.items()}
-    process.communicate(json.dumps(asked))
+    process.communicate(json.dumps({stage: job.question(stage) for stage in job.stages}))
     return broken + process.returncode

@@ -33,9 +33,8 @@ def files_below(folder: Path) -> Iterator[Path]:
         folders[:] = [] if real in seen else sorted(f for f in folders if not f.startswith(".") and f != "__pycache__")
         seen.add(real)
         for name in sorted(names):
-            path = Path(place, name)
-            if not name.startswith(".") and path.is_file():
-                yield path
+            if not name.startswith(".") and os.path.isfile(path := os.path.join(place, name)):
+                yield Path(path)
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -13,6 +13,7 @@ from runner import Refused
 from runner.files import RECEIPT, files_below, installed
 
 OWN = ("reffusion", "stages")  # the packages whose modules count as a stage's code where it imports them
+HASHES = ".hashes.json"  # in runs/: where they are remembered
 NOT_CONTENT = (RECEIPT, "trace.jsonl", "checkpoint.pt", "checkpoint.pt.writing")
 NOT_WEIGHTS = (".md", ".py", ".png", ".jpg")  # a model's card, its pictures, the scripts that trained it
 
@@ -27,7 +28,8 @@ def digest(*parts: str) -> str:
 
 
 class Hashes:
-    """Hashes of files, remembered in a JSON file for as long as inode, size and time of change stay the same."""
+    """Hashes of files, remembered in a JSON file for as long as inode, size and time of change stay the same; beside
+    them what stages say of themselves (`resolve`)."""
 
     LIMIT = 100_000  # entries kept, the latest
 
@@ -64,7 +66,9 @@ class Hashes:
 
     def files(self, folder: Path, files: Iterable[Path]) -> str:
         """Names as seen from `folder` and contents of these files, in this order."""
-        return digest(*(part for path in files for part in (os.path.relpath(path, folder), self.file(path))))
+        top = os.path.join(folder, "")
+        name = lambda path: path[len(top) :] if path.startswith(top) else os.path.relpath(path, folder)
+        return digest(*(part for path in files for part in (name(str(path)), self.file(path))))
 
     def weights(self, folder: Path) -> str:
         """Of a model's folder: what a library may read of it. Writing in its card reruns nothing."""
@@ -142,15 +146,15 @@ def _named(path: Path, root: Path) -> Path:
 
 def _run_by(names: Iterable[str], path: Path, root: Path) -> Iterator[Path]:
     """The files of our own packages that importing `names` in the file at `path` runs."""
+    places = set()
     for name in names:
         level = len(name) - len(name.lstrip("."))
         package = _named(path, root).parts[:-level] if level else ()
         parts = (*package, *filter(None, name.lstrip(".").split(".")))
         if parts and parts[0] in OWN:
             base = _base(root, parts[0] == "reffusion")
-            for depth in range(1, len(parts) + 1):  # importing a.b.c runs a and a.b too
-                place = base.joinpath(*parts[:depth])
-                yield from (p for p in (place.with_suffix(".py"), place / "__init__.py") if p.is_file())
+            places |= {os.path.join(base, *parts[: n + 1]) for n in range(len(parts))}  # a.b.c runs a and a.b too
+    yield from (Path(p) for place in places for p in (f"{place}.py", f"{place}/__init__.py") if os.path.isfile(p))
 
 
 def code_of(root: Path, stage: str, hashes: Hashes, folder: str = "stages") -> dict[str, str]:

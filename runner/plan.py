@@ -15,7 +15,7 @@ from runner.pipeline import SCENE, Condition
 from runner.resolve import Job, ask, has_cuda
 
 MACHINE = platform.node()
-TO_DO = ("run", "stale", "undecided")
+TO_DO, SETTLED = ("run", "stale", "undecided"), ("cached", "provided", "skip")
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,7 @@ class Decision:
     settled: bool = False  # this artifact, or its absence, is final
     inputs: Inputs | None = None  # what the artifact depends on, where that is known
     notes: tuple[str, ...] = ()  # what the stage says of itself beforehand
+    needed: tuple[dict[str, Any], ...] = ()  # the weights it will work with: reffusion.weights.Need
 
 
 def decide(job: Job, stage: str, earlier: dict[str, Decision]) -> Decision:
@@ -142,21 +143,12 @@ def _compare(job: Job, stage: str, inputs: Inputs) -> Decision:
     return Decision("run", why + begun, places[0] if receipts else None, False, inputs)
 
 
-def _on_this_machine(job: Job, stage: str, decision: Decision) -> Decision:
+def _with_device(job: Job, stage: str, decision: Decision) -> Decision:
     """The decision, or `missing` for work on a GPU where there is none; what is cached holds on any machine."""
-    if decision.word not in TO_DO:
+    if decision.word not in TO_DO or job.params[stage].get("device") != "cuda" or has_cuda():
         return decision
-    if job.params[stage].get("device") == "cuda" and not has_cuda():
-        cure = f'profile=laptop, or set="{stage}.device=cpu"'
-        return Decision("missing", f"{stage}.device is cuda, and this machine has no CUDA driver: {cure}")
-    lacks = [need for need in job.stages[stage].needed if need["problem"]]
-    for need in (need for need in lacks if not need["optional"]):
-        fetch = f"; `make weights profile={job.profile}` fetches it ({amount(need['bytes'])})"
-        return Decision("missing", need["problem"] + (fetch if need["fetched"] else ""))
-    if lacks:
-        fetch = f"`make weights profile={job.profile}` fetches it ({amount(sum(need['bytes'] or 0 for need in lacks))})"
-        return replace(decision, notes=(f"{lacks[0]['problem']}; {fetch}",))
-    return decision
+    cure = f'profile=laptop, or set="{stage}.device=cpu"'
+    return Decision("missing", f"{stage}.device is cuda, and this machine has no CUDA driver: {cure}")
 
 
 def amount(count: int | None) -> str:
@@ -177,35 +169,47 @@ def _listed(said: list[str], most: int = 3) -> str:
 
 
 def plan(job: Job, stages: list[str], done: dict[str, Decision] | None = None) -> dict[str, Decision]:
-    """The words for `stages`, in order; `done` holds those already settled. Asks the stages for their notes."""
+    """The words for `stages`, in order; `done` holds those already settled. Asks those that may run, each time anew,
+    for their notes and the weights they need."""
     decisions = dict(done or {})
     for stage in stages:
         if stage not in decisions:
-            decisions[stage] = _on_this_machine(job, stage, decide(job, stage, decisions))
-    asked = []
-    for stage in stages:
-        spec, needs = job.pipeline.stages[stage], _previewed(job, stage, decisions)
-        if decisions[stage].word in TO_DO and (SCENE in needs or all(needs[need] for need in spec.needs)):
-            paths = {need: path and str(path) for need, path in needs.items()}
-            asked.append({"stage": stage, "params": job.params[stage], "takes": spec.takes, "needs": paths})
+            decisions[stage] = _with_device(job, stage, decide(job, stage, decisions))
+    asked = [_question(job, stage, decisions) for stage in stages if decisions[stage].word not in SETTLED]
     for question, answer in zip(asked, ask(job.root, asked), strict=True):
-        stage, notes, refusal = question["stage"], answer.get("notes", ()), answer.get("refusal")
-        decisions[stage] = replace(decisions[stage], notes=(*notes, *decisions[stage].notes))
-        # what it looked at is what it will be
-        if refusal and (decisions[stage].inputs or SCENE in question["takes"]):
-            decisions[stage] = replace(decisions[stage], word="missing", reason=refusal)
+        if "broken" in answer and not done:  # while a job runs, it may be mended before its turn comes
+            raise Refused(answer["broken"])
+        decisions[question["stage"]] = _answered(job, question, decisions[question["stage"]], answer)
     job.hashes.save()
     return {stage: decisions[stage] for stage in stages}
 
 
-def _previewed(job: Job, stage: str, decisions: dict[str, Decision]) -> dict[str, Path | None]:
-    """What a stage may look at beforehand: its needs as they stand. One that reads the scene is asked, and may refuse,
-    before its other needs are made; of these it is shown only what will not change any more."""
-    takes = job.pipeline.stages[stage].takes
-    others = {need: decisions[need] for need in takes if need != SCENE}
-    if SCENE not in takes:
-        return {need: decision.path for need, decision in others.items()}
-    return {SCENE: job.folder} | {need: each.path if each.settled else None for need, each in others.items()}
+def _question(job: Job, stage: str, decisions: dict[str, Decision]) -> dict[str, Any]:
+    """See `child.describe`. What may run is shown its needs as they stand, for a preview. One that reads the scene is
+    asked, and may refuse, before its other needs are made; of these it is shown only what will not change any more."""
+    spec, question = job.pipeline.stages[stage], job.question(stage)
+    others = {need: decisions[need] for need in spec.takes if need != SCENE}
+    needs = {need: each.path for need, each in others.items() if each.settled or SCENE not in spec.takes}
+    needs |= {SCENE: job.folder} if SCENE in spec.takes else {}
+    if decisions[stage].word in TO_DO and (SCENE in needs or all(map(needs.get, spec.needs))):
+        question["needs"] = {need: str(path) if (path := needs.get(need)) else None for need in spec.takes}
+    return question
+
+
+def _answered(job: Job, question: dict[str, Any], decision: Decision, answer: dict[str, Any]) -> Decision:
+    """The decision with what the stage says of itself; `missing` where it refuses, or lacks weights."""
+    needed, notes = (tuple(answer.get(name, ())) for name in ("needed", "notes"))
+    if decision.word not in TO_DO:
+        return replace(decision, needed=needed)
+    cure, lacks = f"`make weights profile={job.profile}` fetches it", [need for need in needed if need["problem"]]
+    for need in (need for need in lacks if not need["optional"]):
+        fetch = f"; {cure} ({amount(need['bytes'])})" if need["fetched"] else ""
+        return Decision("missing", need["problem"] + fetch, needed=needed)
+    if lacks:
+        notes += (f"{lacks[0]['problem']}; {cure} ({amount(sum(need['bytes'] or 0 for need in lacks))})",)
+    if "refusal" in answer and (decision.inputs or SCENE in question["takes"]):  # it looked at what will be
+        decision = replace(decision, word="missing", reason=answer["refusal"])
+    return replace(decision, notes=notes, needed=needed)
 
 
 def table(job: Job, decisions: dict[str, Decision]) -> str:
@@ -216,8 +220,7 @@ def table(job: Job, decisions: dict[str, Decision]) -> str:
         time = f"~{seconds:.0f} s" if seconds is not None else ""
         lines.append(f"  {decision.word:<9} {stage:<12} {time:>7}  {decision.reason}".rstrip())
         lines += [f"{'':33}{note}" for note in decision.notes]
-    to_come = [stage for stage, decision in decisions.items() if decision.word not in ("cached", "provided", "skip")]
-    needs = {need["name"]: need for stage in to_come for need in job.stages[stage].needed if need["problem"]}
+    needs = {need["name"]: need for decision in decisions.values() for need in decision.needed if need["problem"]}
     if sizes := [need["bytes"] or 0 for need in needs.values() if need["fetched"] and not need["optional"]]:
         lines.append(f"  weights to fetch: {amount(sum(sizes))}, by `make weights profile={job.profile}`")
     return "\n".join(lines)

@@ -11,11 +11,13 @@ from typing import Any
 
 from runner import Refused
 from runner.files import files_below
-from runner.keys import Hashes, code_of, digest, outside
+from runner.keys import HASHES, Hashes, code_of, digest, outside
 from runner.layers import Layers, layered, parse_set, seconds_of, shared_out
 from runner.pipeline import SCENE, Pipeline, SceneFile, find_scene, load_pipeline, load_scene_file, read_yaml, unknown
 
 AUTO = "auto"  # the profile that this machine can do
+CHILD = Path(__file__).with_name("child.py")
+LASTING = "told "  # before the names of answers that are remembered
 RENAMED = Path("runner", "renamed.yaml")  # old dotted name of a parameter: the new one, or what became of it
 
 
@@ -33,14 +35,6 @@ class Request:
     budget: str | None = None
 
 
-class Memory:
-    """What the jobs of one command share: hashes of files, and `answers` of stages, until a stage has run."""
-
-    def __init__(self, runs: Path):
-        self.hashes = Hashes(runs / ".hashes.json")
-        self.answers: dict[str, Any] = {}
-
-
 @dataclass(frozen=True)
 class Described:
     """What a stage says of itself."""
@@ -48,7 +42,6 @@ class Described:
     params: dict[str, Any]  # every parameter, groups nested
     weights: tuple[str, ...] = ()  # dotted names of the parameters that name weights
     unkeyed: tuple[str, ...] = ()  # and of those that change nothing in the artifact
-    needed: tuple[dict[str, Any], ...] = ()  # the weights it works with: reffusion.weights.Need
     reads: tuple[str, ...] | None = None  # the files of the scene that it reads; None for all of them
 
 
@@ -67,42 +60,41 @@ class Job:
     why: str  # what made the choice of the profile
     trust: bool
     brings: frozenset[str]  # the keys of scene.yaml that have values
-    memory: Memory
+    hashes: Hashes
     stages: dict[str, Described] = field(default_factory=dict)
     broken: dict[str, str] = field(default_factory=dict)  # stages that cannot be described -> what is wrong
-
-    @property
-    def brought(self) -> list[str]:
-        """What the scene brings of itself: the keys of its scene.yaml, and the names of its folders."""
-        folders = self.folder.iterdir() if self.folder != self.root else ()
-        return sorted({*self.brings, *(path.name for path in folders if path.is_dir())})
-
-    @property
-    def hashes(self) -> Hashes:
-        return self.memory.hashes
 
     @property
     def params(self) -> dict[str, dict[str, Any]]:
         """stage -> every parameter."""
         return {stage: each.params for stage, each in self.stages.items()}
 
+    def question(self, stage: str) -> dict[str, Any]:
+        """What a stage is asked for the weights it works with: see `child.describe`. They depend on what the scene
+        brings of itself, the keys of its scene.yaml and its folders, and come and go."""
+        folders = [path.name for path in self.folder.iterdir() if path.is_dir()] if self.folder != self.root else ()
+        asked = {"stage": stage, "params": self.stages[stage].params, "takes": self.pipeline.stages[stage].takes}
+        return asked | {"brings": sorted({*self.brings, *folders})}
 
-def resolve(request: Request, memory: Memory | None = None, scene: bool = True) -> Job:
+
+def resolve(request: Request, hashes: Hashes | None = None, scene: bool = True) -> Job:
     """Read and check everything a request names; without `scene` that of no scene in particular.
 
     Raises Refused with one line that says what would fix it."""
-    return resolve_all([request], memory or Memory(request.runs), scene)[0]
+    return resolve_all([request], hashes or Hashes(request.runs / HASHES), scene)[0]
 
 
-def resolve_all(requests: list[Request], memory: Memory, scene: bool = True) -> list[Job]:
-    """The same for several of one root, whose stages are asked all at once."""
-    drafts = [_draft(request, memory, scene) for request in requests]
+def resolve_all(requests: list[Request], hashes: Hashes, scene: bool = True) -> list[Job]:
+    """The same for several of one root. Stages are asked all at once, and only what they have not answered before."""
+    drafts = [_draft(request, hashes, scene) for request in requests]
     asked = [_questions(job) for job in drafts]
-    ask(requests[0].root, [question for each in asked for question in each], memory.answers)
-    return [_described(job, questions) for job, questions in zip(drafts, asked, strict=True)]
+    new = {name: question for each in asked for name, question in each.items() if name not in hashes.known}
+    answers = dict(zip(new, ask(requests[0].root, list(new.values())), strict=True))
+    hashes.known |= {name: said for name, said in answers.items() if name.startswith(LASTING) and "params" in said}
+    return [_described(job, each, hashes.known | answers) for job, each in zip(drafts, asked, strict=True)]
 
 
-def _draft(request: Request, memory: Memory, scene: bool) -> Job:
+def _draft(request: Request, hashes: Hashes, scene: bool) -> Job:
     """A job that does not know its stages yet."""
     root, runs, variant, pipeline = request.root, request.runs, request.variant, load_pipeline(request.root)
     folder = find_scene(request.scene, root) if scene else None
@@ -119,7 +111,7 @@ def _draft(request: Request, memory: Memory, scene: bool) -> Job:
         origin, text = ("budget", request.budget) if request.budget else (str(found.path), found.budget)
         layers = layered(*given, shared_out(pipeline, layers.values, seconds_of(text, origin)))
     keys = frozenset(found.brings)
-    return Job(root, runs, folder or root, home, base, pipeline, layers, profile, why, request.trust, keys, memory)
+    return Job(root, runs, folder or root, home, base, pipeline, layers, profile, why, request.trust, keys, hashes)
 
 
 def choose_profile(asked: str | None, scene: SceneFile, pinned: list[Path], pipeline: Pipeline) -> tuple[str, str]:
@@ -162,59 +154,57 @@ def child(root: Path, *arguments: str, **options: Any) -> subprocess.Popen[str]:
     return subprocess.Popen(command, cwd=root, env=environment, stdin=subprocess.PIPE, text=True, **options)
 
 
-def ask(root: Path, questions: list[dict[str, Any]], answers: dict[str, Any] | None = None) -> list[dict[str, Any]]:
-    """The answer to each: see `child.describe`. What is in `answers` already is not asked again; what is new joins."""
-    answers = {} if answers is None else answers
-    names = [json.dumps(question) for question in questions]
-    if new := [name for name in dict.fromkeys(names) if name not in answers]:
-        process = child(root, "describe", stdout=subprocess.PIPE)
-        said, _ = process.communicate(f"[{','.join(new)}]")
-        if process.returncode:
-            raise Refused("the stages could not be asked for their parameters (see above)")
-        answers.update(zip(new, json.loads(said), strict=True))
-    return [answers[name] for name in names]
+def ask(root: Path, questions: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The answer to each, from one process (none where there is no question): see `child.describe`."""
+    if not questions:
+        return []
+    process = child(root, "describe", stdout=subprocess.PIPE)
+    said, _ = process.communicate(json.dumps(questions))
+    if process.returncode:
+        raise Refused("the stages could not be asked for their parameters (see above)")
+    return json.loads(said)
 
 
-def _questions(job: Job) -> list[dict[str, Any]]:
-    """What the stages that have a file are asked: see `child.describe`."""
-    questions = []
-    for name, spec in job.pipeline.stages.items():
-        if (job.root / "stages" / f"{name}.py").is_file():
-            question = {"stage": name, "params": job.layers.values[name], "brings": job.brought, "takes": spec.takes}
+def _questions(job: Job) -> dict[str, dict[str, Any]]:
+    """What the stages that have a file are asked (see `child.describe`), each under the name of its answer."""
+    questions = {}
+    for stage, spec in job.pipeline.stages.items():
+        if (job.root / "stages" / f"{stage}.py").is_file():
+            question = {"stage": stage, "params": job.layers.values[stage], "takes": spec.takes}
             if SCENE in spec.takes and job.folder != job.root:
-                question["state"] = _state(job, name)
-                question["scene"] = None if question["state"] in job.hashes.known else str(job.folder)
-            questions.append(question)
+                question["scene"] = str(job.folder)
+            questions[_name(job, question)] = question
     return questions
 
 
-def _state(job: Job, stage: str) -> str | None:
-    """A name for all that decides which files of the scene a stage reads, which may take it a second to find out; None
-    where files elsewhere may have a say."""
-    params, plan = job.layers.values[stage], "stages/plan"
-    if any(outside(params, job.folder)):
-        return None
-    code = code_of(job.root, stage, job.hashes, plan if (job.root / plan / f"{stage}.py").is_file() else "stages")
-    files = [(str(path), (stat := path.stat()).st_size, stat.st_mtime_ns) for path in files_below(job.folder)]
-    return "reads " + digest(json.dumps([stage, params, code, files]))
+def _name(job: Job, question: dict[str, Any]) -> str:
+    """The same for as long as nothing changes that decides the answer, which is remembered under a LASTING name: to
+    start a process that imports stages takes half a second, and so may finding out which files of a scene one reads."""
+    stage, plan, listed = question["stage"], "stages/plan", files_below(job.folder) if "scene" in question else ()
+    try:
+        code = code_of(job.root, stage, job.hashes, plan if (job.root / plan / f"{stage}.py").is_file() else "stages")
+        code["run"] = job.hashes.module(job.root / "stages" / f"{stage}.py", job.root)[0]
+    except Refused:  # it is no Python, and is said to be broken
+        return json.dumps(question)
+    if "scene" in question and any(outside(question["params"], job.folder)):  # files elsewhere may have a say
+        return json.dumps(question)
+    files = [(str(path), (stat := path.stat()).st_size, stat.st_mtime_ns) for path in listed]
+    return LASTING + digest(json.dumps([question, code, job.hashes.file(CHILD), files]))
 
 
-def _described(job: Job, questions: list[dict[str, Any]]) -> Job:
+def _described(job: Job, questions: dict[str, dict[str, Any]], answers: dict[str, Any]) -> Job:
     """The job with its stages. Raises Refused for the first parameter that is wrong."""
     broken = {name: f"stages/{name}.py: no such file, and pipeline.yaml names it" for name in job.pipeline.stages}
     stages = {}
-    for question, answer in zip(questions, ask(job.root, questions, job.memory.answers), strict=True):
-        stage = question["stage"]
+    for name, question in questions.items():
+        stage, answer = question["stage"], answers[name]
         for error in answer.get("errors", ()):
             origin = job.layers.origin(stage, error["where"])
             raise Refused(f"{origin}: {_refusal(job.root, stage, error, answer['known'])}")
         if "broken" in answer:
             broken[stage] = answer["broken"]
         else:
-            state, reads = question.get("state"), answer.get("reads")
-            if state and reads is not None:
-                job.hashes.known[state] = reads
-            stages[stage] = Described(**answer | {"reads": job.hashes.known.get(state, reads)})
+            stages[stage] = Described(**answer)
             del broken[stage]
     return replace(job, stages=stages, broken=broken)
 

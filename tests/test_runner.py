@@ -841,15 +841,44 @@ def test_a_run_that_does_not_fit_its_needs_is_refused_without_importing_it(fresh
 # ------------------------------------------------------------------------------------------------------------- asking
 
 
-def test_stages_are_asked_once_for_the_same_inputs(root, capsys, monkeypatch):
+@pytest.fixture
+def started(monkeypatch) -> list[str]:
+    """What each process is started for that imports stages."""
     started, child = [], resolving.child
-    monkeypatch.setattr(resolving, "child", lambda *given, **how: started.append(given) or child(*given, **how))
+    monkeypatch.setattr(resolving, "child", lambda *given, **how: started.append(given[1]) or child(*given, **how))
+    return started
+
+
+def test_stages_are_asked_once_for_the_same_inputs(root, capsys, started):
     assert compare.compare(request(root), "full,same") == 0
     assert len(started) == 1 and ": done in" not in capsys.readouterr().out
     edit(root / "data/toy/number.txt", "4", "5")
     assert compare.compare(request(root), "full,same") == 0
-    described = [given for given in started[1:] if given[1] == "describe"]
-    assert len(described) > 1  # after a stage has run, what they said may not hold
+    assert len(started) > 2  # which files are read, as the scene changed; what the run will do, as far as it is known
+
+
+def test_what_a_stage_says_of_its_parameters_is_remembered_until_its_code_changes(root, started):
+    words(root)  # in this folder for the first time
+    del started[:]
+    assert set(words(root).values()) == {"cached"} and started == []
+    assert words(root, set="fit.rate=3")["fit"] == "run param rate 2 -> 3" and started == ["describe"] * 2
+    assert words(root, set="fit.rate=3")["fit"].startswith("run") and started == ["describe"] * 3  # its preview anew
+    edit(root / "stages/fit.py", "rate: int = 1", "rate: int = 1\n    slope: int = 1")
+    assert words(root)["fit"] == "run param slope is new, code of stages/fit.py changed"
+    assert words(root, set="fit.slope=2")["poses"] == "cached"
+    write(root, {"stages/fit.py": "import nowhere"})
+    with pytest.raises(Refused, match=r"stages/fit.py: ModuleNotFoundError"):
+        words(root)
+
+
+def test_a_stage_that_was_described_and_cannot_be_imported_any_more_is_refused_before_any_work(fresh):
+    edit(fresh / "stages/distill.py", "from pydantic", "import installed\nfrom pydantic")
+    write(fresh, {"installed.py": ""})
+    assert words(fresh)["distill"].startswith("undecided")
+    (fresh / "installed.py").unlink()
+    with pytest.raises(Refused, match=r"stages/distill.py: ModuleNotFoundError.*installed"):
+        run_scene(request(fresh), "all")
+    assert not (fresh / "runs/toy/poses").exists()
 
 
 def test_which_files_a_stage_reads_is_asked_again_only_where_something_changed(root):
