@@ -24,6 +24,17 @@ def root() -> Path:
     return here / "app" if (here / "app").is_dir() else here.parent
 
 
+def installed(root: Path) -> bool:
+    """Is `root` the folder `app` inside an installed package `reffusion`, and not a checkout, where both lie side by
+    side?"""
+    return root.parts[-2:] == ("reffusion", "app") and not (root / "reffusion").is_dir()
+
+
+def workplace(root: Path) -> Path:
+    """Where data/ and runs/ are: a checkout's root; the current folder where an installed version is used."""
+    return Path.cwd() if installed(root) else root
+
+
 def main() -> None:
     module = REPORTS.get(" ".join(sys.argv[1:2]), "runner")
     if module != "runner":

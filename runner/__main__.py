@@ -1,4 +1,5 @@
-"""reffusion plan|run|compare|batch|weights|clean --scene NAME: what the Makefile calls (or python -m runner)."""
+"""reffusion plan|run|compare|batch|weights|clean --scene NAME: what the Makefile calls (or python -m runner).
+Pages of what was made: reffusion report|compare-page|view|turntable|sheet, each with --help."""
 
 import argparse
 import os
@@ -6,11 +7,12 @@ import signal
 import sys
 from pathlib import Path
 
+from reffusion.command import workplace
 from runner import Failed, Refused
 from runner.child import INTERRUPTED
 from runner.compare import batch, compare, show_results
 from runner.execute import clean, run_scene, weights
-from runner.files import workplace, write_json
+from runner.files import write_json
 from runner.plan import as_record, plan, table
 from runner.resolve import Request, resolve
 
@@ -56,8 +58,7 @@ def main() -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    others = "pages of what was made: reffusion report|compare-page|view|turntable|sheet, each with --help"
-    parser = argparse.ArgumentParser(prog="reffusion", description=__doc__, epilog=others)
+    parser = argparse.ArgumentParser(prog="reffusion", description=__doc__)
     parser.add_argument("command", choices=["plan", "run", "compare", "batch", "weights", "clean"])
     parser.add_argument("stage", nargs="?", default="all", help="run this stage and what it needs; `all` (default)")
     parser.add_argument("--scene", default="", help="a name under data/, or a path")

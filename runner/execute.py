@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from runner import Failed, Refused, say
-from runner.files import RECEIPT, discard, hand_out, locked, put_in_place, receipt, recover, shown, write_json
+from runner.files import RECEIPT, discard, hand_out, locked, put_in_place, read_json, recover, shown, write_json
 from runner.keys import Hashes, Inputs
 from runner.pipeline import SCENE
 from runner.plan import MACHINE, Decision, amount, decide, expected_seconds, partial_folder, plan, table
@@ -51,9 +51,9 @@ def run_stage(job: Job, stage: str, decision: Decision, earlier: dict[str, Decis
 def copied_from_variant(job: Job, stage: str, key: str, to: Path) -> str | None:
     """Where another variant of the scene has done this very work, copy it; that variant's folder, or None."""
     for home in sorted(job.runs.glob(f"{job.base.name}@*")):
-        if home != job.home and (receipt(home / stage) or {}).get("key") == key:
+        if home != job.home and (read_json(home / stage / RECEIPT) or {}).get("key") == key:
             with suppress(Refused), locked(job.runs, home.name, shared=True, wait=False):
-                copy, found = job.home / f".copying-{stage}", receipt(home / stage)
+                copy, found = job.home / f".copying-{stage}", read_json(home / stage / RECEIPT)
                 discard(copy)
                 if found and found["key"] == key and job.hashes.folder(home / stage) == found["output"]:
                     shutil.copytree(home / stage, copy)

@@ -1,6 +1,7 @@
 """Folders on the disk: their files, locks, swaps that survive a kill, and copies that people work with."""
 
 import fcntl
+import filecmp
 import json
 import os
 import shutil
@@ -12,17 +13,6 @@ from typing import Any
 from runner import Refused, say
 
 RECEIPT = "receipt.json"
-
-
-def installed(root: Path) -> bool:
-    """Is `root` the folder `app` inside an installed package `reffusion`, and not a checkout, where both lie side by
-    side?"""
-    return root.parts[-2:] == ("reffusion", "app") and not (root / "reffusion").is_dir()
-
-
-def workplace(root: Path) -> Path:
-    """Where data/ and runs/ are: a checkout's root; the current folder where an installed version is used."""
-    return Path.cwd() if installed(root) else root
 
 
 def files_below(folder: Path) -> Iterator[Path]:
@@ -44,10 +34,10 @@ def write_json(path: Path, content: Any) -> None:
     os.replace(partial, path)
 
 
-def receipt(folder: Path) -> dict[str, Any] | None:
-    """What an artifact's folder says of how it was made; None where it is no whole artifact."""
+def read_json(path: Path) -> Any:
+    """What a file holds; None where it is none, or not whole."""
     try:
-        return json.loads((folder / RECEIPT).read_text())
+        return json.loads(path.read_text())
     except (OSError, ValueError):
         return None
 
@@ -114,7 +104,8 @@ def hand_out(made: Path, before: Path, home: Path, names: tuple[str, ...]) -> It
     person changed or added stays as it is."""
     for name in names:
         for path in list(files_below(home / name)):
-            if any(_same(path, artifact / path.relative_to(home)) for artifact in (before, made)):
+            twins = [artifact / path.relative_to(home) for artifact in (before, made)]
+            if any(twin.is_file() and filecmp.cmp(path, twin, shallow=False) for twin in twins):
                 path.unlink()
         kept = [path.relative_to(home) for path in files_below(home / name)]
         for path in files_below(made / name):
@@ -123,7 +114,3 @@ def hand_out(made: Path, before: Path, home: Path, names: tuple[str, ...]) -> It
                 (home / relative).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy2(path, home / relative)
         yield from (f"{home.name}/{relative} was changed by hand: kept" for relative in kept)
-
-
-def _same(one: Path, other: Path) -> bool:
-    return other.is_file() and one.stat().st_size == other.stat().st_size and one.read_bytes() == other.read_bytes()

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from reffusion.command import installed
 from runner import Refused
-from runner.files import RECEIPT, files_below, installed
+from runner.files import RECEIPT, files_below, read_json
 
 OWN = ("reffusion", "stages")  # the packages whose modules count as a stage's code where it imports them
 HASHES = ".hashes.json"  # in runs/: where they are remembered
@@ -35,10 +36,7 @@ class Hashes:
 
     def __init__(self, path: Path):
         self.path = path
-        try:
-            self.known: dict[str, Any] = json.loads(path.read_text())
-        except (OSError, ValueError):
-            self.known = {}
+        self.known: dict[str, Any] = read_json(path) or {}
         self._saved = len(self.known)
         self._runs: dict[tuple[Path, str], list[Path]] = {}  # a module with its fingerprint -> see `module`
 
@@ -50,7 +48,11 @@ class Hashes:
         return self.known[name]
 
     def file(self, path: Path) -> str:
-        return self._remember("file", path, _file_digest)
+        def content(path: Path) -> str:
+            with open(path, "rb") as file:
+                return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=10)).hexdigest()
+
+        return self._remember("file", path, content)
 
     def module(self, path: Path, root: Path) -> tuple[str, list[Path]]:
         """The fingerprint of a Python file, and those files below `root` that its imports run."""
@@ -83,11 +85,6 @@ class Hashes:
         partial.write_text(json.dumps(kept))
         os.replace(partial, self.path)
         self._saved = len(self.known)
-
-
-def _file_digest(path: Path) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=10)).hexdigest()
 
 
 def outside(value: Any, folder: Path) -> Iterator[Path]:
@@ -134,14 +131,9 @@ def _imported(tree: ast.AST) -> Iterator[str]:
             yield from _imported(node)
 
 
-def _base(root: Path, library: bool) -> Path:
-    """The folder that modules are named from: the root, but for those of the library where it is installed, for it
-    then holds the root."""
-    return root.parents[1] if library and installed(root) else root
-
-
 def _named(path: Path, root: Path) -> Path:
-    return path.relative_to(_base(root, not path.is_relative_to(root)))
+    """From the root; a module of the library from beside it where it is installed, for it then holds the root."""
+    return path.relative_to(root if path.is_relative_to(root) else root.parents[1])
 
 
 def _run_by(names: Iterable[str], path: Path, root: Path) -> Iterator[Path]:
@@ -152,7 +144,7 @@ def _run_by(names: Iterable[str], path: Path, root: Path) -> Iterator[Path]:
         package = _named(path, root).parts[:-level] if level else ()
         parts = (*package, *filter(None, name.lstrip(".").split(".")))
         if parts and parts[0] in OWN:
-            base = _base(root, parts[0] == "reffusion")
+            base = root.parents[1] if parts[0] == "reffusion" and installed(root) else root
             places |= {os.path.join(base, *parts[: n + 1]) for n in range(len(parts))}  # a.b.c runs a and a.b too
     yield from (Path(p) for place in places for p in (f"{place}.py", f"{place}/__init__.py") if os.path.isfile(p))
 

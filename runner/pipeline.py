@@ -10,8 +10,8 @@ from typing import Annotated, Any, Self
 import yaml
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_validator
 
+from reffusion.command import workplace
 from runner import Refused
-from runner.files import installed, workplace
 
 SCENE = "scene"  # the need that stands for the scene's own folder
 LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the one in C takes a tenth of the time
@@ -195,8 +195,7 @@ def find_scene(text: str, root: Path) -> Path:
                 raise Refused(f"{folder}: a scene is called by its folder's name; use letters, digits and _ . - + only")
             return folder
     known = sorted(p.name for p in data.glob("[!._]*/")) if data.is_dir() else []
-    demo = "`make demo` makes one" if not installed(root) else "`make demo` in a checkout of the project makes one"
     raise Refused(
         f"unknown scene {text!r}: there is no folder data/{text}, nor one at that path; "
-        f"known: {', '.join(known) or 'none'} ({demo})"
+        f"known: {', '.join(known) or 'none'} (`make demo` makes one, in a checkout)"
     )

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from runner import Refused
-from runner.files import RECEIPT, files_below, receipt
+from runner.files import RECEIPT, files_below, read_json
 from runner.keys import Inputs, changes, code_changes, code_of, leaves, outside
 from runner.pipeline import SCENE, Condition
 from runner.resolve import Job, ask, has_cuda
@@ -62,7 +62,7 @@ def decide(job: Job, stage: str, earlier: dict[str, Decision]) -> Decision:
     moving = [need for need, decision in needs.items() if not decision.settled]
     if moving:
         path = _there(job, stage)
-        found = path and receipt(path)
+        found = path and read_json(path / RECEIPT)
         if not found:
             return Decision("run", "no artifact yet")
         as_then = Inputs(job.params[stage], found["needs"], found["weights"], code, job.stages[stage].unkeyed)
@@ -128,7 +128,7 @@ def _inputs(job: Job, stage: str, needs: dict[str, Path | None], code: dict[str,
 def _compare(job: Job, stage: str, inputs: Inputs) -> Decision:
     """Cached where a receipt differs in nothing (the variant's own, else the base's); else run, and why."""
     places = [home / stage for home in dict.fromkeys((job.home, job.base))]
-    receipts = [(place, found, changes(found, inputs)) for place in places if (found := receipt(place))]
+    receipts = [(place, found, changes(found, inputs)) for place in places if (found := read_json(place / RECEIPT))]
     for place, found, differs in receipts:
         if not differs:
             said = [] if place.parent == job.home else [f"shared with {job.base.name}"]
@@ -236,6 +236,6 @@ def as_record(job: Job, decisions: dict[str, Decision]) -> dict[str, Any]:
 def expected_seconds(job: Job, stage: str) -> float | None:
     """What the stage last took for this scene, or a variant of it, on this machine with this profile."""
     places = [job.runs / job.base.name, *job.runs.glob(f"{job.base.name}@*")]
-    found = [r for place in places if (r := receipt(place / stage))]
+    found = [r for place in places if (r := read_json(place / stage / RECEIPT))]
     here = [r for r in found if r["machine"] == MACHINE and r["profile"] == job.profile]
     return max(here, key=lambda r: r["date"])["seconds"] if here else None

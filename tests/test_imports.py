@@ -89,7 +89,9 @@ def named(path: Path) -> str:
 
 @pytest.mark.parametrize("path", sources("runner"), ids=named)
 def test_runner_knows_nothing_of_3d(path):
-    assert outsiders(path, {"runner", "pydantic", "yaml"}) == set()
+    assert outsiders(path, {"runner", "reffusion", "pydantic", "yaml"}) == set()
+    own = {name for name in imports(path) if name.split(".")[0] == "reffusion"}
+    assert own <= {"reffusion.command", "reffusion.command.installed", "reffusion.command.workplace"}
 
 
 @pytest.mark.parametrize("path", sources("stages"), ids=named)

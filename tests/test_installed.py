@@ -99,7 +99,7 @@ def test_plan_in_any_folder(unpacked, tmp_path):
 def test_a_demo_scene_needs_a_checkout(unpacked, tmp_path):
     done = command(unpacked, tmp_path, "run", "--scene", "demo")
     assert done.returncode == 1 and len(done.stderr.splitlines()) == 1
-    assert "no folder data/demo" in done.stderr and "`make demo` in a checkout" in done.stderr
+    assert "no folder data/demo" in done.stderr and "`make demo` makes one, in a checkout" in done.stderr
 
 
 def test_reports_are_commands_too(unpacked, tmp_path):

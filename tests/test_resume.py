@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from runner.keys import Hashes
-from runner.plan import receipt
+from runner.files import RECEIPT, read_json
 
 ROOT = Path(__file__).resolve().parent.parent
 KILLS = int(os.environ.get("RESUME_KILLS", "3"))
@@ -68,7 +68,7 @@ def assert_whole(home: Path) -> None:
     """Every artifact in place is one that a stage finished."""
     for stage in ("poses", *STAGES):
         if (home / stage).exists():
-            found = receipt(home / stage)
+            found = read_json(home / stage / RECEIPT)
             assert found and Hashes(home / "none").folder(home / stage) == found["output"], stage
 
 
@@ -82,7 +82,7 @@ def scene(tmp_path_factory) -> Path:
 
 def test_killed_at_random_moments(scene, tmp_path):
     unbroken = finish(scene, tmp_path / "unbroken")
-    seconds = {stage: receipt(tmp_path / "unbroken/mini" / stage)["seconds"] for stage in STAGES}
+    seconds = {stage: read_json(tmp_path / "unbroken/mini" / stage / RECEIPT)["seconds"] for stage in STAGES}
     random = np.random.default_rng(0)
     killed = 0
     for stage in sorted((IN_TURN[i % len(IN_TURN)] for i in range(KILLS)), key=STAGES.index):
