@@ -18,13 +18,14 @@ from reffusion.initialize.settle import Known, settle
 from reffusion.io.arrays import load_json, load_labels, save_json, save_labels
 from reffusion.io.images import save_exr, save_image, save_mask
 from reffusion.io.ply import load_ply, save_ply
-from reffusion.io.scene import load_mask_sets, load_references, load_scene
-from reffusion.masks import continuation, taint, undecided, voting, witness
+from reffusion.io.scene import load_mask_sets, load_object, load_references, load_scene
+from reffusion.masks import taint, undecided, voting
 from reffusion.masks.witness import with_photographed_depth
-from reffusion.paint import margin, pieces
+from reffusion.paint import margin
 from reffusion.params.initialize import Params
 from reffusion.prior import inpaint
 from reffusion.splat import rasterizer
+from reffusion.texture import surfaces
 from reffusion.types import Reference
 
 WARN_FROM = 0.01  # share of C that shows nothing, from which a view is named
@@ -49,7 +50,7 @@ def run(
     references = load_references(completed, scene) if completed else []
     network = monocular.load_network(params.depth.model) if params.depth.model and references else None
     sets = load_mask_sets(masks, scene.cameras)
-    thing = labels & ~debris_of(masks, labels)
+    thing = load_object(masks)
     around = surroundings(params, scene, gaussians, thing, sets, poses, fit) if references else None
     removed = gaussians.map(lambda p: p[thing])
     gaussians = gaussians.map(lambda p: p[~labels])
@@ -90,22 +91,16 @@ def run(
         print(f"uncovered in {len(bare)} views: {', '.join(bare)}: complete another view and add it to the references")
 
 
-def debris_of(masks: Path, labels):
-    """bool [N]: of what goes, what was not the object."""
-    path = masks / "debris.npy"
-    return load_labels(path) if path.exists() else torch.zeros_like(labels)
-
-
 def surroundings(params: Params, scene, gaussians, thing, sets, poses: Path, fit: Path):
     """What the photographs say of the space around the object, and the planes that go on into what they do not."""
     hidden = {name: each.consistent & (name not in scene.clean) for name, each in sets.items()}
     train = [scene.cameras[name] for name in scene.train]
-    views = witness.witnesses(gaussians, train, hidden)
-    planes = []
-    if thing.any():
-        planes = continuation.planes_around(*voting.extent(gaussians.means[thing]), views, SEED)
     photos = exposure.load_views(poses, fit, scene.train)
-    return filling.Surroundings(train, {n: sets[n].consistent for n in sets}, photos, views, planes, scene.points)
+    found = surfaces.looked_around(gaussians, thing, train, hidden, photos, SEED)
+    consistent = {name: each.consistent for name, each in sets.items()}
+    return filling.Surroundings(
+        train, consistent, photos, found.views, found.planes, scene.points, found.centre, found.radius
+    )
 
 
 def at_random(params: Params, removed, remaining, scene, sets, poses: Path):
@@ -190,8 +185,8 @@ def without_shadows(out: Path, true: list, gaussians, around):
 
 
 def completed_further(params: Params, out: Path, gaussians, new, around):
-    """Views put together from pieces of themselves, the one with most that nothing covers first; the Gaussians with
-    what they show, the labels, and the views."""
+    """Views put together from patches of the photographs, the one with most that nothing covers first; the Gaussians
+    with what they show, the labels, and the views."""
     further: list[Reference] = []
     found = coverage.open_pixels(gaussians, around, around.cameras)
     haze = coverage.haze(gaussians, new, around, found, LEAK)
@@ -201,7 +196,9 @@ def completed_further(params: Params, out: Path, gaussians, new, around):
         # Just outside C a photograph may still show the object's rim, which would be repeated.
         rimmed = margin.widened(hidden, coverage.RIM)
         base = inpaint.background(gaussians, camera, around.photos[camera.name], rimmed)
-        picture = pieces.exemplar(base, mask | hidden & margin.widened(mask, coverage.RIM))
+        open_too = mask | rimmed & margin.widened(mask, coverage.RIM)
+        (found_here,) = surfaces.completions(base, open_too, camera, hidden, around.looked(), [SEED])
+        picture = found_here.image
         reference = Reference(camera, picture, mask)
         print(f"further view {camera.name}: {mask.sum() / hidden.sum():.1%} of the mask is covered by nothing")
         try:

@@ -15,23 +15,23 @@ from reffusion.fit import exposure
 from reffusion.io.arrays import load_json, load_labels, save_json, save_text
 from reffusion.io.images import save_image, save_mask
 from reffusion.io.ply import load_ply
-from reffusion.io.scene import load_mask_sets, load_scene, load_views, save_references
+from reffusion.io.scene import load_mask_sets, load_object, load_scene, load_views, save_references
 from reffusion.masks import taint
-from reffusion.paint import margin, painting, pieces, registration
+from reffusion.paint import painting, registration
 from reffusion.params.reference import Params
 from reffusion.prior import inpaint, memory
 from reffusion.prior.model import load_prior
-from reffusion.types import MaskSet, Reference, Scene
+from reffusion.texture import surfaces
+from reffusion.types import Camera, MaskSet, Reference, Scene
 
 TO_PAINT, VIEWS_TO_PAINT = "to_paint", 4
-RIM = 0.006  # of the picture's width, repainted around I too, as far as it is no photograph
 MARGIN, BLEND = 0.01, 0.01  # of it: taken from a reference from elsewhere around the hole, and blended beyond
 WHOLE = 0.9  # share of the hole that a reference from elsewhere must have
 
 
 def run(params: Params, out: Path, *, scene: Path, poses: Path, fit: Path, masks: Path) -> None:
     """Write references/, masks/, depth/ and facts.json; to_paint/, unless scene.yaml names the references; and
-    candidates.png and candidates.json, where the prior paints."""
+    candidates.png and candidates.json, where it is painted here."""
     placed, given = load_scene(poses), load_given(scene, placed_views(poses), params.reference)
     if given:
         references = taken_over(given, placed, poses, fit, masks)
@@ -117,14 +117,32 @@ def inpainted(params: Params, out: Path, scene: Scene, poses: Path, fit: Path, m
     photo = exposure.load_views(poses, fit, [name])[name]
     base = inpaint.background(remaining, camera, photo, pixels.consistent)
     if params.inpainter == "exemplar":
-        return Reference(camera, from_itself(base, pixels.consistent, pixels.invent), pixels.invent)
+        around = surfaces_around(scene, poses, fit, masks)
+        return Reference(camera, from_photographs(params, out, base, pixels, camera, around), pixels.invent)
     return Reference(camera, from_prior(params, out, name, base, pixels.invent), pixels.invent)
 
 
-def from_itself(base: np.ndarray, consistent: np.ndarray, invent: np.ndarray) -> np.ndarray:
-    """The picture [H, W, 3] uint8 with I, and the part of C at its rim, put together from pieces of the rest: what is
-    left of the object's blurred edge there would be continued into the hole."""
-    return pieces.exemplar(base, invent | consistent & margin.widened(invent, RIM))
+def surfaces_around(scene: Scene, poses: Path, fit: Path, masks: Path) -> surfaces.Around:
+    """What the photographs show around the object."""
+    sets, train = load_mask_sets(masks, scene.train), [scene.cameras[name] for name in scene.train]
+    hidden = {name: each.consistent & (name not in scene.clean) for name, each in sets.items()}
+    photos = exposure.load_views(poses, fit, scene.train)
+    return surfaces.looked_around(load_ply(fit / "gaussians.ply"), load_object(masks), train, hidden, photos)
+
+
+def from_photographs(
+    params: Params, out: Path, base: np.ndarray, pixels: MaskSet, camera: Camera, around: surfaces.Around
+) -> np.ndarray:
+    """The picture [H, W, 3] uint8 with I put together from patches of the photographs; also writes the sheet of
+    candidates."""
+    hole = surfaces.to_paint(pixels.consistent, pixels.invent)
+    seeds = [params.seed + index for index in range(params.candidates)]
+    found = surfaces.completions(base, hole, camera, pixels.consistent, around, seeds)
+    misfits = [each.misfit for each in found]
+    chosen = int(np.argmin(misfits)) if params.choose is None else params.choose
+    save_image(out / "candidates.png", np.concatenate([each.image for each in found], 1))
+    save_json(out / "candidates.json", {"view": camera.name, "misfits": misfits, "chosen": chosen})
+    return found[chosen].image
 
 
 def from_prior(params: Params, out: Path, name: str, base: np.ndarray, invent: np.ndarray) -> np.ndarray:

@@ -33,7 +33,6 @@ OWN_FILES = (
     "reffusion/weights/local.py",
     "reffusion/weights/download.py",
     "reffusion/capture/sfm.py",
-    "reffusion/paint/shiftmap.py",
     COMPILER,
 )  # weights, databases, pipes, kernels
 PURE = (
@@ -132,7 +131,13 @@ def test_a_folder_is_seen_at_a_glance():
         assert folder.name == "reffusion" or not (folder / "__init__.py").read_text().strip(), folder
 
 
-KERNELS = ("reffusion/kernels/", "reffusion/splat/", "reffusion/gaussians/optimize.py", "reffusion/gaussians/ssim.py")
+KERNELS = (
+    "reffusion/kernels/",
+    "reffusion/splat/",
+    "reffusion/gaussians/optimize.py",
+    "reffusion/gaussians/ssim.py",
+    "reffusion/texture/search.py",
+)
 
 
 @pytest.mark.parametrize("path", sources("reffusion", "stages", "runner", "report"), ids=named)

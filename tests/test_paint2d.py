@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from reffusion.distill import perceptual
-from reffusion.paint import margin, paint2d, pieces
+from reffusion.paint import margin, paint2d
 from reffusion.seeding import generator
 
 HEIGHT, WIDTH = 37, 50
@@ -40,7 +40,7 @@ def hole():
 def painters(folder):
     torch.jit.script(Mean()).save(folder / "any-name.pt")
     return [paint2d.load(folder), paint2d.load(folder / "any-name.pt"), paint2d.load(),
-            paint2d.Painter("telea", paint2d.telea), paint2d.Painter("exemplar", pieces.exemplar)]  # fmt: skip
+            paint2d.Painter("telea", paint2d.telea)]  # fmt: skip
 
 
 def test_only_the_hole_changes_and_its_content_does_not_count(tmp_path):
@@ -51,31 +51,6 @@ def test_only_the_hole_changes_and_its_content_does_not_count(tmp_path):
         assert (painted[~hole()] == image[~hole()]).all() and painted.dtype == np.uint8, painter.name
         assert (painter.paint(poisoned, hole()) == painted).all(), painter.name
         assert (painter.paint(image, np.zeros_like(hole())) == image).all(), painter.name
-
-
-def test_a_pattern_is_continued_by_exemplars_as_sharp_as_it_is():
-    """A hole in a checkerboard with period 16, from which four fifths of the board's own contrast must come back."""
-    rows, columns = np.mgrid[:96, :128] // 8
-    board = np.where((rows + columns) % 2, 200, 60).astype(np.uint8)[..., None].repeat(3, 2)
-    mask = np.zeros((96, 128), bool)
-    mask[30:61, 45:84] = True
-    wrong = lambda painted: np.abs(painted[mask].astype(int) - board[mask]).mean()
-    assert wrong(pieces.exemplar(board, mask)) < 0.2 * 70 < wrong(paint2d.telea(board, mask))
-
-
-@pytest.mark.parametrize("kind", ["a pixel", "specks", "at the border", "nearly all"])
-def test_exemplars_fill_every_hole(kind):
-    image, mask = np.random.default_rng(1).integers(60, 200, (64, 80, 3), np.uint8), np.zeros((64, 80), bool)
-    if kind == "a pixel":
-        mask[30, 40] = True
-    elif kind == "specks":
-        mask[:] = np.random.default_rng(2).random(mask.shape) < 0.05
-    elif kind == "at the border":
-        mask[20:, :30] = True
-    else:
-        mask[8:] = True
-    painted = pieces.exemplar(image, mask)
-    assert (painted[~mask] == image[~mask]).all() and painted[mask].min() >= 20, "no pixel is left black"
 
 
 def test_a_mask_is_widened_by_a_share_of_the_width():

@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from runner.keys import Hashes
 from runner.files import RECEIPT, read_json
+from runner.keys import Hashes
 
 ROOT = Path(__file__).resolve().parent.parent
 KILLS = int(os.environ.get("RESUME_KILLS", "3"))

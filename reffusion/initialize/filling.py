@@ -19,6 +19,7 @@ from reffusion.masks.continuation import Plane
 from reffusion.masks.witness import Witness, votes, widened, with_photographed_depth
 from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
+from reffusion.texture.surfaces import Around
 from reffusion.types import Camera, Gaussians, Reference
 
 SWEPT = 0.1  # of the image's width: how far around a hole depth is found by comparing photographs
@@ -160,6 +161,7 @@ class Surroundings:
         hidden: view name -> bool [H, W], C. photos: view name -> uint8 [H, W, 3], exposed as the Gaussians are.
         views: the training views as witnesses. planes: those that go on into what nobody saw.
         points: [P, 3] sparse points of the scene.
+        centre: [3], the object's middle. radius: of most of it; infinite where there is none.
     """
 
     cameras: Sequence[Camera]
@@ -168,6 +170,12 @@ class Surroundings:
     views: Sequence[Witness]
     planes: Sequence[Plane]
     points: np.ndarray
+    centre: np.ndarray
+    radius: float
+
+    def looked(self) -> Around:
+        """What of this pictures are completed by."""
+        return Around(self.views, self.planes, self.photos, self.centre, self.radius)
 
     def photographed(self, camera: Camera) -> np.ndarray:
         """[H, W] depth that a training view shows outside its mask; 0 elsewhere."""

@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from reffusion.io.arrays import load_json, save_json
+from reffusion.io.arrays import load_json, load_labels, save_json
 from reffusion.io.colmap import ModelCamera, ModelImage, load_cameras, load_images, load_model_points, save_model
 from reffusion.io.images import load_exr, load_image, load_mask, save_exr, save_image, save_mask
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from reffusion.types import MaskSet, Reference, Scene
 
 PIXEL_CLASSES = ("raw", "consistent", "undecided", "invent")
@@ -94,6 +96,12 @@ def load_mask_sets(masks_dir: Path, names: Iterable[str]) -> dict[str, MaskSet]:
 
     load = lambda kind, name: load_mask(Path(masks_dir) / kind / f"{name}.png")
     return {name: MaskSet(*(load(kind, name) for kind in PIXEL_CLASSES)) for name in names}
+
+
+def load_object(masks_dir: Path) -> Tensor:
+    """[N] bool, of the Gaussians that `masks` removes those that are the object, and not debris."""
+    labels, debris = load_labels(masks_dir / "labels.npy"), masks_dir / "debris.npy"
+    return labels & ~load_labels(debris) if debris.exists() else labels
 
 
 def save_references(reference_dir: Path, references: Sequence[Reference]) -> None:

@@ -45,6 +45,7 @@ class Plane:
         within: bool [CELLS, CELLS], these and what they enclose with what is seen of the plane: mirrored light makes a
             polished part look like a pit.
         free: bool [CELLS, CELLS], where views look through it: there it is not.
+        seen: bool [CELLS, CELLS], where views show it.
     """
 
     normal: np.ndarray
@@ -55,6 +56,7 @@ class Plane:
     goes_on: np.ndarray
     within: np.ndarray
     free: np.ndarray
+    seen: np.ndarray
 
     def depth(self, camera: Camera) -> np.ndarray:
         """[H, W] camera z where a view's rays meet the plane; inf where they do not."""
@@ -245,4 +247,4 @@ def _mapped(
             ends |= inside & beyond
     goes_on &= _hull(seen)
     within = goes_on | (ndimage.binary_fill_holes(seen | goes_on) & ~seen & ~ends & (said.hidden > 0).reshape(shape))
-    return Plane(normal, height, origin, along, pitch, goes_on, within, free)
+    return Plane(normal, height, origin, along, pitch, goes_on, within, free, seen)

@@ -73,11 +73,11 @@ def holes(
         known = (drawn.alpha.cpu().numpy() > 0.5) & ~covered
         pixels = shrunk(invent[camera.name], 0.5) & covered
         if pixels.any() and known.any():
-            found[camera.name] = Hole(small, pixels, _drawn_across(drawn.depth.cpu().numpy(), known))
+            found[camera.name] = Hole(small, pixels, drawn_across(drawn.depth.cpu().numpy(), known))
     return found
 
 
-def _drawn_across(depth: np.ndarray, known: np.ndarray) -> np.ndarray:
+def drawn_across(depth: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Depth [h, w] whose unknown pixels continue the known disparity, from all sides, by distance."""
     disparity = np.where(known, 1 / np.where(known, depth, 1.0), 0.0)
     top = max(float(disparity.max()), 1e-12)

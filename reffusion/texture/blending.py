@@ -1,0 +1,36 @@
+"""Patches blended without seams: the picture whose changes from pixel to pixel are nearest to theirs."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+ABSOLUTE = 0.02  # weight of the patches' own colours against their changes: far from the border they hold
+
+
+def blended(known: np.ndarray, hole: np.ndarray, right: np.ndarray, below: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """[N, 3], the colours of the hole's pixels in reading order (screened Poisson, as in Perez et al. 2003).
+
+    Args:
+        known: [H, W, 3], read beside the hole. hole: bool [H, W].
+        right, below: [H, W, 3], wanted change to the next pixel. own: [H, W, 3], wanted colours.
+    """
+    rows, columns = np.nonzero(hole)
+    index = np.full(hole.shape, -1)
+    index[rows, columns] = np.arange(len(rows))
+    total, wanted, links = np.full(len(rows), ABSOLUTE), ABSOLUTE * own[rows, columns].astype(np.float64), []
+    for down, along, change in ((0, 1, right), (0, -1, right), (1, 0, below), (-1, 0, below)):
+        row, column = rows + down, columns + along
+        here = np.flatnonzero((row >= 0) & (column >= 0) & (row < hole.shape[0]) & (column < hole.shape[1]))
+        row, column = row[here], column[here]
+        first = np.minimum(rows[here], row), np.minimum(columns[here], column)
+        total[here] += 1
+        wanted[here] -= change[first] * (down + along)
+        other = index[row, column]
+        outside = other < 0
+        wanted[here[outside]] += known[row[outside], column[outside]]
+        links.append(np.stack([here[~outside], other[~outside]]))
+    here, there = np.concatenate(links, 1)
+    matrix = sparse.csc_matrix((-np.ones(len(here)), (here, there)), (len(rows),) * 2) + sparse.diags(total)
+    return splu(matrix.tocsc()).solve(wanted)

@@ -1,0 +1,254 @@
+"""A hole completed from patches of photographs, coarse to fine.
+
+PatchMatch with votes (after Wexler et al. 2007, Barnes et al. 2009, Newson et al. 2017), patches carried along planes
+(after Huang et al. 2014), blended by their gradients. Nothing new is invented, and nothing is downloaded.
+
+PAPER leaves open: who inpaints the reference (it shows results of several tools, and of people).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from scipy import ndimage
+
+from reffusion import seeding
+from reffusion.paint.paint2d import blanked, telea
+from reffusion.texture import search, votes
+from reffusion.texture.blending import blended
+from reffusion.texture.matches import NONE, PATCH, Choice, Hole, Match, Pictures
+
+COARSEST = 40.0  # px that the hole may be wide at the coarsest level: there its parts are laid out
+SMALL = 16.0  # px: a wider hole has two levels at least
+ROUGHNESS = 2.0  # weight of the local mean gradient beside the colours: what tells gravel from a wall of its colour
+AROUND = 15  # px, a side of the window of that mean
+FADING = 1.2  # factor by which trust falls with each pixel from the hole's border
+LEAST_TRUST = 0.02
+ELSEWHERE = 0.25  # by how much more a patch of another surface counts
+CLEAR = 1.5  # times PATCH: how far from what is masked a patch's middle must lie
+FEWEST = 200  # places for patches: with fewer there is no coarser level, or Telea's method instead
+RINGS, TRIES = (3, 60), 20  # rounds and tries anywhere of the first layout, and tries of what follows
+ROUNDS = (8, 5, 3)  # of search and vote: at the coarsest level, between, at the finest
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A picture and the surfaces that it shows.
+
+    Attributes:
+        image: [H, W, 3] uint8.
+        masked: bool [H, W], pixels that must not be read.
+        usable: bool [H, W], where a patch may have its middle.
+        surface: int [H, W], the plane shown, 1, 2, ...; 0: none.
+        to_plane: [H, W, 2, 2], change of the plane's coordinates with (x, y) in pixels; any regular matrix off planes.
+        size: [H, W], the world's length of a pixel.
+    """
+
+    image: np.ndarray
+    masked: np.ndarray
+    usable: np.ndarray
+    surface: np.ndarray
+    to_plane: np.ndarray
+    size: np.ndarray
+
+
+def alone(image: np.ndarray, hole: np.ndarray) -> Shown:
+    """A picture of which nothing else is known."""
+    unit = np.broadcast_to(np.eye(2), (*hole.shape, 2, 2))
+    return Shown(image, hole, ~hole, np.zeros(hole.shape, np.int64), unit, np.ones(hole.shape))
+
+
+@dataclass(frozen=True)
+class Completed:
+    """A picture with its hole filled, uint8 [H, W, 3], and how badly its patches fit on the whole: of several, the one
+    with the least is the best to look at, mostly."""
+
+    image: np.ndarray
+    misfit: float
+
+
+def complete(
+    target: Shown, hole: np.ndarray, sources: Sequence[Shown], smooth: Sequence[int] = (), seed: int = 0
+) -> Completed:
+    """The target with its hole filled by patches of the sources, which may be the target itself.
+
+    Args:
+        target: its image is read outside the hole only. hole: bool [H, W].
+        smooth: numbers of the planes along which patches are carried; on rough ground that would smear grass.
+        seed: of the search.
+    """
+    if not hole.any():
+        return Completed(target.image.copy(), 0.0)
+    target = replace(target, image=blanked(target.image, hole))
+    levels = _levels(target, hole, sources)
+    if not levels:
+        return Completed(telea(target.image, hole), float(NONE))
+    state = np.array([seeding.seed_for(seed, "texture") | 1], np.uint64)
+    match = before = None
+    for k, (now, mask, pictures, sheet) in enumerate(levels):
+        pixels, choice = _pixels(sheet, mask, 2 ** (len(levels) - 1 - k), smooth, pictures), _choice(pictures)
+        trust = np.where(mask, np.maximum(FADING ** -_depth(mask), LEAST_TRUST), 1).astype(np.float32)
+        if match is None:
+            match = _laid_out(now, mask, trust, pixels, pictures, choice, state)
+        else:
+            match = _from_coarser(match, before, pixels, pictures)
+            _voted(now, pixels, match, trust, pictures, 1e12)
+        last = k == len(levels) - 1
+        rounds = ROUNDS[0] if k == 0 else ROUNDS[2] if last else ROUNDS[1]
+        todo = np.arange(len(pixels.row))
+        for turn in range(rounds):
+            tries = TRIES if k == 0 else TRIES // 5
+            search.search(todo, 2, tries, match, pixels, now, trust, pictures, choice, np.float32(ELSEWHERE), state)
+            if not last or turn < rounds - 1:
+                _voted(now, pixels, match, trust, pictures, max(float(np.median(match.misfit)), 1.0))
+        before = pixels
+    weight = trust[pixels.row, pixels.column] * (match.misfit < NONE)
+    misfit = float((match.misfit * weight).sum() / max(weight.sum(), 1e-6))
+    return Completed(_finished(target.image, hole, now, pixels, match, pictures, trust), misfit)
+
+
+def _finished(image, hole, now, pixels, match, pictures, trust) -> np.ndarray:
+    """uint8 [H, W, 3]: each pixel from the best patch that covers it, without seams."""
+    own = now[..., :3].copy()
+    right, below = np.zeros_like(own), np.zeros_like(own)
+    beside, under = np.zeros(hole.shape, np.float32), np.zeros(hole.shape, np.float32)
+    votes.steps(match, pixels, pictures, right, below, beside, under, own)
+    right, below = right / np.maximum(beside, 1)[..., None], below / np.maximum(under, 1)[..., None]
+    picture = image.copy()
+    picture[hole] = blended(now[..., :3], hole, right, below, own).clip(0, 255).round().astype(np.uint8)
+    return picture
+
+
+def _levels(target: Shown, hole: np.ndarray, sources: Sequence[Shown]) -> list:
+    """Coarsest first: the target's values [h, w, C], its hole, the sources, and the target at that size; none where
+    there is too little to take patches from."""
+    width = 2 * _depth(hole).max()
+    count = 1 + int(np.ceil(np.log2(max(width / COARSEST, 2.0 if width > SMALL else 1.0))))
+    now, mask, scale, sheet = _values(target.image, hole), hole, 1, target
+    seen = [(_values(source.image, source.masked), source.masked) for source in sources]
+    levels = []
+    for _ in range(count):
+        pictures = _pictures(seen, sources, scale)
+        if (pictures.surface >= 0).sum() < FEWEST:
+            break
+        levels.append((now, mask, pictures, sheet))
+        now, mask = _halved(now, mask)
+        seen = [_halved(values, masked) for values, masked in seen]
+        scale *= 2
+    return [(now.copy(), mask, pictures, target) for now, mask, pictures, target in reversed(levels)]
+
+
+def _values(image: np.ndarray, masked: np.ndarray) -> np.ndarray:
+    """[H, W, 5] float32: colours, and the local mean of the grey picture's change along x and y. What is masked shows
+    what is next to it."""
+    if masked.any() and not masked.all():
+        nearest = ndimage.distance_transform_edt(masked, return_distances=False, return_indices=True)
+        image = image[tuple(nearest)]
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    known = cv2.erode((~masked).astype(np.float32), np.ones((3, 3)))
+    window = (AROUND, AROUND)
+    mass = np.maximum(cv2.blur(known, window), 1e-3)
+    change = [cv2.blur(np.abs(cv2.Scharr(grey, -1, *way)) / 16 * known, window) / mass for way in ((1, 0), (0, 1))]
+    return np.concatenate([image.astype(np.float32), ROUGHNESS * np.stack(change, -1)], -1)
+
+
+def _halved(values: np.ndarray, masked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Both at half the size, rounded up; a pixel is masked that holds any masked one."""
+    even = lambda a: np.pad(a, [(0, a.shape[0] % 2), (0, a.shape[1] % 2)] + [(0, 0)] * (a.ndim - 2), mode="edge")
+    values, known = even(values), even((~masked).astype(np.float32))
+    size = (known.shape[1] // 2, known.shape[0] // 2)
+    share = cv2.resize(known, size, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(values * known[..., None], size, interpolation=cv2.INTER_AREA)
+    return small / np.maximum(share, 1e-3)[..., None], share < 0.999
+
+
+def _pictures(seen: Sequence[tuple[np.ndarray, np.ndarray]], sources: Sequence[Shown], scale: int) -> Pictures:
+    """The sources at 1 / `scale` of their size, `seen` as values and masks of that size already."""
+    height, width = (max(masked.shape[axis] for _, masked in seen) for axis in (0, 1))
+    shape = (len(seen), height, width)
+    found = Pictures(
+        np.zeros((*shape, 5), np.float32), np.full(shape, -1, np.int32), np.zeros((*shape, 4), np.float32),
+        np.ones(shape, np.float32),
+    )  # fmt: skip
+    for k, ((values, masked), source) in enumerate(zip(seen, sources, strict=True)):
+        here = (k, slice(masked.shape[0]), slice(masked.shape[1]))
+        every = (slice(None, None, scale),) * 2
+        clear = ndimage.distance_transform_edt(np.pad(~masked, 1))[1:-1, 1:-1] > CLEAR * PATCH
+        found.values[here] = values
+        found.surface[here] = np.where(clear & source.usable[every], source.surface[every], -1)
+        found.to_pixels[here] = _inverse(scale * source.to_plane[every]).reshape(*masked.shape, 4)
+        found.size[here] = scale * source.size[every]
+    return found
+
+
+def _inverse(matrices: np.ndarray) -> np.ndarray:
+    """Of [..., 2, 2]; zeros for one that has none."""
+    (a, b), (c, d) = (np.moveaxis(matrices[..., row, :], -1, 0) for row in (0, 1))
+    area = a * d - b * c
+    adjugate = np.stack([np.stack([d, -b], -1), np.stack([-c, a], -1)], -2)
+    return np.divide(adjugate, area[..., None, None], out=np.zeros(matrices.shape), where=area[..., None, None] != 0)
+
+
+def _pixels(target: Shown, mask: np.ndarray, scale: int, smooth: Sequence[int], pictures: Pictures) -> Hole:
+    """The hole's pixels at 1 / `scale` of the target's size. Along planes that hardly any source shows nothing is
+    carried."""
+    rows, columns = np.nonzero(mask)
+    index = np.full(mask.shape, -1)
+    index[rows, columns] = np.arange(len(rows))
+    at = np.minimum(rows * scale, target.surface.shape[0] - 1), np.minimum(columns * scale, target.surface.shape[1] - 1)
+    surface = target.surface[at].astype(np.int32)
+    carried = [k for k in smooth if (pictures.surface == k).sum() >= FEWEST]
+    to_plane = (scale * target.to_plane[at]).reshape(-1, 4).astype(np.float32)
+    size = (scale * target.size[at]).astype(np.float32)
+    return Hole(rows, columns, index, surface, np.isin(surface, carried), to_plane, size)
+
+
+def _choice(pictures: Pictures) -> Choice:
+    places = np.argwhere(pictures.surface >= 0).astype(np.int32)
+    surface = pictures.surface[tuple(places.T)]
+    parts = [places] + [places[surface == k] for k in range(1, int(pictures.surface.max()) + 1)]
+    starts = np.cumsum([0] + [len(part) for part in parts])
+    return Choice(np.concatenate(parts), np.append(starts, [starts[-1]] * 64))  # planes that no source shows have none
+
+
+def _laid_out(now, mask, trust, pixels: Hole, pictures: Pictures, choice: Choice, state) -> Match:
+    """The first patches, from the hole's border inwards: each ring is compared with what is known outside it."""
+    count = len(pixels.row)
+    zeros = lambda kind: np.zeros(count, kind)
+    picture = np.full(count, -1, np.int32)
+    misfit = np.full(count, NONE, np.float32)
+    match = Match(picture, zeros(np.float32), zeros(np.float32), zeros(np.float32), zeros(bool), misfit)
+    weight = np.where(mask, 0, 1).astype(np.float32)
+    ring = np.ceil(_depth(mask))[pixels.row, pixels.column]
+    for k in range(1, int(ring.max()) + 1):
+        todo = np.flatnonzero(ring == k)
+        search.search(todo, *RINGS, match, pixels, now, weight, pictures, choice, np.float32(ELSEWHERE), state)
+        _voted(now, pixels, match, trust, pictures, max(2 * float(np.percentile(match.misfit[todo], 75)), 1.0), todo)
+        weight[pixels.row[todo], pixels.column[todo]] = trust[pixels.row[todo], pixels.column[todo]]
+    return match
+
+
+def _from_coarser(match: Match, before: Hole, pixels: Hole, pictures: Pictures) -> Match:
+    """The patches of a coarser level, `before`, for the pixels of this one."""
+    height, width = before.index.shape
+    row, column = np.minimum(pixels.row // 2, height - 1), np.minimum(pixels.column // 2, width - 1)
+    parent = before.index[row, column]
+    taken = Match(*(each[parent].copy() for each in match))
+    taken = taken._replace(planar=taken.planar & pixels.planar)
+    votes.carried_down(taken, before.row[parent], before.column[parent], pixels, pictures)
+    return taken
+
+
+def _voted(now, pixels, match, trust, pictures, spread: float, todo: np.ndarray | None = None) -> None:
+    """`now` with its hole, or the pixels `todo` of it, as the patches say."""
+    voted = now.copy()
+    votes.vote(np.arange(len(pixels.row)) if todo is None else todo, match, pixels, trust, pictures, spread, voted)
+    now[...] = voted
+
+
+def _depth(mask: np.ndarray) -> np.ndarray:
+    """[H, W]: how far inside the mask, in pixels; the picture's border counts as one of it."""
+    return ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]

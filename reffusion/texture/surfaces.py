@@ -1,0 +1,172 @@
+"""The surfaces that photographs show around a hole, and that go on in it: along them texture is taken."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from torch import Tensor
+
+from reffusion import geometry
+from reffusion.masks.continuation import Plane, planes_around
+from reffusion.masks.voting import extent
+from reffusion.masks.witness import Witness, pixels, witnesses
+from reffusion.paint.margin import widened
+from reffusion.paint.painting import drawn_across
+from reffusion.texture.completion import Completed, Shown, complete
+from reffusion.types import Camera, Gaussians
+
+OTHERS = 3  # photographs beside the view's own that patches are taken from
+NEARBY = 4.0  # radii of the object around its middle within which they are taken
+RIM = 0.006  # of the image's width, painted anew around what is unknown
+NARROW = 0.02  # of it: the radius of a disk that what is decided must have room for, not to be painted over
+BESIDE = 0.008  # of the image's width: so near to a mask a photograph shows a mixture
+ON = 0.03  # relative depth within which a pixel lies on a plane
+LOOSE = 0.06  # the same, of what is asked whether a plane is smooth
+REACH = 2.5  # radii of the object around its middle within which it is
+SMOOTH = 0.01  # median distance from it, relative to depth, up to which it is: not grass, nor rock
+SOME = 200  # pixels of a view that tell
+
+
+@dataclass(frozen=True)
+class Around:
+    """What the photographs show around the object.
+
+    Attributes:
+        views: the training views as witnesses. planes: those around the object.
+        photos: view name -> uint8 [H, W, 3], exposed alike.
+        centre: [3], the object's middle. radius: of most of it; infinite where there is none.
+    """
+
+    views: Sequence[Witness]
+    planes: Sequence[Plane]
+    photos: Mapping[str, np.ndarray]
+    centre: np.ndarray
+    radius: float
+
+
+def looked_around(
+    gaussians: Gaussians,
+    thing: Tensor,
+    cameras: Sequence[Camera],
+    hidden: Mapping[str, np.ndarray],
+    photos: Mapping[str, np.ndarray],
+    seed: int = 0,
+) -> Around:
+    """What the training views, `cameras`, show around the object.
+
+    Args:
+        gaussians: N of them, the object included. thing: [N] bool, the object's.
+        hidden: view name -> bool [H, W], where the photograph shows the object. photos: see `Around`.
+        seed: of the draws that find planes.
+    """
+    views = witnesses(gaussians, cameras, hidden)
+    if not thing.any():
+        return Around(views, [], photos, np.zeros(3), np.inf)
+    centre, radius = extent(gaussians.means[thing])
+    return Around(views, planes_around(centre, radius, views, seed), photos, centre, radius)
+
+
+def to_paint(hidden: np.ndarray, unknown: np.ndarray) -> np.ndarray:
+    """bool [H, W]: what of a view is painted anew for the pixels that are `unknown`: also what of C (`hidden`) is left
+    between them in narrow pieces, and the rim, where what is left of the object's blurred edge would be continued."""
+    decided = hidden & ~unknown
+    reach = pixels(NARROW, hidden.shape[1])
+    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    wide = np.pad((~hidden | decided).astype(np.uint8), reach, constant_values=1)
+    broad = cv2.morphologyEx(wide, cv2.MORPH_OPEN, disk)[reach:-reach, reach:-reach] > 0
+    hole = hidden & ~(broad & decided)
+    return hole | widened(hidden, RIM) & widened(hole, RIM)
+
+
+def completions(
+    image: np.ndarray, hole: np.ndarray, camera: Camera, hidden: np.ndarray, around: Around, seeds: Sequence[int]
+) -> list[Completed]:
+    """A training view's picture, uint8 [H, W, 3], with its hole filled from patches of its own photograph and of
+    others, once for each seed.
+
+    Args:
+        hole: bool [H, W]. hidden: bool [H, W], C: where the photograph shows the object.
+    """
+    own = next(view for view in around.views if view.camera.name == camera.name)
+    surface, depth = _behind(own, hidden, around.planes)
+    target = Shown(image, hole, ~hole, surface, _frames(surface, camera, around.planes), depth / camera.fx)
+    sources = [_photographed(view, around) for view in (own, *_others(own, around.views))]
+    smooth = [k for k, plane in enumerate(around.planes, start=1) if _roughness(plane, around) < SMOOTH]
+    return [complete(target, hole, sources, smooth, seed) for seed in seeds]
+
+
+def _behind(own: Witness, hidden: np.ndarray, planes: Sequence[Plane]) -> tuple[np.ndarray, np.ndarray]:
+    """What a view shows without the object: planes' numbers, int [H, W], and depth, [H, W] float64.
+
+    In C the nearest plane that is seen there by others or goes on there; where there is none, the surroundings' depth.
+    """
+    known = (own.depth > 0) & ~hidden
+    across = drawn_across(own.depth.astype(np.float64), known) if known.any() else np.ones(hidden.shape)
+    depth = np.where(across > 0, across, np.median(across[across > 0]))
+    surface, nearest = np.where(hidden, 0, _labelled(own.depth, own.camera, planes)), np.full(hidden.shape, np.inf)
+    for k, plane in enumerate(planes, start=1):
+        at = plane.depth(own.camera)
+        there = plane.on(plane.seen | plane.within | plane.goes_on, at, own.camera, hidden) & (at < nearest)
+        surface[there], nearest[there] = k, at[there]
+    return surface, np.where(np.isfinite(nearest), nearest, depth)
+
+
+def _photographed(view: Witness, around: Around) -> Shown:
+    """A photograph as a source of patches: what it shows near the object, beside its mask."""
+    depth = view.depth.astype(np.float64)
+    points = geometry.unproject(depth, view.camera)
+    near = np.linalg.norm(points - around.centre, axis=-1) < NEARBY * around.radius
+    surface = _labelled(depth, view.camera, around.planes)
+    size = np.where(depth > 0, depth, 1.0) / view.camera.fx
+    frames = _frames(surface, view.camera, around.planes)
+    photo = around.photos[view.camera.name]
+    return Shown(photo, widened(view.hidden, BESIDE), near & (depth > 0), surface, frames, size)
+
+
+def _others(own: Witness, views: Sequence[Witness]) -> list[Witness]:
+    """From near to far, so that what is oblique in one is not in another."""
+    away = lambda view: float(np.linalg.norm(view.camera.center - own.camera.center))
+    rest = sorted((view for view in views if view is not own), key=away)
+    chosen = {int(k) for k in np.linspace(1, len(rest) - 1, OTHERS)} if len(rest) > OTHERS else range(len(rest))
+    return [rest[k] for k in sorted(chosen)]
+
+
+def _labelled(depth: np.ndarray, camera: Camera, planes: Sequence[Plane]) -> np.ndarray:
+    """int [H, W]: the plane that each pixel lies on, 1, 2, ...; 0: none."""
+    surface, nearest = np.zeros(depth.shape, np.int64), np.full(depth.shape, ON)
+    for k, plane in enumerate(planes, start=1):
+        off = np.abs(depth / plane.depth(camera) - 1)
+        mine = (off < nearest) & (depth > 0)
+        surface[mine], nearest[mine] = k, off[mine]
+    return surface
+
+
+def _frames(surface: np.ndarray, camera: Camera, planes: Sequence[Plane]) -> np.ndarray:
+    """[H, W, 2, 2]: change of the coordinates along a pixel's plane with x and y in pixels; the identity off planes."""
+    frames = np.broadcast_to(np.eye(2), (*surface.shape, 2, 2)).copy()
+    rays = geometry.pixel_rays(camera) @ camera.world_to_camera[:3, :3]
+    steps = camera.world_to_camera[:2, :3] / np.array([[camera.fx], [camera.fy]])
+    for k, plane in enumerate(planes, start=1):
+        mine = surface == k
+        slope = rays[mine] @ plane.normal
+        distance = (plane.height - camera.center @ plane.normal) / slope
+        for axis, step in enumerate(steps):
+            moved = step - rays[mine] * (step @ plane.normal / slope)[:, None]
+            frames[mine, :, axis] = distance[:, None] * moved @ plane.along.T
+    return frames
+
+
+def _roughness(plane: Plane, around: Around) -> float:
+    """Median distance of what is seen of a plane from it, relative to depth."""
+    found = []
+    for view in around.views[:: max(1, len(around.views) // 6)]:
+        off = np.abs(view.depth / plane.depth(view.camera) - 1)
+        points = geometry.unproject(view.depth, view.camera)
+        near = np.linalg.norm(points - around.centre, axis=-1) < REACH * around.radius
+        mine = near & (view.depth > 0) & ~view.hidden & (off < LOOSE)
+        if mine.sum() >= SOME:
+            found.append(float(np.median(off[mine])))
+    return float(np.median(found)) if found else np.inf

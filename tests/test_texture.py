@@ -1,0 +1,216 @@
+"""Texture without a network: patches of photographs, carried along surfaces, blended without seams."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from reffusion import geometry
+from reffusion.masks.continuation import CELLS, Plane
+from reffusion.masks.witness import Witness, surface_range
+from reffusion.paint.paint2d import telea
+from reffusion.texture import completion, search, surfaces
+from reffusion.texture.blending import blended
+from reffusion.texture.completion import alone, complete
+from reffusion.texture.matches import NONE, PATCH
+from reffusion.types import Camera
+
+SIDE = 128
+RED = (255, 0, 0)
+
+
+def alone_completed(image, mask, seed=0):
+    return complete(alone(image, mask), mask, [alone(image, mask)], seed=seed).image
+
+
+def board():
+    rows, columns = np.mgrid[:96, :128] // 8
+    return np.where((rows + columns) % 2, 200, 60).astype(np.uint8)[..., None].repeat(3, 2)
+
+
+def middle():
+    mask = np.zeros((96, 128), bool)
+    mask[30:61, 45:84] = True
+    return mask
+
+
+def test_a_pattern_is_continued_as_sharp_as_it_is():
+    """A hole in a checkerboard with period 16, of which nine tenths of the board's own contrast must come back."""
+    wrong = lambda painted: np.abs(painted[middle()].astype(int) - board()[middle()]).mean()
+    assert wrong(alone_completed(board(), middle())) < 0.1 * 70 < wrong(telea(board(), middle()))
+
+
+def test_only_the_hole_changes_and_its_content_does_not_count():
+    noise = np.random.default_rng(0).integers(0, 256, (96, 128, 3), np.uint8)
+    image = np.where(np.arange(128)[None, :, None] < 64, board(), noise)
+    painted = alone_completed(image, middle())
+    assert (painted[~middle()] == image[~middle()]).all() and painted.dtype == np.uint8
+    poisoned = np.where(middle()[..., None], np.uint8(RED), image)
+    assert (alone_completed(poisoned, middle()) == painted).all()
+    assert (alone_completed(image, middle()) == painted).all(), "the same seed, the same picture"
+    assert (alone_completed(image, np.zeros_like(middle())) == image).all()
+
+
+@pytest.mark.parametrize("kind", ["a pixel", "specks", "at the border", "nearly all"])
+def test_every_hole_is_filled(kind):
+    image, mask = np.random.default_rng(1).integers(60, 200, (64, 80, 3), np.uint8), np.zeros((64, 80), bool)
+    if kind == "a pixel":
+        mask[30, 40] = True
+    elif kind == "specks":
+        mask[:] = np.random.default_rng(2).random(mask.shape) < 0.05
+    elif kind == "at the border":
+        mask[20:, :30] = True
+    else:
+        mask[8:] = True
+    painted = alone_completed(image, mask)
+    assert (painted[~mask] == image[~mask]).all() and painted[mask].min() > 0, "no pixel is left black"
+
+
+@pytest.mark.parametrize("shape", [(67, 93), (96, 64)])
+def test_sources_may_have_other_sizes(shape):
+    rng = np.random.default_rng(3)
+    stripes = np.where(np.arange(shape[1])[None, :] % 6 < 3, 40, 210).astype(np.uint8)
+    source = np.broadcast_to(stripes[..., None], (*shape, 3)) + rng.integers(0, 5, (*shape, 3), np.uint8)
+    image, nothing = np.full((96, 128, 3), 128, np.uint8), np.zeros(shape, bool)
+    beside = np.abs(np.arange(128) - 64) > 30
+    image[:, beside] = np.where(np.arange(128) % 6 < 3, 40, 210)[None, beside, None]
+    painted = complete(alone(image, middle()), middle(), [alone(source, nothing)]).image
+    assert painted[middle()].std() > 50, "striped as the only source is"
+
+
+def test_masked_pixels_of_a_source_never_show():
+    image, mask, red = board(), middle(), np.zeros((96, 128), bool)
+    red[::12, ::9] = True
+    other = np.where(red[..., None], np.uint8(RED), board())
+    source = replace(alone(other, red), usable=np.ones_like(red))
+    painted = complete(alone(image, mask), mask, [source, alone(image, mask)]).image[mask].astype(int)
+    assert (painted[:, 0] - painted[:, 1]).max() < 30
+
+
+# ------------------------------------------------------------------------------------------------ along a plane
+
+
+def camera(name: str, centre: tuple[float, float, float], at=(0.0, 0.0, 0.0)) -> Camera:
+    """Looks from `centre` at a point, y down."""
+    centre, forward = np.array(centre), np.array(at) - np.array(centre)
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ centre
+    return Camera(name, SIDE, SIDE, 140.0, 140.0, SIDE / 2, SIDE / 2, pose)
+
+
+CAMERAS = [camera("a", (0.0, -1.2, 0.7)), camera("b", (0.7, -1.0, 0.8)), camera("c", (-0.8, -0.9, 0.6))]
+EVERYWHERE, NOWHERE = np.ones((CELLS, CELLS), bool), np.zeros((CELLS, CELLS), bool)
+FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0, np.zeros(3), np.eye(3)[:2], 4 / CELLS, EVERYWHERE, EVERYWHERE, NOWHERE,
+              EVERYWHERE)  # fmt: skip
+
+
+def planks(view: Camera) -> np.ndarray:
+    """A floor of planks 0.12 wide that run away from camera a, uint8 [H, W, 3]."""
+    depth = FLOOR.depth(view)
+    x, y, _ = np.moveaxis(geometry.unproject(np.where(np.isfinite(depth), depth, 1.0), view), -1, 0)
+    joint = np.abs((x + 0.3 * y) / 0.12 % 1 - 0.5) > 0.42
+    tone = 150 + 25 * np.sin(7 * np.floor((x + 0.3 * y) / 0.12 + 0.5)) + 6 * np.sin(40 * y)
+    return np.where(joint, 40, tone)[..., None].repeat(3, 2).astype(np.uint8)
+
+
+def hidden() -> np.ndarray:
+    rows, columns = np.mgrid[:SIDE, :SIDE]
+    return (rows - 70) ** 2 + (columns - 62) ** 2 < 24**2
+
+
+def floor() -> surfaces.Around:
+    views = []
+    for view in CAMERAS:
+        depth = FLOOR.depth(view)
+        depth = np.where(np.isfinite(depth) & (depth < 5), depth, 0).astype(np.float32)
+        views.append(Witness(view, depth, *surface_range(depth), hidden()))
+    return surfaces.Around(views, [FLOOR], {view.name: planks(view) for view in CAMERAS}, np.zeros(3), 1.0)
+
+
+def test_planks_run_on_in_their_own_perspective():
+    image = np.where(hidden()[..., None], np.uint8(RED), planks(CAMERAS[0]))
+    found = min(surfaces.completions(image, hidden(), CAMERAS[0], hidden(), floor(), range(3)), key=lambda f: f.misfit)
+    off = np.abs(found.image.astype(int) - planks(CAMERAS[0]))[hidden()].mean()
+    plain = np.abs(telea(image, hidden()).astype(int) - planks(CAMERAS[0]))[hidden()].mean()
+    assert off < 12 and off < 0.4 * plain, "a joint misplaced by its width would be off by some 25"
+
+
+def test_frames_are_the_derivative_of_a_planes_coordinates():
+    view, h = CAMERAS[1], 1e-4
+    frames = surfaces._frames(np.ones((SIDE, SIDE), np.int64), view, [FLOOR])
+    for row, column in ((80, 30), (100, 90)):
+        for axis, (dx, dy) in enumerate(((h, 0), (0, h))):
+            coordinates = []
+            for sign in (-1, 1):
+                moved = replace(view, cx=view.cx - sign * dx, cy=view.cy - sign * dy)
+                point = geometry.unproject(FLOOR.depth(moved), moved)[row, column]
+                coordinates.append(FLOOR.along @ (point - FLOOR.origin))
+            numeric = (coordinates[1] - coordinates[0]) / (2 * h)
+            assert np.allclose(frames[row, column, :, axis], numeric, rtol=1e-6, atol=1e-9)
+
+
+def test_a_floor_is_smooth_and_grass_is_not():
+    around = floor()
+    assert surfaces._roughness(FLOOR, around) < 1e-6
+    rng = np.random.default_rng(0)
+    uneven = lambda view: replace(view, depth=view.depth * (1 + 0.03 * rng.standard_normal(view.depth.shape)))
+    grass = replace(around, views=[uneven(view) for view in around.views])
+    assert surfaces._roughness(FLOOR, grass) > surfaces.SMOOTH
+
+
+def test_the_misfit_is_the_mean_square_by_weight():
+    """Against NumPy, in float64, for a patch that is turned and carried along the floor."""
+    around = floor()
+    own, other = (surfaces._photographed(view, around) for view in around.views[:2])
+    seen = [(completion._values(each.image, each.masked), each.masked) for each in (own, other)]
+    pictures = completion._pictures(seen, [own, other], 1)
+    mask = np.zeros((SIDE, SIDE), bool)
+    mask[70, 62] = True
+    target = replace(own, surface=np.ones((SIDE, SIDE), np.int64))
+    target = replace(target, to_plane=surfaces._frames(target.surface, CAMERAS[0], [FLOOR]))
+    pixels = completion._pixels(target, mask, 1, [1], pictures)
+    now, weight = seen[0][0], np.random.default_rng(0).random((SIDE, SIDE)).astype(np.float32)
+    row, column, angle = 100.0, 40.0, 0.2
+    found = search._misfit(0, True, 1, row, column, np.float32(angle), NONE, pixels, now, weight, pictures, 0.0)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    matrix = pictures.to_pixels[1, 100, 40].reshape(2, 2) @ turn @ target.to_plane[70, 62]
+    steps = np.arange(-PATCH, PATCH + 1)
+    total = mass = 0.0
+    for dy in steps:
+        for dx in steps:
+            x, y = np.array([column, row]) + matrix @ (dx, dy)
+            j, i = int(np.floor(x)), int(np.floor(y))
+            corners = pictures.values[1, i : i + 2, j : j + 2].astype(float)
+            value = np.array([1 - (y - i), y - i]) @ np.moveaxis(np.array([1 - (x - j), x - j]) @ corners, 0, 0)
+            w = float(weight[70 + dy, 62 + dx])
+            total, mass = total + w * ((value - now[70 + dy, 62 + dx]) ** 2).sum(), mass + w
+    assert np.isclose(found, total / mass, rtol=1e-4)
+
+
+# ------------------------------------------------------------------------------------------------------- blending
+
+
+def test_a_pictures_own_steps_give_it_back():
+    rng, hole = np.random.default_rng(0), middle()
+    picture = rng.normal(size=(96, 128, 3))
+    right, below = np.zeros_like(picture), np.zeros_like(picture)
+    right[:, :-1], below[:-1] = np.diff(picture, axis=1), np.diff(picture, axis=0)
+    assert np.allclose(blended(picture, hole, right, below, picture), picture[hole], atol=1e-9)
+    shifted = blended(picture, hole, right, below, picture + 5)
+    offset = np.zeros(hole.shape)
+    offset[hole] = (shifted - picture[hole])[:, 0]
+    assert offset[31, 46] < 1 < offset[45, 64], "a cast of the patches fades towards the hole's border"
+
+
+def test_what_is_painted_reaches_over_the_rim_and_narrow_rests():
+    mask, unknown = np.zeros((100, 200), bool), np.zeros((100, 200), bool)
+    mask[20:80, 40:160] = True
+    unknown[20:80, 40:80] = unknown[20:80, 84:100] = True  # a rest of 4 px is left between, and 60 px beside
+    hole = surfaces.to_paint(mask, unknown)
+    assert hole[50, 82] and hole[50, 39] and not hole[50, 120] and not hole[50, 37] and not hole[10].any()
