@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from reffusion.kernels.compiled import FREE_ROUNDING, inlined, kernel
-from reffusion.texture.matches import NONE, PATCH, TURN, carried, carried_match
+from reffusion.texture.matches import FARTHEST, NEAREST, NONE, PATCH, TURN, carried, carried_match
 
 
 @inlined
@@ -27,7 +27,8 @@ def _uniform(state):
 
 def _misfit(n, planar, picture, y, x, angle, limit, hole, picture_now, weight, pictures, elsewhere):
     """Mean squared difference under `weight` between the patch around pixel n and the one at (y, x) of a picture;
-    `NONE` where that must not be, or exceeds `limit`. On another surface it counts 1 + `elsewhere` times."""
+    `NONE` where that must not be, or exceeds `limit`. On another surface, or one much nearer or farther, it counts
+    1 + `elsewhere` times."""
     row, column = math.floor(y + 0.5), math.floor(x + 0.5)
     height, width, channels = pictures.values.shape[1:]
     if row < 0 or column < 0 or row >= height or column >= width:
@@ -45,7 +46,9 @@ def _misfit(n, planar, picture, y, x, angle, limit, hole, picture_now, weight, p
     for dy in range(top, bottom + 1):
         for dx in range(left, right + 1):
             mass += weight[middle_row + dy, middle_column + dx]
-    factor = np.float32(1) if surface == hole.surface[n] else np.float32(1) + elsewhere
+    ratio = hole.size[n] / pictures.size[picture, row, column]
+    alike = surface == hole.surface[n] and FARTHEST < ratio < NEAREST
+    factor = np.float32(1) if alike else np.float32(1) + elsewhere
     most = limit * mass / factor
     for dy in range(top, bottom + 1):
         for dx in range(left, right + 1):
