@@ -27,7 +27,7 @@ def shared_out(disparity: np.ndarray, known: np.ndarray, hole: np.ndarray, guide
         hole: bool [H, W].
         guide: [H, W, 3] picture, uint8 or [0, 1].
     """
-    surfaces = _pieces(disparity, known)
+    surfaces = pieces(disparity, known)
     todo = hole & ~known
     if surfaces.max() < 2 or not todo.any():
         return np.where(known | hole, 1, 0) if surfaces.max() < 2 else surfaces
@@ -70,7 +70,7 @@ def _pairs(index: np.ndarray, ahead: tuple[int, int]) -> tuple[np.ndarray, np.nd
     return here[both], there[both]
 
 
-def _pieces(disparity: np.ndarray, known: np.ndarray) -> np.ndarray:
+def pieces(disparity: np.ndarray, known: np.ndarray) -> np.ndarray:
     """int [H, W]: the known pixels' connected pieces without jumps, 1, 2, ... from the largest on; 0: too small."""
     index = np.full(known.shape, -1)
     index[known] = np.arange(known.sum())

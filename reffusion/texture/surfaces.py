@@ -10,6 +10,7 @@ import numpy as np
 from torch import Tensor
 
 from reffusion import geometry
+from reffusion.depth.layers import pieces
 from reffusion.masks.continuation import Plane, planes_around
 from reffusion.masks.voting import extent
 from reffusion.masks.witness import Witness, pixels, witnesses
@@ -19,6 +20,7 @@ from reffusion.texture.completion import Completed, Shown, complete
 from reffusion.types import Camera, Gaussians
 
 OTHERS = 3  # photographs beside the view's own that patches are taken from
+RING = 0.12  # of the image's width: how far around the object surfaces are told apart
 NEARBY = 4.0  # radii of the object around its middle within which they are taken
 RIM = 0.006  # of the image's width, painted anew around what is unknown
 NARROW = 0.02  # of it: the radius of a disk that what is decided must have room for, not to be painted over
@@ -101,17 +103,42 @@ def completions(
 def _behind(own: Witness, hidden: np.ndarray, planes: Sequence[Plane]) -> tuple[np.ndarray, np.ndarray]:
     """What a view shows without the object: planes' numbers, int [H, W], and depth, [H, W] float64.
 
-    In C the nearest plane that is seen there by others or goes on there; where there is none, the surroundings' depth.
+    In C the nearest plane that is seen there by others or goes on there; where there is none, see `_drawn`.
     """
     known = (own.depth > 0) & ~hidden
-    across = drawn_across(own.depth.astype(np.float64), known) if known.any() else np.ones(hidden.shape)
-    depth = np.where(across > 0, across, np.median(across[across > 0]))
+    depth = _drawn(own.depth.astype(np.float64), known, hidden) if known.any() else np.ones(hidden.shape)
     surface, nearest = np.where(hidden, 0, _labelled(own.depth, own.camera, planes)), np.full(hidden.shape, np.inf)
     for k, plane in enumerate(planes, start=1):
         at = plane.depth(own.camera)
         there = plane.on(plane.seen | plane.within | plane.goes_on, at, own.camera, hidden) & (at < nearest)
         surface[there], nearest[there] = k, at[there]
     return surface, np.where(np.isfinite(nearest), nearest, depth)
+
+
+def _drawn(depth: np.ndarray, known: np.ndarray, hidden: np.ndarray) -> np.ndarray:
+    """Depth [H, W], drawn across what is `hidden` from what is around it.
+
+    Where it jumps, what is around falls into pieces. A nearer one goes on as far as its convex hull in the picture, so
+    that it ends at the straight prolongation of its visible borders; beyond, the farther ones do.
+    """
+    across = drawn_across(depth, known)
+    found = np.where(across > 0, across, np.median(depth[known]))
+    ring = known & widened(hidden, RING)
+    piece = pieces(geometry.reciprocal(depth), ring)
+    away = lambda k: -float(np.median(depth[piece == k]))
+    for nearer, k in enumerate(sorted(range(1, piece.max() + 1), key=away)):
+        own = drawn_across(depth, piece == k)
+        there = hidden & (own > 0) & (_hull(piece == k) if nearer else True)
+        found[there] = own[there]
+    return found
+
+
+def _hull(mask: np.ndarray) -> np.ndarray:
+    """bool [H, W], the convex hull of the pixels of a mask."""
+    rows, columns = np.nonzero(mask)
+    hull = np.zeros(mask.shape, np.uint8)
+    cv2.fillConvexPoly(hull, cv2.convexHull(np.stack([columns, rows], 1).astype(np.int32)), 1)
+    return hull > 0
 
 
 def _photographed(view: Witness, around: Around) -> Shown:
