@@ -83,7 +83,7 @@ def further(job: Job, out: Path) -> list[str]:
     shown = [load_image(folder / "further" / f"{view}.png") for view in shares]
     titles = [f"{view}: {share:.1%} of its mask was open" for view, share in shares.items()]
     save_image(out / "further.png", wall(shown, titles))
-    said = "No reference shows what was open there: these views were put together from pieces of themselves."
+    said = "No reference shows what was open there: these views were put together from patches of the photographs."
     parts = [page.heading("Further views"), page.paragraph(said)]
     return [*parts, page.picture(out / "further.png", "views completed beside the references")]
 

@@ -214,3 +214,15 @@ def test_what_is_painted_reaches_over_the_rim_and_narrow_rests():
     unknown[20:80, 40:80] = unknown[20:80, 84:100] = True  # a rest of 4 px is left between, and 60 px beside
     hole = surfaces.to_paint(mask, unknown)
     assert hole[50, 82] and hole[50, 39] and not hole[50, 120] and not hole[50, 37] and not hole[10].any()
+
+
+def test_a_nearer_surface_ends_at_the_prolongation_of_its_border():
+    """A bench's end before a hedge: left and right of the object its upper edge is seen, at row 60."""
+    depth = np.full((120, 160), 4.0)
+    depth[60:] = 1.0
+    hidden = np.zeros((120, 160), bool)
+    hidden[30:90, 60:100] = True
+    found = surfaces._drawn(depth, ~hidden, hidden)
+    assert np.allclose(found[30:60, 60:100], 4, rtol=0.01) and np.allclose(found[61:90, 60:100], 1, rtol=0.01)
+    alone = surfaces._drawn(np.full((120, 160), 2.0), ~hidden, hidden)
+    assert np.allclose(alone, 2, rtol=0.01)

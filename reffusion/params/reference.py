@@ -21,7 +21,7 @@ class Given(Settings):
 class Params(Settings):
     reference: Given | list[Given] | None = Field(None, description="completed views that the scene brings")
     inpainter: Literal["diffusion", "exemplar"] = Field(
-        "diffusion", description="the prior; or pieces of the picture itself, sharp, with nothing new in them"
+        "diffusion", description="the prior; or patches of the photographs, along surfaces: sharp, with nothing new"
     )
     prior: str = prior_field()
     prompt: str = Field("", description="what the invented region shows, for a prior that reads")

@@ -24,6 +24,7 @@ from reffusion.texture.matches import NONE, PATCH, Choice, Hole, Match, Pictures
 COARSEST = 40.0  # px that the hole may be wide at the coarsest level: there its parts are laid out
 SMALL = 16.0  # px: a wider hole has two levels at least
 ROUGHNESS = 2.0  # weight of the local mean gradient beside the colours: what tells gravel from a wall of its colour
+APART = 50.0  # difference of two planes beside that of colours
 AROUND = 15  # px, a side of the window of that mean
 FADING = 1.2  # factor by which trust falls with each pixel from the hole's border
 LEAST_TRUST = 0.02
@@ -83,7 +84,7 @@ def complete(
     if not hole.any():
         return Completed(target.image.copy(), 0.0)
     target = replace(target, image=blanked(target.image, hole))
-    levels = _levels(target, hole, sources)
+    levels = _levels(target, hole, sources, smooth)
     if not levels:
         return Completed(telea(target.image, hole), float(NONE))
     state = np.array([seeding.seed_for(seed, "texture") | 1], np.uint64)
@@ -122,7 +123,7 @@ def _finished(image, hole, now, pixels, match, pictures, trust) -> np.ndarray:
     return picture
 
 
-def _levels(target: Shown, hole: np.ndarray, sources: Sequence[Shown]) -> list:
+def _levels(target: Shown, hole: np.ndarray, sources: Sequence[Shown], smooth: Sequence[int]) -> list:
     """Coarsest first: the target's values [h, w, C], its hole, the sources, and the target at that size; none where
     there is too little to take patches from."""
     width = 2 * _depth(hole).max()
@@ -131,10 +132,13 @@ def _levels(target: Shown, hole: np.ndarray, sources: Sequence[Shown]) -> list:
     seen = [(_values(source.image, source.masked), source.masked) for source in sources]
     levels = []
     for _ in range(count):
+        seen = [
+            (_marked(values, each, smooth, scale), masked) for (values, masked), each in zip(seen, sources, strict=True)
+        ]
         pictures = _pictures(seen, sources, scale)
         if (pictures.surface >= 0).sum() < FEWEST:
             break
-        levels.append((now, mask, pictures, sheet))
+        levels.append((_marked(now, sheet, smooth, scale), mask, pictures, sheet))
         now, mask = _halved(now, mask)
         seen = [_halved(values, masked) for values, masked in seen]
         scale *= 2
@@ -142,8 +146,8 @@ def _levels(target: Shown, hole: np.ndarray, sources: Sequence[Shown]) -> list:
 
 
 def _values(image: np.ndarray, masked: np.ndarray) -> np.ndarray:
-    """[H, W, 5] float32: colours, and the local mean of the grey picture's change along x and y. What is masked shows
-    what is next to it."""
+    """[H, W, 6] float32: colours, the local mean of the grey picture's change along x and y, and room for the plane.
+    What is masked shows what is next to it."""
     if masked.any() and not masked.all():
         nearest = ndimage.distance_transform_edt(masked, return_distances=False, return_indices=True)
         image = image[tuple(nearest)]
@@ -152,7 +156,15 @@ def _values(image: np.ndarray, masked: np.ndarray) -> np.ndarray:
     window = (AROUND, AROUND)
     mass = np.maximum(cv2.blur(known, window), 1e-3)
     change = [cv2.blur(np.abs(cv2.Scharr(grey, -1, *way)) / 16 * known, window) / mass for way in ((1, 0), (0, 1))]
-    return np.concatenate([image.astype(np.float32), ROUGHNESS * np.stack(change, -1)], -1)
+    return np.concatenate([image.astype(np.float32), ROUGHNESS * np.stack([*change, 0 * grey], -1)], -1)
+
+
+def _marked(values: np.ndarray, shown: Shown, smooth: Sequence[int], scale: int) -> np.ndarray:
+    """[H, W, 6] with the plane in the last channel: where two meet, patches must show the same edge."""
+    of = np.zeros(max([*smooth, int(shown.surface.max())]) + 1, np.float32)
+    of[list(smooth)] = APART * np.arange(1, len(smooth) + 1)
+    plane = cv2.medianBlur(of[shown.surface], 5)[::scale, ::scale]
+    return np.concatenate([values[..., :5], plane[..., None]], -1)
 
 
 def _halved(values: np.ndarray, masked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -170,7 +182,7 @@ def _pictures(seen: Sequence[tuple[np.ndarray, np.ndarray]], sources: Sequence[S
     height, width = (max(masked.shape[axis] for _, masked in seen) for axis in (0, 1))
     shape = (len(seen), height, width)
     found = Pictures(
-        np.zeros((*shape, 5), np.float32), np.full(shape, -1, np.int32), np.zeros((*shape, 4), np.float32),
+        np.zeros((*shape, 6), np.float32), np.full(shape, -1, np.int32), np.zeros((*shape, 4), np.float32),
         np.ones(shape, np.float32),
     )  # fmt: skip
     for k, ((values, masked), source) in enumerate(zip(seen, sources, strict=True)):
@@ -246,7 +258,7 @@ def _voted(now, pixels, match, trust, pictures, spread: float, todo: np.ndarray 
     """`now` with its hole, or the pixels `todo` of it, as the patches say."""
     voted = now.copy()
     votes.vote(np.arange(len(pixels.row)) if todo is None else todo, match, pixels, trust, pictures, spread, voted)
-    now[...] = voted
+    now[..., :5] = voted[..., :5]
 
 
 def _depth(mask: np.ndarray) -> np.ndarray:

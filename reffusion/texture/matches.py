@@ -10,7 +10,7 @@ import numpy as np
 from reffusion.kernels.compiled import inlined
 
 PATCH = 3  # pixels from a patch's middle to its border
-TURN = 0.5  # radians by which a patch may be turned in its plane
+TURN = 0.15  # radians by which a patch may be turned in its plane
 NEAREST, FARTHEST = 1.4, 0.8  # bounds of the scale between two patches off planes
 SAME_SCALE = 0.1  # within it of 1 they are not scaled: nothing is lost by sampling between pixels
 SHRINK, GROW = 0.6, 3.0  # bounds of the source's area for one pixel of the hole, along a plane

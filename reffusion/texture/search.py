@@ -25,7 +25,7 @@ def _uniform(state):
     return np.float32((x >> np.uint64(40)) / np.float64(1 << 24))
 
 
-BEFORE, NOT_SEEN = 1.25, 4.0  # a patch that was so much nearer counts so many times more: it would have been seen
+BEFORE, FOREIGN = 1.25, 4.0  # a patch that is so much nearer, or on another plane, counts so many times more
 
 
 def _misfit(n, planar, picture, y, x, angle, limit, hole, picture_now, weight, pictures, elsewhere):
@@ -52,8 +52,8 @@ def _misfit(n, planar, picture, y, x, angle, limit, hole, picture_now, weight, p
     ratio = hole.size[n] / pictures.size[picture, row, column]
     alike = surface == hole.surface[n] and FARTHEST < ratio < NEAREST
     factor = np.float32(1) if alike else np.float32(1) + elsewhere
-    if ratio > BEFORE:
-        factor *= NOT_SEEN
+    if ratio > BEFORE or (surface != hole.surface[n] and surface > 0 and hole.surface[n] > 0):
+        factor *= FOREIGN
     most = limit * mass / factor
     for dy in range(top, bottom + 1):
         for dx in range(left, right + 1):

@@ -19,4 +19,4 @@ def preview(params: Params, **_: Path | None) -> list[str]:
     """What the stage will do, as far as that is known before it looks."""
     if not (params.further and params.start == "reference"):
         return []
-    return [f"completes up to {params.further} further views from pieces of themselves: what no reference shows"]
+    return [f"completes up to {params.further} further views from patches of the photographs: what no reference shows"]

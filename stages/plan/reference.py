@@ -31,4 +31,4 @@ def preview(params: Params, *, scene: Path, poses: Path | None = None, **_: Path
     if params.inpainter == "diffusion":
         return []
     unread = f"; the prompt '{params.prompt}' is not read, reference.inpainter=diffusion would" if params.prompt else ""
-    return [f"completes the reference from pieces of itself: no diffusion here{unread}"]
+    return [f"puts the reference together from patches of the photographs: no diffusion here{unread}"]
