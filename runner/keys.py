@@ -73,7 +73,9 @@ class Hashes:
         return digest(*(part for path in files for part in (name(str(path)), self.file(path))))
 
     def weights(self, folder: Path) -> str:
-        """Of a model's folder: what a library may read of it. Writing in its card reruns nothing."""
+        """Of a model's folder: what a library may read of it. Writing in its card reruns nothing. Or of a file."""
+        if folder.is_file():
+            return self.file(folder)
         return self.files(folder, (path for path in files_below(folder) if path.suffix not in NOT_WEIGHTS))
 
     def save(self) -> None:
@@ -169,7 +171,7 @@ class Inputs:
 
     params: dict[str, Any]  # every parameter of the stage, resolved
     needs: dict[str, str | None]  # need -> hash of its content, None where it was left out
-    weights: dict[str, str]  # parameter -> hash of the folder it names, or the name itself where that is none here
+    weights: dict[str, str]  # parameter -> hash of the folder or file it names, or the name itself where none is here
     code: dict[str, str]  # file -> fingerprint
     unkeyed: tuple[str, ...] = ()  # parameters that nothing in the artifact depends on
 

@@ -54,7 +54,7 @@ def decide(job: Job, stage: str, earlier: dict[str, Decision]) -> Decision:
             unknown_yet.append(f"waits for {need}")
     for param, _, folder in _weights(job, stage):
         if folder and not folder.exists():
-            lost = f"{stage}.{param}: no weights at {folder}; name a folder, or an id such as owner/model"
+            lost = f"{stage}.{param}: no weights at {folder}; name a folder or a file, or an id such as owner/model"
             return Decision("missing", lost)
     code = code_of(job.root, stage, job.hashes)
     if unknown_yet:

@@ -17,12 +17,13 @@ from reffusion.io.images import save_image, save_mask
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets, load_object, load_scene, load_views, save_references
 from reffusion.masks import taint
-from reffusion.paint import painting, registration
+from reffusion.paint import feedforward, painting, registration
 from reffusion.params.reference import Params
 from reffusion.prior import inpaint, memory
 from reffusion.prior.model import load_prior
 from reffusion.texture import surfaces
 from reffusion.types import Camera, MaskSet, Reference, Scene
+from reffusion.weights.published import PAINTERS
 
 TO_PAINT, VIEWS_TO_PAINT = "to_paint", 4
 MARGIN, BLEND = 0.01, 0.01  # of it: taken from a reference from elsewhere around the hole, and blended beyond
@@ -119,6 +120,8 @@ def inpainted(params: Params, out: Path, scene: Scene, poses: Path, fit: Path, m
     if params.inpainter == "exemplar":
         around = surfaces_around(scene, poses, fit, masks)
         return Reference(camera, from_photographs(params, out, base, pixels, camera, around), pixels.invent)
+    if params.inpainter in PAINTERS:
+        return Reference(camera, from_network(params, out, name, base, pixels), pixels.invent)
     return Reference(camera, from_prior(params, out, name, base, pixels.invent), pixels.invent)
 
 
@@ -143,6 +146,15 @@ def from_photographs(
     save_image(out / "candidates.png", np.concatenate([each.image for each in found], 1))
     save_json(out / "candidates.json", {"view": camera.name, "misfits": misfits, "chosen": chosen})
     return found[chosen].image
+
+
+def from_network(params: Params, out: Path, name: str, base: np.ndarray, pixels: MaskSet) -> np.ndarray:
+    """The picture [H, W, 3] uint8 with I painted in one pass by LaMa or MI-GAN; also written as the one candidate."""
+    painter = feedforward.load(params.inpainter, params.prior, params.device)
+    image = painter.paint(base, surfaces.to_paint(pixels.consistent, pixels.invent))
+    save_image(out / "candidates.png", image)
+    save_json(out / "candidates.json", {"view": name, "painter": painter.name, "chosen": 0})
+    return image
 
 
 def from_prior(params: Params, out: Path, name: str, base: np.ndarray, invent: np.ndarray) -> np.ndarray:

@@ -22,6 +22,7 @@ DOORS = {
     "peft": ("reffusion/prior/lora.py",),
     "transformers": ("reffusion/prior/model.py", "reffusion/depth/monocular.py"),
     "huggingface_hub": ("reffusion/weights/download.py",),
+    "onnxruntime": ("reffusion/paint/onnx_model.py",),
 }
 OPENERS = {"open", "read_text", "write_text", "read_bytes", "write_bytes", "imread", "imwrite", "imsave", "savez"}
 MAY_OPEN = ("reffusion/io/", "reffusion/capture/", "reffusion/trace.py")

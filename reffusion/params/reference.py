@@ -20,8 +20,10 @@ class Given(Settings):
 
 class Params(Settings):
     reference: Given | list[Given] | None = Field(None, description="completed views that the scene brings")
-    inpainter: Literal["diffusion", "exemplar"] = Field(
-        "diffusion", description="the prior; or patches of the photographs, along surfaces: sharp, with nothing new"
+    inpainter: Literal["diffusion", "exemplar", "lama", "migan"] = Field(
+        "diffusion",
+        description="the prior; patches of the photographs, along surfaces: sharp, with nothing new; LaMa or MI-GAN: "
+        "`prior` then names their file (.pt or .onnx) or its folder",
     )
     prior: str = prior_field()
     prompt: str = Field("", description="what the invented region shows, for a prior that reads")

@@ -50,3 +50,33 @@ LPIPS_FILES = {
     "alex.pth": (_LINEAR, 6_009, "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0"),
     "vgg.pth": (_LINEAR, 7_289, "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868"),
 }
+
+
+@dataclass(frozen=True)
+class PublishedPainter:
+    """A feed-forward inpainter, one file.
+
+    Attributes:
+        name: for tables and messages.
+        endings: of the files that are read.
+        where: which file, its size and licence, and who publishes it. Taken from public sources, not tried.
+    """
+
+    name: str
+    endings: tuple[str, ...]
+    where: str
+
+
+PAINTERS = {
+    "lama": PublishedPainter(
+        "LaMa",
+        (".pt", ".onnx"),
+        "lama_fp32.onnx (208 MB, Apache-2.0) from https://huggingface.co/Carve/LaMa-ONNX or big-lama.pt (206 MB) from "
+        "https://github.com/enesmsahin/simple-lama-inpainting/releases",
+    ),
+    "migan": PublishedPainter(
+        "MI-GAN",
+        (".onnx",),
+        "migan_pipeline_v2.onnx (28 MB, MIT) from https://huggingface.co/andraniksargsyan/migan",
+    ),
+}

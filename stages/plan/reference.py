@@ -7,13 +7,18 @@ from pathlib import Path
 from reffusion.capture.given import PAINTED, listed, load_given, paintings_in, words
 from reffusion.capture.views import placed_views
 from reffusion.params.reference import Params
-from reffusion.weights import local
+from reffusion.weights import local, painters
+from reffusion.weights.published import PAINTERS
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
     """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml, and its folders."""
     given = params.reference is not None or PAINTED in brings or params.inpainter == "exemplar"
-    return [] if given else [local.of_model(params.prior, params.dtype)]
+    if given:
+        return []
+    if params.inpainter in PAINTERS:
+        return [painters.of_painter(params.inpainter, params.prior, "reference.prior")]
+    return [local.of_model(params.prior, params.dtype)]
 
 
 def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
@@ -31,4 +36,7 @@ def preview(params: Params, *, scene: Path, poses: Path | None = None, **_: Path
     if params.inpainter == "diffusion":
         return []
     unread = f"; the prompt '{params.prompt}' is not read, reference.inpainter=diffusion would" if params.prompt else ""
-    return [f"puts the reference together from patches of the photographs: no diffusion here{unread}"]
+    how = "puts the reference together from patches of the photographs"
+    if params.inpainter in PAINTERS:
+        how = f"completes the reference by {PAINTERS[params.inpainter].name}, one picture"
+    return [f"{how}: no diffusion here{unread}"]

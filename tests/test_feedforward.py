@@ -1,0 +1,261 @@
+"""LaMa and MI-GAN from files: what they are shown, what of it is taken, and which files are refused.
+
+Stand-ins for the published files, of the same inputs and outputs, are built here; they fill a hole with the mean of
+what lies around it.
+"""
+
+import json
+import shutil
+import sys
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from test_paint2d import Mean
+from test_references import ROOT, capture, wall  # noqa: F401 (a fixture)
+
+from reffusion.io.images import load_image
+from reffusion.io.scene import load_mask_sets, load_references, load_scene
+from reffusion.paint import feedforward
+from reffusion.paint.onnx_model import Network
+from reffusion.params.reference import Params
+from reffusion.texture import surfaces
+from reffusion.weights import painters
+from runner.keys import Hashes
+from runner.plan import plan
+from runner.resolve import Request
+from runner.resolve import resolve as prepare_job
+from stages import reference
+from stages.plan import reference as plan_reference
+
+HEIGHT, WIDTH = 96, 136  # multiples of 8: the means are of these pixels alone
+SIDE = 32
+
+
+def picture() -> np.ndarray:
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    return np.stack([2 * rows, columns, 100 + 0 * rows], -1).astype(np.uint8)
+
+
+def hole() -> np.ndarray:
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    mask[20:40, 25:65] = True
+    mask[30:50, 50:60] = True
+    return mask
+
+
+# ------------------------------------------------------------------------------------------------------- the stand-ins
+
+
+def model(path, kind="lama", side=None, answer=None, **changes):
+    """An ONNX file of the inputs and outputs of LaMa's ("lama") or MI-GAN's.
+
+    Args:
+        side: fixed size, None: any.
+        answer: factor of the answer, another than its kind's.
+        changes: "names" of the inputs, channels of the "mask", "size" (height, width) of the image, "batch", "outputs".
+    """
+    onnx = pytest.importorskip("onnx", reason="needs onnx and onnxruntime")
+    pytest.importorskip("onnxruntime", reason="needs onnx and onnxruntime")
+    helper, FLOAT = onnx.helper, onnx.TensorProto.FLOAT
+    lama = kind == "lama"
+    own = FLOAT if lama else onnx.TensorProto.UINT8
+    size = changes.get("size", (side, side) if side else ("height", "width"))
+    image, mask = changes.get("names", ("image", "mask"))
+    batch = changes.get("batch", "batch" if lama else "batch_size")
+    value = helper.make_tensor_value_info
+    constants = {"full": 255.0, "one": 1.0, "scale": answer or (255.0 if lama else 1.0), "least": 1e-6}
+    initial = [helper.make_tensor(name, FLOAT, [], [number]) for name, number in constants.items()]
+    initial.append(helper.make_tensor("axes", onnx.TensorProto.INT64, [2], [2, 3]))
+    node = lambda op, inputs, out, **more: helper.make_node(op, inputs, [out], **more)
+    nodes = [node("Cast", [image], "shown", to=FLOAT), node("Cast", [mask], "said", to=FLOAT)]
+    nodes += (
+        [node("Identity", ["said"], "inner"), node("Sub", ["one", "said"], "known")]
+        if lama
+        else [node("Div", ["said", "full"], "known"), node("Sub", ["one", "known"], "inner")]
+    )
+    nodes += [
+        node("Mul", ["shown", "known"], "kept"),
+        node("ReduceSum", ["kept", "axes"], "sum"),
+        node("ReduceSum", ["known", "axes"], "number"),
+        node("Add", ["number", "least"], "count"),
+        node("Div", ["sum", "count"], "mean"),
+        node("Mul", ["mean", "inner"], "filled"),
+        node("Add", ["kept", "filled"], "all"),
+        node("Mul", ["all", "scale"], "scaled"),
+        node("Cast", ["scaled"], "result", to=own),
+    ]
+    inputs = [value(image, own, [batch, 3, *size]), value(mask, own, [batch, changes.get("mask", 1), *size])]
+    outputs = [value(name, own, None) for name in changes.get("outputs", ["result"])]
+    graph = helper.make_graph(nodes, kind, inputs, outputs, initial)
+    made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
+    onnx.save(made, str(path))
+    return path
+
+
+def script(path):
+    torch.jit.script(Mean()).save(path)
+    return path
+
+
+# ----------------------------------------------------------------------------------------- what is shown, what is taken
+
+
+@pytest.mark.parametrize("kind", ["lama", "migan"])
+@pytest.mark.parametrize("side", [None, SIDE, 512])
+def test_only_the_hole_changes_and_its_content_does_not_count(tmp_path, kind, side):
+    painter = feedforward.load(kind, model(tmp_path / "net.onnx", kind, side))
+    assert painter.name == {"lama": "LaMa (net.onnx)", "migan": "MI-GAN (net.onnx)"}[kind]
+    image, inner = picture(), hole()
+    painted = painter.paint(image, inner)
+    assert painted.dtype == np.uint8 and (painted[~inner] == image[~inner]).all()
+    place = feedforward.around(inner, side) if side else (slice(None), slice(None))
+    known = image[place][~inner[place]].mean(0)
+    middle = cv2.erode(inner.astype(np.uint8), np.ones((9, 9))) > 0  # of scaled answers the border mixes
+    assert np.abs(painted[middle if side else inner] - known).max() < (1.01 if not side else 4)
+    noise = np.random.default_rng(0).integers(0, 256, image.shape, np.uint8)
+    assert (painter.paint(np.where(inner[..., None], noise, image), inner) == painted).all()
+    assert (painter.paint(image, np.zeros_like(inner)) == image).all()
+    assert (painted[inner][:, 2] >= 90).all(), "no black is scaled or blended into the rim"
+
+
+def test_a_torchscript_lama_is_read_as_by_the_baselines(tmp_path):
+    painter = feedforward.load("lama", script(tmp_path / "big.pt").parent)
+    painted = painter.paint(picture(), hole())
+    assert painter.name == "LaMa (big.pt)" and (painted[hole()] == painted[hole()][0]).all()
+
+
+def seen_by(side, inner):
+    """What a network of this size is shown: (picture, hole)."""
+    shown = []
+
+    def paint(image, mask):
+        shown.append((image, mask))
+        return image
+
+    feedforward.painted(Network(side, paint), np.full((*inner.shape, 3), 77, np.uint8), inner)
+    return shown[0]
+
+
+def test_a_fixed_size_sees_a_square_around_the_hole_with_as_much_again():
+    inner = np.zeros((300, 400), bool)
+    inner[100:140, 200:260] = True
+    assert feedforward.around(inner, 64) == (slice(60, 180), slice(170, 290))  # twice the hole
+    assert feedforward.around(inner, 200) == (slice(20, 220), slice(130, 330))  # as large as the model
+    assert feedforward.around(inner, 512) == (slice(0, 300), slice(80, 380))  # as the picture has it
+    inner[:] = False
+    inner[290:, :20] = True
+    assert feedforward.around(inner, 64) == (slice(236, 300), slice(0, 64)), "at the picture's border"
+    inner[10, :] = True
+    assert feedforward.around(inner, 64) == (slice(0, 300), slice(0, 400)), "longer than the picture is high"
+    for side in (64, 512):
+        image, mask = seen_by(side, inner)
+        assert image.shape == (side, side, 3) and mask.shape == (side, side) and (abs(image.astype(int) - 77) < 5).all()
+        assert mask[int(10.5 * side / 400)].all(), "a line of one pixel is not lost"
+    image, mask = seen_by(None, inner[:, :397])
+    assert image.shape == (304, 400, 3) and mask.shape == (304, 400), "any size: multiples of 8"
+
+
+# ----------------------------------------------------------------------------------------------------- what is refused
+
+
+def test_other_models_are_refused_in_one_line(tmp_path):
+    def refusal(kind, path):
+        with pytest.raises(ValueError) as told:
+            feedforward.load(kind, path)
+        assert "\n" not in str(told.value) and path.name in str(told.value)
+        return str(told.value)
+
+    file = tmp_path / "net.onnx"
+    wanted = "expected image float32 [1, 3, H, W], mask float32 [1, 1, H, W], of any or one square size"
+    said = refusal("lama", model(file, "migan"))
+    assert wanted in said and "it takes image uint8 [batch_size, 3, height, width]" in said
+    assert "expected image uint8" in refusal("migan", model(file, "lama", 512))
+    assert "it takes input float" in refusal("lama", model(file, names=("input", "mask")))
+    for other in ({"mask": 3}, {"size": (512, 256)}, {"size": (512, "width")}, {"batch": 4}):
+        assert wanted in refusal("lama", model(file, **other))
+    assert "one float32 picture" in refusal("lama", model(file, outputs=["result", "mean"]))
+    file.write_text("<html>")
+    assert "is no ONNX model that onnxruntime reads" in refusal("lama", file)
+    fraction = feedforward.load("lama", model(file, answer=1.0))
+    with pytest.raises(ValueError, match=r"net\.onnx: answers in \[0, 1\]; expected 0\.\.255"):
+        fraction.paint(picture(), hole())
+    poisoned = feedforward.load("lama", model(file, answer=float("inf")))
+    with pytest.raises(ValueError, match="not finite"):
+        poisoned.paint(picture(), hole())
+
+
+def test_without_onnxruntime_one_line_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    (tmp_path / "lama_fp32.onnx").write_bytes(b"x")
+    with pytest.raises(ValueError, match=r"lama_fp32.onnx needs onnxruntime: `pip install onnxruntime`"):
+        feedforward.load("lama", tmp_path)
+    (need,) = needs(inpainter="lama", prior=str(tmp_path))
+    assert "pip install onnxruntime" in need.problem and not need.fetched
+
+
+# --------------------------------------------------------------------------------------------- the parameter, the stage
+
+
+def needs(**params):
+    return plan_reference.needed_weights(Params(**params), frozenset())
+
+
+def test_the_file_is_found_or_the_plan_says_where_people_get_it(tmp_path):
+    (need,) = needs(inpainter="lama")  # the diffusion prior's name is no file
+    assert need.name == "LaMa" and not need.fetched and "reference.prior: LaMa: sd2-community/" in need.problem
+    assert "is not on this machine; get" in need.problem
+    assert "lama_fp32.onnx (208 MB" in need.problem and "name the file or its folder" in need.problem
+    (need,) = needs(inpainter="migan", prior=str(script(tmp_path / "big.pt")))
+    assert "is no .onnx file; get migan_pipeline_v2.onnx" in need.problem
+    (need,) = needs(inpainter="lama", prior=str(tmp_path))
+    assert need.problem is None and need.name == str(tmp_path / "big.pt") and need.bytes > 0
+    assert painters.file_of("lama", tmp_path) == tmp_path / "big.pt"
+    shutil.copy(tmp_path / "big.pt", tmp_path / "other.pt")
+    (need,) = needs(inpainter="lama", prior=str(tmp_path))
+    assert r"holds 2 .pt or .onnx files (big.pt, other.pt); name one" in need.problem
+    params = Params(inpainter="lama", prior=str(tmp_path), prompt="a vase")
+    (note,) = plan_reference.preview(params, scene=tmp_path)
+    assert "by LaMa, one picture" in note and "'a vase' is not read" in note
+    assert not plan_reference.needed_weights(params, frozenset({"painted"}))
+
+
+def test_a_job_is_told_before_any_work_and_keyed_by_the_files_content(tmp_path):
+    scene, file = capture(tmp_path / "wall"), tmp_path / "big.pt"
+
+    def planned(prior):
+        job = prepare_job(Request(ROOT, tmp_path / "runs", str(scene), profile="laptop",
+                                  set=f"reference.inpainter=lama reference.prior={prior}"))  # fmt: skip
+        found = plan(job, job.pipeline.closure("reference"))["reference"]
+        return found.word, found.reason
+
+    word, reason = planned(file)
+    assert word == "missing" and f"reference.prior: no weights at {file}; name a folder or a file" in reason
+    word, reason = planned("priors/tiny")
+    assert word == "missing" and "reference.prior: LaMa: priors/tiny holds no .pt or .onnx file; get" in reason
+    script(file)
+    assert planned(file)[0] == "undecided", "it waits for masks"
+    hashes = Hashes(tmp_path / "hashes.json")
+    before = hashes.weights(file)
+    file.write_bytes(file.read_bytes() + b"more")
+    assert hashes.weights(file) != before
+
+
+@pytest.mark.parametrize("kind", ["lama", "migan"])
+def test_the_stage_paints_the_hole_in_one_pass(wall, tmp_path, kind):  # noqa: F811
+    file = script(tmp_path / "big.pt") if kind == "lama" else model(tmp_path / "pipeline.onnx", "migan")
+    out = tmp_path / "out"
+    out.mkdir()
+    reference.run(Params(inpainter=kind, prior=str(file)), out, **wall)
+    (found,) = load_references(out, load_scene(wall["poses"]))
+    pixels = load_mask_sets(wall["masks"], ["a2"])["a2"]
+    inner = surfaces.to_paint(pixels.consistent, pixels.invent)
+    assert found.camera.name == "a2" and np.array_equal(found.mask, pixels.invent)
+    assert np.ptp(found.image[inner].astype(int), axis=0).max() <= 1, "the stand-in's mean"
+    outside = ~inner & ~pixels.consistent
+    assert np.array_equal(found.image[outside], load_image(wall["poses"] / "images" / "a2.png")[outside])
+    assert np.array_equal(load_image(out / "candidates.png"), found.image)
+    name = {"lama": "LaMa (big.pt)", "migan": "MI-GAN (pipeline.onnx)"}[kind]
+    record = json.loads((out / "candidates.json").read_text())
+    assert record == {"view": "a2", "painter": name, "chosen": 0}
