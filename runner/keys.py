@@ -74,9 +74,8 @@ class Hashes:
 
     def weights(self, folder: Path) -> str:
         """Of a model's folder: what a library may read of it. Writing in its card reruns nothing. Or of a file."""
-        if folder.is_file():
-            return self.file(folder)
-        return self.files(folder, (path for path in files_below(folder) if path.suffix not in NOT_WEIGHTS))
+        read = [path for path in files_below(folder) if path.suffix not in NOT_WEIGHTS]
+        return self.file(folder) if folder.is_file() else self.files(folder, read)
 
     def save(self) -> None:
         if len(self.known) == self._saved:

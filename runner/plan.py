@@ -54,8 +54,7 @@ def decide(job: Job, stage: str, earlier: dict[str, Decision]) -> Decision:
             unknown_yet.append(f"waits for {need}")
     for param, _, folder in _weights(job, stage):
         if folder and not folder.exists():
-            lost = f"{stage}.{param}: no weights at {folder}; name a folder or a file, or an id such as owner/model"
-            return Decision("missing", lost)
+            return Decision("missing", f"{stage}.{param}: no weights at {folder}; name a folder, a file or owner/model")
     code = code_of(job.root, stage, job.hashes)
     if unknown_yet:
         return Decision("undecided", unknown_yet[0], _there(job, stage))
