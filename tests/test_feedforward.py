@@ -231,7 +231,7 @@ def test_a_job_is_told_before_any_work_and_keyed_by_the_files_content(tmp_path):
         return found.word, found.reason
 
     word, reason = planned(file)
-    assert word == "missing" and f"reference.prior: no weights at {file}; name a folder or a file" in reason
+    assert word == "missing" and f"reference.prior: no weights at {file}; name a folder, a file" in reason
     word, reason = planned("priors/tiny")
     assert word == "missing" and "reference.prior: LaMa: priors/tiny holds no .pt or .onnx file; get" in reason
     script(file)

@@ -525,7 +525,7 @@ REFUSALS = {
     "scene.yaml stage": ({"data/toy/scene.yaml": "stages: {fi: {}}"}, {}, r"scene.yaml: stages: unknown stage 'fi'"),
     "scene.yaml syntax": ({"data/toy/scene.yaml": "a: [1"}, {}, r"toy/scene.yaml: not valid YAML"),
     "scene.yaml list": ({"data/toy/scene.yaml": "- 1"}, {}, r"scene.yaml: expected `key: value`"),
-    "weights": ({}, {"set": "distill.prior=./none"}, r"distill.prior: no weights at .*none; name a folder or a file"),
+    "weights": ({}, {"set": "distill.prior=./none"}, r"distill.prior: no weights at .*none; name a folder, a file"),
     "no GPU": ({}, {"set": "fit.device=cuda"}, r"fit: fit.device is cuda, .*no CUDA driver: profile=laptop"),
     "missing input": ({"data/void/x": ""}, {"scene": "void"}, r"poses: .*void: no number.txt; write one"),
     "pipeline": ({"pipeline.yaml": "stages: {a: {needs: [b]}}"}, {}, r"pipeline.yaml: "),
