@@ -1,0 +1,160 @@
+"""Depth made up in the hole against ray-cast truth: `python -m benchmarks.studies.depth --scene data/demo-table`.
+
+For each reference whose depth `initialize` completed, the pixels of its invent mask: the share within 1, 2 and 5 % of
+the true camera z of the room without the object, and the median error, of all of them, of those near a step of the
+true depth, and of those away from one. Writes a picture each: reference, true depth, the made up, and the error, red
+where it is too far, blue where too near. The scene must be one of the generator's: only there is the truth known. The
+depth of what is seen outside the masks is compared too, and must agree: else poses and truth are not one system.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from benchmarks.studies.masks import true_never_seen
+from reffusion.geometry import pixel_rays
+from reffusion.io.arrays import load_json
+from reffusion.io.images import load_exr, save_image
+from reffusion.io.scene import load_mask_sets, load_references, load_scene
+from reffusion.types import Camera, Reference, Similarity
+
+DATA = Path(__file__).resolve().parents[2] / "data"
+KINDS = ("wide", "360", "seen", "behind", "table", "corner", "grass", "mini")  # else: demo; a scene's name says which
+WITHIN = (0.01, 0.02, 0.05)  # of the true depth
+EDGE, NEAR = 0.02, 4  # bend of disparity over a pixel that is a step, of itself; px
+AGREE = 0.02  # the middle error outside the masks; more is no fit's inaccuracy
+CLIP, MARGIN, SIDE = 0.05, 12, 480  # of the drawn error; px around the hole; least px of a panel's width
+
+
+def kind_of(name: str) -> str:
+    """The kind of a scene that make named: `demo-table-21` is a table."""
+    return next((part for part in name.split("-") if part in KINDS), "demo")
+
+
+def scene_pose(camera: Camera, similarity: Similarity) -> np.ndarray:
+    """[4, 4] world to camera in the scene's own frame and unit."""
+    pose = camera.world_to_camera.copy()
+    pose[:3, 3] = pose[:3, 3] / similarity.scale - pose[:3, :3] @ similarity.offset
+    return pose
+
+
+def true_depth(seed: int, kind: str, camera: Camera, similarity: Similarity) -> np.ndarray:
+    """[H, W] camera z in the normalised frame without the object, by the generator in a process of its own."""
+    with tempfile.TemporaryDirectory() as folder:
+        view, made = Path(folder) / "view.npz", Path(folder) / "depth.npy"
+        np.savez(view, world_to_camera=scene_pose(camera, similarity), rays=pixel_rays(camera)[..., :2])
+        asked = ["--seed", str(seed), "--kind", kind, "--view", str(view), "--out", str(made)]
+        subprocess.run([sys.executable, str(DATA / "depths.py"), *asked], check=True)
+        return np.load(made) * similarity.scale
+
+
+def near_edges(depth: np.ndarray) -> np.ndarray:
+    """bool [H, W]: within NEAR px of a step. Disparity is linear over a plane however slanted it is seen."""
+    padded = np.pad(1 / depth, 1, mode="edge")
+    middle = padded[1:-1, 1:-1]
+    across = np.abs(padded[1:-1, :-2] - 2 * middle + padded[1:-1, 2:])
+    down = np.abs(padded[:-2, 1:-1] - 2 * middle + padded[2:, 1:-1])
+    across[:, [0, -1]], down[[0, -1]] = 0, 0  # at the border one neighbour is missing
+    step = np.maximum(across, down) > EDGE * middle
+    return cv2.distanceTransform((~step).astype(np.uint8), cv2.DIST_L2, 5) <= NEAR if step.any() else step
+
+
+def errors(made: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """[H, W] of the true depth, positive where too far, infinite where there is none."""
+    return np.where(np.isfinite(made) & (made > 0), made / true - 1, np.inf)
+
+
+def scores(error: np.ndarray) -> dict[str, float]:
+    """Of the pixels [P]: how many, the shares within WITHIN, the middle of the errors' sizes and of the errors."""
+    if not error.size:
+        return {"pixels": 0}
+    shares = {f"within {limit:.0%}": float((np.abs(error) <= limit).mean()) for limit in WITHIN}
+    return {"pixels": error.size, **shares, "median": float(np.median(np.abs(error))), "bias": float(np.median(error))}
+
+
+def picture(reference: Reference, true: np.ndarray, made: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """Reference, truth, made-up depth and error around the hole, whose border is drawn; [h, w, 3] uint8."""
+    mask = reference.mask
+    near, far = np.percentile(1 / true[mask], (99.5, 0.5))
+    far, near = min(far, near / 1.02) / 1.02, near * 1.02
+    greys = [np.clip((1 / np.maximum(z, 1e-9) - far) / (near - far), 0, 1) for z in (true, made)]
+    depths = [cv2.applyColorMap(np.uint8(255 * grey), cv2.COLORMAP_VIRIDIS)[..., ::-1] for grey in greys]
+    share = np.clip(error / CLIP, -1, 1)[..., None]
+    signed = 255 * (1 - np.where(share > 0, share * [0, 1, 1], -share * [1, 1, 0]))
+    row, column = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
+    cut = tuple(slice(max(found[0] - MARGIN, 0), found[-1] + MARGIN + 1) for found in (row, column))
+    larger = -(-SIDE // (cut[1].stop - cut[1].start))
+    panels = []
+    for panel in (reference.image, *depths, np.where(mask[..., None], signed, 200).astype(np.uint8)):
+        shown = np.ascontiguousarray(panel[cut].repeat(larger, 0).repeat(larger, 1))
+        outline, _ = cv2.findContours(
+            mask[cut].astype(np.uint8).repeat(larger, 0).repeat(larger, 1), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE
+        )
+        panels.append(cv2.drawContours(shown, outline, -1, (255, 255, 255), 1))
+    return np.concatenate(panels, 1)
+
+
+def measure(scene_folder: Path, run: Path, out: Path, kind: str) -> dict[str, dict[str, dict[str, float]]]:
+    """View -> part of it -> scores; pictures are put in `out`. Parts: the hole, near and away from edges, the rest of C
+    (what other views should show), what truly no training view shows, and what this view shows, away from edges.
+
+    Raises:
+        ValueError: no reference's depth was completed; the truth does not fit what is seen outside the masks.
+    """
+    seed, scene = load_json(scene_folder / "truth/facts.json")["seed"], load_scene(run / "poses")
+    found = {}
+    for reference in load_references(run / "reference", scene):
+        name = reference.camera.name
+        file = run / "initialize/depth" / f"{name}.exr"
+        if not file.exists():
+            continue
+        made, true = load_exr(file).astype(float), true_depth(seed, kind, reference.camera, scene.similarity)
+        error, edges, mask = errors(made, true), near_edges(true), reference.mask
+        sets = load_mask_sets(run / "masks", [name])[name]
+        hidden = sets.raw | sets.consistent | mask
+        parts = {"hole": mask, "near edges": mask & edges, "elsewhere": mask & ~edges}
+        never = true_never_seen(scene_folder, [reference.camera])[name]
+        parts |= {"rest of C": sets.consistent & ~mask, "never seen": never, "outside": ~hidden & ~edges}
+        found[name] = {part: scores(error[pixels]) for part, pixels in parts.items()}
+        if not found[name]["outside"].get("median", 0) < AGREE:
+            outside = found[name]["outside"]
+            raise ValueError(f"{name}: what is seen outside the masks is not at its true depth ({outside}): --kind?")
+        save_image(out / f"{name}.png", picture(reference, true, made, error))
+    if not found:
+        raise ValueError(f"{run / 'initialize/depth'}: no depth of a reference; run `make scene=... initialize`")
+    return found
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", type=Path, required=True, help="a scene's folder made by data/generate.py")
+    parser.add_argument("--run", type=Path, help="default: runs/<scene's name>")
+    parser.add_argument("--out", type=Path, help="default: runs/depth/<scene's name>")
+    parser.add_argument("--kind", choices=("demo", *KINDS), help="of the scene; default: what its name says")
+    given = parser.parse_args()
+    name = given.scene.resolve().name
+    run, out = given.run or Path("runs") / name, given.out or Path("runs/depth") / name
+    for path in (given.scene / "truth/facts.json", run / "initialize/facts.json"):
+        if not path.exists():
+            raise ValueError(f"{path} is missing: make a scene of the generator's, and run `make scene=... initialize`")
+    results = measure(given.scene, run, out, given.kind or kind_of(name))
+    (out / "depth.json").write_text(json.dumps(results, indent=1))
+    for view, parts in results.items():
+        for part, found in parts.items():
+            if found["pixels"]:
+                shares = ", ".join(f"{found[f'within {limit:.0%}']:6.1%} within {limit:.0%}" for limit in WITHIN)
+                middle = f"median error {found['median']:.2%} ({found['bias']:+.2%})"
+                print(f"{name} {view} {part:10} {found['pixels']:6} px: {shares}, {middle}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
