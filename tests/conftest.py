@@ -38,3 +38,8 @@ def text(prior):
 
     with torch.no_grad():
         return embed_text(prior, list(PROMPTS))
+
+
+def pytest_collection_modifyitems(items):
+    """The file that takes longest first: at the end one process would be busy with it while the other waits."""
+    items.sort(key=lambda item: item.path.name != "test_resume.py")
