@@ -194,12 +194,11 @@ def completed_further(params: Params, out: Path, gaussians, new, around):
     while len(further) < params.further and (camera := coverage.barest(around, found)):
         mask, hidden = found[camera.name], around.hidden[camera.name]
         # Just outside C a photograph may still show the object's rim, which would be repeated.
-        rimmed = margin.widened(hidden, coverage.RIM)
+        rimmed = margin.widened(hidden, surfaces.RIM)
         base = inpaint.background(gaussians, camera, around.photos[camera.name], rimmed)
-        open_too = mask | rimmed & margin.widened(mask, coverage.RIM)
-        (found_here,) = surfaces.completions(base, open_too, camera, hidden, around.looked(), [SEED])
-        picture = found_here.image
-        reference = Reference(camera, picture, mask)
+        hole = surfaces.with_rim(mask, hidden)
+        (completed,) = surfaces.completions(base, hole, camera, hidden, around.looked(), [SEED])
+        reference = Reference(camera, completed.image, mask)
         print(f"further view {camera.name}: {mask.sum() / hidden.sum():.1%} of the mask is covered by nothing")
         try:
             gaussians, new = filled(params, out, gaussians, new, reference, around, None, None, farthest=True)
@@ -207,7 +206,7 @@ def completed_further(params: Params, out: Path, gaussians, new, around):
             print(f"left as it is: {error}")
             found[camera.name] = np.zeros_like(mask)
             continue
-        save_image(out / "further" / f"{camera.name}.png", picture)
+        save_image(out / "further" / f"{camera.name}.png", completed.image)
         further.append(reference)
         found |= coverage.open_pixels(gaussians, around, [c for c in around.cameras if found[c.name].any()])
     return gaussians, new, further

@@ -14,7 +14,6 @@ from reffusion.masks.witness import OPAQUE
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
-RIM = 0.006  # of the picture's width, repainted around what is open too, as far as it is no photograph
 ENOUGH = 0.001  # share of a view's C under which what is open is left to its neighbours
 
 

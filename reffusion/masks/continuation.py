@@ -13,6 +13,7 @@ from scipy.sparse.linalg import spsolve
 from reffusion import geometry, seeding
 from reffusion.depth.behind import grown
 from reffusion.masks.witness import SURFACE, Witness, votes
+from reffusion.paint.margin import hull
 from reffusion.types import Camera
 
 REACH = 2.5  # radii of the object around its middle within which surfaces are looked for
@@ -175,11 +176,7 @@ def _hull(seen: np.ndarray) -> np.ndarray:
     patches, count = ndimage.label(solid)
     areas = np.bincount(patches.ravel(), minlength=count + 1)
     areas[0] = 0
-    rows, columns = np.nonzero((areas >= LARGE * max(areas.max(), 1))[patches])
-    hull = np.zeros(seen.shape, np.uint8)
-    if len(rows):
-        cv2.fillConvexPoly(hull, cv2.convexHull(np.stack([columns, rows], 1).astype(np.int32)), 1)
-    return hull > 0
+    return hull((areas >= LARGE * max(areas.max(), 1))[patches])
 
 
 def _between(unknown: np.ndarray, seen: np.ndarray, free: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Masks with a margin."""
+"""Masks with a margin, and their hulls."""
 
 from __future__ import annotations
 
@@ -12,3 +12,13 @@ def widened(mask: np.ndarray, fraction: float) -> np.ndarray:
     reach = round(fraction * mask.shape[1])
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     return cv2.dilate(mask.astype(np.uint8), disk) > 0
+
+
+def hull(mask: np.ndarray) -> np.ndarray:
+    """bool [H, W], the convex hull of a mask's pixels: what is seen of a surface goes on as far as the straight
+    prolongations of its borders."""
+    rows, columns = np.nonzero(mask)
+    found = np.zeros(mask.shape, np.uint8)
+    if len(rows):
+        cv2.fillConvexPoly(found, cv2.convexHull(np.stack([columns, rows], 1).astype(np.int32)), 1)
+    return found > 0

@@ -19,7 +19,7 @@ from reffusion import seeding
 from reffusion.paint.paint2d import blanked, telea
 from reffusion.texture import search, votes
 from reffusion.texture.blending import blended
-from reffusion.texture.matches import NONE, PATCH, Choice, Hole, Match, Pictures
+from reffusion.texture.matches import NONE, PATCH, Choice, Compared, Hole, Match, Pictures
 
 COARSEST = 40.0  # px that the hole may be wide at the coarsest level: there its parts are laid out
 SMALL = 16.0  # px: a wider hole has two levels at least
@@ -28,7 +28,6 @@ APART = 50.0  # difference of two planes beside that of colours
 AROUND = 15  # px, a side of the window of that mean
 FADING = 1.2  # factor by which trust falls with each pixel from the hole's border
 LEAST_TRUST = 0.02
-ELSEWHERE = 0.5  # by how much more a patch of another surface counts
 CLEAR = 1.5  # times PATCH: how far from what is masked a patch's middle must lie
 FEWEST = 200  # places for patches: with fewer there is no coarser level, or Telea's method instead
 RINGS, TRIES = (3, 60), 20  # rounds and tries anywhere of the first layout, and tries of what follows
@@ -89,65 +88,64 @@ def complete(
         return Completed(telea(target.image, hole), float(NONE))
     state = np.array([seeding.seed_for(seed, "texture") | 1], np.uint64)
     match = before = None
-    for k, (now, mask, pictures, sheet) in enumerate(levels):
-        pixels, choice = _pixels(sheet, mask, 2 ** (len(levels) - 1 - k), smooth, pictures), _choice(pictures)
-        trust = np.where(mask, np.maximum(FADING ** -_depth(mask), LEAST_TRUST), 1).astype(np.float32)
-        if match is None:
-            match = _laid_out(now, mask, trust, pixels, pictures, choice, state)
+    for k, (now, mask, pictures) in enumerate(levels):
+        first, last = k == 0, k == len(levels) - 1
+        pixels = _pixels(target, mask, 2 ** (len(levels) - 1 - k), smooth, pictures)
+        of = Compared(pixels, pictures, now, _trust(mask))
+        choice = _choice(pictures, int(pixels.surface.max()))
+        if first:
+            match = _laid_out(of, mask, choice, state)
         else:
-            match = _from_coarser(match, before, pixels, pictures)
-            _voted(now, pixels, match, trust, pictures, 1e12)
-        last = k == len(levels) - 1
-        rounds = ROUNDS[0] if k == 0 else ROUNDS[2] if last else ROUNDS[1]
-        todo = np.arange(len(pixels.row))
+            match = _from_coarser(match, before, of)
+            _voted(of, match, of.weight, 1e12)
+        rounds, todo = ROUNDS[0] if first else ROUNDS[2] if last else ROUNDS[1], np.arange(len(pixels.row))
         for turn in range(rounds):
-            tries = TRIES if k == 0 else TRIES // 5
-            search.search(todo, 2, tries, match, pixels, now, trust, pictures, choice, np.float32(ELSEWHERE), state)
+            search.search(todo, 2, TRIES if first else TRIES // 5, match, of, choice, state)
             if not last or turn < rounds - 1:
-                _voted(now, pixels, match, trust, pictures, max(float(np.median(match.misfit)), 1.0))
+                _voted(of, match, of.weight, max(float(np.median(match.misfit)), 1.0))
         before = pixels
-    weight = trust[pixels.row, pixels.column] * (match.misfit < NONE)
-    misfit = float((match.misfit * weight).sum() / max(weight.sum(), 1e-6))
-    return Completed(_finished(target.image, hole, now, pixels, match, pictures, trust), misfit)
+    weight = of.weight[pixels.row, pixels.column] * (match.misfit < NONE)
+    fitted = float((match.misfit * weight).sum() / max(weight.sum(), 1e-6))
+    return Completed(_finished(target.image, hole, of, match), fitted)
 
 
-def _finished(image, hole, now, pixels, match, pictures, trust) -> np.ndarray:
-    """uint8 [H, W, 3]: each pixel from the best patch that covers it, without seams."""
-    own = now[..., :3].copy()
+def _finished(image: np.ndarray, hole: np.ndarray, of: Compared, match: Match) -> np.ndarray:
+    """uint8 [H, W, 3]: what the patches show at their middles, without seams, and no colour beyond theirs and those
+    outside the hole."""
+    own = of.now[..., :3].copy()
     right, below = np.zeros_like(own), np.zeros_like(own)
     beside, under = np.zeros(hole.shape, np.float32), np.zeros(hole.shape, np.float32)
-    votes.steps(match, pixels, pictures, right, below, beside, under, own)
+    votes.steps(match, of.hole, of.pictures, right, below, beside, under, own)
     right, below = right / np.maximum(beside, 1)[..., None], below / np.maximum(under, 1)[..., None]
+    low, high = own.min((0, 1)), own.max((0, 1))
     picture = image.copy()
-    picture[hole] = blended(now[..., :3], hole, right, below, own).clip(0, 255).round().astype(np.uint8)
+    picture[hole] = blended(of.now[..., :3], hole, right, below, own).clip(low, high).round().astype(np.uint8)
     return picture
 
 
 def _levels(target: Shown, hole: np.ndarray, sources: Sequence[Shown], smooth: Sequence[int]) -> list:
-    """Coarsest first: the target's values [h, w, C], its hole, the sources, and the target at that size; none where
-    there is too little to take patches from."""
+    """Coarsest first: the target's values [h, w, C], its hole, and the sources; none where there is too little to take
+    patches from."""
     width = 2 * _depth(hole).max()
     count = 1 + int(np.ceil(np.log2(max(width / COARSEST, 2.0 if width > SMALL else 1.0))))
-    now, mask, scale, sheet = _values(target.image, hole), hole, 1, target
+    now, mask, scale = _values(target.image, hole), hole, 1
     seen = [(_values(source.image, source.masked), source.masked) for source in sources]
     levels = []
     for _ in range(count):
-        seen = [
-            (_marked(values, each, smooth, scale), masked) for (values, masked), each in zip(seen, sources, strict=True)
-        ]
-        pictures = _pictures(seen, sources, scale)
+        marked = [_marked(values, each, smooth, scale) for (values, _), each in zip(seen, sources, strict=True)]
+        pictures = _pictures(marked, [masked for _, masked in seen], sources, scale)
         if (pictures.surface >= 0).sum() < FEWEST:
             break
-        levels.append((_marked(now, sheet, smooth, scale), mask, pictures, sheet))
+        levels.append((_marked(now, target, smooth, scale), mask, pictures))
         now, mask = _halved(now, mask)
         seen = [_halved(values, masked) for values, masked in seen]
         scale *= 2
-    return [(now.copy(), mask, pictures, target) for now, mask, pictures, target in reversed(levels)]
+    return levels[::-1]
 
 
 def _values(image: np.ndarray, masked: np.ndarray) -> np.ndarray:
-    """[H, W, 6] float32: colours, the local mean of the grey picture's change along x and y, and room for the plane.
-    What is masked shows what is next to it."""
+    """[H, W, 5] float32: colours, and the local mean of the grey picture's change along x and y. What is masked shows
+    what is next to it."""
     if masked.any() and not masked.all():
         nearest = ndimage.distance_transform_edt(masked, return_distances=False, return_indices=True)
         image = image[tuple(nearest)]
@@ -156,15 +154,15 @@ def _values(image: np.ndarray, masked: np.ndarray) -> np.ndarray:
     window = (AROUND, AROUND)
     mass = np.maximum(cv2.blur(known, window), 1e-3)
     change = [cv2.blur(np.abs(cv2.Scharr(grey, -1, *way)) / 16 * known, window) / mass for way in ((1, 0), (0, 1))]
-    return np.concatenate([image.astype(np.float32), ROUGHNESS * np.stack([*change, 0 * grey], -1)], -1)
+    return np.concatenate([image.astype(np.float32), ROUGHNESS * np.stack(change, -1)], -1)
 
 
 def _marked(values: np.ndarray, shown: Shown, smooth: Sequence[int], scale: int) -> np.ndarray:
-    """[H, W, 6] with the plane in the last channel: where two meet, patches must show the same edge."""
+    """[H, W, 6], the plane in the last channel: where two meet, patches must show the same edge."""
     of = np.zeros(max([*smooth, int(shown.surface.max())]) + 1, np.float32)
     of[list(smooth)] = APART * np.arange(1, len(smooth) + 1)
     plane = cv2.medianBlur(of[shown.surface], 5)[::scale, ::scale]
-    return np.concatenate([values[..., :5], plane[..., None]], -1)
+    return np.concatenate([values, plane[..., None]], -1)
 
 
 def _halved(values: np.ndarray, masked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -177,15 +175,17 @@ def _halved(values: np.ndarray, masked: np.ndarray) -> tuple[np.ndarray, np.ndar
     return small / np.maximum(share, 1e-3)[..., None], share < 0.999
 
 
-def _pictures(seen: Sequence[tuple[np.ndarray, np.ndarray]], sources: Sequence[Shown], scale: int) -> Pictures:
-    """The sources at 1 / `scale` of their size, `seen` as values and masks of that size already."""
-    height, width = (max(masked.shape[axis] for _, masked in seen) for axis in (0, 1))
-    shape = (len(seen), height, width)
+def _pictures(
+    marked: Sequence[np.ndarray], masks: Sequence[np.ndarray], sources: Sequence[Shown], scale: int
+) -> Pictures:
+    """The sources at 1 / `scale` of their size; `marked` values [h, w, C] and `masks` [h, w] have it already."""
+    height, width = (max(masked.shape[axis] for masked in masks) for axis in (0, 1))
+    shape = (len(masks), height, width)
     found = Pictures(
         np.zeros((*shape, 6), np.float32), np.full(shape, -1, np.int32), np.zeros((*shape, 4), np.float32),
         np.ones(shape, np.float32),
     )  # fmt: skip
-    for k, ((values, masked), source) in enumerate(zip(seen, sources, strict=True)):
+    for k, (values, masked, source) in enumerate(zip(marked, masks, sources, strict=True)):
         here = (k, slice(masked.shape[0]), slice(masked.shape[1]))
         every = (slice(None, None, scale),) * 2
         clear = ndimage.distance_transform_edt(np.pad(~masked, 1))[1:-1, 1:-1] > CLEAR * PATCH
@@ -218,47 +218,53 @@ def _pixels(target: Shown, mask: np.ndarray, scale: int, smooth: Sequence[int], 
     return Hole(rows, columns, index, surface, np.isin(surface, carried), to_plane, size)
 
 
-def _choice(pictures: Pictures) -> Choice:
+def _choice(pictures: Pictures, most: int) -> Choice:
+    """All places, then those of each plane up to number `most`."""
     places = np.argwhere(pictures.surface >= 0).astype(np.int32)
     surface = pictures.surface[tuple(places.T)]
-    parts = [places] + [places[surface == k] for k in range(1, int(pictures.surface.max()) + 1)]
-    starts = np.cumsum([0] + [len(part) for part in parts])
-    return Choice(np.concatenate(parts), np.append(starts, [starts[-1]] * 64))  # planes that no source shows have none
+    parts = [places] + [places[surface == k] for k in range(1, most + 1)]
+    return Choice(np.concatenate(parts), np.cumsum([0] + [len(part) for part in parts]))
 
 
-def _laid_out(now, mask, trust, pixels: Hole, pictures: Pictures, choice: Choice, state) -> Match:
+def _trust(mask: np.ndarray) -> np.ndarray:
+    """[H, W] float32: 1 where known, falling from the hole's border inwards."""
+    return np.where(mask, np.maximum(FADING ** -_depth(mask), LEAST_TRUST), 1).astype(np.float32)
+
+
+def _laid_out(of: Compared, mask: np.ndarray, choice: Choice, state: np.ndarray) -> Match:
     """The first patches, from the hole's border inwards: each ring is compared with what is known outside it."""
-    count = len(pixels.row)
+    row, column, trust = of.hole.row, of.hole.column, of.weight
+    count = len(row)
     zeros = lambda kind: np.zeros(count, kind)
     picture = np.full(count, -1, np.int32)
-    misfit = np.full(count, NONE, np.float32)
-    match = Match(picture, zeros(np.float32), zeros(np.float32), zeros(np.float32), zeros(bool), misfit)
-    weight = np.where(mask, 0, 1).astype(np.float32)
-    ring = np.ceil(_depth(mask))[pixels.row, pixels.column]
+    unfit = np.full(count, NONE, np.float32)
+    match = Match(picture, zeros(np.float32), zeros(np.float32), zeros(np.float32), zeros(bool), unfit)
+    of = of._replace(weight=np.where(mask, 0, 1).astype(np.float32))
+    ring = np.ceil(_depth(mask))[row, column]
     for k in range(1, int(ring.max()) + 1):
         todo = np.flatnonzero(ring == k)
-        search.search(todo, *RINGS, match, pixels, now, weight, pictures, choice, np.float32(ELSEWHERE), state)
-        _voted(now, pixels, match, trust, pictures, max(2 * float(np.percentile(match.misfit[todo], 75)), 1.0), todo)
-        weight[pixels.row[todo], pixels.column[todo]] = trust[pixels.row[todo], pixels.column[todo]]
+        search.search(todo, *RINGS, match, of, choice, state)
+        _voted(of, match, trust, max(2 * float(np.percentile(match.misfit[todo], 75)), 1.0), todo)
+        of.weight[row[todo], column[todo]] = trust[row[todo], column[todo]]
     return match
 
 
-def _from_coarser(match: Match, before: Hole, pixels: Hole, pictures: Pictures) -> Match:
+def _from_coarser(match: Match, before: Hole, of: Compared) -> Match:
     """The patches of a coarser level, `before`, for the pixels of this one."""
-    height, width = before.index.shape
+    (height, width), pixels = before.index.shape, of.hole
     row, column = np.minimum(pixels.row // 2, height - 1), np.minimum(pixels.column // 2, width - 1)
     parent = before.index[row, column]
     taken = Match(*(each[parent].copy() for each in match))
     taken = taken._replace(planar=taken.planar & pixels.planar)
-    votes.carried_down(taken, before.row[parent], before.column[parent], pixels, pictures)
+    votes.carried_down(taken, before.row[parent], before.column[parent], pixels, of.pictures)
     return taken
 
 
-def _voted(now, pixels, match, trust, pictures, spread: float, todo: np.ndarray | None = None) -> None:
-    """`now` with its hole, or the pixels `todo` of it, as the patches say."""
-    voted = now.copy()
-    votes.vote(np.arange(len(pixels.row)) if todo is None else todo, match, pixels, trust, pictures, spread, voted)
-    now[..., :5] = voted[..., :5]
+def _voted(of: Compared, match: Match, trust: np.ndarray, spread: float, todo: np.ndarray | None = None) -> None:
+    """`of.now` with its hole, or the pixels `todo` of it, as the patches say; but the planes, which are known."""
+    todo, voted = np.arange(len(of.hole.row)) if todo is None else todo, of.now.copy()
+    votes.vote(todo, match, of.hole, trust, of.pictures, spread, voted)
+    of.now[..., :-1] = voted[..., :-1]
 
 
 def _depth(mask: np.ndarray) -> np.ndarray:

@@ -52,6 +52,21 @@ class Hole(NamedTuple):
     size: np.ndarray
 
 
+class Compared(NamedTuple):
+    """What patches are compared in.
+
+    Attributes:
+        hole: its pixels. pictures: the sources.
+        now: [H, W, C] float32, the picture as it is now.
+        weight: [H, W] float32, how much each of its pixels counts.
+    """
+
+    hole: Hole
+    pictures: Pictures
+    now: np.ndarray
+    weight: np.ndarray
+
+
 class Match(NamedTuple):
     """The patch that each pixel of the hole takes; all [N].
 

@@ -14,7 +14,7 @@ from reffusion.depth.layers import pieces
 from reffusion.masks.continuation import Plane, planes_around
 from reffusion.masks.voting import extent
 from reffusion.masks.witness import Witness, pixels, witnesses
-from reffusion.paint.margin import widened
+from reffusion.paint.margin import hull, widened
 from reffusion.paint.painting import drawn_across
 from reffusion.texture.completion import Completed, Shown, complete
 from reffusion.types import Camera, Gaussians
@@ -73,13 +73,18 @@ def looked_around(
 
 def to_paint(hidden: np.ndarray, unknown: np.ndarray) -> np.ndarray:
     """bool [H, W]: what of a view is painted anew for the pixels that are `unknown`: also what of C (`hidden`) is left
-    between them in narrow pieces, and the rim, where what is left of the object's blurred edge would be continued."""
+    between them in narrow pieces, and the rim."""
     decided = hidden & ~unknown
     reach = pixels(NARROW, hidden.shape[1])
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     wide = np.pad((~hidden | decided).astype(np.uint8), reach, constant_values=1)
     broad = cv2.morphologyEx(wide, cv2.MORPH_OPEN, disk)[reach:-reach, reach:-reach] > 0
-    hole = hidden & ~(broad & decided)
+    return with_rim(hidden & ~(broad & decided), hidden)
+
+
+def with_rim(hole: np.ndarray, hidden: np.ndarray) -> np.ndarray:
+    """The hole, bool [H, W], and the rim of C (`hidden`) beside it, inside and out: what is left there of the object's
+    blurred edge would be continued."""
     return hole | widened(hidden, RIM) & widened(hole, RIM)
 
 
@@ -128,17 +133,9 @@ def _drawn(depth: np.ndarray, known: np.ndarray, hidden: np.ndarray) -> np.ndarr
     away = lambda k: -float(np.median(depth[piece == k]))
     for nearer, k in enumerate(sorted(range(1, piece.max() + 1), key=away)):
         own = drawn_across(depth, piece == k)
-        there = hidden & (own > 0) & (_hull(piece == k) if nearer else True)
+        there = hidden & (own > 0) & (hull(piece == k) if nearer else True)
         found[there] = own[there]
     return found
-
-
-def _hull(mask: np.ndarray) -> np.ndarray:
-    """bool [H, W], the convex hull of the pixels of a mask."""
-    rows, columns = np.nonzero(mask)
-    hull = np.zeros(mask.shape, np.uint8)
-    cv2.fillConvexPoly(hull, cv2.convexHull(np.stack([columns, rows], 1).astype(np.int32)), 1)
-    return hull > 0
 
 
 def _photographed(view: Witness, around: Around) -> Shown:

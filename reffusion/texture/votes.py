@@ -9,8 +9,6 @@ import numpy as np
 from reffusion.kernels.compiled import inlined, kernel
 from reffusion.texture.matches import PATCH, carried, carried_match
 
-BEST_BESIDE = 0.15  # growth of a patch's misfit with the square of its distance, where the best one alone decides
-
 
 @inlined
 def _cubic(t):
@@ -40,13 +38,12 @@ def vote(todo, match, hole, trust, pictures, spread, voted):
     """What the patches that cover a pixel show there, mean by weight, into `voted` [H, W, C].
 
     Args:
-        trust: [H, W] float32, of the patches' middles. spread: misfit over which their weight falls by a factor of e;
-            0: the best patch alone decides.
+        trust: [H, W] float32, of the patches' middles. spread: misfit over which their weight falls by a factor of e.
     """
     height, width, channels = voted.shape
     total = np.empty(channels)
     for n in todo:
-        total[:], mass, best, least = 0.0, 0.0, -1, 1e30
+        total[:], mass = 0.0, 0.0
         for dy in range(-PATCH, PATCH + 1):
             for dx in range(-PATCH, PATCH + 1):
                 row, column = hole.row[n] + dy, hole.column[n] + dx
@@ -55,24 +52,12 @@ def vote(todo, match, hole, trust, pictures, spread, voted):
                 m = hole.index[row, column]
                 if m < 0 or match.picture[m] < 0:
                     continue
-                if spread == 0:
-                    here = match.misfit[m] * (1 + BEST_BESIDE * (dy * dy + dx * dx))
-                    if here < least:
-                        least, best = here, m
-                    continue
                 w = trust[row, column] * math.exp(-match.misfit[m] / spread) + 1e-9
                 _, xx, xy, yx, yy = carried_match(hole, m, pictures, match)
                 y, x = match.row[m] - yx * dx - yy * dy, match.column[m] - xx * dx - xy * dy
                 for c in range(channels):
                     total[c] += w * sampled(pictures.values, match.picture[m], y, x, c)
                 mass += w
-        if best >= 0:
-            _, xx, xy, yx, yy = carried_match(hole, best, pictures, match)
-            dy, dx = hole.row[n] - hole.row[best], hole.column[n] - hole.column[best]
-            y, x = match.row[best] + yx * dx + yy * dy, match.column[best] + xx * dx + xy * dy
-            for c in range(channels):
-                total[c] = sampled(pictures.values, match.picture[best], y, x, c)
-            mass = 1.0
         if mass > 0:
             voted[hole.row[n], hole.column[n]] = total / mass
 
