@@ -1,4 +1,4 @@
-"""reffusion plan|run|compare|batch|weights|clean --scene NAME: what the Makefile calls (or python -m runner).
+"""reffusion plan|run|compare|batch|weights|verify|clean --scene NAME: what the Makefile calls (or python -m runner).
 Pages of what was made: reffusion report|compare-page|view|turntable|sheet, each with --help."""
 
 import argparse
@@ -11,10 +11,11 @@ from reffusion.command import workplace
 from runner import Failed, Refused
 from runner.child import INTERRUPTED
 from runner.compare import batch, compare, show_results
-from runner.execute import clean, run_scene, weights
-from runner.files import write_json
+from runner.execute import run_scene, weights
+from runner.files import told, write_json
 from runner.plan import as_record, plan, table
 from runner.resolve import Request, resolve
+from runner.upkeep import clean, verify
 
 SOME_FAILED = 3  # compare: done, but for some variants
 
@@ -23,8 +24,8 @@ def main() -> int:
     arguments = _parser().parse_args()
     root = arguments.root.resolve()
     runs = (arguments.runs or workplace(root) / "runs").resolve()
-    asked = (arguments.scene, arguments.profile, arguments.variant, arguments.trust, arguments.set, arguments.budget)
-    request = Request(root, runs, *asked)
+    names = ("scene", "profile", "variant", "trust", "set", "budget", "keep")
+    request = Request(root, runs, *(getattr(arguments, name) for name in names))
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # told to end: as Ctrl-C
     try:
         if arguments.command == "plan":
@@ -43,23 +44,25 @@ def main() -> int:
             return 1 if batch(request, arguments.data) else 0
         elif arguments.command == "weights":
             return 1 if weights(request, arguments.offline) else 0
+        elif arguments.command == "verify":
+            return 1 if verify(request) else 0
         else:
             clean(request)
-    except (Refused, Failed) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
     except KeyboardInterrupt:
         print("\nstopped; the same command goes on from here", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:  # as in `plan | head`: who read the output is gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except (Refused, Failed, OSError) as error:
+        print(f"error: {told(error)}", file=sys.stderr)
+        return 2
     return 0
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="reffusion", description=__doc__)
-    parser.add_argument("command", choices=["plan", "run", "compare", "batch", "weights", "clean"])
+    parser.add_argument("command", choices=["plan", "run", "compare", "batch", "weights", "verify", "clean"])
     parser.add_argument("stage", nargs="?", default="all", help="run this stage and what it needs; `all` (default)")
     parser.add_argument("--scene", default="", help="a name under data/, or a path")
     parser.add_argument("--data", type=Path, default=Path("data"), help="batch: the folder of scenes")
@@ -69,6 +72,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--seeds", type=int, default=1, help="compare: on so many scenes: X, X-1, X-2 ...")
     parser.add_argument("--record", action="store_true", help="plan: write it to runs/<scene>/plan.json")
     parser.add_argument("--trust", action="store_true", help="accept artifacts made by older code")
+    parser.add_argument("--keep", action="store_true", help="go on with artifacts as people changed them, from now on")
     parser.add_argument("--budget", help="time for the whole job, like 5m: sets the number of steps")
     parser.add_argument("--offline", action="store_true", help="weights: only say what is missing")
     parser.add_argument("--set", default="", help="stage.parameter=value ...")

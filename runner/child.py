@@ -19,11 +19,11 @@ import traceback
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from pydantic import BaseModel, ValidationError
 
-from runner.files import files_below
+from runner.files import files_below, told
 
 INTERRUPTED = 130
 
@@ -58,7 +58,7 @@ def _describe(asked: dict[str, Any]) -> dict[str, Any]:
         path = Path(f"stages/{stage}.py")
         _check_run(path, asked["takes"])
     except Exception as error:
-        return {"broken": f"{path}: {_one_line(error)}"}
+        return {"broken": f"{path}: {told(error)}"}
     fields = dict(_fields(planned.Params))
     try:
         resolved = planned.Params(**asked["params"])
@@ -79,9 +79,9 @@ def _describe(asked: dict[str, Any]) -> dict[str, Any]:
         try:
             answer["notes"] = list(planned.preview(resolved, **{n: p and Path(p) for n, p in needs.items()}))
         except ValueError as error:
-            answer["refusal"] = _one_line(error)
+            answer["refusal"] = told(error)
         except Exception as error:
-            answer["notes"] = [f"(its preview failed: {_one_line(error)})"]
+            answer["notes"] = [f"(its preview failed: {told(error)})"]
     return answer
 
 
@@ -121,11 +121,6 @@ def _error(error: Any, model: type[BaseModel]) -> dict[str, Any]:
     return {"where": ".".join(where) or "?", "unknown": unknown, "value": repr(value), "message": message}
 
 
-def _one_line(error: BaseException) -> str:
-    text = " ".join(str(error).split())
-    return text if isinstance(error, ValueError) and text else f"{type(error).__name__}: {text}"
-
-
 def fetch() -> int:
     """Get the weights that stages need and that are not here, each once; how many could not be had, which are told on
     standard error. Standard input: {stage: {"params", "brings"}}."""
@@ -142,38 +137,48 @@ def fetch() -> int:
             print(f"{need.name}: fetched", flush=True)
         except ValueError as error:
             failed += 1
-            print(f"error: {_one_line(error)}", file=sys.stderr, flush=True)
+            print(f"error: {told(error)}", file=sys.stderr, flush=True)
     return failed
 
 
 def run() -> int:
     """Do one stage. Standard input: one line of JSON, then nothing until the runner is gone.
 
-    The line: {"stage", "params", "out", "needs": {need: path or null}, "log", "result", "lock"}. Writes to `result`
-    {"seconds", "peak_memory_mb"} or {"error": one line}, and to `log` the full traceback.
+    The line: {"stage", "params", "out", "needs": {need: path or null}, "log", "result", "lock"}. Writes to `result`,
+    an open file's number, {"seconds", "peak_memory_mb"} or {"error": one line}, and to `log` the full traceback.
     """
     job = json.loads(sys.stdin.readline())
-    os.set_inheritable(job["lock"], False)  # held open until this process ends: no second runner before that
+    for number in (job["lock"], job["result"]):  # the lock is held until this process ends: no second runner before
+        os.set_inheritable(number, False)
     threading.Thread(target=_end_with_runner, args=(sys.stdin.fileno(),), daemon=True).start()
-    began, code = time.perf_counter(), 0
-    with open(job["log"], "w") as log:
-        faulthandler.enable(log)
-        log.write(f"{time.strftime('%F %T')} {job['stage']} {json.dumps(job['params'])}\n")
-        try:
-            params = _module(_described_in(job["stage"])).Params(**job["params"])
-            stage = importlib.import_module(f"stages.{job['stage']}")
-            needs = {name: path and Path(path) for name, path in job["needs"].items()}
-            stage.run(params, Path(job["out"]), **needs)
-            result = {"seconds": round(time.perf_counter() - began, 2), "peak_memory_mb": _peak_memory_mb()}
-        except KeyboardInterrupt:
-            return INTERRUPTED
-        except Exception as error:
-            log.write(traceback.format_exc())
-            result, code = {"error": _one_line(error)}, 1
-        log.write(f"{time.strftime('%F %T')} {json.dumps(result)}\n")
-        faulthandler.disable()
-    Path(job["result"]).write_text(json.dumps(result))
-    return code
+    result: dict[str, Any] = {}
+    try:
+        with open(job["log"], "w") as log:
+            faulthandler.enable(log)
+            log.write(f"{time.strftime('%F %T')} {job['stage']} {json.dumps(job['params'])}\n")
+            result = _done(job, log)
+            log.write(f"{time.strftime('%F %T')} {json.dumps(result)}\n")
+            faulthandler.disable()
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except OSError as error:  # of the log
+        result = result or {"error": told(error)}
+    os.write(job["result"], json.dumps(result).encode())
+    return int("error" in result)
+
+
+def _done(job: dict[str, Any], log: TextIO) -> dict[str, Any]:
+    """What there is to tell of a stage, done here and now."""
+    began = time.perf_counter()
+    try:
+        params = _module(_described_in(job["stage"])).Params(**job["params"])
+        stage = importlib.import_module(f"stages.{job['stage']}")
+        needs = {name: path and Path(path) for name, path in job["needs"].items()}
+        stage.run(params, Path(job["out"]), **needs)
+    except Exception as error:
+        log.write(traceback.format_exc())
+        return {"error": told(error)}
+    return {"seconds": round(time.perf_counter() - began, 2), "peak_memory_mb": _peak_memory_mb()}
 
 
 def _end_with_runner(fd: int) -> None:

@@ -1,6 +1,7 @@
 """Many runs: `compare`, the full method and every variant on a scene or several; `batch`, every scene of a folder."""
 
 import csv
+import io
 import json
 import os
 import re
@@ -10,9 +11,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from runner import Failed, Refused, say
+from runner import Refused, say
 from runner.execute import run_scene
-from runner.files import RECEIPT, shown, write_json
+from runner.files import RECEIPT, shown, told, write_json, write_text
 from runner.keys import HASHES, Hashes
 from runner.pipeline import Pipeline, find_scene, load_pipeline, unknown
 from runner.resolve import Request, resolve_all
@@ -35,8 +36,7 @@ def compare(request: Request, only: str = "", seeds: int = 1) -> int:
     asks = lambda scene, method: replace(request, scene=scene, variant=None if method == FULL else method)
     requests = {(scene, method): asks(scene, method) for scene in scenes for method in methods}
     hashes = Hashes(request.runs / HASHES)
-    # Wrong parameters of any variant, or of any scene, are refused before the first stage runs.
-    resolve_all([r for (scene, method), r in requests.items() if scene == scenes[0] or method == FULL], hashes)
+    _refuse_wrong(scenes, requests, hashes)
     names = {scene: find_scene(scene, request.root).name for scene in scenes}
     runs = [{"scene": names[scene], "method": method, "state": WAITING} for scene, method in requests]
     record = {"scene": names[scenes[0]], "scenes": list(names.values()), "methods": methods, "runs": runs}
@@ -58,13 +58,26 @@ def compare(request: Request, only: str = "", seeds: int = 1) -> int:
     return len(failed)
 
 
+def _refuse_wrong(scenes: list[str], requests: dict[tuple[str, str], Request], hashes: Hashes) -> None:
+    """Before the first stage runs: wrong parameters, of any variant. A scene that cannot be read fails in its turn,
+    where another can."""
+    refusals = []
+    for each in scenes:
+        try:
+            resolve_all([request for (scene, _), request in requests.items() if scene == each], hashes)
+            return
+        except Refused as error:
+            refusals.append(error)
+    raise refusals[0]
+
+
 def _tried(request: Request, hashes: Hashes) -> tuple[dict[str, Path | None], str | None]:
     """Run one: stage -> its artifact, and what went wrong."""
     try:
         return run_scene(request, "all", hashes), None
-    except (Refused, Failed) as error:
-        print(f"error: {error}", file=sys.stderr, flush=True)
-        return {}, str(error)
+    except Exception as error:  # of whatever kind: it must not keep others waiting
+        print(f"error: {told(error)}", file=sys.stderr, flush=True)
+        return {}, told(error)
 
 
 def _chosen(only: str, pipeline: Pipeline) -> list[str]:
@@ -139,8 +152,7 @@ def _write_table(stem: Path, rows: dict[str, dict[str, float | None]], failed: d
     there = [[row[name] for row in rows.values() if isinstance(row.get(name), int | float)] for name in names]
     lines.append([f"mean of {len(rows)}", "", *(_number(sum(v) / len(v)) if v else "" for v in there)])
     header = ["scene", "state", *names]
-    stem.parent.mkdir(parents=True, exist_ok=True)
-    with open(f"{stem}.csv", "w", newline="") as file:
-        csv.writer(file).writerows([header, *lines])
+    csv.writer(table := io.StringIO(), lineterminator="\n").writerows([header, *lines])
+    write_text(Path(f"{stem}.csv"), table.getvalue())
     text = [" | ".join(cells) for cells in (header, ["---"] * len(header), *lines)]
-    Path(f"{stem}.md").write_text("".join(f"| {line} |\n" for line in text))
+    write_text(Path(f"{stem}.md"), "".join(f"| {line} |\n" for line in text))

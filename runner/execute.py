@@ -3,6 +3,7 @@
 import functools
 import importlib.metadata
 import json
+import os
 import platform
 import shutil
 import signal
@@ -15,13 +16,25 @@ from pathlib import Path
 from typing import Any
 
 from runner import Failed, Refused, say
-from runner.files import RECEIPT, discard, hand_out, locked, put_in_place, read_json, recover, shown, write_json
+from runner.artifacts import accept, contents, discard, put_in_place, recover, wear
+from runner.files import (
+    MACHINE,
+    RECEIPT,
+    hand_out,
+    locked,
+    read_receipt,
+    refuse_lost,
+    shown,
+    write_json,
+    write_text,
+)
 from runner.keys import Hashes, Inputs
 from runner.pipeline import SCENE
-from runner.plan import MACHINE, Decision, amount, decide, expected_seconds, partial_folder, plan, table
+from runner.plan import Decision, amount, decide, expected_seconds, partial_folder, plan, table
 from runner.resolve import Job, Request, ask, child, resolve
 
 PACKAGES = ("reffusion", "numpy", "torch", "numba", "diffusers", "transformers", "peft", "pycolmap", "gsplat")
+LITTLE = 2**20  # bytes: a disk with less is full
 GRACE = 20.0  # seconds an interrupted stage has to end by itself
 
 
@@ -31,17 +44,18 @@ def run_stage(job: Job, stage: str, decision: Decision, earlier: dict[str, Decis
     partial, place = partial_folder(job, stage, decision.inputs.key), job.home / stage
     if not partial.exists() and (other := copied_from_variant(job, stage, decision.inputs.key, partial)):
         say(f"{stage}: the same as in {other}: copied")
-    if not (partial / RECEIPT).exists():  # it is there where the runner was killed just before the swap
+    if not read_receipt(partial):  # it is there where the runner was killed just before the swap
         resumed = partial.exists()
         partial.mkdir(parents=True, exist_ok=True)
         seconds = expected_seconds(job, stage)
         say(f"{stage}: {decision.reason}" + (f"; about {seconds:.0f} s" if seconds is not None else ""))
         result = {"resumed": resumed} | _in_child(job, stage, partial, earlier, lock)  # the last try's seconds only
         say(f"{stage}: done in {result['seconds']:.1f} s, {result['peak_memory_mb']} MB")
+        refuse_lost(lock)
         write_json(partial / RECEIPT, _receipt(job, stage, decision.inputs, partial, result))
     for line in hand_out(partial, place, job.home, job.pipeline.stages[stage].hands_out):
         say(line)
-    put_in_place(partial, place)
+    put_in_place(partial, place, job.hashes)
     for other in job.home.glob(f".partial-{stage}-*"):
         discard(other)
     job.hashes.save()
@@ -51,11 +65,15 @@ def run_stage(job: Job, stage: str, decision: Decision, earlier: dict[str, Decis
 def copied_from_variant(job: Job, stage: str, key: str, to: Path) -> str | None:
     """Where another variant of the scene has done this very work, copy it; that variant's folder, or None."""
     for home in sorted(job.runs.glob(f"{job.base.name}@*")):
-        if home != job.home and (read_json(home / stage / RECEIPT) or {}).get("key") == key:
+        if home != job.home and (read_receipt(home / stage) or {}).get("key") == key:
             with suppress(Refused), locked(job.runs, home.name, shared=True, wait=False):
-                copy, found = job.home / f".copying-{stage}", read_json(home / stage / RECEIPT)
+                copy, found, worn = (
+                    job.home / f".copying-{stage}",
+                    read_receipt(home / stage),
+                    wear(home / stage, job.hashes),
+                )
                 discard(copy)
-                if found and found["key"] == key and job.hashes.folder(home / stage) == found["output"]:
+                if found and found["key"] == key and not worn.words():
                     shutil.copytree(home / stage, copy)
                     copy.rename(to)
                     return home.name
@@ -63,18 +81,19 @@ def copied_from_variant(job: Job, stage: str, key: str, to: Path) -> str | None:
 
 
 def _in_child(job: Job, stage: str, partial: Path, earlier: dict[str, Decision], lock: int) -> dict[str, Any]:
-    """The result the child wrote. Raises Failed with its error; an interrupt is passed on to it and raised again."""
-    result, log = job.home / f".result-{stage}.json", job.home / f"{stage}.log"
-    result.unlink(missing_ok=True)
+    """The result the child told. Raises Failed with its error; an interrupt is passed on to it and raised again."""
+    log = job.home / f"{stage}.log"
     needs = {need: job.folder if need == SCENE else earlier[need].path for need in job.pipeline.stages[stage].takes}
+    heard, result = os.pipe()  # no file: that there is no room for one may be what must be told
     task = {"stage": stage, "params": job.params[stage], "out": partial, "log": log, "result": result, "lock": lock}
-    told = json.dumps(task | {"needs": needs}, default=str)
+    line = json.dumps(task | {"needs": needs}, default=str)
     # A process group of its own: Ctrl-C reaches it once, from here.
-    process = child(job.root, "run", pass_fds=(lock,), process_group=0)
+    process = child(job.root, "run", pass_fds=(lock, result), process_group=0)
     assert process.stdin
+    os.close(result)
     try:
         with suppress(BrokenPipeError):  # a child that is gone already has its code below
-            process.stdin.write(told + "\n")
+            process.stdin.write(line + "\n")
             process.stdin.flush()  # and left open: the child ends when this process does
         code = process.wait()
     except KeyboardInterrupt:
@@ -88,13 +107,15 @@ def _in_child(job: Job, stage: str, partial: Path, earlier: dict[str, Decision],
     finally:
         with suppress(BrokenPipeError):
             process.stdin.close()
-    answer = json.loads(result.read_text()) if result.exists() else {}
-    result.unlink(missing_ok=True)
-    if code == 0:
+        with open(heard) as file:
+            answer = json.loads(file.read() or "{}")
+    if code == 0 and answer:
         return answer
     how = f"ended by signal {-code} ({signal.Signals(-code).name})" if code < 0 else f"ended with code {code}"
     hint = "; out of memory?" if code == -signal.SIGKILL else ""
-    raise Failed(f"{stage}: {answer.get('error', how + hint)} (all of it in {shown(log)})")
+    full = "; the disk is full: make room, and the same command goes on from here"
+    hint += full if shutil.disk_usage(job.home).free < LITTLE else ""
+    raise Failed(f"{stage}: {answer.get('error', how)}{hint} (all of it in {shown(log)})")
 
 
 def _receipt(job: Job, stage: str, inputs: Inputs, folder: Path, result: dict[str, Any]) -> dict[str, Any]:
@@ -104,7 +125,7 @@ def _receipt(job: Job, stage: str, inputs: Inputs, folder: Path, result: dict[st
         "key": inputs.key,
         **asdict(inputs),
         "profile": job.profile,
-        "output": job.hashes.folder(folder),
+        **contents(folder, job.hashes),
         "versions": {"python": platform.python_version(), **_installed()},
         "platform": platform.platform(),
         "machine": MACHINE,
@@ -134,16 +155,18 @@ def run_scene(request: Request, target: str, hashes: Hashes | None = None) -> di
             held.enter_context(locked(job.runs, job.base.name, shared=True))
         lock = held.enter_context(locked(job.runs, job.home.name))
         job.home.mkdir(parents=True, exist_ok=True)
-        recover(job.home)
+        recover(job.home, job.hashes)
         planned = plan(job, stages)
         say(table(job, planned))
         refuse_missing(job, planned)
-        (job.home / "profile").write_text(job.profile + "\n")
+        write_text(job.home / "profile", job.profile + "\n")
         inside = job.folder.is_relative_to(job.root)  # then as seen from there
-        (job.home / "source").write_text(f"{job.folder.relative_to(job.root) if inside else job.folder}\n")
+        write_text(job.home / "source", f"{job.folder.relative_to(job.root) if inside else job.folder}\n")
         done: dict[str, Decision] = {}
         for position, stage in enumerate(stages):
             done[stage] = decide(job, stage, done)
+            if job.keep and done[stage].word == "cached" and done[stage].path == job.home / stage:
+                accept(job.home / stage, job.hashes)
             if done[stage].word == "run":
                 done[stage] = run_stage(job, stage, done[stage], done, lock)
                 if any(planned[later].word == "undecided" for later in stages[position + 1 :]):
@@ -159,19 +182,6 @@ def refuse_missing(job: Job, planned: dict[str, Decision]) -> None:
     for stage, decision in planned.items():
         if decision.word == "missing":
             raise Refused(f"{job.home.name}: {stage}: {decision.reason}")
-
-
-def clean(request: Request) -> None:
-    """Remove what was computed for a scene with its variants, or for one variant. Works for a scene that is gone."""
-    name = Path(request.scene).name
-    names = [name, *sorted(p.name for p in request.runs.glob(f"{name}@*"))]
-    names = [f"{name}@{request.variant}"] if request.variant else names
-    with ExitStack() as held:
-        for each in names:
-            held.enter_context(locked(request.runs, each, wait=False))
-        for folder in filter(Path.exists, (request.runs / each for each in names)):
-            shutil.rmtree(folder)
-            say(f"removed {shown(folder)}")
 
 
 def weights(request: Request, offline: bool) -> int:

@@ -5,13 +5,14 @@ import hashlib
 import json
 import os
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from reffusion.command import installed
 from runner import Refused
-from runner.files import RECEIPT, files_below, read_json
+from runner.files import RECEIPT, files_below, read_json, write_text
 
 OWN = ("reffusion", "stages")  # the packages whose modules count as a stage's code where it imports them
 HASHES = ".hashes.json"  # in runs/: where they are remembered
@@ -28,23 +29,33 @@ def digest(*parts: str) -> str:
     return state.hexdigest()
 
 
+def content(listing: dict[str, str], leave_out: tuple[str, ...] = NOT_CONTENT) -> str:
+    """One hash of names and hashes, but for the names in `leave_out`."""
+    return digest(*(part for name, file in listing.items() if name not in leave_out for part in (name, file)))
+
+
 class Hashes:
     """Hashes of files, remembered in a JSON file for as long as inode, size and time of change stay the same; beside
     them what stages say of themselves (`resolve`)."""
 
     LIMIT = 100_000  # entries kept, the latest
 
-    def __init__(self, path: Path):
-        self.path = path
-        self.known: dict[str, Any] = read_json(path) or {}
-        self._saved = len(self.known)
+    def __init__(self, path: Path, afresh: bool = False):
+        """afresh: compute all that is asked for, once; `rotten` are files that changed though nothing else says so."""
+        self.path, self.afresh = path, afresh
+        self.rotten: list[Path] = []
+        found = read_json(path)
+        self.known: dict[str, Any] = found if isinstance(found, dict) else {}
+        self._saved = 0 if afresh else len(self.known)
         self._runs: dict[tuple[Path, str], list[Path]] = {}  # a module with its fingerprint -> see `module`
 
     def _remember(self, kind: str, path: Path, compute: Any) -> Any:
         stat = os.stat(path)
         name = f"{kind} {stat.st_dev} {stat.st_ino} {stat.st_size} {stat.st_mtime_ns}"
-        if name not in self.known:
-            self.known[name] = compute(path)
+        if name not in self.known or self.afresh:
+            before, self.known[name] = self.known.get(name), compute(path)
+            if before not in (None, self.known[name]):
+                self.rotten.append(path)
         return self.known[name]
 
     def file(self, path: Path) -> str:
@@ -63,8 +74,12 @@ class Hashes:
 
     def folder(self, folder: Path, leave_out: tuple[str, ...] = NOT_CONTENT) -> str:
         """Names and contents of all files below `folder`, but hidden ones and those at its top in `leave_out`."""
-        top = {str(folder / name) for name in leave_out}
-        return self.files(folder, (path for path in files_below(folder) if str(path) not in top))
+        return content(self.listing(folder), leave_out)
+
+    def listing(self, folder: Path) -> dict[str, str]:
+        """Name, as seen from `folder`, and hash of all files below, but hidden ones."""
+        top = os.path.join(folder, "")
+        return {str(path)[len(top) :]: self.file(path) for path in files_below(folder)}
 
     def files(self, folder: Path, files: Iterable[Path]) -> str:
         """Names as seen from `folder` and contents of these files, in this order."""
@@ -80,12 +95,10 @@ class Hashes:
     def save(self) -> None:
         if len(self.known) == self._saved:
             return
-        self.path.parent.mkdir(parents=True, exist_ok=True)
         kept = dict(list(self.known.items())[-self.LIMIT :])
-        partial = self.path.with_name(f"{self.path.name}.{os.getpid()}")
-        partial.write_text(json.dumps(kept))
-        os.replace(partial, self.path)
-        self._saved = len(self.known)
+        with suppress(OSError):  # a full disk, or one that is only read: they are computed again the next time
+            write_text(self.path, json.dumps(kept))
+            self._saved = len(self.known)
 
 
 def outside(value: Any, folder: Path) -> Iterator[Path]:
@@ -95,8 +108,14 @@ def outside(value: Any, folder: Path) -> Iterator[Path]:
             yield from outside(part, folder)
     elif isinstance(value, str) and value and "\0" not in value and len(value) < 1024:
         path = (folder / value).resolve()
-        if ("/" in value or os.sep in value) and not path.is_relative_to(folder) and path.exists():
+        if ("/" in value or value == "..") and not path.is_relative_to(folder) and path.exists():
             yield path
+
+
+def elsewhere(files: Iterable[str], folder: Path) -> list[Path]:
+    """Those of these files that are not reached through the folder."""
+    paths = (Path(os.path.normpath(os.path.join(folder, file))) for file in files)
+    return [path for path in paths if not path.is_relative_to(folder)]
 
 
 def fingerprint(tree: ast.Module) -> str:

@@ -14,6 +14,7 @@ from reffusion.command import workplace
 from runner import Refused
 
 SCENE = "scene"  # the need that stands for the scene's own folder
+NAME = re.compile(r"[\w'][\w'\" .,()+\-]*")  # of a scene; none that patterns or variants could be made of
 LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the one in C takes a tenth of the time
 
 Overrides = dict[str, dict[str, Any]]  # stage -> parameter, or group of parameters -> value
@@ -191,8 +192,11 @@ def find_scene(text: str, root: Path) -> Path:
     for folder in (data / text, Path(text).expanduser()):
         if text and folder.is_dir():
             folder = folder.resolve()
-            if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.\-+]*", folder.name):
-                raise Refused(f"{folder}: a scene is called by its folder's name; use letters, digits and _ . - + only")
+            if not NAME.fullmatch(folder.name):
+                raise Refused(
+                    f"{folder}: a scene is called by its folder's name; use letters, digits, blanks and "
+                    "_ . , - + ' ( ) only"
+                )
             return folder
     known = sorted(p.name for p in data.glob("[!._]*/")) if data.is_dir() else []
     raise Refused(

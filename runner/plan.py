@@ -2,19 +2,19 @@
 
 import json
 import os
-import platform
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from runner import Refused
-from runner.files import RECEIPT, files_below, read_json
-from runner.keys import Inputs, changes, code_changes, code_of, leaves, outside
+from runner.artifacts import listed, wear
+from runner.files import MACHINE, RECEIPT, files_below, read_receipt
+from runner.keys import Inputs, changes, code_changes, code_of, elsewhere, leaves, outside
 from runner.pipeline import SCENE, Condition
 from runner.resolve import Job, ask, has_cuda
 
-MACHINE = platform.node()
 TO_DO, SETTLED = ("run", "stale", "undecided"), ("cached", "provided", "skip")
 
 
@@ -61,12 +61,12 @@ def decide(job: Job, stage: str, earlier: dict[str, Decision]) -> Decision:
     moving = [need for need, decision in needs.items() if not decision.settled]
     if moving:
         path = _there(job, stage)
-        found = path and read_json(path / RECEIPT)
-        if not found:
+        found = path and read_receipt(path)
+        if not path or not found:
             return Decision("run", "no artifact yet")
         as_then = Inputs(job.params[stage], found["needs"], found["weights"], code, job.stages[stage].unkeyed)
-        if known := [] if job.trust else changes(found, as_then):
-            return Decision("run", _listed(known), path)
+        if known := ([] if job.trust else changes(found, as_then)) or _harm(job, path):
+            return Decision("run", listed(known), path)
         return Decision("stale", f"waits for {', '.join(moving)}; kept if the new content is the same", path)
     return _compare(job, stage, _inputs(job, stage, {need: d.path for need, d in needs.items()}, code))
 
@@ -119,27 +119,38 @@ def _inputs(job: Job, stage: str, needs: dict[str, Path | None], code: dict[str,
     elif SCENE in job.pipeline.stages[stage].takes:
         hashes[SCENE] = job.hashes.folder(job.folder, leave_out=("scene.yaml",))
         for path in outside(own.params, job.folder):
+            if job.folder.is_relative_to(path):
+                raise Refused(f"{stage}: {path} is named in scene.yaml, and holds the scene itself; name one beside it")
             hashes[str(path)] = job.hashes.folder(path) if path.is_dir() else job.hashes.file(path)
     weights = {param: job.hashes.weights(folder) if folder else name for param, name, folder in _weights(job, stage)}
     return Inputs(own.params, hashes, weights, code, own.unkeyed)
 
 
 def _compare(job: Job, stage: str, inputs: Inputs) -> Decision:
-    """Cached where a receipt differs in nothing (the variant's own, else the base's); else run, and why."""
+    """Cached where a receipt differs in nothing (the variant's own, else the base's), and the artifact not from it;
+    else run, and why."""
     places = [home / stage for home in dict.fromkeys((job.home, job.base))]
-    receipts = [(place, found, changes(found, inputs)) for place in places if (found := read_json(place / RECEIPT))]
-    for place, found, differs in receipts:
-        if not differs:
-            said = [] if place.parent == job.home else [f"shared with {job.base.name}"]
-            if job.hashes.folder(place) != found["output"]:
-                said.append("its files were changed by hand since")
-            return Decision("cached", "; ".join(said), place, True, inputs)
-    for place, found, differs in receipts:
-        if job.trust and differs == code_changes(found, inputs):
-            return Decision("cached", f"trusted although {_listed(differs)}", place, True, inputs)
+    receipts = [(place, changes(found, inputs), found) for place in places if (found := read_receipt(place))]
+    whys = []
+    for place, differs, found in sorted(receipts, key=lambda receipt: bool(receipt[1])):
+        said = [] if place.parent == job.home else [f"shared with {job.base.name}"]
+        if differs and not (job.trust and differs == code_changes(found, inputs)):
+            whys.append(differs)
+        elif harm := _harm(job, place):
+            whys.append(harm)
+        else:
+            said = [f"trusted although {listed(differs)}"] if differs else said
+            return Decision("cached", "; ".join([*said, *wear(place, job.hashes).words()]), place, True, inputs)
     begun = "; goes on where it stopped" if partial_folder(job, stage, inputs.key).exists() else ""
-    why = _listed(receipts[0][2]) if receipts else "no artifact yet"
-    return Decision("run", why + begun, places[0] if receipts else None, False, inputs)
+    why = listed(whys[0]) if whys else "no artifact yet"
+    return Decision("run", why + begun, receipts[0][0] if receipts else None, False, inputs)
+
+
+def _harm(job: Job, place: Path) -> list[str]:
+    """What makes an artifact unfit, in words: files that are missing, or not as they were made."""
+    worn = wear(place, job.hashes)
+    changed = f"{listed(worn.changed)} changed since (keep=1 keeps it)"
+    return [f"{listed(worn.missing)} missing"] * bool(worn.missing) + [changed] * bool(worn.changed and not job.keep)
 
 
 def _with_device(job: Job, stage: str, decision: Decision) -> Decision:
@@ -160,11 +171,6 @@ def amount(count: int | None) -> str:
 
 def partial_folder(job: Job, stage: str, key: str) -> Path:
     return job.home / f".partial-{stage}-{key}"
-
-
-def _listed(said: list[str], most: int = 3) -> str:
-    rest = f" and {len(said) - most} more" if len(said) > most else ""
-    return ", ".join(said[:most]) + rest
 
 
 def plan(job: Job, stages: list[str], done: dict[str, Decision] | None = None) -> dict[str, Decision]:
@@ -222,7 +228,21 @@ def table(job: Job, decisions: dict[str, Decision]) -> str:
     needs = {need["name"]: need for decision in decisions.values() for need in decision.needed if need["problem"]}
     if sizes := [need["bytes"] or 0 for need in needs.values() if need["fetched"] and not need["optional"]]:
         lines.append(f"  weights to fetch: {amount(sum(sizes))}, by `make weights profile={job.profile}`")
+    if paths := _read_elsewhere(job, list(decisions)):
+        folders = Counter(str(path if path.is_dir() else path.parent) for path in paths)
+        named = [f"{path} ({count} file{'s' * (count > 1)})" for path, count in folders.items()]
+        lines.append(f"  read outside the scene's folder: {listed(named)}")
     return "\n".join(lines)
+
+
+def _read_elsewhere(job: Job, stages: list[str]) -> list[Path]:
+    """What the stages read that scene.yaml or the capture's own files name, and the scene's folder does not hold."""
+    there = [stage for stage in stages if stage in job.stages and SCENE in job.pipeline.stages[stage].takes]
+    reads = [path for stage in there for path in elsewhere(job.stages[stage].reads or (), job.folder)]
+    named = [
+        path for stage in there if job.stages[stage].reads is None for path in outside(job.params[stage], job.folder)
+    ]
+    return sorted({*reads, *named})
 
 
 def as_record(job: Job, decisions: dict[str, Decision]) -> dict[str, Any]:
@@ -235,6 +255,6 @@ def as_record(job: Job, decisions: dict[str, Decision]) -> dict[str, Any]:
 def expected_seconds(job: Job, stage: str) -> float | None:
     """What the stage last took for this scene, or a variant of it, on this machine with this profile."""
     places = [job.runs / job.base.name, *job.runs.glob(f"{job.base.name}@*")]
-    found = [r for place in places if (r := read_json(place / stage / RECEIPT))]
-    here = [r for r in found if r["machine"] == MACHINE and r["profile"] == job.profile]
+    found = [r for place in places if (r := read_receipt(place / stage))]
+    here = [r for r in found if r.get("machine") == MACHINE and r.get("profile") == job.profile]
     return max(here, key=lambda r: r["date"])["seconds"] if here else None

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 from dataclasses import dataclass, field, replace
@@ -10,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from runner import Refused
-from runner.files import files_below
-from runner.keys import HASHES, Hashes, code_of, digest, outside
+from runner.files import files_below, read_text
+from runner.keys import HASHES, Hashes, code_of, digest, elsewhere, outside
 from runner.layers import Layers, layered, parse_set, seconds_of, shared_out
 from runner.pipeline import SCENE, Pipeline, SceneFile, find_scene, load_pipeline, load_scene_file, read_yaml, unknown
 
@@ -33,6 +34,7 @@ class Request:
     trust: bool = False
     set: str = ""
     budget: str | None = None
+    keep: bool = False
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,7 @@ class Job:
     trust: bool
     brings: frozenset[str]  # the keys of scene.yaml that have values
     hashes: Hashes
+    keep: bool = False  # what people changed in artifacts
     stages: dict[str, Described] = field(default_factory=dict)
     broken: dict[str, str] = field(default_factory=dict)  # stages that cannot be described -> what is wrong
 
@@ -90,7 +93,9 @@ def resolve_all(requests: list[Request], hashes: Hashes, scene: bool = True) -> 
     asked = [_questions(job) for job in drafts]
     new = {name: question for each in asked for name, question in each.items() if name not in hashes.known}
     answers = dict(zip(new, ask(requests[0].root, list(new.values())), strict=True))
-    hashes.known |= {name: said for name, said in answers.items() if name.startswith(LASTING) and "params" in said}
+    lasting = lambda name, said: name.startswith(LASTING) and "params" in said
+    inside = lambda question, said: not any(elsewhere(said.get("reads") or (), Path(question.get("scene", "."))))
+    hashes.known |= {n: said for n, said in answers.items() if lasting(n, said) and inside(new[n], said)}
     return [_described(job, each, hashes.known | answers) for job, each in zip(drafts, asked, strict=True)]
 
 
@@ -103,7 +108,7 @@ def _draft(request: Request, hashes: Hashes, scene: bool) -> Job:
         raise Refused(f"{root / 'pipeline.yaml'}: {unknown('variant', variant, pipeline.variants)}")
     base = runs / (folder.name if folder else "")
     home = base.with_name(f"{base.name}@{variant}") if variant else base
-    _one_folder_a_name(base, folder, root)
+    one_folder_a_name(base, folder, root)
     profile, why = choose_profile(request.profile, found, [home / "profile", base / "profile"], pipeline)
     given = (pipeline, found, profile, variant, parse_set(request.set, pipeline))
     layers = layered(*given, {})
@@ -111,7 +116,21 @@ def _draft(request: Request, hashes: Hashes, scene: bool) -> Job:
         origin, text = ("budget", request.budget) if request.budget else (str(found.path), found.budget)
         layers = layered(*given, shared_out(pipeline, layers.values, seconds_of(text, origin)))
     keys = frozenset(found.brings)
-    return Job(root, runs, folder or root, home, base, pipeline, layers, profile, why, request.trust, keys, hashes)
+    return Job(
+        root,
+        runs,
+        folder or root,
+        home,
+        base,
+        pipeline,
+        layers,
+        profile,
+        why,
+        request.trust,
+        keys,
+        hashes,
+        request.keep,
+    )
 
 
 def choose_profile(asked: str | None, scene: SceneFile, pinned: list[Path], pipeline: Pipeline) -> tuple[str, str]:
@@ -121,8 +140,8 @@ def choose_profile(asked: str | None, scene: SceneFile, pinned: list[Path], pipe
     profile = asked or scene.profile or AUTO
     if profile == AUTO:
         origin, profile, why = "profile", "laptop", "no CUDA driver on this machine"
-        if record := next((path for path in pinned if path.is_file()), None):
-            origin, profile, why = str(record), record.read_text().strip(), "this scene was run with it"
+        if record := next((path for path in pinned if read_text(path)), None):
+            origin, profile, why = str(record), read_text(record), "this scene was run with it"
         elif has_cuda():
             profile, why = "paper", "this machine has a CUDA driver"
     if profile not in pipeline.profiles:
@@ -137,12 +156,12 @@ def has_cuda() -> bool:
     return any(Path(p).exists() for p in ("/proc/driver/nvidia/version", "/dev/nvidia0", "/usr/lib/wsl/lib/libcuda.so"))
 
 
-def _one_folder_a_name(base: Path, folder: Path | None, root: Path) -> None:
-    before = root / (base / "source").read_text().strip() if (base / "source").is_file() else folder
-    if folder and before != folder and before.is_dir():
+def one_folder_a_name(base: Path, folder: Path | None, root: Path) -> None:
+    before = root / read_text(base / "source")
+    if folder and before not in (root, folder) and before.is_dir():
         raise Refused(
             f"two scenes are called {folder.name!r}: {base} was made from {before}, and {folder} is asked for; "
-            f"rename one folder, or make room with `make scene={before} clean`"
+            f"rename one folder, or make room with `make scene={shlex.quote(str(before))} clean`"
         )
 
 
@@ -186,7 +205,7 @@ def _name(job: Job, question: dict[str, Any]) -> str:
         code["run"] = job.hashes.module(job.root / "stages" / f"{stage}.py", job.root)[0]
     except Refused:  # it is no Python, and is said to be broken
         return json.dumps(question)
-    if "scene" in question and any(outside(question["params"], job.folder)):  # files elsewhere may have a say
+    if "scene" in question and any(outside(question["params"], job.folder)):  # its files may have a say
         return json.dumps(question)
     files = [(str(path), (stat := path.stat()).st_size, stat.st_mtime_ns) for path in listed]
     return LASTING + digest(json.dumps([question, code, job.hashes.file(CHILD), files]))

@@ -187,7 +187,7 @@ def test_killed_and_started_again_nothing_runs_twice(tmp_path):
     command = [sys.executable, "-m", "runner", "compare", "--scene", "toy", "--root", str(root), "--profile", "laptop"]
     command += ["--variants", "full", "--seeds", "2"]
     environment = {**os.environ, "PYTHONPATH": str(REPO)}
-    process = subprocess.Popen(command, cwd=root, env=environment, stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(command, cwd=REPO, env=environment, stdout=subprocess.PIPE, text=True)
     assert any("compare: full on toy-1, 2 of 2" in line for line in process.stdout)
     for _ in range(1200):
         if list((root / "runs/toy-1").glob(".partial-distill-*")):
@@ -354,7 +354,7 @@ def test_the_median_of_curves():
 def plan_of(root: Path, runs: Path, *options: str) -> None:
     command = [sys.executable, "-m", "runner", "plan", "--record", "--scene", "toy", "--root", str(root)]
     environment = {**os.environ, "PYTHONPATH": str(REPO)}
-    subprocess.run([*command, "--runs", str(runs), *options], cwd=root, env=environment, check=True)
+    subprocess.run([*command, "--runs", str(runs), *options], cwd=REPO, env=environment, check=True)
 
 
 def test_report_of_a_job(compared, home):

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from runner import Refused, compare, execute
+from runner import Refused, compare, upkeep
 from runner import resolve as resolving
 from runner.execute import Failed, run_scene
 from runner.keys import Hashes, code_of, fingerprint
@@ -209,7 +209,7 @@ def start(root: Path, *arguments: str) -> subprocess.Popen[str]:
     environment = {**os.environ, "PYTHONPATH": str(REPO)}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     # A shell starts background jobs, and so their children, with Ctrl-C ignored: as from a terminal, it is not.
-    return subprocess.Popen(command, cwd=root, env=environment, preexec_fn=heed_ctrl_c, **pipes)
+    return subprocess.Popen(command, cwd=REPO, env=environment, preexec_fn=heed_ctrl_c, **pipes)
 
 
 def heed_ctrl_c() -> None:
@@ -370,9 +370,11 @@ def test_weights_profile_and_hand_edits(root, capsys):
     assert paper["poses"] == "cached" and paper["fit"] == "run param rate 2 -> 1"
     assert words(root, profile=None) == words(root)  # pinned by the first run
     (root / "runs/toy/fit/gaussians.ply").write_text("11")
-    assert words(root)["fit"] == "cached its files were changed by hand since"
-    assert ran(capsys, root) == ["masks", "distill", "evaluate"]
-    assert result(root) == 11.0
+    assert words(root, keep=True)["fit"] == "cached gaussians.ply changed"
+    assert ran(capsys, root, keep=True) == ["masks", "distill", "evaluate"] and result(root) == 11.0
+    assert words(root)["fit"] == "cached gaussians.ply by hand" and ran(capsys, root) == []  # from then on
+    assert ran(capsys, root, set="fit.rate=3") == ["fit", "masks", "distill", "evaluate"]
+    assert (root / "runs/toy/kept/fit/gaussians.ply").read_text() == "11"
 
 
 def test_left_out_and_provided(root, capsys):
@@ -469,7 +471,7 @@ def test_two_runners_on_one_scene(root):
     wait_for(lambda: list((root / "runs/toy").glob(".partial-fit-*")))
     first.send_signal(signal.SIGSTOP)  # until the second has had to wait
     with pytest.raises(Refused, match=f"toy is in use by process {first.pid}"):
-        execute.clean(request(root))
+        upkeep.clean(request(root))
     second = start(root, "--scene", "toy", "--set", "fit.pause=0.2 fit.iterations=8")
     output = second.stdout.readline()
     first.send_signal(signal.SIGCONT)
@@ -490,13 +492,14 @@ def test_killed_in_the_swap(root, finished, capsys, moment):
         key = json.loads((home / "new/receipt.json").read_text())["key"]
         (home / "new").rename(home / f".partial-fit-{key}")
     else:
-        shutil.copytree(finished / "runs/toy/fit", home / ".old-fit")
+        old = ".gone-.old-fit" if moment == "while the old is deleted" else ".old-fit"
+        shutil.copytree(finished / "runs/toy/fit", home / old)
         (home / "new").rename(home / "fit")
         if moment == "while the old is deleted":
-            (home / ".old-fit/receipt.json").unlink()
+            (home / old / "receipt.json").unlink()
     assert ran(capsys, root, **five) == []
     assert (home / "fit/gaussians.ply").read_text() == "14"
-    assert not list(home.glob(".old*")) and not list(home.glob(".partial*"))
+    assert not list(home.glob(".[gop]*")) and not (home / "kept").exists()
 
 
 def test_a_failing_stage_keeps_the_rest(root, capsys):
@@ -566,13 +569,53 @@ def test_two_folders_of_one_name(root, tmp_path):
     assert set(words(root, scene=str(tmp_path / "elsewhere/toy")).values()) == {"cached"}
 
 
-def test_clean(root):
+def test_clean(root, capsys):
     run_scene(request(root, variant="strong"), "distill")
-    execute.clean(request(root, variant="strong"))
+    upkeep.clean(request(root, variant="strong"))
     assert (root / "runs/toy").exists() and not (root / "runs/toy@strong").exists()
-    shutil.rmtree(root / "data/toy")
-    execute.clean(request(root))
+    upkeep.clean(request(root, scene=str(root / "data/toy")))
     assert not (root / "runs/toy").exists()
+    assert "removing" in (said := capsys.readouterr().out) and "runs/toy: distill, evaluate, fit, masks, poses" in said
+    upkeep.clean(request(root))
+    assert "nothing was computed for toy" in capsys.readouterr().out
+    run_scene(request(root), "fit")
+    shutil.rmtree(root / "data/toy")
+    upkeep.clean(request(root))
+    assert not (root / "runs/toy").exists()
+
+
+@pytest.mark.parametrize(
+    "name", ["*", "to*", "[t]oy", ".locks", "..", ".", "/", "data/..", "toy@strong", "tyo", "toys", "mine"]
+)
+def test_clean_removes_only_what_it_was_asked_for_by_name(root, tmp_path, name):
+    run_scene(request(root, variant="strong"), "distill")
+    write(root, {"runs/mine/notes.txt": "no scene's"})
+    before = sorted(root.rglob("*"))
+    with pytest.raises(Refused, match="toy"):
+        upkeep.clean(request(root, scene=name))
+    for variant in ("*", "../toy", "string"):
+        with pytest.raises(Refused, match="unknown variant .*strong"):
+            upkeep.clean(request(root, variant=variant))
+    assert sorted(root.rglob("*")) == before
+
+
+def test_clean_and_a_rerun_leave_what_people_put_there(root, tmp_path, capsys):
+    mine = {"notes.txt": "1", "fit/notes.txt": "2", "to_paint/a.png": "3", "report/index.html": "a page"}
+    write(root / "runs/toy", mine)
+    write(tmp_path, {"elsewhere/fit/gaussians.ply": "4"})
+    (root / "runs/toy/linked").symlink_to(tmp_path / "elsewhere")
+    assert words(root)["fit"] == "cached notes.txt added"
+    ran(capsys, root, set="fit.rate=3")
+    assert (root / "runs/toy/fit/notes.txt").read_text() == "2" and result(root) == 13.0
+    (root / "runs/toy/masks/facts.json").write_text("{}")
+    upkeep.clean(request(root))
+    assert "kept, as it was not made by the runner: " in capsys.readouterr().out
+    home = root / "runs/toy"
+    left = {path.relative_to(home).as_posix() for path in home.rglob("*") if path.is_file()}
+    assert left == {"notes.txt", "fit/notes.txt", "to_paint/a.png", "masks/facts.json"}
+    assert (tmp_path / "elsewhere/fit/gaussians.ply").read_text() == "4"
+    ran(capsys, root)
+    assert result(root) == 10.0 and (home / "fit/notes.txt").exists() and (home / "kept/masks/facts.json").exists()
 
 
 # ------------------------------------------------------------------------------------------------------------- batch
