@@ -1,26 +1,15 @@
 # One run: make scene=demo all        What it would do: make scene=demo plan        Everything else: make help
 
-# Given on the command line; set here so that a variable of the environment is not taken for one of them.
-scene :=
-profile :=
-variant :=
-budget :=
-set :=
-trust :=
-runs :=
+# Given on the command line; set here so that a variable of the environment is not taken for one of them. Recipes read
+# them from their environment, in double quotes, as they were typed: there is no quote or $ that a shell or make obeys.
+given := scene profile variant budget set trust keep runs variants seeds seed name steps gate slow offline port
+$(foreach each,$(given),$(eval $(each) :=))
 data := data
-variants :=
-seeds :=
-seed :=
-name :=
-steps :=
-gate :=
-slow :=
-offline :=
-port :=
+$(foreach each,$(given) data,$(eval override $(each) := $$(value $(each))))
+goals := $(value MAKECMDGOALS)
+export $(given) data goals
 
 # GOMP_SPINCOUNT: see reffusion/__init__.py
-export set # its value may hold quotes, so recipes read it from the environment
 export GOMP_SPINCOUNT ?= 30000
 
 PYTHON ?= python3
@@ -29,10 +18,12 @@ PY := $(VENV)/bin/python
 RUN := $(VENV)/bin/reffusion
 STAGES := poses fit masks reference lift personalize initialize distill evaluate
 
-options = $(if $(profile),--profile '$(profile)') $(if $(variant),--variant '$(variant)') \
-	$(if $(budget),--budget '$(budget)') $(if $(set),--set "$$set") $(if $(trust),--trust) $(if $(runs),--runs '$(runs)')
+of = --scene="$$scene"
+where = $(if $(variant),--variant="$$variant") $(if $(runs),--runs="$$runs")
+options = $(where) $(if $(profile),--profile="$$profile") $(if $(budget),--budget="$$budget") \
+	$(if $(set),--set="$$set") $(if $(trust),--trust) $(if $(keep),--keep)
 
-.PHONY: help setup all $(STAGES) plan clean batch weights demo prior prior-report sds-variance view turntable test \
+.PHONY: help setup all $(STAGES) plan verify clean batch weights demo prior prior-report sds-variance view turntable test \
 	bench stability gpu-check lint
 .DELETE_ON_ERROR:
 
@@ -47,6 +38,7 @@ help:
 	@echo 'make scene=X turntable         the finished scene on a way around the capture: runs/X/turntable.webm'
 	@echo 'make scene=X sds-variance      the SDS gradient over noise and timesteps, before and after personalization'
 	@echo 'make data=FOLDER report        the same of all its scenes: runs/report/index.html'
+	@echo 'make scene=X verify            hash all that was computed for it: is it as it was made?'
 	@echo 'make scene=X clean             remove what was computed for it'
 	@echo 'make data=FOLDER batch         every scene of a folder, and one table'
 	@echo 'make demo [seed=N]             make the demo scene, or another: data/demo-N; others are made when named:'
@@ -61,7 +53,7 @@ help:
 	@echo 'scene=  a name under data/, or the path of any folder'
 	@echo 'profile=auto|laptop|paper|paper-terms  variant=NAME  set="fit.iterations=500 distill.seed=3"  runs=FOLDER'
 	@echo 'budget=5m  time for the whole job: sets the number of steps of fit, personalize and distill'
-	@echo 'trust=1  keep results of older code'
+	@echo 'trust=1  keep results of older code; keep=1  and results that you changed by hand'
 
 # ---------------------------------------------------------------------------------------------------- environment
 
@@ -89,11 +81,14 @@ $(VENV)/.ready-dev: $(VENV)/.ready
 
 # The demo scenes are made by the project: `demo`, `demo-photos` (no poses) and demo-<one of the others>, each with `-<seed>` or not.
 kinds := photos wide 360 seen behind table corner grass
-made = $(filter demo demo-%,$(scene))
+# Their names become part of a recipe, so there are none with other characters than these.
+plain := a b c d e f g h i j k l m n o p q r s t u v w x y z 0 1 2 3 4 5 6 7 8 9 -
+rest = $(if $1,$(call rest,$(wordlist 2,99,$1),$(subst $(firstword $1),,$2)),$2)
+made := $(if $(call rest,$(plain),$(scene)),,$(filter demo demo-%,$(scene)))
 
 demo: setup
-	$(PY) data/generate.py --out data/$(or $(name),demo$(if $(seed),-$(seed))) --seed $(or $(seed),0)
-	@touch data/$(or $(name),demo$(if $(seed),-$(seed)))/.generated
+	@out="data/$${name:-demo$${seed:+-$$seed}}" && \
+		$(PY) data/generate.py --out="$$out" --seed="$${seed:-0}" && touch "$$out/.generated"
 
 data/%/.generated: | $(VENV)/.ready
 	$(strip $(PY) data/generate.py --out data/$* $(patsubst %,--kind %,$(filter $(kinds),$(subst -, ,$*))) \
@@ -104,50 +99,50 @@ data/%/.generated: | $(VENV)/.ready
 
 .PHONY: named ready
 named:
-	@test -n '$(scene)' || { echo 'error: which scene? For example: make scene=demo $(MAKECMDGOALS)' >&2; exit 1; }
+	@test -n "$$scene" || { echo "error: which scene? For example: make scene=demo $$goals" >&2; exit 2; }
 
 ready: named setup $(made:%=data/%/.generated)
 
 all $(STAGES): ready
-	@$(RUN) run $@ --scene '$(scene)' $(options)
+	@$(RUN) run $@ $(of) $(options)
 
 plan: ready
-	@$(RUN) plan --scene '$(scene)' $(options)
+	@$(RUN) plan $(of) $(options)
 
 .PHONY: compare report
 # On the demo scenes of other seeds too. A variant that fails (3) stops no other: the table is drawn, then make fails.
-others = $(if $(made),$(foreach n,$(shell seq 1 $$(( $(or $(seeds),1) - 1 ))),data/$(made)-$(n)/.generated))
+others := $(if $(call rest,0 1 2 3 4 5 6 7 8 9,$(seeds)),,$(if $(made),$(addsuffix /.generated,\
+	$(addprefix data/$(made)-,$(wordlist 2,$(or $(seeds),1),$(shell seq 0 99))))))
 compare: ready $(others)
-	@$(RUN) compare --scene '$(scene)' $(options) $(if $(variants),--variants '$(variants)') \
-		$(if $(seeds),--seeds '$(seeds)'); status=$$?; test $$status = 0 || test $$status = 3 || exit $$status; \
-		$(RUN) compare-page --scene '$(scene)' $(if $(runs),--runs '$(runs)') && exit $$status
+	@$(RUN) compare $(of) $(options) $(if $(variants),--variants="$$variants") $(if $(seeds),--seeds="$$seeds"); \
+		status=$$?; test $$status = 0 || test $$status = 3 || exit $$status; \
+		$(RUN) compare-page $(of) $(if $(runs),--runs="$$runs") && exit $$status
 
 report: $(if $(scene),ready,setup)
 ifneq ($(scene),)
-	@$(RUN) plan --record --scene '$(scene)' $(options)
-	@$(RUN) report --scene '$(scene)' $(if $(variant),--variant '$(variant)') $(if $(runs),--runs '$(runs)')
+	@$(RUN) plan --record $(of) $(options)
+	@$(RUN) report $(of) $(where)
 else
-	@$(RUN) report --data '$(data)' $(if $(variant),--variant '$(variant)') $(if $(runs),--runs '$(runs)')
+	@$(RUN) report --data="$$data" $(where)
 endif
 
 view: named $(VENV)/.ready-view
-	@$(RUN) view --scene '$(scene)' $(if $(variant),--variant '$(variant)') $(if $(runs),--runs '$(runs)') \
-		$(if $(port),--port '$(port)')
+	@$(RUN) view $(of) $(where) $(if $(port),--port="$$port")
 
 turntable: named setup
-	@$(RUN) turntable --scene '$(scene)' $(if $(variant),--variant '$(variant)') $(if $(runs),--runs '$(runs)')
+	@$(RUN) turntable $(of) $(where)
 
-clean: named setup
-	@$(RUN) clean --scene '$(scene)' $(options)
+verify clean: named setup
+	@$(RUN) $@ $(of) $(options)
 
 batch: setup
-	@$(RUN) batch --data '$(data)' $(options)
+	@$(RUN) batch --data="$$data" $(options)
 
 weights: setup
-	@$(RUN) weights $(if $(scene),--scene '$(scene)') $(if $(offline),--offline) $(options)
+	@$(RUN) weights $(if $(scene),$(of)) $(if $(offline),--offline) $(options)
 
 prior: setup
-	$(PY) -m priors.tiny.train --start priors/tiny $(if $(steps),--steps '$(steps)')
+	$(PY) -m priors.tiny.train --start priors/tiny $(if $(steps),--steps="$$steps")
 
 # Personalizes on the demo's reference, which is made first where it is missing.
 prior-report: data/demo/.generated setup
@@ -157,9 +152,9 @@ prior-report: data/demo/.generated setup
 
 # On any scene; what it lacks of personalization and initialization is made first.
 sds-variance: ready
-	@$(RUN) run personalize --scene '$(scene)' $(options)
-	@$(RUN) run initialize --scene '$(scene)' $(options)
-	$(PY) -m benchmarks.studies.sds_variance --run '$(or $(runs),runs)/$(notdir $(abspath $(scene)))'
+	@$(RUN) run personalize $(of) $(options)
+	@$(RUN) run initialize $(of) $(options)
+	$(PY) -m benchmarks.studies.sds_variance --run="$${runs:-runs}/$$(basename "$$scene")"
 
 # Two processes of one thread each, whole files to each: kernels that are compiled for one test serve the next.
 test: $(VENV)/.ready-dev
@@ -172,11 +167,11 @@ lint: $(VENV)/.ready-dev
 
 # slow=1 adds the splatting of 100,000 Gaussians and more, and personalization (an hour).
 bench: $(VENV)/.ready
-	$(PY) -m benchmarks.bench --out '$(or $(runs),runs)/bench' $(if $(gate),--gate) $(if $(slow),--slow)
+	$(PY) -m benchmarks.bench --out="$${runs:-runs}/bench" $(if $(gate),--gate) $(if $(slow),--slow)
 	$(if $(slow),$(PY) -m benchmarks.bench.large)
 
 stability: $(VENV)/.ready-dev
-	$(PY) -m benchmarks.stability --out '$(or $(runs),runs)/stability.json'
+	$(PY) -m benchmarks.stability --out="$${runs:-runs}/stability.json"
 
 gpu-check: $(VENV)/.ready
-	$(PY) -m benchmarks.gpu.check --out $(or $(runs),runs)/gpu-check
+	$(PY) -m benchmarks.gpu.check --out="$${runs:-runs}/gpu-check"
