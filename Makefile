@@ -47,7 +47,7 @@ help:
 	@echo 'make weights [profile=paper]   fetch what a profile needs, sizes first; offline=1 only says what is missing'
 	@echo 'make gpu-check                 values, time and memory at the paper'"'"'s sizes on a CUDA machine (8 minutes)'
 	@echo 'make prior-report              measure it, and draw what it paints (minutes): runs/prior-report'
-	@echo 'make setup | test | lint       .venv; the tests; ruff and mypy'
+	@echo 'make setup | test | lint       .venv; the tests, slow=1 those that take minutes too; ruff and mypy'
 	@echo 'make bench                     work-precision diagrams of the kernels: runs/bench; gate=1: against the baselines'
 	@echo 'make stability                 stiff and extreme cases, each with its bound (minutes): runs/stability.json'
 	@echo 'scene=  a name under data/, or the path of any folder'
@@ -158,7 +158,7 @@ sds-variance: ready
 
 # Two processes of one thread each, whole files to each: kernels that are compiled for one test serve the next.
 test: $(VENV)/.ready-dev
-	OMP_NUM_THREADS=1 $(PY) -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
+	$(if $(slow),REFFUSION_SLOW=1) OMP_NUM_THREADS=1 $(PY) -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 lint: $(VENV)/.ready-dev
 	$(PY) -m ruff check .

@@ -41,17 +41,29 @@ def generate(out: Path, seed: int, kind: Kind) -> dict:
     """Write the scene to `out`, all of it or nothing, and return its facts.
 
     Raises:
-        ValueError: where `out` holds something that this script did not write; where less than the kind's share
-            of the masks hides background that no training view saw (where any does, if the object hangs).
+        ValueError: where `out` holds something that this script did not write, or that was changed since; where less
+            than the kind's share of the masks hides background that no training view saw (where any does, if the
+            object hangs).
     """
     if out.exists() and any(out.iterdir()) and not (out / "truth/facts.json").exists():
         raise ValueError(f"{out} holds files that data/generate.py did not write; name another folder, or empty it")
     partial = out.with_name(out.name + ".writing")
     shutil.rmtree(partial, ignore_errors=True)
     facts = _write_scene(partial, seed, kind)
+    if theirs := _by_hand(out, partial):
+        shutil.rmtree(partial)
+        raise ValueError(f"{theirs[0]} was put there or changed by hand; move it away, or name another folder")
     shutil.rmtree(out, ignore_errors=True)
     partial.rename(out)
     return facts
+
+
+def _by_hand(out: Path, made: Path) -> list[Path]:
+    """Files of `out` that a scene made anew would not have, or that are younger than the sign that it was made."""
+    sign = out / ".generated"
+    files = [path for path in out.rglob("*") if path.is_file() and path != sign] if sign.exists() else []
+    young = lambda path: path.stat().st_mtime > sign.stat().st_mtime
+    return sorted(path for path in files if young(path) or not (made / path.relative_to(out)).exists())
 
 
 def _write_scene(out: Path, seed: int, kind: Kind) -> dict:

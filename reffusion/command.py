@@ -40,7 +40,13 @@ def main() -> None:
     if module != "runner":
         del sys.argv[1]
     sys.path.insert(0, str(root()))  # never this folder itself: its `io` and `types` would hide Python's own
-    runpy.run_module(module, run_name="__main__", alter_sys=True)
+    try:
+        runpy.run_module(module, run_name="__main__", alter_sys=True)
+    except SystemExit as end:  # told in a line
+        if isinstance(end.code, str):
+            print(end.code, file=sys.stderr)
+            sys.exit(2)
+        raise
 
 
 if __name__ == "__main__":

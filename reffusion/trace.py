@@ -7,6 +7,7 @@ import os
 import shutil
 import sys
 import time
+import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from math import floor, isfinite, log2, log10
@@ -33,9 +34,20 @@ def save_checkpoint(folder: Path, state: dict[str, Any]) -> None:
 
 
 def load_checkpoint(folder: Path) -> dict[str, Any] | None:
-    """The state last saved in `folder`, or None. The runner hands a stage only folders of its own key."""
+    """The state last saved in `folder`, or None, also where it is not whole, which is said. The runner hands a stage
+    only folders of its own key."""
     path = folder / CHECKPOINT
-    return torch.load(path, weights_only=True) if path.exists() else None
+    if not path.exists():
+        return None
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if archive.testzip() is None:  # torch does not look at the checksums that it writes
+                return torch.load(path, weights_only=True)
+    except Exception:  # of many kinds: whatever a broken file may be taken for
+        pass
+    print(f"{path} is damaged: from the start", flush=True)
+    clear_checkpoint(folder)
+    return None
 
 
 def clear_checkpoint(folder: Path) -> None:

@@ -48,8 +48,8 @@ def make(home: Path) -> dict[str, Path]:
     comparison = load(home)
     out = home / "compare"
     out.mkdir(exist_ok=True)
-    for old in out.glob("*.png"):
-        old.unlink()
+    for chart in ("tradeoff", "differences"):  # there may be nothing to draw any more
+        (out / f"{chart}.png").unlink(missing_ok=True)
     table = rows(comparison)
     paths = {kind: home / f"compare.{kind}" for kind in ("csv", "md", "html")}
     save_csv(paths["csv"], table)

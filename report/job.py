@@ -37,8 +37,6 @@ def make(home: Path) -> Path:
     job = load_job(home)
     out = home / "report"
     out.mkdir(exist_ok=True)
-    for old in out.glob("*.png"):
-        old.unlink()
     title = f"{home.name}: what was done"
     seconds = sum(receipt["seconds"] for receipt in job.receipts.values())
     done = f"{page.duration(seconds)} in {len(job.receipts)} stages"

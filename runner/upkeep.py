@@ -12,7 +12,7 @@ from runner.keys import HASHES, Hashes
 from runner.pipeline import NAME, Pipeline, find_scene, load_pipeline, unknown
 from runner.resolve import Request, one_folder_a_name
 
-PAGES = ("report", "compare")  # folders of pictures and pages
+PAGES = ("report/index.html", "report/*.png", "compare/*.png")
 RECORDS = ("profile", "source", "plan.json", "turntable.webm", "compare.json", "compare.csv", "compare.md",
            "compare.html")  # fmt: skip
 WORKING = (".partial-*", ".copying-*", ".gone-*")
@@ -101,8 +101,8 @@ def _made(home: Path, pipeline: Pipeline, hashes: Hashes) -> Iterator[Path]:
     """The files of a scene's results that are as the runner or a page's maker left them; an artifact's receipt last."""
     yield from (home / name for name in RECORDS)
     yield from (home / f"{stage}.log" for stage in pipeline.stages)
-    for page in PAGES:
-        yield from files_below(home / page)
+    for pattern in PAGES:
+        yield from home.glob(pattern)
     for folder in sorted(path.parent for path in home.glob(f"*/{RECEIPT}")):
         if folder.is_symlink():  # a person's: what it leads to may be another scene's
             yield folder

@@ -600,7 +600,7 @@ def test_clean_removes_only_what_it_was_asked_for_by_name(root, tmp_path, name):
 
 
 def test_clean_and_a_rerun_leave_what_people_put_there(root, tmp_path, capsys):
-    mine = {"notes.txt": "1", "fit/notes.txt": "2", "to_paint/a.png": "3", "report/index.html": "a page"}
+    mine = {"notes.txt": "1", "fit/notes.txt": "2", "to_paint/a.png": "3", "report/index.html": "a page", "report/x.txt": "5"}
     write(root / "runs/toy", mine)
     write(tmp_path, {"elsewhere/fit/gaussians.ply": "4"})
     (root / "runs/toy/linked").symlink_to(tmp_path / "elsewhere")
@@ -612,7 +612,7 @@ def test_clean_and_a_rerun_leave_what_people_put_there(root, tmp_path, capsys):
     assert "kept, as it was not made by the runner: " in capsys.readouterr().out
     home = root / "runs/toy"
     left = {path.relative_to(home).as_posix() for path in home.rglob("*") if path.is_file()}
-    assert left == {"notes.txt", "fit/notes.txt", "to_paint/a.png", "masks/facts.json"}
+    assert left == {"notes.txt", "report/x.txt", "fit/notes.txt", "to_paint/a.png", "masks/facts.json"}
     assert (tmp_path / "elsewhere/fit/gaussians.ply").read_text() == "4"
     ran(capsys, root)
     assert result(root) == 10.0 and (home / "fit/notes.txt").exists() and (home / "kept/masks/facts.json").exists()

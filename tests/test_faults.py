@@ -1,0 +1,398 @@
+"""Faults of the machine and of hands: kills, full disks, lost and rotten files, locks, quotes. Nothing is lost, and
+what went wrong is told in one line. REFFUSION_SLOW=1: all kills and all sizes of a disk, a few of them otherwise."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+import signal
+import stat
+import subprocess
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from test_installed import write_capture
+from test_runner import FILES, REPO, ran, request, result, start, wait_for, words, write
+
+from reffusion import trace
+from runner import Refused, compare, upkeep
+from runner.artifacts import wear
+from runner.execute import run_scene
+from runner.files import RECEIPT
+from runner.keys import Hashes
+from runner.plan import decide, plan, table
+from runner.resolve import Request, resolve
+
+SLOW = os.environ.get("REFFUSION_SLOW") == "1"
+KILLS, SIZES = (200, 30) if SLOW else (3, 2)
+SLOWLY = "stages: {fit: {pause: 0.1}}\n"
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("finished")
+    write(root, FILES)
+    run_scene(request(root), "all")
+    return root
+
+
+@pytest.fixture
+def root(finished: Path, tmp_path: Path) -> Path:
+    """A toy project in which everything is done."""
+    shutil.copytree(finished, tmp_path / "project")
+    return tmp_path / "project"
+
+
+@pytest.fixture
+def fresh(tmp_path: Path) -> Path:
+    write(tmp_path / "project", FILES)
+    return tmp_path / "project"
+
+
+def command(root: Path, *arguments: str, **options) -> subprocess.Popen[str]:
+    whole = [sys.executable, "-m", "runner", *arguments, "--root", str(root), "--profile", "laptop"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen(whole, cwd=REPO, **pipes, **options)
+
+
+def told(root: Path, *arguments: str, **options) -> tuple[int, str, str]:
+    """Exit code, output and errors of a command."""
+    process = command(root, *arguments, **options)
+    output, errors = process.communicate(timeout=120)
+    return process.returncode, output, errors
+
+
+def assert_one_line(said: tuple[int, str, str]) -> str:
+    code, output, errors = said
+    assert code == 2 and errors.startswith("error: ") and errors.count("\n") == 1, (output, errors)
+    return errors
+
+
+def assert_whole(runs: Path) -> None:
+    """Every artifact in place is one that a stage finished, and every table and record is whole."""
+    for receipt in runs.glob("*/[a-z]*/" + RECEIPT):
+        worn = wear(receipt.parent, Hashes(runs / "none"))
+        assert json.loads(receipt.read_text())["files"] and not worn.words(), receipt
+    for path in runs.glob("*/compare.json"):
+        json.loads(path.read_text())
+
+
+# ----------------------------------------------------------------------------------------------- kills, and full disks
+
+LONG = {
+    "run": ["run", "--scene", "toy"],
+    "batch": ["batch", "--data", "data"],
+    "compare": ["compare", "--scene", "toy", "--variants", "full,strong"],
+}
+
+
+@pytest.mark.parametrize("what", LONG)
+def test_killed_at_random_moments(fresh, what):
+    write(fresh, {"data/toy/scene.yaml": SLOWLY})
+    if what == "batch":
+        write(fresh, {"data/wide/number.txt": "6"})
+    arguments = [str(fresh / "data") if word == "data" else word for word in LONG[what]]
+    random, killed = np.random.default_rng(len(what)), 0
+    for _ in range(-(-KILLS // 3)):
+        process = command(fresh, *arguments)
+        try:
+            process.wait(random.uniform(0.2, 5 if SLOW else 1.5))
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGKILL)
+            killed += 1
+        else:  # too late: it was done
+            shutil.rmtree(fresh / "runs")
+        process.communicate()
+        assert_whole(fresh / "runs")
+    code, _, errors = told(fresh, *arguments)
+    assert code == 0 and killed, errors
+    assert_whole(fresh / "runs")
+    assert result(fresh) == 10.0
+    if what == "batch":
+        assert result(fresh, "wide") == 12.0 and "toy,done,10.0000" in (fresh / "runs/results.csv").read_text()
+    if what == "compare":
+        assert result(fresh, "toy@strong") == 50.0
+        runs = json.loads((fresh / "runs/toy/compare.json").read_text())["runs"]
+        assert [run["state"] for run in runs] == ["done"] * 2
+    left = {path.name for home in (fresh / "runs").iterdir() for path in home.glob("*") if home.name != ".locks"}
+    assert not [name for name in left if name.startswith(".")] and "kept" not in left
+
+
+@contextmanager
+def disk(folder: Path):
+    """A disk in memory at `folder`; yields what sets its size or makes it read-only."""
+    folder.mkdir(exist_ok=True)
+    mount = lambda *how: subprocess.run(["mount", "-t", "tmpfs", *how, "none", str(folder)], capture_output=True)
+    if shutil.which("mount") is None or mount("-o", "size=1m").returncode:
+        pytest.skip("no tmpfs can be mounted here")
+    try:
+        yield lambda how: subprocess.run(["mount", "-o", f"remount,{how}", str(folder)], check=True)
+    finally:
+        subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+def test_a_full_disk(fresh):
+    random = np.random.default_rng(0)
+    with disk(fresh / "runs") as remount:
+        for _ in range(SIZES):
+            remount(f"size={4 * random.integers(1, 30)}k")
+            said = told(fresh, "run", "--scene", "toy")
+            assert said[0] == 0 or "make room" in assert_one_line(said)
+            assert_whole(fresh / "runs")
+            if SLOW and random.random() < 0.3:
+                shutil.rmtree(fresh / "runs/toy", ignore_errors=True)
+        remount("size=1m")
+        assert told(fresh, "run", "--scene", "toy")[0] == 0 and result(fresh) == 10.0
+
+
+@pytest.mark.parametrize("size", [0, 60, 700, 2500][:: 1 if SLOW else 2])
+def test_files_that_cannot_be_written_whole(fresh, size):
+    limit = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+    assert "make room" in assert_one_line(told(fresh, "run", "--scene", "toy", preexec_fn=limit))
+    assert_whole(fresh / "runs")
+    run_scene(request(fresh), "all")
+    assert result(fresh) == 10.0
+
+
+def test_a_folder_that_is_only_read(root):
+    kept = root / "made"
+    (root / "runs").rename(kept)
+    with disk(root / "runs") as remount:
+        shutil.copytree(kept, root / "runs", dirs_exist_ok=True)
+        remount("ro")
+        code, output, _ = told(root, "plan", "--scene", "toy")
+        assert code == 0 and "cached    evaluate" in output
+        assert "Read-only file system; runs=FOLDER" in assert_one_line(told(root, "run", "--scene", "toy"))
+        assert "Read-only file system; runs=FOLDER" in assert_one_line(told(root, "clean", "--scene", "toy"))
+
+
+# ------------------------------------------------------------------------------------------- lost, rotten, edited files
+
+
+def flip(path: Path, quietly: bool = False) -> None:
+    """Another byte in the middle; `quietly`: size and time say nothing of it."""
+    data, then = bytearray(path.read_bytes()), path.stat().st_mtime_ns
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    if quietly:
+        os.utime(path, ns=(then, then))
+
+
+def test_what_is_missing_or_changed_is_named_and_made_again(root, capsys):
+    before = {path: path.read_bytes() for path in (root / "runs/toy").rglob("*") if path.parent.name != "toy"}
+    before = {path: data for path, data in before.items() if path.name not in (RECEIPT, "trace.jsonl")}
+    (root / "runs/toy/evaluate/metrics.json").unlink()
+    (root / "runs/toy/masks/facts.json").unlink()
+    flip(root / "runs/toy/fit/gaussians.ply")
+    flip(root / "runs/toy/poses/masks/a.png")
+    said = words(root)
+    assert said["fit"] == "run gaussians.ply changed since (keep=1 keeps it)" and said["distill"].startswith(
+        "undecided"
+    )
+    assert said["masks"] == "run facts.json missing" and said["evaluate"] == "run metrics.json missing"
+    assert ran(capsys, root) == ["poses", "fit", "masks", "evaluate"]  # `distill` is as it was, and so are its needs
+    assert {path: path.read_bytes() for path in before} == before
+    assert {path.name for path in (root / "runs/toy/kept").rglob("*.*")} == {"gaussians.ply", "a.png"}
+
+
+def test_verify_hashes_everything(root, capsys):
+    assert upkeep.verify(request(root)) == 0 and "runs/toy/fit: as it was made" in capsys.readouterr().out
+    files = [path for path in (root / "runs/toy").glob("*/*") if path.is_file() and path.suffix in (".ply", ".json")]
+    files = [path for path in files if path.name != RECEIPT]
+    for path in (*files, root / "data/toy/number.txt"):
+        flip(path, quietly=True)
+    assert set(words(root).values()) == {"cached"}  # by size and time
+    assert upkeep.verify(request(root)) == len(files) + 1
+    said = capsys.readouterr().out
+    assert all(f"toy/{path.parent.name}: {path.name} changed" in said for path in files)
+    assert "data/toy/number.txt: its content changed, its size and time did not" in said and "keep=1" in said
+    flip(root / "data/toy/number.txt")
+    assert ran(capsys, root) == ["fit", "masks", "distill", "evaluate"] and result(root) == 10.0
+    assert upkeep.verify(request(root)) == 0
+    for spoiled in ("{", "[]", "{}"):
+        (root / "runs/toy/masks" / RECEIPT).write_text(spoiled)
+        assert upkeep.verify(request(root)) == 1 and "receipt.json cannot be read" in capsys.readouterr().out
+    assert words(root)["masks"] == "run no artifact yet"
+
+
+def test_an_old_receipt_holds_as_a_whole(root):
+    path = root / "runs/toy/fit" / RECEIPT
+    found = json.loads(path.read_text())
+    del found["files"]
+    path.write_text(json.dumps(found))
+    assert words(root)["fit"] == "cached"
+    flip(root / "runs/toy/fit/gaussians.ply")
+    assert words(root)["fit"] == "run gaussians.ply changed since (keep=1 keeps it)"
+
+
+@pytest.mark.parametrize("how", ["a byte", "half", "nothing", "text"])
+def test_a_damaged_checkpoint_means_a_fresh_start(tmp_path, capsys, how):
+    state = {"step": 3, "values": torch.arange(5000.0)}
+    trace.save_checkpoint(tmp_path, state)
+    found = trace.load_checkpoint(tmp_path)
+    assert found["step"] == 3 and torch.equal(found["values"], state["values"]) and not capsys.readouterr().out
+    path = tmp_path / "checkpoint.pt"
+    if how == "a byte":
+        flip(path)
+    else:
+        path.write_bytes({"half": path.read_bytes()[: path.stat().st_size // 2], "nothing": b"", "text": b"no"}[how])
+    assert trace.load_checkpoint(tmp_path) is None and not path.exists()
+    assert "checkpoint.pt is damaged: from the start" in capsys.readouterr().out
+
+
+def test_empty_records_are_none(root):
+    for name in ("source", "profile"):
+        (root / "runs/toy" / name).write_text("")
+    (root / "runs/.hashes.json").write_text("[]")
+    assert set(words(root).values()) == {"cached"}
+    assert "no CUDA driver" in resolve(request(root, profile=None)).why or resolve(request(root)).profile
+
+
+# --------------------------------------------------------------------------------------------------------------- locks
+
+
+def test_a_lock_that_is_lost_while_a_stage_works(root):
+    process = start(root, "--scene", "toy", "--set", "fit.pause=0.1 fit.iterations=8")
+    wait_for(lambda: list((root / "runs/toy").glob(".partial-fit-*")))
+    (root / "runs/.locks/toy").unlink()
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 2 and "its lock in .locks was removed" in output and "Traceback" not in output
+    assert (root / "runs/toy/fit/gaussians.ply").read_text() == "10"
+    run_scene(request(root, set="fit.pause=0.1 fit.iterations=8"), "fit")
+    assert (root / "runs/toy/fit/gaussians.ply").read_text() == "20"
+
+
+def test_another_machine(root, capsys):
+    write(root, {"runs/.locks/toy": "77 elsewhere\n"})
+    ran(capsys, root)
+    run_scene(request(root), "all")
+    assert "elsewhere" not in capsys.readouterr().out and not (root / "runs/.locks/toy").read_text()
+    write(root, {"runs/.locks/toy": "77 elsewhere\n"})
+    run_scene(request(root), "all")
+    assert "toy was last in use on elsewhere; is it still?" in capsys.readouterr().out
+
+
+# -------------------------------------------------------------------------------------------------- what a stage reads
+
+
+def test_pictures_outside_the_scene_count_and_are_listed(tmp_path):
+    scene, pictures = tmp_path / "data/row", tmp_path / "pictures"
+    write_capture(scene)
+    (scene / "images").rename(pictures)
+    record = json.loads((scene / "transforms.json").read_text())
+    for number, frame in enumerate(record["frames"]):
+        name = Path(frame["file_path"]).name
+        frame["file_path"] = f"../../pictures/{name}" if number else str(pictures / name)
+    (scene / "transforms.json").write_text(json.dumps(record))
+    key = lambda: decide(job := resolve(Request(REPO, tmp_path / "runs", str(scene), "laptop")), "poses", {}), job
+    (before, job) = key()
+    assert f"read outside the scene's folder: {pictures} (4 files)" in table(job, plan(job, ["poses"]))
+    shutil.copy(scene / "masks/v2.png", pictures / "v3.png")
+    assert key()[0].inputs.key != before.inputs.key
+
+
+def test_a_folder_above_the_scene_and_a_pipe_are_refused(fresh):
+    for folder in ("/", "..", "../.."):
+        write(fresh, {"data/toy/scene.yaml": f"gaussians: {folder}\n"})
+        with pytest.raises(Refused, match="holds the scene itself"):
+            words(fresh)
+    write(fresh, {"data/toy/scene.yaml": ""})
+    os.mkfifo(fresh / "data/toy/a.png")
+    assert stat.S_ISFIFO((fresh / "data/toy/a.png").stat().st_mode)
+    with pytest.raises(Refused, match=r"toy/a\.png: neither a file nor a folder"):
+        words(fresh)
+
+
+# ---------------------------------------------------------------------------------------------------------- many scenes
+
+UNREADABLE = {
+    "a": "shift: [1",
+    "b": "shift: 2022-08-19",
+    "c": "shift: !!python/object:os.system {}",
+    "d": "shift: &a [*a]",
+    "e": "[" * 3000,
+    "f": "shift: \x07",
+    "g": "stages: 7",
+}
+
+
+def test_scenes_that_cannot_be_read_are_rows_that_failed(root, capsys):
+    for name, text in UNREADABLE.items():
+        write(root, {f"data/{name}/number.txt": "1", f"data/{name}/scene.yaml": text})
+    (root / "data/h").mkdir()
+    (root / "data/h/scene.yaml").write_bytes(b"\xff\xfe\x00")
+    assert compare.batch(request(root, scene=""), root / "data") == 8
+    rows = dict(line.split(",")[:2] for line in (root / "runs/results.csv").read_text().splitlines())
+    assert rows.pop("toy") == "done" and [rows[name] for name in "abcdefgh"] == ["failed"] * 8
+    assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("bad", ["toy", "toy-1"])
+def test_compare_goes_on_after_a_scene_that_cannot_be_read(root, bad):
+    write(root, {"data/toy-1/number.txt": "4", f"data/{bad}/scene.yaml": "shift: [1"})
+    assert compare.compare(request(root), "full", 2) == 1
+    states = {run["scene"]: run["state"] for run in json.loads((root / "runs/toy/compare.json").read_text())["runs"]}
+    assert states.pop(bad) == "failed" and list(states.values()) == ["done"]
+    with pytest.raises(Refused, match="did you mean 'rate'"):
+        compare.compare(request(root, set="fit.rat=1"), "full", 2)
+
+
+# ---------------------------------------------------------------------------------------------------------------- make
+
+TYPED = (
+    "it's",
+    'a "b"',
+    "'; touch pwned; '",
+    '"; touch pwned; "',
+    "$(shell touch pwned)",
+    "`touch pwned`",
+    "$(touch pwned)",
+)
+
+
+@pytest.fixture
+def stub(tmp_path) -> Path:
+    """An environment whose commands only say what they were given."""
+    (tmp_path / "bin").mkdir()
+    for name in ("reffusion", "python"):
+        (tmp_path / "bin" / name).write_text('#!/bin/sh\nfor each in "$@"; do printf "%s|" "$each"; done; echo\n')
+        (tmp_path / "bin" / name).chmod(0o755)
+    (tmp_path / ".ready").touch()
+    for name in (".ready-dev", ".ready-view"):
+        (tmp_path / name).touch()
+    return tmp_path
+
+
+@pytest.mark.parametrize("typed", TYPED)
+def test_what_is_typed_is_no_command(stub, typed):
+    def made(*words: str) -> str:
+        done = subprocess.run(["make", "-s", "-C", str(REPO), f"VENV={stub}", *words], capture_output=True, text=True)
+        assert not list(REPO.glob("pwned*")), words
+        return done.stdout
+
+    assert made(f"scene={typed}", "plan") == f"plan|--scene={typed}|\n"
+    names = ("variant", "runs", "profile", "budget", "set")
+    given = "|".join(f"--{name}={typed}" for name in names)
+    assert made("scene=x", *(f"{name}={typed}" for name in names), "all") == f"run|all|--scene=x|{given}|\n"
+    assert f"--variants={typed}|--seeds={typed}|" in made("scene=x", f"variants={typed}", f"seeds={typed}", "compare")
+    assert made("scene=x", f"port={typed}", "view") == f"view|--scene=x|--port={typed}|\n"
+    assert made(f"data={typed}", "batch") == f"batch|--data={typed}|\n"
+    assert made(f"scene=demo-1{typed}", "plan").startswith(f"plan|--scene=demo-1{typed}|")
+    assert f"--out=data/{typed}|--seed={typed}|" in made(f"name={typed}", f"seed={typed}", "demo")
+    assert "which scene" not in made("plan", typed)
+
+
+def test_a_quote_in_a_scenes_name(fresh, capsys):
+    name = 'anna\'s "room"'
+    (fresh / "data/toy").rename(fresh / "data" / name)
+    assert ran(capsys, fresh, scene=name) == ["poses", "fit", "masks", "distill", "evaluate"]
+    run_scene(request(fresh, scene=str(fresh / "data" / name), variant="strong"), "all")
+    assert result(fresh, f"{name}@strong") == 50.0
+    upkeep.clean(request(fresh, scene=name))
+    assert [path.name for path in (fresh / "runs").glob("[!.]*")] == []
