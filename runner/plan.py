@@ -88,7 +88,9 @@ def _holds(job: Job, condition: Condition, earlier: dict[str, Decision]) -> bool
     try:
         return json.loads((source.path / "facts.json").read_text())[name] == condition.equals
     except (OSError, ValueError, KeyError):
-        raise Refused(f"{source.path / 'facts.json'}: has no {name!r}, which pipeline.yaml asks for") from None
+        raise Refused(
+            f"{source.path / 'facts.json'}: has no {name!r}, which pipeline.yaml asks for; `verify` it"
+        ) from None
 
 
 def _is(job: Job, param: str, value: Any) -> bool:
