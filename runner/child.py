@@ -177,7 +177,7 @@ def _done(job: dict[str, Any], log: TextIO) -> dict[str, Any]:
         stage.run(params, Path(job["out"]), **needs)
     except Exception as error:
         log.write(traceback.format_exc())
-        return {"error": told(error)}
+        return {"error": told(error)[:9999]}  # what a pipe holds
     return {"seconds": round(time.perf_counter() - began, 2), "peak_memory_mb": _peak_memory_mb()}
 
 

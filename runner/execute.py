@@ -91,6 +91,7 @@ def _in_child(job: Job, stage: str, partial: Path, earlier: dict[str, Decision],
     process = child(job.root, "run", pass_fds=(lock, result), process_group=0)
     assert process.stdin
     os.close(result)
+    answer: dict[str, Any] = {}
     try:
         with suppress(BrokenPipeError):  # a child that is gone already has its code below
             process.stdin.write(line + "\n")
@@ -107,8 +108,9 @@ def _in_child(job: Job, stage: str, partial: Path, earlier: dict[str, Decision],
     finally:
         with suppress(BrokenPipeError):
             process.stdin.close()
-        with open(heard) as file:
-            answer = json.loads(file.read() or "{}")
+        os.set_blocking(heard, False)  # what a stage has started may live on, and hold its end open
+        with suppress(BlockingIOError), open(heard, "rb", buffering=0) as file:
+            answer = json.loads(file.read(1 << 16) or "{}")
     if code == 0 and answer:
         return answer
     how = f"ended by signal {-code} ({signal.Signals(-code).name})" if code < 0 else f"ended with code {code}"

@@ -40,7 +40,7 @@ def files_below(folder: Path) -> Iterator[Path]:
 def write_text(path: Path, text: str) -> None:
     """At once or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    partial = path.with_name(f".{path.name}.writing")
     try:
         partial.write_text(text, encoding="utf-8")
         os.replace(partial, path)

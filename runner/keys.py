@@ -97,7 +97,9 @@ class Hashes:
             return
         kept = dict(list(self.known.items())[-self.LIMIT :])
         with suppress(OSError):  # a full disk, or one that is only read: they are computed again the next time
-            write_text(self.path, json.dumps(kept))
+            partial = self.path.with_name(f"{self.path.name}.{os.getpid()}")  # runners of other scenes do the same
+            write_text(partial, json.dumps(kept))
+            os.replace(partial, self.path)
             self._saved = len(self.known)
 
 

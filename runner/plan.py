@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from runner import Refused
-from runner.artifacts import listed, wear
+from runner.artifacts import Wear, listed, wear
 from runner.files import MACHINE, RECEIPT, files_below, read_receipt
 from runner.keys import Inputs, changes, code_changes, code_of, elsewhere, leaves, outside
 from runner.pipeline import SCENE, Condition
@@ -65,7 +65,7 @@ def decide(job: Job, stage: str, earlier: dict[str, Decision]) -> Decision:
         if not path or not found:
             return Decision("run", "no artifact yet")
         as_then = Inputs(job.params[stage], found["needs"], found["weights"], code, job.stages[stage].unkeyed)
-        if known := ([] if job.trust else changes(found, as_then)) or _harm(job, path):
+        if known := ([] if job.trust else changes(found, as_then)) or _harm(job, wear(path, job.hashes)):
             return Decision("run", listed(known), path)
         return Decision("stale", f"waits for {', '.join(moving)}; kept if the new content is the same", path)
     return _compare(job, stage, _inputs(job, stage, {need: d.path for need, d in needs.items()}, code))
@@ -135,22 +135,21 @@ def _compare(job: Job, stage: str, inputs: Inputs) -> Decision:
     receipts = [(place, changes(found, inputs), found) for place in places if (found := read_receipt(place))]
     whys = []
     for place, differs, found in sorted(receipts, key=lambda receipt: bool(receipt[1])):
-        said = [] if place.parent == job.home else [f"shared with {job.base.name}"]
+        said, worn = [] if place.parent == job.home else [f"shared with {job.base.name}"], wear(place, job.hashes)
         if differs and not (job.trust and differs == code_changes(found, inputs)):
             whys.append(differs)
-        elif harm := _harm(job, place):
+        elif harm := _harm(job, worn):
             whys.append(harm)
         else:
             said = [f"trusted although {listed(differs)}"] if differs else said
-            return Decision("cached", "; ".join([*said, *wear(place, job.hashes).words()]), place, True, inputs)
+            return Decision("cached", "; ".join([*said, *worn.words()]), place, True, inputs)
     begun = "; goes on where it stopped" if partial_folder(job, stage, inputs.key).exists() else ""
     why = listed(whys[0]) if whys else "no artifact yet"
     return Decision("run", why + begun, receipts[0][0] if receipts else None, False, inputs)
 
 
-def _harm(job: Job, place: Path) -> list[str]:
+def _harm(job: Job, worn: Wear) -> list[str]:
     """What makes an artifact unfit, in words: files that are missing, or not as they were made."""
-    worn = wear(place, job.hashes)
     changed = f"{listed(worn.changed)} changed since (keep=1 keeps it)"
     return [f"{listed(worn.missing)} missing"] * bool(worn.missing) + [changed] * bool(worn.changed and not job.keep)
 

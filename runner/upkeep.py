@@ -12,9 +12,9 @@ from runner.keys import HASHES, Hashes
 from runner.pipeline import NAME, Pipeline, find_scene, load_pipeline, unknown
 from runner.resolve import Request, one_folder_a_name
 
-PAGES = ("report/index.html", "report/*.png", "compare/*.png")
-RECORDS = ("profile", "source", "plan.json", "turntable.webm", "compare.json", "compare.csv", "compare.md",
-           "compare.html")  # fmt: skip
+RECORDS = ("profile", "source", "plan.json", "turntable.webm")
+PAGES = (*(f"compare.{kind}" for kind in ("json", "csv", "md", "html")), "report/index.html", "report/*.png",
+         "compare/*.png", "**/.*.writing")  # fmt: skip
 WORKING = (".partial-*", ".copying-*", ".gone-*")
 
 
@@ -22,27 +22,23 @@ def verify(request: Request) -> int:
     """Hash every file of a scene's artifacts, of its variants' and of the scene; how many are not as they were.
 
     What is found is remembered, so that the next run makes again what is missing or changed."""
-    hashes, worse = Hashes(request.runs / HASHES, afresh=True), 0
-    for home in _homes(request):
+    hashes, homes, worse = Hashes(request.runs / HASHES, afresh=True), _homes(request), 0
+    for home in homes:
         with locked(request.runs, home.name, shared=True, wait=False):
             for folder in sorted(path.parent for path in home.glob(f"*/{RECEIPT}")):
                 worn = wear(folder, hashes) if read_receipt(folder) else None
                 worse += not worn or bool(worn.missing or worn.changed)
-                said = "; ".join(worn.words()) if worn else f"{RECEIPT} cannot be read"
+                said = ", ".join(worn.words()) if worn else f"{RECEIPT} cannot be read"
                 say(f"{shown(folder)}: {said or 'as it was made'}")
-            del hashes.rotten[:]  # told by its receipt
-            scene = request.root / read_text(home / "source")
-            for path in files_below(scene) if read_text(home / "source") and scene.is_dir() else ():
-                hashes.file(path)
-            for path in hashes.rotten:
-                say(f"{shown(path)}: its content changed, its size and time did not")
-            worse += len(hashes.rotten)
+    del hashes.rotten[:]  # receipts told of them
+    for scene in {request.root / source for home in homes if (source := read_text(home / "source"))}:
+        hashes.folder(scene)
+    for path in hashes.rotten:
+        say(f"{shown(path)}: its content changed, its size and time did not")
     hashes.save()
-    if worse:
-        say(
-            f"`make scene={request.scene} all` makes again what is missing or changed; with keep=1 only what is missing"
-        )
-    return worse
+    if worse + len(hashes.rotten):
+        say(f"`make scene={request.scene} all` makes again what is missing or changed; keep=1: what is missing")
+    return worse + len(hashes.rotten)
 
 
 def clean(request: Request) -> None:
@@ -101,8 +97,7 @@ def _made(home: Path, pipeline: Pipeline, hashes: Hashes) -> Iterator[Path]:
     """The files of a scene's results that are as the runner or a page's maker left them; an artifact's receipt last."""
     yield from (home / name for name in RECORDS)
     yield from (home / f"{stage}.log" for stage in pipeline.stages)
-    for pattern in PAGES:
-        yield from home.glob(pattern)
+    yield from (path for pattern in PAGES for path in home.glob(pattern))
     for folder in sorted(path.parent for path in home.glob(f"*/{RECEIPT}")):
         if folder.is_symlink():  # a person's: what it leads to may be another scene's
             yield folder

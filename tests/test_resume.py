@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,8 +17,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from runner.files import RECEIPT, read_json
+from runner import upkeep
+from runner.files import RECEIPT, files_below, read_json
 from runner.keys import Hashes
+from runner.plan import decide
+from runner.resolve import Request, resolve
 
 ROOT = Path(__file__).resolve().parent.parent
 KILLS = int(os.environ.get("RESUME_KILLS", "3"))
@@ -80,14 +84,42 @@ def scene(tmp_path_factory) -> Path:
     return folder
 
 
-def test_killed_at_random_moments(scene, tmp_path):
-    unbroken = finish(scene, tmp_path / "unbroken")
-    seconds = {stage: read_json(tmp_path / "unbroken/mini" / stage / RECEIPT)["seconds"] for stage in STAGES}
+@pytest.fixture(scope="module")
+def unbroken(scene, tmp_path_factory) -> tuple[Path, dict]:
+    """Where the results of a run from end to end are, and its metrics."""
+    runs = tmp_path_factory.mktemp("unbroken")
+    return runs / "mini", finish(scene, runs)
+
+
+def test_killed_at_random_moments(scene, unbroken, tmp_path):
+    made, metrics = unbroken
+    seconds = {stage: read_json(made / stage / RECEIPT)["seconds"] for stage in STAGES}
     random = np.random.default_rng(0)
     killed = 0
     for stage in sorted((IN_TURN[i % len(IN_TURN)] for i in range(KILLS)), key=STAGES.index):
         killed += kill_during(scene, tmp_path / "broken", stage, random.uniform(0, seconds[stage]))
         assert_whole(tmp_path / "broken/mini")
-    assert finish(scene, tmp_path / "broken") == unbroken
+    assert finish(scene, tmp_path / "broken") == metrics
     assert killed >= KILLS // 2  # the others came too late, their stage was done
     assert not list((tmp_path / "broken/mini").glob(".partial*"))
+
+
+def test_one_byte_flipped_in_each_kind_of_file_is_noticed_and_named(scene, unbroken, tmp_path, capsys):
+    """Of every stage; what then runs, tests of the runner tell."""
+    shutil.copytree(unbroken[0].parent, tmp_path / "runs")
+    request = Request(ROOT, tmp_path / "runs", str(scene), "laptop", set=SMALL)
+    assert upkeep.verify(request) == 0
+    home = tmp_path / "runs" / "mini"
+    files = [path for stage in ("poses", *STAGES) for path in files_below(home / stage) if path.name != RECEIPT]
+    kinds = {(path.relative_to(home).parts[0], path.suffix): path for path in files}
+    for path in kinds.values():
+        data, then = bytearray(path.read_bytes()), path.stat().st_mtime_ns
+        data[len(data) // 3] ^= 16
+        path.write_bytes(data)
+        os.utime(path, ns=(then, then))
+    capsys.readouterr()
+    assert upkeep.verify(request) == len({stage for stage, _ in kinds}) == 8
+    said = {line.split(": ")[0].rpartition("/")[2]: line for line in capsys.readouterr().out.splitlines()}
+    for (stage, _), path in kinds.items():
+        assert path.relative_to(home / stage).as_posix() in said[stage] or " more changed" in said[stage]
+    assert decide(resolve(request), "poses", {}).word == "run"
