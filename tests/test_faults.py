@@ -110,7 +110,7 @@ def test_killed_at_random_moments(fresh, what):
         write(fresh, {"data/wide/number.txt": "6"})
     arguments = [str(fresh / "data") if word == "data" else word for word in LONG[what]]
     random, killed = np.random.default_rng(len(what)), 0
-    for _ in range(-(-KILLS // 3)):
+    while killed < -(-KILLS // 3):
         process = command(fresh, *arguments)
         try:
             process.wait(random.uniform(0.2, 4 if SLOW else 1.5))
@@ -122,7 +122,7 @@ def test_killed_at_random_moments(fresh, what):
         process.communicate()
         assert_whole(fresh / "runs")
     code, _, errors = told(fresh, *arguments)
-    assert code == 0 and killed, errors
+    assert code == 0, errors
     assert_whole(fresh / "runs")
     assert result(fresh) == 10.0
     if what == "batch":
@@ -163,7 +163,7 @@ def test_a_full_disk(fresh):
         assert told(fresh, "run", "--scene", "toy")[0] == 0 and result(fresh) == 10.0
 
 
-@pytest.mark.parametrize("size", [700, 0, 60, 2500, 4000][: 5 if SLOW else 1])
+@pytest.mark.parametrize("size", [700, 0, 60, 300, 1000][: 5 if SLOW else 1])
 def test_files_that_cannot_be_written_whole(fresh, size):
     limit = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
     assert "make room" in assert_one_line(told(fresh, "run", "--scene", "toy", preexec_fn=limit))
