@@ -6,7 +6,9 @@
 - plan.py: one word and a reason for each stage, from what lies on the disk.
   - keys.py: what an artifact depends on, as hashes: contents of folders, code, parameters.
 - execute.py: does it: a fresh process a stage, folders renamed into place, receipts.
-  - files.py: locks, swaps, and copies that people work with.
+  - artifacts.py: what of one is as its receipt says, and swaps that survive a kill.
+  - files.py: files written whole, locks, and copies that people work with.
+- upkeep.py: what was made is verified, or removed.
 - child.py: the other side: the process in which stages are imported.
 - compare.py: many runs.
 """

@@ -1,5 +1,6 @@
 """The third step: does what a plan asks for, in a fresh process a stage, and renames folders into place."""
 
+import errno
 import functools
 import importlib.metadata
 import json
@@ -18,6 +19,7 @@ from typing import Any
 from runner import Failed, Refused, say
 from runner.artifacts import accept, contents, discard, put_in_place, recover, wear
 from runner.files import (
+    CURES,
     MACHINE,
     RECEIPT,
     hand_out,
@@ -67,13 +69,9 @@ def copied_from_variant(job: Job, stage: str, key: str, to: Path) -> str | None:
     for home in sorted(job.runs.glob(f"{job.base.name}@*")):
         if home != job.home and (read_receipt(home / stage) or {}).get("key") == key:
             with suppress(Refused), locked(job.runs, home.name, shared=True, wait=False):
-                copy, found, worn = (
-                    job.home / f".copying-{stage}",
-                    read_receipt(home / stage),
-                    wear(home / stage, job.hashes),
-                )
+                copy, found = job.home / f".copying-{stage}", read_receipt(home / stage)
                 discard(copy)
-                if found and found["key"] == key and not worn.words():
+                if found and found["key"] == key and not wear(home / stage, job.hashes).words():
                     shutil.copytree(home / stage, copy)
                     copy.rename(to)
                     return home.name
@@ -115,9 +113,10 @@ def _in_child(job: Job, stage: str, partial: Path, earlier: dict[str, Decision],
         return answer
     how = f"ended by signal {-code} ({signal.Signals(-code).name})" if code < 0 else f"ended with code {code}"
     hint = "; out of memory?" if code == -signal.SIGKILL else ""
-    full = "; the disk is full: make room, and the same command goes on from here"
-    hint += full if shutil.disk_usage(job.home).free < LITTLE else ""
-    raise Failed(f"{stage}: {answer.get('error', how)}{hint} (all of it in {shown(log)})")
+    said = answer.get("error", how + hint)
+    if shutil.disk_usage(job.home).free < LITTLE and CURES[errno.ENOSPC] not in said:  # libraries do not tell
+        said += f"; the disk is full: {CURES[errno.ENOSPC]}"
+    raise Failed(f"{stage}: {said} (all of it in {shown(log)})")
 
 
 def _receipt(job: Job, stage: str, inputs: Inputs, folder: Path, result: dict[str, Any]) -> dict[str, Any]:
