@@ -220,14 +220,10 @@ def test_verify_hashes_everything(root, capsys):
     said = capsys.readouterr().out
     assert all(f"toy/{path.parent.name}: {path.name} changed" in said for path in files)
     assert "data/toy/number.txt: its content changed, its size and time did not" in said and "keep=1" in said
-    flip(root / "data/toy/number.txt", quietly=True)
-    upkeep.verify(request(root))
-    assert ran(capsys, root) == ["fit", "masks", "distill", "evaluate"] and result(root) == 10.0
-    assert upkeep.verify(request(root)) == 0
+    assert words(root)["poses"].startswith("run need scene changed") and "gaussians.ply changed" in words(root)["fit"]
     for spoiled in ("{", "[]", "{}"):
         (root / "runs/toy/masks" / RECEIPT).write_text(spoiled)
-        assert upkeep.verify(request(root)) == 1 and "receipt.json cannot be read" in capsys.readouterr().out
-    assert words(root)["masks"] == "run no artifact yet"
+        assert upkeep.verify(request(root)) and "masks: receipt.json cannot be read" in capsys.readouterr().out
 
 
 def test_an_old_receipt_holds_as_a_whole(root):

@@ -606,17 +606,17 @@ def test_clean_and_a_rerun_leave_what_people_put_there(root, tmp_path, capsys):
     write(tmp_path, {"elsewhere/fit/gaussians.ply": "4"})
     (root / "runs/toy/linked").symlink_to(tmp_path / "elsewhere")
     assert words(root)["fit"] == "cached notes.txt added"
-    ran(capsys, root, set="fit.rate=3")
-    assert (root / "runs/toy/fit/notes.txt").read_text() == "2" and result(root) == 13.0
-    (root / "runs/toy/masks/facts.json").write_text("{}")
+    assert ran(capsys, root, "fit", set="fit.rate=3") == ["fit"]
+    assert (root / "runs/toy/fit/notes.txt").read_text() == "2"
+    (root / "runs/toy/poses/number.txt").write_text("9")
     upkeep.clean(request(root))
     assert "kept, as it was not made by the runner: " in capsys.readouterr().out
     home = root / "runs/toy"
     left = {path.relative_to(home).as_posix() for path in home.rglob("*") if path.is_file()}
-    assert left == {"notes.txt", "report/x.txt", "fit/notes.txt", "to_paint/a.png", "masks/facts.json"}
+    assert left == {"notes.txt", "report/x.txt", "fit/notes.txt", "to_paint/a.png", "poses/number.txt"}
     assert (tmp_path / "elsewhere/fit/gaussians.ply").read_text() == "4"
-    ran(capsys, root)
-    assert result(root) == 10.0 and (home / "fit/notes.txt").exists() and (home / "kept/masks/facts.json").exists()
+    assert ran(capsys, root, "fit") == ["poses", "fit"]
+    assert (home / "fit/notes.txt").exists() and (home / "kept/poses/number.txt").read_text() == "9"
 
 
 # ------------------------------------------------------------------------------------------------------------- batch
