@@ -584,15 +584,13 @@ def test_clean(root, capsys):
     assert not (root / "runs/toy").exists()
 
 
-@pytest.mark.parametrize(
-    "name", ["*", "to*", "[t]oy", ".locks", "..", ".", "/", "data/..", "toy@strong", "tyo", "toys", "mine"]
-)
-def test_clean_removes_only_what_it_was_asked_for_by_name(root, tmp_path, name):
+def test_clean_removes_only_what_it_was_asked_for_by_name(root):
     run_scene(request(root, variant="strong"), "distill")
     write(root, {"runs/mine/notes.txt": "no scene's"})
     before = sorted(root.rglob("*"))
-    with pytest.raises(Refused, match="toy"):
-        upkeep.clean(request(root, scene=name))
+    for name in ("*", "to*", "[t]oy", ".locks", "..", ".", "/", "data/..", "toy@strong", "tyo", "toys", "mine"):
+        with pytest.raises(Refused, match="toy"):
+            upkeep.clean(request(root, scene=name))
     for variant in ("*", "../toy", "string"):
         with pytest.raises(Refused, match=r"unknown variant .*strong"):
             upkeep.clean(request(root, variant=variant))
