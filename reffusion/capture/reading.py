@@ -7,11 +7,13 @@ from pathlib import Path
 from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.load import load_capture
 from reffusion.capture.roles import Roles, load_roles
+from reffusion.io.files import BadInput, there
+from reffusion.io.ply import gaussian_count
 from reffusion.params.poses import Params
 
 
 def read_scene(params: Params, scene: Path) -> tuple[Capture, Roles]:
-    """The capture and its views' roles; ValueError naming the file and the remedy where one is wrong."""
+    """The capture and its views' roles; BadInput naming the file and the remedy where one is wrong."""
     capture = load_capture(scene, params.layout, params.images)
     roles = load_roles(
         scene,
@@ -23,6 +25,8 @@ def read_scene(params: Params, scene: Path) -> tuple[Capture, Roles]:
         clean=params.clean,
         region=params.region is not None,
     )
-    if params.gaussians is not None and not (scene / params.gaussians).is_file():
-        raise ValueError(f"{scene / params.gaussians}: no such file; correct `gaussians` in scene.yaml")
+    if params.gaussians is not None:
+        if not there(scene / params.gaussians):
+            raise BadInput(f"{scene / params.gaussians}: no such file; correct `gaussians` in scene.yaml")
+        gaussian_count(scene / params.gaussians)
     return capture, roles

@@ -16,6 +16,7 @@ from reffusion.capture.layouts.capture import (
 )
 from reffusion.capture.lens import from_colmap
 from reffusion.io.colmap import is_model, load_cameras, load_images, load_model_points, model_file
+from reffusion.io.files import BadInput
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap", ".")
 
@@ -28,7 +29,7 @@ def read(folder: Path, images: str | None) -> Capture:
     """See `load_capture`."""
     model = model_folder(folder)
     if model is None:
-        raise ValueError(f"{folder}: no COLMAP model (cameras and images, .bin or .txt) in {', '.join(MODEL_FOLDERS)}")
+        raise BadInput(f"{folder}: no COLMAP model (cameras and images, .bin or .txt) in {', '.join(MODEL_FOLDERS)}")
     return from_model(folder, model, image_folder_of(folder, images, ("images", "images_2", "images_4", ".")), "colmap")
 
 
@@ -44,13 +45,13 @@ def from_model(folder: Path, model: Path, image_folder: Path, layout: str) -> Ca
         images = dict(zip(found, (images[name] for name in sorted(images)), strict=True))
     pictures = {name: path for name, path in found.items() if name in images}
     if not pictures:
-        raise ValueError(f"{source}: none of its images is in {image_folder}; name their folder as `images`")
+        raise BadInput(f"{source}: none of its images is in {image_folder}; name their folder as `images`")
     cameras = load_cameras(model_file(model, "cameras"))
     lenses, poses = {}, {}
     for name, path in pictures.items():
         camera = cameras.get(images[name].camera_id)
         if camera is None:
-            raise ValueError(f"{source}: the camera {images[name].camera_id} of '{name}' is missing in the model")
+            raise BadInput(f"{source}: the camera {images[name].camera_id} of '{name}' is missing in the model")
         lenses[name] = fitted(from_colmap(camera.model, camera.width, camera.height, camera.params), path)
         poses[name] = images[name].world_to_camera
     file = model_file(model, "points3D")
