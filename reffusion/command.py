@@ -40,7 +40,13 @@ def main() -> None:
     if module != "runner":
         del sys.argv[1]
     sys.path.insert(0, str(root()))  # never this folder itself: its `io` and `types` would hide Python's own
-    runpy.run_module(module, run_name="__main__", alter_sys=True)
+    try:
+        runpy.run_module(module, run_name="__main__", alter_sys=True)
+    except SystemExit as end:
+        if not isinstance(end.code, str):
+            raise
+        print(end.code, file=sys.stderr)
+        sys.exit(2)  # as the runner for what is told in one line; 1 is Python's own for a traceback
 
 
 if __name__ == "__main__":

@@ -47,7 +47,7 @@ def main() -> int:
             clean(request)
     except (Refused, Failed) as error:
         print(f"error: {error}", file=sys.stderr)
-        return 1
+        return 2
     except KeyboardInterrupt:
         print("\nstopped; the same command goes on from here", file=sys.stderr)
         return INTERRUPTED

@@ -98,10 +98,10 @@ def test_plan_in_any_folder(unpacked, tmp_path):
 
 def test_a_demo_scene_needs_a_checkout(unpacked, tmp_path):
     done = command(unpacked, tmp_path, "run", "--scene", "demo")
-    assert done.returncode == 1 and len(done.stderr.splitlines()) == 1
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
     assert "no folder data/demo" in done.stderr and "`make demo` makes one, in a checkout" in done.stderr
 
 
 def test_reports_are_commands_too(unpacked, tmp_path):
     done = command(unpacked, tmp_path, "report", "--scene", "nothing")
-    assert done.returncode == 1 and "no stage has been done" in done.stderr and "Traceback" not in done.stderr
+    assert done.returncode == 2 and "no stage has been done" in done.stderr and "Traceback" not in done.stderr

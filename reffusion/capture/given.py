@@ -152,7 +152,7 @@ def _values(path: Path) -> np.ndarray:
     if path.suffix.lower() == ".exr":
         return load_exr(path)
     if path.suffix.lower() == ".npy":
-        return load_array(path)
+        return load_array(path, "a readable depth map")
     with opened(path, "a readable depth map") as image:
         mode, values = image.mode, np.array(image)
     if mode[0] not in "IF":

@@ -59,6 +59,6 @@ def check_masks(masks: Mapping[str, Path]) -> None:
     if shares and (max(shares) == 0 or min(shares) == 1):
         state = "empty" if max(shares) == 0 else "full"
         raise BadInput(
-            f"{next(iter(masks.values())).parent}: all {len(shares)} masks are {state}; mark the object, and nothing else,"
-            " with 255 (or 1)"
+            f"{next(iter(masks.values())).parent}: all {len(shares)} masks are {state}; mark the object, and nothing "
+            "else, with 255 (or 1)"
         )

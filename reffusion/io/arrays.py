@@ -33,9 +33,9 @@ def load_json(path: Path) -> Any:
         return json.loads(Path(path).read_bytes())
 
 
-def load_array(path: Path) -> np.ndarray:
+def load_array(path: Path, what: str = "a readable array") -> np.ndarray:
     """The array in a `.npy` file. BadInput where it is something else: pickles are not read, nor archives."""
-    with reading(path, "a readable array"):
+    with reading(path, what):
         # Mapped first, so that what the header declares is compared with the file's length before memory is taken.
         array = np.load(path, mmap_mode="r", allow_pickle=False)
         if not isinstance(array, np.ndarray):

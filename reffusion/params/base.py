@@ -36,7 +36,8 @@ class Settings(BaseModel):
         """YAML reads `true` and `on` as truth values, and pydantic would make 1 of them."""
         info = cls.model_fields[field.field_name]
         if isinstance(value, bool) and bool not in _kinds(info.annotation):
-            raise ValueError("a truth value (true, false, yes, no, on or off), where none is meant; write it in quotes")
+            cure = "write it in quotes" if str in _kinds(info.annotation) else "give a number"
+            raise ValueError(f"yes, no, on, off, true and false are truth values; {cure}")
         if isinstance(value, int | float) and _kinds(info.annotation) <= {str, type(None)}:
             raise ValueError(f"read as the number {value}; write it in quotes")
         return value

@@ -9,7 +9,6 @@ from pydantic import Field
 from reffusion.params.base import UNKEYED, Settings
 from reffusion.params.reference import Given
 
-
 Side = Annotated[float, Field(gt=0)]
 
 
