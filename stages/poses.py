@@ -77,7 +77,7 @@ def _supported_size(params: Params, capture: Capture, roles: Roles) -> int:
     images = [load_at(capture.pictures[name], params.longest, capture.upright) for name in chosen]
     if not support.enlarged(images, params.detail):
         return params.longest
-    side = max(images[0].shape[:2])
+    side = max(max(image.shape[:2]) for image in images)
     print(f"pictures of {side} px show no more than {side // 2} px would: taken at that size", flush=True)
     return side // 2
 
