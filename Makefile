@@ -32,7 +32,7 @@ STAGES := poses fit masks reference lift personalize initialize distill evaluate
 options = $(if $(profile),--profile '$(profile)') $(if $(variant),--variant '$(variant)') \
 	$(if $(budget),--budget '$(budget)') $(if $(set),--set "$$set") $(if $(trust),--trust) $(if $(runs),--runs '$(runs)')
 
-.PHONY: help setup all $(STAGES) plan clean batch weights demo prior prior-report sds-variance view turntable test \
+.PHONY: help setup all $(STAGES) plan check clean batch weights demo prior prior-report sds-variance view turntable test \
 	bench stability gpu-check lint
 .DELETE_ON_ERROR:
 
@@ -40,6 +40,7 @@ help:
 	@echo 'make scene=demo all            the whole job; a second call finds everything cached'
 	@echo 'make scene=X STAGE             one stage and what it needs: $(STAGES)'
 	@echo 'make scene=X plan              what would run, and why'
+	@echo 'make scene=X check             what is odd about its photographs, masks and poses; each mask over its photograph'
 	@echo 'make scene=X compare           the full method, ablations and baselines side by side: runs/X/compare.html'
 	@echo '                               variants=a,b  only these; seeds=5  on demo, demo-1 ... demo-4, with intervals'
 	@echo 'make scene=X report            what was done, errors against seconds: runs/X/report/index.html'
@@ -113,6 +114,10 @@ all $(STAGES): ready
 
 plan: ready
 	@$(RUN) plan --scene '$(scene)' $(options)
+
+check: ready
+	@$(RUN) run poses --scene '$(scene)' $(options)
+	@$(RUN) check --scene '$(scene)' $(if $(variant),--variant '$(variant)') $(if $(runs),--runs '$(runs)')
 
 .PHONY: compare report
 # On the demo scenes of other seeds too. A variant that fails (3) stops no other: the table is drawn, then make fails.

@@ -17,6 +17,7 @@ import sys
 import threading
 import time
 import traceback
+import warnings
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -165,6 +166,7 @@ def run() -> int:
     job = json.loads(sys.stdin.readline())
     os.set_inheritable(job["lock"], False)  # held open until this process ends: no second runner before that
     threading.Thread(target=_end_with_runner, args=(sys.stdin.fileno(),), daemon=True).start()
+    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
     began, code = time.perf_counter(), 0
     with open(job["log"], "w") as log:
         faulthandler.enable(log)

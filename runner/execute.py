@@ -144,6 +144,9 @@ def run_scene(request: Request, target: str, hashes: Hashes | None = None) -> di
         done: dict[str, Decision] = {}
         for position, stage in enumerate(stages):
             done[stage] = decide(job, stage, done)
+            if done[stage].word == "cached":  # one that runs says it itself
+                for line in read_json(done[stage].path / "warnings.json") or ():
+                    say(f"warning: {line}")
             if done[stage].word == "run":
                 done[stage] = run_stage(job, stage, done[stage], done, lock)
                 if any(planned[later].word == "undecided" for later in stages[position + 1 :]):
