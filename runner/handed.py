@@ -1,5 +1,6 @@
 """YAML that people write by hand, scene.yaml above all: names are text, and nothing in it can cost much."""
 
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -82,8 +83,8 @@ def _tree(text: str) -> tuple[Any, Any]:
 
 def _pairs(loader: Any, node: yaml.MappingNode) -> list[tuple[str, Any]]:
     """Keys, as text, and values of a mapping; what it merges by `<<` included."""
-    keys = [_key(key) for key, _ in node.value]
-    if twice := [key for key in keys if keys.count(key) > 1]:
+    keys = Counter(_key(key) for key, _ in node.value)
+    if twice := [key for key, count in keys.items() if count > 1]:
         raise ValueError(f"line {node.start_mark.line + 1}: the key {twice[0]!r:.60} comes twice; keep one")
     loader.flatten_mapping(node)
     return [(_key(key), value) for key, value in node.value]

@@ -37,6 +37,8 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     capture, roles = read_scene(params, scene)
     said = [*capture.warnings, *roles.warnings]
     check_masks(roles.masks)
+    if params.gaussians is not None:
+        load_ply(scene / params.gaussians)  # before the work, not after it
     if capture.poses is None:
         everyone, capture = sorted(capture.pictures), _place(params, out, capture)
         if lost := [name for name in everyone if name not in capture.pictures]:

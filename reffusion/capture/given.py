@@ -135,7 +135,7 @@ def load_depth(path: Path) -> np.ndarray:
     values = _values(path)
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
-    if values.ndim != 2 or not np.issubdtype(values.dtype, np.number) or np.iscomplexobj(values):
+    if values.ndim != 2 or not values.size or not np.issubdtype(values.dtype, np.number) or np.iscomplexobj(values):
         raise BadInput(f"{path}: {values.dtype} {list(values.shape)}; a depth map is one number for each pixel")
     empty = (values == 0) if np.issubdtype(values.dtype, np.integer) else np.zeros(values.shape, bool)
     with np.errstate(over="ignore"):

@@ -15,7 +15,7 @@ from reffusion.geometry import pixel_rays, project, sample_nearest
 from reffusion.types import Camera, Scene
 
 LARGE = 0.5  # of a picture: a mask that covers more is more often inverted than meant
-LOOKED_AT = 24  # masks, spread evenly, that are compared in 3D
+LOOKED_AT = 24  # masks, spread evenly, that each is compared with in 3D
 RAYS, DEPTHS = 64, 32  # pixels of a mask, and places along the ray of each
 AGREE = 0.75  # of the other masks that must hold a place for it to be the object
 SUPPORTED = 0.3  # of a mask's pixels, under which it shows something else than the others
@@ -62,11 +62,10 @@ def _disagreeing(scene: Scene, masks: Mapping[str, np.ndarray]) -> list[str]:
     """Masks that show something else than the others: along none of their pixels' rays lies a place that is inside the
     other masks too."""
     names = [name for name in scene.train if name in masks and name not in scene.clean]
-    names = names[:: max(1, -(-len(names) // LOOKED_AT))]
     marked = [name for name in names if masks[name].any()]
     if len(marked) < 3:
         return []
-    cameras = [scene.cameras[name] for name in names]
+    cameras = [scene.cameras[name] for name in names[:: -(-len(names) // LOOKED_AT)]]
     share = {}
     for name in marked:
         places = _along_rays(scene.cameras[name], masks[name], scene.points)

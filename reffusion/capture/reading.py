@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from reffusion.capture.layouts.capture import Capture
+from reffusion.capture.lens import without_distortion
 from reffusion.capture.load import load_capture
 from reffusion.capture.roles import Roles, load_roles
 from reffusion.io.files import BadInput, there
-from reffusion.io.ply import gaussian_count
+from reffusion.io.ply import check_gaussians
 from reffusion.params.poses import Params
 
 
@@ -28,5 +29,16 @@ def read_scene(params: Params, scene: Path) -> tuple[Capture, Roles]:
     if params.gaussians is not None:
         if not there(scene / params.gaussians):
             raise BadInput(f"{scene / params.gaussians}: no such file; correct `gaussians` in scene.yaml")
-        gaussian_count(scene / params.gaussians)
+        check_gaussians(scene / params.gaussians)
+    _check_lenses(capture)
     return capture, roles
+
+
+def _check_lenses(capture: Capture) -> None:
+    """BadInput for a lens whose distortion cannot be undone."""
+    of = {lens: name for name, lens in capture.poses.lenses.items()} if capture.poses else {}
+    for lens, name in of.items():
+        try:
+            without_distortion(lens)
+        except BadInput as error:
+            raise BadInput(f"{capture.brought_by}: view '{name}': {error}") from None

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from reffusion.io.files import BadInput, reading
+from reffusion.io.files import BadInput, reading, shortened
 
 if TYPE_CHECKING:
     from reffusion.types import Gaussians, Similarity
@@ -86,12 +86,8 @@ def load_ply(path: Path, similarity: Similarity | None = None) -> Gaussians:
 
 def _arrays(path: Path, table: np.ndarray, similarity: Similarity | None) -> list[np.ndarray]:
     """Of the vertices what `_FIELDS` names, float32."""
-    missing = [n for n in (*POSITION, *DC, "opacity", *SCALES, *ROTATION) if n not in table.dtype.names]
-    if missing:
-        raise BadInput(f"{path}: not a file of Gaussians, it lacks {', '.join(missing)}")
+    _check_properties(path, table.dtype.names)
     rest_names = [n for n in table.dtype.names if n.startswith("f_rest_")]
-    if len(rest_names) not in (0, 9, 24, 45):
-        raise BadInput(f"{path}: {len(rest_names)} f_rest properties; 0, 9, 24 or 45 belong to degrees 0 to 3")
     take = lambda names: np.stack([table[n] for n in names], axis=1).astype(np.float64)
     means, log_scales = take(POSITION), take(SCALES)
     if similarity is not None:
@@ -187,11 +183,11 @@ def _header(path: Path) -> _Header:
     with reading(path, "a readable PLY file with vertices"), open(path, "rb") as file:
         if file.readline(8).strip() != b"ply":
             raise BadInput(f"{path}: not a PLY file; its first line is not `ply`")
-        text, elements, comments = False, [], []
+        form, elements, comments = "", [], []
         for raw in iter(lambda: file.readline(_LONGEST_LINE), b""):
             words = raw.decode("ascii", "replace").split()
             if words[:1] == ["format"]:
-                text = words[1] == "ascii"
+                form = words[1]
             elif words[:1] == ["comment"]:
                 comments.append(" ".join(words[1:]))
             elif words[:1] == ["element"]:
@@ -203,7 +199,9 @@ def _header(path: Path) -> _Header:
         else:
             raise BadInput(f"{path}: cut off within its header")
         held = tuple((name, count, tuple(properties)) for name, count, properties in elements)
-        header = _Header(text, held, tuple(comments), file.tell())
+        header = _Header(form == "ascii", held, tuple(comments), file.tell())
+        if form not in ("ascii", "binary_little_endian", "binary_big_endian"):
+            raise BadInput(f"{path}: not a readable PLY file with vertices: its format is '{shortened(form)}'")
         if any(count < 0 for _, count, _ in held) or not any(name == "vertex" for name, _, _ in held):
             raise BadInput(f"{path}: not a readable PLY file with vertices")
         if header.at + header.least() > path.stat().st_size:
@@ -214,12 +212,23 @@ def _header(path: Path) -> _Header:
 _LONGEST_LINE = 10_000  # of a header, in bytes
 
 
-def gaussian_count(path: Path) -> int:
-    """The number of Gaussians, by the header alone. BadInput where it is 0, or the file is too short for them."""
-    count = next(count for name, count, _ in _header(Path(path)).elements if name == "vertex")
+def check_gaussians(path: Path) -> None:
+    """By the header alone: BadInput where there are none, the file is cut off, or its properties are not those of 3DGS."""
+    count, properties = next((c, p) for name, c, p in _header(Path(path)).elements if name == "vertex")
     if not count:
         raise BadInput(f"{path}: it holds no Gaussians")
-    return count
+    _check_properties(path, [name for kind, name in properties if kind in _TYPES])
+
+
+def _check_properties(path: Path, names: Sequence[str]) -> None:
+    missing = [n for n in (*POSITION, *DC, "opacity", *SCALES, *ROTATION) if n not in names]
+    if missing:
+        raise BadInput(f"{path}: not a file of Gaussians, it lacks {', '.join(missing)}")
+    count = sum(n.startswith("f_rest_") for n in names)
+    if count not in (0, 9, 24, 45) or any(f"f_rest_{k}" not in names for k in range(count)):
+        raise BadInput(f"{path}: {count} f_rest properties; 0, 9, 24 or 45 belong to degrees 0 to 3")
+    if len(set(names)) < len(names):
+        raise BadInput(f"{path}: a property comes twice")
 
 
 def _read(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:

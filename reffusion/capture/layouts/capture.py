@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from reffusion.capture.lens import Lens
+from reffusion.capture.lens import Lens, from_colmap
+from reffusion.io.colmap import ModelCamera
 from reffusion.io.files import BadInput
 from reffusion.io.images import ENDINGS, image_size
 
@@ -85,6 +86,14 @@ def image_folder_of(folder: Path, images: str | None, usual: tuple[str, ...]) ->
     if not there:
         raise BadInput(f"{folder}: no pictures in {', '.join(usual)}; name their folder as `images` in scene.yaml")
     return next((path for path in there if (path / "label").is_dir()), there[0])
+
+
+def lens_of(camera: ModelCamera, source: Path) -> Lens:
+    """`from_colmap`, of a camera that the file `source` names."""
+    try:
+        return from_colmap(camera.model, camera.width, camera.height, camera.params)
+    except BadInput as error:
+        raise BadInput(f"{source}: {error}") from None
 
 
 def fitted(lens: Lens, picture: Path) -> Lens:

@@ -14,11 +14,12 @@ from reffusion.capture.layouts.capture import (
     fitted,
     image_folder_of,
     inverse,
+    lens_of,
     pictures_in,
     rigid,
 )
 from reffusion.capture.layouts.colmap import from_model, model_folder
-from reffusion.capture.lens import Lens, from_colmap
+from reffusion.capture.lens import Lens
 from reffusion.io.arrays import load_array
 from reffusion.io.colmap import load_cameras, load_model_points, model_file
 from reffusion.io.files import BadInput, there
@@ -84,7 +85,7 @@ def _lens_of_partial_model(
     cameras = list(load_cameras(file).values()) if file else []
     if len(cameras) != 1:
         return lenses
-    exact = from_colmap(cameras[0].model, cameras[0].width, cameras[0].height, cameras[0].params)
+    exact = lens_of(cameras[0], file)
     replaced = {name: fitted(exact, path) for name, path in pictures.items()}
     ratio = np.median([replaced[name].fx / lens.fx for name, lens in lenses.items()])
     if abs(ratio - 1) > 0.02:

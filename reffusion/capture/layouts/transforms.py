@@ -84,6 +84,8 @@ def _frame_file(folder: Path, images: str | None, listed: str) -> Path | None:
     """The frame's picture: as listed, or by its name in the folder `images`; usual endings are tried."""
     listed_path = Path(listed.replace("\\", "/"))
     base = folder / listed_path if images is None else folder / images / listed_path.name
+    if base.suffix.lower() in ENDINGS:
+        there(base)  # a folder or a pipe of that name is no missing picture
     candidates = [base, *(base.with_name(base.name + end) for e in ENDINGS for end in (e, e.upper()))]
     if images is not None:
         candidates += [base.with_suffix(end) for e in ENDINGS for end in (e, e.upper())]
