@@ -884,7 +884,7 @@ ASKED = [
     ("g.ply", both(gaussians, half), ""),
     ("v00", yaml(YAML["reference of a test view"]), ""),
 ]
-THROUGH_THE_COMMAND = [*QUICK, *(ASKED if SLOW else ASKED[:3])]
+THROUGH_THE_COMMAND = [*QUICK, *(ASKED if SLOW else ASKED[:1])]
 
 
 @pytest.mark.parametrize(("names", "change", "set_"), THROUGH_THE_COMMAND)

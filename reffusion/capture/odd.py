@@ -124,10 +124,10 @@ def _contradicting(cameras: list[Camera], points: np.ndarray, image_of: Callable
 
 
 def _brightness(camera: Camera, points: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """[P, 2] what the photograph shows where its pose puts the points: brightness, and what of it is finer than an
-    eighth of the picture (a floor is dark in every view, whatever the pose). NaN outside, and behind nearer points."""
+    """[P, 2] what the photograph shows where its pose puts the points: brightness, and what of it is finer than a
+    quarter of the picture (a floor is dark in every view, whatever the pose). NaN outside, and behind nearer points."""
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    near, wide = (cv2.blur(gray, (max(3, camera.width // part),) * 2) for part in (80, 8))
+    near, wide = (cv2.blur(gray, (max(3, camera.width // part),) * 2) for part in (40, 4))
     uv, depth = project(points, camera)
     values, inside = sample_nearest(np.stack([near, near - wide], -1), uv)
     cell = max(1.0, camera.width / 40)

@@ -15,6 +15,9 @@ MOST_PIXELS = 200_000_000  # of a picture or depth map; what declares more is re
 class BadInput(ValueError):
     """What a person handed over is wrong: one line that names the file or key, and where it can what mends it."""
 
+    def __init__(self, message: str):
+        super().__init__(" ".join(message.splitlines()))
+
 
 @contextmanager
 def understood(path: Path, what: str) -> Iterator[None]:

@@ -168,6 +168,8 @@ def load_exr(path: Path) -> np.ndarray:
         file = oiio.ImageInput.open(str(path))
         if file is None:
             raise BadInput(f"{path}: not a readable EXR file ({shortened(oiio.geterror(), 200)})")
+        if file.format_name() != "openexr":
+            raise BadInput(f"{path}: {file.format_name()}, called .exr; give it the ending of what it is")
         spec = file.spec()
         check_pixels(path, spec.width, spec.height * max(spec.depth, 1))
         pixels = file.read_image(0, 0, 0, 1, oiio.FLOAT)

@@ -213,7 +213,7 @@ _LONGEST_LINE = 10_000  # of a header, in bytes
 
 
 def check_gaussians(path: Path) -> None:
-    """By the header alone: BadInput where there are none, the file is cut off, or its properties are not those of 3DGS."""
+    """By the header alone: BadInput where there are none, the file is cut off, or its properties are others."""
     count, properties = next((c, p) for name, c, p in _header(Path(path)).elements if name == "vertex")
     if not count:
         raise BadInput(f"{path}: it holds no Gaussians")
