@@ -33,7 +33,7 @@ options = $(if $(profile),--profile '$(profile)') $(if $(variant),--variant '$(v
 	$(if $(budget),--budget '$(budget)') $(if $(set),--set "$$set") $(if $(trust),--trust) $(if $(runs),--runs '$(runs)')
 
 .PHONY: help setup all $(STAGES) plan check clean batch weights demo prior prior-report sds-variance view turntable test \
-	bench stability gpu-check lint
+	fuzz bench stability gpu-check lint
 .DELETE_ON_ERROR:
 
 help:
@@ -169,6 +169,10 @@ sds-variance: ready
 # Two processes of one thread each, whole files to each: kernels that are compiled for one test serve the next.
 test: $(VENV)/.ready-dev
 	OMP_NUM_THREADS=1 $(PY) -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
+
+# Every reader on spoilt files, ten minutes each.
+fuzz: $(VENV)/.ready-dev
+	$(PY) -m tests.test_fuzz
 
 lint: $(VENV)/.ready-dev
 	$(PY) -m ruff check .
