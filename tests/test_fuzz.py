@@ -248,7 +248,7 @@ def _tried(read: Callable[[Path], object], path: Path) -> None:
     assert time.monotonic() - began < LONGEST, "too long"
 
 
-def tried(reader: Reader, data: bytes, others: dict[str, bytes] | None = None) -> None:
+def tried(reader: Reader, data: bytes) -> None:
     """Only our own errors come out, of one line, that name the file."""
     with tempfile.TemporaryDirectory() as name, warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -163,6 +163,7 @@ def _border(lens: Lens) -> tuple[np.ndarray, ...]:
     return tuple(np.stack(pair, axis=1) for pair in pairs)
 
 
+@lru_cache(maxsize=4096)
 def largest_shift(lens: Lens) -> float:
     """Pixels by which the lens moves the border pixel that it moves furthest; 0 for a pinhole, inf off its range."""
     border = np.concatenate(_border(lens))
@@ -172,6 +173,7 @@ def largest_shift(lens: Lens) -> float:
     return float(np.linalg.norm(seen * (lens.fx, lens.fy) + (lens.cx, lens.cy) - border, axis=1).max())
 
 
+@lru_cache(maxsize=4096)
 def without_distortion(lens: Lens) -> Lens:
     """The pinhole that an undistorted picture of the same size gets.
 

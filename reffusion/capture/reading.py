@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from reffusion.capture.layouts.capture import Capture
@@ -36,7 +37,8 @@ def read_scene(params: Params, scene: Path) -> tuple[Capture, Roles]:
 
 def _check_lenses(capture: Capture) -> None:
     """BadInput for a lens whose distortion cannot be undone."""
-    of = {lens: name for name, lens in capture.poses.lenses.items()} if capture.poses else {}
+    lenses = capture.poses.lenses.items() if capture.poses else ()
+    of = {lens: name for name, lens in lenses if replace(lens.pinhole, model=lens.model) != lens}
     for lens, name in of.items():
         try:
             without_distortion(lens)

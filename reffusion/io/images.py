@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +17,7 @@ ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")  # of pict
 
 # What is read under these names; other kinds that Pillow knows call programs, or are not for photographs.
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM")
+logging.getLogger("PIL").addHandler(logging.NullHandler())  # what it says on standard error is in our line too
 Image.MAX_IMAGE_PIXELS = None  # `opened` looks at the size itself: with one limit, and without a warning below it
 
 
