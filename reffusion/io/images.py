@@ -162,16 +162,20 @@ def save_exr(path: Path, depth: np.ndarray) -> None:
         raise ValueError(f"{path}: cannot be written ({file.geterror() if file else oiio.geterror()})")
 
 
+_EXR = b"\x76\x2f\x31\x01"
+
+
 def load_exr(path: Path) -> np.ndarray:
     """float32 [H, W], the first channel of an OpenEXR file."""
     import OpenImageIO as oiio
 
     with reading(path, "a readable EXR file"):
+        with open(path, "rb") as start:
+            if start.read(4) != _EXR:  # else other formats are tried, which complain on standard error
+                raise BadInput(f"{path}: not an EXR file; give it the ending of what it is")
         file = oiio.ImageInput.open(str(path))
         if file is None:
             raise BadInput(f"{path}: not a readable EXR file ({shortened(oiio.geterror(), 200)})")
-        if file.format_name() != "openexr":
-            raise BadInput(f"{path}: {file.format_name()}, called .exr; give it the ending of what it is")
         spec = file.spec()
         check_pixels(path, spec.width, spec.height * max(spec.depth, 1))
         pixels = file.read_image(0, 0, 0, 1, oiio.FLOAT)
