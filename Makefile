@@ -23,14 +23,15 @@ where = $(if $(variant),--variant="$$variant") $(if $(runs),--runs="$$runs")
 options = $(where) $(if $(profile),--profile="$$profile") $(if $(budget),--budget="$$budget") \
 	$(if $(set),--set="$$set") $(if $(trust),--trust) $(if $(keep),--keep)
 
-.PHONY: help setup all $(STAGES) plan verify clean batch weights demo prior prior-report sds-variance view turntable test \
-	bench stability gpu-check lint
+.PHONY: help setup all $(STAGES) plan check verify clean batch weights demo prior prior-report sds-variance view turntable test \
+	fuzz bench stability gpu-check lint
 .DELETE_ON_ERROR:
 
 help:
 	@echo 'make scene=demo all            the whole job; a second call finds everything cached'
 	@echo 'make scene=X STAGE             one stage and what it needs: $(STAGES)'
 	@echo 'make scene=X plan              what would run, and why'
+	@echo 'make scene=X check             what is odd about its photographs, masks and poses; each mask over its photograph'
 	@echo 'make scene=X compare           the full method, ablations and baselines side by side: runs/X/compare.html'
 	@echo '                               variants=a,b  only these; seeds=5  on demo, demo-1 ... demo-4, with intervals'
 	@echo 'make scene=X report            what was done, errors against seconds: runs/X/report/index.html'
@@ -109,6 +110,10 @@ all $(STAGES): ready
 plan: ready
 	@$(RUN) plan $(of) $(options)
 
+check: ready
+	@$(RUN) run poses $(of) $(options)
+	@$(RUN) check $(of) $(where)
+
 .PHONY: compare report
 # On the demo scenes of other seeds too. A variant that fails (3) stops no other: the table is drawn, then make fails.
 others := $(if $(call rest,0 1 2 3 4 5 6 7 8 9,$(seeds)),,$(if $(made),$(addsuffix /.generated,\
@@ -159,6 +164,10 @@ sds-variance: ready
 # Two processes of one thread each, whole files to each: kernels that are compiled for one test serve the next.
 test: $(VENV)/.ready-dev
 	$(if $(slow),REFFUSION_SLOW=1) OMP_NUM_THREADS=1 $(PY) -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
+
+# Every reader on spoilt files, ten minutes each.
+fuzz: $(VENV)/.ready-dev
+	$(PY) -m tests.test_fuzz
 
 lint: $(VENV)/.ready-dev
 	$(PY) -m ruff check .

@@ -14,6 +14,7 @@ REPORTS = {
     "view": "report.view",
     "turntable": "report.turntable",
     "sheet": "report.sheet",
+    "check": "report.check",
 }  # every other word is the runner's
 
 

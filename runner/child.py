@@ -10,16 +10,19 @@ import faulthandler
 import importlib
 import json
 import os
+import reprlib
 import resource
 import signal
 import sys
 import threading
 import time
 import traceback
+import warnings
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TextIO
+from types import NoneType, UnionType
+from typing import Any, TextIO, get_args
 
 from pydantic import BaseModel, ValidationError
 
@@ -110,7 +113,7 @@ def _is_group(annotation: Any) -> bool:
 
 def _error(error: Any, model: type[BaseModel]) -> dict[str, Any]:
     """`where` it is, dotted; `unknown`: it is a name that no group has, with what is in it where it is a mapping."""
-    where, value, group = [str(part) for part in error["loc"]], error["input"], model
+    where, value, group = _place(error["loc"], model), error["input"], model
     for part in where[:-1]:
         group = _is_group(group) and part in group.model_fields and group.model_fields[part].annotation
     unknown = error["type"] == "extra_forbidden" and _is_group(group)
@@ -118,7 +121,15 @@ def _error(error: Any, model: type[BaseModel]) -> dict[str, Any]:
         name, value = next(iter(value.items()))
         where.append(str(name))
     message = error["msg"].removeprefix("Value error, ")
-    return {"where": ".".join(where) or "?", "unknown": unknown, "value": repr(value), "message": message}
+    return {"where": ".".join(where) or "?", "unknown": unknown, "value": reprlib.repr(value), "message": message}
+
+
+def _place(loc: tuple[Any, ...], model: type[BaseModel]) -> list[str]:
+    """The way to what is wrong, without the name of the alternative (of `str | list[str]`) that pydantic tried."""
+    field = model.model_fields.get(loc[0]) if loc else None
+    alternatives = [kind for kind in get_args(field.annotation) if kind is not NoneType] if field else []
+    tried = isinstance(field and field.annotation, UnionType) and len(alternatives) > 1
+    return [str(part) for part in (loc[:1] + loc[2:] if tried else loc)]
 
 
 def fetch() -> int:
@@ -151,6 +162,7 @@ def run() -> int:
     for number in (job["lock"], job["result"]):  # the lock is held until this process ends: no second runner before
         os.set_inheritable(number, False)
     threading.Thread(target=_end_with_runner, args=(sys.stdin.fileno(),), daemon=True).start()
+    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
     result: dict[str, Any] = {}
     try:
         with open(job["log"], "w") as log:

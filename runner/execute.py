@@ -24,6 +24,7 @@ from runner.files import (
     RECEIPT,
     hand_out,
     locked,
+    read_json,
     read_receipt,
     refuse_lost,
     shown,
@@ -168,6 +169,9 @@ def run_scene(request: Request, target: str, hashes: Hashes | None = None) -> di
             done[stage] = decide(job, stage, done)
             if job.keep and done[stage].word == "cached" and done[stage].path == job.home / stage:
                 accept(job.home / stage, job.hashes)
+            if done[stage].word == "cached":  # one that runs says it itself
+                for line in read_json(done[stage].path / "warnings.json") or ():
+                    say(f"warning: {line}")
             if done[stage].word == "run":
                 done[stage] = run_stage(job, stage, done[stage], done, lock)
                 if any(planned[later].word == "undecided" for later in stages[position + 1 :]):

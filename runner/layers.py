@@ -6,9 +6,8 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
-import yaml
-
 from runner import Refused
+from runner.handed import value_of
 from runner.keys import leaves
 from runner.pipeline import Overrides, Pipeline, SceneFile, unknown
 
@@ -24,7 +23,11 @@ def merged(below: dict[str, Any], above: dict[str, Any], whole: Collection[str] 
 def parse_set(text: str, pipeline: Pipeline) -> Overrides:
     """`fit.iterations=500 distill.sds.weight=1`; the values are read as YAML."""
     overrides: Overrides = {}
-    for word in shlex.split(text):
+    try:
+        words = shlex.split(text)
+    except ValueError as error:
+        raise Refused(f"set: {text!r}: {error}") from None
+    for word in words:
         match = re.fullmatch(r"(\w+)((?:\.\w+)+)=(.*)", word, flags=re.DOTALL)
         if not match:
             raise Refused(f"set: {word!r} is not of the form stage.parameter=value")
@@ -32,9 +35,9 @@ def parse_set(text: str, pipeline: Pipeline) -> Overrides:
         if stage not in pipeline.stages:
             raise Refused(f"set: {unknown('stage', stage, pipeline.stages)}")
         try:
-            value = yaml.safe_load(given)
-        except yaml.YAMLError:
-            raise Refused(f"set: the value of {stage}{names} is not valid YAML: {given!r}") from None
+            value = value_of(given, is_text=names.split(".")[1] in pipeline.scene_keys.get(stage, ()))
+        except ValueError:
+            raise Refused(f"set: the value of {stage}{names} is not valid YAML: {given!r:.60}") from None
         for name in reversed(names[1:].split(".")):
             value = {name: value}
         overrides[stage] = merged(overrides.get(stage, {}), value)

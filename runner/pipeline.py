@@ -12,6 +12,7 @@ from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_v
 
 from reffusion.command import workplace
 from runner import Refused
+from runner.handed import read_handed
 
 SCENE = "scene"  # the need that stands for the scene's own folder
 NAME = re.compile(r"[\w'][\w'\" .,()+\-]*")  # of a scene; none that patterns or variants could be made of
@@ -172,7 +173,7 @@ class SceneFile:
 
 def load_scene_file(folder: Path, pipeline: Pipeline) -> SceneFile:
     path = folder / "scene.yaml"
-    content = read_yaml(path) if path.is_file() else {}
+    content = read_handed(path, typed=("stages",))
     keys = [key for names in pipeline.scene_keys.values() for key in names]
     known = [*keys, "profile", "budget", "stages"]
     for key in (key for key in content if key not in known):
@@ -182,6 +183,8 @@ def load_scene_file(folder: Path, pipeline: Pipeline) -> SceneFile:
         raise Refused(f"{path}: stages: expected {{stage: {{parameter: value}}}}")
     for stage in (stage for stage in stages if stage not in pipeline.stages):
         raise Refused(f"{path}: stages: {unknown('stage', stage, pipeline.stages)}")
+    if not isinstance(content.get("profile"), str | None):
+        raise Refused(f"{path}: profile: expected the name of one")
     brings = {key: value for key, value in content.items() if key in keys and value is not None}
     return SceneFile(path, content.get("profile"), brings, stages, content.get("budget"))
 

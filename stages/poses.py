@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from reffusion import seeding, trace
-from reffusion.capture import frame, sfm, stereo, support
+from reffusion.capture import frame, odd, sfm, stereo, support
 from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.lenses import save_lenses
 from reffusion.capture.reading import read_scene
@@ -21,24 +21,28 @@ from reffusion.capture.undistorted import check_masks, load_at, save_undistorted
 from reffusion.io.arrays import save_json
 from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply, save_ply
-from reffusion.io.scene import load_views, save_scene
+from reffusion.io.scene import load_raw_masks, load_views, save_scene
 from reffusion.params.poses import Params
 from reffusion.types import Scene, Similarity
 
 LEAST_POINTS = 100  # with fewer sparse points, some of optical flow are added to them
 MORE_POINTS = 10_000  # how many at most; random ones, where flow finds too few
 SEED = 0
+WARNINGS = "warnings.json"  # sentences
 
 
 def run(params: Params, out: Path, *, scene: Path) -> None:
     """Write images/, masks/, test_masks/, sparse/0/, lenses.json, transform.json, views.json; refine.json where cameras
-    were adjusted; gaussians.ply and region.json where the scene brings them."""
+    were adjusted; gaussians.ply and region.json where the scene brings them; warnings.json where something is odd."""
     capture, roles = read_scene(params, scene)
-    for warning in (*capture.warnings, *roles.warnings):
-        warnings.warn(warning, stacklevel=1)
+    said = [*capture.warnings, *roles.warnings]
     check_masks(roles.masks)
+    if params.gaussians is not None:
+        load_ply(scene / params.gaussians)  # before the work, not after it
     if capture.poses is None:
-        capture = _place(params, out, capture)
+        everyone, capture = sorted(capture.pictures), _place(params, out, capture)
+        if lost := [name for name in everyone if name not in capture.pictures]:
+            said.append(f"{len(lost)} views were not placed and are left out: {', '.join(lost)}")
         roles = roles.among(set(capture.pictures))
     views, longest = sorted({*roles.train, *roles.test}), _supported_size(params, capture, roles)
     lenses, pinholes = {}, {}
@@ -51,12 +55,25 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
         normalised = _refined(normalised, out)
     if len(normalised.points) < LEAST_POINTS:
         normalised = _with_flow_points(normalised, out)
+    _save_warnings(out, [*said, *_oddities(normalised, out)])
     if len(normalised.points) < LEAST_POINTS:
         ranges = frame.ranges_of(capture.poses, pinholes) * normalised.similarity.scale
         draws = seeding.generator(SEED, "poses", "random points")
         normalised = frame.filled_up(normalised, ranges, MORE_POINTS, draws, lambda v: load_views(out, [v])[v])
     save_scene(out, normalised)
     _save_brought(params, out, scene, normalised.similarity)
+
+
+def _oddities(scene: Scene, out: Path) -> list[str]:
+    return odd.oddities(scene, load_raw_masks(out, scene.train), lambda name: load_views(out, [name])[name])
+
+
+def _save_warnings(out: Path, said: list[str]) -> None:
+    """Say them, and keep them for `make check` and for runs that find this stage done."""
+    for line in said:
+        warnings.warn(line, stacklevel=1)
+    if said:
+        save_json(out / WARNINGS, said)
 
 
 def _save_brought(params: Params, out: Path, scene: Path, similarity: Similarity) -> None:
@@ -77,7 +94,7 @@ def _supported_size(params: Params, capture: Capture, roles: Roles) -> int:
     images = [load_at(capture.pictures[name], params.longest, capture.upright) for name in chosen]
     if not support.enlarged(images, params.detail):
         return params.longest
-    side = max(images[0].shape[:2])
+    side = max(max(image.shape[:2]) for image in images)
     print(f"pictures of {side} px show no more than {side // 2} px would: taken at that size", flush=True)
     return side // 2
 
@@ -117,7 +134,4 @@ def _place(params: Params, out: Path, capture: Capture) -> Capture:
     for name, path in prepared.items():
         save_image(path, load_at(capture.pictures[name], params.longest, upright=True))
     poses = sfm.solve(prepared, capture.pictures, work / "colmap", SEED)
-    lost = sorted(set(prepared) - set(poses.lenses))
-    if lost:
-        warnings.warn(f"{len(lost)} views were not placed and are left out: {', '.join(lost)}", stacklevel=1)
     return replace(capture, pictures={name: prepared[name] for name in poses.lenses}, poses=poses)

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 from plyfile import PlyData
 
-from reffusion.io import colmap
+from reffusion.io import rotations
 from reffusion.io.arrays import load_json, load_labels, save_json, save_labels
 from reffusion.io.images import image_size, load_exr, load_image, load_mask, save_exr, save_image, save_mask
 from reffusion.io.ply import load_ply, load_points, save_ply, save_points
@@ -247,11 +247,11 @@ def test_scene_round_trip_in_full_precision(tmp_path):
 def test_quaternions_survive_half_turns():
     for axis in np.eye(3):
         half_turn = 2 * np.outer(axis, axis) - np.eye(3)
-        np.testing.assert_allclose(colmap.pose_matrix(colmap.quaternion_of(half_turn), axis)[:3, :3], half_turn)
+        np.testing.assert_allclose(rotations.pose_matrix(rotations.quaternion_of(half_turn), axis)[:3, :3], half_turn)
     generator = np.random.default_rng(1)
     for _ in range(50):
         rotation = some_rotation(generator)
-        again = colmap.pose_matrix(colmap.quaternion_of(rotation), np.zeros(3))[:3, :3]
+        again = rotations.pose_matrix(rotations.quaternion_of(rotation), np.zeros(3))[:3, :3]
         np.testing.assert_allclose(again, rotation, atol=1e-15)
 
 

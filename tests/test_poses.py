@@ -35,12 +35,13 @@ from reffusion.capture import frame, lens
 from reffusion.capture.lenses import load_lenses
 from reffusion.capture.load import load_capture
 from reffusion.capture.roles import load_roles
+from reffusion.io import colmap
 from reffusion.io.arrays import load_json
 from reffusion.io.images import image_size
 from reffusion.io.ply import load_ply, save_ply, save_points
 from reffusion.io.scene import load_raw_masks, load_scene, load_test_masks, load_views
 from reffusion.types import Gaussians
-from stages import poses
+from stages import fit, poses
 from stages.plan import poses as plan
 
 CAPTURES = Path(__file__).parents[2] / "shared" / "data"
@@ -185,6 +186,50 @@ def test_large_pictures_are_brought_to_the_longest_side(tmp_path):
     big = replace(scene, cameras={n: c.resized(WIDTH, HEIGHT) for n, c in scene.cameras.items()})
     assert reprojection_error(big, truth) < 1e-3
     assert load_raw_masks(out, ["v00"])["v00"].shape == (36, 48)
+
+
+SIZES = {"v00": (1.0, 0), "v01": (0.5, 0), "v02": (1.0, 20), "v03": (1.5, 0), "v04": (1.0, 0), "v05": (0.75, 8)}
+
+
+def write_several_sizes(folder: Path, truth: Truth, layout: str) -> dict[str, tuple[int, int]]:
+    """Pictures of noise enlarged by a factor after columns were cut off left and right, each with its own camera."""
+    (folder / "images").mkdir(parents=True)
+    noise, flip, frames, cameras, images, sizes = np.random.default_rng(0), np.diag([1.0, -1, -1, 1]), [], {}, {}, {}
+    for k, (name, (factor, left)) in enumerate(SIZES.items(), start=1):
+        size = sizes[name] = round((WIDTH - 2 * left) * factor), round(HEIGHT * factor)
+        Image.fromarray(noise.integers(0, 256, (9, 12, 3), np.uint8)).resize(size).save(folder / f"images/{name}.png")
+        focal, cx, cy = truth.lens.fx * factor, (truth.lens.cx - left) * factor, truth.lens.cy * factor
+        pose = truth.world_to_camera[name]
+        cameras[k] = colmap.ModelCamera("SIMPLE_PINHOLE", *size, (focal, cx, cy))
+        images[k] = colmap.ModelImage(f"{name}.png", k, pose)
+        frame = {"w": size[0], "h": size[1], "fl_x": focal, "cx": cx, "cy": cy}
+        frame["transform_matrix"] = (np.linalg.inv(pose) @ flip).tolist()
+        frames.append(frame | {"file_path": f"images/{name}.png"})
+        write_masks(folder / "masks", [name], size)
+    if layout == "transforms":
+        (folder / "transforms.json").write_text(json.dumps({"frames": frames}))
+    else:
+        colmap.save_model(folder / "sparse/0", cameras, images, truth.points, np.zeros((60, 3), np.uint8))
+    return sizes
+
+
+@pytest.mark.parametrize("layout", ["transforms", "colmap"])
+def test_pictures_of_several_sizes_each_with_its_camera(tmp_path, layout):
+    truth = some_truth()
+    sizes = write_several_sizes(tmp_path / "s", truth, layout)
+    with pytest.warns(UserWarning, match="contradict"):  # noise agrees with none
+        scene, out = run(tmp_path / "s", refine=True, test=["v04"])
+    assert {name: (camera.width, camera.height) for name, camera in scene.cameras.items()} == sizes
+    for name, camera in scene.cameras.items():
+        expected = truth.world_to_camera[name] @ np.append(truth.points[0], 1)
+        z = scene.similarity.apply(truth.points[:1])[0] @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
+        assert z / scene.similarity.scale == pytest.approx(expected[2], rel=1e-6)
+        assert image_size(out / "images" / f"{name}.png") == image_size(out / "masks" / f"{name}.png") == sizes[name]
+        assert camera.fx == pytest.approx(truth.lens.fx * SIZES[name][0])
+    (tmp_path / "fit").mkdir()
+    changes = {"iterations": 3, "densify.cap_max": 500, "sh.degree": 0, "init.flow_cell": 3}
+    fit.run(fit.Params().changed(changes), tmp_path / "fit", poses=out)
+    assert len(load_ply(tmp_path / "fit" / "gaussians.ply")) > 100
 
 
 @pytest.mark.parametrize("brings", ["points", "bounds", "nothing"])

@@ -740,7 +740,7 @@ def test_groups_merge_layer_over_layer(fresh):
     assert said["sds"] == {"weight": 4.0, "lora": {"rank": 3, **model}} and said["gain"] == 2
     assert params_of(fresh)["extra"] == {"view": "a", "depth": "b"}
     assert params_of(fresh, set="distill.extra='{view: c}'")["extra"] == {"view": "c"}  # a value of the scene, no group
-    assert params_of(fresh, set="distill.extra=[1,2]")["extra"] == [1, 2]
+    assert params_of(fresh, set="distill.extra=[1,2]")["extra"] == ["1", "2"]
 
 
 def test_nested_parameters_rerun_and_leave_out_by_their_dotted_names(fresh, capsys):

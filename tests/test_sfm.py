@@ -113,7 +113,7 @@ def test_a_walk_past_a_corner(tmp_path):
     assert all(np.array_equal(again.world_to_camera[n], once_more.world_to_camera[n]) for n in truth)
     assert len(scene.points) > 300 and "stray" not in load_raw_masks(tmp_path / "out", ["stray"])
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
-        "images", "lenses.json", "masks", "sparse", "transform.json", "views.json",
+        "images", "lenses.json", "masks", "sparse", "transform.json", "views.json", "warnings.json",
     ]  # fmt: skip
 
 

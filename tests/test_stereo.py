@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from reffusion.capture import stereo
+from reffusion.io.images import resized
 from reffusion.types import Camera
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
@@ -98,6 +99,21 @@ def test_a_painted_plane_comes_back(slope):
     cells = WIDTH * HEIGHT / 9
     assert 0.6 * cells < len(points) < 2 * cells  # later views add what the first does not see
     assert colors.shape == points.shape and colors.dtype == np.uint8
+    away = np.abs(points[:, 2] - 1 - slope * points[:, 0]) / 2
+    assert np.median(away) < 0.01 and np.quantile(away, 0.95) < 0.05
+
+
+def test_views_of_several_sizes_and_lenses_match(slope=0.3):
+    """One at 0.6 of the size, one cropped to a portrait, one larger."""
+    shown, cameras = pictures(slope), []
+    for view, factor, left in zip(CAMERAS, (1.0, 0.6, 1.0, 1.5), (0, 0, 30, 0), strict=True):
+        size = round((WIDTH - 2 * left) * factor), round(HEIGHT * factor)
+        cut = np.ascontiguousarray(shown[view.name][:, left : WIDTH - left])
+        shown[view.name] = resized(cut, size)
+        focal, middle = FOCAL * factor, ((WIDTH / 2 - left) * factor, HEIGHT / 2 * factor)
+        cameras.append(Camera(view.name, *size, focal, focal, *middle, view.world_to_camera))
+    points, _ = stereo.dense_points(cameras, shown, 3)
+    assert len(points) > 0.6 * WIDTH * HEIGHT / 9
     away = np.abs(points[:, 2] - 1 - slope * points[:, 0]) / 2
     assert np.median(away) < 0.01 and np.quantile(away, 0.95) < 0.05
 

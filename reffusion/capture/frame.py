@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from reffusion.capture.lens import Lens
+from reffusion.io.files import BadInput
 
 if TYPE_CHECKING:
     from torch import Generator
@@ -30,7 +31,7 @@ def depth_ranges(
         world_to_camera: [V, 4, 4]. points: [P, 3]. bounds: [V, 2] near and far, or None.
 
     Raises:
-        ValueError: where nothing tells the depth: no points, no bounds, and all cameras at one place.
+        BadInput: where nothing tells the depth: no points, no bounds, and all cameras at one place.
     """
     guess = _depths_of_axes(world_to_camera) if bounds is None else None
     ranges = np.empty((len(lenses), 3))
@@ -45,7 +46,7 @@ def depth_ranges(
             ranges[k] = np.nan if np.isnan(guess[k]) else guess[k] * np.array([1 / 3, 1.0, 4.0])
     known = ~np.isnan(ranges[:, 1])
     if not known.any():
-        raise ValueError("no points, no bounds and all cameras at one place: nothing tells how far the scene is")
+        raise BadInput("no points, no bounds and all cameras at one place: nothing tells how far the scene is")
     ranges[~known] = np.median(ranges[known], axis=0)
     return ranges
 

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
 
 from reffusion.capture.views import Views, check_proportions, known_for, not_placed
-from reffusion.io.images import ENDINGS, image_size, load_exr
+from reffusion.io.arrays import load_array
+from reffusion.io.files import BadInput
+from reffusion.io.images import ENDINGS, image_size, load_exr, opened
 from reffusion.params.reference import Given
 
 PAINTED = "painted"  # folder of the scene: <view>.png and <view>_depth.*
@@ -52,7 +53,7 @@ def load_given(folder: Path, views: Views, asked: Given | Sequence[Given] | None
     there is one; sorted by view. A painting stands for one that scene.yaml names for the same view.
 
     Raises:
-        ValueError: naming the file and the remedy: an unknown view, a test view, a view that is for neither, two for a
+        BadInput: naming the file and the remedy: an unknown view, a test view, a view that is for neither, two for a
             view, a missing file, other proportions than the view's, a depth map of another kind.
     """
     folder = Path(folder)
@@ -61,7 +62,7 @@ def load_given(folder: Path, views: Views, asked: Given | Sequence[Given] | None
         path = folder / each.image
         name = known_for(path, each.view, views, "reference")
         if name in found:
-            raise ValueError(f"scene.yaml: reference: two for the view '{name}'; keep one")
+            raise BadInput(f"scene.yaml: reference: two for the view '{name}'; keep one")
         depth = None if each.depth is None else folder / each.depth
         found[name] = GivenReference(name, path, depth, each.undistorted)
     for given in _paintings(paintings_in(folder), views):
@@ -88,16 +89,16 @@ def _paintings(files: Sequence[Path], views: Views) -> list[GivenReference]:
         elif path.suffix.lower() in ENDINGS:
             kind, name = pictures, path.stem
         else:
-            raise ValueError(f"{path}: no picture; a painting is called <view>.png, its depth <view>_depth.png or .exr")
+            raise BadInput(f"{path}: no picture; a painting is called <view>.png, its depth <view>_depth.png or .exr")
         if name not in views.names and views.placed:
             raise not_placed(path, name, views)
         if name not in views.names:
-            raise ValueError(f"{path}: no view is called '{name}'; call the painting like its view, or remove it")
+            raise BadInput(f"{path}: no view is called '{name}'; call the painting like its view, or remove it")
         if name in kind:
-            raise ValueError(f"{path}: there is {kind[name].name} too; keep one for the view '{name}'")
+            raise BadInput(f"{path}: there is {kind[name].name} too; keep one for the view '{name}'")
         kind[name] = path
     for name in depths.keys() - pictures.keys():
-        raise ValueError(f"{depths[name]}: a depth map without a painting; add {name}.png, or remove it")
+        raise BadInput(f"{depths[name]}: a depth map without a painting; add {name}.png, or remove it")
     return [GivenReference(name, path, depths.get(name), True, True) for name, path in pictures.items()]
 
 
@@ -105,21 +106,21 @@ def _check(given: GivenReference, views: Views) -> None:
     where = "" if given.painted else "; correct `reference` in scene.yaml"
     for path in (given.path, given.depth):
         if path is not None and not path.is_file():
-            raise ValueError(f"{path}: no such file{where}")
+            raise BadInput(f"{path}: no such file{where}")
     if given.view in views.test:
-        raise ValueError(
+        raise BadInput(
             f"{given.path}: '{given.view}' is a test view, and scored: a reference would train it; "
             "make it for a training view, or take the view out of `test` in scene.yaml"
         )
     if given.view not in views.train:
-        raise ValueError(
+        raise BadInput(
             f"{given.path}: '{given.view}' is neither a training nor a test view; "
             "name it in `train` in scene.yaml, or make the reference for another view"
         )
     check_proportions(given.path, given.view, views.size_of(given.view), PROPORTIONS, "reference", views.upright)
     if given.depth is not None:
         if given.depth.suffix.lower() not in DEPTHS:
-            raise ValueError(f"{given.depth}: a depth map is a 16-bit .png, a .npy or an .exr; convert it")
+            raise BadInput(f"{given.depth}: a depth map is a 16-bit .png, a .npy or an .exr; convert it")
         if given.depth.suffix.lower() not in (".npy", ".exr"):
             image_size(given.depth)
 
@@ -128,35 +129,32 @@ def load_depth(path: Path) -> np.ndarray:
     """float32 [h, w], a map of depth or disparity in any unit; NaN where it says nothing (not finite; 0 in a picture).
 
     Raises:
-        ValueError: naming the file, where it is unreadable, not of one channel, 8-bit, empty or constant.
+        BadInput: naming the file, where it is unreadable, not of one channel, 8-bit, empty or constant.
     """
     path = Path(path)
     values = _values(path)
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
-    if values.ndim != 2 or not np.issubdtype(values.dtype, np.number) or np.iscomplexobj(values):
-        raise ValueError(f"{path}: {values.dtype} {list(values.shape)}; a depth map is one number for each pixel")
+    if values.ndim != 2 or not values.size or not np.issubdtype(values.dtype, np.number) or np.iscomplexobj(values):
+        raise BadInput(f"{path}: {values.dtype} {list(values.shape)}; a depth map is one number for each pixel")
     empty = (values == 0) if np.issubdtype(values.dtype, np.integer) else np.zeros(values.shape, bool)
     with np.errstate(over="ignore"):
         values = values.astype(np.float32)
     values[empty | ~np.isfinite(values)] = np.nan
     if np.isnan(values).mean() > 0.9:
-        raise ValueError(f"{path}: nine tenths of it are 0 or not finite; a depth map needs values over the whole view")
+        raise BadInput(f"{path}: nine tenths of it are 0 or not finite; a depth map needs values over the whole view")
     if np.nanmin(values) == np.nanmax(values):
-        raise ValueError(f"{path}: all its values are {np.nanmin(values):g}; that is no depth map")
+        raise BadInput(f"{path}: all its values are {np.nanmin(values):g}; that is no depth map")
     return values
 
 
 def _values(path: Path) -> np.ndarray:
     if path.suffix.lower() == ".exr":
         return load_exr(path)
-    try:
-        if path.suffix.lower() == ".npy":
-            return np.load(path, allow_pickle=False)
-        with Image.open(path) as image:
-            mode, values = image.mode, np.array(image)
-    except (OSError, ValueError, EOFError, SyntaxError, UnidentifiedImageError) as error:
-        raise ValueError(f"{path}: not a readable depth map ({error})") from error
+    if path.suffix.lower() == ".npy":
+        return load_array(path, "a readable depth map")
+    with opened(path, "a readable depth map") as image:
+        mode, values = image.mode, np.array(image)
     if mode[0] not in "IF":
-        raise ValueError(f"{path}: {mode} pixels of 8 bits are too coarse for depth; write 16-bit grey, .npy or .exr")
+        raise BadInput(f"{path}: {mode} pixels of 8 bits are too coarse for depth; write 16-bit grey, .npy or .exr")
     return values

@@ -10,6 +10,8 @@ from functools import lru_cache
 
 import numpy as np
 
+from reffusion.io.files import BadInput
+
 PINHOLE_ENOUGH = 0.05  # px: a lens that moves no border pixel further counts as a pinhole
 
 
@@ -64,9 +66,9 @@ class Lens:
 
 
 def from_colmap(model: str, width: int, height: int, params: tuple[float, ...]) -> Lens:
-    """The lens of a COLMAP camera; ValueError naming the model where it is none of those understood."""
+    """The lens of a COLMAP camera; BadInput naming the model where it is none of those understood."""
     if model not in _COLMAP:
-        raise ValueError(f"camera model {model} is not understood; convert it to one of {', '.join(_COLMAP)}")
+        raise BadInput(f"camera model {model} is not understood; convert it to one of {', '.join(_COLMAP)}")
     single_focal, fisheye, names = _COLMAP[model]
     head = (params[0], *params[:3]) if single_focal else params[:4]
     k = dict(zip(names, params[3 if single_focal else 4 :], strict=True))
@@ -161,6 +163,7 @@ def _border(lens: Lens) -> tuple[np.ndarray, ...]:
     return tuple(np.stack(pair, axis=1) for pair in pairs)
 
 
+@lru_cache(maxsize=4096)
 def largest_shift(lens: Lens) -> float:
     """Pixels by which the lens moves the border pixel that it moves furthest; 0 for a pinhole, inf off its range."""
     border = np.concatenate(_border(lens))
@@ -170,6 +173,7 @@ def largest_shift(lens: Lens) -> float:
     return float(np.linalg.norm(seen * (lens.fx, lens.fy) + (lens.cx, lens.cy) - border, axis=1).max())
 
 
+@lru_cache(maxsize=4096)
 def without_distortion(lens: Lens) -> Lens:
     """The pinhole that an undistorted picture of the same size gets.
 
@@ -178,14 +182,14 @@ def without_distortion(lens: Lens) -> Lens:
     its coefficients.
 
     Raises:
-        ValueError: where the distortion folds over, or a fisheye reaches 85 degrees, inside the picture.
+        BadInput: where the distortion folds over, or a fisheye reaches 85 degrees, inside the picture.
     """
     shift = largest_shift(lens)
     if shift <= PINHOLE_ENOUGH:
         return lens.pinhole
     edges = [to_directions(edge, lens) for edge in _border(lens)]
     if not np.isfinite(shift) or np.linalg.norm(np.concatenate(edges), axis=1).max() > np.tan(np.radians(85.0)):
-        raise ValueError(
+        raise BadInput(
             f"the lens {lens.coefficients()} cannot be undone inside its {lens.width}x{lens.height} px picture; "
             "check its coefficients, or crop the pictures"
         )

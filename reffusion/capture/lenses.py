@@ -8,6 +8,7 @@ from pathlib import Path
 
 from reffusion.capture.lens import Lens
 from reffusion.io.arrays import load_json, save_json
+from reffusion.io.files import BadInput
 
 LENSES = "lenses.json"
 
@@ -22,7 +23,7 @@ def load_lenses(poses_dir: Path) -> tuple[dict[str, Lens], bool]:
     """View name -> its photograph's lens, at the size of the undistorted picture; is the orientation tag obeyed?"""
     path = Path(poses_dir) / LENSES
     if not path.is_file():
-        raise ValueError(f"{path}: missing; {poses_dir} is no finished `poses` folder")
+        raise BadInput(f"{path}: missing; {poses_dir} is no finished `poses` folder")
     read = load_json(path)
     tuples = ("radial", "denominator", "tangential")
     views = {

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from reffusion.capture.layouts import colmap, llff, photos, transforms
 from reffusion.capture.layouts.capture import Capture, Poses, pictures_in
+from reffusion.io.files import BadInput, there, understood
 
 __all__ = ["LAYOUTS", "Capture", "Poses", "load_capture", "pictures_in", "recognise"]
 
@@ -25,24 +26,31 @@ def load_capture(folder: Path, layout: str | None = None, images: str | None = N
         images: the folder of pictures, relative to the scene, where it is not the usual one.
 
     Raises:
-        ValueError: naming the file and the remedy, where the folder is no capture, two pictures share a view name,
+        BadInput: naming the file and the remedy, where the folder is no capture, two pictures share a view name,
             a picture is unreadable, a pose is not finite or no rotation, or the files contradict each other.
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise ValueError(f"{folder}: no such folder")
+        raise BadInput(f"{folder}: no such folder")
     layout = layout or recognise(folder)
     if layout not in READERS:
-        raise ValueError(f"{folder}: unknown layout '{layout}'; one of {', '.join(LAYOUTS)}")
+        raise BadInput(f"{folder}: unknown layout '{layout}'; one of {', '.join(LAYOUTS)}")
     if images is not None and not (folder / images).is_dir():
-        raise ValueError(f"{folder / images}: no such folder; correct `images` in scene.yaml")
-    return READERS[layout](folder, images)
+        raise BadInput(f"{folder / images}: no such folder; correct `images` in scene.yaml")
+    with understood(_source(folder, layout), "a capture that can be read"):
+        return READERS[layout](folder, images)
+
+
+def _source(folder: Path, layout: str) -> Path:
+    """What brings the poses, for messages."""
+    known = {"llff": "poses_bounds.npy", "transforms": "transforms.json"}
+    return folder / known[layout] if layout in known else folder
 
 
 def recognise(folder: Path) -> str:
     """The layout by the files that are there: poses_bounds.npy, transforms.json, a COLMAP model, else photos."""
-    if (folder / "poses_bounds.npy").is_file():
+    if there(folder / "poses_bounds.npy"):
         return "llff"
-    if (folder / "transforms.json").is_file():
+    if there(folder / "transforms.json"):
         return "transforms"
     return "colmap" if colmap.model_folder(folder) is not None else "photos"

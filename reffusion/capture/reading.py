@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from reffusion.capture.layouts.capture import Capture
+from reffusion.capture.lens import without_distortion
 from reffusion.capture.load import load_capture
 from reffusion.capture.roles import Roles, load_roles
+from reffusion.io.files import BadInput, there
+from reffusion.io.ply import check_gaussians
 from reffusion.params.poses import Params
 
 
 def read_scene(params: Params, scene: Path) -> tuple[Capture, Roles]:
-    """The capture and its views' roles; ValueError naming the file and the remedy where one is wrong."""
+    """The capture and its views' roles; BadInput naming the file and the remedy where one is wrong."""
     capture = load_capture(scene, params.layout, params.images)
     roles = load_roles(
         scene,
@@ -23,6 +27,20 @@ def read_scene(params: Params, scene: Path) -> tuple[Capture, Roles]:
         clean=params.clean,
         region=params.region is not None,
     )
-    if params.gaussians is not None and not (scene / params.gaussians).is_file():
-        raise ValueError(f"{scene / params.gaussians}: no such file; correct `gaussians` in scene.yaml")
+    if params.gaussians is not None:
+        if not there(scene / params.gaussians):
+            raise BadInput(f"{scene / params.gaussians}: no such file; correct `gaussians` in scene.yaml")
+        check_gaussians(scene / params.gaussians)
+    _check_lenses(capture)
     return capture, roles
+
+
+def _check_lenses(capture: Capture) -> None:
+    """BadInput for a lens whose distortion cannot be undone."""
+    lenses = capture.poses.lenses.items() if capture.poses else ()
+    of = {lens: name for name, lens in lenses if replace(lens.pinhole, model=lens.model) != lens}
+    for lens, name in of.items():
+        try:
+            without_distortion(lens)
+        except BadInput as error:
+            raise BadInput(f"{capture.brought_by}: view '{name}': {error}") from None

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from reffusion.capture.layouts.capture import Capture, pictures_in
 from reffusion.capture.views import Views, check_proportions, known
+from reffusion.io.files import BadInput
 from reffusion.io.images import image_size
 
 LEAST_TRAINING_VIEWS = 3
@@ -37,7 +38,7 @@ class Roles:
         """Without the views that are not in `names` (those that structure from motion could not place).
 
         Raises:
-            ValueError: where fewer than 3 training views are left.
+            BadInput: where fewer than 3 training views are left.
         """
         kept = lambda values: {name: value for name, value in values.items() if name in names}
         roles = replace(
@@ -76,7 +77,7 @@ def load_roles(
         region: the scene names a 3D region, so it may lack masks.
 
     Raises:
-        ValueError: naming the file and the remedy: a mask for no picture, of other proportions (over 10%), no mask
+        BadInput: naming the file and the remedy: a mask for no picture, of other proportions (over 10%), no mask
             at all, an unknown view, a view for both training and test, fewer than 3 training views.
     """
     folder = Path(folder)
@@ -87,7 +88,7 @@ def load_roles(
     train_named, test_views = _parted(train_named, test_named, labelled, capture)
     clean_views = frozenset(known(name, capture.pictures, "clean") for name in clean)
     if clean_views - set(train_named):
-        raise ValueError(f"scene.yaml: clean: {', '.join(sorted(clean_views - set(train_named)))} is no training view")
+        raise BadInput(f"scene.yaml: clean: {', '.join(sorted(clean_views - set(train_named)))} is no training view")
     # Test views with masks of their own among the training masks show the object: held out, but without a truth inside.
     held_out = {name: path for name, path in mask_files.items() if name in set(test_views)}
     beside = dict(held_out)
@@ -130,14 +131,14 @@ def _parted(
         test_views = [name for name in test_views if name not in set(train)]
     both = sorted(set(train) & set(test_views))
     if both:
-        raise ValueError(f"scene.yaml: {', '.join(both)} in both train and test; a view is for one of them")
+        raise BadInput(f"scene.yaml: {', '.join(both)} in both train and test; a view is for one of them")
     _check_enough(train)
     return train, test_views
 
 
 def _check_enough(train: Sequence[str]) -> None:
     if len(train) < LEAST_TRAINING_VIEWS:
-        raise ValueError(
+        raise BadInput(
             f"{len(train)} training view{'' if len(train) == 1 else 's'} ({', '.join(train) or 'none'}): "
             f"at least {LEAST_TRAINING_VIEWS} are needed; add pictures, or correct train and test in scene.yaml"
         )
@@ -150,12 +151,12 @@ def _chosen(value: Sequence[str] | str | None, capture: Capture, key: str) -> li
     if isinstance(value, str):
         match = re.fullmatch(r"every ([1-9][0-9]*)", value.strip())
         if match is None:
-            raise ValueError(f"scene.yaml: {key}: '{value}' is neither a list of views nor like 'every 8'")
+            raise BadInput(f"scene.yaml: {key}: '{value}' is neither a list of views nor like 'every 8'")
         return list(capture.pictures)[:: int(match[1])]
     names = sorted(known(name, capture.pictures, key) for name in value)
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise ValueError(f"scene.yaml: {key}: {', '.join(twice)} named twice")
+        raise BadInput(f"scene.yaml: {key}: {', '.join(twice)} named twice")
     return names
 
 
@@ -169,11 +170,11 @@ def _mask_files(folder: Path, capture: Capture, masks: str | None, region: bool)
     else:
         found = folder / masks
         if not found.is_dir() or not pictures_in(found):
-            raise ValueError(f"{found}: no masks there; correct `masks` in scene.yaml")
+            raise BadInput(f"{found}: no masks there; correct `masks` in scene.yaml")
     if found is None:
         if region:
             return {}
-        raise ValueError(
+        raise BadInput(
             f"{folder}: no mask at all (looked for {', '.join(str(p.relative_to(folder)) for p in usual)}); add a mask "
             "for each picture, name their folder as `masks` or a box as `region` in scene.yaml, or say `masks: none` "
             "to fit and render only"
@@ -183,10 +184,10 @@ def _mask_files(folder: Path, capture: Capture, masks: str | None, region: bool)
         # COLMAP's masks are called <picture with its ending>.png
         name = next((n for n in (stem, Path(stem).stem) if n in capture.pictures or n in capture.left_out), None)
         if name is None:
-            raise ValueError(f"{path}: a mask for no picture; name it like its picture, or remove it")
+            raise BadInput(f"{path}: a mask for no picture; name it like its picture, or remove it")
         if name in capture.pictures:
             if name in result:
-                raise ValueError(f"{path}: '{name}' has another mask, {result[name]}; remove one")
+                raise BadInput(f"{path}: '{name}' has another mask, {result[name]}; remove one")
             result[name] = path
     return dict(sorted(result.items()))
 
@@ -198,7 +199,7 @@ def _test_mask_files(folder: Path, capture: Capture, test_masks: str | None) -> 
     found = capture.image_folder / "test_label" if test_masks is None else folder / test_masks
     files = list(pictures_in(found).values()) if found.is_dir() else []
     if not files and test_masks is not None:
-        raise ValueError(f"{found}: no masks there; correct `test_masks` in scene.yaml")
+        raise BadInput(f"{found}: no masks there; correct `test_masks` in scene.yaml")
     return files or None
 
 
@@ -213,7 +214,7 @@ def _labelled(capture: Capture, masks: dict[str, Path], labels: list[Path], test
             return candidate
     if test_named is not None and len(test_named) == len(labels):
         return test_named
-    raise ValueError(
+    raise BadInput(
         f"{labels[0].parent}: {len(labels)} test masks, but {len(without)} views have no training mask and the first "
         f"{len(labels)} in order of names are not all among them; name the test views as `test` in scene.yaml, or the "
         "masks like their views"

@@ -11,6 +11,7 @@ import numpy as np
 
 from reffusion.capture.layouts.capture import Poses
 from reffusion.capture.lens import from_colmap
+from reffusion.io.files import BadInput
 from reffusion.types import Camera
 
 LEAST_VIEWS = 3
@@ -32,7 +33,7 @@ def solve(pictures: Mapping[str, Path], originals: Mapping[str, Path], work: Pat
         Poses of the views that were placed, in an arbitrary frame; fewer than `pictures` where some were not.
 
     Raises:
-        ValueError: naming the views that were not placed, where fewer than 3 were.
+        BadInput: naming the views that were not placed, where fewer than 3 were.
     """
     import pycolmap
 
@@ -56,7 +57,7 @@ def solve(pictures: Mapping[str, Path], originals: Mapping[str, Path], work: Pat
     placed = [] if best is None else [image for image in best.images.values() if image.has_pose]
     if len(placed) < LEAST_VIEWS:
         lost = sorted(set(pictures) - {names[image.name] for image in placed})
-        raise ValueError(
+        raise BadInput(
             f"structure from motion placed {len(placed)} of {len(pictures)} views in {folder}; not {', '.join(lost)}. "
             "Take more photos that overlap by two thirds, sharp and of things that do not move, or bring poses"
         )

@@ -26,6 +26,7 @@ RESIDUAL = 1.5  # px between a point's image and where flow saw it
 PLAIN = 0.7  # deviation of grey, of 255, in a window of 9 px under which nothing can be matched
 NOISE = 0.3  # px of deviation, assumed of flow; it says which depths cannot be told from infinity
 FARTHEST = 20.0  # frame units; what lies beyond, sky too, is put there
+ZOOM = 1.1  # ratio of focal lengths from which a neighbour is looked at through this view's lens
 ALIKE = 0.1  # relative difference of depth under which two views' points show the same surface
 
 
@@ -85,7 +86,9 @@ def match(
     pairs = list(dict.fromkeys(tuple(sorted((name, other))) for name in around for other in around[name]))
     found = {}
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        both_ways = pool.map(lambda pair: _both_ways(gray[pair[0]], gray[pair[1]], cell), pairs)
+        by_name = {camera.name: camera for camera in cameras}
+        sides = lambda pair: [(by_name[name], gray[name]) for name in pair]
+        both_ways = pool.map(lambda pair: _both_ways(*sides(pair), cell), pairs)
         for (one, other), (there, back) in zip(pairs, both_ways, strict=True):
             found[one, other], found[other, one] = there, back
     for camera in chosen:
@@ -112,11 +115,42 @@ def _pixels(gray: np.ndarray, cell: int) -> np.ndarray:
     return np.stack(np.meshgrid(columns, rows), -1) + 0.5
 
 
-def _both_ways(one: np.ndarray, other: np.ndarray, cell: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """For each of two pictures, the places [P, 2] of its pixels in the other, and whether they mean anything [P]."""
-    matcher = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    there, back = matcher.calc(one, other, None), matcher.calc(other, one, None)
-    return [_followed(one, there, back, cell), _followed(other, back, there, cell)]
+def _both_ways(
+    one: tuple[Camera, np.ndarray], other: tuple[Camera, np.ndarray], cell: int
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """For each of two views, camera and picture, the places [P, 2] of its pixels in the other, and whether they mean
+    anything [P]."""
+    if not _alike(one[0], other[0]):
+        return [_seen_through(*one, *other, cell), _seen_through(*other, *one, cell)]
+    there, back = _flow(one[1], other[1]), _flow(other[1], one[1])
+    return [_followed(one[1], there, back, cell), _followed(other[1], back, there, cell)]
+
+
+def _flow(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    return cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(one, other, None)
+
+
+def _alike(one: Camera, other: Camera) -> bool:
+    """Do both show things at about the same size, in pictures of the same size?"""
+    zoom = max(one.fx / other.fx, other.fx / one.fx, one.fy / other.fy, other.fy / one.fy)
+    return (one.width, one.height) == (other.width, other.height) and zoom < ZOOM
+
+
+def _seen_through(
+    camera: Camera, gray: np.ndarray, other: Camera, picture: np.ndarray, cell: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """As `_followed`, of a view whose neighbour has another size or lens: flow looks at the neighbour's picture as this
+    view's lens would have shown it."""
+    scale = np.array([camera.fx / other.fx, camera.fy / other.fy])
+    # pixel coordinates as in CONVENTIONS.md; OpenCV counts from the centre of the first pixel
+    shift = np.array([camera.cx, camera.cy]) - scale * (other.cx, other.cy)
+    if scale.min() < 1:
+        picture = cv2.GaussianBlur(picture, (0, 0), 0.5 / scale.min())
+    warp = np.array([[scale[0], 0, shift[0] + scale[0] / 2 - 0.5], [0, scale[1], shift[1] + scale[1] / 2 - 0.5]])
+    shown = cv2.warpAffine(picture, warp, (camera.width, camera.height), borderMode=cv2.BORDER_REPLICATE)
+    places, seen = _followed(gray, _flow(gray, shown), _flow(shown, gray), cell)
+    places = (places - shift) / scale
+    return places, seen & ((places > 0) & (places < (other.width, other.height))).all(-1)
 
 
 def _followed(gray: np.ndarray, there: np.ndarray, back: np.ndarray, cell: int) -> tuple[np.ndarray, np.ndarray]:

@@ -6,6 +6,7 @@ import numpy as np
 
 from reffusion.capture.given import GivenReference, load_depth
 from reffusion.capture.lens import Lens, to_pixels, undistort_image, undoing
+from reffusion.io.files import BadInput
 from reffusion.io.images import image_size, load_image, resize_nearest, resized
 
 MUCH_LARGER = 1.5  # times the view: a picture is shrunk before it is read at moved places
@@ -41,14 +42,14 @@ def load_straight_depth(
     says nothing; None where it has none.
 
     Raises:
-        ValueError: naming the file, where it is no depth map, or of other proportions than its picture.
+        BadInput: naming the file, where it is no depth map, or of other proportions than its picture.
     """
     if given.depth is None:
         return None
     depth, (of_width, of_height) = load_depth(given.depth), image_size(given.path, upright)
     height, width = depth.shape
     if abs(width * of_height - height * of_width) > 0.01 * width * of_height:
-        raise ValueError(
+        raise BadInput(
             f"{given.depth}: {width}x{height} px, but {given.path.name} has {of_width}x{of_height}; "
             "make it over the whole picture, in its proportions"
         )

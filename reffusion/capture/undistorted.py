@@ -10,6 +10,7 @@ import numpy as np
 from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.lens import Lens, undistort_image, undistort_mask, undoing
 from reffusion.capture.roles import Roles
+from reffusion.io.files import BadInput
 from reffusion.io.images import load_image, load_mask, resized, save_image, save_mask
 
 
@@ -34,7 +35,7 @@ def save_undistorted(out: Path, name: str, capture: Capture, roles: Roles, longe
         the photograph's lens at this size, and the pinhole.
 
     Raises:
-        ValueError: naming the file, where one is unreadable, or its lens cannot be undone.
+        BadInput: naming the file, where one is unreadable, or its lens cannot be undone.
     """
     image = load_at(capture.pictures[name], longest, capture.upright)
     size = image.shape[1], image.shape[0]
@@ -42,7 +43,7 @@ def save_undistorted(out: Path, name: str, capture: Capture, roles: Roles, longe
     try:
         pinhole, where = undoing(lens)
     except ValueError as error:
-        raise ValueError(f"{capture.brought_by or capture.pictures[name]}: view '{name}': {error}") from error
+        raise BadInput(f"{capture.brought_by or capture.pictures[name]}: view '{name}': {error}") from error
     save_image(out / "images" / f"{name}.png", image if where is None else undistort_image(image, where))
     for folder, files in (("masks", roles.masks), ("test_masks", roles.test_masks)):
         if name in files:
@@ -52,9 +53,12 @@ def save_undistorted(out: Path, name: str, capture: Capture, roles: Roles, longe
 
 
 def check_masks(masks: Mapping[str, Path]) -> None:
-    """ValueError where masks are given and not one of them holds a masked pixel, or one is unreadable."""
-    found = [load_mask(path).any() for path in masks.values()]
-    if found and not any(found):
-        raise ValueError(
-            f"{next(iter(masks.values())).parent}: all {len(found)} masks are empty; mark the object with 255 (or 1)"
+    """BadInput where masks are given and not one of them holds a masked pixel, or all hold nothing else, or one is
+    unreadable."""
+    shares = [load_mask(path).mean() for path in masks.values()]
+    if shares and (max(shares) == 0 or min(shares) == 1):
+        state = "empty" if max(shares) == 0 else "full"
+        raise BadInput(
+            f"{next(iter(masks.values())).parent}: all {len(shares)} masks are {state}; mark the object, and nothing "
+            "else, with 255 (or 1)"
         )

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from reffusion.capture.lenses import load_lenses
 from reffusion.io.arrays import load_json
+from reffusion.io.files import BadInput
 from reffusion.io.images import image_size
 
 
@@ -44,7 +45,7 @@ def known(name: str, names: Collection[str], key: str) -> str:
     """The view of that name, an ending allowed; ValueError with the nearest names where there is none."""
     if found := _found(name, names):
         return found
-    raise ValueError(f"scene.yaml: {key}: there is no view '{name}'; views are named like {_near(name, names)}")
+    raise BadInput(f"scene.yaml: {key}: there is no view '{name}'; views are named like {_near(name, names)}")
 
 
 def known_for(path: Path, name: str, views: Views, key: str) -> str:
@@ -56,8 +57,8 @@ def known_for(path: Path, name: str, views: Views, key: str) -> str:
     raise not_placed(path, name, views)
 
 
-def not_placed(path: Path, name: str, views: Views) -> ValueError:
-    return ValueError(
+def not_placed(path: Path, name: str, views: Views) -> BadInput:
+    return BadInput(
         f"{path}: its view '{name}' could not be placed, or is neither a training nor a test view; "
         f"make it for another view: they are named like {_near(name, views.names)}"
     )
@@ -74,10 +75,10 @@ def _near(name: str, names: Collection[str]) -> str:
 def check_proportions(
     path: Path, name: str, of_size: tuple[int, int], tolerance: float, what: str, upright: bool = False
 ) -> None:
-    """ValueError where a picture's sides are not in the proportion of its view's, by more than `tolerance`."""
+    """BadInput where a picture's sides are not in the proportion of its view's, by more than `tolerance`."""
     (width, height), (of_width, of_height) = image_size(path, upright), of_size
     if abs(width * of_height - height * of_width) > tolerance * width * of_height:
-        raise ValueError(
+        raise BadInput(
             f"{path}: {width}x{height} px, but its view '{name}' has {of_width}x{of_height}; "
             f"make the {what} over the whole picture, in its proportions"
         )

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from reffusion.io.files import BadInput, reading
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -26,13 +28,19 @@ def save_text(path: Path, text: str) -> None:
 
 
 def load_json(path: Path) -> Any:
-    """The value in a JSON file; ValueError naming the file where it is absent or not JSON."""
-    try:
-        return json.loads(Path(path).read_text())
-    except FileNotFoundError:
-        raise ValueError(f"{path}: no such file") from None
-    except ValueError as error:
-        raise ValueError(f"{path}: not valid JSON ({error})") from error
+    """The value in a JSON file, in UTF-8, -16 or -32; BadInput naming the file where it is absent or not JSON."""
+    with reading(path, "valid JSON"):
+        return json.loads(Path(path).read_bytes())
+
+
+def load_array(path: Path, what: str = "a readable array") -> np.ndarray:
+    """The array in a `.npy` file. BadInput where it is something else: pickles are not read, nor archives."""
+    with reading(path, what):
+        # Mapped first, so that what the header declares is compared with the file's length before memory is taken.
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+        if not isinstance(array, np.ndarray):
+            raise BadInput(f"{path}: an archive; save a single array, as .npy")
+        return np.array(array)
 
 
 def save_labels(path: Path, labels: Tensor | np.ndarray) -> None:
@@ -49,7 +57,7 @@ def load_labels(path: Path) -> Tensor:
     """bool [N] on the CPU, True = masked Gaussian."""
     import torch
 
-    array = np.load(path, allow_pickle=False)
+    array = load_array(path)
     if array.dtype != np.bool_ or array.ndim != 1:
-        raise ValueError(f"{path}: labels must be bool [N], got {array.dtype} {list(array.shape)}")
+        raise BadInput(f"{path}: labels must be bool [N], got {array.dtype} {list(array.shape)}")
     return torch.from_numpy(array)

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+
+from reffusion.io.files import BadInput, Cursor, reading, shortened, there
+from reffusion.io.rotations import pose_matrix, quaternion_of
 
 # Order is COLMAP's numbering in binary files.
 MODELS = {
@@ -63,7 +68,7 @@ class ModelPoints:
 
 def model_file(folder: Path, stem: str) -> Path | None:
     """`<folder>/<stem>.bin` or, failing that, `.txt`; None where neither is there."""
-    return next((p for p in (Path(folder) / f"{stem}{end}" for end in (".bin", ".txt")) if p.is_file()), None)
+    return next((p for p in (Path(folder) / f"{stem}{end}" for end in (".bin", ".txt")) if there(p)), None)
 
 
 def is_model(folder: Path) -> bool:
@@ -74,88 +79,103 @@ def is_model(folder: Path) -> bool:
 # ---------------------------------------------------------------------------------------------- reading
 
 
-class _Bytes:
-    """A cursor over a file that says so where the file ends early."""
-
-    def __init__(self, path: Path):
-        self.path, self.data, self.at = path, Path(path).read_bytes(), 0
-
-    def read(self, layout: str) -> tuple:
-        layout = "<" + layout
-        try:
-            values = struct.unpack_from(layout, self.data, self.at)
-        except struct.error:
-            raise ValueError(f"{self.path}: cut off at byte {len(self.data)}") from None
-        self.at += struct.calcsize(layout)
-        return values
-
-    def array(self, dtype: np.dtype | str, count: int) -> np.ndarray:
-        dtype = np.dtype(dtype)
-        if self.at + count * dtype.itemsize > len(self.data):
-            raise ValueError(f"{self.path}: cut off at byte {len(self.data)}")
-        values = np.frombuffer(self.data, dtype, count, self.at)
-        self.at += count * dtype.itemsize
-        return values
-
-    def text(self) -> str:
-        end = self.data.find(b"\0", self.at)
-        if end < 0:
-            raise ValueError(f"{self.path}: cut off at byte {len(self.data)}")
-        name, self.at = self.data[self.at : end].decode(), end + 1
-        return name
-
-
 def _lines(path: Path) -> list[str]:
     """The lines of a text file but comments; a blank line is kept, it may be an image without points."""
-    return [line.strip() for line in Path(path).read_text().splitlines() if not line.lstrip().startswith("#")]
+    lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
+    return [line.strip() for line in lines if not line.lstrip().startswith("#")]
 
 
 def load_cameras(path: Path) -> dict[int, ModelCamera]:
-    """Camera id -> intrinsics, from cameras.bin or cameras.txt."""
-    found = _cameras_binary(path) if path.suffix == ".bin" else _cameras_text(path)
-    for camera in found.values():
+    """Camera id -> intrinsics, from cameras.bin or cameras.txt.
+
+    Raises:
+        BadInput: naming the file; also for a camera without pixels, or whose parameters are not finite or whose focal
+            lengths not positive.
+    """
+    with reading(path, "COLMAP's cameras"):
+        found = _cameras_binary(path) if path.suffix == ".bin" else _cameras_text(path)
+    for identity, camera in found.items():
+        focal = camera.params[:1] if camera.model in _ONE_FOCAL_LENGTH else camera.params[:2]
         if not np.isfinite(camera.params).all():
-            raise ValueError(f"{path}: camera parameters that are not finite")
+            raise BadInput(f"{path}: camera {identity}: camera parameters that are not finite")
+        if min(focal) <= 0:
+            raise BadInput(f"{path}: camera {identity}: a focal length of {min(focal):g} px; it must be positive")
+        if camera.width < 1 or camera.height < 1:
+            raise BadInput(f"{path}: camera {identity} is for a picture of {camera.width}x{camera.height} px")
     return found
 
 
+_ONE_FOCAL_LENGTH = (
+    "SIMPLE_PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+)
+
+
 def _cameras_binary(path: Path) -> dict[int, ModelCamera]:
-    file, cameras = _Bytes(path), {}
-    for _ in range(file.read("Q")[0]):
+    file, cameras = Cursor(path), {}
+    for _ in range(file.count(48)):
         identity, model, width, height = file.read("IiQQ")
         if not 0 <= model < len(NAMES):
-            raise ValueError(f"{path}: unknown camera model number {model}")
+            raise BadInput(f"{path}: unknown camera model number {model}")
         params = file.read(f"{MODELS[NAMES[model]]}d")
-        cameras[identity] = ModelCamera(NAMES[model], width, height, params)
+        _add(cameras, identity, ModelCamera(NAMES[model], width, height, params), path)
+    file.end()
     return cameras
 
 
 def _cameras_text(path: Path) -> dict[int, ModelCamera]:
     cameras = {}
     for line in filter(None, _lines(path)):
-        identity, model, width, height, *params = line.split()
-        if model not in MODELS or len(params) != MODELS[model]:
-            raise ValueError(f"{path}: cannot read the camera '{line}'")
-        cameras[int(identity)] = ModelCamera(model, int(width), int(height), tuple(map(float, params)))
+        with _line(path, "camera", line):
+            identity, model, width, height, *params = line.split()
+            if len(params) != MODELS[model]:
+                raise ValueError("its number of parameters")
+            camera = ModelCamera(model, int(width), int(height), tuple(map(float, params)))
+            _add(cameras, int(identity), camera, path)
     return cameras
 
 
+def _add(found: dict, identity: int, value: ModelCamera | ModelImage, path: Path) -> None:
+    if identity in found:
+        raise BadInput(f"{path}: the number {identity} comes twice")
+    found[identity] = value
+
+
+@contextmanager
+def _line(path: Path, what: str, line: str) -> Iterator[None]:
+    """BadInput with the line for what is wrong with it."""
+    try:
+        yield
+    except BadInput:
+        raise
+    except (ValueError, KeyError, OverflowError) as error:
+        raise BadInput(f"{path}: cannot read the {what} '{shortened(line)}' ({shortened(str(error))})") from None
+
+
 def load_images(path: Path) -> dict[int, ModelImage]:
-    """Image id -> pose and name, from images.bin or images.txt. ValueError where a pose is not finite."""
-    found = _images_binary(path) if path.suffix == ".bin" else _images_text(path)
+    """Image id -> pose and name, from images.bin or images.txt. BadInput where a pose is not finite."""
+    with reading(path, "COLMAP's images"):
+        found = _images_binary(path) if path.suffix == ".bin" else _images_text(path)
     for image in found.values():
         if not np.isfinite(image.world_to_camera).all():
-            raise ValueError(f"{path}: the pose of {image.name} is not finite; remove the view or solve it again")
+            raise BadInput(
+                f"{path}: the pose of {shortened(image.name)} is not finite; remove the view or solve it again"
+            )
     return found
 
 
 def _images_binary(path: Path) -> dict[int, ModelImage]:
-    file, images = _Bytes(path), {}
-    for _ in range(file.read("Q")[0]):
+    file, images = Cursor(path), {}
+    for _ in range(file.count(73)):
         identity, *pose, camera_id = file.read("I7dI")
         name = file.text()
-        file.array("V24", file.read("Q")[0])
-        images[identity] = ModelImage(name, camera_id, pose_matrix(pose[:4], pose[4:]))
+        seen = file.count(24)
+        file.at += 24 * seen
+        _add(images, identity, ModelImage(_named(name, path), camera_id, pose_matrix(pose[:4], pose[4:])), path)
+    file.end()
     return images
 
 
@@ -166,12 +186,20 @@ def _images_text(path: Path) -> dict[int, ModelImage]:
     for line in lines[::2]:
         if not line:
             break
-        fields = line.split(maxsplit=9)
-        if len(fields) != 10:
-            raise ValueError(f"{path}: cannot read the image '{line}'")
-        pose = [float(f) for f in fields[1:8]]
-        images[int(fields[0])] = ModelImage(fields[9], int(fields[8]), pose_matrix(pose[:4], pose[4:]))
+        with _line(path, "image", line):
+            fields = line.split(maxsplit=9)
+            if len(fields) != 10:
+                raise ValueError("10 fields are expected")
+            pose = [float(f) for f in fields[1:8]]
+            image = ModelImage(_named(fields[9], path), int(fields[8]), pose_matrix(pose[:4], pose[4:]))
+            _add(images, int(fields[0]), image, path)
     return images
+
+
+def _named(name: str, path: Path) -> str:
+    if not Path(name).stem or "\0" in name:
+        raise BadInput(f"{path}: an image without a name")
+    return name
 
 
 POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])
@@ -179,22 +207,25 @@ POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", 
 
 def load_model_points(path: Path) -> ModelPoints:
     """The points of points3D.bin or points3D.txt, with the images that see each."""
-    points = _points_binary(path) if path.suffix == ".bin" else _points_text(path)
+    with reading(path, "COLMAP's points"):
+        points = _points_binary(path) if path.suffix == ".bin" else _points_text(path)
     if not np.isfinite(points.positions).all():
-        raise ValueError(f"{path}: points that are not finite")
+        raise BadInput(f"{path}: points that are not finite")
     return points
 
 
 def _points_binary(path: Path) -> ModelPoints:
-    file = _Bytes(path)
-    count = file.read("Q")[0]
+    file = Cursor(path)
+    count = file.count(POINT.itemsize)
     # Records follow each other at distances that their track lengths tell: first the places, then all at once.
     starts, at, track_at = np.empty(count, np.int64), file.at, POINT.itemsize - 8
     for k in range(count):
         starts[k] = at
         at += POINT.itemsize + 8 * int.from_bytes(file.data[at + track_at : at + POINT.itemsize], "little")
         if at > len(file.data):
-            raise ValueError(f"{path}: cut off at byte {len(file.data)}")
+            raise BadInput(f"{path}: cut off at byte {len(file.data)}")
+    file.at = at
+    file.end()
     data = np.frombuffer(file.data, np.uint8)
     records = data[starts[:, None] + np.arange(POINT.itemsize)].reshape(-1).view(POINT)
     lengths = records["track"].astype(np.int64)
@@ -206,52 +237,20 @@ def _points_binary(path: Path) -> ModelPoints:
 
 
 def _points_text(path: Path) -> ModelPoints:
-    rows = [line.split() for line in filter(None, _lines(path))]
-    tracks = [np.array(row[8::2], np.int64) for row in rows]
+    positions, colors, tracks = [], [], []
+    for line in filter(None, _lines(path)):
+        with _line(path, "point", line):
+            row = line.split()
+            x, y, z, red, green, blue, _ = row[1:8]
+            positions.append((float(x), float(y), float(z)))
+            colors.append(np.array((int(red), int(green), int(blue)), np.uint8))
+            tracks.append(np.array(row[8::2], np.int64))
     return ModelPoints(
-        np.array([[float(v) for v in row[1:4]] for row in rows]).reshape(-1, 3),
-        np.array([[int(v) for v in row[4:7]] for row in rows], np.uint8).reshape(-1, 3),
-        np.repeat(np.arange(len(rows)), [len(track) for track in tracks]),
+        np.array(positions).reshape(-1, 3),
+        np.array(colors, np.uint8).reshape(-1, 3),
+        np.repeat(np.arange(len(tracks)), [len(track) for track in tracks]),
         np.concatenate([np.zeros(0, np.int64), *tracks]),
     )
-
-
-def pose_matrix(quaternion: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    """[4, 4] float64 from wxyz (any length but zero) and a translation."""
-    w, x, y, z = np.asarray(quaternion, np.float64) / np.linalg.norm(quaternion)
-    matrix = np.eye(4)
-    matrix[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    matrix[:3, 3] = translation
-    return matrix
-
-
-def quaternion_of(rotation: np.ndarray) -> np.ndarray:
-    """[4] wxyz of a [3, 3] rotation, w >= 0, without loss where the angle nears pi."""
-    r = np.asarray(rotation, np.float64)
-    # The largest of the four components is found first, so that none is divided by a small number.
-    squares = np.array(
-        [
-            1 + r[0, 0] + r[1, 1] + r[2, 2],
-            1 + r[0, 0] - r[1, 1] - r[2, 2],
-            1 - r[0, 0] + r[1, 1] - r[2, 2],
-            1 - r[0, 0] - r[1, 1] + r[2, 2],
-        ]
-    )
-    products = np.array(
-        [
-            [squares[0], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
-            [r[2, 1] - r[1, 2], squares[1], r[1, 0] + r[0, 1], r[0, 2] + r[2, 0]],
-            [r[0, 2] - r[2, 0], r[1, 0] + r[0, 1], squares[2], r[2, 1] + r[1, 2]],
-            [r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[2, 1] + r[1, 2], squares[3]],
-        ]
-    )
-    quaternion = products[int(np.argmax(squares))]
-    quaternion = quaternion / np.linalg.norm(quaternion)
-    return quaternion if quaternion[0] >= 0 else -quaternion
 
 
 # ---------------------------------------------------------------------------------------------- writing

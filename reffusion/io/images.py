@@ -2,23 +2,40 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image, ImageOps
+
+from reffusion.io.files import BadInput, check_pixels, reading, shortened
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")  # of pictures, in small letters
 
 
+# What is read under these names; other kinds that Pillow knows call programs, or are not for photographs.
+_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM")
+logging.getLogger("PIL").addHandler(logging.NullHandler())  # what it says on standard error is in our line too
+Image.MAX_IMAGE_PIXELS = None  # `opened` looks at the size itself: with one limit, and without a warning below it
+
+
+@contextmanager
+def opened(path: Path, what: str = "a readable image") -> Iterator[Image.Image]:
+    """A picture of which the header was read; BadInput naming the file for all that is wrong with it, here or inside
+    the block, and for more than `MOST_PIXELS`."""
+    with reading(path, what), Image.open(path, formats=_FORMATS) as image:
+        check_pixels(path, *image.size)
+        yield image
+
+
 def image_size(path: Path, upright: bool = False) -> tuple[int, int]:
     """(width, height) in pixels, from the file's header alone. `upright` as in `load_image`."""
-    try:
-        with Image.open(path) as image:
-            width, height = image.size
-            turned = upright and image.getexif().get(0x0112, 1) >= 5
-            return (height, width) if turned else (width, height)
-    except (OSError, UnidentifiedImageError) as error:
-        raise ValueError(f"{path}: not a readable image ({error})") from error
+    with opened(path) as image:
+        width, height = image.size
+        turned = upright and image.getexif().get(0x0112, 1) in (5, 6, 7, 8)
+        return (height, width) if turned else (width, height)
 
 
 def load_image(path: Path, upright: bool = False) -> np.ndarray:
@@ -28,17 +45,13 @@ def load_image(path: Path, upright: bool = False) -> np.ndarray:
     that come with photographs refer to the stored pixels; `upright=True` obeys it.
 
     Raises:
-        ValueError: naming the file, where it is absent, cut off, or not an 8-bit picture.
+        BadInput: naming the file, where it is absent, cut off, or not an 8-bit picture.
     """
-    try:
-        with Image.open(path) as image:
-            if image.mode[0] in "IF":
-                raise ValueError(f"{path}: {image.mode} pixels; save it as an 8-bit picture")
-            if upright:
-                image = ImageOps.exif_transpose(image)
-            return np.array(image.convert("RGB"))
-    except (OSError, UnidentifiedImageError) as error:
-        raise ValueError(f"{path}: not a readable image ({error})") from error
+    with opened(path) as image:
+        if image.mode[0] in "IF":
+            raise BadInput(f"{path}: {image.mode} pixels; save it as an 8-bit picture")
+        turned = ImageOps.exif_transpose(image) if upright else image
+        return np.array(turned.convert("RGB"))
 
 
 def save_image(path: Path, array: np.ndarray) -> None:
@@ -79,28 +92,28 @@ def load_mask(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
     """Read a mask as bool [H, W], True = masked.
 
     Understood are files of {0, 1}, of {0, 255} (cut at 128, so lossy and soft edges do no harm), one-bit files
-    and palettes (any entry but the first). Of colours the brightest channel counts; alpha is ignored.
+    and palettes (any entry but the first). Of colours the brightest channel counts; alpha is ignored, but not where
+    the mask can only be there: which of its ends is the object differs from tool to tool.
 
     Args:
         size: (height, width) to resize to, nearest neighbour; None keeps the file's.
 
     Raises:
-        ValueError: naming the file, where it is unreadable or its values are neither {0, 1} nor {0, 255}.
+        BadInput: naming the file, where it is unreadable, in its alpha, or its values are neither {0, 1} nor {0, 255}.
     """
-    try:
-        with Image.open(path) as image:
-            mode = image.mode
-            array = np.array(image)
-    except (OSError, UnidentifiedImageError) as error:
-        raise ValueError(f"{path}: not a readable mask ({error})") from error
+    with opened(path, "a readable mask") as image:
+        mode, array = image.mode, np.array(image)
     if array.ndim == 3:
-        array = array[..., : 3 if array.shape[2] >= 3 else 1].max(axis=2)
+        colors = array[..., : 3 if array.shape[2] >= 3 else 1]
+        if mode in ("RGBA", "LA") and (colors == colors[0, 0]).all() and np.ptp(array[..., -1]):
+            raise BadInput(f"{path}: its alpha differs, its colours do not; write 255 where the object is, 0 elsewhere")
+        array = colors.max(axis=2)
     if mode == "P" or array.dtype == np.bool_ or array.max() <= 1:
         mask = array > 0
     elif array.max() >= 128:
         mask = array >= (32768 if array.max() > 255 else 128)
     else:
-        raise ValueError(
+        raise BadInput(
             f"{path}: its values reach {array.max()}, neither 0/1 nor 0/255; write 255 where the object is, 0 elsewhere"
         )
     return mask if size is None else resize_nearest(mask, size)
@@ -149,15 +162,24 @@ def save_exr(path: Path, depth: np.ndarray) -> None:
         raise ValueError(f"{path}: cannot be written ({file.geterror() if file else oiio.geterror()})")
 
 
+_EXR = b"\x76\x2f\x31\x01"
+
+
 def load_exr(path: Path) -> np.ndarray:
     """float32 [H, W], the first channel of an OpenEXR file."""
     import OpenImageIO as oiio
 
-    file = oiio.ImageInput.open(str(path))
-    if file is None:
-        raise ValueError(f"{path}: not a readable EXR file ({oiio.geterror()})")
-    pixels = file.read_image(oiio.FLOAT)
-    file.close()
-    if pixels is None:
-        raise ValueError(f"{path}: cut off ({file.geterror()})")
-    return np.ascontiguousarray(pixels.reshape(pixels.shape[0], pixels.shape[1], -1)[..., 0])
+    with reading(path, "a readable EXR file"):
+        with open(path, "rb") as start:
+            if start.read(4) != _EXR:  # else other formats are tried, which complain on standard error
+                raise BadInput(f"{path}: not an EXR file; give it the ending of what it is")
+        file = oiio.ImageInput.open(str(path))
+        if file is None:
+            raise BadInput(f"{path}: not a readable EXR file ({shortened(oiio.geterror(), 200)})")
+        spec = file.spec()
+        check_pixels(path, spec.width, spec.height * max(spec.depth, 1))
+        pixels = file.read_image(0, 0, 0, 1, oiio.FLOAT)
+        file.close()
+        if pixels is None:
+            raise BadInput(f"{path}: cut off ({shortened(file.geterror(), 200)})")
+        return np.ascontiguousarray(pixels.reshape(pixels.shape[0], pixels.shape[1], -1)[..., 0])

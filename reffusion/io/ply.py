@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+from reffusion.io.files import BadInput, reading, shortened
 
 if TYPE_CHECKING:
     from reffusion.types import Gaussians, Similarity
@@ -68,20 +71,23 @@ def load_ply(path: Path, similarity: Similarity | None = None) -> Gaussians:
         similarity: with it, the file is in the scene's own frame and the result is in the normalised one.
 
     Raises:
-        ValueError: naming the file, where properties are missing (e.g. a plain point cloud), `f_rest` has a
+        BadInput: naming the file, where properties are missing (e.g. a plain point cloud), `f_rest` has a
             count that belongs to no degree from 0 to 3, or values are not finite.
     """
     import torch
 
     from reffusion.types import Gaussians
 
-    table = _read(path)
-    missing = [n for n in (*POSITION, *DC, "opacity", *SCALES, *ROTATION) if n not in table.dtype.names]
-    if missing:
-        raise ValueError(f"{path}: not a file of Gaussians, it lacks {', '.join(missing)}")
+    table, comments = _read(path)
+    with reading(path, "a file of Gaussians"):
+        arrays = _arrays(path, table, similarity)
+    return Gaussians(*map(torch.from_numpy, arrays), antialiased=ANTIALIASED in comments)
+
+
+def _arrays(path: Path, table: np.ndarray, similarity: Similarity | None) -> list[np.ndarray]:
+    """Of the vertices what `_FIELDS` names, float32."""
+    _check_properties(path, table.dtype.names)
     rest_names = [n for n in table.dtype.names if n.startswith("f_rest_")]
-    if len(rest_names) not in (0, 9, 24, 45):
-        raise ValueError(f"{path}: {len(rest_names)} f_rest properties; 0, 9, 24 or 45 belong to degrees 0 to 3")
     take = lambda names: np.stack([table[n] for n in names], axis=1).astype(np.float64)
     means, log_scales = take(POSITION), take(SCALES)
     if similarity is not None:
@@ -90,12 +96,13 @@ def load_ply(path: Path, similarity: Similarity | None = None) -> Gaussians:
     if rest_names:
         rest = take([f"f_rest_{i}" for i in range(len(rest_names))]).reshape(len(table), 3, len(rest_names) // 3)
         sh = np.concatenate([sh, rest.transpose(0, 2, 1)], axis=1)
-    arrays = (means, take(ROTATION), log_scales, table["opacity"], sh)
-    for name, array in zip(_FIELDS, arrays, strict=True):
-        if not np.isfinite(array).all():
-            raise ValueError(f"{path}: {name} holds values that are not finite")
-    tensors = (torch.from_numpy(np.array(array, np.float32)) for array in arrays)
-    return Gaussians(*tensors, antialiased=ANTIALIASED in _comments(path))
+    arrays = []
+    for name, array in zip(_FIELDS, (means, take(ROTATION), log_scales, table["opacity"], sh), strict=True):
+        with np.errstate(over="ignore"):
+            arrays.append(np.array(array, np.float32))
+        if not np.isfinite(arrays[-1]).all():
+            raise BadInput(f"{path}: {name} holds values that are not finite, or too large for 32 bits")
+    return arrays
 
 
 def save_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
@@ -110,9 +117,14 @@ def save_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
 
 def load_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """[P, 3] float64 positions and [P, 3] uint8 colours (mid grey where the file has none) of a point cloud."""
-    table = _read(path)
+    table, _ = _read(path)
+    with reading(path, "a readable PLY file of points"):
+        return _points(path, table)
+
+
+def _points(path: Path, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if any(name not in table.dtype.names for name in POSITION):
-        raise ValueError(f"{path}: its vertices have no x, y, z")
+        raise BadInput(f"{path}: its vertices have no x, y, z")
     points = np.stack([table[n] for n in POSITION], axis=1).astype(np.float64)
     if all(name in table.dtype.names for name in RED_GREEN_BLUE):
         colors = np.stack([table[n] for n in RED_GREEN_BLUE], axis=1)
@@ -129,59 +141,112 @@ def _write(path: Path, table: np.ndarray, comments: Sequence[str] = ()) -> None:
     PlyData([PlyElement.describe(table, "vertex")], byte_order="<", comments=list(comments)).write(str(path))
 
 
-def _comments(path: Path) -> list[str]:
-    """Of a file that could be read."""
-    found = []
-    with open(path, "rb") as file:
-        for line in iter(file.readline, b"end_header\n"):
-            if line.startswith(b"comment "):
-                found.append(line[8:].decode("ascii", "replace").strip())
-            elif not line or line.rstrip() == b"end_header":
-                break
-    return found
+@dataclass(frozen=True)
+class _Header:
+    """What a PLY file says of itself.
 
-
-def _read(path: Path) -> np.ndarray:
-    from plyfile import PlyData, PlyParseError
-
-    try:
-        with open(path, "rb") as file:
-            lines = _ascii_vertices(file)
-            if lines is not None:
-                types, count = lines
-                return np.loadtxt(file, dtype=types, max_rows=count, ndmin=1) if count else np.empty(0, types)
-        return np.array(PlyData.read(str(path))["vertex"].data)  # mapped: number by number takes seconds
-    except FileNotFoundError:
-        raise ValueError(f"{path}: no such file") from None
-    except (PlyParseError, KeyError, ValueError) as error:
-        raise ValueError(f"{path}: not a readable PLY file with vertices ({error})") from error
-
-
-def _ascii_vertices(file: BinaryIO) -> tuple[np.dtype, int] | None:
-    """Type and number of the vertices of a text file that begins with them, its header consumed; else None.
-
-    numpy reads these forty times faster than plyfile, and nerfstudio writes its points as text.
+    Attributes:
+        text: the numbers are written as text.
+        elements: name, number of rows, and of each of its properties type and name; of a list ("list", name).
+        comments: the lines of comment.
+        at: where the data begins, in bytes.
     """
-    types, count = [], 0
-    for raw in iter(file.readline, b""):
-        words = raw.decode("ascii", "replace").split()
-        if words[:1] == ["format"] and words[1:2] != ["ascii"]:
-            return None
-        if words[:1] == ["element"]:
-            if count or types or words[1:2] != ["vertex"]:
-                break
-            count = int(words[2])
-        if words[:1] == ["property"]:
-            if words[1] not in _ASCII_TYPES:
-                return None
-            types.append((words[2], _ASCII_TYPES[words[1]]))
-        if words[:1] == ["end_header"]:
-            return np.dtype(types), count
-    return None
+
+    text: bool
+    elements: tuple[tuple[str, int, tuple[tuple[str, str], ...]], ...]
+    comments: tuple[str, ...]
+    at: int
+
+    def least(self) -> int:
+        """Bytes that the data takes at least: a digit and a blank for each number of a text, one for a list's length.
+
+        An element without properties takes none, however many it is said to have: it counts as a byte each."""
+        size = lambda kind: 2 if self.text else _TYPES[kind].itemsize if kind in _TYPES else 1
+        rows = ((count, max(sum(size(kind) for kind, _ in each), 1)) for _, count, each in self.elements)
+        return sum(count * row for count, row in rows) - int(self.text)  # the last line may end without a break
 
 
-_ASCII_TYPES = {
-    **{name: "f8" for name in ("float", "float32", "double", "float64")},
-    **{name: "i8" for name in ("char", "int8", "uchar", "uint8", "short", "int16", "ushort", "uint16")},
-    **{name: "i8" for name in ("int", "int32", "uint", "uint32")},
+_TYPES: dict[str, np.dtype] = {
+    **dict.fromkeys(("char", "int8"), np.dtype("i1")),
+    **dict.fromkeys(("uchar", "uint8"), np.dtype("u1")),
+    **dict.fromkeys(("short", "int16"), np.dtype("i2")),
+    **dict.fromkeys(("ushort", "uint16"), np.dtype("u2")),
+    **dict.fromkeys(("int", "int32"), np.dtype("i4")),
+    **dict.fromkeys(("uint", "uint32"), np.dtype("u4")),
+    **dict.fromkeys(("float", "float32"), np.dtype("f4")),
+    **dict.fromkeys(("double", "float64"), np.dtype("f8")),
 }
+
+
+def _header(path: Path) -> _Header:
+    """Raises BadInput, where it is none, or where the file is too short for what it declares."""
+    with reading(path, "a readable PLY file with vertices"), open(path, "rb") as file:
+        if file.readline(8).strip() != b"ply":
+            raise BadInput(f"{path}: not a PLY file; its first line is not `ply`")
+        form, elements, comments = "", [], []
+        for raw in iter(lambda: file.readline(_LONGEST_LINE), b""):
+            words = raw.decode("ascii", "replace").split()
+            if words[:1] == ["format"]:
+                form = words[1]
+            elif words[:1] == ["comment"]:
+                comments.append(" ".join(words[1:]))
+            elif words[:1] == ["element"]:
+                elements.append((words[1], int(words[2]), []))
+            elif words[:1] == ["property"]:
+                elements[-1][2].append((words[1], words[-1]))
+            elif words[:1] == ["end_header"]:
+                break
+        else:
+            raise BadInput(f"{path}: cut off within its header")
+        held = tuple((name, count, tuple(properties)) for name, count, properties in elements)
+        header = _Header(form == "ascii", held, tuple(comments), file.tell())
+        if form not in ("ascii", "binary_little_endian", "binary_big_endian"):
+            raise BadInput(f"{path}: not a readable PLY file with vertices: its format is '{shortened(form)}'")
+        if any(count < 0 for _, count, _ in held) or not any(name == "vertex" for name, _, _ in held):
+            raise BadInput(f"{path}: not a readable PLY file with vertices")
+        if header.at + header.least() > path.stat().st_size:
+            raise BadInput(f"{path}: cut off: it is too short for what its header declares")
+        return header
+
+
+_LONGEST_LINE = 10_000  # of a header, in bytes
+
+
+def check_gaussians(path: Path) -> None:
+    """By the header alone: BadInput where there are none, the file is cut off, or its properties are others."""
+    count, properties = next((c, p) for name, c, p in _header(Path(path)).elements if name == "vertex")
+    if not count:
+        raise BadInput(f"{path}: it holds no Gaussians")
+    _check_properties(path, [name for kind, name in properties if kind in _TYPES])
+
+
+def _check_properties(path: Path, names: Sequence[str]) -> None:
+    missing = [n for n in (*POSITION, *DC, "opacity", *SCALES, *ROTATION) if n not in names]
+    if missing:
+        raise BadInput(f"{path}: not a file of Gaussians, it lacks {', '.join(missing)}")
+    count = sum(n.startswith("f_rest_") for n in names)
+    if count not in (0, 9, 24, 45) or any(f"f_rest_{k}" not in names for k in range(count)):
+        raise BadInput(f"{path}: {count} f_rest properties; 0, 9, 24 or 45 belong to degrees 0 to 3")
+    if len(set(names)) < len(names):
+        raise BadInput(f"{path}: a property comes twice")
+
+
+def _read(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
+    """The vertices, and the comments."""
+    from plyfile import PlyData
+
+    path = Path(path)
+    header = _header(path)
+    with reading(path, "a readable PLY file with vertices"):
+        (name, count, properties), *_ = header.elements
+        if header.text and name == "vertex" and all(kind in _TYPES for kind, _ in properties):
+            # numpy reads these forty times faster than plyfile, and nerfstudio writes its points as text
+            types = np.dtype([(n, "f8" if _TYPES[kind].kind == "f" else "i8") for kind, n in properties])
+            with open(path, "rb") as file:
+                file.seek(header.at)
+                table = np.loadtxt(file, dtype=types, max_rows=count, ndmin=1) if count else np.empty(0, types)
+            if len(table) != count:
+                raise BadInput(f"{path}: cut off: {len(table)} of {count} vertices")
+            return table, header.comments
+        # mapped: number by number takes seconds
+        return np.array(PlyData.read(str(path))["vertex"].data), header.comments

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, Self
+from types import UnionType
+from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
 Decay = Annotated[float, Field(ge=0, lt=1)]  # part of a running mean that the next step keeps
 Device = Literal["cpu", "cuda"]
@@ -19,10 +20,27 @@ UNKEYED: dict[str, Any] = {"keyed": False}
 PRIOR = "sd2-community/stable-diffusion-2-inpainting"
 
 
+def _kinds(annotation: Any) -> set[Any]:
+    """The types of which one is allowed."""
+    return set(get_args(annotation)) if isinstance(annotation, UnionType) else {annotation}
+
+
 class Settings(BaseModel):
     """A frozen set of parameters. Unknown names are refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _as_meant(cls, value: Any, field: ValidationInfo) -> Any:
+        """YAML reads `true` and `on` as truth values, and pydantic would make 1 of them."""
+        info = cls.model_fields[field.field_name]
+        if isinstance(value, bool) and bool not in _kinds(info.annotation):
+            cure = "write it in quotes" if str in _kinds(info.annotation) else "give a number"
+            raise ValueError(f"yes, no, on, off, true and false are truth values; {cure}")
+        if isinstance(value, int | float) and _kinds(info.annotation) <= {str, type(None)}:
+            raise ValueError(f"read as the number {value}; write it in quotes")
+        return value
 
     def changed(self, values: Mapping[str, Any]) -> Self:
         """These settings with other values at dotted names, `{"sh.degree": 2}`; all checked anew."""

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 from reffusion.params.base import UNKEYED, Settings
 from reffusion.params.reference import Given
 
+Side = Annotated[float, Field(gt=0)]
+
 
 class Region(Settings):
     center: tuple[float, float, float] = Field(description="of a box along the axes, in the scene's own frame")
-    size: tuple[float, float, float] = Field(description="side lengths in the scene's own units")
+    size: tuple[Side, Side, Side] = Field(description="side lengths in the scene's own units")
 
 
 class Params(Settings):

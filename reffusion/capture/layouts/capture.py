@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from reffusion.capture.lens import Lens
+from reffusion.capture.lens import Lens, from_colmap
+from reffusion.io.colmap import ModelCamera
+from reffusion.io.files import BadInput
 from reffusion.io.images import ENDINGS, image_size
 
 NO_POINTS = (np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
@@ -61,17 +63,17 @@ class Capture:
 
 
 def pictures_in(folder: Path) -> dict[str, Path]:
-    """View name (file name without ending) -> picture, sorted by name. ValueError where two share a name."""
+    """View name (file name without ending) -> picture, sorted by name. BadInput where two share a name."""
     files = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in ENDINGS and not p.name.startswith(".")]
     return unique((p.stem, p) for p in files)
 
 
 def unique(named: Iterable[tuple[str, Path]]) -> dict[str, Path]:
-    """A dictionary sorted by name; ValueError where a name comes twice."""
+    """A dictionary sorted by name; BadInput where a name comes twice."""
     result: dict[str, Path] = {}
     for name, path in named:
         if name in result:
-            raise ValueError(f"{path}: the view name '{name}' is also that of {result[name]}; rename one of them")
+            raise BadInput(f"{path}: the view name '{name}' is also that of {result[name]}; rename one of them")
         result[name] = path
     return dict(sorted(result.items()))
 
@@ -82,15 +84,23 @@ def image_folder_of(folder: Path, images: str | None, usual: tuple[str, ...]) ->
         return folder / images
     there = [folder / name for name in usual if (folder / name).is_dir() and pictures_in(folder / name)]
     if not there:
-        raise ValueError(f"{folder}: no pictures in {', '.join(usual)}; name their folder as `images` in scene.yaml")
+        raise BadInput(f"{folder}: no pictures in {', '.join(usual)}; name their folder as `images` in scene.yaml")
     return next((path for path in there if (path / "label").is_dir()), there[0])
 
 
+def lens_of(camera: ModelCamera, source: Path) -> Lens:
+    """`from_colmap`, of a camera that the file `source` names."""
+    try:
+        return from_colmap(camera.model, camera.width, camera.height, camera.params)
+    except BadInput as error:
+        raise BadInput(f"{source}: {error}") from None
+
+
 def fitted(lens: Lens, picture: Path) -> Lens:
-    """The lens at the size of the picture file; ValueError where the two have different proportions."""
+    """The lens at the size of the picture file; BadInput where the two have different proportions."""
     width, height = image_size(picture)
     if abs(width * lens.height - height * lens.width) > 0.02 * width * lens.height:
-        raise ValueError(
+        raise BadInput(
             f"{picture}: {width}x{height} px, but its camera is for {lens.width}x{lens.height}; "
             "other proportions: the picture was cropped or turned after its pose was found"
         )
@@ -98,12 +108,12 @@ def fitted(lens: Lens, picture: Path) -> Lens:
 
 
 def rigid(matrix: np.ndarray, name: str, source: Path) -> np.ndarray:
-    """[4, 4] with the nearest rotation; ValueError where it is not finite, mirrored, sheared or a scaling."""
+    """[4, 4] with the nearest rotation; BadInput where it is not finite, mirrored, sheared or a scaling."""
     if not np.isfinite(matrix).all():
-        raise ValueError(f"{source}: the pose of '{name}' is not finite; remove the view or solve its pose again")
+        raise BadInput(f"{source}: the pose of '{name}' is not finite; remove the view or solve its pose again")
     u, stretch, v = np.linalg.svd(matrix[:3, :3])
-    if np.linalg.det(u @ v) < 0 or stretch[0] > 1.02 * stretch[2]:
-        raise ValueError(f"{source}: the pose of '{name}' is no rotation; solve its pose again")
+    if np.linalg.det(u @ v) < 0 or stretch[0] > 1.02 * stretch[2] or stretch[2] < 1e-6:
+        raise BadInput(f"{source}: the pose of '{name}' is no rotation; solve its pose again")
     result = np.eye(4)
     result[:3, :3], result[:3, 3] = u @ v, matrix[:3, 3]
     return result

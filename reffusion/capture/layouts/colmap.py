@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
 from reffusion.capture.layouts.capture import (
@@ -11,11 +12,11 @@ from reffusion.capture.layouts.capture import (
     counted,
     fitted,
     image_folder_of,
+    lens_of,
     pictures_in,
-    unique,
 )
-from reffusion.capture.lens import from_colmap
 from reffusion.io.colmap import is_model, load_cameras, load_images, load_model_points, model_file
+from reffusion.io.files import BadInput
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap", ".")
 
@@ -28,7 +29,7 @@ def read(folder: Path, images: str | None) -> Capture:
     """See `load_capture`."""
     model = model_folder(folder)
     if model is None:
-        raise ValueError(f"{folder}: no COLMAP model (cameras and images, .bin or .txt) in {', '.join(MODEL_FOLDERS)}")
+        raise BadInput(f"{folder}: no COLMAP model (cameras and images, .bin or .txt) in {', '.join(MODEL_FOLDERS)}")
     return from_model(folder, model, image_folder_of(folder, images, ("images", "images_2", "images_4", ".")), "colmap")
 
 
@@ -36,7 +37,10 @@ def from_model(folder: Path, model: Path, image_folder: Path, layout: str) -> Ca
     """Pictures matched to the model's images by name without ending; failing that, by order where the counts agree."""
     source = model_file(model, "images")
     registered = sorted(load_images(source).values(), key=lambda image: image.name)
-    by_name = dict(unique((Path(image.name).stem, Path(image.name)) for image in registered))
+    stems = Counter(Path(image.name).stem for image in registered)
+    if twice := [stem for stem, count in stems.items() if count > 1]:
+        raise BadInput(f"{source}: two images are called '{twice[0]}', but for their endings or folders; rename one")
+    by_name = {Path(image.name).stem: Path(image.name) for image in registered}
     images = {Path(image.name).stem: image for image in registered}
     found = _pictures_of_model(image_folder, by_name)
     if not found.keys() & images.keys() and len(found) == len(images):
@@ -44,14 +48,15 @@ def from_model(folder: Path, model: Path, image_folder: Path, layout: str) -> Ca
         images = dict(zip(found, (images[name] for name in sorted(images)), strict=True))
     pictures = {name: path for name, path in found.items() if name in images}
     if not pictures:
-        raise ValueError(f"{source}: none of its images is in {image_folder}; name their folder as `images`")
-    cameras = load_cameras(model_file(model, "cameras"))
+        raise BadInput(f"{source}: none of its images is in {image_folder}; name their folder as `images`")
+    camera_file = model_file(model, "cameras")
+    cameras = load_cameras(camera_file)
     lenses, poses = {}, {}
     for name, path in pictures.items():
         camera = cameras.get(images[name].camera_id)
         if camera is None:
-            raise ValueError(f"{source}: the camera {images[name].camera_id} of '{name}' is missing in the model")
-        lenses[name] = fitted(from_colmap(camera.model, camera.width, camera.height, camera.params), path)
+            raise BadInput(f"{source}: the camera {images[name].camera_id} of '{name}' is missing in the model")
+        lenses[name] = fitted(lens_of(camera, camera_file), path)
         poses[name] = images[name].world_to_camera
     file = model_file(model, "points3D")
     points = load_model_points(file) if file else None

@@ -14,12 +14,15 @@ from reffusion.capture.layouts.capture import (
     fitted,
     image_folder_of,
     inverse,
+    lens_of,
     pictures_in,
     rigid,
 )
 from reffusion.capture.layouts.colmap import from_model, model_folder
-from reffusion.capture.lens import Lens, from_colmap
+from reffusion.capture.lens import Lens
+from reffusion.io.arrays import load_array
 from reffusion.io.colmap import load_cameras, load_model_points, model_file
+from reffusion.io.files import BadInput, there
 
 
 def read(folder: Path, images: str | None) -> Capture:
@@ -30,12 +33,12 @@ def read(folder: Path, images: str | None) -> Capture:
     model = model_folder(folder)
     if model is not None:  # exact poses, the lens's distortion and the points
         return from_model(folder, model, image_folder, "llff")
-    if not source.is_file():
-        raise ValueError(f"{source}: missing, and there is no complete COLMAP model in {folder / 'sparse/0'}")
+    if not there(source):
+        raise BadInput(f"{source}: missing, and there is no complete COLMAP model in {folder / 'sparse/0'}")
     pictures = pictures_in(image_folder)
     rows = _poses_bounds(source)
     if len(rows) != len(pictures):
-        raise ValueError(
+        raise BadInput(
             f"{source}: {len(rows)} poses, but {image_folder} holds {len(pictures)} pictures; "
             "one pose a picture is needed, in order of the sorted names"
         )
@@ -60,18 +63,17 @@ def read(folder: Path, images: str | None) -> Capture:
 
 def _poses_bounds(source: Path) -> np.ndarray:
     """[V, 17] float64, checked."""
-    try:
-        rows = np.load(source, allow_pickle=False)
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{source}: not a readable array ({error})") from error
+    rows = load_array(source)
     if rows.ndim != 2 or rows.shape[1] != 17:
-        raise ValueError(f"{source}: {list(rows.shape)}, expected [views, 17] as LLFF writes it")
+        raise BadInput(f"{source}: {list(rows.shape)}, expected [views, 17] as LLFF writes it")
+    if rows.dtype.kind not in "fiu":
+        raise BadInput(f"{source}: {rows.dtype}, expected numbers as LLFF writes them")
     rows = rows.astype(np.float64)
     if not np.isfinite(rows).all():
         bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
-        raise ValueError(f"{source}: rows {bad.tolist()} are not finite; solve these poses again")
+        raise BadInput(f"{source}: rows {bad.tolist()} are not finite; solve these poses again")
     if (rows[:, [4, 9, 14, 15]] <= 0).any() or (rows[:, 16] <= rows[:, 15]).any():
-        raise ValueError(f"{source}: sizes, focal lengths and bounds must be positive, and far greater than near")
+        raise BadInput(f"{source}: sizes, focal lengths and bounds must be positive, and far greater than near")
     return rows
 
 
@@ -83,7 +85,7 @@ def _lens_of_partial_model(
     cameras = list(load_cameras(file).values()) if file else []
     if len(cameras) != 1:
         return lenses
-    exact = from_colmap(cameras[0].model, cameras[0].width, cameras[0].height, cameras[0].params)
+    exact = lens_of(cameras[0], file)
     replaced = {name: fitted(exact, path) for name, path in pictures.items()}
     ratio = np.median([replaced[name].fx / lens.fx for name, lens in lenses.items()])
     if abs(ratio - 1) > 0.02:

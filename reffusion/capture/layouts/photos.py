@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from reffusion.capture.layouts.capture import Capture, image_folder_of, pictures_in
+from reffusion.io.files import BadInput
 from reffusion.io.images import image_size
 
 
@@ -17,7 +18,7 @@ def read(folder: Path, images: str | None) -> Capture:
         sizes.setdefault(image_size(path, upright=True), []).append(name)
     if len(sizes) > 1:
         shown = "; ".join(f"{w}x{h}: {', '.join(names[:3])}" for (w, h), names in sizes.items())
-        raise ValueError(
+        raise BadInput(
             f"{image_folder}: pictures of {len(sizes)} sizes and no intrinsics ({shown}); "
             "bring poses and intrinsics (COLMAP or transforms.json), or photos of one size"
         )

@@ -1,0 +1,168 @@
+"""What is odd about a capture, in plain words: input that can be read, and is more likely a mistake than meant.
+
+PAPER leaves open: it takes masks, poses and photographs as given. The thresholds are loose: what is said here should be
+worth a look, and nothing is refused for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+
+import cv2
+import numpy as np
+
+from reffusion.geometry import pixel_rays, project, sample_nearest
+from reffusion.types import Camera, Scene
+
+LARGE = 0.5  # of a picture: a mask that covers more is more often inverted than meant
+LOOKED_AT = 24  # masks, spread evenly, that each is compared with in 3D
+RAYS, DEPTHS = 64, 32  # pixels of a mask, and places along the ray of each
+AGREE = 0.75  # of the other masks that must hold a place for it to be the object
+SUPPORTED = 0.3  # of a mask's pixels, under which it shows something else than the others
+BRIGHTER = 1.5  # times as bright as the others
+POINTS = 5000  # at most, at which photographs are compared
+LEAST_SEEN = 50  # points in a view for anything to be said of it
+LEAST_CONTRAST = 6.0  # levels of 255, deviation over a view's points
+ALIKE = (
+    0.25  # correlation of a view's brightness with the others' at the same points; 0.8 to 0.99 where poses are right
+)
+
+
+def oddities(scene: Scene, masks: Mapping[str, np.ndarray], image_of: Callable[[str], np.ndarray]) -> list[str]:
+    """A sentence for each thing that is odd.
+
+    Args:
+        scene: undistorted, in the normalised frame; its points are sparse ones or those of flow, none that were drawn.
+        masks: view name -> bool [H, W], True = the object.
+        image_of: view name -> uint8 [H, W, 3].
+    """
+    said = [*_covering(masks), *_disagreeing(scene, masks)]
+    return said + _contradicting([scene.cameras[n] for n in (*scene.train, *scene.test)], scene.points, image_of)
+
+
+def _covering(masks: Mapping[str, np.ndarray]) -> list[str]:
+    """Masks that cover most of their pictures."""
+    shares = {name: float(mask.mean()) for name, mask in masks.items()}
+    large = sorted(name for name, share in shares.items() if share > LARGE)
+    if not large:
+        return []
+    middle = float(np.median(list(shares.values())))
+    who = f"the masks of {_listed(large)} cover" if len(large) > 1 else f"the mask of {large[0]} covers"
+    if middle > LARGE:
+        who = f"the masks cover {middle:.0%} of the pictures (median);"
+    else:
+        who += f" more than {LARGE:.0%} of the picture, the others' median is {middle:.0%};"
+    return [f"{who} inverted? The object is 255 (or 1), all else 0"]
+
+
+# ---------------------------------------------------------------------------------------------- masks in 3D
+
+
+def _disagreeing(scene: Scene, masks: Mapping[str, np.ndarray]) -> list[str]:
+    """Masks that show something else than the others: along none of their pixels' rays lies a place that is inside the
+    other masks too."""
+    names = [name for name in scene.train if name in masks and name not in scene.clean]
+    marked = [name for name in names if masks[name].any()]
+    if len(marked) < 3:
+        return []
+    cameras = [scene.cameras[name] for name in names[:: -(-len(names) // LOOKED_AT)]]
+    share = {}
+    for name in marked:
+        places = _along_rays(scene.cameras[name], masks[name], scene.points)
+        inside, framed = np.zeros(places.shape[:2]), np.zeros(places.shape[:2])
+        for camera in cameras:
+            if camera.name != name:
+                hit, within = sample_nearest(masks[camera.name], project(places, camera)[0])
+                inside += hit & within
+                framed += within
+        held = ((inside >= AGREE * framed) & (framed >= 2)).any(1)
+        told = (framed >= 2).any(1)
+        if told.sum() >= RAYS // 4:
+            share[name] = float(held[told].mean())
+    alone = sorted(name for name, each in share.items() if each < SUPPORTED)
+    if len(alone) > len(share) / 2:
+        return [
+            f"{len(alone)} of {len(share)} masks do not agree in 3D; do all mark the same object, and are the poses "
+            "right?"
+        ]
+    return [f"the mask of {name} shows something else than those of the other views do" for name in alone]
+
+
+def _along_rays(camera: Camera, mask: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """[R, D, 3]: places behind pixels of the mask, evenly in disparity from the nearest to the farthest point."""
+    rows, columns = np.nonzero(mask)
+    chosen = np.unique(np.linspace(0, len(rows) - 1, RAYS).astype(int))
+    depth = project(points, camera)[1]
+    depth = depth[depth > 1e-3]
+    near, far = np.percentile(depth, (1, 99)) if len(depth) else (1 / 3, 4.0)
+    rays = pixel_rays(camera)[rows[chosen], columns[chosen]]
+    local = rays[:, None] / np.linspace(1 / (0.7 * near), 1 / (1.5 * far), DEPTHS)[:, None]
+    return (local - camera.world_to_camera[:3, 3]) @ camera.world_to_camera[:3, :3]
+
+
+# ---------------------------------------------------------------------------------------------- photographs
+
+
+def _contradicting(cameras: list[Camera], points: np.ndarray, image_of: Callable[[str], np.ndarray]) -> list[str]:
+    """Photographs of another exposure than the others, or that show something else where their poses put the points."""
+    points = points[:: max(1, -(-len(points) // POINTS))]
+    if len(points) < LEAST_SEEN or len(cameras) < 3:
+        return []
+    seen = np.stack([_brightness(camera, points, image_of(camera.name)) for camera in cameras])  # [V, P, 2]
+    known = ~np.isnan(seen[..., :1])
+    total, count = np.where(known, seen, 0).sum(0), known.sum(0)
+    ratios, likeness = {}, {}
+    for camera, own, here in zip(cameras, seen, known[..., 0], strict=True):
+        here &= count[:, 0] > 1
+        if here.sum() < LEAST_SEEN:
+            continue
+        (mine, my_detail), (theirs, their_detail) = own[here].T, ((total - own)[here] / (count[here] - 1)).T
+        ratios[camera.name] = float(np.median((mine + 4) / (theirs + 4)))
+        if min(my_detail.std(), their_detail.std()) > LEAST_CONTRAST:
+            likeness[camera.name] = float(np.corrcoef(my_detail, their_detail)[0, 1])
+    return [*_exposed(ratios), *_elsewhere(likeness)]
+
+
+def _brightness(camera: Camera, points: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """[P, 2] what the photograph shows where its pose puts the points: brightness, and what of it is finer than a
+    quarter of the picture (a floor is dark in every view, whatever the pose). NaN outside, and behind nearer points."""
+    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    near, wide = (cv2.blur(gray, (max(3, camera.width // part),) * 2) for part in (40, 4))
+    uv, depth = project(points, camera)
+    values, inside = sample_nearest(np.stack([near, near - wide], -1), uv)
+    cell = max(1.0, camera.width / 40)
+    index = np.zeros(len(points), int)
+    index[inside] = (uv[inside] // cell).astype(int) @ (10_000, 1)
+    order = np.argsort(depth)
+    cells, first = np.unique(index[order], return_index=True)
+    nearest = depth[order][first][np.searchsorted(cells, index)]
+    shown = inside & (depth < 1.15 * np.maximum(nearest, 0))
+    return np.where(shown[:, None], values, np.nan)
+
+
+def _exposed(ratios: Mapping[str, float]) -> list[str]:
+    jumps = {name: ratio for name, ratio in ratios.items() if not 1 / BRIGHTER < ratio < BRIGHTER}
+    if not jumps:
+        return []
+    worst = max(jumps, key=lambda name: abs(np.log(jumps[name])))
+    who = f"{len(jumps)} of {len(ratios)} photographs are" if len(jumps) > 1 else "a photograph is"
+    return [
+        f"{who} exposed otherwise than the rest ({_listed(sorted(jumps))}; {worst} is {jumps[worst]:.2g} times as "
+        "bright): take them with a fixed exposure, or try fit.exposure"
+    ]
+
+
+def _elsewhere(likeness: Mapping[str, float]) -> list[str]:
+    lost = sorted(name for name, each in likeness.items() if each < ALIKE)
+    if not lost:
+        return []
+    if len(lost) > len(likeness) / 2:
+        return [
+            f"{len(lost)} of {len(likeness)} photographs contradict their poses; do poses and pictures belong together?"
+        ]
+    return [f"the photograph {name} contradicts its pose, or shows something else than the others" for name in lost]
+
+
+def _listed(names: Iterable[str], most: int = 4) -> str:
+    names = list(names)
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -1,0 +1,113 @@
+"""The one place where a file that somebody hands over is opened, and where what is wrong with it becomes one line."""
+
+from __future__ import annotations
+
+import reprlib
+import stat
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+MOST_PIXELS = 200_000_000  # of a picture or depth map; what declares more is refused before memory is taken
+
+
+class BadInput(ValueError):
+    """What a person handed over is wrong: one line that names the file or key, and where it can what mends it."""
+
+    def __init__(self, message: str):
+        super().__init__(" ".join(message.splitlines()))
+
+
+@contextmanager
+def understood(path: Path, what: str) -> Iterator[None]:
+    """Whatever is raised inside comes out as BadInput: libraries raise dozens of kinds of errors for what they do not
+    understand, so all are caught.
+
+    Args:
+        path: the file that is read, for the message; what: what it should be, as in "a readable picture".
+    """
+    try:
+        yield
+    except BadInput:
+        raise
+    except Exception as error:
+        said = shortened(" ".join(str(error).split()), 200) or "cut off"
+        raise BadInput(f"{path}: not {what} ({type(error).__name__}: {said})") from error
+
+
+@contextmanager
+def reading(path: Path, what: str) -> Iterator[None]:
+    """`understood`, of a file that is opened inside: BadInput too where it is absent, a folder, a pipe or a device."""
+    with understood(path, what):
+        _check_regular(path)
+        yield
+
+
+def _check_regular(path: Path) -> None:
+    """Opening a pipe would wait for its other end for ever."""
+    try:
+        mode = Path(path).stat().st_mode
+    except FileNotFoundError:
+        raise BadInput(f"{path}: " + ("a link to nothing" if Path(path).is_symlink() else "no such file")) from None
+    if not stat.S_ISREG(mode):
+        raise BadInput(f"{path}: {'a folder' if stat.S_ISDIR(mode) else 'a pipe or device'}; a file is expected")
+
+
+def check_pixels(path: Path, width: int, height: int) -> None:
+    """BadInput where a picture has no pixel, or declares more than `MOST_PIXELS`."""
+    if width < 1 or height < 1:
+        raise BadInput(f"{path}: {width}x{height} px; it has no pixel")
+    if width * height > MOST_PIXELS:
+        raise BadInput(f"{path}: {width}x{height} px are more than {MOST_PIXELS // 10**6} megapixels; make it smaller")
+
+
+def there(path: Path) -> bool:
+    """Is a file of this name there? BadInput where it is something else: it would be passed over without a word."""
+    if path.is_file():
+        return True
+    if path.exists() or path.is_symlink():
+        _check_regular(path)
+    return False
+
+
+def shortened(value: object, most: int = 60) -> str:
+    """What was found, for a message; long texts and whole objects are cut."""
+    text = value if isinstance(value, str) else reprlib.repr(value)
+    return text if len(text) <= most else text[: most - 3] + "..."
+
+
+class Cursor:
+    """A place in a binary file, little endian; BadInput where the file ends before what it declares."""
+
+    def __init__(self, path: Path):
+        self.path, self.data, self.at = path, Path(path).read_bytes(), 0
+
+    def read(self, layout: str) -> tuple:
+        layout = "<" + layout
+        self.need(1, struct.calcsize(layout))
+        values = struct.unpack_from(layout, self.data, self.at)
+        self.at += struct.calcsize(layout)
+        return values
+
+    def need(self, count: int, size: int) -> None:
+        """BadInput where fewer than `count` records of `size` bytes follow: before memory is taken for them."""
+        if self.at + count * size > len(self.data):
+            raise BadInput(f"{self.path}: cut off at byte {len(self.data)}")
+
+    def count(self, size: int) -> int:
+        """The number of records that follow, each of at least `size` bytes."""
+        (count,) = self.read("Q")
+        self.need(count, size)
+        return count
+
+    def text(self) -> str:
+        end = self.data.find(b"\0", self.at)
+        if end < 0:
+            raise BadInput(f"{self.path}: cut off at byte {len(self.data)}")
+        name, self.at = self.data[self.at : end].decode(), end + 1
+        return name
+
+    def end(self) -> None:
+        if self.at != len(self.data):
+            raise BadInput(f"{self.path}: {len(self.data) - self.at} bytes too many at its end; write the model again")

@@ -1,0 +1,44 @@
+"""Rotations as quaternions, as COLMAP's files have them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def pose_matrix(quaternion: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """[4, 4] float64 from wxyz (any length; not finite where it is zero) and a translation."""
+    with np.errstate(all="ignore"):
+        w, x, y, z = np.asarray(quaternion, np.float64) / np.linalg.norm(quaternion)
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    matrix[:3, 3] = translation
+    return matrix
+
+
+def quaternion_of(rotation: np.ndarray) -> np.ndarray:
+    """[4] wxyz of a [3, 3] rotation, w >= 0, without loss where the angle nears pi."""
+    r = np.asarray(rotation, np.float64)
+    # The largest of the four components is found first, so that none is divided by a small number.
+    squares = np.array(
+        [
+            1 + r[0, 0] + r[1, 1] + r[2, 2],
+            1 + r[0, 0] - r[1, 1] - r[2, 2],
+            1 - r[0, 0] + r[1, 1] - r[2, 2],
+            1 - r[0, 0] - r[1, 1] + r[2, 2],
+        ]
+    )
+    products = np.array(
+        [
+            [squares[0], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
+            [r[2, 1] - r[1, 2], squares[1], r[1, 0] + r[0, 1], r[0, 2] + r[2, 0]],
+            [r[0, 2] - r[2, 0], r[1, 0] + r[0, 1], squares[2], r[2, 1] + r[1, 2]],
+            [r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[2, 1] + r[1, 2], squares[3]],
+        ]
+    )
+    quaternion = products[int(np.argmax(squares))]
+    quaternion = quaternion / np.linalg.norm(quaternion)
+    return quaternion if quaternion[0] >= 0 else -quaternion

@@ -1,0 +1,86 @@
+"""A look at what a scene brings: `python -m report.check --scene demo` (`make scene=X check`), after its stage `poses`.
+
+Writes runs/<scene>/check.png, every mask over its photograph, and prints what is odd.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from reffusion.io.arrays import load_json
+from reffusion.io.images import load_image, load_mask, resize_nearest, resized, save_image
+from report import sheet
+
+WIDTH, HEIGHT, GAP = 240, 180, 4  # px of the room for a picture, and between them
+COLUMNS = 6
+TINT = (255, 0, 160)  # of masks; test masks in the complement
+
+
+def make(home: Path) -> tuple[Path, list[str]]:
+    """Write check.png of runs/<scene>; its path, and what is odd, a sentence each.
+
+    Raises:
+        ValueError: the stage `poses` has not run.
+    """
+    poses = sheet.stage_folder(home, "poses")
+    if not (poses / "views.json").is_file():
+        raise ValueError(f"{poses}: not there; run `make scene={home.name.split('@')[0]} poses` first")
+    views, warnings = load_json(poses / "views.json"), poses / "warnings.json"
+    cells = [(name, tinted(poses, name), kind_of(name, views)) for name in sorted({*views["train"], *views["test"]})]
+    save_image(home / "check.png", arranged(cells))
+    return home / "check.png", load_json(warnings) if warnings.is_file() else []
+
+
+def kind_of(name: str, views: dict[str, list[str]]) -> str:
+    return "clean" if name in views["clean"] else "test" if name in views["test"] else "training"
+
+
+def tinted(poses: Path, name: str) -> np.ndarray:
+    """uint8 [h, w, 3], at most `WIDTH` x `HEIGHT`: the photograph, its mask over it."""
+    image = load_image(poses / "images" / f"{name}.png")
+    factor = min(WIDTH / image.shape[1], HEIGHT / image.shape[0])
+    size = max(1, round(image.shape[1] * factor)), max(1, round(image.shape[0] * factor))
+    small = resized(image, size)
+    for folder, tint in (("test_masks", [255 - level for level in TINT]), ("masks", TINT)):
+        if (path := poses / folder / f"{name}.png").is_file():
+            mask = resize_nearest(load_mask(path), size[::-1])
+            small[mask] = (small[mask] // 2 + np.array(tint, np.uint8) // 2).astype(np.uint8)
+    return small
+
+
+def arranged(cells: list[tuple[str, np.ndarray, str]]) -> np.ndarray:
+    """uint8 [H, W, 3]: the pictures in rows on white, under each its view's name and what it is for."""
+    font, line = ImageFont.load_default(13), 20
+    columns = min(COLUMNS, len(cells))
+    rows = -(-len(cells) // columns)
+    canvas = Image.new("RGB", (columns * (WIDTH + GAP) + GAP, rows * (HEIGHT + GAP + line) + GAP), "white")
+    draw = ImageDraw.Draw(canvas)
+    for index, (name, picture, kind) in enumerate(cells):
+        left, top = GAP + index % columns * (WIDTH + GAP), GAP + index // columns * (HEIGHT + GAP + line)
+        canvas.paste(Image.fromarray(picture), (left, top))
+        draw.text((left, top + HEIGHT + 2), f"{name[:28]}  {kind}", "black", font)
+    return np.asarray(canvas)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="reffusion check", description=__doc__.split("\n")[0])
+    parser.add_argument("--scene", type=Path, required=True, help="its name, or the path of its folder")
+    parser.add_argument("--variant", default="", help="of the scene")
+    parser.add_argument("--runs", type=Path, default=Path("runs"))
+    arguments = parser.parse_args()
+    name = arguments.scene.resolve().name
+    try:
+        path, said = make(arguments.runs / (f"{name}@{arguments.variant}" if arguments.variant else name))
+    except ValueError as error:
+        raise SystemExit(f"error: {error}") from None
+    for line in said:
+        print(f"odd: {line}")
+    print(f"{len(said) or 'nothing'} odd; every mask over its photograph: {path}")
+
+
+if __name__ == "__main__":
+    main()

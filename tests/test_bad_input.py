@@ -1,0 +1,904 @@
+"""Bad input, a row each: one line that names the file or the key, at once, and nothing is touched.
+
+Most rows go through what the command does below its process start (`told`); some through the command itself.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import struct
+import subprocess
+import sys
+import time
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from small_capture import HEIGHT, WIDTH, prepare, some_truth, write_masks, write_pictures
+
+from reffusion.capture.given import load_depth, load_given
+from reffusion.capture.reading import read_scene
+from reffusion.capture.roles import views_of
+from reffusion.capture.straight import GivenReference
+from reffusion.io.files import BadInput
+from reffusion.io.images import load_image, save_exr, save_image
+from reffusion.io.ply import save_ply
+from reffusion.params.poses import Params
+from reffusion.types import Gaussians
+from runner import Refused, child
+from runner.layers import layered, parse_set, seconds_of
+from runner.pipeline import load_pipeline, load_scene_file
+from runner.resolve import choose_profile
+from stages import poses
+
+ROOT = Path(__file__).resolve().parent.parent
+PIPELINE = load_pipeline(ROOT)
+SLOW = os.environ.get("REFFUSION_SLOW") == "1"
+LONGEST = 10.0  # seconds
+
+Change = Callable[[Path], None]
+
+
+@pytest.fixture(scope="session")
+def captures(tmp_path_factory) -> Path:
+    """A good capture of each layout, to copy and to spoil."""
+    home = tmp_path_factory.mktemp("good")
+    for layout in ("llff", "colmap", "colmap txt", "transforms", "photos"):
+        prepare(home / layout, layout, some_truth())
+    return home
+
+
+def told(folder: Path, out: Path, set_: str = "") -> str | None:
+    """What the command says of a scene, or None where it goes through `poses`. Other errors than ours come out."""
+    try:
+        scene = load_scene_file(folder, PIPELINE)
+        profile, _ = choose_profile("laptop" if scene.profile is None else None, scene, [], PIPELINE)
+        layers = layered(PIPELINE, scene, profile, None, parse_set(set_, PIPELINE), {})
+        if scene.budget is not None:
+            seconds_of(scene.budget, str(scene.path))
+    except Refused as error:
+        return str(error)
+    for stage, spec in PIPELINE.stages.items():
+        asked = {"stage": stage, "params": layers.values[stage], "takes": spec.takes}
+        if "scene" in spec.takes and stage == "poses":
+            asked |= {"scene": str(folder), "needs": {"scene": str(folder)}}
+        answer = child._describe(asked)
+        assert "broken" not in answer, answer
+        for error in answer.get("errors", ()):
+            origin = layers.origin(stage, error["where"])
+            return f"{origin}: {stage}.{error['where']} = {error['value']}: {error['message']}"
+        if "refusal" in answer:
+            return answer["refusal"]
+        assert not any("preview failed" in note for note in answer.get("notes", ())), answer["notes"]
+    try:
+        poses.run(Params(**layers.values["poses"]), out, scene=folder)
+    except BadInput as error:
+        return str(error)
+    return None
+
+
+def refused(captures: Path, tmp_path: Path, layout: str, change: Change, names: str, set_: str = "") -> str:
+    """Spoil a copy of a good capture, and check what is said of it."""
+    folder, out = tmp_path / "s", tmp_path / "out"
+    shutil.copytree(captures / layout, folder)
+    out.mkdir()
+    change(folder)
+    began = time.monotonic()
+    said = told(folder, out, set_)
+    assert said is not None, "accepted"
+    assert time.monotonic() - began < LONGEST
+    assert "\n" not in said and len(said) < 1000 and names in said, said
+    assert not (out / "views.json").exists()
+    return said
+
+
+# ---------------------------------------------------------------------------------------------- what changes a capture
+
+
+def file(name: str, content: bytes | str) -> Change:
+    def change(folder: Path) -> None:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).unlink(missing_ok=True)
+        (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
+
+    return change
+
+
+def yaml(text: str) -> Change:
+    return file("scene.yaml", text)
+
+
+def cut(name: str, keep: int) -> Change:
+    """The first bytes of a file; without its last ones where `keep` is negative."""
+    return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:keep])
+
+
+def replaced(name: str, old: str, new: str) -> Change:
+    def change(folder: Path) -> None:
+        text = (folder / name).read_text()
+        assert old in text
+        (folder / name).write_text(text.replace(old, new, 1))
+
+    return change
+
+
+def other_kind(name: str, kind: str) -> Change:
+    """A folder, a pipe, or a link to nothing where a file is expected."""
+
+    def change(folder: Path) -> None:
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)
+        {"folder": path.mkdir, "pipe": lambda: os.mkfifo(path), "link": lambda: path.symlink_to("nowhere")}[kind]()
+
+    return change
+
+
+def record(change: Callable[[dict], object]) -> Change:
+    def edit(folder: Path) -> None:
+        path = folder / "transforms.json"
+        content = json.loads(path.read_text())
+        changed = change(content)
+        path.write_text(json.dumps(content if changed is None else changed))
+
+    return edit
+
+
+def key(name: str, value: object) -> Change:
+    return record(lambda r: r.update({name: value}))
+
+
+def in_frame(name: str, value: object) -> Change:
+    return record(lambda r: r["frames"][1].update({name: value}))
+
+
+def rows(change: Callable[[np.ndarray], np.ndarray]) -> Change:
+    return lambda folder: np.save(folder / "poses_bounds.npy", change(np.load(folder / "poses_bounds.npy")))
+
+
+def pixel(row: int, column: int, value: float) -> Callable[[np.ndarray], np.ndarray]:
+    def change(array: np.ndarray) -> np.ndarray:
+        array[row, column] = value
+        return array
+
+    return change
+
+
+def both(*changes: Change) -> Change:
+    def change(folder: Path) -> None:
+        for each in changes:
+            each(folder)
+
+    return change
+
+
+def png(width: int, height: int, kind: int = 2) -> bytes:
+    """A PNG file that declares a size, and holds hardly anything."""
+    chunk = lambda tag, data: struct.pack(">I", len(data)) + tag + data + struct.pack(">I", zlib.crc32(tag + data))
+    header = struct.pack(">IIBBBBB", width, height, 8, kind, 0, 0, 0)
+    return (
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0" * 99)) + chunk(b"IEND", b"")
+    )
+
+
+def npy(shape: str, data: bytes = b"", descr: str = "'<f8'") -> bytes:
+    header = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}}}".encode().ljust(117) + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + data
+
+
+# ---------------------------------------------------------------------------------------------- scene.yaml
+
+
+LAUGHS = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]\n" for k in range(1, 12)
+)
+YAML = {
+    "a list": "- images",
+    "a word": "images",
+    "a number": "7",
+    "open bracket": "test: [v00",
+    "open brace": "region: {center: [0, 0, 0]",
+    "open quote": 'images: "images',
+    "tab": "reference:\n\tview: v00",
+    "bad indent": "reference:\n  view: v00\n image: x.png",
+    "two documents": "images: images\n---\nimages: other",
+    "python tag": "images: !!python/object/apply:os.system [true]",
+    "python name": "images: !!python/name:os.system",
+    "own tag": "images: !folder images",
+    "set tag": "test: !!set {v00}",
+    "binary tag": "images: !!binary aW1hZ2Vz",
+    "omap tag": "reference: !!omap [view: v00]",
+    "timestamp tag": "test: [!!timestamp 2022-08-19]",
+    "billion laughs": LAUGHS,
+    "an alias of itself": "test: &a [*a]",
+    "an unknown alias": "test: *a",
+    "deep": "test: " + "[" * 5000,
+    "deep and closed": "test: " + "[" * 500 + "]" * 500,
+    "deep mappings": "region: " + "{a: " * 500 + "1" + "}" * 500,
+    "key twice": "images: images\nimages: other",
+    "key twice inside": "stages: {fit: {iterations: 1, iterations: 2}}",
+    "stage twice": "stages: {fit: {iterations: 1}, fit: {seed: 2}}",
+    "key that is a list": "? [images]\n: images",
+    "key that is a mapping": "? {a: b}\n: images",
+    "unknown key": "imagse: images",
+    "number as a key": "1: images",
+    "null as a key": "~: images",
+    "control character": "images: \x01images",
+    "null byte": "images: im\0ages",
+    "merge of a number": "stages: {fit: {<<: 5}}",
+    "stages a list": "stages: [fit]",
+    "stages a word": "stages: fit",
+    "stage a number": "stages: {fit: 5}",
+    "stage nothing": "stages: {fit: }",
+    "unknown stage": "stages: {fitt: {iterations: 1}}",
+    "unknown parameter": "stages: {fit: {iteration: 1}}",
+    "group a number": "stages: {fit: {densify: 3}}",
+    "profile unknown": "profile: lapdog",
+    "profile a list": "profile: [laptop]",
+    "profile a mapping": "profile: {laptop: 1}",
+    "profile on": "profile: on",
+    "budget a word": "budget: soon",
+    "budget a list": "budget: [5m]",
+    "budget zero": "budget: 0s",
+    "budget negative": "budget: -5m",
+    "budget sexagesimal": "budget: 1:30",
+    "layout unknown": "layout: nerf",
+    "layout a number": "layout: 5",
+    "layout not there": "layout: colmap",
+    "images not there": "images: pictures",
+    "images a list": "images: [images]",
+    "images a mapping": "images: {folder: images}",
+    "images a file": "images: transforms.json",
+    "masks not there": "masks: nowhere",
+    "masks a list": "masks: [masks]",
+    "masks empty text": 'masks: ""',
+    "test_masks not there": "test_masks: nowhere",
+    "test_masks a mapping": "test_masks: {a: b}",
+    "train nobody": "train: []",
+    "train unknown": "train: [v00, v01, w02]",
+    "train a mapping": "train: {v00: v01}",
+    "train lists": "train: [[v00, v01, v02]]",
+    "train nothing inside": "train: [v00, v01, ~]",
+    "train one name": "train: v00",
+    "train twice": "train: [v00, v01, v02, v02]",
+    "train every 0": "train: every 0",
+    "train every -2": "train: every -2",
+    "train every": "train: every",
+    "test all": "test: every 1",
+    "test unknown": "test: [2022-08-19]",
+    "test a date unlike the name": "test: [2022-8-19]",
+    "test without zeros": "test: [0]",
+    "test a truth value": "test: [on]",
+    "test and train": "train: [v00, v01, v02]\ntest: [v02]",
+    "test a mapping inside": "test: [{view: v00}]",
+    "clean a word": "clean: v00",
+    "clean unknown": "clean: [v77]",
+    "clean of test": "clean: [v00]\ntest: [v00]",
+    "gaussians not there": "gaussians: no.ply",
+    "gaussians a folder": "gaussians: images",
+    "gaussians a picture": "gaussians: images/v00.png",
+    "gaussians a list": "gaussians: [a.ply]",
+    "gaussians empty text": 'gaussians: ""',
+    "region a number": "region: 5",
+    "region nothing inside": "region: {}",
+    "region without size": "region: {center: [0, 0, 0]}",
+    "region of two sides": "region: {center: [0, 0, 0], size: [1, 1]}",
+    "region of no size": "region: {center: [0, 0, 0], size: [0, 0, 0]}",
+    "region flat": "region: {center: [0, 0, 0], size: [1, 1, 0]}",
+    "region negative": "region: {center: [0, 0, 0], size: [1, -1, 1]}",
+    "region nan": "region: {center: [0, .nan, 0], size: [1, 1, 1]}",
+    "region infinite": "region: {center: [0, 0, 0], size: [1, 1, inf]}",
+    "region of words": "region: {center: [a, b, c], size: [1, 1, 1]}",
+    "region with more": "region: {center: [0, 0, 0], size: [1, 1, 1], turn: 5}",
+    "region truth value": "region: {center: [true, 0, 0], size: [1, 1, 1]}",
+    "reference a word": "reference: v00",
+    "reference without image": "reference: {view: v00}",
+    "reference without view": "reference: {image: images/v00.png}",
+    "reference with more": "reference: {view: v00, image: images/v00.png, mask: masks/v00.png}",
+    "reference of no view": "reference: {view: v99, image: images/v00.png}",
+    "reference not there": "reference: {view: v00, image: nowhere.png}",
+    "reference a folder": "reference: {view: v00, image: images}",
+    "reference no picture": "reference: {view: v00, image: transforms.json}",
+    "reference twice": "reference: [{view: v00, image: images/v00.png}, {view: v00, image: images/v01.png}]",
+    "reference of a test view": "test: [v00]\nreference: {view: v00, image: images/v00.png}",
+    "reference of neither": "train: [v00, v01, v02]\nreference: {view: v03, image: images/v03.png}",
+    "reference undistorted perhaps": "reference: {view: v00, image: images/v00.png, undistorted: perhaps}",
+    "reference depth missing": "reference: {view: v00, image: images/v00.png, depth: d.exr}",
+    "reference depth a jpg": "reference: {view: v00, image: images/v00.png, depth: transforms.json}",
+    "reference lists in lists": "reference: [[{view: v00, image: images/v00.png}]]",
+}
+
+
+@pytest.mark.parametrize("text", YAML.values(), ids=YAML.keys())
+def test_scene_yaml(captures, tmp_path, text):
+    refused(captures, tmp_path, "transforms", yaml(text), "")
+
+
+VALUES = {  # parameter -> values that it cannot have
+    "fit.iterations": ("true", "-1", "1.5", "many", ".nan", ".inf", "[1]", "{a: 1}", "null", '"x"'),
+    "fit.seed": ("on", "half", "1e400"),
+    "fit.lr.means": ("true", "-1", ".nan", ".inf", "fast"),
+    "fit.pixels": ("some", "1", "true"),
+    "poses.longest": ("0", "8", "-5", "false", "wide", "2022-08-19"),
+    "poses.detail": ("-1", ".nan", "yes"),
+    "poses.refine": ("perhaps", "2", "[]"),
+    "masks.tau": ("much", ".inf"),
+    "reference.prompt": ("1984", "true", "[a]"),
+    "reference.candidates": ("0", "true", "2.5"),
+    "reference.sampler.steps": ("0", "on", "-1"),
+    "distill.sds.patches": ("-1", "true"),
+    "evaluate.beyond": ("maybe",),
+}
+
+
+@pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in VALUES.items() for value in values])
+def test_values_of_parameters(captures, tmp_path, name, value):
+    stage, *groups = name.split(".")
+    text = "".join(f"{{{group}: " for group in groups) + value + "}" * len(groups)
+    refused(captures, tmp_path, "transforms", yaml(f"stages: {{{stage}: {text}}}"), f"{name}")
+    if "[" not in value and "{" not in value and '"' not in value:
+        said = refused(captures, tmp_path / "typed", "transforms", lambda folder: None, name, f"{name}={value}")
+        assert said.startswith("set: ")
+
+
+SET = {
+    "no stage": "iterations=5",
+    "no value": "fit.iterations",
+    "unknown stage": "fitt.iterations=5",
+    "unknown parameter": "fit.iteration=5",
+    "open quote": "fit.iterations='5",
+    "open bracket": "poses.test=[v00",
+    "tag": "poses.test=!!set",
+    "spaces": "fit.iterations = 5",
+    "double dot": "fit..iterations=5",
+    "deep": "poses.test=" + "[" * 3000,
+    "unknown view": "poses.test=[2022-08-19]",
+    "an unknown alias": "poses.test=*a",
+    "laughs": "fit.iterations=" + "[&a*a]",
+}
+
+
+@pytest.mark.parametrize("text", SET.values(), ids=SET.keys())
+def test_what_is_typed_as_set(captures, tmp_path, text):
+    refused(captures, tmp_path, "transforms", lambda folder: None, "", text)
+
+
+@pytest.mark.parametrize("kind", ["folder", "pipe", "link"])
+def test_scene_yaml_that_is_no_file(captures, tmp_path, kind):
+    refused(captures, tmp_path, "transforms", other_kind("scene.yaml", kind), "scene.yaml")
+
+
+@pytest.mark.parametrize("content", [b"\xff\xfei\0m\0", b"images: \xe4\xf6", b"\0\0\0", b"x" * 1_100_000])
+def test_scene_yaml_of_other_bytes(captures, tmp_path, content):
+    refused(captures, tmp_path, "transforms", file("scene.yaml", content), "scene.yaml")
+
+
+# ---------------------------------------------------------------------------------------------- transforms.json
+
+NUMBERS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "p1")
+NO_NUMBERS: tuple[object, ...] = ("640", float("nan"), float("inf"), None, True, [], {"a": 1}, 1e300)
+TRANSFORMS: dict[str, Change] = {
+    **{f"{name} = {value!r}": key(name, value) for name in NUMBERS for value in NO_NUMBERS},
+    **{f"{name} = {value!r}": key(name, value) for name in ("w", "h", "fl_x", "fl_y") for value in (0, -100)},
+    **{f"frame's {name} = 'x'": in_frame(name, "x") for name in NUMBERS},
+    **{
+        f"angle = {value!r}": both(record(lambda r: r.pop("fl_x") and None), key("camera_angle_x", value))
+        for value in (0, -1, 3.2, 7, "wide", float("nan"))
+    },
+    "w of other proportions": key("w", 500),
+    "model a mapping": key("camera_model", {"a": list(range(1000))}),
+    "model unknown": key("camera_model", "OPENCV2"),
+    "no intrinsics": record(lambda r: r.pop("fl_x") and None),
+    "a list": record(lambda r: [r]),
+    "a number": record(lambda r: 5),
+    "nothing": record(lambda r: {}),
+    "no frames": key("frames", []),
+    "frames a mapping": key("frames", {"0": 1}),
+    "frames of numbers": key("frames", [1, 2, 3]),
+    "frames of null": key("frames", [None]),
+    "a frame without path": record(lambda r: r["frames"][0].pop("file_path") and None),
+    "a frame without pose": record(lambda r: r["frames"][0].pop("transform_matrix") and None),
+    **{f"path {value!r}": in_frame("file_path", value) for value in (5, None, [], "", "a\0b", {}, True, "/", ".")},
+    "no picture is there": record(lambda r: [f.update(file_path="none/x.png") for f in r["frames"]] and None),
+    "two of a name": record(lambda r: r["frames"][0].update(file_path=r["frames"][1]["file_path"])),
+    **{
+        f"pose {name}": in_frame("transform_matrix", value)
+        for name, value in {
+            "of words": [["a"] * 4] * 4,
+            "of null": [[None] * 4] * 4,
+            "null": None,
+            "a number": 5,
+            "a word": "identity",
+            "of 3x3": np.eye(3).tolist(),
+            "ragged": [[1, 0, 0, 0], [0, 1, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
+            "of zeros": np.zeros((4, 4)).tolist(),
+            "mirrored": np.diag([-1.0, 1, 1, 1]).tolist(),
+            "sheared": np.diag([1.0, 2, 1, 1]).tolist(),
+            "of nan": np.full((4, 4), np.nan).tolist(),
+            "infinite": np.full((4, 4), np.inf).tolist(),
+            "of truth values": [[True] * 4] * 4,
+            "of huge numbers": [[10**400] * 4] * 4,
+            "deep": [[[[1]]]],
+        }.items()
+    },
+    **{
+        f"points file {value!r}": key("ply_file_path", value)
+        for value in (5, [], "", "a\0b", "images", "transforms.json")
+    },
+    **{f"cut at {keep}": cut("transforms.json", keep) for keep in (0, 1, 10, 100, 500, -1, -30)},
+    "deep": file("transforms.json", "[" * 100_000),
+    "deep mappings": file("transforms.json", '{"a":' * 100_000),
+    "long number": file("transforms.json", '{"frames": ' + "9" * 10_000 + "}"),
+    "latin": file("transforms.json", '{"frames": "é"}'.encode("latin-1")),
+    "zeros": file("transforms.json", b"\0" * 100),
+    "not JSON": file("transforms.json", "frames: []"),
+    "a picture": file("transforms.json", png(2, 2)),
+    **{f"a {kind}": other_kind("transforms.json", kind) for kind in ("folder", "pipe", "link")},
+}
+
+
+@pytest.mark.parametrize("change", TRANSFORMS.values(), ids=TRANSFORMS.keys())
+def test_transforms_json(captures, tmp_path, change):
+    said = refused(captures, tmp_path, "transforms", change, "")
+    assert "transforms.json" in said or ".png" in said or "images" in said
+
+
+# ---------------------------------------------------------------------------------------------- COLMAP, LLFF
+
+MODEL = "sparse/0"
+CAMERA = "1 SIMPLE_PINHOLE 96 72 90"  # begins the line in cameras.txt
+COLMAP_TEXT: dict[str, tuple[str, Change]] = {
+    **{
+        f"camera: {line!r:.40}": ("cameras.txt", file(f"{MODEL}/cameras.txt", line + "\n"))
+        for line in (
+            "1",
+            "1 SIMPLE_PINHOLE",
+            "x SIMPLE_PINHOLE 96 72 90 48 36",
+            "1 PINHOLE_CAMERA 96 72 90 48 36",
+            "1 SIMPLE_PINHOLE 96 72 90 48",
+            "1 SIMPLE_PINHOLE 96 72 90 48 36 0",
+            "1 SIMPLE_PINHOLE wide 72 90 48 36",
+            "1 SIMPLE_PINHOLE 96.5 72 90 48 36",
+            "1 SIMPLE_PINHOLE 96 72 long 48 36",
+            "1 SIMPLE_PINHOLE 96 72 nan 48 36",
+            "1 SIMPLE_PINHOLE 96 72 inf 48 36",
+            "1 SIMPLE_PINHOLE 96 72 -90 48 36",
+            "1 SIMPLE_PINHOLE 96 72 0 48 36",
+            "1 PINHOLE 96 72 90 -90 48 36",
+            "1 SIMPLE_PINHOLE 0 0 90 48 36",
+            "1 SIMPLE_PINHOLE -96 -72 90 48 36",
+            "1 FOV 96 72 90 90 48 36 0.5",
+            "1 SIMPLE_PINHOLE 96 72 90 48 36\n1 SIMPLE_PINHOLE 96 72 91 48 36",
+            "ÿ",
+        )
+    },
+    **{
+        f"camera: {line!r:.40}": (names, file(f"{MODEL}/cameras.txt", line + "\n"))
+        for names, line in (
+            ("SIMPLE_RADIAL", "1 SIMPLE_RADIAL 96 72 90 48 36 -9"),
+            ("OPENCV_FISHEYE", "1 OPENCV_FISHEYE 96 72 10 10 48 36 0 0 0 0"),
+            ("v00.png", "1 SIMPLE_PINHOLE 500 72 90 48 36"),
+        )
+    },
+    "no cameras": ("images", file(f"{MODEL}/cameras.txt", "")),
+    **{
+        f"image: {line!r:.40}": ("images", file(f"{MODEL}/images.txt", line + "\n\n"))
+        for line in (
+            "1 1 0 0 0",
+            "x 1 0 0 0 0 0 0 1 v00.png",
+            "1 one 0 0 0 0 0 0 1 v00.png",
+            "1 nan 0 0 0 0 0 0 1 v00.png",
+            "1 0 0 0 0 0 0 0 1 v00.png",
+            "1 1 0 0 0 inf 0 0 1 v00.png",
+            "1 1 0 0 0 0 0 0 x v00.png",
+            "1 1 0 0 0 0 0 0 7 v00.png",
+            "1 1 0 0 0 0 0 0 1 v99.png",
+            "1 1 0 0 0 0 0 0 1 v00.png\n\n1 1 0 0 0 0 0 0 1 v01.png",
+            "1 1 0 0 0 0 0 0 1 v00.png\n\n2 1 0 0 0 0 0 0 1 v00.jpg",
+        )
+    },
+    "one image": ("training view", file(f"{MODEL}/images.txt", "1 1 0 0 0 0 0 0 1 v00.png\n\n")),
+    "no images": ("images", file(f"{MODEL}/images.txt", "")),
+    **{
+        f"point: {line!r:.40}": ("points3D.txt", file(f"{MODEL}/points3D.txt", line + "\n"))
+        for line in (
+            "1",
+            "1 0 0",
+            "1 0 0 0 255 255",
+            "1 x 0 0 255 255 255 1",
+            "1 nan 0 0 255 255 255 1",
+            "1 0 0 0 red 255 255 1",
+            "1 0 0 0 256 0 0 1",
+            "1 0 0 0 -1 0 0 1",
+            "1 0 0 0 1 2 3 1 a b",
+            "1 0 0 0 1 2 3 1 99999999999999999999 0",
+        )
+    },
+    **{
+        f"{name} {kind}": (name, other_kind(f"{MODEL}/{name}", kind))
+        for name in ("cameras.txt", "images.txt", "points3D.txt")
+        for kind in ("folder", "pipe", "link")
+    },
+}
+
+
+@pytest.mark.parametrize(("names", "change"), COLMAP_TEXT.values(), ids=COLMAP_TEXT.keys())
+def test_colmap_text(captures, tmp_path, names, change):
+    refused(captures, tmp_path, "colmap txt", change, names)
+
+
+def number(name: str, at: int, layout: str, value: float) -> Change:
+    """A number written over another in a binary file."""
+
+    def change(folder: Path) -> None:
+        data = bytearray((folder / name).read_bytes())
+        struct.pack_into("<" + layout, data, at, value)
+        (folder / name).write_bytes(data)
+
+    return change
+
+
+COLMAP_BINARY: dict[str, tuple[str, Change]] = {
+    **{
+        f"{name} cut at {keep}": (f"{name}.bin", cut(f"{MODEL}/{name}.bin", keep))
+        for name in ("cameras", "images", "points3D")
+        for keep in (0, 1, 8, 20, 40, -1, -9)
+    },
+    **{
+        f"{name} of {count}": (f"{name}.bin", number(f"{MODEL}/{name}.bin", 0, "Q", count))
+        for name in ("cameras", "images", "points3D")
+        for count in (10**6, 2**63, 2**64 - 1)
+    },
+    **{
+        f"{name} too long": (
+            f"{name}.bin",
+            lambda f, n=name: (f / MODEL / f"{n}.bin").open("ab").write(b"\0" * 9) and None,
+        )
+        for name in ("cameras", "images", "points3D")
+    },
+    "unknown model": ("cameras.bin", number(f"{MODEL}/cameras.bin", 12, "i", 99)),
+    "negative model": ("cameras.bin", number(f"{MODEL}/cameras.bin", 12, "i", -1)),
+    "no width": ("cameras.bin", number(f"{MODEL}/cameras.bin", 16, "Q", 0)),
+    "huge width": ("v00", number(f"{MODEL}/cameras.bin", 16, "Q", 2**63)),
+    "nan focal length": ("cameras.bin", number(f"{MODEL}/cameras.bin", 32, "d", float("nan"))),
+    "negative focal length": ("cameras.bin", number(f"{MODEL}/cameras.bin", 32, "d", -90.0)),
+    "nan pose": ("images.bin", number(f"{MODEL}/images.bin", 12, "d", float("nan"))),
+    "long track": ("points3D.bin", number(f"{MODEL}/points3D.bin", 8 + 43, "Q", 2**62)),
+    "nan point": ("points3D.bin", number(f"{MODEL}/points3D.bin", 16, "d", float("nan"))),
+    "text as binary": ("cameras.bin", file(f"{MODEL}/cameras.bin", CAMERA)),
+}
+
+
+@pytest.mark.parametrize(("names", "change"), COLMAP_BINARY.values(), ids=COLMAP_BINARY.keys())
+def test_colmap_binary(captures, tmp_path, names, change):
+    refused(captures, tmp_path, "colmap", change, names)
+
+
+LLFF: dict[str, Change] = {
+    "empty": file("poses_bounds.npy", b""),
+    "text": file("poses_bounds.npy", "1 2 3"),
+    "pickle": lambda f: np.save(f / "poses_bounds.npy", np.array([{}], object), allow_pickle=True),
+    "archive": lambda f: np.savez(open(f / "poses_bounds.npy", "wb"), a=np.zeros((6, 17))),
+    "words": lambda f: np.save(f / "poses_bounds.npy", np.full((6, 17), "a")),
+    "complex": lambda f: np.save(f / "poses_bounds.npy", np.zeros((6, 17), complex)),
+    "16 columns": rows(lambda r: r[:, :16]),
+    "flat": rows(np.ravel),
+    "no rows": rows(lambda r: r[:0]),
+    "five rows": rows(lambda r: r[:5]),
+    "nan": rows(pixel(2, 0, np.nan)),
+    "infinite bound": rows(pixel(2, 16, np.inf)),
+    "negative focal length": rows(pixel(2, 14, -5)),
+    "no height": rows(pixel(2, 4, 0)),
+    "near is far": rows(pixel(2, 15, 1e9)),
+    "a pose of zeros": rows(lambda r: np.where(np.arange(17) % 5 < 3, 0 * r, r)),
+    "other proportions": rows(pixel(2, 4, 5000)),
+    "huge": file("poses_bounds.npy", npy("(1000000000000, 17)")),
+    "negative shape": file("poses_bounds.npy", npy("(-1, 17)")),
+    "a shape of words": file("poses_bounds.npy", npy("('a', 17)")),
+    "a broken header": file("poses_bounds.npy", npy("((((", b"")),
+    "an unknown type": file("poses_bounds.npy", npy("(6, 17)", b"\0" * 816, "'<q9'")),
+    **{f"cut at {keep}": cut("poses_bounds.npy", keep) for keep in (3, 6, 9, 60, 128, 200, -1)},
+    **{f"a {kind}": other_kind("poses_bounds.npy", kind) for kind in ("folder", "pipe", "link")},
+}
+
+
+@pytest.mark.parametrize("change", LLFF.values(), ids=LLFF.keys())
+def test_poses_bounds(captures, tmp_path, change):
+    said = refused(captures, tmp_path, "llff", change, "")
+    assert "poses_bounds.npy" in said or ".png" in said
+
+
+# ---------------------------------------------------------------------------------------------- pictures, masks
+
+
+def picture(name: str, array: np.ndarray, kind: str = "PNG") -> Change:
+    return lambda folder: Image.fromarray(array).save(folder / name, kind)
+
+
+BROKEN: dict[str, Callable[[str], Change]] = {
+    "empty": lambda name: file(name, b""),
+    "text": lambda name: file(name, "no picture"),
+    "postscript": lambda name: file(name, "%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 96 72\n"),
+    "a bomb": lambda name: file(name, png(60_000, 60_000)),
+    "of no width": lambda name: file(name, png(0, 72)),
+    "of a little data": lambda name: file(name, png(WIDTH, HEIGHT)),
+    **{f"cut at {keep}": lambda name, keep=keep: cut(name, keep) for keep in (1, 8, 20, 33, 60, -30)},
+    **{f"a {kind}": lambda name, kind=kind: other_kind(name, kind) for kind in ("folder", "pipe", "link")},
+}
+NOISE = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("layout", ["transforms", "colmap", "llff"])
+@pytest.mark.parametrize("broken", BROKEN.values(), ids=BROKEN.keys())
+def test_photographs(captures, tmp_path, broken, layout):
+    name = f"{'images_4' if layout == 'llff' else 'images'}/v01.png"
+    change = both(picture(name, NOISE), broken(name), lambda folder: (folder / "masks/v01.png").unlink(missing_ok=True))
+    refused(captures, tmp_path, layout, change, "v01")
+
+
+@pytest.mark.parametrize("broken", BROKEN.values(), ids=BROKEN.keys())
+def test_masks(captures, tmp_path, broken):
+    change = both(
+        picture("masks/v01.png", np.kron(NOISE[..., 0] > 127, np.ones((1, 1), bool))), broken("masks/v01.png")
+    )
+    refused(captures, tmp_path, "transforms", change, "v01")
+
+
+def mask_of(value: int) -> Change:
+    return lambda folder: write_masks(folder / "masks", [f"v{k:02d}" for k in range(6)], value=value)
+
+
+WHITE = np.full((HEIGHT, WIDTH, 4), 255, np.uint8)
+WHITE[10:30, 20:40, 3] = 0
+NAMES_OF_ALL = [f"v{k:02d}" for k in range(6)]
+
+
+def all_full(folder: Path) -> None:
+    for path in (folder / "masks").iterdir():
+        save_image(path, np.full((HEIGHT, WIDTH), 255, np.uint8))
+
+
+def masks_are_a_file(folder: Path) -> None:
+    shutil.rmtree(folder / "masks")
+    (folder / "masks").write_text("x")
+
+
+def only_two(folder: Path) -> None:
+    for path in [*(folder / "images").iterdir(), *(folder / "masks").iterdir()]:
+        if path.stem > "v01":
+            path.unlink()
+
+
+def copied(old: str, new: str) -> Change:
+    return lambda folder: shutil.copy(folder / old, folder / new)
+
+
+OTHER_PICTURES: dict[str, tuple[str, Change]] = {
+    "16-bit photograph": ("v01", picture("images/v01.png", np.zeros((HEIGHT, WIDTH), np.uint16))),
+    "floats": ("v01", picture("images/v01.png", np.zeros((HEIGHT, WIDTH), np.float32), "TIFF")),
+    "photograph of other proportions": ("v01", lambda f: write_pictures(f / "images", ["v01"], (HEIGHT, WIDTH))),
+    "two of a name": ("v01", copied("images/v01.png", "images/v01.jpg")),
+    "mask of other proportions": ("v01", lambda f: write_masks(f / "masks", ["v01"], (HEIGHT, WIDTH))),
+    "mask of one pixel": ("v01", lambda f: write_masks(f / "masks", ["v01"], (1, 9))),
+    "mask for no picture": ("zz", lambda f: write_masks(f / "masks", ["zz"])),
+    "two masks": ("v01", copied("masks/v01.png", "masks/v01.bmp")),
+    "mask in alpha": ("v01", picture("masks/v01.png", WHITE)),
+    "mask in alpha of black": ("v01", picture("masks/v01.png", WHITE * np.array([0, 0, 0, 1], np.uint8))),
+    "mask of sevens": ("masks", lambda f: write_masks(f / "masks", NAMES_OF_ALL, value=7)),
+    "mask of a hundred": ("masks", lambda f: write_masks(f / "masks", NAMES_OF_ALL, value=100)),
+    "empty masks": ("masks", lambda f: write_masks(f / "masks", NAMES_OF_ALL, value=0)),
+    "full masks": ("masks", all_full),
+    "no masks": ("masks", lambda f: shutil.rmtree(f / "masks")),
+    "masks a file": ("mask", masks_are_a_file),
+    "no pictures": ("images", lambda f: shutil.rmtree(f / "images")),
+    "two pictures": ("training views", only_two),
+}
+
+
+@pytest.mark.parametrize("layout", ["transforms", "colmap"])
+@pytest.mark.parametrize(("names", "change"), OTHER_PICTURES.values(), ids=OTHER_PICTURES.keys())
+def test_other_pictures(captures, tmp_path, names, change, layout):
+    if layout == "transforms" and change is OTHER_PICTURES["two of a name"][1]:
+        return  # the file says which
+    refused(captures, tmp_path, layout, change, names)
+
+
+# ---------------------------------------------------------------------------------------------- Gaussians
+
+
+def gaussians(folder: Path, count: int = 20) -> None:
+    import torch
+
+    draw = lambda *shape: torch.rand(*shape, generator=torch.Generator().manual_seed(0))
+    made = Gaussians(draw(count, 3), draw(count, 4), draw(count, 3) - 4, draw(count), draw(count, 1, 3))
+    save_ply(folder / "g.ply", made)
+    (folder / "scene.yaml").write_text("gaussians: g.ply\n")
+
+
+def as_text(folder: Path) -> None:
+    from plyfile import PlyData
+
+    read = PlyData.read(str(folder / "g.ply"), mmap=False)
+    read.text = True
+    read.write(str(folder / "g.ply"))
+
+
+def header(old: bytes, new: bytes) -> Change:
+    def change(folder: Path) -> None:
+        data = (folder / "g.ply").read_bytes()
+        assert old in data
+        (folder / "g.ply").write_bytes(data.replace(old, new, 1))
+
+    return change
+
+
+def half(folder: Path) -> None:
+    data = (folder / "g.ply").read_bytes()
+    (folder / "g.ply").write_bytes(data[: data.index(b"end_header") + (len(data) - data.index(b"end_header")) // 2])
+
+
+PLY: dict[str, Change] = {
+    "none": lambda folder: gaussians(folder, 0),
+    "none, as text": both(lambda folder: gaussians(folder, 0), as_text),
+    "half": half,
+    "half, as text": both(as_text, half),
+    "half a line, as text": both(as_text, cut("g.ply", -40)),
+    **{f"cut at {keep}": cut("g.ply", keep) for keep in (0, 3, 10, 50, 200, -1)},
+    "too many": header(b"vertex 20", b"vertex 21"),
+    "far too many": header(b"vertex 20", b"vertex 99999999999999"),
+    "fewer than none": header(b"vertex 20", b"vertex -20"),
+    "a word of them": header(b"vertex 20", b"vertex many"),
+    "no number of them": header(b"vertex 20", b"vertex"),
+    "no vertices": header(b"element vertex", b"element points"),
+    "no format": header(b"format binary_little_endian 1.0\n", b""),
+    "an unknown format": header(b"binary_little_endian", b"binary_middle_endian"),
+    "an unknown type": header(b"property float x", b"property quad x"),
+    "a list": header(b"property float x", b"property list uchar float x"),
+    "no opacity": header(b"property float opacity", b"property float opaque"),
+    "two of a property": header(b"property float y", b"property float x"),
+    "a property alone": header(b"property float y", b"property"),
+    "no end": header(b"end_header", b"endheader!"),
+    "other rest": header(b"property float nx", b"property float f_rest_7"),
+    "nan": number("g.ply", -4, "f", float("nan")),
+    "an infinite scale": number("g.ply", -20, "f", float("inf")),
+    "text with words": both(as_text, lambda folder: header(b"\n0.", b"\nx.")(folder)),
+    "a picture": file("g.ply", png(5, 5)),
+    **{f"a {kind}": other_kind("g.ply", kind) for kind in ("folder", "pipe", "link")},
+}
+
+
+@pytest.mark.parametrize("change", PLY.values(), ids=PLY.keys())
+def test_gaussians(captures, tmp_path, change):
+    refused(captures, tmp_path, "transforms", both(gaussians, change), "g.ply")
+
+
+# ---------------------------------------------------------------------------------------------- references
+
+KINDS: dict[str, Callable[[str], Change]] = {
+    "empty": lambda name: file(name, b""),
+    "text": lambda name: file(name, "deep"),
+    "a folder": lambda name: other_kind(name, "folder"),
+    "a pipe": lambda name: other_kind(name, "pipe"),
+    "a link to nothing": lambda name: other_kind(name, "link"),
+}
+
+
+def exr(keep: int) -> Change:
+    return both(lambda folder: save_exr(folder / "d.exr", NOISE[..., 0]), cut("d.exr", keep))
+
+
+DEPTH: dict[str, tuple[str, Change]] = {
+    **{
+        f"{ending}: {kind}": (f"d.{ending}", change(f"d.{ending}"))
+        for ending in ("png", "exr", "npy", "tif")
+        for kind, change in KINDS.items()
+    },
+    "8-bit": ("d.png", picture("d.png", NOISE[..., 0])),
+    "colours": ("d.png", picture("d.png", NOISE)),
+    "constant": ("d.npy", lambda f: np.save(f / "d.npy", np.ones((HEIGHT, WIDTH)))),
+    "nothing known": ("d.npy", lambda f: np.save(f / "d.npy", np.full((HEIGHT, WIDTH), np.nan))),
+    "three channels": ("d.npy", lambda f: np.save(f / "d.npy", np.ones((HEIGHT, WIDTH, 3)))),
+    "no pixel": ("d.npy", lambda f: np.save(f / "d.npy", np.ones((0, WIDTH)))),
+    "words": ("d.npy", lambda f: np.save(f / "d.npy", np.full((HEIGHT, WIDTH), "a"))),
+    "complex": ("d.npy", lambda f: np.save(f / "d.npy", np.zeros((HEIGHT, WIDTH), complex))),
+    "pickle": ("d.npy", lambda f: np.save(f / "d.npy", np.array([{}], object), allow_pickle=True)),
+    "huge npy": ("d.npy", file("d.npy", npy("(1000000, 1000000)"))),
+    "huge png": ("d.png", file("d.png", png(60_000, 60_000, 0))),
+    **{f"EXR cut at {keep}": ("d.exr", exr(keep)) for keep in (4, 20, 100, 300, -400)},
+}
+
+
+@pytest.mark.parametrize(("name", "change"), DEPTH.values(), ids=DEPTH.keys())
+def test_depth_maps(captures, tmp_path, name, change):
+    """Of references: what `poses` lets pass by its header, `reference` refuses."""
+    folder = tmp_path / "s"
+    shutil.copytree(captures / "transforms", folder)
+    change(folder)
+    began = time.monotonic()
+    with pytest.raises(BadInput, match=name):
+        capture, roles = read_scene(Params(), folder)
+        given = {"view": "v01", "image": "images/v01.png", "depth": name}
+        found = load_given(folder, views_of(capture, roles), Params(reference=given).reference)
+        load_depth(found[0].depth)
+    assert time.monotonic() - began < LONGEST
+
+
+@pytest.mark.parametrize("broken", BROKEN.values(), ids=BROKEN.keys())
+def test_paintings(captures, tmp_path, broken):
+    folder = tmp_path / "s"
+    shutil.copytree(captures / "transforms", folder)
+    (folder / "painted").mkdir()
+    both(picture("painted/v01.png", NOISE), broken("painted/v01.png"))(folder)
+    with pytest.raises(BadInput, match="v01"):
+        capture, roles = read_scene(Params(), folder)
+        found = load_given(folder, views_of(capture, roles), None)
+        load_image(found[0].path if found else GivenReference("v01", folder / "painted/v01.png").path)
+
+
+# ---------------------------------------------------------------------------------------------- what is meant, works
+
+NAMES = ["20220819_104425", "2022-08-19", "007", "1e3", "on", "null_"]
+
+
+def test_names_that_look_like_numbers_or_dates_are_names(captures, tmp_path):
+    folder, out = tmp_path / "s", tmp_path / "out"
+    shutil.copytree(captures / "transforms", folder)
+    for old, new in zip([f"v{k:02d}" for k in range(6)], NAMES, strict=True):
+        for kind in ("images", "masks"):
+            (folder / kind / f"{old}.png").rename(folder / kind / f"{new}.png")
+        replaced("transforms.json", f"images/{old}.png", f"images/{new}.png")(folder)
+    shutil.copy(folder / "images/20220819_104425.png", folder / "12.png")
+    yaml(
+        "test: [2022-08-19, 007]\nclean: [on]\nreference: {view: 20220819_104425, image: 12.png, undistorted: off}\n"
+        "budget: 90\nregion: {center: [0, 1, 0.5], size: [1, 2, 3]}\nstages: {fit: {iterations: 20}}"
+    )(folder)
+    assert told(folder, out) is None
+    views = json.loads((out / "views.json").read_text())
+    assert views["test"] == ["007", "2022-08-19"] and views["clean"] == ["on"] and "20220819_104425" in views["train"]
+    shutil.rmtree(out)
+    assert told(folder, out, "poses.test=[1e3]") is None
+    assert json.loads((out / "views.json").read_text())["test"] == ["1e3"]
+
+
+# ---------------------------------------------------------------------------------------------- the command itself
+
+QUICK = [  # refused before a stage is asked
+    ("scene.yaml", yaml(YAML["billion laughs"]), ""),
+    ("scene.yaml", yaml(YAML["python tag"]), ""),
+    ("scene.yaml", other_kind("scene.yaml", "pipe"), ""),
+    ("scene.yaml", yaml("profile: [laptop]"), ""),
+    ("set", lambda folder: None, "fit.iterations='5"),
+]
+ASKED = [
+    ("scene.yaml", yaml("stages: {fit: {iterations: true}}"), ""),
+    ("scene.yaml", yaml(YAML["region flat"]), ""),
+    ("transforms.json", key("fl_x", "640"), ""),
+    ("transforms.json", cut("transforms.json", 100), ""),
+    ("v01", file("images/v01.png", png(60_000, 60_000)), ""),
+    ("v01", other_kind("images/v01.png", "pipe"), ""),
+    ("g.ply", both(gaussians, half), ""),
+    ("v00", yaml(YAML["reference of a test view"]), ""),
+]
+THROUGH_THE_COMMAND = [*QUICK, *(ASKED if SLOW else ASKED[:1])]
+
+
+@pytest.mark.parametrize(("names", "change", "set_"), THROUGH_THE_COMMAND)
+def test_the_command_says_one_line_and_ends_with_2(captures, tmp_path, names, change, set_):
+    folder, runs = tmp_path / "s", tmp_path / "runs"
+    shutil.copytree(captures / "transforms", folder)
+    (runs / "s" / "poses").mkdir(parents=True)
+    (runs / "s" / "poses" / "kept.txt").write_text("earlier")
+    change(folder)
+    command = [sys.executable, "-m", "runner", "run", "poses", "--profile", "laptop", "--scene", str(folder)]
+    ended = subprocess.run(
+        [*command, "--runs", str(runs), "--set", set_], cwd=ROOT, capture_output=True, text=True, timeout=60
+    )
+    errors = [line for line in ended.stderr.splitlines() if line.startswith("error: ")]
+    assert ended.returncode == 2 and len(errors) == 1 and names in errors[0], ended.stderr
+    assert "Traceback" not in ended.stdout + ended.stderr
+    assert (runs / "s" / "poses" / "kept.txt").read_text() == "earlier"

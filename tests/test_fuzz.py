@@ -1,0 +1,315 @@
+"""Every reader of what people hand over, on spoilt files: only our own errors come out.
+
+`REFFUSION_SLOW=1` spends `REFFUSION_FUZZ_SECONDS` (600) on each reader; `python -m tests.test_fuzz` likewise, without
+pytest. What was found once stays in `FOUND`.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import struct
+import tempfile
+import time
+import warnings
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from reffusion.capture.given import load_depth
+from reffusion.capture.load import load_capture
+from reffusion.io.arrays import load_array, load_json
+from reffusion.io.colmap import ModelCamera, ModelImage, load_cameras, load_images, load_model_points, save_model
+from reffusion.io.files import BadInput
+from reffusion.io.images import image_size, load_exr, load_image, load_mask, save_exr
+from reffusion.io.ply import check_gaussians, load_ply, load_points, save_ply, save_points
+from reffusion.types import Gaussians
+from runner import Refused
+from runner.handed import read_handed
+
+SLOW = os.environ.get("REFFUSION_SLOW") == "1"
+SECONDS = float(os.environ.get("REFFUSION_FUZZ_SECONDS", "600"))
+QUICK = 40  # files a reader in an ordinary run
+LONGEST = 10.0  # seconds that a file may take
+
+
+@dataclass(frozen=True)
+class Reader:
+    """What reads a file of that name, and good files to spoil."""
+
+    name: str
+    read: Callable[[Path], object]
+    seeds: tuple[bytes, ...]
+
+
+# ---------------------------------------------------------------------------------------------- good files
+
+
+def _files() -> dict[str, bytes]:
+    """File name -> content, of every kind."""
+    import torch
+
+    draw = np.random.default_rng(0)
+    picture = draw.integers(0, 256, (9, 12, 3), np.uint8)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        cameras = {1: ModelCamera("OPENCV", 12, 9, (9.0, 9.0, 6.0, 4.5, 0.1, 0.0, 0.0, 0.0))}
+        pose = np.eye(4)
+        images = {k: ModelImage(f"v{k}.png", 1, pose) for k in (1, 2, 3)}
+        save_model(folder, cameras, images, draw.normal(size=(3, 3)), np.zeros((3, 3), np.uint8))
+        for mode, kind in (("RGB", "png"), ("RGB", "jpg"), ("L", "bmp"), ("RGB", "webp"), ("RGB", "tif"), ("P", "gif")):
+            Image.fromarray(picture).convert(mode).save(folder / f"p.{kind}")
+        Image.fromarray(picture[..., 0] > 127).save(folder / "bit.png")
+        Image.fromarray(picture[..., 0].astype(np.uint16) * 99).save(folder / "deep.png")
+        Image.fromarray(np.dstack([picture, picture[..., :1]])).save(folder / "alpha.png")
+        save_exr(folder / "d.exr", picture[..., 0] / 7)
+        np.save(folder / "d.npy", picture[..., 0] / 7)
+        np.save(folder / "poses_bounds.npy", np.arange(51.0).reshape(3, 17) + 1)
+        save_points(folder / "points.ply", draw.normal(size=(3, 3)), np.zeros((3, 3), np.uint8))
+        some = lambda *shape: torch.from_numpy(draw.normal(size=shape).astype(np.float32))
+        save_ply(folder / "g.ply", Gaussians(some(3, 3), some(3, 4), some(3, 3), some(3), some(3, 4, 3)))
+        return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
+CAMERAS_TXT = b"# ids\n1 SIMPLE_PINHOLE 12 9 9.5 6 4.5\n2 OPENCV 12 9 9 9 6 4.5 0.1 0 0 0\n"
+IMAGES_TXT = b"""# ids
+1 1 0 0 0 0.5 0 -1 1 v1.png
+1 2 -1 3 4 5
+2 0.9 0.1 0 0 0 0 0 1 sub/v2.png
+
+3 1 0 0 0 0 0 1 1 v3.png
+
+"""
+POINTS_TXT = b"# ids\n1 0.5 1 2 255 0 9 0.3 1 0 2 1\n2 -1 1e3 0 1 2 3 0.1\n"
+TRANSFORMS = json.dumps(
+    {
+        "w": 12,
+        "h": 9,
+        "fl_x": 9.5,
+        "k1": 0.1,
+        "camera_model": "OPENCV",
+        "ply_file_path": "points.ply",
+        "frames": [
+            {"file_path": f"images/v{k}.png", "transform_matrix": np.eye(4).tolist(), "fl_x": 9} for k in (1, 2, 3)
+        ],
+    }
+).encode()
+SCENE = b"""layout: transforms
+train: [v1, 20220819_104425, 2022-08-19]
+test: every 8
+reference:
+  - {view: v1, image: "r.png", undistorted: off}
+  - &other {view: 'v2', image: r2.png, depth: ~}
+region: {center: [0, .5, -1e3], size: [1, 1, 1]}
+profile: laptop
+budget: 5m
+stages:
+  fit: {iterations: 500, densify: {cap_max: 3_000, stop: .5}}
+  poses: &p {longest: 0x10, refine: yes}
+"""
+
+
+def _capture(name: str, others: dict[str, bytes]) -> Callable[[Path], object]:
+    """Reads the folder of a file as a capture, pictures and other files beside it."""
+
+    def read(path: Path) -> object:
+        folder = path.parent
+        (folder / "images").mkdir(exist_ok=True)
+        for k in (1, 2, 3):
+            (folder / "images" / f"v{k}.png").write_bytes(others["p.png"])
+        return load_capture(folder, name)
+
+    return read
+
+
+def _ascii(data: bytes) -> bytes:
+    from plyfile import PlyData
+
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / "g.ply"
+        path.write_bytes(data)
+        read = PlyData.read(str(path), mmap=False)
+        read.text = True
+        read.write(str(path))
+        return path.read_bytes()
+
+
+def readers() -> list[Reader]:
+    made = _files()
+    of = lambda *names: tuple(made[name] for name in names)
+    pictures = of("p.png", "p.jpg", "p.bmp", "p.webp", "p.tif", "p.gif", "alpha.png", "bit.png")
+
+    def any_ply(path: Path) -> None:
+        for read in (check_gaussians, load_points, load_ply):
+            _tried(read, path)
+
+    def any_picture(path: Path) -> None:
+        for read in (image_size, load_image, load_mask, lambda p: image_size(p, True), lambda p: load_image(p, True)):
+            _tried(read, path)
+
+    return [
+        Reader("cameras.bin", load_cameras, of("cameras.bin")),
+        Reader("images.bin", load_images, of("images.bin")),
+        Reader("points3D.bin", load_model_points, of("points3D.bin")),
+        Reader("cameras.txt", load_cameras, (CAMERAS_TXT,)),
+        Reader("images.txt", load_images, (IMAGES_TXT,)),
+        Reader("points3D.txt", load_model_points, (POINTS_TXT,)),
+        Reader("transforms.json", _capture("transforms", made), (TRANSFORMS,)),
+        Reader("poses_bounds.npy", _capture("llff", made), of("poses_bounds.npy")),
+        Reader("scene.yaml", lambda path: read_handed(path, ("stages",)), (SCENE,)),
+        Reader("g.ply", any_ply, (*of("g.ply", "points.ply"), _ascii(made["g.ply"]), _ascii(made["points.ply"]))),
+        Reader("p.png", any_picture, pictures),
+        Reader("d.exr", load_depth, of("d.exr")),
+        Reader("d.npy", load_depth, of("d.npy")),
+        Reader("d.png", load_depth, of("deep.png", "p.tif", "p.png")),
+        Reader("array.npy", load_array, of("d.npy", "poses_bounds.npy")),
+        Reader("any.json", load_json, (TRANSFORMS,)),
+        Reader("any.exr", load_exr, (*of("d.exr"), *pictures)),
+    ]
+
+
+# ---------------------------------------------------------------------------------------------- spoiling
+
+NUMBERS = [struct.pack(f"<{kind}", value) for kind, value in (
+    ("B", 0), ("B", 255), ("H", 65535), ("I", 2**31), ("I", 2**32 - 1), ("Q", 2**63), ("Q", 2**64 - 1), ("Q", 10**9),
+    ("d", float("nan")), ("d", float("inf")), ("d", 1e308), ("d", -1.0), ("d", 0.0), ("f", float("nan")), ("f", 3e38),
+)]  # fmt: skip
+WORDS = [word.encode() for word in (
+    "nan", "-1", "0", "1e999", "99999999999999999999", "true", "null", "~", "[]", "{}", "[[[[", "}", "\n", "\n\n", " ",
+    "#",
+    '"', "'", "&a", "*a", "<<: *p", "!!set ", "!!python/name:os.system", "? ", "- ", ": ", "é", "ÿþ", "\0",
+    "element x 5",
+    "property list uchar int x", "end_header", "..", "/", "2022-08-19", "1:30", "0o7", "PINHOLE", "\\u0000", "NaN",
+)]  # fmt: skip
+
+
+@st.composite
+def spoilt(draw: st.DrawFn, seeds: tuple[bytes, ...]) -> bytes:
+    """A good file with some changes: cut, bytes and numbers and words put in or over, pieces doubled or taken out."""
+    data = bytearray(draw(st.sampled_from(seeds)))
+    for _ in range(draw(st.integers(1, 6))):
+        at = draw(st.integers(0, max(len(data), 1)))
+        length = draw(st.integers(0, 24))
+        kind = draw(st.sampled_from(("cut", "over", "word", "number", "bytes", "out", "double", "flip", "long")))
+        if kind == "cut":
+            del data[at:]
+        elif kind == "over":
+            put = draw(st.sampled_from(NUMBERS))
+            data[at : at + len(put)] = put
+        elif kind == "word":
+            data[at : at + length] = draw(st.sampled_from(WORDS))
+        elif kind == "number":
+            data[at:at] = draw(st.sampled_from(NUMBERS))
+        elif kind == "bytes":
+            data[at : at + length] = draw(st.binary(max_size=24))
+        elif kind == "out":
+            del data[at : at + length]
+        elif kind == "double":
+            data[at:at] = data[at : at + length] * draw(st.integers(1, 4))
+        elif kind == "long":
+            data[at:at] = draw(st.sampled_from((b"[", b"9", b"a", b"\0", b" ", b"{a: "))) * 2000
+        elif at < len(data):
+            data[at] ^= 1 << draw(st.integers(0, 7))
+    data = bytes(data)
+    return repaired(data) if draw(st.booleans()) else data
+
+
+def repaired(data: bytes) -> bytes:
+    """A PNG with its checksums made right again, so that what lies behind them is reached."""
+    if not data.startswith(b"\x89PNG\r\n\x1a\n"):
+        return data
+    out, at = bytearray(data[:8]), 8
+    while at + 12 <= len(data):
+        length = int.from_bytes(data[at : at + 4], "big")
+        chunk = data[at + 4 : at + 8 + length]
+        if len(chunk) < length + 4:
+            break
+        out += data[at : at + 4] + chunk + struct.pack(">I", zlib.crc32(chunk))
+        at += 12 + length
+    return bytes(out) + data[at:]
+
+
+def _tried(read: Callable[[Path], object], path: Path) -> None:
+    began = time.monotonic()
+    try:
+        read(path)
+    except (BadInput, Refused) as error:
+        said = str(error)
+        assert "\n" not in said and len(said) < 1500, said
+        assert path.parent.name in said or path.name in said or "scene.yaml" in said, said
+    assert time.monotonic() - began < LONGEST, "too long"
+
+
+def tried(reader: Reader, data: bytes) -> None:
+    """Only our own errors come out, of one line, that name the file."""
+    with tempfile.TemporaryDirectory() as name, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        path = Path(name) / reader.name
+        path.write_bytes(data)
+        _tried(reader.read, path)
+
+
+def fuzz(reader: Reader, files: int | None, seconds: float = 0.0) -> int:
+    """Try so many files, always the same; or ever new ones for so many seconds. How many were tried."""
+    count = 0
+
+    def one(data: bytes) -> None:
+        nonlocal count
+        count += 1
+        tried(reader, data)
+
+    began, most = time.monotonic(), files or 500
+    while True:
+        chosen = settings(
+            max_examples=most,
+            deadline=None,
+            database=None,
+            derandomize=files is not None,
+            phases=(Phase.generate,) if files else (Phase.generate, Phase.shrink),
+            suppress_health_check=list(HealthCheck),
+        )
+        chosen(given(spoilt(reader.seeds))(one))()
+        if time.monotonic() - began >= seconds:
+            return count
+
+
+READERS = {reader.name: reader for reader in readers()}
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_good_files_are_read(name):
+    for seed in READERS[name].seeds:
+        tried(READERS[name], seed)
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_spoilt_files(name):
+    fuzz(READERS[name], QUICK)
+
+
+@pytest.mark.skipif(not SLOW, reason="minutes a reader; set REFFUSION_SLOW=1")
+@pytest.mark.parametrize("name", READERS)
+def test_spoilt_files_for_long(name):
+    fuzz(READERS[name], None, SECONDS)
+
+
+# Reader -> files that once came through as another error, base64.
+FOUND: dict[str, tuple[str, ...]] = {}
+
+
+@pytest.mark.parametrize(("name", "data"), [(name, data) for name, each in FOUND.items() for data in each])
+def test_what_was_found_once(name, data):
+    tried(READERS[name], base64.b64decode(data))
+
+
+if __name__ == "__main__":
+    for each in READERS.values():
+        print(f"{each.name}: {fuzz(each, None, SECONDS)} files", flush=True)

@@ -1,0 +1,82 @@
+"""What is odd about a capture is said in plain words, and what is not odd is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import small_scene
+
+from reffusion.capture.odd import oddities
+from reffusion.io.arrays import save_json
+from reffusion.io.images import image_size
+from reffusion.io.scene import load_raw_masks, load_scene, load_views
+from report import check
+
+
+@pytest.fixture(scope="module")
+def brought(tmp_path_factory):
+    """Scene, masks and pictures of a wall with a square before it; the wall's texture is fine enough to tell places."""
+    folder = tmp_path_factory.mktemp("odd")
+    poses, _, _ = small_scene.write(folder, 1.5)
+    scene = load_scene(poses)
+    return scene, load_raw_masks(poses, scene.train), load_views(poses, scene.cameras)
+
+
+def said(scene, masks, pictures) -> str:
+    return "; ".join(oddities(scene, masks, pictures.__getitem__))
+
+
+def test_nothing_is_odd_about_a_good_capture(brought):
+    scene, masks, pictures = brought
+    assert said(scene, masks, pictures) == ""
+    assert said(replace(scene, points=scene.points[:3]), {}, pictures) == ""
+
+
+def test_inverted_masks(brought):
+    scene, masks, pictures = brought
+    assert "the masks cover 9" in said(scene, {name: ~mask for name, mask in masks.items()}, pictures)
+    one = said(scene, masks | {"a1": ~masks["a1"]}, pictures)
+    assert "the mask of a1 covers more than 50%" in one and "inverted?" in one
+
+
+def test_masks_that_disagree_in_3d(brought):
+    scene, masks, pictures = brought
+    elsewhere = np.roll(masks["a3"], 40, 0)
+    assert said(scene, masks | {"a3": elsewhere}, pictures) == (
+        "the mask of a3 shows something else than those of the other views do"
+    )
+    far = {name: np.roll(mask, 17 * k, 0) for k, (name, mask) in enumerate(masks.items())}
+    assert "masks do not agree in 3D" in said(scene, far, pictures)
+    assert said(replace(scene, clean=frozenset({"a3"})), masks | {"a3": elsewhere}, pictures) == ""
+
+
+def test_exposure_that_jumps(brought):
+    scene, masks, pictures = brought
+    dark = (pictures["a2"] * 0.4).astype(np.uint8)
+    assert "exposed otherwise than the rest (a2; a2 is 0.4" in said(scene, masks, pictures | {"a2": dark})
+
+
+def test_poses_that_the_photographs_contradict(brought):
+    scene, _, pictures = brought
+    noise = np.random.default_rng(0)
+    blocks = {n: np.kron(noise.integers(0, 256, (9, 12, 3)), np.ones((8, 8, 1))).astype(np.uint8) for n in pictures}
+    assert "the photograph a2 contradicts its pose" in said(scene, {}, pictures | {"a2": blocks["a2"]})
+    assert "photographs contradict their poses" in said(scene, {}, blocks)
+
+
+def test_the_sheet_shows_every_mask_over_its_photograph(tmp_path, brought):
+    _, masks, _ = brought
+    poses, _, _ = small_scene.write(tmp_path / "wall", 1.5)
+    save_json(poses / "warnings.json", ["the mask of a3 is odd"])
+    path, lines = check.make(tmp_path / "wall")
+    assert lines == ["the mask of a3 is odd"] and image_size(path)[0] > 3 * check.WIDTH
+    shown = check.tinted(poses, "a3")
+    assert shown.shape[:2] == (180, 240)
+    assert (np.abs(shown.astype(int) - check.TINT).sum(-1) < 300).mean() > 0.5 * masks["a3"].mean()
+
+
+def test_the_sheet_needs_the_stage_poses(tmp_path):
+    with pytest.raises(ValueError, match=r"run `make scene=x poses` first"):
+        check.make(tmp_path / "x")
