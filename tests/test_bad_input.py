@@ -67,7 +67,10 @@ def told(folder: Path, out: Path, set_: str = "") -> str | None:
         asked = {"stage": stage, "params": layers.values[stage], "takes": spec.takes}
         if "scene" in spec.takes and stage == "poses":
             asked |= {"scene": str(folder), "needs": {"scene": str(folder)}}
-        answer = child._describe(asked)
+        try:
+            answer = child._describe(asked)
+        except Refused as error:
+            return str(error)
         assert "broken" not in answer, answer
         for error in answer.get("errors", ()):
             origin = layers.origin(stage, error["where"])
