@@ -18,6 +18,7 @@ from reffusion.io.images import load_exr
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets, save_references
 from reffusion.splat import rasterizer
+from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Reference
 from stages import initialize, masks
 
@@ -217,6 +218,20 @@ def test_the_reference_is_reproduced_by_matched_colors():
     assert error(matched) < 0.5 * error(new)
     kept = rules.match_colors(new, ~labels, picture, everything, view, 5)
     assert torch.equal(kept.sh, new.sh)
+
+
+def test_a_hidden_gaussian_does_not_become_a_speck_of_another_colour():
+    """Behind a red sheet it cannot show the picture; from elsewhere it would be seen as what it had been made."""
+    view = small.camera("v", 0.0)
+    picture = np.random.default_rng(0).integers(110, 140, (small.HEIGHT, small.WIDTH, 3)).astype(np.uint8)
+    far, everything = np.full((small.HEIGHT, small.WIDTH), small.WALL), np.ones((small.HEIGHT, small.WIDTH), bool)
+    red = np.zeros_like(picture) + np.uint8([255, 0, 0])
+    before = surface_gaussians(red, 0.9 * far, everything, view, sh_count=1, spread=0.4)
+    new = surface_gaussians(picture, far, everything, view, sh_count=1, spread=0.4)
+    both = before.zipped(new, lambda a, b: torch.cat([a, b]))
+    labels = torch.arange(len(both)) >= len(before)
+    colors = 0.5 + SH0 * rules.match_colors(both, labels, picture, everything, view, 5).sh[labels, 0]
+    assert colors.min() > 110 / 255 - 0.11 and colors.max() < 140 / 255 + 0.11
 
 
 def test_settling_moves_the_gaussians_and_leaves_no_checkpoint(scene, tmp_path):

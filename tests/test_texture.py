@@ -184,6 +184,7 @@ def test_the_misfit_is_the_mean_square_by_weight():
     row, column, angle = 100.0, 40.0, 0.2
     of = Compared(pixels, pictures, now, weight)
     found = search.misfit(0, True, 1, row, column, np.float32(angle), NONE, of)
+    assert search.misfit(0, False, 1, row, column, np.float32(0), NONE, of) == NONE, "along a plane nothing is shifted"
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     matrix = pictures.to_pixels[1, 100, 40].reshape(2, 2) @ turn @ target.to_plane[70, 62]
     steps = np.arange(-PATCH, PATCH + 1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import torch
 
@@ -22,6 +23,7 @@ from reffusion.splat.conventions import SH0
 from reffusion.texture.surfaces import Around
 from reffusion.types import Camera, Gaussians, Reference
 
+AROUND, BEYOND = 2, 0.1  # px around, and how far beyond the colours there, in [0, 1], a Gaussian's may lie
 SWEPT = 0.1  # of the image's width: how far around a hole depth is found by comparing photographs
 
 
@@ -242,6 +244,17 @@ def placed(
     return together, torch.cat([new, fresh[len(new) :]])
 
 
+def _range_around(gaussians: Gaussians, image: np.ndarray, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
+    """[N, 3] twice: between which constant colours may lie, that of the picture around each Gaussian and a bit more."""
+    window = np.ones((2 * AROUND + 1,) * 2, np.uint8)
+    uv, _ = geometry.project(gaussians.means.double().numpy(), camera)
+    bounds = []
+    for of, beyond in ((cv2.erode, -BEYOND), (cv2.dilate, BEYOND)):
+        told, _ = geometry.sample_nearest(of(image, window), uv)
+        bounds.append(torch.from_numpy((told / 255 + beyond).clip(0, 1) - 0.5).to(gaussians.sh.dtype) / SH0)
+    return bounds[0], bounds[1]
+
+
 @torch.no_grad()
 def match_colors(
     gaussians: Gaussians, labels: torch.Tensor, image: np.ndarray, pixels: np.ndarray, camera: Camera, steps: int
@@ -249,19 +262,21 @@ def match_colors(
     """The labelled Gaussians' constant colours, corrected until the view shows `image` on `pixels`.
 
     Each step gives a Gaussian the mean residual of the pixels it is blended into, by weight: this undoes the blur that
-    the footprints lay over the picture.
+    the footprints lay over the picture. One that is hidden by others cannot show the picture whatever its colour: what
+    is around in the picture bounds it, or it would stand out as a speck from elsewhere.
 
     Args:
         image: [H, W, 3] uint8; pixels: bool [H, W]; labels: bool [N]; steps: corrections.
     """
     target = torch.from_numpy(image).float() / 255
     chosen = torch.from_numpy(pixels)[..., None].float()
+    low, high = _range_around(gaussians, image, camera)
     for _ in range(steps):
         residual = (target - rasterizer.render(gaussians, camera).color) * chosen
         gathered = rasterizer.accumulate(gaussians, camera, torch.cat([residual, chosen], -1))
         seen = labels & (gathered[:, 3] > 1e-3)
         sh = gaussians.sh.clone()
         sh[seen, 0] += gathered[seen, :3] / gathered[seen, 3:] / SH0
-        sh[seen, 0] = sh[seen, 0].clamp(-0.5 / SH0, 0.5 / SH0)
+        sh[seen, 0] = sh[seen, 0].clamp(low[seen], high[seen])
         gaussians = replace(gaussians, sh=sh)
     return gaussians

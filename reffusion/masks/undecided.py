@@ -26,7 +26,9 @@ from reffusion.types import Camera, Gaussians
 BEFORE = 0.97  # of the depth shown: a continuation must be nearer than that to hide it
 BESIDE = 0.03  # of the image's width: how far around a plane's patch it is compared with what is shown
 ROUGHEST = 0.06  # of the depth: a wider range around a pixel is no rough surface, but a depth edge
+TRUSTED = 0.25  # share of the views that look its way in which a surface must be seen, not stand behind another
 AGREES = 0.5  # share of these pixels that must lie on the plane
+GRAVEL, MOSTLY = 1.1, 0.75  # farthest over nearest depth, and share of these pixels, from which the ground is rough
 
 
 @dataclass(frozen=True)
@@ -52,16 +54,14 @@ def behind(
     hidden: np.ndarray,
     views: Sequence[Witness],
     planes: Sequence[Plane],
-    *,
-    witnesses: int = 1,
 ) -> Behind:
-    """A pixel of C is decided if its ray meets no continuation of a surface before one that another view shows,
-    unmasked, at that depth and from the same side.
+    """A pixel of C is decided if its ray meets no continuation of a surface before one that other views show,
+    unmasked, at that depth and from the same side: a quarter of those in which it or something before it is seen. What
+    lies beneath a surface in nearly all of them is what the fit left there.
 
     Args:
         remaining: the M Gaussians without the object.
         hidden: bool [H, W], C of that view.
-        witnesses: views that must show the point; 0: the rest alone decides.
     """
     drawn = rasterizer.render(remaining, camera, sh_degree=0)
     depth, alpha = (t.double().cpu().numpy() for t in (drawn.depth, drawn.alpha))
@@ -69,7 +69,8 @@ def behind(
     undecided = hidden.copy()
     if len(rows):
         points, normals = (each[rows, columns] for each in smoothed_surface(depth, camera))
-        undecided[rows, columns] = votes(points, views, normals).seen < witnesses
+        said = votes(points, views, normals)
+        undecided[rows, columns] = said.seen < np.maximum(1, TRUSTED * (said.seen + said.behind))
     depth = with_photographed_depth(depth, camera, views)
     hides, reach = np.zeros_like(hidden), np.full(hidden.shape, np.inf)
     for plane in planes:
@@ -98,5 +99,8 @@ def _grows_out_of(
     if not beside.any():
         return False
     nearest, farthest = surface_range(depth)
-    lies = (at > nearest * (1 - SURFACE)) & (at < farthest * (1 + SURFACE)) & (np.abs(at - depth) < ROUGHEST * depth)
-    return float(lies[beside].mean()) > AGREES
+    within = (at > nearest * (1 - SURFACE)) & (at < farthest * (1 + SURFACE))
+    lies = np.abs(at - depth) < ROUGHEST * depth
+    if (farthest > nearest * GRAVEL)[beside].mean() > MOSTLY:  # on rough ground one view may be wrong: others tell
+        lies |= plane.on(plane.seen, at, camera, beside)
+    return float((within & lies)[beside].mean()) > AGREES

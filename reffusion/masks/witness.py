@@ -100,11 +100,13 @@ class Votes:
     Attributes:
         seen: [P], views that show a surface there. With normals: a surface that faces them.
         free: [P], views that look past the point onto something farther.
+        behind: [P], views in which something stands before the point.
         hidden: [P], views that see the object in the point's direction.
     """
 
     seen: np.ndarray
     free: np.ndarray
+    behind: np.ndarray
     hidden: np.ndarray
 
 
@@ -117,19 +119,21 @@ def votes(points: np.ndarray, views: Sequence[Witness], normals: np.ndarray | No
         normals: [P, 3], of the surface that the points lie on, towards the side asked about; a view from the other
             side does not count, so that the underside of a table is no witness of its top.
     """
-    seen, free, hidden = np.zeros((3, len(points)), np.int64)
+    seen, free, behind, hidden = np.zeros((4, len(points)), np.int64)
     for view in views:
         uv, z = geometry.project(points, view.camera)
         masked, inside = geometry.sample_nearest(view.hidden, uv)
         nearest, _ = geometry.sample_nearest(view.nearest, uv)
+        farthest, _ = geometry.sample_nearest(view.farthest, uv)
         shown = inside & ~masked & (z > 0) & (nearest > 0)
         on = seen_by(view, points)
         if normals is not None:
             on &= ((view.camera.center - points) * normals).sum(-1) > 0
         seen += on
         free += shown & (nearest > z * (1 + FREE))
+        behind += shown & (z > farthest * (1 + SURFACE))
         hidden += inside & masked & (z > 0)
-    return Votes(seen, free, hidden)
+    return Votes(seen, free, behind, hidden)
 
 
 def seen_by(view: Witness, points: np.ndarray) -> np.ndarray:

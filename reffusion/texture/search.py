@@ -49,6 +49,8 @@ def misfit(n, planar, picture, y, x, angle, limit, of):
     surface = pictures.surface[picture, row, column]
     if surface < 0 or (planar and surface != hole.surface[n]):
         return NONE
+    if hole.planar[n] and not planar and surface == hole.surface[n]:  # shifted, planks seen at a slant are stripes
+        return NONE
     ok, xx, xy, yx, yy = carried(hole, n, pictures, planar, picture, row, column, angle)
     if not ok:
         return NONE
