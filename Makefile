@@ -48,7 +48,7 @@ help:
 	@echo 'make weights [profile=paper]   fetch what a profile needs, sizes first; offline=1 only says what is missing'
 	@echo 'make gpu-check                 values, time and memory at the paper'"'"'s sizes on a CUDA machine (8 minutes)'
 	@echo 'make prior-report              measure it, and draw what it paints (minutes): runs/prior-report'
-	@echo 'make setup | test | lint       .venv; the tests, slow=1 those that take minutes too; ruff and mypy'
+	@echo 'make setup | test | lint       .venv; the tests, slow=1 those that take minutes too (make fuzz: hours); ruff and mypy'
 	@echo 'make bench                     work-precision diagrams of the kernels: runs/bench; gate=1: against the baselines'
 	@echo 'make stability                 stiff and extreme cases, each with its bound (minutes): runs/stability.json'
 	@echo 'scene=  a name under data/, or the path of any folder'

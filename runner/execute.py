@@ -201,16 +201,16 @@ def weights(request: Request, offline: bool) -> int:
     to_fetch = [need for need in missing if need["fetched"]]
     print(f"weights of profile {job.profile} ({job.why})")
     for name, need in needs.items():
-        state = "here" if not need["problem"] else "to fetch" if need["fetched"] else "broken"
-        print(f"  {state:<9} {amount(need['bytes']):>12}  {name}  ({users[name]})")
+        state = "here" if not need["problem"] else "to fetch" if need["fetched"] else "not usable"
+        print(f"  {state:<10} {amount(need['bytes']):>12}  {name}  ({users[name]})")
     for need in missing:
         if not need["fetched"]:
             print(f"error: {need['problem']}", file=sys.stderr)
     unsized = " and what has no known size" if any(need["bytes"] is None for need in to_fetch) else ""
     print(f"to fetch: about {amount(sum(need['bytes'] or 0 for need in to_fetch))}{unsized}", flush=True)
-    broken = len(missing) - len(to_fetch)
+    unusable = len(missing) - len(to_fetch)
     if offline or not to_fetch:
-        return broken + sum(not need["optional"] for need in to_fetch)
+        return unusable + sum(not need["optional"] for need in to_fetch)
     process = child(request.root, "fetch")
     process.communicate(json.dumps({stage: job.question(stage) for stage in job.stages}))
-    return broken + process.returncode
+    return unusable + process.returncode
