@@ -24,11 +24,12 @@ from reffusion.io.images import load_image, load_mask, save_exr, save_image, sav
 from reffusion.io.scene import load_references, load_scene, save_mask_sets
 from reffusion.paint import painting, registration
 from reffusion.types import MaskSet
-from runner.execute import clean, run_scene
+from runner.execute import run_scene
 from runner.keys import Hashes, code_of
 from runner.plan import plan
 from runner.resolve import Request
 from runner.resolve import resolve as prepare_job
+from runner.upkeep import clean
 from stages import poses, reference
 from stages.plan import poses as plan_poses
 from stages.plan import reference as plan_reference
