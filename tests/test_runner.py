@@ -679,7 +679,7 @@ def test_weights_that_are_missing_are_told_before_any_work_and_fetched(fresh, ca
     asked = request(fresh, scene="")
     assert weights(asked, offline=True) == 1
     shown = capsys.readouterr().out
-    assert "to fetch        2.6 GB  acme/net  (distill)" in shown and "5 kB  metric.pth" in shown
+    assert "to fetch         2.6 GB  acme/net  (distill)" in shown and "5 kB  metric.pth" in shown
     (fresh / "unreachable").touch()
     assert weights(asked, offline=False) == 2
     (fresh / "unreachable").unlink()

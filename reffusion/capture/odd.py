@@ -23,9 +23,7 @@ BRIGHTER = 1.5  # times as bright as the others
 POINTS = 5000  # at most, at which photographs are compared
 LEAST_SEEN = 50  # points in a view for anything to be said of it
 LEAST_CONTRAST = 6.0  # levels of 255, deviation over a view's points
-ALIKE = (
-    0.25  # correlation of a view's brightness with the others' at the same points; 0.8 to 0.99 where poses are right
-)
+ALIKE = 0.25  # correlation of a view's fine detail with the others' at the same points, under which its pose is wrong
 
 
 def oddities(scene: Scene, masks: Mapping[str, np.ndarray], image_of: Callable[[str], np.ndarray]) -> list[str]:
