@@ -5,7 +5,6 @@ Writes runs/<scene>/check.png, every mask over its photograph, and prints what i
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from reffusion.io.arrays import load_json
 from reffusion.io.images import load_image, load_mask, resize_nearest, resized, save_image
-from report import sheet
+from report import command, sheet
 
 WIDTH, HEIGHT, GAP = 240, 180, 4  # px of the room for a picture, and between them
 COLUMNS = 6
@@ -67,14 +66,9 @@ def arranged(cells: list[tuple[str, np.ndarray, str]]) -> np.ndarray:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="reffusion check", description=__doc__.split("\n")[0])
-    parser.add_argument("--scene", type=Path, required=True, help="its name, or the path of its folder")
-    parser.add_argument("--variant", default="", help="of the scene")
-    parser.add_argument("--runs", type=Path, default=Path("runs"))
-    arguments = parser.parse_args()
-    name = arguments.scene.resolve().name
+    arguments = command.parser("check", __doc__).parse_args()
     try:
-        path, said = make(arguments.runs / (f"{name}@{arguments.variant}" if arguments.variant else name))
+        path, said = make(command.home(arguments))
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
     for line in said:

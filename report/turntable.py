@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import cv2
@@ -12,7 +11,7 @@ from reffusion.io.images import to_uint8
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_scene
 from reffusion.splat import rasterizer
-from report import flight
+from report import command, flight
 
 FRAMES, RATE = 144, 24  # six seconds
 # In a .webm: what browsers play and OpenCV's wheels write, with a complaint about the tag that means nothing.
@@ -46,14 +45,9 @@ def make(home: Path, frames: int = FRAMES) -> Path:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="reffusion turntable", description=__doc__.split("\n")[0])
-    parser.add_argument("--scene", type=Path, required=True, help="its name, or the path of its folder")
-    parser.add_argument("--variant", default="", help="of the scene")
-    parser.add_argument("--runs", type=Path, default=Path("runs"))
-    arguments = parser.parse_args()
-    name = arguments.scene.expanduser().resolve().name + (f"@{arguments.variant}" if arguments.variant else "")
+    arguments = command.parser("turntable", __doc__).parse_args()
     try:
-        print(make(arguments.runs / name))
+        print(make(command.home(arguments)))
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
 

@@ -6,7 +6,6 @@ in full. So what one sees is what `evaluate` scores, and the browser needs no gr
 
 from __future__ import annotations
 
-import argparse
 import threading
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +21,7 @@ from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_scene, load_views
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Scene, Similarity
-from report import flight
+from report import command, flight
 from report.sheet import stage_folder
 
 PORT = 8080
@@ -204,15 +203,11 @@ def _quaternion(rotation: np.ndarray) -> np.ndarray:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="reffusion view", description=__doc__.split("\n")[0])
-    parser.add_argument("--scene", type=Path, required=True, help="its name, or the path of its folder")
-    parser.add_argument("--variant", default="", help="of the scene")
-    parser.add_argument("--runs", type=Path, default=Path("runs"))
+    parser = command.parser("view", __doc__)
     parser.add_argument("--port", type=int, default=PORT, help="the next free one is taken where it is not free")
     arguments = parser.parse_args()
-    name = arguments.scene.expanduser().resolve().name + (f"@{arguments.variant}" if arguments.variant else "")
     try:
-        window = Window(arguments.runs / name, arguments.port)
+        window = Window(command.home(arguments), arguments.port)
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
     print(f"http://127.0.0.1:{window.server.get_port()}  (Ctrl-C ends)", flush=True)

@@ -1,6 +1,8 @@
 """Faults of the machine and of hands: kills, full disks, lost and rotten files, locks, quotes. Nothing is lost, and
 what went wrong is told in one line. REFFUSION_SLOW=1: all kills and all sizes of a disk, a few of them otherwise."""
 
+# ruff: noqa: F401, F811 (fixtures are imported, and taken as arguments)
+
 from __future__ import annotations
 
 import json
@@ -17,7 +19,7 @@ import numpy as np
 import pytest
 import torch
 from test_installed import write_capture
-from test_runner import FILES, REPO, ran, request, result, start, wait_for, words, write
+from test_runner import FILES, REPO, finished, ran, request, result, root, start, wait_for, words, write
 
 from reffusion import trace
 from runner import Refused, compare, upkeep
@@ -43,21 +45,6 @@ variants: {strong: {fit: {rate: 5}}}
     .replace("poses: Path, fit: Path, masks: Path | None, distill: Path | None", "fit: Path")
     .replace("(distill or fit)", "fit"),
 }
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory) -> Path:
-    root = tmp_path_factory.mktemp("finished")
-    write(root, FILES)
-    run_scene(request(root), "all")
-    return root
-
-
-@pytest.fixture
-def root(finished: Path, tmp_path: Path) -> Path:
-    """A toy project in which everything is done."""
-    shutil.copytree(finished, tmp_path / "project")
-    return tmp_path / "project"
 
 
 @pytest.fixture
