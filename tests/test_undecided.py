@@ -110,6 +110,34 @@ def test_borders_that_are_visible_go_on_under_the_box():
     assert table.within[under & (across > 1.3 * BOX)].mean() < 0.05
 
 
+def beside_a_plinth(view: Camera) -> Witness:
+    """Rough ground with a plinth's face upright behind the box, that ends where the box begins."""
+    rays = geometry.pixel_rays(view) @ view.world_to_camera[:3, :3]
+    ground, face = -view.center[2] / rays[..., 2], (0.5 - view.center[1]) / rays[..., 1]
+    place = view.center + rays * face[..., None]
+    upright = (face > 0) & (place[..., 0] < -BOX) & (place[..., 0] > -1.5) & (place[..., 2] > 0) & (place[..., 2] < 0.7)
+    depth = np.where(upright, face, np.where(ground > 0, ground, 20.0))
+    low, high = np.array([-BOX, -BOX, 0.0]), np.array([BOX, BOX, HIGH])
+    bounds = np.stack([(low - view.center) / rays, (high - view.center) / rays])
+    enter, leave = bounds.min(0).max(-1), bounds.max(0).min(-1)
+    wide = cv2.dilate(((enter < leave) & (leave > 0)).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    return Witness(view, depth, 0.94 * cv2.erode(depth, np.ones((3, 3))), 1.06 * cv2.dilate(depth, np.ones((3, 3))), wide)
+
+
+def test_a_wall_does_not_go_on_along_the_ground_where_it_was_never_seen():
+    """Near their crossing, and beneath it, rough ground looks like the wall's: on both sides of the box."""
+    views = [beside_a_plinth(camera(f"a{k}", 200 + 12 * k, 1.4)) for k in range(12)]
+    planes = planes_around(np.array([0.0, 0.0, HIGH / 2]), 0.45, views)
+    face = max(planes, key=lambda plane: abs(plane.normal[1]))
+    assert abs(face.normal[1]) > 0.99
+    right = face.cells[..., 0] > -0.8 * BOX
+    assert not (face.goes_on & right).any()
+    assert (face.seen & ~right).sum() > 5 * (face.seen & right).sum()
+    ground = max(planes, key=lambda plane: abs(plane.normal[2]))
+    under = (np.abs(ground.cells[..., :2]) < 0.8 * BOX).all(-1)
+    assert ground.goes_on[under].mean() > 0.95
+
+
 def test_what_lies_beneath_the_table_in_all_views_but_one_is_not_what_is_behind_the_box(views):
     """Left there by a fit that is wrong about the ground in one view."""
     camera = views[0].camera

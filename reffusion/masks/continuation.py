@@ -12,7 +12,8 @@ from scipy.sparse.linalg import spsolve
 
 from reffusion import geometry, seeding
 from reffusion.depth.behind import grown
-from reffusion.masks.witness import SURFACE, Witness, votes
+from reffusion.gaussians.surfels import surface_normals
+from reffusion.masks.witness import SURFACE, Witness, seen_by, votes
 from reffusion.paint.margin import hull
 from reffusion.types import Camera
 
@@ -31,6 +32,8 @@ ENOUGH = 200  # pixels that must
 FAR = 0.08  # relative depth: a plane that would move farther anywhere in the hole stays where it is
 STAYS = 0.05  # weight of the plane as it was, within the hole, against what is around
 ACROSS = 0.9  # cosine of the angle between two planes under which they cross
+LIKEWISE = 0.7  # cosine of the angle up to which a surface faces as a plane does
+EVENED = 0.01  # of the image's width: the scale on which a surface's direction is taken
 RIM = 1  # cells on either side: what is seen in a thinner strip is blurred by the masks' margin
 TOUCHING = 0.25  # share of an unknown patch's border that must be seen for the plane to go on into it
 
@@ -71,13 +74,22 @@ class Plane:
         meant (bool [CELLS, CELLS])."""
         asked = asked & np.isfinite(depth)
         rays = geometry.pixel_rays(camera)[asked] @ camera.world_to_camera[:3, :3]
-        place = (camera.center + rays * depth[asked, None] - self.origin) @ self.along.T / self.pitch
-        cells = np.floor(place + CELLS / 2).astype(np.int64)
+        found = np.zeros_like(asked)
+        found[asked] = self.in_cells(cells_meant, camera.center + rays * depth[asked, None])
+        return found
+
+    def in_cells(self, cells_meant: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """bool [P]: points [P, 3] that lie over one of the cells meant (bool [CELLS, CELLS])."""
+        cells = np.floor((points - self.origin) @ self.along.T / self.pitch + CELLS / 2).astype(np.int64)
         inside = ((cells >= 0) & (cells < CELLS)).all(-1)
         row, column = np.where(inside[:, None], cells, 0).T
-        found = np.zeros_like(asked)
-        found[asked] = inside & cells_meant[row, column]
-        return found
+        return inside & cells_meant[row, column]
+
+    @property
+    def cells(self) -> np.ndarray:
+        """[CELLS, CELLS, 3], the middle of each cell in the world."""
+        steps = (np.arange(CELLS) + 0.5 - CELLS / 2) * self.pitch
+        return self.origin + steps[:, None, None] * self.along[0] + steps[None, :, None] * self.along[1]
 
 
 def planes_around(centre: np.ndarray, radius: float, views: Sequence[Witness], seed: int = 0) -> list[Plane]:
@@ -101,8 +113,20 @@ def planes_around(centre: np.ndarray, radius: float, views: Sequence[Witness], s
         free &= np.abs(samples @ normal - height) >= 1.5 * near
     away = [np.linalg.norm(view.camera.center - centre) for view in views]
     band = max(1.5 * near, SURFACE * float(np.median(away))) if found else 0.0
-    crossing = lambda normal: [other for other in found if abs(other[0] @ normal) < ACROSS]
-    return [_mapped(*plane, crossing(plane[0]), band, centre, REACH * radius, views) for plane in found]
+    mapped = [_mapped(*plane, centre, REACH * radius, views) for plane in found]
+    facings = [_facing(view) for view in views] if len(found) > 1 else []
+    whole = []
+    for k, (plane, hidden) in enumerate(mapped):
+        seen = plane.seen
+        if _crossing(plane, [better for better, _ in mapped[:k]]):
+            # What may be the one or the other is the better supported one's, unless it faces as this one does.
+            seen = seen & _faces_so(plane, views, facings)
+        whole.append(_continued(plane, seen, hidden, _crossing(plane, [other for other, _ in mapped]), band))
+    return whole
+
+
+def _crossing(plane: Plane, others: Sequence[Plane]) -> list[Plane]:
+    return [other for other in others if abs(other.normal @ plane.normal) < ACROSS]
 
 
 def aligned(plane: Plane, depth: np.ndarray, camera: Camera, hole: np.ndarray) -> Plane:
@@ -202,46 +226,68 @@ def _between(unknown: np.ndarray, seen: np.ndarray, free: np.ndarray) -> np.ndar
 
 
 def _mapped(
-    normal: np.ndarray,
-    height: float,
-    others: Sequence[tuple[np.ndarray, float]],
-    band: float,
-    centre: np.ndarray,
-    reach: float,
-    views: Sequence[Witness],
-) -> Plane:
-    """The plane with its map: a patch of it that nobody saw, because the object was in the way, and that touches what
-    was seen of it, is where it goes on; where views look through it, it does not.
-
-    Args:
-        others: normals and heights of planes that cross it. band: distance from these up to which a view that seems to
-            show the one may show the other.
-    """
+    normal: np.ndarray, height: float, centre: np.ndarray, reach: float, views: Sequence[Witness]
+) -> tuple[Plane, np.ndarray]:
+    """The plane with a map of where views show it and where they look through it; and bool [CELLS, CELLS], where
+    the object hides it from some."""
     first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
     along = np.stack([first / np.linalg.norm(first), np.cross(normal, first / np.linalg.norm(first))])
     origin, pitch = centre - (centre @ normal - height) * normal, 2 * reach / CELLS
-    steps = (np.arange(CELLS) + 0.5 - CELLS / 2) * pitch
-    points = origin + steps[:, None, None] * along[0] + steps[None, :, None] * along[1]
+    nowhere = np.zeros((CELLS, CELLS), bool)
+    plane = Plane(normal, height, origin, along, pitch, nowhere, nowhere, nowhere, nowhere)
     # On the object's side: a table's underside, seen from below, is not the top under the object.
     facing = normal if centre @ normal > height else -normal
-    said = votes(points.reshape(-1, 3), views, np.broadcast_to(facing, (CELLS * CELLS, 3)))
-    shape = (CELLS, CELLS)
-    seen = ((said.seen >= 1) & (said.seen >= said.free)).reshape(shape)
-    free = ((said.free >= 2) & (said.free > said.seen)).reshape(shape)
-    unknown = ~seen & ~free & (said.hidden > 0).reshape(shape)
+    said = votes(plane.cells.reshape(-1, 3), views, np.broadcast_to(facing, (CELLS * CELLS, 3)))
+    seen = ((said.seen >= 1) & (said.seen >= said.free)).reshape(nowhere.shape)
+    free = ((said.free >= 2) & (said.free > said.seen)).reshape(nowhere.shape)
+    return replace(plane, seen=seen, free=free), (said.hidden > 0).reshape(nowhere.shape)
+
+
+def _continued(plane: Plane, seen: np.ndarray, hidden: np.ndarray, others: Sequence[Plane], band: float) -> Plane:
+    """The plane with where it goes on: a patch of it that nobody saw, because the object was in the way, and that
+    touches what was seen of it, belongs to it up to its border; where views look through it, it is not.
+
+    Args:
+        seen, hidden: bool [CELLS, CELLS], what views show of the plane itself, and where the object hides it.
+        others: planes that cross it.
+        band: distance from these up to which a view that seems to show the one may show the other.
+    """
     # Neither a thin rim nor a crossing tells where the plane goes on to.
-    crossed = np.any([np.abs(points @ other - high) < band for other, high in others], 0) & np.ones(shape, bool)
-    square = np.ones((2 * RIM + 1,) * 2, np.uint8)
-    solid = cv2.morphologyEx((seen & ~crossed).astype(np.uint8), cv2.MORPH_OPEN, square) > 0
+    own = seen.copy()
+    for other in others:
+        own &= np.abs(plane.cells @ other.normal - other.height) >= band
+    solid = cv2.morphologyEx(own.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2 * RIM + 1,) * 2, np.uint8)) > 0
+    unknown = ~plane.seen & ~plane.free & hidden
     patches, count = ndimage.label(unknown)
-    goes_on, ends = np.zeros((2, *shape), bool)
+    goes_on, ends = np.zeros((2, *hidden.shape), bool)
     for patch in range(1, count + 1):
         inside = patches == patch
         border = ndimage.binary_dilation(inside, iterations=2) & ~inside
         if inside.sum() >= 4 and seen[border].mean() > TOUCHING:
-            beyond = _between(inside, solid, free) < 0.5
+            beyond = _between(inside, solid, plane.free) < 0.5
             goes_on |= inside & ~beyond
             ends |= inside & beyond
-    goes_on &= _hull(seen)
-    within = goes_on | (ndimage.binary_fill_holes(seen | goes_on) & ~seen & ~ends & (said.hidden > 0).reshape(shape))
-    return Plane(normal, height, origin, along, pitch, goes_on, within, free, seen)
+    goes_on &= _hull(solid)
+    within = goes_on | (ndimage.binary_fill_holes(seen | goes_on) & ~plane.seen & ~ends & hidden)
+    return replace(plane, seen=seen, goes_on=goes_on, within=within)
+
+
+def _faces_so(plane: Plane, views: Sequence[Witness], facings: Sequence[np.ndarray]) -> np.ndarray:
+    """bool [CELLS, CELLS]: of the views that show a surface at a cell, most show one that faces as the plane does."""
+    points = plane.cells.reshape(-1, 3)
+    likewise, shown = np.zeros((2, len(points)), np.int64)
+    for view, facing in zip(views, facings, strict=True):
+        on = seen_by(view, points)
+        there, _ = geometry.sample_nearest(facing, geometry.project(points, view.camera)[0])
+        shown += on
+        likewise += on & (np.abs(there @ plane.normal) > LIKEWISE)
+    return (2 * likewise > shown).reshape(plane.seen.shape)
+
+
+def _facing(view: Witness) -> np.ndarray:
+    """[H, W, 3] unit normals of what a view shows, evened out over rough ground."""
+    sigma = EVENED * view.depth.shape[1]
+    told = (view.depth > 0) & ~view.hidden
+    known = ndimage.gaussian_filter(told.astype(np.float64), sigma)
+    even = ndimage.gaussian_filter(np.where(told, geometry.reciprocal(view.depth.astype(np.float64)), 0), sigma)
+    return surface_normals(geometry.reciprocal(even / np.maximum(known, 1e-9)), view.camera)
