@@ -117,11 +117,10 @@ def planes_around(centre: np.ndarray, radius: float, views: Sequence[Witness], s
     facings = [_facing(view) for view in views] if len(found) > 1 else []
     whole = []
     for k, (plane, hidden) in enumerate(mapped):
-        seen = plane.seen
         if _crossing(plane, [better for better, _ in mapped[:k]]):
             # What may be the one or the other is the better supported one's, unless it faces as this one does.
-            seen = seen & _faces_so(plane, views, facings)
-        whole.append(_continued(plane, seen, hidden, _crossing(plane, [other for other, _ in mapped]), band))
+            plane = replace(plane, seen=plane.seen & _faces_so(plane, views, facings))
+        whole.append(_continued(plane, hidden, _crossing(plane, [other for other, _ in mapped]), band))
     return whole
 
 
@@ -243,17 +242,16 @@ def _mapped(
     return replace(plane, seen=seen, free=free), (said.hidden > 0).reshape(nowhere.shape)
 
 
-def _continued(plane: Plane, seen: np.ndarray, hidden: np.ndarray, others: Sequence[Plane], band: float) -> Plane:
+def _continued(plane: Plane, hidden: np.ndarray, others: Sequence[Plane], band: float) -> Plane:
     """The plane with where it goes on: a patch of it that nobody saw, because the object was in the way, and that
     touches what was seen of it, belongs to it up to its border; where views look through it, it is not.
 
     Args:
-        seen, hidden: bool [CELLS, CELLS], what views show of the plane itself, and where the object hides it.
-        others: planes that cross it.
+        hidden: bool [CELLS, CELLS], where the object hides it. others: planes that cross it.
         band: distance from these up to which a view that seems to show the one may show the other.
     """
     # Neither a thin rim nor a crossing tells where the plane goes on to.
-    own = seen.copy()
+    own = plane.seen.copy()
     for other in others:
         own &= np.abs(plane.cells @ other.normal - other.height) >= band
     solid = cv2.morphologyEx(own.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2 * RIM + 1,) * 2, np.uint8)) > 0
@@ -263,13 +261,13 @@ def _continued(plane: Plane, seen: np.ndarray, hidden: np.ndarray, others: Seque
     for patch in range(1, count + 1):
         inside = patches == patch
         border = ndimage.binary_dilation(inside, iterations=2) & ~inside
-        if inside.sum() >= 4 and seen[border].mean() > TOUCHING:
+        if inside.sum() >= 4 and plane.seen[border].mean() > TOUCHING:
             beyond = _between(inside, solid, plane.free) < 0.5
             goes_on |= inside & ~beyond
             ends |= inside & beyond
     goes_on &= _hull(solid)
-    within = goes_on | (ndimage.binary_fill_holes(seen | goes_on) & ~plane.seen & ~ends & hidden)
-    return replace(plane, seen=seen, goes_on=goes_on, within=within)
+    within = goes_on | (ndimage.binary_fill_holes(plane.seen | goes_on) & ~plane.seen & ~ends & hidden)
+    return replace(plane, goes_on=goes_on, within=within)
 
 
 def _faces_so(plane: Plane, views: Sequence[Witness], facings: Sequence[np.ndarray]) -> np.ndarray:
