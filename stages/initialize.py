@@ -57,7 +57,7 @@ def run(
     new = torch.zeros(len(gaussians), dtype=torch.bool)
     train = [scene.cameras[name] for name in scene.train]
     haze = torch.zeros(len(gaussians), dtype=torch.bool)
-    if params.start != "nothing":  # where nothing is put in its place, haze is better than a black hole
+    if params.tidy and params.start != "nothing":  # where nothing is put in its place, haze is better than a black hole
         haze = voting.leaking(gaussians, train, {c.name: sets[c.name].undecided for c in train}, LEAK)
     gaussians, new = gaussians.map(lambda p: p[~haze]), new[~haze]
     best = load_json(masks / "facts.json")["best_reference"]
@@ -137,7 +137,7 @@ def filled(params: Params, out: Path, gaussians, new, reference, around, network
     save_exr(out / "depth" / f"{camera.name}.exr", depth.astype("float32"))
     pixels = behind.grown(hole, OVERLAP)
     gaussians, new = filling.placed(gaussians, new, reference, depth, pixels, around, sheets)
-    if farthest:  # what is open still is asked for view by view
+    if farthest or not params.tidy:  # what is open still is asked for view by view, or left
         return gaussians, new
     views = [(each, around.hidden[each.name]) for each in around.cameras]
     gap = filling.seen_through(gaussians, camera, made_up, hidden & ~pixels, views, SEEN_THROUGH)
