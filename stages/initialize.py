@@ -76,7 +76,8 @@ def run(
         gaussians = gaussians.zipped(added, lambda a, b: torch.cat([a, b]))
         new = torch.cat([new, torch.ones(len(added), dtype=torch.bool)])
     if true and params.settle:
-        gaussians = settled(params, out, gaussians, true, around)
+        drawn_there = {name: each.invent & (name not in scene.clean) for name, each in sets.items()}
+        gaussians = settled(params, out, gaussians, true, around, drawn_there)
     save_ply(out / "gaussians.ply", gaussians)
     save_labels(out / "labels.npy", new)
     uncovered = {each.name: filling.uncovered(gaussians, each, sets[each.name].consistent) for each in train}
@@ -212,9 +213,12 @@ def completed_further(params: Params, out: Path, gaussians, new, around):
     return gaussians, new, further
 
 
-def settled(params: Params, out: Path, gaussians, references, around):
-    """The Gaussians after `params.settle` steps of reconstruction; see `reffusion.initialize.settle`."""
-    hidden = {view.camera.name: view.hidden for view in around.views}
+def settled(params: Params, out: Path, gaussians, references, around, drawn_there):
+    """The Gaussians after `params.settle` steps of reconstruction; see `reffusion.initialize.settle`.
+
+    `drawn_there`: view name -> bool [H, W], where something is to be drawn that no photograph shows.
+    """
+    hidden = {view.camera.name: view.hidden | drawn_there[view.camera.name] for view in around.views}
     work = out / ".settle"  # hidden: its trace tells seconds, which are no part of the artifact's content
     work.mkdir(exist_ok=True)
     done = settle(gaussians, Known(around.cameras, around.photos, hidden, references), params.settle, SEED, work)
