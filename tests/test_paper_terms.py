@@ -20,7 +20,6 @@ from reffusion.fit import step
 from reffusion.gaussians.optimize import Rates
 from reffusion.geometry import cameras_extent
 from reffusion.io.arrays import load_labels
-from reffusion.io.images import save_image
 from reffusion.io.scene import load_mask_sets, load_references, load_scene, save_mask_sets
 from reffusion.params.distill import Params, Sds
 from reffusion.params.fit import LearningRates
@@ -72,7 +71,7 @@ def test_photographs_do_not_supervise_where_an_object_is_drawn(views_of):
 
 
 def test_a_view_without_invented_pixels_is_distilled_where_c_is_repainted(views_of):
-    made, hidden, drawn = views_of
+    made, hidden, _ = views_of
     assert not made(repaint="invent")["a3"].repaint.any()
     views = made(repaint="consistent")
     assert torch.equal(views["a3"].repaint, hidden) and not views["a4"].repaint.any()
