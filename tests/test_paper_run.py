@@ -64,13 +64,13 @@ def picture(view) -> torch.Tensor:
 def network_of_the_tilt() -> torch.nn.Module:
     """A random Depth Anything that happens to say how the wall leans; one that says the opposite is refused."""
     wanted = -np.mgrid[: small.HEIGHT, : small.WIDTH][0].ravel()
-    for seed in range(40):
+    for seed in (28, *range(200)):
         model = small_model(seed=seed)
         network = monocular.make_network(model)
         said = [monocular.disparity(network, picture(small.CAMERAS[n])).numpy().ravel() for n in ("a0", "a2", "a4")]
         if min(np.corrcoef(answer, wanted)[0, 1] for answer in said) > 0.5:
             return model
-    raise AssertionError("no such network among 40")
+    raise AssertionError("no such network among 200")
 
 
 def tilted(fit: Path) -> None:
