@@ -86,3 +86,9 @@ def angle_between_views(point: np.ndarray, camera: Camera, others: Sequence[Came
     cosines = towards[1:] @ towards[0] / np.maximum(lengths[1:] * lengths[0], np.finfo(np.float64).tiny)
     known = (lengths[1:] > 0) & (lengths[0] > 0)
     return float(np.degrees(np.arccos(np.where(known, cosines, -1.0).clip(-1, 1))).min())
+
+
+def cameras_extent(cameras: Sequence[Camera]) -> float:
+    """3DGS's measure of a scene: 1.1 times the largest distance of a camera's centre from the mean of all."""
+    centers = np.stack([camera.center for camera in cameras])
+    return 1.1 * float(np.linalg.norm(centers - centers.mean(0), axis=1).max())

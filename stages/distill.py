@@ -86,7 +86,7 @@ def adapted_prior(params: Params, personalize: Path | None) -> tuple[Prior | Non
     prior = load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
     prior = prior if personalize is None else lora.merged(prior, personalize)
     with torch.no_grad():
-        text = diffusion.embed_text(prior, list(PROMPTS))
+        text = diffusion.embed_text(prior, list(PROMPTS) if params.prompts == "sks" else [""] * len(PROMPTS))
     prior = without_text(prior)
     return recomputing(prior) if params.checkpointing else prior, text
 
@@ -110,10 +110,9 @@ def train_views(
     views = []
     for name in scene.train:
         clean, pixels = name in scene.clean, sets[name]
-        repaint = pixels.invent if params.repaint == "invent" else pixels.consistent
-        # A view with nothing to invent shows the truth, or at least what other views saw: nothing is distilled there.
-        repaint = repaint & pixels.invent.any() & (not clean)
-        supervises = ~pixels.consistent | clean
+        repaint = (pixels.invent if params.repaint == "invent" else pixels.consistent) & (not clean)
+        # C shows the object; I, where it reaches beyond C, the place of one that is to be drawn there.
+        supervises = ~(pixels.consistent | pixels.invent) | clean
         if tainted and (tainted / f"{name}.png").exists():
             supervises &= ~load_mask(tainted / f"{name}.png")
         lifted = place(painted[name]) / 255 if name in painted else None

@@ -57,6 +57,8 @@ def run(params: Params, out: Path, *, poses: Path) -> None:
 def supported(params: Params, scene: Scene) -> Params:
     """The parameters with no higher degree of spherical harmonics than the training views determine."""
     most = params.sh.degree
+    if not params.sh.limited:
+        return params
     degree, views = support.harmonics(scene.points, [scene.cameras[name] for name in scene.train], most)
     if degree == most:
         return params

@@ -57,7 +57,7 @@ def run(
     new = torch.zeros(len(gaussians), dtype=torch.bool)
     train = [scene.cameras[name] for name in scene.train]
     haze = torch.zeros(len(gaussians), dtype=torch.bool)
-    if params.start != "nothing":  # where nothing is put in its place, haze is better than a black hole
+    if params.tidy and params.start != "nothing":  # where nothing is put in its place, haze is better than a black hole
         haze = voting.leaking(gaussians, train, {c.name: sets[c.name].undecided for c in train}, LEAK)
     gaussians, new = gaussians.map(lambda p: p[~haze]), new[~haze]
     best = load_json(masks / "facts.json")["best_reference"]
@@ -76,7 +76,8 @@ def run(
         gaussians = gaussians.zipped(added, lambda a, b: torch.cat([a, b]))
         new = torch.cat([new, torch.ones(len(added), dtype=torch.bool)])
     if true and params.settle:
-        gaussians = settled(params, out, gaussians, true, around)
+        drawn_there = {name: each.invent & (name not in scene.clean) for name, each in sets.items()}
+        gaussians = settled(params, out, gaussians, true, around, drawn_there)
     save_ply(out / "gaussians.ply", gaussians)
     save_labels(out / "labels.npy", new)
     uncovered = {each.name: filling.uncovered(gaussians, each, sets[each.name].consistent) for each in train}
@@ -137,7 +138,7 @@ def filled(params: Params, out: Path, gaussians, new, reference, around, network
     save_exr(out / "depth" / f"{camera.name}.exr", depth.astype("float32"))
     pixels = behind.grown(hole, OVERLAP)
     gaussians, new = filling.placed(gaussians, new, reference, depth, pixels, around, sheets)
-    if farthest:  # what is open still is asked for view by view
+    if farthest or not params.tidy:  # what is open still is asked for view by view, or left
         return gaussians, new
     views = [(each, around.hidden[each.name]) for each in around.cameras]
     gap = filling.seen_through(gaussians, camera, made_up, hidden & ~pixels, views, SEEN_THROUGH)
@@ -212,9 +213,12 @@ def completed_further(params: Params, out: Path, gaussians, new, around):
     return gaussians, new, further
 
 
-def settled(params: Params, out: Path, gaussians, references, around):
-    """The Gaussians after `params.settle` steps of reconstruction; see `reffusion.initialize.settle`."""
-    hidden = {view.camera.name: view.hidden for view in around.views}
+def settled(params: Params, out: Path, gaussians, references, around, drawn_there):
+    """The Gaussians after `params.settle` steps of reconstruction; see `reffusion.initialize.settle`.
+
+    `drawn_there`: view name -> bool [H, W], where something is to be drawn that no photograph shows.
+    """
+    hidden = {view.camera.name: view.hidden | drawn_there[view.camera.name] for view in around.views}
     work = out / ".settle"  # hidden: its trace tells seconds, which are no part of the artifact's content
     work.mkdir(exist_ok=True)
     done = settle(gaussians, Known(around.cameras, around.photos, hidden, references), params.settle, SEED, work)

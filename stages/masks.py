@@ -85,15 +85,16 @@ def voted(
     """Labels [N] bool by the masks of the views that vote; `seen`: the votes by weight."""
     votes = seen if params.vote == "weight" else voting.cast_votes(gaussians, train, ballots, mode=params.vote)
     labels = voting.label_gaussians(votes, params.tau)
-    # What hardly any view sees (buried in the object, or in the wall behind it) votes by where it stands.
-    unseen = seen.masked + seen.unmasked <= BURIED
+    # What hardly any view sees (buried in the object, or in the wall behind it) votes by where it stands. PAPER leaves
+    # open: the ratio of 0 to 0, what no view sees at all.
+    unseen = seen.masked + seen.unmasked <= (BURIED if params.tidy else 0)
     return labels | (unseen & voting.hidden_inside(gaussians, train, ballots))
 
 
 def drawn(params: Params, gaussians: Gaussians, labels: Tensor, cameras: dict[str, Camera]) -> dict[str, np.ndarray]:
     """The labels rendered back into each view: its consistent mask C, bool [H, W]."""
     shares = {name: voting.label_view(gaussians, labels, camera) for name, camera in cameras.items()}
-    return {name: tidied(share > params.tau_rendered) for name, share in shares.items()}
+    return {name: tidied(params, share > params.tau_rendered) for name, share in shares.items()}
 
 
 def classified(
@@ -114,7 +115,7 @@ def classified(
     for k in trace.progress(len(names), "masks"):
         name, camera = names[k], scene.cameras[names[k]]
         found = undecided.behind(remaining, camera, consistent[name], views, planes)
-        unknown = tidied(found.undecided) & consistent[name] & (name not in scene.clean)
+        unknown = tidied(params, found.undecided) & consistent[name] & (name not in scene.clean)
         invent = consistent[name] & (name not in scene.clean) if params.invent == "consistent" else unknown
         if fill is not None:
             disparity = geometry.reciprocal(found.depth)
@@ -128,8 +129,8 @@ def continuations(params: Params, gaussians: Gaussians, labels: Tensor, views: l
     return planes_around(*extent(gaussians.means[labels]), views, SEED) if labels.any() else []
 
 
-def tidied(mask: np.ndarray) -> np.ndarray:
-    return voting.tidy(mask, SPECK * mask.shape[1], GAP * mask.shape[1])
+def tidied(params: Params, mask: np.ndarray) -> np.ndarray:
+    return voting.tidy(mask, SPECK * mask.shape[1], GAP * mask.shape[1]) if params.tidy else mask
 
 
 def pixels_of(kind: str, sets: dict[str, MaskSet], names: Sequence[str]) -> int:

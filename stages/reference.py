@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -45,10 +46,13 @@ def run(params: Params, out: Path, *, scene: Path, poses: Path, fit: Path, masks
 
 
 def taken_over(given: list[GivenReference], scene: Scene, poses: Path, fit: Path, masks: Path) -> list[Reference]:
-    """The scene's own references, each standing for the invent mask of its view, and exposed as its photograph is."""
+    """The scene's own references, each standing for the invent mask of its view, of a clean one for the consistent
+    mask, and exposed as its photograph is."""
     references = []
     for each in given:
         sets = load_mask_sets(masks, [each.view])[each.view]
+        # A clean photograph shows what elsewhere has to be invented.
+        sets = replace(sets, invent=sets.consistent) if each.view in scene.clean else sets
         if sets.invent.any():
             references.append(fitted(each, sets, scene, poses, fit))
         else:

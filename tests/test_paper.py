@@ -1,74 +1,215 @@
-"""The profile `paper` holds the constants of the paper, and of 3DGS, each where it is said to be."""
+"""docs/paper.md, `pipeline.yaml` and the paper agree, value by value."""
 
+import re
+from fractions import Fraction
 from pathlib import Path
 
 import pytest
 
-from runner.resolve import Request, resolve
+from runner.keys import HASHES, Hashes
+from runner.pipeline import read_yaml
+from runner.resolve import Request, resolve_all
 
 ROOT = Path(__file__).resolve().parent.parent
+DOC = ROOT / "docs" / "paper.md"
+PROFILES = ("paper", "best", "laptop")
+SD2, SDXL = "sd2-community/stable-diffusion-2-inpainting", "diffusers/stable-diffusion-xl-1.0-inpainting-0.1"
+NETWORK = "depth-anything/Depth-Anything-V2-Small-hf"
+SHORT = {"SD2": SD2, "SDXL": SDXL, "Depth Anything": NETWORK, "embedded": "priors/tiny", "none": None}
+SHORT |= {"on": True, "off": False}
+MACHINE = ("device", "dtype", "memory_gb")  # of the machine: docs/production.md
+BASELINES = ("lift.prior", "lift.steps")  # of no part of the method
 
-# what -> (stage.param, value)
-CONSTANTS = {
-    "larger image side, px": ("poses.longest", 1600),
-    "3DGS: iterations": ("fit.iterations", 30_000),
-    "SH degree": ("fit.sh.degree", 3),
-    "3DGS: step size of means": ("fit.lr.means", 1.6e-4),
-    "3DGS: step size of scales": ("fit.lr.scales", 5e-3),
-    "3DGS: step size of rotations": ("fit.lr.quats", 1e-3),
-    "3DGS: step size of colours": ("fit.lr.sh0", 2.5e-3),
-    "3DGS: step size of the other harmonics": ("fit.lr.shN", 1.25e-4),
-    "3DGS: densification from step 500": ("fit.densify.start", 500 / 30_000),
-    "3DGS: densification to step 15000": ("fit.densify.stop", 0.5),
-    "3DGS: densification each": ("fit.densify.every", 100),
-    "3DGS: slope that densifies": ("fit.densify.grow_grad2d", 2e-4),
-    "3DGS: opacities reset each 3000 steps": ("fit.densify.reset_every", 0.1),
-    "3DGS: a degree more each 1000 steps": ("fit.sh.every", 1 / 30),
-    "3DGS: least opacity": ("fit.densify.prune_opa", 0.005),
-    "votes are counted": ("masks.vote", "count"),
-    "tau": ("masks.tau", 1.0),
-    "tau'": ("masks.tau_rendered", 0.3),
-    "adapted model": ("personalize.prior", "sd2-community/stable-diffusion-2-inpainting"),
-    "the same model distils": ("distill.prior", "sd2-community/stable-diffusion-2-inpainting"),
-    "LoRA rank": ("personalize.lora.rank", 8),
-    "LoRA alpha": ("personalize.lora.alpha", 16),
-    "LoRA dropout": ("personalize.lora.dropout", 0.1),
-    "LoRA layers": ("personalize.lora.layers", "attention"),
-    "LoRA steps": ("personalize.steps", 2000),
-    "learning rate of the UNet": ("personalize.optimizer.lr_unet", 2e-4),
-    "learning rate of the text encoder": ("personalize.optimizer.lr_text", 4e-5),
-    "personalization at the prior's native size": ("personalize.samples.size", 0),
-    "lambda of SDS": ("distill.sds.weight", 1e-3),
-    "local patches": ("distill.sds.patches", 2),
-    "the reference does not supervise": ("distill.reference.weight", 0.0),
-    "lambda of the depth loss": ("distill.depth.weight", 0.0625),
-    "depth loss every": ("distill.depth.every", 8),
-    "lambda of the adversarial loss": ("distill.adversarial.weight", 0.03),
-    "patches of the critic": ("distill.adversarial.patches", 64),
-    "their side, px": ("distill.adversarial.size", 64),
+# What the paper fixes, and 3DGS where the paper takes its defaults.
+FIXED = {
+    "poses.longest": 1600,
+    "fit.iterations": 30_000,
+    "fit.sh.degree": 3,
+    "fit.sh.every": 1000 / 30_000,
+    "fit.init.opacity": 0.1,
+    "fit.init.scale": 1,
+    "fit.densify.start": 500 / 30_000,
+    "fit.densify.stop": 15_000 / 30_000,
+    "fit.densify.every": 100,
+    "fit.densify.grow_grad2d": 2e-4,
+    "fit.densify.prune_opa": 0.005,
+    "fit.densify.reset_every": 3000 / 30_000,
+    "fit.lr.means": 1.6e-4,
+    "fit.lr.means_unit": "cameras",
+    "fit.lr.scales": 5e-3,
+    "fit.lr.quats": 1e-3,
+    "fit.lr.sh0": 2.5e-3,
+    "fit.lr.shN": 1.25e-4,
+    "fit.lr.betas": (0.9, 0.999),
+    "fit.random_background": False,
+    "masks.vote": "count",
+    "masks.tau": 1,
+    "masks.tau_rendered": 0.3,
+    "masks.invent": "consistent",
+    "reference.inpainter": "diffusion",
+    "reference.prior": SDXL,
+    "personalize.prior": SD2,
+    "personalize.steps": 2000,
+    "personalize.lora.rank": 8,
+    "personalize.lora.alpha": 16,
+    "personalize.lora.dropout": 0.1,
+    "personalize.lora.layers": "attention",
+    "personalize.optimizer.lr_unet": 2e-4,
+    "personalize.optimizer.lr_text": 4e-5,
+    "personalize.samples.size": 0,
+    "personalize.samples.masks": "rectangles",
+    "initialize.start": "reference",
+    "distill.prior": SD2,
+    "distill.sds.weight": 1e-3,
+    "distill.sds.patches": 2,
+    "distill.sds.reaches": "masked",
+    "distill.depth.weight": 0.0625,
+    "distill.depth.every": 8,
+    "distill.adversarial.weight": 0.03,
+    "distill.adversarial.patches": 64,
+    "distill.adversarial.size": 64,
+    "distill.adversarial.form": "saturating",
+    "distill.adversarial.penalized": "fake",
+    "distill.reconstruction.reaches": "unmasked",
+    "distill.repaint": "consistent",
+    "distill.prompts": "sks",
+    "distill.confined": True,
 }
+# What it has not, each at the value that leaves it out.
+ABSENT = {
+    "poses.detail": 0,
+    "poses.refine": False,
+    "fit.sh.limited": False,
+    "fit.init.flow_cell": 0,
+    "fit.densify.per_pixel": 0,
+    "masks.tidy": False,
+    "masks.hull": 1,
+    "masks.debris": False,
+    "masks.negligible": 0,
+    "personalize.samples.hole_share": 0,
+    "personalize.samples.outside_weight": 1,
+    "initialize.depth.sweep": False,
+    "initialize.tidy": False,
+    "initialize.gloss": False,
+    "initialize.further": 0,
+    "initialize.settle": 0,
+    "distill.sds.within": 180,
+    "distill.sds.keep_contrast": False,
+    "distill.reference.weight": 0,
+    "distill.reference.reaches": "masked",
+    "evaluate.beyond": False,
+}
+# What it says and the profile does not do, or says without saying how.
+OTHERWISE = {"fit.densify.cap_max", "fit.densify.prune_scale3d", "distill.densify.every"}
+
+
+def flat(params, above=""):
+    """Dotted name -> value."""
+    found = {}
+    for name, value in params.items():
+        found |= flat(value, f"{above}{name}.") if isinstance(value, dict) else {above + name: value}
+    return found
+
+
+def meant(cell, paper=None):
+    """The value that a cell of the table stands for; `=`: the profile paper's."""
+    if cell == "=":
+        return paper
+    if cell in SHORT:
+        return SHORT[cell]
+    if ", " in cell:
+        return [meant(part) for part in cell.split(", ")]
+    return float(Fraction(cell)) if re.fullmatch(r"[-+.\de/]+", cell) else cell
+
+
+def rows(text):
+    """Dotted name -> (what the paper says, the values of the profiles)."""
+    found = {}
+    for line in text.splitlines():
+        if line.startswith("|`"):
+            name, says, paper, best, laptop, _ = line.replace("`", "").split("|")[1:-1]
+            assert name not in found, f"{name} twice"
+            found[name] = says, (meant(paper), meant(best, meant(paper)), meant(laptop, meant(paper)))
+    return found
+
+
+def same(a, b):
+    if isinstance(b, list | tuple):
+        return len(a) == len(b) and all(map(same, a, b))
+    return a == (pytest.approx(b) if isinstance(b, float) else b)
+
+
+def wrong(name, row, values):
+    """What is wrong with a row: against the profiles, and against what the paper says."""
+    (says, stated), found = row, [values[profile].get(name) for profile in PROFILES]
+    if not all(map(same, stated, found)):
+        return [f"{name}: {stated}, the profiles have {found}"]
+    fixed, absent = name in FIXED and same(stated[0], FIXED[name]), name in ABSENT and same(stated[0], ABSENT[name])
+    kinds = {"=": fixed, "no": absent, "open": name not in FIXED | ABSENT}
+    return (
+        [] if kinds.get(says, name in OTHERWISE) else [f"{name}: '{says}' and {stated[0]} is not what the paper says"]
+    )
+
+
+def without_row(table, values):
+    """Parameters that the paper has a word on, or the profiles differ in, and the table does not name."""
+    paper = values["paper"]
+    differing = {name for name in paper if any(not same(values[p][name], paper[name]) for p in PROFILES)}
+    differing = {name for name in differing if not name.endswith(MACHINE) and name not in BASELINES}
+    return {*differing, *FIXED, *ABSENT, *OTHERWISE} - table.keys()
 
 
 @pytest.fixture(scope="module")
-def params():
-    """stage -> parameters of the paper profile, without a scene."""
-    return resolve(Request(ROOT, ROOT / "runs", "", profile="paper"), scene=False).params
+def values():
+    """Profile -> dotted name -> value, without a scene."""
+    requests = [Request(ROOT, ROOT / "runs", "", profile=name) for name in PROFILES]
+    jobs = resolve_all(requests, Hashes(ROOT / "runs" / HASHES), scene=False)
+    return {job.profile: flat(job.params) for job in jobs}
 
 
-@pytest.mark.parametrize("what", CONSTANTS)
-def test_the_profile_holds_the_constant(params, what):
-    place, value = CONSTANTS[what]
-    found = params
-    for name in place.split("."):
-        found = found[name]
-    assert found == (pytest.approx(value) if isinstance(value, float) else value)
+def test_table_profiles_and_paper_agree(values):
+    table = rows(DOC.read_text())
+    assert [line for name, row in table.items() for line in wrong(name, row, values)] == []
+    assert without_row(table, values) == set()
 
 
-def test_work_is_on_the_gpu_within_24_gb_in_half_precision(params):
+def other(value):
+    """A value of the same kind."""
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, int | float):
+        return 2 * value + 1
+    return [*value, 1] if isinstance(value, list | tuple) else f"not {value}"
+
+
+def test_a_changed_value_is_found_wherever_it_stands(values):
+    table = rows(DOC.read_text())
+    for name, (says, stated) in table.items():
+        with_other = lambda profile, name=name: values | {profile: {name: other(values[profile][name])}}
+        for k, profile in enumerate(PROFILES):
+            changed = (*stated[:k], other(stated[k]), *stated[k + 1 :])
+            assert wrong(name, (says, changed), values), f"{name} of {profile} in the table"
+            assert wrong(name, (says, stated), with_other(profile)), f"{name} of {profile} in pipeline.yaml"
+        if says in ("=", "no"):  # the same change in both is found by what stands here
+            assert wrong(name, (says, (other(stated[0]), *stated[1:])), with_other("paper")), name
+    left_out = [name for name, (says, _) in table.items() if says != "open"]
+    assert without_row({}, values) >= {*left_out}
+
+
+def test_best_is_paper_with_other_values_of_the_same_keys(values):
+    profiles = read_yaml(ROOT / "pipeline.yaml")["profiles"]
+    assert flat(profiles["paper"]).keys() == flat(profiles["best"]).keys()
+    for name in values["paper"]:
+        if name.endswith((*MACHINE, "prior", "model")):
+            assert values["best"][name] == values["paper"][name], name
+
+
+def test_work_is_on_the_gpu_within_24_gb_in_half_precision(values):
+    paper = values["paper"]
     for stage in ("reference", "personalize", "distill"):
-        assert params[stage]["device"] == "cuda" and params[stage]["dtype"] in ("float16", "bfloat16")
-        assert 0 < params[stage]["memory_gb"] <= 22
-    assert params["personalize"]["dtype"] == "bfloat16"  # gradients of a mean over a batch underflow in float16
+        assert paper[f"{stage}.device"] == "cuda" and paper[f"{stage}.dtype"] in ("float16", "bfloat16")
+        assert 0 < paper[f"{stage}.memory_gb"] <= 22
+    assert paper["personalize.dtype"] == "bfloat16"  # gradients of a mean over a batch underflow in float16
 
 
 def test_constants_of_the_library():

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from reffusion.distill.adversary import Adversary
 from reffusion.distill.discriminator import gathered
@@ -108,8 +109,9 @@ def sds_term(
     size = prior.native_size
     reached = None if probe is None else probe * masked[:, None]
     rendering = render(confine(gaussians, masked), view.camera, probe=reached)
-    drawn = enlarged(rendering.color.permute(2, 0, 1) * 2 - 1, size)
-    shown = torch.where(view.supervises[..., None], view.photo, rendering.color.detach())
+    color = displayed(rendering.color)
+    drawn = enlarged(color.permute(2, 0, 1) * 2 - 1, size)
+    shown = torch.where(view.supervises[..., None], view.photo, color.detach())
     shown = enlarged(shown.permute(2, 0, 1) * 2 - 1, size)
     hole = enlarged(view.repaint.to(drawn)[None], size)[0] > 1e-4
 
@@ -136,6 +138,29 @@ def sds_term(
     if not torch.isfinite(gradient).all():
         raise FloatingPointError(f"the prior's answer at timesteps {timesteps.tolist()} is not finite")
     return sds_loss(latents, gradient, sds.reduction), rendering
+
+
+def displayed(color: Tensor) -> Tensor:
+    """Colours of any value as a picture has them, in [0, 1]; a gradient that leads back from outside passes.
+
+    PAPER leaves open: colours above 1, which harmonics can add up to and no prior or critic was ever shown. A plain
+    clamp would leave them there for good; to let every gradient pass would drive white on without end.
+    """
+    return _Displayed.apply(color)
+
+
+class _Displayed(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, color: Tensor) -> Tensor:
+        ctx.save_for_backward(color)
+        return color.clamp(0, 1)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, gradient: Tensor) -> Tensor:
+        (color,) = ctx.saved_tensors
+        outwards = ((color > 1) & (gradient < 0)) | ((color < 0) & (gradient > 0))
+        return torch.where(outwards, 0.0, gradient)
 
 
 def adversarial_term(
@@ -169,7 +194,7 @@ def adversarial_term(
     shaded = replace(gaussians.map(Tensor.detach), sh=confine(gaussians, masked).sh)
     rendering = render(shaded, view.camera)
     real = patches_around(image, hole, choices.patches, choices.size, generator)
-    fake = patches_around(rendering.color, view.repaint, choices.patches, choices.size, generator)
+    fake = patches_around(displayed(rendering.color), view.repaint, choices.patches, choices.size, generator)
     said = adversary.learn(real, fake)
     loss = adversary.loss(fake)
     return loss, rendering, {"adversarial": float(loss.detach()), **said}

@@ -17,6 +17,7 @@ from reffusion.distill.perceptual import Distance
 from reffusion.distill.steps import Job, job_of, step_of
 from reffusion.gaussians.densify import densify, prune
 from reffusion.gaussians.optimize import GaussianOptimizer, Rates
+from reffusion.geometry import cameras_extent
 from reffusion.params.distill import Densify, LearningRates, Params
 from reffusion.prior.model import Prior
 from reffusion.splat.rasterizer import render
@@ -55,7 +56,7 @@ def distill(
             loss), critic_loss, critic_slope (R1 before its weight), gaussians, masked_gaussians.
         estimator: of the depth term; None where there is none.
         distance: of patches, for the perceptual loss of lifted pictures.
-        rates: Adam's step sizes; None: 3DGS's.
+        rates: Adam's step sizes; None: 3DGS's, by `settings.lr.means_unit`.
     Returns:
         The Gaussians, detached, and their labels.
     Raises:
@@ -63,6 +64,7 @@ def distill(
         ValueError: a term lacks what it needs: a prior, an estimator, a hole in a reference.
     """
     job = job_of(views, holes, prior, text, settings, initial, masked, estimator, distance)
+    rates = rates or rates_of(settings.lr, [view.camera for view in views])
     optimizer = GaussianOptimizer(initial, masked, rates, masked_factors(settings.lr), epsilon=settings.lr.epsilon)
     region = region_of(initial.means, masked) if settings.confined and masked.any() else None
     run = _Run.begun(optimizer, job, trace.load_checkpoint(folder))
@@ -84,6 +86,11 @@ def distill(
             run.seconds = log.seconds
             trace.save_checkpoint(folder, run.state_dict())
     return optimizer.gaussians.map(Tensor.detach), optimizer.masked
+
+
+def rates_of(lr: LearningRates, cameras: Sequence[Camera]) -> Rates:
+    """3DGS's step sizes for these views."""
+    return Rates().in_units_of(cameras_extent(cameras)) if lr.means_unit == "cameras" else Rates()
 
 
 def masked_factors(lr: LearningRates) -> dict[str, float]:

@@ -58,7 +58,7 @@ def fit(
     weights = weights or {}
     _refuse_misfits(cameras, held_out, images, weights)
     state = trace.load_checkpoint(folder)
-    run = _Run.begun(initial, cameras, settings, rates or rates_of(settings.lr), state, spent)
+    run = _Run.begun(initial, cameras, settings, rates or rates_of(settings.lr, cameras), state, spent)
     optimizer, exposures = run.optimizer, run.exposures
     log = trace.Trace(folder, run.seconds, run.iteration + 1 if run.iteration else 0)
     centers = torch.tensor(np.stack([camera.center for camera in cameras]), dtype=torch.float32)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -11,6 +12,7 @@ from reffusion import seeding
 from reffusion.fit.exposure import Exposures
 from reffusion.gaussians.densify import densify, prune, viewing_distance
 from reffusion.gaussians.optimize import GaussianOptimizer, Rates, reconstruction_loss
+from reffusion.geometry import cameras_extent
 from reffusion.params.fit import LearningRates, Params
 from reffusion.splat.rasterizer import render
 from reffusion.types import Camera
@@ -18,9 +20,9 @@ from reffusion.types import Camera
 GROW_SCALE3D = 0.01  # deviation / distance from which on a Gaussian is split, not cloned
 
 
-def rates_of(lr: LearningRates) -> Rates:
-    """Adam's step sizes of a fit; that of positions falls to a hundredth."""
-    return Rates(
+def rates_of(lr: LearningRates, cameras: Sequence[Camera]) -> Rates:
+    """Adam's step sizes of a fit to these views; that of positions falls to a hundredth."""
+    rates = Rates(
         means=lr.means,
         means_last=lr.means / 100,
         quaternions=lr.quats,
@@ -28,6 +30,7 @@ def rates_of(lr: LearningRates) -> Rates:
         sh_dc=lr.sh0,
         sh_rest=lr.shN,
     )
+    return rates.in_units_of(cameras_extent(cameras)) if lr.means_unit == "cameras" else rates
 
 
 def step(

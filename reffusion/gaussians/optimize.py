@@ -6,7 +6,7 @@ Shared by `fit` and `distill`. Everything here takes tensors and plain numbers.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -72,6 +72,10 @@ class Rates:
     opacity_logits: float = 0.05
     sh_dc: float = 2.5e-3
     sh_rest: float = 2.5e-3 / 20
+
+    def in_units_of(self, unit: float) -> Rates:
+        """The same with positions measured in `unit` units of the frame."""
+        return replace(self, means=unit * self.means, means_last=unit * self.means_last)
 
     def at(self, progress: float, gaussians: Gaussians) -> dict[str, Tensor]:
         """Step size per parameter and column, at `progress` in [0, 1] of the run."""

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validat
 Decay = Annotated[float, Field(ge=0, lt=1)]  # part of a running mean that the next step keeps
 Device = Literal["cpu", "cuda"]
 Dtype = Literal["float32", "bfloat16", "float16"]
+MeansUnit = Literal["distance", "cameras"]
 
 # Of a Field's json_schema_extra. WEIGHTS: names a folder of weights, whose content is part of the artifact's key.
 # UNKEYED: changes nothing of the result, and is no part of the key.
@@ -73,6 +74,14 @@ def depth_model_field() -> Any:
 
 def memory_field() -> Any:
     return Field(0.0, ge=0, description="GB that the prior may take; batches are split to fit; 0: no limit")
+
+
+def means_unit_field() -> Any:
+    return Field(
+        "distance",
+        description="unit of that step size: the cameras' distance from the scene, or, as in 3DGS's code, 1.1 times "
+        "the radius of the cameras around their middle",
+    )
 
 
 def seconds_field() -> Any:

@@ -9,9 +9,11 @@ from pydantic import Field
 from reffusion.params.base import (
     Device,
     Dtype,
+    MeansUnit,
     Settings,
     checkpoint_field,
     depth_model_field,
+    means_unit_field,
     memory_field,
     prior_field,
     seconds_field,
@@ -55,9 +57,9 @@ class Adversarial(Settings):
     weight: float = Field(0.03, ge=0, description="lambda of the adversarial term; 0 leaves it out")
     patches: int = Field(64, ge=4, multiple_of=4, description="real patches in a step, and fake ones")
     size: Literal[8, 16, 32, 64, 128, 256] = Field(64, description="their side, px")
-    # PAPER leaves open: the critic's width, StyleGAN2's here; its step size, GANeRF's.
-    width: int = Field(512, ge=1, description="the critic's channels at that side, doubled up to 512")
-    # PAPER leaves open: the generator's form; this one pulls where the critic is sure.
+    # PAPER leaves open: the critic's width and its step size; GANeRF's.
+    width: int = Field(256, ge=1, description="the critic's channels at that side, doubled up to 512")
+    # The paper prints the saturating form; GANeRF's code has this one, which pulls where the critic is sure.
     form: Literal["non-saturating", "saturating"] = Field("non-saturating", description="generator's loss")
     # PAPER leaves open: the weight, GANeRF's here. The paper prints the slope at the fake patches, GANeRF at the real.
     penalty: float = Field(0.2, ge=0, description="weight of half the squared slope of the critic (R1)")
@@ -95,6 +97,7 @@ class LearningRates(Settings):
     blurred rim had tinted is put right by the reconstruction term."""
 
     masked: float = Field(1.0, gt=0, description="factor on 3DGS's step sizes of masked Gaussians")
+    means_unit: MeansUnit = means_unit_field()
     opacities: float = Field(1.0, ge=0, description="further factor on the opacities'")
     shape: float = Field(1.0, ge=0, description="further factor on those of means, scales and rotations")
     # PAPER leaves open: Adam's epsilon; 3DGS's 1e-15. The gradient of a mean over an image's pixels is about 1e-6. At
@@ -126,6 +129,12 @@ class Params(Settings):
     densify: Densify = Densify()
     # PAPER leaves open: which mask m is. Its text repaints the consistent mask; the invent mask keeps true background.
     repaint: Literal["invent", "consistent"] = Field("invent", description="the pixels the UNet repaints")
+    # PAPER leaves open: the prompt of a prior that was not adapted. "sks" was taught to none, but may mean something.
+    prompts: Literal["sks", "empty"] = Field(
+        "sks",
+        description="what the prior is told of a view: the prompts it is adapted with, or nothing, and then guidance, "
+        "which strengthens what a prompt adds, changes nothing",
+    )
     confined: bool = Field(
         True,
         description="each term reaches its own Gaussians; false (an ablation): all of them, and none is pruned for "

@@ -10,11 +10,20 @@ from typing import Literal
 
 from pydantic import Field
 
-from reffusion.params.base import Decay, Device, Settings, checkpoint_field, seconds_field
+from reffusion.params.base import (
+    Decay,
+    Device,
+    MeansUnit,
+    Settings,
+    checkpoint_field,
+    means_unit_field,
+    seconds_field,
+)
 
 
 class SphericalHarmonics(Settings):
     degree: int = Field(3, ge=0, le=3, description="highest degree")
+    limited: bool = Field(True, description="no higher than the views determine")
     every: float = Field(1 / 30, ge=0, le=1, description="part of the run after which one more degree joins")
 
 
@@ -47,6 +56,7 @@ class LearningRates(Settings):
     """Adam's step sizes, for the normalised frame, in which cameras stand about 1 from the scene."""
 
     means: float = Field(1.6e-4, gt=0, description="first step size of positions; the last is a hundredth of it")
+    means_unit: MeansUnit = means_unit_field()
     scales: float = Field(5e-3, gt=0, description="of log scales")
     quats: float = Field(1e-3, gt=0, description="of quaternions")
     sh0: float = Field(2.5e-3, gt=0, description="of the constant spherical harmonic")

@@ -24,6 +24,11 @@ class Params(Settings):
         "lift painted of the best view, Gaussians at random (initialize.scatter), or nothing: it only removes",
     )
     depth: Depth = Depth()
+    tidy: bool = Field(
+        True,
+        description="haze goes that shows mostly where nobody saw; where other views see past the new surface into "
+        "nothing, there is a second",
+    )
     # PAPER leaves open: the new Gaussians' view-dependent colour. The reference shows one side only.
     gloss: bool = Field(False, description="they change with the direction as the surfaces around them do")
     # PAPER leaves open: what the reference's camera does not see of the hole.

@@ -15,6 +15,11 @@ class Params(Settings):
     )
     tau: float = Field(1.0, gt=0, description="masked from this ratio of masked to unmasked contributions (paper: 1)")
     tau_rendered: float = Field(0.3, gt=0, lt=1, description="C is where the rendered label exceeds it (paper: 0.3)")
+    tidy: bool = Field(
+        True,
+        description="what hardly any view shows votes by where it stands; of masks, islands below 1 % of the image's "
+        "width go and holes below 2 % close",
+    )
     hull: float = Field(
         0.9, ge=0, le=1, description="masked too: centres inside C in more than this share of the views; 1 = none"
     )

@@ -22,7 +22,11 @@ class Lora(Settings):
     rank: int = Field(8, ge=1, description="LoRA rank")
     alpha: float = Field(16, gt=0, description="LoRA alpha; a weight changes by alpha / rank * B A")
     dropout: float = Field(0.1, ge=0, lt=1, description="LoRA dropout")
-    layers: Literal["attention", "attention+conv"] = Field("attention", description="what carries LoRA in the UNet")
+    layers: Literal["attention", "qkv", "attention+conv"] = Field(
+        "attention",
+        description="what carries LoRA: attention layers; without their output projections (RealFill's code); or "
+        "convolutions and feed-forward layers of the UNet too",
+    )
 
 
 class Optimizer(Settings):
@@ -45,6 +49,10 @@ class Samples(Settings):
 
     size: int = Field(0, ge=0, description="side of a sample in pixels; 0: the prior's native size (paper)")
     local_share: float = Field(0.5, ge=0, le=1, description="share of the samples that are local crops")
+    # PAPER leaves open: the rectangles' number and sides, RealFill's in either case; the paper has nothing but them.
+    masks: Literal["rectangles", "realfill"] = Field(
+        "rectangles", description="random rectangles; RealFill's code: a tenth of the masks repaints all"
+    )
     # The hole is the mask of the job; rectangles leave most of it to be seen, and a short training does not get beyond.
     hole_share: float = Field(
         0.0, ge=0, le=1, description="share of the samples whose mask is the reference's hole (paper: 0)"

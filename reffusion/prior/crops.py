@@ -23,6 +23,7 @@ EMPTY_SHARE = 0.1  # of samples whose prompt is replaced by the empty one, so th
 BORDER = 0.1  # the largest share of height or width that a global sample loses at each side
 RECTANGLES = (1, 29)  # the fewest and the most of a mask
 SIDE = (0.03, 0.25)  # the shortest and the longest side of one, in sides of the sample
+WHOLE_SHARE = 0.1  # of the masks `realfill` that repaint all
 INVERTED_SHARE = 0.5  # of masks that repaint everything but their rectangles
 
 
@@ -75,6 +76,13 @@ def rectangle_mask(
     return 1 - mask if _uniform(0, 1, generator) < inverted_share else mask
 
 
+def random_mask(samples: Samples, size: int, generator: torch.Generator) -> Tensor:
+    """[1, size, size] float, 1 = repaint, by `samples.masks`."""
+    if samples.masks == "realfill" and _uniform(0, 1, generator) < WHOLE_SHARE:
+        return torch.ones(1, size, size)
+    return rectangle_mask(size, generator)
+
+
 def without_border(source: Picture, border: float, generator: torch.Generator) -> Picture:
     """The picture less a thin strip, drawn for each of its four sides: at most `border` of its height or width."""
     height, width = source.region.shape
@@ -107,7 +115,7 @@ def draw_samples(
         image, hole, prompt = _of_reference(source, native, size, samples.local_share, generator)
         images.append(image)
         as_asked = hole.any() and _uniform(0, 1, generator) < samples.hole_share
-        masks.append(hole if as_asked else rectangle_mask(size, generator))
+        masks.append(hole if as_asked else random_mask(samples, size, generator))
         prompts.append(EMPTY if _uniform(0, 1, generator) < empty_share else prompt)
     return Batch(torch.stack(images), torch.stack(masks), torch.tensor(prompts))
 

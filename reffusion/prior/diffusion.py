@@ -171,11 +171,14 @@ def sample(
 def guided(
     prior: Prior, noisy: Tensor, t: Tensor, condition: Tensor, text: Tensor, empty: Tensor | None, guidance: float
 ) -> tuple[Tensor, Tensor]:
-    """(eps, z_0) under classifier-free guidance (1 + a) eps(cond) - a eps(empty); one UNet batch for both."""
-    if guidance == 0:
-        return predict(prior, noisy, t, condition, text)
-    if empty is None:
+    """(eps, z_0) under classifier-free guidance (1 + a) eps(cond) - a eps(empty); one UNet batch for both.
+
+    Of the empty prompt itself that is eps(empty), whatever a, and one pass.
+    """
+    if guidance and empty is None:
         raise ValueError("guidance needs the empty prompt's embedding")
+    if guidance == 0 or torch.equal(text, empty):
+        return predict(prior, noisy, t, condition, text)
     both = [torch.cat([x, x]) for x in (noisy, t, condition)]
     eps, clean = predict(prior, *both, torch.cat([text, empty]))
     (eps, eps_empty), (clean, clean_empty) = eps.chunk(2), clean.chunk(2)

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from reffusion.prior.model import Prior, pipeline, pipeline_class
 
 LORA_FILE = "pytorch_lora_weights.safetensors"
+# Queries, keys, values; the last of either is the output projection.
 ATTENTION = ("to_q", "to_k", "to_v", "to_out.0")
 TEXT_ATTENTION = ("q_proj", "k_proj", "v_proj", "out_proj")
 CONVOLUTIONS = (
@@ -42,7 +43,8 @@ def add(prior: Prior, rank: int, alpha: float, dropout: float, layers: str, seed
 
     Args:
         rank, alpha, dropout: of every layer; the change of a weight is alpha / rank * B A.
-        layers: "attention" (the paper's), or "attention+conv" (UNet convolutions and feed-forward layers too).
+        layers: "attention" (the paper's), "qkv" (without its output projections), or "attention+conv" (UNet
+            convolutions and feed-forward layers too).
         seed: of the layers' initial values.
 
     Returns:
@@ -54,12 +56,16 @@ def add(prior: Prior, rank: int, alpha: float, dropout: float, layers: str, seed
 
     if prior.text_encoder_2 is not None:
         raise ValueError("SDXL cannot be adapted here: it paints references (reference.prior); adapt an SD2-type prior")
-    if layers not in ("attention", "attention+conv"):
-        raise ValueError(f"layers must be 'attention' or 'attention+conv', not {layers!r}")
-    targets = ATTENTION if layers == "attention" else ATTENTION + CONVOLUTIONS
+    if layers not in ("attention", "qkv", "attention+conv"):
+        raise ValueError(f"layers must be 'attention', 'qkv' or 'attention+conv', not {layers!r}")
+    targets, of_text = ATTENTION, TEXT_ATTENTION
+    if layers == "qkv":
+        targets, of_text = ATTENTION[:-1], TEXT_ATTENTION[:-1]
+    elif layers == "attention+conv":
+        targets = ATTENTION + CONVOLUTIONS
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        for part, names in ((prior.unet, targets), (prior.text_encoder, TEXT_ATTENTION)):
+        for part, names in ((prior.unet, targets), (prior.text_encoder, of_text)):
             part.add_adapter(LoraConfig(r=rank, lora_alpha=alpha, lora_dropout=dropout, target_modules=list(names)))
     set_dropout(prior, False)
     found = {"unet": _lora_parameters(prior.unet), "text": _lora_parameters(prior.text_encoder)}

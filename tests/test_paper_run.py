@@ -1,0 +1,153 @@
+"""The profile `paper` from masks to scores, every term on, with small random models of the real architectures."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import small_scene as small
+import torch
+from test_monocular import small_model
+
+from benchmarks.gpu import full_size
+from reffusion.depth import monocular
+from reffusion.io.arrays import load_json
+from reffusion.io.images import load_image
+from reffusion.io.ply import load_ply, save_ply
+from reffusion.io.scene import load_mask_sets, load_references, load_scene
+from reffusion.io.traces import read_trace
+from reffusion.params.base import Settings
+from reffusion.prior.model import pipeline
+from reffusion.weights import published
+from runner.resolve import Request, resolve
+
+ROOT = Path(__file__).resolve().parent.parent
+STAGES = {
+    "masks": ("poses", "fit"),
+    "reference": ("scene", "poses", "fit", "masks"),
+    "personalize": ("poses", "reference"),
+    "initialize": ("poses", "fit", "masks", "reference"),
+    "distill": ("poses", "fit", "masks", "reference", "personalize", "initialize"),
+    "evaluate": ("poses", "fit", "masks", "reference", "personalize", "initialize", "distill"),
+}
+# All that differs from the profile: sizes and numbers of steps; where to compute, and where the weights lie.
+SIZES = {
+    "reference": {"candidates": 2, "sampler.steps": 2},
+    "personalize": {"steps": 2, "optimizer.batch": 2},
+    "distill": {
+        "iterations": 9,
+        "densify.every": 4,
+        "depth.steps": 2,
+        "adversarial.patches": 4,
+        "adversarial.size": 16,
+        "adversarial.width": 4,
+    },
+}
+WEIGHTS = {
+    "reference": {"prior": "sdxl"},
+    "personalize": {"prior": "sd2"},
+    "initialize": {"depth.model": "depth"},
+    "distill": {"prior": "sd2", "depth.model": "depth"},
+}
+STANDS_FOR = {"sd2": published.SD2, "sdxl": published.SDXL, "depth": "depth-anything/Depth-Anything-V2-Small-hf"}
+HERE = {"device": "cpu", "dtype": "float32"}
+
+
+def picture(view) -> torch.Tensor:
+    return torch.from_numpy(small.photo(view)).permute(2, 0, 1) / 255
+
+
+def network_of_the_tilt() -> torch.nn.Module:
+    """A random Depth Anything that happens to say how the wall leans; one that says the opposite is refused."""
+    wanted = -np.mgrid[: small.HEIGHT, : small.WIDTH][0].ravel()
+    for seed in (28, *range(200)):
+        model = small_model(seed=seed)
+        network = monocular.make_network(model)
+        said = [monocular.disparity(network, picture(small.CAMERAS[n])).numpy().ravel() for n in ("a0", "a2", "a4")]
+        if min(np.corrcoef(answer, wanted)[0, 1] for answer in said) > 0.5:
+            return model
+    raise AssertionError("no such network among 200")
+
+
+def tilted(fit: Path) -> None:
+    """The wall leans, as seen from the middle: a wall parallel to the views would not fix the scale of a depth."""
+    gaussians = load_ply(fit / "gaussians.ply")
+    means = gaussians.means / (1 - 0.2 * gaussians.means[:, 1:2] / small.WALL)
+    save_ply(fit / "gaussians.ply", replace(gaussians, means=means))
+
+
+def parameters(weights: Path) -> dict[str, Settings]:
+    """stage -> the profile's parameters but for `SIZES`, `WEIGHTS` and `HERE`."""
+    said = resolve(Request(ROOT, ROOT / "runs", "", profile="paper"), scene=False).params
+    found = {}
+    for stage in STAGES:
+        profile = importlib.import_module(f"reffusion.params.{stage}").Params(**said[stage])
+        places = {name: str(weights / folder) for name, folder in WEIGHTS.get(stage, {}).items()}
+        assert profile == profile.changed({n: STANDS_FOR[folder] for n, folder in WEIGHTS.get(stage, {}).items()})
+        here = {name: value for name, value in HERE.items() if name in said[stage]}
+        found[stage] = profile.changed(SIZES.get(stage, {}) | places | here)
+    return found
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Every stage's folder."""
+    home = tmp_path_factory.mktemp("paper")
+    paths = {name: home / name for name in ("scene", "poses", "fit", *STAGES)}
+    for name, shape in (("sd2", full_size.SD2), ("sdxl", full_size.SDXL)):
+        prior = full_size.build(full_size.shrunk(shape), torch.float32)
+        pipeline(replace(prior, zero_empty=True)).save_pretrained(home / name)
+    network_of_the_tilt().save_pretrained(home / "depth")
+    small.write(home, 1.5)
+    small.write_photos(paths["scene"], paths["poses"], small.CAMERAS)
+    tilted(paths["fit"])
+    params = parameters(home)
+    for stage, needs in STAGES.items():
+        paths[stage].mkdir(exist_ok=True)
+        module = importlib.import_module(f"stages.{stage}")
+        module.run(params[stage], paths[stage], **{need: paths[need] for need in needs})
+    return paths
+
+
+def test_the_consistent_mask_is_the_mask_of_every_term(made):
+    sets = load_mask_sets(made["masks"], small.CAMERAS)
+    assert all((each.invent == each.consistent).all() and each.invent.any() for each in sets.values())
+    scene = load_scene(made["poses"])
+    (reference,) = load_references(made["reference"], scene)
+    name = load_json(made["masks"] / "facts.json")["best_reference"]
+    assert reference.camera.name == name and (reference.mask == sets[name].consistent).all()
+    photo = load_image(made["poses"] / "images" / f"{name}.png")
+    outside = ~reference.mask
+    assert (reference.image[outside] == photo[outside]).all() and (reference.image != photo).any()
+
+
+def test_personalization_leaves_the_papers_lora(made):
+    header = (made["personalize"] / "pytorch_lora_weights.safetensors").read_bytes()
+    facts = json.loads(header[8 : 8 + int.from_bytes(header[:8], "little")])
+    shapes = {name.rpartition(".lora")[0]: each["shape"] for name, each in facts.items() if "lora_A" in name}
+    assert {shape[0] for shape in shapes.values()} == {8} and any("text_encoder" in name for name in shapes)
+    said = json.loads(facts["__metadata__"]["lora_adapter_metadata"])
+    assert [said[f"{part}.{name}"] for part in ("unet", "text_encoder") for name in ("r", "lora_alpha")] == [8, 16] * 2
+
+
+def test_every_term_works_and_masked_gaussians_multiply(made):
+    lines = read_trace(made["distill"] / "trace.jsonl")
+    last, first = lines[-1], lines[0]
+    assert last["iteration"] == 9 and last["reason"] == "finished"
+    assert last["sds_gradient_max"] > 0 and last["depth"] > 0 and last["reconstruction"] > 0
+    assert last["adversarial"] < 0 < last["critic_slope"]  # the saturating form; R1
+    assert not [name for name in last if name.startswith("depth_skipped")]
+    assert last["masked_gaussians"] > first["masked_gaussians"]
+    assert last["gaussians"] - last["masked_gaussians"] == first["gaussians"] - first["masked_gaussians"]
+    assert load_json(made["initialize"] / "facts.json")["haze"] == 0
+    assert not (made["initialize"] / "further").exists() and not (made["initialize"] / "tainted").exists()
+
+
+def test_the_scores_are_those_of_a_scene_with_noise_in_its_hole(made):
+    mean = load_json(made["evaluate"] / "metrics.json")["mean"]
+    assert mean["psnr_outside"] > 30 > 20 > mean["psnr_box"] > 5
+    assert {path.stem for path in (made["evaluate"] / "renders").iterdir()} == set(small.TEST)

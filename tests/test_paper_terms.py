@@ -1,0 +1,210 @@
+"""Where code and paper once parted: what supervises, what stands for what, prompts, masks, step sizes, colours."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+import small_scene as small
+import torch
+from small_params import altered
+from small_prior import small_prior
+from test_distill import camera, train_view, wall
+
+from reffusion.distill import confinement, optimization
+from reffusion.distill.depth_term import _within
+from reffusion.fit import step
+from reffusion.gaussians.optimize import Rates
+from reffusion.geometry import cameras_extent
+from reffusion.io.arrays import load_labels
+from reffusion.io.scene import load_mask_sets, load_references, load_scene, save_mask_sets
+from reffusion.params.distill import Params, Sds
+from reffusion.params.fit import LearningRates
+from reffusion.params.personalize import Samples
+from reffusion.prior import crops, diffusion, lora
+from reffusion.seeding import generator
+from reffusion.types import MaskSet
+from runner.keys import HASHES, Hashes
+from runner.resolve import Request, resolve_all
+from stages import distill, fit, initialize, masks, reference
+
+ROOT = Path(__file__).resolve().parent.parent
+NEAR = 1.6
+
+
+@pytest.fixture(scope="module")
+def prior():
+    return small_prior()
+
+
+# ------------------------------------------------------------------------------------------------ what supervises
+
+
+@pytest.fixture(scope="module")
+def views_of(tmp_path_factory):
+    """(parameters) -> the training views of a scene where I lies beside C, and view a3 has no I."""
+    home = tmp_path_factory.mktemp("insertion")
+    poses, fitted, _ = small.write(home, NEAR, clean=("a4",))
+    hidden, drawn, none = (np.zeros((small.HEIGHT, small.WIDTH), bool) for _ in range(3))
+    hidden[20:40, 10:30], drawn[20:40, 50:70] = True, True
+    sets = {name: MaskSet(none, hidden, none, none if name == "a3" else drawn) for name in small.CAMERAS}
+    save_mask_sets(home / "masks", sets)
+    scene = load_scene(poses)
+
+    def made(**changes):
+        views = distill.train_views(altered(Params(), **changes), scene, poses, fitted, home / "masks")
+        return {view.camera.name: view for view in views}
+
+    return made, torch.from_numpy(hidden), torch.from_numpy(drawn)
+
+
+def test_photographs_do_not_supervise_where_an_object_is_drawn(views_of):
+    made, hidden, drawn = views_of
+    views = made()
+    assert torch.equal(views["a0"].supervises, ~(hidden | drawn)) and torch.equal(views["a3"].supervises, ~hidden)
+    assert views["a4"].clean and views["a4"].supervises.all()
+    _, _, not_seen = _within(10_000, views["a0"])  # the depth term's
+    assert torch.equal(not_seen, hidden | drawn)
+
+
+def test_a_view_without_invented_pixels_is_distilled_where_c_is_repainted(views_of):
+    made, hidden, _ = views_of
+    assert not made(repaint="invent")["a3"].repaint.any()
+    views = made(repaint="consistent")
+    assert torch.equal(views["a3"].repaint, hidden) and not views["a4"].repaint.any()
+
+
+def test_settling_leaves_what_is_to_be_drawn_alone(tmp_path, monkeypatch):
+    said = {}
+    monkeypatch.setattr(initialize, "settle", lambda gaussians, known, *_: said.update(known.hidden) or gaussians)
+    hidden, drawn = np.eye(4, dtype=bool), np.eye(4, dtype=bool)[::-1]
+    view = type("View", (), {"camera": camera(), "hidden": hidden})
+    around = type("Around", (), {"cameras": [camera()], "photos": {}, "views": [view]})
+    initialize.settled(initialize.Params(settle=1), tmp_path, None, [], around, {"a": drawn})
+    assert (said["a"] == hidden | drawn).all()
+
+
+def test_a_clean_view_can_be_a_reference(tmp_path):
+    """The stages on it: its hole is C, and what is behind the object lies where the wall is."""
+    paths = {name: tmp_path / name for name in ("scene", "poses", "fit", "masks", "reference", "initialize")}
+    poses, fitted, _ = small.write(tmp_path, NEAR, clean=("a2",))
+    small.write_photos(paths["scene"], poses, small.CAMERAS)
+    for name in ("masks", "reference", "initialize"):
+        paths[name].mkdir()
+    masks.run(masks.Params(invent="consistent"), paths["masks"], poses=poses, fit=fitted)
+    given = {"view": "a2", "image": "images/a2.png"}
+    asked = reference.Params(reference=given)
+    reference.run(asked, paths["reference"], **{k: paths[k] for k in ("scene", "poses", "fit", "masks")})
+    (found,) = load_references(paths["reference"], load_scene(poses))
+    sets = load_mask_sets(paths["masks"], ["a2"])["a2"]
+    assert not sets.invent.any() and (found.mask == sets.consistent).all() and found.mask.sum() > 100
+    needs = {k: paths[k] for k in ("poses", "fit", "masks", "reference")}
+    initialize.run(initialize.Params(), paths["initialize"], **needs)
+    assert load_labels(paths["initialize"] / "labels.npy").any()
+
+
+# ------------------------------------------------------------------------------------- what a prior is told and shown
+
+
+def test_an_unadapted_prior_is_not_prompted_unless_asked():
+    asked = [(None, ""), *product(("no_personalization", "sds_plain"), ("", "distill.prompts=sks"))]
+    where = ROOT, ROOT / "runs", ""
+    requests = [Request(*where, profile="paper", variant=variant, set=chosen) for variant, chosen in asked]
+    jobs = resolve_all(requests, Hashes(ROOT / "runs" / HASHES), scene=False)
+    assert [job.params["distill"]["prompts"] for job in jobs] == ["sks", "empty", "sks", "empty", "sks"]
+
+
+def test_what_the_prior_is_told(prior, monkeypatch):
+    monkeypatch.setattr(distill, "load_prior", lambda *_, **__: prior)
+    _, told = distill.adapted_prior(Params(), None)
+    _, nothing = distill.adapted_prior(Params(prompts="empty"), None)
+    assert torch.equal(told, diffusion.embed_text(prior, list(crops.PROMPTS)))
+    assert torch.equal(nothing, diffusion.embed_text(prior, [""] * 3)) and not torch.equal(told[0], nothing[0])
+
+
+def test_guidance_of_the_empty_prompt_changes_nothing_and_costs_nothing(prior, monkeypatch):
+    noise = torch.randn(2, 9, 16, 16, generator=generator(0, "guidance"))
+    noisy, condition, at = noise[:, :4], noise[:, 4:], torch.tensor([300, 700])
+    empty = diffusion.embed_text(prior, ["", ""])
+    rows = []
+    asked = diffusion.raw_prediction
+    monkeypatch.setattr(diffusion, "raw_prediction", lambda p, z, *rest: rows.append(len(z)) or asked(p, z, *rest))
+    with torch.no_grad():
+        plain = diffusion.guided(prior, noisy, at, condition, empty, None, 0.0)
+        guided = diffusion.guided(prior, noisy, at, condition, empty, empty, 7.5)
+    assert rows == [2, 2] and all(torch.equal(a, b) for a, b in zip(plain, guided, strict=True))
+
+
+def test_colours_above_1_are_shown_as_1_and_may_only_come_back():
+    color = torch.tensor([-0.2, 0.5, 1.5, 1.5], requires_grad=True)
+    shown = confinement.displayed(color)
+    assert torch.equal(shown, torch.tensor([0.0, 0.5, 1.0, 1.0]))
+    (shown * torch.tensor([1.0, 1.0, 1.0, -1.0])).sum().backward()  # a step goes against the gradient
+    assert color.grad.tolist() == [0, 1, 1, 0]
+
+
+def test_no_term_shows_a_prior_or_a_critic_colours_above_1(prior, monkeypatch):
+    gaussians, masked = wall()
+    bright = replace(gaussians, sh=gaussians.sh + 3)
+    seen = []
+    encode, patches = diffusion.encode, confinement.patches_around
+    monkeypatch.setattr(diffusion, "encode", lambda p, images: seen.append(float(images.max())) or encode(p, images))
+    watched = lambda image, *rest: seen.append(float(image.max()) * 2 - 1) or patches(image, *rest)
+    monkeypatch.setattr(confinement, "patches_around", watched)
+    with torch.no_grad():
+        text = diffusion.embed_text(prior, list(crops.PROMPTS))
+    confinement.sds_term(bright, masked, train_view(), prior, text, Sds(guidance=0), generator(0, "bright"))
+    critic = optimization.Params(adversarial={"patches": 4, "size": 8, "width": 4}).adversarial
+    adversary = confinement.Adversary(critic, 0)
+    view = train_view()
+    confinement.adversarial_term(bright, masked, view, view.photo, view.repaint, adversary, generator(0, "bright"))
+    assert len(seen) >= 4 and max(seen) <= 1 + 1e-5
+
+
+# ------------------------------------------------------------------------------------------------ RealFill's choices
+
+
+def test_a_tenth_of_realfills_masks_repaints_all():
+    whole = {}
+    for kind in ("rectangles", "realfill"):
+        draws = generator(0, "masks")
+        drawn = [crops.random_mask(Samples(masks=kind), 32, draws) for _ in range(600)]
+        assert all(((mask == 0) | (mask == 1)).all() for mask in drawn)
+        whole[kind] = np.mean([bool(mask.all()) for mask in drawn])
+    assert whole["rectangles"] < 0.01 and whole["realfill"] == pytest.approx(0.1, abs=0.03)
+
+
+@pytest.mark.parametrize("layers", ["attention", "qkv"])
+def test_output_projections_are_adapted_or_not(layers):
+    fresh = small_prior()
+    lora.add(fresh, 2, 2.0, 0.0, layers, 0)
+    names = list(lora.state(fresh))
+    assert any("to_out" in name for name in names) == any("out_proj" in name for name in names) == (layers != "qkv")
+    assert all(any(part in name for name in names) for part in ("to_q", "to_k", "to_v", "q_proj", "k_proj", "v_proj"))
+
+
+# ---------------------------------------------------------------------------------------------------- the fit's letter
+
+
+def test_positions_step_by_the_cameras_extent_as_3dgs_has_it():
+    cameras = [camera("a", -0.3), camera("b", 0.3), camera("c", 0.0)]
+    assert cameras_extent(cameras) == pytest.approx(1.1 * 0.3)
+    for unit, factor in (("distance", 1.0), ("cameras", 1.1 * 0.3)):
+        rates = step.rates_of(LearningRates(means_unit=unit), cameras)
+        ours = optimization.rates_of(Params(lr={"means_unit": unit}).lr, cameras)
+        for each in (rates, ours):
+            assert (each.means, each.means_last) == pytest.approx((1.6e-4 * factor, 1.6e-6 * factor))
+            assert replace(each, means=Rates.means, means_last=Rates.means_last) == Rates()
+
+
+def test_what_the_paper_does_not_do_can_be_left_out(monkeypatch):
+    monkeypatch.setattr(fit.support, "harmonics", lambda *_: (0, 1.0))
+    scene = type("Scene", (), {"points": None, "cameras": {}, "train": ()})
+    degree = lambda limited: fit.supported(fit.Params(sh={"limited": limited}), scene).sh.degree
+    assert (degree(True), degree(False)) == (0, 3)
+    speck = np.zeros((100, 200), bool)
+    speck[50, 50] = True
+    assert not masks.tidied(masks.Params(), speck).any() and masks.tidied(masks.Params(tidy=False), speck).sum() == 1
