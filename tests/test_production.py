@@ -150,6 +150,23 @@ def test_a_small_lora_is_not_lost_in_half_precision(sd2, dropout):
     assert torch.dot(exact, rounded) / exact.norm() / rounded.norm() > 0.65  # 0.41 where it is added to the weights
 
 
+def test_a_lora_loads_into_diffusers_own_pipeline_of_sd2(sd2, tmp_path):
+    """Its UNet's and its text encoder's part, by `load_lora_weights`, into models of the same weights."""
+    before = F.epsilon(sd2)
+    found = lora.add(sd2, 4, 8.0, 0.1, "attention", 0)
+    noise = generator(0, "lora")
+    for parameter in found["unet"] + found["text"]:
+        parameter.data += 0.1 * torch.randn(parameter.shape, generator=noise)
+    trained, words = F.epsilon(sd2), diffusion.embed_text(sd2, [crops.PROMPTS[0]])
+    lora.save(sd2, tmp_path)
+    fresh = F.build(F.shrunk(F.SD2), torch.float32)
+    pipe = pipeline(fresh)
+    pipe.load_lora_weights(tmp_path)
+    lora.set_dropout(fresh, False)  # new layers begin in training mode
+    assert (F.epsilon(fresh) - trained).abs().max() < 1e-5 < (trained - before).abs().max()
+    assert (diffusion.embed_text(fresh, [crops.PROMPTS[0]]) - words).abs().max() < 1e-5
+
+
 def test_the_text_encoder_is_let_go():
     prior = F.build(F.shrunk(F.SD2), torch.float32)
     whole, encoder = prior.bytes, weakref.ref(prior.text_encoder)
