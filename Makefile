@@ -24,7 +24,7 @@ options = $(where) $(if $(profile),--profile="$$profile") $(if $(budget),--budge
 	$(if $(set),--set="$$set") $(if $(trust),--trust) $(if $(keep),--keep)
 
 .PHONY: help setup all $(STAGES) plan check verify clean batch weights demo prior prior-report sds-variance view turntable test \
-	fuzz bench stability gpu-check lint
+	fuzz bench stability gpu gpu-check lint
 .DELETE_ON_ERROR:
 
 help:
@@ -46,6 +46,7 @@ help:
 	@echo '                               demo-wide, -360, -seen, -photos, -behind, -table, -corner, -grass, with -N too'
 	@echo 'make prior [steps=N]           train the embedded prior further (hours)'
 	@echo 'make weights [profile=paper]   fetch what a profile needs, sizes first; offline=1 only says what is missing'
+	@echo 'make gpu                       on a CUDA machine: gsplat, and its extension built and loaded (minutes, once)'
 	@echo 'make gpu-check                 values, time and memory at the paper'"'"'s sizes on a CUDA machine (8 minutes)'
 	@echo 'make prior-report              measure it, and draw what it paints (minutes): runs/prior-report'
 	@echo 'make setup | test | lint       .venv; the tests, slow=1 those that take minutes too (make fuzz: hours); ruff and mypy'
@@ -181,6 +182,12 @@ bench: $(VENV)/.ready
 
 stability: $(VENV)/.ready-dev
 	$(PY) -m benchmarks.stability --out="$${runs:-runs}/stability.json"
+
+# First what cannot be mended by installing; MAX_JOBS bounds the compilers, each of which takes up to 1 GB.
+gpu: $(VENV)/.ready
+	@$(PY) -m benchmarks.gpu.ready --before
+	$(PY) -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[gpu]'
+	@$(PY) -m benchmarks.gpu.ready
 
 gpu-check: $(VENV)/.ready
 	$(PY) -m benchmarks.gpu.check --out="$${runs:-runs}/gpu-check"

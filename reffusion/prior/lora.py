@@ -132,12 +132,11 @@ def save(prior: Prior, folder: Path) -> None:
     """Write `pytorch_lora_weights.safetensors` as diffusers' `load_lora_weights` reads it, rank and alpha included."""
     from peft import get_peft_model_state_dict
 
+    text = get_peft_model_state_dict(prior.text_encoder, save_embedding_layers=False)
     pipeline_class().save_lora_weights(
         folder,
         unet_lora_layers=get_peft_model_state_dict(prior.unet, save_embedding_layers=False),
-        text_encoder_lora_layers=_as_published(
-            get_peft_model_state_dict(prior.text_encoder, save_embedding_layers=False)
-        ),
+        text_encoder_lora_layers=_as_published(text),
         weight_name=LORA_FILE,
         unet_lora_adapter_metadata=_adapter_facts(prior.unet),
         text_encoder_lora_adapter_metadata=_adapter_facts(prior.text_encoder),

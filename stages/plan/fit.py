@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from reffusion.io import machine
 from reffusion.params.fit import Params
 
-__all__ = ["Params", "preview"]
+__all__ = ["Params", "lacks", "preview"]
 
 
 def preview(params: Params, *, poses: Path | None) -> list[str]:
     given = poses is not None and (poses / "gaussians.ply").exists() and params.pixels == "all"
     return ["takes over the scene's gaussians.ply: no optimisation"] if given else []
+
+
+def lacks(params: Params) -> list[str]:
+    """What this machine has not, and the stage needs on CUDA."""
+    return machine.lacks(machine.machine())
