@@ -2,7 +2,7 @@
 
 # Given on the command line; set here so that a variable of the environment is not taken for one of them. Recipes read
 # them from their environment, in double quotes, as they were typed: there is no quote or $ that a shell or make obeys.
-given := scene profile variant budget set trust keep runs variants seeds seed name steps gate slow offline port
+given := scene profile variant budget set trust keep runs variants seeds seed name steps gate slow offline port card
 $(foreach each,$(given),$(eval $(each) :=))
 data := data
 $(foreach each,$(given) data,$(eval override $(each) := $$(value $(each))))
@@ -30,7 +30,7 @@ options = $(where) $(if $(profile),--profile="$$profile") $(if $(budget),--budge
 help:
 	@echo 'make scene=demo all            the whole job; a second call finds everything cached'
 	@echo 'make scene=X STAGE             one stage and what it needs: $(STAGES)'
-	@echo 'make scene=X plan              what would run, and why'
+	@echo 'make scene=X plan              what would run, and why; card=rtx-4090: and what each stage takes on that card'
 	@echo 'make scene=X check             what is odd about its photographs, masks and poses; each mask over its photograph'
 	@echo 'make scene=X compare           the full method, ablations and baselines side by side: runs/X/compare.html'
 	@echo '                               variants=a,b  only these; seeds=5  on demo, demo-1 ... demo-4, with intervals'
@@ -109,7 +109,7 @@ all $(STAGES): ready
 	@$(RUN) run $@ $(of) $(options)
 
 plan: ready
-	@$(RUN) plan $(of) $(options)
+	@$(RUN) plan $(of) $(options) $(if $(card),--card="$$card")
 
 check: ready
 	@$(RUN) run poses $(of) $(options)
