@@ -167,6 +167,19 @@ def test_a_lora_loads_into_diffusers_own_pipeline_of_sd2(sd2, tmp_path):
     assert (diffusion.embed_text(fresh, [crops.PROMPTS[0]]) - words).abs().max() < 1e-5
 
 
+def test_the_order_of_weights_in_memory_changes_nothing(sd2, tmp_path):
+    """What a UNet on CUDA is laid out like: the same answer, with LoRA that is trained, saved and merged."""
+    lora.add(sd2, 4, 8.0, 0.0, "attention+conv", 0)
+    before = F.epsilon(sd2)
+    sd2.unet.to(memory_format=torch.channels_last)
+    assert (F.epsilon(sd2) - before).abs().max() < 1e-5
+    F.personalization_step(F.build(F.shrunk(F.SD2), torch.float32), F.reference(32), 1, tmp_path)
+    fresh = F.build(F.shrunk(F.SD2), torch.float32)
+    fresh.unet.to(memory_format=torch.channels_last)
+    plain = lora.merged(F.build(F.shrunk(F.SD2), torch.float32), tmp_path)
+    assert (F.epsilon(lora.merged(fresh, tmp_path)) - F.epsilon(plain)).abs().max() < 1e-5
+
+
 def test_the_text_encoder_is_let_go():
     prior = F.build(F.shrunk(F.SD2), torch.float32)
     whole, encoder = prior.bytes, weakref.ref(prior.text_encoder)

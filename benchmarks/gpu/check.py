@@ -74,10 +74,11 @@ class Sizes:
     repeats: int
     critic: Adversarial
     shape: full_size.Shape
+    oracle: tuple[int, int] = (400, 200)  # Gaussians and width of what is compared with the oracle
 
 
 PAPER = Sizes(1280, 500_000, 16, 400, 12, 3, Adversarial(), full_size.SD2)  # 1600 x 1280 px
-TOY = Sizes(40, 300, 2, 4, 3, 1, Adversarial(patches=8, size=8, width=8), full_size.shrunk(full_size.SD2))
+TOY = Sizes(40, 300, 2, 4, 3, 1, Adversarial(patches=8, size=8, width=8), full_size.shrunk(full_size.SD2), (100, 70))
 
 
 @dataclass
@@ -176,7 +177,8 @@ def compared(found: dict[str, Tensor], truth: dict[str, Tensor]) -> dict[str, An
     return {"errors": errors, "ok": not beyond} | ({"beyond": ", ".join(beyond)} if beyond else {})
 
 
-def splatting(bench: Bench, antialiased: bool = False, crop: bool = False, count: int = 400, width: int = 200):
+def splatting(bench: Bench, antialiased: bool = False, crop: bool = False) -> dict[str, Any]:
+    count, width = bench.sizes.oracle
     height = width * 4 // 5
     camera = Camera("oracle", width, height, width, width, width / 2, height / 2, np.eye(4))
     camera = camera.cropped(width // 3, height // 4, width // 3, height // 3) if crop else camera
@@ -186,9 +188,9 @@ def splatting(bench: Bench, antialiased: bool = False, crop: bool = False, count
     return compared(found, drawn(bench, scene, camera, "reference", torch.float64))
 
 
-def similarity(bench: Bench, size: int = 200) -> dict[str, Any]:
+def similarity(bench: Bench) -> dict[str, Any]:
     """D-SSIM and its gradient in float32 on the device against float64: TF32 would be off by a tenth."""
-    draw = generator(0, "ssim")
+    draw, size = generator(0, "ssim"), bench.sizes.oracle[1]
     image, other = (torch.rand(size, size, 3, generator=draw, dtype=torch.float64) for _ in range(2))
     image, other = 0.5 + 0.1 * image, 0.5 + 0.1 * other  # little contrast: most is lost in the subtraction
     weights = torch.rand(size, size, generator=draw, dtype=torch.float64) > 0.3
