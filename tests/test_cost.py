@@ -8,6 +8,7 @@ import re
 
 import pytest
 from test_installed import ROOT, write_capture
+from test_machine import with_nvidia_smi
 
 from benchmarks.gpu import counts
 from reffusion.cost import estimate
@@ -15,7 +16,7 @@ from reffusion.cost.counts import COUNTS
 from reffusion.params import distill, fit, personalize, reference
 from runner import Refused
 from runner.costs import costs, span
-from runner.plan import plan
+from runner.plan import plan, table
 from runner.resolve import Request, resolve
 
 HALF = {"device": "cuda", "dtype": "float16"}
@@ -73,9 +74,18 @@ def test_cards_by_any_name():
 
 
 def test_what_a_plan_prints(tmp_path, monkeypatch):
+    """On a machine with a small card, an old driver and, as it may be, no gsplat and a torch without CUDA."""
     write_capture(tmp_path / "row")
+    monkeypatch.setattr(os, "environ", with_nvidia_smi(tmp_path, "NVIDIA GeForce GTX 1080, 8192, 440.10"))
+    monkeypatch.setattr("runner.plan.has_cuda", lambda: True)
     job = resolve(Request(ROOT, tmp_path / "runs", str(tmp_path / "row"), profile="paper"))
     decisions = plan(job, job.pipeline.closure("all"))
+    printed = table(job, decisions)
+    for stage, memory in (("personalize", 20), ("distill", 16)):
+        assert decisions[stage].word == "missing"
+        assert any(f"{stage}.memory_gb is {memory}, and NVIDIA" in line for line in decisions[stage].lacks), stage
+        assert f"{stage}.memory_gb is {memory}, and NVIDIA GeForce GTX 1080 has 9 GB" in printed
+    assert "fit.device is cuda, and " in printed and printed.count("\n") < 40
     head, *lines = costs(job, decisions, "rtx-4090").splitlines()
     assert "on rtx-4090: counted operations" in head and "never timed on a card" in head
     shape = r"    (fit|reference|personalize|distill) +[\d.]+ (s|min|h) +\d+\.\d GB"
