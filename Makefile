@@ -2,7 +2,7 @@
 
 # Given on the command line; set here so that a variable of the environment is not taken for one of them. Recipes read
 # them from their environment, in double quotes, as they were typed: there is no quote or $ that a shell or make obeys.
-given := scene profile variant budget set trust keep runs variants seeds seed name steps gate slow offline port
+given := scene profile variant budget set trust keep runs variants seeds seed name steps gate slow offline port card
 $(foreach each,$(given),$(eval $(each) :=))
 data := data
 $(foreach each,$(given) data,$(eval override $(each) := $$(value $(each))))
@@ -24,13 +24,13 @@ options = $(where) $(if $(profile),--profile="$$profile") $(if $(budget),--budge
 	$(if $(set),--set="$$set") $(if $(trust),--trust) $(if $(keep),--keep)
 
 .PHONY: help setup all $(STAGES) plan check verify clean batch weights demo prior prior-report sds-variance view turntable test \
-	fuzz bench stability gpu-check lint
+	fuzz bench stability gpu gpu-check lint
 .DELETE_ON_ERROR:
 
 help:
 	@echo 'make scene=demo all            the whole job; a second call finds everything cached'
 	@echo 'make scene=X STAGE             one stage and what it needs: $(STAGES)'
-	@echo 'make scene=X plan              what would run, and why'
+	@echo 'make scene=X plan              what would run, and why; card=rtx-4090: and what each stage takes on that card'
 	@echo 'make scene=X check             what is odd about its photographs, masks and poses; each mask over its photograph'
 	@echo 'make scene=X compare           the full method, ablations and baselines side by side: runs/X/compare.html'
 	@echo '                               variants=a,b  only these; seeds=5  on demo, demo-1 ... demo-4, with intervals'
@@ -46,6 +46,7 @@ help:
 	@echo '                               demo-wide, -360, -seen, -photos, -behind, -table, -corner, -grass, with -N too'
 	@echo 'make prior [steps=N]           train the embedded prior further (hours)'
 	@echo 'make weights [profile=paper]   fetch what a profile needs, sizes first; offline=1 only says what is missing'
+	@echo 'make gpu                       on a CUDA machine: gsplat, and its extension built and loaded (minutes, once)'
 	@echo 'make gpu-check                 values, time and memory at the paper'"'"'s sizes on a CUDA machine (8 minutes)'
 	@echo 'make prior-report              measure it, and draw what it paints (minutes): runs/prior-report'
 	@echo 'make setup | test | lint       .venv; the tests, slow=1 those that take minutes too (make fuzz: hours); ruff and mypy'
@@ -108,7 +109,7 @@ all $(STAGES): ready
 	@$(RUN) run $@ $(of) $(options)
 
 plan: ready
-	@$(RUN) plan $(of) $(options)
+	@$(RUN) plan $(of) $(options) $(if $(card),--card="$$card")
 
 check: ready
 	@$(RUN) run poses $(of) $(options)
@@ -181,6 +182,12 @@ bench: $(VENV)/.ready
 
 stability: $(VENV)/.ready-dev
 	$(PY) -m benchmarks.stability --out="$${runs:-runs}/stability.json"
+
+# First what cannot be mended by installing; MAX_JOBS bounds the compilers, each of which takes up to 1 GB.
+gpu: $(VENV)/.ready
+	@$(PY) -m benchmarks.gpu.ready --before
+	$(PY) -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[gpu]'
+	@$(PY) -m benchmarks.gpu.ready
 
 gpu-check: $(VENV)/.ready
 	$(PY) -m benchmarks.gpu.check --out="$${runs:-runs}/gpu-check"

@@ -20,6 +20,7 @@ from reffusion.io.traces import read_trace
 
 CHECKPOINT = "checkpoint.pt"
 LENGTH = "length.json"  # the number of steps that fit into a time budget
+WORTH = 50  # times what the last checkpoint took, that work goes on before the next: under 2 % of the time is for them
 TRIAL = 4  # steps by which a stage measures its speed
 
 
@@ -54,6 +55,26 @@ def clear_checkpoint(folder: Path) -> None:
     """Remove what `save_checkpoint` wrote: the stage is done."""
     (folder / CHECKPOINT).unlink(missing_ok=True)
     (folder / (CHECKPOINT + ".writing")).unlink(missing_ok=True)
+
+
+class Checkpoints:
+    """When the next one is due: `seconds` after the last was written, and later where that took long, as with a million
+    Gaussians or a slow disk. The clock starts anew after writing."""
+
+    def __init__(self, folder: Path, seconds: float):
+        self._folder, self._seconds = folder, seconds
+        self._wait, self._since = seconds, time.monotonic()
+
+    @property
+    def due(self) -> bool:
+        return time.monotonic() - self._since > self._wait
+
+    def save(self, state: Callable[[], dict[str, Any]]) -> None:
+        """Write the state, which is put together only now: that is a part of what it takes."""
+        began = time.monotonic()
+        save_checkpoint(self._folder, state())
+        self._since = time.monotonic()
+        self._wait = max(self._seconds, WORTH * (self._since - began))
 
 
 class Trace:

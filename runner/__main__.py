@@ -11,6 +11,7 @@ from reffusion.command import workplace
 from runner import Failed, Refused
 from runner.child import INTERRUPTED
 from runner.compare import batch, compare, show_results
+from runner.costs import costs
 from runner.execute import run_scene, weights
 from runner.files import told, write_json
 from runner.plan import as_record, plan, table
@@ -34,7 +35,7 @@ def main() -> int:
             if arguments.record:
                 write_json(job.home / "plan.json", as_record(job, decisions))
             else:
-                print(table(job, decisions))
+                print("\n".join(filter(None, [table(job, decisions), costs(job, decisions, arguments.card)])))
         elif arguments.command == "run":
             stage, folder = list(run_scene(request, arguments.stage).items())[-1]
             show_results(stage, folder)
@@ -71,6 +72,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--variants", default="", help="compare: these only, with commas between")
     parser.add_argument("--seeds", type=int, default=1, help="compare: on so many scenes: X, X-1, X-2 ...")
     parser.add_argument("--record", action="store_true", help="plan: write it to runs/<scene>/plan.json")
+    parser.add_argument("--card", help="plan: seconds and GB of each stage on this card, like rtx-4090, a100, h100")
     parser.add_argument("--trust", action="store_true", help="accept artifacts made by older code")
     parser.add_argument("--keep", action="store_true", help="go on with artifacts as people changed them, from now on")
     parser.add_argument("--budget", help="time for the whole job, like 5m: sets the number of steps")

@@ -1,8 +1,8 @@
 """The process in which stages are imported: `describe` reads their parameters, `fetch` gets the weights they name,
 `run` does a stage's work.
 
-What can be told of a stage before it runs (Params, needed_weights, preview, scene_files) lies in stages/plan/<stage>.py
-where there is such a file, which imports nothing heavy, else in stages/<stage>.py itself.
+What can be told of a stage before it runs (Params, needed_weights, lacks, cost, preview, scene_files) lies in
+stages/plan/<stage>.py where there is such a file, which imports nothing heavy, else in stages/<stage>.py itself.
 """
 
 import ast
@@ -52,8 +52,8 @@ def describe() -> None:
 
 def _describe(asked: dict[str, Any]) -> dict[str, Any]:
     """What `resolve.Described` holds, where `scene` is given with the files of it that are read; where `brings` is the
-    weights that are "needed"; where `needs` is the preview's "notes" or "refusal"; or {"broken": why}; or {"errors": in
-    the params, "known": names}."""
+    weights that are "needed", and what this machine "lacks" for CUDA; where `card` is its "cost" on that; where `needs`
+    is the preview's "notes" or "refusal"; or {"broken": why}; or {"errors": in the params, "known": names}."""
     stage, needs, brings, scene = (asked.get(name) for name in ("stage", "needs", "brings", "scene"))
     path = _described_in(stage)
     try:
@@ -75,6 +75,13 @@ def _describe(asked: dict[str, Any]) -> dict[str, Any]:
     }
     if brings is not None and hasattr(planned, "needed_weights"):
         answer["needed"] = [asdict(need) for need in planned.needed_weights(resolved, frozenset(brings))]
+    if brings is not None and hasattr(planned, "lacks") and answer["params"].get("device") == "cuda":
+        answer["lacks"] = planned.lacks(resolved)
+    if "card" in asked and hasattr(planned, "cost"):
+        try:
+            answer["cost"] = planned.cost(resolved, asked["card"])
+        except ValueError as error:
+            answer["unknown card"] = told(error)
     if scene is not None and hasattr(planned, "scene_files"):
         files = planned.scene_files(resolved, Path(scene), list(files_below(Path(scene))))
         answer["reads"] = sorted(str(path) for path in files)

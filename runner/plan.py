@@ -29,6 +29,7 @@ class Decision:
     inputs: Inputs | None = None  # what the artifact depends on, where that is known
     notes: tuple[str, ...] = ()  # what the stage says of itself beforehand
     needed: tuple[dict[str, Any], ...] = ()  # the weights it will work with: reffusion.weights.Need
+    lacks: tuple[str, ...] = ()  # what this machine has not, for a stage on CUDA: a line each, with what mends it
 
 
 def decide(job: Job, stage: str, earlier: dict[str, Decision]) -> Decision:
@@ -203,10 +204,13 @@ def _question(job: Job, stage: str, decisions: dict[str, Decision]) -> dict[str,
 
 
 def _answered(job: Job, question: dict[str, Any], decision: Decision, answer: dict[str, Any]) -> Decision:
-    """The decision with what the stage says of itself; `missing` where it refuses, or lacks weights."""
+    """The decision with what the stage says of itself; `missing` where it refuses, or something is lacking."""
     needed, notes = (tuple(answer.get(name, ())) for name in ("needed", "notes"))
     if decision.word not in TO_DO:
         return replace(decision, needed=needed)
+    if absent := tuple(answer.get("lacks", ())):
+        reason = f"{question['stage']}.device is cuda, and {absent[0]}"
+        return Decision("missing", reason, needed=needed, lacks=absent)
     cure, lacks = f"`make weights profile={job.profile}` fetches it", [need for need in needed if need["problem"]]
     for need in (need for need in lacks if not need["optional"]):
         fetch = f"; {cure} ({amount(need['bytes'])})" if need["fetched"] else ""
@@ -226,6 +230,8 @@ def table(job: Job, decisions: dict[str, Decision]) -> str:
         time = f"~{seconds:.0f} s" if seconds is not None else ""
         lines.append(f"  {decision.word:<9} {stage:<12} {time:>7}  {decision.reason}".rstrip())
         lines += [f"{'':33}{note}" for note in decision.notes]
+    rest = dict.fromkeys(line for decision in decisions.values() for line in decision.lacks[1:])
+    lines += [f"  besides, {line}" for line in rest]
     needs = {need["name"]: need for decision in decisions.values() for need in decision.needed if need["problem"]}
     if sizes := [need["bytes"] or 0 for need in needs.values() if need["fetched"] and not need["optional"]]:
         lines.append(f"  weights to fetch: {amount(sum(sizes))}, by `make weights profile={job.profile}`")

@@ -26,6 +26,7 @@ from reffusion.params.distill import Params
 from reffusion.prior import diffusion, lora, memory
 from reffusion.prior.crops import PROMPTS
 from reffusion.prior.model import Prior, load_prior, recomputing, without_text
+from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Scene
 
 MEMORY = "distill.memory_gb"  # what an error names
@@ -44,6 +45,7 @@ def run(
     initialize: Path,
     lift: Path | None = None,
 ) -> None:
+    rasterizer.prepare(params.device)
     began = time.monotonic()
     scene = load_scene(poses)
     initial, masked, holes = start(params, scene, reference, initialize)

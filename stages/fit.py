@@ -19,6 +19,7 @@ from reffusion.io.scene import load_raw_masks, load_scene, load_views
 from reffusion.masks import voting
 from reffusion.paint import paint2d
 from reffusion.params.fit import Params
+from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Scene
 
 
@@ -26,6 +27,7 @@ def run(params: Params, out: Path, *, poses: Path) -> None:
     if (poses / "gaussians.ply").exists() and params.pixels == "all":
         save_ply(out / "gaussians.ply", load_ply(poses / "gaussians.ply"))
         return
+    rasterizer.prepare(params.device)
     began, scene = time.monotonic(), load_scene(poses)
     params = supported(params, scene)
     held_out = scene.train[params.holdout // 2 :: params.holdout] if params.holdout else ()

@@ -40,7 +40,8 @@ SEED = 0  # of the draws that find planes, of settling, and of Gaussians at rand
 def run(
     params: Params, out: Path, *, poses: Path, fit: Path, masks: Path, reference: Path | None, lift: Path | None = None
 ) -> None:
-    gaussians, labels = load_ply(fit / "gaussians.ply"), load_labels(masks / "labels.npy")
+    gaussians = load_ply(fit / "gaussians.ply").map(lambda p: p.to(params.device))
+    labels = load_labels(masks / "labels.npy").to(params.device)
     if len(labels) != len(gaussians):
         raise ValueError(f"{masks}: {len(labels)} labels for {len(gaussians)} Gaussians of {fit}: run masks again")
     scene = load_scene(poses)
@@ -48,15 +49,15 @@ def run(
         raise ValueError("initialize.start is 'lift', but the stage lift was left out: set distill.lift.weight")
     completed = {"reference": reference, "lift": lift}.get(params.start)
     references = load_references(completed, scene) if completed else []
-    network = monocular.load_network(params.depth.model) if params.depth.model and references else None
+    network = monocular.load_network(params.depth.model, params.device) if params.depth.model and references else None
     sets = load_mask_sets(masks, scene.cameras)
-    thing = load_object(masks)
+    thing = load_object(masks).to(params.device)
     around = surroundings(params, scene, gaussians, thing, sets, poses, fit) if references else None
     removed = gaussians.map(lambda p: p[thing])
     gaussians = gaussians.map(lambda p: p[~labels])
-    new = torch.zeros(len(gaussians), dtype=torch.bool)
+    new = torch.zeros(len(gaussians), dtype=torch.bool, device=params.device)
     train = [scene.cameras[name] for name in scene.train]
-    haze = torch.zeros(len(gaussians), dtype=torch.bool)
+    haze = torch.zeros_like(new)
     if params.tidy and params.start != "nothing":  # where nothing is put in its place, haze is better than a black hole
         haze = voting.leaking(gaussians, train, {c.name: sets[c.name].undecided for c in train}, LEAK)
     gaussians, new = gaussians.map(lambda p: p[~haze]), new[~haze]
@@ -74,12 +75,12 @@ def run(
     if params.start == "random" and any(each.invent.any() for each in sets.values()):
         added = at_random(params, removed, gaussians, scene, sets, poses)
         gaussians = gaussians.zipped(added, lambda a, b: torch.cat([a, b]))
-        new = torch.cat([new, torch.ones(len(added), dtype=torch.bool)])
+        new = torch.cat([new, new.new_ones(len(added))])
     if true and params.settle:
         drawn_there = {name: each.invent & (name not in scene.clean) for name, each in sets.items()}
         gaussians = settled(params, out, gaussians, true, around, drawn_there)
     save_ply(out / "gaussians.ply", gaussians)
-    save_labels(out / "labels.npy", new)
+    save_labels(out / "labels.npy", new.cpu())
     uncovered = {each.name: filling.uncovered(gaussians, each, sets[each.name].consistent) for each in train}
     facts = {"new_gaussians": int(new.sum()), "removed_gaussians": int(labels.sum()), "haze": int(haze.sum())}
     facts |= {"completed": [each.camera.name for each in true], "uncovered": uncovered}
@@ -110,14 +111,15 @@ def at_random(params: Params, removed, remaining, scene, sets, poses: Path):
     if region.exists():
         box = scatter.box_around(**load_json(region))
     elif len(removed):
-        box = scatter.box_of(removed.means.double().numpy())
+        box = scatter.box_of(removed.means.double().cpu().numpy())
     else:
         raise ValueError("initialize.start is 'random', but no Gaussian was removed: nothing says where the hole is")
     invents = {camera.name: sets[camera.name].invent for camera in train if sets[camera.name].invent.any()}
     count = max(len(removed), scatter.FEWEST)
     points = scatter.points_in(box, count, train, invents, seeding.generator(SEED, "initialize", "random"))
     draw = seeding.generator(SEED, "initialize", "random colours")
-    return scatter.gaussians_at(points, remaining.sh.shape[1], remaining.antialiased, draw)
+    added = scatter.gaussians_at(points, remaining.sh.shape[1], remaining.antialiased, draw)
+    return added.map(lambda p: p.to(params.device))
 
 
 def filled(params: Params, out: Path, gaussians, new, reference, around, network, log, farthest=False):
@@ -171,7 +173,7 @@ def without_shadows(out: Path, true: list, gaussians, around):
         if not found.any():
             continue
         print(f"reference {name}: beside the hole {found.sum()} px differ from what is seen, a shadow perhaps")
-        depth = rasterizer.render(gaussians, each.camera, sh_degree=0).depth.double().numpy()
+        depth = rasterizer.render(gaussians, each.camera, sh_degree=0).depth.double().cpu().numpy()
         depth = with_photographed_depth(depth, each.camera, around.views)
         brighter = taint.light(each.image, shown)
         for view, (mask, light) in taint.carried(found, brighter, depth, each.camera, around.views).items():

@@ -29,7 +29,7 @@ SEED = 0  # of the draws that find planes
 
 
 def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
-    scene, gaussians = load_scene(poses), load_ply(fit / "gaussians.ply")
+    scene, gaussians = load_scene(poses), load_ply(fit / "gaussians.ply").map(lambda p: p.to(params.device))
     train = [scene.cameras[name] for name in scene.train]
     region = load_json(poses / "region.json") if (poses / "region.json").exists() else None
     raw = load_raw_masks(poses, scene.train)

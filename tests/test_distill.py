@@ -10,6 +10,7 @@ from small_params import altered
 from small_prior import save_small_prior
 from small_scene import write_photos
 
+from reffusion import trace
 from reffusion.distill import optimization as D
 from reffusion.distill import steps
 from reffusion.distill.adversary import Adversary
@@ -205,6 +206,7 @@ def run(folder, prior, text, settings=SETTINGS, views=None, gaussians=None):
 
 
 def test_interrupted_distillation_resumes_to_the_same_gaussians(prior, text, tmp_path, monkeypatch):
+    monkeypatch.setattr(trace, "WORTH", 0)  # a checkpoint after every step
     monkeypatch.setattr(D, "REGION_EVERY", 2)
     whole, labels = run(tmp_path / "whole", prior, text)
     assert labels.sum() > wall()[1].sum(), "densification added no masked Gaussian"

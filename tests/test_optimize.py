@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from reffusion import seeding
+from reffusion.gaussians import ssim
 from reffusion.gaussians.densify import SHRINK, densify, prune, rotate, split
 from reffusion.gaussians.optimize import (
     GaussianOptimizer,
@@ -116,6 +117,24 @@ def test_large_images_in_one_value():
     rows = torch.arange(40)[:, None] + torch.arange(40)[None]
     checker = (rows % 2).float()[..., None]
     assert 1.9 < dssim(checker, 1 - checker).item() <= 2.0
+
+
+def test_ssim_is_never_computed_in_tf32(monkeypatch):
+    """Neither there nor on the way back; before and after, and where it fails, the flag is as it was."""
+    seen, convolve = [], torch.nn.functional.conv2d
+
+    def watched(*given, **options):
+        seen.append(torch.backends.cudnn.allow_tf32)
+        return convolve(*given, **options)
+
+    monkeypatch.setattr(ssim.F, "conv2d", watched)
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", True)
+    image = torch.rand(20, 30, 3, dtype=torch.float64, requires_grad=True)
+    dssim(image, torch.rand(20, 30, 3, dtype=torch.float64)).backward()
+    assert len(seen) == 4 and not any(seen) and torch.backends.cudnn.allow_tf32
+    with pytest.raises(ZeroDivisionError), ssim.no_tf32():
+        raise ZeroDivisionError
+    assert torch.backends.cudnn.allow_tf32
 
 
 # ---------------------------------------------------------------------------------------------- confine

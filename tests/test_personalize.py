@@ -7,6 +7,7 @@ import torch
 from small_params import altered
 from small_prior import small_prior
 
+from reffusion import trace
 from reffusion.params.personalize import Params, Samples
 from reffusion.prior import crops, denoising, diffusion, lora
 from reffusion.prior import personalize as P
@@ -144,6 +145,8 @@ def test_training_learns_the_reference_and_logs_it(tiny, tmp_path):
 
 
 def test_interrupted_training_resumes_to_the_same_weights(tmp_path, monkeypatch):
+    monkeypatch.setattr(trace, "WORTH", 0)  # a checkpoint after every step
+
     def trained(folder):
         prior = small_prior()
         trained = lora.add(prior, 4, 8, 0.1, "attention", 0)

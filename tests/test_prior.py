@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors import safe_open
 
 from reffusion.prior import diffusion, fill, lora
 from reffusion.prior.model import CONDITIONING, load_prior, make_prior
@@ -128,6 +129,9 @@ def test_saved_lora_gives_the_trained_epsilon_in_a_fresh_diffusers_pipeline(tiny
     for _ in range(5):
         lora.save(tiny, tmp_path)
         assert (tmp_path / lora.LORA_FILE).read_bytes() == written, "equal weights, another file"
+    with safe_open(tmp_path / lora.LORA_FILE, "pt") as file:
+        text = [key for key in file.keys() if key.startswith("text_encoder.")]
+    assert text and all(key.startswith("text_encoder.text_model.encoder.layers.") for key in text)
 
     from diffusers import StableDiffusionInpaintPipeline
 

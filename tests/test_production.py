@@ -150,6 +150,36 @@ def test_a_small_lora_is_not_lost_in_half_precision(sd2, dropout):
     assert torch.dot(exact, rounded) / exact.norm() / rounded.norm() > 0.65  # 0.41 where it is added to the weights
 
 
+def test_a_lora_loads_into_diffusers_own_pipeline_of_sd2(sd2, tmp_path):
+    """Its UNet's and its text encoder's part, by `load_lora_weights`, into models of the same weights."""
+    before = F.epsilon(sd2)
+    found = lora.add(sd2, 4, 8.0, 0.1, "attention", 0)
+    noise = generator(0, "lora")
+    for parameter in found["unet"] + found["text"]:
+        parameter.data += 0.1 * torch.randn(parameter.shape, generator=noise)
+    trained, words = F.epsilon(sd2), diffusion.embed_text(sd2, [crops.PROMPTS[0]])
+    lora.save(sd2, tmp_path)
+    fresh = F.build(F.shrunk(F.SD2), torch.float32)
+    pipe = pipeline(fresh)
+    pipe.load_lora_weights(tmp_path)
+    lora.set_dropout(fresh, False)  # new layers begin in training mode
+    assert (F.epsilon(fresh) - trained).abs().max() < 1e-5 < (trained - before).abs().max()
+    assert (diffusion.embed_text(fresh, [crops.PROMPTS[0]]) - words).abs().max() < 1e-5
+
+
+def test_the_order_of_weights_in_memory_changes_nothing(sd2, tmp_path):
+    """What a UNet on CUDA is laid out like: the same answer, with LoRA that is trained, saved and merged."""
+    lora.add(sd2, 4, 8.0, 0.0, "attention+conv", 0)
+    before = F.epsilon(sd2)
+    sd2.unet.to(memory_format=torch.channels_last)
+    assert (F.epsilon(sd2) - before).abs().max() < 1e-5
+    F.personalization_step(F.build(F.shrunk(F.SD2), torch.float32), F.reference(32), 1, tmp_path)
+    fresh = F.build(F.shrunk(F.SD2), torch.float32)
+    fresh.unet.to(memory_format=torch.channels_last)
+    plain = lora.merged(F.build(F.shrunk(F.SD2), torch.float32), tmp_path)
+    assert (F.epsilon(lora.merged(fresh, tmp_path)) - F.epsilon(plain)).abs().max() < 1e-5
+
+
 def test_the_text_encoder_is_let_go():
     prior = F.build(F.shrunk(F.SD2), torch.float32)
     whole, encoder = prior.bytes, weakref.ref(prior.text_encoder)
@@ -237,14 +267,41 @@ def test_the_full_size_benchmark_at_a_small_size(tmp_path, monkeypatch, dtype):
     assert report["epsilon difference"] < (1e-5 if dtype == "float32" else 0.05 * report["epsilon size"])
 
 
-def test_gpu_check_at_a_small_size(tmp_path):
-    report = gpu_check.check(True, tmp_path)
-    assert report["gsplat against the oracle"] == {"skipped": "gsplat runs on CUDA only"}
-    terms = {"reconstruction", "reference", "SDS", "depth", "adversarial", "personalization"}
-    assert set(report["losses"]) == terms
-    assert all(line["seconds"] > 0 and line["peak_gb"] > 0 for line in report["losses"].values())
-    assert report["fit"]["ok"] and "personalization" in (tmp_path / "gpu_check.md").read_text()
+def test_gpu_check_keeps_what_it_has(tmp_path, monkeypatch):
+    """At a small size on the CPU, with a critic that runs out of memory: that part says so in a line; all others have
+    their figures, against the oracle and in seconds; the file is whole after each part."""
+
+    def full(*given):
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate\n 20.00 GiB")
+
+    written, write = [], gpu_check.write
+    monkeypatch.setattr(gpu_check, "adversarial_term", full)
+    monkeypatch.setattr(gpu_check, "write", lambda path, text: written.append(text) or write(path, text))
+    report = gpu_check.check("cpu", tmp_path)
+    parts = report["parts"]
+    assert parts["adversarial"] == {
+        "failed": "OutOfMemoryError: CUDA out of memory. Tried to allocate 20.00 GiB"
+    } and list(parts).index("personalization") < list(parts).index("adversarial")
+    against = [name for name in parts if name.startswith("splatting")]
+    outputs = {"color", "depth", "alpha", "features", "weights", "gradient of means", "gradient of background"}
+    assert len(against) == 3 and all(parts[name]["ok"] and outputs <= parts[name]["errors"].keys() for name in against)
+    assert parts["SSIM"]["ok"] and parts["fit"]["ok"]
+    steps = ("reconstruction", "reference", "personalization", "SDS", "depth")
+    assert all(parts[name]["seconds"] > 0 and parts[name]["peak_gb"] > 0 for name in steps)
+    assert set(report["projected_hours"]) == {"fit", "personalize"}, "distill's needs the critic"
+    assert len(written) == 2 * len(parts) and [len(json.loads(text)["parts"]) for text in written[::2]][:2] == [1, 2]
     assert json.loads((tmp_path / "gpu_check.json").read_text()) == report
+    assert "out of memory" in (tmp_path / "gpu_check.md").read_text()
+
+
+def test_gpu_check_finds_small_errors():
+    truth = {"color": torch.rand(50, 40, 3), "gradient of means": torch.randn(90, 3)}
+    flipped = {name: tensor.clone() for name, tensor in truth.items()}
+    assert gpu_check.compared(flipped, truth)["ok"]
+    wrong = flipped | {"color": truth["color"] * (1 + 3e-5)}
+    assert gpu_check.compared(wrong, truth)["beyond"] == "color"
+    wrong = flipped | {"gradient of means": truth["gradient of means"] * 1.001}
+    assert gpu_check.compared(wrong, truth)["beyond"] == "gradient of means"
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")

@@ -2,6 +2,7 @@
 
 import copy
 import json
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -181,8 +182,39 @@ KILLED = {
 }
 
 
+@pytest.mark.parametrize(("saving", "every"), [(3.0, 10.0), (0.01, 10.0), (30.0, 0.1)])
+def test_checkpoints_cost_under_two_percent(tmp_path, monkeypatch, saving, every):
+    """Steps of half a second and checkpoints of so many: after the first, whose cost nobody knew."""
+    now, spent = [0.0], []
+    monkeypatch.setattr(trace.time, "monotonic", lambda: now[0])
+
+    def slowly(folder, state):
+        now[0] += saving
+        spent.append(saving)
+
+    monkeypatch.setattr(trace, "save_checkpoint", slowly)
+    checkpoints, began = trace.Checkpoints(tmp_path, every), None
+    for _ in range(20_000):
+        now[0] += 0.5
+        if checkpoints.due:
+            checkpoints.save(dict)
+            began = now[0] if began is None else began
+    share = sum(spent[1:]) / (now[0] - began)
+    assert len(spent) > 3 and share < 0.02
+
+
+@pytest.mark.parametrize("stage", ["fit", "personalize", "distill"])
+def test_a_slow_disk_does_not_hold_a_stage_up(ready, tmp_path, monkeypatch, stage):
+    """One checkpoint of 0.3 s, and none more in a run of less than 15."""
+    saved = []
+    monkeypatch.setattr(trace, "save_checkpoint", lambda *given: saved.append(time.sleep(0.3)))
+    run(stage, ready, tmp_path, checkpoint_seconds=1e-9)
+    assert len(saved) == 1
+
+
 @pytest.mark.parametrize("stage", list(KILLED))
 def test_a_stage_gives_the_same_after_a_kill(ready, tmp_path, monkeypatch, stage):
+    monkeypatch.setattr(trace, "WORTH", 0)  # a checkpoint after every step
     module, name, position = KILLED[stage]
     often = {"checkpoint_seconds": 1e-9}
     whole = run(stage, ready, tmp_path / "whole", **often)

@@ -69,6 +69,7 @@ def distill(
     region = region_of(initial.means, masked) if settings.confined and masked.any() else None
     run = _Run.begun(optimizer, job, trace.load_checkpoint(folder))
     log = trace.Trace(folder, run.seconds, run.step + bool(run.step))  # a line is numbered by the steps done
+    checkpoints = trace.Checkpoints(folder, settings.checkpoint_seconds)
     if run.step == 0:
         _write_line(log, run, {})
 
@@ -82,9 +83,9 @@ def distill(
             optimizer.select(~changed_region(region, optimizer.gaussians.means.detach(), optimizer.masked))
         if trace.log_spaced(done, settings.iterations, per_octave=4):
             _write_line(log, run, line)
-        if log.seconds - run.seconds > settings.checkpoint_seconds:
+        if checkpoints.due:
             run.seconds = log.seconds
-            trace.save_checkpoint(folder, run.state_dict())
+            checkpoints.save(run.state_dict)
     return optimizer.gaussians.map(Tensor.detach), optimizer.masked
 
 

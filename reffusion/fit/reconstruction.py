@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,7 +61,7 @@ def fit(
     optimizer, exposures = run.optimizer, run.exposures
     log = trace.Trace(folder, run.seconds, run.iteration + 1 if run.iteration else 0)
     centers = torch.tensor(np.stack([camera.center for camera in cameras]), dtype=torch.float32)
-    saved_at, measured = time.monotonic(), (held_out, images, settings, impl)
+    checkpoints, measured = trace.Checkpoints(folder, settings.checkpoint_seconds), (held_out, images, settings, impl)
     if run.iteration == 0:
         _write_line(log, run, *measured)
     for i, (camera, target, counts) in zip(
@@ -74,13 +73,12 @@ def fit(
         run.count(*step(optimizer, exposures, *seen, settings, i, impl))
         adapt(optimizer, centers, run.started_with, settings, run.iteration)
         line_due = trace.log_spaced(run.iteration, settings.iterations, first=FIRST_MOMENT)
-        save_due = time.monotonic() - saved_at > settings.checkpoint_seconds and run.iteration < settings.iterations
+        save_due = checkpoints.due and run.iteration < settings.iterations
         _check(optimizer.gaussians, i, camera, values=line_due or save_due)
         if line_due:
             _write_line(log, run, *measured)
         if save_due:
-            trace.save_checkpoint(folder, run.state_dict() | {"seconds": log.seconds})
-            saved_at = time.monotonic()
+            checkpoints.save(lambda: run.state_dict() | {"seconds": log.seconds})
     if exposures is not None:
         exposures.save(folder)
     return optimizer.gaussians.map(Tensor.detach)

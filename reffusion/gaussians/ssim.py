@@ -10,6 +10,8 @@ masked, would paint an edge that both share into the windows around a mask and s
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import lru_cache, partial
 
 import numpy as np
@@ -53,21 +55,44 @@ def dssim_torch(image: Tensor, target: Tensor, weights: Tensor | None = None) ->
     if weights is None:
         weights = torch.ones_like(image[..., 0])
     weights = weights[..., None]
-    window = torch.as_tensor(_window(), dtype=image.dtype, device=image.device)
-
-    def windowed(field: Tensor) -> Tensor:
-        planes = field.permute(2, 0, 1)[:, None]
-        planes = F.conv2d(planes, window.view(1, 1, 1, -1), padding=(0, RADIUS))
-        return F.conv2d(planes, window.view(1, 1, -1, 1), padding=(RADIUS, 0))[:, 0].permute(1, 2, 0)
-
-    total = windowed(weights)
-    total = torch.where(weights > 0, total, 1.0)
-    mean = lambda field: windowed(weights * field) / total
-    mu_x, mu_y = mean(image), mean(target)
-    covariance = mean(image * target) - mu_x * mu_y
-    variances = mean(image**2 + target**2) - mu_x**2 - mu_y**2
+    products = [weights * field for field in (image, target, image**2 + target**2, image * target)]
+    windowed = _Windowed.apply(torch.cat([*products, weights], -1))
+    total = torch.where(weights > 0, windowed[..., -1:], 1.0)
+    mu_x, mu_y, squares, product = (windowed[..., :-1] / total).chunk(4, -1)
+    covariance = product - mu_x * mu_y
+    variances = squares - mu_x**2 - mu_y**2
     similarity = (2 * mu_x * mu_y + C1) * (2 * covariance + C2) / ((mu_x**2 + mu_y**2 + C1) * (variances + C2))
     return (weights * (1 - similarity)).sum() / image.numel()
+
+
+class _Windowed(torch.autograd.Function):
+    """[H, W, F] -> [H, W, F], each field's window sums, zeros around the image. The window is symmetric: its own
+    adjoint. A function of its own, so that the way back is as exact as the way there."""
+
+    @staticmethod
+    def forward(ctx, fields: Tensor) -> Tensor:
+        window = torch.as_tensor(_window(), dtype=fields.dtype, device=fields.device)
+        planes = fields.permute(2, 0, 1)[:, None]
+        with no_tf32():
+            planes = F.conv2d(planes, window.view(1, 1, 1, -1), padding=(0, RADIUS))
+            planes = F.conv2d(planes, window.view(1, 1, -1, 1), padding=(RADIUS, 0))
+        return planes[:, 0].permute(1, 2, 0)
+
+    @staticmethod
+    def backward(ctx, upstream: Tensor) -> Tensor:
+        return _Windowed.apply(upstream)
+
+
+@contextmanager
+def no_tf32() -> Iterator[None]:
+    """Convolutions on CUDA keep float32's digits inside. SSIM subtracts E[x]^2 from E[x^2]: of TF32's 10 bits hardly
+    any would be left, and gradients would be wrong by a tenth to a third."""
+    before = torch.backends.cudnn.allow_tf32
+    torch.backends.cudnn.allow_tf32 = False
+    try:
+        yield
+    finally:
+        torch.backends.cudnn.allow_tf32 = before
 
 
 class _FastDssim(torch.autograd.Function):

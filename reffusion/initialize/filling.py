@@ -233,8 +233,9 @@ def placed(
 ) -> tuple[Gaussians, torch.Tensor]:
     """The Gaussians with a surface that shows these pixels of the reference, bool [H, W], and the labels of the new."""
     added = surface(reference.image, depth, pixels, reference.camera, gaussians.sh.shape[1], how)
+    added = added.map(lambda p: p.to(gaussians.means))
     together = gaussians.zipped(added, lambda a, b: torch.cat([a, b]))
-    fresh = torch.arange(len(together)) >= len(gaussians)
+    fresh = torch.arange(len(together), device=new.device) >= len(gaussians)
     if how.gloss:
         camera, known = reference.camera, around.photographed(reference.camera)
         hole = pixels | around.hidden[camera.name]
@@ -247,11 +248,11 @@ def placed(
 def _range_around(gaussians: Gaussians, image: np.ndarray, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
     """[N, 3] twice: between which constant colours may lie, that of the picture around each Gaussian and a bit more."""
     window = np.ones((2 * AROUND + 1,) * 2, np.uint8)
-    uv, _ = geometry.project(gaussians.means.double().numpy(), camera)
+    uv, _ = geometry.project(gaussians.means.double().cpu().numpy(), camera)
     bounds = []
     for of, beyond in ((cv2.erode, -BEYOND), (cv2.dilate, BEYOND)):
         told, _ = geometry.sample_nearest(of(image, window), uv)
-        bounds.append(torch.from_numpy((told / 255 + beyond).clip(0, 1) - 0.5).to(gaussians.sh.dtype) / SH0)
+        bounds.append(torch.from_numpy((told / 255 + beyond).clip(0, 1) - 0.5).to(gaussians.sh) / SH0)
     return bounds[0], bounds[1]
 
 
@@ -268,8 +269,8 @@ def match_colors(
     Args:
         image: [H, W, 3] uint8; pixels: bool [H, W]; labels: bool [N]; steps: corrections.
     """
-    target = torch.from_numpy(image).float() / 255
-    chosen = torch.from_numpy(pixels)[..., None].float()
+    target = torch.from_numpy(image).to(gaussians.means) / 255
+    chosen = torch.from_numpy(pixels)[..., None].to(gaussians.means)
     low, high = _range_around(gaussians, image, camera)
     for _ in range(steps):
         residual = (target - rasterizer.render(gaussians, camera).color) * chosen

@@ -108,7 +108,8 @@ def lent(
         return gaussians
     sh = gaussians.sh.clone()
     for part in chosen.split(AT_ONCE):
-        sh[part] = _harmonics_of(gaussians.map(lambda p, part=part: p[part]), camera, around, views)
+        theirs = gaussians.map(lambda p, part=part: p[part].cpu())
+        sh[part] = _harmonics_of(theirs, camera, around, views).to(sh.device)
     return replace(gaussians, sh=sh)
 
 

@@ -157,8 +157,8 @@ def box_silhouette(center: np.ndarray, size: np.ndarray, camera: Camera, dispari
 
 def inside_box(gaussians: Gaussians, center: np.ndarray, size: np.ndarray) -> Tensor:
     """bool [N]: centres within an axis-aligned box."""
-    offset = gaussians.means - torch.as_tensor(center, dtype=gaussians.means.dtype)
-    return (offset.abs() <= torch.as_tensor(size, dtype=gaussians.means.dtype) / 2).all(-1)
+    middle, sides = (gaussians.means.new_tensor(each) for each in (center, size))
+    return ((gaussians.means - middle).abs() <= sides / 2).all(-1)
 
 
 def best_view(invent: Mapping[str, np.ndarray], names: Sequence[str]) -> str | None:

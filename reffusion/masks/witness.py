@@ -174,9 +174,9 @@ def debris(
     remaining = gaussians.map(lambda p: p[~labels])
     uncovered, outside = torch.zeros(len(remaining)), torch.zeros(len(remaining))
     for view in views:
-        inside = torch.from_numpy(hidden[view.camera.name])[..., None]
-        uncovered += rasterizer.accumulate(remaining, view.camera, inside.to(remaining.means.dtype))[:, 0].cpu()
-        photographed = torch.from_numpy(~view.hidden)[..., None].to(gaussians.means.dtype)
+        inside = torch.from_numpy(hidden[view.camera.name])[..., None].to(gaussians.means)
+        uncovered += rasterizer.accumulate(remaining, view.camera, inside)[:, 0].cpu()
+        photographed = torch.from_numpy(~view.hidden)[..., None].to(gaussians.means)
         outside += rasterizer.accumulate(gaussians, view.camera, photographed)[:, 0].cpu()[~labels.cpu()]
     suspects = torch.nonzero((uncovered > 0.5) & (uncovered > outside))[:, 0]
     asked = remaining.map(lambda p: p[suspects.to(p.device)])

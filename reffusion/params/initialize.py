@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from reffusion.params.base import Settings, depth_model_field
+from reffusion.params.base import Device, Settings, depth_model_field
 
 
 class Depth(Settings):
@@ -34,3 +34,4 @@ class Params(Settings):
     # PAPER leaves open: what the reference's camera does not see of the hole.
     further: int = Field(0, ge=0, description="most views completed beside the references, until nothing is uncovered")
     settle: int = Field(0, ge=0, description="steps of reconstruction after filling; 0: none")
+    device: Device = Field("cpu", description="where Gaussians are drawn and the depth model is asked")

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from reffusion.params.base import Settings
+from reffusion.params.base import Device, Settings
 
 
 class Params(Settings):
@@ -29,3 +29,4 @@ class Params(Settings):
     invent: Literal["auto", "undecided", "consistent", "region"] = Field(
         "auto", description="what is made up; auto = the scene's 3D region where it names one, else undecided pixels"
     )
+    device: Device = Field("cpu", description="where Gaussians are drawn and votes are counted")

@@ -138,15 +138,22 @@ def save(prior: Prior, folder: Path) -> None:
     """Write `pytorch_lora_weights.safetensors` as diffusers' `load_lora_weights` reads it, rank and alpha included."""
     from peft import get_peft_model_state_dict
 
+    text = get_peft_model_state_dict(prior.text_encoder, save_embedding_layers=False)
     pipeline_class().save_lora_weights(
         folder,
         unet_lora_layers=get_peft_model_state_dict(prior.unet, save_embedding_layers=False),
-        text_encoder_lora_layers=get_peft_model_state_dict(prior.text_encoder, save_embedding_layers=False),
+        text_encoder_lora_layers=_as_published(text),
         weight_name=LORA_FILE,
         unet_lora_adapter_metadata=_adapter_facts(prior.unet),
         text_encoder_lora_adapter_metadata=_adapter_facts(prior.text_encoder),
     )
     _put_in_order(folder / LORA_FILE)
+
+
+def _as_published(layers: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The text encoder's keys as published LoRA files have them: transformers 5 does without the prefix, transformers 4
+    and what else reads such files does not; diffusers takes it off where the encoder has none."""
+    return {key if key.startswith("text_model.") else f"text_model.{key}": value for key, value in layers.items()}
 
 
 def _put_in_order(path: Path) -> None:

@@ -200,6 +200,8 @@ def make_prior(
     for part in (unet, vae, text, text_2):
         if part is not None:
             part.requires_grad_(False).eval().to(device)
+    if torch.device(device).type == "cuda":  # the order in which half-precision convolutions read there: no transposing
+        unet.to(memory_format=torch.channels_last)
     return Prior(unet, vae, text, tokenizer, alphas.to(device), kind, scheduler, text_2, tokenizer_2)
 
 

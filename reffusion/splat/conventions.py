@@ -3,7 +3,7 @@
 NEAR = 0.01  # camera z below which a Gaussian is left out, in units of the normalised frame
 LOW_PASS = 0.3  # px^2 added to the diagonal of the 2D covariance
 MIN_ALPHA = 1.0 / 255.0  # fainter contributions are skipped
-MAX_ALPHA = 0.99  # stronger ones are cut; their gradient is then zero
+MAX_ALPHA = 0.999  # stronger ones are cut; their gradient is then zero. gsplat has this value compiled in
 MIN_TRANSMITTANCE = 1e-4  # the Gaussian that would go below is not blended, and the pixel is finished
 JACOBIAN_MARGIN = 0.3  # x/z is clamped at the image border + this share of half the image, in the Jacobian only
 MAX_PIXELS = 1e7  # Gaussians whose 2D mean lies farther than this from the image are left out

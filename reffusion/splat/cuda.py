@@ -1,8 +1,8 @@
 """Splatting on a CUDA GPU by gsplat 1.5, with the conventions of the other implementations.
 
 gsplat's `rasterization` in its parts, because the probe is added to the 2D means between two of them. What differs
-from `reference` and cannot be set: alpha is clamped at 0.999 instead of 0.99, the transmittance stop is <= 1e-4 instead
-of <, and the conic is inverted from a float32 determinant (long needles lose digits).
+from `reference` and cannot be set: the transmittance stop is <= 1e-4 instead of <, and the conic is inverted from a
+float32 determinant (long needles lose digits).
 """
 
 from __future__ import annotations
@@ -36,9 +36,11 @@ def require_gpu(means: Tensor) -> None:
     if not means.is_cuda or means.dtype != torch.float32:
         raise ValueError(f"impl='cuda' needs float32 tensors on the GPU, not {means.dtype} on {means.device}")
     try:
-        import gsplat  # noqa: F401
+        from gsplat.cuda import _backend
     except ImportError as error:
-        raise ValueError("impl='cuda' needs gsplat: pip install 'reffusion[gpu]'") from error
+        raise ValueError("impl='cuda' needs gsplat: `make gpu` installs it") from error
+    if _backend._C is None:  # it can be imported all the same
+        raise ValueError("impl='cuda' needs gsplat's compiled extension, and there is no nvcc to build it: `make gpu`")
 
 
 def render(

@@ -60,6 +60,12 @@ def render(
     return _implementation(impl, means).render(gaussians, camera, features, background, degree, probe)
 
 
+def prepare(device: str) -> None:
+    """Load what draws on this device, before a clock runs: gsplat compiles its extension when it is first loaded."""
+    if torch.device(device).type == "cuda":
+        _implementation("cuda", torch.zeros(1, device=device))
+
+
 @torch.no_grad()
 def accumulate(
     gaussians: Gaussians, camera: Camera, values: Tensor, *, impl: Implementation = "auto", count: bool = False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from reffusion.io import machine
 from reffusion.params.evaluate import Params
 from reffusion.weights import local
 
@@ -9,3 +10,8 @@ from reffusion.weights import local
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
     """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
     return local.of_lpips(params.lpips_weights)
+
+
+def lacks(params: Params) -> list[str]:
+    """What this machine has not, and the stage needs on CUDA."""
+    return machine.lacks(machine.machine())

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from reffusion.io import machine
 from reffusion.params.initialize import Params
 from reffusion.weights import local
 
-__all__ = ["Params", "needed_weights", "preview"]
+__all__ = ["Params", "lacks", "needed_weights", "preview"]
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
@@ -20,3 +21,8 @@ def preview(params: Params, **_: Path | None) -> list[str]:
     if not (params.further and params.start == "reference"):
         return []
     return [f"completes up to {params.further} further views from patches of the photographs: what no reference shows"]
+
+
+def lacks(params: Params) -> list[str]:
+    """What this machine has not, and the stage needs on CUDA."""
+    return machine.lacks(machine.machine())

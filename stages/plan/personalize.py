@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+from reffusion.cost import estimate
+from reffusion.io import machine
 from reffusion.params.personalize import Params
 from reffusion.weights import local
 
-__all__ = ["Params", "needed_weights"]
+__all__ = ["Params", "cost", "lacks", "needed_weights"]
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
     """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
     return [local.of_model(params.prior, params.dtype)]
+
+
+def lacks(params: Params) -> list[str]:
+    """What this machine has not, and the stage needs on CUDA."""
+    return machine.lacks(machine.machine(), params.memory_gb, splats=False, memory_param="personalize.memory_gb")
+
+
+def cost(params: Params, card: str) -> Mapping[str, object] | None:
+    """What it takes on a card; "": this machine's. ValueError for one that is not in the table."""
+    return estimate.said(card, params.device, estimate.personalize(params))

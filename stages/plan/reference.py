@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from reffusion.capture.given import PAINTED, listed, load_given, paintings_in, words
 from reffusion.capture.views import placed_views
+from reffusion.cost import estimate
+from reffusion.io import machine
 from reffusion.params.reference import Params
 from reffusion.weights import local, painters
 from reffusion.weights.published import PAINTERS
@@ -40,3 +43,13 @@ def preview(params: Params, *, scene: Path, poses: Path | None = None, **_: Path
     if params.inpainter in PAINTERS:
         how = f"completes the reference by {PAINTERS[params.inpainter].name}, one picture"
     return [f"{how}: no diffusion here{unread}"]
+
+
+def lacks(params: Params) -> list[str]:
+    """What this machine has not, and the stage needs on CUDA."""
+    return machine.lacks(machine.machine(), params.memory_gb, splats=False, memory_param="reference.memory_gb")
+
+
+def cost(params: Params, card: str) -> Mapping[str, object] | None:
+    """What it takes on a card; "": this machine's. ValueError for one that is not in the table."""
+    return estimate.said(card, params.device, estimate.reference(params))

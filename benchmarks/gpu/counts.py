@@ -1,0 +1,175 @@
+"""What the parts of a step compute and move at full size, counted without computing: the table of the cost model.
+
+Floating-point operations of products and convolutions, and the bytes that all operations read and write (an attention's
+matrices left out: a GPU's kernels do not write them), on torch's device without memory.
+
+    python -m benchmarks.gpu.counts > reffusion/cost/counts.py
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+from torch.utils.flop_counter import FlopCounterMode
+
+from benchmarks.gpu import full_size
+from reffusion.distill.discriminator import Critic, critic_loss, generator_loss, gradient_penalty
+from reffusion.gaussians import optimize
+from reffusion.gaussians.ssim import dssim_torch
+from reffusion.prior import denoising, diffusion
+from reffusion.prior.model import Prior
+
+HEIGHT, WIDTH, GAUSSIANS = 300, 400, 1000  # of what is counted by pixel, and by Gaussian
+PATCHES, SIDE = 64, 64  # the paper's
+
+
+class _Moved(TorchDispatchMode):
+    """Counts the bytes of what each operation is given and makes; views move nothing."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.bytes = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        given = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
+        made = [leaf for leaf in tree_leaves(result) if isinstance(leaf, Tensor)]
+        homes = {leaf.untyped_storage()._cdata for leaf in given}
+        in_place = func.__name__.split(".")[0].endswith("_")
+        view = made and all(leaf.untyped_storage()._cdata in homes for leaf in made) and not in_place
+        if not view and not any(map(_attention, given + made)):
+            self.bytes += sum(leaf.numel() * leaf.element_size() for leaf in given + made)
+        return result
+
+
+def _attention(tensor: Tensor) -> bool:
+    """A matrix of who looks at whom, a row for each pixel of a latent."""
+    return tensor.ndim >= 3 and min(tensor.shape[-2:]) >= 1024
+
+
+def counted(work: Callable[[], object]) -> dict[str, float]:
+    """TFLOP and GB (1e9 bytes) of one call."""
+    with FlopCounterMode(display=False) as flops, _Moved() as moved:
+        work()
+    return {"tflop": round(flops.get_total_flops() / 1e12, 5), "gb": round(moved.bytes / 1e9, 5)}
+
+
+def of_prior(shape: full_size.Shape, name: str) -> dict[str, dict[str, float]]:
+    """One sample of the prior's native size: the UNet's answer, encoding, encoding and the way back, decoding, and a
+    personalization sample forward and backward."""
+    with torch.device("meta"):
+        made = full_size.networks(shape, torch.float16)
+    prior = full_size.assembled(shape, made, "meta")
+    size, side = prior.native_size, prior.native_size // prior.factor
+    image = torch.zeros(1, 3, size, size, device="meta")
+    latents = torch.zeros(1, 4, side, side, device="meta")
+    found = {
+        "unet": counted(lambda: answered(prior, latents)),
+        "encode": counted(_without(diffusion.encode, prior, image)),
+    }
+    found["decode"] = counted(_without(diffusion.decode, prior, latents))
+    if prior.text_encoder_2 is None:  # SDXL paints references only
+        graded = image.clone().requires_grad_()
+        found["encode and back"] = counted(lambda: diffusion.encode(prior, graded).sum().backward())
+        full_size.trainer(prior, 1)
+        picture = full_size.reference(size)
+        found["personalize a sample"] = counted(lambda: denoising.one_sample(prior, [picture], 0))
+    return {f"{name} {part}": each for part, each in found.items()}
+
+
+def _without(function: Callable[..., Tensor], *given: Any) -> Callable[[], Tensor]:
+    def work() -> Tensor:
+        with torch.no_grad():
+            return function(*given)
+
+    return work
+
+
+@torch.no_grad()
+def answered(prior: Prior, latents: Tensor) -> None:
+    text = torch.zeros(1, 78, prior.unet.config.cross_attention_dim, device="meta")
+    condition = torch.cat([latents[:, :1], latents], 1)
+    diffusion.raw_prediction(prior, latents, torch.zeros(1, dtype=torch.long, device="meta"), condition, text)
+
+
+def critic_step(width: int) -> dict[str, float]:
+    """What `Adversary.learn` and `.loss` do: the critic's step with R1, then its word on the fake patches."""
+    critic = Critic(SIDE, width, torch.Generator()).to("meta")
+    real = torch.zeros(PATCHES, 3, SIDE, SIDE, device="meta")
+    leaf = torch.zeros(PATCHES, 3, SIDE, SIDE, device="meta", requires_grad=True)
+
+    def work() -> None:
+        fake = 1 * leaf  # the counter cannot follow a leaf
+        scores = critic(fake)
+        (critic_loss(critic(real), scores) + gradient_penalty(scores, fake)).backward()
+        critic.requires_grad_(False)
+        generator_loss(critic(1 * leaf)).backward()
+
+    return counted(work)
+
+
+def depth_network(height: int = 518, width: int = 686) -> dict[str, float]:
+    """Depth Anything V2 Small on a view of 4:3."""
+    from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
+
+    backbone = Dinov2Config(
+        hidden_size=384, num_hidden_layers=12, num_attention_heads=6, image_size=518, patch_size=14,
+        out_features=["stage3", "stage6", "stage9", "stage12"], reshape_hidden_states=False,
+    )  # fmt: skip
+    with torch.device("meta"):
+        model = DepthAnythingForDepthEstimation(DepthAnythingConfig(
+            backbone_config=backbone, reassemble_hidden_size=384, neck_hidden_sizes=[48, 96, 192, 384],
+            fusion_hidden_size=64, head_hidden_size=32,
+        ))  # fmt: skip
+    picture = torch.zeros(1, 3, height, width, device="meta")
+    return counted(lambda: _without(lambda: model(pixel_values=picture).predicted_depth)())
+
+
+def loss_of_a_pixel() -> dict[str, float]:
+    """Reconstruction loss there and back, a pixel of three channels; gsplat reads and writes as much again."""
+    image = torch.zeros(HEIGHT, WIDTH, 3, requires_grad=True)
+
+    def work() -> None:
+        difference = (image - torch.zeros(HEIGHT, WIDTH, 3)).abs().mean()
+        (0.8 * difference + 0.2 * dssim_torch(image, torch.zeros(HEIGHT, WIDTH, 3))).backward()
+
+    return _scaled(counted(work), HEIGHT * WIDTH)
+
+
+def adam_of_a_gaussian() -> dict[str, float]:
+    """One step of Adam for each Gaussian of degree 3, all of them visible."""
+    scene = full_size.gaussians(GAUSSIANS, "cpu")
+    optimizer = optimize.GaussianOptimizer(scene)
+    rates = optimizer.rates.at(0.0, optimizer.gaussians)
+    updates = []
+    for name in optimize.PARAMETERS:
+        rows = [optimize._rows(getattr(each, name)) for each in optimizer._states()]
+        updates.append(optimize.Update(*rows, torch.zeros_like(rows[0]), rates[name], 1.0))
+    everyone, steps = torch.ones(GAUSSIANS, dtype=torch.bool), torch.ones(GAUSSIANS, dtype=torch.int32)
+    given = (steps, everyone, ~everyone, *optimize._unbiasing((0.9, 0.999), 1), 0.9, 0.999, 1e-15)
+    return _scaled(counted(lambda: optimize._adam(updates, *given)), GAUSSIANS)
+
+
+def _scaled(found: dict[str, float], count: int) -> dict[str, float]:
+    """Per a million."""
+    return {name: round(value * 1e6 / count, 5) for name, value in found.items()}
+
+
+def main() -> None:
+    found = of_prior(full_size.SD2, "SD2") | of_prior(full_size.SDXL, "SDXL")
+    found |= {f"critic {width}": critic_step(width) for width in (256, 512)}
+    found |= {"depth network": depth_network(), "loss, a million pixels": loss_of_a_pixel()}
+    found["Adam, a million Gaussians"] = adam_of_a_gaussian()
+    rows = "".join(f"    {json.dumps(name)}: {json.dumps(each)},\n" for name, each in found.items())
+    print('"""TFLOP and GB of the parts of a step: made by `python -m benchmarks.gpu.counts`."""')
+    print(f"\nCOUNTS = {{\n{rows}}}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,149 @@
+"""What this machine has for work on a CUDA card, and what it lacks: read from small files, without importing torch."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import json
+import os
+import re
+import shutil
+import subprocess
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+DRIVER = Path("/proc/driver/nvidia/version")
+TOOLKIT = Path("/usr/local/cuda")
+# The oldest Linux driver that runs programs of a CUDA version (NVIDIA, CUDA compatibility).
+OLDEST_DRIVER = {11: 450, 12: 525, 13: 580}
+INSTALL = "`make gpu` installs it"
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What is there for CUDA; None where it is not there or cannot be told.
+
+    Attributes:
+        card: its name. gigabytes: its memory, 1e9 bytes. driver: major version.
+        torch_cuda: the CUDA version torch was built for, e.g. "13.0"; "" for a build without.
+        gsplat: is the package there? extension: its kernels, compiled with it.
+        nvcc: the CUDA version of the compiler, "" where it is there but does not say.
+    """
+
+    card: str | None = None
+    gigabytes: float | None = None
+    driver: int | None = None
+    torch_cuda: str | None = None
+    gsplat: bool = False
+    extension: bool = False
+    nvcc: str | None = None
+
+
+@functools.cache
+def machine() -> Machine:
+    """This one: a few files are read, and nvidia-smi is asked where there is one."""
+    card, gigabytes, driver = _asked_of_driver()
+    package = _package("gsplat")
+    extension = package is not None and any(package.glob("csrc*.so"))
+    return Machine(card, gigabytes, driver or _driver(DRIVER), _torch_cuda(), package is not None, extension, _nvcc())
+
+
+def lacks(here: Machine, memory_gb: float = 0.0, splats: bool = True, memory_param: str = "") -> list[str]:
+    """What keeps this machine from a stage on CUDA, a line each, with what would mend it; a driver is there.
+
+    Args:
+        memory_gb: what the stage may take by its parameters, 0: no limit. memory_param: the parameter that says so.
+        splats: does it draw Gaussians?
+    """
+    found = []
+    if here.torch_cuda == "":
+        found.append(f"this torch is built without CUDA: {INSTALL}, or pip install torch from its CUDA index")
+    wanted = _major(here.torch_cuda)
+    oldest = OLDEST_DRIVER.get(wanted, 0) if wanted else 0
+    if here.driver is not None and here.driver < oldest:
+        found.append(
+            f"the NVIDIA driver is {here.driver}, and torch's CUDA {here.torch_cuda} needs {oldest} or later: "
+            f"update the driver, or install a torch for an older CUDA"
+        )
+    if splats and not here.gsplat:
+        found.append(f"gsplat is not installed: {INSTALL}")
+    elif splats and not here.extension:
+        found += _cannot_build(here, wanted)
+    if memory_gb and here.gigabytes is not None and memory_gb > here.gigabytes:
+        found.append(
+            f"{memory_param} is {memory_gb:g}, and {here.card or 'this card'} has {here.gigabytes:.0f} GB: "
+            f'set="{memory_param}={int(0.8 * here.gigabytes)}"'
+        )
+    return found
+
+
+def _cannot_build(here: Machine, wanted: int | None) -> list[str]:
+    """gsplat's wheel brings sources only, which nvcc compiles when they are first loaded."""
+    if here.nvcc is None:
+        toolkit = f"CUDA toolkit {wanted}" if wanted else "the CUDA toolkit"
+        return [
+            f"gsplat has no compiled extension, and there is no nvcc to build it: install {toolkit} (or name it in "
+            "CUDA_HOME), then `make gpu`"
+        ]
+    if wanted and here.nvcc and _major(here.nvcc) != wanted:
+        return [
+            f"gsplat has no compiled extension, and nvcc {here.nvcc} cannot build it for torch's CUDA "
+            f"{here.torch_cuda}: install CUDA toolkit {wanted}, then `make gpu`"
+        ]
+    return []
+
+
+def _major(version: str | None) -> int | None:
+    return int(version.split(".")[0]) if version else None
+
+
+def _asked_of_driver() -> tuple[str | None, float | None, int | None]:
+    """(name, GB, driver's major version) of the first card that can be seen, by nvidia-smi."""
+    command = shutil.which("nvidia-smi") or shutil.which("nvidia-smi", path="/usr/lib/wsl/lib")
+    if not command:
+        return None, None, None
+    fields = ["--query-gpu=name,memory.total,driver_version", "--format=csv,noheader,nounits"]
+    first = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")[0]
+    with suppress(OSError, ValueError, subprocess.TimeoutExpired):
+        said = subprocess.run(
+            [command, *([f"--id={first}"] if first else []), *fields], capture_output=True, text=True, timeout=10
+        )
+        name, memory, driver = (word.strip() for word in said.stdout.splitlines()[0].split(",")) if said.stdout else ()
+        return name, float(memory) * 2**20 / 1e9, int(driver.split(".")[0])
+    return None, None, None
+
+
+def _driver(path: Path) -> int | None:
+    """Of a line like `NVRM version: NVIDIA UNIX x86_64 Kernel Module  580.65.06  Sun ...`, open modules' too."""
+    with suppress(OSError):
+        if found := re.search(r"Kernel Module\D*?(?:for \S+)?\s+(\d+)\.\d", path.read_text()):
+            return int(found[1])
+    return None
+
+
+def _package(name: str) -> Path | None:
+    spec = importlib.util.find_spec(name)
+    return Path(spec.origin).parent if spec and spec.origin else None
+
+
+def _torch_cuda() -> str | None:
+    """What torch/version.py says of its build, without importing torch."""
+    folder = _package("torch")
+    with suppress(OSError):
+        text = (folder / "version.py").read_text() if folder else ""
+        if found := re.search(r"^cuda\b[^=]*=\s*(?:'([\d.]+)'|\"([\d.]+)\"|None)", text, re.MULTILINE):
+            return found[1] or found[2] or ""
+    return None
+
+
+def _nvcc() -> str | None:
+    """The version of the toolkit where torch looks for it: CUDA_HOME, CUDA_PATH, nvcc on the path, /usr/local/cuda."""
+    on_path = shutil.which("nvcc")
+    named = os.environ.get("CUDA_HOME") or os.environ.get("CUDA_PATH")
+    home = Path(named) if named else Path(on_path).resolve().parent.parent if on_path else TOOLKIT
+    if not (home / "bin" / "nvcc").is_file():
+        return "" if on_path else None
+    with suppress(OSError, ValueError, KeyError):
+        return str(json.loads((home / "version.json").read_text())["cuda"]["version"])
+    return ""

@@ -1,0 +1,111 @@
+"""A card that is not there: tensors that say they are on `cuda:0` and refuse to be mixed with the CPU's.
+
+Inside `card()` whatever is made on, or moved to, the device `cuda` is an ordinary tensor in disguise. An operation on
+it and on a tensor of the CPU is refused, as CUDA refuses it; so is to take it for an array of numpy. gsplat's part is
+played by the CPU's rasterizer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+import torch
+from torch.overrides import TorchFunctionMode
+from torch.utils._pytree import tree_leaves, tree_map
+
+from reffusion.splat import cpu, cuda
+from reffusion.types import Rendering
+
+CARD = torch.device("cuda:0")
+SAID = {torch.Tensor.device.__get__: CARD, torch.Tensor.is_cuda.__get__: True}
+ONLY_ON_CPU = (torch.Tensor.numpy, torch.Tensor.__array__)
+INDEXING = (torch.Tensor.__getitem__, torch.Tensor.__setitem__)
+
+
+class OnCard(torch.Tensor):
+    """In disguise."""
+
+
+def disguised(tensor: torch.Tensor) -> torch.Tensor:
+    return tensor if isinstance(tensor, OnCard) else tensor.as_subclass(OnCard)
+
+
+def plain(tensor: torch.Tensor) -> torch.Tensor:
+    with torch._C.DisableTorchFunction():
+        return tensor.as_subclass(torch.Tensor)
+
+
+def _is_card(device: Any) -> bool:
+    return isinstance(device, (str, torch.device)) and torch.device(device).type == "cuda"
+
+
+class Card(TorchFunctionMode):
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = dict(kwargs or {})
+        tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor)]
+        here = bool(args) and isinstance(args[0], OnCard)
+        if func in SAID and here:
+            return SAID[func]
+        with torch._C.DisableTorchFunctionSubclass():
+            if func in (torch.Tensor.cpu, torch.Tensor.to, torch.Tensor.cuda):
+                return self._moved(func, args, kwargs)
+            if func in ONLY_ON_CPU and here:
+                raise TypeError("can't convert cuda:0 device type tensor to numpy")
+            wanted = _is_card(kwargs.get("device"))
+            leaf = wanted and kwargs.pop("requires_grad", False)  # the disguised one, not what it hides
+            if wanted:
+                kwargs.pop("device")
+            on_card = any(isinstance(t, OnCard) for t in tensors)
+            self._refuse_mixed(func, args, tensors)
+            result = func(*args, **kwargs)
+        if not (wanted or on_card) or func is torch.Tensor.as_subclass:
+            return result
+        shown = tree_map(lambda each: disguised(each) if isinstance(each, torch.Tensor) else each, result)
+        return shown.requires_grad_() if leaf else shown
+
+    def _moved(self, func: Any, args: Any, kwargs: dict[str, Any]) -> torch.Tensor:
+        tensor, *rest = args
+        device = kwargs.pop("device", None)
+        given = [*rest]
+        if rest and (isinstance(rest[0], (str, torch.device))):
+            device = given.pop(0)
+        elif rest and isinstance(rest[0], torch.Tensor):  # to(other): its type and its place
+            device, given = (CARD if isinstance(rest[0], OnCard) else "cpu"), [rest[0].dtype, *rest[1:]]
+        if func is not torch.Tensor.to:
+            device, given, kwargs = ("cpu" if func is torch.Tensor.cpu else CARD), [], {}
+        on_card = isinstance(tensor, OnCard) if device is None else _is_card(device)
+        moved = tensor.to(*given, **kwargs) if given or kwargs else tensor
+        return disguised(moved) if on_card else moved.as_subclass(torch.Tensor)
+
+    def _refuse_mixed(self, func: Any, args: Any, tensors: list[torch.Tensor]) -> None:
+        if func is torch.Tensor.copy_:
+            return
+        if func in INDEXING and isinstance(args[0], OnCard):  # CUDA takes indices from the CPU
+            tensors = [args[0], *(leaf for leaf in tree_leaves(args[2:]) if isinstance(leaf, torch.Tensor))]
+        kinds = {isinstance(t, OnCard) for t in tensors if t.ndim or isinstance(t, OnCard)}
+        if len(kinds) > 1:
+            raise RuntimeError(f"{getattr(func, '__name__', func)}: expected all tensors to be on the same device")
+
+
+@contextmanager
+def card() -> Iterator[None]:
+    """The block's machine has a card."""
+    leave = lambda value: plain(value) if isinstance(value, torch.Tensor) else value
+    enter = lambda value: disguised(value) if isinstance(value, torch.Tensor) else value
+
+    def render(gaussians, camera, features, background, degree, probe):
+        given = (leave(each) for each in (features, background))
+        drawn = cpu.render(gaussians.map(leave), camera, *given, degree, leave(probe))
+        return Rendering(*map(enter, drawn))
+
+    def accumulate(gaussians, camera, values, count):
+        return enter(cpu.accumulate(gaussians.map(leave), camera, leave(values), count))
+
+    with pytest.MonkeyPatch.context() as patched, Card():
+        patched.setattr(cuda, "require_gpu", lambda means: None)
+        patched.setattr(cuda, "render", render)
+        patched.setattr(cuda, "accumulate", accumulate)
+        yield

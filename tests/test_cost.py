@@ -1,0 +1,98 @@
+"""What a plan says that a stage takes on a card: from counted operations; longer for more work, less on a faster card;
+and that no card was timed."""
+
+from __future__ import annotations
+
+import os
+import re
+
+import pytest
+from test_installed import ROOT, write_capture
+from test_machine import with_nvidia_smi
+
+from benchmarks.gpu import counts
+from reffusion.cost import estimate
+from reffusion.cost.counts import COUNTS
+from reffusion.params import distill, fit, personalize, reference
+from runner import Refused
+from runner.costs import costs, span
+from runner.plan import plan, table
+from runner.resolve import Request, resolve
+
+HALF = {"device": "cuda", "dtype": "float16"}
+WORK = {
+    "fit": (estimate.fit, fit.Params(device="cuda"), ["iterations"]),
+    "reference": (estimate.reference, reference.Params(**HALF), ["candidates", "sampler.steps"]),
+    "personalize": (estimate.personalize, personalize.Params(memory_gb=20, **HALF), ["steps", "optimizer.batch"]),
+    "distill": (estimate.distill, distill.Params(memory_gb=16, **HALF), ["iterations", "sds.patches"]),
+}
+
+
+@pytest.mark.parametrize("stage", list(WORK))
+def test_more_work_takes_longer_and_a_faster_card_less(stage):
+    function, params, more = WORK[stage]
+    work, gigabytes = function(params)
+    seconds = {name: work.seconds(card) for name, card in estimate.CARDS.items()}
+    assert seconds["rtx-3090"] > seconds["rtx-4090"] > seconds["h100"] > 0 and seconds["a100"] > seconds["h100"]
+    assert 0 < gigabytes < 20
+    for name in more:
+        value = params
+        for part in name.split("."):
+            value = getattr(value, part)
+        longer, _ = function(params.changed({name: 2 * value}))
+        assert longer.seconds(estimate.CARDS["a100"]) > work.seconds(estimate.CARDS["a100"]), name
+
+
+def test_each_term_of_distillation_costs():
+    card, params = estimate.CARDS["rtx-4090"], WORK["distill"][1]
+    whole = estimate.distill(params)[0].seconds(card)
+    without = lambda name: estimate.distill(params.changed({f"{name}.weight": 0}))[0].seconds(card)
+    assert all(without(name) < whole for name in ("sds", "depth", "adversarial"))
+    narrow = [estimate.distill(params.changed({"adversarial.width": w}))[0].seconds(card) for w in (64, 256, 512)]
+    assert narrow == sorted(narrow) and narrow[2] == pytest.approx(whole)
+
+
+def test_another_prior_was_not_counted():
+    assert estimate.distill(distill.Params(prior="priors/tiny", **HALF)) is None
+    assert estimate.said("a100", "cpu", estimate.fit(fit.Params())) is None
+
+
+@pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="slow: a minute")
+def test_the_table_is_what_is_counted_today():
+    """The parts that are our own; `python -m benchmarks.gpu.counts` makes it anew."""
+    found = {"critic 256": counts.critic_step(256), "loss, a million pixels": counts.loss_of_a_pixel()}
+    found["Adam, a million Gaussians"] = counts.adam_of_a_gaussian()
+    for name, each in found.items():
+        assert each["tflop"] == pytest.approx(COUNTS[name]["tflop"], rel=0.02), name
+        assert each["gb"] == pytest.approx(COUNTS[name]["gb"], rel=0.05), name
+
+
+def test_cards_by_any_name():
+    assert estimate.card_of("NVIDIA GeForce RTX 4090") == "rtx-4090" and estimate.card_of("A100") == "a100"
+    with pytest.raises(ValueError, match=r"card 'voodoo' is none of rtx-3090, .*h100"):
+        estimate.card_of("voodoo")
+
+
+def test_what_a_plan_prints(tmp_path, monkeypatch):
+    """On a machine with a small card, an old driver and, as it may be, no gsplat and a torch without CUDA."""
+    write_capture(tmp_path / "row")
+    monkeypatch.setattr(os, "environ", with_nvidia_smi(tmp_path, "NVIDIA GeForce GTX 1080, 8192, 440.10"))
+    monkeypatch.setattr("runner.plan.has_cuda", lambda: True)
+    job = resolve(Request(ROOT, tmp_path / "runs", str(tmp_path / "row"), profile="paper"))
+    decisions = plan(job, job.pipeline.closure("all"))
+    printed = table(job, decisions)
+    for stage, memory in (("personalize", 20), ("distill", 16)):
+        assert decisions[stage].word == "missing"
+        assert any(f"{stage}.memory_gb is {memory}, and NVIDIA" in line for line in decisions[stage].lacks), stage
+        assert f"{stage}.memory_gb is {memory}, and NVIDIA GeForce GTX 1080 has 9 GB" in printed
+    assert "fit.device is cuda, and " in printed and printed.count("\n") < 40
+    head, *lines = costs(job, decisions, "rtx-4090").splitlines()
+    assert "on rtx-4090: counted operations" in head and "never timed on a card" in head
+    shape = r"    (fit|reference|personalize|distill) +[\d.]+ (s|min|h) +\d+\.\d GB"
+    assert len(lines) == 5 and all(re.fullmatch(shape, line) for line in lines[:-1]), lines
+    assert re.fullmatch(r"    together +[\d.]+ (s|min|h)", lines[-1])
+    with pytest.raises(Refused, match="card 'voodoo' is none of"):
+        costs(job, decisions, "voodoo")
+    monkeypatch.setattr("runner.costs.has_cuda", lambda: False)
+    assert costs(job, decisions, None) == "", "nothing is asked where there is no card"
+    assert [span(s) for s in (12.3, 600, 7200)] == ["12 s", "10 min", "2.0 h"]

@@ -1,0 +1,104 @@
+"""Stages on a card give what they give on the CPU; a stand-in for one, which refuses to mix tensors of two devices
+(tests/other_device.py)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import small_scene as small
+import torch
+from other_device import card
+
+from reffusion.io.arrays import load_labels
+from reffusion.io.ply import load_ply, save_ply
+from reffusion.io.scene import load_mask_sets, save_references
+from reffusion.masks import voting
+from reffusion.types import PARAMETERS, Reference
+from stages import fit, initialize, masks
+
+NEAR = 1.7
+
+
+@pytest.fixture(scope="module")
+def ready(tmp_path_factory):
+    """A small scene, whose colours may change with the direction, up to a reference."""
+    home = tmp_path_factory.mktemp("scene")
+    poses, fitted, _ = small.write(home, NEAR)
+    gaussians = load_ply(fitted / "gaussians.ply")
+    higher = torch.zeros(len(gaussians), 3, 3)
+    save_ply(fitted / "gaussians.ply", replace(gaussians, sh=torch.cat([gaussians.sh, higher], 1)))
+    (home / "masks").mkdir()
+    masks.run(masks.Params(), home / "masks", poses=poses, fit=fitted)
+    hole = load_mask_sets(home / "masks", ["a2"])["a2"].invent
+    save_references(home / "reference", [Reference(small.CAMERAS["a2"], small.photo(small.CAMERAS["a2"]), hole)])
+    return SimpleNamespace(home=home, poses=poses, fit=fitted)
+
+
+def both(tmp_path, work) -> list:
+    """The folders that `work(device, folder)` fills on the CPU and on the card."""
+    folders = [tmp_path / "cpu", tmp_path / "cuda"]
+    for folder in folders:
+        folder.mkdir()
+    work("cpu", folders[0])
+    with card():
+        work("cuda", folders[1])
+    return folders
+
+
+def test_the_stand_in_refuses_what_cuda_refuses():
+    with card():
+        here, there = torch.ones(3), torch.ones(3, device="cuda")
+        assert there.device.type == "cuda" and not here.is_cuda and (there + 1).is_cuda and there[here > 0].is_cuda
+        for mixed in (lambda: here + there, lambda: torch.where(here > 0, there, 0.0), lambda: here[there > 0]):
+            with pytest.raises(RuntimeError, match="same device"):
+                mixed()
+        with pytest.raises(TypeError, match="numpy"):
+            there.numpy()
+        assert there.cpu().numpy().sum() == 3 and (there.to(here) + here).device.type == "cpu"
+
+
+@pytest.mark.parametrize("vote", ["weight", "count"])
+def test_masks_on_a_card(ready, tmp_path, vote):
+    run = lambda device, out: masks.run(masks.Params(device=device, vote=vote), out, poses=ready.poses, fit=ready.fit)
+    cpu, cuda = both(tmp_path, run)
+    assert torch.equal(load_labels(cpu / "labels.npy"), load_labels(cuda / "labels.npy"))
+    before, after = (load_mask_sets(folder, small.TRAIN) for folder in (cpu, cuda))
+    for name in small.TRAIN:
+        for kind in ("consistent", "undecided", "invent"):
+            assert np.array_equal(getattr(before[name], kind), getattr(after[name], kind)), (name, kind)
+
+
+def test_a_box_on_a_card():
+    gaussians, _ = small.gaussians(NEAR)
+    box = (0, 0, NEAR), (0.5, 0.5, 0.1)
+    with card():
+        there = voting.inside_box(gaussians.map(lambda p: p.to("cuda")), *box)
+        assert there.is_cuda and there.any() and torch.equal(there.cpu(), voting.inside_box(gaussians, *box))
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [{"gloss": True, "settle": 2, "further": 1}, {"start": "random"}, {"start": "nothing"}],
+    ids=["reference", "random", "nothing"],
+)
+def test_initialize_on_a_card(ready, tmp_path, changed):
+    needs = {"poses": ready.poses, "fit": ready.fit, "masks": ready.home / "masks"}
+    needs |= {"reference": ready.home / "reference"}
+    cpu, cuda = both(tmp_path, lambda d, out: initialize.run(initialize.Params(device=d, **changed), out, **needs))
+    assert torch.equal(load_labels(cpu / "labels.npy"), load_labels(cuda / "labels.npy"))
+    before, after = (load_ply(folder / "gaussians.ply") for folder in (cpu, cuda))
+    for name in PARAMETERS:  # settling takes torch's SSIM and Adam there, which round otherwise
+        assert torch.allclose(getattr(before, name), getattr(after, name), atol=2e-2), name
+
+
+def test_a_fit_on_a_card(ready, tmp_path):
+    changed = {"iterations": 6, "sh.degree": 1, "densify.cap_max": 300, "holdout": 3, "densify.stop": 0.5}
+    changed |= {"densify.every": 2, "densify.start": 0.1, "checkpoint_seconds": 1e-9}
+    run = lambda device, out: fit.run(fit.Params().changed(changed | {"device": device}), out, poses=ready.poses)
+    cpu, cuda = both(tmp_path, run)
+    before, after = (load_ply(folder / "gaussians.ply") for folder in (cpu, cuda))
+    assert len(before) == len(after)
+    assert all(torch.allclose(getattr(before, n), getattr(after, n), atol=2e-2) for n in PARAMETERS)
