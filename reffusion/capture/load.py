@@ -50,8 +50,12 @@ def _source(folder: Path, layout: str) -> Path:
 
 
 def recognise(folder: Path) -> str:
-    """The layout by the files that are there: poses_bounds.npy, transforms.json, a COLMAP model, else photos."""
+    """The layout by the files that are there: poses_bounds.npy, transforms.json, a COLMAP model, else photos.
+
+    A COLMAP model beside masks of `images_4` is SPIn-NeRF's, whose poses_bounds.npy is not needed then."""
     if there(folder / "poses_bounds.npy"):
+        return "llff"
+    if (folder / "images_4" / "label").is_dir() and colmap.model_folder(folder) is not None:
         return "llff"
     if there(folder / "transforms.json"):
         return "transforms"
