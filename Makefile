@@ -5,6 +5,7 @@
 given := scene profile variant budget set trust keep runs variants seeds seed name steps gate slow offline port
 $(foreach each,$(given),$(eval $(each) :=))
 data := data
+folder := $(findstring command,$(origin data))
 $(foreach each,$(given) data,$(eval override $(each) := $$(value $(each))))
 goals := $(value MAKECMDGOALS)
 export $(given) data goals
@@ -23,7 +24,7 @@ where = $(if $(variant),--variant="$$variant") $(if $(runs),--runs="$$runs")
 options = $(where) $(if $(profile),--profile="$$profile") $(if $(budget),--budget="$$budget") \
 	$(if $(set),--set="$$set") $(if $(trust),--trust) $(if $(keep),--keep)
 
-.PHONY: help setup all $(STAGES) plan check verify clean batch weights demo prior prior-report sds-variance view turntable test \
+.PHONY: help setup all $(STAGES) plan check verify clean batch spinnerf weights demo prior prior-report sds-variance view turntable test \
 	fuzz bench stability gpu-check lint
 .DELETE_ON_ERROR:
 
@@ -34,6 +35,8 @@ help:
 	@echo 'make scene=X check             what is odd about its photographs, masks and poses; each mask over its photograph'
 	@echo 'make scene=X compare           the full method, ablations and baselines side by side: runs/X/compare.html'
 	@echo '                               variants=a,b  only these; seeds=5  on demo, demo-1 ... demo-4, with intervals'
+	@echo 'make data=FOLDER compare       the same over all its scenes, in one table: runs/compare/compare.html'
+	@echo 'make data=FOLDER spinnerf      what it holds of SPIn-NeRF'"'"'s published scenes; then as batch'
 	@echo 'make scene=X report            what was done, errors against seconds: runs/X/report/index.html'
 	@echo 'make scene=X view              walk through the finished scene in a browser; port=8080'
 	@echo 'make scene=X turntable         the finished scene on a way around the capture: runs/X/turntable.webm'
@@ -118,10 +121,12 @@ check: ready
 # On the demo scenes of other seeds too. A variant that fails (3) stops no other: the table is drawn, then make fails.
 others := $(if $(call rest,0 1 2 3 4 5 6 7 8 9,$(seeds)),,$(if $(made),$(addsuffix /.generated,\
 	$(addprefix data/$(made)-,$(wordlist 2,$(or $(seeds),1),$(shell seq 0 99))))))
-compare: ready $(others)
-	@$(RUN) compare $(of) $(options) $(if $(variants),--variants="$$variants") $(if $(seeds),--seeds="$$seeds"); \
+# Of a folder of scenes where it is named on the command line and no scene is.
+these = $(if $(scene),$(of),--data="$$data")
+compare: $(if $(scene),ready $(others),$(if $(folder),setup,named))
+	@$(RUN) compare $(these) $(options) $(if $(variants),--variants="$$variants") $(if $(seeds),--seeds="$$seeds"); \
 		status=$$?; test $$status = 0 || test $$status = 3 || exit $$status; \
-		$(RUN) compare-page $(of) $(if $(runs),--runs="$$runs") && exit $$status
+		$(RUN) compare-page $(these) $(if $(runs),--runs="$$runs") && exit $$status
 
 report: $(if $(scene),ready,setup)
 ifneq ($(scene),)
@@ -139,6 +144,10 @@ turntable: named setup
 
 verify clean: named setup
 	@$(RUN) $@ $(of) $(options)
+
+spinnerf: setup
+	@$(PY) data/spinnerf.py --data="$$data"
+	@$(RUN) batch --data="$$data" $(options)
 
 batch: setup
 	@$(RUN) batch --data="$$data" $(options)
