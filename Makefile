@@ -2,7 +2,7 @@
 
 # Given on the command line; set here so that a variable of the environment is not taken for one of them. Recipes read
 # them from their environment, in double quotes, as they were typed: there is no quote or $ that a shell or make obeys.
-given := scene profile variant budget set trust keep runs variants seeds seed name steps gate slow offline port
+given := scene profile variant budget set trust keep runs variants seeds seed name steps gate slow offline port device dtype
 $(foreach each,$(given),$(eval $(each) :=))
 data := data
 folder := $(findstring command,$(origin data))
@@ -24,7 +24,7 @@ where = $(if $(variant),--variant="$$variant") $(if $(runs),--runs="$$runs")
 options = $(where) $(if $(profile),--profile="$$profile") $(if $(budget),--budget="$$budget") \
 	$(if $(set),--set="$$set") $(if $(trust),--trust) $(if $(keep),--keep)
 
-.PHONY: help setup all $(STAGES) plan check verify clean batch spinnerf weights demo prior prior-report sds-variance view turntable test \
+.PHONY: help setup all $(STAGES) plan check verify clean batch spinnerf weights demo prior prior-report sds-variance adapted view turntable test \
 	fuzz bench stability gpu-check lint
 .DELETE_ON_ERROR:
 
@@ -41,6 +41,8 @@ help:
 	@echo 'make scene=X view              walk through the finished scene in a browser; port=8080'
 	@echo 'make scene=X turntable         the finished scene on a way around the capture: runs/X/turntable.webm'
 	@echo 'make scene=X sds-variance      the SDS gradient over noise and timesteps, before and after personalization'
+	@echo '                               device=cuda dtype=float16  for this and the next'
+	@echo 'make scene=X adapted           views painted by the adapted prior, beside the unadapted: runs/X/adapted/sheet.png'
 	@echo 'make data=FOLDER report        the same of all its scenes: runs/report/index.html'
 	@echo 'make scene=X verify            hash all that was computed for it: is it as it was made?'
 	@echo 'make scene=X clean             remove what was computed for it'
@@ -168,7 +170,13 @@ prior-report: data/demo/.generated setup
 sds-variance: ready
 	@$(RUN) run personalize $(of) $(options)
 	@$(RUN) run initialize $(of) $(options)
-	$(PY) -m benchmarks.studies.sds_variance --run="$${runs:-runs}/$$(basename "$$scene")"
+	$(PY) -m benchmarks.studies.sds_variance --run="$${runs:-runs}/$$(basename "$$scene")" $(on)
+
+# Where a study computes; what is made first runs where the profile says.
+on = $(if $(device),--device="$$device") $(if $(dtype),--dtype="$$dtype")
+adapted: ready
+	@$(RUN) run personalize $(of) $(options)
+	$(PY) -m benchmarks.studies.adapted --run="$${runs:-runs}/$$(basename "$$scene")" $(on) $(if $(steps),--steps="$$steps")
 
 # Two processes of one thread each, whole files to each: kernels that are compiled for one test serve the next.
 test: $(VENV)/.ready-dev

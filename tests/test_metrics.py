@@ -322,6 +322,24 @@ def test_lpips_weights_are_found_in_the_caches_and_checked(no_caches):
         lpips.load("alex")
 
 
+@pytest.mark.parametrize(
+    "package, below", [("lpips", "weights/v0.1"), ("torchmetrics", "functional/image/lpips_models")]
+)
+def test_lpips_takes_the_linear_weights_of_an_installed_package(no_caches, monkeypatch, package, below):
+    """Beside torchvision's backbone in torch hub's cache; the package itself is not imported."""
+    backbone, linear = random_states("vgg")
+    hub, inside = no_caches / "torch/hub/checkpoints", no_caches / "site" / package / below
+    for folder in (hub, inside):
+        folder.mkdir(parents=True)
+    (no_caches / "site" / package / "__init__.py").write_text("raise ImportError('torchvision is missing')")
+    torch.save(backbone, hub / "vgg16-own.pth")
+    assert "install lpips or torchmetrics" in lpips.load("vgg")[1]
+    torch.save(linear, inside / "vgg.pth")
+    monkeypatch.syspath_prepend(str(no_caches / "site"))
+    model, reason = lpips.load("vgg")
+    assert reason is None and set(model.files) == {"vgg16-own.pth", "vgg.pth"}
+
+
 # --- a view's row
 
 

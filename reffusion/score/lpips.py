@@ -14,7 +14,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from reffusion.weights.local import lpips_folders
+from reffusion.weights.local import at_home, lpips_folders
+from reffusion.weights.published import LPIPS_PACKAGES
 
 Net = Literal["alex", "vgg"]
 
@@ -129,8 +130,10 @@ def load(net: Net, folder: str | Path | None = None) -> tuple[Lpips | None, str 
     for role, pattern in [("backbone", BACKBONE_FILES[net]), ("linear weights", LINEAR_FILES[net])]:
         paths = [path for place in places for path in sorted(place.glob(pattern))]
         if not paths:
-            looked = ", ".join(_short(place) for place in places)
-            return None, f"no {role} for LPIPS ({net}): run `make weights`, or put {pattern} into one of {looked}"
+            looked = ", ".join(at_home(place) for place in places)
+            brings = f"install {' or '.join(LPIPS_PACKAGES)}, " if pattern == LINEAR_FILES[net] else ""
+            cures = f"run `make weights`, {brings}or put {pattern} into one of {looked}"
+            return None, f"no {role} for LPIPS ({net}): {cures}"
         found[role] = paths[0]
     hashes = {path: _sha256(path) for path in found.values()}
     stated = found["backbone"].stem.rpartition("-")[2]
@@ -148,9 +151,3 @@ def load(net: Net, folder: str | Path | None = None) -> tuple[Lpips | None, str 
 def _sha256(path: Path) -> str:
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _short(path: Path) -> str:
-    """`~/...` where it lies at home, so that no user's name enters a result file."""
-    home = Path.home()
-    return f"~/{path.relative_to(home)}" if path.is_relative_to(home) else str(path)
