@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 
 from reffusion.score import lpips, metrics
 from reffusion.score.metrics import Box, mask_box
+from reffusion.weights import local
+from reffusion.weights.published import LPIPS_PACKAGES
 
 
 def pair(height, width, seed=0, noise=0.1):
@@ -285,6 +287,7 @@ def test_lpips_weights_of_another_shape_are_refused_by_name():
 def no_caches(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    monkeypatch.setattr(local, "LPIPS_PACKAGES", {})
     return tmp_path
 
 
@@ -322,15 +325,14 @@ def test_lpips_weights_are_found_in_the_caches_and_checked(no_caches):
         lpips.load("alex")
 
 
-@pytest.mark.parametrize(
-    "package, below", [("lpips", "weights/v0.1"), ("torchmetrics", "functional/image/lpips_models")]
-)
+@pytest.mark.parametrize("package, below", LPIPS_PACKAGES.items())
 def test_lpips_takes_the_linear_weights_of_an_installed_package(no_caches, monkeypatch, package, below):
     """Beside torchvision's backbone in torch hub's cache; the package itself is not imported."""
     backbone, linear = random_states("vgg")
     hub, inside = no_caches / "torch/hub/checkpoints", no_caches / "site" / package / below
     for folder in (hub, inside):
         folder.mkdir(parents=True)
+    monkeypatch.setattr(local, "LPIPS_PACKAGES", {package: below})
     (no_caches / "site" / package / "__init__.py").write_text("raise ImportError('torchvision is missing')")
     torch.save(backbone, hub / "vgg16-own.pth")
     assert "install lpips or torchmetrics" in lpips.load("vgg")[1]
