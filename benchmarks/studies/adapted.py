@@ -26,7 +26,6 @@ from reffusion.paint import painting
 from reffusion.params.base import Sampler
 from reffusion.prior import inpaint
 from reffusion.prior.crops import PROMPTS
-from reffusion.prior.memory import peak_bytes
 from reffusion.prior.model import Prior
 from report.sheet import enlarged, evenly, framed
 
@@ -102,11 +101,11 @@ def main() -> None:
     device.add_arguments(parser)
     given = parser.parse_args()
     models, base = device.before_and_after(given)
-    sampler, out, views = Sampler(steps=given.steps), given.out or given.run / "adapted", []
-    peak = peak_bytes(lambda: views.extend(drawn(models, given.run, given.views, sampler, out)), given.device)
+    sampler, out = Sampler(steps=given.steps), given.out or given.run / "adapted"
+    views = drawn(models, given.run, given.views, sampler, out)
     facts = {"prior": base, "seed": SEED, "sampler": sampler.model_dump(), "views": views}
-    save_json(out / "adapted.json", facts | device.facts(given, peak))
-    print(device.words(given, peak), out / "sheet.png", sep="\n")
+    save_json(out / "adapted.json", facts | device.facts(given))
+    print(device.words(given), out / "sheet.png", sep="\n")
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import resource
 from pathlib import Path
 from typing import Any
 
@@ -36,9 +37,18 @@ def before_and_after(given: argparse.Namespace) -> tuple[dict[str, Prior], str]:
     return {"before": fresh(), "after": lora.merged(fresh(), adapted)}, base
 
 
-def facts(given: argparse.Namespace, peak: int) -> dict[str, Any]:
-    return {"device": given.device, "dtype": given.dtype, "peak_mb_beside_weights": round(peak / 1e6)}
+def peak_mb(device: str) -> int:
+    """The most memory, weights included, that this process took: of the GPU by its allocator's count, else of the
+    machine."""
+    if device == "cuda":
+        return round(torch.cuda.max_memory_allocated() / 1e6)
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6)
 
 
-def words(given: argparse.Namespace, peak: int) -> str:
-    return f"on {given.device} in {given.dtype}: at most {peak / 1e6:.0f} MB beside both priors' weights"
+def facts(given: argparse.Namespace) -> dict[str, Any]:
+    """What a study's file says of it."""
+    return {"device": given.device, "dtype": given.dtype, "peak_mb": peak_mb(given.device)}
+
+
+def words(given: argparse.Namespace) -> str:
+    return f"on {given.device} in {given.dtype}, both priors loaded: at most {peak_mb(given.device):,} MB"

@@ -32,7 +32,6 @@ from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets, load_scene
 from reffusion.prior import diffusion, windows
 from reffusion.prior.crops import PROMPTS
-from reffusion.prior.memory import peak_bytes
 from reffusion.prior.model import Prior
 from reffusion.splat import rasterizer
 
@@ -141,13 +140,12 @@ def main() -> None:
     device.add_arguments(parser)
     given = parser.parse_args()
     models, base = device.before_and_after(given)
-    found, out = {}, given.out or given.run / "sds-variance"
-    peak = peak_bytes(lambda: found.update(measured(models, given.run)), given.device)
+    found, out = measured(models, given.run), given.out or given.run / "sds-variance"
     out.mkdir(parents=True, exist_ok=True)
-    facts = {"prior": base, "timesteps": TIMESTEPS, **device.facts(given, peak)}
+    facts = {"prior": base, "timesteps": TIMESTEPS, **device.facts(given)}
     save_json(out / "sds_variance.json", facts | found)
     print(table(found))
-    print(device.words(given, peak), out / "sds_variance.json", sep="\n")
+    print(device.words(given), out / "sds_variance.json", sep="\n")
 
 
 if __name__ == "__main__":
