@@ -166,7 +166,9 @@ def further_tables(comparison: Comparison, table: list[dict[str, Any]]) -> dict[
         each = {metric: overview.by_scene(comparison, metric, DIGITS[metric]) for metric in BETTER}
         found |= {f"{SHORT[metric]} in each scene": cells for metric, cells in each.items() if cells}
     if given := overview.published(comparison.data):
-        found["Published, and here"] = overview.beside(given, table, SHORT, DIGITS)
+        done = [run for method in comparison.methods for run in comparison.of(method)]
+        here = " ".join(overview.protocol(done))
+        found["Published, and here"] = overview.beside(given, table, SHORT, DIGITS, here)
     return found
 
 
@@ -194,7 +196,7 @@ def notes(comparison: Comparison) -> list[str]:
     said = [
         "Box: the bounding box of the view's mask, 10% wider on each side. Means over the test views"
         + (" and the scenes; ± half the 95% interval over the scenes." if len(comparison.scenes) > 1 else "."),
-        *overview.protocol(done),
+        *(f"Scored: {words}." for words in overview.protocol(done)),
         "seconds: all stages of the method, evaluation included, from their receipts; own seconds: of the stages that "
         "it does not share with the full method. Peak memory: of its hungriest stage.",
     ]

@@ -25,14 +25,14 @@ def by_scene(comparison: Comparison, metric: str, digits: int) -> Table | None:
 
 
 def protocol(done: list[Run]) -> list[str]:
-    """What was rendered in which scenes, and at what size; a sentence where that is known."""
+    """What was rendered in which scenes, and at what size; one phrase, none where that is not known."""
     said: dict[str, dict[str, None]] = {}
     for run in done:
         sizes = ", ".join(run.metrics.get("protocol", {}).get("resolution", ()))
         if sizes:
             said.setdefault(f"{run.metrics['rendered']} of {sizes} px", {})[run.scene] = None
     groups = [f"{what} ({', '.join(scenes)})" for what, scenes in said.items()]
-    return [f"Scored: {'; '.join(groups)}."] if groups else []
+    return ["; ".join(groups)] if groups else []
 
 
 def published(data: Path | None) -> list[dict[str, str]]:
@@ -58,8 +58,10 @@ def published(data: Path | None) -> list[dict[str, str]]:
     return rows
 
 
-def beside(rows: list[dict[str, str]], table: list[dict], short: dict[str, str], digits: dict[str, int]) -> Table:
-    """The published rows, each metric followed by our own rows in it, with intervals over scenes."""
+def beside(
+    rows: list[dict[str, str]], table: list[dict], short: dict[str, str], digits: dict[str, int], here: str
+) -> Table:
+    """The published rows, each metric followed by our own in it, with intervals over scenes; `here`: our protocol."""
     lines = []
     for metric in dict.fromkeys(row["metric"] for row in rows):
         lines += [
@@ -68,7 +70,7 @@ def beside(rows: list[dict[str, str]], table: list[dict], short: dict[str, str],
             if row["metric"] == metric
         ]
         ours = [row for row in table if row[metric] is not None]
-        lines += [[row["method"], "here", short[metric], spread(row, metric, digits[metric]), ""] for row in ours]
+        lines += [[row["method"], "here", short[metric], spread(row, metric, digits[metric]), here] for row in ours]
     return ["method", "from", "metric", "mean over scenes", "protocol"], lines
 
 

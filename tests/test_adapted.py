@@ -12,7 +12,6 @@ from reffusion.io.arrays import save_labels
 from reffusion.io.images import load_image, save_image
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_scene, save_references
-from reffusion.params.base import Sampler
 from reffusion.types import Reference
 
 HOLE = np.zeros((36, 48), bool)
@@ -34,7 +33,7 @@ def learnt_run(home):
 
 def test_same_views_same_noise_and_holes_alone_are_painted(tmp_path):
     prior, run = small_prior(), learnt_run(tmp_path / "run")
-    views = adapted.drawn({"before": prior, "after": prior}, run, 3, Sampler(steps=2), tmp_path / "out")
+    views = adapted.drawn({"before": prior, "after": prior}, run, 3, 2, tmp_path / "out")
     assert views == ["b"]  # the reference's own view is what was learnt, the third is clean
     pictures = {path.stem: load_image(path) for path in (tmp_path / "out/b").glob("*.png")}
     assert sorted(pictures) == ["adapted", "as-it-is", "as-it-is-no-prompt", "to-paint"]

@@ -231,6 +231,34 @@ def test_a_folder_of_scenes_killed_and_started_again_nothing_runs_twice(tmp_path
             page.make(home)
 
 
+@pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="takes minutes; set REFFUSION_SLOW=1")
+def test_three_made_scenes_of_spin_nerfs_layout_by_the_real_stages(tmp_path, generate):
+    """As `make data=FOLDER compare` runs them, at tiny sizes; killed in the second scene, and gone on with."""
+    from reffusion.capture.layouts import spinnerf
+
+    for seed, name in enumerate(("1", "2", "book")):
+        generate.generate(tmp_path / "data" / name, seed, generate.KINDS["mini"])
+    assert sum("8 training and 3 test views" in line for line in spinnerf.told(tmp_path / "data")) == 3
+    small = "fit.iterations=60 personalize.steps=4 personalize.optimizer.batch=1 distill.iterations=4"
+    command = [sys.executable, "-m", "reffusion.command", "compare", "--data", str(tmp_path / "data")]
+    command += ["--runs", str(tmp_path / "runs"), "--profile", "laptop", "--variants", "masked", "--set", small]
+    process = subprocess.Popen(command, cwd=REPO, stdout=subprocess.PIPE, text=True)
+    assert any("compare: full on 2, 3 of 6" in line for line in process.stdout)
+    while not list((tmp_path / "runs/2").glob(".partial-fit-*")):
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.kill()
+    process.wait(30)
+    dates = {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").glob("1*/*/receipt.json")}
+    home = tmp_path / "runs/compare"
+    assert len(dates) > 8 and by_method(home)["full"]["state"] == "1 of 3 done"
+    subprocess.run(command, cwd=REPO, check=True)
+    assert {path: path.stat().st_mtime_ns for path in dates} == dates
+    table = by_method(home)
+    assert all(row["scenes"] == 3 and row["psnr_box_interval"] > 0 for row in table.values())
+    assert table["full"]["psnr_box"] > table["masked"]["psnr_box"] and page.make(home)["html"].is_file()
+
+
 def test_refused_before_any_work(tmp_path):
     root = written(tmp_path)
     for arguments, options, message in [

@@ -1,10 +1,10 @@
 """The paper's Figure 2: several views of a scene painted by the adapted prior, beside the prior as it is.
 
 `python -m benchmarks.studies.adapted --run runs/demo`, or `make scene=X adapted`; needs the stages up to `personalize`.
-Training views with something to invent, spread evenly, are completed as a reference would be: known without the object
-as far as other views tell, the hole from pure noise. Same views, same noise, same sampler; the prior as it is with the
-empty prompt, and with the adapted one's, which may mean something to it. Writes sheet.png, the pictures, each as
-<view>/<column>.png, and adapted.json to --out.
+Training views with something to invent, spread evenly, are known without the object as far as other views tell; their
+hole is painted from pure noise, the whole view at the prior's own size as SDS sees it. Same views, same noise,
+same sampler; the prior as it is with the empty prompt, and with the adapted one's, which may mean something to it.
+Writes sheet.png, the pictures, each as <view>/<column>.png, and adapted.json to --out.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from benchmarks.studies import device
+from reffusion import seeding
 from reffusion.fit import exposure
 from reffusion.io.arrays import load_labels, save_json
 from reffusion.io.images import save_image
@@ -24,7 +25,7 @@ from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets, load_references, load_scene
 from reffusion.paint import painting
 from reffusion.params.base import Sampler
-from reffusion.prior import inpaint
+from reffusion.prior import diffusion, inpaint
 from reffusion.prior.crops import PROMPTS
 from reffusion.prior.model import Prior
 from report.sheet import enlarged, evenly, framed
@@ -63,26 +64,32 @@ def given_views(run: Path, count: int) -> dict[str, tuple[np.ndarray, np.ndarray
     return {name: (known(name), sets[name].invent) for name in chosen}
 
 
-def painted(prior: Prior, picture: np.ndarray, hole: np.ndarray, prompt: str, sampler: Sampler) -> np.ndarray:
+@torch.no_grad()
+def painted(prior: Prior, picture: np.ndarray, hole: np.ndarray, prompt: str, steps: int) -> np.ndarray:
     """uint8 [H, W, 3]: the hole painted from the noise of `SEED`."""
-    made = inpaint.paint(
+    inside = torch.from_numpy(hole)
+    made = inpaint.repaint(
         prior,
-        inpaint.as_input(picture),
-        torch.from_numpy(hole),
-        prompt=prompt,
-        seeds=[SEED],
-        **sampler.model_dump(),
+        inpaint.as_input(picture) * ~inside,
+        inside,
+        diffusion.embed_text(prior, [prompt, prompt, ""]),
+        seeding.generator(SEED, "adapted"),
+        start=1.0,
+        finest=1.0,
+        levels=0,
+        steps=steps,
+        guidance=0.0,
     )
-    return inpaint.as_picture(made[0])
+    return inpaint.as_picture(made)
 
 
-def drawn(models: dict[str, Prior], run: Path, count: int, sampler: Sampler, out: Path) -> list[str]:
+def drawn(models: dict[str, Prior], run: Path, count: int, steps: int, out: Path) -> list[str]:
     """Write the pictures and sheet.png; the views on it."""
     views, rows = given_views(run, count), []
     for name, (picture, hole) in views.items():
         row = {"to paint": painting.to_paint(picture, hole)}
         for column, (when, prompt) in COLUMNS.items():
-            row[column] = painted(models[when], picture, hole, prompt, sampler)
+            row[column] = painted(models[when], picture, hole, prompt, steps)
         for column, made in row.items():
             save_image(out / name / f"{column.replace(', ', '-').replace(' ', '-')}.png", made)
         scale = max(1, round(WIDTH / picture.shape[1]))
@@ -101,9 +108,9 @@ def main() -> None:
     device.add_arguments(parser)
     given = parser.parse_args()
     models, base = device.before_and_after(given)
-    sampler, out = Sampler(steps=given.steps), given.out or given.run / "adapted"
-    views = drawn(models, given.run, given.views, sampler, out)
-    facts = {"prior": base, "seed": SEED, "sampler": sampler.model_dump(), "views": views}
+    out = given.out or given.run / "adapted"
+    views = drawn(models, given.run, given.views, given.steps, out)
+    facts = {"prior": base, "seed": SEED, "steps": given.steps, "views": views}
     save_json(out / "adapted.json", facts | device.facts(given))
     print(device.words(given), out / "sheet.png", sep="\n")
 
