@@ -2,9 +2,10 @@
 
 # Given on the command line; set here so that a variable of the environment is not taken for one of them. Recipes read
 # them from their environment, in double quotes, as they were typed: there is no quote or $ that a shell or make obeys.
-given := scene profile variant budget set trust keep runs variants seeds seed name steps gate slow offline port card
+given := scene profile variant budget set trust keep runs variants seeds seed name steps gate slow offline port card device dtype
 $(foreach each,$(given),$(eval $(each) :=))
 data := data
+folder := $(findstring command,$(origin data))
 $(foreach each,$(given) data,$(eval override $(each) := $$(value $(each))))
 goals := $(value MAKECMDGOALS)
 export $(given) data goals
@@ -23,8 +24,8 @@ where = $(if $(variant),--variant="$$variant") $(if $(runs),--runs="$$runs")
 options = $(where) $(if $(profile),--profile="$$profile") $(if $(budget),--budget="$$budget") \
 	$(if $(set),--set="$$set") $(if $(trust),--trust) $(if $(keep),--keep)
 
-.PHONY: help setup all $(STAGES) plan check verify clean batch weights demo prior prior-report sds-variance view turntable test \
-	fuzz bench stability gpu gpu-check lint
+.PHONY: help setup all $(STAGES) plan check verify clean batch spinnerf weights demo prior prior-report sds-variance \
+	adapted view turntable test fuzz bench stability gpu gpu-check lint
 .DELETE_ON_ERROR:
 
 help:
@@ -34,10 +35,14 @@ help:
 	@echo 'make scene=X check             what is odd about its photographs, masks and poses; each mask over its photograph'
 	@echo 'make scene=X compare           the full method, ablations and baselines side by side: runs/X/compare.html'
 	@echo '                               variants=a,b  only these; seeds=5  on demo, demo-1 ... demo-4, with intervals'
+	@echo 'make data=FOLDER compare       the same over all its scenes, in one table: runs/compare/compare.html'
+	@echo 'make data=FOLDER spinnerf      what it holds of SPIn-NeRF'"'"'s published scenes; then as batch'
 	@echo 'make scene=X report            what was done, errors against seconds: runs/X/report/index.html'
 	@echo 'make scene=X view              walk through the finished scene in a browser; port=8080'
 	@echo 'make scene=X turntable         the finished scene on a way around the capture: runs/X/turntable.webm'
 	@echo 'make scene=X sds-variance      the SDS gradient over noise and timesteps, before and after personalization'
+	@echo '                               device=cuda dtype=float16  for this and the next'
+	@echo 'make scene=X adapted           views painted by the adapted prior, beside the unadapted: runs/X/adapted/sheet.png'
 	@echo 'make data=FOLDER report        the same of all its scenes: runs/report/index.html'
 	@echo 'make scene=X verify            hash all that was computed for it: is it as it was made?'
 	@echo 'make scene=X clean             remove what was computed for it'
@@ -53,7 +58,7 @@ help:
 	@echo 'make bench                     work-precision diagrams of the kernels: runs/bench; gate=1: against the baselines'
 	@echo 'make stability                 stiff and extreme cases, each with its bound (minutes): runs/stability.json'
 	@echo 'scene=  a name under data/, or the path of any folder'
-	@echo 'profile=auto|laptop|paper|paper-terms  variant=NAME  set="fit.iterations=500 distill.seed=3"  runs=FOLDER'
+	@echo 'profile=auto|laptop|paper|best|paper-terms  variant=NAME  set="fit.iterations=500 distill.seed=3"  runs=FOLDER'
 	@echo 'budget=5m  time for the whole job: sets the number of steps of fit, personalize and distill'
 	@echo 'trust=1  keep results of older code; keep=1  and results that you changed by hand'
 
@@ -119,10 +124,12 @@ check: ready
 # On the demo scenes of other seeds too. A variant that fails (3) stops no other: the table is drawn, then make fails.
 others := $(if $(call rest,0 1 2 3 4 5 6 7 8 9,$(seeds)),,$(if $(made),$(addsuffix /.generated,\
 	$(addprefix data/$(made)-,$(wordlist 2,$(or $(seeds),1),$(shell seq 0 99))))))
-compare: ready $(others)
-	@$(RUN) compare $(of) $(options) $(if $(variants),--variants="$$variants") $(if $(seeds),--seeds="$$seeds"); \
+# Of a folder of scenes where it is named on the command line and no scene is.
+these = $(if $(scene),$(of),--data="$$data")
+compare: $(if $(scene),ready $(others),$(if $(folder),setup,named))
+	@$(RUN) compare $(these) $(options) $(if $(variants),--variants="$$variants") $(if $(seeds),--seeds="$$seeds"); \
 		status=$$?; test $$status = 0 || test $$status = 3 || exit $$status; \
-		$(RUN) compare-page $(of) $(if $(runs),--runs="$$runs") && exit $$status
+		$(RUN) compare-page $(these) $(if $(runs),--runs="$$runs") && exit $$status
 
 report: $(if $(scene),ready,setup)
 ifneq ($(scene),)
@@ -140,6 +147,10 @@ turntable: named setup
 
 verify clean: named setup
 	@$(RUN) $@ $(of) $(options)
+
+spinnerf: setup
+	@$(PY) data/spinnerf.py --data="$$data"
+	@$(RUN) batch --data="$$data" $(options)
 
 batch: setup
 	@$(RUN) batch --data="$$data" $(options)
@@ -160,7 +171,13 @@ prior-report: data/demo/.generated setup
 sds-variance: ready
 	@$(RUN) run personalize $(of) $(options)
 	@$(RUN) run initialize $(of) $(options)
-	$(PY) -m benchmarks.studies.sds_variance --run="$${runs:-runs}/$$(basename "$$scene")"
+	$(PY) -m benchmarks.studies.sds_variance --run="$${runs:-runs}/$$(basename "$$scene")" $(on)
+
+# Where a study computes; what is made first runs where the profile says.
+on = $(if $(device),--device="$$device") $(if $(dtype),--dtype="$$dtype")
+adapted: ready
+	@$(RUN) run personalize $(of) $(options)
+	$(PY) -m benchmarks.studies.adapted --run="$${runs:-runs}/$$(basename "$$scene")" $(on) $(if $(steps),--steps="$$steps")
 
 # Two processes of one thread each, whole files to each: kernels that are compiled for one test serve the next.
 test: $(VENV)/.ready-dev

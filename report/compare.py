@@ -1,4 +1,5 @@
-"""What `make scene=X compare` ran, as tables and pictures: runs/X/compare.md, .csv and .html.
+"""What `make scene=X compare` ran, as tables and pictures: runs/X/compare.md, .csv and .html; of a whole folder
+runs/compare/compare.md, .csv and .html.
 
 python -m report.compare --scene X --runs runs
 """
@@ -10,8 +11,21 @@ from pathlib import Path
 from typing import Any
 
 from reffusion.io.arrays import load_json
-from report import charts, page, pictures
-from report.results import AGAINST, BETTER, FULL, OUTSIDE, SCORES, Comparison, Run, differences, load, rows, save_csv
+from report import charts, overview, page, pictures
+from report.results import (
+    AGAINST,
+    BETTER,
+    FULL,
+    OUTSIDE,
+    SCORES,
+    TOGETHER,
+    Comparison,
+    Run,
+    differences,
+    load,
+    rows,
+    save_csv,
+)
 
 TITLES = {
     "method": "method",
@@ -19,6 +33,8 @@ TITLES = {
     "ssim_box": "SSIM ↑",
     "flip_box": "FLIP ↓",
     "lpips_vgg_box": "LPIPS (vgg) ↓",
+    "lpips_alex_box": "LPIPS (alex) ↓",
+    "stlpips_box": "ST-LPIPS ↓",
     "psnr_outside": "outside: PSNR ↑",
     "ssim_outside": "outside: SSIM ↑",
     "flip_outside": "outside: FLIP ↓",
@@ -28,12 +44,19 @@ TITLES = {
     "peak_memory_mb": "peak MB",
     "gaussians": "Gaussians",
 }
-DIGITS = {"psnr_box": 2, "ssim_box": 4, "flip_box": 4, "lpips_vgg_box": 4, "consistency": 5}
+DIGITS = {"psnr_box": 2, "ssim_box": 4, "flip_box": 4, "lpips_vgg_box": 4, "lpips_alex_box": 4, "stlpips_box": 4}
+DIGITS |= {"consistency": 5}
 DIGITS |= {"psnr_outside": 2, "ssim_outside": 4, "flip_outside": 4}
 ERRORS = {"flip_box": "FLIP in the box", "ssim_box": "1 − SSIM in the box", "lpips_vgg_box": "LPIPS (vgg) in the box"}
 SHORT = {"psnr_box": "PSNR, dB", "ssim_box": "SSIM", "flip_box": "FLIP", "lpips_vgg_box": "LPIPS (vgg)"}
+SHORT |= {"lpips_alex_box": "LPIPS (alex)", "stlpips_box": "ST-LPIPS"}
 SHORT |= {"psnr_outside": "PSNR outside, dB", "ssim_outside": "SSIM outside", "flip_outside": "FLIP outside"}
-WHERE_THERE = ("consistency", *OUTSIDE)  # columns that are left out where no method has a value
+WHERE_THERE = (
+    "consistency",
+    "lpips_alex_box",
+    "stlpips_box",
+    *OUTSIDE,
+)  # columns that are left out where no method has a value
 WAYS = {"inpainter": "2D inpainter", "perceptual": "perceptual distance"}  # keys of the files, in words
 
 
@@ -99,15 +122,21 @@ def cells(table: list[dict[str, Any]]) -> tuple[list[str], list[list[str]], list
     """Header, texts and which are best in their column; a dash where there is no value."""
     names = [name for name in TITLES if name not in WHERE_THERE or any(row[name] is not None for row in table)]
     best = {}
-    for name, better in SCORES.items():  # not in consistency, which blur has too
-        values = [row[name] for row in table if row[name] is not None]
+    most = max(row["scenes"] for row in table)
+    for name, better in SCORES.items():  # not in consistency, which blur has too; nor a mean over fewer scenes
+        values = [row[name] for row in table if row[name] is not None and row["scenes"] == most]
         best[name] = (max if better == "more" else min)(values, default=None) if len(values) > 1 else None
     texts, bold = [], []
     for row in table:
         state = "" if row["state"] == "done" else f" ({row['state']})"
-        texts.append([row["method"] + state if n == "method" else page.number(row[n], DIGITS.get(n, 0)) for n in names])
+        texts.append([row["method"] + state if n == "method" else _cell(row, n) for n in names])
         bold.append([best.get(n) is not None and row[n] == best[n] for n in names])
     return [TITLES[name] for name in names], texts, bold
+
+
+def _cell(row: dict[str, Any], name: str) -> str:
+    digits = DIGITS.get(name, 0)
+    return overview.spread(row, name, digits) if name in SCORES else page.number(row[name], digits)
 
 
 def difference_cells(table: list[dict[str, Any]]) -> tuple[list[str], list[list[str]]] | None:
@@ -124,6 +153,23 @@ def _signed(row: dict[str, Any], metric: str) -> str:
     text = f"{mean:+.{DIGITS[metric]}f}".replace("-", "−")
     text += "" if views is None else f" ± {views:.{DIGITS[metric]}f}"
     return text if scenes is None else f"{text} (± {scenes:.{DIGITS[metric]}f})"
+
+
+def further_tables(comparison: Comparison, table: list[dict[str, Any]]) -> dict[str, overview.Table]:
+    """Title -> header and rows: every scene, where there are several, and what others published.
+
+    Raises:
+        ValueError: FOLDER/published.csv is not as it must be.
+    """
+    found: dict[str, overview.Table] = {}
+    if len(comparison.scenes) > 1:
+        each = {metric: overview.by_scene(comparison, metric, DIGITS[metric]) for metric in BETTER}
+        found |= {f"{SHORT[metric]} in each scene": cells for metric, cells in each.items() if cells}
+    if given := overview.published(comparison.data):
+        done = [run for method in comparison.methods for run in comparison.of(method)]
+        here = " ".join(overview.protocol(done))
+        found["Published, and here"] = overview.beside(given, table, SHORT, DIGITS, here)
+    return found
 
 
 # ---------------------------------------------------------------------------------------------------------- words
@@ -149,7 +195,8 @@ def notes(comparison: Comparison) -> list[str]:
     done = [run for method in comparison.methods for run in comparison.of(method)]
     said = [
         "Box: the bounding box of the view's mask, 10% wider on each side. Means over the test views"
-        + (" and the scenes." if len(comparison.scenes) > 1 else "."),
+        + (" and the scenes; ± half the 95% interval over the scenes." if len(comparison.scenes) > 1 else "."),
+        *(f"Scored: {words}." for words in overview.protocol(done)),
         "seconds: all stages of the method, evaluation included, from their receipts; own seconds: of the stages that "
         "it does not share with the full method. Peak memory: of its hungriest stage.",
     ]
@@ -196,8 +243,10 @@ def intervals(comparison: Comparison) -> str:
 def markdown(comparison: Comparison, table: list[dict], drawn: dict[str, Path | None], views: dict[str, Path]) -> str:
     header, texts, bold = cells(table)
     strong = [[f"**{c}**" if b else c for c, b in zip(*line, strict=True)] for line in zip(texts, bold, strict=True)]
-    lines = [f"# {comparison.home.name}: methods compared", "", summary(comparison, table), ""]
+    lines = [f"# {comparison.name}: methods compared", "", summary(comparison, table), ""]
     lines += [page.markdown(header, strong)]
+    for title, further in further_tables(comparison, table).items():
+        lines += [f"## {title}", "", page.markdown(*further)]
     if found := difference_cells(table):
         lines += ["## Difference to the full method", "", intervals(comparison), "", page.markdown(*found)]
     for title, path in drawn.items():
@@ -209,10 +258,12 @@ def markdown(comparison: Comparison, table: list[dict], drawn: dict[str, Path | 
 
 def html(comparison: Comparison, table: list[dict], drawn: dict[str, Path | None], views: dict[str, Path]) -> str:
     header, texts, bold = cells(table)
-    title = f"{comparison.home.name}: methods compared"
+    title = f"{comparison.name}: methods compared"
     full = next((number for number, row in enumerate(table) if row["method"] == FULL), None)
     body = [page.heading(title, 1), page.paragraph(summary(comparison, table))]
     body += [page.table(header, texts, bold=bold, marked=full)]
+    for heading, further in further_tables(comparison, table).items():
+        body += [page.heading(heading), page.table(*further)]
     for heading, path in drawn.items():
         body += [page.heading(heading), page.picture(path, heading, embed=True)] if path else []
     if found := difference_cells(table):
@@ -227,11 +278,14 @@ def html(comparison: Comparison, table: list[dict], drawn: dict[str, Path | None
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="reffusion compare-page", description=__doc__.split("\n")[0])
-    parser.add_argument("--scene", type=Path, required=True, help="its name, or the path of its folder")
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--scene", type=Path, help="its name, or the path of its folder")
+    what.add_argument("--data", type=Path, help="the folder whose scenes were compared last")
     parser.add_argument("--runs", type=Path, default=Path("runs"))
     arguments = parser.parse_args()
     try:
-        made = make(arguments.runs / arguments.scene.expanduser().resolve().name)
+        name = arguments.scene.expanduser().resolve().name if arguments.scene else TOGETHER
+        made = make(arguments.runs / name)
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
     text = made["md"].read_text(encoding="utf-8")

@@ -18,8 +18,17 @@ BOX = ("left", "top", "right", "bottom")
 
 
 def sheets(comparison: Comparison, out: Path, count: int = 3) -> dict[str, Path]:
-    """View -> a PNG with what every method made of it, and the truth; views of the first scene, spread evenly."""
-    scene = comparison.scenes[0]
+    """View -> a PNG with what every method made of it, and the truth; views of the only scene, spread evenly, or one
+    of each of so many scenes."""
+    if len(comparison.scenes) == 1:
+        return _sheets_of(comparison, comparison.scenes[0], out, "", count)
+    made: dict[str, Path] = {}
+    for scene in evenly(list(comparison.scenes), count):
+        made |= _sheets_of(comparison, scene, out, f"{scene}-", 1)
+    return made
+
+
+def _sheets_of(comparison: Comparison, scene: str, out: Path, prefix: str, count: int) -> dict[str, Path]:
     runs = [run for m in comparison.methods if (run := comparison.runs[m, scene]).state == "done" and run.views]
     if not runs:
         return {}
@@ -29,8 +38,8 @@ def sheets(comparison: Comparison, out: Path, count: int = 3) -> dict[str, Path]
     for view in evenly(boxed or list(first.views), count):
         cells = _cells(runs, first, view)
         if cells:
-            made[view] = out / f"{view}.png"
-            save_image(made[view], wall([picture for _, picture in cells], [title for title, _ in cells]))
+            path = made[f"{prefix}{view}"] = out / f"{prefix}{view}.png"
+            save_image(path, wall([picture for _, picture in cells], [title for title, _ in cells]))
     return made
 
 

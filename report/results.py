@@ -11,16 +11,19 @@ from typing import Any
 import numpy as np
 
 from reffusion.io.arrays import load_json
-from report.paired import Difference, paired
+from report.paired import Difference, half_width, paired
 
 FULL = "full"
-BETTER = {"psnr_box": "more", "ssim_box": "more", "flip_box": "less", "lpips_vgg_box": "less"}
+TOGETHER = "compare"  # the folder in runs/ of a comparison over a folder of scenes
+BETTER = {"psnr_box": "more", "ssim_box": "more", "flip_box": "less", "lpips_vgg_box": "less", "lpips_alex_box": "less"}
+BETTER |= {"stlpips_box": "less"}
 OUTSIDE = {"psnr_outside": "more", "ssim_outside": "more", "flip_outside": "less"}  # of the masks
 SCORES = BETTER | OUTSIDE
 PSNR_CAP = 100.0  # dB, what an identical view counts: as in metrics.json
 MEASURED = ("consistency", "seconds", "own_seconds", "peak_memory_mb", "gaussians", "scenes")
 AGAINST = ("minus_full", "interval_views", "interval_scenes")  # see report.paired.Difference; halves of intervals
 COLUMNS = ("method", "state", *SCORES, *MEASURED, *(f"{metric}_{what}" for metric in SCORES for what in AGAINST))
+COLUMNS += tuple(f"{metric}_interval" for metric in SCORES)  # half the 95% interval of the mean over scenes
 
 
 @dataclass(frozen=True)
@@ -48,12 +51,18 @@ class Run:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All methods on all scenes. `runs[method, scene]`; the first method is the full one."""
+    """All methods on all scenes. `runs[method, scene]`; the first method is the full one; `data`: the folder that the
+    scenes are from, where they are all of a folder."""
 
     home: Path
+    data: Path | None
     scenes: tuple[str, ...]
     methods: tuple[str, ...]
     runs: dict[tuple[str, str], Run]
+
+    @property
+    def name(self) -> str:
+        return f"{self.data.name}, {len(self.scenes)} scenes" if self.data else self.home.name
 
     def of(self, method: str) -> list[Run]:
         """The method's finished runs."""
@@ -61,13 +70,16 @@ class Comparison:
 
 
 def load(home: Path) -> Comparison:
-    """Read runs/<scene>/compare.json and what it names. Raises ValueError where nothing was compared yet."""
+    """Read compare.json of runs/<scene>, or of runs/compare for a folder of scenes, and what it names. Raises
+    ValueError where nothing was compared yet."""
     path = home / "compare.json"
     if not path.exists():
-        raise ValueError(f"{path}: no such file; run `make scene={home.name} compare` first")
+        what = "data=FOLDER" if home.name == TOGETHER else f"scene={home.name}"
+        raise ValueError(f"{path}: no such file; run `make {what} compare` first")
     record = load_json(path)
     runs = {(run["method"], run["scene"]): load_run(run, home.parent) for run in record["runs"]}
-    return Comparison(home, tuple(record["scenes"]), tuple(record["methods"]), runs)
+    data = Path(record["data"]) if "data" in record else None
+    return Comparison(home, data, tuple(record["scenes"]), tuple(record["methods"]), runs)
 
 
 def load_run(record: dict[str, Any], runs: Path) -> Run:
@@ -134,7 +146,8 @@ def _row(comparison: Comparison, method: str) -> dict[str, Any]:
     row |= {"method": method, "scenes": len(done)}
     row["state"] = states[0] if len(set(states)) == 1 else f"{len(done)} of {len(states)} done"
     for name in SCORES:
-        row[name] = mean([run.metrics.get("mean", {}).get(name) for run in done])
+        values = [run.metrics.get("mean", {}).get(name) for run in done]
+        row |= {name: mean(values), f"{name}_interval": interval(values)}
     row["consistency"] = mean([consistency(run) for run in done])
     row["seconds"] = mean([seconds(run) for run in done])
     row["own_seconds"] = mean([own_seconds(run, comparison.runs[FULL, run.scene]) for run in done])
@@ -149,6 +162,11 @@ def mean(values: list[float | None]) -> float | None:
     """Of those that are there and finite; None where there are none."""
     there = [value for value in values if value is not None and math.isfinite(value)]
     return sum(there) / len(there) if there else None
+
+
+def interval(values: list[float | None]) -> float | None:
+    """Half the 95% interval of the mean of those that are there and finite; None under two."""
+    return half_width(np.array([value for value in values if value is not None and math.isfinite(value)]))
 
 
 def seconds(run: Run) -> float:

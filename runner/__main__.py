@@ -40,9 +40,9 @@ def main() -> int:
             stage, folder = list(run_scene(request, arguments.stage).items())[-1]
             show_results(stage, folder)
         elif arguments.command == "compare":
-            return SOME_FAILED if compare(request, arguments.variants, arguments.seeds) else 0
+            return SOME_FAILED if compare(request, arguments.variants, arguments.seeds, arguments.data) else 0
         elif arguments.command == "batch":
-            return 1 if batch(request, arguments.data) else 0
+            return 1 if batch(request, arguments.data or Path("data")) else 0
         elif arguments.command == "weights":
             return 1 if weights(request, arguments.offline) else 0
         elif arguments.command == "verify":
@@ -66,8 +66,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("command", choices=["plan", "run", "compare", "batch", "weights", "verify", "clean"])
     parser.add_argument("stage", nargs="?", default="all", help="run this stage and what it needs; `all` (default)")
     parser.add_argument("--scene", default="", help="a name under data/, or a path")
-    parser.add_argument("--data", type=Path, default=Path("data"), help="batch: the folder of scenes")
-    parser.add_argument("--profile", help="auto, or a profile of pipeline.yaml: laptop, paper, paper-terms")
+    parser.add_argument("--data", type=Path, help="batch, compare: a folder of scenes; batch takes data/")
+    parser.add_argument("--profile", help="auto, or a profile of pipeline.yaml: laptop, paper, best, paper-terms")
     parser.add_argument("--variant", help="a variant of pipeline.yaml")
     parser.add_argument("--variants", default="", help="compare: these only, with commas between")
     parser.add_argument("--seeds", type=int, default=1, help="compare: on so many scenes: X, X-1, X-2 ...")

@@ -19,28 +19,34 @@ from runner.pipeline import Pipeline, find_scene, load_pipeline, unknown
 from runner.resolve import Request, resolve_all
 
 FULL = "full"  # what the scene's own run, without a variant, is called beside them
+TOGETHER = "compare"  # the folder in runs/ of a comparison over a folder of scenes
 RECORD = "compare.json"
+RUNS = "compare-runs"  # .csv and .md: a row a run, written anew after each
 WAITING, DONE, FAILED = "not run yet", "done", "failed"
 
 
-def compare(request: Request, only: str = "", seeds: int = 1) -> int:
-    """Bring the full method and the variants up to date, and write runs/<scene>/compare.json; how many failed.
+def compare(request: Request, only: str = "", seeds: int = 1, data: Path | None = None) -> int:
+    """Bring the full method and the variants up to date, and write compare.json to runs/<scene>/, of a folder of
+    scenes to runs/compare/; how many failed.
 
-    What is cached is not run again, so the same command goes on after a kill. A variant that fails stops no other.
-    `only` names variants, with commas or blanks between (all where empty); `seeds` counts scenes: X, X-1, X-2 ...
+    What is cached is not run again, so the same command goes on after a kill; after each run all that is done is a
+    table, compare-runs.csv and .md. A variant that fails stops no other.
+    `only` names variants, with commas or blanks between (all where empty); `seeds` counts scenes: X, X-1, X-2 ...;
+    `data` is a folder whose scenes are compared, where the request names none.
     Raises Refused before any work, where a variant, a scene or a parameter is not right."""
     if request.variant:
         raise Refused(f"variant={request.variant}: compare runs all variants; variants={request.variant} picks some")
     methods = [FULL, *_chosen(only, load_pipeline(request.root))]
-    scenes = _scenes(request, seeds)
+    names = _scenes(request, seeds, data)
     asks = lambda scene, method: replace(request, scene=scene, variant=None if method == FULL else method)
-    requests = {(scene, method): asks(scene, method) for scene in scenes for method in methods}
+    requests = {(scene, method): asks(scene, method) for scene in names for method in methods}
     hashes = Hashes(request.runs / HASHES)
-    _refuse_wrong(scenes, requests, hashes)
-    names = {scene: find_scene(scene, request.root).name for scene in scenes}
+    _refuse_wrong(list(names), requests, hashes)
     runs = [{"scene": names[scene], "method": method, "state": WAITING} for scene, method in requests]
-    record = {"scene": names[scenes[0]], "scenes": list(names.values()), "methods": methods, "runs": runs}
-    home = request.runs / record["scene"]
+    scenes = list(names.values())
+    home = request.runs / (TOGETHER if data else scenes[0])
+    record = {"scene": home.name, "scenes": scenes, "methods": methods, "runs": runs}
+    record |= {"data": str(data.expanduser().resolve())} if data else {}
     began = time.monotonic()
     for number, (run, asked) in enumerate(zip(runs, requests.values(), strict=True), 1):
         write_json(home / RECORD, record)
@@ -49,6 +55,8 @@ def compare(request: Request, only: str = "", seeds: int = 1) -> int:
         stages, error = _tried(asked, hashes)
         where = {stage: path and os.path.relpath(path, request.runs) for stage, path in stages.items()}
         run |= {"state": FAILED, "error": error} if error else {"state": DONE, "stages": where}
+        run |= {"mean": _mean(stages.get("evaluate"))}
+        _write_table(home / RUNS, runs, ("method", "scene"))
     write_json(home / RECORD, record)
     failed = [run for run in runs if run["state"] == FAILED]
     say("")
@@ -89,16 +97,31 @@ def _chosen(only: str, pipeline: Pipeline) -> list[str]:
     return list(dict.fromkeys(asked)) if only else list(pipeline.variants)
 
 
-def _scenes(request: Request, seeds: int) -> list[str]:
+def _scenes(request: Request, seeds: int, data: Path | None) -> dict[str, str]:
+    """What a request names each scene by -> the scene's own name."""
     if seeds < 1:
         raise Refused(f"seeds={seeds}: on how many scenes; 1 or more")
+    if data:
+        if request.scene or seeds > 1:
+            raise Refused(f"data={data}: all scenes of a folder, without scene={request.scene} and seeds={seeds}")
+        return {str(folder): folder.name for folder in _folders(data)}
     scenes = [request.scene, *(f"{request.scene.rstrip('/')}-{seed}" for seed in range(1, seeds))]
+    names = {scenes[0]: find_scene(scenes[0], request.root).name}
     for scene in scenes[1:]:
         try:
-            find_scene(scene, request.root)
+            names[scene] = find_scene(scene, request.root).name
         except Refused as error:
             raise Refused(f"seeds={seeds} asks for the scenes {scenes[0]} to {scenes[-1]}: {error}") from None
-    return scenes
+    return names
+
+
+def _folders(data: Path) -> list[Path]:
+    """The folders of scenes in a folder. Raises Refused where there are none."""
+    data = data.expanduser()
+    found = sorted(p for p in data.iterdir() if p.is_dir() and p.name[0] not in "._") if data.is_dir() else []
+    if not found:
+        raise Refused(f"data={data}: no folders of scenes there")
+    return found
 
 
 def _mean(evaluate: Path | None, of: str = "mean") -> dict[str, float | None]:
@@ -123,36 +146,38 @@ def _number(value: Any) -> str:
 
 
 def batch(request: Request, folder: Path) -> int:
-    """Every scene in `folder`, one after another; a table in runs/results.{csv,md}. Returns how many failed."""
-    scenes = sorted(p for p in folder.iterdir() if p.is_dir() and p.name[0] not in "._") if folder.is_dir() else []
-    if not scenes:
-        raise Refused(f"data={folder}: no folders of scenes there")
-    rows: dict[str, dict[str, float | None]] = {}
-    failed: dict[str, str] = {}
-    hashes = Hashes(request.runs / HASHES)
-    for scene in scenes:
+    """Every scene in `folder`, one after another; a table in runs/results.{csv,md}, written anew after each. Returns
+    how many failed."""
+    scenes, hashes = _folders(folder), Hashes(request.runs / HASHES)
+    stem = request.runs / (f"results@{request.variant}" if request.variant else "results")
+    runs: list[dict[str, Any]] = [{"scene": scene.name, "method": "", "state": WAITING} for scene in scenes]
+    for run, scene in zip(runs, scenes, strict=True):
         stages, error = _tried(replace(request, scene=str(scene)), hashes)
-        if error:
-            failed[scene.name] = error
-        else:
-            rows[scene.name] = _mean(stages.get("evaluate"))
-    suffix = f"@{request.variant}" if request.variant else ""
-    _write_table(request.runs / f"results{suffix}", rows, failed)
-    for name, reason in failed.items():
-        say(f"failed: {name}: {reason}")
-    say(f"{len(rows)} of {len(scenes)} scenes done; table: {shown(request.runs)}/results{suffix}.csv and .md")
+        run |= {"state": FAILED, "error": error} if error else {"state": DONE}
+        run |= {"mean": _mean(stages.get("evaluate"))}
+        _write_table(stem, runs, ("scene",))
+    failed = [run for run in runs if run["state"] == FAILED]
+    for run in failed:
+        say(f"failed: {run['scene']}: {run['error']}")
+    say(f"{len(runs) - len(failed)} of {len(runs)} scenes done; table: {shown(stem)}.csv and .md")
     return len(failed)
 
 
-def _write_table(stem: Path, rows: dict[str, dict[str, float | None]], failed: dict[str, str]) -> None:
-    """A row a scene, and the mean over the scenes that have a value."""
-    names = list(dict.fromkeys(name for row in rows.values() for name in row))
-    lines = [[scene, "done", *(_number(row.get(name)) for name in names)] for scene, row in rows.items()]
-    lines += [[scene, "failed", *("" for _ in names)] for scene in failed]
-    there = [[row[name] for row in rows.values() if isinstance(row.get(name), int | float)] for name in names]
-    lines.append([f"mean of {len(rows)}", "", *(_number(sum(v) / len(v)) if v else "" for v in there)])
-    header = ["scene", "state", *names]
+def _write_table(stem: Path, runs: list[dict[str, Any]], keys: tuple[str, ...]) -> None:
+    """A row a run, and for each method the mean over the scenes that have a value. `keys`: the columns that name it."""
+    names = list(dict.fromkeys(name for run in runs for name in run.get("mean", {})))
+    lines = [[*(run[key] for key in keys), run["state"], *_numbers(run.get("mean", {}), names)] for run in runs]
+    for method in dict.fromkeys(run["method"] for run in runs):
+        done = [run["mean"] for run in runs if run["method"] == method and run["state"] == DONE]
+        there = {name: [mean[name] for mean in done if isinstance(mean.get(name), int | float)] for name in names}
+        means = {name: sum(values) / len(values) for name, values in there.items() if values}
+        lines.append([*([method] if len(keys) > 1 else []), f"mean of {len(done)}", "", *_numbers(means, names)])
+    header = [*keys, "state", *names]
     csv.writer(table := io.StringIO(), lineterminator="\n").writerows([header, *lines])
     write_text(Path(f"{stem}.csv"), table.getvalue())
     text = [" | ".join(cells) for cells in (header, ["---"] * len(header), *lines)]
     write_text(Path(f"{stem}.md"), "".join(f"| {line} |\n" for line in text))
+
+
+def _numbers(mean: dict[str, Any], names: list[str]) -> list[str]:
+    return [_number(mean.get(name)) for name in names]

@@ -206,6 +206,10 @@ def weights(request: Request, offline: bool) -> int:
     for need in missing:
         if not need["fetched"]:
             print(f"error: {need['problem']}", file=sys.stderr)
+    for places in dict.fromkeys(tuple(need.get("looked", ())) for need in missing):
+        names = [need["name"] for need in missing if tuple(need.get("looked", ())) == places]
+        if places:
+            print(f"looked for {', '.join(names)} in {', '.join(places)}")
     unsized = " and what has no known size" if any(need["bytes"] is None for need in to_fetch) else ""
     print(f"to fetch: about {amount(sum(need['bytes'] or 0 for need in to_fetch))}{unsized}", flush=True)
     unusable = len(missing) - len(to_fetch)

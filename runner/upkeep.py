@@ -13,8 +13,8 @@ from runner.pipeline import NAME, Pipeline, find_scene, load_pipeline, unknown
 from runner.resolve import Request, one_folder_a_name
 
 RECORDS = ("profile", "source", "plan.json", "turntable.webm", "check.png")
-PAGES = (*(f"compare.{kind}" for kind in ("json", "csv", "md", "html")), "report/index.html", "report/*.png",
-         "compare/*.png", "**/.*.writing")  # fmt: skip
+PAGES = (*(f"compare.{kind}" for kind in ("json", "csv", "md", "html")), "compare-runs.csv", "compare-runs.md",
+         "compare/*.png", "report/index.html", "report/*.png", "**/.*.writing")  # fmt: skip
 WORKING = (".partial-*", ".copying-*", ".gone-*")
 
 

@@ -125,6 +125,20 @@ def prepare(folder: Path, layout: str, truth: Truth) -> Path:
     return folder
 
 
+def write_spin_nerf(folder: Path, test=2, full=True, mask_value=1, label_size=(WIDTH, HEIGHT + 3)) -> Truth:
+    """A scene as SPIn-NeRF publishes its own, but 6 views of which the first `test` are test views."""
+    truth = some_truth(RADIAL)
+    names = sorted(truth.world_to_camera)
+    write_pictures(folder / "images_4", names)
+    if full:
+        write_pictures(folder / "images", names, (4 * WIDTH, 4 * HEIGHT), ".jpg")
+    write_masks(folder / "images_4" / "label", names[test:], value=mask_value)
+    write_masks(folder / "images_4" / "test_label", [f"out_{k:05d}" for k in range(test)], label_size)
+    write_poses_bounds(folder, truth)
+    write_model(folder / "sparse" / "0", truth, factor=4)
+    return truth
+
+
 def run(folder: Path, **params):
     out = folder.parent / (folder.name + "_out")
     out.mkdir(exist_ok=True)

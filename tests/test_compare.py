@@ -126,10 +126,17 @@ def request(root: Path, scene: str = "toy", **options) -> Request:
     return Request(root, root / "runs", scene, **{"profile": "laptop", **options})
 
 
-def written(root: Path) -> Path:
-    for name, text in FILES.items():
+PUBLISHED = 'method,metric,value,protocol\nsomebody,psnr_box,19.5,"ten scenes, 1600 px"\n'
+
+
+def write(root: Path, files: dict[str, str]) -> None:
+    for name, text in files.items():
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).write_text(text)
+
+
+def written(root: Path) -> Path:
+    write(root, FILES)
     return root
 
 
@@ -180,29 +187,76 @@ def test_a_failed_variant_shows_and_stops_no_other(compared, pages):
     assert all("a gain below 0 | cannot be" in pages[kind].read_text() for kind in ("md", "html"))
 
 
-def test_killed_and_started_again_nothing_runs_twice(tmp_path):
+def test_a_folder_of_scenes_killed_and_started_again_nothing_runs_twice(tmp_path):
+    """Three scenes, `better` too; the second scene is slow at first."""
     root = written(tmp_path)
+    write(root, {"data/toy-2/number.txt": "20", "data/published.csv": PUBLISHED})
     slow = root / "data/toy-1/scene.yaml"
     slow.write_text("stages: {distill: {pause: 60}}")
-    command = [sys.executable, "-m", "runner", "compare", "--scene", "toy", "--root", str(root), "--profile", "laptop"]
-    command += ["--variants", "full", "--seeds", "2"]
+    command = [sys.executable, "-m", "runner", "compare", "--data", str(root / "data"), "--root", str(root)]
+    command += ["--profile", "laptop", "--variants", "better"]
     environment = {**os.environ, "PYTHONPATH": str(REPO)}
     process = subprocess.Popen(command, cwd=REPO, env=environment, stdout=subprocess.PIPE, text=True)
-    assert any("compare: full on toy-1, 2 of 2" in line for line in process.stdout)
+    assert any("compare: full on toy-1, 3 of 6" in line for line in process.stdout)
     for _ in range(1200):
         if list((root / "runs/toy-1").glob(".partial-distill-*")):
             break
         time.sleep(0.05)
     process.send_signal(signal.SIGKILL)
     process.wait(30)
-    before = ["toy distill", "toy evaluate", "toy poses", "toy-1 poses"]
-    assert ran(root) == sorted(before)
-    assert by_method(root / "runs/toy")["full"]["state"] == "1 of 2 done"  # a table can be drawn at any moment
+    before = [f"toy{end}" for end in (" distill", " evaluate", " poses", "@better distill", "@better evaluate")]
+    assert ran(root) == sorted([*before, "toy-1 poses"])
+    home = root / "runs/compare"
+    partial = (home / "compare-runs.md").read_text().splitlines()  # written after each run
+    assert "| full | toy | done | 23.6500 | 0.6000 |" in partial[2] and "not run yet" in partial[4]
+    assert "| full | mean of 1 |  | 23.6500 |" in partial[-2]
+    assert by_method(home)["full"]["state"] == "1 of 3 done"  # the page can be drawn at any moment
     slow.unlink()
-    assert compare(request(root), "full", 2) == 0
-    assert ran(root) == sorted([*before, "toy-1 distill", "toy-1 evaluate"])
-    row = by_method(root / "runs/toy")["full"]
-    assert row["scenes"] == 2 and row["psnr_box"] == pytest.approx(21.5 + 1.15 + (1 + 3) / 2)
+    assert compare(request(root, ""), "better", data=root / "data") == 0
+    ends = (" distill", " evaluate", " poses", "@better distill", "@better evaluate")
+    assert ran(root) == sorted(f"{scene}{end}" for scene in ("toy", "toy-1", "toy-2") for end in ends)
+    row = by_method(home)["full"]
+    assert row["scenes"] == 3 and row["psnr_box"] == pytest.approx(21.5 + 1.15 + (1 + 2 + 3) / 3)
+    assert row["psnr_box_interval"] == pytest.approx(4.302653 / np.sqrt(3), rel=1e-6)  # deviation 1, Student's t of 2
+    made = page.make(home)
+    text = made["md"].read_text()
+    assert text.startswith("# data, 3 scenes: methods compared") and "| full | 24.65 ± 2.48 |" in text
+    assert "| better | 25.95 | 27.95 | 26.95 | 26.95 |" in text  # in each scene, and their mean
+    assert "| somebody | published | PSNR, dB | 19.5 | ten scenes, 1600 px |" in text
+    assert "| full | here | PSNR, dB | 24.65 ± 2.48 |" in text
+    assert len(list((home / "compare").glob("toy*.png"))) == 3 and "24.65 ± 2.48" in made["html"].read_text()
+    for wrong, message in (("psnr_box,x", "'x' is no number"), ("psnr,1", "metric 'psnr' is none of")):
+        (root / "data/published.csv").write_text(f"method,metric,value,protocol\na,{wrong},b\n")
+        with pytest.raises(ValueError, match=re.escape(message)):
+            page.make(home)
+
+
+@pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="takes minutes; set REFFUSION_SLOW=1")
+def test_three_made_scenes_of_spin_nerfs_layout_by_the_real_stages(tmp_path, generate):
+    """As `make data=FOLDER compare` runs them, at tiny sizes; killed in the second scene, and gone on with."""
+    from reffusion.capture.layouts import spinnerf
+
+    for seed, name in enumerate(("1", "2", "book")):
+        generate.generate(tmp_path / "data" / name, seed, generate.KINDS["mini"])
+    assert sum("8 training and 3 test views" in line for line in spinnerf.told(tmp_path / "data")) == 3
+    small = "fit.iterations=60 personalize.steps=4 personalize.optimizer.batch=1 distill.iterations=4"
+    command = [sys.executable, "-m", "reffusion.command", "compare", "--data", str(tmp_path / "data")]
+    command += ["--runs", str(tmp_path / "runs"), "--profile", "laptop", "--variants", "masked", "--set", small]
+    process = subprocess.Popen(command, cwd=REPO, stdout=subprocess.PIPE, text=True)
+    assert any("compare: full on 2, 3 of 6" in line for line in process.stdout)
+    while not list((tmp_path / "runs/2").glob(".partial-fit-*")):
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.kill()
+    process.wait(30)
+    dates = {path: path.stat().st_mtime_ns for path in (tmp_path / "runs").glob("1*/*/receipt.json")}
+    home = tmp_path / "runs/compare"
+    assert len(dates) > 8 and by_method(home)["full"]["state"] == "1 of 3 done"
+    subprocess.run(command, cwd=REPO, check=True)
+    assert {path: path.stat().st_mtime_ns for path in dates} == dates
+    table = by_method(home)
+    assert all(row["scenes"] == 3 and row["psnr_box_interval"] > 0 for row in table.values())
+    assert table["full"]["psnr_box"] > table["masked"]["psnr_box"] and page.make(home)["html"].is_file()
 
 
 def test_refused_before_any_work(tmp_path):
@@ -213,9 +267,11 @@ def test_refused_before_any_work(tmp_path):
         (("", 0), {}, "seeds=0"),
         ((), {"variant": "better"}, "variants=better"),
         ((), {"set": "distill.gian=1"}, "did you mean 'gain'"),
+        (("", 1, root / "data"), {}, "all scenes of a folder"),
+        (("", 1, root / "stages/none"), {"scene": ""}, "no folders of scenes there"),
     ]:
         with pytest.raises(Refused, match=re.escape(message)):
-            compare(request(root, **options), *arguments)
+            compare(request(root, **{"scene": "toy", **options}), *arguments)
     (root / "pipeline.yaml").write_text(FILES["pipeline.yaml"].replace("{gain: 3}", "{gain: much}"))
     with pytest.raises(Refused, match=r"variant better: distill.gain = 'much'"):
         compare(request(root))

@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 
 from reffusion.score import lpips, metrics
 from reffusion.score.metrics import Box, mask_box
+from reffusion.weights import local
+from reffusion.weights.published import LPIPS_PACKAGES
 
 
 def pair(height, width, seed=0, noise=0.1):
@@ -218,9 +220,17 @@ def random_states(net, seed=0):
     return backbone, linear
 
 
+def thinned(x):
+    """[1, C, H, W] filtered by [1 2 1] / 4 along both axes, mirrored 2 cells beyond the border, every second cell."""
+    wide = np.pad(x[0].numpy(), ((0, 0), (2, 2), (2, 2)), mode="reflect")
+    rows = (wide[:, :-2] + 2 * wide[:, 1:-1] + wide[:, 2:])[:, ::2] / 4
+    return torch.from_numpy((rows[..., :-2] + 2 * rows[..., 1:-1] + rows[..., 2:])[..., ::2] / 4)[None]
+
+
 def lpips_by_definition(net, backbone, linear, images):
     """The formula, layer by layer with functional calls, in float64; images [H, W, 3] in [0, 1]."""
     F = torch.nn.functional
+    blurred = net == "st"
     steps = {
         "alex": [(0, 4, 2), "tap", 3, (3, 1, 2), "tap", 3, (6, 1, 1), "tap", (8, 1, 1), "tap", (10, 1, 1), "tap"],
         "vgg": [
@@ -228,7 +238,7 @@ def lpips_by_definition(net, backbone, linear, images):
             *[(10, 1, 1), (12, 1, 1), (14, 1, 1), "tap", 2, (17, 1, 1), (19, 1, 1), (21, 1, 1), "tap", 2],
             *[(24, 1, 1), (26, 1, 1), (28, 1, 1), "tap"],
         ],
-    }[net]
+    }["vgg" if blurred else net]
     taps = []
     for image in images:
         x = torch.from_numpy(image).double()
@@ -238,7 +248,8 @@ def lpips_by_definition(net, backbone, linear, images):
             if step == "tap":
                 found.append(x[0] / torch.linalg.vector_norm(x[0], dim=0))
             elif isinstance(step, int):
-                x = F.max_pool2d(x, step, 2)
+                x = F.max_pool2d(x, step, 1 if blurred else 2)
+                x = thinned(x) if blurred else x
             else:
                 index, stride, padding = step
                 weight, bias = (backbone[f"features.{index}.{key}"].double() for key in ("weight", "bias"))
@@ -285,6 +296,8 @@ def test_lpips_weights_of_another_shape_are_refused_by_name():
 def no_caches(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
+    monkeypatch.setattr(local, "LPIPS_PACKAGES", {})
+    monkeypatch.setattr(lpips, "ST_FILE", ("no_such_package", lpips.ST_FILE[1]))
     return tmp_path
 
 
@@ -320,6 +333,51 @@ def test_lpips_weights_are_found_in_the_caches_and_checked(no_caches):
     torch.save({"features.0.weight": torch.zeros(1)}, hub / "alexnet-own.pth")
     with pytest.raises(ValueError, match=r"alexnet-own.pth.*cannot be used"):
         lpips.load("alex")
+
+
+@pytest.mark.parametrize("package, below", LPIPS_PACKAGES.items())
+def test_lpips_takes_the_linear_weights_of_an_installed_package(no_caches, monkeypatch, package, below):
+    """Beside torchvision's backbone in torch hub's cache; the package itself is not imported."""
+    backbone, linear = random_states("vgg")
+    hub, inside = no_caches / "torch/hub/checkpoints", no_caches / "site" / package / below
+    for folder in (hub, inside):
+        folder.mkdir(parents=True)
+    monkeypatch.setattr(local, "LPIPS_PACKAGES", {package: below})
+    (no_caches / "site" / package / "__init__.py").write_text("raise ImportError('torchvision is missing')")
+    torch.save(backbone, hub / "vgg16-own.pth")
+    assert "install lpips or torchmetrics" in lpips.load("vgg")[1]
+    torch.save(linear, inside / "vgg.pth")
+    monkeypatch.syspath_prepend(str(no_caches / "site"))
+    model, reason = lpips.load("vgg")
+    assert reason is None and set(model.files) == {"vgg16-own.pth", "vgg.pth"}
+
+
+def test_st_lpips_from_its_package_equals_its_formula(no_caches, monkeypatch):
+    """Random weights of its own keys; in float64, maxima of 2 px a step apart, then every second of [1 2 1] / 4."""
+    assert lpips.load_st() == (None, "no weights for ST-LPIPS: `pip install no_such_package` brings them")
+    backbone, linear = random_states("vgg")
+    blurs = {0: 0, 2: 0, 5: 1, 7: 1, 10: 2, 12: 2, 14: 2, 17: 3, 19: 3, 21: 3, 24: 4, 26: 4, 28: 4}  # before a layer
+    state = dict(linear)
+    for index, before in blurs.items():
+        for kind in ("weight", "bias"):
+            state[f"net.slice{before + 1}.{index + before}.{kind}"] = backbone[f"features.{index}.{kind}"]
+    file = no_caches / "site/a_package" / lpips.ST_FILE[1]
+    file.parent.mkdir(parents=True)
+    torch.save(state, file)
+    monkeypatch.setattr(lpips, "ST_FILE", ("a_package", lpips.ST_FILE[1]))
+    monkeypatch.syspath_prepend(str(no_caches / "site"))
+    model, reason = lpips.load_st()
+    image, truth = pair(45, 38)
+    assert reason is None and metrics.lpips(truth, truth, model) == 0
+    assert metrics.lpips(image, truth, model) == pytest.approx(
+        lpips_by_definition("st", backbone, linear, (image, truth)), rel=1e-4
+    )
+    row = metrics.score(image, truth, {"st": model})
+    assert row["stlpips"] > 0 and "lpips_vgg" not in row
+    assert (
+        np.isfinite(metrics.lpips(*pair(18, 18), model))
+        and metrics.score(*pair(17, 17), {"st": model})["stlpips"] is None
+    )
 
 
 # --- a view's row

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -29,9 +30,11 @@ from small_capture import (
     write_model,
     write_pictures,
     write_poses_bounds,
+    write_spin_nerf,
 )
 
 from reffusion.capture import frame, lens
+from reffusion.capture.layouts import spinnerf
 from reffusion.capture.lenses import load_lenses
 from reffusion.capture.load import load_capture
 from reffusion.capture.roles import load_roles
@@ -104,22 +107,10 @@ def test_points_without_images_bin_are_taken_only_in_the_right_frame(tmp_path, m
         np.testing.assert_allclose(scene.similarity.invert(scene.points), truth.points, atol=1e-9)
 
 
-def spin_nerf(folder: Path, mask_value=1, label_size=(WIDTH, HEIGHT)) -> Truth:
-    """The first 2 of 6 views are test views without the object."""
-    truth = some_truth(RADIAL)
-    names = sorted(truth.world_to_camera)
-    write_pictures(folder / "images_4", names)
-    write_masks(folder / "images_4" / "label", names[2:], value=mask_value)
-    write_masks(folder / "images_4" / "test_label", ["out_00000", "out_00001"], label_size)
-    write_poses_bounds(folder, truth)
-    write_model(folder / "sparse" / "0", truth, factor=4)
-    return truth
-
-
 @pytest.mark.parametrize("mask_value", [1, 255])
 def test_spin_nerf_split_and_masks(tmp_path, mask_value):
-    spin_nerf(tmp_path / "s", mask_value, (WIDTH, HEIGHT + 3))
-    scene, out = run(tmp_path / "s")
+    write_spin_nerf(tmp_path / "s", mask_value=mask_value)
+    scene, out = run(tmp_path / "s", longest=WIDTH)
     assert scene.test == ("v00", "v01") and scene.train == ("v02", "v03", "v04", "v05")
     assert sorted(load_raw_masks(out, scene.cameras)) == list(scene.train)
     labels = load_test_masks(out)
@@ -130,12 +121,63 @@ def test_spin_nerf_split_and_masks(tmp_path, mask_value):
 
 
 def test_spin_nerf_with_a_missing_training_mask(tmp_path):
-    spin_nerf(tmp_path / "s")
+    write_spin_nerf(tmp_path / "s")
     (tmp_path / "s/images_4/label/v04.png").unlink()
     with pytest.warns(UserWarning, match="1 training views have no mask: v04"):
         scene, out = run(tmp_path / "s")
     assert scene.test == ("v00", "v01") and "v04" in scene.train
     assert "v04" not in load_raw_masks(out, scene.train)
+
+
+@pytest.mark.parametrize("longest, taken", [(WIDTH, 1), (WIDTH + 2, 4), (4 * WIDTH, 4), (5000, 4)])
+def test_spin_nerf_at_the_size_that_is_asked_for(tmp_path, longest, taken):
+    """Pictures of images_4 or of the full size, the cameras with them, distortion too; the masks of images_4."""
+    truth = write_spin_nerf(tmp_path / "s")
+    scene, out = run(tmp_path / "s", longest=longest)
+    width = min(longest, taken * WIDTH)
+    assert image_size(out / "images/v00.png") == (width, round(width * HEIGHT / WIDTH))
+    at_quarter = replace(scene, cameras={n: c.resized(WIDTH, HEIGHT) for n, c in scene.cameras.items()})
+    assert reprojection_error(at_quarter, truth) < 1e-2
+    assert scene.test == ("v00", "v01")
+    for mask in (*load_test_masks(out).values(), *load_raw_masks(out, scene.train).values()):
+        rows, columns = np.nonzero(mask)
+        factor = width / WIDTH
+        sides = np.array([rows.min(), rows.max() + 1, columns.min(), columns.max() + 1]) / factor
+        np.testing.assert_allclose(sides, [HEIGHT / 4, HEIGHT / 2, WIDTH / 4, WIDTH / 2], atol=2.5)  # the lens bends
+
+
+def test_spin_nerf_the_folder_that_is_named_wins(tmp_path):
+    write_spin_nerf(tmp_path / "s")
+    for named, width in (("images_4", WIDTH), ("images", 4 * WIDTH)):
+        scene, out = run(tmp_path / "s", longest=4 * WIDTH, images=named)
+        assert image_size(out / "images/v00.png")[0] == width and len(load_raw_masks(out, scene.train)) == 4
+
+
+def test_spin_nerf_full_size_pictures_of_other_names_are_not_taken(tmp_path):
+    write_spin_nerf(tmp_path / "s")
+    (tmp_path / "s/images/v03.jpg").rename(tmp_path / "s/images/other.jpg")
+    with pytest.warns(UserWarning, match="images: not the pictures of images_4 under the same names"):
+        _, out = run(tmp_path / "s", longest=4 * WIDTH)
+    assert image_size(out / "images/v00.png") == (WIDTH, HEIGHT)
+
+
+def test_spin_nerf_folders_are_told_in_a_line_each(tmp_path):
+    for name in ("1", "2", "3", "book"):
+        write_spin_nerf(tmp_path / name, full=name != "2")
+    shutil.rmtree(tmp_path / "2/images_4/test_label")
+    shutil.rmtree(tmp_path / "3/sparse")
+    (tmp_path / "3/poses_bounds.npy").unlink()
+    (tmp_path / "book/poses_bounds.npy").unlink()
+    (tmp_path / "notes").mkdir()
+    lines = dict(line.split(": ", 1) for line in spinnerf.told(tmp_path))
+    assert lines["1"] == "4 training and 2 test views (published: 60 and 40); images_4 96x72, images 384x288 px"
+    assert "lacks images_4/test_label (no test views" in lines["2"] and "images (full size" in lines["2"]
+    assert lines["3"].startswith("cannot be run: lacks poses_bounds.npy") and "4 training" in lines["book"]
+    assert [name for name, said in lines.items() if said == "not there"] == ["4", "7", "9", "10", "12", "trash"]
+    run(tmp_path / "book", longest=4 * WIDTH)  # the model stands for poses_bounds.npy
+    assert image_size(tmp_path / "book_out/images/v00.png")[0] == 4 * WIDTH
+    with pytest.raises(ValueError, match="no scenes of SPIn-NeRF"):
+        spinnerf.told(tmp_path / "notes")
 
 
 def test_splits_from_scene_yaml(tmp_path):
@@ -299,7 +341,7 @@ def test_what_the_scene_brings_comes_into_the_normalised_frame(tmp_path):
 
 
 def test_preview_is_light_and_says_what_will_happen(tmp_path):
-    spin_nerf(tmp_path / "s")
+    write_spin_nerf(tmp_path / "s", full=False)
     notes = plan.preview(poses.Params(), tmp_path / "s")
     assert notes[0] == "4 training and 2 test views, 4 masks"
     assert notes[1] == f"SfM left out: {Path('sparse/0/images.bin')} brings poses"

@@ -11,7 +11,8 @@ latents, means over them and over the views:
   over noise, over timesteps, together: the mean of `noise` over the timesteps, the variance of that mean gradient from
               one timestep to another, and their sum: the variance of what one step of distillation draws
 
-Every draw is seeded, and the same before and after. Prints tables, and writes sds_variance.json to --out.
+Every draw is seeded, and the same before and after, on any device. Prints tables and the memory it took, and writes
+sds_variance.json to --out.
 """
 
 from __future__ import annotations
@@ -24,13 +25,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.studies import device
 from reffusion import seeding
-from reffusion.io.arrays import load_json, save_json
+from reffusion.io.arrays import save_json
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets, load_scene
-from reffusion.prior import diffusion, lora, windows
+from reffusion.prior import diffusion, windows
 from reffusion.prior.crops import PROMPTS
-from reffusion.prior.model import Prior, load_prior
+from reffusion.prior.model import Prior
 from reffusion.splat import rasterizer
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -66,7 +68,7 @@ def inputs(run: Path, prior: Prior) -> dict[str, tuple[Tensor, Tensor]]:
         picked = [windows.window_around(hole, size, seeding.generator(SEED, "sds variance", name))]
         pictures.append(windows.two_scales(view, picked, size))
         holes.append(windows.two_scale_masks(hole, picked, size))
-    pictures, holes = torch.stack(pictures, 1), torch.stack(holes, 1)  # [scale, view, ...]
+    pictures, holes = (torch.stack(each, 1).to(prior.device) for each in (pictures, holes))  # [scale, view, ...]
     return {scale: (pictures[k], holes[k]) for k, scale in enumerate(SCALES)}
 
 
@@ -77,9 +79,10 @@ def gradients(prior: Prior, pictures: Tensor, holes: Tensor, prompt: str) -> Ten
     text = diffusion.embed_text(prior, [prompt]).expand(len(latents), -1, -1)
     inside, found = condition[:, :1].expand_as(latents) > 0.5, []
     for part in TIMESTEPS:
-        t = torch.full((len(latents),), round(part * (prior.timesteps - 1)))
+        t = torch.full((len(latents),), round(part * (prior.timesteps - 1)), device=prior.device)
         for k in range(NOISES):
             noise = torch.randn(latents.shape, generator=seeding.generator(SEED, "sds variance", int(t[0]), k))
+            noise = noise.to(latents)
             clean = diffusion.predict(prior, diffusion.add_noise(prior, latents, noise, t), t, condition, text)[1]
             found.append((latents - clean)[inside])
     return torch.stack(found).view(len(TIMESTEPS), NOISES, -1)
@@ -133,19 +136,16 @@ def _pair(before: float, after: float) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--run", type=Path, required=True, help="runs/<scene>, with initialize and personalize")
-    parser.add_argument("--prior", help="the one that was personalized; default: as personalize's receipt names it")
     parser.add_argument("--out", type=Path, help="default: runs/<scene>/sds-variance")
+    device.add_arguments(parser)
     given = parser.parse_args()
-    adapted = given.run / "personalize"
-    if not adapted.is_dir():
-        raise ValueError(f"{adapted} is missing: run `make scene={given.run.name} personalize` first")
-    base = given.prior or load_json(adapted / "receipt.json")["params"]["prior"]
-    models = {"before": load_prior(base), "after": lora.merged(load_prior(base), adapted)}
+    models, base = device.before_and_after(given)
     found, out = measured(models, given.run), given.out or given.run / "sds-variance"
     out.mkdir(parents=True, exist_ok=True)
-    save_json(out / "sds_variance.json", {"prior": base, "timesteps": TIMESTEPS, **found})
+    facts = {"prior": base, "timesteps": TIMESTEPS, **device.facts(given)}
+    save_json(out / "sds_variance.json", facts | found)
     print(table(found))
-    print(out / "sds_variance.json")
+    print(device.words(given), out / "sds_variance.json", sep="\n")
 
 
 if __name__ == "__main__":

@@ -14,16 +14,18 @@ from reffusion.io.files import BadInput, there, understood
 
 __all__ = ["LAYOUTS", "Capture", "Poses", "load_capture", "pictures_in", "recognise"]
 
-READERS = {"llff": llff.read, "colmap": colmap.read, "transforms": transforms.read, "photos": photos.read}
-LAYOUTS = tuple(READERS)
+READERS = {"colmap": colmap.read, "transforms": transforms.read, "photos": photos.read}
+LAYOUTS = ("llff", *READERS)
+LONGEST = 1600  # px: the paper's
 
 
-def load_capture(folder: Path, layout: str | None = None, images: str | None = None) -> Capture:
+def load_capture(folder: Path, layout: str | None = None, images: str | None = None, longest: int = LONGEST) -> Capture:
     """Read a scene folder, recognising its layout unless it is named.
 
     Args:
         layout: one of LAYOUTS, or None.
         images: the folder of pictures, relative to the scene, where it is not the usual one.
+        longest: larger image side in px that is asked for; chooses among folders of the same pictures (LLFF).
 
     Raises:
         BadInput: naming the file and the remedy, where the folder is no capture, two pictures share a view name,
@@ -33,12 +35,12 @@ def load_capture(folder: Path, layout: str | None = None, images: str | None = N
     if not folder.is_dir():
         raise BadInput(f"{folder}: no such folder")
     layout = layout or recognise(folder)
-    if layout not in READERS:
+    if layout not in LAYOUTS:
         raise BadInput(f"{folder}: unknown layout '{layout}'; one of {', '.join(LAYOUTS)}")
     if images is not None and not (folder / images).is_dir():
         raise BadInput(f"{folder / images}: no such folder; correct `images` in scene.yaml")
     with understood(_source(folder, layout), "a capture that can be read"):
-        return READERS[layout](folder, images)
+        return llff.read(folder, images, longest) if layout == "llff" else READERS[layout](folder, images)
 
 
 def _source(folder: Path, layout: str) -> Path:
@@ -48,8 +50,12 @@ def _source(folder: Path, layout: str) -> Path:
 
 
 def recognise(folder: Path) -> str:
-    """The layout by the files that are there: poses_bounds.npy, transforms.json, a COLMAP model, else photos."""
+    """The layout by the files that are there: poses_bounds.npy, transforms.json, a COLMAP model, else photos.
+
+    A COLMAP model beside masks of `images_4` is SPIn-NeRF's, whose poses_bounds.npy is not needed then."""
     if there(folder / "poses_bounds.npy"):
+        return "llff"
+    if (folder / "images_4" / "label").is_dir() and colmap.model_folder(folder) is not None:
         return "llff"
     if there(folder / "transforms.json"):
         return "transforms"

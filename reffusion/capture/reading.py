@@ -16,7 +16,7 @@ from reffusion.params.poses import Params
 
 def read_scene(params: Params, scene: Path) -> tuple[Capture, Roles]:
     """The capture and its views' roles; BadInput naming the file and the remedy where one is wrong."""
-    capture = load_capture(scene, params.layout, params.images)
+    capture = load_capture(scene, params.layout, params.images, params.longest)
     roles = load_roles(
         scene,
         capture,

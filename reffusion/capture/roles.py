@@ -66,12 +66,12 @@ def load_roles(
 ) -> Roles:
     """The roles of the capture's views, from scene.yaml's keys and the folder's usual places.
 
-    Test views: those named; else, where the folder has test masks (`<images>/test_label`), the views without a
+    Test views: those named; else, where the folder has test masks (`<pictures>/test_label`), the views without a
     mask, or where some training masks are missing the first ones in order of names; else none. Training views:
     those named, else all others. A view that is neither is left out of the scene.
 
     Args:
-        masks: folder of masks; "none" for a scene without; None looks into <images>/label, masks, mask, label.
+        masks: folder of masks; "none" for a scene without; None looks into <pictures>/label, masks, mask, label.
         test_masks: folder of the test views' masks, named like the views or in their order; "none"; None looks.
         train, test: names, or "every 8" (the first of each eight in order of names), or None.
         region: the scene names a 3D region, so it may lack masks.
@@ -165,8 +165,8 @@ def _mask_files(folder: Path, capture: Capture, masks: str | None, region: bool)
     if masks is not None and masks.lower() == NONE:
         return {}
     if masks is None:
-        usual = (capture.image_folder / "label", folder / "masks", folder / "mask", folder / "label")
-        found = next((p for p in usual if p.is_dir() and p != capture.image_folder and pictures_in(p)), None)
+        usual = (capture.label_folder / "label", folder / "masks", folder / "mask", folder / "label")
+        found = next((p for p in usual if p.is_dir() and p != capture.label_folder and pictures_in(p)), None)
     else:
         found = folder / masks
         if not found.is_dir() or not pictures_in(found):
@@ -196,7 +196,7 @@ def _test_mask_files(folder: Path, capture: Capture, test_masks: str | None) -> 
     """The test views' masks in order of their names, or None."""
     if test_masks is not None and test_masks.lower() == NONE:
         return None
-    found = capture.image_folder / "test_label" if test_masks is None else folder / test_masks
+    found = capture.label_folder / "test_label" if test_masks is None else folder / test_masks
     files = list(pictures_in(found).values()) if found.is_dir() else []
     if not files and test_masks is not None:
         raise BadInput(f"{found}: no masks there; correct `test_masks` in scene.yaml")

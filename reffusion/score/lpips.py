@@ -2,6 +2,9 @@
 
 Two files a network: the backbone as torchvision saves it (keys `features.N.weight`), and the published linear
 weights (keys `lin0.model.1.weight`). Where either is absent the metric is unavailable, with a reason.
+
+ST-LPIPS (Ghildyal and Liu, 2022) is the same formula on a VGG of its own, whose maxima are blurred before they are
+thinned out. Its weights, the backbone's too, come with the package stlpips_pytorch, which is read and not imported.
 """
 
 from __future__ import annotations
@@ -12,15 +15,20 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
-from reffusion.weights.local import lpips_folders
+from reffusion.weights.local import at_home, inside_package, lpips_folders
+from reffusion.weights.published import LPIPS_PACKAGES
 
-Net = Literal["alex", "vgg"]
+Net = Literal["alex", "vgg", "st"]
 
 BACKBONE_FILES = {"alex": "alexnet-*.pth", "vgg": "vgg16-*.pth"}  # torchvision's names; a hash follows the dash
 LINEAR_FILES = {"alex": "alex.pth", "vgg": "vgg.pth"}
-SMALLEST = {"alex": 31, "vgg": 16}  # px a side: anything smaller leaves the deepest layer without a single cell
+NAMES = {"vgg": "lpips_vgg", "alex": "lpips_alex", "st": "stlpips"}  # of the scores
+# px a side: anything smaller leaves the deepest layer without a single cell, or nothing to mirror at a border
+SMALLEST = {"alex": 31, "vgg": 16, "st": 18}
+ST_FILE = ("stlpips_pytorch", "weights/vST0.0/vgg_shift_tolerant.pth")  # package, file inside
 
 # Layers of torchvision's `features`: (channels, kernel, stride, padding) a convolution with its ReLU, "pool" a maximum.
 _ALEX = [(64, 11, 4, 2), "pool", (192, 5, 1, 2), "pool", (384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1)]
@@ -35,18 +43,32 @@ _VGG = [
     "pool",
     *[(512, 3, 1, 1)] * 3,
 ]
-_LAYERS: dict[str, list[Any]] = {"alex": _ALEX, "vgg": _VGG}
-_POOL = {"alex": (3, 2), "vgg": (2, 2)}
-TAPS = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}  # indices in `features` of the ReLUs compared
-WIDTHS = {"alex": (64, 192, 384, 256, 256), "vgg": (64, 128, 256, 512, 512)}
+_LAYERS: dict[str, list[Any]] = {"alex": _ALEX, "vgg": _VGG, "st": _VGG}
+_POOL = {"alex": (3, 2), "vgg": (2, 2), "st": (2, 1)}  # side and step of a maximum
+# Indices in `features` of the ReLUs compared.
+TAPS = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29), "st": (3, 9, 17, 25, 33)}
+WIDTHS = {"alex": (64, 192, 384, 256, 256), "vgg": (64, 128, 256, 512, 512), "st": (64, 128, 256, 512, 512)}
+
+
+class Blur(nn.Module):
+    """Every second cell of [B, C, H, W] after a binomial filter of 3 x 3, the border mirrored 2 cells far."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        side = torch.tensor([1.0, 2.0, 1.0]) / 4
+        self.register_buffer("filter", side.outer(side)[None, None], persistent=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        kernel = self.filter.expand(x.shape[1], 1, 3, 3)
+        return F.conv2d(F.pad(x, (2, 2, 2, 2), mode="reflect"), kernel, stride=2, groups=x.shape[1])
 
 
 class Lpips(nn.Module):
     """The distance of one network. Build it with `from_states` or `load`.
 
     Attributes:
-        net: "alex" or "vgg" (16 layers).
-        features: the backbone under torchvision's indices.
+        net: "alex", "vgg" (16 layers) or "st".
+        features: the backbone under torchvision's indices, of "st" under its own.
         linear: five non-negative weights, [C_l] each.
         files: what was read: file name -> first 16 digits of its SHA-256 (empty when built from states).
     """
@@ -57,7 +79,7 @@ class Lpips(nn.Module):
         layers, channels = [], 3
         for layer in _LAYERS[net]:
             if layer == "pool":
-                layers.append(nn.MaxPool2d(*_POOL[net]))
+                layers += [nn.MaxPool2d(*_POOL[net]), *([Blur()] if net == "st" else [])]
             else:
                 width, kernel, stride, padding = layer
                 layers += [nn.Conv2d(channels, width, kernel, stride, padding), nn.ReLU()]
@@ -129,8 +151,10 @@ def load(net: Net, folder: str | Path | None = None) -> tuple[Lpips | None, str 
     for role, pattern in [("backbone", BACKBONE_FILES[net]), ("linear weights", LINEAR_FILES[net])]:
         paths = [path for place in places for path in sorted(place.glob(pattern))]
         if not paths:
-            looked = ", ".join(_short(place) for place in places)
-            return None, f"no {role} for LPIPS ({net}): run `make weights`, or put {pattern} into one of {looked}"
+            looked = ", ".join(at_home(place) for place in places)
+            brings = f"install {' or '.join(LPIPS_PACKAGES)}, " if pattern == LINEAR_FILES[net] else ""
+            cures = f"run `make weights`, {brings}or put {pattern} into one of {looked}"
+            return None, f"no {role} for LPIPS ({net}): {cures}"
         found[role] = paths[0]
     hashes = {path: _sha256(path) for path in found.values()}
     stated = found["backbone"].stem.rpartition("-")[2]
@@ -145,12 +169,21 @@ def load(net: Net, folder: str | Path | None = None) -> tuple[Lpips | None, str 
     return model, None
 
 
+def load_st() -> tuple[Lpips | None, str | None]:
+    """ST-LPIPS: (metric, None), or (None, why it is unavailable). Raises ValueError for a file that is broken."""
+    package, below = ST_FILE
+    path = inside_package(package, below)
+    if path is None:
+        return None, f"no weights for ST-LPIPS: `pip install {package}` brings them"
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        model = from_states("st", {re.sub(r"^net\.slice\d\.", "features.", key): v for key, v in state.items()}, state)
+    except Exception as error:
+        raise ValueError(f"ST-LPIPS weights {path} cannot be used: {error}") from error
+    model.files = {path.name: _sha256(path)[:16]}
+    return model, None
+
+
 def _sha256(path: Path) -> str:
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _short(path: Path) -> str:
-    """`~/...` where it lies at home, so that no user's name enters a result file."""
-    home = Path.home()
-    return f"~/{path.relative_to(home)}" if path.is_relative_to(home) else str(path)

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from reffusion.score.lpips import SMALLEST, Lpips
+from reffusion.score.lpips import NAMES, SMALLEST, Lpips
 
 PIXELS_PER_DEGREE = 67.0  # FLIP's own default: 0.7 m away from a 0.7 m wide 4K display
 SSIM_WINDOW = 11  # px
@@ -28,8 +28,7 @@ COLUMNS = (
     "psnr_box",
     "ssim_box",
     "flip_box",
-    "lpips_vgg_box",
-    "lpips_alex_box",
+    *(f"{name}_box" for name in NAMES.values()),
     "psnr_outside",
     "ssim_outside",
     "flip_outside",
@@ -57,6 +56,8 @@ PROTOCOL = {
     "flip": f"LDR-FLIP, mean of the error map, {PIXELS_PER_DEGREE:.0f} pixels per degree",
     "lpips": "version 0.1, backbones alex and vgg16, input in [-1, 1] at native resolution; "
     f"no value under {SMALLEST['alex']} (alex) or {SMALLEST['vgg']} (vgg) px a side",
+    "stlpips": "ST-LPIPS, another score than LPIPS: shift-tolerant VGG of the package stlpips_pytorch, input in "
+    f"[-1, 1] at native resolution; no value under {SMALLEST['st']} px a side",
     "mean": "over the views that have the value; `views` says how many those are",
 }
 
@@ -148,7 +149,7 @@ def lpips(image: np.ndarray, truth: np.ndarray, model: Lpips) -> float:
 
 
 def score(image: np.ndarray, truth: np.ndarray, models: dict[str, Lpips] | None = None) -> dict[str, float | None]:
-    """{"psnr", "ssim", "flip", "lpips_<net>" for each model}; None where the image is too small for a metric."""
+    """{"psnr", "ssim", "flip", and `NAMES` of each model}; None where the image is too small for a metric."""
     side = min(image.shape[:2])
     values = {
         "psnr": psnr(image, truth),
@@ -156,7 +157,7 @@ def score(image: np.ndarray, truth: np.ndarray, models: dict[str, Lpips] | None 
         "flip": flip(image, truth),
     }
     for net, model in (models or {}).items():
-        values[f"lpips_{net}"] = lpips(image, truth, model) if side >= SMALLEST[net] else None
+        values[NAMES[net]] = lpips(image, truth, model) if side >= SMALLEST[net] else None
     return values
 
 

@@ -6,6 +6,7 @@ Nothing here reaches the network, and no stage does: `make weights` fetches (`re
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import re
@@ -14,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from reffusion.weights.published import LPIPS_FILES, NETWORKS, PUBLISHED
+from reffusion.weights.published import LPIPS_FILES, LPIPS_PACKAGES, NETWORKS, PUBLISHED
 
 PARTS = ("unet", "vae", "text_encoder", "tokenizer", "scheduler")
 SECOND_TEXT = ("text_encoder_2", "tokenizer_2")  # what an SDXL folder has besides
@@ -33,6 +34,7 @@ class Need:
         optional: the stage works without them, and says what it leaves out.
         half: half precision is enough.
         url, sha256: of a plain file; the latter may be its beginning.
+        looked: the folders in which a plain file is looked for.
     """
 
     name: str
@@ -43,13 +45,14 @@ class Need:
     half: bool = False
     url: str | None = None
     sha256: str = ""
+    looked: tuple[str, ...] = ()
 
     def fetch(self) -> None:
         """Download them, whole and checked. Raises ValueError with one message where that cannot be."""
         from reffusion.weights import download
 
         if self.url:
-            download.file(self.url, lpips_folders()[-2] / self.name, self.sha256, self.bytes)
+            download.file(self.url, lpips_cache() / self.name, self.sha256, self.bytes)
         else:
             download.model(self.name, self.half)
 
@@ -78,12 +81,13 @@ def of_model(source: str | Path, dtype: str) -> Need:
 def of_lpips(folder: str | None) -> list[Need]:
     """The files of both LPIPS networks; `folder` as in `reffusion.score.lpips.load`."""
     places = lpips_folders(folder)
+    looked = tuple(map(at_home, places))
     needs = []
     for name, (address, size, sha256) in LPIPS_FILES.items():
         pattern = f"{name.split('-')[0]}-*.pth" if "-" in name else name
         found = any(path for place in places for path in place.glob(pattern))
         problem = None if found else f"LPIPS is left out: {name} is not on this machine"
-        needs.append(Need(name, problem, size, optional=True, url=address + name, sha256=sha256))
+        needs.append(Need(name, problem, size, optional=True, url=address + name, sha256=sha256, looked=looked))
     return needs
 
 
@@ -94,11 +98,31 @@ def _cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser()
 
 
+def lpips_cache() -> Path:
+    """The project's own folder of LPIPS weights, into which they are fetched."""
+    return _cache() / "reffusion" / "lpips"
+
+
 def lpips_folders(first: str | Path | None = None) -> list[Path]:
-    """Where LPIPS weights are looked for, in this order: the given folder, the project's cache, torch hub's."""
+    """Where LPIPS weights are looked for, in this order: the given folder, the project's cache, torch hub's, where
+    torchvision puts the backbones, and the packages lpips and torchmetrics, which bring the linear weights along."""
     hub = Path(os.environ.get("TORCH_HOME", _cache() / "torch")).expanduser()
     given = [Path(first).expanduser()] if first else []
-    return [*given, _cache() / "reffusion" / "lpips", hub / "hub" / "checkpoints"]
+    packaged = [folder for package, below in LPIPS_PACKAGES.items() if (folder := inside_package(package, below))]
+    return [*given, lpips_cache(), hub / "hub" / "checkpoints", *packaged]
+
+
+def inside_package(package: str, below: str) -> Path | None:
+    """A folder of an installed package, which is not imported; None where the package is not here."""
+    found = importlib.util.find_spec(package)
+    roots = (found.submodule_search_locations or ()) if found else ()
+    return next((Path(root) / below for root in roots if (Path(root) / below).exists()), None)
+
+
+def at_home(path: Path) -> str:
+    """`~/...` where it lies at home, so that no user's name enters a result file."""
+    home = Path.home()
+    return f"~/{path.relative_to(home)}" if path.is_relative_to(home) else str(path)
 
 
 def hub_cache() -> Path:

@@ -52,6 +52,10 @@ LPIPS_FILES = {
 }
 
 
+# Packages that bring the linear weights of version 0.1 along, under the same names, and the folder inside them.
+LPIPS_PACKAGES = {"lpips": "weights/v0.1", "torchmetrics": "functional/image/lpips_models"}
+
+
 @dataclass(frozen=True)
 class PublishedPainter:
     """A feed-forward inpainter, one file.

@@ -43,7 +43,8 @@ class Capture:
         pictures: view name -> picture file, sorted by name; all of them have poses, if any has.
         poses: None where they must be found by structure from motion.
         brought_by: the file the poses come from, for messages; None without poses.
-        image_folder: where the pictures lie (masks are looked for beside them).
+        label_folder: where masks (`label`) and test masks (`test_label`) are looked for: the pictures' folder, or that
+            of the same pictures at another size.
         left_out: names of views that have a picture but no pose, or a pose but no picture.
         warnings: what the user should know, each one sentence.
     """
@@ -52,7 +53,7 @@ class Capture:
     pictures: dict[str, Path]
     poses: Poses | None
     brought_by: Path | None
-    image_folder: Path
+    label_folder: Path
     left_out: frozenset[str]
     warnings: tuple[str, ...]
 

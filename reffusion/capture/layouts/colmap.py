@@ -30,10 +30,11 @@ def read(folder: Path, images: str | None) -> Capture:
     model = model_folder(folder)
     if model is None:
         raise BadInput(f"{folder}: no COLMAP model (cameras and images, .bin or .txt) in {', '.join(MODEL_FOLDERS)}")
-    return from_model(folder, model, image_folder_of(folder, images, ("images", "images_2", "images_4", ".")), "colmap")
+    image_folder = image_folder_of(folder, images, ("images", "images_2", "images_4", "."))
+    return from_model(folder, model, image_folder, "colmap", image_folder)
 
 
-def from_model(folder: Path, model: Path, image_folder: Path, layout: str) -> Capture:
+def from_model(folder: Path, model: Path, image_folder: Path, layout: str, label_folder: Path) -> Capture:
     """Pictures matched to the model's images by name without ending; failing that, by order where the counts agree."""
     source = model_file(model, "images")
     registered = sorted(load_images(source).values(), key=lambda image: image.name)
@@ -70,7 +71,7 @@ def from_model(folder: Path, model: Path, image_folder: Path, layout: str) -> Ca
         pictures,
         Poses(lenses, poses, *brought, {}),
         source,
-        image_folder,
+        label_folder,
         frozenset(images.keys() ^ found.keys()),
         tuple(filter(None, warnings)),
     )

@@ -1,7 +1,11 @@
-"""LLFF's poses_bounds.npy, as SPIn-NeRF's scenes have it; a COLMAP model beside it wins, or helps where incomplete."""
+"""LLFF's poses_bounds.npy, as SPIn-NeRF's scenes have it; a COLMAP model beside it wins, or helps where incomplete.
+
+The same pictures lie there in several sizes, and the masks beside one of them, in SPIn-NeRF beside those of a quarter.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,16 +27,20 @@ from reffusion.capture.lens import Lens
 from reffusion.io.arrays import load_array
 from reffusion.io.colmap import load_cameras, load_model_points, model_file
 from reffusion.io.files import BadInput, there
+from reffusion.io.images import image_size
+
+USUAL = ("images_4", "images_2", "images_8", "images")
 
 
-def read(folder: Path, images: str | None) -> Capture:
+def read(folder: Path, images: str | None, longest: int) -> Capture:
     """See `load_capture`."""
     source = folder / "poses_bounds.npy"
-    usual = ("images_4", "images_2", "images_8", "images")
-    image_folder = image_folder_of(folder, images, usual)
+    label_folder = _label_folder(folder, images)
+    image_folder, warnings = (folder / images, []) if images else _large_enough(folder, label_folder, longest)
     model = model_folder(folder)
     if model is not None:  # exact poses, the lens's distortion and the points
-        return from_model(folder, model, image_folder, "llff")
+        found = from_model(folder, model, image_folder, "llff", label_folder)
+        return replace(found, warnings=(*warnings, *found.warnings))
     if not there(source):
         raise BadInput(f"{source}: missing, and there is no complete COLMAP model in {folder / 'sparse/0'}")
     pictures = pictures_in(image_folder)
@@ -54,11 +62,38 @@ def read(folder: Path, images: str | None) -> Capture:
         camera_to_world[:3] = np.stack([columns[:, 1], columns[:, 0], -columns[:, 2], columns[:, 3]], axis=1)
         poses[name] = inverse(rigid(camera_to_world, name, source))
         bounds[name] = float(row[15]), float(row[16])
-    warnings, partial = [], folder / "sparse" / "0"
+    partial = folder / "sparse" / "0"
     lenses = _lens_of_partial_model(partial, lenses, pictures, warnings)
     points = _points_of_partial_model(partial, lenses, poses, bounds, warnings)
     brought = Poses(lenses, poses, *points, bounds)
-    return Capture("llff", pictures, brought, source, image_folder, frozenset(), tuple(warnings))
+    return Capture("llff", pictures, brought, source, label_folder, frozenset(), tuple(warnings))
+
+
+def _label_folder(folder: Path, images: str | None) -> Path:
+    """The named folder of pictures where masks lie in it, else the usual one in which they do."""
+    if images and (folder / images / "label").is_dir():
+        return folder / images
+    labelled = [folder / name for name in USUAL if (folder / name / "label").is_dir()]
+    return labelled[0] if labelled else image_folder_of(folder, images, USUAL)
+
+
+def _large_enough(folder: Path, label_folder: Path, longest: int) -> tuple[Path, list[str]]:
+    """The smallest size of the pictures that is `longest` px or more, else the largest; and what to warn of.
+
+    Only folders that hold all the pictures of the folder with the masks, under the same names, are that size."""
+    names, sizes, other = pictures_in(label_folder).keys(), {}, []
+    for place in dict.fromkeys([label_folder, *(folder / name for name in USUAL)]):
+        pictures = pictures_in(place) if place.is_dir() else {}
+        if pictures and names <= pictures.keys():
+            sizes[place] = max(image_size(next(iter(pictures.values()))))
+        elif pictures:
+            other.append(place)
+    enough = {place: size for place, size in sizes.items() if size >= longest}
+    chosen = min(enough, key=enough.__getitem__) if enough else max(sizes, key=sizes.__getitem__)
+    if enough or not other:
+        return chosen, []
+    named = ", ".join(place.name for place in other)
+    return chosen, [f"{named}: not the pictures of {label_folder.name} under the same names, so not used"]
 
 
 def _poses_bounds(source: Path) -> np.ndarray:

@@ -1,0 +1,122 @@
+"""The paper's Figure 2: several views of a scene painted by the adapted prior, beside the prior as it is.
+
+`python -m benchmarks.studies.adapted --run runs/demo`, or `make scene=X adapted`; needs the stages up to `personalize`.
+Training views with something to invent, spread evenly, are known without the object as far as other views tell; their
+hole is painted from pure noise, the whole view at the prior's own size as SDS sees it. Same views, same noise,
+same sampler; the prior as it is with the empty prompt, and with the adapted one's, which may mean something to it.
+Writes sheet.png, the pictures, each as <view>/<column>.png, and adapted.json to --out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from benchmarks.studies import device
+from reffusion import seeding
+from reffusion.fit import exposure
+from reffusion.io.arrays import load_labels, save_json
+from reffusion.io.images import save_image
+from reffusion.io.ply import load_ply
+from reffusion.io.scene import load_mask_sets, load_references, load_scene
+from reffusion.paint import painting
+from reffusion.params.base import Sampler
+from reffusion.prior import diffusion, inpaint
+from reffusion.prior.crops import PROMPTS
+from reffusion.prior.model import Prior
+from report.sheet import enlarged, evenly, framed
+
+VIEWS = 5
+SEED = 0
+WIDTH = 400  # px of a picture on the sheet, about
+COLUMNS = {  # column -> the prior, and its prompt
+    "as it is, no prompt": ("before", ""),
+    "as it is": ("before", PROMPTS[0]),
+    "adapted": ("after", PROMPTS[0]),
+}
+
+
+def given_views(run: Path, count: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """View -> (uint8 [H, W, 3], as far as it is known without the object; hole, bool [H, W]): up to `count` training
+    views with something to invent, the reference's own left out.
+
+    Raises:
+        ValueError: naming what is missing, or where nothing is to be invented.
+    """
+    for stage in ("poses", "fit", "masks", "reference"):
+        if not (run / stage).is_dir():
+            raise ValueError(f"{run / stage} is missing: run `make scene={run.name} personalize` first")
+    scene = load_scene(run / "poses")
+    sets = load_mask_sets(run / "masks", scene.train)
+    learnt = {each.camera.name for each in load_references(run / "reference", scene)}
+    names = [name for name in scene.train if sets[name].invent.any() and name not in scene.clean | learnt]
+    if not names:
+        raise ValueError(f"{run / 'masks'}: nothing is to be invented but in the reference")
+    keep = ~load_labels(run / "masks" / "labels.npy")
+    remaining = load_ply(run / "fit" / "gaussians.ply").map(lambda p: p[keep])
+    chosen = evenly(names, count)
+    photos = exposure.load_views(run / "poses", run / "fit", chosen)
+    known = lambda n: inpaint.background(remaining, scene.cameras[n], photos[n], sets[n].consistent)
+    return {name: (known(name), sets[name].invent) for name in chosen}
+
+
+@torch.no_grad()
+def painted(prior: Prior, picture: np.ndarray, hole: np.ndarray, prompt: str, steps: int) -> np.ndarray:
+    """uint8 [H, W, 3]: the hole painted from the noise of `SEED`."""
+    inside = torch.from_numpy(hole)
+    made = inpaint.repaint(
+        prior,
+        inpaint.as_input(picture) * ~inside,
+        inside,
+        diffusion.embed_text(prior, [prompt, prompt, ""]),
+        seeding.generator(SEED, "adapted"),
+        start=1.0,
+        finest=1.0,
+        levels=0,
+        steps=steps,
+        guidance=0.0,
+    )
+    return inpaint.as_picture(made)
+
+
+def drawn(models: dict[str, Prior], run: Path, count: int, steps: int, out: Path) -> list[str]:
+    """Write the pictures and sheet.png; the views on it."""
+    views, rows = given_views(run, count), []
+    for name, (picture, hole) in views.items():
+        row = {"to paint": painting.to_paint(picture, hole)}
+        for column, (when, prompt) in COLUMNS.items():
+            row[column] = painted(models[when], picture, hole, prompt, steps)
+        for column, made in row.items():
+            save_image(out / name / f"{column.replace(', ', '-').replace(' ', '-')}.png", made)
+        scale = max(1, round(WIDTH / picture.shape[1]))
+        rows.append([enlarged(made, scale) for made in row.values()])
+        print(f"{name}: painted by {len(COLUMNS)}", flush=True)
+    save_image(out / "sheet.png", framed(rows, ["to paint", *COLUMNS], list(views)))
+    return list(views)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--run", type=Path, required=True, help="runs/<scene>, with the stages up to personalize")
+    parser.add_argument("--views", type=int, default=VIEWS)
+    parser.add_argument("--steps", type=int, default=Sampler().steps, help="sampler steps from pure noise")
+    parser.add_argument("--out", type=Path, help="default: runs/<scene>/adapted")
+    device.add_arguments(parser)
+    given = parser.parse_args()
+    models, base = device.before_and_after(given)
+    out = given.out or given.run / "adapted"
+    views = drawn(models, given.run, given.views, given.steps, out)
+    facts = {"prior": base, "seed": SEED, "steps": given.steps, "views": views}
+    save_json(out / "adapted.json", facts | device.facts(given))
+    print(device.words(given), out / "sheet.png", sep="\n")
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except ValueError as error:
+        sys.exit(f"error: {error}")

@@ -1,0 +1,54 @@
+"""A scene's prior before and after personalization, on the device that a study is told."""
+
+from __future__ import annotations
+
+import argparse
+import resource
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from reffusion.io.arrays import load_json
+from reffusion.prior import lora
+from reffusion.prior.model import Prior, load_prior
+
+DTYPES = ("float32", "float16", "bfloat16")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--prior", help="the one that was personalized; default: as personalize's receipt names it")
+    parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
+    parser.add_argument("--dtype", choices=DTYPES, default="float32", help="of the UNet and the text encoder")
+
+
+def before_and_after(given: argparse.Namespace) -> tuple[dict[str, Prior], str]:
+    """{"before", "after"} personalization, and the prior's name. ValueError where the run has none, or this machine no
+    such device."""
+    adapted: Path = given.run / "personalize"
+    if not adapted.is_dir():
+        raise ValueError(f"{adapted} is missing: run `make scene={given.run.name} personalize` first")
+    if given.device == "cuda" and not torch.cuda.is_available():
+        raise ValueError("device=cuda: torch finds no CUDA device here; device=cpu")
+    if given.device == "cpu" and given.dtype == "float16":
+        raise ValueError("dtype=float16 is for device=cuda; on the CPU float32 or bfloat16")
+    base = given.prior or load_json(adapted / "receipt.json")["params"]["prior"]
+    fresh = lambda: load_prior(base, given.device, getattr(torch, given.dtype))
+    return {"before": fresh(), "after": lora.merged(fresh(), adapted)}, base
+
+
+def peak_mb(device: str) -> int:
+    """The most memory, weights included, that this process took: of the GPU by its allocator's count, else of the
+    machine."""
+    if device == "cuda":
+        return round(torch.cuda.max_memory_allocated() / 1e6)
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6)
+
+
+def facts(given: argparse.Namespace) -> dict[str, Any]:
+    """What a study's file says of it."""
+    return {"device": given.device, "dtype": given.dtype, "peak_mb": peak_mb(given.device)}
+
+
+def words(given: argparse.Namespace) -> str:
+    return f"on {given.device} in {given.dtype}, both priors loaded: at most {peak_mb(given.device):,} MB"

@@ -1,0 +1,21 @@
+"""What of SPIn-NeRF's published scenes a folder holds, a line a scene: `python data/spinnerf.py --data FOLDER`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from reffusion.capture.layouts import spinnerf
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, required=True, help="the folder that holds the scenes")
+    try:
+        print("\n".join(spinnerf.told(parser.parse_args().data.expanduser())), flush=True)
+    except ValueError as error:
+        raise SystemExit(f"error: {error}") from None
+
+
+if __name__ == "__main__":
+    main()

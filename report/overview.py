@@ -1,0 +1,80 @@
+"""Many scenes in one table: each method in each scene; beside them rows that others published."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+from report import page
+from report.results import BETTER, Comparison, Run, mean
+
+PUBLISHED = "published.csv"  # in the folder of the scenes
+COLUMNS = ("method", "metric", "value", "protocol")
+Table = tuple[list[str], list[list[str]]]
+
+
+def by_scene(comparison: Comparison, metric: str, digits: int) -> Table | None:
+    """Header and rows: a method in each scene, then the mean of those that are done. None where none has a value."""
+    lines, found = [], False
+    for method in comparison.methods:
+        runs = [comparison.runs[method, scene] for scene in comparison.scenes]
+        values = [run.metrics.get("mean", {}).get(metric) if run.state == "done" else None for run in runs]
+        found |= any(value is not None for value in values)
+        lines.append([method, *(page.number(value, digits) for value in [*values, mean(values)])])
+    return (["method", *comparison.scenes, "mean"], lines) if found else None
+
+
+def protocol(done: list[Run]) -> list[str]:
+    """What was rendered in which scenes, and at what size; one phrase, none where that is not known."""
+    said: dict[str, dict[str, None]] = {}
+    for run in done:
+        sizes = ", ".join(run.metrics.get("protocol", {}).get("resolution", ()))
+        if sizes:
+            said.setdefault(f"{run.metrics['rendered']} of {sizes} px", {})[run.scene] = None
+    groups = [f"{what} ({', '.join(scenes)})" for what, scenes in said.items()]
+    return ["; ".join(groups)] if groups else []
+
+
+def published(data: Path | None) -> list[dict[str, str]]:
+    """The rows of FOLDER/published.csv, none where there is none.
+
+    Raises:
+        ValueError: it has other columns, a metric that is not compared, or a value that is no number.
+    """
+    path = data / PUBLISHED if data else None
+    if path is None or not path.is_file():
+        return []
+    with open(path, newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    for number, row in enumerate(rows, 2):
+        if set(row) != set(COLUMNS):
+            raise ValueError(f"{path}: its columns are {', '.join(map(str, row))}; expected {', '.join(COLUMNS)}")
+        if row["metric"] not in BETTER:
+            raise ValueError(f"{path}: line {number}: metric {row['metric']!r} is none of {', '.join(BETTER)}")
+        try:
+            float(row["value"])
+        except (TypeError, ValueError):
+            raise ValueError(f"{path}: line {number}: {row['value']!r} is no number") from None
+    return rows
+
+
+def beside(
+    rows: list[dict[str, str]], table: list[dict], short: dict[str, str], digits: dict[str, int], here: str
+) -> Table:
+    """The published rows, each metric followed by our own in it, with intervals over scenes; `here`: our protocol."""
+    lines = []
+    for metric in dict.fromkeys(row["metric"] for row in rows):
+        lines += [
+            [row["method"], "published", short[metric], row["value"], row["protocol"]]
+            for row in rows
+            if row["metric"] == metric
+        ]
+        ours = [row for row in table if row[metric] is not None]
+        lines += [[row["method"], "here", short[metric], spread(row, metric, digits[metric]), here] for row in ours]
+    return ["method", "from", "metric", "mean over scenes", "protocol"], lines
+
+
+def spread(row: dict, metric: str, digits: int) -> str:
+    """The mean, and half its interval over scenes where there are several."""
+    half = row[f"{metric}_interval"]
+    return page.number(row[metric], digits) + ("" if half is None else f" ± {half:.{digits}f}")

@@ -1,0 +1,64 @@
+"""The sheet of the adapted prior beside the prior as it is: same views, same noise, holes alone painted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from small_prior import small_prior
+from test_sds_variance import small_run
+
+from benchmarks.studies import adapted, device
+from reffusion.io.arrays import save_labels
+from reffusion.io.images import load_image, save_image
+from reffusion.io.ply import load_ply, save_ply
+from reffusion.io.scene import load_scene, save_references
+from reffusion.types import Reference
+
+HOLE = np.zeros((36, 48), bool)
+HOLE[10:24, 12:30] = True
+
+
+def learnt_run(home):
+    """`small_run` as `reference` leaves it: photographs, a fit of which nothing is removed, view `a` completed."""
+    run = small_run(home, HOLE)
+    wall = load_ply(run / "initialize" / "gaussians.ply")
+    save_ply(run / "fit" / "gaussians.ply", wall)
+    save_labels(run / "masks" / "labels.npy", np.zeros(len(wall), bool))
+    scene = load_scene(run / "poses")
+    for name in scene.cameras:
+        save_image(run / "poses" / "images" / f"{name}.png", np.full((*HOLE.shape, 3), 90, np.uint8))
+    save_references(run / "reference", [Reference(scene.cameras["a"], np.full((*HOLE.shape, 3), 90, np.uint8), HOLE)])
+    return run
+
+
+def test_same_views_same_noise_and_holes_alone_are_painted(tmp_path):
+    prior, run = small_prior(), learnt_run(tmp_path / "run")
+    views = adapted.drawn({"before": prior, "after": prior}, run, 3, 2, tmp_path / "out")
+    assert views == ["b"]  # the reference's own view is what was learnt, the third is clean
+    pictures = {path.stem: load_image(path) for path in (tmp_path / "out/b").glob("*.png")}
+    assert sorted(pictures) == ["adapted", "as-it-is", "as-it-is-no-prompt", "to-paint"]
+    assert (pictures["adapted"] == pictures["as-it-is"]).all()  # one prior, so one picture
+    assert (pictures["adapted"][~HOLE] == pictures["to-paint"][~HOLE]).all()
+    assert (pictures["adapted"][HOLE] != pictures["to-paint"][HOLE]).any()
+    assert load_image(tmp_path / "out/sheet.png").shape[1] > 4 * HOLE.shape[1]
+
+
+def test_what_is_missing_is_named(tmp_path):
+    with pytest.raises(ValueError, match="make scene=nowhere personalize"):
+        adapted.given_views(tmp_path / "nowhere", 3)
+
+
+def test_a_device_that_is_not_there_is_refused(tmp_path, monkeypatch):
+    import argparse
+
+    import torch
+
+    (tmp_path / "run/personalize").mkdir(parents=True)
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--run", type=lambda text: tmp_path / text)
+    device.add_arguments(parser)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    for typed, message in ((["--device", "cuda"], "no CUDA device"), (["--dtype", "float16"], "for device=cuda")):
+        with pytest.raises(ValueError, match=message):
+            device.before_and_after(parser.parse_args(["--run", "run", *typed]))
+    assert device.peak_mb("cpu") > 10
