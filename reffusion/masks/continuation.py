@@ -32,7 +32,7 @@ ENOUGH = 200  # pixels that must
 FAR = 0.08  # relative depth: a plane that would move farther anywhere in the hole stays where it is
 STAYS = 0.05  # weight of the plane as it was, within the hole, against what is around
 ACROSS = 0.9  # cosine of the angle between two planes under which they cross
-LIKEWISE = 0.7  # cosine of the angle up to which a surface faces as a plane does
+RATHER = 1.0  # cosine to a plane over that to another, from which a surface faces rather as the one does
 EVENED = 0.01  # of the image's width: the scale on which a surface's direction is taken
 RIM = 1  # cells on either side: what is seen in a thinner strip is blurred by the masks' margin
 TOUCHING = 0.25  # share of an unknown patch's border that must be seen for the plane to go on into it
@@ -80,10 +80,14 @@ class Plane:
 
     def in_cells(self, cells_meant: np.ndarray, points: np.ndarray) -> np.ndarray:
         """bool [P]: points [P, 3] that lie over one of the cells meant (bool [CELLS, CELLS])."""
-        cells = np.floor((points - self.origin) @ self.along.T / self.pitch + CELLS / 2).astype(np.int64)
+        cells = self.cell_of(points)
         inside = ((cells >= 0) & (cells < CELLS)).all(-1)
         row, column = np.where(inside[:, None], cells, 0).T
         return inside & cells_meant[row, column]
+
+    def cell_of(self, points: np.ndarray) -> np.ndarray:
+        """[P, 2], row and column of the cells that points [P, 3] lie over, perhaps outside the map."""
+        return np.floor((points - self.origin) @ self.along.T / self.pitch + CELLS / 2).astype(np.int64)
 
     @property
     def cells(self) -> np.ndarray:
@@ -117,10 +121,10 @@ def planes_around(centre: np.ndarray, radius: float, views: Sequence[Witness], s
     facings = [_facing(view) for view in views] if len(found) > 1 else []
     whole = []
     for k, (plane, hidden) in enumerate(mapped):
-        if _crossing(plane, [better for better, _ in mapped[:k]]):
-            # What may be the one or the other is the better supported one's, unless it faces as this one does.
-            plane = replace(plane, seen=plane.seen & _faces_so(plane, views, facings))
-        whole.append(_continued(plane, hidden, _crossing(plane, [other for other, _ in mapped]), band))
+        better = _crossing(plane, [other for other, _ in mapped[:k]])
+        if better:  # what may be the one or the other is the better supported one's, unless it faces as this one does
+            plane = replace(plane, seen=plane.seen & _faces_so(plane, better, views, facings))
+        whole.append(_continued(plane, hidden, better, _crossing(plane, [other for other, _ in mapped]), band))
     return whole
 
 
@@ -192,14 +196,21 @@ def _best_plane(points: np.ndarray, near: float, draws: np.random.Generator) -> 
     return normal, float(height), int((np.abs(points @ normal - height) < near).sum())
 
 
-def _hull(seen: np.ndarray) -> np.ndarray:
+def _hull(plane: Plane, seen: np.ndarray, grounds: Sequence[Plane]) -> np.ndarray:
     """bool [CELLS, CELLS], the convex hull of the large patches of seen cells: a surface ends where the prolongations
-    of its visible borders do."""
+    of its visible borders do. What stands on one of the grounds, planes that it crosses,
+    goes on down to it."""
     solid = cv2.morphologyEx(seen.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     patches, count = ndimage.label(solid)
     areas = np.bincount(patches.ravel(), minlength=count + 1)
     areas[0] = 0
-    return hull((areas >= LARGE * max(areas.max(), 1))[patches])
+    large = (areas >= LARGE * max(areas.max(), 1))[patches]
+    standing = plane.cells[large]
+    for other in grounds:
+        down = other.normal - (other.normal @ plane.normal) * plane.normal
+        feet = standing + ((other.height - standing @ other.normal) / (down @ down))[:, None] * down
+        large[tuple(plane.cell_of(feet).clip(0, CELLS - 1).T)] = True
+    return hull(large)
 
 
 def _between(unknown: np.ndarray, seen: np.ndarray, free: np.ndarray) -> np.ndarray:
@@ -242,12 +253,15 @@ def _mapped(
     return replace(plane, seen=seen, free=free), (said.hidden > 0).reshape(nowhere.shape)
 
 
-def _continued(plane: Plane, hidden: np.ndarray, others: Sequence[Plane], band: float) -> Plane:
+def _continued(
+    plane: Plane, hidden: np.ndarray, grounds: Sequence[Plane], others: Sequence[Plane], band: float
+) -> Plane:
     """The plane with where it goes on: a patch of it that nobody saw, because the object was in the way, and that
     touches what was seen of it, belongs to it up to its border; where views look through it, it is not.
 
     Args:
-        hidden: bool [CELLS, CELLS], where the object hides it. others: planes that cross it.
+        hidden: bool [CELLS, CELLS], where the object hides it.
+        others: planes that cross it. grounds: those of them with more samples.
         band: distance from these up to which a view that seems to show the one may show the other.
     """
     # Neither a thin rim nor a crossing tells where the plane goes on to.
@@ -265,20 +279,24 @@ def _continued(plane: Plane, hidden: np.ndarray, others: Sequence[Plane], band: 
             beyond = _between(inside, solid, plane.free) < 0.5
             goes_on |= inside & ~beyond
             ends |= inside & beyond
-    goes_on &= _hull(solid)
+    goes_on &= _hull(plane, solid, grounds)
     within = goes_on | (ndimage.binary_fill_holes(plane.seen | goes_on) & ~plane.seen & ~ends & hidden)
     return replace(plane, goes_on=goes_on, within=within)
 
 
-def _faces_so(plane: Plane, views: Sequence[Witness], facings: Sequence[np.ndarray]) -> np.ndarray:
-    """bool [CELLS, CELLS]: of the views that show a surface at a cell, most show one that faces as the plane does."""
+def _faces_so(
+    plane: Plane, others: Sequence[Plane], views: Sequence[Witness], facings: Sequence[np.ndarray]
+) -> np.ndarray:
+    """bool [CELLS, CELLS]: of the views that show a surface at a cell, most show one that faces rather as the plane
+    does than as one of the others, which cross it."""
     points = plane.cells.reshape(-1, 3)
     likewise, shown = np.zeros((2, len(points)), np.int64)
     for view, facing in zip(views, facings, strict=True):
         on = seen_by(view, points)
         there, _ = geometry.sample_nearest(facing, geometry.project(points, view.camera)[0])
         shown += on
-        likewise += on & (np.abs(there @ plane.normal) > LIKEWISE)
+        other = np.max([np.abs(there @ each.normal) for each in others], 0)
+        likewise += on & (np.abs(there @ plane.normal) > RATHER * other)
     return (2 * likewise > shown).reshape(plane.seen.shape)
 
 
