@@ -121,7 +121,9 @@ def beside_a_plinth(view: Camera) -> Witness:
     bounds = np.stack([(low - view.center) / rays, (high - view.center) / rays])
     enter, leave = bounds.min(0).max(-1), bounds.max(0).min(-1)
     wide = cv2.dilate(((enter < leave) & (leave > 0)).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    return Witness(view, depth, 0.94 * cv2.erode(depth, np.ones((3, 3))), 1.06 * cv2.dilate(depth, np.ones((3, 3))), wide)
+    return Witness(
+        view, depth, 0.94 * cv2.erode(depth, np.ones((3, 3))), 1.06 * cv2.dilate(depth, np.ones((3, 3))), wide
+    )
 
 
 def test_a_wall_does_not_go_on_along_the_ground_where_it_was_never_seen():
