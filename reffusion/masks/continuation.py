@@ -279,7 +279,7 @@ def _continued(
             beyond = _between(inside, solid, plane.free) < 0.5
             goes_on |= inside & ~beyond
             ends |= inside & beyond
-    goes_on &= _hull(plane, solid, grounds)
+    goes_on &= _hull(plane, solid if grounds else plane.seen, grounds)
     within = goes_on | (ndimage.binary_fill_holes(plane.seen | goes_on) & ~plane.seen & ~ends & hidden)
     return replace(plane, goes_on=goes_on, within=within)
 
