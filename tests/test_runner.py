@@ -599,8 +599,8 @@ def test_clean_removes_only_what_it_was_asked_for_by_name(root):
 
 def test_clean_and_a_rerun_leave_what_people_put_there(root, tmp_path, capsys):
     mine = {"notes.txt": "1", "fit/notes.txt": "2", "to_paint/a.png": "3", "report/x.txt": "5"}
-    write(root / "runs/toy", {"report/index.html": "a page"})
-    write(root / "runs/toy", mine)
+    pages = ("report/index.html", "adapted/sheet.png", "adapted/view/adapted.png", "sds-variance/sds_variance.json")
+    write(root / "runs/toy", dict.fromkeys(pages, "a page") | mine)
     write(tmp_path, {"elsewhere/fit/gaussians.ply": "4"})
     (root / "runs/toy/linked").symlink_to(tmp_path / "elsewhere")
     assert words(root)["fit"] == "cached notes.txt added"
