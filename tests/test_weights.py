@@ -229,8 +229,8 @@ class Files(http.server.BaseHTTPRequestHandler):
         self.send_response(206 if first else 200)
         self.send_header("Content-Length", str(len(body) - first))
         self.end_headers()
+        self.sent.append(len(body) - first)  # before the client has it all, and goes on
         self.wfile.write(body[first:])
-        self.sent.append(len(body) - first)
 
     def log_message(self, *_):
         pass

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from scipy import ndimage, sparse
-from scipy.sparse.linalg import spsolve
+from scipy import ndimage
 
 from reffusion import geometry, seeding
 from reffusion.depth.behind import grown
 from reffusion.gaussians.surfels import surface_normals
+from reffusion.masks.borders import RIM, between
 from reffusion.masks.witness import SURFACE, Witness, seen_by, votes
 from reffusion.paint.margin import hull
 from reffusion.types import Camera
@@ -34,7 +34,6 @@ STAYS = 0.05  # weight of the plane as it was, within the hole, against what is 
 ACROSS = 0.9  # cosine of the angle between two planes under which they cross
 RATHER = 1.0  # cosine to a plane over that to another, from which a surface faces rather as the one does
 EVENED = 0.01  # of the image's width: the scale on which a surface's direction is taken
-RIM = 1  # cells on either side: what is seen in a thinner strip is blurred by the masks' margin
 TOUCHING = 0.25  # share of an unknown patch's border that must be seen for the plane to go on into it
 
 
@@ -213,28 +212,6 @@ def _hull(plane: Plane, seen: np.ndarray, grounds: Sequence[Plane]) -> np.ndarra
     return hull(large)
 
 
-def _between(unknown: np.ndarray, seen: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """[CELLS, CELLS] in [0, 1], on the unknown cells the harmonic function that is 1 where they meet seen cells and 0
-    where they meet free ones: at a half the borders that are visible go on through them, straight where they can."""
-    unknown = unknown | (ndimage.binary_dilation(unknown, iterations=2 * RIM + 1) & ~seen & ~free)
-    index = np.full(unknown.shape, -1)
-    index[unknown] = np.arange(unknown.sum())
-    centre, total = index[unknown], np.zeros(int(unknown.sum()))
-    right, links = np.zeros_like(total), []
-    for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
-        moved = lambda cells, axis=axis, step=step: np.roll(np.pad(cells, 1), step, axis)[1:-1, 1:-1][unknown]
-        next_seen, next_free = moved(seen), moved(free)
-        next_one = np.roll(np.pad(index, 1, constant_values=-1), step, axis)[1:-1, 1:-1][unknown]
-        linked = next_one >= 0
-        total += next_seen | next_free | linked
-        right += next_seen
-        links.append(sparse.coo_matrix((np.ones(linked.sum()), (centre[linked], next_one[linked])), (len(total),) * 2))
-    found = np.zeros(unknown.shape)
-    if right.any():
-        found[unknown] = spsolve((sparse.diags(total + 1e-9) - sum(links)).tocsc(), right)
-    return found
-
-
 def _mapped(
     normal: np.ndarray, height: float, centre: np.ndarray, reach: float, views: Sequence[Witness]
 ) -> tuple[Plane, np.ndarray]:
@@ -276,7 +253,7 @@ def _continued(
         inside = patches == patch
         border = ndimage.binary_dilation(inside, iterations=2) & ~inside
         if inside.sum() >= 4 and plane.seen[border].mean() > TOUCHING:
-            beyond = _between(inside, solid, plane.free) < 0.5
+            beyond = between(inside, solid, plane.free) < 0.5
             goes_on |= inside & ~beyond
             ends |= inside & beyond
     goes_on &= _hull(plane, solid if grounds else plane.seen, grounds)
