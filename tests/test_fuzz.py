@@ -302,7 +302,9 @@ def test_spoilt_files_for_long(name):
 
 
 # Reader -> files that once came through as another error, base64.
-FOUND: dict[str, tuple[str, ...]] = {}
+FOUND: dict[str, tuple[str, ...]] = {
+    "cameras.txt": (base64.b64encode(b"9" * 2000 + b" PINHOLE 0 9 9 9 6 4.5\n").decode(),),
+}
 
 
 @pytest.mark.parametrize(("name", "data"), [(name, data) for name, each in FOUND.items() for data in each])

@@ -10,13 +10,15 @@ from contextlib import contextmanager
 from pathlib import Path
 
 MOST_PIXELS = 200_000_000  # of a picture or depth map; what declares more is refused before memory is taken
+LONGEST_WORD = 400  # characters of a message without a blank
 
 
 class BadInput(ValueError):
     """What a person handed over is wrong: one line that names the file or key, and where it can what mends it."""
 
     def __init__(self, message: str):
-        super().__init__(" ".join(message.splitlines()))
+        # A number of two thousand digits is told by its beginning; a path is hardly ever so long.
+        super().__init__(" ".join(shortened(word, LONGEST_WORD) for word in " ".join(message.splitlines()).split(" ")))
 
 
 @contextmanager
