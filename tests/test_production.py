@@ -11,7 +11,9 @@ import pytest
 import torch
 
 from benchmarks.gpu import check as gpu_check
+from benchmarks.gpu import exact as gpu_exact
 from benchmarks.gpu import full_size as F
+from benchmarks.gpu import steps as gpu_steps
 from reffusion.prior import crops, denoising, diffusion, inpaint, lora, memory
 from reffusion.prior.model import load_prior, pipeline, recomputing, without_text
 from reffusion.prior.personalize import train_step
@@ -275,7 +277,7 @@ def test_gpu_check_keeps_what_it_has(tmp_path, monkeypatch):
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate\n 20.00 GiB")
 
     written, write = [], gpu_check.write
-    monkeypatch.setattr(gpu_check, "adversarial_term", full)
+    monkeypatch.setattr(gpu_steps, "adversarial_term", full)
     monkeypatch.setattr(gpu_check, "write", lambda path, text: written.append(text) or write(path, text))
     report = gpu_check.check("cpu", tmp_path)
     parts = report["parts"]
@@ -297,11 +299,11 @@ def test_gpu_check_keeps_what_it_has(tmp_path, monkeypatch):
 def test_gpu_check_finds_small_errors():
     truth = {"color": torch.rand(50, 40, 3), "gradient of means": torch.randn(90, 3)}
     flipped = {name: tensor.clone() for name, tensor in truth.items()}
-    assert gpu_check.compared(flipped, truth)["ok"]
+    assert gpu_exact.compared(flipped, truth)["ok"]
     wrong = flipped | {"color": truth["color"] * (1 + 3e-5)}
-    assert gpu_check.compared(wrong, truth)["beyond"] == "color"
+    assert gpu_exact.compared(wrong, truth)["beyond"] == "color"
     wrong = flipped | {"gradient of means": truth["gradient of means"] * 1.001}
-    assert gpu_check.compared(wrong, truth)["beyond"] == "gradient of means"
+    assert gpu_exact.compared(wrong, truth)["beyond"] == "gradient of means"
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")

@@ -1,0 +1,96 @@
+"""Where the parts of gpu-check work: sizes, scene, prior, and the clock."""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.gpu import full_size
+from reffusion.params.distill import Adversarial
+from reffusion.prior import memory
+from reffusion.prior.model import Prior, load_prior
+from reffusion.seeding import generator
+from reffusion.types import Gaussians
+from reffusion.weights import local, published
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Of what is measured: rows of a view (a quarter wider), Gaussians, samples, steps and views of the fit."""
+
+    rows: int
+    gaussians: int
+    batch: int
+    fit_steps: int
+    views: int
+    repeats: int
+    critic: Adversarial
+    shape: full_size.Shape
+    oracle: tuple[int, int] = (400, 200)  # Gaussians and width of what is compared with the oracle
+
+
+PAPER = Sizes(1280, 500_000, 16, 400, 12, 3, Adversarial(), full_size.SD2)  # 1600 x 1280 px
+TOY = Sizes(40, 300, 2, 4, 3, 1, Adversarial(patches=8, size=8, width=8), full_size.shrunk(full_size.SD2), (100, 70))
+
+
+@dataclass
+class Bench:
+    """Where the parts work, and the prior that the last of them left: two in a row may need the same.
+
+    Attributes:
+        device: "cuda" or "cpu". out: a folder for what a part writes.
+    """
+
+    sizes: Sizes
+    device: str
+    out: Path
+    _prior: tuple[str, Prior, str] | None = field(default=None, repr=False)
+
+    def prior(self, half: str) -> tuple[Prior, str]:
+        """Of that precision on a GPU, else float32; the published weights where they are here, else random ones."""
+        if self._prior is None or self._prior[0] != half:
+            self._prior = None
+            gc.collect()
+            dtype, shape = getattr(torch, half if self.device == "cuda" else "float32"), self.sizes.shape
+            if shape == full_size.SD2 and local.locate(published.SD2) is not None:
+                self._prior = half, load_prior(published.SD2, self.device, dtype), published.SD2
+            else:
+                self._prior = half, full_size.build(shape, dtype, self.device), "random"
+        return self._prior[1], self._prior[2]
+
+    def forget_prior(self) -> None:
+        self._prior = None
+
+    def scene(self) -> tuple[Gaussians, Tensor]:
+        """Gaussians that fill the view, and labels."""
+        made = full_size.gaussians(self.sizes.gaussians, self.device)
+        masked = torch.rand(len(made), generator=generator(0, "labels")) < 0.1
+        return made, masked.to(self.device)
+
+    def measured(self, work: Callable[[], dict[str, float] | None]) -> dict[str, Any]:
+        """Seconds (median, after a run to warm up), peak of the GPU (or of living tensors), what `work` says."""
+        said, seconds = work() or {}, []
+        for _ in range(self.sizes.repeats):
+            self._wait()
+            began = time.perf_counter()
+            work()
+            self._wait()
+            seconds.append(time.perf_counter() - began)
+        peak = memory.peak_bytes(work, self.device)
+        found = {"seconds": float(np.median(seconds)), "peak_gb": peak / 1e9}
+        if self.device == "cuda":
+            found["peak_gb"] += torch.cuda.memory_allocated() / 1e9
+            found["reserved_gb"] = torch.cuda.max_memory_reserved() / 1e9
+        return found | said
+
+    def _wait(self) -> None:
+        if self.device == "cuda":
+            torch.cuda.synchronize()

@@ -1,0 +1,175 @@
+"""One step of each loss at the paper's sizes, and a fit: seconds and memory."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.gpu import full_size
+from benchmarks.gpu.bench import PAPER, Bench, Sizes
+from reffusion import trace
+from reffusion.depth import monocular
+from reffusion.depth.behind import Completion, Seen
+from reffusion.distill.adversary import Adversary
+from reffusion.distill.confinement import adversarial_term, reconstruction_term, reference_term
+from reffusion.distill.depth_term import Estimator, by_network, depth_term
+from reffusion.fit.reconstruction import fit
+from reffusion.geometry import Degenerate
+from reffusion.params.distill import Depth, Sds
+from reffusion.params.fit import Densify, Params, SphericalHarmonics
+from reffusion.prior import crops, denoising, diffusion, memory
+from reffusion.prior.model import Prior, without_text
+from reffusion.prior.personalize import train_step
+from reffusion.seeding import generator
+from reffusion.splat import rasterizer
+from reffusion.types import PARAMETERS, Camera, Gaussians
+from reffusion.weights import local, published
+
+
+def term(scene: Gaussians, loss: Tensor) -> None:
+    """The way back, and nothing kept of it."""
+    loss.backward()
+    for name in PARAMETERS:
+        getattr(scene, name).grad = None
+
+
+def reconstruction(bench: Bench) -> dict[str, Any]:
+    (scene, masked), view = bench.scene(), full_size.train_view(bench.sizes.rows, bench.device)
+    return bench.measured(lambda: term(scene, reconstruction_term(scene, masked, view)[0]))
+
+
+def reference(bench: Bench) -> dict[str, Any]:
+    (scene, masked), view = bench.scene(), full_size.train_view(bench.sizes.rows, bench.device)
+    return bench.measured(lambda: term(scene, reference_term(scene, masked, view.camera, view.photo, view.repaint)[0]))
+
+
+def personalization(bench: Bench) -> dict[str, Any]:
+    """Steps of the paper's LoRA, as many samples at once as fit into 20 GB."""
+    prior, source = bench.prior("bfloat16")
+    picture = full_size.reference(prior.native_size)
+    trained, optimizer, training = full_size.trainer(prior, bench.sizes.batch)
+    prior = memory.fitted(prior, 20.0, "personalize.memory_gb", lambda p: denoising.one_sample(p, [picture], 0))
+    said = bench.measured(lambda: {"loss": train_step(prior, optimizer, [picture], training, 0)})
+    moved = sum(float(p.detach().abs().sum()) for p in trained["text"])
+    bench.forget_prior()  # it carries LoRA
+    return said | {"batch": bench.sizes.batch, "rows": prior.rows_graded, "lora_text": moved, "weights": source}
+
+
+def prompted(bench: Bench) -> tuple[Prior, Tensor, str]:
+    """The prior without its text encoder, the embedded prompts, and where the weights are from."""
+    prior, source = bench.prior("float16")
+    with torch.no_grad():
+        return without_text(prior), diffusion.embed_text(prior, list(crops.PROMPTS)), source
+
+
+def distillation(bench: Bench) -> dict[str, Any]:
+    prior, text, source = prompted(bench)
+    (scene, _), view = bench.scene(), full_size.train_view(bench.sizes.rows, bench.device)
+
+    def step() -> dict[str, float]:
+        said = full_size.sds_step(prior, text, view, scene, Sds())
+        for name in PARAMETERS:
+            getattr(scene, name).grad = None
+        return said
+
+    return bench.measured(step) | {"weights": source}
+
+
+def depth(bench: Bench) -> dict[str, Any]:
+    prior, text, source = prompted(bench)
+    (scene, masked), view = bench.scene(), full_size.train_view(bench.sizes.rows, bench.device)
+    estimator, whose = depth_estimator(bench.sizes, bench.device)
+
+    def step() -> dict[str, float]:
+        draw = generator(0, "depth")
+        loss, _ = depth_term(scene, masked, view, prior, text, Depth(), Sds().guidance, draw, estimator)
+        term(scene, loss)
+        return {"loss": float(loss.detach())}
+
+    return bench.measured(step) | {"weights": f"{source}, {whose}"}
+
+
+def adversarial(bench: Bench) -> dict[str, Any]:
+    bench.forget_prior()
+    (scene, masked), view = bench.scene(), full_size.train_view(bench.sizes.rows, bench.device)
+    critic = Adversary(bench.sizes.critic, 0, bench.device)
+
+    def step() -> dict[str, float]:
+        draw = generator(0, "patches")
+        loss, _, said = adversarial_term(scene, masked, view, view.photo, view.repaint, critic, draw)
+        term(scene, loss)
+        return said
+
+    return bench.measured(step)
+
+
+def depth_estimator(sizes: Sizes, device: str) -> tuple[Estimator, str]:
+    """Depth Anything V2 Small, published or with random weights, of which the sign that fits the scene is taken."""
+    from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
+
+    if sizes == PAPER and local.locate(published.DEPTH_ANYTHING) is not None:
+        network, source = monocular.load_network(published.DEPTH_ANYTHING, device), published.DEPTH_ANYTHING
+    else:
+        backbone = Dinov2Config(
+            hidden_size=384, num_hidden_layers=12, num_attention_heads=6, image_size=518 if sizes == PAPER else 56,
+            patch_size=14, out_features=["stage3", "stage6", "stage9", "stage12"], reshape_hidden_states=False,
+        )  # fmt: skip
+        torch.manual_seed(0)
+        model = DepthAnythingForDepthEstimation(DepthAnythingConfig(
+            backbone_config=backbone, reassemble_hidden_size=384, neck_hidden_sizes=[48, 96, 192, 384],
+            fusion_hidden_size=64, head_hidden_size=32, initializer_range=0.1,
+        ))  # fmt: skip
+        network, source = monocular.make_network(model, device), "random"
+    tries = [by_network(lambda image, sign=sign: sign * monocular.disparity(network, image), Completion())
+             for sign in (1, -1)]  # fmt: skip
+
+    def disparity(view: Seen, picture: Callable[[], np.ndarray]) -> np.ndarray:
+        painted = picture()
+        try:
+            return tries[0].disparity(view, lambda: painted)
+        except Degenerate:
+            return tries[1].disparity(view, lambda: painted)
+
+    return Estimator(tries[0].how, disparity), source
+
+
+def fitted_scene(bench: Bench) -> dict[str, Any]:
+    """A cloud of coloured Gaussians photographed by the splatting itself, fitted from blurred and shifted ones."""
+    sizes, device, out = bench.sizes, bench.device, bench.out
+    truth = full_size.gaussians(sizes.gaussians, device, degree=1).map(Tensor.detach)
+    cameras, images = [], {}
+    for k in range(sizes.views):
+        base, pose = full_size.train_view(sizes.rows, "cpu").camera, np.eye(4)
+        pose[0, 3] = 0.3 * (k / max(sizes.views - 1, 1) - 0.5)
+        camera = Camera(f"v{k}", base.width, base.height, base.fx, base.fy, base.cx, base.cy, pose)
+        with torch.no_grad():
+            color = rasterizer.render(truth, camera).color.clamp(0, 1)
+        cameras.append(camera)
+        images[camera.name] = (color * 255).round().to(torch.uint8).cpu().numpy()
+    noise = torch.randn(truth.means.shape, generator=generator(0, "start")).to(device)
+    start = truth.map(lambda p: p.clone())
+    start.means.add_(0.003 * noise)
+    start.sh.mul_(0.5)
+
+    def psnr(gaussians: Gaussians) -> float:
+        with torch.no_grad():
+            color = rasterizer.render(gaussians, cameras[0]).color.clamp(0, 1).cpu()
+        error = (color - torch.from_numpy(images[cameras[0].name]) / 255).square().mean()
+        return float(-10 * error.log10())
+
+    before = psnr(start)
+    densify, sh = Densify(stop=0.0, cap_max=2 * sizes.gaussians), SphericalHarmonics(degree=1)
+    settings = Params(iterations=sizes.fit_steps, sh=sh, densify=densify)
+    trace.clear_checkpoint(out)  # of a check that was stopped
+    began = time.perf_counter()
+    after = psnr(fit(cameras, images, start, settings, folder=out))
+    seconds = time.perf_counter() - began
+    trace.clear_checkpoint(out)
+    size = f"{cameras[0].width}x{cameras[0].height}"
+    rate = sizes.fit_steps / seconds
+    return {"size": size, "images_per_second": rate, "psnr_before": before, "psnr_after": after, "ok": after > before}
