@@ -49,16 +49,12 @@ def test_what_is_missing_is_named(tmp_path):
 
 
 def test_a_device_that_is_not_there_is_refused(tmp_path, monkeypatch):
-    import argparse
-
     import torch
 
     (tmp_path / "run/personalize").mkdir(parents=True)
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--run", type=lambda text: tmp_path / text)
-    device.add_arguments(parser)
+    parser = device.arguments("", "all stages", "adapted")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     for typed, message in ((["--device", "cuda"], "no CUDA device"), (["--dtype", "float16"], "for device=cuda")):
         with pytest.raises(ValueError, match=message):
-            device.before_and_after(parser.parse_args(["--run", "run", *typed]))
+            device.before_and_after(parser.parse_args(["--run", str(tmp_path / "run"), *typed]))
     assert device.peak_mb("cpu") > 10

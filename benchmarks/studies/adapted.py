@@ -9,8 +9,6 @@ Writes sheet.png, the pictures, each as <view>/<column>.png, and adapted.json to
 
 from __future__ import annotations
 
-import argparse
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +17,7 @@ import torch
 from benchmarks.studies import device
 from reffusion import seeding
 from reffusion.fit import exposure
-from reffusion.io.arrays import load_labels, save_json
+from reffusion.io.arrays import load_labels
 from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets, load_references, load_scene
@@ -100,23 +98,16 @@ def drawn(models: dict[str, Prior], run: Path, count: int, steps: int, out: Path
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--run", type=Path, required=True, help="runs/<scene>, with the stages up to personalize")
+    parser = device.arguments(__doc__, "the stages up to personalize", "adapted")
     parser.add_argument("--views", type=int, default=VIEWS)
     parser.add_argument("--steps", type=int, default=Sampler().steps, help="sampler steps from pure noise")
-    parser.add_argument("--out", type=Path, help="default: runs/<scene>/adapted")
-    device.add_arguments(parser)
     given = parser.parse_args()
     models, base = device.before_and_after(given)
     out = given.out or given.run / "adapted"
     views = drawn(models, given.run, given.views, given.steps, out)
-    facts = {"prior": base, "seed": SEED, "steps": given.steps, "views": views}
-    save_json(out / "adapted.json", facts | device.facts(given))
-    print(device.words(given), out / "sheet.png", sep="\n")
+    device.save(given, out, "adapted.json", {"prior": base, "seed": SEED, "steps": given.steps, "views": views})
+    print(out / "sheet.png")
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except ValueError as error:
-        sys.exit(f"error: {error}")
+    device.run(main)

@@ -4,22 +4,37 @@ from __future__ import annotations
 
 import argparse
 import resource
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from reffusion.io.arrays import load_json
+from reffusion.io.arrays import load_json, save_json
 from reffusion.prior import lora
 from reffusion.prior.model import Prior, load_prior
 
 DTYPES = ("float32", "float16", "bfloat16")
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def arguments(about: str, needs: str, folder: str) -> argparse.ArgumentParser:
+    """What such studies are told. `about`: the help; `needs`: of the run; `folder`: where the results go in it."""
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--run", type=Path, required=True, help=f"runs/<scene>, with {needs}")
+    parser.add_argument("--out", type=Path, help=f"default: runs/<scene>/{folder}")
     parser.add_argument("--prior", help="the one that was personalized; default: as personalize's receipt names it")
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
     parser.add_argument("--dtype", choices=DTYPES, default="float32", help="of the UNet and the text encoder")
+    return parser
+
+
+def run(study: Callable[[], None]) -> None:
+    """A study as a command: what is wrong is one line."""
+    try:
+        study()
+    except ValueError as error:
+        sys.exit(f"error: {error}")
 
 
 def before_and_after(given: argparse.Namespace) -> tuple[dict[str, Prior], str]:
@@ -45,10 +60,8 @@ def peak_mb(device: str) -> int:
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6)
 
 
-def facts(given: argparse.Namespace) -> dict[str, Any]:
-    """What a study's file says of it."""
-    return {"device": given.device, "dtype": given.dtype, "peak_mb": peak_mb(given.device)}
-
-
-def words(given: argparse.Namespace) -> str:
-    return f"on {given.device} in {given.dtype}, both priors loaded: at most {peak_mb(given.device):,} MB"
+def save(given: argparse.Namespace, folder: Path, name: str, found: dict[str, Any]) -> None:
+    """The study's file, with what it ran on, which is printed too."""
+    peak = peak_mb(given.device)
+    save_json(folder / name, found | {"device": given.device, "dtype": given.dtype, "peak_mb": peak})
+    print(f"on {given.device} in {given.dtype}, both priors loaded: at most {peak:,} MB")

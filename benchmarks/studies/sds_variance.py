@@ -17,8 +17,6 @@ sds_variance.json to --out.
 
 from __future__ import annotations
 
-import argparse
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +25,6 @@ from torch import Tensor
 
 from benchmarks.studies import device
 from reffusion import seeding
-from reffusion.io.arrays import save_json
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets, load_scene
 from reffusion.prior import diffusion, windows
@@ -134,22 +131,14 @@ def _pair(before: float, after: float) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--run", type=Path, required=True, help="runs/<scene>, with initialize and personalize")
-    parser.add_argument("--out", type=Path, help="default: runs/<scene>/sds-variance")
-    device.add_arguments(parser)
-    given = parser.parse_args()
+    given = device.arguments(__doc__, "initialize and personalize", "sds-variance").parse_args()
     models, base = device.before_and_after(given)
     found, out = measured(models, given.run), given.out or given.run / "sds-variance"
     out.mkdir(parents=True, exist_ok=True)
-    facts = {"prior": base, "timesteps": TIMESTEPS, **device.facts(given)}
-    save_json(out / "sds_variance.json", facts | found)
     print(table(found))
-    print(device.words(given), out / "sds_variance.json", sep="\n")
+    device.save(given, out, "sds_variance.json", {"prior": base, "timesteps": TIMESTEPS} | found)
+    print(out / "sds_variance.json")
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except ValueError as error:
-        sys.exit(f"error: {error}")
+    device.run(main)

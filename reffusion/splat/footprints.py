@@ -211,19 +211,19 @@ def draw_backward(
             empty.
     """
     basis, along = np.zeros(16 * LANES, np.float32), np.zeros(16 * LANES, np.float32)
-    coefficients, used = np.zeros(width * LANES, np.float32), 3 * (degree + 1) * (degree + 1)
+    coefficients = np.zeros(width * LANES, np.float32)
     sums, moments = np.zeros(LANES * columns, np.float32), np.zeros(columns * LANES, np.float32)
-    last, zero = opacity_logits.shape[0] - 1, splat(0.0)
+    last = opacity_logits.shape[0] - 1
     while True:
         begin, end = next_part(tickets, radii.shape[0] // LANES)
         if begin < 0:
             return
         for row in range(begin * LANES, end * LANES, LANES):
             add_records(records, written, first_slots, columns, row, sums)
-            seen = load_mask(radii, row)
             for lane in range(LANES):
                 for c in range(grad_features.shape[1]):
                     grad_features[row + lane, c] = sums[lane * columns + GRAD_FEATURES + c]
+            seen = load_mask(radii, row)
             if not some(seen):
                 _store_zeros(grad_probe, 2 if grad_probe.shape[0] > 0 else 0, row)
                 _store_zeros(grad_means, 3, row)
@@ -232,36 +232,56 @@ def draw_backward(
                 _store_zeros(grad_opacities, 1, row)
                 _store_zeros(grad_sh, width, row)
                 continue
-            mean = projection.three_columns(means, row, last)
-            x, y, z, inverse = harmonics.direction(mean, center)
-            x, y, z = select(seen, x, zero), select(seen, y, zero), select(seen, z, zero)
-            harmonics.fill_basis(degree, x, y, z, basis)
             _read_rows(sums, columns, 0, LANES - 1, moments)
-            red = _color_gradient(moments, GRAD_RED, footprints, RED, seen, row)
-            green = _color_gradient(moments, GRAD_GREEN, footprints, GREEN, seen, row)
-            blue = _color_gradient(moments, GRAD_BLUE, footprints, BLUE, seen, row)
+            mean = projection.three_columns(means, row, last)
             _read_rows(sh, width, row, last, coefficients)
-            harmonics.colors_backward(degree, basis, coefficients, red, green, blue, along)
-            coefficients[used * LANES :] = np.float32(0.0)
+            # The direction's way, from the colours to the mean.
+            x, y, z = _colors_backward(degree, mean, center, seen, moments, footprints, row, basis, along, coefficients)
             _write_rows(grad_sh, width, row, coefficients)
-            through_x, through_y, through_z = harmonics.direction_backward(degree, x, y, z, inverse, along)
             to_mean, to_quaternion, to_scales, to_logit, to_probe = projection.project_backward(
                 view, mean, quaternions, log_scales, opacity_logits, row, last, moments
             )
-            store_column(grad_means, 3, 0, row, select(seen, narrow(to_mean[0]) + through_x, zero))
-            store_column(grad_means, 3, 1, row, select(seen, narrow(to_mean[1]) + through_y, zero))
-            store_column(grad_means, 3, 2, row, select(seen, narrow(to_mean[2]) + through_z, zero))
-            store_column(grad_quaternions, 4, 0, row, select(seen, narrow(to_quaternion[0]), zero))
-            store_column(grad_quaternions, 4, 1, row, select(seen, narrow(to_quaternion[1]), zero))
-            store_column(grad_quaternions, 4, 2, row, select(seen, narrow(to_quaternion[2]), zero))
-            store_column(grad_quaternions, 4, 3, row, select(seen, narrow(to_quaternion[3]), zero))
-            store_column(grad_scales, 3, 0, row, select(seen, narrow(to_scales[0]), zero))
-            store_column(grad_scales, 3, 1, row, select(seen, narrow(to_scales[1]), zero))
-            store_column(grad_scales, 3, 2, row, select(seen, narrow(to_scales[2]), zero))
-            store_column(grad_opacities, 1, 0, row, select(seen, narrow(to_logit), zero))
+            _store_three(
+                grad_means, 3, row, seen, narrow(to_mean[0]) + x, narrow(to_mean[1]) + y, narrow(to_mean[2]) + z
+            )
+            w, i, j, k = to_quaternion
+            _store_three(grad_quaternions, 4, row, seen, narrow(w), narrow(i), narrow(j))
+            _store_one(grad_quaternions, 4, 3, row, seen, narrow(k))
+            _store_three(grad_scales, 3, row, seen, narrow(to_scales[0]), narrow(to_scales[1]), narrow(to_scales[2]))
+            _store_one(grad_opacities, 1, 0, row, seen, narrow(to_logit))
             if grad_probe.shape[0] > 0:
-                store_column(grad_probe, 2, 0, row, select(seen, narrow(to_probe[0]), zero))
-                store_column(grad_probe, 2, 1, row, select(seen, narrow(to_probe[1]), zero))
+                _store_one(grad_probe, 2, 0, row, seen, narrow(to_probe[0]))
+                _store_one(grad_probe, 2, 1, row, seen, narrow(to_probe[1]))
+
+
+@inlined
+def _colors_backward(degree, mean, center, seen, moments, footprints, row, basis, along, coefficients):
+    """From the gradients of the colours to those of the harmonics, in the place of their coefficients, and of the mean.
+    `basis`, `along`: room to work in."""
+    x, y, z, inverse = harmonics.direction(mean, center)
+    zero, used = splat(0.0), 3 * (degree + 1) * (degree + 1)
+    x, y, z = select(seen, x, zero), select(seen, y, zero), select(seen, z, zero)
+    harmonics.fill_basis(degree, x, y, z, basis)
+    red = _color_gradient(moments, GRAD_RED, footprints, RED, seen, row)
+    green = _color_gradient(moments, GRAD_GREEN, footprints, GREEN, seen, row)
+    blue = _color_gradient(moments, GRAD_BLUE, footprints, BLUE, seen, row)
+    harmonics.colors_backward(degree, basis, coefficients, red, green, blue, along)
+    coefficients[used * LANES :] = np.float32(0.0)
+    return harmonics.direction_backward(degree, x, y, z, inverse, along)
+
+
+@inlined
+def _store_one(array, width, column, row, seen, value):
+    """A column of LANES rows; 0 for what was not seen."""
+    store_column(array, width, column, row, select(seen, value, splat(0.0)))
+
+
+@inlined
+def _store_three(array, width, row, seen, first, second, third):
+    """The first three columns likewise."""
+    _store_one(array, width, 0, row, seen, first)
+    _store_one(array, width, 1, row, seen, second)
+    _store_one(array, width, 2, row, seen, third)
 
 
 @inlined
