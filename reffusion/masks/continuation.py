@@ -117,13 +117,14 @@ def planes_around(centre: np.ndarray, radius: float, views: Sequence[Witness], s
     away = [np.linalg.norm(view.camera.center - centre) for view in views]
     band = max(1.5 * near, SURFACE * float(np.median(away))) if found else 0.0
     mapped = [_mapped(*plane, centre, REACH * radius, views) for plane in found]
-    facings = [_facing(view) for view in views] if len(found) > 1 else []
+    planes = [plane for plane, _ in mapped]
+    grounds = [_crossing(plane, planes[:k]) for k, plane in enumerate(planes)]
+    facings = [_facing(view) for view in views] if any(grounds) else []
     whole = []
-    for k, (plane, hidden) in enumerate(mapped):
-        better = _crossing(plane, [other for other, _ in mapped[:k]])
-        if better:  # what may be the one or the other is the better supported one's, unless it faces as this one does
-            plane = replace(plane, seen=plane.seen & _faces_so(plane, better, views, facings))
-        whole.append(_continued(plane, hidden, better, _crossing(plane, [other for other, _ in mapped]), band))
+    for (plane, hidden), below in zip(mapped, grounds, strict=True):
+        if below:  # what may be the one or the other is the better supported one's, unless it faces as this one does
+            plane = replace(plane, seen=plane.seen & _faces_so(plane, below, views, facings))
+        whole.append(_continued(plane, hidden, below, _crossing(plane, planes), band))
     return whole
 
 
@@ -197,10 +198,8 @@ def _best_plane(points: np.ndarray, near: float, draws: np.random.Generator) -> 
 
 def _hull(plane: Plane, seen: np.ndarray, grounds: Sequence[Plane]) -> np.ndarray:
     """bool [CELLS, CELLS], the convex hull of the large patches of seen cells: a surface ends where the prolongations
-    of its visible borders do. What stands on one of the grounds, planes that it crosses,
-    goes on down to it."""
-    solid = cv2.morphologyEx(seen.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    patches, count = ndimage.label(solid)
+    of its visible borders do. What stands on one of the grounds, planes that it crosses, goes on down to it."""
+    patches, count = ndimage.label(_solid(seen))
     areas = np.bincount(patches.ravel(), minlength=count + 1)
     areas[0] = 0
     large = (areas >= LARGE * max(areas.max(), 1))[patches]
@@ -210,6 +209,11 @@ def _hull(plane: Plane, seen: np.ndarray, grounds: Sequence[Plane]) -> np.ndarra
         feet = standing + ((other.height - standing @ other.normal) / (down @ down))[:, None] * down
         large[tuple(plane.cell_of(feet).clip(0, CELLS - 1).T)] = True
     return hull(large)
+
+
+def _solid(seen: np.ndarray) -> np.ndarray:
+    """bool [CELLS, CELLS]: seen cells without thin rims."""
+    return cv2.morphologyEx(seen.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2 * RIM + 1,) * 2, np.uint8)) > 0
 
 
 def _mapped(
@@ -245,7 +249,6 @@ def _continued(
     own = plane.seen.copy()
     for other in others:
         own &= np.abs(plane.cells @ other.normal - other.height) >= band
-    solid = cv2.morphologyEx(own.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2 * RIM + 1,) * 2, np.uint8)) > 0
     unknown = ~plane.seen & ~plane.free & hidden
     patches, count = ndimage.label(unknown)
     goes_on, ends = np.zeros((2, *hidden.shape), bool)
@@ -253,10 +256,10 @@ def _continued(
         inside = patches == patch
         border = ndimage.binary_dilation(inside, iterations=2) & ~inside
         if inside.sum() >= 4 and plane.seen[border].mean() > TOUCHING:
-            beyond = between(inside, solid, plane.free) < 0.5
+            beyond = between(inside, _solid(own), plane.free) < 0.5
             goes_on |= inside & ~beyond
             ends |= inside & beyond
-    goes_on &= _hull(plane, solid if grounds else plane.seen, grounds)
+    goes_on &= _hull(plane, own if grounds else plane.seen, grounds)
     within = goes_on | (ndimage.binary_fill_holes(plane.seen | goes_on) & ~plane.seen & ~ends & hidden)
     return replace(plane, goes_on=goes_on, within=within)
 
