@@ -198,11 +198,11 @@ def test_too_small_a_share_is_an_error_and_writes_nothing(generate, tmp_path):
 
 
 def test_insertion_and_outpainting_are_asked_for_by_scene_files(generate, tmp_path):
-    """The reference, and it alone of the training views, shows the object; a sphere's disc is what outpainting keeps."""
-    small = {"width": 64, "height": 48, "samples": 1, "train": 8, "test": 3, "texture": 256, "node": 0.4, "points": 60}
+    """The reference alone of the training views shows the object; outpainting keeps the disc of a sphere."""
+    stamp = {"width": 64, "height": 48, "samples": 1, "train": 8, "test": 3, "texture": 256}
     said = {}
     for name in ("insert", "outpaint"):
-        generate.generate(tmp_path / name, 0, replace(generate.KINDS[name], **small))
+        generate.generate(tmp_path / name, 0, replace(generate.KINDS[name], **stamp, node=0.4))
         said[name] = yaml.safe_load((tmp_path / name / "scene.yaml").read_text())
     folder, reference = tmp_path / "insert", said["insert"]["reference"]
     photo, picture = load_image(folder / f"images_4/{reference['view']}.png"), load_image(folder / reference["image"])

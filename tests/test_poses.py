@@ -351,7 +351,8 @@ def test_a_sphere_on_an_optical_axis_is_filled_or_masks_what_lies_beyond(tmp_pat
     assert region["round"] and not region["holds"]
     np.testing.assert_allclose(camera.world_to_camera[:3, :3] @ (region["center"] - camera.center), [0, 0, 4 * scale],
                                atol=1e-9)  # fmt: skip
-    _, out = run(folder, masks="none", region={**sphere, "outside": True})
+    folder = prepare(tmp_path / "t", "transforms", some_truth(scale=5.0, offset=(50.0, 0.0, 0.0)))
+    scene, out = run(folder, masks="none", region={**sphere, "outside": True})
     masks = load_raw_masks(out, scene.train)
     assert set(masks) == set(scene.train) and not (out / "region.json").exists()
     row, column = int(camera.cy), int(camera.cx)
