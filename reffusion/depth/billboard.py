@@ -60,7 +60,7 @@ def _upright(sight: np.ndarray, normal: np.ndarray) -> np.ndarray:
 
 def _profile(piece: np.ndarray) -> np.ndarray:
     """[H, W] in [0, 1]: 0 at the outline, 1 in the middle, round between."""
-    inward = ndimage.distance_transform_edt(np.pad(piece, 1))[1:-1, 1:-1]
+    inward = np.maximum(ndimage.distance_transform_edt(np.pad(piece, 1))[1:-1, 1:-1] - 1, 0)
     share = inward / max(inward.max(), 1.0)
     return np.sqrt(1 - (1 - share) ** 2)
 
