@@ -177,7 +177,7 @@ def without_shadows(out: Path, true: list, gaussians, around):
         name = each.camera.name
         hidden = around.hidden[name]
         shown = inpaint.background(gaussians, each.camera, photos[name], hidden)
-        found = taint.tainted(each.image, shown, hidden)
+        found = taint.tainted(each.image, shown, hidden) & (hidden | ~each.mask)  # what is drawn there is no shadow
         pictures.append(replace(each, mask=each.mask | found))
         if not found.any():
             continue
