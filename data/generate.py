@@ -10,6 +10,8 @@ A furnished room is ray-cast with and without one object. Kinds:
   table   an object on the edge of a table, free space under it, some cameras low enough to look there
   corner  an object before the corner of a wall that juts out: behind it the depth has a step
   grass   an object on a lawn before a hedge: thousands of blades and leaves, nothing flat
+  insert  the same turned round: an object on the floor, in the test views and the reference only; it is to be put in
+  outpaint  the room as photographed, and a sphere beyond which it is to be continued from three references
   photos  26 larger photographs and masks without poses, for structure from motion
 
 Poses are written in a scene frame of arbitrary scale, rotation and origin, as SfM leaves it. As in SPIn-NeRF the
@@ -23,16 +25,20 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from files import write_image, write_model, write_poses_bounds, write_truth_cameras
 from kinds import KINDS, Kind
 from photographs import Session, corner_shift, photographed
-from reconstruction import scene_frame, sparse_points
+from reconstruction import Frame, scene_frame, sparse_points
 from room import furnish
-from world import bake
+from tasks import SPHERE, bare, beyond, depth, on_axis, outermost, region_around
+from world import World, bake
 
+AWAY = 2.5  # metres from the middle camera to the sphere's centre, about where the views look
 MOST_NEVER_SEEN = 0.005  # of the masks, where the object hangs: crannies behind furniture
 PROFILE = "profile: laptop # small pictures, made for it; `make profile=paper` has precedence\n"
 
@@ -82,8 +88,12 @@ def _write_scene(out: Path, seed: int, kind: Kind) -> dict:
     if kind.photos:
         _write_photos(out, session)
         return facts
-    _write_pictures(out, session, kind)
-    points = sparse_points(seed, kind, world, session.cameras[kind.test :], session.photos[kind.test :])
+    _write_pictures(out, session)
+    {"remove": _ask_removal, "insert": _ask_insertion, "outpaint": _ask_outpainting}[kind.task](
+        out, session, kind, world, frame
+    )
+    captured = replace(world, solids=bare(world.solids)) if kind.task == "insert" else world
+    points = sparse_points(seed, kind, captured, session.cameras[kind.test :], session.photos[kind.test :])
     write_model(out / "sparse/0", kind, session.names, session.cameras, frame, points)
     write_poses_bounds(out / "poses_bounds.npy", kind, session.cameras, frame, points)
     return facts
@@ -110,22 +120,57 @@ def _write_photos(out: Path, session: Session) -> None:
         write_image(out / f"masks/{name}.png", mask * np.uint8(255))
 
 
-def _write_pictures(out: Path, session: Session, kind: Kind) -> None:
-    """Photographs, masks, scene.yaml, and where there is something to invent the reference, in SPIn-NeRF's layout."""
-    for k, name in enumerate(session.names):
-        mask = session.masks[k]
-        write_image(out / f"images_4/{name}.png", session.photos[k])
-        write_image(out / f"truth/never_seen/{name}.png", session.hidden[k] * np.uint8(255))
-        if k < session.test:
-            write_image(out / f"images_4/test_label/out_{k:05d}.png", mask * np.uint8(255))
-            write_image(out / f"truth/masks_test/{name}.png", mask * np.uint8(255))
-        else:
+def _write_pictures(out: Path, session: Session) -> None:
+    """Photographs, in SPIn-NeRF's layout."""
+    for name, photo in zip(session.names, session.photos, strict=True):
+        write_image(out / f"images_4/{name}.png", photo)
+
+
+def _write_test_masks(out: Path, session: Session, masks: Sequence[np.ndarray]) -> None:
+    for k, mask in enumerate(masks):
+        write_image(out / f"images_4/test_label/out_{k:05d}.png", mask * np.uint8(255))
+        write_image(out / f"truth/masks_test/{session.names[k]}.png", mask * np.uint8(255))
+
+
+def _ask_removal(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
+    """Masks of the object, and where there is something to invent the reference."""
+    _write_test_masks(out, session, session.masks[: session.test])
+    for name, mask, hidden in zip(session.names, session.masks, session.hidden, strict=True):
+        write_image(out / f"truth/never_seen/{name}.png", hidden * np.uint8(255))
+        if name in session.names[session.test :]:
             write_image(out / f"images_4/label/{name}.png", mask * np.uint8(1))
     brought = ""
     if not kind.hangs:
         write_image(out / "reference.png", session.completed)
         brought = f"reference: {{view: {session.names[session.middle]}, image: reference.png}}\n"
     (out / "scene.yaml").write_text(brought + PROFILE)
+
+
+def _ask_insertion(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
+    """A reference that shows the object, its depth map, and a sphere in which it stands."""
+    _write_test_masks(out, session, session.masks[: session.test])
+    write_image(out / "reference.png", session.completed)
+    np.save(out / "reference.npy", depth(session.cameras[session.middle], kind, world, frame))
+    center, radius = region_around(world.solids)
+    region = {"center": frame.points(center).tolist(), "radius": frame.scale * radius}
+    reference = f"{{view: {session.names[session.middle]}, image: reference.png, depth: reference.npy}}"
+    (out / "scene.yaml").write_text(f"masks: none\nregion: {json.dumps(region)}\nreference: {reference}\n{PROFILE}")
+
+
+def _ask_outpainting(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
+    """A sphere on the middle view's optical axis, and whole pictures of three views with their depth."""
+    center = on_axis(session.cameras[session.middle], AWAY)
+    masks = [beyond(camera, kind, world, center, SPHERE) for camera in session.cameras[: session.test]]
+    _write_test_masks(out, session, masks)
+    lines = []
+    for k in sorted({session.middle, *(kind.test + each for each in outermost(session.cameras[kind.test :]))}):
+        name = session.names[k]
+        write_image(out / f"references/{name}.png", session.photos[k])
+        np.save(out / f"references/{name}.npy", depth(session.cameras[k], kind, world, frame))
+        lines.append(f"  - {{view: {name}, image: references/{name}.png, depth: references/{name}.npy}}\n")
+    sphere = {"view": session.names[session.middle], "distance": frame.scale * AWAY}
+    sphere |= {"radius": frame.scale * SPHERE, "outside": True}
+    (out / "scene.yaml").write_text(f"masks: none\nregion: {json.dumps(sphere)}\nreference:\n{''.join(lines)}{PROFILE}")
 
 
 def main() -> None:

@@ -22,7 +22,9 @@ class Kind:
         bend: SIMPLE_RADIAL's k1 at its largest; points: sparse points wanted.
         hangs: the object hangs in mid-air, so that other views show all that it hides.
         place: where the object is: "room", "behind" (a kept thing before it), "table" (on the edge of one), "corner"
-            (before the corner of a wall) or "grass".
+            (before the corner of a wall), "grass" or "floor".
+        task: what the scene asks for: "remove" the object; "insert" it: the training views are without it, the test
+            views and the reference with it; "outpaint" what lies beyond a sphere, nothing else is changed.
         least: share of the masks that no training view may show, at least.
         low: metres above the floor of the lowest cameras; None: all at the height of a person's eyes.
     """
@@ -40,6 +42,7 @@ class Kind:
     points: int = 3000
     hangs: bool = False
     place: str = "room"
+    task: str = "remove"
     least: float = 0.4
     low: float | None = None
 
@@ -59,6 +62,8 @@ KINDS = {
     "table": Kind(spread=34.0, place="table", least=0.05, low=0.45),
     "corner": Kind(spread=30.0, place="corner", least=0.25),
     "grass": Kind(samples=2, spread=30.0, node=0.08, place="grass"),
+    "insert": Kind(place="floor", task="insert", least=0),
+    "outpaint": Kind(spread=16.0, task="outpaint", least=0),
     "photos": Kind(width=480, height=360, train=26, test=0, photos=True, texture=2048, node=0.025),
 }
 

@@ -12,7 +12,7 @@ from world import World
 
 @dataclass(frozen=True)
 class Session:
-    """V photographs, those of test views first and without the object.
+    """V photographs, those of test views first and without the object (`shows_object`).
 
     Attributes:
         names: of the views; cameras: [V, 16]; test: how many are test views.
@@ -38,12 +38,17 @@ def photographed(seed: int, kind: Kind, world: World, target: np.ndarray) -> Ses
     names = [f"IMG_{k + 2000:04d}" for k in range(len(cameras))]
     middle = kind.test + _middle(train, kind)
     world = exposed(world, cameras[middle], kind)
-    shots = [shoot(world, camera, kind, k >= kind.test) for k, camera in enumerate(cameras)]
+    shots = [shoot(world, camera, kind, shows_object(kind, k)) for k, camera in enumerate(cameras)]
     photos, masks = (np.stack(pictures) for pictures in zip(*shots, strict=True))
     in_training = train, masks[kind.test :]
     hidden = [never_seen(world, camera, mask, *in_training) for camera, mask in zip(cameras, masks, strict=True)]
-    completed, _ = shoot(world, cameras[middle], kind, False)
+    completed, _ = shoot(world, cameras[middle], kind, kind.task == "insert")
     return Session(names, cameras, kind.test, photos, masks, np.stack(hidden), middle, completed)
+
+
+def shows_object(kind: Kind, k: int) -> bool:
+    """Does the photograph of view k show the object?"""
+    return (k >= kind.test) != (kind.task == "insert") or kind.task == "outpaint"
 
 
 def path(seed: int, kind: Kind, target: np.ndarray, count: int, label: str) -> np.ndarray:

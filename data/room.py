@@ -4,7 +4,7 @@ removal is harder than against a wall see `places.py`."""
 from __future__ import annotations
 
 import numpy as np
-from furniture import WHITE, WOOD, Furniture, Material, cabinet, daybed, keepsake, lantern, plant, shelf
+from furniture import WHITE, WOOD, Furniture, Material, cabinet, chest, daybed, keepsake, lantern, plant, shelf
 from kinds import Kind, randomness
 from places import PLAIN, RUG, WALL, garden, shell, table_room, wall_corner
 
@@ -22,7 +22,9 @@ def furnish(seed: int, kind: Kind) -> tuple[Furniture, np.ndarray]:
     # The corner stands clear of the outermost camera.
     corner = 1.45 + max(0.0, 2.6 * np.sin(np.radians(kind.spread)) - 0.97)
     shell(f, draw, planks, side, corner)
-    if kind.hangs:
+    if kind.place == "floor":
+        chest(f, draw, draw.uniform(-0.1, 0.1), 0.0, draw.uniform(0.85, 0.95))
+    elif kind.hangs:
         lantern(f, draw, 0.0, 1.15)
     else:
         _cabinet(f, draw, flat=kind.spread > 30)

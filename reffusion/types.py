@@ -168,7 +168,7 @@ class MaskSet:
         raw: the given 2D mask (all False where none was given).
         consistent: C, rendered back from the labelled Gaussians; it must not supervise.
         undecided: U, inside C: no other photograph shows what is to be seen there.
-        invent: I, the pixels to be made up: U, or the region the scene asks to fill.
+        invent: I, the pixels to be made up: U, and the region the scene asks to fill.
     """
 
     raw: np.ndarray

@@ -112,9 +112,10 @@ def train_views(
     views = []
     for name in scene.train:
         clean, pixels = name in scene.clean, sets[name]
-        repaint = (pixels.invent if params.repaint == "invent" else pixels.consistent) & (not clean)
+        drawn = pixels.consistent | pixels.invent  # a region that is filled is part of the paper's m
+        repaint = (pixels.invent if params.repaint == "invent" else drawn) & (not clean)
         # C shows the object; I, where it reaches beyond C, the place of one that is to be drawn there.
-        supervises = ~(pixels.consistent | pixels.invent) | clean
+        supervises = ~drawn | clean
         if tainted and (tainted / f"{name}.png").exists():
             supervises &= ~load_mask(tainted / f"{name}.png")
         lifted = place(painted[name]) / 255 if name in painted else None

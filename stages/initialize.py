@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from reffusion import seeding, trace
-from reffusion.depth import behind, monocular
+from reffusion.depth import behind, billboard, monocular
 from reffusion.depth.behind import Completion
 from reffusion.fit import exposure
 from reffusion.initialize import coverage, filling, scatter
@@ -109,7 +109,8 @@ def at_random(params: Params, removed, remaining, scene, sets, poses: Path):
     """Gaussians at random in the region of the hole: that of the removed ones, or the box that the scene names."""
     region, train = poses / "region.json", [scene.cameras[name] for name in scene.train]
     if region.exists():
-        box = scatter.box_around(**load_json(region))
+        told = load_json(region)
+        box = scatter.box_around(told["center"], told["size"])
     elif len(removed):
         box = scatter.box_of(removed.means.double().cpu().numpy())
     else:
@@ -136,6 +137,14 @@ def filled(params: Params, out: Path, gaussians, new, reference, around, network
     depth, made_up, said = filling.depth_behind(
         remaining, reference, hole, hidden, around.points, HOW, estimate, log, hints, farthest
     )
+    # Drawn over what stays and is seen, it stands before it.
+    drawn_over = hole & reference.mask & ~hidden
+    if reference.depth is None and estimate is None and drawn_over.any():
+        shown = rasterizer.render(remaining, camera, sh_degree=0).depth.double().cpu().numpy()
+        behind_it = np.where(shown > 0, shown, depth)
+        stands = billboard.standing(drawn_over, behind_it, camera)
+        depth, made_up = (np.where(drawn_over, stands, each) for each in (depth, made_up))
+        said = f"{said}; a billboard, good within {billboard.GOOD_WITHIN} degrees, stands where the scene goes on"
     print(f"depth of reference {camera.name}: {said}")
     save_exr(out / "depth" / f"{camera.name}.exr", depth.astype("float32"))
     pixels = behind.grown(hole, OVERLAP)
@@ -168,7 +177,7 @@ def without_shadows(out: Path, true: list, gaussians, around):
         name = each.camera.name
         hidden = around.hidden[name]
         shown = inpaint.background(gaussians, each.camera, photos[name], hidden)
-        found = taint.tainted(each.image, shown, hidden)
+        found = taint.tainted(each.image, shown, hidden) & (hidden | ~each.mask)  # what is drawn there is no shadow
         pictures.append(replace(each, mask=each.mask | found))
         if not found.any():
             continue

@@ -16,8 +16,9 @@ from reffusion.fit import exposure
 from reffusion.io.arrays import load_json, save_json, save_labels
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_raw_masks, load_scene, save_mask_sets
-from reffusion.masks import undecided, voting, witness
+from reffusion.masks import regions, undecided, voting, witness
 from reffusion.masks.continuation import Plane, planes_around
+from reffusion.masks.regions import Region
 from reffusion.masks.voting import Votes, extent
 from reffusion.masks.witness import Witness
 from reffusion.params.masks import Params
@@ -31,7 +32,7 @@ SEED = 0  # of the draws that find planes
 def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
     scene, gaussians = load_scene(poses), load_ply(fit / "gaussians.ply").map(lambda p: p.to(params.device))
     train = [scene.cameras[name] for name in scene.train]
-    region = load_json(poses / "region.json") if (poses / "region.json").exists() else None
+    region = Region(**load_json(poses / "region.json")) if (poses / "region.json").exists() else None
     raw = load_raw_masks(poses, scene.train)
     empty = {name: np.zeros((camera.height, camera.width), bool) for name, camera in scene.cameras.items()}
     ballots = raw | {name: empty[name] for name in scene.clean}
@@ -45,7 +46,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
     if raw:
         labels = voted(params, gaussians, train, ballots, seen)
     else:
-        labels = voting.inside_box(gaussians, region["center"], region["size"])
+        labels = regions.inside(gaussians, region) & region.holds
     consistent = drawn(params, gaussians, labels, scene.cameras)
     # What stands where (almost) every view sees the object can only be the object, whatever it was painted with.
     labels |= voting.hidden_inside(
@@ -58,7 +59,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
         debris = witness.debris(gaussians, labels, views, hidden, exposure.load_views(poses, fit, scene.train))
         save_labels(out / "debris.npy", debris.cpu())
         labels |= debris
-    fill = region if params.invent in ("region", "auto") else None
+    fill = None if params.invent == "undecided" else region
     sets = classified(params, scene, gaussians.map(lambda p: p[~labels]), raw, consistent, views, planes, fill)
     undecided = share_undecided(sets, scene.train)
     if params.invent != "consistent" and fill is None and undecided <= params.negligible:
@@ -105,7 +106,7 @@ def classified(
     consistent: dict[str, np.ndarray],
     views: list[Witness],
     planes: list[Plane],
-    fill: dict | None,
+    fill: Region | None,
 ) -> dict[str, MaskSet]:
     """The masks of each view: what other views show behind the object is decided, and is not invented.
 
@@ -119,7 +120,7 @@ def classified(
         invent = consistent[name] & (name not in scene.clean) if params.invent == "consistent" else unknown
         if fill is not None:
             disparity = geometry.reciprocal(found.depth)
-            invent = voting.box_silhouette(**fill, camera=camera, disparity=disparity)
+            invent = invent | regions.silhouette(fill, camera, disparity)
         sets[name] = MaskSet(raw.get(name, np.zeros_like(unknown)), consistent[name], unknown, invent)
     return sets
 

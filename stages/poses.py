@@ -16,14 +16,16 @@ from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.lenses import save_lenses
 from reffusion.capture.reading import read_scene
 from reffusion.capture.refine import refined
-from reffusion.capture.roles import Roles
+from reffusion.capture.roles import NONE, Roles
 from reffusion.capture.undistorted import check_masks, load_at, save_undistorted
+from reffusion.capture.views import known
 from reffusion.io.arrays import save_json
-from reffusion.io.images import save_image
+from reffusion.io.images import save_image, save_mask
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_raw_masks, load_views, save_scene
+from reffusion.masks import regions
 from reffusion.params.poses import Params
-from reffusion.types import Scene, Similarity
+from reffusion.types import Scene
 
 LEAST_POINTS = 100  # with fewer sparse points, some of optical flow are added to them
 MORE_POINTS = 10_000  # how many at most; random ones, where flow finds too few
@@ -61,7 +63,10 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
         draws = seeding.generator(SEED, "poses", "random points")
         normalised = frame.filled_up(normalised, ranges, MORE_POINTS, draws, lambda v: load_views(out, [v])[v])
     save_scene(out, normalised)
-    _save_brought(params, out, scene, normalised.similarity)
+    if params.gaussians is not None:  # in the scene's own frame
+        save_ply(out / "gaussians.ply", load_ply(scene / params.gaussians, normalised.similarity))
+    if params.region is not None:
+        _save_region(params, out, normalised)
 
 
 def _oddities(scene: Scene, out: Path) -> list[str]:
@@ -76,14 +81,22 @@ def _save_warnings(out: Path, said: list[str]) -> None:
         save_json(out / WARNINGS, said)
 
 
-def _save_brought(params: Params, out: Path, scene: Path, similarity: Similarity) -> None:
-    """What the scene brings in its own frame, in the normalised one."""
-    if params.gaussians is not None:
-        save_ply(out / "gaussians.ply", load_ply(scene / params.gaussians, similarity))
-    if params.region is not None:
-        center = similarity.apply(params.region.center).tolist()
-        size = [side * similarity.scale for side in params.region.size]
-        save_json(out / "region.json", {"center": center, "size": size})
+def _save_region(params: Params, out: Path, scene: Scene) -> None:
+    """The region that the scene names, as region.json; or the masks of what lies beyond it."""
+    region, scale = params.region, scene.similarity.scale
+    if region.view is not None:
+        center = regions.on_axis(scene.cameras[known(region.view, scene.cameras, "region")], region.distance * scale)
+    else:
+        center = scene.similarity.apply(region.center)
+    if region.outside:
+        given = load_raw_masks(out, scene.train)
+        for name in scene.train:
+            mask = regions.beyond(center, region.radius * scale, scene.cameras[name])
+            save_mask(out / "masks" / f"{name}.png", mask | given.get(name, mask))
+        return
+    size = [side * scale for side in region.size or [2 * region.radius] * 3]
+    said = {"center": center.tolist(), "size": size, "round": region.size is None}
+    save_json(out / "region.json", {**said, "holds": (params.masks or "").lower() != NONE})
 
 
 def _supported_size(params: Params, capture: Capture, roles: Roles) -> int:

@@ -85,9 +85,10 @@ def fitted(given: GivenReference, sets: MaskSet, scene: Scene, poses: Path, fit:
         image = registration.cut_in(image, photo, hole, inside, margin, blend)
     if (share := inside[sets.invent].mean()) < WHOLE:
         raise ValueError(f"{given.path}: shows only {share:.0%} of the hole in '{given.view}'; crop less")
+    drawn = sets.consistent | taint.changed(image, photo, sets.invent)
     image = image if given.painted else exposure.normalised(image, fit, given.view)
     depth = load_straight_depth(given, lens, upright, found.moved)
-    return Reference(camera, image, sets.invent & inside, depth)
+    return Reference(camera, image, sets.invent & inside & drawn, depth)
 
 
 def lay_out(folder: Path, painted: list[str], scene: Scene, poses: Path, fit: Path, masks: Path) -> None:

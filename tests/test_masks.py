@@ -8,7 +8,7 @@ import torch
 from reffusion import geometry
 from reffusion.io.arrays import load_json, load_labels, save_json
 from reffusion.io.scene import load_mask_sets
-from reffusion.masks import voting
+from reffusion.masks import regions, voting
 from reffusion.types import Gaussians
 from stages import masks as stage
 from stages.masks import Params, run
@@ -173,13 +173,38 @@ def test_a_region_alone_marks_and_fills(tmp_path):
     assert all(abs((side.max() - side.min() + 1) / 2 - half) <= 1 for side in (rows, columns))
 
 
+@pytest.mark.parametrize("invent", ["auto", "consistent", "region"])
+def test_a_region_to_be_filled_removes_nothing_and_is_a_part_of_m(tmp_path, invent):
+    poses, fit, _ = small.write(tmp_path, NEAR, masks={})
+    save_json(poses / "region.json", {"center": [0, 0, NEAR], "size": [0.5] * 3, "round": True, "holds": False})
+    run(Params(invent=invent), tmp_path, poses=poses, fit=fit)
+    sets = load_mask_sets(tmp_path, small.CAMERAS)
+    assert not load_labels(tmp_path / "labels.npy").any()
+    assert not any(each.consistent.any() for each in sets.values())
+    assert all(sets[name].invent.any() for name in small.TRAIN)
+
+
 def test_a_box_behind_the_surface_has_no_silhouette():
     view = small.camera("v", 0.0)
     wall = np.full((small.HEIGHT, small.WIDTH), 1 / small.WALL)
-    visible = voting.box_silhouette([0, 0, 1.5], [0.2] * 3, view, wall)
+    box = regions.Region([0, 0, 1.5], [0.2] * 3)
+    visible = regions.silhouette(box, view, wall)
     assert visible[36, 48] and not visible[2, 2]
-    assert not voting.box_silhouette([0, 0, 1.5], [0.2] * 3, view, np.full(wall.shape, 1 / 1.2)).any()
-    assert not voting.box_silhouette([0, 0, -1.5], [0.2] * 3, view, wall).any()
+    assert not regions.silhouette(box, view, np.full(wall.shape, 1 / 1.2)).any()
+    assert not regions.silhouette(regions.Region([0, 0, -1.5], [0.2] * 3), view, wall).any()
+
+
+def test_what_lies_beyond_a_sphere_on_the_optical_axis():
+    """A sphere of radius r at distance d shows as a disc of tan(asin(r / d)), and the rest of the view is beyond it."""
+    view = small.camera("v", 0.0)
+    ahead, radius = view.center + 1.0 * view.world_to_camera[2, :3], 0.25
+    np.testing.assert_allclose(regions.on_axis(view, 1.0), ahead)
+    beyond = regions.beyond(ahead, radius, view)
+    rays = geometry.pixel_rays(view)
+    disc = np.hypot(rays[..., 0], rays[..., 1]) < np.tan(np.arcsin(radius))
+    assert disc.any() and not disc.all() and (beyond == ~disc).all()
+    assert regions.beyond(view.center - (ahead - view.center), radius, view).all(), "it is behind the camera"
+    assert not regions.beyond(view.center, radius, view).any(), "the camera is in it"
 
 
 def test_the_best_view_has_the_largest_mask_clear_of_the_border():

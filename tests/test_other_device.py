@@ -15,7 +15,7 @@ from other_device import card
 from reffusion.io.arrays import load_labels
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_mask_sets, save_references
-from reffusion.masks import voting
+from reffusion.masks import regions
 from reffusion.types import PARAMETERS, Reference
 from stages import fit, initialize, masks
 
@@ -73,10 +73,10 @@ def test_masks_on_a_card(ready, tmp_path, vote):
 
 def test_a_box_on_a_card():
     gaussians, _ = small.gaussians(NEAR)
-    box = (0, 0, NEAR), (0.5, 0.5, 0.1)
+    box = regions.Region((0, 0, NEAR), (0.5, 0.5, 0.1))
     with card():
-        there = voting.inside_box(gaussians.map(lambda p: p.to("cuda")), *box)
-        assert there.is_cuda and there.any() and torch.equal(there.cpu(), voting.inside_box(gaussians, *box))
+        there = regions.inside(gaussians.map(lambda p: p.to("cuda")), box)
+        assert there.is_cuda and there.any() and torch.equal(there.cpu(), regions.inside(gaussians, box))
 
 
 @pytest.mark.parametrize(

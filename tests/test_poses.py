@@ -336,8 +336,34 @@ def test_what_the_scene_brings_comes_into_the_normalised_frame(tmp_path):
     region = load_json(out / "region.json")
     np.testing.assert_allclose(region["center"], similarity.apply(np.array([50.0, 0.0, 0.0])))
     np.testing.assert_allclose(region["size"], np.array([1.0, 2.0, 3.0]) * similarity.scale)
+    assert region["holds"] and not region["round"]
     lenses, upright = load_lenses(out)
     assert set(lenses.values()) == {truth.lens} and list(lenses) == sorted(truth.world_to_camera) and not upright
+
+
+def test_a_sphere_on_an_optical_axis_is_filled_or_masks_what_lies_beyond(tmp_path):
+    folder = prepare(tmp_path / "s", "transforms", some_truth(scale=5.0, offset=(50.0, 0.0, 0.0)))
+    name = sorted(some_truth().world_to_camera)[0]
+    sphere = {"view": name, "distance": 4.0, "radius": 0.5}
+    scene, out = run(folder, masks="none", region=sphere)
+    region, camera, scale = load_json(out / "region.json"), scene.cameras[name], scene.similarity.scale
+    np.testing.assert_allclose(region["size"], [scale] * 3)
+    assert region["round"] and not region["holds"]
+    np.testing.assert_allclose(camera.world_to_camera[:3, :3] @ (region["center"] - camera.center), [0, 0, 4 * scale],
+                               atol=1e-9)  # fmt: skip
+    folder = prepare(tmp_path / "t", "transforms", some_truth(scale=5.0, offset=(50.0, 0.0, 0.0)))
+    scene, out = run(folder, masks="none", region={**sphere, "outside": True})
+    masks = load_raw_masks(out, scene.train)
+    assert set(masks) == set(scene.train) and not (out / "region.json").exists()
+    row, column = int(camera.cy), int(camera.cx)
+    assert not masks[name][row, column] and masks[name][0, 0]
+    for wrong in ({"view": name}, {**sphere, "center": [0, 0, 0]}, {**sphere, "size": [1, 1, 1]}, {"radius": 1.0}):
+        with pytest.raises(ValueError, match="give either"):
+            run(folder, region=wrong)
+    with pytest.raises(ValueError, match="outside needs a sphere"):
+        run(folder, region={"center": [0, 0, 0], "size": [1, 1, 1], "outside": True})
+    with pytest.raises(ValueError, match="region: there is no view 'nobody'"):
+        run(folder, region={**sphere, "view": "nobody"})
 
 
 def test_preview_is_light_and_says_what_will_happen(tmp_path):

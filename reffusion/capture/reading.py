@@ -9,6 +9,7 @@ from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.lens import without_distortion
 from reffusion.capture.load import load_capture
 from reffusion.capture.roles import Roles, load_roles
+from reffusion.capture.views import known
 from reffusion.io.files import BadInput, there
 from reffusion.io.ply import check_gaussians
 from reffusion.params.poses import Params
@@ -27,6 +28,8 @@ def read_scene(params: Params, scene: Path) -> tuple[Capture, Roles]:
         clean=params.clean,
         region=params.region is not None,
     )
+    if params.region is not None and params.region.view is not None:
+        known(params.region.view, {*roles.train, *roles.test}, "region")
     if params.gaussians is not None:
         if not there(scene / params.gaussians):
             raise BadInput(f"{scene / params.gaussians}: no such file; correct `gaussians` in scene.yaml")

@@ -9,6 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from reffusion import geometry
+from reffusion.masks.voting import tidy
 from reffusion.masks.witness import FREE, Witness, pixels, widened
 from reffusion.types import Camera
 
@@ -19,6 +20,19 @@ DARKER = 0.08  # logarithm of the ratio of brightness from which a pixel is tain
 BESIDE = 0.02  # of the image's width: so near to the mask a tainted patch must come
 SHADOW = 0.02  # of the mask's area, that must differ beside it
 WIDER = 0.012  # of the image's width: a shadow's soft rim beyond what is found
+
+FINE, CHANGED = 0.003, 8  # of the image's width: a finer blur; levels of 255 from which a pixel was drawn anew
+SPECK, CLOSED = 0.015, 0.01  # of it: islands below this diameter are none; notches twice as wide are closed
+
+
+def changed(reference: np.ndarray, photo: np.ndarray, within: np.ndarray) -> np.ndarray:
+    """bool [H, W]: pixels of `within` where a completed view shows something else than its photograph, holes filled."""
+    sigma = pixels(FINE, within.shape[1])
+    soft = lambda image: cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma)
+    differs = within & (np.abs(soft(reference) - soft(photo)).max(-1) > CHANGED)
+    # What was drawn in may here and there look like what it hides.
+    closed = ~widened(~widened(tidy(differs, SPECK * within.shape[1], 0), CLOSED), CLOSED)
+    return ndimage.binary_fill_holes(closed & within)
 
 
 def tainted(reference: np.ndarray, shown: np.ndarray, hidden: np.ndarray) -> np.ndarray:

@@ -146,21 +146,6 @@ def _small_parts(mask: np.ndarray, diameter: float) -> np.ndarray:
     return small[parts]
 
 
-def box_silhouette(center: np.ndarray, size: np.ndarray, camera: Camera, disparity: np.ndarray) -> np.ndarray:
-    """bool [H, W]: pixels whose ray meets an axis-aligned box before the surface of the given disparity [H, W]."""
-    rays = geometry.pixel_rays(camera) @ camera.world_to_camera[:3, :3]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        bounds = (np.asarray(center) + np.multiply.outer((-0.5, 0.5), size) - camera.center)[:, None, None] / rays
-    near, far = np.fmin(*bounds).max(-1), np.fmax(*bounds).min(-1)  # in units of camera z
-    return (far > np.maximum(near, 0.0)) & (np.maximum(near, 0.0) * disparity < 1.0)
-
-
-def inside_box(gaussians: Gaussians, center: np.ndarray, size: np.ndarray) -> Tensor:
-    """bool [N]: centres within an axis-aligned box."""
-    middle, sides = (gaussians.means.new_tensor(each) for each in (center, size))
-    return ((gaussians.means - middle).abs() <= sides / 2).all(-1)
-
-
 def best_view(invent: Mapping[str, np.ndarray], names: Sequence[str]) -> str | None:
     """The view to complete: of those whose invent mask keeps clear of the border (if any does), the largest mask.
 

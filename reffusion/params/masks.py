@@ -27,6 +27,6 @@ class Params(Settings):
     # PAPER leaves open: it always invents. So few pixels are rims of masks and crannies, not worth a diffusion model.
     negligible: float = Field(0.005, ge=0, lt=1, description="share of C up to which undecided pixels are left alone")
     invent: Literal["auto", "undecided", "consistent", "region"] = Field(
-        "auto", description="what is made up; auto = the scene's 3D region where it names one, else undecided pixels"
+        "auto", description="what is made up; auto = undecided pixels, and the scene's region where it names one"
     )
     device: Device = Field("cpu", description="where Gaussians are drawn and votes are counted")

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from reffusion.params.base import UNKEYED, Settings
 from reffusion.params.reference import Given
@@ -13,8 +13,24 @@ Side = Annotated[float, Field(gt=0)]
 
 
 class Region(Settings):
-    center: tuple[float, float, float] = Field(description="of a box along the axes, in the scene's own frame")
-    size: tuple[Side, Side, Side] = Field(description="side lengths in the scene's own units")
+    """A place in the scene's own frame and units: a box along its axes, or a sphere."""
+
+    center: tuple[float, float, float] | None = Field(None, description="its middle")
+    view: str | None = Field(None, description="instead of center: a view on whose optical axis the middle lies")
+    distance: Side | None = Field(None, description="with view: how far from its camera")
+    size: tuple[Side, Side, Side] | None = Field(None, description="side lengths of a box")
+    radius: Side | None = Field(None, description="instead of size: of a sphere")
+    outside: bool = Field(False, description="all that lies beyond the sphere is masked in every view")
+
+    @model_validator(mode="after")
+    def _whole(self) -> Self:
+        if (self.size is None) == (self.radius is None):
+            raise ValueError("give either the size of a box, or the radius of a sphere")
+        if (self.center is None) == (self.view is None) or (self.view is None) != (self.distance is None):
+            raise ValueError("give either its center, or a view and a distance along that view's optical axis")
+        if self.outside and self.radius is None:
+            raise ValueError("outside needs a sphere: give its radius")
+        return self
 
 
 class Params(Settings):
@@ -26,7 +42,7 @@ class Params(Settings):
     test: list[str] | str | None = Field(None, description='view names, or "every N"; None: those of the test masks')
     clean: list[str] = Field([], description="training views in which the object is absent")
     gaussians: str | None = Field(None, description=".ply the scene brings in its own frame, 3DGS layout")
-    region: Region | None = Field(None, description="3D box that holds the object, or is to be filled")
+    region: Region | None = Field(None, description="box or sphere that holds the object, or is to be filled")
     reference: Given | list[Given] | None = Field(
         None,
         description="read by the stage `reference`; here only checked against the views",

@@ -1,0 +1,59 @@
+"""What a scene asks for beside removal: an object put into it, or the space beyond a sphere."""
+
+from __future__ import annotations
+
+import numpy as np
+import raycast
+from kinds import Kind
+from reconstruction import Frame
+from solids import Solids
+from world import World
+
+ROOM_FOR_IT = 1.08  # radius of the region over that of the object within
+SPHERE = 0.95  # metres: radius of the sphere beyond which the scene is to be continued
+
+
+def bare(solids: Solids) -> Solids:
+    """The room without the object."""
+    return solids._replace(**{name: each[~solids.removable] for name, each in solids._asdict().items()})
+
+
+def region_around(solids: Solids) -> tuple[np.ndarray, float]:
+    """A sphere (centre [3], radius), metres, around the object."""
+    center, reach = solids.center[solids.removable], solids.reach[solids.removable]
+    half = solids.half[solids.removable]
+    middle = ((center - half).min(0) + (center + half).max(0)) / 2
+    return middle, ROOM_FOR_IT * float((np.linalg.norm(center - middle, axis=1) + reach).max())
+
+
+def rays(camera: np.ndarray, kind: Kind, world: World) -> tuple[np.ndarray, np.ndarray]:
+    """Surface points [H, W, 3] and directions of the rays [H, W, 3] of all pixels, the object included."""
+    rows, columns = np.mgrid[: kind.height, : kind.width]
+    centers = np.stack([columns, rows], -1).reshape(-1, 2) + 0.5
+    points, _ = raycast.surface_points(world.solids, camera, centers, True)
+    away = (points - camera[13:]).reshape(kind.height, kind.width, 3)
+    return points.reshape(away.shape), away / np.linalg.norm(away, axis=-1, keepdims=True)
+
+
+def depth(camera: np.ndarray, kind: Kind, world: World, frame: Frame) -> np.ndarray:
+    """[H, W] camera z of what the photograph shows, in the scene frame's unit."""
+    points, _ = rays(camera, kind, world)
+    return (frame.scale * ((points - camera[13:]) @ camera[4:13].reshape(3, 3)[:, 2])).astype(np.float32)
+
+
+def beyond(camera: np.ndarray, kind: Kind, world: World, center: np.ndarray, radius: float) -> np.ndarray:
+    """bool [H, W]: pixels whose rays miss the sphere."""
+    _, along = rays(camera, kind, world)
+    offset = center - camera[13:]
+    return offset @ offset - (along @ offset) ** 2 > radius**2
+
+
+def on_axis(camera: np.ndarray, distance: float) -> np.ndarray:
+    """The point at that distance along a camera's optical axis."""
+    return camera[13:] + distance * camera[4:13].reshape(3, 3)[:, 2]
+
+
+def outermost(cameras: np.ndarray) -> list[int]:
+    """The two cameras that stand farthest apart, from which most of what others miss is seen."""
+    apart = np.linalg.norm(cameras[:, None, 13:] - cameras[None, :, 13:], axis=-1)
+    return [int(k) for k in np.unravel_index(apart.argmax(), apart.shape)]

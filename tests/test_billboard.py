@@ -1,0 +1,44 @@
+"""What is drawn in front of a scene, without a depth map, stands on the surface beneath it."""
+
+import numpy as np
+
+from reffusion import geometry
+from reffusion.depth.billboard import standing
+from reffusion.types import Camera
+
+TILT = np.radians(25)  # the camera looks down on a floor 1 below it
+
+
+def floor_view() -> tuple[Camera, np.ndarray]:
+    """The camera, and the camera z [H, W] of the floor (a wall at 4 beyond it)."""
+    c, s = np.cos(TILT), np.sin(TILT)
+    pose = np.eye(4)
+    pose[:3, :3] = [[1, 0, 0], [0, c, -s], [0, s, c]]  # world: x right, y down, z ahead
+    camera = Camera("v", 96, 72, 80.0, 80.0, 48.0, 36.0, pose)
+    rays = geometry.pixel_rays(camera) @ pose[:3, :3]
+    with np.errstate(divide="ignore"):
+        floor = np.where(rays[..., 1] > 0, 1.0 / rays[..., 1], np.inf)
+    return camera, np.minimum(floor, 4.0 / rays[..., 2])
+
+
+def test_it_stands_upright_where_its_lowest_pixels_meet_the_floor():
+    camera, depth = floor_view()
+    drawn = np.zeros(depth.shape, bool)
+    drawn[20:50, 38:58] = True
+    found = standing(drawn, depth, camera)
+    assert (found[~drawn] == depth[~drawn]).all() and (found[drawn] <= depth[drawn]).all()
+    points = geometry.unproject(found, camera)
+    foot, rim = points[49, 48], points[20:50, 38]
+    assert abs(foot[1] - 1.0) < 0.05, "its foot is on the floor"
+    assert abs(foot[2] - geometry.unproject(depth, camera)[50, 48, 2]) < 0.1
+    assert np.ptp(rim[:, 2]) < 0.15 * np.ptp(rim[:, 1]), "its outline is upright"
+    middle, edge = points[35, 48, 2], points[35, 38, 2]
+    assert 0.05 < edge - middle < 0.2, "and its middle comes nearer by about half of half its width"
+
+
+def test_on_a_wall_it_hangs_facing_the_camera():
+    camera = Camera("v", 96, 72, 80.0, 80.0, 48.0, 36.0, np.eye(4))
+    depth, drawn = np.full((72, 96), 2.0), np.zeros((72, 96), bool)
+    drawn[30:40, 40:50] = True
+    found = standing(drawn, depth, camera)
+    assert np.isfinite(found).all() and (found[drawn] <= 2.0).all() and found[drawn].min() > 1.8
