@@ -9,6 +9,7 @@ A furnished room is ray-cast with and without one object. Kinds:
   behind  wide with a thing before the object that stays: it hides a part of what is to be filled from the reference
   table   an object on the edge of a table, free space under it, some cameras low enough to look there
   corner  an object before the corner of a wall that juts out: behind it the depth has a step
+  pair    two objects side by side, each with masks of its own, and two references
   grass   an object on a lawn before a hedge: thousands of blades and leaves, nothing flat
   photos  26 larger photographs and masks without poses, for structure from motion
 
@@ -119,13 +120,24 @@ def _write_pictures(out: Path, session: Session, kind: Kind) -> None:
         if k < session.test:
             write_image(out / f"images_4/test_label/out_{k:05d}.png", mask * np.uint8(255))
             write_image(out / f"truth/masks_test/{name}.png", mask * np.uint8(255))
+        elif session.apart:
+            for own, of in session.apart.items():
+                write_image(out / f"masks/{own}/{name}.png", of[k] * np.uint8(255))
         else:
             write_image(out / f"images_4/label/{name}.png", mask * np.uint8(1))
-    brought = ""
-    if not kind.hangs:
-        write_image(out / "reference.png", session.completed)
-        brought = f"reference: {{view: {session.names[session.middle]}, image: reference.png}}\n"
-    (out / "scene.yaml").write_text(brought + PROFILE)
+    (out / "scene.yaml").write_text(("" if kind.hangs else _write_references(out, session)) + PROFILE)
+
+
+def _write_references(out: Path, session: Session) -> str:
+    """Write the completed views; the lines of scene.yaml that name them."""
+    files = ["reference.png", *(f"reference_{session.names[k]}.png" for k in list(session.completed)[1:])]
+    said = []
+    for (k, picture), file in zip(session.completed.items(), files, strict=True):
+        write_image(out / file, picture)
+        said.append(f"{{view: {session.names[k]}, image: {file}}}")
+    if len(said) == 1:
+        return f"reference: {said[0]}\n"
+    return "reference:\n" + "".join(f"- {each}\n" for each in said)
 
 
 def main() -> None:

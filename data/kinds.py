@@ -22,7 +22,8 @@ class Kind:
         bend: SIMPLE_RADIAL's k1 at its largest; points: sparse points wanted.
         hangs: the object hangs in mid-air, so that other views show all that it hides.
         place: where the object is: "room", "behind" (a kept thing before it), "table" (on the edge of one), "corner"
-            (before the corner of a wall) or "grass".
+            (before the corner of a wall), "grass" or "pair" (two objects side by side).
+        references: how many views the scene brings completed.
         least: share of the masks that no training view may show, at least.
         low: metres above the floor of the lowest cameras; None: all at the height of a person's eyes.
     """
@@ -42,6 +43,7 @@ class Kind:
     place: str = "room"
     least: float = 0.4
     low: float | None = None
+    references: int = 1
 
     @property
     def around(self) -> bool:
@@ -59,6 +61,7 @@ KINDS = {
     "table": Kind(spread=34.0, place="table", least=0.05, low=0.45),
     "corner": Kind(spread=30.0, place="corner", least=0.25),
     "grass": Kind(samples=2, spread=30.0, node=0.08, place="grass"),
+    "pair": Kind(spread=30.0, place="pair", least=0.2, references=2),
     "photos": Kind(width=480, height=360, train=26, test=0, photos=True, texture=2048, node=0.025),
 }
 

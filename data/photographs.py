@@ -18,7 +18,9 @@ class Session:
         names: of the views; cameras: [V, 16]; test: how many are test views.
         photos: [V, H, W, 3] uint8; masks: bool [V, H, W], pixels that the object touches or would touch.
         hidden: bool [V, H, W], never-seen pixels of the masks.
-        middle: the view from the middle of the training views' walk; completed: it without the object.
+        middle: the view from the middle of the training views' walk.
+        completed: view -> uint8 [H, W, 3] without the object, of the middle one and those farthest from it.
+        apart: object -> bool [V, H, W], what its mask holds: of objects that are named apart.
     """
 
     names: list[str]
@@ -28,7 +30,8 @@ class Session:
     masks: np.ndarray
     hidden: np.ndarray
     middle: int
-    completed: np.ndarray
+    completed: dict[int, np.ndarray]
+    apart: dict[str, np.ndarray]
 
 
 def photographed(seed: int, kind: Kind, world: World, target: np.ndarray) -> Session:
@@ -42,8 +45,21 @@ def photographed(seed: int, kind: Kind, world: World, target: np.ndarray) -> Ses
     photos, masks = (np.stack(pictures) for pictures in zip(*shots, strict=True))
     in_training = train, masks[kind.test :]
     hidden = [never_seen(world, camera, mask, *in_training) for camera, mask in zip(cameras, masks, strict=True)]
-    completed, _ = shoot(world, cameras[middle], kind, False)
-    return Session(names, cameras, kind.test, photos, masks, np.stack(hidden), middle, completed)
+    references = [middle, *(kind.test + _farthest(train, middle - kind.test, kind.references - 1))]
+    completed = {int(k): shoot(world, cameras[k], kind, False)[0] for k in references}
+    apart = {name: np.stack([_alone(world, c, kind, own) for c in cameras]) for name, own in world.objects.items()}
+    return Session(names, cameras, kind.test, photos, masks, np.stack(hidden), middle, completed, apart)
+
+
+def _farthest(cameras: np.ndarray, middle: int, count: int) -> np.ndarray:
+    """The `count` cameras that stand farthest from the one called `middle`."""
+    return np.argsort(-np.linalg.norm(cameras[:, 13:] - cameras[middle, 13:], axis=1), kind="stable")[:count]
+
+
+def _alone(world: World, camera: np.ndarray, kind: Kind, own: np.ndarray) -> np.ndarray:
+    """Bool [H, W]: pixels in which this object, bool [n] of the solids, is met before anything else."""
+    alone = replace(world, solids=world.solids._replace(removable=own))
+    return _radiance(alone, camera, kind, True, kind.samples)[1]
 
 
 def path(seed: int, kind: Kind, target: np.ndarray, count: int, label: str) -> np.ndarray:

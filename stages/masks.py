@@ -15,7 +15,7 @@ from reffusion import geometry, trace
 from reffusion.fit import exposure
 from reffusion.io.arrays import load_json, save_json, save_labels
 from reffusion.io.ply import load_ply
-from reffusion.io.scene import load_raw_masks, load_scene, save_mask_sets
+from reffusion.io.scene import load_raw_masks, load_scene, objects_of, save_mask_sets
 from reffusion.masks import undecided, voting, witness
 from reffusion.masks.continuation import Plane, planes_around
 from reffusion.masks.voting import Votes, extent
@@ -32,7 +32,10 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
     scene, gaussians = load_scene(poses), load_ply(fit / "gaussians.ply").map(lambda p: p.to(params.device))
     train = [scene.cameras[name] for name in scene.train]
     region = load_json(poses / "region.json") if (poses / "region.json").exists() else None
-    raw = load_raw_masks(poses, scene.train)
+    objects = objects_of(poses)
+    raw = load_raw_masks(poses, scene.train, params.remove)
+    if objects and not raw:
+        raise ValueError(f"{poses / 'masks'}: no view has a mask of each object; add empty ones where one is unseen")
     empty = {name: np.zeros((camera.height, camera.width), bool) for name, camera in scene.cameras.items()}
     ballots = raw | {name: empty[name] for name in scene.clean}
     if params.invent == "region" and region is None:
@@ -67,6 +70,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
     save_mask_sets(out, sets)
     invents = {name: each.invent for name, each in sets.items()}
     facts = {
+        "kept": [name for name in objects if params.remove is not None and name not in params.remove],
         "masked_gaussians": int(torch.count_nonzero(labels)),
         "gaussians": len(gaussians),
         "voting_views": len(ballots),

@@ -22,7 +22,8 @@ class Roles:
 
     Attributes:
         train, test, clean: names of views.
-        masks: where a photograph shows the object: of training views, and of test views that show it too.
+        masks: object -> view -> file, where a photograph shows it: of training views, and of test views that show it
+            too. "" is the object of masks that tell none apart.
         test_masks: where a test view shows the object, or would show it; what its box comes from.
         warnings: what is odd.
     """
@@ -30,7 +31,7 @@ class Roles:
     train: tuple[str, ...]
     test: tuple[str, ...]
     clean: frozenset[str]
-    masks: dict[str, Path]
+    masks: dict[str, dict[str, Path]]
     test_masks: dict[str, Path]
     warnings: tuple[str, ...]
 
@@ -46,7 +47,7 @@ class Roles:
             train=tuple(n for n in self.train if n in names),
             test=tuple(n for n in self.test if n in names),
             clean=self.clean & names,
-            masks=kept(self.masks),
+            masks={thing: kept(files) for thing, files in self.masks.items()},
             test_masks=kept(self.test_masks),
         )
         _check_enough(roles.train)
@@ -63,6 +64,7 @@ def load_roles(
     test: Sequence[str] | str | None = None,
     clean: Sequence[str] = (),
     region: bool = False,
+    remove: Sequence[str] | None = None,
 ) -> Roles:
     """The roles of the capture's views, from scene.yaml's keys and the folder's usual places.
 
@@ -75,13 +77,16 @@ def load_roles(
         test_masks: folder of the test views' masks, named like the views or in their order; "none"; None looks.
         train, test: names, or "every 8" (the first of each eight in order of names), or None.
         region: the scene names a 3D region, so it may lack masks.
+        remove: objects, each a folder of masks; only checked here.
 
     Raises:
         BadInput: naming the file and the remedy: a mask for no picture, of other proportions (over 10%), no mask
             at all, an unknown view, a view for both training and test, fewer than 3 training views.
     """
     folder = Path(folder)
-    mask_files = _mask_files(folder, capture, masks, region)
+    of_objects = _mask_files(folder, capture, masks, region)
+    _check_objects(remove, of_objects)
+    mask_files = {name: path for files in of_objects.values() for name, path in files.items()}
     label_files = _test_mask_files(folder, capture, test_masks)
     train_named, test_named = (_chosen(value, capture, key) for key, value in (("train", train), ("test", test)))
     labelled = None if label_files is None else _labelled(capture, mask_files, label_files, test_named)
@@ -97,7 +102,8 @@ def load_roles(
         beside |= labels
         held_out = {name: path for name, path in held_out.items() if name not in labels}
     kept = {name: path for name, path in mask_files.items() if name in set(train_named)}
-    for name, path in (*kept.items(), *beside.items()):
+    ours = {thing: _among(files, {*kept, *held_out}) for thing, files in of_objects.items()}
+    for name, path in (*(item for files in ours.values() for item in files.items()), *beside.items()):
         check_proportions(path, name, _size_of(name, capture), 0.10, "mask")
     bare = [name for name in train_named if name not in kept and name not in clean_views]
     warning = f"{len(bare)} training views have no mask: {', '.join(bare)}" if kept and bare else None
@@ -105,10 +111,23 @@ def load_roles(
         tuple(train_named),
         tuple(test_views),
         clean_views,
-        dict(sorted((kept | held_out).items())),
+        ours,
         beside,
         (warning,) if warning else (),
     )
+
+
+def _among(files: dict[str, Path], names: set[str]) -> dict[str, Path]:
+    return {name: path for name, path in files.items() if name in names}
+
+
+def _check_objects(remove: Sequence[str] | None, found: dict[str, dict[str, Path]]) -> None:
+    if remove is None:
+        return
+    if "" in found or not found:
+        raise BadInput("scene.yaml: remove: the masks tell no objects apart; give each a folder, masks/<object>/")
+    if unknown := [name for name in remove if name not in found]:
+        raise BadInput(f"scene.yaml: remove: there is no object '{unknown[0]}'; masks tell apart {', '.join(found)}")
 
 
 def views_of(capture: Capture, roles: Roles) -> Views:
@@ -160,16 +179,16 @@ def _chosen(value: Sequence[str] | str | None, capture: Capture, key: str) -> li
     return names
 
 
-def _mask_files(folder: Path, capture: Capture, masks: str | None, region: bool) -> dict[str, Path]:
-    """View name -> mask, each mask checked to have its picture."""
+def _mask_files(folder: Path, capture: Capture, masks: str | None, region: bool) -> dict[str, dict[str, Path]]:
+    """Object -> view name -> mask, each mask checked to have its picture; see `Roles`."""
     if masks is not None and masks.lower() == NONE:
         return {}
     if masks is None:
         usual = (capture.label_folder / "label", folder / "masks", folder / "mask", folder / "label")
-        found = next((p for p in usual if p.is_dir() and p != capture.label_folder and pictures_in(p)), None)
+        found = next((p for p in usual if p != capture.label_folder and _objects_in(p)), None)
     else:
         found = folder / masks
-        if not found.is_dir() or not pictures_in(found):
+        if not _objects_in(found):
             raise BadInput(f"{found}: no masks there; correct `masks` in scene.yaml")
     if found is None:
         if region:
@@ -179,8 +198,27 @@ def _mask_files(folder: Path, capture: Capture, masks: str | None, region: bool)
             "for each picture, name their folder as `masks` or a box as `region` in scene.yaml, or say `masks: none` "
             "to fit and render only"
         )
-    result = {}
-    for stem, path in pictures_in(found).items():
+    return {thing: _masks_of(pictures, capture) for thing, pictures in _objects_in(found).items()}
+
+
+def _objects_in(folder: Path) -> dict[str, dict[str, Path]]:
+    """Object -> stem -> mask: of a folder with masks, or with a folder of masks for each object."""
+    if not folder.is_dir():
+        return {}
+    inside = sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
+    named = {path.name: pictures for path in inside if (pictures := pictures_in(path))}
+    loose = pictures_in(folder)
+    if loose and named:
+        raise BadInput(
+            f"{folder}: holds masks and folders of masks ({', '.join(named)}); put them into one folder for each "
+            "object, or all into one"
+        )
+    return {"": loose} if loose else named
+
+
+def _masks_of(pictures: dict[str, Path], capture: Capture) -> dict[str, Path]:
+    result: dict[str, Path] = {}
+    for stem, path in pictures.items():
         # COLMAP's masks are called <picture with its ending>.png
         name = next((n for n in (stem, Path(stem).stem) if n in capture.pictures or n in capture.left_out), None)
         if name is None:

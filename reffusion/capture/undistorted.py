@@ -29,7 +29,8 @@ def load_at(path: Path, longest: int, upright: bool) -> np.ndarray:
 def save_undistorted(out: Path, name: str, capture: Capture, roles: Roles, longest: int) -> tuple[Lens, Lens]:
     """Write the view's image, mask and test mask, all in the same pinhole.
 
-    Writes images/, masks/, test_masks/<view>.png; the last two where the view has one.
+    Writes images/, masks/, test_masks/<view>.png; the last two where the view has one, of objects that are told apart
+    masks/<object>/<view>.png.
 
     Returns:
         the photograph's lens at this size, and the pinhole.
@@ -45,7 +46,8 @@ def save_undistorted(out: Path, name: str, capture: Capture, roles: Roles, longe
     except ValueError as error:
         raise BadInput(f"{capture.brought_by or capture.pictures[name]}: view '{name}': {error}") from error
     save_image(out / "images" / f"{name}.png", image if where is None else undistort_image(image, where))
-    for folder, files in (("masks", roles.masks), ("test_masks", roles.test_masks)):
+    masks = {f"masks/{thing}": files for thing, files in roles.masks.items()}
+    for folder, files in (*masks.items(), ("test_masks", roles.test_masks)):
         if name in files:
             mask = load_mask(files[name], (size[1], size[0]))
             save_mask(out / folder / f"{name}.png", mask if where is None else undistort_mask(mask, where))

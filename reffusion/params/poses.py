@@ -27,6 +27,9 @@ class Params(Settings):
     clean: list[str] = Field([], description="training views in which the object is absent")
     gaussians: str | None = Field(None, description=".ply the scene brings in its own frame, 3DGS layout")
     region: Region | None = Field(None, description="3D box that holds the object, or is to be filled")
+    remove: list[str] | None = Field(
+        None, description="read by the stage `masks`; here only checked", json_schema_extra=UNKEYED
+    )
     reference: Given | list[Given] | None = Field(
         None,
         description="read by the stage `reference`; here only checked against the views",
