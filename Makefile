@@ -48,7 +48,7 @@ help:
 	@echo 'make scene=X clean             remove what was computed for it'
 	@echo 'make data=FOLDER batch         every scene of a folder, and one table'
 	@echo 'make demo [seed=N]             make the demo scene, or another: data/demo-N; others are made when named:'
-	@echo '                               demo-wide, -360, -seen, -photos, -behind, -table, -corner, -grass, -pair, with -N too'
+	@echo '                               demo-wide, -360, -seen, -photos, -behind, -table, -corner, -grass, -pair, -sparse, with -N too'
 	@echo 'make prior [steps=N]           train the embedded prior further (hours)'
 	@echo 'make weights [profile=paper]   fetch what a profile needs, sizes first; offline=1 only says what is missing'
 	@echo 'make gpu                       on a CUDA machine: gsplat, and its extension built and loaded (minutes, once)'
@@ -87,7 +87,7 @@ $(VENV)/.ready-dev: $(VENV)/.ready
 # --------------------------------------------------------------------------------------------------------- scenes
 
 # The demo scenes are made by the project: `demo`, `demo-photos` (no poses) and demo-<one of the others>, each with `-<seed>` or not.
-kinds := photos wide 360 seen behind table corner grass pair
+kinds := photos wide 360 seen behind table corner grass pair sparse
 # Their names become part of a recipe, so there are none with other characters than these.
 plain := a b c d e f g h i j k l m n o p q r s t u v w x y z 0 1 2 3 4 5 6 7 8 9 -
 rest = $(if $1,$(call rest,$(wordlist 2,99,$1),$(subst $(firstword $1),,$2)),$2)

@@ -10,6 +10,7 @@ A furnished room is ray-cast with and without one object. Kinds:
   table   an object on the edge of a table, free space under it, some cameras low enough to look there
   corner  an object before the corner of a wall that juts out: behind it the depth has a step
   pair    two objects side by side, each with masks of its own, and two references
+  sparse  nothing to remove; of four training views alone the pixels may be used, the others are cameras
   grass   an object on a lawn before a hedge: thousands of blades and leaves, nothing flat
   photos  26 larger photographs and masks without poses, for structure from motion
 
@@ -75,7 +76,7 @@ def _write_scene(out: Path, seed: int, kind: Kind) -> dict:
     shares, asked = [s for s in facts["never_seen_share"].values() if s is not None], f"{kind.least} or more"
     if kind.hangs:
         asked = f"{MOST_NEVER_SEEN} or less"
-    if max(shares) > MOST_NEVER_SEEN if kind.hangs else min(shares) < kind.least:
+    if not kind.shown and (max(shares) > MOST_NEVER_SEEN if kind.hangs else min(shares) < kind.least):
         raise ValueError(f"seed {seed}: {facts['never_seen_share']} of the masks was never seen; it must be {asked}")
     frame = scene_frame(seed)
     write_truth_cameras(out / "truth/cameras.json", kind, session.names, session.cameras, frame)
@@ -91,13 +92,14 @@ def _write_scene(out: Path, seed: int, kind: Kind) -> dict:
 
 
 def _facts(seed: int, session: Session) -> dict:
-    shares = [float(h.sum() / m.sum()) for h, m in zip(session.hidden, session.masks, strict=True)]
+    shares = [float(h.sum() / max(m.sum(), 1)) for h, m in zip(session.hidden, session.masks, strict=True)]
     return {
         "seed": seed,
         "reference": session.names[session.middle],
         "mask_share": _by_split(session.masks.mean((1, 2)), session.test),
         "never_seen_share": _by_split(shares, session.test),
         "lens_shift_px": float(corner_shift(session.cameras[0])),
+        "shown": [session.names[k] for k in session.spread],
     }
 
 
@@ -113,9 +115,13 @@ def _write_photos(out: Path, session: Session) -> None:
 
 def _write_pictures(out: Path, session: Session, kind: Kind) -> None:
     """Photographs, masks, scene.yaml, and where there is something to invent the reference, in SPIn-NeRF's layout."""
+    for name, photo in zip(session.names, session.photos, strict=True):
+        write_image(out / f"images_4/{name}.png", photo)
+    if kind.shown:
+        (out / "scene.yaml").write_text(_sparse(session, kind) + PROFILE)
+        return
     for k, name in enumerate(session.names):
         mask = session.masks[k]
-        write_image(out / f"images_4/{name}.png", session.photos[k])
         write_image(out / f"truth/never_seen/{name}.png", session.hidden[k] * np.uint8(255))
         if k < session.test:
             write_image(out / f"images_4/test_label/out_{k:05d}.png", mask * np.uint8(255))
@@ -126,6 +132,17 @@ def _write_pictures(out: Path, session: Session, kind: Kind) -> None:
         else:
             write_image(out / f"images_4/label/{name}.png", mask * np.uint8(1))
     (out / "scene.yaml").write_text(("" if kind.hangs else _write_references(out, session)) + PROFILE)
+
+
+def _sparse(session: Session, kind: Kind) -> str:
+    """The lines of scene.yaml: a few photographs, each a reference; the other training views are cameras."""
+    shown = [session.names[k] for k in session.spread[: kind.shown]]
+    given = "".join(f"- {{view: {name}, image: images_4/{name}.png}}\n" for name in shown)
+    listed = lambda names: f"[{', '.join(names)}]\n"
+    return (
+        f"train: {listed(shown)}clean: {listed(shown)}test: {listed(session.names[: session.test])}"
+        f"cameras_only: others\nmasks: none\nreference:\n{given}"
+    )
 
 
 def _write_references(out: Path, session: Session) -> str:

@@ -24,6 +24,8 @@ class Kind:
         place: where the object is: "room", "behind" (a kept thing before it), "table" (on the edge of one), "corner"
             (before the corner of a wall), "grass" or "pair" (two objects side by side).
         references: how many views the scene brings completed.
+        shown: of so many training views the pixels may be used, the others are cameras only, and nothing is to be
+            removed; 0: there is an object.
         least: share of the masks that no training view may show, at least.
         low: metres above the floor of the lowest cameras; None: all at the height of a person's eyes.
     """
@@ -44,6 +46,7 @@ class Kind:
     least: float = 0.4
     low: float | None = None
     references: int = 1
+    shown: int = 0
 
     @property
     def around(self) -> bool:
@@ -62,6 +65,7 @@ KINDS = {
     "corner": Kind(spread=30.0, place="corner", least=0.25),
     "grass": Kind(samples=2, spread=30.0, node=0.08, place="grass"),
     "pair": Kind(spread=30.0, place="pair", least=0.2, references=2),
+    "sparse": Kind(spread=30.0, shown=4),
     "photos": Kind(width=480, height=360, train=26, test=0, photos=True, texture=2048, node=0.025),
 }
 

@@ -9,6 +9,8 @@ import raycast
 from kinds import Kind, randomness
 from world import World
 
+SPREAD = 8  # views of `Session.spread`
+
 
 @dataclass(frozen=True)
 class Session:
@@ -20,6 +22,7 @@ class Session:
         hidden: bool [V, H, W], never-seen pixels of the masks.
         middle: the view from the middle of the training views' walk.
         completed: view -> uint8 [H, W, 3] without the object, of the middle one and those farthest from it.
+        spread: training views, each the one farthest from those before it, the middle one first.
         apart: object -> bool [V, H, W], what its mask holds: of objects that are named apart.
     """
 
@@ -31,6 +34,7 @@ class Session:
     hidden: np.ndarray
     middle: int
     completed: dict[int, np.ndarray]
+    spread: list[int]
     apart: dict[str, np.ndarray]
 
 
@@ -45,15 +49,20 @@ def photographed(seed: int, kind: Kind, world: World, target: np.ndarray) -> Ses
     photos, masks = (np.stack(pictures) for pictures in zip(*shots, strict=True))
     in_training = train, masks[kind.test :]
     hidden = [never_seen(world, camera, mask, *in_training) for camera, mask in zip(cameras, masks, strict=True)]
-    references = [middle, *(kind.test + _farthest(train, middle - kind.test, kind.references - 1))]
-    completed = {int(k): shoot(world, cameras[k], kind, False)[0] for k in references}
+    spread = [kind.test + k for k in _spread(train, middle - kind.test, min(SPREAD, kind.train))]
+    references = spread[: kind.references]
+    completed = {k: shoot(world, cameras[k], kind, False)[0] for k in references}
     apart = {name: np.stack([_alone(world, c, kind, own) for c in cameras]) for name, own in world.objects.items()}
-    return Session(names, cameras, kind.test, photos, masks, np.stack(hidden), middle, completed, apart)
+    return Session(names, cameras, kind.test, photos, masks, np.stack(hidden), middle, completed, spread, apart)
 
 
-def _farthest(cameras: np.ndarray, middle: int, count: int) -> np.ndarray:
-    """The `count` cameras that stand farthest from the one called `middle`."""
-    return np.argsort(-np.linalg.norm(cameras[:, 13:] - cameras[middle, 13:], axis=1), kind="stable")[:count]
+def _spread(cameras: np.ndarray, first: int, count: int) -> list[int]:
+    """So many cameras, each the one farthest from those before it."""
+    chosen, away = [first], np.full(len(cameras), np.inf)
+    while len(chosen) < count:
+        away = np.minimum(away, np.linalg.norm(cameras[:, 13:] - cameras[chosen[-1], 13:], axis=1))
+        chosen.append(int(np.argmax(away)))
+    return chosen
 
 
 def _alone(world: World, camera: np.ndarray, kind: Kind, own: np.ndarray) -> np.ndarray:

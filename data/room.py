@@ -24,6 +24,8 @@ def furnish(seed: int, kind: Kind) -> tuple[Furniture, np.ndarray]:
     shell(f, draw, planks, side, corner)
     if kind.hangs:
         lantern(f, draw, 0.0, 1.15)
+    elif kind.shown:
+        keepsake(f, draw, draw.uniform(-0.3, 0.3), draw.uniform(0.4, 0.5))
     elif kind.place == "pair":
         pair(f, draw, side, draw.uniform(0.03, 0.06))
     else:

@@ -21,6 +21,7 @@ from reffusion.masks.continuation import Plane, planes_around
 from reffusion.masks.voting import Votes, extent
 from reffusion.masks.witness import Witness
 from reffusion.params.masks import Params
+from reffusion.score import sight
 from reffusion.types import Camera, Gaussians, MaskSet, Scene
 
 BURIED = 0.1  # blending weight in all views up to which a Gaussian votes by where it stands
@@ -40,13 +41,15 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
     ballots = raw | {name: empty[name] for name in scene.clean}
     if params.invent == "region" and region is None:
         raise ValueError(f"masks.invent is 'region', but {poses / 'region.json'} is missing: set region in scene.yaml")
-    if not raw and region is None:
+    if not raw and region is None and not scene.blank:
         raise ValueError(f"{poses}: neither masks nor a region say what is to be changed: add masks, or a region")
 
     # Observation outside the masks is measured by weight, whatever the votes count.
     seen = voting.cast_votes(gaussians, train, ballots or empty, mode="weight")
     if raw:
         labels = voted(params, gaussians, train, ballots, seen)
+    elif region is None:
+        labels = torch.zeros(len(gaussians), dtype=torch.bool, device=params.device)
     else:
         labels = voting.inside_box(gaussians, region["center"], region["size"])
     consistent = drawn(params, gaussians, labels, scene.cameras)
@@ -63,7 +66,9 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
         labels |= debris
     fill = region if params.invent in ("region", "auto") else None
     sets = classified(params, scene, gaussians.map(lambda p: p[~labels]), raw, consistent, views, planes, fill)
-    undecided = share_undecided(sets, scene.train)
+    sets |= of_blank_views(params, scene, gaussians, hidden, sets)
+    distilled = (*scene.train, *scene.blank)
+    undecided = share_undecided(sets, distilled)
     if params.invent != "consistent" and fill is None and undecided <= params.negligible:
         sets = {name: replace(each, invent=empty[name]) for name, each in sets.items()}
     save_labels(out / "labels.npy", labels.cpu())
@@ -74,10 +79,10 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
         "masked_gaussians": int(torch.count_nonzero(labels)),
         "gaussians": len(gaussians),
         "voting_views": len(ballots),
-        "invent_pixels": pixels_of("invent", sets, scene.train),
-        "consistent_pixels": pixels_of("consistent", sets, scene.train),
+        "invent_pixels": pixels_of("invent", sets, distilled),
+        "consistent_pixels": pixels_of("consistent", sets, distilled),
         "undecided_share": undecided,
-        "invent_views": [name for name in scene.train if invents[name].any()],
+        "invent_views": [name for name in distilled if invents[name].any()],
         "best_reference": voting.best_view(invents, scene.train),
     }
     save_json(out / "facts.json", facts)
@@ -126,6 +131,20 @@ def classified(
             invent = voting.box_silhouette(**fill, camera=camera, disparity=disparity)
         sets[name] = MaskSet(raw.get(name, np.zeros_like(unknown)), consistent[name], unknown, invent)
     return sets
+
+
+def of_blank_views(
+    params: Params, scene: Scene, gaussians: Gaussians, hidden: dict[str, np.ndarray], sets: dict[str, MaskSet]
+) -> dict[str, MaskSet]:
+    """The masks of views without pixels: what they show and no photograph does is unknown, and to be made up."""
+    if not scene.blank:
+        return {}
+    seen_by = sight.seen_views(gaussians, [scene.cameras[name] for name in scene.train], hidden)
+    found = {name: tidied(params, sight.unseen(gaussians, scene.cameras[name], seen_by)) for name in scene.blank}
+    union = lambda name, mask: MaskSet(
+        sets[name].raw, sets[name].consistent | mask, sets[name].undecided | mask, sets[name].invent | mask
+    )
+    return {name: union(name, mask) for name, mask in found.items()}
 
 
 def continuations(params: Params, gaussians: Gaussians, labels: Tensor, views: list[Witness]) -> list[Plane]:

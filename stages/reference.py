@@ -53,7 +53,7 @@ def taken_over(given: list[GivenReference], scene: Scene, poses: Path, fit: Path
         sets = load_mask_sets(masks, [each.view])[each.view]
         # A clean photograph shows what elsewhere has to be invented.
         sets = replace(sets, invent=sets.consistent) if each.view in scene.clean else sets
-        if sets.invent.any():
+        if sets.invent.any() or each.view in scene.clean:  # one without a hole teaches the prior all the same
             references.append(fitted(each, sets, scene, poses, fit))
         else:
             print(f"reference {each.view} is left out: nothing has to be invented in its view")
@@ -100,7 +100,7 @@ def fitted(given: GivenReference, sets: MaskSet, scene: Scene, poses: Path, fit:
         margin, blend = (share * camera.width for share in (MARGIN, BLEND))
         hole = hidden | taint.tainted(image, photo, hidden) & inside
         image = registration.cut_in(image, photo, hole, inside, margin, blend)
-    if (share := inside[sets.invent].mean()) < WHOLE:
+    if sets.invent.any() and (share := inside[sets.invent].mean()) < WHOLE:
         raise ValueError(f"{given.path}: shows only {share:.0%} of the hole in '{given.view}'; crop less")
     image = image if given.painted else exposure.normalised(image, fit, given.view)
     depth = load_straight_depth(given, lens, upright, found.moved)

@@ -26,6 +26,7 @@ def read_scene(params: Params, scene: Path) -> tuple[Capture, Roles]:
         test=params.test,
         clean=params.clean,
         region=params.region is not None,
+        cameras_only=params.cameras_only,
         remove=params.remove,
     )
     if params.gaussians is not None:

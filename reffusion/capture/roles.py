@@ -12,8 +12,9 @@ from reffusion.capture.views import Views, check_proportions, known
 from reffusion.io.files import BadInput
 from reffusion.io.images import image_size
 
-LEAST_TRAINING_VIEWS = 3
+LEAST_TRAINING_VIEWS = 3  # but for a scene with views that are cameras only
 NONE = "none"
+OTHERS = "others"
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,7 @@ class Roles:
             too. "" is the object of masks that tell none apart.
         test_masks: where a test view shows the object, or would show it; what its box comes from.
         warnings: what is odd.
+        blank: names of views without pixels, beside training and test views.
     """
 
     train: tuple[str, ...]
@@ -34,6 +36,7 @@ class Roles:
     masks: dict[str, dict[str, Path]]
     test_masks: dict[str, Path]
     warnings: tuple[str, ...]
+    blank: tuple[str, ...] = ()
 
     def among(self, names: set[str]) -> Roles:
         """Without the views that are not in `names` (those that structure from motion could not place).
@@ -47,10 +50,11 @@ class Roles:
             train=tuple(n for n in self.train if n in names),
             test=tuple(n for n in self.test if n in names),
             clean=self.clean & names,
+            blank=tuple(n for n in self.blank if n in names),
             masks={thing: kept(files) for thing, files in self.masks.items()},
             test_masks=kept(self.test_masks),
         )
-        _check_enough(roles.train)
+        _check_enough(roles.train, bool(roles.blank))
         return roles
 
 
@@ -64,6 +68,7 @@ def load_roles(
     test: Sequence[str] | str | None = None,
     clean: Sequence[str] = (),
     region: bool = False,
+    cameras_only: Sequence[str] | str | None = None,
     remove: Sequence[str] | None = None,
 ) -> Roles:
     """The roles of the capture's views, from scene.yaml's keys and the folder's usual places.
@@ -77,6 +82,7 @@ def load_roles(
         test_masks: folder of the test views' masks, named like the views or in their order; "none"; None looks.
         train, test: names, or "every 8" (the first of each eight in order of names), or None.
         region: the scene names a 3D region, so it may lack masks.
+        cameras_only: views whose pixels nobody reads: names, "every 8", or "others": all not in train or test.
         remove: objects, each a folder of masks; only checked here.
 
     Raises:
@@ -84,23 +90,21 @@ def load_roles(
             at all, an unknown view, a view for both training and test, fewer than 3 training views.
     """
     folder = Path(folder)
-    of_objects = _mask_files(folder, capture, masks, region)
+    of_objects = _mask_files(folder, capture, masks, region or cameras_only is not None)
     _check_objects(remove, of_objects)
     mask_files = {name: path for files in of_objects.values() for name, path in files.items()}
     label_files = _test_mask_files(folder, capture, test_masks)
     train_named, test_named = (_chosen(value, capture, key) for key, value in (("train", train), ("test", test)))
     labelled = None if label_files is None else _labelled(capture, mask_files, label_files, test_named)
-    train_named, test_views = _parted(train_named, test_named, labelled, capture)
+    asked = None if cameras_only in (None, OTHERS) else _chosen(cameras_only, capture, "cameras_only")
+    train_named, test_views = _parted(train_named, test_named, labelled, asked or [], capture)
+    _check_enough(train_named, cameras_only is not None)
+    blank = _blank(cameras_only, asked, {*train_named, *test_views}, capture)
     clean_views = frozenset(known(name, capture.pictures, "clean") for name in clean)
     if clean_views - set(train_named):
         raise BadInput(f"scene.yaml: clean: {', '.join(sorted(clean_views - set(train_named)))} is no training view")
-    # Test views with masks of their own among the training masks show the object: held out, but without a truth inside.
-    held_out = {name: path for name, path in mask_files.items() if name in set(test_views)}
-    beside = dict(held_out)
-    if label_files is not None and labelled is not None:
-        labels = {n: p for n, p in zip(labelled, label_files, strict=True) if n in set(test_views)}
-        beside |= labels
-        held_out = {name: path for name, path in held_out.items() if name not in labels}
+    labels = None if labelled is None else dict(zip(labelled, label_files or (), strict=True))
+    held_out, beside = _beside(test_views, mask_files, labels or {})
     kept = {name: path for name, path in mask_files.items() if name in set(train_named)}
     ours = {thing: _among(files, {*kept, *held_out}) for thing, files in of_objects.items()}
     for name, path in (*(item for files in ours.values() for item in files.items()), *beside.items()):
@@ -114,7 +118,20 @@ def load_roles(
         ours,
         beside,
         (warning,) if warning else (),
+        blank,
     )
+
+
+def _beside(
+    test: list[str], masks: dict[str, Path], labels: dict[str, Path]
+) -> tuple[dict[str, Path], dict[str, Path]]:
+    """The test views that show the object, with the masks that say so, and where all would show it.
+
+    Those with masks of their own among the training masks are held out, but without a truth inside.
+    """
+    held_out = {name: path for name, path in masks.items() if name in set(test)}
+    own = {name: path for name, path in labels.items() if name in set(test)}
+    return {name: path for name, path in held_out.items() if name not in own}, held_out | own
 
 
 def _among(files: dict[str, Path], names: set[str]) -> dict[str, Path]:
@@ -140,23 +157,36 @@ def _size_of(name: str, capture: Capture) -> tuple[int, int]:
 
 
 def _parted(
-    train: list[str] | None, test: list[str] | None, labelled: list[str] | None, capture: Capture
+    train: list[str] | None, test: list[str] | None, labelled: list[str] | None, blank: list[str], capture: Capture
 ) -> tuple[list[str], list[str]]:
     """Training and test views from those named, None where they are not, and those that test masks tell of."""
     test_views = test if test is not None else (labelled or [])
     if train is None:
-        train = [name for name in capture.pictures if name not in set(test_views)]
+        train = [name for name in capture.pictures if name not in {*test_views, *blank}]
     elif test is None:
         test_views = [name for name in test_views if name not in set(train)]
     both = sorted(set(train) & set(test_views))
     if both:
         raise BadInput(f"scene.yaml: {', '.join(both)} in both train and test; a view is for one of them")
-    _check_enough(train)
     return train, test_views
 
 
-def _check_enough(train: Sequence[str]) -> None:
-    if len(train) < LEAST_TRAINING_VIEWS:
+def _blank(
+    asked: Sequence[str] | str | None, named: Sequence[str] | None, taken: set[str], capture: Capture
+) -> tuple[str, ...]:
+    """The views without pixels."""
+    if asked is None:
+        return ()
+    if named is None:
+        return tuple(name for name in capture.pictures if name not in taken)
+    if both := sorted(set(named) & taken):
+        if not isinstance(asked, str):
+            raise BadInput(f"scene.yaml: cameras_only: {', '.join(both)} is a training or test view too")
+    return tuple(name for name in named if name not in taken)
+
+
+def _check_enough(train: Sequence[str], sparse: bool = False) -> None:
+    if len(train) < (1 if sparse else LEAST_TRAINING_VIEWS):
         raise BadInput(
             f"{len(train)} training view{'' if len(train) == 1 else 's'} ({', '.join(train) or 'none'}): "
             f"at least {LEAST_TRAINING_VIEWS} are needed; add pictures, or correct train and test in scene.yaml"

@@ -11,7 +11,7 @@ from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.lens import Lens, undistort_image, undistort_mask, undoing
 from reffusion.capture.roles import Roles
 from reffusion.io.files import BadInput
-from reffusion.io.images import load_image, load_mask, resized, save_image, save_mask
+from reffusion.io.images import image_size, load_image, load_mask, resized, save_image, save_mask
 
 
 def fitting_size(width: int, height: int, longest: int) -> tuple[int, int]:
@@ -24,6 +24,13 @@ def load_at(path: Path, longest: int, upright: bool) -> np.ndarray:
     """The picture, uint8 [H, W, 3], at its `fitting_size`; downscaled by area averaging."""
     image = load_image(path, upright)
     return resized(image, fitting_size(image.shape[1], image.shape[0], longest))
+
+
+def lens_of(name: str, capture: Capture, longest: int) -> tuple[Lens, Lens]:
+    """The lens of a view whose pixels nobody reads, and its pinhole, at the size its picture would have."""
+    width, height = image_size(capture.pictures[name], upright=capture.upright)
+    lens = capture.poses.lenses[name].resized(*fitting_size(width, height, longest))
+    return lens, undoing(lens)[0]
 
 
 def save_undistorted(out: Path, name: str, capture: Capture, roles: Roles, longest: int) -> tuple[Lens, Lens]:

@@ -36,6 +36,7 @@ def save_scene(poses_dir: Path, scene: Scene) -> None:
     similarity = {"scale": float(scene.similarity.scale), "offset": [float(v) for v in scene.similarity.offset]}
     save_json(poses_dir / "transform.json", similarity)
     views = {"train": list(scene.train), "test": list(scene.test), "clean": sorted(scene.clean)}
+    views |= {"cameras_only": list(scene.blank)} if scene.blank else {}
     save_json(poses_dir / "views.json", views)
 
 
@@ -64,6 +65,7 @@ def load_scene(poses_dir: Path) -> Scene:
         points=points.positions,
         point_colors=points.colors,
         similarity=Similarity(similarity["scale"], np.array(similarity["offset"], np.float64)),
+        blank=tuple(views.get("cameras_only", ())),
     )
 
 

@@ -24,7 +24,8 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
     except ValueError:  # `preview` refuses it
         return others
     masks = {path for files in roles.masks.values() for path in files.values()}
-    read = {*capture.pictures.values(), *masks, *roles.test_masks.values()}
+    shown = {path for name, path in capture.pictures.items() if name not in roles.blank}
+    read = {*shown, *masks, *roles.test_masks.values()}
     read |= {scene / params.gaussians} if params.gaussians is not None else set()
     kept = [path for path in others if path.suffix.lower() not in NOT_READ or path.name == "poses_bounds.npy"]
     return sorted(read | {path for path in kept if path.parent != scene / PAINTED})
@@ -38,6 +39,7 @@ def preview(params: Params, scene: Path) -> list[str]:
     masks = sum(len(files) for files in roles.masks.values())
     apart = f" of {', '.join(roles.masks)}" if len(roles.masks) > 1 else ""
     notes = [f"{len(roles.train)} training and {len(roles.test)} test views, {masks} masks{apart}"]
+    notes += [f"{len(roles.blank)} views are cameras only"] if roles.blank else []
     notes += _of_poses(capture, scene)
     notes += [f"the scene brings a reference of {words(given)}"] if given else []
     return [*notes, *capture.warnings, *roles.warnings]
