@@ -42,6 +42,7 @@ help:
 	@echo 'make scene=X turntable         the finished scene on a way around the capture: runs/X/turntable.webm'
 	@echo 'make scene=X sds-variance      the SDS gradient over noise and timesteps, before and after personalization'
 	@echo '                               device=cuda dtype=float16  for this and the next'
+	@echo 'make scene=demo-sparse sparse  scores against the number of photographs; seeds=3  on two more scenes (hours)'
 	@echo 'make scene=X adapted           views painted by the adapted prior, beside the unadapted: runs/X/adapted/sheet.png'
 	@echo 'make data=FOLDER report        the same of all its scenes: runs/report/index.html'
 	@echo 'make scene=X verify            hash all that was computed for it: is it as it was made?'
@@ -178,6 +179,11 @@ on = $(if $(device),--device="$$device") $(if $(dtype),--dtype="$$dtype")
 adapted: ready
 	@$(RUN) run personalize $(of) $(options)
 	$(PY) -m benchmarks.studies.adapted --run="$${runs:-runs}/$$(basename "$$scene")" $(on) $(if $(steps),--steps="$$steps")
+
+# Of a made scene demo-sparse, with seeds=3 of two others too: scores against the number of photographs (hours).
+.PHONY: sparse
+sparse: ready $(others)
+	$(PY) -m benchmarks.studies.sparse --scenes data/$(made) $(patsubst %/.generated,%,$(others)) --out="$${runs:-runs}/sparse"
 
 # Two processes of one thread each, whole files to each: kernels that are compiled for one test serve the next.
 test: $(VENV)/.ready-dev
