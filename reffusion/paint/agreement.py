@@ -20,7 +20,7 @@ from reffusion.types import Reference
 SMOOTH, REACH = 0.02, 0.04  # of the image's width: deviation of the smoothing; how far around colours are taken
 FEWEST = 40  # pixels that both show, at `painting.SIDE`, from which a pair is compared
 # Mean of the differences, colours in [0, 1], from which two pictures contradict each other. On demo-pair true pictures
-# are at 0.001, one of them 0.9 times as bright at 0.005, its hole smoothly inpainted 0.008, turned upside down 0.019; 0.7
+# are at 0.001, one 0.9 times as bright at 0.005, its hole smoothly inpainted 0.008, turned upside down 0.019; 0.7
 # times as bright 0.044, red and blue exchanged 0.039, mirrored 0.058, with the objects left in 0.099.
 UNLIKE = 0.03
 
