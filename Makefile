@@ -42,13 +42,15 @@ help:
 	@echo 'make scene=X turntable         the finished scene on a way around the capture: runs/X/turntable.webm'
 	@echo 'make scene=X sds-variance      the SDS gradient over noise and timesteps, before and after personalization'
 	@echo '                               device=cuda dtype=float16  for this and the next'
+	@echo 'make scene=demo-sparse sparse  scores against the number of photographs; seeds=3  on two more scenes (hours)'
 	@echo 'make scene=X adapted           views painted by the adapted prior, beside the unadapted: runs/X/adapted/sheet.png'
 	@echo 'make data=FOLDER report        the same of all its scenes: runs/report/index.html'
 	@echo 'make scene=X verify            hash all that was computed for it: is it as it was made?'
 	@echo 'make scene=X clean             remove what was computed for it'
 	@echo 'make data=FOLDER batch         every scene of a folder, and one table'
 	@echo 'make demo [seed=N]             make the demo scene, or another: data/demo-N; others are made when named:'
-	@echo '                               demo-wide, -360, -seen, -photos, -behind, -table, -corner, -grass, -insert, -outpaint, with -N too'
+	@echo '                               demo-wide, -360, -seen, -photos, -behind, -table, -corner, -grass, -insert, -outpaint, -pair, -sparse,'
+	@echo '                               with -N too'
 	@echo 'make prior [steps=N]           train the embedded prior further (hours)'
 	@echo 'make weights [profile=paper]   fetch what a profile needs, sizes first; offline=1 only says what is missing'
 	@echo 'make gpu                       on a CUDA machine: gsplat, and its extension built and loaded (minutes, once)'
@@ -87,7 +89,7 @@ $(VENV)/.ready-dev: $(VENV)/.ready
 # --------------------------------------------------------------------------------------------------------- scenes
 
 # The demo scenes are made by the project: `demo`, `demo-photos` (no poses) and demo-<one of the others>, each with `-<seed>` or not.
-kinds := photos wide 360 seen behind table corner grass insert outpaint
+kinds := photos wide 360 seen behind table corner grass insert outpaint pair sparse
 # Their names become part of a recipe, so there are none with other characters than these.
 plain := a b c d e f g h i j k l m n o p q r s t u v w x y z 0 1 2 3 4 5 6 7 8 9 -
 rest = $(if $1,$(call rest,$(wordlist 2,99,$1),$(subst $(firstword $1),,$2)),$2)
@@ -178,6 +180,11 @@ on = $(if $(device),--device="$$device") $(if $(dtype),--dtype="$$dtype")
 adapted: ready
 	@$(RUN) run personalize $(of) $(options)
 	$(PY) -m benchmarks.studies.adapted --run="$${runs:-runs}/$$(basename "$$scene")" $(on) $(if $(steps),--steps="$$steps")
+
+# Of a made scene demo-sparse, with seeds=3 of two others too: scores against the number of photographs (hours).
+.PHONY: sparse
+sparse: ready $(others)
+	$(PY) -m benchmarks.studies.sparse --scenes data/$(made) $(patsubst %/.generated,%,$(others)) --out="$${runs:-runs}/sparse"
 
 # Two processes of one thread each, whole files to each: kernels that are compiled for one test serve the next.
 test: $(VENV)/.ready-dev

@@ -26,6 +26,12 @@ class Furniture:
         self.leaves: dict[int, tuple] = {}
         self.materials: list[Material] = []
 
+    @property
+    def objects(self) -> dict[str, np.ndarray]:
+        """Name -> bool [n], the solids of each object that is named apart."""
+        of = [removable for *_, removable in self.solids]
+        return {name: np.array([each == name for each in of]) for name in sorted({n for n in of if isinstance(n, str)})}
+
     def _add(self, kind, center, half, yaw, materials, removable):
         turn = (np.cos(np.radians(yaw)), np.sin(np.radians(yaw)))
         self.solids.append((kind, center, half, turn, len(self.materials), removable))
@@ -65,7 +71,7 @@ class Furniture:
         leaves = [self.leaves.get(n, (0,) * 8) for n in range(len(self.solids))]
         return Solids(
             np.array(kind, np.int32), np.array(center, float), np.array(half, float),
-            np.array(turn, float), np.array(first, np.int32), np.array(removable, bool),
+            np.array(turn, float), np.array(first, np.int32), np.array([bool(name) for name in removable]),
             np.array([_reach(k, h) for k, h in zip(kind, half, strict=True)]),
             np.array(leaves, float),
         )  # fmt: skip
@@ -150,6 +156,16 @@ def cabinet(f: Furniture, draw, x: float, z: float, wide: float, high: float, de
     f.sphere(x + side * wide * 0.26, top, z + deep / 2, radius, Material("ball"), draw.uniform(0, 360), removable=True)
     f.cylinder(x - side * wide * 0.2, top, z + deep / 2, min(0.1, deep / 3), draw.uniform(0.16, 0.26), Material("jar"),
                removable=True)  # fmt: skip
+
+
+def pair(f: Furniture, draw, side: int, z: float) -> None:
+    """The two objects of pair, a box and a ball on a foot, side by side before a wall; z is the wall."""
+    wide, deep, high = draw.uniform(0.5, 0.58), draw.uniform(0.2, 0.24), draw.uniform(0.62, 0.74)
+    f.box(side * 0.44, 0, z + deep / 2, (wide, high, deep), Material("paint", 1.3), Material("front"), removable="box")
+    f.box(side * 0.44, high, z + deep / 2, (wide + 0.03, 0.02, deep + 0.02), WOOD, removable="box")
+    radius, foot = draw.uniform(0.19, 0.22), draw.uniform(0.2, 0.26)
+    f.cylinder(-side * 0.42, 0, z + radius, 0.14, foot, Material("jar"), WOOD, removable="ball")
+    f.sphere(-side * 0.42, foot, z + radius, radius, Material("ball"), draw.uniform(0, 360), removable="ball")
 
 
 def lantern(f: Furniture, draw, x: float, z: float) -> None:

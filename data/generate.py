@@ -9,6 +9,8 @@ A furnished room is ray-cast with and without one object. Kinds:
   behind  wide with a thing before the object that stays: it hides a part of what is to be filled from the reference
   table   an object on the edge of a table, free space under it, some cameras low enough to look there
   corner  an object before the corner of a wall that juts out: behind it the depth has a step
+  pair    two objects side by side, each with masks of its own, and two references
+  sparse  nothing to remove; of four training views alone the pixels may be used, the others are cameras
   grass   an object on a lawn before a hedge: thousands of blades and leaves, nothing flat
   insert  the same turned round: an object on the floor, in the test views and the reference only; it is to be put in
   outpaint  the room as photographed, and a sphere beyond which it is to be continued from three references
@@ -80,7 +82,7 @@ def _write_scene(out: Path, seed: int, kind: Kind) -> dict:
     shares, asked = [s for s in facts["never_seen_share"].values() if s is not None], f"{kind.least} or more"
     if kind.hangs:
         asked = f"{MOST_NEVER_SEEN} or less"
-    if max(shares) > MOST_NEVER_SEEN if kind.hangs else min(shares) < kind.least:
+    if kind.task == "remove" and (max(shares) > MOST_NEVER_SEEN if kind.hangs else min(shares) < kind.least):
         raise ValueError(f"seed {seed}: {facts['never_seen_share']} of the masks was never seen; it must be {asked}")
     frame = scene_frame(seed)
     write_truth_cameras(out / "truth/cameras.json", kind, session.names, session.cameras, frame)
@@ -89,7 +91,7 @@ def _write_scene(out: Path, seed: int, kind: Kind) -> dict:
         _write_photos(out, session)
         return facts
     _write_pictures(out, session)
-    {"remove": _ask_removal, "insert": _ask_insertion, "outpaint": _ask_outpainting}[kind.task](
+    {"remove": _ask_removal, "insert": _ask_insertion, "outpaint": _ask_outpainting, "sparse": _ask_views}[kind.task](
         out, session, kind, world, frame
     )
     captured = replace(world, solids=bare(world.solids)) if kind.task == "insert" else world
@@ -100,13 +102,14 @@ def _write_scene(out: Path, seed: int, kind: Kind) -> dict:
 
 
 def _facts(seed: int, session: Session) -> dict:
-    shares = [float(h.sum() / m.sum()) for h, m in zip(session.hidden, session.masks, strict=True)]
+    shares = [float(h.sum() / max(m.sum(), 1)) for h, m in zip(session.hidden, session.masks, strict=True)]
     return {
         "seed": seed,
         "reference": session.names[session.middle],
         "mask_share": _by_split(session.masks.mean((1, 2)), session.test),
         "never_seen_share": _by_split(shares, session.test),
         "lens_shift_px": float(corner_shift(session.cameras[0])),
+        "shown": [session.names[k] for k in session.spread],
     }
 
 
@@ -133,23 +136,46 @@ def _write_test_masks(out: Path, session: Session, masks: Sequence[np.ndarray]) 
 
 
 def _ask_removal(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
-    """Masks of the object, and where there is something to invent the reference."""
+    """Masks of the object, or of each of them, and where there is something to invent the references."""
     _write_test_masks(out, session, session.masks[: session.test])
-    for name, mask, hidden in zip(session.names, session.masks, session.hidden, strict=True):
-        write_image(out / f"truth/never_seen/{name}.png", hidden * np.uint8(255))
-        if name in session.names[session.test :]:
-            write_image(out / f"images_4/label/{name}.png", mask * np.uint8(1))
-    brought = ""
-    if not kind.hangs:
-        write_image(out / "reference.png", session.completed)
-        brought = f"reference: {{view: {session.names[session.middle]}, image: reference.png}}\n"
-    (out / "scene.yaml").write_text(brought + PROFILE)
+    for k, name in enumerate(session.names):
+        write_image(out / f"truth/never_seen/{name}.png", session.hidden[k] * np.uint8(255))
+        if k < session.test:
+            continue
+        for own, of in session.apart.items():
+            write_image(out / f"masks/{own}/{name}.png", of[k] * np.uint8(255))
+        if not session.apart:
+            write_image(out / f"images_4/label/{name}.png", session.masks[k] * np.uint8(1))
+    (out / "scene.yaml").write_text(("" if kind.hangs else _write_references(out, session)) + PROFILE)
+
+
+def _write_references(out: Path, session: Session) -> str:
+    """Write the completed views; the lines of scene.yaml that name them."""
+    files = ["reference.png", *(f"reference_{session.names[k]}.png" for k in list(session.completed)[1:])]
+    said = []
+    for (k, picture), file in zip(session.completed.items(), files, strict=True):
+        write_image(out / file, picture)
+        said.append(f"{{view: {session.names[k]}, image: {file}}}")
+    if len(said) == 1:
+        return f"reference: {said[0]}\n"
+    return "reference:\n" + "".join(f"- {each}\n" for each in said)
+
+
+def _ask_views(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
+    """A few photographs, each a reference; the other training views are cameras."""
+    shown = [session.names[k] for k in session.spread[: kind.shown]]
+    given = "".join(f"- {{view: {name}, image: images_4/{name}.png}}\n" for name in shown)
+    listed = lambda names: f"[{', '.join(names)}]\n"
+    (out / "scene.yaml").write_text(
+        f"train: {listed(shown)}clean: {listed(shown)}test: {listed(session.names[: session.test])}"
+        f"cameras_only: others\nmasks: none\nreference:\n{given}{PROFILE}"
+    )
 
 
 def _ask_insertion(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
     """A reference that shows the object, its depth map, and a sphere in which it stands."""
     _write_test_masks(out, session, session.masks[: session.test])
-    write_image(out / "reference.png", session.completed)
+    write_image(out / "reference.png", session.completed[session.middle])
     np.save(out / "reference.npy", depth(session.cameras[session.middle], kind, world, frame))
     center, radius = region_around(world.solids)
     region = {"center": frame.points(center).tolist(), "radius": frame.scale * radius}

@@ -22,9 +22,12 @@ class Kind:
         bend: SIMPLE_RADIAL's k1 at its largest; points: sparse points wanted.
         hangs: the object hangs in mid-air, so that other views show all that it hides.
         place: where the object is: "room", "behind" (a kept thing before it), "table" (on the edge of one), "corner"
-            (before the corner of a wall), "grass" or "floor".
+            (before the corner of a wall), "grass", "floor" or "pair" (two objects side by side).
         task: what the scene asks for: "remove" the object; "insert" it: the training views are without it, the test
-            views and the reference with it; "outpaint" what lies beyond a sphere, nothing else is changed.
+            views and the reference with it; "outpaint" what lies beyond a sphere, nothing else is changed; "sparse":
+            nothing is changed, but few views have pixels.
+        references: how many views the scene brings completed.
+        shown: of so many training views the pixels may be used, the others are cameras only; 0: of all.
         least: share of the masks that no training view may show, at least.
         low: metres above the floor of the lowest cameras; None: all at the height of a person's eyes.
     """
@@ -45,6 +48,8 @@ class Kind:
     task: str = "remove"
     least: float = 0.4
     low: float | None = None
+    references: int = 1
+    shown: int = 0
 
     @property
     def around(self) -> bool:
@@ -64,6 +69,8 @@ KINDS = {
     "grass": Kind(samples=2, spread=30.0, node=0.08, place="grass"),
     "insert": Kind(place="floor", task="insert", least=0),
     "outpaint": Kind(spread=16.0, task="outpaint", least=0),
+    "pair": Kind(spread=30.0, place="pair", least=0.2, references=2),
+    "sparse": Kind(spread=30.0, task="sparse", least=0, shown=4),
     "photos": Kind(width=480, height=360, train=26, test=0, photos=True, texture=2048, node=0.025),
 }
 

@@ -9,6 +9,8 @@ import raycast
 from kinds import Kind, randomness
 from world import World
 
+SPREAD = 8  # views of `Session.spread`
+
 
 @dataclass(frozen=True)
 class Session:
@@ -18,7 +20,10 @@ class Session:
         names: of the views; cameras: [V, 16]; test: how many are test views.
         photos: [V, H, W, 3] uint8; masks: bool [V, H, W], pixels that the object touches or would touch.
         hidden: bool [V, H, W], never-seen pixels of the masks.
-        middle: the view from the middle of the training views' walk; completed: it without the object.
+        middle: the view from the middle of the training views' walk.
+        completed: view -> uint8 [H, W, 3] without the object, of the middle one and those farthest from it.
+        spread: training views, each the one farthest from those before it, the middle one first.
+        apart: object -> bool [V, H, W], what its mask holds: of objects that are named apart.
     """
 
     names: list[str]
@@ -28,7 +33,9 @@ class Session:
     masks: np.ndarray
     hidden: np.ndarray
     middle: int
-    completed: np.ndarray
+    completed: dict[int, np.ndarray]
+    spread: list[int]
+    apart: dict[str, np.ndarray]
 
 
 def photographed(seed: int, kind: Kind, world: World, target: np.ndarray) -> Session:
@@ -42,8 +49,25 @@ def photographed(seed: int, kind: Kind, world: World, target: np.ndarray) -> Ses
     photos, masks = (np.stack(pictures) for pictures in zip(*shots, strict=True))
     in_training = train, masks[kind.test :]
     hidden = [never_seen(world, camera, mask, *in_training) for camera, mask in zip(cameras, masks, strict=True)]
-    completed, _ = shoot(world, cameras[middle], kind, kind.task == "insert")
-    return Session(names, cameras, kind.test, photos, masks, np.stack(hidden), middle, completed)
+    spread = [kind.test + k for k in _spread(train, middle - kind.test, min(SPREAD, kind.train))]
+    whole = {k: shoot(world, cameras[k], kind, kind.task == "insert")[0] for k in spread[: kind.references]}
+    apart = {name: np.stack([_alone(world, c, kind, own) for c in cameras]) for name, own in world.objects.items()}
+    return Session(names, cameras, kind.test, photos, masks, np.stack(hidden), middle, whole, spread, apart)
+
+
+def _spread(cameras: np.ndarray, first: int, count: int) -> list[int]:
+    """So many cameras, each the one farthest from those before it."""
+    chosen, away = [first], np.full(len(cameras), np.inf)
+    while len(chosen) < count:
+        away = np.minimum(away, np.linalg.norm(cameras[:, 13:] - cameras[chosen[-1], 13:], axis=1))
+        chosen.append(int(np.argmax(away)))
+    return chosen
+
+
+def _alone(world: World, camera: np.ndarray, kind: Kind, own: np.ndarray) -> np.ndarray:
+    """Bool [H, W]: pixels in which this object, bool [n] of the solids, is met before anything else."""
+    alone = replace(world, solids=world.solids._replace(removable=own))
+    return _radiance(alone, camera, kind, True, kind.samples)[1]
 
 
 def shows_object(kind: Kind, k: int) -> bool:

@@ -4,7 +4,7 @@ removal is harder than against a wall see `places.py`."""
 from __future__ import annotations
 
 import numpy as np
-from furniture import WHITE, WOOD, Furniture, Material, cabinet, chest, daybed, keepsake, lantern, plant, shelf
+from furniture import WHITE, WOOD, Furniture, Material, cabinet, chest, daybed, keepsake, lantern, pair, plant, shelf
 from kinds import Kind, randomness
 from places import PLAIN, RUG, WALL, garden, shell, table_room, wall_corner
 
@@ -26,6 +26,10 @@ def furnish(seed: int, kind: Kind) -> tuple[Furniture, np.ndarray]:
         chest(f, draw, draw.uniform(-0.1, 0.1), 0.0, draw.uniform(0.85, 0.95))
     elif kind.hangs:
         lantern(f, draw, 0.0, 1.15)
+    elif kind.shown:
+        keepsake(f, draw, draw.uniform(-0.3, 0.3), draw.uniform(0.4, 0.5))
+    elif kind.place == "pair":
+        pair(f, draw, side, draw.uniform(0.03, 0.06))
     else:
         _cabinet(f, draw, flat=kind.spread > 30)
     plant(f, draw, side * (corner - 0.42), 0.36, draw.uniform(1.35, 1.6))

@@ -16,13 +16,16 @@ from solids import Faces, Solids
 
 @dataclass(frozen=True)
 class World:
-    """All that `raycast.render` needs: geometry, materials, baked light [M, 3], and the exposure."""
+    """All that `raycast.render` needs: geometry, materials, baked light [M, 3], and the exposure; for masks `objects`,
+    name -> bool [n], the solids of each object that is named apart.
+    """
 
     solids: Solids
     faces: Faces
     textures: Textures
     light: np.ndarray
     exposure: float
+    objects: dict[str, np.ndarray]
 
 
 def paint_textures(seed: int, size: int) -> dict[str, np.ndarray]:
@@ -85,4 +88,4 @@ def bake(furniture: Furniture, seed: int, kind: Kind) -> World:
     light = direct
     for rays in (32, 96):
         light = direct + bounced_light(solids, faces, pictures, *nodes, light, 0.03, rays)
-    return World(solids, faces, pictures, light, 1.0)
+    return World(solids, faces, pictures, light, 1.0, furniture.objects)

@@ -89,6 +89,7 @@ class Scene:
         points: [P, 3] float64 sparse points.
         point_colors: [P, 3] uint8.
         similarity: from the scene's own frame to this one.
+        blank: names of further views, without pixels: they are distilled, and supervise nothing.
     """
 
     cameras: dict[str, Camera]
@@ -98,6 +99,7 @@ class Scene:
     points: np.ndarray
     point_colors: np.ndarray
     similarity: Similarity
+    blank: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

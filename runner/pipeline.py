@@ -34,7 +34,7 @@ class Condition(Strict):
     param: Annotated[tuple[str, ...], BeforeValidator(lambda said: (said,) if isinstance(said, str) else said)] = ()
     equals: Any = None
     empty: str | None = None  # <stage>/<folder>: of an earlier artifact, is without a file
-    unless: str | None = None  # ignored where the scene brings this key
+    unless: tuple[str, ...] = ()  # ignored where the scene brings one of these keys
 
     @model_validator(mode="after")
     def _one_question(self) -> Self:

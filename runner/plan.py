@@ -75,7 +75,7 @@ def decide(job: Job, stage: str, earlier: dict[str, Decision]) -> Decision:
 def _holds(job: Job, condition: Condition, earlier: dict[str, Decision]) -> bool | None:
     """Is the condition true? None: not known yet."""
     stage, name = condition.names
-    if condition.unless and condition.unless in job.brings:
+    if job.brings.intersection(condition.unless):
         return False
     if condition.param:
         return all(_is(job, param, condition.equals) for param in condition.param)

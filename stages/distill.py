@@ -106,20 +106,20 @@ def train_views(
 
     `tainted`: a folder of masks, of pixels that the object had shadowed; they may not supervise.
     """
-    photos, sets = exposure.load_views(poses, fit, scene.train), load_mask_sets(masks, scene.train)
+    photos, sets = exposure.load_views(poses, fit, scene.train), load_mask_sets(masks, (*scene.train, *scene.blank))
     place = lambda array: torch.from_numpy(array).to(params.device)
     painted = load_views(lift, [n for n in scene.train if (lift / "images" / f"{n}.png").exists()]) if lift else {}
     views = []
-    for name in scene.train:
+    for name in (*scene.train, *scene.blank):
         clean, pixels = name in scene.clean, sets[name]
         drawn = pixels.consistent | pixels.invent  # a region that is filled is part of the paper's m
         repaint = (pixels.invent if params.repaint == "invent" else drawn) & (not clean)
         # C shows the object; I, where it reaches beyond C, the place of one that is to be drawn there.
-        supervises = ~drawn | clean
+        supervises = (~drawn | clean) & (name not in scene.blank)
         if tainted and (tainted / f"{name}.png").exists():
             supervises &= ~load_mask(tainted / f"{name}.png")
         lifted = place(painted[name]) / 255 if name in painted else None
-        photo = place(photos[name]) / 255
+        photo = place(photos.get(name, np.zeros((*repaint.shape, 3), np.uint8))) / 255
         views.append(TrainView(scene.cameras[name], photo, place(supervises), place(repaint), clean, lifted))
     return views
 

@@ -12,7 +12,7 @@ from reffusion import trace
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.images import load_image, load_mask, save_image
 from reffusion.io.ply import load_ply, save_ply
-from reffusion.io.scene import load_scene
+from reffusion.io.scene import load_raw_masks, load_scene, raw_mask_files
 from reffusion.paint import paint2d
 from reffusion.paint.paint2d import Painter
 from reffusion.params.evaluate import Params
@@ -130,9 +130,13 @@ def rendered(work: Work, camera: Camera) -> tuple[Shown, dict[str, np.ndarray]]:
 
 
 def truth_for(work: Work, camera: Camera) -> rows.Truth:
-    """What the view is compared with; its photograph shows the object where it has a mask among the training views'."""
-    picture = truth_of(camera, work.poses) if work.tested else None
-    shows_object = (work.poses / "masks" / f"{camera.name}.png").exists()
+    """What the view is compared with; its photograph shows the object where it has a mask among the training views'.
+
+    Nothing where an object is kept: test photographs show none.
+    """
+    kept = work.masks and load_json(work.masks / "facts.json").get("kept")
+    picture = truth_of(camera, work.poses) if work.tested and not kept else None
+    shows_object = bool(raw_mask_files(work.poses, camera.name))
     return rows.Truth(picture, shows_object, work.unseen.get(camera.name))
 
 
@@ -201,9 +205,10 @@ def mask_of(camera: Camera, poses: Path, masks: Path | None) -> np.ndarray:
     """bool [H, W]: the view's test mask, else its consistent mask, else (a variant without the stage masks) its raw
     mask, else empty. Where there are test masks, every variant is so scored in the same box."""
     size, file = (camera.height, camera.width), f"{camera.name}.png"
-    given = [poses / "test_masks" / file, *([masks / "consistent" / file] if masks else []), poses / "masks" / file]
+    given = [poses / "test_masks" / file, *([masks / "consistent" / file] if masks else [])]
     found = [path for path in given if path.exists()]
-    return load_mask(found[0], size) if found else np.zeros(size, bool)
+    raw = {} if found else load_raw_masks(poses, [camera.name])
+    return load_mask(found[0], size) if found else raw.get(camera.name, np.zeros(size, bool))
 
 
 def view_of(gaussians: Gaussians, camera: Camera, picture: np.ndarray, mask: np.ndarray) -> Shown:

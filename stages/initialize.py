@@ -63,7 +63,8 @@ def run(
     gaussians, new = gaussians.map(lambda p: p[~haze]), new[~haze]
     best = load_json(masks / "facts.json")["best_reference"]
     log = trace.Trace(out) if references else None
-    for each in sorted(references, key=lambda r: (r.camera.name != best, -int(r.mask.sum()))):
+    holes = [each for each in references if each.mask.any()]
+    for each in sorted(holes, key=lambda r: (r.camera.name != best, -int(r.mask.sum()))):
         gaussians, new = filled(params, out, gaussians, new, each, around, network, log)
     true = true_pictures(reference, references, around) if references and params.start == "reference" else []
     if true and params.settle:
@@ -78,7 +79,8 @@ def run(
         new = torch.cat([new, new.new_ones(len(added))])
     if true and params.settle:
         drawn_there = {name: each.invent & (name not in scene.clean) for name, each in sets.items()}
-        gaussians = settled(params, out, gaussians, true, around, drawn_there)
+        shown = replace(around, cameras=[camera for camera in around.cameras if camera.name not in scene.blank])
+        gaussians = settled(params, out, gaussians, [each for each in true if each.mask.any()], shown, drawn_there)
     save_ply(out / "gaussians.ply", gaussians)
     save_labels(out / "labels.npy", new.cpu())
     uncovered = {each.name: filling.uncovered(gaussians, each, sets[each.name].consistent) for each in train}
@@ -96,8 +98,11 @@ def run(
 def surroundings(params: Params, scene, gaussians, thing, sets, poses: Path, fit: Path):
     """What the photographs say of the space around the object, and the planes that go on into what they do not."""
     hidden = {name: each.consistent & (name not in scene.clean) for name, each in sets.items()}
-    train = [scene.cameras[name] for name in scene.train]
+    train = [scene.cameras[name] for name in (*scene.train, *scene.blank)]
     photos = exposure.load_views(poses, fit, scene.train)
+    for name in scene.blank:  # the Gaussians' own picture; what no photograph shows of it is hidden
+        everything = np.ones_like(hidden[name])
+        photos[name] = inpaint.background(gaussians, scene.cameras[name], np.zeros((1, 1, 3), np.uint8), everything)
     found = surfaces.looked_around(gaussians, thing, train, hidden, photos, SEED)
     consistent = {name: each.consistent for name, each in sets.items()}
     return filling.Surroundings(

@@ -15,13 +15,14 @@ from reffusion import geometry, trace
 from reffusion.fit import exposure
 from reffusion.io.arrays import load_json, save_json, save_labels
 from reffusion.io.ply import load_ply
-from reffusion.io.scene import load_raw_masks, load_scene, save_mask_sets
+from reffusion.io.scene import load_raw_masks, load_scene, objects_of, save_mask_sets
 from reffusion.masks import regions, undecided, voting, witness
 from reffusion.masks.continuation import Plane, planes_around
 from reffusion.masks.regions import Region
 from reffusion.masks.voting import Votes, extent
 from reffusion.masks.witness import Witness
 from reffusion.params.masks import Params
+from reffusion.score import sight
 from reffusion.types import Camera, Gaussians, MaskSet, Scene
 
 BURIED = 0.1  # blending weight in all views up to which a Gaussian votes by where it stands
@@ -33,18 +34,23 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
     scene, gaussians = load_scene(poses), load_ply(fit / "gaussians.ply").map(lambda p: p.to(params.device))
     train = [scene.cameras[name] for name in scene.train]
     region = Region(**load_json(poses / "region.json")) if (poses / "region.json").exists() else None
-    raw = load_raw_masks(poses, scene.train)
+    objects = objects_of(poses)
+    raw = load_raw_masks(poses, scene.train, params.remove)
+    if objects and not raw:
+        raise ValueError(f"{poses / 'masks'}: no view has a mask of each object; add empty ones where one is unseen")
     empty = {name: np.zeros((camera.height, camera.width), bool) for name, camera in scene.cameras.items()}
     ballots = raw | {name: empty[name] for name in scene.clean}
     if params.invent == "region" and region is None:
         raise ValueError(f"masks.invent is 'region', but {poses / 'region.json'} is missing: set region in scene.yaml")
-    if not raw and region is None:
+    if not raw and region is None and not scene.blank:
         raise ValueError(f"{poses}: neither masks nor a region say what is to be changed: add masks, or a region")
 
     # Observation outside the masks is measured by weight, whatever the votes count.
     seen = voting.cast_votes(gaussians, train, ballots or empty, mode="weight")
     if raw:
         labels = voted(params, gaussians, train, ballots, seen)
+    elif region is None:
+        labels = torch.zeros(len(gaussians), dtype=torch.bool, device=params.device)
     else:
         labels = regions.inside(gaussians, region) & region.holds
     consistent = drawn(params, gaussians, labels, scene.cameras)
@@ -61,20 +67,23 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
         labels |= debris
     fill = None if params.invent == "undecided" else region
     sets = classified(params, scene, gaussians.map(lambda p: p[~labels]), raw, consistent, views, planes, fill)
-    undecided = share_undecided(sets, scene.train)
+    sets |= of_blank_views(params, scene, gaussians, hidden, sets)
+    distilled = (*scene.train, *scene.blank)
+    undecided = share_undecided(sets, distilled)
     if params.invent != "consistent" and fill is None and undecided <= params.negligible:
         sets = {name: replace(each, invent=empty[name]) for name, each in sets.items()}
     save_labels(out / "labels.npy", labels.cpu())
     save_mask_sets(out, sets)
     invents = {name: each.invent for name, each in sets.items()}
     facts = {
+        "kept": [name for name in objects if params.remove is not None and name not in params.remove],
         "masked_gaussians": int(torch.count_nonzero(labels)),
         "gaussians": len(gaussians),
         "voting_views": len(ballots),
-        "invent_pixels": pixels_of("invent", sets, scene.train),
-        "consistent_pixels": pixels_of("consistent", sets, scene.train),
+        "invent_pixels": pixels_of("invent", sets, distilled),
+        "consistent_pixels": pixels_of("consistent", sets, distilled),
         "undecided_share": undecided,
-        "invent_views": [name for name in scene.train if invents[name].any()],
+        "invent_views": [name for name in distilled if invents[name].any()],
         "best_reference": voting.best_view(invents, scene.train),
     }
     save_json(out / "facts.json", facts)
@@ -123,6 +132,20 @@ def classified(
             invent = invent | regions.silhouette(fill, camera, disparity)
         sets[name] = MaskSet(raw.get(name, np.zeros_like(unknown)), consistent[name], unknown, invent)
     return sets
+
+
+def of_blank_views(
+    params: Params, scene: Scene, gaussians: Gaussians, hidden: dict[str, np.ndarray], sets: dict[str, MaskSet]
+) -> dict[str, MaskSet]:
+    """The masks of views without pixels: what they show and no photograph does is unknown, and to be made up."""
+    if not scene.blank:
+        return {}
+    seen_by = sight.seen_views(gaussians, [scene.cameras[name] for name in scene.train], hidden)
+    found = {name: tidied(params, sight.unseen(gaussians, scene.cameras[name], seen_by)) for name in scene.blank}
+    union = lambda name, mask: MaskSet(
+        sets[name].raw, sets[name].consistent | mask, sets[name].undecided | mask, sets[name].invent | mask
+    )
+    return {name: union(name, mask) for name, mask in found.items()}
 
 
 def continuations(params: Params, gaussians: Gaussians, labels: Tensor, views: list[Witness]) -> list[Plane]:

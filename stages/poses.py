@@ -17,7 +17,7 @@ from reffusion.capture.lenses import save_lenses
 from reffusion.capture.reading import read_scene
 from reffusion.capture.refine import refined
 from reffusion.capture.roles import NONE, Roles
-from reffusion.capture.undistorted import check_masks, load_at, save_undistorted
+from reffusion.capture.undistorted import check_masks, lens_of, load_at, save_undistorted
 from reffusion.capture.views import known
 from reffusion.io.arrays import save_json
 from reffusion.io.images import save_image, save_mask
@@ -38,7 +38,8 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     were adjusted; gaussians.ply and region.json where the scene brings them; warnings.json where something is odd."""
     capture, roles = read_scene(params, scene)
     said = [*capture.warnings, *roles.warnings]
-    check_masks(roles.masks)
+    for files in roles.masks.values():
+        check_masks(files)
     if params.gaussians is not None:
         load_ply(scene / params.gaussians)  # before the work, not after it
     if capture.poses is None:
@@ -50,9 +51,12 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     lenses, pinholes = {}, {}
     for k in trace.progress(len(views), "poses"):
         lenses[views[k]], pinholes[views[k]] = save_undistorted(out, views[k], capture, roles, longest)
+    for name in roles.blank:
+        lenses[name], pinholes[name] = lens_of(name, capture, longest)
     save_lenses(out, lenses, capture.upright)
     shutil.rmtree(out / "sfm", ignore_errors=True)
     normalised = frame.normalised(capture.poses, pinholes, roles.train, roles.test, roles.clean)
+    normalised = replace(normalised, blank=roles.blank)
     if params.refine and params.gaussians is None:  # Gaussians that the scene brings were fitted with its cameras
         normalised = _refined(normalised, out)
     if len(normalised.points) < LEAST_POINTS:
@@ -61,7 +65,9 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     if len(normalised.points) < LEAST_POINTS:
         ranges = frame.ranges_of(capture.poses, pinholes) * normalised.similarity.scale
         draws = seeding.generator(SEED, "poses", "random points")
-        normalised = frame.filled_up(normalised, ranges, MORE_POINTS, draws, lambda v: load_views(out, [v])[v])
+        shown = replace(normalised, cameras={name: normalised.cameras[name] for name in views})
+        filled = frame.filled_up(shown, ranges[: len(views)], MORE_POINTS, draws, lambda v: load_views(out, [v])[v])
+        normalised = replace(filled, cameras=normalised.cameras)
     save_scene(out, normalised)
     if params.gaussians is not None:  # in the scene's own frame
         save_ply(out / "gaussians.ply", load_ply(scene / params.gaussians, normalised.similarity))
@@ -114,13 +120,14 @@ def _supported_size(params: Params, capture: Capture, roles: Roles) -> int:
 
 def _refined(scene: Scene, out: Path) -> Scene:
     """The scene with cameras that agree with optical flow; test views too, as they are in structure from motion."""
-    found = refined(list(scene.cameras.values()), load_views(out, scene.cameras))
+    shown = {name: camera for name, camera in scene.cameras.items() if name not in scene.blank}
+    found = refined(list(shown.values()), load_views(out, shown))
     if found.after is None:
         print(f"cameras as given: the views miss each other by {found.before:.2f} px", flush=True)
     else:
         print(f"cameras adjusted: views missed each other by {found.before:.2f} px, now {found.after:.2f}", flush=True)
     save_json(out / "refine.json", {"before": found.before, "after": found.after})
-    return replace(scene, cameras=found.cameras)
+    return replace(scene, cameras=scene.cameras | found.cameras)
 
 
 def _with_flow_points(scene: Scene, out: Path) -> Scene:

@@ -18,7 +18,7 @@ from reffusion.io.images import save_image, save_mask
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets, load_object, load_scene, load_views, save_references
 from reffusion.masks import taint
-from reffusion.paint import feedforward, painting, registration
+from reffusion.paint import agreement, feedforward, painting, registration
 from reffusion.params.reference import Params
 from reffusion.prior import inpaint, memory
 from reffusion.prior.model import load_prior
@@ -53,13 +53,30 @@ def taken_over(given: list[GivenReference], scene: Scene, poses: Path, fit: Path
         sets = load_mask_sets(masks, [each.view])[each.view]
         # A clean photograph shows what elsewhere has to be invented.
         sets = replace(sets, invent=sets.consistent) if each.view in scene.clean else sets
-        if sets.invent.any():
+        if sets.invent.any() or each.view in scene.clean:  # one without a hole teaches the prior all the same
             references.append(fitted(each, sets, scene, poses, fit))
         else:
             print(f"reference {each.view} is left out: nothing has to be invented in its view")
     if not references:
         raise ValueError(f"{given[0].path}: in no reference's view anything has to be invented; choose other views")
+    refuse_contradictions(references, scene, fit, masks)
     return references
+
+
+def refuse_contradictions(references: list[Reference], scene: Scene, fit: Path, masks: Path) -> None:
+    """ValueError where two show something else in the part of the hole that both see: a mixture would be learnt."""
+    if len(references) < 2:
+        return
+    cameras, sets = [each.camera for each in references], load_mask_sets(masks, scene.train)
+    keep = ~load_labels(masks / "labels.npy")
+    remaining = load_ply(fit / "gaussians.ply").map(lambda p: p[keep])
+    hidden = {camera.name: sets[camera.name].consistent for camera in cameras}
+    holes = painting.holes(remaining, cameras, hidden, {each.camera.name: each.mask for each in references})
+    for first, second, unlike in agreement.contradicting(references, holes):
+        raise ValueError(
+            f"the references of '{first}' and '{second}' contradict each other: in what both show, colours differ by "
+            f"{255 * unlike:.0f} of 255; make them alike, or give one of them"
+        )
 
 
 def fitted(given: GivenReference, sets: MaskSet, scene: Scene, poses: Path, fit: Path) -> Reference:
@@ -83,7 +100,7 @@ def fitted(given: GivenReference, sets: MaskSet, scene: Scene, poses: Path, fit:
         margin, blend = (share * camera.width for share in (MARGIN, BLEND))
         hole = hidden | taint.tainted(image, photo, hidden) & inside
         image = registration.cut_in(image, photo, hole, inside, margin, blend)
-    if (share := inside[sets.invent].mean()) < WHOLE:
+    if sets.invent.any() and (share := inside[sets.invent].mean()) < WHOLE:
         raise ValueError(f"{given.path}: shows only {share:.0%} of the hole in '{given.view}'; crop less")
     drawn = sets.consistent | taint.changed(image, photo, sets.invent)
     image = image if given.painted else exposure.normalised(image, fit, given.view)

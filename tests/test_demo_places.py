@@ -6,6 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
+
+from reffusion.io.images import load_mask
 
 
 @pytest.mark.parametrize(
@@ -80,6 +83,20 @@ def test_behind_the_object_a_corner_makes_a_step(generate):
     back = (which == 0) & (points[:, 1] > 0.01) & (points[:, 2] < 0.01)
     assert (which == wall).mean() > 0.2 and back.mean() > 0.1
     assert points[which == wall, 2].max() > 0.4
+
+
+def test_a_pair_has_masks_for_each_object_that_make_up_the_hole(generate, tmp_path):
+    """And two references; what hides the other object is in its own mask only."""
+    folder = tmp_path / "pair"
+    facts = generate.generate(folder, 0, small(generate.KINDS["pair"]))
+    assert 0.2 <= min(facts["never_seen_share"].values()) and facts["mask_share"]["train"] > 0.05
+    boxes, balls = (sorted((folder / f"masks/{name}").iterdir()) for name in ("box", "ball"))
+    assert [path.name for path in boxes] == [path.name for path in balls] and len(boxes) == 24
+    for box, ball in zip(boxes, balls, strict=True):
+        assert load_mask(box).any() and load_mask(ball).any()
+    given = yaml.safe_load((folder / "scene.yaml").read_text())["reference"]
+    assert len({each["view"] for each in given}) == 2
+    assert all((folder / each["image"]).is_file() for each in given)
 
 
 def test_leaves_are_where_the_rays_meet_them(generate):

@@ -7,6 +7,8 @@ import torch
 
 from reffusion import geometry
 from reffusion.io.arrays import load_json, load_labels, save_json
+from reffusion.io.images import load_mask, save_mask
+from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets
 from reffusion.masks import regions, voting
 from reffusion.types import Gaussians
@@ -223,3 +225,33 @@ def test_haze_shows_mostly_where_nobody_saw():
     aside.means[0, 0] = 0.4
     both = blob.zipped(aside, lambda a, b: torch.cat([a, b]))
     assert voting.leaking(both, [view], {"v": inside}).tolist() == [True, False]
+
+
+def test_any_subset_of_the_objects_goes_and_the_others_stay(tmp_path):
+    """Two squares side by side with masks of their own, and one set of Gaussians."""
+    poses, fit, labels = small.write(tmp_path, NEAR)
+    first = labels & (load_ply(fit / "gaussians.ply").means[:, 0] < 0)
+    for path in sorted((poses / "masks").glob("*.png")):
+        mask, half = load_mask(path), split_at(path.stem)
+        for name, part in (("left", half), ("right", ~half)):
+            save_mask(poses / "masks" / name / path.name, mask & part)
+        path.unlink()
+    found = {}
+    for remove in (None, ["left"], ["right"], ["left", "right"]):
+        out = tmp_path / f"masks-{remove}"
+        out.mkdir()
+        run(Params(remove=remove), out, poses=poses, fit=fit)
+        found[str(remove)] = load_labels(out / "labels.npy"), load_json(out / "facts.json")["kept"]
+    everything, left, right, both = found.values()
+    assert torch.equal(everything[0], both[0]) and everything[1] == both[1] == []
+    assert left[1] == ["right"] and right[1] == ["left"]
+    assert (left[0] == first)[labels].float().mean() > 0.9
+    assert (right[0] == (labels & ~first))[labels].float().mean() > 0.9
+    assert (left[0] & right[0])[labels].float().mean() < 0.05
+
+
+def split_at(name: str) -> np.ndarray:
+    """bool [H, W]: left of where the view shows the middle of the square."""
+    camera = small.CAMERAS[name]
+    column = geometry.project(np.array([[0.0, 0.0, NEAR]]), camera)[0][0, 0]
+    return np.broadcast_to(np.arange(small.WIDTH) + 0.5 < column, (small.HEIGHT, small.WIDTH))

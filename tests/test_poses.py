@@ -40,9 +40,10 @@ from reffusion.capture.load import load_capture
 from reffusion.capture.roles import load_roles
 from reffusion.io import colmap
 from reffusion.io.arrays import load_json
+from reffusion.io.files import BadInput
 from reffusion.io.images import image_size
 from reffusion.io.ply import load_ply, save_ply, save_points
-from reffusion.io.scene import load_raw_masks, load_scene, load_test_masks, load_views
+from reffusion.io.scene import load_raw_masks, load_scene, load_test_masks, load_views, objects_of
 from reffusion.types import Gaussians
 from stages import fit, poses
 from stages.plan import poses as plan
@@ -118,6 +119,45 @@ def test_spin_nerf_split_and_masks(tmp_path, mask_value):
     for mask in (*labels.values(), *load_raw_masks(out, scene.train).values()):
         assert mask.shape == (HEIGHT, WIDTH) and 0.04 < mask.mean() < 0.1
     assert set(np.unique(np.array(Image.open(out / "masks" / "v02.png")))) == {0, 255}
+
+
+def test_cameras_without_pixels_stay(tmp_path):
+    """Their pictures are no part of what is read, and one training view is enough beside them."""
+    folder = prepare(tmp_path / "s", "colmap", some_truth())
+    everyone, out = run(folder)
+    for path in (folder / "masks", out):
+        shutil.rmtree(path)
+    asked = {"train": ["v01"], "test": ["v04"], "clean": ["v01"], "cameras_only": "others"}
+    scene, out = run(folder, **asked)
+    assert scene.blank == ("v00", "v02", "v03", "v05") and scene.train == ("v01",)
+    assert sorted(path.stem for path in (out / "images").iterdir()) == ["v01", "v04"]
+    for name, camera in scene.cameras.items():
+        np.testing.assert_allclose(camera.world_to_camera, everyone.cameras[name].world_to_camera, atol=1e-9)
+    params = poses.Params(**asked)
+    read = {path.name for path in plan.scene_files(params, folder, sorted(folder.rglob("*.*")))}
+    assert {"v01.png", "v04.png"} <= read and "v00.png" not in read
+    assert "4 views are cameras only" in plan.preview(params, folder)
+    with pytest.raises(BadInput, match="cameras_only: v04 is a training or test view too"):
+        plan.preview(poses.Params(**asked | {"cameras_only": ["v04"]}), folder)
+
+
+def test_objects_that_are_told_apart(tmp_path):
+    folder = prepare(tmp_path / "s", "colmap", some_truth())
+    usual = folder / "masks"
+    for name in ("box", "ball"):
+        (usual / name).mkdir()
+        for path in usual.glob("*.png"):
+            shutil.copy(path, usual / name)
+    with pytest.raises(BadInput, match="holds masks and folders of masks"):
+        run(folder)
+    for path in usual.glob("*.png"):
+        path.unlink()
+    (usual / "ball/v03.png").unlink()
+    scene, out = run(folder)
+    assert objects_of(out) == ["ball", "box"]
+    assert "v03" in load_raw_masks(out, scene.train, ["box"]) and "v03" not in load_raw_masks(out, scene.train)
+    with pytest.raises(BadInput, match="no object 'cat'; masks tell apart ball, box"):
+        plan.preview(poses.Params(remove=["cat"]), folder)
 
 
 def test_spin_nerf_with_a_missing_training_mask(tmp_path):

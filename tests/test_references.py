@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io as buffers
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,7 @@ import yaml
 from PIL import Image
 from small_capture import HEIGHT, OPENCV, WIDTH, prepare, run, some_truth, write_pictures, write_transforms
 
+from reffusion import geometry
 from reffusion.capture import lens
 from reffusion.capture.given import GivenReference, load_depth
 from reffusion.capture.lenses import save_lenses
@@ -22,8 +24,8 @@ from reffusion.depth import alignment
 from reffusion.io.arrays import save_json, save_labels
 from reffusion.io.images import load_image, load_mask, save_exr, save_image, save_mask
 from reffusion.io.scene import load_references, load_scene, save_mask_sets
-from reffusion.paint import painting, registration
-from reffusion.types import MaskSet
+from reffusion.paint import agreement, painting, registration
+from reffusion.types import MaskSet, Reference
 from runner.execute import run_scene
 from runner.keys import Hashes, code_of
 from runner.plan import plan
@@ -480,3 +482,21 @@ def test_a_photograph_that_is_also_a_reference_still_counts_for_poses(tmp_path):
     assert of_reference == [folder / "images/v00.png"]
     scene, _ = run(folder)
     assert len(scene.cameras) == 6
+
+
+def test_references_that_contradict_each_other_are_told_from_those_that_agree():
+    """Two views of a wall: the same paint on it, then another in one of them."""
+    views = [small.camera("a", -0.2), small.camera("b", 0.2)]
+    depth = np.full((small.HEIGHT, small.WIDTH), small.WALL)
+    hole = np.zeros_like(depth, bool)
+    hole[20:52, 24:72] = True
+    painted = {}
+    for view in views:
+        points = geometry.unproject(depth, view)
+        painted[view.name] = np.round(255 * small.texture(points[..., 0], points[..., 1])).astype(np.uint8)
+    holes = {view.name: painting.Hole(view, hole, depth) for view in views}
+    alike = [Reference(view, painted[view.name], hole) for view in views]
+    assert agreement.difference(*alike, *holes.values()) < agreement.UNLIKE / 4
+    other = replace(alike[1], image=np.where(hole[..., None], 255 - alike[1].image, alike[1].image))
+    ((first, second, unlike),) = agreement.contradicting([alike[0], other], holes)
+    assert (first, second) == ("a", "b") and unlike > 2 * agreement.UNLIKE

@@ -27,6 +27,8 @@ def read_scene(params: Params, scene: Path) -> tuple[Capture, Roles]:
         test=params.test,
         clean=params.clean,
         region=params.region is not None,
+        cameras_only=params.cameras_only,
+        remove=params.remove,
     )
     if params.region is not None and params.region.view is not None:
         known(params.region.view, {*roles.train, *roles.test}, "region")

@@ -12,8 +12,9 @@ from reffusion.capture.views import Views, check_proportions, known
 from reffusion.io.files import BadInput
 from reffusion.io.images import image_size
 
-LEAST_TRAINING_VIEWS = 3
+LEAST_TRAINING_VIEWS = 3  # but for a scene with views that are cameras only
 NONE = "none"
+OTHERS = "others"
 
 
 @dataclass(frozen=True)
@@ -22,17 +23,20 @@ class Roles:
 
     Attributes:
         train, test, clean: names of views.
-        masks: where a photograph shows the object: of training views, and of test views that show it too.
+        masks: object -> view -> file, where a photograph shows it: of training views, and of test views that show it
+            too. "" is the object of masks that tell none apart.
         test_masks: where a test view shows the object, or would show it; what its box comes from.
         warnings: what is odd.
+        blank: names of views without pixels, beside training and test views.
     """
 
     train: tuple[str, ...]
     test: tuple[str, ...]
     clean: frozenset[str]
-    masks: dict[str, Path]
+    masks: dict[str, dict[str, Path]]
     test_masks: dict[str, Path]
     warnings: tuple[str, ...]
+    blank: tuple[str, ...] = ()
 
     def among(self, names: set[str]) -> Roles:
         """Without the views that are not in `names` (those that structure from motion could not place).
@@ -46,10 +50,11 @@ class Roles:
             train=tuple(n for n in self.train if n in names),
             test=tuple(n for n in self.test if n in names),
             clean=self.clean & names,
-            masks=kept(self.masks),
+            blank=tuple(n for n in self.blank if n in names),
+            masks={thing: kept(files) for thing, files in self.masks.items()},
             test_masks=kept(self.test_masks),
         )
-        _check_enough(roles.train)
+        _check_enough(roles.train, bool(roles.blank))
         return roles
 
 
@@ -63,6 +68,8 @@ def load_roles(
     test: Sequence[str] | str | None = None,
     clean: Sequence[str] = (),
     region: bool = False,
+    cameras_only: Sequence[str] | str | None = None,
+    remove: Sequence[str] | None = None,
 ) -> Roles:
     """The roles of the capture's views, from scene.yaml's keys and the folder's usual places.
 
@@ -75,29 +82,32 @@ def load_roles(
         test_masks: folder of the test views' masks, named like the views or in their order; "none"; None looks.
         train, test: names, or "every 8" (the first of each eight in order of names), or None.
         region: the scene names a 3D region, so it may lack masks.
+        cameras_only: views whose pixels nobody reads: names, "every 8", or "others": all not in train or test.
+        remove: objects, each a folder of masks; only checked here.
 
     Raises:
         BadInput: naming the file and the remedy: a mask for no picture, of other proportions (over 10%), no mask
             at all, an unknown view, a view for both training and test, fewer than 3 training views.
     """
     folder = Path(folder)
-    mask_files = _mask_files(folder, capture, masks, region)
+    of_objects = _mask_files(folder, capture, masks, region or cameras_only is not None)
+    _check_objects(remove, of_objects)
+    mask_files = {name: path for files in of_objects.values() for name, path in files.items()}
     label_files = _test_mask_files(folder, capture, test_masks)
     train_named, test_named = (_chosen(value, capture, key) for key, value in (("train", train), ("test", test)))
     labelled = None if label_files is None else _labelled(capture, mask_files, label_files, test_named)
-    train_named, test_views = _parted(train_named, test_named, labelled, capture)
+    asked = None if cameras_only in (None, OTHERS) else _chosen(cameras_only, capture, "cameras_only")
+    train_named, test_views = _parted(train_named, test_named, labelled, asked or [], capture)
+    _check_enough(train_named, cameras_only is not None)
+    blank = _blank(cameras_only, asked, {*train_named, *test_views}, capture)
     clean_views = frozenset(known(name, capture.pictures, "clean") for name in clean)
     if clean_views - set(train_named):
         raise BadInput(f"scene.yaml: clean: {', '.join(sorted(clean_views - set(train_named)))} is no training view")
-    # Test views with masks of their own among the training masks show the object: held out, but without a truth inside.
-    held_out = {name: path for name, path in mask_files.items() if name in set(test_views)}
-    beside = dict(held_out)
-    if label_files is not None and labelled is not None:
-        labels = {n: p for n, p in zip(labelled, label_files, strict=True) if n in set(test_views)}
-        beside |= labels
-        held_out = {name: path for name, path in held_out.items() if name not in labels}
+    labels = None if labelled is None else dict(zip(labelled, label_files or (), strict=True))
+    held_out, beside = _beside(test_views, mask_files, labels or {})
     kept = {name: path for name, path in mask_files.items() if name in set(train_named)}
-    for name, path in (*kept.items(), *beside.items()):
+    ours = {thing: _among(files, {*kept, *held_out}) for thing, files in of_objects.items()}
+    for name, path in (*(item for files in ours.values() for item in files.items()), *beside.items()):
         check_proportions(path, name, _size_of(name, capture), 0.10, "mask")
     bare = [name for name in train_named if name not in kept and name not in clean_views]
     warning = f"{len(bare)} training views have no mask: {', '.join(bare)}" if kept and bare else None
@@ -105,10 +115,36 @@ def load_roles(
         tuple(train_named),
         tuple(test_views),
         clean_views,
-        dict(sorted((kept | held_out).items())),
+        ours,
         beside,
         (warning,) if warning else (),
+        blank,
     )
+
+
+def _beside(
+    test: list[str], masks: dict[str, Path], labels: dict[str, Path]
+) -> tuple[dict[str, Path], dict[str, Path]]:
+    """The test views that show the object, with the masks that say so, and where all would show it.
+
+    Those with masks of their own among the training masks are held out, but without a truth inside.
+    """
+    held_out = {name: path for name, path in masks.items() if name in set(test)}
+    own = {name: path for name, path in labels.items() if name in set(test)}
+    return {name: path for name, path in held_out.items() if name not in own}, held_out | own
+
+
+def _among(files: dict[str, Path], names: set[str]) -> dict[str, Path]:
+    return {name: path for name, path in files.items() if name in names}
+
+
+def _check_objects(remove: Sequence[str] | None, found: dict[str, dict[str, Path]]) -> None:
+    if remove is None:
+        return
+    if "" in found or not found:
+        raise BadInput("scene.yaml: remove: the masks tell no objects apart; give each a folder, masks/<object>/")
+    if unknown := [name for name in remove if name not in found]:
+        raise BadInput(f"scene.yaml: remove: there is no object '{unknown[0]}'; masks tell apart {', '.join(found)}")
 
 
 def views_of(capture: Capture, roles: Roles) -> Views:
@@ -121,23 +157,36 @@ def _size_of(name: str, capture: Capture) -> tuple[int, int]:
 
 
 def _parted(
-    train: list[str] | None, test: list[str] | None, labelled: list[str] | None, capture: Capture
+    train: list[str] | None, test: list[str] | None, labelled: list[str] | None, blank: list[str], capture: Capture
 ) -> tuple[list[str], list[str]]:
     """Training and test views from those named, None where they are not, and those that test masks tell of."""
     test_views = test if test is not None else (labelled or [])
     if train is None:
-        train = [name for name in capture.pictures if name not in set(test_views)]
+        train = [name for name in capture.pictures if name not in {*test_views, *blank}]
     elif test is None:
         test_views = [name for name in test_views if name not in set(train)]
     both = sorted(set(train) & set(test_views))
     if both:
         raise BadInput(f"scene.yaml: {', '.join(both)} in both train and test; a view is for one of them")
-    _check_enough(train)
     return train, test_views
 
 
-def _check_enough(train: Sequence[str]) -> None:
-    if len(train) < LEAST_TRAINING_VIEWS:
+def _blank(
+    asked: Sequence[str] | str | None, named: Sequence[str] | None, taken: set[str], capture: Capture
+) -> tuple[str, ...]:
+    """The views without pixels."""
+    if asked is None:
+        return ()
+    if named is None:
+        return tuple(name for name in capture.pictures if name not in taken)
+    if both := sorted(set(named) & taken):
+        if not isinstance(asked, str):
+            raise BadInput(f"scene.yaml: cameras_only: {', '.join(both)} is a training or test view too")
+    return tuple(name for name in named if name not in taken)
+
+
+def _check_enough(train: Sequence[str], sparse: bool = False) -> None:
+    if len(train) < (1 if sparse else LEAST_TRAINING_VIEWS):
         raise BadInput(
             f"{len(train)} training view{'' if len(train) == 1 else 's'} ({', '.join(train) or 'none'}): "
             f"at least {LEAST_TRAINING_VIEWS} are needed; add pictures, or correct train and test in scene.yaml"
@@ -160,16 +209,16 @@ def _chosen(value: Sequence[str] | str | None, capture: Capture, key: str) -> li
     return names
 
 
-def _mask_files(folder: Path, capture: Capture, masks: str | None, region: bool) -> dict[str, Path]:
-    """View name -> mask, each mask checked to have its picture."""
+def _mask_files(folder: Path, capture: Capture, masks: str | None, region: bool) -> dict[str, dict[str, Path]]:
+    """Object -> view name -> mask, each mask checked to have its picture; see `Roles`."""
     if masks is not None and masks.lower() == NONE:
         return {}
     if masks is None:
         usual = (capture.label_folder / "label", folder / "masks", folder / "mask", folder / "label")
-        found = next((p for p in usual if p.is_dir() and p != capture.label_folder and pictures_in(p)), None)
+        found = next((p for p in usual if p != capture.label_folder and _objects_in(p)), None)
     else:
         found = folder / masks
-        if not found.is_dir() or not pictures_in(found):
+        if not _objects_in(found):
             raise BadInput(f"{found}: no masks there; correct `masks` in scene.yaml")
     if found is None:
         if region:
@@ -179,8 +228,27 @@ def _mask_files(folder: Path, capture: Capture, masks: str | None, region: bool)
             "for each picture, name their folder as `masks` or a box as `region` in scene.yaml, or say `masks: none` "
             "to fit and render only"
         )
-    result = {}
-    for stem, path in pictures_in(found).items():
+    return {thing: _masks_of(pictures, capture) for thing, pictures in _objects_in(found).items()}
+
+
+def _objects_in(folder: Path) -> dict[str, dict[str, Path]]:
+    """Object -> stem -> mask: of a folder with masks, or with a folder of masks for each object."""
+    if not folder.is_dir():
+        return {}
+    inside = sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
+    named = {path.name: pictures for path in inside if (pictures := pictures_in(path))}
+    loose = pictures_in(folder)
+    if loose and named:
+        raise BadInput(
+            f"{folder}: holds masks and folders of masks ({', '.join(named)}); put them into one folder for each "
+            "object, or all into one"
+        )
+    return {"": loose} if loose else named
+
+
+def _masks_of(pictures: dict[str, Path], capture: Capture) -> dict[str, Path]:
+    result: dict[str, Path] = {}
+    for stem, path in pictures.items():
         # COLMAP's masks are called <picture with its ending>.png
         name = next((n for n in (stem, Path(stem).stem) if n in capture.pictures or n in capture.left_out), None)
         if name is None:

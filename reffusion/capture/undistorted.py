@@ -11,7 +11,7 @@ from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.lens import Lens, undistort_image, undistort_mask, undoing
 from reffusion.capture.roles import Roles
 from reffusion.io.files import BadInput
-from reffusion.io.images import load_image, load_mask, resized, save_image, save_mask
+from reffusion.io.images import image_size, load_image, load_mask, resized, save_image, save_mask
 
 
 def fitting_size(width: int, height: int, longest: int) -> tuple[int, int]:
@@ -26,10 +26,18 @@ def load_at(path: Path, longest: int, upright: bool) -> np.ndarray:
     return resized(image, fitting_size(image.shape[1], image.shape[0], longest))
 
 
+def lens_of(name: str, capture: Capture, longest: int) -> tuple[Lens, Lens]:
+    """The lens of a view whose pixels nobody reads, and its pinhole, at the size its picture would have."""
+    width, height = image_size(capture.pictures[name], upright=capture.upright)
+    lens = capture.poses.lenses[name].resized(*fitting_size(width, height, longest))
+    return lens, undoing(lens)[0]
+
+
 def save_undistorted(out: Path, name: str, capture: Capture, roles: Roles, longest: int) -> tuple[Lens, Lens]:
     """Write the view's image, mask and test mask, all in the same pinhole.
 
-    Writes images/, masks/, test_masks/<view>.png; the last two where the view has one.
+    Writes images/, masks/, test_masks/<view>.png; the last two where the view has one, of objects that are told apart
+    masks/<object>/<view>.png.
 
     Returns:
         the photograph's lens at this size, and the pinhole.
@@ -45,7 +53,8 @@ def save_undistorted(out: Path, name: str, capture: Capture, roles: Roles, longe
     except ValueError as error:
         raise BadInput(f"{capture.brought_by or capture.pictures[name]}: view '{name}': {error}") from error
     save_image(out / "images" / f"{name}.png", image if where is None else undistort_image(image, where))
-    for folder, files in (("masks", roles.masks), ("test_masks", roles.test_masks)):
+    masks = {f"masks/{thing}": files for thing, files in roles.masks.items()}
+    for folder, files in (*masks.items(), ("test_masks", roles.test_masks)):
         if name in files:
             mask = load_mask(files[name], (size[1], size[0]))
             save_mask(out / folder / f"{name}.png", mask if where is None else undistort_mask(mask, where))

@@ -142,8 +142,9 @@ def _write_line(log: trace.Trace, run: _Run, line: dict[str, float]) -> None:
     optimizer, job, last = run.optimizer, run.job, run.job.settings.iterations
     end = {"reason": "finished"} if run.step == last else {}
     with log.paused():
-        psnr = reference_psnr(optimizer.gaussians, job.holes)
-        log.log(run.step, reference_psnr=psnr, **line, **job.tally, **_counts(optimizer), **end)
+        shown = [hole for hole in job.holes if hole[2].any()]
+        line = line | ({"reference_psnr": reference_psnr(optimizer.gaussians, shown)} if shown else {})
+        log.log(run.step, **line, **job.tally, **_counts(optimizer), **end)
 
 
 def _counts(optimizer: GaussianOptimizer) -> dict[str, int]:

@@ -39,7 +39,7 @@ class Job:
     """What `distill` was given, for its terms; only the adversary and the tally change.
 
     Attributes:
-        painted: the views with pixels to repaint.
+        photographed: the views with pixels that supervise. painted: those with pixels to repaint.
         distilled: names of those that SDS distils: near enough to a reference.
         distance: of patches, for lifted pictures; None where they are compared by their squared error.
         adversary: the critic; None where it has no part.
@@ -47,6 +47,7 @@ class Job:
     """
 
     views: Sequence[TrainView]
+    photographed: Sequence[TrainView]
     painted: Sequence[TrainView]
     distilled: frozenset[str]
     holes: Sequence[tuple[Camera, Tensor, Tensor]]
@@ -89,7 +90,10 @@ def job_of(
             raise ValueError("the perceptual loss of lifted pictures needs a distance")
     references = [camera for camera, _, _ in holes]
     distilled = near_a_reference(painted, references, initial.means[masked], settings.sds.within)
-    return Job(views, painted, distilled, holes, prior, text, estimator, distance, adversary, settings, {})
+    photographed = [view for view in views if view.supervises.any()]
+    return Job(
+        views, photographed, painted, distilled, holes, prior, text, estimator, distance, adversary, settings, {}
+    )
 
 
 def near_a_reference(
@@ -210,9 +214,9 @@ def _lift(optimizer: GaussianOptimizer, step: int, job: Job) -> _Done:
 
 def _reconstruction(optimizer: GaussianOptimizer, step: int, job: Job) -> _Done:
     gaussians, settings, every = optimizer.gaussians, job.settings, job.settings.reconstruction.every
-    if not every or step % every:
+    if not every or step % every or not job.photographed:
         return None
-    view = _drawn(job.views, step // every, settings.seed, "reconstruction")
+    view = _drawn(job.photographed, step // every, settings.seed, "reconstruction")
     # Gaussians that photographs without the clean mark leave alone.
     left = optimizer.masked & (settings.confined and settings.reconstruction.reaches == "unmasked")
     with _named(step, "reconstruction", view.camera):

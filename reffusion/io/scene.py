@@ -36,6 +36,7 @@ def save_scene(poses_dir: Path, scene: Scene) -> None:
     similarity = {"scale": float(scene.similarity.scale), "offset": [float(v) for v in scene.similarity.offset]}
     save_json(poses_dir / "transform.json", similarity)
     views = {"train": list(scene.train), "test": list(scene.test), "clean": sorted(scene.clean)}
+    views |= {"cameras_only": list(scene.blank)} if scene.blank else {}
     save_json(poses_dir / "views.json", views)
 
 
@@ -64,6 +65,7 @@ def load_scene(poses_dir: Path) -> Scene:
         points=points.positions,
         point_colors=points.colors,
         similarity=Similarity(similarity["scale"], np.array(similarity["offset"], np.float64)),
+        blank=tuple(views.get("cameras_only", ())),
     )
 
 
@@ -72,10 +74,29 @@ def load_views(poses_dir: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
     return {name: load_image(Path(poses_dir) / "images" / f"{name}.png") for name in names}
 
 
-def load_raw_masks(poses_dir: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
-    """View name -> bool [H, W], True = the object; only the views that have a mask."""
-    paths = {name: Path(poses_dir) / "masks" / f"{name}.png" for name in names}
-    return {name: load_mask(path) for name, path in paths.items() if path.is_file()}
+def objects_of(poses_dir: Path) -> list[str]:
+    """The objects that masks tell apart, sorted."""
+    return sorted(path.name for path in (Path(poses_dir) / "masks").glob("[!.]*") if path.is_dir())
+
+
+def raw_mask_files(poses_dir: Path, name: str, objects: Sequence[str] | None = None) -> list[Path]:
+    """The view's masks: one, or where objects are told apart one for each of `objects` (None: all) that has one."""
+    folder = Path(poses_dir) / "masks"
+    told = objects_of(poses_dir) if objects is None else objects
+    return [path for path in (folder / thing / f"{name}.png" for thing in told or [""]) if path.is_file()]
+
+
+def load_raw_masks(
+    poses_dir: Path, names: Iterable[str], objects: Sequence[str] | None = None
+) -> dict[str, np.ndarray]:
+    """View name -> bool [H, W], True = the object; only the views that have a mask.
+
+    Where objects are told apart, the union of those in `objects` (None: all), of views with a mask of each.
+    """
+    objects = objects_of(poses_dir) if objects is None else objects
+    files = {name: raw_mask_files(poses_dir, name, objects) for name in names}
+    found = {name: paths for name, paths in files.items() if len(paths) == max(len(objects), 1)}
+    return {name: np.logical_or.reduce([load_mask(path) for path in paths]) for name, paths in found.items()}
 
 
 def load_test_masks(poses_dir: Path) -> dict[str, np.ndarray]:

@@ -10,6 +10,9 @@ from reffusion.params.base import Device, Settings
 
 
 class Params(Settings):
+    remove: list[str] | None = Field(
+        None, min_length=1, description="objects, each a folder of masks (masks/<object>/); None: all of them"
+    )
     vote: Literal["weight", "count"] = Field(
         "weight", description="what a contribution counts: its blending weight, or 1 (the paper's word is 'count')"
     )

@@ -41,8 +41,14 @@ class Params(Settings):
     train: list[str] | str | None = Field(None, description='view names, or "every N"; None: all that are not test')
     test: list[str] | str | None = Field(None, description='view names, or "every N"; None: those of the test masks')
     clean: list[str] = Field([], description="training views in which the object is absent")
+    cameras_only: list[str] | str | None = Field(
+        None, description='views whose pixels are not used: names, "every N", or "others" than train and test'
+    )
     gaussians: str | None = Field(None, description=".ply the scene brings in its own frame, 3DGS layout")
     region: Region | None = Field(None, description="box or sphere that holds the object, or is to be filled")
+    remove: list[str] | None = Field(
+        None, description="read by the stage `masks`; here only checked", json_schema_extra=UNKEYED
+    )
     reference: Given | list[Given] | None = Field(
         None,
         description="read by the stage `reference`; here only checked against the views",

@@ -57,11 +57,12 @@ def denoising_error(
 
 
 def held_out_samples(references: Sequence[Picture], size: int, seed: int) -> Batch:
-    """The reference's own hole: the whole view and a crop. Same for equal seeds."""
+    """The reference's own hole, all of it where it has none: the whole view and a crop. Same for equal seeds."""
     draw = seeded(seed, "personalize", "held out")
     first = references[0]
-    windows = [window_around(first.region, size, draw)]
-    masks = two_scale_masks(first.region, windows, size)
+    region = first.region if first.region.any() else torch.ones_like(first.region)
+    windows = [window_around(region, size, draw)]
+    masks = two_scale_masks(region, windows, size)
     return Batch(two_scales(first.image, windows, size), masks, torch.tensor([GLOBAL, LOCAL]))
 
 

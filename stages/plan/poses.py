@@ -23,7 +23,9 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
         capture, roles = read_scene(params, scene)
     except ValueError:  # `preview` refuses it
         return others
-    read = {*capture.pictures.values(), *roles.masks.values(), *roles.test_masks.values()}
+    masks = {path for files in roles.masks.values() for path in files.values()}
+    shown = {path for name, path in capture.pictures.items() if name not in roles.blank}
+    read = {*shown, *masks, *roles.test_masks.values()}
     read |= {scene / params.gaussians} if params.gaussians is not None else set()
     kept = [path for path in others if path.suffix.lower() not in NOT_READ or path.name == "poses_bounds.npy"]
     return sorted(read | {path for path in kept if path.parent != scene / PAINTED})
@@ -34,7 +36,10 @@ def preview(params: Params, scene: Path) -> list[str]:
     brings, read by a later stage, belongs to none of its views."""
     capture, roles = read_scene(params, scene)
     given = load_given(scene, views_of(capture, roles), params.reference)
-    notes = [f"{len(roles.train)} training and {len(roles.test)} test views, {len(roles.masks)} masks"]
+    masks = sum(len(files) for files in roles.masks.values())
+    apart = f" of {', '.join(roles.masks)}" if len(roles.masks) > 1 else ""
+    notes = [f"{len(roles.train)} training and {len(roles.test)} test views, {masks} masks{apart}"]
+    notes += [f"{len(roles.blank)} views are cameras only"] if roles.blank else []
     notes += _of_poses(capture, scene)
     notes += [f"the scene brings a reference of {words(given)}"] if given else []
     return [*notes, *capture.warnings, *roles.warnings]
