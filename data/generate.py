@@ -12,7 +12,7 @@ A furnished room is ray-cast with and without one object. Kinds:
   pair    two objects side by side, each with masks of its own, and two references
   sparse  nothing to remove; of four training views alone the pixels may be used, the others are cameras
   grass   an object on a lawn before a hedge: thousands of blades and leaves, nothing flat
-  insert  the same turned round: an object on the floor, in the test views and the reference only; it is to be put in
+  insert  the same turned round: an object on the floor, in the test views and three references only; it is to be put in
   outpaint  the room as photographed, and a sphere beyond which it is to be continued from three references
   photos  26 larger photographs and masks without poses, for structure from motion
 
@@ -37,7 +37,7 @@ from kinds import KINDS, Kind
 from photographs import Session, corner_shift, photographed
 from reconstruction import Frame, scene_frame, sparse_points
 from room import furnish
-from tasks import SPHERE, bare, beyond, depth, on_axis, outermost, region_around
+from tasks import SPHERE, bare, beyond, depth, on_axis, region_around
 from world import World, bake
 
 AWAY = 2.5  # metres from the middle camera to the sphere's centre, about where the views look
@@ -173,14 +173,11 @@ def _ask_views(out: Path, session: Session, kind: Kind, world: World, frame: Fra
 
 
 def _ask_insertion(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
-    """A reference that shows the object, its depth map, and a sphere in which it stands."""
+    """Three references that show the object, their depth, and a sphere in which it stands."""
     _write_test_masks(out, session, session.masks[: session.test])
-    write_image(out / "reference.png", session.completed[session.middle])
-    np.save(out / "reference.npy", depth(session.cameras[session.middle], kind, world, frame))
     center, radius = region_around(world.solids)
     region = {"center": frame.points(center).tolist(), "radius": frame.scale * radius}
-    reference = f"{{view: {session.names[session.middle]}, image: reference.png, depth: reference.npy}}"
-    (out / "scene.yaml").write_text(f"masks: none\nregion: {json.dumps(region)}\nreference: {reference}\n{PROFILE}")
+    _write_region(out, region, _write_measured(out, session, kind, world, frame))
 
 
 def _ask_outpainting(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
@@ -188,15 +185,24 @@ def _ask_outpainting(out: Path, session: Session, kind: Kind, world: World, fram
     center = on_axis(session.cameras[session.middle], AWAY)
     masks = [beyond(camera, kind, world, center, SPHERE) for camera in session.cameras[: session.test]]
     _write_test_masks(out, session, masks)
-    lines = []
-    for k in sorted({session.middle, *(kind.test + each for each in outermost(session.cameras[kind.test :]))}):
-        name = session.names[k]
-        write_image(out / f"references/{name}.png", session.photos[k])
-        np.save(out / f"references/{name}.npy", depth(session.cameras[k], kind, world, frame))
-        lines.append(f"  - {{view: {name}, image: references/{name}.png, depth: references/{name}.npy}}\n")
     sphere = {"view": session.names[session.middle], "distance": frame.scale * AWAY}
     sphere |= {"radius": frame.scale * SPHERE, "outside": True}
-    (out / "scene.yaml").write_text(f"masks: none\nregion: {json.dumps(sphere)}\nreference:\n{''.join(lines)}{PROFILE}")
+    _write_region(out, sphere, _write_measured(out, session, kind, world, frame))
+
+
+def _write_measured(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> str:
+    """Write the completed views and their depth; the lines of scene.yaml that name them."""
+    said = ["reference:\n"]
+    for k, picture in session.completed.items():
+        name = session.names[k]
+        write_image(out / f"references/{name}.png", picture)
+        np.save(out / f"references/{name}.npy", depth(session.cameras[k], kind, world, frame))
+        said.append(f"- {{view: {name}, image: references/{name}.png, depth: references/{name}.npy}}\n")
+    return "".join(said)
+
+
+def _write_region(out: Path, region: dict, references: str) -> None:
+    (out / "scene.yaml").write_text(f"masks: none\nregion: {json.dumps(region)}\n{references}{PROFILE}")
 
 
 def main() -> None:

@@ -24,7 +24,7 @@ class Kind:
         place: where the object is: "room", "behind" (a kept thing before it), "table" (on the edge of one), "corner"
             (before the corner of a wall), "grass", "floor" or "pair" (two objects side by side).
         task: what the scene asks for: "remove" the object; "insert" it: the training views are without it, the test
-            views and the reference with it; "outpaint" what lies beyond a sphere, nothing else is changed; "sparse":
+            views and the references with it; "outpaint" what lies beyond a sphere, nothing else is changed; "sparse":
             nothing is changed, but few views have pixels.
         references: how many views the scene brings completed.
         shown: of so many training views the pixels may be used, the others are cameras only; 0: of all.
@@ -67,8 +67,8 @@ KINDS = {
     "table": Kind(spread=34.0, place="table", least=0.05, low=0.45),
     "corner": Kind(spread=30.0, place="corner", least=0.25),
     "grass": Kind(samples=2, spread=30.0, node=0.08, place="grass"),
-    "insert": Kind(place="floor", task="insert", least=0),
-    "outpaint": Kind(spread=16.0, task="outpaint", least=0),
+    "insert": Kind(place="floor", task="insert", least=0, references=3),
+    "outpaint": Kind(spread=16.0, task="outpaint", least=0, references=3),
     "pair": Kind(spread=30.0, place="pair", least=0.2, references=2),
     "sparse": Kind(spread=30.0, task="sparse", least=0, shown=4),
     "photos": Kind(width=480, height=360, train=26, test=0, photos=True, texture=2048, node=0.025),

@@ -21,7 +21,7 @@ class Session:
         photos: [V, H, W, 3] uint8; masks: bool [V, H, W], pixels that the object touches or would touch.
         hidden: bool [V, H, W], never-seen pixels of the masks.
         middle: the view from the middle of the training views' walk.
-        completed: view -> uint8 [H, W, 3] without the object, of the middle one and those farthest from it.
+        completed: view -> uint8 [H, W, 3] as it is wanted, of the middle one and those farthest from it.
         spread: training views, each the one farthest from those before it, the middle one first.
         apart: object -> bool [V, H, W], what its mask holds: of objects that are named apart.
     """
@@ -50,7 +50,7 @@ def photographed(seed: int, kind: Kind, world: World, target: np.ndarray) -> Ses
     in_training = train, masks[kind.test :]
     hidden = [never_seen(world, camera, mask, *in_training) for camera, mask in zip(cameras, masks, strict=True)]
     spread = [kind.test + k for k in _spread(train, middle - kind.test, min(SPREAD, kind.train))]
-    whole = {k: shoot(world, cameras[k], kind, kind.task == "insert")[0] for k in spread[: kind.references]}
+    whole = {k: shoot(world, cameras[k], kind, kind.task != "remove")[0] for k in spread[: kind.references]}
     apart = {name: np.stack([_alone(world, c, kind, own) for c in cameras]) for name, own in world.objects.items()}
     return Session(names, cameras, kind.test, photos, masks, np.stack(hidden), middle, whole, spread, apart)
 

@@ -51,9 +51,3 @@ def beyond(camera: np.ndarray, kind: Kind, world: World, center: np.ndarray, rad
 def on_axis(camera: np.ndarray, distance: float) -> np.ndarray:
     """The point at that distance along a camera's optical axis."""
     return camera[13:] + distance * camera[4:13].reshape(3, 3)[:, 2]
-
-
-def outermost(cameras: np.ndarray) -> list[int]:
-    """The two cameras that stand farthest apart, from which most of what others miss is seen."""
-    apart = np.linalg.norm(cameras[:, None, 13:] - cameras[None, :, 13:], axis=-1)
-    return [int(k) for k in np.unravel_index(apart.argmax(), apart.shape)]

@@ -247,7 +247,9 @@ def test_any_subset_of_the_objects_goes_and_the_others_stay(tmp_path):
     assert left[1] == ["right"] and right[1] == ["left"]
     assert (left[0] == first)[labels].float().mean() > 0.9
     assert (right[0] == (labels & ~first))[labels].float().mean() > 0.9
-    assert (left[0] & right[0])[labels].float().mean() < 0.05
+    across = load_ply(fit / "gaussians.ply").means[:, 0]
+    apart = across[labels].unique().diff().max()
+    assert across[left[0] & right[0] & labels].abs().max() < 1.5 * apart  # a column at the seam, which both show
 
 
 def split_at(name: str) -> np.ndarray:

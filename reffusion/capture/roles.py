@@ -100,9 +100,7 @@ def load_roles(
     train_named, test_views = _parted(train_named, test_named, labelled, asked or [], capture)
     _check_enough(train_named, cameras_only is not None)
     blank = _blank(cameras_only, asked, {*train_named, *test_views}, capture)
-    clean_views = frozenset(known(name, capture.pictures, "clean") for name in clean)
-    if clean_views - set(train_named):
-        raise BadInput(f"scene.yaml: clean: {', '.join(sorted(clean_views - set(train_named)))} is no training view")
+    clean_views = _clean(clean, train_named, capture)
     labels = None if labelled is None else dict(zip(labelled, label_files or (), strict=True))
     held_out, beside = _beside(test_views, mask_files, labels or {})
     kept = {name: path for name, path in mask_files.items() if name in set(train_named)}
@@ -111,15 +109,16 @@ def load_roles(
         check_proportions(path, name, _size_of(name, capture), 0.10, "mask")
     bare = [name for name in train_named if name not in kept and name not in clean_views]
     warning = f"{len(bare)} training views have no mask: {', '.join(bare)}" if kept and bare else None
-    return Roles(
-        tuple(train_named),
-        tuple(test_views),
-        clean_views,
-        ours,
-        beside,
-        (warning,) if warning else (),
-        blank,
-    )
+    said = (warning,) if warning else ()
+    return Roles(tuple(train_named), tuple(test_views), clean_views, ours, beside, said, blank)
+
+
+def _clean(clean: Sequence[str], train: list[str], capture: Capture) -> frozenset[str]:
+    """The views that the scene says are without the object."""
+    views = frozenset(known(name, capture.pictures, "clean") for name in clean)
+    if views - set(train):
+        raise BadInput(f"scene.yaml: clean: {', '.join(sorted(views - set(train)))} is no training view")
+    return views
 
 
 def _beside(
