@@ -72,6 +72,7 @@ def refuse_contradictions(references: list[Reference], scene: Scene, fit: Path, 
     remaining = load_ply(fit / "gaussians.ply").map(lambda p: p[keep])
     hidden = {camera.name: sets[camera.name].consistent for camera in cameras}
     holes = painting.holes(remaining, cameras, hidden, {each.camera.name: each.mask for each in references})
+    holes = agreement.as_drawn(holes, references, remaining, hidden)
     for first, second, unlike in agreement.contradicting(references, holes):
         raise ValueError(
             f"the references of '{first}' and '{second}' contradict each other: in what both show, colours differ by "

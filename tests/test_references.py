@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import small_scene as small
+import torch
 import yaml
 from PIL import Image
 from small_capture import HEIGHT, OPENCV, WIDTH, prepare, run, some_truth, write_pictures, write_transforms
@@ -500,3 +501,29 @@ def test_references_that_contradict_each_other_are_told_from_those_that_agree():
     other = replace(alike[1], image=np.where(hole[..., None], 255 - alike[1].image, alike[1].image))
     ((first, second, unlike),) = agreement.contradicting([alike[0], other], holes)
     assert (first, second) == ("a", "b") and unlike > 2 * agreement.UNLIKE
+
+
+def test_what_references_draw_before_a_scene_is_compared_at_its_own_depth():
+    """A striped square before a wall and a step: true in both views; without its depth nothing can be said."""
+    near, step = 1.4, 1.7
+    floor = small.plane(step, 2.0, 0.25, small.texture)
+    floor = replace(floor, means=floor.means + torch.tensor([0.0, 0.6, 0.0]))
+    scene = small.plane(small.WALL, 2.0, 1.4, small.texture).zipped(floor, lambda a, b: torch.cat([a, b]))
+    references = []
+    for view in (small.camera("a", -0.2), small.camera("b", 0.2)):
+        drawn = small.true_mask(view, near)
+        wide = geometry.unproject(np.full(drawn.shape, step), view)[..., 1] > 0.35
+        depth = np.where(drawn, near, np.where(wide, step, small.WALL))
+        points = geometry.unproject(depth, view)
+        stripe = np.where((points[..., :1] * 12).astype(int) % 2 == 0, [0.9, 0.1, 0.1], [0.1, 0.9, 0.1])
+        image = np.where(drawn[..., None], stripe, small.texture(points[..., 0], points[..., 1]))
+        references.append(Reference(view, np.round(255 * image).astype(np.uint8), drawn, 3 * depth))
+    cameras, nothing = [each.camera for each in references], np.zeros((small.HEIGHT, small.WIDTH), bool)
+    hidden = {camera.name: nothing for camera in cameras}
+    holes = painting.holes(scene, cameras, hidden, {each.camera.name: each.mask for each in references})
+    measured = agreement.as_drawn(holes, references, scene, hidden)
+    assert set(measured) == {"a", "b"} and not agreement.contradicting(references, measured)
+    assert agreement.contradicting(references, holes)  # at the wall's depth the stripes would not meet
+    assert agreement.as_drawn(holes, [replace(each, depth=None) for each in references], scene, hidden) == {}
+    other = replace(references[1], image=references[1].image[..., [2, 0, 1]])
+    assert agreement.contradicting([references[0], other], measured)

@@ -1,21 +1,25 @@
 """Do completed views agree where two of them show the same part of a hole?
 
 The surface behind the object is not known yet; as in `painting` it is the surroundings' disparity drawn across the
-hole. So one picture lands in the other only to a few pixels, and colours are asked for, not texture: those of the one,
-smoothed, beyond the range of the other's around the same place.
+hole, unless the completed view brings its depth. So one picture lands in the other only to a few pixels, and colours
+are asked for, not texture: those of the one, smoothed, beyond the range of the other's around the same place.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from itertools import combinations
 
 import cv2
 import numpy as np
 
 from reffusion import geometry
+from reffusion.depth.alignment import Degenerate, align_either
 from reffusion.paint.painting import NEAR, Hole
-from reffusion.types import Reference
+from reffusion.splat import rasterizer
+from reffusion.types import Gaussians, Reference
 
 SMOOTH, REACH = 0.02, 0.04  # of the image's width: deviation of the smoothing; how far around colours are taken
 FEWEST = 40  # pixels that both show, at `painting.SIDE`, from which a pair is compared
@@ -23,6 +27,36 @@ FEWEST = 40  # pixels that both show, at `painting.SIDE`, from which a pair is c
 # are at 0.001, one 0.9 times as bright at 0.005, its hole smoothly inpainted 0.008, turned upside down 0.019; 0.7
 # times as bright 0.044, red and blue exchanged 0.039, mirrored 0.058, with the objects left in 0.099.
 UNLIKE = 0.03
+
+
+def as_drawn(
+    holes: Mapping[str, Hole], references: Sequence[Reference], remaining: Gaussians, hidden: Mapping[str, np.ndarray]
+) -> dict[str, Hole]:
+    """The holes with the depth that completed views bring; without those whose depth nothing tells, for what is drawn
+    over what stays does not lie at the surroundings' depth.
+
+    Args:
+        remaining: the Gaussians without the object's. hidden: view name -> bool [H, W], where it stood.
+    """
+    found = {}
+    for each in (each for each in references if each.camera.name in holes):
+        hole, beside = holes[each.camera.name], each.mask & ~hidden[each.camera.name]
+        if each.depth is not None:
+            with suppress(Degenerate):
+                found[each.camera.name] = _measured(hole, each, remaining, hidden[each.camera.name])
+        elif beside.sum() < each.mask.sum() / 2:
+            found[each.camera.name] = hole
+    return found
+
+
+def _measured(hole: Hole, reference: Reference, remaining: Gaussians, hidden: np.ndarray) -> Hole:
+    size = hole.camera.width, hole.camera.height
+    shrunk = lambda array: cv2.resize(array, size, interpolation=cv2.INTER_NEAREST)
+    told = shrunk(reference.depth.astype(np.float64))
+    covered = cv2.resize((hidden | reference.mask).astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.01
+    shown = rasterizer.render(remaining, hole.camera, sh_degree=0)
+    aligned, _ = align_either(told, shown.depth.cpu().numpy(), (shown.alpha.cpu().numpy() > 0.5) & ~covered)
+    return replace(hole, depth=np.where(np.isfinite(aligned), aligned, 0.0))
 
 
 def contradicting(references: Sequence[Reference], holes: Mapping[str, Hole]) -> list[tuple[str, str, float]]:
