@@ -4,7 +4,7 @@ invent mask."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from reffusion import geometry, trace
 from reffusion.fit import exposure
 from reffusion.io.arrays import load_json, save_json, save_labels
 from reffusion.io.ply import load_ply
-from reffusion.io.scene import load_raw_masks, load_scene, objects_of, save_mask_sets
+from reffusion.io.scene import load_fill, load_raw_masks, load_scene, objects_of, save_mask_sets
 from reffusion.masks import regions, undecided, voting, witness
 from reffusion.masks.continuation import Plane, planes_around
 from reffusion.masks.regions import Region
@@ -40,9 +40,8 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
         raise ValueError(f"{poses / 'masks'}: no view has a mask of each object; add empty ones where one is unseen")
     empty = {name: np.zeros((camera.height, camera.width), bool) for name, camera in scene.cameras.items()}
     ballots = raw | {name: empty[name] for name in scene.clean}
-    if params.invent == "region" and region is None:
-        raise ValueError(f"masks.invent is 'region', but {poses / 'region.json'} is missing: set region in scene.yaml")
-    if not raw and region is None and not scene.blank:
+    fill = Filled(region, load_fill(poses)) if params.invent != "undecided" else Filled(None, {})
+    if not raw and region is None and not fill.masks and not scene.blank:
         raise ValueError(f"{poses}: neither masks nor a region say what is to be changed: add masks, or a region")
 
     # Observation outside the masks is measured by weight, whatever the votes count.
@@ -65,12 +64,11 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
         debris = witness.debris(gaussians, labels, views, hidden, exposure.load_views(poses, fit, scene.train))
         save_labels(out / "debris.npy", debris.cpu())
         labels |= debris
-    fill = None if params.invent == "undecided" else region
     sets = classified(params, scene, gaussians.map(lambda p: p[~labels]), raw, consistent, views, planes, fill)
     sets |= of_blank_views(params, scene, gaussians, hidden, sets)
     distilled = (*scene.train, *scene.blank)
     undecided = share_undecided(sets, distilled)
-    if params.invent != "consistent" and fill is None and undecided <= params.negligible:
+    if params.invent != "consistent" and not fill and undecided <= params.negligible:
         sets = {name: replace(each, invent=empty[name]) for name, each in sets.items()}
     save_labels(out / "labels.npy", labels.cpu())
     save_mask_sets(out, sets)
@@ -87,6 +85,24 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
         "best_reference": voting.best_view(invents, scene.train),
     }
     save_json(out / "facts.json", facts)
+
+
+@dataclass(frozen=True)
+class Filled:
+    """What is made up whatever anyone saw: a region, and masks of it (view -> bool [H, W])."""
+
+    region: Region | None
+    masks: dict[str, np.ndarray]
+
+    def __bool__(self) -> bool:
+        return self.region is not None or bool(self.masks)
+
+    def shown(self, camera: Camera, depth: np.ndarray) -> np.ndarray:
+        """bool [H, W], in a view in which `depth` [H, W] of what stays hides some of it."""
+        found = self.masks.get(camera.name, np.zeros(depth.shape, bool))
+        if self.region is None:
+            return found
+        return found | regions.silhouette(self.region, camera, geometry.reciprocal(depth))
 
 
 def voted(
@@ -115,21 +131,16 @@ def classified(
     consistent: dict[str, np.ndarray],
     views: list[Witness],
     planes: list[Plane],
-    fill: Region | None,
+    fill: Filled,
 ) -> dict[str, MaskSet]:
-    """The masks of each view: what other views show behind the object is decided, and is not invented.
-
-    `fill`: the region that is made up whatever anyone saw, or None.
-    """
+    """The masks of each view: what other views show behind the object is decided, and is not invented."""
     names, sets = list(scene.cameras), {}
     for k in trace.progress(len(names), "masks"):
         name, camera = names[k], scene.cameras[names[k]]
         found = undecided.behind(remaining, camera, consistent[name], views, planes)
         unknown = tidied(params, found.undecided) & consistent[name] & (name not in scene.clean)
         invent = consistent[name] & (name not in scene.clean) if params.invent == "consistent" else unknown
-        if fill is not None:
-            disparity = geometry.reciprocal(found.depth)
-            invent = invent | regions.silhouette(fill, camera, disparity)
+        invent = invent | fill.shown(camera, found.depth)
         sets[name] = MaskSet(raw.get(name, np.zeros_like(unknown)), consistent[name], unknown, invent)
     return sets
 

@@ -198,13 +198,13 @@ def test_too_small_a_share_is_an_error_and_writes_nothing(generate, tmp_path):
 
 
 def test_insertion_and_outpainting_are_asked_for_by_scene_files(generate, tmp_path):
-    """The reference alone of the training views shows the object; outpainting keeps the disc of a sphere."""
+    """The references alone of the training views show the object; outpainting keeps the disc of a sphere."""
     stamp = {"width": 64, "height": 48, "samples": 1, "train": 8, "test": 3, "texture": 256}
     said = {}
     for name in ("insert", "outpaint"):
         generate.generate(tmp_path / name, 0, replace(generate.KINDS[name], **stamp, node=0.4))
         said[name] = yaml.safe_load((tmp_path / name / "scene.yaml").read_text())
-    folder, reference = tmp_path / "insert", said["insert"]["reference"]
+    folder, reference = tmp_path / "insert", said["insert"]["reference"][0]
     photo, picture = load_image(folder / f"images_4/{reference['view']}.png"), load_image(folder / reference["image"])
     depth, differs = np.load(folder / reference["depth"]), (photo != picture).any(-1)
     assert 0.02 < differs.mean() < 0.25 and said["insert"]["region"]["radius"] > 0

@@ -164,8 +164,6 @@ def test_a_region_alone_marks_and_fills(tmp_path):
     poses, fit, labels = small.write(tmp_path, NEAR, masks={})
     with pytest.raises(ValueError, match="neither masks nor a region"):
         run(Params(), tmp_path, poses=poses, fit=fit)
-    with pytest.raises(ValueError, match=r"region\.json is missing"):
-        run(Params(invent="region"), tmp_path, poses=poses, fit=fit)
     save_json(poses / "region.json", {"center": [0, 0, NEAR], "size": [0.5, 0.5, 0.1]})
     run(Params(), tmp_path, poses=poses, fit=fit)
     sets = load_mask_sets(tmp_path, small.CAMERAS)
@@ -175,7 +173,7 @@ def test_a_region_alone_marks_and_fills(tmp_path):
     assert all(abs((side.max() - side.min() + 1) / 2 - half) <= 1 for side in (rows, columns))
 
 
-@pytest.mark.parametrize("invent", ["auto", "consistent", "region"])
+@pytest.mark.parametrize("invent", ["auto", "consistent"])
 def test_a_region_to_be_filled_removes_nothing_and_is_a_part_of_m(tmp_path, invent):
     poses, fit, _ = small.write(tmp_path, NEAR, masks={})
     save_json(poses / "region.json", {"center": [0, 0, NEAR], "size": [0.5] * 3, "round": True, "holds": False})
@@ -184,6 +182,19 @@ def test_a_region_to_be_filled_removes_nothing_and_is_a_part_of_m(tmp_path, inve
     assert not load_labels(tmp_path / "labels.npy").any()
     assert not any(each.consistent.any() for each in sets.values())
     assert all(sets[name].invent.any() for name in small.TRAIN)
+
+
+def test_masks_say_what_is_to_be_filled(tmp_path):
+    """As they are, whatever stands there; beside them nothing is."""
+    poses, fit, _ = small.write(tmp_path, NEAR, masks={})
+    wanted = np.zeros((small.HEIGHT, small.WIDTH), bool)
+    wanted[10:30, 5:40] = True
+    for name in small.TRAIN:
+        save_mask(poses / "fill" / f"{name}.png", wanted)
+    run(Params(), tmp_path, poses=poses, fit=fit)
+    sets = load_mask_sets(tmp_path, small.CAMERAS)
+    assert not load_labels(tmp_path / "labels.npy").any()
+    assert all((sets[name].invent == wanted).all() and not sets[name].consistent.any() for name in small.TRAIN)
 
 
 def test_a_box_behind_the_surface_has_no_silhouette():

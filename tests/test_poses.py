@@ -43,7 +43,7 @@ from reffusion.io.arrays import load_json
 from reffusion.io.files import BadInput
 from reffusion.io.images import image_size
 from reffusion.io.ply import load_ply, save_ply, save_points
-from reffusion.io.scene import load_raw_masks, load_scene, load_test_masks, load_views, objects_of
+from reffusion.io.scene import load_fill, load_raw_masks, load_scene, load_test_masks, load_views, objects_of
 from reffusion.types import Gaussians
 from stages import fit, poses
 from stages.plan import poses as plan
@@ -158,6 +158,19 @@ def test_objects_that_are_told_apart(tmp_path):
     assert "v03" in load_raw_masks(out, scene.train, ["box"]) and "v03" not in load_raw_masks(out, scene.train)
     with pytest.raises(BadInput, match="no object 'cat'; masks tell apart ball, box"):
         plan.preview(poses.Params(remove=["cat"]), folder)
+
+
+def test_masks_of_what_is_to_be_filled(tmp_path):
+    folder = prepare(tmp_path / "s", "colmap", some_truth(RADIAL))
+    (folder / "masks").rename(folder / "new")
+    asked = {"fill": "new", "train": ["v00", "v01", "v02", "v03"]}
+    scene, out = run(folder, **asked)
+    assert sorted(load_fill(out)) == list(scene.train) and not load_raw_masks(out, scene.train)
+    read = plan.scene_files(poses.Params(**asked), folder, sorted(folder.rglob("*.*")))
+    assert folder / "new/v02.png" in read
+    (folder / "new/v02.png").unlink()
+    with pytest.raises(BadInput, match="new: no mask for 1 of 4 training views, 'v02' for one"):
+        plan.preview(poses.Params(**asked), folder)
 
 
 def test_spin_nerf_with_a_missing_training_mask(tmp_path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from reffusion.capture.layouts.capture import Capture, pictures_in
@@ -28,6 +28,7 @@ class Roles:
         test_masks: where a test view shows the object, or would show it; what its box comes from.
         warnings: what is odd.
         blank: names of views without pixels, beside training and test views.
+        fill: training view -> file, a mask of what is to be filled whatever its photograph shows there.
     """
 
     train: tuple[str, ...]
@@ -37,6 +38,7 @@ class Roles:
     test_masks: dict[str, Path]
     warnings: tuple[str, ...]
     blank: tuple[str, ...] = ()
+    fill: dict[str, Path] = field(default_factory=dict)
 
     def among(self, names: set[str]) -> Roles:
         """Without the views that are not in `names` (those that structure from motion could not place).
@@ -53,6 +55,7 @@ class Roles:
             blank=tuple(n for n in self.blank if n in names),
             masks={thing: kept(files) for thing, files in self.masks.items()},
             test_masks=kept(self.test_masks),
+            fill=kept(self.fill),
         )
         _check_enough(roles.train, bool(roles.blank))
         return roles
@@ -227,7 +230,7 @@ def _mask_files(folder: Path, capture: Capture, masks: str | None, region: bool)
             "for each picture, name their folder as `masks` or a box as `region` in scene.yaml, or say `masks: none` "
             "to fit and render only"
         )
-    return {thing: _masks_of(pictures, capture) for thing, pictures in _objects_in(found).items()}
+    return {thing: masks_of(pictures, capture) for thing, pictures in _objects_in(found).items()}
 
 
 def _objects_in(folder: Path) -> dict[str, dict[str, Path]]:
@@ -245,7 +248,8 @@ def _objects_in(folder: Path) -> dict[str, dict[str, Path]]:
     return {"": loose} if loose else named
 
 
-def _masks_of(pictures: dict[str, Path], capture: Capture) -> dict[str, Path]:
+def masks_of(pictures: dict[str, Path], capture: Capture) -> dict[str, Path]:
+    """View name -> mask, of masks by stem; BadInput where one belongs to no picture, or two to one."""
     result: dict[str, Path] = {}
     for stem, path in pictures.items():
         # COLMAP's masks are called <picture with its ending>.png

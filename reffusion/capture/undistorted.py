@@ -34,10 +34,10 @@ def lens_of(name: str, capture: Capture, longest: int) -> tuple[Lens, Lens]:
 
 
 def save_undistorted(out: Path, name: str, capture: Capture, roles: Roles, longest: int) -> tuple[Lens, Lens]:
-    """Write the view's image, mask and test mask, all in the same pinhole.
+    """Write the view's image and masks, all in the same pinhole.
 
-    Writes images/, masks/, test_masks/<view>.png; the last two where the view has one, of objects that are told apart
-    masks/<object>/<view>.png.
+    Writes images/, masks/, test_masks/, fill/<view>.png; the last three where the view has one, of objects that are
+    told apart masks/<object>/<view>.png.
 
     Returns:
         the photograph's lens at this size, and the pinhole.
@@ -54,7 +54,7 @@ def save_undistorted(out: Path, name: str, capture: Capture, roles: Roles, longe
         raise BadInput(f"{capture.brought_by or capture.pictures[name]}: view '{name}': {error}") from error
     save_image(out / "images" / f"{name}.png", image if where is None else undistort_image(image, where))
     masks = {f"masks/{thing}": files for thing, files in roles.masks.items()}
-    for folder, files in (*masks.items(), ("test_masks", roles.test_masks)):
+    for folder, files in (*masks.items(), ("test_masks", roles.test_masks), ("fill", roles.fill)):
         if name in files:
             mask = load_mask(files[name], (size[1], size[0]))
             save_mask(out / folder / f"{name}.png", mask if where is None else undistort_mask(mask, where))

@@ -104,6 +104,11 @@ def load_test_masks(poses_dir: Path) -> dict[str, np.ndarray]:
     return {path.stem: load_mask(path) for path in sorted((Path(poses_dir) / "test_masks").glob("*.png"))}
 
 
+def load_fill(poses_dir: Path) -> dict[str, np.ndarray]:
+    """Training view name -> bool [H, W], what is to be filled there; empty where the scene brings no such masks."""
+    return {path.stem: load_mask(path) for path in sorted((Path(poses_dir) / "fill").glob("*.png"))}
+
+
 def save_mask_sets(masks_dir: Path, sets: Mapping[str, MaskSet]) -> None:
     """Write raw/, consistent/, undecided/ and invent/<view>.png."""
     for name, mask_set in sets.items():

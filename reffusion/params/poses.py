@@ -46,6 +46,7 @@ class Params(Settings):
     )
     gaussians: str | None = Field(None, description=".ply the scene brings in its own frame, 3DGS layout")
     region: Region | None = Field(None, description="box or sphere that holds the object, or is to be filled")
+    fill: str | None = Field(None, description="instead of a region: folder of masks, of what is to be filled")
     remove: list[str] | None = Field(
         None, description="read by the stage `masks`; here only checked", json_schema_extra=UNKEYED
     )

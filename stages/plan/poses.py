@@ -25,7 +25,7 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
         return others
     masks = {path for files in roles.masks.values() for path in files.values()}
     shown = {path for name, path in capture.pictures.items() if name not in roles.blank}
-    read = {*shown, *masks, *roles.test_masks.values()}
+    read = {*shown, *masks, *roles.test_masks.values(), *roles.fill.values()}
     read |= {scene / params.gaussians} if params.gaussians is not None else set()
     kept = [path for path in others if path.suffix.lower() not in NOT_READ or path.name == "poses_bounds.npy"]
     return sorted(read | {path for path in kept if path.parent != scene / PAINTED})
