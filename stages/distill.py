@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -51,7 +52,7 @@ def run(
     initial, masked, holes = start(params, scene, reference, initialize)
     prior, text = adapted_prior(params, personalize)
     estimator = depth_estimator(params, scene.points) if params.depth.weight > 0 else None
-    views = train_views(params, scene, poses, fit, masks, lift, initialize / "tainted")
+    views = train_views(params, scene, poses, fit, masks, lift, initialize)
     named, distance = lift_distance(params)
     if params.sds.weight > 0 and params.sds.within < 180:
         print(within(params, initial.means[masked], views, holes), flush=True)
@@ -100,15 +101,18 @@ def train_views(
     fit: Path,
     masks: Path,
     lift: Path | None = None,
-    tainted: Path | None = None,
+    initialize: Path | None = None,
 ) -> list[TrainView]:
     """The training views with the pixels that may supervise, those to repaint, and their pictures inpainted in 2D.
 
-    `tainted`: a folder of masks, of pixels that the object had shadowed; they may not supervise.
+    `initialize` may know of pixels that the object had shadowed, which may not supervise, and of fewer to repaint.
     """
     photos, sets = exposure.load_views(poses, fit, scene.train), load_mask_sets(masks, (*scene.train, *scene.blank))
     place = lambda array: torch.from_numpy(array).to(params.device)
     painted = load_views(lift, [n for n in scene.train if (lift / "images" / f"{n}.png").exists()]) if lift else {}
+    known = lambda folder: {path.stem: path for path in (initialize / folder).glob("*.png")} if initialize else {}
+    shadowed = known("tainted")
+    sets |= {name: replace(sets[name], invent=load_mask(path)) for name, path in known("invent").items()}
     views = []
     for name in (*scene.train, *scene.blank):
         clean, pixels = name in scene.clean, sets[name]
@@ -116,8 +120,8 @@ def train_views(
         repaint = (pixels.invent if params.repaint == "invent" else drawn) & (not clean)
         # C shows the object; I, where it reaches beyond C, the place of one that is to be drawn there.
         supervises = (~drawn | clean) & (name not in scene.blank)
-        if tainted and (tainted / f"{name}.png").exists():
-            supervises &= ~load_mask(tainted / f"{name}.png")
+        if name in shadowed:
+            supervises &= ~load_mask(shadowed[name])
         lifted = place(painted[name]) / 255 if name in painted else None
         photo = place(photos.get(name, np.zeros((*repaint.shape, 3), np.uint8))) / 255
         views.append(TrainView(scene.cameras[name], photo, place(supervises), place(repaint), clean, lifted))

@@ -19,7 +19,7 @@ from reffusion.io.arrays import load_json, load_labels, save_json, save_labels
 from reffusion.io.images import save_exr, save_image, save_mask
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_mask_sets, load_object, load_references, load_scene
-from reffusion.masks import taint, undecided, voting
+from reffusion.masks import regions, taint, undecided, voting
 from reffusion.masks.witness import with_photographed_depth
 from reffusion.paint import margin
 from reffusion.params.initialize import Params
@@ -66,6 +66,8 @@ def run(
     holes = [each for each in references if each.mask.any()]
     for each in sorted(holes, key=lambda r: (r.camera.name != best, -int(r.mask.sum()))):
         gaussians, new = filled(params, out, gaussians, new, each, around, network, log)
+    if references and params.start == "reference":
+        sets = narrowed(out, gaussians, new, sets, around.cameras)
     true = true_pictures(reference, references, around) if references and params.start == "reference" else []
     if true and params.settle:
         true, around = without_shadows(out, true, gaussians, around)
@@ -161,6 +163,18 @@ def filled(params: Params, out: Path, gaussians, new, reference, around, network
     if not gap.any():
         return gaussians, new
     return filling.placed(gaussians, new, reference, made_up, gap, around, sheets)
+
+
+def narrowed(out: Path, gaussians, new, sets, cameras):
+    """The masks with I where the references drew something. Writes invent/<view>.png where that is less than it was."""
+    less = {}
+    for camera in cameras:
+        each = sets[camera.name]
+        if (each.invent & ~each.consistent).any():
+            shown = voting.label_view(gaussians, new, camera)
+            less[camera.name] = replace(each, invent=regions.where_drawn(each.invent, each.consistent, shown))
+            save_mask(out / "invent" / f"{camera.name}.png", less[camera.name].invent)
+    return sets | less
 
 
 def true_pictures(reference: Path, references: list, around) -> list:

@@ -9,7 +9,11 @@ import numpy as np
 from torch import Tensor
 
 from reffusion import geometry
+from reffusion.masks.witness import widened
 from reffusion.types import Camera, Gaussians
+
+SHOWN = 0.05  # blending weight of new Gaussians from which a pixel shows them
+CLOSED, RIM = 0.02, 0.015  # of the image's width: notches twice as wide are closed; the rim that is repainted too
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,18 @@ def inside(gaussians: Gaussians, region: Region) -> Tensor:
     middle, sides = (gaussians.means.new_tensor(np.asarray(each)) for each in (region.center, region.size))
     off = (gaussians.means - middle) / (sides / 2)
     return (off**2).sum(-1) <= 1 if region.round else (off.abs() <= 1).all(-1)
+
+
+def where_drawn(invent: np.ndarray, consistent: np.ndarray, shown: np.ndarray) -> np.ndarray:
+    """bool [H, W]: I of a view, once the references' pixels stand in the scene. PAPER leaves open: where a region was
+    to be filled over what stays, only what was drawn and its rim are repainted; photographs know the rest of it.
+
+    Args:
+        invent, consistent: bool [H, W], I and C.
+        shown: [H, W] in [0, 1), what the view shows of the references' pixels.
+    """
+    closed = ~widened(~widened(shown > SHOWN, CLOSED), CLOSED)
+    return invent & (consistent | widened(closed, RIM))
 
 
 def _crossing(region: Region, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
