@@ -197,6 +197,17 @@ def test_masks_say_what_is_to_be_filled(tmp_path):
     assert all((sets[name].invent == wanted).all() and not sets[name].consistent.any() for name in small.TRAIN)
 
 
+def test_of_a_region_what_was_drawn_is_repainted_and_its_rim():
+    """Within C all of it is, whatever was drawn there; what is thin or faint was not drawn."""
+    invent, consistent, shown = np.zeros((60, 100), bool), np.zeros((60, 100), bool), np.zeros((60, 100))
+    invent[10:50, 10:90], consistent[10:50, 10:20], shown[20:40, 40:60] = True, True, 0.9
+    shown[30, 50], shown[15, 80] = 0.0, 0.01  # a pinhole, haze
+    found = regions.where_drawn(invent, consistent, shown)
+    rows, columns = np.nonzero(found & ~consistent)
+    assert found[20:40, 40:60].all() and (found & consistent == invent & consistent).all()
+    assert rows.min() >= 17 and rows.max() < 43 and columns.min() >= 37 and columns.max() < 63
+
+
 def test_a_box_behind_the_surface_has_no_silhouette():
     view = small.camera("v", 0.0)
     wall = np.full((small.HEIGHT, small.WIDTH), 1 / small.WALL)

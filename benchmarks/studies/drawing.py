@@ -89,6 +89,27 @@ def draw(view: Pictured, camera: np.ndarray, thing: placing.Thing, tints: np.nda
     return view.mean(color), view.mean(hit.astype(float))
 
 
+def drawn_into(
+    photo: np.ndarray, view: Pictured, camera: np.ndarray, thing: placing.Thing, tints: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(a photograph, [H, W, 3] in [0, 1], with the object in it, its mask [H, W] in {0, 255}), uint8 both."""
+    color, cover = draw(view, camera, thing, tints)
+    both = photo * (1 - cover[..., None]) + color
+    return (both * 255 + 0.5).clip(0, 255).astype(np.uint8), (cover > 0).astype(np.uint8) * 255
+
+
+def depth(view: Pictured, camera: np.ndarray, thing: placing.Thing, ground: float) -> np.ndarray:
+    """[H, W] camera z of the object, and of the surface up to `ground` times its height around its foot; else NaN."""
+    ways, shape = view.coarse @ camera[:3, :3].T, (view.capture.height, view.capture.width)
+    start = (camera[:3, 3] - thing.middle) @ thing.axes.T / thing.half
+    far, hit, _, _ = (_cube if thing.shape == "box" else _ball)(ways @ thing.axes.T / thing.half, start, thing.half)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        surface = ((thing.foot - camera[:3, 3]) @ thing.normal) / (ways @ thing.normal)
+    at = camera[:3, 3] + np.where(np.isfinite(surface), surface, 0)[:, None] * ways
+    near = (surface > 0) & (np.linalg.norm(at - thing.foot, axis=1) < ground * thing.height)
+    return np.where(hit, far, np.where(near, surface, np.nan)).reshape(shape)
+
+
 def _cube(ways: np.ndarray, start: np.ndarray, half: np.ndarray):
     """(distance [N], hit [N], normal [N, 3] in the object's axes, face [N]: its axis) of rays to the unit cube."""
     with np.errstate(divide="ignore"):
@@ -143,21 +164,19 @@ def write(place: placing.Place, capture: placing.Photographs, options: Options, 
     random, view = np.random.default_rng(options.seed), Pictured(capture)
     tints = random.uniform(0.35, 0.9, (3, 3))
     for name in views.all:
-        camera, photo = capture.cameras[name], _photograph(capture, name)
-        color, cover = draw(view, camera, thing, tints)
-        mask = (cover > 0).astype(np.uint8) * 255
+        camera, photo = capture.cameras[name], photograph(capture, name)
+        light = light_left(view, camera, thing, options.shadow)[..., None] if options.shadow else 1.0
+        both, mask = drawn_into(photo / 255.0 * light, view, camera, thing, tints)
         save_image(out / f"truth/{name}.png", photo)
         if name in views.test:
             save_image(out / f"images/{name}.png", photo)
             save_image(out / f"test_masks/{name}.png", mask)
             continue
-        light = light_left(view, camera, thing, options.shadow)[..., None] if options.shadow else 1.0
-        both = photo / 255.0 * light * (1 - cover[..., None]) + color
-        save_image(out / f"images/{name}.png", (both * 255 + 0.5).clip(0, 255).astype(np.uint8))
+        save_image(out / f"images/{name}.png", both)
         given = roughened(mask, options.rough, random) if options.rough else mask
         save_image(out / f"masks/{name}.png", given)
-    _write_meta(capture, views, out)
-    lines = ["masks: masks", "test_masks: test_masks", f"test: {_listed(views.test)}"]
+    write_meta(capture, views, out)
+    lines = ["masks: masks", "test_masks: test_masks", f"test: {listed(views.test)}"]
     if options.reference:
         middle = views.train[len(views.train) // 2]
         lines += ["reference:", f'  view: "{middle}"', f"  image: truth/{middle}.png"]
@@ -171,17 +190,19 @@ def write_untouched(place: placing.Place, capture: placing.Photographs, scene: P
     shutil.rmtree(out, ignore_errors=True)
     shutil.copytree(scene / "truth", out / "images")
     shutil.copytree(scene / "test_masks", out / "test_masks")
-    _write_meta(capture, views, out)
-    (out / "scene.yaml").write_text(f"masks: none\ntest_masks: test_masks\ntest: {_listed(views.test)}\n")
+    write_meta(capture, views, out)
+    (out / "scene.yaml").write_text(f"masks: none\ntest_masks: test_masks\ntest: {listed(views.test)}\n")
 
 
-def _write_meta(capture: placing.Photographs, views: placing.Views, out: Path) -> None:
+def write_meta(capture: placing.Photographs, views: placing.Views, out: Path) -> None:
+    """transforms.json and the points of the capture."""
     placing.save_meta(capture, views.all, out / "transforms.json")
     (out / capture.cloud).parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(capture.folder / capture.cloud, out / capture.cloud)
 
 
-def _photograph(capture: placing.Photographs, name: str) -> np.ndarray:
+def photograph(capture: placing.Photographs, name: str) -> np.ndarray:
+    """uint8 [H, W, 3]; ValueError where it is of another size than transforms.json says."""
     path = capture.folder / capture.frames[name]["file_path"]
     photo = load_image(path)
     if photo.shape[:2] != (capture.height, capture.width):
@@ -190,5 +211,6 @@ def _photograph(capture: placing.Photographs, name: str) -> np.ndarray:
     return photo
 
 
-def _listed(names: list[str]) -> str:
+def listed(names: list[str]) -> str:
+    """Of YAML."""
     return "[" + ", ".join(f'"{name}"' for name in names) + "]"

@@ -35,17 +35,17 @@ def write(start: placing.Place, goal: placing.Place, capture: placing.Photograph
     for folder in (scene, ceiling):
         shutil.rmtree(folder, ignore_errors=True)
     for name in views.all:
-        camera, photo = capture.cameras[name], drawing.photograph(capture, name)
-        shown, cover = drawing.drawn_into(photo, pictured, camera, after, tints)
+        camera, photo = capture.cameras[name], drawing.photograph(capture, name) / 255
+        shown, mask = drawing.drawn_into(photo, pictured, camera, after, tints)
         save_image(ceiling / f"images/{name}.png", shown)
         if name in views.test:
             save_image(scene / f"images/{name}.png", shown)
             for folder in (scene, ceiling):
-                save_image(folder / f"test_masks/{name}.png", drawing.mask_of(cover))
+                save_image(folder / f"test_masks/{name}.png", mask)
             continue
-        with_it, cover = drawing.drawn_into(photo, pictured, camera, before, tints)
+        with_it, mask = drawing.drawn_into(photo, pictured, camera, before, tints)
         save_image(scene / f"images/{name}.png", with_it)
-        save_image(scene / f"masks/{name}.png", drawing.mask_of(cover))
+        save_image(scene / f"masks/{name}.png", mask)
         if name in asked:
             save_image(scene / f"references/{name}.png", shown)
             np.save(scene / f"references/{name}.npy", drawing.depth(pictured, camera, after, GROUND))
@@ -72,7 +72,9 @@ def main() -> None:
     given = parser.parse_args()
     (start,), (goal,) = (composites.chosen(name, False) for name in (given.start, given.goal))
     if start.capture != goal.capture:
-        parser.error(f"{start.name} is a place of {start.capture}, {goal.name} of {goal.capture}; take two of one capture")
+        parser.error(
+            f"{start.name} is a place of {start.capture}, {goal.name} of {goal.capture}; take two of one capture"
+        )
     scene = write(start, goal, placing.load(given.captures / start.capture), given.out / "scenes")
     folders = (scene, scene.with_name(f"{scene.name}-untouched"))
     run, ceiling = (judging.Run.at(composites.job(each, given.out / "runs", given.profile)) for each in folders)
