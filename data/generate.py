@@ -37,7 +37,7 @@ from kinds import KINDS, Kind
 from photographs import Session, corner_shift, photographed
 from reconstruction import Frame, scene_frame, sparse_points
 from room import furnish
-from tasks import SPHERE, bare, beyond, depth, on_axis, region_around
+from tasks import SPHERE, bare, beyond, covering, depth, on_axis, region_around
 from world import World, bake
 
 AWAY = 2.5  # metres from the middle camera to the sphere's centre, about where the views look
@@ -177,7 +177,7 @@ def _ask_insertion(out: Path, session: Session, kind: Kind, world: World, frame:
     _write_test_masks(out, session, session.masks[: session.test])
     center, radius = region_around(world.solids)
     region = {"center": frame.points(center).tolist(), "radius": frame.scale * radius}
-    _write_region(out, region, _write_measured(out, session, kind, world, frame))
+    _write_region(out, region, _write_measured(out, session, session.completed, kind, world, frame))
 
 
 def _ask_outpainting(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
@@ -185,15 +185,20 @@ def _ask_outpainting(out: Path, session: Session, kind: Kind, world: World, fram
     center = on_axis(session.cameras[session.middle], AWAY)
     masks = [beyond(camera, kind, world, center, SPHERE) for camera in session.cameras[: session.test]]
     _write_test_masks(out, session, masks)
+    middle = session.middle - session.test
+    chosen = covering(session.cameras[session.test :], kind, world, center, middle, kind.references)
+    whole = {session.test + k: session.photos[session.test + k] for k in chosen}
     sphere = {"view": session.names[session.middle], "distance": frame.scale * AWAY}
     sphere |= {"radius": frame.scale * SPHERE, "outside": True}
-    _write_region(out, sphere, _write_measured(out, session, kind, world, frame))
+    _write_region(out, sphere, _write_measured(out, session, whole, kind, world, frame))
 
 
-def _write_measured(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> str:
-    """Write the completed views and their depth; the lines of scene.yaml that name them."""
+def _write_measured(
+    out: Path, session: Session, pictures: dict[int, np.ndarray], kind: Kind, world: World, frame: Frame
+) -> str:
+    """Write pictures of views and their depth; the lines of scene.yaml that name them."""
     said = ["reference:\n"]
-    for k, picture in session.completed.items():
+    for k, picture in pictures.items():
         name = session.names[k]
         write_image(out / f"references/{name}.png", picture)
         np.save(out / f"references/{name}.npy", depth(session.cameras[k], kind, world, frame))

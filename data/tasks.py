@@ -10,6 +10,7 @@ from solids import Solids
 from world import World
 
 ROOM_FOR_IT = 1.08  # radius of the region over that of the object within
+GRID, NEAR = 61, 0.03  # every so many-th pixel tells what is covered; relative depth within which a point is shown
 SPHERE = 0.95  # metres: radius of the sphere beyond which the scene is to be continued
 
 
@@ -46,6 +47,33 @@ def beyond(camera: np.ndarray, kind: Kind, world: World, center: np.ndarray, rad
     _, along = rays(camera, kind, world)
     offset = center - camera[13:]
     return offset @ offset - (along @ offset) ** 2 > radius**2
+
+
+def covering(cameras: np.ndarray, kind: Kind, world: World, center: np.ndarray, first: int, count: int) -> list[int]:
+    """So many cameras, `first` and then each the one that shows most of what lies beyond the sphere and no earlier one
+    shows."""
+    depths, pooled = [], []
+    for camera in cameras:
+        points, _ = rays(camera, kind, world)
+        depths.append((points - camera[13:]) @ camera[4:13].reshape(3, 3)[:, 2])
+        pooled.append(points[beyond(camera, kind, world, center, SPHERE)][::GRID])
+    points = np.concatenate(pooled)
+    shown = np.stack([_seen(points, *each, kind) for each in zip(cameras, depths, strict=True)])
+    chosen = [first]
+    while len(chosen) < count:
+        chosen.append(int((shown & ~shown[chosen].any(0)).sum(1).argmax()))
+    return chosen
+
+
+def _seen(points: np.ndarray, camera: np.ndarray, depth: np.ndarray, kind: Kind) -> np.ndarray:
+    """bool [N]: points that the camera shows, the lens's bend left out."""
+    at = (points - camera[13:]) @ camera[4:13].reshape(3, 3)
+    z = np.maximum(at[:, 2], 1e-6)
+    column, row = (np.floor(camera[0] * at[:, k] / z + camera[1 + k]).astype(int) for k in (0, 1))
+    framed = (at[:, 2] > 0) & (column >= 0) & (column < kind.width) & (row >= 0) & (row < kind.height)
+    found = np.zeros(len(points), bool)
+    found[framed] = np.abs(at[framed, 2] - depth[row[framed], column[framed]]) < NEAR * at[framed, 2]
+    return found
 
 
 def on_axis(camera: np.ndarray, distance: float) -> np.ndarray:

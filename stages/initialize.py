@@ -73,7 +73,7 @@ def run(
         true, around = without_shadows(out, true, gaussians, around)
     further = []
     if true and params.further:
-        gaussians, new, further = completed_further(params, out, gaussians, new, around)
+        gaussians, new, further = completed_further(params, out, gaussians, new, around, true)
         true += further
     if params.start == "random" and any(each.invent.any() for each in sets.values()):
         added = at_random(params, removed, gaussians, scene, sets, poses)
@@ -215,20 +215,21 @@ def without_shadows(out: Path, true: list, gaussians, around):
     return pictures, replace(around, views=views, photos=photos)
 
 
-def completed_further(params: Params, out: Path, gaussians, new, around):
-    """Views put together from patches of the photographs, the one with most that nothing covers first; the Gaussians
-    with what they show, the labels, and the views."""
+def completed_further(params: Params, out: Path, gaussians, new, around, true):
+    """Views put together from patches of the photographs and of the `true` pictures, the one with most that nothing
+    covers first; the Gaussians with what they show, the labels, and the views."""
     further: list[Reference] = []
     found = coverage.open_pixels(gaussians, around, around.cameras)
     haze = coverage.haze(gaussians, new, around, found, LEAK)
     gaussians, new = gaussians.map(lambda p: p[~haze]), new[~haze]
+    looked = replace(around.looked(), completed=coverage.completed(true, gaussians, around))
     while len(further) < params.further and (camera := coverage.barest(around, found)):
         mask, hidden = found[camera.name], around.hidden[camera.name]
         # Just outside C a photograph may still show the object's rim, which would be repeated.
         rimmed = margin.widened(hidden, surfaces.RIM)
         base = inpaint.background(gaussians, camera, around.photos[camera.name], rimmed)
         hole = surfaces.with_rim(mask, hidden)
-        (completed,) = surfaces.completions(base, hole, camera, hidden, around.looked(), [SEED])
+        (completed,) = surfaces.completions(base, hole, camera, hidden, looked, [SEED])
         reference = Reference(camera, completed.image, mask)
         print(f"further view {camera.name}: {mask.sum() / hidden.sum():.1%} of the mask is covered by nothing")
         try:

@@ -171,7 +171,7 @@ def test_a_floor_is_smooth_and_grass_is_not():
 def test_the_misfit_is_the_mean_square_by_weight():
     """Against NumPy, in float64, for a patch that is turned and carried along the floor."""
     around = floor()
-    own, other = (surfaces._photographed(view, around) for view in around.views[:2])
+    own, other = (surfaces._source(view, around.photos[view.camera.name], around) for view in around.views[:2])
     seen = [(completion._values(each.image, each.masked), each.masked) for each in (own, other)]
     marked = [completion._marked(values, each, [1], 1) for (values, _), each in zip(seen, (own, other), strict=True)]
     pictures = completion._pictures(marked, [masked for _, masked in seen], [own, other], 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -10,9 +11,9 @@ from torch import Tensor
 
 from reffusion.initialize.filling import Surroundings
 from reffusion.masks import voting
-from reffusion.masks.witness import OPAQUE
+from reffusion.masks.witness import OPAQUE, Witness
 from reffusion.splat import rasterizer
-from reffusion.types import Camera, Gaussians
+from reffusion.types import Camera, Gaussians, Reference
 
 ENOUGH = 0.001  # share of a view's C under which what is open is left to its neighbours
 
@@ -37,6 +38,20 @@ def haze(
 ) -> Tensor:
     """bool [N]: old Gaussians that show mostly where nothing else covers C."""
     return voting.leaking(gaussians, around.cameras, found, leak) & ~new
+
+
+@torch.no_grad()
+def completed(
+    references: Sequence[Reference], gaussians: Gaussians, around: Surroundings
+) -> list[tuple[Witness, np.ndarray]]:
+    """The completed views as witnesses of what they show in C, where Gaussians lie by now, and their pictures."""
+    of, found = {view.camera.name: view for view in around.views}, []
+    for each in references:
+        drawn = rasterizer.render(gaussians, each.camera, sh_degree=0)
+        depth = torch.where(drawn.alpha > OPAQUE, drawn.depth, 0.0).cpu().numpy()
+        view = of[each.camera.name]
+        found.append((replace(view, depth=depth, hidden=view.hidden & ~each.mask), each.image))
+    return found
 
 
 def barest(around: Surroundings, found: Mapping[str, np.ndarray]) -> Camera | None:

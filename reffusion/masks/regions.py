@@ -13,7 +13,7 @@ from reffusion.masks.witness import widened
 from reffusion.types import Camera, Gaussians
 
 SHOWN = 0.05  # blending weight of new Gaussians from which a pixel shows them
-CLOSED, RIM = 0.02, 0.015  # of the image's width: notches twice as wide are closed; the rim that is repainted too
+CLOSED, RIM = 0.008, 0.003  # of the image's width: notches twice as wide are closed; a rim of half shown pixels
 
 
 @dataclass(frozen=True)

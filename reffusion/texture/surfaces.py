@@ -40,6 +40,7 @@ class Around:
         views: the training views as witnesses. planes: those around the object.
         photos: view name -> uint8 [H, W, 3], exposed alike.
         centre: [3], the object's middle. radius: of most of it; infinite where there is none.
+        completed: views completed before, without the object, and their pictures, uint8 [H, W, 3].
     """
 
     views: Sequence[Witness]
@@ -47,6 +48,7 @@ class Around:
     photos: Mapping[str, np.ndarray]
     centre: np.ndarray
     radius: float
+    completed: Sequence[tuple[Witness, np.ndarray]] = ()
 
 
 def looked_around(
@@ -91,8 +93,8 @@ def with_rim(hole: np.ndarray, hidden: np.ndarray) -> np.ndarray:
 def completions(
     image: np.ndarray, hole: np.ndarray, camera: Camera, hidden: np.ndarray, around: Around, seeds: Sequence[int]
 ) -> list[Completed]:
-    """A training view's picture, uint8 [H, W, 3], with its hole filled from patches of its own photograph and of
-    others, once for each seed.
+    """A training view's picture, uint8 [H, W, 3], with its hole filled from patches of its own photograph, of others
+    and of views completed before, once for each seed.
 
     Args:
         hole: bool [H, W]. hidden: bool [H, W], C: where the photograph shows the object.
@@ -100,7 +102,8 @@ def completions(
     own = next(view for view in around.views if view.camera.name == camera.name)
     surface, depth = _behind(own, hidden, around.planes)
     target = Shown(image, hole, ~hole, surface, _frames(surface, camera, around.planes), depth / camera.fx)
-    sources = [_photographed(view, around) for view in (own, *_others(own, around.views))]
+    shown = [(view, around.photos[view.camera.name]) for view in (own, *_others(own, around.views))]
+    sources = [_source(*each, around) for each in (*shown, *around.completed)]
     smooth = [k for k, plane in enumerate(around.planes, start=1) if _roughness(plane, around) < SMOOTH]
     return [complete(target, hole, sources, smooth, seed) for seed in seeds]
 
@@ -138,16 +141,15 @@ def _drawn(depth: np.ndarray, known: np.ndarray, hidden: np.ndarray) -> np.ndarr
     return found
 
 
-def _photographed(view: Witness, around: Around) -> Shown:
-    """A photograph as a source of patches: what it shows near the object, beside its mask."""
+def _source(view: Witness, picture: np.ndarray, around: Around) -> Shown:
+    """A view's picture as a source of patches: what it shows near the object, beside its mask."""
     depth = view.depth.astype(np.float64)
     points = geometry.unproject(depth, view.camera)
     near = np.linalg.norm(points - around.centre, axis=-1) < NEARBY * around.radius
     surface = _labelled(depth, view.camera, around.planes)
     size = np.where(depth > 0, depth, 1.0) / view.camera.fx
     frames = _frames(surface, view.camera, around.planes)
-    photo = around.photos[view.camera.name]
-    return Shown(photo, widened(view.hidden, BESIDE), near & (depth > 0), surface, frames, size)
+    return Shown(picture, widened(view.hidden, BESIDE), near & (depth > 0), surface, frames, size)
 
 
 def _others(own: Witness, views: Sequence[Witness]) -> list[Witness]:
