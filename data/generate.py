@@ -13,7 +13,7 @@ A furnished room is ray-cast with and without one object. Kinds:
   sparse  nothing to remove; of four training views alone the pixels may be used, the others are cameras
   grass   an object on a lawn before a hedge: thousands of blades and leaves, nothing flat
   insert  the same turned round: an object on the floor, in the test views and three references only; it is to be put in
-  outpaint  the room as photographed, and a sphere beyond which it is to be continued from three references
+  outpaint  the room as photographed, and a sphere beyond which it is to be continued from four references
   photos  26 larger photographs and masks without poses, for structure from motion
 
 Poses are written in a scene frame of arbitrary scale, rotation and origin, as SfM leaves it. As in SPIn-NeRF the
@@ -181,7 +181,7 @@ def _ask_insertion(out: Path, session: Session, kind: Kind, world: World, frame:
 
 
 def _ask_outpainting(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
-    """A sphere on the middle view's optical axis, and whole pictures of three views with their depth."""
+    """A sphere on the middle view's optical axis, and whole pictures of some views with their depth."""
     center = on_axis(session.cameras[session.middle], AWAY)
     masks = [beyond(camera, kind, world, center, SPHERE) for camera in session.cameras[: session.test]]
     _write_test_masks(out, session, masks)

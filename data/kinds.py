@@ -68,7 +68,7 @@ KINDS = {
     "corner": Kind(spread=30.0, place="corner", least=0.25),
     "grass": Kind(samples=2, spread=30.0, node=0.08, place="grass"),
     "insert": Kind(place="floor", task="insert", least=0, references=3),
-    "outpaint": Kind(spread=16.0, task="outpaint", least=0, references=3),
+    "outpaint": Kind(spread=16.0, task="outpaint", least=0, references=4),
     "pair": Kind(spread=30.0, place="pair", least=0.2, references=2),
     "sparse": Kind(spread=30.0, task="sparse", least=0, shown=4),
     "photos": Kind(width=480, height=360, train=26, test=0, photos=True, texture=2048, node=0.025),

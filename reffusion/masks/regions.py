@@ -12,8 +12,8 @@ from reffusion import geometry
 from reffusion.masks.witness import widened
 from reffusion.types import Camera, Gaussians
 
-SHOWN = 0.05  # blending weight of new Gaussians from which a pixel shows them
-CLOSED, RIM = 0.008, 0.003  # of the image's width: notches twice as wide are closed; a rim of half shown pixels
+SHOWN = 0.1  # blending weight of new Gaussians from which a pixel shows them
+CLOSED = 0.008  # of the image's width: notches up to twice as wide are closed
 
 
 @dataclass(frozen=True)
@@ -57,14 +57,13 @@ def inside(gaussians: Gaussians, region: Region) -> Tensor:
 
 def where_drawn(invent: np.ndarray, consistent: np.ndarray, shown: np.ndarray) -> np.ndarray:
     """bool [H, W]: I of a view, once the references' pixels stand in the scene. PAPER leaves open: where a region was
-    to be filled over what stays, only what was drawn and its rim are repainted; photographs know the rest of it.
+    to be filled over what stays, only what was drawn is repainted; photographs know the rest of it.
 
     Args:
         invent, consistent: bool [H, W], I and C.
         shown: [H, W] in [0, 1), what the view shows of the references' pixels.
     """
-    closed = ~widened(~widened(shown > SHOWN, CLOSED), CLOSED)
-    return invent & (consistent | widened(closed, RIM))
+    return invent & (consistent | ~widened(~widened(shown > SHOWN, CLOSED), CLOSED))
 
 
 def _crossing(region: Region, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
