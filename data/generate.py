@@ -12,7 +12,7 @@ A furnished room is ray-cast with and without one object. Kinds:
   pair    two objects side by side, each with masks of its own, and two references
   sparse  nothing to remove; of four training views alone the pixels may be used, the others are cameras
   grass   an object on a lawn before a hedge: thousands of blades and leaves, nothing flat
-  insert  the same turned round: an object on the floor, in the test views and three references only; it is to be put in
+  insert  the same turned round: an object on the floor, in the test views and four references only; it is to be put in
   outpaint  the room as photographed, and a sphere beyond which it is to be continued from four references
   photos  26 larger photographs and masks without poses, for structure from motion
 
@@ -173,7 +173,7 @@ def _ask_views(out: Path, session: Session, kind: Kind, world: World, frame: Fra
 
 
 def _ask_insertion(out: Path, session: Session, kind: Kind, world: World, frame: Frame) -> None:
-    """Three references that show the object, their depth, and a sphere in which it stands."""
+    """References that show the object, their depth, and a sphere in which it stands."""
     _write_test_masks(out, session, session.masks[: session.test])
     center, radius = region_around(world.solids)
     region = {"center": frame.points(center).tolist(), "radius": frame.scale * radius}

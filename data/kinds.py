@@ -67,7 +67,7 @@ KINDS = {
     "table": Kind(spread=34.0, place="table", least=0.05, low=0.45),
     "corner": Kind(spread=30.0, place="corner", least=0.25),
     "grass": Kind(samples=2, spread=30.0, node=0.08, place="grass"),
-    "insert": Kind(place="floor", task="insert", least=0, references=3),
+    "insert": Kind(place="floor", task="insert", least=0, references=4),
     "outpaint": Kind(spread=16.0, task="outpaint", least=0, references=4),
     "pair": Kind(spread=30.0, place="pair", least=0.2, references=2),
     "sparse": Kind(spread=30.0, task="sparse", least=0, shown=4),
