@@ -61,6 +61,7 @@ def write_stages(home):
     other = np.zeros_like(mask)
     other[4:24, 20:48] = True
     save_mask_sets(made["masks"], {name: MaskSet(empty, other, empty, empty) for name in names})
+    save_json(made["masks"] / "facts.json", {"kept": []})
     for stage, count in (("fit", 60), ("initialize", 40), ("distill", 50)):
         save_ply(made[stage] / "gaussians.ply", blobs(count))
     for stage, seconds in (("fit", 12.5), ("distill", 3.0)):
@@ -72,6 +73,13 @@ def run(out, folders, **params):
     out.mkdir()
     evaluate.run(evaluate.Params(**params), out, **folders)
     return json.loads((out / "metrics.json").read_text())
+
+
+def test_while_an_object_is_kept_nothing_is_scored(tmp_path, folders):
+    """Test photographs show none."""
+    save_json(folders["masks"] / "facts.json", {"kept": ["ball"]})
+    found = run(tmp_path / "out", folders)
+    assert found["mean"].get("psnr_box") is None and (tmp_path / "out/renders/view0.png").exists()
 
 
 @pytest.fixture
