@@ -1,7 +1,7 @@
 """An object removed from one place of a real capture and put in at another: `python -m benchmarks.studies.moving`.
 
 The training photographs show the object where it stood, with masks; three pictures of it at the other place are the
-references, each with the depth of the object and of the ground around it, as a modelling program would give them. The
+references, each with the depth of the object, of the ground around its foot and between sparse points. The
 same object drawn there into all photographs is the truth, and a fit to them the ceiling. Writes moving.json and a sheet
 of all test views (truth, as photographed, ours, ceiling, difference) to --out.
 """
@@ -19,7 +19,7 @@ from reffusion.io.arrays import save_json
 from reffusion.io.images import save_image
 
 ROOM_FOR_IT = 1.08  # radius of the region over that of the object
-GROUND = 2.5  # of the object's height: how far around it the ground's depth is told
+GROUND = 0.9  # of the object's height: how far around its foot the depth of the ground is told
 REFERENCES = 3
 
 
