@@ -187,8 +187,9 @@ class Reference:
         camera: the view.
         image: [H, W, 3] uint8.
         mask: [H, W] bool, the pixels the reference stands for (the view's invent mask).
-        depth: [H, W] float32 as the scene brings it, depth or disparity of any scale and offset, NaN where it says
-            nothing (`alignment.align_either` brings it to the scene); None where it brings none.
+        depth: [H, W] float32 as the scene brings it, depth or disparity of any scale and offset, in this frame's unit
+            where it was in the scene's, NaN where it says nothing (`alignment.align_either` brings it to the scene);
+            None where it brings none.
     """
 
     camera: Camera

@@ -198,7 +198,9 @@ def without_shadows(out: Path, true: list, gaussians, around):
         name = each.camera.name
         hidden = around.hidden[name]
         shown = inpaint.background(gaussians, each.camera, photos[name], hidden)
-        found = taint.tainted(each.image, shown, hidden) & (hidden | ~each.mask)  # what is drawn there is no shadow
+        found = taint.tainted(each.image, shown, hidden)
+        if (each.mask & ~hidden).any():  # it draws something over what stays, which is no shadow, nor is its rim
+            found &= hidden
         pictures.append(replace(each, mask=each.mask | found))
         if not found.any():
             continue

@@ -106,6 +106,8 @@ def fitted(given: GivenReference, sets: MaskSet, scene: Scene, poses: Path, fit:
     drawn = sets.consistent | taint.changed(image, photo, sets.invent)
     image = image if given.painted else exposure.normalised(image, fit, given.view)
     depth = load_straight_depth(given, lens, upright, found.moved)
+    if depth is not None:  # where it is in the scene's own unit, it is in this frame's now
+        depth = depth * scene.similarity.scale
     return Reference(camera, image, sets.invent & inside & drawn, depth)
 
 

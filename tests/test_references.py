@@ -184,6 +184,17 @@ def test_depth_of_any_kind_is_brought_to_the_scenes(tmp_path, kind):
     assert space == ("disparity" if "disparity" in kind else "depth")
 
 
+def test_depth_in_the_scenes_unit_stays_as_it_is():
+    """Where what is seen is noisy a line of its own would move it; in another unit it has to be fitted."""
+    rng = np.random.default_rng(1)
+    z = 2 + 0.01 * np.arange(40)[:, None] + np.zeros((40, 40))
+    seen = z * rng.normal(1.01, 0.05, z.shape)
+    everywhere = np.ones(z.shape, bool)
+    assert np.array_equal(alignment.align_either(z, seen, everywhere)[0], z)
+    other, _ = alignment.align_either(3 * z, seen, everywhere)
+    assert 0.9 < np.median(other / z) < 1.1 and not np.array_equal(other, z)
+
+
 def test_depth_that_says_nothing_of_the_scene_is_refused():
     rng = np.random.default_rng(0)
     z, everywhere = rng.uniform(1, 3, (40, 40)), np.ones((40, 40), bool)

@@ -20,6 +20,7 @@ TRIALS = 1000  # of two pixels: of 10% inliers both are in one of a hundred; all
 JURY = 500  # pixels that judge a trial: of 10% inliers 50 agree with the right line, with a wrong one a handful
 SUPPORTS = 32  # numbers of agreeing pixels that are looked at
 DISAGREES = 0.7  # of the spread of what is known: half the pixels missing by more, and a map says nothing of the scene
+AS_IT_IS = 1.5  # times the best fit's error, up to which a map counts as being in the scene's unit
 LEAST_DISPARITY = 0.02  # relative; a scene that varies less is flat, and any map that is right to this fits
 
 
@@ -213,7 +214,8 @@ def align_either(estimate: np.ndarray, depth: np.ndarray, known: np.ndarray) -> 
     """A depth map of unknown kind brought to the scene's: (depth [H, W] float64 camera z, what the map is affine in).
 
     It is taken as depth and as disparity, each with a scale and an offset, robustly; of the two that rise with the
-    scene's the one that comes nearer in disparity is kept.
+    scene's the one that comes nearer in disparity is kept. One that is in the scene's unit stays as it is, if it fits
+    hardly worse: two such maps agree with each other, while each fitted by itself would be off by its own noise.
 
     Args:
         estimate: [H, W], depth or disparity of any scale and offset; NaN where it says nothing.
@@ -251,4 +253,7 @@ def align_either(estimate: np.ndarray, depth: np.ndarray, known: np.ndarray) -> 
             f"the depth map does not fit what is seen: half of it misses by {error / np.median(disparity):.0%} of the "
             f"disparity or more, and the scene's own varies by {spread / np.median(disparity):.0%}"
         )
+    given = estimate[shown]
+    if (estimate[said] > 0).all() and np.median(np.abs(1 / given - disparity)) <= AS_IT_IS * error:
+        return np.where(said, estimate, np.nan), "depth"
     return np.where(said, aligned, np.nan), space
