@@ -153,9 +153,11 @@ def filled(params: Params, out: Path, gaussians, new, reference, around, network
         stands = billboard.standing(drawn_over, behind_it, camera)
         depth, made_up = (np.where(drawn_over, stands, each) for each in (depth, made_up))
         said = f"{said}; a billboard, good within {billboard.GOOD_WITHIN} degrees, stands where the scene goes on"
+    elif (more := coverage.before(gaussians, made_up, reference, hidden) & ~hole).any():
+        drawn_over, depth = drawn_over | more, np.where(more, made_up, depth)
     print(f"depth of reference {camera.name}: {said}")
     save_exr(out / "depth" / f"{camera.name}.exr", depth.astype("float32"))
-    over = drawn_over & ~filling.beside_edges(depth, behind_it)
+    over = drawn_over & ~coverage.beside_edges(depth, behind_it)
     pixels = behind.grown(hole & ~drawn_over, OVERLAP) | over
     gaussians, new = filling.placed(gaussians, new, reference, depth, pixels, around, sheets)
     if farthest or not params.tidy:  # what is open still is asked for view by view, or left

@@ -1,10 +1,11 @@
-"""What no reference shows: the pixels still open after filling, and the view to complete next."""
+"""What is still to be drawn: of a reference over what stays; of other views what no reference shows, and which next."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -15,6 +16,7 @@ from reffusion.masks.witness import OPAQUE, Witness
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Reference
 
+EDGE = 0.03  # relative depth: of a step between two things, and within which two surfaces are the same
 ENOUGH = 0.001  # share of a view's C under which what is open is left to its neighbours
 
 
@@ -58,3 +60,27 @@ def barest(around: Surroundings, found: Mapping[str, np.ndarray]) -> Camera | No
     """The view with the most open pixels; None where in each they are too few to count."""
     bare = [c for c in around.cameras if found[c.name].sum() > ENOUGH * max(around.hidden[c.name].sum(), 1)]
     return max(bare, key=lambda camera: int(found[camera.name].sum()), default=None)
+
+
+@torch.no_grad()
+def before(gaussians: Gaussians, depth: np.ndarray, reference: Reference, hidden: np.ndarray) -> np.ndarray:
+    """bool [H, W]: what a reference draws over what stays, before all that the Gaussians show: the back of a thing of
+    which earlier ones drew the front, seen from within.
+
+    Args:
+        depth: [H, W] of the reference's surface. hidden: bool [H, W], C.
+    """
+    drawn = rasterizer.render(gaussians, reference.camera, sh_degree=0)
+    shown = torch.where(drawn.alpha > 0.5, drawn.depth, torch.inf).double().cpu().numpy()
+    return reference.mask & ~hidden & (depth < (1 - EDGE) * shown)
+
+
+def beside_edges(depth: np.ndarray, stays: np.ndarray) -> np.ndarray:
+    """bool [H, W]: pixels just beyond the edge of something nearer, on what stays there: stained by its colour,
+    and photographs show them clean.
+
+    Args:
+        depth, stays: [H, W] of the completed view, and of the scene as it is.
+    """
+    nearest = cv2.erode(depth, np.ones((3, 3)))
+    return (depth > (1 + EDGE) * nearest) & (np.abs(depth - stays) < EDGE * stays)

@@ -25,7 +25,6 @@ from reffusion.types import Camera, Gaussians, Reference
 
 AROUND, BEYOND = 2, 0.1  # px around, and how far beyond the colours there, in [0, 1], a Gaussian's may lie
 SWEPT = 0.1  # of the image's width: how far around a hole depth is found by comparing photographs
-EDGE = 0.03  # relative depth: of a step between two things, and within which two surfaces are the same
 
 
 @dataclass(frozen=True)
@@ -122,17 +121,6 @@ def to_fill(
     drawn = rasterizer.render(gaussians, reference.camera, features=new[:, None].to(gaussians.means.dtype), sh_degree=0)
     thin, filled = drawn.alpha.cpu().numpy() < covered, drawn.features[..., 0].cpu().numpy() > 0.5
     return (reference.mask & ~filled) | (hidden & thin)
-
-
-def beside_edges(depth: np.ndarray, stays: np.ndarray) -> np.ndarray:
-    """bool [H, W]: pixels just beyond the edge of something nearer, on what stays there: stained by its colour,
-    and photographs show them clean.
-
-    Args:
-        depth, stays: [H, W] of the completed view, and of the scene as it is.
-    """
-    nearest = cv2.erode(depth, np.ones((3, 3)))
-    return (depth > (1 + EDGE) * nearest) & (np.abs(depth - stays) < EDGE * stays)
 
 
 @torch.no_grad()
