@@ -11,6 +11,7 @@ from reffusion import geometry
 from reffusion.depth import behind
 from reffusion.depth.behind import Completion
 from reffusion.gaussians.surfels import surface_gaussians, surface_normals
+from reffusion.initialize import coverage
 from reffusion.initialize import filling as rules
 from reffusion.initialize.settle import Known, turns_of
 from reffusion.io.arrays import load_json, load_labels, save_labels
@@ -270,3 +271,28 @@ def test_a_few_pixels_of_a_further_view_do_not_cost_the_reference_its_turns():
     assert turns_of(shown(large, few, few, few)) == [20, 1, 1, 1]
     assert turns_of(shown(large, large)) == [10, 10]
     assert turns_of(shown()) == []
+
+
+def test_the_back_of_a_thing_is_drawn_though_its_front_shows_from_behind():
+    """What a reference draws before all that the Gaussians show, and not where they show it already."""
+    view, near = small.camera("v", 0.0), 1.4
+    wall = small.plane(small.WALL, 2.0, 1.4, small.texture)
+    drawn, hidden = small.true_mask(view, near), np.zeros((small.HEIGHT, small.WIDTH), bool)
+    reference = Reference(view, np.zeros((*drawn.shape, 3), np.uint8), drawn)
+    depth = np.where(drawn, near, small.WALL)
+    assert (coverage.before(wall, depth, reference, hidden) == drawn).all()
+    front = small.plane(near, small.HALF, small.HALF, small.texture)
+    both = wall.zipped(front, lambda a, b: torch.cat([a, b]))
+    assert coverage.before(both, depth, reference, hidden).sum() < 0.2 * drawn.sum()  # the square's soft rim
+    assert not coverage.before(wall, depth, reference, drawn).any()
+
+
+def test_pixels_stained_by_an_edge_lie_beside_it_on_what_stays():
+    depth, stays = np.full((9, 9), 2.0), np.full((9, 9), 2.0)
+    depth[3:6, 3:6] = 1.0
+    found = coverage.beside_edges(depth, stays)
+    ring = np.zeros((9, 9), bool)
+    ring[2:7, 2:7] = True
+    ring[3:6, 3:6] = False
+    assert (found == ring).all()
+    assert not coverage.beside_edges(depth, stays + 1).any()  # not on what stays: a part of the thing
