@@ -144,20 +144,20 @@ def filled(params: Params, out: Path, gaussians, new, reference, around, network
     depth, made_up, said = filling.depth_behind(
         remaining, reference, hole, hidden, around.points, HOW, estimate, log, hints, farthest
     )
-    # Drawn over what stays and is seen, it stands before it.
-    drawn_over, behind_it = hole & reference.mask & ~hidden, depth
-    if drawn_over.any():
+    drawn_over = over = np.zeros_like(hole)
+    if (stays := reference.mask & ~hidden).any():
         shown = rasterizer.render(remaining, camera, sh_degree=0).depth.double().cpu().numpy()
-        behind_it = np.where(shown > 0, shown, depth)
-    if reference.depth is None and estimate is None and drawn_over.any():
-        stands = billboard.standing(drawn_over, behind_it, camera)
-        depth, made_up = (np.where(drawn_over, stands, each) for each in (depth, made_up))
-        said = f"{said}; a billboard, good within {billboard.GOOD_WITHIN} degrees, stands where the scene goes on"
-    elif (more := coverage.before(gaussians, made_up, reference, hidden) & ~hole).any():
-        drawn_over, depth = drawn_over | more, np.where(more, made_up, depth)
+        behind_it, drawn_over = np.where(shown > 0, shown, depth), hole & stays
+        if reference.depth is None and estimate is None:
+            stands = billboard.standing(drawn_over, behind_it, camera)
+            depth, made_up = (np.where(drawn_over, stands, each) for each in (depth, made_up))
+            said = f"{said}; a billboard, good within {billboard.GOOD_WITHIN} degrees, stands where the scene goes on"
+        else:
+            back = coverage.before(gaussians, made_up, reference, hidden) & ~hole
+            drawn_over, depth = drawn_over | back, np.where(back, made_up, depth)
+        over = drawn_over & ~coverage.beside_edges(depth, behind_it)
     print(f"depth of reference {camera.name}: {said}")
     save_exr(out / "depth" / f"{camera.name}.exr", depth.astype("float32"))
-    over = drawn_over & ~coverage.beside_edges(depth, behind_it)
     pixels = behind.grown(hole & ~drawn_over, OVERLAP) | over
     gaussians, new = filling.placed(gaussians, new, reference, depth, pixels, around, sheets)
     if farthest or not params.tidy:  # what is open still is asked for view by view, or left

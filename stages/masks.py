@@ -4,21 +4,21 @@ invent mask."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from reffusion import geometry, trace
+from reffusion import trace
 from reffusion.fit import exposure
 from reffusion.io.arrays import load_json, save_json, save_labels
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_fill, load_raw_masks, load_scene, objects_of, save_mask_sets
 from reffusion.masks import regions, undecided, voting, witness
 from reffusion.masks.continuation import Plane, planes_around
-from reffusion.masks.regions import Region
+from reffusion.masks.regions import Filled, Region
 from reffusion.masks.voting import Votes, extent
 from reffusion.masks.witness import Witness
 from reffusion.params.masks import Params
@@ -85,24 +85,6 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
         "best_reference": voting.best_view(invents, scene.train),
     }
     save_json(out / "facts.json", facts)
-
-
-@dataclass(frozen=True)
-class Filled:
-    """What is made up whatever anyone saw: a region, and masks of it (view -> bool [H, W])."""
-
-    region: Region | None
-    masks: dict[str, np.ndarray]
-
-    def __bool__(self) -> bool:
-        return self.region is not None or bool(self.masks)
-
-    def shown(self, camera: Camera, depth: np.ndarray) -> np.ndarray:
-        """bool [H, W], in a view in which `depth` [H, W] of what stays hides some of it."""
-        found = self.masks.get(camera.name, np.zeros(depth.shape, bool))
-        if self.region is None:
-            return found
-        return found | regions.silhouette(self.region, camera, geometry.reciprocal(depth))
 
 
 def voted(

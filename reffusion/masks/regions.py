@@ -32,6 +32,24 @@ class Region:
     holds: bool = True
 
 
+@dataclass(frozen=True)
+class Filled:
+    """What is made up whatever anyone saw: a region, and masks of it (view -> bool [H, W])."""
+
+    region: Region | None
+    masks: dict[str, np.ndarray]
+
+    def __bool__(self) -> bool:
+        return self.region is not None or bool(self.masks)
+
+    def shown(self, camera: Camera, depth: np.ndarray) -> np.ndarray:
+        """bool [H, W], in a view in which `depth` [H, W] of what stays hides some of it."""
+        found = self.masks.get(camera.name, np.zeros(depth.shape, bool))
+        if self.region is None:
+            return found
+        return found | silhouette(self.region, camera, geometry.reciprocal(depth))
+
+
 def silhouette(region: Region, camera: Camera, disparity: np.ndarray) -> np.ndarray:
     """bool [H, W]: pixels whose ray meets the region before the surface of the given disparity [H, W]."""
     near, far = _crossing(region, camera)
