@@ -79,7 +79,7 @@ FIXED = {
 ABSENT = {
     "poses.detail": 0,
     "poses.refine": False,
-    "fit.sh.limited": False,
+    "fit.few_views": "as_many",
     "fit.init.flow_cell": 0,
     "fit.densify.per_pixel": 0,
     "masks.tidy": False,
