@@ -29,6 +29,7 @@ from reffusion.io.ply import load_ply, load_points, save_ply
 from reffusion.io.scene import load_raw_masks, load_views, save_scene
 from reffusion.masks import regions
 from reffusion.params.poses import Params
+from reffusion.splat.conventions import SH0
 from reffusion.types import Scene
 
 LEAST_POINTS = 100  # with fewer sparse points, some of optical flow are added to them
@@ -39,7 +40,8 @@ WARNINGS = "warnings.json"  # sentences
 
 def run(params: Params, out: Path, *, scene: Path) -> None:
     """Write images/, masks/, test_masks/, sparse/0/, lenses.json, transform.json, views.json; refine.json where cameras
-    were adjusted; gaussians.ply, deleted.npy and region.json where the scene brings them; warnings.json where something is odd."""
+    were adjusted; gaussians.ply, deleted.npy and region.json where the scene brings them; warnings.json where
+    something is odd."""
     deleted = _deleted(params, scene)  # before the work, not after it
     if unphotographed(params, scene):
         _save_unphotographed(params, out, scene, deleted)
@@ -96,8 +98,8 @@ def _deleted(params: Params, scene: Path) -> np.ndarray | None:
     match = matching.matched(whole, cleaned)
     if match.found < matching.SAME:
         raise BadInput(
-            f"{files[1]}: of its splats {match.found:.0%} are where {files[0].name} has one: it is another scene, or was "
-            "moved, turned or scaled; only delete, and save it where it was"
+            f"{files[1]}: of its splats {match.found:.0%} are where {files[0].name} has one: it is another scene, or "
+            "was moved, turned or scaled; only delete, and save it where it was"
         )
     if not match.deleted.any():
         raise BadInput(f"{files[1]}: nothing was deleted: all splats of {files[0].name} are there")
@@ -124,7 +126,7 @@ def _save_unphotographed(params: Params, out: Path, scene: Path, deleted: np.nda
     some = np.flatnonzero(opaque)
     draws = seeding.generator(SEED, "poses", "points of Gaussians")
     some = some[torch.randperm(len(some), generator=draws)[:MORE_POINTS].numpy()]
-    colors = (255 * (0.5 + SH_BASE * gaussians.sh[some, 0]).clamp(0, 1)).round().byte().numpy()
+    colors = (255 * (0.5 + SH0 * gaussians.sh[some, 0]).clamp(0, 1)).round().byte().numpy()
     poses = replace(poses, points=means[some], colors=colors)
     at = {n: each.resized(*fitting_size(each.width, each.height, params.longest)) for n, each in poses.lenses.items()}
     pinholes = {name: undoing(lens)[0] for name, lens in at.items()}

@@ -48,8 +48,8 @@ def cameras_around(means: np.ndarray, sizes: np.ndarray, opaque: np.ndarray, del
                 found[f"ring_{len(found):02d}"] = _looking(place, center, up)
     if len(found) < LEAST:
         raise BadInput(
-            "scene.yaml: cleaned: the hole is in sight from too few places around it; bring cameras, as transforms.json "
-            "or a COLMAP model"
+            "scene.yaml: cleaned: the hole is in sight from too few places around it; bring cameras, as "
+            "transforms.json or a COLMAP model"
         )
     height, focal = round(width / ASPECT), width / 2 / np.tan(ANGLE / 2)
     lens = Lens(width, height, focal, focal, width / 2, height / 2)

@@ -41,10 +41,8 @@ def preview(params: Params, scene: Path) -> list[str]:
     if unphotographed(params, scene):
         check_brought(params, scene)
         found = cameras.read(scene)
-        where = (
-            f"{len(found[0].lenses)} cameras of {found[1].relative_to(scene)}" if found else "cameras around the hole"
-        )
-        return [f"no photographs: {where} look at renders of {params.gaussians} instead"]
+        who = f"{len(found[0].lenses)} cameras of {found[1].relative_to(scene)}" if found else "cameras around the hole"
+        return [f"no photographs: {who} look at renders of {params.gaussians} instead"]
     capture, roles = read_scene(params, scene)
     given = load_given(scene, views_of(capture, roles), params.reference)
     masks = sum(len(files) for files in roles.masks.values())

@@ -74,9 +74,7 @@ def read_cameras(folder: Path) -> Poses:
     for frame in _frames(record, source):
         path, values = Path(frame["file_path"].replace("\\", "/")), {**record, **frame}
         if path.stem in lenses:
-            raise BadInput(
-                f"{source}: two frames are called '{path.stem}', but for their endings or folders; rename one"
-            )
+            raise BadInput(f"{source}: two frames are called '{path.stem}'; rename one")
         if "w" not in values or "h" not in values:
             raise BadInput(f"{source}: neither pictures nor w and h of '{path.name}'; give its size in pixels")
         lenses[path.stem] = _valid(_lens(values, path, source, (0, 0)), path, source)
