@@ -25,7 +25,7 @@ from reffusion.gaussians import matching
 from reffusion.io.arrays import save_json, save_labels
 from reffusion.io.files import BadInput
 from reffusion.io.images import save_image, save_mask
-from reffusion.io.ply import load_ply, load_points, save_ply
+from reffusion.io.ply import load_ply, load_points, properties_of, save_ply
 from reffusion.io.scene import load_raw_masks, load_views, save_scene
 from reffusion.masks import regions
 from reffusion.params.poses import Params
@@ -110,8 +110,10 @@ def _deleted(params: Params, scene: Path) -> np.ndarray | None:
 
 
 def _save_brought(params: Params, out: Path, scene: Path, placed: Scene, deleted: np.ndarray | None) -> None:
-    """The scene's own Gaussians in the normalised frame, and which of them were deleted."""
-    save_ply(out / "gaussians.ply", load_ply(scene / params.gaussians, placed.similarity))
+    """The scene's own Gaussians in the normalised frame, properties in the order of its file, and which of them were
+    deleted."""
+    path = scene / params.gaussians
+    save_ply(out / "gaussians.ply", load_ply(path, placed.similarity), properties=properties_of(path))
     if deleted is not None:
         save_labels(out / "deleted.npy", deleted)
 

@@ -74,13 +74,20 @@ def score(run: Path, out: Path, runs: Path) -> None:
     placed = load_scene(run / "poses")
     files = {"own result": run / "evaluate" / "scene.ply", "as given": out / "patch-photographs" / "scene.ply"}
     files |= {kind: runs / f"patch-{kind}" / "patch" / "patched.ply" for kind in KINDS}
-    pieces = {kind: (out / f"patch-{kind}" / "cleaned.compressed.ply", files[kind].with_name("new.ply")) for kind in KINDS}
+    pieces = {
+        kind: (out / f"patch-{kind}" / "cleaned.compressed.ply", files[kind].with_name("new.ply")) for kind in KINDS
+    }
     found, rows = {}, []
-    for title, parts in {**{t: (f,) for t, f in files.items()}, **{f"{k}: cleaned + new": p for k, p in pieces.items()}}.items():
+    for title, parts in {
+        **{t: (f,) for t, f in files.items()},
+        **{f"{k}: cleaned + new": p for k, p in pieces.items()},
+    }.items():
         if all(path.exists() for path in parts):
             pictures = renders(parts, placed, placed.similarity)
             found[title] = box_psnr(pictures, run, placed)
-            rows.append(np.concatenate([pictures[name] for name in placed.test[:: len(placed.test) // SHOWN][:SHOWN]], 1))
+            rows.append(
+                np.concatenate([pictures[name] for name in placed.test[:: len(placed.test) // SHOWN][:SHOWN]], 1)
+            )
             print(f"{title}: {found[title]:.2f} dB", flush=True)
     save_json(out / "patching.json", found)
     save_image(out / "patching.png", np.concatenate(rows))
