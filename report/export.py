@@ -41,7 +41,7 @@ def make(home: Path) -> list[str]:
     for name in pictured:
         (out / CAMERAS / IMAGES).mkdir(exist_ok=True)
         shutil.copyfile(poses / "images" / f"{name}.png", out / CAMERAS / IMAGES / f"{name}.png")
-    pictures = f"{len(pictured)} undistorted photographs, the object in them" if pictured else "no photographs"
+    pictures = f"{len(pictured)} undistorted photographs" if pictured else "no photographs"
     said.append(f"{out / CAMERAS}: {len(scene.cameras)} pinholes, a COLMAP model and transforms.json; {pictures}")
     adapted = stage_folder(home, "personalize") / LORA_FILE
     if adapted.exists():

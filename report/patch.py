@@ -24,8 +24,8 @@ def check(home: Path) -> None:
 
 
 def make(home: Path) -> str:
-    """Write patch/patched.ply, the whole scene, and patch/new.ply, what was put in: both in the scene's own frame, their
-    properties in the order of the file that the scene brought. What to say of them.
+    """Write patch/patched.ply, the whole scene, and patch/new.ply, what was put in: both in the scene's own frame,
+    their properties in the order of the file that the scene brought. What to say of them.
 
     Args:
         home: runs/<scene> or runs/<scene>@<variant>, its stage `evaluate` finished.
@@ -42,11 +42,9 @@ def make(home: Path) -> str:
     out = home / "patch"
     save_ply(out / WHOLE, result, similarity, properties)
     save_ply(out / NEW, result.map(lambda parameter: parameter[new]), similarity, properties)
-    deleted = load_labels(poses / "deleted.npy")
-    more = len(deleted) - int(deleted.sum()) - (len(result) - int(new.sum()))
-    left = (
-        f"; beside the {int(deleted.sum())} deleted {more} more went, hidden in the object or haze" if more > 0 else ""
-    )
+    kept, stayed = int((~load_labels(poses / "deleted.npy")).sum()), len(result) - int(new.sum())
+    more = kept - stayed
+    left = f"; of the {kept} that were kept {more} went, hidden in the object or haze" if more > 0 else ""
     return (
         f"{out / WHOLE}: the whole scene, {len(result)} splats{left}\n"
         f"{out / NEW}: the {int(new.sum())} new ones, to be laid over the cleaned scene where nothing else may change"

@@ -1,9 +1,9 @@
 """A hole that deleting left, patched: `python -m benchmarks.studies.patching write`.
 
-The fit of a finished scene is what an artist opens; a box around the object's splats is deleted, and the rest saved as an
-editor does: in another order, quantised, without spherical harmonics. `write` makes three scenes of it in --out: with
-the photographs, with the capture's cameras alone, and with neither. `make scene=... patch` patches each; `score` renders
-the patched files from the test views, beside the run's own result, as PSNR in the box, and draws a sheet of them.
+The fit of a finished scene is what an artist opens; a box around the object's splats is deleted, and the rest saved as
+an editor does: in another order, quantised, without spherical harmonics. `write` makes three scenes of it in --out:
+with the photographs, with the capture's cameras alone, and with neither. `make scene=... patch` patches each; `score`
+renders the patched files from the test views, beside the run's own result: PSNR in the box, and a sheet of pictures.
 """
 
 from __future__ import annotations
@@ -74,20 +74,16 @@ def score(run: Path, out: Path, runs: Path) -> None:
     placed = load_scene(run / "poses")
     files = {"own result": run / "evaluate" / "scene.ply", "as given": out / "patch-photographs" / "scene.ply"}
     files |= {kind: runs / f"patch-{kind}" / "patch" / "patched.ply" for kind in KINDS}
-    pieces = {
-        kind: (out / f"patch-{kind}" / "cleaned.compressed.ply", files[kind].with_name("new.ply")) for kind in KINDS
-    }
-    found, rows = {}, []
-    for title, parts in {
-        **{t: (f,) for t, f in files.items()},
-        **{f"{k}: cleaned + new": p for k, p in pieces.items()},
-    }.items():
+    together = {title: (path,) for title, path in files.items()}
+    for kind in KINDS:
+        cleaned = out / f"patch-{kind}" / "cleaned.compressed.ply"
+        together[f"{kind}: cleaned and new"] = cleaned, files[kind].with_name("new.ply")
+    found, rows, some = {}, [], placed.test[:: max(1, len(placed.test) // SHOWN)][:SHOWN]
+    for title, parts in together.items():
         if all(path.exists() for path in parts):
             pictures = renders(parts, placed, placed.similarity)
             found[title] = box_psnr(pictures, run, placed)
-            rows.append(
-                np.concatenate([pictures[name] for name in placed.test[:: len(placed.test) // SHOWN][:SHOWN]], 1)
-            )
+            rows.append(np.concatenate([pictures[name] for name in some], 1))
             print(f"{title}: {found[title]:.2f} dB", flush=True)
     save_json(out / "patching.json", found)
     save_image(out / "patching.png", np.concatenate(rows))

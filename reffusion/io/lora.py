@@ -11,8 +11,8 @@ FACTS = "lora_adapter_metadata"  # of diffusers: its configuration by part, as J
 
 
 def save_portable(source: Path, path: Path) -> None:
-    """Write the LoRA of `source`, as diffusers saved it, so that tools that do not read its configuration change weights
-    as much: alpha / rank is multiplied into B, and alpha is the rank."""
+    """Write the LoRA of `source`, as diffusers saved it, so that tools that do not read its configuration change
+    weights as much: alpha / rank is multiplied into B, and alpha is the rank."""
     from safetensors import safe_open
     from safetensors.torch import save_file
 
