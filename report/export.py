@@ -14,6 +14,7 @@ from report import command
 from report.sheet import stage_folder
 
 PLY, COMPRESSED, CAMERAS, IMAGES, LORA = "scene.ply", "scene.compressed.ply", "cameras", "images", "lora"
+HEADER = 1000  # bytes of it that tell the type of x
 LORA_FILE = "pytorch_lora_weights.safetensors"
 
 
@@ -52,8 +53,9 @@ def make(home: Path) -> list[str]:
 
 def unlike_3dgs(path: Path, antialiased: bool) -> str:
     """What of the file not every viewer shows as we do."""
-    with_doubles = "property double x" in path.read_bytes()[:4000].decode("ascii", "replace")
-    doubles = "; positions are doubles, which floats cannot hold: many editors read floats only" if with_doubles else ""
+    with open(path, "rb") as file:
+        exact = b"property double x" in file.read(HEADER)
+    doubles = "; positions are doubles, as floats would move them: many editors read floats only" if exact else ""
     smoothed = "; made for Mip-Splatting's filter: viewers without it show it a little bolder" if antialiased else ""
     return doubles + smoothed
 

@@ -44,10 +44,10 @@ def make(home: Path) -> str:
     save_ply(out / NEW, result.map(lambda parameter: parameter[new]), similarity, properties)
     kept, stayed = int((~load_labels(poses / "deleted.npy")).sum()), len(result) - int(new.sum())
     more = kept - stayed
-    left = f"; of the {kept} that were kept {more} went, hidden in the object or haze" if more > 0 else ""
+    left = f"; {more} more than were deleted are gone: haze, and what the object hid" if more > 0 else ""
     return (
         f"{out / WHOLE}: the whole scene, {len(result)} splats{left}\n"
-        f"{out / NEW}: the {int(new.sum())} new ones, to be laid over the cleaned scene where nothing else may change"
+        f"{out / NEW}: the {int(new.sum())} new ones alone, which the whole holds too"
     )
 
 

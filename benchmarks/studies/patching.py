@@ -25,7 +25,7 @@ from reffusion.splat import rasterizer
 from reffusion.types import Scene, Similarity
 
 KINDS = ("photographs", "cameras", "neither")
-TRIMMED = 1.0  # percent of the object's splats on each side that are beyond the box: floaters
+TRIMMED = 0.2  # percent of the object's splats on each side that are beyond the box: floaters
 SHOWN = 4  # test views on the sheet
 
 

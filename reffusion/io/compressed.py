@@ -33,17 +33,16 @@ def save_compressed(path: Path, gaussians: Gaussians, similarity: Similarity) ->
     lengths = np.linalg.norm(arrays["quaternions"], axis=1, keepdims=True)
     turned = np.where(lengths > 0, arrays["quaternions"] / np.maximum(lengths, 1e-30), [1.0, 0.0, 0.0, 0.0])
     sh = gaussians.sh.numpy()[order]
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    gsply.plywrite(
-        str(path),
+    data = gsply.compress_to_bytes(
         plain(similarity.invert(arrays["means"])),
         plain(arrays["log_scales"] - np.log(similarity.scale)),
         plain(turned),
         plain(gaussians.opacity_logits.numpy()[order]),
         plain(sh[:, 0]),
         plain(sh[:, 1:]) if sh.shape[1] > 1 else None,
-        compressed=True,
     )
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    Path(path).write_bytes(data)
 
 
 def load_table(path: Path) -> np.ndarray:
