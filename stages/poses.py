@@ -123,7 +123,7 @@ def _save_unphotographed(params: Params, out: Path, scene: Path, deleted: np.nda
     gaussians = load_ply(scene / params.gaussians)
     opaque = gaussians.opacity_logits.numpy() > 0
     means, found = gaussians.means.double().numpy(), cameras.read(scene)
-    sizes = gaussians.log_scales.amax(1).exp().numpy()
+    sizes = gaussians.log_scales.median(1).values.exp().numpy()
     poses, source = found or (ring.cameras_around(means, sizes, opaque, deleted, params.longest), None)
     some = np.flatnonzero(opaque)
     draws = seeding.generator(SEED, "poses", "points of Gaussians")

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from reffusion.io.arrays import load_labels, save_json, save_text
 from reffusion.io.compressed import save_compressed
@@ -30,12 +31,14 @@ SHOWN = 4  # test views on the sheet
 
 
 def in_box(means: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """bool [N]: the splats in a box along the object's own axes, drawn as a person would: by what most of it fills."""
-    thing = means[labels]
-    middle = np.median(thing, 0)
-    axes = np.linalg.svd(thing - middle, full_matrices=False)[2]
-    along, of_thing = (means - middle) @ axes.T, (thing - middle) @ axes.T
-    low, high = np.percentile(of_thing, (TRIMMED, 100 - TRIMMED), axis=0)
+    """bool [N]: the splats in the smallest box around the object, which a person would turn until it fits."""
+    thing, draws, box = means[labels], np.random.default_rng(0), Rotation.identity()
+    bounds = lambda turn: np.percentile(turn.apply(thing), (TRIMMED, 100 - TRIMMED), axis=0)
+    volume = lambda turn: float(np.prod(np.diff(bounds(turn), axis=0)))
+    for spread in np.geomspace(1.5, 0.01, 40):  # radians
+        tries = [box, *(Rotation.from_rotvec(v) * box for v in draws.normal(0, spread, (30, 3)))]
+        box = min(tries, key=volume)
+    along, (low, high) = box.apply(means), bounds(box)
     return ((along >= low) & (along <= high)).all(1)
 
 
