@@ -36,7 +36,6 @@ def make(home: Path) -> list[str]:
     said[0] += unlike_3dgs(finished, gaussians.antialiased)
     smaller = finished.stat().st_size / (out / COMPRESSED).stat().st_size
     said.append(f"{out / COMPRESSED}: the same, quantised, {smaller:.1f} times smaller, in PlayCanvas's format")
-    shutil.rmtree(out / CAMERAS, ignore_errors=True)
     save_cameras(out / CAMERAS, scene, IMAGES)
     pictured = [name for name in scene.cameras if has_photograph(poses, name)]
     for name in pictured:
