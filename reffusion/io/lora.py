@@ -12,7 +12,7 @@ FACTS = "lora_adapter_metadata"  # of diffusers: its configuration by part, as J
 
 def save_portable(source: Path, path: Path) -> None:
     """Write the LoRA of `source`, as diffusers saved it, so that tools that do not read its configuration change
-    weights as much: alpha / rank is multiplied into B, and alpha is the rank."""
+    weights as much: alpha / rank is multiplied into B, and alpha is the rank. Nothing is dropped out: it is for use."""
     from safetensors import safe_open
     from safetensors.torch import save_file
 
@@ -25,6 +25,6 @@ def save_portable(source: Path, path: Path) -> None:
         for name in tensors:
             if name.startswith(f"{part}.") and name.endswith("lora_B.weight"):
                 tensors[name] = tensors[name] * scale
-        facts |= {f"{part}.lora_alpha": rank} if rank else {}
+        facts |= {f"{part}.lora_alpha": rank, f"{part}.lora_dropout": 0.0} if rank else {}
     path.parent.mkdir(parents=True, exist_ok=True)
     save_file(tensors, path, {"format": "pt", FACTS: json.dumps(facts, indent=2, sort_keys=True)})
