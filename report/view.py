@@ -148,7 +148,7 @@ class Window:
             choice.on_update(changed)
 
     def _cameras(self, scene: Scene, photos: dict[str, np.ndarray]) -> None:
-        """Every training view as a pyramid with its photograph, if it has one; a click on it takes the visitor there."""
+        """Every training view as a pyramid with its photograph, where it has one; a click takes the visitor there."""
         train, drawn, add = [scene.cameras[name] for name in scene.train], [], self.server.scene.add_camera_frustum
         target = flight.focus(train, scene.points)
         self.server.scene.set_up_direction(-np.mean([camera.world_to_camera[1, :3] for camera in train], 0))
