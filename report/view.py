@@ -18,7 +18,7 @@ from torch import Tensor
 from reffusion.io.arrays import load_json, load_labels
 from reffusion.io.images import to_uint8
 from reffusion.io.ply import load_ply
-from reffusion.io.scene import load_scene, load_views
+from reffusion.io.scene import has_photograph, load_scene, load_views
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Scene, Similarity
 from report import command, flight
@@ -130,7 +130,7 @@ class Window:
         self.open = True
         self.server = viser.ViserServer(host="127.0.0.1", port=port, label=home.name, verbose=False)
         self._choices()
-        self._cameras(scene, load_views(poses, scene.train))
+        self._cameras(scene, load_views(poses, [name for name in scene.train if has_photograph(poses, name)]))
         self.server.on_client_connect(self._visit)
         self.server.on_client_disconnect(lambda client: self._ask(client.client_id))
 
@@ -148,14 +148,15 @@ class Window:
             choice.on_update(changed)
 
     def _cameras(self, scene: Scene, photos: dict[str, np.ndarray]) -> None:
-        """Every training view as a pyramid with its photograph; a click on it takes the visitor there."""
+        """Every training view as a pyramid with its photograph, where it has one; a click takes the visitor there."""
         train, drawn, add = [scene.cameras[name] for name in scene.train], [], self.server.scene.add_camera_frustum
         target = flight.focus(train, scene.points)
         self.server.scene.set_up_direction(-np.mean([camera.world_to_camera[1, :3] for camera in train], 0))
         go_to(self.server.initial_camera, train[len(train) // 2], target)
         shown = self.server.gui.add_checkbox("cameras", False)
         for camera in train:
-            small = photos[camera.name][:: (step := max(1, camera.width // THUMBNAIL)), ::step]
+            step = max(1, camera.width // THUMBNAIL)
+            small = photos[camera.name][::step, ::step] if camera.name in photos else None
             place = {"wxyz": _quaternion(camera.world_to_camera[:3, :3].T), "position": camera.center}
             lens = {"fov": field_of_view(camera), "aspect": camera.width / camera.height}
             size = {"scale": PYRAMID, "thickness": PYRAMID / 40}

@@ -15,7 +15,11 @@ from runner.resolve import Request, one_folder_a_name
 RECORDS = ("profile", "source", "plan.json", "turntable.webm", "check.png")
 PAGES = (*(f"compare.{kind}" for kind in ("json", "csv", "md", "html")), "compare-runs.csv", "compare-runs.md",
          "compare/*.png", "adapted/sheet.png", "adapted/*/*.png", "adapted/adapted.json",
-         "sds-variance/sds_variance.json", "report/index.html", "report/*.png", "**/.*.writing")  # fmt: skip
+         "sds-variance/sds_variance.json", "report/index.html", "report/*.png",
+         "patch/patched.ply", "patch/new.ply",
+         "export/scene.ply", "export/scene.compressed.ply", "export/lora/pytorch_lora_weights.safetensors",
+         "export/cameras/transforms.json", "export/cameras/sparse_pc.ply", "export/cameras/sparse/0/*.bin",
+         "export/cameras/images/*.png", "**/.*.writing")  # fmt: skip
 WORKING = (".partial-*", ".copying-*", ".gone-*")
 
 

@@ -16,7 +16,7 @@ from reffusion.fit import exposure
 from reffusion.io.arrays import load_json, load_labels, save_json, save_text
 from reffusion.io.images import save_image, save_mask
 from reffusion.io.ply import load_ply
-from reffusion.io.scene import load_mask_sets, load_object, load_scene, load_views, save_references
+from reffusion.io.scene import has_photograph, load_mask_sets, load_object, load_scene, load_views, save_references
 from reffusion.masks import taint
 from reffusion.paint import agreement, feedforward, painting, registration
 from reffusion.params.reference import Params
@@ -85,7 +85,8 @@ def fitted(given: GivenReference, sets: MaskSet, scene: Scene, poses: Path, fit:
     hole of it, its shadow and a blended rim."""
     lenses, upright = load_lenses(poses)
     camera, lens = scene.cameras[given.view], lenses[given.view]
-    views = exposure.load_views(poses, fit, [given.view]) if given.painted else load_views(poses, [given.view])
+    as_photographed = not given.painted and has_photograph(poses, given.view)
+    views = load_views(poses, [given.view]) if as_photographed else exposure.load_views(poses, fit, [given.view])
     photo, hidden = views[given.view], sets.raw | sets.consistent | sets.invent
     image, inside = load_straight(given, lens, upright)
     found = registration.register(image, photo, hidden)

@@ -74,6 +74,11 @@ def load_views(poses_dir: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
     return {name: load_image(Path(poses_dir) / "images" / f"{name}.png") for name in names}
 
 
+def has_photograph(poses_dir: Path, name: str) -> bool:
+    """None has one in a scene without photographs, where renders of its Gaussians stand for them."""
+    return (Path(poses_dir) / "images" / f"{name}.png").exists()
+
+
 def objects_of(poses_dir: Path) -> list[str]:
     """The objects that masks tell apart, sorted."""
     return sorted(path.name for path in (Path(poses_dir) / "masks").glob("[!.]*") if path.is_dir())
