@@ -46,7 +46,6 @@ class Densify(Settings):
         "that some are left for where late views still pull",
     )
     per_pixel: float = Field(0.0, ge=0, description="most Gaussians for each pixel of a view; 0: `cap_max` alone")
-    prune_opa: float = Field(0.005, ge=0, lt=1, description="fainter Gaussians are pruned")
     prune_scale3d: float = Field(0.5, gt=0, description="Gaussians of a larger size are pruned; deviation / distance")
     reset_every: float = Field(0.1, ge=0, le=1, description="part of the run between opacity resets; 0 = none")
 
