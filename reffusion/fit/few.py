@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from scipy import ndimage
 
 from reffusion.depth.between import SparsePoints, depth_between
 from reffusion.gaussians.optimize import Rates
@@ -22,6 +23,7 @@ from reffusion.types import Camera, Gaussians
 BELOW = 10  # training views that a typical point is in: from so many on a fit from points is as good
 STEPS = 0.2  # of a fit's: the surfaces are there, and more steps only bend them
 COVERED, BEFORE = 0.7, 1.05  # alpha from which, and relative depth up to which, a pixel shows what is there already
+STAINED = 3  # px, side of the square that is looked at for something nearer
 # Between those of a fit's start and end: the scene is there, but what does not agree must move.
 RATES = Rates(
     means=4e-4,
@@ -60,7 +62,7 @@ def surfaces(
         depth = depth_between(sparse, camera, image)
         if depth is None:
             continue
-        wanted = ~hidden.get(camera.name, np.zeros(depth.shape, bool))
+        wanted = ~hidden.get(camera.name, np.zeros(depth.shape, bool)) & ~beside_nearer(depth)
         if found is not None:
             drawn = rasterizer.render(found, camera, sh_degree=0)
             there, thick = drawn.depth.cpu().numpy(), drawn.alpha.cpu().numpy() >= COVERED
@@ -69,6 +71,11 @@ def surfaces(
         added = replace(added.map(lambda p: p.to(params.device)), antialiased=params.antialiased)
         found = added if found is None else found.zipped(added, lambda a, b: torch.cat([a, b]))
     return found
+
+
+def beside_nearer(depth: np.ndarray) -> np.ndarray:
+    """bool [H, W], pixels of a depth map next to something nearer, by whose colour they are stained."""
+    return depth > BEFORE * ndimage.minimum_filter(depth, STAINED)
 
 
 def gently(params: Params) -> Params:
