@@ -79,7 +79,8 @@ def test_a_further_view_adds_what_those_before_do_not_show():
     params = Params(sh={"degree": 0})
     one, both = (few.surfaces(views[:k], images, *sparse(), NONE, params) for k in (1, 2))
     pixels = views[0].width * views[0].height
-    assert len(one) == 2 * pixels and len(one) < len(both) < 2.4 * pixels
+    assert 1.9 * pixels < len(one) < 2 * pixels, "but for what is beside the square"
+    assert len(one) < len(both) < 2.4 * pixels
     hidden = {"a": np.ones((views[0].height, views[0].width), bool)}
     assert len(few.surfaces(views[:1], images, *sparse(), hidden, params)) == 0
 
