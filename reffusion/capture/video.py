@@ -31,6 +31,7 @@ PATIENCE, JUMP = 3, 0.3  # frames for which they may be, before all counts as ne
 MIDDLE, ASIDE = 0.5, 0.6  # of its window; a frame outside counts as so much less sharp, so that few stand side by side
 NEAR = 4  # windows to either side with whose frames one is compared
 BLURRED = 0.4  # of the sharpness of those, under which it is left out
+NOISE = 4.0  # of the Laplacian's variance, levels of 255 squared: rounding and coding leave so much in a plain picture
 TOO_BLURRED = 0.003  # sharpness; photographs of grass, stone and rooms have 0.5 to 0.9, blurred by 2 px 0.003 to 0.01
 QUALITY = 95  # of the JPEGs: the video lost more
 RECORD, TABLE = "frames.json", "frames.csv"
@@ -111,7 +112,7 @@ def _count(video: Path) -> int:
 
 def sharpness(gray: np.ndarray) -> float:
     """Of a grey picture, uint8 [H, W]: 0 where it is plain."""
-    return float(cv2.Laplacian(gray, cv2.CV_32F).var() / (gray.var() + 10))
+    return max(0.0, float((cv2.Laplacian(gray, cv2.CV_32F).var() - NOISE) / (gray.var() + NOISE)))
 
 
 class _Way:
