@@ -25,7 +25,7 @@ def section(job: Job) -> list[str]:
     said = f"Of what is removed, {_mean([made for _, made, _ in shares.values()]):.0%} is made up in the mean of views"
     if covered:
         bare = [name for name, (_, _, open_) in shares.items() if (open_ or 0) > OPEN]
-        said += f"; {len(bare)} views show places that nothing covers" + (f": {', '.join(bare[:8])}" if bare else "")
+        said += f"; places that nothing covers: in {len(bare)} views" + (f", {', '.join(bare[:8])}" if bare else "")
     else:
         said += "; what is left uncovered is known after the stage initialize"
     rows = sorted(shares.items(), key=lambda each: (-(each[1][2] or 0), -each[1][1]))
