@@ -37,7 +37,7 @@ help:
 	@echo '                               variants=a,b  only these; seeds=5  on demo, demo-1 ... demo-4, with intervals'
 	@echo 'make data=FOLDER compare       the same over all its scenes, in one table: runs/compare/compare.html'
 	@echo 'make data=FOLDER spinnerf      what it holds of SPIn-NeRF'"'"'s published scenes; then as batch'
-	@echo 'make scene=X report            what was done, errors against seconds: runs/X/report/index.html'
+	@echo 'make scene=X report            what was done, errors against seconds: runs/X/report.html'
 	@echo 'make scene=X view              walk through the finished scene in a browser; port=8080'
 	@echo 'make scene=X turntable         the finished scene on a way around the capture: runs/X/turntable.webm'
 	@echo 'make scene=X sds-variance      the SDS gradient over noise and timesteps, before and after personalization'

@@ -417,18 +417,28 @@ def test_report_of_a_job(compared, home):
     plan_of(compared, home.parent)
     path = job.make(home)
     html = path.read_text()
-    assert {p.name for p in path.parent.glob("*.png")} == {"sheet.png", "job.png", "distill.png"}
+    assert path == home / "report.html" and not list(home.glob("report*/*"))
+    sources = re.findall(r'src="([^"]*)"', html)
+    assert len(sources) == 4 * 2 + 2 and all(source.startswith("data:image/") for source in sources)
+    assert html.count("data:image/png") == 2, "the whole job, and the trace of distill"
     assert "101 Gaussians; 23.65 dB and FLIP 0.150" in html
     targets = re.findall(r'href="([^"]*)"', html)
     assert len(targets) == 3 and all((path.parent / target).exists() for target in targets)
     assert "What was left out or taken over, and why" in html and "http" not in html
+    assert "make scene=" in html and "profile=laptop all" in html and "set by hand" not in html
+    receipt = json.loads((home / "distill/receipt.json").read_text())
+    receipt["params"]["gain"] = 2  # as set="distill.gain=2" would have left it
+    (home / "distill/receipt.json").write_text(json.dumps(receipt))
+    html = job.make(home).read_text()
+    assert "set by hand" in html and "profile=laptop set=distill.gain=2 all" in html
 
 
 def test_report_of_a_variant_says_what_was_left_out(compared, home):
     plan_of(compared, home.parent, "--variant", "none")
     html = job.make(home.with_name("toy@none")).read_text()
     assert re.search(r"<td>distill</td><td[^>]*>left.out</td><td[^>]*>no gain</td>", html)
-    assert "shared with toy" in html and "distill.png" not in html
+    assert "shared with toy" in html and "distill: error against seconds" not in html
+    assert "profile=laptop variant=none all" in html
 
 
 def test_report_with_pieces_missing(home):
@@ -437,6 +447,7 @@ def test_report_with_pieces_missing(home):
         file.write('{"seconds": 1.0, "iteration": 9}\n')
     html = job.make(home).read_text()
     assert "It is not evaluated yet." in html and "None yet: " in html and "Not drawn: " in html
+    assert "Still to run, or to run again: fit, evaluate." in html
     (home / "distill/trace.jsonl").unlink()
     assert "Not drawn" not in job.make(home).read_text()
     for stage in ("distill", "poses"):

@@ -18,6 +18,7 @@ from reffusion.distill.steps import Job, job_of, step_of
 from reffusion.gaussians.densify import densify, prune
 from reffusion.gaussians.optimize import GaussianOptimizer, Rates
 from reffusion.geometry import cameras_extent
+from reffusion.io.ply import save_ply
 from reffusion.params.distill import Densify, LearningRates, Params
 from reffusion.prior.model import Prior
 from reffusion.splat.rasterizer import render
@@ -25,6 +26,7 @@ from reffusion.types import Camera, Gaussians
 
 GROW_SCALE3D = 0.01  # standard deviation from which a Gaussian is split, not cloned
 PRUNE_OPA = 0.005  # fainter Gaussians are pruned when others are added
+SNAPSHOTS = 4  # parts of the run, after each but the last of which the masked Gaussians are kept
 REGION_EVERY = 50  # steps between prunings of Gaussians that changed region
 
 
@@ -49,11 +51,12 @@ def distill(
         holes: (camera, image [H, W, 3] in [0, 1], hole [H, W] bool) of each reference.
         prior: adapted to the reference; None where there is neither SDS nor the depth term.
         text: [3, L, D], hidden states of the global, the local and the empty prompt.
-        folder: gets trace.jsonl and checkpoints. A line of the trace: reconstruction and lift (those terms' values),
-            reference_psnr (in the references' holes), sds_gradient_mean and _max (norm of the weighted SDS gradient
-            per masked Gaussian in that step; none where its view was too far from a reference), depth (the last depth
-            term's value), depth_skipped_<reason> (how often it was left out so far), adversarial (the generator's
-            loss), critic_loss, critic_slope (R1 before its weight), gaussians, masked_gaussians.
+        folder: gets trace.jsonl, checkpoints, and snapshots/ of the masked Gaussians. A line of the trace:
+            reconstruction and lift (those terms' values), reference_psnr (in the references' holes),
+            sds_gradient_mean and _max (norm of the weighted SDS gradient per masked Gaussian in that step; none where
+            its view was too far from a reference), depth (the last depth term's value), depth_skipped_<reason> (how
+            often it was left out so far), adversarial (the generator's loss), critic_loss, critic_slope (R1 before its
+            weight), gaussians, masked_gaussians.
         estimator: of the depth term; None where there is none.
         distance: of patches, for the perceptual loss of lifted pictures.
         rates: Adam's step sizes; None: 3DGS's, by `settings.lr.means_unit`.
@@ -83,10 +86,21 @@ def distill(
             optimizer.select(~changed_region(region, optimizer.gaussians.means.detach(), optimizer.masked))
         if trace.log_spaced(done, settings.iterations, per_octave=4):
             _write_line(log, run, line)
+        part = SNAPSHOTS * done // settings.iterations
+        if SNAPSHOTS * step // settings.iterations < part < SNAPSHOTS:
+            _save_snapshot(optimizer, folder, done)
         if checkpoints.due:
             run.seconds = log.seconds
             checkpoints.save(run.state_dict)
     return optimizer.gaussians.map(Tensor.detach), optimizer.masked
+
+
+def _save_snapshot(optimizer: GaussianOptimizer, folder: Path, done: int) -> None:
+    """The masked Gaussians as they are, for those who look on afterwards: folder/snapshots/<steps>.ply."""
+    masked = optimizer.masked
+    if masked.any():
+        path = folder / "snapshots" / f"{done}.ply"
+        save_ply(path, optimizer.gaussians.map(lambda parameter: parameter.detach()[masked].cpu()))
 
 
 def rates_of(lr: LearningRates, cameras: Sequence[Camera]) -> Rates:

@@ -13,7 +13,7 @@ from reffusion.capture.roles import views_of
 from reffusion.params.poses import Params
 
 # pictures count where they are photographs or masks; depth maps belong to references
-NOT_READ = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".npy", ".exr")
+NOT_READ = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".npy", ".exr")
 
 
 def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
