@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from reffusion import seeding, trace
-from reffusion.capture import frame, odd, ring, sfm, stereo, support
-from reffusion.capture.layouts import cameras
+from reffusion.capture import frame, odd, sfm, stereo, support
+from reffusion.capture.layouts import cameras, ring
 from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.lens import undoing
 from reffusion.capture.lenses import save_lenses

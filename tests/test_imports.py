@@ -172,8 +172,8 @@ def test_the_command_starts_at_once():
 @pytest.mark.parametrize("path", sources("report"), ids=named)
 def test_report_reads_through_io(path):
     own = {name for name in imports(path) if name.split(".")[0] in OWN - {"report"}}
-    draws = named(path) in ("report/flight.py", "report/turntable.py", "report/view.py")
-    drawing = ("reffusion.splat.rasterizer", "reffusion.types") if draws else ()
+    draws = ("flight", "turntable", "view", "drawn", "layers", "unseen")
+    drawing = ("reffusion.splat.rasterizer", "reffusion.types", "reffusion.score.sight") if path.stem in draws else ()
     assert all(name.startswith(("reffusion.io", *drawing)) for name in own), own
 
 

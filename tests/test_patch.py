@@ -11,7 +11,7 @@ import torch
 from plyfile import PlyData
 from small_capture import prepare, some_truth
 
-from reffusion.capture import ring
+from reffusion.capture.layouts import ring
 from reffusion.fit import exposure
 from reffusion.gaussians import matching
 from reffusion.io.arrays import load_json, load_labels, save_labels

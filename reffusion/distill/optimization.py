@@ -53,10 +53,9 @@ def distill(
         text: [3, L, D], hidden states of the global, the local and the empty prompt.
         folder: gets trace.jsonl, checkpoints, and snapshots/ of the masked Gaussians. A line of the trace:
             reconstruction and lift (those terms' values), reference_psnr (in the references' holes),
-            sds_gradient_mean and _max (norm of the weighted SDS gradient per masked Gaussian in that step; none where
-            its view was too far from a reference), depth (the last depth term's value), depth_skipped_<reason> (how
-            often it was left out so far), adversarial (the generator's loss), critic_loss, critic_slope (R1 before its
-            weight), gaussians, masked_gaussians.
+            sds_gradient_mean and _max (norm of the weighted SDS gradient per masked Gaussian; none where its view was
+            too far from a reference), depth (the last depth term's value), depth_skipped_<reason> (how often so far),
+            adversarial (the generator's loss), critic_loss, critic_slope (R1 unweighted), gaussians, masked_gaussians.
         estimator: of the depth term; None where there is none.
         distance: of patches, for the perceptual loss of lifted pictures.
         rates: Adam's step sizes; None: 3DGS's, by `settings.lr.means_unit`.
@@ -71,8 +70,8 @@ def distill(
     optimizer = GaussianOptimizer(initial, masked, rates, masked_factors(settings.lr), epsilon=settings.lr.epsilon)
     region = region_of(initial.means, masked) if settings.confined and masked.any() else None
     run = _Run.begun(optimizer, job, trace.load_checkpoint(folder))
-    log = trace.Trace(folder, run.seconds, run.step + bool(run.step))  # a line is numbered by the steps done
     checkpoints = trace.Checkpoints(folder, settings.checkpoint_seconds)
+    log = trace.Trace(folder, run.seconds, run.step + bool(run.step))  # a line is numbered by the steps done
     if run.step == 0:
         _write_line(log, run, {})
 
@@ -86,19 +85,17 @@ def distill(
             optimizer.select(~changed_region(region, optimizer.gaussians.means.detach(), optimizer.masked))
         if trace.log_spaced(done, settings.iterations, per_octave=4):
             _write_line(log, run, line)
-        part = SNAPSHOTS * done // settings.iterations
-        if SNAPSHOTS * step // settings.iterations < part < SNAPSHOTS:
-            _save_snapshot(optimizer, folder, done)
+        _save_snapshot(optimizer, folder, done, settings.iterations)
         if checkpoints.due:
             run.seconds = log.seconds
             checkpoints.save(run.state_dict)
     return optimizer.gaussians.map(Tensor.detach), optimizer.masked
 
 
-def _save_snapshot(optimizer: GaussianOptimizer, folder: Path, done: int) -> None:
-    """The masked Gaussians as they are, for those who look on afterwards: folder/snapshots/<steps>.ply."""
-    masked = optimizer.masked
-    if masked.any():
+def _save_snapshot(optimizer: GaussianOptimizer, folder: Path, done: int, steps: int) -> None:
+    """The masked Gaussians after each part of the run but the last, to look at: folder/snapshots/<steps done>.ply."""
+    part, masked = SNAPSHOTS * done // steps, optimizer.masked
+    if SNAPSHOTS * (done - 1) // steps < part < SNAPSHOTS and masked.any():
         path = folder / "snapshots" / f"{done}.ply"
         save_ply(path, optimizer.gaussians.map(lambda parameter: parameter.detach()[masked].cpu()))
 
