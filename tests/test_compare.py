@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import visiting
 
 from report import compare as page
 from report import curves, job, loading, pictures, results, scenes
@@ -471,3 +472,23 @@ def test_a_job_that_failed_is_still_reported(home):
     for stage in ("distill", "evaluate"):
         shutil.rmtree(home / stage)
     assert "in 1 stages. It is not evaluated yet." in job.make(home.with_name("toy@bad")).read_text()
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_the_report_is_walked_through_in_a_browser(compared, home, width):
+    plan_of(compared, home.parent)
+    with visiting(job.make(home).as_uri(), width) as page:
+        view, left, right = page.locator(".compare select").all()
+        names = [option.inner_text() for option in view.locator("option").all()]
+        shown = lambda: [pair.get_attribute("data-view") for pair in page.locator(".pair:visible").all()]
+        assert len(names) > 1 and shown() == names[:1]
+        page.get_by_label("next view").click()
+        assert shown() == [names[1]]
+        first = "document.querySelector('.pair:not([hidden])')"
+        at = lambda: float(page.evaluate(f"{first}.style.getPropertyValue('--at')").rstrip("%"))
+        stage = page.locator(".pair:visible .stage").bounding_box()
+        page.mouse.click(stage["x"] + 0.8 * stage["width"], stage["y"] + 0.5 * stage["height"])
+        assert at() == pytest.approx(80, abs=4)
+        right.select_option(left.input_value())
+        assert page.locator(".pair:visible img.left.right").count() == 1
+        assert page.evaluate("document.documentElement.scrollWidth") <= width, "nothing is wider than the screen"
