@@ -132,7 +132,7 @@ class Window:
         for kind, pictures in (("cameras", photos), ("references", given)):
             shown = self.server.gui.add_checkbox(kind, False, visible=bool(pictures))
             drawn = [self._pyramid(kind, scene.cameras[name], p, target) for name, p in pictures.items()]
-            shown.on_update(lambda _, drawn=drawn, shown=shown: [setattr(d, "visible", shown.value) for d in drawn])
+            shown.on_update(lambda _, drawn=drawn, shown=shown: _show(drawn, shown.value))
 
     def _pyramid(self, kind: str, camera: Camera, image: np.ndarray | None, target: np.ndarray) -> Any:
         """A camera with its picture, where it has one; not visible yet."""
@@ -182,6 +182,11 @@ class Window:
     def close(self) -> None:
         self.open = False
         self.server.stop()
+
+
+def _show(things: list[Any], visible: bool) -> None:
+    for thing in things:
+        thing.visible = visible
 
 
 def _quaternion(rotation: np.ndarray) -> np.ndarray:
