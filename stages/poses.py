@@ -20,7 +20,7 @@ from reffusion.capture.roles import NONE, Roles
 from reffusion.capture.undistorted import check_masks, lens_of, load_at, save_undistorted
 from reffusion.capture.views import known
 from reffusion.io.arrays import save_json
-from reffusion.io.images import save_image, save_mask
+from reffusion.io.images import image_size, save_image, save_mask
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_raw_masks, load_views, save_scene
 from reffusion.masks import regions
@@ -38,6 +38,7 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     were adjusted; gaussians.ply and region.json where the scene brings them; warnings.json where something is odd."""
     capture, roles = read_scene(params, scene)
     said = [*capture.warnings, *roles.warnings]
+    sizes = {name: image_size(path, upright=capture.upright or not capture.poses) for name, path in capture.pictures.items()}
     for files in (*roles.masks.values(), roles.fill):
         check_masks(files)
     if params.gaussians is not None:
@@ -53,7 +54,7 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
         lenses[views[k]], pinholes[views[k]] = save_undistorted(out, views[k], capture, roles, longest)
     for name in roles.blank:
         lenses[name], pinholes[name] = lens_of(name, capture, longest)
-    save_lenses(out, lenses, capture.upright)
+    save_lenses(out, lenses, capture.upright, {name: sizes[name] for name in lenses})
     shutil.rmtree(out / "sfm", ignore_errors=True)
     normalised = frame.normalised(capture.poses, pinholes, roles.train, roles.test, roles.clean)
     normalised = replace(normalised, blank=roles.blank)

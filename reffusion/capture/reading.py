@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from reffusion.capture.layouts.capture import Capture, pictures_in
+from reffusion.capture.clicked import check_clicks
 from reffusion.capture.lens import without_distortion
 from reffusion.capture.load import load_capture
 from reffusion.capture.roles import Roles, load_roles, masks_of
@@ -26,7 +27,7 @@ def read_scene(params: Params, scene: Path) -> tuple[Capture, Roles]:
         train=params.train,
         test=params.test,
         clean=params.clean,
-        region=params.region is not None or params.fill is not None,
+        region=params.region is not None or params.fill is not None or params.clicks is not None,
         cameras_only=params.cameras_only,
         remove=params.remove,
     )
@@ -34,6 +35,8 @@ def read_scene(params: Params, scene: Path) -> tuple[Capture, Roles]:
         roles = replace(roles, fill=_to_fill(scene / params.fill, capture, roles))
     if params.region is not None and params.region.view is not None:
         known(params.region.view, {*roles.train, *roles.test}, "region")
+    if params.clicks:
+        check_clicks(params.clicks, capture, roles)
     if params.gaussians is not None:
         if not there(scene / params.gaussians):
             raise BadInput(f"{scene / params.gaussians}: no such file; correct `gaussians` in scene.yaml")

@@ -7,6 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from reffusion.params.base import UNKEYED, Settings
+from reffusion.params.clicks import Clicked
 from reffusion.params.reference import Given
 
 Side = Annotated[float, Field(gt=0)]
@@ -47,6 +48,9 @@ class Params(Settings):
     gaussians: str | None = Field(None, description=".ply the scene brings in its own frame, 3DGS layout")
     region: Region | None = Field(None, description="box or sphere that holds the object, or is to be filled")
     fill: str | None = Field(None, description="instead of a region: folder of masks, of what is to be filled")
+    clicks: Clicked | None = Field(
+        None, description="read by the stage `masks`; here only checked", json_schema_extra=UNKEYED
+    )
     remove: list[str] | None = Field(
         None, description="read by the stage `masks`; here only checked", json_schema_extra=UNKEYED
     )
