@@ -38,7 +38,7 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     were adjusted; gaussians.ply and region.json where the scene brings them; warnings.json where something is odd."""
     capture, roles = read_scene(params, scene)
     said = [*capture.warnings, *roles.warnings]
-    sizes = {name: image_size(path, upright=capture.upright or not capture.poses) for name, path in capture.pictures.items()}
+    sizes = {name: image_size(path, upright=capture.upright) for name, path in capture.pictures.items()}
     for files in (*roles.masks.values(), roles.fill):
         check_masks(files)
     if params.gaussians is not None:

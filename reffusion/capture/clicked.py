@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from reffusion.capture.layouts.capture import Capture
-from reffusion.capture.lens import Lens, to_directions, undoing
+from reffusion.capture.lens import Lens, to_directions, to_pixels, undoing
 from reffusion.capture.lenses import load_lenses, photograph_sizes
 from reffusion.capture.roles import Roles
 from reffusion.capture.views import known
@@ -59,6 +59,13 @@ def straightened(points: np.ndarray, lens: Lens, size: tuple[int, int]) -> np.nd
     pinhole = undoing(lens)[0]
     directions = to_directions(points * (lens.width / size[0], lens.height / size[1]), lens)
     return directions * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)
+
+
+def photographed(points: np.ndarray, lens: Lens, size: tuple[int, int]) -> np.ndarray:
+    """Inverse of `straightened`."""
+    pinhole = undoing(lens)[0]
+    directions = (points - (pinhole.cx, pinhole.cy)) / (pinhole.fx, pinhole.fy)
+    return to_pixels(directions, lens) * (size[0] / lens.width, size[1] / lens.height)
 
 
 def as_photographed(mask: np.ndarray, lens: Lens, size: tuple[int, int]) -> np.ndarray:

@@ -22,6 +22,8 @@ NEIGHBOURS = 8
 MOST = 5.0  # px of blending weight, beyond which a vote counts no more
 SEEN = 1.0  # px of blending weight from which a Gaussian is shown to be the object
 UNSURE = 0.006  # of the picture's larger side: pixels this near to a mask's rim do not vote
+AROUND = 0.05  # of the picture's larger side: the ring around a mask that a test photograph is judged by
+ABSENT, LEVEL = 3.0, 0.02  # times as far off as in that ring, beside a part of white: the object is not there
 SHOWN = 0.5  # of a pixel: the object covers it
 
 
@@ -59,7 +61,7 @@ def neighbours(gaussians: Gaussians) -> Neighbours:
     pairs = np.unique(np.sort(np.stack([own, near.ravel()], 1), 1), axis=0)
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
     square = ((color[pairs[:, 0]] - color[pairs[:, 1]]) ** 2).sum(1)
-    return Neighbours(pairs, np.exp(-square / (2 * square.mean() + 1e-12)) if len(pairs) else square)
+    return Neighbours(pairs, np.exp(-square / (2 * square.sum() / max(len(square), 1) + 1e-12)))
 
 
 def solved(
@@ -116,6 +118,17 @@ def shown(
     mask = voting.label_view(gaussians, labels, camera) > SHOWN
     nothing = Clicks(np.zeros((0, 2)), np.zeros(0, bool))
     return refined(image, mask, marked(clicks or nothing, mask.shape))
+
+
+def there(gaussians: Gaussians, camera: Camera, image: np.ndarray, mask: np.ndarray) -> bool:
+    """Does the photograph show the object where its mask [H, W] is, as the Gaussians do, or was it taken without?"""
+    around = ~shrunk(~mask, max(2, round(AROUND * max(mask.shape)))) & ~mask
+    if not mask.any() or not around.any():
+        return bool(mask.any())
+    with torch.no_grad():
+        drawn = rasterizer.render(gaussians, camera).color.clamp(0, 1).cpu().numpy()
+    off = np.abs(drawn - image / 255.0).mean(-1)
+    return float(off[mask].mean()) < ABSENT * float(off[around].mean()) + LEVEL
 
 
 def _sure(mask: np.ndarray) -> np.ndarray:

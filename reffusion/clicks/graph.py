@@ -13,7 +13,7 @@ HARD = 1e4  # a cost that no sum of links outweighs
 BINS = 20  # of colours, a side of L*a*b* of 8 bit
 ROUNDS = 3  # of distances and colours, each by the labels of the one before
 BY_COLOR, BY_LIKELIHOOD = 0.3, 100.0  # what a way costs from the second round on: a step of colour, of likelihood
-SMOOTH = 3.0  # cost of a border between two that look alike
+SMOOTH = 5.0  # cost of a border between two that look alike
 REACH = 150.0  # of colour and pixels, how far a click goes that corrects
 MOST = 3.0  # that colour may cost, natural logarithm of a ratio
 
@@ -57,13 +57,11 @@ def grown(lab: np.ndarray, pairs: np.ndarray, length: np.ndarray, seeds: np.ndar
     bins = tuple((lab * (BINS / 256)).astype(int).clip(0, BINS - 1).T)
     cost, labels = step, None
     for _ in range(ROUNDS):
-        way = sparse.coo_array(((cost + 1.0) * length, tuple(pairs.T)), (len(lab),) * 2).tocsr()
-        near, far = (_distance(way, start) for start in (seeds == OBJECT, other))
-        nearer = (far - near) / (far + near + 1e-9)
-        inside = np.maximum(nearer, 0) if labels is None else labels * (0.5 + nearer).clip(0.1, 1)
-        outside = np.maximum(-nearer, 0) if labels is None else ~labels * (0.5 - nearer).clip(0.1, 1)
+        side = nearer(pairs, (cost + 1.0) * length, seeds == OBJECT, other)
+        inside = np.maximum(side, 0) if labels is None else labels * (0.5 + side).clip(0.1, 1)
+        outside = np.maximum(-side, 0) if labels is None else ~labels * (0.5 - side).clip(0.1, 1)
         like, unlike = (_frequency(bins, weight) for weight in (inside, outside))
-        gain = 2 * nearer + np.log(like / unlike).clip(-MOST, MOST)
+        gain = 2 * side + np.log(like / unlike).clip(-MOST, MOST)
         against = np.where(seeds == OTHER, HARD, np.maximum(-gain, 0) * (seeds != OBJECT))
         against_other = np.where(seeds == OBJECT, HARD, np.maximum(gain, 0) * (seeds != OTHER))
         labels = least_cut(against, against_other, pairs, smooth)
@@ -102,8 +100,17 @@ def attached(labels: np.ndarray, pairs: np.ndarray, seeds: np.ndarray) -> np.nda
     return labels & np.isin(part, part[seeds & labels])
 
 
+def nearer(pairs: np.ndarray, length: np.ndarray, these: np.ndarray, those: np.ndarray) -> np.ndarray:
+    """[N] in [-1, 1]: 1 at `these`, -1 at `those` (bool [N]), between them by the shortest ways along pairs."""
+    way = sparse.coo_array((length, tuple(pairs.T)), (len(these),) * 2).tocsr()
+    near, far = (_distance(way, start) for start in (these, those))
+    return (far - near) / (far + near + 1e-9)
+
+
 def _distance(way: sparse.csr_array, start: np.ndarray) -> np.ndarray:
     """[N], length of the shortest way from any of `start`; where none leads there, longer than all."""
+    if not start.any():
+        return np.ones(way.shape[0])
     found = csgraph.dijkstra(way, directed=False, indices=np.flatnonzero(start), min_only=True)
     reached = np.isfinite(found)
     return np.where(reached, found, 2 * found[reached].max() + 1)

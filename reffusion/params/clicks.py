@@ -6,6 +6,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
+CLICKS = "clicks.json"  # in a scene's folder: what the mask page keeps of its own, and no stage reads
+
 
 def _click(said: Any) -> Any:
     """YAML reads an unquoted + or - as text, and a click without either is on the object."""

@@ -9,6 +9,7 @@ from reffusion.capture.given import PAINTED, load_given, words
 from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.reading import read_scene
 from reffusion.capture.roles import views_of
+from reffusion.params.clicks import CLICKS
 from reffusion.params.poses import Params
 
 # pictures count where they are photographs or masks; depth maps belong to references
@@ -18,7 +19,7 @@ NOT_READ = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".npy", "
 def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
     """Of the scene's files those that this stage reads, and what it reads elsewhere: the photographs and masks, and
     all that is neither a picture nor a depth map. So a new reference, wherever it lies, reruns nothing here."""
-    others = [path for path in files if path.parent != scene or path.name != "scene.yaml"]
+    others = [path for path in files if path.parent != scene or path.name not in ("scene.yaml", CLICKS)]
     try:
         capture, roles = read_scene(params, scene)
     except ValueError:  # `preview` refuses it
