@@ -37,7 +37,7 @@ help:
 	@echo '                               variants=a,b  only these; seeds=5  on demo, demo-1 ... demo-4, with intervals'
 	@echo 'make data=FOLDER compare       the same over all its scenes, in one table: runs/compare/compare.html'
 	@echo 'make data=FOLDER spinnerf      what it holds of SPIn-NeRF'"'"'s published scenes; then as batch'
-	@echo 'make scene=X report            what was done, errors against seconds: runs/X/report/index.html'
+	@echo 'make scene=X report            what was done, errors against seconds: runs/X/report.html'
 	@echo 'make scene=X view              walk through the finished scene in a browser; port=8080'
 	@echo 'make scene=X turntable         the finished scene on a way around the capture: runs/X/turntable.webm'
 	@echo 'make scene=X sds-variance      the SDS gradient over noise and timesteps, before and after personalization'
@@ -45,6 +45,8 @@ help:
 	@echo 'make scene=demo-sparse sparse  scores against the number of photographs; seeds=3  on two more scenes (hours)'
 	@echo 'make scene=X adapted           views painted by the adapted prior, beside the unadapted: runs/X/adapted/sheet.png'
 	@echo 'make data=FOLDER report        the same of all its scenes: runs/report/index.html'
+	@echo 'make scene=X patch             fill what was deleted in an editor (scene.yaml: gaussians, cleaned): runs/X/patch/'
+	@echo 'make scene=X export            the finished scene for other tools, .ply, cameras, LoRA: runs/X/export/'
 	@echo 'make scene=X verify            hash all that was computed for it: is it as it was made?'
 	@echo 'make scene=X clean             remove what was computed for it'
 	@echo 'make data=FOLDER batch         every scene of a folder, and one table'
@@ -80,6 +82,10 @@ $(VENV)/.ready: pyproject.toml constraints.txt | $(VENV)/bin/python
 
 $(VENV)/.ready-view: $(VENV)/.ready
 	$(PY) -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[view]'
+	@touch $@
+
+$(VENV)/.ready-export: $(VENV)/.ready
+	$(PY) -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[export]'
 	@touch $@
 
 $(VENV)/.ready-dev: $(VENV)/.ready
@@ -146,6 +152,18 @@ view: named $(VENV)/.ready-view
 
 turntable: named setup
 	@$(RUN) turntable $(of) $(where)
+
+# What was deleted is known once `poses` has run: before the work, not after it.
+.PHONY: patch export
+patch: ready $(VENV)/.ready-export
+	@$(RUN) run poses $(of) $(options)
+	@$(RUN) patch $(of) $(where) --only-check
+	@$(RUN) run all $(of) $(options)
+	@$(RUN) patch $(of) $(where)
+
+export: ready $(VENV)/.ready-export
+	@$(RUN) run all $(of) $(options)
+	@$(RUN) export $(of) $(where)
 
 verify clean: named setup
 	@$(RUN) $@ $(of) $(options)

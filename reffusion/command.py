@@ -15,6 +15,8 @@ REPORTS = {
     "turntable": "report.turntable",
     "sheet": "report.sheet",
     "check": "report.check",
+    "patch": "report.patch",
+    "export": "report.export",
 }  # every other word is the runner's
 
 

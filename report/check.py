@@ -12,6 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from reffusion.io.arrays import load_json
 from reffusion.io.images import load_image, load_mask, resize_nearest, resized, save_image
+from reffusion.io.scene import has_photograph
 from report import command, sheet
 
 WIDTH, HEIGHT, GAP = 240, 180, 4  # px of the room for a picture, and between them
@@ -29,7 +30,10 @@ def make(home: Path) -> tuple[Path, list[str]]:
     if not (poses / "views.json").is_file():
         raise ValueError(f"{poses}: not there; run `make scene={home.name.split('@')[0]} poses` first")
     views, warnings = load_json(poses / "views.json"), poses / "warnings.json"
-    cells = [(name, tinted(poses, name), kind_of(name, views)) for name in sorted({*views["train"], *views["test"]})]
+    named = [name for name in sorted({*views["train"], *views["test"]}) if has_photograph(poses, name)]
+    if not named:
+        raise ValueError(f"{poses}: the scene has no photographs to look at")
+    cells = [(name, tinted(poses, name), kind_of(name, views)) for name in named]
     save_image(home / "check.png", arranged(cells))
     return home / "check.png", load_json(warnings) if warnings.is_file() else []
 

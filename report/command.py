@@ -16,5 +16,6 @@ def parser(name: str, description: str) -> argparse.ArgumentParser:
 
 def home(arguments: argparse.Namespace) -> Path:
     """runs/<scene>, or runs/<scene>@<variant>."""
-    name = arguments.scene.expanduser().resolve().name
+    scene = arguments.scene.expanduser().resolve()
+    name = scene.stem if scene.is_file() else scene.name
     return arguments.runs / (f"{name}@{arguments.variant}" if arguments.variant else name)

@@ -137,9 +137,10 @@ def _errors(
         words = f"{stage}: {QUANTITIES[name].label}, {points[-1, 1]:.1f}"
         late = points[-1, 0] > total / 2  # then there is no room to its right
         write(axes, words, points[-1], *(((-8, 4), colour, "right") if late else ((6, 0), colour)))
-    for stage, at in ends.items():
+    for row, (stage, at) in enumerate(ends.items()):  # below one another: they may stand side by side
         axes.plot(*at, "D", color=INK, markersize=6)
-        write(axes, f"box of the test views\nafter {stage}: {at[1]:.2f}", at, (-8, 0), ha="right")
+        words = f"box of the test views\nafter {stage}: {at[1]:.2f}"
+        write(axes, words, at, (0, -10 - 26 * row), ha="right", va="top")
     finals = [points[-1, 1] for _, points in curves.values()] + [value for _, value in ends.values()]
     highest = max([*finals, *(points[:, 1].max() for _, points in curves.values())])
     axes.set_ylim(min(finals) - 10, highest + 2)  # how a fit begins, at 10 dB, matters to no one

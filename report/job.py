@@ -1,6 +1,6 @@
 """One page on what a scene's job did: errors against time, seconds, pictures, what was left out and why.
 
-python -m report.job --scene X --runs runs          runs/X/report/index.html
+python -m report.job --scene X --runs runs          runs/X/report.html, one file
 python -m report.job --data FOLDER --runs runs      runs/report/index.html, of all scenes in the folder
 """
 
@@ -9,17 +9,24 @@ from __future__ import annotations
 import argparse
 import os
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from reffusion.io.arrays import load_json
-from reffusion.io.images import load_image, save_image
-from report import curves, page, scenes, sheet
+from report import before, command, covered, curves, drawn, inside, page, scenes, settings
 from report.loading import Job, load_job
-from report.pictures import wall
 
 WORDS = {
     "skip": "left\u00a0out", "provided": "brought", "cached": "done", "run": "to\u00a0run", "stale": "to\u00a0run",
     "missing": "cannot\u00a0run", "undecided": "undecided",
 }  # fmt: skip
+STYLE = """
+.grid { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(14rem, 46%), 1fr)); gap: .6rem }
+.grid figure { margin: 0; break-inside: avoid } .grid img { width: 100%; margin: 0 }
+figcaption { overflow-wrap: anywhere }
+img.chart { max-width: none; width: max(100%, 40rem) } summary { cursor: pointer; padding: .4rem 0; color: #0a5a8c }
+td.bar { background: linear-gradient(#bcd9ec, #bcd9ec) no-repeat left; min-width: 6rem; print-color-adjust: exact }
+@media print { img.chart { width: 100% } .wide { overflow: visible } }
+"""
 RESULTS = {
     "evaluate/scene.ply": "the result as Gaussians, in the scene's own frame",
     "evaluate/renders": "renders of the result",
@@ -33,18 +40,18 @@ RESULTS = {
 
 
 def make(home: Path) -> Path:
-    """Write runs/<scene>/report/: index.html and PNGs; gives back the page's path."""
+    """Write runs/<scene>/report.html, which needs no other file; gives back its path."""
     job = load_job(home)
-    out = home / "report"
-    out.mkdir(exist_ok=True)
     title = f"{home.name}: what was done"
     seconds = sum(receipt["seconds"] for receipt in job.receipts.values())
     done = f"{page.duration(seconds)} in {len(job.receipts)} stages"
-    parts = [page.heading(title, 1), page.paragraph(f"{done}. {outcome(job)}")]
-    parts += pictures(job, out) + further(job, out) + whole(job, out) + stages(job, out)
-    parts += left_out(job) + receipts(job) + artifacts(job, out)
-    path = out / "index.html"
-    path.write_text(page.document(title, parts), encoding="utf-8")
+    parts = [page.heading(title, 1), page.paragraph(f"{done}. {outcome(job)}"), *unfinished(job), *said(job)]
+    parts += before.section(job) + drawn.masks(job) + drawn.references(job) + drawn.depths(job) + covered.section(job)
+    with TemporaryDirectory() as charts:
+        parts += whole(job, Path(charts)) + stages(job, Path(charts))
+    parts += left_out(job) + settings.section(job) + receipts(job) + settings.command(job) + artifacts(job)
+    path = home / "report.html"
+    path.write_text(page.document(title, parts, STYLE + before.STYLE, before.SCRIPT), encoding="utf-8")
     return path
 
 
@@ -63,27 +70,21 @@ def outcome(job: Job) -> str:
 # --------------------------------------------------------------------------------------------------------- sections
 
 
-def pictures(job: Job, out: Path) -> list[str]:
-    try:
-        path = sheet.make(job.home, out / "sheet.png")
-    except ValueError as error:
-        return [page.heading("Pictures"), page.paragraph(f"None yet: {error}")]
-    return [page.heading("Pictures"), page.picture(path, "views of the scene")]
+def unfinished(job: Job) -> list[str]:
+    """The stages that are still to run."""
+    due = [stage for stage, told in job.plan.items() if told["word"] not in ("cached", "skip", "provided")]
+    if not job.plan:
+        due = [stage for stage in ("poses", "fit", "evaluate") if stage not in job.folders]
+    return [page.paragraph(f"Still to run, or to run again: {', '.join(due)}.")] if due else []
 
 
-def further(job: Job, out: Path) -> list[str]:
-    """The views that were completed beside the references, and why."""
-    folder = job.folders.get("initialize", Path())
-    facts = folder / "facts.json"
-    shares = load_json(facts).get("further", {}) if facts.is_file() else {}
-    if not shares:
-        return []
-    shown = [load_image(folder / "further" / f"{view}.png") for view in shares]
-    titles = [f"{view}: {share:.1%} of its mask was open" for view, share in shares.items()]
-    save_image(out / "further.png", wall(shown, titles))
-    said = "No reference shows what was open there: these views were put together from patches of the photographs."
-    parts = [page.heading("Further views"), page.paragraph(said)]
-    return [*parts, page.picture(out / "further.png", "views completed beside the references")]
+def said(job: Job) -> list[str]:
+    """What was odd about the photographs, and which frames of a video were taken."""
+    record = job.home.with_name(job.home.name.split("@")[0]) / "frames" / "frames.json"
+    lines = [load_json(record)["said"]] if record.is_file() else []
+    warnings = job.folders.get("poses", Path()) / "warnings.json"
+    lines += load_json(warnings) if "poses" in job.folders and warnings.is_file() else []
+    return [page.bullets(lines)] if lines else []
 
 
 def whole(job: Job, out: Path) -> list[str]:
@@ -94,7 +95,7 @@ def whole(job: Job, out: Path) -> list[str]:
     box = {"initialize": job.metrics.get("initialize", {}).get("psnr_box")}
     box |= {result: job.metrics.get("mean", {}).get("psnr_box")}
     curves.job_chart(seconds, {stage: own for stage, own in lines.items() if own}, box, out / "job.png")
-    parts = [page.heading("The whole job"), page.picture(out / "job.png", "PSNR and stages against seconds")]
+    parts = [page.heading("The whole job"), inside.chart(out / "job.png", "PSNR and stages against seconds")]
     if any(stage in lines for stage in ("fit", "distill")):
         words = (
             "Curves: each stage's own error, on training views or references. Test views are only scored at the end."
@@ -123,7 +124,7 @@ def stages(job: Job, out: Path) -> list[str]:
     for stage, series in job.traces.items():
         path = out / f"{stage}.png"
         if names := curves.stage_chart(stage, series, path):
-            parts += [page.heading(f"{stage}: error against seconds"), page.picture(path, ", ".join(names))]
+            parts += [page.heading(f"{stage}: error against seconds"), inside.chart(path, ", ".join(names))]
     parts += [page.paragraph(f"Not drawn: {why}", quiet=True) for why in job.unread]
     return parts
 
@@ -157,13 +158,14 @@ def receipts(job: Job) -> list[str]:
     return [page.heading("Receipts"), table, page.paragraph(f"With {said}.", quiet=True) if said else ""]
 
 
-def artifacts(job: Job, out: Path) -> list[str]:
-    there = {}
+def artifacts(job: Job) -> list[str]:
+    there = {"turntable.webm: a way around the capture": "turntable.webm"}
+    there = there if (job.home / "turntable.webm").is_file() else {}
     for name, words in RESULTS.items():
         stage, rest = name.split("/")
         path = job.folders.get(stage, Path()) / rest
         if stage in job.folders and path.exists():
-            there[f"{name}: {words}"] = os.path.relpath(path, out)
+            there[f"{name}: {words}"] = os.path.relpath(path, job.home)
     return [page.heading("Files"), page.links(there)]
 
 
@@ -178,7 +180,7 @@ def main() -> None:
     suffix = f"@{arguments.variant}" if arguments.variant else ""
     try:
         if arguments.scene:
-            print(make(arguments.runs / (arguments.scene.expanduser().resolve().name + suffix)))
+            print(make(command.home(arguments)))
             return
         folders = sorted(path for path in arguments.data.iterdir() if path.is_dir()) if arguments.data.is_dir() else []
         homes = [home for path in folders if (home := arguments.runs / (path.name + suffix)).is_dir()]

@@ -21,6 +21,7 @@ class Job:
     Attributes:
         home: runs/<scene>, or runs/<scene>@<variant>.
         plan: stage -> word, reason, notes, as the runner wrote them to plan.json; or empty, see `load_plan`.
+        unset: stage -> all its parameters as they are without `set=` and `budget=`; or empty.
         folders: stage -> its artifact, in order; a variant's may lie with the scene's own run.
         receipts: stage -> receipt.json.
         traces: stage -> series -> lines.
@@ -30,6 +31,7 @@ class Job:
 
     home: Path
     plan: dict[str, dict[str, Any]]
+    unset: dict[str, dict[str, Any]]
     folders: dict[str, Path]
     receipts: dict[str, dict[str, Any]]
     traces: dict[str, dict[str, curves.Lines]]
@@ -56,7 +58,9 @@ def load_job(home: Path) -> Job:
                 unread.append(str(error))
     metrics = folders.get("evaluate", Path()) / "metrics.json"
     scores = load_json(metrics) if metrics.is_file() else {}
-    return Job(home, plan, folders, load_receipts(folders), traces, tuple(unread), scores)
+    record = home / "plan.json"
+    unset = load_json(record).get("params", {}) if record.exists() else {}
+    return Job(home, plan, unset, folders, load_receipts(folders), traces, tuple(unread), scores)
 
 
 def load_plan(home: Path) -> dict[str, dict[str, Any]]:

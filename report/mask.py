@@ -1,6 +1,6 @@
 """Masks from clicks, in a browser: `python -m report.mask --scene demo` (`make scene=X mask`).
 
-Places the photographs (the stage `poses`), opens the page, and fits the scene meanwhile, which gives masks of all views.
+Places the photographs (the stage `poses`), serves the page, and fits the scene meanwhile, for masks of all views.
 Served on this machine only.
 """
 
@@ -27,7 +27,8 @@ THUMBNAIL = 160  # px, larger side
 MOST = 2_000_000  # bytes of a request
 TINT = (255, 0, 160)
 # The page is one file, and asks nobody but this server.
-POLICY = "default-src 'none'; img-src 'self' data:; connect-src 'self'; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+POLICY = "default-src 'none'; img-src 'self' data:; connect-src 'self'; "
+POLICY += "style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 
 
 class Server(ThreadingHTTPServer):

@@ -1,4 +1,4 @@
-"""Plain HTML pages: one file without scripts, fonts or addresses of other machines."""
+"""Plain HTML pages: one file without fonts or addresses of other machines."""
 
 from __future__ import annotations
 
@@ -17,15 +17,21 @@ th, td { white-space: nowrap } th:first-child, td:first-child { text-align: left
 th { font-weight: 600; border-bottom: 1px solid #888 }
 .text { text-align: left !important; white-space: normal } tr.ours td { background: #eef5fa }
 img { max-width: 100%; display: block; margin: .4rem 0 } p, li { max-width: 50rem }
-.wide { overflow-x: auto } .quiet { color: #666; font-size: .9rem } a { color: #0a5a8c }
+@media (max-width: 40rem) { body { margin: 1rem auto } th, td { padding: .2rem .4rem } .text { min-width: 9rem } }
+@media print { body { max-width: none; margin: 0; font-size: 11pt }
+  h2 { break-after: avoid } img { break-inside: avoid } }
+.wide { overflow-x: auto } .quiet { color: #666; font-size: .9rem } a { color: #0a5a8c } li { overflow-wrap: anywhere }
+pre { white-space: pre-wrap; overflow-wrap: anywhere; font-size: .85rem; background: #f3f3f3; padding: .6rem }
 """
 
 
-def document(title: str, body: Sequence[str]) -> str:
-    """A whole page; `title` is plain text, the parts of `body` are HTML."""
-    head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{escape(title)}</title>'
-    top = f'<!doctype html>\n<html lang="en"><head>{head}<style>{STYLE}</style></head>\n<body>'
-    return "\n".join([top, *body, "</body></html>\n"])
+def document(title: str, body: Sequence[str], style: str = "", script: str = "") -> str:
+    """A whole page; `title` is plain text, the parts of `body` are HTML; `style` and `script` go into it."""
+    head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
+    head += f"<title>{escape(title)}</title><style>{STYLE}{style}</style>"
+    top = f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>'
+    end = [f"<script>{script}</script>"] if script else []
+    return "\n".join([top, *body, *end, "</body></html>\n"])
 
 
 def heading(text: str, level: int = 2) -> str:
@@ -64,6 +70,11 @@ def picture(path: Path, alt: str, embed: bool = False) -> str:
     """A PNG, by its name beside the page, or inside the page."""
     source = f"data:image/png;base64,{base64.b64encode(path.read_bytes()).decode()}" if embed else escape(path.name)
     return f'<img src="{source}" alt="{escape(alt)}">'
+
+
+def code(line: str) -> str:
+    """A command, to be copied."""
+    return f"<pre><code>{escape(line)}</code></pre>"
 
 
 def links(targets: dict[str, str]) -> str:

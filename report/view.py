@@ -7,72 +7,25 @@ in full. So what one sees is what `evaluate` scores, and the browser needs no gr
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from reffusion.io.arrays import load_json, load_labels
-from reffusion.io.images import to_uint8
-from reffusion.io.ply import load_ply
-from reffusion.io.scene import load_scene, load_views
+from reffusion.io.images import load_image, to_uint8
+from reffusion.io.scene import has_photograph, load_scene, load_views
 from reffusion.splat import rasterizer
-from reffusion.types import Camera, Gaussians, Scene, Similarity
-from report import command, flight
+from reffusion.types import Camera, Gaussians, Scene
+from report import command, flight, unseen
+from report.layers import how, load_layers
 from report.sheet import stage_folder
 
 PORT = 8080
 MOVING, STILL = 180, 480  # px, height of a picture while the camera moves, and once it rests
-THUMBNAIL = 160  # px, width of a photograph in its camera
 PYRAMID = 0.04  # size of a drawn camera, of the scene's extent 1
+# Of cameras: width in px of the picture inside, colour, and thickness of the lines.
+LOOKS = {"cameras": (160, (20, 20, 20), PYRAMID / 40), "references": (480, (230, 120, 0), PYRAMID / 15)}
 TURN = threading.Lock()  # the rasterizer's threads serve one picture at a time
-
-
-@dataclass(frozen=True)
-class Layer:
-    """A state of the scene: its Gaussians, and which of them were added, [N] bool."""
-
-    gaussians: Gaussians
-    added: Tensor
-
-    def shown(self, there: bool, added: bool) -> Gaussians:
-        """Of what was there, and what was added, the asked parts."""
-        chosen = (self.added & added) | (~self.added & there)
-        return self.gaussians.map(lambda parameter: parameter[chosen])
-
-
-def layers(home: Path, similarity: Similarity) -> dict[str, Layer]:
-    """Title -> layer, the result first; then what it was made from, latest first.
-
-    Args:
-        home: runs/<scene> or runs/<scene>@<variant>.
-        similarity: the scene's.
-
-    Raises:
-        ValueError: the stage `evaluate` has not run.
-    """
-    finished = home / "evaluate"
-    if not (finished / "scene.ply").exists():
-        raise ValueError(f"{finished / 'scene.ply'} is missing; {_how(home)} makes it")
-    used = {stage for stage, key in load_json(finished / "receipt.json")["needs"].items() if key}
-    result = load_ply(finished / "scene.ply", similarity)
-    found = {}
-    for stage, title in (("distill", "result"), ("initialize", "before distillation"), ("fit", "as photographed")):
-        folder = stage_folder(home, stage)
-        if stage in used:
-            labels, title = folder / "labels.npy", title if found else "result"
-            gaussians = load_ply(folder / "gaussians.ply") if found else result
-            added = load_labels(labels) if labels.exists() else torch.zeros(len(gaussians), dtype=torch.bool)
-            found[title] = Layer(gaussians, added)
-    return found
-
-
-def _how(home: Path) -> str:
-    scene, _, variant = home.name.partition("@")
-    return f"`make scene={scene}{f' variant={variant}' if variant else ''} all`"
 
 
 def camera_of(place: Any, height: int) -> Camera:
@@ -91,6 +44,11 @@ def picture(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     """uint8 [H, W, 3]."""
     with TURN:
         return to_uint8(rasterizer.render(gaussians, camera).color.numpy())
+
+
+def home_of(home: Path) -> Path:
+    """The scene's own run, where `poses` lies, of one of its variants."""
+    return home.with_name(home.name.split("@")[0])
 
 
 def go_to(place: Any, camera: Camera, target: np.ndarray) -> None:
@@ -120,52 +78,74 @@ class Window:
             import viser
         except ImportError:
             raise ValueError("the viewer needs viser: `make scene=X view`, or `pip install viser`") from None
-        poses = home.with_name(home.name.split("@")[0]) / "poses"
+        poses = home_of(home) / "poses"
         if not poses.is_dir():
-            raise ValueError(f"{poses} is missing; {_how(home)} makes it")
+            raise ValueError(f"{poses} is missing; {how(home)} makes it")
         scene = load_scene(poses)
-        self.layers = layers(home, scene.similarity)
-        self.shown = next(iter(self.layers.values())).gaussians
+        self.layers = load_layers(home, scene.similarity)
+        self.seen_by = unseen.photographed(home, scene)
+        self.shown, self.noted = next(reversed(self.layers.states.values()))[0], True
         self.asked: dict[int, threading.Event] = {}
         self.open = True
         self.server = viser.ViserServer(host="127.0.0.1", port=port, label=home.name, verbose=False)
         self._choices()
-        self._cameras(scene, load_views(poses, scene.train))
+        self._cameras(home, scene)
         self.server.on_client_connect(self._visit)
         self.server.on_client_disconnect(lambda client: self._ask(client.client_id))
 
     def _choices(self) -> None:
-        gui = self.server.gui
-        state = gui.add_dropdown("scene", list(self.layers), initial_value=next(iter(self.layers)))
-        there, added = (gui.add_checkbox(f"what was {kind}", True) for kind in ("there", "added"))
+        """What is shown: of which state, and which of its parts."""
+        gui, titles = self.server.gui, list(self.layers.states)
+        last = len(titles) - 1
+        marks = tuple((k, title if k in (0, last) else "") for k, title in enumerate(titles))
+        hint = "from the initialization to the result"
+        slider = gui.add_slider("distillation", 0, max(last, 1), 1, last, marks=marks, hint=hint, visible=last > 0)
+        state = gui.add_markdown("")
+        kept, added = (gui.add_checkbox(f"what was {kind}", True) for kind in ("kept", "added"))
+        removed = gui.add_checkbox("what was removed", False, visible=len(self.layers.removed) > 0)
+        words = "hatch what no photograph shows, once the camera rests"
+        note = gui.add_checkbox("never seen", True, hint=words, visible=len(self.seen_by) > 0)
 
-        def changed(_: Any) -> None:
-            self.shown = self.layers[state.value].shown(there.value, added.value)
+        def changed(_: Any = None) -> None:
+            title = titles[min(int(slider.value), last)]
+            state.content = title if last else ""
+            self.shown = self.layers.shown(title, kept.value, added.value, removed.value)
+            self.noted = note.value and not removed.value and bool(self.seen_by)
             for visitor in list(self.asked):
                 self._ask(visitor)
 
-        for choice in (state, there, added):
+        for choice in (slider, kept, added, removed, note):
             choice.on_update(changed)
+        changed()
 
-    def _cameras(self, scene: Scene, photos: dict[str, np.ndarray]) -> None:
-        """Every training view as a pyramid with its photograph; a click on it takes the visitor there."""
-        train, drawn, add = [scene.cameras[name] for name in scene.train], [], self.server.scene.add_camera_frustum
+    def _cameras(self, home: Path, scene: Scene) -> None:
+        """Every training view as a pyramid with its photograph, and the references with theirs; a click on one takes
+        the visitor there."""
+        train, poses = [scene.cameras[name] for name in scene.train], home_of(home) / "poses"
+        photographed = load_views(poses, [name for name in scene.train if has_photograph(poses, name)])
+        photos = {name: photographed.get(name) for name in scene.train}
         target = flight.focus(train, scene.points)
         self.server.scene.set_up_direction(-np.mean([camera.world_to_camera[1, :3] for camera in train], 0))
         go_to(self.server.initial_camera, train[len(train) // 2], target)
-        shown = self.server.gui.add_checkbox("cameras", False)
-        for camera in train:
-            small = photos[camera.name][:: (step := max(1, camera.width // THUMBNAIL)), ::step]
-            place = {"wxyz": _quaternion(camera.world_to_camera[:3, :3].T), "position": camera.center}
-            lens = {"fov": field_of_view(camera), "aspect": camera.width / camera.height}
-            size = {"scale": PYRAMID, "thickness": PYRAMID / 40}
-            drawn.append(add(f"/cameras/{camera.name}", **lens, **place, **size, image=small, visible=False))
-            drawn[-1].on_click(lambda event, camera=camera: go_to(event.client.camera, camera, target))
+        folder = stage_folder(home, "reference") / "references"
+        given = {path.stem: load_image(path) for path in sorted(folder.glob("*.png")) if path.stem in scene.cameras}
+        for kind, pictures in (("cameras", photos), ("references", given)):
+            shown = self.server.gui.add_checkbox(kind, False, visible=bool(pictures))
+            drawn = [self._pyramid(kind, scene.cameras[name], p, target) for name, p in pictures.items()]
+            shown.on_update(lambda _, drawn=drawn, shown=shown: _show(drawn, shown.value))
 
-        @shown.on_update
-        def _(_: Any) -> None:
-            for frustum in drawn:
-                frustum.visible = shown.value
+    def _pyramid(self, kind: str, camera: Camera, image: np.ndarray | None, target: np.ndarray) -> Any:
+        """A camera with its picture, where it has one; not visible yet."""
+        width, color, thickness = LOOKS[kind]
+        step = max(1, camera.width // width)
+        small = image[::step, ::step] if image is not None else None
+        place = {"wxyz": _quaternion(camera.world_to_camera[:3, :3].T), "position": camera.center}
+        lens = {"fov": field_of_view(camera), "aspect": camera.width / camera.height}
+        look = {"scale": PYRAMID, "thickness": thickness, "color": color}
+        add = self.server.scene.add_camera_frustum
+        made = add(f"/{kind}/{camera.name}", **lens, **place, **look, image=small, visible=False)
+        made.on_click(lambda event: go_to(event.client.camera, camera, target))
+        return made
 
     def _visit(self, client: Any) -> None:
         self.asked[client.client_id] = threading.Event()
@@ -184,15 +164,29 @@ class Window:
             asked.wait(1.0)
             for height in (MOVING, STILL) if asked.is_set() else ():
                 asked.clear()
-                drawn = picture(self.shown, camera_of(client.camera, height))
+                drawn = self._drawn(camera_of(client.camera, height), client.camera)
                 client.scene.set_background_image(drawn, format="jpeg", jpeg_quality=90)
                 if asked.is_set():
                     break
         self.asked.pop(client.client_id, None)
 
+    def _drawn(self, camera: Camera, place: Any) -> np.ndarray:
+        """uint8 [H, W, 3]; once the camera rests, with a note of what was never seen."""
+        shown = self.shown
+        drawn = picture(shown, camera)
+        if camera.height == STILL and self.noted:
+            with TURN:
+                drawn = unseen.noted(drawn, shown, camera_of(place, MOVING), self.seen_by)
+        return drawn
+
     def close(self) -> None:
         self.open = False
         self.server.stop()
+
+
+def _show(things: list[Any], visible: bool) -> None:
+    for thing in things:
+        thing.visible = visible
 
 
 def _quaternion(rotation: np.ndarray) -> np.ndarray:

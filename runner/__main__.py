@@ -5,6 +5,7 @@ import argparse
 import os
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from reffusion.command import workplace
@@ -33,7 +34,8 @@ def main() -> int:
             job = resolve(request)
             decisions = plan(job, job.pipeline.closure(arguments.stage))
             if arguments.record:
-                write_json(job.home / "plan.json", as_record(job, decisions))
+                unset = resolve(replace(request, set="", budget=None), job.hashes)
+                write_json(job.home / "plan.json", as_record(job, decisions, unset))
             else:
                 print("\n".join(filter(None, [table(job, decisions), costs(job, decisions, arguments.card)])))
         elif arguments.command == "run":

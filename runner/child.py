@@ -1,5 +1,5 @@
 """The process in which stages are imported: `describe` reads their parameters, `fetch` gets the weights they name,
-`run` does a stage's work.
+`run` does a stage's work, `frames` takes pictures from a video.
 
 What can be told of a stage before it runs (Params, needed_weights, lacks, cost, preview, scene_files) lies in
 stages/plan/<stage>.py where there is such a file, which imports nothing heavy, else in stages/<stage>.py itself.
@@ -159,6 +159,19 @@ def fetch() -> int:
     return failed
 
 
+def frames() -> int:
+    """Take a video's frames. Standard input: {"video", "folder", "content": its hash}; standard output: what was taken,
+    or what is wrong."""
+    asked = json.load(sys.stdin)
+    video = importlib.import_module("reffusion.capture.video")
+    try:
+        print(video.take(Path(asked["video"]), Path(asked["folder"]), asked["content"]))
+    except ValueError as error:
+        print(told(error))
+        return 1
+    return 0
+
+
 def run() -> int:
     """Do one stage. Standard input: one line of JSON, then nothing until the runner is gone.
 
@@ -214,4 +227,4 @@ def _peak_memory_mb() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit({"describe": describe, "fetch": fetch, "run": run}[sys.argv[1]]())
+    sys.exit({"describe": describe, "fetch": fetch, "frames": frames, "run": run}[sys.argv[1]]())

@@ -15,7 +15,7 @@ from runner import Refused, say
 from runner.execute import run_scene
 from runner.files import RECEIPT, shown, told, write_json, write_text
 from runner.keys import HASHES, Hashes
-from runner.pipeline import Pipeline, find_scene, load_pipeline, unknown
+from runner.pipeline import Pipeline, find_scene, load_pipeline, scene_name, unknown
 from runner.resolve import Request, resolve_all
 
 FULL = "full"  # what the scene's own run, without a variant, is called beside them
@@ -106,10 +106,10 @@ def _scenes(request: Request, seeds: int, data: Path | None) -> dict[str, str]:
             raise Refused(f"data={data}: all scenes of a folder, without scene={request.scene} and seeds={seeds}")
         return {str(folder): folder.name for folder in _folders(data)}
     scenes = [request.scene, *(f"{request.scene.rstrip('/')}-{seed}" for seed in range(1, seeds))]
-    names = {scenes[0]: find_scene(scenes[0], request.root).name}
+    names = {scenes[0]: scene_name(find_scene(scenes[0], request.root))}
     for scene in scenes[1:]:
         try:
-            names[scene] = find_scene(scene, request.root).name
+            names[scene] = scene_name(find_scene(scene, request.root))
         except Refused as error:
             raise Refused(f"seeds={seeds} asks for the scenes {scenes[0]} to {scenes[-1]}: {error}") from None
     return names

@@ -201,20 +201,25 @@ def load_scene_file(folder: Path, pipeline: Pipeline) -> SceneFile:
     return SceneFile(path, content.get("profile"), brings, stages, content.get("budget"))
 
 
+def scene_name(scene: Path) -> str:
+    """What the scene in a folder, or of a video, is called."""
+    return scene.stem if scene.is_file() else scene.name
+
+
 def find_scene(text: str, root: Path) -> Path:
-    """The folder meant by `scene=`: a name under data/, or a path."""
+    """What is meant by `scene=`, a name under data/ or a path: a folder, or a file that is taken for a video."""
     data = workplace(root) / "data"
-    for folder in (data / text, Path(text).expanduser()):
-        if text and folder.is_dir():
-            folder = folder.resolve()
-            if not NAME.fullmatch(folder.name):
+    for scene in (data / text, Path(text).expanduser()):
+        if text and (scene.is_dir() or scene.is_file()):
+            scene = scene.resolve()
+            if not NAME.fullmatch(scene_name(scene)):
                 raise Refused(
-                    f"{folder}: a scene is called by its folder's name; use letters, digits, blanks and "
+                    f"{scene}: a scene is called by its folder's name; use letters, digits, blanks and "
                     "_ . , - + ' ( ) only"
                 )
-            return folder
+            return scene
     known = sorted(p.name for p in data.glob("[!._]*/")) if data.is_dir() else []
     raise Refused(
-        f"unknown scene {text!r}: there is no folder data/{text}, nor one at that path; "
+        f"unknown scene {text!r}: there is no folder data/{text}, nor one or a video at that path; "
         f"known: {', '.join(known) or 'none'} (`make demo` makes one, in a checkout)"
     )

@@ -255,11 +255,13 @@ def _read_elsewhere(job: Job, stages: list[str]) -> list[Path]:
     return sorted({*reads, *named})
 
 
-def as_record(job: Job, decisions: dict[str, Decision]) -> dict[str, Any]:
-    """The same for plan.json, which the report reads: stage -> word, reason, notes, artifact's folder below runs/."""
+def as_record(job: Job, decisions: dict[str, Decision], unset: Job) -> dict[str, Any]:
+    """The same for plan.json, which the report reads: stage -> word, reason, notes, artifact's folder below runs/; and
+    the parameters of the job as it is without `set=` and `budget=`."""
     folder = lambda path: path and os.path.relpath(path, job.runs)
     words = lambda d: {"word": d.word, "reason": d.reason, "notes": list(d.notes), "folder": folder(d.path)}
-    return {"profile": job.profile, "stages": {stage: words(decision) for stage, decision in decisions.items()}}
+    stages = {stage: words(decision) for stage, decision in decisions.items()}
+    return {"profile": job.profile, "stages": stages, "params": unset.params}
 
 
 def expected_seconds(job: Job, stage: str) -> float | None:

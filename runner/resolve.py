@@ -10,14 +10,25 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from runner import Refused
-from runner.files import files_below, read_text
+from runner import Refused, say
+from runner.files import files_below, read_json, read_text, shown
 from runner.keys import HASHES, Hashes, code_of, digest, elsewhere, outside
 from runner.layers import Layers, layered, parse_set, seconds_of, shared_out
-from runner.pipeline import SCENE, Pipeline, SceneFile, find_scene, load_pipeline, load_scene_file, read_yaml, unknown
+from runner.pipeline import (
+    SCENE,
+    Pipeline,
+    SceneFile,
+    find_scene,
+    load_pipeline,
+    load_scene_file,
+    read_yaml,
+    scene_name,
+    unknown,
+)
 
 AUTO = "auto"  # the profile that this machine can do
 CHILD = Path(__file__).with_name("child.py")
+FRAMES, TAKEN = "frames", ("frames.json", "frames.csv")  # in runs/<video>/, and what is written there beside images/
 LASTING = "told "  # before the names of answers that are remembered
 RENAMED = Path("runner", "renamed.yaml")  # old dotted name of a parameter: the new one, or what became of it
 
@@ -102,19 +113,22 @@ def resolve_all(requests: list[Request], hashes: Hashes, scene: bool = True) -> 
 def _draft(request: Request, hashes: Hashes, scene: bool) -> Job:
     """A job that does not know its stages yet."""
     root, runs, variant, pipeline = request.root, request.runs, request.variant, load_pipeline(request.root)
-    folder = find_scene(request.scene, root) if scene else None
+    given = find_scene(request.scene, root) if scene else None
+    base = runs / (scene_name(given) if given else "")
+    folder = base / FRAMES if given and given.is_file() else given
+    one_folder_a_name(base, folder, root)
+    if folder != given:
+        take_frames(given, folder, root, hashes)
     found = load_scene_file(folder, pipeline) if folder else SceneFile(root / "scene.yaml", None, {}, {})
     if variant and variant not in pipeline.variants:
         raise Refused(f"{root / 'pipeline.yaml'}: {unknown('variant', variant, pipeline.variants)}")
-    base = runs / (folder.name if folder else "")
     home = base.with_name(f"{base.name}@{variant}") if variant else base
-    one_folder_a_name(base, folder, root)
     profile, why = choose_profile(request.profile, found, [home / "profile", base / "profile"], pipeline)
-    given = (pipeline, found, profile, variant, parse_set(request.set, pipeline))
-    layers = layered(*given, {})
+    layer = (pipeline, found, profile, variant, parse_set(request.set, pipeline))
+    layers = layered(*layer, {})
     if request.budget or found.budget is not None:
         origin, text = ("budget", request.budget) if request.budget else (str(found.path), found.budget)
-        layers = layered(*given, shared_out(pipeline, layers.values, seconds_of(text, origin)))
+        layers = layered(*layer, shared_out(pipeline, layers.values, seconds_of(text, origin)))
     keys = frozenset(found.brings)
     return Job(
         root,
@@ -163,6 +177,29 @@ def one_folder_a_name(base: Path, folder: Path | None, root: Path) -> None:
             f"two scenes are called {folder.name!r}: {base} was made from {before}, and {folder} is asked for; "
             f"rename one folder, or make room with `make scene={shlex.quote(str(before))} clean`"
         )
+
+
+def take_frames(video: Path, folder: Path, root: Path, hashes: Hashes) -> None:
+    """A video's frames into a scene's folder, unless they are there.
+
+    Raises Refused where it is no such video, or the folder holds frames of another one, or things that people put there
+    for these frames as they were."""
+    content, taken = hashes.file(video), read_json(folder / TAKEN[0]) or {}
+    if taken.get("content") == content:
+        return
+    ours = [folder / name for name in TAKEN]
+    theirs = [path for path in files_below(folder) if path not in ours and path.parent != folder / "images"]
+    if taken and (theirs or taken["video"] != str(video)):
+        raise Refused(
+            f"{shown(folder)} holds frames of another video, {taken['video']} as it was"
+            + (f", and {shown(theirs[0])} for them" if theirs else "")
+            + "; rename the video, or move that folder away"
+        )
+    process = child(root, "frames", stdout=subprocess.PIPE)
+    said, _ = process.communicate(json.dumps({"video": str(video), "folder": str(folder), "content": content}))
+    if process.returncode:
+        raise Refused(said.strip() or f"{video}: its frames could not be taken (see above)")
+    say(said.strip())
 
 
 def child(root: Path, *arguments: str, **options: Any) -> subprocess.Popen[str]:

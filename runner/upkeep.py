@@ -9,13 +9,18 @@ from runner import Refused, say
 from runner.artifacts import discard, listed, recover, wear
 from runner.files import RECEIPT, files_below, locked, read_receipt, read_text, shown
 from runner.keys import HASHES, Hashes
-from runner.pipeline import NAME, Pipeline, find_scene, load_pipeline, unknown
-from runner.resolve import Request, one_folder_a_name
+from runner.pipeline import NAME, Pipeline, find_scene, load_pipeline, scene_name, unknown
+from runner.resolve import FRAMES, Request, one_folder_a_name
 
 RECORDS = ("profile", "source", "plan.json", "turntable.webm", "check.png")
 PAGES = (*(f"compare.{kind}" for kind in ("json", "csv", "md", "html")), "compare-runs.csv", "compare-runs.md",
          "compare/*.png", "adapted/sheet.png", "adapted/*/*.png", "adapted/adapted.json",
-         "sds-variance/sds_variance.json", "report/index.html", "report/*.png", "**/.*.writing")  # fmt: skip
+         "sds-variance/sds_variance.json", "report.html", "report/index.html", "report/*.png",
+         "frames/frames.json", "frames/frames.csv", "frames/images/frame_*.jpg",
+         "patch/patched.ply", "patch/new.ply",
+         "export/scene.ply", "export/scene.compressed.ply", "export/lora/pytorch_lora_weights.safetensors",
+         "export/cameras/transforms.json", "export/cameras/sparse_pc.ply", "export/cameras/sparse/0/*.bin",
+         "export/cameras/images/*.png", "**/.*.writing")  # fmt: skip
 WORKING = (".partial-*", ".copying-*", ".gone-*")
 
 
@@ -66,7 +71,7 @@ def clean(request: Request) -> None:
 def _homes(request: Request) -> list[Path]:
     """The folders that the runner made for a scene and its variants, or for one variant; none for a scene that is
     there and was not run. The scene may be gone."""
-    name, runs = Path(request.scene).name, request.runs
+    name, runs = scene_name(Path(request.scene).expanduser()), request.runs
     made = sorted(path.name for path in (runs.iterdir() if runs.is_dir() else ()) if _is_home(path))
     scenes = list(dict.fromkeys(each.partition("@")[0] for each in made))
     if not NAME.fullmatch(name):
@@ -74,12 +79,13 @@ def _homes(request: Request) -> list[Path]:
             f"scene={request.scene}: no scene has such a name; in {shown(runs)}: {', '.join(scenes) or 'none'}"
         )
     try:
-        folder = find_scene(request.scene, request.root)
+        scene = find_scene(request.scene, request.root)
     except Refused:
         if name not in scenes:
             raise Refused(f"{shown(runs)}: {unknown('scene', name, scenes)}") from None
     else:
-        one_folder_a_name(runs / folder.name, folder, request.root)
+        base = runs / scene_name(scene)
+        one_folder_a_name(base, base / FRAMES if scene.is_file() else scene, request.root)
     variants = [each for each in made if each.startswith(f"{name}@")]
     if request.variant and f"{name}@{request.variant}" not in variants:
         known = [each.partition("@")[2] for each in variants]

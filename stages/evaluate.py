@@ -111,7 +111,9 @@ def prepared(
     unseen = unseen_in(scene, captured, poses, masks) if tested else {}
     # Brought Gaussians may know more than these views do.
     if params.beyond and reaches_beyond(unseen) and not (poses / "gaussians.ply").exists():
-        gaussians |= finished(scene, gaussians, result)
+        # What was made up in views without pixels is as good as seen.
+        views = (*scene.train, *scene.blank) if needs["reference"] else scene.train
+        gaussians |= finished([scene.cameras[name] for name in views], gaussians, result)
     painter = paint2d.load(params.lama, params.device) if params.inpaint else None
     return Work(out, poses, masks, gaussians, result, painter, tested, unseen), counts
 
@@ -165,10 +167,9 @@ def reaches_beyond(unseen: dict[str, np.ndarray]) -> bool:
     return not unseen or float(np.mean([each.mean() for each in unseen.values()])) > LEAST_UNSEEN
 
 
-def finished(scene: Scene, gaussians: dict[str, Gaussians], result: str) -> dict[str, Gaussians]:
+def finished(cameras: list[Camera], gaussians: dict[str, Gaussians], result: str) -> dict[str, Gaussians]:
     """Stage -> its Gaussians completed by what lies beyond the capture: of the result, and of the initialization."""
     stages = [stage for stage in ("initialize", result) if stage in gaussians]
-    cameras = [scene.cameras[name] for name in scene.train]
     return {stage: beyond.completed(gaussians[stage], cameras) for stage in dict.fromkeys(stages)}
 
 

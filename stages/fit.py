@@ -12,6 +12,7 @@ import numpy as np
 
 from reffusion import seeding, trace
 from reffusion.capture import stereo, support
+from reffusion.fit import few
 from reffusion.fit.reconstruction import fit
 from reffusion.fit.start import initial_gaussians
 from reffusion.io.ply import load_ply, save_ply
@@ -32,23 +33,28 @@ def run(params: Params, out: Path, *, poses: Path) -> None:
     params = supported(params, scene)
     held_out = scene.train[params.holdout // 2 :: params.holdout] if params.holdout else ()
     cameras = [scene.cameras[name] for name in scene.train if name not in held_out]
-    images, params = load_views(poses, scene.train), capped(params, cameras)
+    images = load_views(poses, scene.train)
     hidden = hidden_pixels(poses, scene) if params.pixels == "unmasked" else {}
     images |= {name: paint2d.telea(images[name], mask) for name, mask in hidden.items()}  # flow looks at them too
-    if (out / trace.CHECKPOINT).exists():  # of what it starts from only the degree and the device still matter
-        points, colors = scene.points, scene.point_colors
+    params, first = capped(params, cameras), on_surfaces(params, scene, cameras, images, hidden)
+    rates = few.RATES if first is not None else None
+    if first is not None:
+        params = few.gently(params)
+    elif (out / trace.CHECKPOINT).exists():  # of what it starts from only the degree and the device still matter
+        first = start(params, scene.points, scene.point_colors)
     else:
-        points, colors = start_points(params, scene, cameras, images, hidden)
-    views = (cameras, images, start(params, points, colors))
+        first = start(params, *start_points(params, scene, cameras, images, hidden))
+    views = (cameras, images, first)
     weights = {name: (~mask).astype("float32") for name, mask in hidden.items()}
     spent, lasting = lambda: time.monotonic() - began, lambda steps: params.changed({"iterations": steps})
-    tried = lambda folder, steps: fit(*views, lasting(steps), folder=folder, weights=weights)
+    tried = lambda folder, steps: fit(*views, lasting(steps), folder=folder, weights=weights, rates=rates)
     steps = trace.affordable(out, params.iterations, params.seconds, spent, tried)
     gaussians = fit(
         *views,
         lasting(steps),
         folder=out,
         weights=weights,
+        rates=rates,
         held_out=[scene.cameras[name] for name in held_out],
         spent=spent(),
     )
@@ -59,13 +65,24 @@ def run(params: Params, out: Path, *, poses: Path) -> None:
 def supported(params: Params, scene: Scene) -> Params:
     """The parameters with no higher degree of spherical harmonics than the training views determine."""
     most = params.sh.degree
-    if not params.sh.limited:
+    if params.few_views == "as_many":
         return params
     degree, views = support.harmonics(scene.points, [scene.cameras[name] for name in scene.train], most)
     if degree == most:
         return params
     print(f"spherical harmonics of degree {degree}: a typical point is in {views} views", flush=True)
     return params.changed({"sh.degree": degree})
+
+
+def on_surfaces(params: Params, scene: Scene, cameras: list[Camera], images, hidden) -> Gaussians | None:
+    """The Gaussians to start from where few views see a typical point; None where there are enough, or too few points
+    that they show."""
+    if params.few_views != "surfaces" or support.views_of(scene.points, cameras) >= few.BELOW:
+        return None
+    found = few.surfaces(cameras, images, scene.points, scene.point_colors, hidden, params)
+    if found is not None:
+        print(f"few photographs: {len(found)} Gaussians on surfaces between {len(scene.points)} points", flush=True)
+    return found
 
 
 def hidden_pixels(poses: Path, scene: Scene) -> dict[str, np.ndarray]:

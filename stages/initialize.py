@@ -13,6 +13,7 @@ from reffusion import seeding, trace
 from reffusion.depth import behind, billboard, monocular
 from reffusion.depth.behind import Completion
 from reffusion.fit import exposure
+from reffusion.gaussians.sheets import Sheets
 from reffusion.initialize import coverage, filling, scatter
 from reffusion.initialize.settle import Known, settle
 from reffusion.io.arrays import load_json, load_labels, save_json, save_labels
@@ -133,7 +134,7 @@ def at_random(params: Params, removed, remaining, scene, sets, poses: Path):
 def filled(params: Params, out: Path, gaussians, new, reference, around, network, log, farthest=False):
     """The Gaussians with those of one reference, on what is still empty in its mask, and the labels."""
     camera, hidden = reference.camera, around.hidden[reference.camera.name]
-    sheets = filling.Sheets(gloss=params.gloss and not farthest)  # a sliver tells nothing of shine
+    sheets = Sheets(gloss=params.gloss and not farthest)  # a sliver tells nothing of shine
     hole = filling.to_fill(gaussians, new, reference, hidden, COVERED)
     remaining = gaussians.map(lambda p: p[~new])
     near, told = around.compared(camera, hole) if params.depth.sweep else (around, None)

@@ -16,10 +16,10 @@ from reffusion.capture.clicked import to_views
 from reffusion.clicks import everywhere
 from reffusion.clicks.marks import Clicks
 from reffusion.fit import exposure
-from reffusion.io.arrays import load_json, save_json, save_labels
+from reffusion.io.arrays import load_json, load_labels, save_json, save_labels
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_fill, load_raw_masks, load_scene, load_views, objects_of, save_mask_sets
-from reffusion.masks import regions, undecided, voting, witness
+from reffusion.masks import brought, regions, undecided, voting, witness
 from reffusion.masks.continuation import Plane, planes_around
 from reffusion.masks.regions import Filled, Region
 from reffusion.masks.voting import Votes, extent
@@ -31,27 +31,32 @@ from reffusion.types import Camera, Gaussians, MaskSet, Scene
 BURIED = 0.1  # blending weight in all views up to which a Gaussian votes by where it stands
 SPECK, GAP = 0.01, 0.02  # of the image's width: islands of a mask below this diameter go, holes in it close
 SEED = 0  # of the draws that find planes
+LOOKED_AT = 8  # views, with which Gaussians that the scene brings are compared
 
 
 def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
     scene, gaussians = load_scene(poses), load_ply(fit / "gaussians.ply").map(lambda p: p.to(params.device))
     train = [scene.cameras[name] for name in scene.train]
+    check_brought(poses, fit, gaussians, train)
     region = Region(**load_json(poses / "region.json")) if (poses / "region.json").exists() else None
     objects = objects_of(poses)
-    raw = load_raw_masks(poses, scene.train, params.remove)
-    if objects and not raw:
+    deleted = deleted_from(poses, params.device)  # stands for votes
+    raw = {} if deleted is not None else load_raw_masks(poses, scene.train, params.remove)
+    if deleted is None and objects and not raw:
         raise ValueError(f"{poses / 'masks'}: no view has a mask of each object; add empty ones where one is unseen")
     if params.clicks:
         raw = clicked(params, scene, gaussians, poses, raw)
     empty = {name: np.zeros((camera.height, camera.width), bool) for name, camera in scene.cameras.items()}
     ballots = {name: raw[name] for name in scene.train if name in raw} | {name: empty[name] for name in scene.clean}
     fill = Filled(region, load_fill(poses)) if params.invent != "undecided" else Filled(None, {})
-    if not raw and region is None and not fill.masks and not scene.blank:
+    if deleted is None and not raw and region is None and not fill.masks and not scene.blank:
         raise ValueError(f"{poses}: neither masks nor a region say what is to be changed: add masks, or a region")
 
     # Observation outside the masks is measured by weight, whatever the votes count.
     seen = voting.cast_votes(gaussians, train, ballots or empty, mode="weight")
-    if raw:
+    if deleted is not None:
+        labels = deleted.clone()
+    elif raw:
         labels = voted(params, gaussians, train, ballots, seen)
     elif region is None:
         labels = torch.zeros(len(gaussians), dtype=torch.bool, device=params.device)
@@ -65,7 +70,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
     hidden = {name: empty[name] if name in scene.clean else consistent[name] for name in scene.cameras}
     views = witness.witnesses(gaussians, train, hidden)
     planes = continuations(params, gaussians, labels, views)
-    if params.debris and raw:
+    if params.debris and (raw or deleted is not None):
         debris = witness.debris(gaussians, labels, views, hidden, exposure.load_views(poses, fit, scene.train))
         save_labels(out / "debris.npy", debris.cpu())
         labels |= debris
@@ -112,6 +117,22 @@ def clicked(
         if name in scene.train or everywhere.there(gaussians, camera, image, mask):
             masks[name] = mask
     return masks
+
+
+def deleted_from(poses: Path, device: str) -> Tensor | None:
+    """bool [N], what someone deleted from the Gaussians that the scene brings; None where nobody did."""
+    path = poses / "deleted.npy"
+    return load_labels(path).to(device) if path.exists() else None
+
+
+def check_brought(poses: Path, fit: Path, gaussians: Gaussians, train: list[Camera]) -> None:
+    """ValueError where the Gaussians that the scene brings are not in the frame of its cameras."""
+    if not (poses / "gaussians.ply").exists():
+        return
+    some = train[:: max(1, len(train) // LOOKED_AT)]
+    photos = {camera.name: exposure.load_views(poses, fit, [camera.name])[camera.name] for camera in some}
+    if wrong := brought.misplaced(gaussians, some, photos):
+        raise ValueError(f"{poses / 'gaussians.ply'}: `gaussians` of scene.yaml: {wrong}")
 
 
 def voted(

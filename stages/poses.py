@@ -12,19 +12,24 @@ import torch
 
 from reffusion import seeding, trace
 from reffusion.capture import frame, odd, sfm, stereo, support
+from reffusion.capture.layouts import cameras, ring
 from reffusion.capture.layouts.capture import Capture
+from reffusion.capture.lens import undoing
 from reffusion.capture.lenses import save_lenses
-from reffusion.capture.reading import read_scene
+from reffusion.capture.reading import check_brought, read_scene, unphotographed
 from reffusion.capture.refine import refined
 from reffusion.capture.roles import NONE, Roles
-from reffusion.capture.undistorted import check_masks, lens_of, load_at, save_undistorted
+from reffusion.capture.undistorted import check_masks, fitting_size, lens_of, load_at, save_undistorted
 from reffusion.capture.views import known
-from reffusion.io.arrays import save_json
+from reffusion.gaussians import matching
+from reffusion.io.arrays import save_json, save_labels
+from reffusion.io.files import BadInput
 from reffusion.io.images import image_size, save_image, save_mask
-from reffusion.io.ply import load_ply, save_ply
+from reffusion.io.ply import load_ply, load_points, properties_of, save_ply
 from reffusion.io.scene import load_raw_masks, load_views, save_scene
 from reffusion.masks import regions
 from reffusion.params.poses import Params
+from reffusion.splat.conventions import SH0
 from reffusion.types import Scene
 
 LEAST_POINTS = 100  # with fewer sparse points, some of optical flow are added to them
@@ -35,14 +40,19 @@ WARNINGS = "warnings.json"  # sentences
 
 def run(params: Params, out: Path, *, scene: Path) -> None:
     """Write images/, masks/, test_masks/, sparse/0/, lenses.json, transform.json, views.json; refine.json where cameras
-    were adjusted; gaussians.ply and region.json where the scene brings them; warnings.json where something is odd."""
+    were adjusted; gaussians.ply, deleted.npy and region.json where the scene brings them; warnings.json where
+    something is odd."""
+    deleted = _deleted(params, scene)  # before the work, not after it
+    if unphotographed(params, scene):
+        _save_unphotographed(params, out, scene, deleted)
+        return
     capture, roles = read_scene(params, scene)
     said = [*capture.warnings, *roles.warnings]
     sizes = {name: image_size(path, upright=capture.upright) for name, path in capture.pictures.items()}
     for files in (*roles.masks.values(), roles.fill):
         check_masks(files)
     if params.gaussians is not None:
-        load_ply(scene / params.gaussians)  # before the work, not after it
+        load_ply(scene / params.gaussians)
     if capture.poses is None:
         everyone, capture = sorted(capture.pictures), _place(params, out, capture)
         if lost := [name for name in everyone if name not in capture.pictures]:
@@ -70,10 +80,68 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
         filled = frame.filled_up(shown, ranges[: len(views)], MORE_POINTS, draws, lambda v: load_views(out, [v])[v])
         normalised = replace(filled, cameras=normalised.cameras)
     save_scene(out, normalised)
-    if params.gaussians is not None:  # in the scene's own frame
-        save_ply(out / "gaussians.ply", load_ply(scene / params.gaussians, normalised.similarity))
+    if params.gaussians is not None:
+        _save_brought(params, out, scene, normalised, deleted)
     if params.region is not None:
         _save_region(params, out, normalised)
+
+
+def _deleted(params: Params, scene: Path) -> np.ndarray | None:
+    """bool [N], those of the scene's Gaussians that the cleaned ones lack; None where it brings none."""
+    check_brought(params, scene)
+    if params.cleaned is None:
+        return None
+    files = scene / params.gaussians, scene / params.cleaned
+    whole, cleaned = (load_points(path)[0] for path in files)
+    for path, points in zip(files, (whole, cleaned), strict=True):
+        if not np.isfinite(points).all():
+            raise BadInput(f"{path}: positions that are not finite")
+    match = matching.matched(whole, cleaned)
+    if match.found < matching.SAME:
+        raise BadInput(
+            f"{files[1]}: of its splats {match.found:.0%} are where {files[0].name} has one: it is another scene, or "
+            "was moved, turned or scaled; only delete, and save it where it was"
+        )
+    if not match.deleted.any():
+        raise BadInput(f"{files[1]}: nothing was deleted: all splats of {files[0].name} are there")
+    turned = "" if min(match.turn) > 0 else ", and it was turned by 180 degrees"
+    strange = "" if match.found == 1 else f", and {1 - match.found:.1%} of its splats are new and left out"
+    print(f"{files[1].name}: {match.deleted.sum()} of {len(whole)} splats were deleted{turned}{strange}", flush=True)
+    return match.deleted
+
+
+def _save_brought(params: Params, out: Path, scene: Path, placed: Scene, deleted: np.ndarray | None) -> None:
+    """The scene's own Gaussians in the normalised frame, properties in the order of its file, and which of them were
+    deleted."""
+    path = scene / params.gaussians
+    save_ply(out / "gaussians.ply", load_ply(path, placed.similarity), properties=properties_of(path))
+    if deleted is not None:
+        save_labels(out / "deleted.npy", deleted)
+
+
+def _save_unphotographed(params: Params, out: Path, scene: Path, deleted: np.ndarray) -> None:
+    """The same without photographs: cameras that a capture left, or some around the hole; nothing in images/."""
+    gaussians = load_ply(scene / params.gaussians)
+    opaque = gaussians.opacity_logits.numpy() > 0
+    means, found = gaussians.means.double().numpy(), cameras.read(scene)
+    sizes = gaussians.log_scales.median(1).values.exp().numpy()
+    poses, source = found or (ring.cameras_around(means, sizes, opaque, deleted, params.longest), None)
+    some = np.flatnonzero(opaque)
+    draws = seeding.generator(SEED, "poses", "points of Gaussians")
+    some = some[torch.randperm(len(some), generator=draws)[:MORE_POINTS].numpy()]
+    colors = (255 * (0.5 + SH0 * gaussians.sh[some, 0]).clamp(0, 1)).round().byte().numpy()
+    poses = replace(poses, points=means[some], colors=colors)
+    at = {n: each.resized(*fitting_size(each.width, each.height, params.longest)) for n, each in poses.lenses.items()}
+    pinholes = {name: undoing(lens)[0] for name, lens in at.items()}
+    placed = frame.normalised(poses, pinholes, sorted(pinholes), (), frozenset())
+    save_lenses(out, pinholes, False, {n: (each.width, each.height) for n, each in pinholes.items()})
+    where = f"the {len(pinholes)} cameras of {source}" if source else f"{len(pinholes)} cameras around the hole"
+    _save_warnings(out, [
+        f"no photographs: {where} look at renders of {params.gaussians} instead; what it does not hold, or holds "
+        "blurred, stays so: with photographs results are sharper"
+    ])  # fmt: skip
+    save_scene(out, placed)
+    _save_brought(params, out, scene, placed, deleted)
 
 
 def _oddities(scene: Scene, out: Path) -> list[str]:

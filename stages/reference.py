@@ -16,7 +16,7 @@ from reffusion.fit import exposure
 from reffusion.io.arrays import load_json, load_labels, save_json, save_text
 from reffusion.io.images import save_image, save_mask
 from reffusion.io.ply import load_ply
-from reffusion.io.scene import load_mask_sets, load_object, load_scene, load_views, save_references
+from reffusion.io.scene import has_photograph, load_mask_sets, load_object, load_scene, load_views, save_references
 from reffusion.masks import taint
 from reffusion.paint import agreement, feedforward, painting, registration
 from reffusion.params.reference import Params
@@ -36,31 +36,34 @@ def run(params: Params, out: Path, *, scene: Path, poses: Path, fit: Path, masks
     candidates.png and candidates.json, where it is painted here."""
     placed, given = load_scene(poses), load_given(scene, placed_views(poses), params.reference)
     if given:
-        references = taken_over(given, placed, poses, fit, masks)
+        references, fits = taken_over(given, placed, poses, fit, masks)
     else:
-        references = [inpainted(params, out, placed, poses, fit, masks)]
+        references, fits = [inpainted(params, out, placed, poses, fit, masks)], {}
     save_references(out, references)
-    save_json(out / "facts.json", {"given": [each.camera.name for each in references] if given else []})
+    save_json(out / "facts.json", {"given": [each.camera.name for each in references] if given else [], "fits": fits})
     if params.reference is None:
         lay_out(out / TO_PAINT, [each.view for each in given], placed, poses, fit, masks)
 
 
-def taken_over(given: list[GivenReference], scene: Scene, poses: Path, fit: Path, masks: Path) -> list[Reference]:
+def taken_over(
+    given: list[GivenReference], scene: Scene, poses: Path, fit: Path, masks: Path
+) -> tuple[list[Reference], dict[str, str]]:
     """The scene's own references, each standing for the invent mask of its view, of a clean one for the consistent
-    mask, and exposed as its photograph is."""
-    references = []
+    mask, and exposed as its photograph is; and view name -> how well it fits its photograph, in words."""
+    references, fits = [], {}
     for each in given:
         sets = load_mask_sets(masks, [each.view])[each.view]
         # A clean photograph shows what elsewhere has to be invented.
         sets = replace(sets, invent=sets.consistent) if each.view in scene.clean else sets
         if sets.invent.any() or each.view in scene.clean:  # one without a hole teaches the prior all the same
-            references.append(fitted(each, sets, scene, poses, fit))
+            reference, fits[each.view] = fitted(each, sets, scene, poses, fit)
+            references.append(reference)
         else:
             print(f"reference {each.view} is left out: nothing has to be invented in its view")
     if not references:
         raise ValueError(f"{given[0].path}: in no reference's view anything has to be invented; choose other views")
     refuse_contradictions(references, scene, fit, masks)
-    return references
+    return references, fits
 
 
 def refuse_contradictions(references: list[Reference], scene: Scene, fit: Path, masks: Path) -> None:
@@ -80,12 +83,13 @@ def refuse_contradictions(references: list[Reference], scene: Scene, fit: Path, 
         )
 
 
-def fitted(given: GivenReference, sets: MaskSet, scene: Scene, poses: Path, fit: Path) -> Reference:
+def fitted(given: GivenReference, sets: MaskSet, scene: Scene, poses: Path, fit: Path) -> tuple[Reference, str]:
     """One of them, registered to its photograph: as it is where it is the photograph outside the object, else only the
-    hole of it, its shadow and a blended rim."""
+    hole of it, its shadow and a blended rim; and how it fits."""
     lenses, upright = load_lenses(poses)
     camera, lens = scene.cameras[given.view], lenses[given.view]
-    views = exposure.load_views(poses, fit, [given.view]) if given.painted else load_views(poses, [given.view])
+    as_photographed = not given.painted and has_photograph(poses, given.view)
+    views = load_views(poses, [given.view]) if as_photographed else exposure.load_views(poses, fit, [given.view])
     photo, hidden = views[given.view], sets.raw | sets.consistent | sets.invent
     image, inside = load_straight(given, lens, upright)
     found = registration.register(image, photo, hidden)
@@ -108,7 +112,7 @@ def fitted(given: GivenReference, sets: MaskSet, scene: Scene, poses: Path, fit:
     depth = load_straight_depth(given, lens, upright, found.moved)
     if depth is not None:  # where it is in the scene's own unit, it is in this frame's now
         depth = depth * scene.similarity.scale
-    return Reference(camera, image, sets.invent & inside & drawn, depth)
+    return Reference(camera, image, sets.invent & inside & drawn, depth), str(found)
 
 
 def lay_out(folder: Path, painted: list[str], scene: Scene, poses: Path, fit: Path, masks: Path) -> None:

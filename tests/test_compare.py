@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import visiting
 
 from report import compare as page
 from report import curves, job, loading, pictures, results, scenes
@@ -417,18 +418,28 @@ def test_report_of_a_job(compared, home):
     plan_of(compared, home.parent)
     path = job.make(home)
     html = path.read_text()
-    assert {p.name for p in path.parent.glob("*.png")} == {"sheet.png", "job.png", "distill.png"}
+    assert path == home / "report.html" and not list(home.glob("report*/*"))
+    sources = re.findall(r'src="([^"]*)"', html)
+    assert len(sources) == 4 * 2 + 2 and all(source.startswith("data:image/") for source in sources)
+    assert html.count("data:image/png") == 2, "the whole job, and the trace of distill"
     assert "101 Gaussians; 23.65 dB and FLIP 0.150" in html
     targets = re.findall(r'href="([^"]*)"', html)
     assert len(targets) == 3 and all((path.parent / target).exists() for target in targets)
     assert "What was left out or taken over, and why" in html and "http" not in html
+    assert "make scene=" in html and "profile=laptop all" in html and "set by hand" not in html
+    receipt = json.loads((home / "distill/receipt.json").read_text())
+    receipt["params"]["gain"] = 2  # as set="distill.gain=2" would have left it
+    (home / "distill/receipt.json").write_text(json.dumps(receipt))
+    html = job.make(home).read_text()
+    assert "set by hand" in html and "profile=laptop set=distill.gain=2 all" in html
 
 
 def test_report_of_a_variant_says_what_was_left_out(compared, home):
     plan_of(compared, home.parent, "--variant", "none")
     html = job.make(home.with_name("toy@none")).read_text()
     assert re.search(r"<td>distill</td><td[^>]*>left.out</td><td[^>]*>no gain</td>", html)
-    assert "shared with toy" in html and "distill.png" not in html
+    assert "shared with toy" in html and "distill: error against seconds" not in html
+    assert "profile=laptop variant=none all" in html
 
 
 def test_report_with_pieces_missing(home):
@@ -437,6 +448,7 @@ def test_report_with_pieces_missing(home):
         file.write('{"seconds": 1.0, "iteration": 9}\n')
     html = job.make(home).read_text()
     assert "It is not evaluated yet." in html and "None yet: " in html and "Not drawn: " in html
+    assert "Still to run, or to run again: fit, evaluate." in html
     (home / "distill/trace.jsonl").unlink()
     assert "Not drawn" not in job.make(home).read_text()
     for stage in ("distill", "poses"):
@@ -460,3 +472,23 @@ def test_a_job_that_failed_is_still_reported(home):
     for stage in ("distill", "evaluate"):
         shutil.rmtree(home / stage)
     assert "in 1 stages. It is not evaluated yet." in job.make(home.with_name("toy@bad")).read_text()
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_the_report_is_walked_through_in_a_browser(compared, home, width):
+    plan_of(compared, home.parent)
+    with visiting(job.make(home).as_uri(), width) as page:
+        view, left, right = page.locator(".compare select").all()
+        names = [option.inner_text() for option in view.locator("option").all()]
+        shown = lambda: [pair.get_attribute("data-view") for pair in page.locator(".pair:visible").all()]
+        assert len(names) > 1 and shown() == names[:1]
+        page.get_by_label("next view").click()
+        assert shown() == [names[1]]
+        first = "document.querySelector('.pair:not([hidden])')"
+        at = lambda: float(page.evaluate(f"{first}.style.getPropertyValue('--at')").rstrip("%"))
+        stage = page.locator(".pair:visible .stage").bounding_box()
+        page.mouse.click(stage["x"] + 0.8 * stage["width"], stage["y"] + 0.5 * stage["height"])
+        assert at() == pytest.approx(80, abs=4)
+        right.select_option(left.input_value())
+        assert page.locator(".pair:visible img.left.right").count() == 1
+        assert page.evaluate("document.documentElement.scrollWidth") <= width, "nothing is wider than the screen"

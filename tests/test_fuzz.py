@@ -304,6 +304,10 @@ def test_spoilt_files_for_long(name):
 # Reader -> files that once came through as another error, base64.
 FOUND: dict[str, tuple[str, ...]] = {
     "cameras.txt": (base64.b64encode(b"9" * 2000 + b" PINHOLE 0 9 9 9 6 4.5\n").decode(),),
+    "p.png": (
+        "iVBORw0KGgoAAAANSUhEUgAAAAwAQAAJAQAAAAAHXjIUAAAAJElEQVR4nGOIYmB0lWY8dorRTonp9wWGRwoMPgeYvBgY5D4A"
+        "AGRfB+OsiEFuAAAAAElFTkSuQmCC",
+    ),  # 50 MP declared in 93 bytes: over 10 s on a starved machine
 }
 
 

@@ -23,6 +23,7 @@ DOORS = {
     "transformers": ("reffusion/prior/model.py", "reffusion/depth/monocular.py"),
     "huggingface_hub": ("reffusion/weights/download.py",),
     "onnxruntime": ("reffusion/paint/onnx_model.py",),
+    "gsply": ("reffusion/io/compressed.py",),
 }
 OPENERS = {"open", "read_text", "write_text", "read_bytes", "write_bytes", "imread", "imwrite", "imsave", "savez"}
 MAY_OPEN = ("reffusion/io/", "reffusion/capture/", "reffusion/trace.py")
@@ -171,8 +172,8 @@ def test_the_command_starts_at_once():
 @pytest.mark.parametrize("path", sources("report"), ids=named)
 def test_report_reads_through_io(path):
     own = {name for name in imports(path) if name.split(".")[0] in OWN - {"report"}}
-    draws = named(path) in ("report/flight.py", "report/turntable.py", "report/view.py")
-    drawing = ("reffusion.splat.rasterizer", "reffusion.types") if draws else ()
+    draws = ("flight", "turntable", "view", "drawn", "layers", "unseen")
+    drawing = ("reffusion.splat.rasterizer", "reffusion.types", "reffusion.score.sight") if path.stem in draws else ()
     assert all(name.startswith(("reffusion.io", *drawing)) for name in own), own
 
 

@@ -10,6 +10,7 @@ import torch
 from reffusion import geometry
 from reffusion.depth import behind
 from reffusion.depth.behind import Completion
+from reffusion.gaussians.sheets import Sheets
 from reffusion.gaussians.surfels import surface_gaussians, surface_normals
 from reffusion.initialize import coverage
 from reffusion.initialize import filling as rules
@@ -24,7 +25,7 @@ from reffusion.types import Camera, Reference
 from stages import initialize, masks
 
 NEAR = 1.7
-SHEETS = rules.Sheets()
+SHEETS = Sheets()
 
 
 @pytest.fixture(scope="module")

@@ -32,7 +32,6 @@ FIXED = {
     "fit.densify.stop": 15_000 / 30_000,
     "fit.densify.every": 100,
     "fit.densify.grow_grad2d": 2e-4,
-    "fit.densify.prune_opa": 0.005,
     "fit.densify.reset_every": 3000 / 30_000,
     "fit.lr.means": 1.6e-4,
     "fit.lr.means_unit": "cameras",
@@ -79,7 +78,7 @@ FIXED = {
 ABSENT = {
     "poses.detail": 0,
     "poses.refine": False,
-    "fit.sh.limited": False,
+    "fit.few_views": "as_many",
     "fit.init.flow_cell": 0,
     "fit.densify.per_pixel": 0,
     "masks.tidy": False,

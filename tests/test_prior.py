@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors import safe_open
+from safetensors.torch import save_file
 
+from reffusion.io.lora import save_portable
 from reffusion.prior import diffusion, fill, lora
 from reffusion.prior.model import CONDITIONING, load_prior, make_prior
 from reffusion.seeding import generator
@@ -143,6 +145,17 @@ def test_saved_lora_gives_the_trained_epsilon_in_a_fresh_diffusers_pipeline(tiny
     fresh = make_prior(pipe.unet, pipe.vae, pipe.text_encoder, pipe.tokenizer, pipe.scheduler)
     loaded = diffusion.raw_prediction(fresh, noisy, t, condition, diffusion.embed_text(fresh, ["A photo of sks"]))
     assert (loaded - trained).abs().max() < 1e-5
+
+    save_portable(tmp_path / lora.LORA_FILE, tmp_path / "out" / "portable.safetensors")
+    with safe_open(tmp_path / "out" / "portable.safetensors", "pt") as file:
+        assert all(key.startswith(("unet.", "text_encoder.text_model.")) for key in file.keys())
+        bare = {key: file.get_tensor(key) for key in file.keys()}
+    save_file(bare, tmp_path / "out" / "bare.safetensors")  # as a tool reads it that knows no configuration: B A
+    for name in ("portable", "bare"):
+        pipe.unload_lora_weights()
+        pipe.load_lora_weights(tmp_path / "out", weight_name=f"{name}.safetensors")
+        loaded = diffusion.raw_prediction(fresh, noisy, t, condition, diffusion.embed_text(fresh, ["A photo of sks"]))
+        assert (loaded - trained).abs().max() < 1e-5
 
     merged = lora.merged(plain, tmp_path)
     again = diffusion.raw_prediction(merged, noisy, t, condition, diffusion.embed_text(merged, ["A photo of sks"]))

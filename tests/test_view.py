@@ -10,12 +10,12 @@ import small_scene
 import torch
 
 from reffusion.io.arrays import save_json, save_labels
-from reffusion.io.images import save_image
+from reffusion.io.images import save_image, save_mask
 from reffusion.io.ply import save_ply
-from reffusion.io.scene import save_scene
+from reffusion.io.scene import load_scene, save_scene
 from reffusion.splat import rasterizer
 from reffusion.types import Scene, Similarity
-from report import view
+from report import layers, unseen, view
 
 SIMILARITY = Similarity(2.0, np.array([0.1, 0.2, 0.3]))
 NEEDS = {"poses": "a", "fit": "b", "masks": "c", "initialize": "d", "distill": "e", "lift": None}
@@ -31,8 +31,9 @@ def finished(home, needs):
     save_scene(poses, scene)
     for name in small_scene.TRAIN:
         save_image(poses / "images" / f"{name}.png", small_scene.photo(train[name]))
-    for stage in ("fit", "initialize", "distill"):
-        save_ply(home / stage / "gaussians.ply", gaussians)
+    for stage in ("fit", "masks", "initialize", "distill"):
+        if stage != "masks":
+            save_ply(home / stage / "gaussians.ply", gaussians)
         if stage != "fit":
             save_labels(home / stage / "labels.npy", labels)
     shown = gaussians if needs["distill"] else gaussians.map(lambda p: p[~labels])
@@ -61,16 +62,47 @@ def test_a_visitor_who_stands_at_a_view_sees_that_view():
 
 def test_the_layers_are_those_that_the_result_was_made_from(tmp_path):
     gaussians, labels = finished(tmp_path / "x", NEEDS)
-    found = view.layers(tmp_path / "x", SIMILARITY)
-    assert list(found) == ["result", "before distillation", "as photographed"]
-    assert torch.allclose(found["result"].gaussians.means, gaussians.means, atol=1e-6)
-    assert len(found["result"].shown(there=True, added=True)) == len(gaussians)
-    assert len(found["result"].shown(there=False, added=True)) == int(labels.sum())
-    assert len(found["as photographed"].shown(there=False, added=True)) == 0
+    added, kept = int(labels.sum()), int((~labels).sum())
+    save_ply(tmp_path / "x/distill/snapshots/20.ply", gaussians.map(lambda p: p[labels]))
+    save_ply(tmp_path / "x/distill/snapshots/100.ply", gaussians.map(lambda p: p[labels][:3]))
+    found = layers.load_layers(tmp_path / "x", SIMILARITY)
+    assert list(found.states) == ["initialization", "step 20", "step 100", "result"]
+    count = lambda state, **parts: len(found.shown(state, **{"kept": False, "added": False, "removed": False} | parts))
+    for state, new in (("initialization", added), ("step 20", added), ("step 100", 3), ("result", added)):
+        assert count(state, kept=True) == kept and count(state, added=True) == new
+        assert count(state, removed=True) == added, "what the stage masks labelled of the fit"
+        assert count(state, kept=True, added=True, removed=True) == kept + new + added and count(state) == 0
+    assert torch.equal(found.states["result"][1].opacity_logits, gaussians.opacity_logits[labels])
     finished(tmp_path / "x@remove", NEEDS | {"initialize": None, "distill": None})
-    assert list(view.layers(tmp_path / "x@remove", SIMILARITY)) == ["result"]
+    alone = layers.load_layers(tmp_path / "x@remove", SIMILARITY)
+    assert list(alone.states) == ["result"] and len(alone.states["result"][1]) == 0 and len(alone.removed) == added
     with pytest.raises(ValueError, match="make scene=x variant=no_sds all"):
-        view.layers(tmp_path / "x@no_sds", SIMILARITY)
+        layers.load_layers(tmp_path / "x@no_sds", SIMILARITY)
+
+
+def test_what_evaluate_adds_beyond_the_capture_counts_as_kept(tmp_path):
+    """And what it leaves out is missing from either."""
+    gaussians, labels = finished(tmp_path / "x", NEEDS)
+    backdrop = gaussians.map(lambda p: p[:5] + 3)
+    fewer = gaussians.map(lambda p: p[1:]).zipped(backdrop, lambda a, b: torch.cat([a, b]))
+    save_ply(tmp_path / "x/evaluate/scene.ply", fewer, similarity=SIMILARITY)
+    kept, added = layers.load_layers(tmp_path / "x", SIMILARITY).states["result"]
+    assert len(kept) + len(added) == len(fewer) and len(added) == int(labels[1:].sum())
+
+
+def test_what_no_photograph_shows_is_hatched(tmp_path):
+    gaussians, _ = finished(tmp_path / "x", NEEDS)
+    scene = load_scene(tmp_path / "x/poses")
+    shape = next(iter(scene.cameras.values()))
+    for name in scene.train:  # all of them hide what lies on the left
+        save_mask(tmp_path / f"x/masks/consistent/{name}.png", np.indices((shape.height, shape.width))[1] < 12)
+    seen_by = unseen.photographed(tmp_path / "x", scene)
+    camera = scene.cameras[scene.train[0]]
+    drawn = view.picture(gaussians, camera)
+    noted = unseen.noted(drawn, gaussians, camera, seen_by)
+    changed = (noted != drawn).any(-1)
+    assert changed[: camera.height // 2, :8].mean() > 0.15 and not changed[: camera.height // 2, -20:].any()
+    assert unseen.photographed(tmp_path / "y", scene) == []
 
 
 def test_nothing_is_served_of_a_scene_that_is_not_there(tmp_path):
@@ -104,8 +136,8 @@ def test_a_visitor_gets_a_small_picture_at_once_then_the_whole_and_another_when_
     window._visit(guest)
     wait(lambda: len(drawn) == 2)
     assert [image.shape[0] for image in drawn] == [view.MOVING, view.STILL]
-    assert np.array_equal(drawn[-1], view.picture(window.shown, view.camera_of(camera, view.STILL)))
-    there = next(h for h in window.server.gui._gui_input_handle_from_uuid.values() if h.label == "what was there")
+    assert np.array_equal(drawn[-1], window._drawn(view.camera_of(camera, view.STILL), camera))
+    there = next(h for h in window.server.gui._gui_input_handle_from_uuid.values() if h.label == "what was kept")
     there.value = False
     wait(lambda: len(drawn) == 4)
     assert drawn[-1].mean() < drawn[1].mean(), "the wall is gone"

@@ -108,7 +108,7 @@ def fit_of_nobody() -> float:
     """A fit whose pruning takes everything says so, with the step."""
     scene = frames.normalised(1.0, 0.0)
     start = initial_gaussians(scene.points, scene.point_colors, 0, 1000, seeding.generator(0))
-    densify = Densify(start=0.0, stop=1.0, every=4, prune_opa=0.999, grow_grad2d=1e9)
+    densify = Densify(start=0.0, stop=1.0, every=4, prune_scale3d=1e-9, grow_grad2d=1e9)
     settings = Params(iterations=8, sh=SphericalHarmonics(degree=0), densify=densify)
     with tempfile.TemporaryDirectory() as folder:
         try:

@@ -5,7 +5,7 @@ A made scene brings its views in the order in which they are given pixels, the f
 
   personalization   the photographs teach the prior, and nothing else: Gaussians start at the sparse points
   both              they also are reconstructed: the method as it is
-  plain 3DGS        a fit to them, and no more: the variant `remove_only`
+  plain 3DGS        a fit to them from points, and no more: the variant `remove_only`
 
 Whole test views are scored. Writes sparse.json and sparse.png to --out; jobs that are done are not run again. Several
 scenes, of several seeds: a curve is their mean.
@@ -30,10 +30,14 @@ ROOT = Path(__file__).resolve().parents[2]
 COUNTS = (1, 2, 4, 8)
 SCORES = {"psnr_full": "PSNR (dB)", "flip_full": "FLIP"}
 BOTH, PLAIN, TAUGHT = "both", "plain 3DGS", "personalization"
+POINTS = "fit.few_views=fewer_harmonics"  # a fit starts from points
 WAYS = {
-    TAUGHT: ("--set=fit.iterations=1 initialize.settle=0 distill.reconstruction.every=0 distill.reference.weight=0",),
+    TAUGHT: (
+        f"--set={POINTS} fit.iterations=1 initialize.settle=0 distill.reconstruction.every=0 "
+        "distill.reference.weight=0",
+    ),
     BOTH: (),
-    PLAIN: ("--variant=remove_only",),
+    PLAIN: ("--variant=remove_only", f"--set={POINTS}"),
 }
 COLOURS = {TAUGHT: charts.GREEN, BOTH: charts.BLUE, PLAIN: charts.ORANGE}
 

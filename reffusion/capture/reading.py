@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from reffusion.capture.layouts.capture import Capture, pictures_in
 from reffusion.capture.clicked import check_clicks
+from reffusion.capture.given import listed
+from reffusion.capture.layouts.cameras import has_pictures
+from reffusion.capture.layouts.capture import Capture, pictures_in
 from reffusion.capture.lens import without_distortion
 from reffusion.capture.load import load_capture
-from reffusion.capture.roles import Roles, load_roles, masks_of
+from reffusion.capture.roles import NONE, Roles, load_roles, masks_of
 from reffusion.capture.views import known
 from reffusion.io.files import BadInput, there
 from reffusion.io.ply import check_gaussians
@@ -27,7 +29,7 @@ def read_scene(params: Params, scene: Path) -> tuple[Capture, Roles]:
         train=params.train,
         test=params.test,
         clean=params.clean,
-        region=params.region is not None or params.fill is not None or params.clicks is not None,
+        region=not (params.region is params.fill is params.cleaned is params.clicks is None),
         cameras_only=params.cameras_only,
         remove=params.remove,
     )
@@ -37,12 +39,43 @@ def read_scene(params: Params, scene: Path) -> tuple[Capture, Roles]:
         known(params.region.view, {*roles.train, *roles.test}, "region")
     if params.clicks:
         check_clicks(params.clicks, capture, roles)
-    if params.gaussians is not None:
-        if not there(scene / params.gaussians):
-            raise BadInput(f"{scene / params.gaussians}: no such file; correct `gaussians` in scene.yaml")
-        check_gaussians(scene / params.gaussians)
+    check_brought(params, scene)
     _check_lenses(capture)
     return capture, roles
+
+
+def check_brought(params: Params, scene: Path) -> None:
+    """BadInput where the Gaussians that the scene brings cannot be used, as far as their headers tell."""
+    counts = {}
+    for key, name in (("gaussians", params.gaussians), ("cleaned", params.cleaned)):
+        if name is not None:
+            if not there(scene / name):
+                raise BadInput(f"{scene / name}: no such file; correct `{key}` in scene.yaml")
+            counts[key] = check_gaussians(scene / name)
+            if not counts[key]:
+                why = ": everything was deleted; delete the object only" if key == "cleaned" else ""
+                raise BadInput(f"{scene / name}: it holds no Gaussians{why}")
+    if params.cleaned is None:
+        return
+    if params.gaussians is None:
+        raise BadInput("scene.yaml: cleaned: name the scene before anything was deleted too, as `gaussians`")
+    if counts["cleaned"] >= counts["gaussians"]:
+        raise BadInput(
+            f"{scene / params.cleaned}: {counts['cleaned']} splats, and {scene / params.gaussians} has "
+            f"{counts['gaussians']}: nothing was deleted; delete the object in an editor, and save what is left"
+        )
+
+
+def unphotographed(params: Params, scene: Path) -> bool:
+    """Are there no photographs, and a cleaned scene whose renders can stand for them? BadInput for a key that is about
+    photographs."""
+    named = [each.image for each in listed(params.reference)]
+    if params.cleaned is None or params.images is not None or has_pictures(scene, frozenset(named)):
+        return False
+    for key in ("test_masks", "train", "test", "cameras_only", "fill", "remove", "region", "clean", "masks"):
+        if (said := getattr(params, key)) and said != NONE:
+            raise BadInput(f"scene.yaml: {key}: the scene has no photographs; add them, or remove the key")
+    return True
 
 
 def _to_fill(folder: Path, capture: Capture, roles: Roles) -> dict[str, Path]:

@@ -12,6 +12,7 @@ import numpy as np
 from reffusion.capture.layouts.capture import Poses
 from reffusion.capture.lens import from_colmap
 from reffusion.io.files import BadInput
+from reffusion.io.images import HEIC, focal_of_heic
 from reffusion.types import Camera
 
 LEAST_VIEWS = 3
@@ -110,6 +111,8 @@ def focal_of(photograph: Path) -> float | None:
     """Focal length over the longer side, from EXIF and COLMAP's table of sensors; None where unknown."""
     import pycolmap
 
+    if photograph.suffix.lower() in HEIC:  # which COLMAP does not read
+        return focal_of_heic(photograph)
     camera = pycolmap.infer_camera_from_image(photograph)
     return camera.mean_focal_length() / max(camera.width, camera.height) if camera.has_prior_focal_length else None
 

@@ -37,14 +37,19 @@ def _octaves(image: np.ndarray) -> float:
     return float(power[frequency >= 0.25].sum() / below) if below > 0 else np.inf
 
 
-def harmonics(points: np.ndarray, cameras: Sequence[Camera], most: int) -> tuple[int, int]:
-    """The highest degree of spherical harmonics, at most `most`, whose (degree + 1)^2 coefficients a typical point's
-    views determine; and in how many views that point is (the median over points [P, 3])."""
+def views_of(points: np.ndarray, cameras: Sequence[Camera]) -> int:
+    """In how many views a typical point is: the median over points [P, 3]; all where there are none."""
     seen = np.zeros(len(points), int)
     for camera in cameras:
         uv, z = geometry.project(points, camera)
         with np.errstate(invalid="ignore"):
             framed = (uv >= 0).all(-1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
         seen += framed & (z > 0)
-    views = int(np.median(seen)) if len(points) else len(cameras)
+    return int(np.median(seen)) if len(points) else len(cameras)
+
+
+def harmonics(points: np.ndarray, cameras: Sequence[Camera], most: int) -> tuple[int, int]:
+    """The highest degree of spherical harmonics, at most `most`, whose (degree + 1)^2 coefficients a typical point's
+    views determine; and in how many views that point is (the median over points [P, 3])."""
+    views = views_of(points, cameras)
     return min(most, max(isqrt(views) - 1, 0)), views

@@ -64,7 +64,8 @@ def refined(image: np.ndarray, mask: np.ndarray, marks: np.ndarray) -> np.ndarra
         return mask
     band = max(1, round(BAND * max(mask.shape)))
     inner, outer = shrunk(mask, band), ~shrunk(~mask, band)
-    window = tuple(slice(max(0, each.min() - MARGIN * band), each.max() + MARGIN * band + 1) for each in np.nonzero(outer))
+    reach = MARGIN * band
+    window = tuple(slice(max(0, each.min() - reach), each.max() + reach + 1) for each in np.nonzero(outer))
     state = np.where(mask, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     state[inner | (marks == OBJECT)], state[~outer | (marks == OTHER)] = cv2.GC_FGD, cv2.GC_BGD
     cut, models = state[window].copy(), (np.zeros((1, 65)), np.zeros((1, 65)))

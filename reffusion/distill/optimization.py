@@ -18,6 +18,7 @@ from reffusion.distill.steps import Job, job_of, step_of
 from reffusion.gaussians.densify import densify, prune
 from reffusion.gaussians.optimize import GaussianOptimizer, Rates
 from reffusion.geometry import cameras_extent
+from reffusion.io.ply import save_ply
 from reffusion.params.distill import Densify, LearningRates, Params
 from reffusion.prior.model import Prior
 from reffusion.splat.rasterizer import render
@@ -25,6 +26,7 @@ from reffusion.types import Camera, Gaussians
 
 GROW_SCALE3D = 0.01  # standard deviation from which a Gaussian is split, not cloned
 PRUNE_OPA = 0.005  # fainter Gaussians are pruned when others are added
+SNAPSHOTS = 4  # parts of the run, after each but the last of which the masked Gaussians are kept
 REGION_EVERY = 50  # steps between prunings of Gaussians that changed region
 
 
@@ -49,11 +51,11 @@ def distill(
         holes: (camera, image [H, W, 3] in [0, 1], hole [H, W] bool) of each reference.
         prior: adapted to the reference; None where there is neither SDS nor the depth term.
         text: [3, L, D], hidden states of the global, the local and the empty prompt.
-        folder: gets trace.jsonl and checkpoints. A line of the trace: reconstruction and lift (those terms' values),
-            reference_psnr (in the references' holes), sds_gradient_mean and _max (norm of the weighted SDS gradient
-            per masked Gaussian in that step; none where its view was too far from a reference), depth (the last depth
-            term's value), depth_skipped_<reason> (how often it was left out so far), adversarial (the generator's
-            loss), critic_loss, critic_slope (R1 before its weight), gaussians, masked_gaussians.
+        folder: gets trace.jsonl, checkpoints, and snapshots/ of the masked Gaussians. A line of the trace:
+            reconstruction and lift (those terms' values), reference_psnr (in the references' holes),
+            sds_gradient_mean and _max (norm of the weighted SDS gradient per masked Gaussian; none where its view was
+            too far from a reference), depth (the last depth term's value), depth_skipped_<reason> (how often so far),
+            adversarial (the generator's loss), critic_loss, critic_slope (R1 unweighted), gaussians, masked_gaussians.
         estimator: of the depth term; None where there is none.
         distance: of patches, for the perceptual loss of lifted pictures.
         rates: Adam's step sizes; None: 3DGS's, by `settings.lr.means_unit`.
@@ -68,8 +70,8 @@ def distill(
     optimizer = GaussianOptimizer(initial, masked, rates, masked_factors(settings.lr), epsilon=settings.lr.epsilon)
     region = region_of(initial.means, masked) if settings.confined and masked.any() else None
     run = _Run.begun(optimizer, job, trace.load_checkpoint(folder))
-    log = trace.Trace(folder, run.seconds, run.step + bool(run.step))  # a line is numbered by the steps done
     checkpoints = trace.Checkpoints(folder, settings.checkpoint_seconds)
+    log = trace.Trace(folder, run.seconds, run.step + bool(run.step))  # a line is numbered by the steps done
     if run.step == 0:
         _write_line(log, run, {})
 
@@ -83,10 +85,19 @@ def distill(
             optimizer.select(~changed_region(region, optimizer.gaussians.means.detach(), optimizer.masked))
         if trace.log_spaced(done, settings.iterations, per_octave=4):
             _write_line(log, run, line)
+        _save_snapshot(optimizer, folder, done, settings.iterations)
         if checkpoints.due:
             run.seconds = log.seconds
             checkpoints.save(run.state_dict)
     return optimizer.gaussians.map(Tensor.detach), optimizer.masked
+
+
+def _save_snapshot(optimizer: GaussianOptimizer, folder: Path, done: int, steps: int) -> None:
+    """The masked Gaussians after each part of the run but the last, to look at: folder/snapshots/<steps done>.ply."""
+    part, masked = SNAPSHOTS * done // steps, optimizer.masked
+    if SNAPSHOTS * (done - 1) // steps < part < SNAPSHOTS and masked.any():
+        path = folder / "snapshots" / f"{done}.ply"
+        save_ply(path, optimizer.gaussians.map(lambda parameter: parameter.detach()[masked].cpu()))
 
 
 def rates_of(lr: LearningRates, cameras: Sequence[Camera]) -> Rates:

@@ -6,7 +6,7 @@ direction; with it they have one exposure, and the photographs are brought to th
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from reffusion.io.images import to_uint8
+from reffusion.splat import rasterizer
 
 FILE = "exposures.json"
 RATE, RATE_LAST = 1e-2, 1e-3  # Adam's step size at the start and at the end
@@ -66,10 +67,27 @@ class Exposures:
 
 
 def load_views(poses: Path, fit: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
-    """View name -> uint8 [H, W, 3], `normalised`."""
+    """View name -> uint8 [H, W, 3], `normalised`; of a scene without photographs what the Gaussians of the folder `fit`
+    show, the object too."""
     from reffusion.io import scene
 
-    return {name: normalised(image, fit, name) for name, image in scene.load_views(poses, names).items()}
+    names = list(names)
+    there = [name for name in names if scene.has_photograph(poses, name)]
+    photos = {name: normalised(image, fit, name) for name, image in scene.load_views(poses, there).items()}
+    drawn = rendered(poses, fit, [name for name in names if name not in photos])
+    return {name: (photos | drawn)[name] for name in names}
+
+
+@torch.no_grad()
+def rendered(poses: Path, fit: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """View name -> uint8 [H, W, 3], as the Gaussians of the folder `fit` show it."""
+    from reffusion.io.ply import load_ply
+    from reffusion.io.scene import load_scene
+
+    if not names:
+        return {}
+    gaussians, cameras = load_ply(fit / "gaussians.ply"), load_scene(poses).cameras
+    return {name: to_uint8(rasterizer.render(gaussians, cameras[name]).color.numpy()) for name in names}
 
 
 def normalised(image: np.ndarray, fit: Path, name: str) -> np.ndarray:

@@ -188,7 +188,7 @@ def _summary(
 def _check(gaussians: Gaussians, step: int, camera: Camera, values: bool) -> None:
     """Refuse to go on without Gaussians, or, where `values` are looked at, with some that are not finite."""
     if not len(gaussians):
-        remedy = "lower densify.prune_opa, or raise densify.prune_scale3d"
+        remedy = "raise densify.prune_scale3d"
         raise ValueError(f"fit, step {step}: pruning left no Gaussian: {remedy}")
     for name in PARAMETERS if values else ():
         if not torch.isfinite(getattr(gaussians, name).detach()).all():

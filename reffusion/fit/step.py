@@ -17,6 +17,7 @@ from reffusion.params.fit import LearningRates, Params
 from reffusion.splat.rasterizer import render
 from reffusion.types import Camera
 
+PRUNE_OPA = 0.005  # 3DGS's: fainter Gaussians are pruned
 GROW_SCALE3D = 0.01  # deviation / distance from which on a Gaussian is split, not cloned
 
 
@@ -97,7 +98,7 @@ def adapt(optimizer: GaussianOptimizer, centers: Tensor, started_with: int, sett
         away = viewing_distance(optimizer.gaussians.means, centers)
         densify(optimizer, schedule.grow_grad2d, GROW_SCALE3D * away, allowed, noise)
         away = viewing_distance(optimizer.gaussians.means, centers)
-        prune(optimizer, schedule.prune_opa, schedule.prune_scale3d * away)
+        prune(optimizer, PRUNE_OPA, schedule.prune_scale3d * away)
     period = round(schedule.reset_every * settings.iterations)
     if period and done % period == 0:
         optimizer.cap_opacity(0.01)

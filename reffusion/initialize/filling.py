@@ -13,7 +13,7 @@ from reffusion import geometry, trace
 from reffusion.depth import behind, estimates
 from reffusion.depth.behind import NO_HINTS, Completion, Hints
 from reffusion.depth.solverlog import SolverLog
-from reffusion.gaussians.surfels import surface_gaussians
+from reffusion.gaussians.sheets import Sheets, surface
 from reffusion.initialize import gloss, sweep
 from reffusion.masks import continuation
 from reffusion.masks.continuation import Plane
@@ -25,40 +25,6 @@ from reffusion.types import Camera, Gaussians, Reference
 
 AROUND, BEYOND = 2, 0.1  # px around, and how far beyond the colours there, in [0, 1], a Gaussian's may lie
 SWEPT = 0.1  # of the image's width: how far around a hole depth is found by comparing photographs
-
-
-@dataclass(frozen=True)
-class Sheets:
-    """How new Gaussians lie on a surface: a sheet of thin ones, and a second, opaque one behind it.
-
-    Opaque Gaussians next to each other cannot show a sharp picture from all sides: the nearer one hides part of the
-    next, so that each is seen on its far side only. What is painted on them seems to slide away from the camera by a
-    third of their distance, and so twice that between opposite views. The fainter they are, the less; the second sheet
-    keeps the surface closed. docs/initialization.md has figures.
-
-    PAPER leaves open: scale and opacity of the initial Gaussians.
-
-    Attributes:
-        spread: standard deviation of new Gaussians, pixels of the reference.
-        thickness: their deviation along the normal over that within the surface.
-        grazing: least cosine to the view at which they are stretched.
-        opacity: of the first sheet.
-        sunk: how far behind it the second lies, in pixels (0: there is none).
-        under_spread, under_opacity: the second's. Wider Gaussians than the first's leave no gaps between them, which a
-            nearer view would show as a grid; what that blurs the colours of the first make up for.
-        color_steps: corrections of the colours, see `match_colors`.
-        gloss: whether they change with the direction as what is around them does, see `reffusion.initialize.gloss`.
-    """
-
-    spread: float = 0.3
-    thickness: float = 0.1
-    grazing: float = 0.15
-    opacity: float = 0.4
-    sunk: float = 1.0
-    under_spread: float = 0.6
-    under_opacity: float = 0.8
-    color_steps: int = 5
-    gloss: bool = False
 
 
 @torch.no_grad()
@@ -207,19 +173,6 @@ def uncovered(gaussians: Gaussians, camera: Camera, hidden: np.ndarray, covered:
     """Share in [0, 1] of C (`hidden`, bool [H, W]) whose alpha is below `covered`."""
     alpha = rasterizer.render(gaussians, camera, sh_degree=0).alpha.cpu().numpy()
     return float((alpha[hidden] < covered).mean()) if hidden.any() else 0.0
-
-
-def surface(
-    image: np.ndarray, depth: np.ndarray, pixels: np.ndarray, camera: Camera, sh_count: int, how: Sheets
-) -> Gaussians:
-    """Both sheets, see `surface_gaussians`."""
-    shown = (image, depth, pixels, camera)
-    shape = {"sh_count": sh_count, "thickness": how.thickness, "grazing": how.grazing}
-    sheet = surface_gaussians(*shown, **shape, spread=how.spread, opacity=how.opacity)
-    if not how.sunk:
-        return sheet
-    under = surface_gaussians(*shown, **shape, spread=how.under_spread, opacity=how.under_opacity, sunk=how.sunk)
-    return sheet.zipped(under, lambda a, b: torch.cat([a, b]))
 
 
 def placed(

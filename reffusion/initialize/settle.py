@@ -8,21 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from reffusion.fit.few import RATES
 from reffusion.fit.reconstruction import fit
-from reffusion.gaussians.optimize import Rates
 from reffusion.params.fit import Densify, LearningRates, Params, SphericalHarmonics
 from reffusion.types import Camera, Gaussians, Reference
 
-# Between those of a fit's start and end: the scene is there, but what the object's Gaussians left behind must move.
-RATES = Rates(
-    means=4e-4,
-    means_last=2e-5,
-    quaternions=2e-3,
-    log_scales=5e-3,
-    opacity_logits=0.05,
-    sh_dc=5e-3,
-    sh_rest=5e-4,
-)
 REFERENCE_SHARE = 1 / 3  # of the steps that look at a completed view
 BETAS = (0.8, 0.99)  # a short run is better off with a short memory
 

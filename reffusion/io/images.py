@@ -12,11 +12,11 @@ from PIL import Image, ImageOps
 
 from reffusion.io.files import BadInput, check_pixels, reading, shortened
 
-ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")  # of pictures, in small letters
-
+HEIC = (".heic", ".heif")  # of phones
+ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", *HEIC)  # of pictures, in small letters
 
 # What is read under these names; other kinds that Pillow knows call programs, or are not for photographs.
-_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM")
+_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM", "HEIF")
 logging.getLogger("PIL").addHandler(logging.NullHandler())  # what it says on standard error is in our line too
 Image.MAX_IMAGE_PIXELS = None  # `opened` looks at the size itself: with one limit, and without a warning below it
 
@@ -25,9 +25,27 @@ Image.MAX_IMAGE_PIXELS = None  # `opened` looks at the size itself: with one lim
 def opened(path: Path, what: str = "a readable image") -> Iterator[Image.Image]:
     """A picture of which the header was read; BadInput naming the file for all that is wrong with it, here or inside
     the block, and for more than `MOST_PIXELS`."""
+    if Path(path).suffix.lower() in HEIC:
+        _learn_heic(path)
     with reading(path, what), Image.open(path, formats=_FORMATS) as image:
         check_pixels(path, *image.size)
         yield image
+
+
+def _learn_heic(path: Path) -> None:
+    """Have Pillow read HEIC, always upright. pi-heif only decodes; pillow-heif's wheels bring an encoder under GPL."""
+    try:
+        import pi_heif
+    except ImportError:
+        raise BadInput(f"{path}: HEIC pictures need pi-heif: `pip install pi-heif`, or save them as JPEG") from None
+    pi_heif.register_heif_opener()
+
+
+def focal_of_heic(path: Path) -> float | None:
+    """Focal length over the longer side, from the EXIF tag that gives it for film of 36 mm; None where unknown."""
+    with opened(path) as image:
+        focal = image.getexif().get_ifd(0x8769).get(0xA405)
+        return float(focal) / 36 if focal else None
 
 
 def image_size(path: Path, upright: bool = False) -> tuple[int, int]:

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from reffusion.io import compressed
+from reffusion.io.compressed import PACKED
 from reffusion.io.files import BadInput, reading, shortened
 
 if TYPE_CHECKING:
@@ -23,7 +25,9 @@ RED_GREEN_BLUE = ("red", "green", "blue")
 ANTIALIASED = "antialiased"  # a comment that says how the Gaussians are meant to be drawn
 
 
-def save_ply(path: Path, gaussians: Gaussians, similarity: Similarity | None = None) -> None:
+def save_ply(
+    path: Path, gaussians: Gaussians, similarity: Similarity | None = None, properties: Sequence[str] = ()
+) -> None:
     """Write Gaussians in the standard 3DGS layout (binary, little endian).
 
     Properties: x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3; `f_rest` runs through the
@@ -33,6 +37,7 @@ def save_ply(path: Path, gaussians: Gaussians, similarity: Similarity | None = N
         similarity: with it, positions and sizes go back through it (in float64) to the scene's own frame.
             Positions are then written as doubles only where floats would move them by more than 1e-5 of the
             normalised extent (geo-referenced scenes); viewers that insist on floats read all others.
+        properties: another order of these, normals left out where it has none (`properties_of` a file to be like).
     """
     columns = {name: getattr(gaussians, name).detach().cpu().double().numpy() for name in _FIELDS}
     means, log_scales, position_type = columns["means"], columns["log_scales"], "f4"
@@ -53,11 +58,12 @@ def save_ply(path: Path, gaussians: Gaussians, similarity: Similarity | None = N
         (ROTATION, columns["quaternions"]),
     )
     comments = [ANTIALIASED] if gaussians.antialiased else []
-    types = [(name, position_type if names is POSITION else "f4") for names, _ in blocks for name in names]
-    table = np.empty(count, dtype=types)
-    for names, values in blocks:
-        for name, column in zip(names, values.T, strict=True):
-            table[name] = column
+    found = {name: column for names, values in blocks for name, column in zip(names, values.T, strict=True)}
+    wanted = [name for name in properties or found if name in found]
+    wanted += [name for name in found if name not in wanted and name not in NORMAL]
+    table = np.empty(count, [(name, position_type if name in POSITION else "f4") for name in wanted])
+    for name in wanted:
+        table[name] = found[name]
     _write(path, table, comments)
 
 
@@ -212,12 +218,24 @@ def _header(path: Path) -> _Header:
 _LONGEST_LINE = 10_000  # of a header, in bytes
 
 
-def check_gaussians(path: Path) -> None:
-    """By the header alone: BadInput where there are none, the file is cut off, or its properties are others."""
-    count, properties = next((c, p) for name, c, p in _header(Path(path)).elements if name == "vertex")
-    if not count:
-        raise BadInput(f"{path}: it holds no Gaussians")
-    _check_properties(path, [name for kind, name in properties if kind in _TYPES])
+def check_gaussians(path: Path) -> int:
+    """How many there are, by the header alone: BadInput where the file is cut off, or its properties are others."""
+    count, properties = _vertices(_header(Path(path)))
+    if PACKED not in properties:
+        _check_properties(path, properties)
+    return count
+
+
+def properties_of(path: Path) -> tuple[str, ...]:
+    """The names of its vertices' properties, in order; none of a compressed file."""
+    _, properties = _vertices(_header(Path(path)))
+    return () if PACKED in properties else tuple(properties)
+
+
+def _vertices(header: _Header) -> tuple[int, list[str]]:
+    """How many, and the names of their properties that are numbers."""
+    count, properties = next((c, p) for name, c, p in header.elements if name == "vertex")
+    return count, [name for kind, name in properties if kind in _TYPES]
 
 
 def _check_properties(path: Path, names: Sequence[str]) -> None:
@@ -237,6 +255,8 @@ def _read(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
 
     path = Path(path)
     header = _header(path)
+    if PACKED in _vertices(header)[1]:
+        return compressed.load_table(path), header.comments
     with reading(path, "a readable PLY file with vertices"):
         (name, count, properties), *_ = header.elements
         if header.text and name == "vertex" and all(kind in _TYPES for kind, _ in properties):

@@ -74,6 +74,11 @@ def load_views(poses_dir: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
     return {name: load_image(Path(poses_dir) / "images" / f"{name}.png") for name in names}
 
 
+def has_photograph(poses_dir: Path, name: str) -> bool:
+    """None has one in a scene without photographs, where renders of its Gaussians stand for them."""
+    return (Path(poses_dir) / "images" / f"{name}.png").exists()
+
+
 def objects_of(poses_dir: Path) -> list[str]:
     """The objects that masks tell apart, sorted."""
     return sorted(path.name for path in (Path(poses_dir) / "masks").glob("[!.]*") if path.is_dir())
@@ -126,8 +131,10 @@ def load_mask_sets(masks_dir: Path, names: Iterable[str]) -> dict[str, MaskSet]:
 
 def shows_object(poses_dir: Path, masks_dir: Path | None, name: str) -> bool:
     """Has the view a raw mask: one that was given, or one made from clicks?"""
-    made = Path(masks_dir) / "raw" / f"{name}.png" if masks_dir else None
-    return bool(raw_mask_files(poses_dir, name)) or (made is not None and made.is_file() and bool(load_mask(made).any()))
+    if raw_mask_files(poses_dir, name) or masks_dir is None:
+        return bool(raw_mask_files(poses_dir, name))
+    made = Path(masks_dir) / "raw" / f"{name}.png"
+    return made.is_file() and bool(load_mask(made).any())
 
 
 def load_object(masks_dir: Path) -> Tensor:

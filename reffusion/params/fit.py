@@ -23,7 +23,6 @@ from reffusion.params.base import (
 
 class SphericalHarmonics(Settings):
     degree: int = Field(3, ge=0, le=3, description="highest degree")
-    limited: bool = Field(True, description="no higher than the views determine")
     every: float = Field(1 / 30, ge=0, le=1, description="part of the run after which one more degree joins")
 
 
@@ -47,7 +46,6 @@ class Densify(Settings):
         "that some are left for where late views still pull",
     )
     per_pixel: float = Field(0.0, ge=0, description="most Gaussians for each pixel of a view; 0: `cap_max` alone")
-    prune_opa: float = Field(0.005, ge=0, lt=1, description="fainter Gaussians are pruned")
     prune_scale3d: float = Field(0.5, gt=0, description="Gaussians of a larger size are pruned; deviation / distance")
     reset_every: float = Field(0.1, ge=0, le=1, description="part of the run between opacity resets; 0 = none")
 
@@ -77,6 +75,11 @@ class Params(Settings):
     random_background: bool = Field(True, description="a new background colour each step, instead of black")
     antialiased: bool = Field(False, description="a Gaussian adds up to the same from any distance (Mip-Splatting)")
     exposure: bool = Field(False, description="fit each view's exposure too; later stages see the views without it")
+    few_views: Literal["as_many", "fewer_harmonics", "surfaces"] = Field(
+        "fewer_harmonics",
+        description="what views too few for it change: nothing; no degree of spherical harmonics that they do not "
+        "determine; that, and a start on surfaces between the sparse points where a typical one is in under 10 views",
+    )
     pixels: Literal["all", "unmasked"] = Field(
         "all", description="those that supervise; unmasked, a baseline: masked pixels are never looked at (Masked NeRF)"
     )

@@ -6,28 +6,32 @@ from pathlib import Path
 
 from reffusion.capture import lens
 from reffusion.capture.given import PAINTED, load_given, words
+from reffusion.capture.layouts import cameras
 from reffusion.capture.layouts.capture import Capture
-from reffusion.capture.reading import read_scene
+from reffusion.capture.reading import check_brought, read_scene, unphotographed
 from reffusion.capture.roles import views_of
 from reffusion.params.clicks import CLICKS
 from reffusion.params.poses import Params
 
 # pictures count where they are photographs or masks; depth maps belong to references
-NOT_READ = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".npy", ".exr")
+NOT_READ = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".npy", ".exr")
 
 
 def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
     """Of the scene's files those that this stage reads, and what it reads elsewhere: the photographs and masks, and
     all that is neither a picture nor a depth map. So a new reference, wherever it lies, reruns nothing here."""
     others = [path for path in files if path.parent != scene or path.name not in ("scene.yaml", CLICKS)]
+    brought = {scene / name for name in (params.gaussians, params.cleaned) if name is not None}
     try:
+        if unphotographed(params, scene):
+            return sorted({path for path in others if path.suffix.lower() not in NOT_READ} | brought)
         capture, roles = read_scene(params, scene)
     except ValueError:  # `preview` refuses it
         return others
     masks = {path for files in roles.masks.values() for path in files.values()}
     shown = {path for name, path in capture.pictures.items() if name not in roles.blank}
     read = {*shown, *masks, *roles.test_masks.values(), *roles.fill.values()}
-    read |= {scene / params.gaussians} if params.gaussians is not None else set()
+    read |= brought
     kept = [path for path in others if path.suffix.lower() not in NOT_READ or path.name == "poses_bounds.npy"]
     return sorted(read | {path for path in kept if path.parent != scene / PAINTED})
 
@@ -35,6 +39,11 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
 def preview(params: Params, scene: Path) -> list[str]:
     """What the stage will do, from headers alone. ValueError where it would refuse, or where a reference that the scene
     brings, read by a later stage, belongs to none of its views."""
+    if unphotographed(params, scene):
+        check_brought(params, scene)
+        found = cameras.read(scene)
+        who = f"{len(found[0].lenses)} cameras of {found[1].relative_to(scene)}" if found else "cameras around the hole"
+        return [f"no photographs: {who} look at renders of {params.gaussians} instead"]
     capture, roles = read_scene(params, scene)
     given = load_given(scene, views_of(capture, roles), params.reference)
     masks = sum(len(files) for files in roles.masks.values())

@@ -77,6 +77,18 @@ def from_model(folder: Path, model: Path, image_folder: Path, layout: str, label
     )
 
 
+def read_cameras(model: Path) -> Poses:
+    """The lenses and poses alone, of a model whose pictures are not there."""
+    source, camera_file = model_file(model, "images"), model_file(model, "cameras")
+    images = {Path(image.name).stem: image for image in load_images(source).values()}
+    cameras = load_cameras(camera_file)
+    if lost := [name for name, image in images.items() if image.camera_id not in cameras]:
+        raise BadInput(f"{source}: the camera of '{lost[0]}' is missing in the model")
+    names = sorted(images)
+    lenses = {name: lens_of(cameras[images[name].camera_id], camera_file) for name in names}
+    return Poses(lenses, {name: images[name].world_to_camera for name in names}, *NO_POINTS, {})
+
+
 def _pictures_of_model(image_folder: Path, by_name: dict[str, Path]) -> dict[str, Path]:
     """Pictures of the folder; those that the model names in sub-folders are found there."""
     if all(len(path.parts) == 1 for path in by_name.values()):

@@ -66,6 +66,29 @@ def read(folder: Path, images: str | None) -> Capture:
     )
 
 
+def read_cameras(folder: Path) -> Poses:
+    """The lenses and poses alone, of a capture whose pictures are not there; their sizes are the file's w and h."""
+    source = folder / "transforms.json"
+    record = load_json(source)
+    lenses, poses = {}, {}
+    for frame in _frames(record, source):
+        path, values = Path(frame["file_path"].replace("\\", "/")), {**record, **frame}
+        if path.stem in lenses:
+            raise BadInput(f"{source}: two frames are called '{path.stem}'; rename one")
+        if "w" not in values or "h" not in values:
+            raise BadInput(f"{source}: neither pictures nor w and h of '{path.name}'; give its size in pixels")
+        lenses[path.stem] = _valid(_lens(values, path, source, (0, 0)), path, source)
+        poses[path.stem] = _frame_pose(frame, path.stem, source)
+    in_order = lambda values: dict(sorted(values.items()))
+    return Poses(in_order(lenses), in_order(poses), *NO_POINTS, {})
+
+
+def has_pictures(folder: Path) -> bool:
+    """Is a picture of one of its frames there?"""
+    source = folder / "transforms.json"
+    return any(_frame_file(folder, None, frame["file_path"]) for frame in _frames(load_json(source), source))
+
+
 def _frames(record: object, source: Path) -> list[dict]:
     frames = record.get("frames") if isinstance(record, dict) else None
     if not isinstance(frames, list) or not frames:
@@ -108,12 +131,15 @@ def _frame_pose(frame: dict, name: str, source: Path) -> np.ndarray:
 
 def _frame_lens(values: dict, picture: Path, source: Path) -> Lens:
     """The lens from the frame's keys over the file's, at the size of the picture."""
-    lens = _lens(values, picture, source)
+    return fitted(_valid(_lens(values, picture, source, image_size(picture)), picture, source), picture)
+
+
+def _valid(lens: Lens, picture: Path, source: Path) -> Lens:
     if min(lens.fx, lens.fy) <= 0:
         raise BadInput(f"{source}: the focal length (or angle) of '{picture.name}' is not positive")
     if lens.width < 1 or lens.height < 1:
         raise BadInput(f"{source}: w and h of '{picture.name}' are {lens.width}x{lens.height}; give its size in pixels")
-    return fitted(lens, picture)
+    return lens
 
 
 def _number(values: dict, key: str, default: float, picture: Path, source: Path) -> float:
@@ -123,9 +149,8 @@ def _number(values: dict, key: str, default: float, picture: Path, source: Path)
     return float(value)
 
 
-def _lens(values: dict, picture: Path, source: Path) -> Lens:
+def _lens(values: dict, picture: Path, source: Path, size: tuple[int, int]) -> Lens:
     number = lambda key, default=0.0: _number(values, key, default, picture, source)
-    size = image_size(picture)
     width, height = number("w", size[0]), number("h", size[1])
     fx = _focal_length(values, "x", width, number)
     if fx is None:

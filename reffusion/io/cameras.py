@@ -1,0 +1,49 @@
+"""Cameras in the scene's own frame for other tools: a COLMAP model and nerfstudio's transforms.json."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from reffusion.io.arrays import save_json
+from reffusion.io.colmap import ModelCamera, ModelImage, save_model
+from reffusion.io.ply import save_points
+
+if TYPE_CHECKING:
+    from reffusion.types import Camera, Scene, Similarity
+
+POINTS = "sparse_pc.ply"
+GL = np.diag([1.0, -1.0, -1.0, 1.0])  # nerfstudio's cameras look along -z, y up
+
+
+def save_cameras(folder: Path, scene: Scene, images: str) -> None:
+    """Write sparse/0/*.bin, transforms.json and sparse_pc.ply: undistorted pinholes and sparse points.
+
+    Args:
+        images: where the views' pictures <view>.png are, relative to `folder`.
+    """
+    folder = Path(folder)
+    points = scene.similarity.invert(scene.points)
+    cameras, registered, frames = {}, {}, []
+    for identity, camera in enumerate(scene.cameras.values(), start=1):
+        pose = own_pose(camera, scene.similarity)
+        lens = (camera.fx, camera.fy, camera.cx, camera.cy)
+        cameras[identity] = ModelCamera("PINHOLE", camera.width, camera.height, lens)
+        registered[identity] = ModelImage(f"{camera.name}.png", identity, pose)
+        frames.append(
+            dict(zip(("fl_x", "fl_y", "cx", "cy"), map(float, lens), strict=True))
+            | {"w": camera.width, "h": camera.height, "file_path": f"{images}/{camera.name}.png"}
+            | {"transform_matrix": (np.linalg.inv(pose) @ GL).tolist()}
+        )
+    save_model(folder / "sparse" / "0", cameras, registered, points, scene.point_colors)
+    save_points(folder / POINTS, points, scene.point_colors)
+    save_json(folder / "transforms.json", {"camera_model": "PINHOLE", "ply_file_path": POINTS, "frames": frames})
+
+
+def own_pose(camera: Camera, similarity: Similarity) -> np.ndarray:
+    """[4, 4] float64, world to camera in the scene's own frame and unit."""
+    pose = camera.world_to_camera.copy()
+    pose[:3, 3] = pose[:3, 3] / similarity.scale - pose[:3, :3] @ similarity.offset
+    return pose

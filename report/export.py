@@ -1,0 +1,71 @@
+"""A finished scene for other tools: `python -m report.export --scene X` (`make scene=X export`)."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from reffusion.io.cameras import save_cameras
+from reffusion.io.compressed import save_compressed
+from reffusion.io.lora import save_portable
+from reffusion.io.ply import load_ply
+from reffusion.io.scene import has_photograph, load_scene
+from report import command
+from report.sheet import stage_folder
+
+PLY, COMPRESSED, CAMERAS, IMAGES, LORA = "scene.ply", "scene.compressed.ply", "cameras", "images", "lora"
+HEADER = 1000  # bytes of it that tell the type of x
+LORA_FILE = "pytorch_lora_weights.safetensors"
+
+
+def make(home: Path) -> list[str]:
+    """Write runs/<scene>/export/; what is there, a line each.
+
+    Raises:
+        ValueError: the stage `evaluate` has not run, or gsply is not installed.
+    """
+    finished, out = home / "evaluate" / PLY, home / "export"
+    if not finished.exists():
+        raise ValueError(f"{finished} is missing; `make scene={home.name.split('@')[0]} export` makes it")
+    poses = stage_folder(home, "poses")
+    scene = load_scene(poses)
+    gaussians = load_ply(finished, scene.similarity)
+    save_compressed(out / COMPRESSED, gaussians, scene.similarity)
+    shutil.copyfile(finished, out / PLY)
+    said = [f"{out / PLY}: {len(gaussians)} Gaussians of degree {gaussians.sh_degree}, in the scene's own frame"]
+    said[0] += unlike_3dgs(finished, gaussians.antialiased)
+    smaller = finished.stat().st_size / (out / COMPRESSED).stat().st_size
+    said.append(f"{out / COMPRESSED}: the same, quantised, {smaller:.1f} times smaller, in PlayCanvas's format")
+    save_cameras(out / CAMERAS, scene, IMAGES)
+    pictured = [name for name in scene.cameras if has_photograph(poses, name)]
+    for name in pictured:
+        (out / CAMERAS / IMAGES).mkdir(exist_ok=True)
+        shutil.copyfile(poses / "images" / f"{name}.png", out / CAMERAS / IMAGES / f"{name}.png")
+    pictures = f"{len(pictured)} undistorted photographs" if pictured else "no photographs"
+    said.append(f"{out / CAMERAS}: {len(scene.cameras)} pinholes, a COLMAP model and transforms.json; {pictures}")
+    adapted = stage_folder(home, "personalize") / LORA_FILE
+    if adapted.exists():
+        save_portable(adapted, out / LORA / LORA_FILE)
+        said.append(f"{out / LORA / LORA_FILE}: the prior's LoRA, as diffusers' load_lora_weights reads it")
+    return said
+
+
+def unlike_3dgs(path: Path, antialiased: bool) -> str:
+    """What of the file not every viewer shows as we do."""
+    with open(path, "rb") as file:
+        exact = b"property double x" in file.read(HEADER)
+    doubles = "; positions are doubles, as floats would move them: many editors read floats only" if exact else ""
+    smoothed = "; made for Mip-Splatting's filter: viewers without it show it a little bolder" if antialiased else ""
+    return doubles + smoothed
+
+
+def main() -> None:
+    arguments = command.parser("export", __doc__).parse_args()
+    try:
+        print("\n".join(make(command.home(arguments))))
+    except ValueError as error:
+        raise SystemExit(f"error: {error}") from None
+
+
+if __name__ == "__main__":
+    main()

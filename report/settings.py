@@ -1,0 +1,91 @@
+"""With what a job was done: parameters other than their defaults, and the command that does it again."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from report import page
+from report.loading import Job
+
+
+def leaves(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted names and values of nested groups."""
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from leaves(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, value
+
+
+def defaults(stage: str) -> dict[str, Any]:
+    """Dotted name -> value; empty for a stage that this code does not know."""
+    try:
+        found = import_module(f"reffusion.params.{stage}").Params()
+    except ModuleNotFoundError:
+        return {}
+    return dict(leaves(found.model_dump(mode="json")))
+
+
+def asked(job: Job) -> dict[str, Any]:
+    """stage.parameter -> value, of what was done otherwise than the profile and scene.yaml say: by `set=` or
+    `budget=`. Empty where the plan was not recorded."""
+    said = {stage: dict(leaves(values)) for stage, values in job.unset.items()}
+    return {
+        f"{stage}.{name}": value
+        for stage, receipt in job.receipts.items()
+        for name, value in leaves(receipt.get("params", {}))
+        if stage in said and said[stage].get(name, value) != value
+    }
+
+
+def section(job: Job) -> list[str]:
+    """A table of what differs from the defaults, those set by hand first."""
+    typed, own, rows = asked(job), [], []
+    for stage, receipt in job.receipts.items():
+        usual = defaults(stage)
+        for name, value in leaves(receipt.get("params", {})):
+            if name not in usual or usual[name] != value:
+                rows.append([f"{stage}.{name}", _short(value), _short(usual.get(name))])
+            if f"{stage}.{name}" in typed:
+                instead = dict(leaves(job.unset[stage])).get(name)
+                own.append([f"{stage}.{name}", _short(value), _short(instead), _short(usual.get(name))])
+    top = page.heading("Parameters other than their defaults")
+    if not rows:
+        return [top, page.paragraph("None.")]
+    parts = [page.table(["set by hand", "value", "instead of", "default"], own, text=(1, 2, 3))] if own else []
+    table = page.table(["", "value", "default"], rows, text=(1, 2))
+    who = "by profile, scene.yaml, variant or hand"
+    return [top, *parts, f"<details><summary>all {len(rows)}, {who}</summary>{table}</details>"]
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value, ensure_ascii=False) if not isinstance(value, str) else value
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def command(job: Job) -> list[str]:
+    """What to type to do it again."""
+    name, _, variant = job.home.name.partition("@")
+    source = job.home.with_name(name) / "source"
+    scene = load_source(source, name)
+    profile = next((receipt["profile"] for receipt in job.receipts.values()), "")
+    words = [f"scene={shlex.quote(scene)}", f"profile={profile}", *([f"variant={variant}"] if variant else [])]
+    if typed := asked(job):
+        text = " ".join(shlex.quote(f"{key}={json.dumps(value)}") for key, value in typed.items())
+        words.append(f"set={shlex.quote(text)}")
+    line = " ".join(["make", *words, "all"])
+    return [page.heading("To do it again"), page.code(line)]
+
+
+def load_source(path: Path, name: str) -> str:
+    """What the scene was called on the command line: its name below data/, else its path, of a video the file's."""
+    said = path.read_text(encoding="utf-8").strip() if path.is_file() else name
+    record = path.parent / "frames" / "frames.json"
+    if record.is_file() and Path(said).name == "frames":
+        return json.loads(record.read_text(encoding="utf-8"))["video"]
+    return name if said == f"data/{name}" else said

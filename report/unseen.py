@@ -1,0 +1,56 @@
+"""A note in a picture: here it shows what no photograph saw."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from reffusion.io.images import load_mask, resize_nearest
+from reffusion.io.ply import load_ply
+from reffusion.io.scene import load_raw_masks
+from reffusion.score import sight
+from reffusion.types import Camera, Gaussians, Scene
+from report.sheet import stage_folder
+
+LEAST = 0.003  # of a picture, under which nothing is said
+EVERY, LINE = 14, 2  # px between the lines of the hatching, and their width
+WORDS = "hatched: no photograph shows it"
+
+
+def photographed(home: Path, scene: Scene) -> list[sight.SeenView]:
+    """What the training views saw, by the fit of them; empty where there is none."""
+    fit = stage_folder(home, "fit") / "gaussians.ply"
+    if not fit.exists():
+        return []
+    consistent = stage_folder(home, "masks") / "consistent"
+    train = [name for name in scene.train if name not in scene.clean]
+    masks = load_raw_masks(stage_folder(home, "poses"), train)
+    masks |= {name: load_mask(path) for name in train if (path := consistent / f"{name}.png").exists()}
+    return sight.seen_views(load_ply(fit), [scene.cameras[name] for name in scene.train], masks)
+
+
+def noted(picture: np.ndarray, gaussians: Gaussians, camera: Camera, seen_by: list[sight.SeenView]) -> np.ndarray:
+    """uint8 [H, W, 3] with what none of the training views saw hatched, and words for it; as it is where that is next
+    to nothing.
+
+    Args:
+        camera: of any size; a small one answers sooner.
+    """
+    found = resize_nearest(sight.unseen(gaussians, camera, seen_by), picture.shape[:2])
+    if found.mean() < LEAST:
+        return picture
+    rows, columns = np.indices(found.shape)
+    place = (rows + columns) % EVERY
+    marked = picture.copy()
+    for offset, level in ((0, 255), (LINE, 0)):  # a bright line beside a dark one: one of them shows anywhere
+        line = found & (place >= offset) & (place < offset + LINE)
+        marked[line] = (0.45 * marked[line] + 0.55 * level).astype(np.uint8)
+    canvas = Image.fromarray(marked)
+    draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(max(11, picture.shape[0] // 32))
+    at = (8, picture.shape[0] - 8)
+    left, top, right, bottom = draw.textbbox(at, WORDS, font, anchor="ls")
+    draw.rectangle((left - 4, top - 4, right + 4, bottom + 4), "#222")
+    draw.text(at, WORDS, "white", font, anchor="ls")
+    return np.asarray(canvas)
