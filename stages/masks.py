@@ -41,11 +41,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
     region = Region(**load_json(poses / "region.json")) if (poses / "region.json").exists() else None
     objects = objects_of(poses)
     deleted = deleted_from(poses, params.device)  # stands for votes
-    raw = {} if deleted is not None else load_raw_masks(poses, scene.train, params.remove)
-    if deleted is None and objects and not raw:
-        raise ValueError(f"{poses / 'masks'}: no view has a mask of each object; add empty ones where one is unseen")
-    if params.clicks:
-        raw = clicked(params, scene, gaussians, poses, raw)
+    raw = {} if deleted is not None else brought_masks(params, scene, gaussians, poses)
     empty = {name: np.zeros((camera.height, camera.width), bool) for name, camera in scene.cameras.items()}
     ballots = {name: raw[name] for name in scene.train if name in raw} | {name: empty[name] for name in scene.clean}
     fill = Filled(region, load_fill(poses)) if params.invent != "undecided" else Filled(None, {})
@@ -95,6 +91,14 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
         "best_reference": voting.best_view(invents, scene.train),
     }
     save_json(out / "facts.json", facts)
+
+
+def brought_masks(params: Params, scene: Scene, gaussians: Gaussians, poses: Path) -> dict[str, np.ndarray]:
+    """View -> bool [H, W], the raw masks: those that the scene brings, and what clicks make of them."""
+    raw = load_raw_masks(poses, scene.train, params.remove)
+    if objects_of(poses) and not raw:
+        raise ValueError(f"{poses / 'masks'}: no view has a mask of each object; add empty ones where one is unseen")
+    return clicked(params, scene, gaussians, poses, raw) if params.clicks else raw
 
 
 def clicked(
