@@ -2,6 +2,7 @@
 
 import itertools
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -121,16 +122,14 @@ def test_clicks_in_one_view_give_the_masks_of_all(scene, tmp_path):
 
 def test_clicks_on_nothing_are_refused(scene, tmp_path):
     _, placed, fit = scene
-    with pytest.raises(ValueError, match="no positive|none is on|show nothing there"):
+    with pytest.raises(ValueError, match="click in the middle of the object"):
         masks.run(masks.Params(clicks={"a2": [[3, 3, "-"]]}), tmp_path, poses=placed, fit=fit)
 
 
 def test_a_mask_in_one_view_stays_as_it_was_given(scene):
-    _, _, _ = scene
+    _, placed, _ = scene
     everything, _ = small.gaussians(NEAR)
-    image_of = lambda name: to_uint8(
-        rasterizer.render(everything, small.CAMERAS[name]).color.detach().clamp(0, 1).numpy()
-    )
+    image_of = lambda name: load_image(placed / "images" / f"{name}.png")
     near = everywhere.neighbours(everything)
     found = everywhere.solved(everything, near, small.CAMERAS, image_of, {}, {"a1": truth("a1")})
     assert (found.masks["a1"] == truth("a1")).all()
@@ -193,6 +192,8 @@ def page(scene, tmp_path):
     capture = Capture(tmp_path, tmp_path / "masks", placed, fit, {})
     server = Server(Session(capture), port=18090)
     threading.Thread(target=server.serve_forever, daemon=True).start()
+    while server.session.gaussians is None:
+        time.sleep(0.05)
     yield server
     server.shutdown()
     server.server_close()

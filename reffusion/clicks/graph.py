@@ -52,7 +52,7 @@ def grown(lab: np.ndarray, pairs: np.ndarray, length: np.ndarray, seeds: np.ndar
         weak: bool [N], the object less likely than not.
     """
     step = np.linalg.norm(lab[pairs[:, 0]] - lab[pairs[:, 1]], axis=1)
-    smooth = SMOOTH * np.exp(-(step**2) / (2 * np.mean(step**2) + 1e-9)) / length
+    smooth = _smoothness(step, length)
     other = (seeds == OTHER) | (weak & (seeds != OBJECT))
     bins = tuple((lab * (BINS / 256)).astype(int).clip(0, BINS - 1).T)
     cost, labels = step, None
@@ -78,7 +78,7 @@ def regrown(lab: np.ndarray, pairs: np.ndarray, length: np.ndarray, seeds: np.nd
         was: bool [N].
     """
     step = np.linalg.norm(lab[pairs[:, 0]] - lab[pairs[:, 1]], axis=1)
-    smooth = SMOOTH * np.exp(-(step**2) / (2 * np.mean(step**2) + 1e-9)) / length
+    smooth = _smoothness(step, length)
     wrong = (seeds == OBJECT) & ~was | (seeds == OTHER) & was
     right = (seeds == OBJECT) & was | (seeds == OTHER) & ~was
     across = was[pairs[:, 0]] != was[pairs[:, 1]]  # what is changed lies on one side of the former border
@@ -90,6 +90,12 @@ def regrown(lab: np.ndarray, pairs: np.ndarray, length: np.ndarray, seeds: np.nd
     against = np.where(seeds == OTHER, HARD, np.maximum(-gain, 0) * (seeds != OBJECT))
     against_other = np.where(seeds == OBJECT, HARD, np.maximum(gain, 0) * (seeds != OTHER))
     return least_cut(against, against_other, pairs, smooth)
+
+
+def _smoothness(step: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """[E], cost of a border between neighbours: less where colours change more than they do on average."""
+    usual = float((step**2).sum()) / max(len(step), 1)
+    return SMOOTH * np.exp(-(step**2) / (2 * usual + 1e-9)) / length
 
 
 def attached(labels: np.ndarray, pairs: np.ndarray, seeds: np.ndarray) -> np.ndarray:
