@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -84,8 +85,9 @@ class Session:
     Masks are made for a view at once. Where the fit is there, a thread of its own makes those of all others.
     """
 
-    def __init__(self, capture: Capture):
+    def __init__(self, capture: Capture, fitted: Callable[[], bool]):
         self.capture, self.scene = capture, load_scene(capture.poses)
+        self.fitted = fitted  # is the fit there that belongs to these poses? one of earlier poses may be, in its place
         self.views = [name for name in self.scene.train if name not in self.scene.clean]
         self.lenses, self.sizes = load_lenses(capture.poses)[0], photograph_sizes(capture.poses)
         self.images = load_views(capture.poses, self.views)
@@ -231,7 +233,7 @@ class Session:
                         self._refine(self.todo[0])
 
     def _load(self) -> None:
-        if (self.capture.fit / "receipt.json").is_file():
+        if self.fitted():
             gaussians = load_ply(self.capture.fit / "gaussians.ply")
             near = everywhere.neighbours(gaussians)
             with self.turn:

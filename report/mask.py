@@ -154,8 +154,9 @@ def main() -> None:
     if status := subprocess.run(run("poses", arguments)).returncode:
         raise SystemExit(status)
     try:
-        session = Session(capture_of(command.home(arguments)))
+        capture = capture_of(command.home(arguments))
         fit = subprocess.Popen(run("fit", arguments))
+        session = Session(capture, lambda: fit.poll() == 0)
         server = Server(session, arguments.port, fit)
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
