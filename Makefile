@@ -32,6 +32,7 @@ help:
 	@echo 'make scene=demo all            the whole job; a second call finds everything cached'
 	@echo 'make scene=X STAGE             one stage and what it needs: $(STAGES)'
 	@echo 'make scene=X plan              what would run, and why; card=rtx-4090: and what each stage takes on that card'
+	@echo 'make scene=X mask              masks from clicks, in a browser; port=8090'
 	@echo 'make scene=X check             what is odd about its photographs, masks and poses; each mask over its photograph'
 	@echo 'make scene=X compare           the full method, ablations and baselines side by side: runs/X/compare.html'
 	@echo '                               variants=a,b  only these; seeds=5  on demo, demo-1 ... demo-4, with intervals'
@@ -146,6 +147,11 @@ ifneq ($(scene),)
 else
 	@$(RUN) report --data="$$data" $(where)
 endif
+
+.PHONY: mask
+mask: ready
+	@$(RUN) mask $(of) $(where) $(if $(profile),--profile="$$profile") $(if $(budget),--budget="$$budget") \
+		$(if $(set),--set="$$set") $(if $(port),--port="$$port")
 
 view: named $(VENV)/.ready-view
 	@$(RUN) view $(of) $(where) $(if $(port),--port="$$port")

@@ -12,6 +12,7 @@ REPORTS = {
     "report": "report.job",
     "compare-page": "report.compare",
     "view": "report.view",
+    "mask": "report.mask",
     "turntable": "report.turntable",
     "sheet": "report.sheet",
     "check": "report.check",

@@ -9,7 +9,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from reffusion.io.arrays import load_json
 from reffusion.io.images import load_image, save_image
-from reffusion.io.scene import raw_mask_files
+from reffusion.io.scene import shows_object
 from report.results import FULL, Comparison, Run
 from report.sheet import GAP, enlarged, evenly
 
@@ -49,8 +49,8 @@ def _cells(runs: list[Run], first: Run, view: str) -> list[tuple[str, np.ndarray
     photo, views = poses / "images" / f"{view}.png", poses / "views.json"
     cells = []
     if photo.exists() and views.exists():
-        shows_object = view not in load_json(views)["test"] or raw_mask_files(poses, view)
-        cells.append(("ground truth" if not shows_object else "photograph, with the object", load_image(photo)))
+        with_object = view not in load_json(views)["test"] or shows_object(poses, first.folders.get("masks"), view)
+        cells.append(("ground truth" if not with_object else "photograph, with the object", load_image(photo)))
     for run in runs:
         path = run.folders["evaluate"] / "renders" / f"{view}.png"
         if path.exists():

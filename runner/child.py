@@ -163,7 +163,7 @@ def frames() -> int:
     """Take a video's frames. Standard input: {"video", "folder", "content": its hash}; standard output: what was taken,
     or what is wrong."""
     asked = json.load(sys.stdin)
-    video = importlib.import_module("reffusion.capture.video")
+    video = importlib.import_module("reffusion.capture.layouts.video")
     try:
         print(video.take(Path(asked["video"]), Path(asked["folder"]), asked["content"]))
     except ValueError as error:

@@ -30,8 +30,9 @@ def digest(*parts: str) -> str:
 
 
 def content(listing: dict[str, str], leave_out: tuple[str, ...] = NOT_CONTENT) -> str:
-    """One hash of names and hashes, but for the names in `leave_out`."""
-    return digest(*(part for name, file in listing.items() if name not in leave_out for part in (name, file)))
+    """One hash of names and hashes, but for the files and folders in `leave_out`."""
+    kept = {name: file for name, file in listing.items() if name.partition("/")[0] not in leave_out}
+    return digest(*(part for item in kept.items() for part in item))
 
 
 class Hashes:

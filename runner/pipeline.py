@@ -64,6 +64,16 @@ class Provided(Strict):
     equals: Any = None
 
 
+class Unread(Strict):
+    """Files and folders of an artifact that the stage does not read, while `param: <stage>.<name>` is `equals`: where
+    only they change, it need not run again."""
+
+    need: str
+    names: tuple[str, ...]
+    param: str
+    equals: Any
+
+
 class Stage(Strict):
     """needs: earlier stages, or `scene`. optional: needs that may be left out, and then arrive as None. hands_out:
     folders of its artifact that people work with, copied to runs/<scene>/ where they outlive it."""
@@ -71,6 +81,7 @@ class Stage(Strict):
     needs: tuple[str, ...]
     optional: tuple[str, ...] = ()
     provided: Provided | None = None
+    unread: Unread | None = None
     left_out: tuple[Condition, ...] = ()
     hands_out: tuple[str, ...] = ()
     params: dict[str, Any] = {}
@@ -97,6 +108,7 @@ class Pipeline(Strict):
         for name, stage in self.stages.items():
             named = [*stage.takes, *(need for c in stage.left_out for need in c.waits_for)]
             named += [stage.provided.artifact] if stage.provided else []
+            named += [stage.unread.need] if stage.unread else []
             for need in named:
                 if need not in earlier:
                     raise ValueError(f"stage {name} names {need!r}, which is not a stage before it")

@@ -11,7 +11,7 @@ from typing import Any
 from runner import Refused
 from runner.artifacts import Wear, listed, wear
 from runner.files import MACHINE, RECEIPT, files_below, read_receipt
-from runner.keys import Inputs, changes, code_changes, code_of, elsewhere, leaves, outside
+from runner.keys import NOT_CONTENT, Inputs, changes, code_changes, code_of, elsewhere, leaves, outside
 from runner.pipeline import SCENE, Condition
 from runner.resolve import Job, ask, has_cuda
 
@@ -116,7 +116,10 @@ def _weights(job: Job, stage: str) -> Iterator[tuple[str, str, Path | None]]:
 
 
 def _inputs(job: Job, stage: str, needs: dict[str, Path | None], code: dict[str, str]) -> Inputs:
-    own, hashes = job.stages[stage], {need: path and job.hashes.folder(path) for need, path in needs.items()}
+    own, unread = job.stages[stage], job.pipeline.stages[stage].unread
+    hashes = {need: path and job.hashes.folder(path) for need, path in needs.items()}
+    if unread and (path := needs[unread.need]) and _is(job, unread.param, unread.equals):
+        hashes[unread.need] = job.hashes.folder(path, (*NOT_CONTENT, *unread.names))
     if own.reads is not None:
         hashes[SCENE] = job.hashes.files(job.folder, map(Path, own.reads))
     elif SCENE in job.pipeline.stages[stage].takes:

@@ -12,7 +12,7 @@ from reffusion import trace
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.images import load_image, load_mask, save_image
 from reffusion.io.ply import load_ply, save_ply
-from reffusion.io.scene import load_raw_masks, load_scene, raw_mask_files
+from reffusion.io.scene import load_raw_masks, load_scene, shows_object
 from reffusion.paint import paint2d
 from reffusion.paint.paint2d import Painter
 from reffusion.params.evaluate import Params
@@ -138,8 +138,8 @@ def truth_for(work: Work, camera: Camera) -> rows.Truth:
     """
     kept = work.masks and load_json(work.masks / "facts.json").get("kept")
     picture = truth_of(camera, work.poses) if work.tested and not kept else None
-    shows_object = bool(raw_mask_files(work.poses, camera.name))
-    return rows.Truth(picture, shows_object, work.unseen.get(camera.name))
+    with_object = shows_object(work.poses, work.masks, camera.name)
+    return rows.Truth(picture, with_object, work.unseen.get(camera.name))
 
 
 def save_side_by_side(out: Path, fit: np.ndarray, truth: np.ndarray | None, shown: Shown) -> None:

@@ -12,10 +12,13 @@ import torch
 from torch import Tensor
 
 from reffusion import trace
+from reffusion.capture.clicked import to_views
+from reffusion.clicks import everywhere
+from reffusion.clicks.marks import Clicks
 from reffusion.fit import exposure
 from reffusion.io.arrays import load_json, load_labels, save_json, save_labels
 from reffusion.io.ply import load_ply
-from reffusion.io.scene import load_fill, load_raw_masks, load_scene, objects_of, save_mask_sets
+from reffusion.io.scene import load_fill, load_raw_masks, load_scene, load_views, objects_of, save_mask_sets
 from reffusion.masks import brought, regions, undecided, voting, witness
 from reffusion.masks.continuation import Plane, planes_around
 from reffusion.masks.regions import Filled, Region
@@ -38,11 +41,9 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
     region = Region(**load_json(poses / "region.json")) if (poses / "region.json").exists() else None
     objects = objects_of(poses)
     deleted = deleted_from(poses, params.device)  # stands for votes
-    raw = {} if deleted is not None else load_raw_masks(poses, scene.train, params.remove)
-    if deleted is None and objects and not raw:
-        raise ValueError(f"{poses / 'masks'}: no view has a mask of each object; add empty ones where one is unseen")
+    raw = {} if deleted is not None else brought_masks(params, scene, gaussians, poses)
     empty = {name: np.zeros((camera.height, camera.width), bool) for name, camera in scene.cameras.items()}
-    ballots = raw | {name: empty[name] for name in scene.clean}
+    ballots = {name: raw[name] for name in scene.train if name in raw} | {name: empty[name] for name in scene.clean}
     fill = Filled(region, load_fill(poses)) if params.invent != "undecided" else Filled(None, {})
     if deleted is None and not raw and region is None and not fill.masks and not scene.blank:
         raise ValueError(f"{poses}: neither masks nor a region say what is to be changed: add masks, or a region")
@@ -90,6 +91,36 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
         "best_reference": voting.best_view(invents, scene.train),
     }
     save_json(out / "facts.json", facts)
+
+
+def brought_masks(params: Params, scene: Scene, gaussians: Gaussians, poses: Path) -> dict[str, np.ndarray]:
+    """View -> bool [H, W], the raw masks: those that the scene brings, and what clicks make of them."""
+    raw = load_raw_masks(poses, scene.train, params.remove)
+    if objects_of(poses) and not raw:
+        raise ValueError(f"{poses / 'masks'}: no view has a mask of each object; add empty ones where one is unseen")
+    return clicked(params, scene, gaussians, poses, raw) if params.clicks else raw
+
+
+def clicked(
+    params: Params, scene: Scene, gaussians: Gaussians, poses: Path, given: dict[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """Masks of all training views, and of test views that show the object, by clicks and those masks that are given.
+
+    Raises:
+        ValueError: the clicks lie where undistorted views show nothing, or on nothing that the Gaussians show.
+    """
+    clicks = {name: Clicks(*points) for name, points in to_views(poses, params.clicks).items()}
+    image_of = lambda name: load_views(poses, [name])[name]
+    found = everywhere.solved(gaussians, everywhere.neighbours(gaussians), scene.cameras, image_of, clicks, given)
+    if not found.labels.any():
+        raise ValueError("scene.yaml: clicks: the views show nothing there; click in the middle of the object")
+    names, masks = [name for name in (*scene.train, *scene.test) if name not in {*given, *scene.clean}], dict(given)
+    for k in trace.progress(len(names), "masks from clicks"):
+        name, camera, image = names[k], scene.cameras[names[k]], image_of(names[k])
+        mask = everywhere.shown(gaussians, found.labels, camera, image, clicks.get(name))
+        if name in scene.train or everywhere.there(gaussians, camera, image, mask):
+            masks[name] = mask
+    return masks
 
 
 def deleted_from(poses: Path, device: str) -> Tensor | None:

@@ -24,7 +24,7 @@ from reffusion.capture.views import known
 from reffusion.gaussians import matching
 from reffusion.io.arrays import save_json, save_labels
 from reffusion.io.files import BadInput
-from reffusion.io.images import save_image, save_mask
+from reffusion.io.images import image_size, save_image, save_mask
 from reffusion.io.ply import load_ply, load_points, properties_of, save_ply
 from reffusion.io.scene import load_raw_masks, load_views, save_scene
 from reffusion.masks import regions
@@ -48,6 +48,7 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
         return
     capture, roles = read_scene(params, scene)
     said = [*capture.warnings, *roles.warnings]
+    sizes = {name: image_size(path, upright=capture.upright) for name, path in capture.pictures.items()}
     for files in (*roles.masks.values(), roles.fill):
         check_masks(files)
     if params.gaussians is not None:
@@ -63,7 +64,7 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
         lenses[views[k]], pinholes[views[k]] = save_undistorted(out, views[k], capture, roles, longest)
     for name in roles.blank:
         lenses[name], pinholes[name] = lens_of(name, capture, longest)
-    save_lenses(out, lenses, capture.upright)
+    save_lenses(out, lenses, capture.upright, {name: sizes[name] for name in lenses})
     shutil.rmtree(out / "sfm", ignore_errors=True)
     normalised = frame.normalised(capture.poses, pinholes, roles.train, roles.test, roles.clean)
     normalised = replace(normalised, blank=roles.blank)
@@ -133,7 +134,7 @@ def _save_unphotographed(params: Params, out: Path, scene: Path, deleted: np.nda
     at = {n: each.resized(*fitting_size(each.width, each.height, params.longest)) for n, each in poses.lenses.items()}
     pinholes = {name: undoing(lens)[0] for name, lens in at.items()}
     placed = frame.normalised(poses, pinholes, sorted(pinholes), (), frozenset())
-    save_lenses(out, pinholes, upright=False)
+    save_lenses(out, pinholes, False, {n: (each.width, each.height) for n, each in pinholes.items()})
     where = f"the {len(pinholes)} cameras of {source}" if source else f"{len(pinholes)} cameras around the hole"
     _save_warnings(out, [
         f"no photographs: {where} look at renders of {params.gaussians} instead; what it does not hold, or holds "

@@ -106,7 +106,7 @@ def write_photos(scene, poses, cameras) -> None:
     for name in cameras:
         save_image(scene / "images" / f"{name}.png", load_image(poses / "images" / f"{name}.png"))
     lenses = {n: Lens(c.width, c.height, c.fx, c.fy, c.cx, c.cy) for n, c in cameras.items()}
-    save_lenses(poses, lenses, upright=False)
+    save_lenses(poses, lenses, False, {n: (c.width, c.height) for n, c in cameras.items()})
 
 
 def iou(a: np.ndarray, b: np.ndarray) -> float:

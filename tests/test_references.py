@@ -318,7 +318,7 @@ def test_paintings_stand_for_named_references_and_masks_beside_them_are_passed_o
 def test_a_view_that_was_not_placed_is_told(tmp_path):
     folder = prepare(tmp_path / "s", "transforms", some_truth())
     write_pictures(folder, ["ref"])
-    save_lenses(tmp_path, {"v00": some_truth().lens}, False)
+    save_lenses(tmp_path, {"v00": some_truth().lens}, False, {})
     save_json(tmp_path / "views.json", {"train": ["v00"], "test": [], "clean": []})
     with pytest.raises(ValueError, match=r"ref\.png: its view 'v01' could not be placed"):
         plan_reference.preview(reference.Params(**named("v01")), scene=folder, poses=tmp_path)

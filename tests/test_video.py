@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from reffusion.capture import sfm, video
+from reffusion.capture import sfm
+from reffusion.capture.layouts import video
 from reffusion.io.files import BadInput
 from reffusion.io.images import image_size, load_image
 from runner import Refused

@@ -13,10 +13,12 @@ from reffusion.io.files import BadInput
 LENSES = "lenses.json"
 
 
-def save_lenses(poses_dir: Path, lenses: Mapping[str, Lens], upright: bool) -> None:
-    """Write lenses.json: the lenses at the size of the undistorted pictures."""
+def save_lenses(
+    poses_dir: Path, lenses: Mapping[str, Lens], upright: bool, photographs: Mapping[str, tuple[int, int]]
+) -> None:
+    """Write lenses.json: the lenses at the size of the undistorted pictures, and (width, height) of photographs."""
     views = {name: asdict(lens) for name, lens in lenses.items()}
-    save_json(Path(poses_dir) / LENSES, {"upright": upright, "views": views})
+    save_json(Path(poses_dir) / LENSES, {"upright": upright, "photographs": dict(photographs), "views": views})
 
 
 def load_lenses(poses_dir: Path) -> tuple[dict[str, Lens], bool]:
@@ -31,3 +33,8 @@ def load_lenses(poses_dir: Path) -> tuple[dict[str, Lens], bool]:
         for name, fields in read["views"].items()
     }
     return views, read["upright"]
+
+
+def photograph_sizes(poses_dir: Path) -> dict[str, tuple[int, int]]:
+    """View name -> (width, height) of its photograph as it was brought."""
+    return {name: tuple(size) for name, size in load_json(Path(poses_dir) / LENSES)["photographs"].items()}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from reffusion.capture.clicked import check_clicks
 from reffusion.capture.given import listed
 from reffusion.capture.layouts.cameras import has_pictures
 from reffusion.capture.layouts.capture import Capture, pictures_in
@@ -28,7 +29,7 @@ def read_scene(params: Params, scene: Path) -> tuple[Capture, Roles]:
         train=params.train,
         test=params.test,
         clean=params.clean,
-        region=not (params.region is params.fill is params.cleaned is None),
+        region=not (params.region is params.fill is params.cleaned is params.clicks is None),
         cameras_only=params.cameras_only,
         remove=params.remove,
     )
@@ -36,6 +37,8 @@ def read_scene(params: Params, scene: Path) -> tuple[Capture, Roles]:
         roles = replace(roles, fill=_to_fill(scene / params.fill, capture, roles))
     if params.region is not None and params.region.view is not None:
         known(params.region.view, {*roles.train, *roles.test}, "region")
+    if params.clicks:
+        check_clicks(params.clicks, capture, roles)
     check_brought(params, scene)
     _check_lenses(capture)
     return capture, roles

@@ -129,6 +129,14 @@ def load_mask_sets(masks_dir: Path, names: Iterable[str]) -> dict[str, MaskSet]:
     return {name: MaskSet(*(load(kind, name) for kind in PIXEL_CLASSES)) for name in names}
 
 
+def shows_object(poses_dir: Path, masks_dir: Path | None, name: str) -> bool:
+    """Has the view a raw mask: one that was given, or one made from clicks?"""
+    if raw_mask_files(poses_dir, name) or masks_dir is None:
+        return bool(raw_mask_files(poses_dir, name))
+    made = Path(masks_dir) / "raw" / f"{name}.png"
+    return made.is_file() and bool(load_mask(made).any())
+
+
 def load_object(masks_dir: Path) -> Tensor:
     """[N] bool, of the Gaussians that `masks` removes those that are the object, and not debris."""
     labels, debris = load_labels(masks_dir / "labels.npy"), masks_dir / "debris.npy"

@@ -7,12 +7,14 @@ from typing import Literal
 from pydantic import Field
 
 from reffusion.params.base import Device, Settings
+from reffusion.params.clicks import Clicked
 
 
 class Params(Settings):
     remove: list[str] | None = Field(
         None, min_length=1, description="objects, each a folder of masks (masks/<object>/); None: all of them"
     )
+    clicks: Clicked | None = Field(None, description="view -> clicks, from which masks are made where none are given")
     vote: Literal["weight", "count"] = Field(
         "weight", description="what a contribution counts: its blending weight, or 1 (the paper's word is 'count')"
     )

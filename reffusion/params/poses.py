@@ -7,6 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from reffusion.params.base import UNKEYED, Settings
+from reffusion.params.clicks import Clicked
 from reffusion.params.reference import Given
 
 Side = Annotated[float, Field(gt=0)]
@@ -48,6 +49,9 @@ class Params(Settings):
     cleaned: str | None = Field(None, description="the same .ply after someone deleted splats: these are the object")
     region: Region | None = Field(None, description="box or sphere that holds the object, or is to be filled")
     fill: str | None = Field(None, description="instead of a region: folder of masks, of what is to be filled")
+    clicks: Clicked | None = Field(
+        None, description="read by the stage `masks`; here only checked", json_schema_extra=UNKEYED
+    )
     remove: list[str] | None = Field(
         None, description="read by the stage `masks`; here only checked", json_schema_extra=UNKEYED
     )

@@ -10,6 +10,7 @@ from reffusion.capture.layouts import cameras
 from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.reading import check_brought, read_scene, unphotographed
 from reffusion.capture.roles import views_of
+from reffusion.params.clicks import CLICKS
 from reffusion.params.poses import Params
 
 # pictures count where they are photographs or masks; depth maps belong to references
@@ -19,7 +20,7 @@ NOT_READ = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".heic", 
 def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
     """Of the scene's files those that this stage reads, and what it reads elsewhere: the photographs and masks, and
     all that is neither a picture nor a depth map. So a new reference, wherever it lies, reruns nothing here."""
-    others = [path for path in files if path.parent != scene or path.name != "scene.yaml"]
+    others = [path for path in files if path.parent != scene or path.name not in ("scene.yaml", CLICKS)]
     brought = {scene / name for name in (params.gaussians, params.cleaned) if name is not None}
     try:
         if unphotographed(params, scene):

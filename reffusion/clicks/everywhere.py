@@ -1,0 +1,137 @@
+"""From masks of a few views to masks of all, by the Gaussians: votes, a cut among neighbours, each view's own edges."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from reffusion.clicks.graph import attached, least_cut
+from reffusion.clicks.marks import Clicks, marked
+from reffusion.clicks.picture import corrected, refined, shrunk, view_mask
+from reffusion.masks import voting
+from reffusion.splat import rasterizer
+from reffusion.splat.conventions import SH0
+from reffusion.types import Camera, Gaussians
+
+NEIGHBOURS = 8
+MOST = 5.0  # px of blending weight, beyond which a vote counts no more
+SEEN = 1.0  # px of blending weight from which a Gaussian is shown to be the object
+UNSURE = 0.006  # of the picture's larger side: pixels this near to a mask's rim do not vote
+AROUND = 0.05  # of the picture's larger side: the ring around a mask that a test photograph is judged by
+ABSENT, LEVEL = 3.0, 0.02  # times as far off as in that ring, beside a part of white: the object is not there
+SHOWN = 0.5  # of a pixel: the object covers it
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """Which Gaussians lie next to each other, and how alike they look.
+
+    Attributes:
+        pairs: [E, 2] int, each pair once.
+        likeness: [E] in (0, 1].
+    """
+
+    pairs: np.ndarray
+    likeness: np.ndarray
+
+
+@dataclass(frozen=True)
+class Solved:
+    """What clicks say of the scene.
+
+    Attributes:
+        labels: bool [N], the Gaussians that are the object.
+        masks: view -> bool [H, W], of the views with clicks, or with a mask that was given.
+    """
+
+    labels: Tensor
+    masks: dict[str, np.ndarray]
+
+
+def neighbours(gaussians: Gaussians) -> Neighbours:
+    """Those next to each other in space; likeness by colour, against what neighbours differ by on average."""
+    means, color = (each.detach().cpu().double().numpy() for each in (gaussians.means, gaussians.sh[:, 0] * SH0))
+    near = cKDTree(means).query(means, min(NEIGHBOURS + 1, len(means)))[1].reshape(len(means), -1)[:, 1:]
+    own = np.repeat(np.arange(len(means)), near.shape[1])
+    pairs = np.unique(np.sort(np.stack([own, near.ravel()], 1), 1), axis=0)
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    square = ((color[pairs[:, 0]] - color[pairs[:, 1]]) ** 2).sum(1)
+    return Neighbours(pairs, np.exp(-square / (2 * square.sum() / max(len(square), 1) + 1e-12)))
+
+
+def solved(
+    gaussians: Gaussians,
+    near: Neighbours,
+    cameras: Mapping[str, Camera],
+    image_of: Callable[[str], np.ndarray],
+    clicks: Mapping[str, Clicks],
+    given: Mapping[str, np.ndarray],
+) -> Solved:
+    """The object by clicks, and by masks of some views.
+
+    The view with most clicks on the object is cut by its photograph alone; in each of the others clicks correct what
+    the Gaussians so far show there.
+
+    Args:
+        near: `neighbours` of the Gaussians.
+        image_of: view -> uint8 [H, W, 3].
+        clicks: view -> clicks in its undistorted pixels.
+        given: view -> bool [H, W], taken as they are.
+    """
+    order = sorted(clicks, key=lambda name: (-int(clicks[name].positive.sum()), name))
+    masks, labels = dict(given), torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
+    if masks:
+        labels = labelled(gaussians, near, cameras, masks)
+    for name in order:
+        if labels.any():
+            before = voting.label_view(gaussians, labels, cameras[name]) > SHOWN
+            masks[name] = corrected(image_of(name), before, clicks[name])
+        else:
+            masks[name] = view_mask(image_of(name), clicks[name])
+        labels = labelled(gaussians, near, cameras, masks)
+    return Solved(labels, masks)
+
+
+def labelled(
+    gaussians: Gaussians, near: Neighbours, cameras: Mapping[str, Camera], masks: Mapping[str, np.ndarray]
+) -> Tensor:
+    """bool [N]: the object, where the views with masks show the Gaussians by their votes, elsewhere by neighbours."""
+    sure = np.zeros((len(gaussians), 2))
+    for name, mask in masks.items():
+        ballots = torch.as_tensor(np.stack([_sure(mask), _sure(~mask)], -1), device=gaussians.means.device)
+        sure += rasterizer.accumulate(gaussians, cameras[name], ballots.to(gaussians.means.dtype)).cpu().numpy()
+    inside, outside = sure.T
+    labels = least_cut(np.minimum(outside, MOST), np.minimum(inside, MOST), near.pairs, near.likeness)
+    labels = attached(labels, near.pairs, inside > np.maximum(SEEN, outside))
+    return torch.as_tensor(labels, device=gaussians.means.device)
+
+
+def shown(
+    gaussians: Gaussians, labels: Tensor, camera: Camera, image: np.ndarray, clicks: Clicks | None = None
+) -> np.ndarray:
+    """bool [H, W]: where a view shows the labelled Gaussians, up to its photograph's own edges."""
+    mask = voting.label_view(gaussians, labels, camera) > SHOWN
+    nothing = Clicks(np.zeros((0, 2)), np.zeros(0, bool))
+    return refined(image, mask, marked(clicks or nothing, mask.shape))
+
+
+def there(gaussians: Gaussians, camera: Camera, image: np.ndarray, mask: np.ndarray) -> bool:
+    """Does the photograph show the object where its mask [H, W] is, as the Gaussians do, or was it taken without?"""
+    around = ~shrunk(~mask, max(2, round(AROUND * max(mask.shape)))) & ~mask
+    if not mask.any() or not around.any():
+        return bool(mask.any())
+    with torch.no_grad():
+        drawn = rasterizer.render(gaussians, camera).color.clamp(0, 1).cpu().numpy()
+    off = np.abs(drawn - image / 255.0).mean(-1)
+    return float(off[mask].mean()) < ABSENT * float(off[around].mean()) + LEVEL
+
+
+def _sure(mask: np.ndarray) -> np.ndarray:
+    """The mask without its rim, where one this thin is not all rim."""
+    inner = shrunk(mask, max(1, round(UNSURE * max(mask.shape))))
+    return inner if inner.sum() > 0.25 * mask.sum() else mask

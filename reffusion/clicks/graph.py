@@ -1,0 +1,130 @@
+"""Cuts through graphs of neighbours, pixels or Gaussians: which of them are the object."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage, sparse
+from scipy.sparse import csgraph
+
+from reffusion.clicks.marks import OBJECT, OTHER
+
+UNIT = 1000  # of capacity: a cost of 1 in whole numbers
+HARD = 1e4  # a cost that no sum of links outweighs
+BINS = 20  # of colours, a side of L*a*b* of 8 bit
+ROUNDS = 3  # of distances and colours, each by the labels of the one before
+BY_COLOR, BY_LIKELIHOOD = 0.3, 100.0  # what a way costs from the second round on: a step of colour, of likelihood
+SMOOTH = 5.0  # cost of a border between two that look alike
+REACH = 150.0  # of colour and pixels, how far a click goes that corrects
+MOST = 3.0  # that colour may cost, natural logarithm of a ratio
+
+
+def least_cut(object_cost: np.ndarray, other_cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray) -> np.ndarray:
+    """bool [N], True = the object: the labels of the least total cost.
+
+    Args:
+        object_cost, other_cost: [N] >= 0, cost of being the object, and of not being it.
+        pairs: [E, 2] int, neighbours, each pair once.
+        strength: [E] >= 0, cost of a pair with different labels.
+    """
+    count = len(object_cost)
+    source, sink, nodes = count, count + 1, np.arange(count)
+    shared = np.minimum(object_cost, other_cost)
+    whole = lambda cost: np.minimum(np.round(cost * UNIT), HARD * UNIT).astype(np.int32)
+    capacity = [whole(other_cost - shared), whole(object_cost - shared), whole(strength), whole(strength)]
+    first = [np.full(count, source), nodes, pairs[:, 0], pairs[:, 1]]
+    second = [nodes, np.full(count, sink), pairs[:, 1], pairs[:, 0]]
+    links = tuple(np.concatenate(each) for each in (first, second))
+    network = sparse.coo_array((np.concatenate(capacity), links), (count + 2, count + 2)).tocsr()
+    left = network - csgraph.maximum_flow(network, source, sink).flow
+    left.data = (left.data > 0).astype(np.int32)
+    left.eliminate_zeros()
+    reached = csgraph.breadth_first_order(left, source, return_predecessors=False)
+    return np.isin(nodes, reached)
+
+
+def grown(lab: np.ndarray, pairs: np.ndarray, length: np.ndarray, seeds: np.ndarray, weak: np.ndarray) -> np.ndarray:
+    """bool [N]: the object, grown from few seeds: a geodesic graph cut, whose colours follow from its own labels.
+
+    Args:
+        lab: [N, 3] float, colours in L*a*b* of 8 bit.
+        pairs: [E, 2] int, neighbours, each pair once; length: [E] > 0, how far apart they are, 1 = next to each other.
+        seeds: int8 [N], OBJECT, OTHER or UNKNOWN; at least one OBJECT.
+        weak: bool [N], the object less likely than not.
+    """
+    step = np.linalg.norm(lab[pairs[:, 0]] - lab[pairs[:, 1]], axis=1)
+    smooth = _smoothness(step, length)
+    other = (seeds == OTHER) | (weak & (seeds != OBJECT))
+    bins = tuple((lab * (BINS / 256)).astype(int).clip(0, BINS - 1).T)
+    cost, labels = step, None
+    for _ in range(ROUNDS):
+        side = nearer(pairs, (cost + 1.0) * length, seeds == OBJECT, other)
+        inside = np.maximum(side, 0) if labels is None else labels * (0.5 + side).clip(0.1, 1)
+        outside = np.maximum(-side, 0) if labels is None else ~labels * (0.5 - side).clip(0.1, 1)
+        like, unlike = (_frequency(bins, weight) for weight in (inside, outside))
+        gain = 2 * side + np.log(like / unlike).clip(-MOST, MOST)
+        against = np.where(seeds == OTHER, HARD, np.maximum(-gain, 0) * (seeds != OBJECT))
+        against_other = np.where(seeds == OBJECT, HARD, np.maximum(gain, 0) * (seeds != OTHER))
+        labels = least_cut(against, against_other, pairs, smooth)
+        likelihood = like / (like + unlike)
+        cost = BY_COLOR * step + BY_LIKELIHOOD * np.abs(likelihood[pairs[:, 0]] - likelihood[pairs[:, 1]])
+    return attached(labels, pairs, seeds == OBJECT)
+
+
+def regrown(lab: np.ndarray, pairs: np.ndarray, length: np.ndarray, seeds: np.ndarray, was: np.ndarray) -> np.ndarray:
+    """bool [N]: the labels `was`, but for what seeds that say otherwise reach without crossing a change of colour.
+
+    Args:
+        lab, pairs, length, seeds: as `grown` takes them.
+        was: bool [N].
+    """
+    step = np.linalg.norm(lab[pairs[:, 0]] - lab[pairs[:, 1]], axis=1)
+    smooth = _smoothness(step, length)
+    wrong = (seeds == OBJECT) & ~was | (seeds == OTHER) & was
+    right = (seeds == OBJECT) & was | (seeds == OTHER) & ~was
+    across = was[pairs[:, 0]] != was[pairs[:, 1]]  # what is changed lies on one side of the former border
+    way = sparse.coo_array(((step + 1.0) * length + REACH * across, tuple(pairs.T)), (len(lab),) * 2).tocsr()
+    lost = 2 * np.exp(-_distance(way, wrong) / REACH)
+    if right.any():
+        lost *= _distance(way, right) > _distance(way, wrong)
+    gain = np.where(was, 1.0, -1.0) * (1 - lost)
+    against = np.where(seeds == OTHER, HARD, np.maximum(-gain, 0) * (seeds != OBJECT))
+    against_other = np.where(seeds == OBJECT, HARD, np.maximum(gain, 0) * (seeds != OTHER))
+    return least_cut(against, against_other, pairs, smooth)
+
+
+def _smoothness(step: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """[E], cost of a border between neighbours: less where colours change more than they do on average."""
+    usual = float((step**2).sum()) / max(len(step), 1)
+    return SMOOTH * np.exp(-(step**2) / (2 * usual + 1e-9)) / length
+
+
+def attached(labels: np.ndarray, pairs: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+    """bool [N]: of the labelled those that hang together with a seed."""
+    kept = pairs[labels[pairs].all(1)]
+    links = sparse.coo_array((np.ones(len(kept)), tuple(kept.T)), (len(labels),) * 2)
+    part = csgraph.connected_components(links, directed=False)[1]
+    return labels & np.isin(part, part[seeds & labels])
+
+
+def nearer(pairs: np.ndarray, length: np.ndarray, these: np.ndarray, those: np.ndarray) -> np.ndarray:
+    """[N] in [-1, 1]: 1 at `these`, -1 at `those` (bool [N]), between them by the shortest ways along pairs."""
+    way = sparse.coo_array((length, tuple(pairs.T)), (len(these),) * 2).tocsr()
+    near, far = (_distance(way, start) for start in (these, those))
+    return (far - near) / (far + near + 1e-9)
+
+
+def _distance(way: sparse.csr_array, start: np.ndarray) -> np.ndarray:
+    """[N], length of the shortest way from any of `start`; where none leads there, longer than all."""
+    if not start.any():
+        return np.ones(way.shape[0])
+    found = csgraph.dijkstra(way, directed=False, indices=np.flatnonzero(start), min_only=True)
+    reached = np.isfinite(found)
+    return np.where(reached, found, 2 * found[reached].max() + 1)
+
+
+def _frequency(bins: tuple[np.ndarray, ...], weight: np.ndarray) -> np.ndarray:
+    """[N], how frequent the colour of each is among all by weight; never 0."""
+    count = np.zeros((BINS,) * 3)
+    np.add.at(count, bins, weight)
+    count = ndimage.gaussian_filter(count, 0.7, mode="nearest")
+    return (count / max(count.sum(), 1e-9))[bins] + 1e-5

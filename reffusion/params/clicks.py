@@ -1,0 +1,22 @@
+"""Clicks that a scene brings: scene.yaml's `clicks`."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field
+
+CLICKS = "clicks.json"  # in a scene's folder: what the mask page keeps of its own, and no stage reads
+
+
+def _click(said: Any) -> Any:
+    """YAML reads an unquoted + or - as text, and a click without either is on the object."""
+    if not isinstance(said, list | tuple) or len(said) not in (2, 3):
+        raise ValueError("a click is [x, y, +] on the object, [x, y, -] on what is not")
+    return (*said, "+") if len(said) == 2 else said
+
+
+Click = Annotated[
+    tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)], Literal["+", "-"]], BeforeValidator(_click)
+]
+Clicked = dict[str, list[Click]]  # view -> clicks, in pixels of its photograph from the upper left corner

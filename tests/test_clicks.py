@@ -1,0 +1,253 @@
+"""Clicks become masks: in one photograph, in all views by the Gaussians, and in a browser."""
+
+import itertools
+import threading
+import time
+
+import numpy as np
+import pytest
+import small_capture
+import small_scene as small
+import torch
+from browser import visiting
+
+from reffusion.capture.clicked import as_photographed, photographed, straightened
+from reffusion.clicks import everywhere
+from reffusion.clicks.graph import least_cut
+from reffusion.clicks.marks import Clicks
+from reffusion.clicks.picture import corrected, view_mask
+from reffusion.io.files import BadInput
+from reffusion.io.images import load_image, load_mask, save_image, save_mask, to_uint8
+from reffusion.io.scene import load_mask_sets
+from reffusion.params.poses import Params as Poses
+from reffusion.splat import rasterizer
+from report.clicking import Capture, Session
+from report.mask import Server
+from stages import masks, poses
+
+NEAR = 1.7
+
+
+def on(*points):
+    """Clicks on the object, (x, y) each; a third entry False: not on it."""
+    return Clicks(np.array([p[:2] for p in points], float), np.array([len(p) < 3 for p in points]))
+
+
+# ---------------------------------------------------------------------------------------------- one photograph
+
+
+def test_the_cut_is_the_cheapest_of_all():
+    draw = np.random.default_rng(0)
+    for _ in range(20):
+        pairs = np.array(list(itertools.combinations(range(8), 2)))[draw.permutation(28)[:14]]
+        for_object, for_other, strength = (draw.integers(0, 9, n) / 4 for n in (8, 8, 14))
+        labels = np.array(list(itertools.product((False, True), repeat=8)))
+        border = (labels[:, pairs[:, 0]] != labels[:, pairs[:, 1]]) @ strength
+        costs = labels @ for_object + ~labels @ for_other + border
+        found = least_cut(for_object, for_other, pairs, strength)
+        cost = found @ for_object + ~found @ for_other + (found[pairs[:, 0]] != found[pairs[:, 1]]) @ strength
+        assert cost == pytest.approx(costs.min())
+
+
+def scenery(shape=(240, 320)):
+    """A picture: noise on a slope of blue, with a red disk that has a yellow stripe; and the disk."""
+    rows, columns = np.mgrid[: shape[0], : shape[1]]
+    disk = np.hypot(rows - 120, columns - 150) < 60
+    noise = np.random.default_rng(1).normal(0, 6, (*shape, 3))
+    picture = np.stack([40 + columns / 8, 60 + rows / 8, 140 + columns / 8], -1)
+    picture[disk] = (200, 50, 40)
+    picture[disk & (abs(rows - 120) < 12)] = (220, 200, 60)
+    return (picture + noise).clip(0, 255).astype(np.uint8), disk
+
+
+def test_one_click_finds_what_is_of_one_colour_and_another_the_rest():
+    picture, disk = scenery()
+    rows = np.mgrid[:240, :320][0]
+    red = disk & (abs(rows - 120) >= 12)
+    assert small.iou(view_mask(picture, on((150, 85), (150, 155))) & red, red) > 0.97
+    assert small.iou(view_mask(picture, on((150, 85), (150, 155), (150, 120))), disk) > 0.97
+    assert not view_mask(picture, on((10, 10, False))).any()
+    assert not view_mask(picture, Clicks(np.zeros((0, 2)), np.zeros(0, bool))).any()
+
+
+def test_a_click_takes_back_what_it_is_on():
+    picture, disk = scenery()
+    stripe = disk & (abs(np.mgrid[:240, :320][0] - 120) < 12)
+    without = corrected(picture, disk, on((150, 120, False)))
+    assert not without[115:125, 140:160].any() and small.iou(without, disk & ~stripe) > 0.9
+    again = corrected(picture, without, on((150, 120)))
+    assert small.iou(again, disk) > 0.95
+
+
+def test_a_plain_picture_of_any_size_is_no_error():
+    for shape in ((1, 1, 3), (2, 300, 3), (40, 40, 3)):
+        found = view_mask(np.full(shape, 7, np.uint8), on((shape[1] / 2, shape[0] / 2)))
+        assert found.shape == shape[:2]
+
+
+# ---------------------------------------------------------------------------------------------- all views
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """The wall with a square before it, photographed with the square; no masks."""
+    folder = tmp_path_factory.mktemp("clicked")
+    placed, fit, _ = small.write(folder, NEAR, masks={})
+    everything, _ = small.gaussians(NEAR)
+    for name in small.TRAIN:
+        with torch.no_grad():
+            drawn = rasterizer.render(everything, small.CAMERAS[name]).color.clamp(0, 1).numpy()
+        save_image(placed / "images" / f"{name}.png", to_uint8(drawn))
+    small.write_photos(folder / "given", placed, small.CAMERAS)
+    return folder, placed, fit
+
+
+def truth(name):
+    return small.true_mask(small.CAMERAS[name], NEAR)
+
+
+def test_clicks_in_one_view_give_the_masks_of_all(scene, tmp_path):
+    _, placed, fit = scene
+    middle = np.argwhere(truth("a2")).mean(0)[::-1] + 0.5
+    params = masks.Params(clicks={"a2": [[*middle, "+"]]})
+    masks.run(params, tmp_path, poses=placed, fit=fit)
+    for name, found in load_mask_sets(tmp_path, small.CAMERAS).items():
+        if name in small.TRAIN:
+            assert small.iou(found.raw, truth(name)) > 0.9 and small.iou(found.consistent, truth(name)) > 0.85
+        else:
+            assert not found.raw.any(), "test photographs do not show it"
+
+
+def test_clicks_on_nothing_are_refused(scene, tmp_path):
+    _, placed, fit = scene
+    with pytest.raises(ValueError, match="click in the middle of the object"):
+        masks.run(masks.Params(clicks={"a2": [[3, 3, "-"]]}), tmp_path, poses=placed, fit=fit)
+
+
+def test_a_mask_in_one_view_stays_as_it_was_given(scene):
+    _, placed, _ = scene
+    everything, _ = small.gaussians(NEAR)
+    image_of = lambda name: load_image(placed / "images" / f"{name}.png")
+    near = everywhere.neighbours(everything)
+    found = everywhere.solved(everything, near, small.CAMERAS, image_of, {}, {"a1": truth("a1")})
+    assert (found.masks["a1"] == truth("a1")).all()
+    shown = everywhere.shown(everything, found.labels, small.CAMERAS["a4"], image_of("a4"))
+    assert small.iou(shown, truth("a4")) > 0.9
+
+
+# ---------------------------------------------------------------------------------------------- what a scene brings
+
+
+def test_clicks_find_their_place_through_the_lens():
+    lens = small_capture.some_truth(small_capture.OPENCV).lens
+    points = np.array([[1.0, 2.0], [50.0, 30.0], [190.0, 140.0]])
+    there = straightened(points, lens, (192, 144))
+    assert np.abs(photographed(there, lens, (192, 144)) - points).max() < 1e-3
+    mask = np.zeros((72, 96), bool)
+    mask[30:40, 40:60] = True
+    photo = as_photographed(mask, lens, (192, 144))
+    corners = photographed(np.array([[40.0, 30.0], [60.0, 40.0]]), lens, (192, 144)).round().astype(int)
+    assert photo.shape == (144, 192)
+    rows, columns = np.nonzero(photo)
+    assert abs(columns.min() - corners[0, 0]) <= 2 and abs(rows.max() + 1 - corners[1, 1]) <= 2
+
+
+def written(folder, with_masks=False):
+    some = small_capture.some_truth()
+    small_capture.write_pictures(folder / "images", sorted(some.world_to_camera))
+    small_capture.write_model(folder / "sparse/0", some, ending=".png")
+    if with_masks:
+        small_capture.write_masks(folder / "masks", ["v01"])
+    return folder
+
+
+@pytest.mark.parametrize(("clicks", "said"), [
+    ({"v9": [[1, 1]]}, "v9"),
+    ({"v00": [[1, 1, "-"]]}, "none is on the object"),
+    ({"v00": [[97, 1]]}, r"\[97, 1\] lies outside of 'v00', which has 96x72 px"),
+    ({"v01": [[1, 1]]}, "has a mask"),
+    ({"v00": [[1, 1]], "v00.png": [[2, 2]]}, "named twice"),
+])  # fmt: skip
+def test_clicks_that_cannot_be_right(tmp_path, clicks, said):
+    folder = written(tmp_path / "scene", with_masks="v01" in clicks)
+    (tmp_path / "out").mkdir()
+    with pytest.raises(BadInput, match=said):
+        poses.run(Poses(clicks=clicks), tmp_path / "out", scene=folder)
+
+
+@pytest.mark.parametrize("click", [[1], [1, 2, 3], [1, 2, "*"], [-1, 2], "1, 2", [1, 2, "+", 4], ["a", 2]])
+def test_what_is_no_click(click):
+    with pytest.raises(ValueError):
+        masks.Params(clicks={"v00": [click]})
+
+
+# ---------------------------------------------------------------------------------------------- the page
+
+
+@pytest.fixture
+def page(scene, tmp_path):
+    _, placed, fit = scene
+    capture = Capture(tmp_path, tmp_path / "masks", placed, fit, {})
+    server = Server(Session(capture, lambda: True), port=18090)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    while server.session.gaussians is None:
+        time.sleep(0.05)
+    yield server
+    server.shutdown()
+    server.server_close()
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_clicks_in_a_browser_make_masks_that_are_saved(page, tmp_path, width):
+    with visiting(page.address, width) as tab:
+        tab.wait_for_function("state && state.fit && view")
+        name = tab.evaluate("view")
+        box = tab.locator("#stage").bounding_box()
+        column, row = np.argwhere(truth(name)).mean(0)[::-1] / (small.WIDTH, small.HEIGHT)
+        at = (box["x"] + column * box["width"], box["y"] + row * box["height"])
+        tab.mouse.click(*at)
+        tab.wait_for_function("!pending && !state.busy && state.views.every(v => v.mask !== null)", timeout=60_000)
+        assert small.iou(page.session.masks[name], truth(name)) > 0.9
+        tab.mouse.click(*at, button="right")
+        tab.wait_for_function("!pending && of(view).clicks.length === 2")
+        assert not page.session.masks[name][round(row * small.HEIGHT), round(column * small.WIDTH)]
+        tab.keyboard.press("Control+z")
+        tab.wait_for_function("!pending && !state.busy && of(view).clicks.length === 1")
+        tab.keyboard.press("ArrowRight")
+        assert tab.evaluate("view") != name
+        tab.locator("#save").click()
+        tab.wait_for_function("document.getElementById('said').textContent.includes('saved')")
+        assert tab.evaluate("document.documentElement.scrollWidth") <= width
+    for each in small.TRAIN:
+        assert small.iou(load_mask(tmp_path / "masks" / f"{each}.png"), truth(each)) > 0.85
+
+
+def test_what_was_clicked_is_there_the_next_time(page, tmp_path):
+    page.session.click("a2", [(48.0, 36.0, True)])
+    page.session.save()
+    again = Session(page.session.capture, lambda: True)
+    assert again.clicks == {"a2": [(48.0, 36.0, True)]}
+    again.save()  # its own files it may write again
+
+
+def test_masks_of_others_are_never_overwritten(page, tmp_path):
+    save_mask(tmp_path / "masks/a3.png", truth("a3"))
+    before = load_image(tmp_path / "masks/a3.png")
+    page.session.click("a2", [(48.0, 36.0, True)])
+    with pytest.raises(ValueError, match=r"a3\.png: not written by this page"):
+        page.session.save()
+    assert (load_image(tmp_path / "masks/a3.png") == before).all()
+    assert sorted(p.name for p in (tmp_path / "masks").iterdir()) == ["a3.png"]
+
+
+def test_the_page_is_for_this_machine_only(page):
+    import urllib.error
+    import urllib.request
+
+    for headers in ({"Host": "elsewhere.example"}, {"Origin": "http://elsewhere.example"}):
+        request = urllib.request.Request(page.address + "save", b"{}", headers)
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(request)
+    request = urllib.request.Request(page.address + "clicks", b'{"view": "a9", "clicks": [[1, 1, "+"]]}')
+    with pytest.raises(urllib.error.HTTPError, match="400"):
+        urllib.request.urlopen(request)
