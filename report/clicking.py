@@ -80,7 +80,7 @@ def _saved(folder: Path) -> dict:
 
 
 class Session:
-    """The clicks of one sitting; safe to call from several threads.
+    """The clicks on a scene; safe to call from several threads.
 
     Masks are made for a view at once. Where the fit is there, a thread of its own makes those of all others.
     """

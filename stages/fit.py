@@ -15,6 +15,7 @@ from reffusion.capture import stereo, support
 from reffusion.fit import few
 from reffusion.fit.reconstruction import fit
 from reffusion.fit.start import initial_gaussians
+from reffusion.fit.step import GENTLE
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_raw_masks, load_scene, load_views
 from reffusion.masks import voting
@@ -37,9 +38,9 @@ def run(params: Params, out: Path, *, poses: Path) -> None:
     hidden = hidden_pixels(poses, scene) if params.pixels == "unmasked" else {}
     images |= {name: paint2d.telea(images[name], mask) for name, mask in hidden.items()}  # flow looks at them too
     params, first = capped(params, cameras), on_surfaces(params, scene, cameras, images, hidden)
-    rates = few.RATES if first is not None else None
+    rates = None
     if first is not None:
-        params = few.gently(params)
+        params, rates = few.gently(params), GENTLE
     elif (out / trace.CHECKPOINT).exists():  # of what it starts from only the degree and the device still matter
         first = start(params, scene.points, scene.point_colors)
     else:

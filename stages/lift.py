@@ -16,13 +16,13 @@ from reffusion.io.images import load_image, replace_image
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets, load_scene, save_references
 from reffusion.paint import paint2d
+from reffusion.params.base import REFINED_FROM
 from reffusion.params.lift import Params
 from reffusion.prior import inpaint
 from reffusion.prior.model import load_prior
 from reffusion.types import Reference
 
-# Of the diffusion, beside its steps: where refinement at each finer level starts, 1 = pure noise; the paper's a.
-START, GUIDANCE, SEED = 0.6, 0.0, 0
+GUIDANCE, SEED = 0.0, 0  # the paper's a
 DTYPE = torch.float32
 
 
@@ -65,7 +65,7 @@ def painter_of(params: Params) -> tuple[str, Callable[[np.ndarray, np.ndarray, s
             prompt=params.prompt,
             seeds=[seeding.seed_for(SEED, "lift", name)],
             steps=params.steps,
-            start=START,
+            start=REFINED_FROM,
             guidance=GUIDANCE,
         )
         return inpaint.as_picture(picture)

@@ -19,6 +19,7 @@ from reffusion.io.ply import load_ply
 from reffusion.io.scene import has_photograph, load_mask_sets, load_object, load_scene, load_views, save_references
 from reffusion.masks import taint
 from reffusion.paint import agreement, feedforward, painting, registration
+from reffusion.params.base import REFINED_FROM
 from reffusion.params.reference import Params
 from reffusion.prior import inpaint, memory
 from reffusion.prior.model import load_prior
@@ -198,6 +199,7 @@ def from_prior(params: Params, out: Path, name: str, base: np.ndarray, invent: n
             hole,
             prompt=params.prompt,
             seeds=[params.seed + index for index in range(params.candidates)],
+            start=REFINED_FROM,
             **params.sampler.model_dump(),
         ).cpu()
     seams = inpaint.seam(candidates, hole)

@@ -238,9 +238,10 @@ def test_interrupted_distillation_resumes_to_the_same_gaussians(prior, text, tmp
 def test_densification_takes_a_share_whatever_the_weight(prior, text, tmp_path, monkeypatch):
     """The SDS gradient has no scale of its own."""
     monkeypatch.setattr(D, "PRUNE_OPA", 0.0)
+    monkeypatch.setattr(D, "DENSIFIED", 0.25)
 
     def grown(name, weight, every):
-        densify = {"every": every, "share": 0.25}
+        densify = {"every": every}
         settings = altered(PLAIN, iterations=2, confined=False, sds={"weight": weight}, densify=densify)
         _, labels = run(tmp_path / name, prior, text, settings)
         return int(labels.sum() - wall()[1].sum())

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from reffusion.cost.counts import COUNTS
 from reffusion.io.machine import machine
-from reffusion.params.base import PRIOR
+from reffusion.params.base import PRIOR, REFINED_FROM
 from reffusion.params.distill import Params as Distill
 from reffusion.params.fit import Params as Fit
 from reffusion.params.personalize import Params as Personalize
@@ -134,7 +134,7 @@ def reference(params: Reference) -> tuple[Work, float] | None:
     sampler, half = params.sampler, params.dtype != "float32"
     guided = sampler.guidance > 0
     whole = answering(prior, half, sampler.steps, guided)
-    window = answering(prior, half, sampler.start * sampler.steps, guided)
+    window = answering(prior, half, REFINED_FROM * sampler.steps, guided)
     return (whole + window.times(finer)).times(params.candidates), WEIGHTS * (2.6 if prior == "SDXL" else 1) + PAINTED
 
 

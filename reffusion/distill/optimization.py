@@ -25,6 +25,7 @@ from reffusion.splat.rasterizer import render
 from reffusion.types import Camera, Gaussians
 
 GROW_SCALE3D = 0.01  # standard deviation from which a Gaussian is split, not cloned
+DENSIFIED = 0.05  # share of the masked Gaussians that are cloned or split each time
 PRUNE_OPA = 0.005  # fainter Gaussians are pruned when others are added
 SNAPSHOTS = 4  # parts of the run, after each but the last of which the masked Gaussians are kept
 REGION_EVERY = 50  # steps between prunings of Gaussians that changed region
@@ -167,7 +168,7 @@ def _densify(optimizer: GaussianOptimizer, chosen: Densify, noise: torch.Generat
     if not optimizer.masked.any():
         return
     pulls = (optimizer.grad2d_sum / optimizer.grad2d_count.clamp(min=1))[optimizer.masked]
-    threshold = float(pulls.kthvalue(max(1, round((1 - chosen.share) * len(pulls)))).values)
+    threshold = float(pulls.kthvalue(max(1, round((1 - DENSIFIED) * len(pulls)))).values)
     threshold = max(threshold, torch.finfo(pulls.dtype).tiny)  # what is not pulled at all stays single
     densify(optimizer, threshold, GROW_SCALE3D, chosen.cap_max, noise)
     prune(optimizer, PRUNE_OPA, float("inf"))

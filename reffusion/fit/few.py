@@ -13,27 +13,16 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from reffusion.depth.between import SparsePoints, depth_between
-from reffusion.gaussians.optimize import Rates
+from reffusion.depth.between import NORMAL_FROM, SparsePoints, depth_between
 from reffusion.gaussians.sheets import Sheets, surface
 from reffusion.params.fit import Params
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
-BELOW = 10  # training views that a typical point is in: from so many on a fit from points is as good
+BELOW = 10  # training views that a typical point is in; with 8 surfaces are ahead of points, with more it was not tried
 STEPS = 0.2  # of a fit's: the surfaces are there, and more steps only bend them
 COVERED, BEFORE = 0.7, 1.05  # alpha from which, and relative depth up to which, a pixel shows what is there already
 STAINED = 3  # px, side of the square that is looked at for something nearer
-# Between those of a fit's start and end: the scene is there, but what does not agree must move.
-RATES = Rates(
-    means=4e-4,
-    means_last=2e-5,
-    quaternions=2e-3,
-    log_scales=5e-3,
-    opacity_logits=0.05,
-    sh_dc=5e-3,
-    sh_rest=5e-4,
-)
 
 
 @torch.no_grad()
@@ -54,7 +43,7 @@ def surfaces(
         hidden: view name -> bool [H, W], pixels that are not looked at.
         params: gives degree, device and way of being drawn.
     """
-    if len(points) <= 10:
+    if len(points) <= NORMAL_FROM:
         return None
     sparse, found = SparsePoints.of(points, colors), None
     for camera in cameras:

@@ -18,6 +18,16 @@ from reffusion.splat.rasterizer import render
 from reffusion.types import Camera
 
 PRUNE_OPA = 0.005  # 3DGS's: fainter Gaussians are pruned
+# Between those of a fit's start and end, for a scene that is there, in which what does not agree must move.
+GENTLE = Rates(
+    means=4e-4,
+    means_last=2e-5,
+    quaternions=2e-3,
+    log_scales=5e-3,
+    opacity_logits=0.05,
+    sh_dc=5e-3,
+    sh_rest=5e-4,
+)
 GROW_SCALE3D = 0.01  # deviation / distance from which on a Gaussian is split, not cloned
 
 

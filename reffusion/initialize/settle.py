@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from reffusion.fit.few import RATES
 from reffusion.fit.reconstruction import fit
+from reffusion.fit.step import GENTLE
 from reffusion.params.fit import Densify, LearningRates, Params, SphericalHarmonics
 from reffusion.types import Camera, Gaussians, Reference
 
@@ -57,7 +57,7 @@ def settle(gaussians: Gaussians, known: Known, steps: int, seed: int, folder: Pa
         densify=Densify(stop=0.0, reset_every=0.0),
         lr=LearningRates(betas=BETAS),
     )
-    return fit(views, images, gaussians, settings, folder=folder, weights=weights, rates=RATES)
+    return fit(views, images, gaussians, settings, folder=folder, weights=weights, rates=GENTLE)
 
 
 def turns_of(known: Known) -> list[int]:

@@ -92,9 +92,12 @@ def checkpoint_field() -> Any:
     return Field(10.0, gt=0, description="seconds of work between checkpoints", json_schema_extra=UNKEYED)
 
 
+# PAPER leaves open: where in the schedule the refinement of each finer level starts; 1 = pure noise.
+REFINED_FROM = 0.6
+
+
 class Sampler(Settings):
     """How a picture is painted by the prior (`reffusion.prior.inpaint`)."""
 
     steps: int = Field(50, ge=1, description="sampler steps from pure noise")
-    start: float = Field(0.6, gt=0, le=1, description="where refinement at each finer level starts, 1 = pure noise")
     guidance: float = Field(0.0, ge=0, description="the paper's a; libraries' guidance scale is 1 + a")

@@ -110,7 +110,6 @@ class Densify(Settings):
     cloned or split, a share of them, for the SDS gradient has no scale a threshold could refer to."""
 
     every: int = Field(0, ge=0, description="steps between densifications of masked Gaussians; 0: never")
-    share: float = Field(0.05, gt=0, lt=1, description="share of the masked Gaussians chosen each time")
     stop: float = Field(0.5, ge=0, le=1, description="part of the run after which no Gaussian is added")
     cap_max: int = Field(2_000_000, ge=1, description="most Gaussians")
 

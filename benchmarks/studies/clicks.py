@@ -1,0 +1,93 @@
+"""Masks from few clicks in one view against true masks: `python -m benchmarks.studies.clicks --runs runs/demo`.
+
+Of each run the stages `poses`, with true masks, and `fit` are needed. Clicks are put where a person would correct: each
+in the middle of the largest error of the middle view's mask so far, until that is right or there are --clicks. Prints
+the view's IoU after each, then mean and worst IoU over all views with masks; --sheets: the masks over four views.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+
+from reffusion.clicks import everywhere
+from reffusion.clicks.marks import Clicks
+from reffusion.clicks.picture import view_mask
+from reffusion.io.images import save_image
+from reffusion.io.ply import load_ply
+from reffusion.io.scene import load_raw_masks, load_scene, load_views
+
+RIGHT = 0.94  # IoU from which a person would not correct
+TINT = (255, 0, 160)
+
+
+def iou(found: np.ndarray, true: np.ndarray) -> float:
+    """Of bool [H, W] masks; 1 where both are empty."""
+    return float((found & true).sum() / (found | true).sum()) if (found | true).any() else 1.0
+
+
+def next_click(found: np.ndarray, true: np.ndarray) -> tuple[float, float, bool]:
+    """(x, y, on the object) of the pixel that lies deepest in what is missing, or in what is too much."""
+    depths = [ndimage.distance_transform_edt(np.pad(wrong, 1))[1:-1, 1:-1] for wrong in (found & ~true, true & ~found)]
+    missing = depths[1].max() >= depths[0].max()
+    row, column = np.unravel_index(depths[missing].argmax(), true.shape)
+    return column + 0.5, row + 0.5, bool(missing)
+
+
+def clicked(image: np.ndarray, true: np.ndarray, most: int) -> Clicks:
+    """The clicks that a person would make on a view, with what comes of each printed."""
+    chosen, found = [], np.zeros_like(true)
+    while len(chosen) < most and iou(found, true) < RIGHT:
+        chosen.append(next_click(found, true))
+        clicks = Clicks(np.array([each[:2] for each in chosen]), np.array([each[2] for each in chosen]))
+        began = time.monotonic()
+        found = view_mask(image, clicks)
+        print(f"  click {len(chosen)}: {iou(found, true):.3f}, {time.monotonic() - began:.1f} s", flush=True)
+    return clicks
+
+
+def measured(run: Path, most: int, sheet: Path | None) -> str:
+    """A line of figures; ValueError where the run has no masks."""
+    scene = load_scene(run / "poses")
+    true = load_raw_masks(run / "poses", scene.train)
+    if not true:
+        raise ValueError(f"{run / 'poses/masks'}: no masks to compare with")
+    names = sorted(true)
+    view, images = names[len(names) // 2], load_views(run / "poses", names)
+    clicks = clicked(images[view], true[view], most)
+    gaussians, began = load_ply(run / "fit/gaussians.ply"), time.monotonic()
+    near = everywhere.neighbours(gaussians)
+    solved = everywhere.solved(gaussians, near, scene.cameras, images.__getitem__, {view: clicks}, {})
+    shown = lambda name: everywhere.shown(gaussians, solved.labels, scene.cameras[name], images[name])
+    found = {name: shown(name) for name in names}
+    seconds = time.monotonic() - began
+    shares = {name: iou(found[name], true[name]) for name in names}
+    if sheet:
+        some = names[:: max(1, len(names) // 4)][:4]
+        save_image(sheet, np.hstack([tinted(images[name], found[name]) for name in some]))
+    worst = min(shares, key=shares.__getitem__)
+    mean = float(np.mean(list(shares.values())))
+    return f"{run.name}: {len(clicks)} clicks, mean {mean:.3f}, worst {shares[worst]:.3f} ({worst}), {seconds:.1f} s"
+
+
+def tinted(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """uint8 [H, W, 3], the mask over its picture."""
+    return np.where(mask[..., None], 0.5 * image + 0.5 * np.array(TINT), image).round().astype(np.uint8)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=Path, nargs="+", required=True)
+    parser.add_argument("--clicks", type=int, default=5, help="at most so many")
+    parser.add_argument("--sheets", type=Path, help="folder for pictures")
+    given = parser.parse_args()
+    for run in given.runs:
+        print(measured(run, given.clicks, given.sheets / f"{run.name}.png" if given.sheets else None), flush=True)
+
+
+if __name__ == "__main__":
+    main()
