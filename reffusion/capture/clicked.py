@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from reffusion.capture.layouts.capture import Capture
@@ -72,6 +71,8 @@ def photographed(points: np.ndarray, lens: Lens, size: tuple[int, int]) -> np.nd
 def as_photographed(mask: np.ndarray, lens: Lens, size: tuple[int, int]) -> np.ndarray:
     """A mask [H, W] of the undistorted picture as its photograph lies, of `size` (width, height); where the undistorted
     picture shows nothing of it, its rim goes on."""
+    import cv2
+
     pinhole, where = undoing(lens)
     at = None if where is None else _back(lens, pinhole)
     soft = mask.astype(np.float32)
