@@ -76,9 +76,9 @@ def supported(params: Params, scene: Scene) -> Params:
 
 
 def on_surfaces(params: Params, scene: Scene, cameras: list[Camera], images, hidden) -> Gaussians | None:
-    """The Gaussians to start from where few views see a typical point; None where there are enough, or too few points
-    that they show."""
-    if params.few_views != "surfaces" or support.views_of(scene.points, cameras) >= few.BELOW:
+    """The Gaussians to start from where there are few views; None where there are enough, or too few points that they
+    show."""
+    if params.few_views != "surfaces" or len(cameras) > few.MOST:
         return None
     found = few.surfaces(cameras, images, scene.points, scene.point_colors, hidden, params)
     if found is not None:

@@ -13,8 +13,10 @@ from reffusion.masks.witness import Witness, surface_range
 from reffusion.paint.paint2d import telea
 from reffusion.texture import completion, search, surfaces
 from reffusion.texture.blending import blended
-from reffusion.texture.completion import alone, complete
+from reffusion.texture.completion import complete
 from reffusion.texture.matches import NONE, PATCH, Compared
+from reffusion.texture.regular import BINS, FEWEST, Seen, nothing, regular
+from reffusion.texture.shown import alone, how_they_repeat
 from reffusion.types import Camera
 
 SIDE = 128
@@ -145,6 +147,38 @@ def test_planks_run_on_in_their_own_perspective():
     assert along < 0.9 * shifted and along < 0.6 * plain
 
 
+def seen_plane(picture: np.ndarray, view: Camera) -> Seen:
+    """The floor within 1.2 of its middle, as a picture shows it."""
+    places = surfaces._places(np.ones((SIDE, SIDE), np.int64), view, [FLOOR])
+    rows, columns = np.nonzero((np.linalg.norm(places, axis=-1) < 1.2) & np.isfinite(FLOOR.depth(view)))
+    return Seen(np.stack([columns, rows], 1), places[rows, columns], picture)
+
+
+def test_a_floor_of_planks_repeats_itself_by_their_width():
+    found = regular(1, {1: seen_plane(planks(CAMERAS[0]), CAMERAS[0])})
+    across = (found.peaks @ (1.0, 0.3)) / 0.12  # planks' widths that each offset goes across them
+    assert len(found.peaks) > 5 and np.abs(across - across.round()).max() < 0.25
+    middle = round(0.06 / found.pitch[1, 0])  # half a plank's width
+    assert found.table[1, BINS, BINS + middle] < 0.1
+    assert (found.starts == (0, 0, len(found.peaks))).all()
+
+
+def test_what_does_not_repeat_itself_has_no_regular_offsets():
+    noise = np.random.default_rng(0).integers(0, 256, (SIDE, SIDE, 3), np.uint8)
+    assert len(regular(1, {1: seen_plane(noise, CAMERAS[0])}).peaks) == 0
+    some = seen_plane(noise, CAMERAS[0])
+    few = Seen(some.pixels[:FEWEST], some.places[:FEWEST], some.image)
+    assert not regular(2, {2: few}).pitch[1].any() and len(regular(2, {2: few}).peaks) == 0
+
+
+def test_joints_stay_straight_where_a_floor_repeats_itself():
+    image = np.where(hidden()[..., None], np.uint8(RED), planks(CAMERAS[0]))
+    target, sources, smooth = surfaces._told(image, hidden(), CAMERAS[0], hidden(), floor())
+    off = lambda done: np.abs(done.image.astype(int) - planks(CAMERAS[0]))[hidden()].mean()
+    wrong = lambda repeats: np.mean([off(complete(target, hidden(), sources, smooth, k, repeats)) for k in range(4)])
+    assert wrong(how_they_repeat(target, sources, smooth)) < 0.9 * wrong(nothing(1))
+
+
 def test_frames_are_the_derivative_of_a_planes_coordinates():
     view, h = CAMERAS[1], 1e-4
     frames = surfaces._frames(np.ones((SIDE, SIDE), np.int64), view, [FLOOR])
@@ -174,15 +208,16 @@ def test_the_misfit_is_the_mean_square_by_weight():
     own, other = (surfaces._source(view, around.photos[view.camera.name], around) for view in around.views[:2])
     seen = [(completion._values(each.image, each.masked), each.masked) for each in (own, other)]
     marked = [completion._marked(values, each, [1], 1) for (values, _), each in zip(seen, (own, other), strict=True)]
-    pictures = completion._pictures(marked, [masked for _, masked in seen], [own, other], 1)
+    pictures = completion._pictures(marked, [masked for _, masked in seen], [own, other], 1, 1)
     mask = np.zeros((SIDE, SIDE), bool)
     mask[70, 62] = True
     target = replace(own, surface=np.ones((SIDE, SIDE), np.int64))
-    target = replace(target, to_plane=surfaces._frames(target.surface, CAMERAS[0], [FLOOR]))
-    pixels = completion._pixels(target, mask, 1, [1], pictures)
+    on_floor = lambda of: of(target.surface, CAMERAS[0], [FLOOR])
+    target = replace(target, to_plane=on_floor(surfaces._frames), place=on_floor(surfaces._places))
+    pixels = completion._pixels(target, mask, 1, [1], pictures, nothing(1))
     now, weight = marked[0], np.random.default_rng(0).random((SIDE, SIDE)).astype(np.float32)
     row, column, angle = 100.0, 40.0, 0.2
-    of = Compared(pixels, pictures, now, weight)
+    of = Compared(pixels, pictures, now, weight, nothing(1))
     found = search.misfit(0, True, 1, row, column, np.float32(angle), NONE, of)
     assert search.misfit(0, False, 1, row, column, np.float32(0), NONE, of) == NONE, "along a plane nothing is shifted"
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])

@@ -78,7 +78,7 @@ class Params(Settings):
     few_views: Literal["as_many", "fewer_harmonics", "surfaces"] = Field(
         "fewer_harmonics",
         description="what views too few for it change: nothing; no degree of spherical harmonics that they do not "
-        "determine; that, and a start on surfaces between the sparse points where a typical one is in under 10 views",
+        "determine; that, and, of at most 8 views, a start on surfaces between the sparse points",
     )
     pixels: Literal["all", "unmasked"] = Field(
         "all", description="those that supervise; unmasked, a baseline: masked pixels are never looked at (Masked NeRF)"

@@ -20,6 +20,8 @@ from reffusion.paint.paint2d import blanked, telea
 from reffusion.texture import search, votes
 from reffusion.texture.blending import blended
 from reffusion.texture.matches import NONE, PATCH, Choice, Compared, Hole, Match, Pictures
+from reffusion.texture.regular import Regular, nothing
+from reffusion.texture.shown import Shown, planes_of
 
 COARSEST = 40.0  # px that the hole may be wide at the coarsest level: there its parts are laid out
 SMALL = 16.0  # px: a wider hole has two levels at least
@@ -35,33 +37,6 @@ ROUNDS = (8, 5, 3)  # of search and vote: at the coarsest level, between, at the
 
 
 @dataclass(frozen=True)
-class Shown:
-    """A picture and the surfaces that it shows.
-
-    Attributes:
-        image: [H, W, 3] uint8.
-        masked: bool [H, W], pixels that must not be read.
-        usable: bool [H, W], where a patch may have its middle.
-        surface: int [H, W], the plane shown, 1, 2, ...; 0: none.
-        to_plane: [H, W, 2, 2], change of the plane's coordinates with (x, y) in pixels; any regular matrix off planes.
-        size: [H, W], the world's length of a pixel.
-    """
-
-    image: np.ndarray
-    masked: np.ndarray
-    usable: np.ndarray
-    surface: np.ndarray
-    to_plane: np.ndarray
-    size: np.ndarray
-
-
-def alone(image: np.ndarray, hole: np.ndarray) -> Shown:
-    """A picture of which nothing else is known."""
-    unit = np.broadcast_to(np.eye(2), (*hole.shape, 2, 2))
-    return Shown(image, hole, ~hole, np.zeros(hole.shape, np.int64), unit, np.ones(hole.shape))
-
-
-@dataclass(frozen=True)
 class Completed:
     """A picture with its hole filled, uint8 [H, W, 3], and how badly its patches fit on the whole: of several, the one
     with the least is the best to look at, mostly."""
@@ -71,7 +46,12 @@ class Completed:
 
 
 def complete(
-    target: Shown, hole: np.ndarray, sources: Sequence[Shown], smooth: Sequence[int] = (), seed: int = 0
+    target: Shown,
+    hole: np.ndarray,
+    sources: Sequence[Shown],
+    smooth: Sequence[int] = (),
+    seed: int = 0,
+    repeats: Regular | None = None,
 ) -> Completed:
     """The target with its hole filled by patches of the sources, which may be the target itself.
 
@@ -79,6 +59,7 @@ def complete(
         target: its image is read outside the hole only. hole: bool [H, W].
         smooth: numbers of the planes along which patches are carried; on rough ground that would smear grass.
         seed: of the search.
+        repeats: how smooth planes repeat themselves (`how_they_repeat`).
     """
     if not hole.any():
         return Completed(target.image.copy(), 0.0)
@@ -87,11 +68,12 @@ def complete(
     if not levels:
         return Completed(telea(target.image, hole), float(NONE))
     state = np.array([seeding.seed_for(seed, "texture") | 1], np.uint64)
+    repeats = repeats or nothing(planes_of([target, *sources]))
     match = before = None
     for k, (now, mask, pictures) in enumerate(levels):
         first, last = k == 0, k == len(levels) - 1
-        pixels = _pixels(target, mask, 2 ** (len(levels) - 1 - k), smooth, pictures)
-        of = Compared(pixels, pictures, now, _trust(mask))
+        pixels = _pixels(target, mask, 2 ** (len(levels) - 1 - k), smooth, pictures, repeats)
+        of = Compared(pixels, pictures, now, _trust(mask), repeats)
         choice = _choice(pictures, int(pixels.surface.max()))
         if first:
             match = _laid_out(of, mask, choice, state)
@@ -133,7 +115,7 @@ def _levels(target: Shown, hole: np.ndarray, sources: Sequence[Shown], smooth: S
     levels = []
     for _ in range(count):
         marked = [_marked(values, each, smooth, scale) for (values, _), each in zip(seen, sources, strict=True)]
-        pictures = _pictures(marked, [masked for _, masked in seen], sources, scale)
+        pictures = _pictures(marked, [masked for _, masked in seen], sources, scale, planes_of([target, *sources]))
         if (pictures.surface >= 0).sum() < FEWEST:
             break
         levels.append((_marked(now, target, smooth, scale), mask, pictures))
@@ -176,14 +158,14 @@ def _halved(values: np.ndarray, masked: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _pictures(
-    marked: Sequence[np.ndarray], masks: Sequence[np.ndarray], sources: Sequence[Shown], scale: int
+    marked: Sequence[np.ndarray], masks: Sequence[np.ndarray], sources: Sequence[Shown], scale: int, planes: int
 ) -> Pictures:
     """The sources at 1 / `scale` of their size; `marked` values [h, w, C] and `masks` [h, w] have it already."""
     height, width = (max(masked.shape[axis] for masked in masks) for axis in (0, 1))
     shape = (len(masks), height, width)
     found = Pictures(
         np.zeros((*shape, 6), np.float32), np.full(shape, -1, np.int32), np.zeros((*shape, 4), np.float32),
-        np.ones(shape, np.float32),
+        np.ones(shape, np.float32), np.zeros((*shape, 2), np.float32), np.zeros((len(masks), planes + 1, 3, 3)),
     )  # fmt: skip
     for k, (values, masked, source) in enumerate(zip(marked, masks, sources, strict=True)):
         here = (k, slice(masked.shape[0]), slice(masked.shape[1]))
@@ -193,7 +175,23 @@ def _pictures(
         found.surface[here] = np.where(clear & source.usable[every], source.surface[every], -1)
         found.to_pixels[here] = _inverse(scale * source.to_plane[every]).reshape(*masked.shape, 4)
         found.size[here] = scale * source.size[every]
+        found.place[here] = source.place[every]
+        for plane in range(1, planes + 1):
+            found.across[k, plane] = _across(found.surface[k] == plane, found.place[k])
     return found
+
+
+def _across(shown: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """[3, 3] float64, from places [H, W, 2] on a plane to the pixels, bool [H, W], that show it; zeros for too few."""
+    rows, columns = np.nonzero(shown)
+    if len(rows) < FEWEST:
+        return np.zeros((3, 3))
+    some = np.linspace(0, len(rows) - 1, FEWEST).astype(int)
+    rows, columns = rows[some], columns[some]
+    found, _ = cv2.findHomography(
+        place[rows, columns].astype(np.float64), np.stack([columns, rows], 1).astype(float), 0
+    )
+    return np.zeros((3, 3)) if found is None else found
 
 
 def _inverse(matrices: np.ndarray) -> np.ndarray:
@@ -204,7 +202,9 @@ def _inverse(matrices: np.ndarray) -> np.ndarray:
     return np.divide(adjugate, area[..., None, None], out=np.zeros(matrices.shape), where=area[..., None, None] != 0)
 
 
-def _pixels(target: Shown, mask: np.ndarray, scale: int, smooth: Sequence[int], pictures: Pictures) -> Hole:
+def _pixels(
+    target: Shown, mask: np.ndarray, scale: int, smooth: Sequence[int], pictures: Pictures, repeats: Regular
+) -> Hole:
     """The hole's pixels at 1 / `scale` of the target's size. Along planes that hardly any source shows nothing is
     carried."""
     rows, columns = np.nonzero(mask)
@@ -215,7 +215,8 @@ def _pixels(target: Shown, mask: np.ndarray, scale: int, smooth: Sequence[int], 
     carried = [k for k in smooth if (pictures.surface == k).sum() >= FEWEST]
     to_plane = (scale * target.to_plane[at]).reshape(-1, 4).astype(np.float32)
     size = (scale * target.size[at]).astype(np.float32)
-    return Hole(rows, columns, index, surface, np.isin(surface, carried), to_plane, size)
+    planar, place = np.isin(surface, carried), target.place[at].astype(np.float32)
+    return Hole(rows, columns, index, surface, planar, to_plane, size, place, repeats.turning, repeats.centre)
 
 
 def _choice(pictures: Pictures, most: int) -> Choice:

@@ -16,7 +16,8 @@ from reffusion.masks.voting import extent
 from reffusion.masks.witness import Witness, pixels, witnesses
 from reffusion.paint.margin import hull, widened
 from reffusion.paint.painting import drawn_across
-from reffusion.texture.completion import Completed, Shown, complete
+from reffusion.texture.completion import Completed, complete
+from reffusion.texture.shown import Shown, how_they_repeat
 from reffusion.types import Camera, Gaussians
 
 OTHERS = 3  # photographs beside the view's own that patches are taken from
@@ -99,13 +100,23 @@ def completions(
     Args:
         hole: bool [H, W]. hidden: bool [H, W], C: where the photograph shows the object.
     """
+    target, sources, smooth = _told(image, hole, camera, hidden, around)
+    repeats = how_they_repeat(target, sources, smooth)
+    return [complete(target, hole, sources, smooth, seed, repeats) for seed in seeds]
+
+
+def _told(
+    image: np.ndarray, hole: np.ndarray, camera: Camera, hidden: np.ndarray, around: Around
+) -> tuple[Shown, list[Shown], list[int]]:
+    """The view, the pictures that it is filled from, and the numbers of the smooth planes; see `completions`."""
     own = next(view for view in around.views if view.camera.name == camera.name)
     surface, depth = _behind(own, hidden, around.planes)
-    target = Shown(image, hole, ~hole, surface, _frames(surface, camera, around.planes), depth / camera.fx)
+    frames, places = (of(surface, camera, around.planes) for of in (_frames, _places))
+    target = Shown(image, hole, ~hole, surface, frames, depth / camera.fx, places)
     shown = [(view, around.photos[view.camera.name]) for view in (own, *_others(own, around.views))]
     sources = [_source(*each, around) for each in (*shown, *around.completed)]
     smooth = [k for k, plane in enumerate(around.planes, start=1) if _roughness(plane, around) < SMOOTH]
-    return [complete(target, hole, sources, smooth, seed) for seed in seeds]
+    return target, sources, smooth
 
 
 def _behind(own: Witness, hidden: np.ndarray, planes: Sequence[Plane]) -> tuple[np.ndarray, np.ndarray]:
@@ -148,8 +159,8 @@ def _source(view: Witness, picture: np.ndarray, around: Around) -> Shown:
     near = np.linalg.norm(points - around.centre, axis=-1) < NEARBY * around.radius
     surface = _labelled(depth, view.camera, around.planes)
     size = np.where(depth > 0, depth, 1.0) / view.camera.fx
-    frames = _frames(surface, view.camera, around.planes)
-    return Shown(picture, widened(view.hidden, BESIDE), near & (depth > 0), surface, frames, size)
+    frames, places = (of(surface, view.camera, around.planes) for of in (_frames, _places))
+    return Shown(picture, widened(view.hidden, BESIDE), near & (depth > 0), surface, frames, size, places)
 
 
 def _others(own: Witness, views: Sequence[Witness]) -> list[Witness]:
@@ -183,6 +194,17 @@ def _frames(surface: np.ndarray, camera: Camera, planes: Sequence[Plane]) -> np.
             moved = step - rays[mine] * (step @ plane.normal / slope)[:, None]
             frames[mine, :, axis] = distance[:, None] * moved @ plane.along.T
     return frames
+
+
+def _places(surface: np.ndarray, camera: Camera, planes: Sequence[Plane]) -> np.ndarray:
+    """[H, W, 2]: where on its plane each pixel lies, in the plane's own coordinates; 0 off planes."""
+    places = np.zeros((*surface.shape, 2))
+    rays = geometry.pixel_rays(camera) @ camera.world_to_camera[:3, :3]
+    for k, plane in enumerate(planes, start=1):
+        mine = surface == k
+        distance = (plane.height - camera.center @ plane.normal) / (rays[mine] @ plane.normal)
+        places[mine] = (camera.center + rays[mine] * distance[:, None] - plane.origin) @ plane.along.T
+    return places
 
 
 def _roughness(plane: Plane, around: Around) -> float:

@@ -1,0 +1,59 @@
+"""A picture beside the surfaces that it shows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from reffusion.texture.regular import FEWEST, Regular, Seen, regular
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A picture and the surfaces that it shows.
+
+    Attributes:
+        image: [H, W, 3] uint8.
+        masked: bool [H, W], pixels that must not be read.
+        usable: bool [H, W], where a patch may have its middle.
+        surface: int [H, W], the plane shown, 1, 2, ...; 0: none.
+        to_plane: [H, W, 2, 2], change of the plane's coordinates with (x, y) in pixels; any regular matrix off planes.
+        size: [H, W], the world's length of a pixel.
+        place: [H, W, 2], where on its plane a pixel lies; anything off planes.
+    """
+
+    image: np.ndarray
+    masked: np.ndarray
+    usable: np.ndarray
+    surface: np.ndarray
+    to_plane: np.ndarray
+    size: np.ndarray
+    place: np.ndarray
+
+
+def alone(image: np.ndarray, hole: np.ndarray) -> Shown:
+    """A picture of which nothing else is known."""
+    unit = np.broadcast_to(np.eye(2), (*hole.shape, 2, 2))
+    return Shown(
+        image, hole, ~hole, np.zeros(hole.shape, np.int64), unit, np.ones(hole.shape), np.zeros((*hole.shape, 2))
+    )
+
+
+def planes_of(pictures: Sequence[Shown]) -> int:
+    """The largest number of a plane."""
+    return max(int(each.surface.max()) for each in pictures)
+
+
+def how_they_repeat(target: Shown, sources: Sequence[Shown], smooth: Sequence[int]) -> Regular:
+    """How smooth planes repeat themselves, each by the source that shows most of it."""
+    seen = {}
+    for plane in smooth:
+        shown = [source.usable & ~source.masked & (source.surface == plane) for source in sources]
+        most = int(np.argmax([mask.sum() for mask in shown])) if shown else 0
+        if shown and shown[most].sum() >= FEWEST:
+            rows, columns = np.nonzero(shown[most])
+            pixels = np.stack([columns, rows], 1)
+            seen[plane] = Seen(pixels, sources[most].place[rows, columns], sources[most].image)
+    return regular(planes_of([target, *sources]), seen)
