@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 import small_scene
 
+from reffusion.capture import odd
 from reffusion.capture.odd import oddities
+from reffusion.geometry import pixel_rays
 from reffusion.io.arrays import save_json
 from reffusion.io.images import image_size
 from reffusion.io.scene import load_raw_masks, load_scene, load_views
+from reffusion.types import Camera, Scene, Similarity
 from report import check
 
 
@@ -50,6 +53,27 @@ def test_masks_that_disagree_in_3d(brought):
     far = {name: np.roll(mask, 17 * k, 0) for k, (name, mask) in enumerate(masks.items())}
     assert "masks do not agree in 3D" in said(scene, far, pictures)
     assert said(replace(scene, clean=frozenset({"a3"})), masks | {"a3": elsewhere}, pictures) == ""
+
+
+def test_masks_of_a_small_object_in_a_deep_scene_agree():
+    """A ball of radius 0.03, 1 away from each of ten cameras around it, in a garden that reaches to 40."""
+    draws, cameras, masks = np.random.default_rng(0), {}, {}
+    for k in range(10):
+        turn, pose = np.radians(9 * k), np.eye(4)
+        pose[:3, :3] = [[np.cos(turn), 0, -np.sin(turn)], [0, 1, 0], [np.sin(turn), 0, np.cos(turn)]]
+        pose[2, 3] = 1.0
+        camera = Camera(f"v{k}", 64, 64, 250.0, 250.0, 32.0, 32.0, pose)
+        rays = pixel_rays(camera)
+        apart = np.linalg.norm(rays - [0, 0, 1] * rays[..., 2:], axis=-1)
+        cameras[camera.name], masks[camera.name] = camera, apart < 0.03
+    directions = draws.standard_normal((500, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    points = directions * np.geomspace(0.5, 40, 500)[:, None]
+    colours = np.zeros((500, 3), np.uint8)
+    scene = Scene(cameras, tuple(cameras), (), frozenset(), points, colours, Similarity(1.0, np.zeros(3)))
+    assert odd._disagreeing(scene, masks) == []
+    moved = masks | {"v4": np.roll(masks["v4"], 20, 0)}
+    assert odd._disagreeing(scene, moved) == ["the mask of v4 shows something else than those of the other views do"]
 
 
 def test_exposure_that_jumps(brought):

@@ -16,7 +16,7 @@ from reffusion.types import Camera, Scene
 
 LARGE = 0.5  # of a picture: a mask that covers more is more often inverted than meant
 LOOKED_AT = 24  # masks, spread evenly, that each is compared with in 3D
-RAYS, DEPTHS = 64, 32  # pixels of a mask, and places along the ray of each
+RAYS, DEPTHS = 64, 256  # pixels of a mask, and places along the ray of each: a small object is thin to a deep scene
 AGREE = 0.75  # of the other masks that must hold a place for it to be the object
 SUPPORTED = 0.3  # of a mask's pixels, under which it shows something else than the others
 BRIGHTER = 1.5  # times as bright as the others
