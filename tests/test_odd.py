@@ -66,10 +66,10 @@ def test_masks_of_a_small_object_in_a_deep_scene_agree():
         rays = pixel_rays(camera)
         apart = np.linalg.norm(rays - [0, 0, 1] * rays[..., 2:], axis=-1)
         cameras[camera.name], masks[camera.name] = camera, apart < 0.03
-    directions = draws.standard_normal((500, 3))
+    directions = draws.standard_normal((40_000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    points = directions * np.geomspace(0.5, 40, 500)[:, None]
-    colours = np.zeros((500, 3), np.uint8)
+    points = directions * np.geomspace(0.5, 40, 40_000)[:, None]
+    colours = np.zeros((40_000, 3), np.uint8)
     scene = Scene(cameras, tuple(cameras), (), frozenset(), points, colours, Similarity(1.0, np.zeros(3)))
     assert odd._disagreeing(scene, masks) == []
     moved = masks | {"v4": np.roll(masks["v4"], 20, 0)}

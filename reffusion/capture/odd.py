@@ -16,7 +16,7 @@ from reffusion.types import Camera, Scene
 
 LARGE = 0.5  # of a picture: a mask that covers more is more often inverted than meant
 LOOKED_AT = 24  # masks, spread evenly, that each is compared with in 3D
-RAYS, DEPTHS = 64, 256  # pixels of a mask, and places along the ray of each: a small object is thin to a deep scene
+RAYS, DEPTHS = 64, 128  # pixels of a mask, and places along the ray of each: a small object is thin to a deep scene
 AGREE = 0.75  # of the other masks that must hold a place for it to be the object
 SUPPORTED = 0.3  # of a mask's pixels, under which it shows something else than the others
 BRIGHTER = 1.5  # times as bright as the others
@@ -87,11 +87,11 @@ def _disagreeing(scene: Scene, masks: Mapping[str, np.ndarray]) -> list[str]:
 
 
 def _along_rays(camera: Camera, mask: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """[R, D, 3]: places behind pixels of the mask, evenly in disparity from the nearest to the farthest point."""
+    """[R, D, 3]: places behind pixels of the mask, evenly in disparity from the nearest to the farthest point shown."""
     rows, columns = np.nonzero(mask)
     chosen = np.unique(np.linspace(0, len(rows) - 1, RAYS).astype(int))
-    depth = project(points, camera)[1]
-    depth = depth[depth > 1e-3]
+    at, depth = project(points, camera)
+    depth = depth[sample_nearest(np.ones(mask.shape, bool), at)[1] & (depth > 1e-3)]
     near, far = np.percentile(depth, (1, 99)) if len(depth) else (1 / 3, 4.0)
     rays = pixel_rays(camera)[rows[chosen], columns[chosen]]
     local = rays[:, None] / np.linspace(1 / (0.7 * near), 1 / (1.5 * far), DEPTHS)[:, None]
