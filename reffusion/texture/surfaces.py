@@ -17,6 +17,7 @@ from reffusion.masks.witness import Witness, pixels, witnesses
 from reffusion.paint.margin import hull, widened
 from reffusion.paint.painting import drawn_across
 from reffusion.texture.completion import Completed, complete
+from reffusion.texture.regular import Regular
 from reffusion.texture.shown import Shown, how_they_repeat
 from reffusion.types import Camera, Gaussians
 
@@ -30,6 +31,7 @@ ON = 0.03  # relative depth within which a pixel lies on a plane
 LOOSE = 0.06  # the same, of what is asked whether a plane is smooth
 REACH = 2.5  # radii of the object around its middle within which it is
 SMOOTH = 0.01  # median distance from it, relative to depth, up to which it is: not grass, nor rock
+LAID = 0.02  # the same, where it repeats itself as planks and tiles do, and grass does not
 SOME = 200  # pixels of a view that tell
 
 
@@ -100,23 +102,25 @@ def completions(
     Args:
         hole: bool [H, W]. hidden: bool [H, W], C: where the photograph shows the object.
     """
-    target, sources, smooth = _told(image, hole, camera, hidden, around)
-    repeats = how_they_repeat(target, sources, smooth)
+    target, sources, smooth, repeats = _told(image, hole, camera, hidden, around)
     return [complete(target, hole, sources, smooth, seed, repeats) for seed in seeds]
 
 
 def _told(
     image: np.ndarray, hole: np.ndarray, camera: Camera, hidden: np.ndarray, around: Around
-) -> tuple[Shown, list[Shown], list[int]]:
-    """The view, the pictures that it is filled from, and the numbers of the smooth planes; see `completions`."""
+) -> tuple[Shown, list[Shown], list[int], Regular]:
+    """The view, the pictures that it is filled from, the planes along which patches are carried, and how these repeat
+    themselves; see `completions`."""
     own = next(view for view in around.views if view.camera.name == camera.name)
     surface, depth = _behind(own, hidden, around.planes)
     frames, places = (of(surface, camera, around.planes) for of in (_frames, _places))
     target = Shown(image, hole, ~hole, surface, frames, depth / camera.fx, places)
     shown = [(view, around.photos[view.camera.name]) for view in (own, *_others(own, around.views))]
     sources = [_source(*each, around) for each in (*shown, *around.completed)]
-    smooth = [k for k, plane in enumerate(around.planes, start=1) if _roughness(plane, around) < SMOOTH]
-    return target, sources, smooth
+    roughness = {k: _roughness(plane, around) for k, plane in enumerate(around.planes, start=1)}
+    repeats = how_they_repeat(target, sources, [k for k, rough in roughness.items() if rough < LAID])
+    smooth = [k for k, rough in roughness.items() if rough < SMOOTH or repeats.starts[k + 1] > repeats.starts[k]]
+    return target, sources, smooth, repeats
 
 
 def _behind(own: Witness, hidden: np.ndarray, planes: Sequence[Plane]) -> tuple[np.ndarray, np.ndarray]:
