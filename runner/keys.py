@@ -4,6 +4,7 @@ import ast
 import hashlib
 import json
 import os
+import threading
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -47,7 +48,7 @@ class Hashes:
         self.rotten: list[Path] = []
         found = read_json(path)
         self.known: dict[str, Any] = found if isinstance(found, dict) else {}
-        self._saved = 0 if afresh else len(self.known)
+        self._saved, self._saving = 0 if afresh else len(self.known), threading.Lock()
         self._runs: dict[tuple[Path, str], list[Path]] = {}  # a module with its fingerprint -> see `module`
 
     def _remember(self, kind: str, path: Path, compute: Any) -> Any:
@@ -96,8 +97,11 @@ class Hashes:
     def save(self) -> None:
         if len(self.known) == self._saved:
             return
-        kept = dict(list(self.known.items())[-self.LIMIT :])
-        with suppress(OSError):  # a full disk, or one that is only read: they are computed again the next time
+        kept = dict(list(self.known.copy().items())[-self.LIMIT :])  # other threads may add to it
+        with (
+            suppress(OSError),
+            self._saving,
+        ):  # a full disk, or one that is only read: they are computed again the next time
             partial = self.path.with_name(f"{self.path.name}.{os.getpid()}")  # runners of other scenes do the same
             write_text(partial, json.dumps(kept))
             os.replace(partial, self.path)

@@ -12,7 +12,7 @@ from runner.keys import HASHES, Hashes
 from runner.pipeline import NAME, Pipeline, find_scene, load_pipeline, scene_name, unknown
 from runner.resolve import FRAMES, Request, one_folder_a_name
 
-RECORDS = ("profile", "source", "plan.json", "turntable.webm", "check.png")
+RECORDS = ("profile", "source", "plan.json", "output.log", "turntable.webm", "check.png")
 PAGES = (*(f"compare.{kind}" for kind in ("json", "csv", "md", "html")), "compare-runs.csv", "compare-runs.md",
          "compare/*.png", "adapted/sheet.png", "adapted/*/*.png", "adapted/adapted.json",
          "sds-variance/sds_variance.json", "report.html", "report/index.html", "report/*.png",
