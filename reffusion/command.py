@@ -11,6 +11,7 @@ from pathlib import Path
 REPORTS = {
     "report": "report.job",
     "compare-page": "report.compare",
+    "batch-page": "report.batch",
     "view": "report.view",
     "mask": "report.mask",
     "turntable": "report.turntable",

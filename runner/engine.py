@@ -16,6 +16,7 @@ from typing import Any, Protocol
 from runner import Refused, say
 from runner.resolve import child
 
+ALL = 2**40  # MB: more than any machine has
 GRACE = 20.0  # seconds an interrupted stage has to end by itself
 CGROUPS = (("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
            ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"))  # fmt: skip
@@ -87,14 +88,22 @@ class Local:
         self._change, self._stopped, self._number = threading.Condition(), False, 0
 
     def run(self, task: Task, needs: Needs, lock: int, begun: Callable[[], None]) -> Ended:
+        ended, beside = self._once(task, needs, lock, begun)
+        if ended.code == -signal.SIGKILL and beside:  # memory ran out, it seems: it goes on alone
+            ended, _ = self._once(task, replace(needs, memory_mb=ALL), lock, begun)
+        return ended
+
+    def _once(self, task: Task, needs: Needs, lock: int, begun: Callable[[], None]) -> tuple[Ended, int]:
+        """How it ended, and how many stages ran beside it then."""
         with self._room(needs) as (cores, cards):
             begun()
             where = {"cores": len(cores), "on": cores} if needs.cores is not None else {}
             where |= {"cards": ",".join(cards)} if cards and self._all_cards > 1 else {}
             ended = carry_out(replace(task, line=task.line | where), lock, self._follow)
+            beside = len(self._given) - 1
         if self._stopped:
             raise KeyboardInterrupt
-        return ended
+        return ended, beside
 
     def stop(self) -> None:
         with self._change:

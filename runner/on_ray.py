@@ -75,7 +75,7 @@ class Ray:
             ray.cancel(ref)
 
 
-@ray.remote(max_retries=RETRIES, max_calls=1)
+@ray.remote(max_retries=RETRIES)
 def _work(task: Task) -> Ended:
     """On the machine that works."""
     return attempt(task)

@@ -28,7 +28,7 @@ class _Row:
 
 
 class Progress:
-    """A context; other threads tell it what happens."""
+    """A context; other threads, whose own words go elsewhere, tell it what happens."""
 
     def __init__(self, names: list[str], homes: list[Path], stages: list[str], at_once: int, said: str):
         """said: what stands above the table."""
@@ -69,7 +69,7 @@ class Progress:
             left = self._left(row)
         if word == RUNS and not self._live:
             about = "" if left is None else f"; {_short(left)} left of all its stages"
-            say(f"{time.strftime('%H:%M:%S')} {row.name}: {stage}{about}")
+            print(f"{time.strftime('%H:%M:%S')} {row.name}: {stage}{about}", flush=True)
 
     def ended(self, place: int, error: str | None, seconds: float) -> None:
         with self._lock:
@@ -78,7 +78,7 @@ class Progress:
             row.behind = set(self._stages)
             over = sum(each.behind == set(self._stages) for each in self._rows)
         if not self._live:
-            say(f"{time.strftime('%H:%M:%S')} {row.name}: {row.state} ({over} of {len(self._rows)})")
+            print(f"{time.strftime('%H:%M:%S')} {row.name}: {row.state} ({over} of {len(self._rows)})", flush=True)
 
     def table(self, width: int, height: int) -> list[str]:
         """The lines of the table as it is now, cut to a terminal's size: what runs first, then what failed."""
