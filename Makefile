@@ -39,6 +39,7 @@ help:
 	@echo '                               variants=a,b  only these; seeds=5  on demo, demo-1 ... demo-4, with intervals'
 	@echo 'make data=FOLDER compare       the same over all its scenes, in one table: runs/compare/compare.html'
 	@echo 'make data=FOLDER spinnerf      what it holds of SPIn-NeRF'"'"'s published scenes; then as batch'
+	@echo 'make data=FOLDER study         then, or with scene=X: paired clips for people to judge: runs/compare/study/index.html'
 	@echo 'make scene=X report            what was done, errors against seconds: runs/X/report.html'
 	@echo 'make scene=X view              walk through the finished scene in a browser; port=8080'
 	@echo 'make scene=X turntable         the finished scene on a way around the capture: runs/X/turntable.webm'
@@ -154,6 +155,11 @@ ifneq ($(scene),)
 else
 	@$(RUN) report --data="$$data" $(where)
 endif
+
+.PHONY: study
+study: setup
+	@$(RUN) study $(these) $(if $(runs),--runs="$$runs") $(if $(variants),--variants="$$variants") \
+		$(if $(seed),--seed="$$seed")
 
 .PHONY: mask
 mask: ready

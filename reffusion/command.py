@@ -13,6 +13,8 @@ REPORTS = {
     "compare-page": "report.compare",
     "batch-page": "report.batch",
     "view": "report.view",
+    "study": "report.study",
+    "study-votes": "report.votes",
     "mask": "report.mask",
     "turntable": "report.turntable",
     "sheet": "report.sheet",

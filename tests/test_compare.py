@@ -61,7 +61,7 @@ class Params(BaseModel, extra="forbid"):
 
 def run(params, out, *, scene):
     from PIL import Image
-    (out / "images").mkdir()
+    (out / "images").mkdir(exist_ok=True)
     number = int((scene / "number.txt").read_text())
     for view in VIEWS:
         Image.new("RGB", (40, 30), (number, 200, 90)).save(out / "images" / f"{view}.png")
