@@ -52,6 +52,7 @@ help:
 	@echo 'make scene=X export            the finished scene for other tools, .ply, cameras, LoRA: runs/X/export/'
 	@echo 'make scene=X verify            hash all that was computed for it: is it as it was made?'
 	@echo 'make scene=X clean             remove what was computed for it'
+	@echo 'make gc                        what no plan uses any more, with sizes; then removes it, if you say so or yes=1'
 	@echo 'make data=FOLDER batch         every scene of a folder, several at once, and one table: runs/results.html; cores=2  each'
 	@echo '                               engine=ray address=HOST:6379  on a cluster; engine=slurm address=PARTITION; also for'
 	@echo '                               compare, all and stages'
@@ -186,6 +187,10 @@ export: ready $(VENV)/.ready-export
 
 verify clean: named setup
 	@$(RUN) $@ $(of) $(options)
+
+.PHONY: gc
+gc: setup
+	@$(RUN) gc $(if $(scene),$(of)) $(options) $(if $(yes),--yes)
 
 spinnerf: setup
 	@$(PY) data/spinnerf.py --data="$$data"

@@ -1,4 +1,4 @@
-"""reffusion plan|run|compare|batch|weights|verify|clean --scene NAME: what the Makefile calls (or python -m runner).
+"""reffusion plan|run|compare|batch|weights|verify|clean|gc --scene NAME: what the Makefile calls (or python -m runner).
 Pages of what was made: reffusion report|compare-page|view|turntable|sheet, each with --help."""
 
 import argparse
@@ -18,6 +18,7 @@ from runner.execute import Work, run_scene, weights
 from runner.files import told, write_json
 from runner.plan import as_record, plan, table
 from runner.resolve import Request, resolve
+from runner.sweep import sweep
 from runner.upkeep import clean, verify
 
 SOME_FAILED = 3  # compare: done, but for some variants
@@ -56,6 +57,8 @@ def main() -> int:
             return 1 if weights(request, arguments.offline) else 0
         elif arguments.command == "verify":
             return 1 if verify(request) else 0
+        elif arguments.command == "gc":
+            sweep(request, arguments.yes)
         else:
             clean(request)
     except KeyboardInterrupt:
@@ -78,7 +81,7 @@ def _by(arguments: argparse.Namespace, request: Request) -> By:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="reffusion", description=__doc__)
-    parser.add_argument("command", choices=["plan", "run", "compare", "batch", "weights", "verify", "clean"])
+    parser.add_argument("command", choices=["plan", "run", "compare", "batch", "weights", "verify", "clean", "gc"])
     parser.add_argument("stage", nargs="?", default="all", help="run this stage and what it needs; `all` (default)")
     parser.add_argument("--scene", default="", help="a name under data/, or a path")
     parser.add_argument("--data", type=Path, help="batch, compare: a folder of scenes; batch takes data/")
@@ -96,6 +99,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--address", help="of the engine: ray://HOST:10001 or HOST:6379; a partition of Slurm")
     parser.add_argument("--offline", action="store_true", help="weights: only say what is missing")
     parser.add_argument("--set", default="", help="stage.parameter=value ...")
+    parser.add_argument("--yes", action="store_true", help="gc: remove what it lists, without asking")
     parser.add_argument("--root", type=Path, default=Path(__file__).parent.parent, help="where pipeline.yaml is")
     parser.add_argument("--runs", type=Path, help="where artifacts go; root/runs, installed ./runs")
     return parser
