@@ -101,7 +101,7 @@ class Local:
             where |= {"cards": ",".join(cards)} if cards and self._all_cards > 1 else {}
             ended = carry_out(replace(task, line=task.line | where), lock, self._follow)
             beside = len(self._given) - 1
-        if self._stopped:
+        if self._stopped and ended.code != 0:
             raise KeyboardInterrupt
         return ended, beside
 
@@ -195,7 +195,8 @@ def carry_out(task: Task, lock: int | None = None, follow: Callable[[Any], Any] 
             with suppress(BrokenPipeError):  # a child that is gone already has its code below
                 process.stdin.write(line + "\n")
                 process.stdin.flush()  # and left open: the child ends when this process does
-            code = process.wait()
+            # Ray's interrupt is seen between waits only; here a signal ends the wait.
+            code = process.wait() if lock is not None else _polled(process)
     except KeyboardInterrupt:
         process.send_signal(signal.SIGINT)
         try:
@@ -211,6 +212,12 @@ def carry_out(task: Task, lock: int | None = None, follow: Callable[[Any], Any] 
         with suppress(BlockingIOError), open(heard, "rb", buffering=0) as file:
             answer = json.loads(file.read(1 << 16) or "{}")
     return Ended(answer, code)
+
+
+def _polled(process: "subprocess.Popen[str]") -> int:
+    while True:
+        with suppress(subprocess.TimeoutExpired):
+            return process.wait(1.0)
 
 
 ENGINES = {"ray": ("Ray", "ray"), "slurm": ("Slurm", "submitit")}  # name -> class in on_<name>.py, what it imports

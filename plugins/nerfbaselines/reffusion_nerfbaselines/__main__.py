@@ -1,0 +1,43 @@
+"""reffusion-nerfbaselines RUN --data SCENE --output FOLDER: a finished run as nerfbaselines' checkpoint, predictions and
+results, from which its own commands make demos, tables and pages."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from nerfbaselines.datasets import load_dataset
+from nerfbaselines.evaluation import evaluate, render_all_images
+
+from reffusion_nerfbaselines.ask import RefFusionError
+from reffusion_nerfbaselines.method import RefFusion, checkpoint
+from reffusion_nerfbaselines.spec import METHOD
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="reffusion-nerfbaselines", description=__doc__)
+    parser.add_argument("run", type=Path, help="runs/<scene>, or runs/<scene>@<variant>")
+    parser.add_argument("--data", type=Path, required=True, help="the scene's folder, in SPIn-NeRF's layout")
+    parser.add_argument("--output", type=Path, required=True, help="a folder that is not there yet")
+    given = parser.parse_args()
+    if given.output.exists():
+        raise SystemExit(f"error: {given.output} is there already")
+    try:
+        print(made(given.run, given.data, given.output))
+    except (RefFusionError, FileNotFoundError) as error:
+        raise SystemExit(f"error: {error}") from None
+
+
+def made(run: Path, data: Path, out: Path) -> dict[str, float]:
+    """The metrics. Writes checkpoint/, predictions/ and results.json."""
+    dataset = load_dataset(str(data), split="test")
+    checkpoint(run, out / "checkpoint", dataset["metadata"])
+    method = RefFusion(checkpoint=str(out / "checkpoint"))
+    info = {"method": METHOD, "dataset_metadata": dataset["metadata"], "color_space": "srgb", "num_iterations": 1}
+    for _ in render_all_images(method, dataset, output=str(out / "predictions"), nb_info=info):
+        pass
+    return evaluate(str(out / "predictions"), str(out / "results.json"))["metrics"]
+
+
+if __name__ == "__main__":
+    main()
