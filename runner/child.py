@@ -181,6 +181,8 @@ def run() -> int:
     `_confine`. Writes to `result`, an open file's number, {"seconds", "peak_memory_mb", "machine"} or {"error": one
     line}, and to `log` the full traceback.
     """
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])  # Ray's processes, and those started by them, block it
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     job = json.loads(sys.stdin.readline())
     for number in (job["lock"], job["result"]):  # the lock is held until this process ends: no second runner before
         if number is not None:

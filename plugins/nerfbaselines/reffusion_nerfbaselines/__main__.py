@@ -1,5 +1,5 @@
-"""reffusion-nerfbaselines RUN --data SCENE --output FOLDER: a finished run as nerfbaselines' checkpoint, predictions and
-results, from which its own commands make demos, tables and pages."""
+"""reffusion-nerfbaselines RUN --data SCENE --output FOLDER: a finished run as nerfbaselines' checkpoint, predictions
+and results, from which its own commands make demos, tables and pages."""
 
 from __future__ import annotations
 

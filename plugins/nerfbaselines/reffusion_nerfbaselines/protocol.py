@@ -1,4 +1,4 @@
-"""Box + 10 %: PSNR, SSIM, FLIP and, where weights are, LPIPS in the box around a test view's mask, by RefFusion's code."""
+"""Box + 10 %: PSNR, SSIM, FLIP and, where weights are, LPIPS in the box around a test view's mask; RefFusion's code."""
 
 from __future__ import annotations
 

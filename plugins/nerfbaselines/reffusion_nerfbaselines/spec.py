@@ -35,8 +35,8 @@ register(
         "backends_order": ["python"],
         "metadata": {
             "name": "RefFusion",
-            "description": "An open implementation of RefFusion. A finished run is rendered; it is trained by RefFusion "
-            "itself (`make scene=X all`).",
+            "description": "An open implementation of RefFusion. A finished run is rendered; RefFusion itself "
+            "trains it (`make scene=X all`).",
             "paper_title": "RefFusion: Reference Adapted Diffusion Models for 3D Scene Inpainting",
             "paper_authors": ["Ashkan Mirzaei"],
             "paper_link": "https://arxiv.org/abs/2404.10765",

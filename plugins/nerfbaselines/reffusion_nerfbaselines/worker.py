@@ -1,7 +1,7 @@
 """What RefFusion does for nerfbaselines, in RefFusion's own environment: `python worker.py`, started by ask.py.
 
-A message, each way: eight bytes with its length, little-endian, then a .npz of arrays; `ask` names the function, a reply
-with `error` says in a line what is wrong.
+A message, each way: eight bytes with its length, little-endian, then a .npz of arrays; `ask` names the function, a
+reply with `error` says in a line what is wrong.
 """
 
 from __future__ import annotations

@@ -1,0 +1,76 @@
+"""The plug-in for nerfbaselines, in the environment that $NERFBASELINES_PYTHON names, on a finished run of a made scene.
+
+    python3 -m venv nb && nb/bin/pip install ./plugins/nerfbaselines
+    NERFBASELINES_PYTHON=nb/bin/python pytest tests/test_nerfbaselines.py
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Thread
+
+import pytest
+from browser import visiting
+
+REPO = Path(__file__).resolve().parent.parent
+PYTHON = os.environ.get("NERFBASELINES_PYTHON", "")
+pytestmark = pytest.mark.skipif(not Path(PYTHON or "none").is_file(), reason="set NERFBASELINES_PYTHON: see above")
+SMALL = "fit.iterations=200 personalize.steps=4 personalize.optimizer.batch=1 distill.iterations=4"
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory, generate) -> Path:
+    """A folder with a scene in data/book, run in runs/book, and what the plug-in made of it in out/."""
+    root = tmp_path_factory.mktemp("finished")
+    generate.generate(root / "data/book", 3, generate.KINDS["mini"])
+    command = [sys.executable, "-m", "reffusion.command", "run", "all", "--scene", str(root / "data/book")]
+    command += ["--runs", str(root / "runs"), "--profile", "laptop", "--set", SMALL]
+    subprocess.run(command, cwd=REPO, check=True, stdout=subprocess.DEVNULL)
+    asked(root, "reffusion_nerfbaselines", str(root / "runs/book"), "--data", str(root / "data/book"),
+          "--output", str(root / "out"))  # fmt: skip
+    return root
+
+
+def asked(root: Path, module: str, *words: str) -> str:
+    home = {**os.environ, "REFFUSION_PYTHON": sys.executable, "HOME": str(root)}
+    command = [PYTHON, "-m", module, *words]
+    done = subprocess.run(command, cwd=root, env=home, stdout=subprocess.PIPE, text=True, check=True)
+    return done.stdout
+
+
+def test_its_evaluation_gives_our_own_figures(finished):
+    ours = json.loads((finished / "runs/book/evaluate/metrics.json").read_text())["mean"]
+    theirs = json.loads((finished / "out/results.json").read_text())
+    assert theirs["evaluation_protocol"] == "spinnerf-box" and theirs["nb_info"]["method"] == "reffusion"
+    for name in ("psnr", "ssim", "flip"):
+        assert theirs["metrics"][name] == pytest.approx(ours[f"{name}_box"], abs=1e-3), name
+    assert len(list((finished / "out/predictions/color").glob("*.png"))) == 3
+
+
+def test_nerfbaselines_own_table_and_demo(finished):
+    table = asked(finished, "nerfbaselines", "generate-dataset-results", "--results", str(finished / "out"),
+                  "--dataset", "spinnerf")  # fmt: skip
+    psnr = json.loads((finished / "out/results.json").read_text())["metrics"]["psnr"]
+    assert "RefFusion" in table and f"{psnr:.2f}" in table
+    asked(finished, "nerfbaselines", "export-demo", "--checkpoint", str(finished / "out/checkpoint"), "--backend",
+          "python", "--data", str(finished / "data/book"), "--output", str(finished / "demo"))  # fmt: skip
+    assert (finished / "demo/index.html").is_file() and (finished / "demo/scene.ksplat").stat().st_size > 1000
+
+
+def test_its_page_opens(finished):
+    """The benchmark's pages as nerfbaselines builds them."""
+    asked(finished, "nerfbaselines", "web", "build", "--data", str(finished / "out"), "--output",
+          str(finished / "web"), "--datasets", "spinnerf")  # fmt: skip
+    psnr = json.loads((finished / "out/results.json").read_text())["metrics"]["psnr"]
+    serve = partial(SimpleHTTPRequestHandler, directory=str(finished / "web"))
+    with ThreadingHTTPServer(("127.0.0.1", 0), serve) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        with visiting(f"http://127.0.0.1:{server.server_port}/spinnerf") as browser:
+            assert "RefFusion" in browser.inner_text("body") and f"{psnr:.2f}" in browser.inner_text("body")
+        server.shutdown()
