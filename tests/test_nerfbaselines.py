@@ -1,7 +1,7 @@
-"""The plug-in for nerfbaselines, in the environment that $NERFBASELINES_PYTHON names, on a finished run of a made scene.
+"""The plug-in for nerfbaselines, in the environment that $NERFBASELINES_PYTHON names, on a run of a made scene.
 
-    python3 -m venv nb && nb/bin/pip install ./plugins/nerfbaselines
-    NERFBASELINES_PYTHON=nb/bin/python pytest tests/test_nerfbaselines.py
+python3 -m venv nb && nb/bin/pip install ./plugins/nerfbaselines
+NERFBASELINES_PYTHON=nb/bin/python pytest tests/test_nerfbaselines.py
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""reffusion-nerfbaselines RUN --data SCENE --output FOLDER: a finished run as nerfbaselines' checkpoint, predictions
+"""reffusion-nerfbaselines RUN --output FOLDER: a finished run as nerfbaselines' checkpoint, predictions
 and results, from which its own commands make demos, tables and pages."""
 
 from __future__ import annotations
@@ -6,31 +6,33 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from nerfbaselines.datasets import load_dataset
+from nerfbaselines.datasets import dataset_load_features
 from nerfbaselines.evaluation import evaluate, render_all_images
 
 from reffusion_nerfbaselines.ask import RefFusionError
-from reffusion_nerfbaselines.method import RefFusion, checkpoint
+from reffusion_nerfbaselines.dataset import load
+from reffusion_nerfbaselines.method import RefFusion, checkpoint, poses_of
 from reffusion_nerfbaselines.spec import METHOD
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="reffusion-nerfbaselines", description=__doc__)
     parser.add_argument("run", type=Path, help="runs/<scene>, or runs/<scene>@<variant>")
-    parser.add_argument("--data", type=Path, required=True, help="the scene's folder, in SPIn-NeRF's layout")
+    parser.add_argument("--data", type=Path, help="the scene's folder, in SPIn-NeRF's layout; else the views as the "
+                        "run has them")  # fmt: skip
     parser.add_argument("--output", type=Path, required=True, help="a folder that is not there yet")
     given = parser.parse_args()
     if given.output.exists():
         raise SystemExit(f"error: {given.output} is there already")
     try:
-        print(made(given.run, given.data, given.output))
+        print(made(given.run, given.data or poses_of(given.run), given.output))
     except (RefFusionError, FileNotFoundError) as error:
         raise SystemExit(f"error: {error}") from None
 
 
 def made(run: Path, data: Path, out: Path) -> dict[str, float]:
     """The metrics. Writes checkpoint/, predictions/ and results.json."""
-    dataset = load_dataset(str(data), split="test")
+    dataset = dataset_load_features(load(str(data), "test"))
     checkpoint(run, out / "checkpoint", dataset["metadata"])
     method = RefFusion(checkpoint=str(out / "checkpoint"))
     info = {"method": METHOD, "dataset_metadata": dataset["metadata"], "color_space": "srgb", "num_iterations": 1}

@@ -1,5 +1,7 @@
-"""Scenes in SPIn-NeRF's layout. Masks of training views are True where a pixel may be used; those of test views are
-True where the object would be, which is where the protocol scores."""
+"""Scenes in SPIn-NeRF's layout, undistorted by RefFusion, or what its stage `poses` made of one.
+
+Masks of training views are True where a pixel may be used; those of test views are True where the object would be,
+which is where the protocol scores."""
 
 from __future__ import annotations
 
@@ -21,9 +23,10 @@ def load(path: str, split: str, features: Any = None, **_: Any) -> Any:
     scene = Path(path).resolve()
     if split not in ("train", "test"):
         raise ValueError(f"split {split!r}: train or test")
-    if not any((scene / name / "label").is_dir() for name in ("images_4", "images_2", "images")):
+    labelled = any((scene / name / "label").is_dir() for name in ("images_4", "images_2", "images"))
+    if not labelled and not (scene / "views.json").is_file():
         raise DatasetNotFoundError(f"{scene}: not in SPIn-NeRF's layout, no masks in images_4/label")
-    cache = CACHE / hashlib.sha256(f"{scene} {split}".encode()).hexdigest()[:16]
+    cache = CACHE / hashlib.sha256(str(scene).encode()).hexdigest()[:16]
     cache.mkdir(parents=True, exist_ok=True)
     try:
         found = ask("dataset", path=str(scene), split=split, cache=str(cache))
@@ -33,22 +36,21 @@ def load(path: str, split: str, features: Any = None, **_: Any) -> Any:
     cameras = new_cameras(
         poses=found["poses"].astype(np.float32),
         intrinsics=found["intrinsics"].astype(np.float32),
-        camera_models=np.array([camera_model_to_int(model) for model in found["models"].tolist()], np.int32),
-        distortion_parameters=found["distortion"].astype(np.float32),
+        camera_models=np.full(len(pictures), camera_model_to_int("pinhole"), np.int32),
         image_sizes=found["sizes"].astype(np.int32),
-        nears_fars=found["bounds"].astype(np.float32) if np.isfinite(found["bounds"]).all() else None,
+        nears_fars=found["bounds"].astype(np.float32),
     )
     return new_dataset(
         cameras=cameras,
         image_paths=pictures,
         image_paths_root=str(Path(pictures[0]).parent),
         mask_paths=found["masks"].tolist(),
-        mask_paths_root=str(cache),
+        mask_paths_root=str(cache / split),
         points3D_xyz=found["points"].astype(np.float32),
         points3D_rgb=found["colors"],
         metadata={
             "id": DATASET,
-            "scene": scene.name,
+            "scene": scene.parent.name if scene.name == "poses" and not labelled else scene.name,
             "color_space": "srgb",
             "type": "forward-facing",
             "evaluation_protocol": PROTOCOL,

@@ -15,11 +15,16 @@ from reffusion_nerfbaselines.spec import METHOD
 FILES = ("scene.ply", "transform.json")  # of a checkpoint, beside nerfbaselines' own nb-info.json
 
 
+def poses_of(run: Path) -> Path:
+    """What `poses` made for a run: a variant's lies with the scene's own."""
+    own = run / "poses"
+    return own if own.is_dir() else run.with_name(run.name.partition("@")[0]) / "poses"
+
+
 def checkpoint(run: Path, out: Path, data: dict[str, Any]) -> None:
     """Make a checkpoint of runs/<scene>, or runs/<scene>@<variant>, which must be finished. `data`: the data set's
     metadata. Raises FileNotFoundError where it is not."""
-    poses = run / "poses" if (run / "poses").is_dir() else run.with_name(run.name.partition("@")[0]) / "poses"
-    sources = {"scene.ply": run / "evaluate" / "scene.ply", "transform.json": poses / "transform.json"}
+    sources = {"scene.ply": run / "evaluate" / "scene.ply", "transform.json": poses_of(run) / "transform.json"}
     for name, source in sources.items():
         if not source.is_file():
             raise FileNotFoundError(f"{source} is missing; `make scene={run.name.partition('@')[0]} all` makes it")

@@ -22,7 +22,7 @@ register(
             "paper_title": "SPIn-NeRF: Multiview Segmentation and Perceptual Inpainting with Neural Radiance Fields",
             "paper_authors": ["Ashkan Mirzaei"],
             "paper_link": "https://arxiv.org/abs/2211.12254",
-            "metrics": ["psnr", "ssim", "flip", "lpips_vgg"],
+            "metrics": ["psnr", "ssim", "lpips_vgg"],  # of those that its pages know; results.json has FLIP
             "default_metric": "psnr",
             "scenes": [{"id": scene, "name": scene} for scene in SCENES],
         },

@@ -6,7 +6,9 @@ reply with `error` says in a line what is wrong.
 
 from __future__ import annotations
 
+import importlib
 import io
+import shutil
 import sys
 from functools import cache
 from pathlib import Path
@@ -14,69 +16,66 @@ from typing import Any
 
 import numpy as np
 
-from reffusion.capture.load import load_capture
-from reffusion.capture.roles import load_roles
+from reffusion.command import root
 from reffusion.io.arrays import load_json
-from reffusion.io.images import image_size, load_mask, save_mask
+from reffusion.io.images import load_mask, save_mask
 from reffusion.io.ply import load_ply
+from reffusion.io.scene import load_raw_masks, load_scene
 from reffusion.score import lpips, metrics
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Similarity
 
-FISHEYE = 4  # coefficients of OpenCV's fisheye; its perspective model has k1, k2, p1, p2, k3 ... k6
-
 
 def dataset(path: np.ndarray, split: np.ndarray, cache: np.ndarray) -> dict[str, Any]:
-    """The views of a split: pictures as they are, cameras with their distortion, and masks, written to `cache`: of a
-    test view where the object is, of a training view where it is not. ValueError where the folder is no such scene."""
-    scene, part = Path(str(path)), str(split)
-    capture = load_capture(scene, "llff")
-    roles = load_roles(scene, capture)
-    if capture.poses is None:
-        raise ValueError(f"{scene}: no poses")
-    names = list(roles.train if part == "train" else roles.test)
-    lenses = [capture.poses.lenses[name].resized(*image_size(capture.pictures[name])) for name in names]
-    masks = []
-    for name, lens in zip(names, lenses, strict=True):
-        files = [roles.test_masks[name]] if name in roles.test_masks else []
-        if part == "train":
-            files = [views[name] for views in roles.masks.values() if name in views]
-        shown = np.zeros((lens.height, lens.width), bool)
-        for file in files:
-            shown |= load_mask(file, (lens.width, lens.height))
-        masks.append(Path(str(cache)) / f"{name}.png")
+    """The views of a split, undistorted as RefFusion undistorts them, cameras in the scene's own frame, and masks,
+    written to `cache`: of a test view where the object is, of a training view where it is not.
+
+    path: a scene, or what RefFusion's stage `poses` made of one. ValueError where it is neither."""
+    poses, part, out = Path(str(path)), str(split), Path(str(cache))
+    if not (poses / "views.json").is_file():
+        poses = _undistorted(poses, out / "poses")
+    scene = load_scene(poses)
+    cameras = [scene.cameras[name] for name in (scene.train if part == "train" else scene.test)]
+    raw = load_raw_masks(poses, scene.train) if part == "train" else {}
+    masks, to_world = [], []
+    for camera in cameras:
+        file = poses / "test_masks" / f"{camera.name}.png"
+        shown = raw.get(camera.name, np.zeros((camera.height, camera.width), bool))
+        shown = load_mask(file) if part == "test" and file.is_file() else shown
+        masks.append(out / part / f"{camera.name}.png")
         save_mask(masks[-1], ~shown if part == "train" else shown)
-    poses = np.stack([np.linalg.inv(capture.poses.world_to_camera[name])[:3] for name in names])
+        pose = np.linalg.inv(camera.world_to_camera)[:3]
+        pose[:, 3] = pose[:, 3] / scene.similarity.scale + scene.similarity.offset
+        to_world.append(pose)
     return {
-        "poses": poses,
-        "intrinsics": np.array([[lens.fx, lens.fy, lens.cx, lens.cy] for lens in lenses]),
-        "sizes": np.array([[lens.width, lens.height] for lens in lenses]),
-        "models": np.array([_model(lens) for lens in lenses]),
-        "distortion": np.stack([_distortion(lens) for lens in lenses]),
-        "pictures": np.array([str(capture.pictures[name]) for name in names]),
+        "poses": np.stack(to_world),
+        "intrinsics": np.array([[each.fx, each.fy, each.cx, each.cy] for each in cameras]),
+        "sizes": np.array([[each.width, each.height] for each in cameras]),
+        "pictures": np.array([str(poses / "images" / f"{each.name}.png") for each in cameras]),
         "masks": np.array([str(mask) for mask in masks]),
-        "bounds": np.array([capture.poses.bounds.get(name, (np.nan, np.nan)) for name in names]),
-        "points": capture.poses.points,
-        "colors": capture.poses.colors,
+        "bounds": np.stack([_bounds(camera, scene.points) for camera in cameras]) / scene.similarity.scale,
+        "points": scene.points / scene.similarity.scale + scene.similarity.offset,
+        "colors": scene.point_colors,
     }
 
 
-def _model(lens: Any) -> str:
-    if lens.fisheye:
-        return "opencv_fisheye"
-    return "opencv" if any(lens.radial) or any(lens.tangential) else "pinhole"
+def _bounds(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Nearest and farthest depth of the points before the camera, and a tenth; 0.1 and 10 without any."""
+    depths = points @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
+    depths = depths[depths > 0]
+    return np.array([0.9 * depths.min(), 1.1 * depths.max()]) if len(depths) else np.array([0.1, 10.0])
 
 
-def _distortion(lens: Any) -> np.ndarray:
-    """[8], in OpenCV's order."""
-    found, radial = np.zeros(8), [*lens.radial, 0.0, 0.0, 0.0, 0.0]
-    if any(lens.denominator) or any(radial[FISHEYE:]):
-        raise ValueError(f"{lens.model}: nerfbaselines has no lens with so many terms")
-    if lens.fisheye:
-        found[:FISHEYE] = radial[:FISHEYE]
-    else:
-        found[:2], found[2:4], found[4] = radial[:2], lens.tangential, radial[2]
-    return found
+def _undistorted(scene: Path, out: Path) -> Path:
+    """What `poses` makes of a scene at the size of its pictures, its cameras as given; once for each scene."""
+    if not (out / "made").is_file():
+        shutil.rmtree(out, ignore_errors=True)
+        out.mkdir(parents=True)
+        sys.path.insert(0, str(root()))
+        stage, params = (importlib.import_module(name) for name in ("stages.poses", "reffusion.params.poses"))
+        stage.run(params.Params(detail=0, refine=False), out, scene=scene)
+        (out / "made").touch()
+    return out
 
 
 @cache
