@@ -121,9 +121,9 @@ def splats(folder: np.ndarray) -> dict[str, np.ndarray]:
     gaussians, similarity = _scene(str(folder))
     return {
         "means": gaussians.means.numpy() / similarity.scale + similarity.offset,
-        "scales": gaussians.scales.exp().numpy() / similarity.scale,
-        "opacities": gaussians.opacities.sigmoid().numpy().reshape(-1, 1),
-        "quaternions": gaussians.quats.numpy(),
+        "scales": gaussians.log_scales.exp().numpy() / similarity.scale,
+        "opacities": gaussians.opacity_logits.sigmoid().numpy().reshape(-1, 1),
+        "quaternions": gaussians.quaternions.numpy(),
         "spherical_harmonics": gaussians.sh.transpose(1, 2).numpy(),
     }
 
