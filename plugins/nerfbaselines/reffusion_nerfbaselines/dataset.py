@@ -34,8 +34,8 @@ def load(path: str, split: str, features: Any = None, **_: Any) -> Any:
         raise DatasetNotFoundError(str(error)) from None
     pictures = found["pictures"].tolist()
     cameras = new_cameras(
-        poses=found["poses"].astype(np.float32),
-        intrinsics=found["intrinsics"].astype(np.float32),
+        poses=found["poses"],
+        intrinsics=found["intrinsics"],
         camera_models=np.full(len(pictures), camera_model_to_int("pinhole"), np.int32),
         image_sizes=found["sizes"].astype(np.int32),
         nears_fars=found["bounds"].astype(np.float32),

@@ -75,8 +75,7 @@ class RefFusion:
     def render(self, camera: Any, *, options: Any = None) -> dict[str, np.ndarray]:
         camera = camera.item()
         arrays = {"pose": camera.poses[:3, :4], "intrinsics": camera.intrinsics, "size": camera.image_sizes}
-        found = ask("render", folder=str(self._folder.resolve()), **arrays)
-        return {**found, "color": found["color"].astype(np.float32) / 255}
+        return ask("render", folder=str(self._folder.resolve()), **arrays)
 
     def export_gaussian_splats(self, *, options: Any = None) -> dict[str, Any]:
         """For nerfbaselines' demo."""
