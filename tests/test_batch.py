@@ -95,7 +95,7 @@ def test_several_at_once_and_a_second_call_runs_what_failed(tmp_path, capsys):
             assert path.read_bytes() == (root / "runs/b" / path.relative_to(root / "alone/b")).read_bytes()
 
 
-@pytest.mark.parametrize("cores, memory_mb, most", [(2, 10_000, 2), (4, 1000, 1), (4, 1300, 2), (4, 100, 1)])
+@pytest.mark.parametrize("cores, memory_mb, most", [(2, 10_000, 2), (4, 1300, 2), (4, 100, 1)])
 def test_never_more_than_there_are_cores_or_memory(tmp_path, cores, memory_mb, most):
     """By pipeline.yaml 500 MB, and 100 for each MB of what poses wrote (next to nothing); then by what it last took."""
     root = toys(tmp_path, 0.5, "memory: {distill: {mb: 600, each: 100}}\n")

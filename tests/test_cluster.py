@@ -25,83 +25,6 @@ from runner.lost import attempt, take_over
 REPO = Path(__file__).resolve().parent.parent
 slow = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="takes minutes; set REFFUSION_SLOW=1")
 
-SMALL = {
-    "pipeline.yaml": """
-scene_keys: {}
-stages:
-  poses: {needs: [scene]}
-  fit: {needs: [scene, poses]}
-  masks: {needs: [poses, fit]}
-  reference:
-    needs: [masks]
-    left_out: [{fact: masks.invent_pixels, equals: 0, because: nothing has to be invented}]
-  initialize: {needs: [poses, fit, masks], optional: [reference]}
-  evaluate: {needs: [poses, fit], optional: [masks, initialize]}
-profiles: {laptop: {masks: {negligible: 0.2}}}
-variants:
-  untidy: {initialize: {tidy: false}}
-  dull: {initialize: {gloss: false, settle: 0}}
-""",
-    "stages/__init__.py": "",
-    "stages/poses.py": """
-import tempfile
-from pathlib import Path
-from shutil import copytree
-from pydantic import BaseModel
-from stages.small_scene import write
-
-class Params(BaseModel, extra="forbid"):
-    pass
-
-def run(params, out, *, scene):
-    with tempfile.TemporaryDirectory() as folder:
-        write(Path(folder), float((scene / "number.txt").read_text()))
-        for path in (Path(folder) / "poses").iterdir():
-            path.rename(out / path.name) if path.is_file() else copytree(path, out / path.name)
-""",
-    "stages/reference.py": """
-from pydantic import BaseModel
-
-class Params(BaseModel, extra="forbid"):
-    pass
-
-def run(params, out, *, masks):
-    raise ValueError("nothing has to be invented")
-""",
-    "stages/fit.py": """
-import tempfile
-from pathlib import Path
-from pydantic import BaseModel
-from stages.small_scene import write
-
-class Params(BaseModel, extra="forbid"):
-    pass
-
-def run(params, out, *, scene, poses):
-    with tempfile.TemporaryDirectory() as folder:
-        write(Path(folder), float((scene / "number.txt").read_text()))
-        (out / "gaussians.ply").write_bytes((Path(folder) / "fit/gaussians.ply").read_bytes())
-""",
-}
-
-
-def small(root: Path, scenes: int) -> Path:
-    """A project of small scenes, a square before a wall at several depths, and the real stages from masks on."""
-    for name, text in SMALL.items():
-        (root / name).parent.mkdir(parents=True, exist_ok=True)
-        (root / name).write_text(text)
-    shutil.copy(REPO / "tests/small_scene.py", root / "stages")
-    for stage in ("masks", "initialize", "evaluate"):
-        shutil.copy(REPO / f"stages/{stage}.py", root / "stages")
-    shutil.copytree(
-        REPO / "stages/plan", root / "stages/plan", ignore=shutil.ignore_patterns("poses.py", "fit.py", "ref*")
-    )
-    (root / "reffusion").symlink_to(REPO / "reffusion")
-    for number in range(scenes):
-        (root / f"many/s{number:02}").mkdir(parents=True)
-        (root / f"many/s{number:02}/number.txt").write_text(str(0.8 + 0.01 * number))
-    return root
-
 
 def results(runs: Path) -> dict[str, str]:
     """Every file of every artifact with its hash, as receipts have them."""
@@ -215,13 +138,6 @@ def test_twelve_scenes_with_three_variants_on_ray_are_those_of_one_machine(tmp_p
     killer.join()
     cluster.others.append(cluster.add_node(num_cpus=1))
     equals_one_machine(root, "better,none", 600)
-
-
-@slow
-def test_real_stages_on_ray_are_those_of_one_machine(tmp_path, on_ray):
-    root = small(tmp_path, 2)
-    assert compare(asked(root, "", cuda=on_ray.cuda), "", data=root / "many", by=By(on_ray, 1)) == 0
-    equals_one_machine(root, "", 100)
 
 
 def equals_one_machine(root: Path, variants: str, least: int) -> None:
