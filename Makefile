@@ -192,7 +192,7 @@ verify clean: named setup
 gc: setup
 	@$(RUN) gc $(if $(scene),$(of)) $(options) $(if $(yes),--yes)
 
-spinnerf: setup
+spinnerf: setup $(if $(engine),$(VENV)/.ready-cluster)
 	@$(PY) data/spinnerf.py --data="$$data"
 	@$(RUN) batch --data="$$data" $(options) $(by)
 

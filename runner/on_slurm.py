@@ -3,6 +3,7 @@ share. Slurm places them; a stage whose node was lost is sent again. No cluster 
 executor of this machine (address=local)."""
 
 import os
+import subprocess
 import time
 from collections.abc import Callable
 from functools import partial
@@ -35,7 +36,7 @@ class Slurm:
         except (RuntimeError, OSError) as error:
             raise Refused(f"engine=slurm: {told(error)}; address=local tries it without a cluster") from None
         self._local, self._partition = address == "local", address
-        self.cuda: bool | None = None if self._local else True  # Slurm refuses what it has no card for
+        self.cuda: bool | None = None if self._local else _has_cards(address)
         self.cores = (os.cpu_count() or 1) if self._local else AT_ONCE
         self._jobs: set[submitit.Job[Any]] = set()
         self._stopped = False
@@ -74,3 +75,9 @@ class Slurm:
         self._stopped = True
         for job in list(self._jobs):
             job.cancel()
+
+
+def _has_cards(partition: str | None) -> bool:
+    """Does Slurm say that its nodes, or those of a partition, have any?"""
+    command = ["sinfo", "--noheader", "--format=%G", *(["--partition", partition] if partition else [])]
+    return "gpu" in subprocess.run(command, capture_output=True, text=True).stdout

@@ -137,7 +137,7 @@ def test_twelve_scenes_with_three_variants_on_ray_are_those_of_one_machine(tmp_p
     assert compare(asked(root, "", cuda=on_ray.cuda), "better,none", data=root / "many", by=By(on_ray, 1)) == 0
     killer.join()
     cluster.others.append(cluster.add_node(num_cpus=1))
-    equals_one_machine(root, "better,none", 600)
+    equals_one_machine(root, "better,none", 300)
 
 
 def equals_one_machine(root: Path, variants: str, least: int) -> None:
