@@ -151,7 +151,7 @@ def _draft(request: Request, hashes: Hashes, scene: bool) -> Job:
 
 
 def choose_profile(
-    asked: str | None, scene: SceneFile, pinned: list[Path], pipeline: Pipeline, cuda: bool | None
+    asked: str | None, scene: SceneFile, pinned: list[Path], pipeline: Pipeline, cuda: bool | None = None
 ) -> tuple[str, str]:
     """The profile asked for, else scene.yaml's, else the one this scene was run with, else by the machine; and why."""
     origin = "profile" if asked else f"{scene.path}: profile"
