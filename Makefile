@@ -2,7 +2,7 @@
 
 # Given on the command line; set here so that a variable of the environment is not taken for one of them. Recipes read
 # them from their environment, in double quotes, as they were typed: there is no quote or $ that a shell or make obeys.
-given := scene profile variant budget set trust keep runs variants seeds seed name steps gate slow offline port card device dtype
+given := scene profile variant budget set trust keep runs variants seeds seed name steps gate slow offline port card device dtype engine address cores yes
 $(foreach each,$(given),$(eval $(each) :=))
 data := data
 folder := $(findstring command,$(origin data))
@@ -21,6 +21,7 @@ STAGES := poses fit masks reference lift personalize initialize distill evaluate
 
 of = --scene="$$scene"
 where = $(if $(variant),--variant="$$variant") $(if $(runs),--runs="$$runs")
+by = $(if $(engine),--engine="$$engine") $(if $(address),--address="$$address") $(if $(cores),--cores="$$cores")
 options = $(where) $(if $(profile),--profile="$$profile") $(if $(budget),--budget="$$budget") \
 	$(if $(set),--set="$$set") $(if $(trust),--trust) $(if $(keep),--keep)
 
@@ -38,6 +39,7 @@ help:
 	@echo '                               variants=a,b  only these; seeds=5  on demo, demo-1 ... demo-4, with intervals'
 	@echo 'make data=FOLDER compare       the same over all its scenes, in one table: runs/compare/compare.html'
 	@echo 'make data=FOLDER spinnerf      what it holds of SPIn-NeRF'"'"'s published scenes; then as batch'
+	@echo 'make data=FOLDER study         then, or with scene=X: paired clips for people to judge: runs/compare/study/index.html'
 	@echo 'make scene=X report            what was done, errors against seconds: runs/X/report.html'
 	@echo 'make scene=X view              walk through the finished scene in a browser; port=8080'
 	@echo 'make scene=X turntable         the finished scene on a way around the capture: runs/X/turntable.webm'
@@ -50,7 +52,10 @@ help:
 	@echo 'make scene=X export            the finished scene for other tools, .ply, cameras, LoRA: runs/X/export/'
 	@echo 'make scene=X verify            hash all that was computed for it: is it as it was made?'
 	@echo 'make scene=X clean             remove what was computed for it'
-	@echo 'make data=FOLDER batch         every scene of a folder, and one table'
+	@echo 'make gc                        what no plan uses any more, with sizes; then removes it, if you say so or yes=1'
+	@echo 'make data=FOLDER batch         every scene of a folder, several at once, and one table: runs/results.html; cores=2  each'
+	@echo '                               engine=ray address=HOST:6379  on a cluster; engine=slurm address=PARTITION; also for'
+	@echo '                               compare, all and stages'
 	@echo 'make demo [seed=N]             make the demo scene, or another: data/demo-N; others are made when named:'
 	@echo '                               demo-wide, -360, -seen, -photos, -behind, -table, -corner, -grass, -insert, -outpaint, -pair, -sparse,'
 	@echo '                               with -N too'
@@ -89,6 +94,10 @@ $(VENV)/.ready-export: $(VENV)/.ready
 	$(PY) -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[export]'
 	@touch $@
 
+$(VENV)/.ready-cluster: $(VENV)/.ready
+	$(PY) -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[cluster]'
+	@touch $@
+
 $(VENV)/.ready-dev: $(VENV)/.ready
 	$(PY) -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[dev]'
 	@touch $@
@@ -117,10 +126,10 @@ data/%/.generated: | $(VENV)/.ready
 named:
 	@test -n "$$scene" || { echo "error: which scene? For example: make scene=demo $$goals" >&2; exit 2; }
 
-ready: named setup $(made:%=data/%/.generated)
+ready: named setup $(if $(engine),$(VENV)/.ready-cluster) $(made:%=data/%/.generated)
 
 all $(STAGES): ready
-	@$(RUN) run $@ $(of) $(options)
+	@$(RUN) run $@ $(of) $(options) $(by)
 
 plan: ready
 	@$(RUN) plan $(of) $(options) $(if $(card),--card="$$card")
@@ -135,8 +144,8 @@ others := $(if $(call rest,0 1 2 3 4 5 6 7 8 9,$(seeds)),,$(if $(made),$(addsuff
 	$(addprefix data/$(made)-,$(wordlist 2,$(or $(seeds),1),$(shell seq 0 99))))))
 # Of a folder of scenes where it is named on the command line and no scene is.
 these = $(if $(scene),$(of),--data="$$data")
-compare: $(if $(scene),ready $(others),$(if $(folder),setup,named))
-	@$(RUN) compare $(these) $(options) $(if $(variants),--variants="$$variants") $(if $(seeds),--seeds="$$seeds"); \
+compare: $(if $(scene),ready $(others),$(if $(folder),setup $(if $(engine),$(VENV)/.ready-cluster),named))
+	@$(RUN) compare $(these) $(options) $(by) $(if $(variants),--variants="$$variants") $(if $(seeds),--seeds="$$seeds"); \
 		status=$$?; test $$status = 0 || test $$status = 3 || exit $$status; \
 		$(RUN) compare-page $(these) $(if $(runs),--runs="$$runs") && exit $$status
 
@@ -147,6 +156,11 @@ ifneq ($(scene),)
 else
 	@$(RUN) report --data="$$data" $(where)
 endif
+
+.PHONY: study
+study: setup
+	@$(RUN) study $(these) $(if $(runs),--runs="$$runs") $(if $(variants),--variants="$$variants") \
+		$(if $(seed),--seed="$$seed")
 
 .PHONY: mask
 mask: ready
@@ -174,12 +188,18 @@ export: ready $(VENV)/.ready-export
 verify clean: named setup
 	@$(RUN) $@ $(of) $(options)
 
-spinnerf: setup
-	@$(PY) data/spinnerf.py --data="$$data"
-	@$(RUN) batch --data="$$data" $(options)
+.PHONY: gc
+gc: setup
+	@$(RUN) gc $(if $(scene),$(of)) $(options) $(if $(yes),--yes)
 
-batch: setup
-	@$(RUN) batch --data="$$data" $(options)
+spinnerf: setup $(if $(engine),$(VENV)/.ready-cluster)
+	@$(PY) data/spinnerf.py --data="$$data"
+	@$(RUN) batch --data="$$data" $(options) $(by)
+
+# A scene that fails (1) stops no other: the page is drawn, then make fails.
+batch: setup $(if $(engine),$(VENV)/.ready-cluster)
+	@$(RUN) batch --data="$$data" $(options) $(by); status=$$?; test $$status = 0 || test $$status = 1 || exit $$status; \
+		$(RUN) batch-page $(where) && exit $$status
 
 weights: setup
 	@$(RUN) weights $(if $(scene),$(of)) $(if $(offline),--offline) $(options)

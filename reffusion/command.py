@@ -11,7 +11,10 @@ from pathlib import Path
 REPORTS = {
     "report": "report.job",
     "compare-page": "report.compare",
+    "batch-page": "report.batch",
     "view": "report.view",
+    "study": "report.study",
+    "study-votes": "report.votes",
     "mask": "report.mask",
     "turntable": "report.turntable",
     "sheet": "report.sheet",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
@@ -34,14 +35,24 @@ def make(home: Path, frames: int = FRAMES) -> Path:
     gaussians = load_ply(finished, scene.similarity)
     train = [scene.cameras[name] for name in scene.train]
     path, cameras = home / "turntable.webm", flight.around(train, scene.points, frames)
-    film = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*CODEC), RATE, (cameras[0].width, cameras[0].height))
-    if not film.isOpened():
-        raise ValueError(f"{path}: this OpenCV writes no {CODEC} video; `pip install opencv-contrib-python-headless`")
-    for camera in cameras:
-        picture = to_uint8(rasterizer.render(gaussians, camera).color.numpy())
-        film.write(np.ascontiguousarray(picture[..., ::-1]))
-    film.release()
+    save_film(path, (to_uint8(rasterizer.render(gaussians, camera).color.numpy()) for camera in cameras))
     return path
+
+
+def save_film(path: Path, pictures: Iterable[np.ndarray], rate: int = RATE) -> None:
+    """Pictures uint8 [H, W, 3], at least one, as a .webm. Raises ValueError where this OpenCV writes none."""
+    film = None
+    for picture in pictures:
+        if film is None:
+            size = (picture.shape[1], picture.shape[0])
+            film = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*CODEC), rate, size)
+        if not film.isOpened():
+            raise ValueError(
+                f"{path}: this OpenCV writes no {CODEC} video; `pip install opencv-contrib-python-headless`"
+            )
+        film.write(np.ascontiguousarray(picture[..., ::-1]))
+    if film is not None:
+        film.release()
 
 
 def main() -> None:

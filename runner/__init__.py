@@ -6,12 +6,19 @@
 - plan.py: one word and a reason for each stage, from what lies on the disk.
   - keys.py: what an artifact depends on, as hashes: contents of folders, code, parameters.
 - execute.py: does it: a fresh process a stage, folders renamed into place, receipts.
+  - engine.py: where that process runs: here, or on a cluster (on_ray.py, on_slurm.py).
   - artifacts.py: what of one is as its receipt says, and swaps that survive a kill.
   - files.py: files written whole, locks, and copies that people work with.
 - upkeep.py: what was made is verified, or removed.
 - child.py: the other side: the process in which stages are imported.
-- compare.py: many runs.
+- compare.py: many runs: which, and their tables.
+  - many.py: several at once; progress.py: how far each is.
+- sweep.py: what no plan uses any more is listed, and removed.
 """
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 
 
 class Refused(Exception):
@@ -23,4 +30,18 @@ class Failed(Exception):
 
 
 def say(text: str) -> None:
-    print(text, flush=True)
+    hear = _hears.get()
+    print(text, flush=True) if hear is None else hear(text)
+
+
+@contextmanager
+def said_to(hear: Callable[[str], None]) -> Iterator[None]:
+    """While this runs, and in this thread, what is said goes to `hear`."""
+    before = _hears.set(hear)
+    try:
+        yield
+    finally:
+        _hears.reset(before)
+
+
+_hears: ContextVar[Callable[[str], None] | None] = ContextVar("hears", default=None)

@@ -1,4 +1,4 @@
-"""reffusion plan|run|compare|batch|weights|verify|clean --scene NAME: what the Makefile calls (or python -m runner).
+"""reffusion plan|run|compare|batch|weights|verify|clean|gc --scene NAME: what the Makefile calls (or python -m runner).
 Pages of what was made: reffusion report|compare-page|view|turntable|sheet, each with --help."""
 
 import argparse
@@ -11,12 +11,14 @@ from pathlib import Path
 from reffusion.command import workplace
 from runner import Failed, Refused
 from runner.child import INTERRUPTED
-from runner.compare import batch, compare, show_results
+from runner.compare import By, batch, compare, show_results
 from runner.costs import costs
-from runner.execute import run_scene, weights
+from runner.engine import ENGINES, chosen
+from runner.execute import Work, run_scene, weights
 from runner.files import told, write_json
 from runner.plan import as_record, plan, table
 from runner.resolve import Request, resolve
+from runner.sweep import sweep
 from runner.upkeep import clean, verify
 
 SOME_FAILED = 3  # compare: done, but for some variants
@@ -39,16 +41,24 @@ def main() -> int:
             else:
                 print("\n".join(filter(None, [table(job, decisions), costs(job, decisions, arguments.card)])))
         elif arguments.command == "run":
-            stage, folder = list(run_scene(request, arguments.stage).items())[-1]
+            by = _by(arguments, request)
+            request, work = replace(request, cuda=by.engine.cuda), Work(by.engine, by.cores)
+            stage, folder = list(run_scene(request, arguments.stage, None, work).items())[-1]
             show_results(stage, folder)
         elif arguments.command == "compare":
-            return SOME_FAILED if compare(request, arguments.variants, arguments.seeds, arguments.data) else 0
+            by = _by(arguments, request)
+            request = replace(request, cuda=by.engine.cuda)
+            return SOME_FAILED if compare(request, arguments.variants, arguments.seeds, arguments.data, by) else 0
         elif arguments.command == "batch":
-            return 1 if batch(request, arguments.data or Path("data")) else 0
+            by = _by(arguments, request)
+            request = replace(request, cuda=by.engine.cuda)
+            return 1 if batch(request, arguments.data or Path("data"), by) else 0
         elif arguments.command == "weights":
             return 1 if weights(request, arguments.offline) else 0
         elif arguments.command == "verify":
             return 1 if verify(request) else 0
+        elif arguments.command == "gc":
+            sweep(request, arguments.yes)
         else:
             clean(request)
     except KeyboardInterrupt:
@@ -63,9 +73,15 @@ def main() -> int:
     return 0
 
 
+def _by(arguments: argparse.Namespace, request: Request) -> By:
+    if arguments.cores is not None and arguments.cores < 1:
+        raise Refused(f"cores={arguments.cores}: of each stage; 1 or more")
+    return By(chosen(arguments.engine, arguments.address, request.root, request.runs), arguments.cores)
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="reffusion", description=__doc__)
-    parser.add_argument("command", choices=["plan", "run", "compare", "batch", "weights", "verify", "clean"])
+    parser.add_argument("command", choices=["plan", "run", "compare", "batch", "weights", "verify", "clean", "gc"])
     parser.add_argument("stage", nargs="?", default="all", help="run this stage and what it needs; `all` (default)")
     parser.add_argument("--scene", default="", help="a name under data/, or a path")
     parser.add_argument("--data", type=Path, help="batch, compare: a folder of scenes; batch takes data/")
@@ -78,8 +94,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--trust", action="store_true", help="accept artifacts made by older code")
     parser.add_argument("--keep", action="store_true", help="go on with artifacts as people changed them, from now on")
     parser.add_argument("--budget", help="time for the whole job, like 5m: sets the number of steps")
+    parser.add_argument("--cores", type=int, help="of each stage; all, for several scenes an equal part for each")
+    parser.add_argument("--engine", help=f"where stages run: local (default), {', '.join(ENGINES)}")
+    parser.add_argument("--address", help="of the engine: ray://HOST:10001 or HOST:6379; a partition of Slurm")
     parser.add_argument("--offline", action="store_true", help="weights: only say what is missing")
     parser.add_argument("--set", default="", help="stage.parameter=value ...")
+    parser.add_argument("--yes", action="store_true", help="gc: remove what it lists, without asking")
     parser.add_argument("--root", type=Path, default=Path(__file__).parent.parent, help="where pipeline.yaml is")
     parser.add_argument("--runs", type=Path, help="where artifacts go; root/runs, installed ./runs")
     return parser

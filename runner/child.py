@@ -10,6 +10,7 @@ import faulthandler
 import importlib
 import json
 import os
+import platform
 import reprlib
 import resource
 import signal
@@ -29,6 +30,7 @@ from pydantic import BaseModel, ValidationError
 from runner.files import files_below, told
 
 INTERRUPTED = 130
+THREADS = ("OMP", "MKL", "OPENBLAS", "NUMBA")  # <each>_NUM_THREADS
 
 
 def _described_in(stage: str) -> Path:
@@ -175,12 +177,17 @@ def frames() -> int:
 def run() -> int:
     """Do one stage. Standard input: one line of JSON, then nothing until the runner is gone.
 
-    The line: {"stage", "params", "out", "needs": {need: path or null}, "log", "result", "lock"}. Writes to `result`,
-    an open file's number, {"seconds", "peak_memory_mb"} or {"error": one line}, and to `log` the full traceback.
+    The line: {"stage", "params", "out", "needs": {need: path or null}, "log", "result", "lock" or null}, and see
+    `_confine`. Writes to `result`, an open file's number, {"seconds", "peak_memory_mb", "machine"} or {"error": one
+    line}, and to `log` the full traceback.
     """
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])  # Ray's processes, and those started by them, block it
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     job = json.loads(sys.stdin.readline())
     for number in (job["lock"], job["result"]):  # the lock is held until this process ends: no second runner before
-        os.set_inheritable(number, False)
+        if number is not None:
+            os.set_inheritable(number, False)
+    _confine(job.get("cores"), job.get("on"), job.get("cards"))
     threading.Thread(target=_end_with_runner, args=(sys.stdin.fileno(),), daemon=True).start()
     warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
     result: dict[str, Any] = {}
@@ -199,6 +206,17 @@ def run() -> int:
     return int("error" in result)
 
 
+def _confine(cores: int | None, on: list[int] | None, cards: str | None) -> None:
+    """Let what is imported from now on use so many threads, on these cores, and these cards; None: as it likes."""
+    if cores is not None:
+        os.environ |= {f"{library}_NUM_THREADS": str(cores) for library in THREADS}
+        os.environ["OPENCV_FOR_THREADS_NUM"] = str(cores)
+    if on and hasattr(os, "sched_setaffinity"):  # what asks the system for its cores, and reads no variable
+        os.sched_setaffinity(0, on)
+    if cards is not None:
+        os.environ["CUDA_VISIBLE_DEVICES"] = cards
+
+
 def _done(job: dict[str, Any], log: TextIO) -> dict[str, Any]:
     """What there is to tell of a stage, done here and now."""
     began = time.perf_counter()
@@ -210,7 +228,8 @@ def _done(job: dict[str, Any], log: TextIO) -> dict[str, Any]:
     except Exception as error:
         log.write(traceback.format_exc())
         return {"error": told(error)[:9999]}  # what a pipe holds
-    return {"seconds": round(time.perf_counter() - began, 2), "peak_memory_mb": _peak_memory_mb()}
+    seconds = round(time.perf_counter() - began, 2)
+    return {"seconds": seconds, "peak_memory_mb": _peak_memory_mb(), "machine": platform.node()}
 
 
 def _end_with_runner(fd: int) -> None:

@@ -5,16 +5,15 @@ import io
 import json
 import os
 import re
-import sys
-import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from runner import Refused, say
-from runner.execute import run_scene
-from runner.files import RECEIPT, shown, told, write_json, write_text
+from runner.engine import Engine, Local
+from runner.files import RECEIPT, shown, write_json, write_text
 from runner.keys import HASHES, Hashes
+from runner.many import Outcome, Run, do_all
 from runner.pipeline import Pipeline, find_scene, load_pipeline, scene_name, unknown
 from runner.resolve import Request, resolve_all
 
@@ -22,10 +21,19 @@ FULL = "full"  # what the scene's own run, without a variant, is called beside t
 TOGETHER = "compare"  # the folder in runs/ of a comparison over a folder of scenes
 RECORD = "compare.json"
 RUNS = "compare-runs"  # .csv and .md: a row a run, written anew after each
+RESULTS = "results"  # .json, .csv and .md of a batch
 WAITING, DONE, FAILED = "not run yet", "done", "failed"
 
 
-def compare(request: Request, only: str = "", seeds: int = 1, data: Path | None = None) -> int:
+@dataclass(frozen=True)
+class By:
+    """Who does the work, with how many cores a stage (None: an equal part for each scene)."""
+
+    engine: Engine
+    cores: int | None = None
+
+
+def compare(request: Request, only: str = "", seeds: int = 1, data: Path | None = None, by: By | None = None) -> int:
     """Bring the full method and the variants up to date, and write compare.json to runs/<scene>/, of a folder of
     scenes to runs/compare/; how many failed.
 
@@ -36,7 +44,8 @@ def compare(request: Request, only: str = "", seeds: int = 1, data: Path | None 
     Raises Refused before any work, where a variant, a scene or a parameter is not right."""
     if request.variant:
         raise Refused(f"variant={request.variant}: compare runs all variants; variants={request.variant} picks some")
-    methods = [FULL, *_chosen(only, load_pipeline(request.root))]
+    pipeline, by = load_pipeline(request.root), by or By(Local())
+    methods = [FULL, *_chosen(only, pipeline)]
     names = _scenes(request, seeds, data)
     asks = lambda scene, method: replace(request, scene=scene, variant=None if method == FULL else method)
     requests = {(scene, method): asks(scene, method) for scene in names for method in methods}
@@ -47,17 +56,22 @@ def compare(request: Request, only: str = "", seeds: int = 1, data: Path | None 
     home = request.runs / (TOGETHER if data else scenes[0])
     record = {"scene": home.name, "scenes": scenes, "methods": methods, "runs": runs}
     record |= {"data": str(data.expanduser().resolve())} if data else {}
-    began = time.monotonic()
-    for number, (run, asked) in enumerate(zip(runs, requests.values(), strict=True), 1):
-        write_json(home / RECORD, record)
-        minutes = (time.monotonic() - began) / 60
-        say(f"\ncompare: {run['method']} on {run['scene']}, {number} of {len(runs)}, {minutes:.0f} min so far")
-        stages, error = _tried(asked, hashes)
-        where = {stage: path and os.path.relpath(path, request.runs) for stage, path in stages.items()}
-        run |= {"state": FAILED, "error": error} if error else {"state": DONE, "stages": where}
-        run |= {"mean": _mean(stages.get("evaluate"))}
+
+    def ended(place: int, outcome: Outcome) -> None:
+        where = {stage: path and os.path.relpath(path, request.runs) for stage, path in outcome.stages.items()}
+        run = runs[place]
+        run |= {"state": FAILED, "error": outcome.error} if outcome.error else {"state": DONE, "stages": where}
+        run |= {"mean": _mean(outcome.stages.get("evaluate"))}
         _write_table(home / RUNS, runs, ("method", "scene"))
+        write_json(home / RECORD, record)
+
     write_json(home / RECORD, record)
+    todo = []
+    for number, ((scene, method), asked) in enumerate(requests.items(), 1):
+        place = request.runs / (names[scene] if method == FULL else f"{names[scene]}@{method}")
+        announced = f"\ncompare: {method} on {names[scene]}, {number} of {len(runs)}"
+        todo.append(Run(place.name, names[scene], place, asked, announced))
+    do_all(todo, by.engine, by.cores, hashes, list(pipeline.stages), ended)
     failed = [run for run in runs if run["state"] == FAILED]
     say("")
     for run in failed:
@@ -77,15 +91,6 @@ def _refuse_wrong(scenes: list[str], requests: dict[tuple[str, str], Request], h
         except Refused as error:
             refusals.append(error)
     raise refusals[0]
-
-
-def _tried(request: Request, hashes: Hashes) -> tuple[dict[str, Path | None], str | None]:
-    """Run one: stage -> its artifact, and what went wrong."""
-    try:
-        return run_scene(request, "all", hashes), None
-    except Exception as error:  # of whatever kind: it must not keep others waiting
-        print(f"error: {told(error)}", file=sys.stderr, flush=True)
-        return {}, told(error)
 
 
 def _chosen(only: str, pipeline: Pipeline) -> list[str]:
@@ -145,17 +150,26 @@ def _number(value: Any) -> str:
     return f"{value:.4f}" if isinstance(value, float) else "" if value is None else str(value)
 
 
-def batch(request: Request, folder: Path) -> int:
-    """Every scene in `folder`, one after another; a table in runs/results.{csv,md}, written anew after each. Returns
-    how many failed."""
-    scenes, hashes = _folders(folder), Hashes(request.runs / HASHES)
-    stem = request.runs / (f"results@{request.variant}" if request.variant else "results")
+def batch(request: Request, folder: Path, by: By | None = None) -> int:
+    """Every scene in `folder`; runs/results.json, and a table in results.csv and .md, written anew after each, that
+    with the reasons of those that failed. Returns how many failed."""
+    scenes, hashes, by = _folders(folder), Hashes(request.runs / HASHES), by or By(Local())
+    end = f"@{request.variant}" if request.variant else ""
+    stem = request.runs / f"{RESULTS}{end}"
     runs: list[dict[str, Any]] = [{"scene": scene.name, "method": "", "state": WAITING} for scene in scenes]
-    for run, scene in zip(runs, scenes, strict=True):
-        stages, error = _tried(replace(request, scene=str(scene)), hashes)
-        run |= {"state": FAILED, "error": error} if error else {"state": DONE}
-        run |= {"mean": _mean(stages.get("evaluate"))}
+
+    def ended(place: int, outcome: Outcome) -> None:
+        run = runs[place]
+        run |= {"state": FAILED, "error": outcome.error} if outcome.error else {"state": DONE}
+        run |= {"home": f"{run['scene']}{end}", "seconds": round(outcome.seconds, 1)}
+        run |= {"mean": _mean(outcome.stages.get("evaluate"))}
         _write_table(stem, runs, ("scene",))
+        write_json(Path(f"{stem}.json"), {"data": str(folder), "runs": runs})
+
+    asks = lambda scene: replace(request, scene=str(scene))
+    homes = [request.runs / f"{scene.name}{end}" for scene in scenes]
+    todo = [Run(scene.name, scene.name, home, asks(scene)) for scene, home in zip(scenes, homes, strict=True)]
+    do_all(todo, by.engine, by.cores, hashes, list(load_pipeline(request.root).stages), ended)
     failed = [run for run in runs if run["state"] == FAILED]
     for run in failed:
         say(f"failed: {run['scene']}: {run['error']}")
@@ -176,7 +190,9 @@ def _write_table(stem: Path, runs: list[dict[str, Any]], keys: tuple[str, ...]) 
     csv.writer(table := io.StringIO(), lineterminator="\n").writerows([header, *lines])
     write_text(Path(f"{stem}.csv"), table.getvalue())
     text = [" | ".join(cells) for cells in (header, ["---"] * len(header), *lines)]
-    write_text(Path(f"{stem}.md"), "".join(f"| {line} |\n" for line in text))
+    failed = [] if len(keys) > 1 else [run for run in runs if run["state"] == FAILED]
+    said = "".join(f"- {run['scene']} failed: {run['error']}\n" for run in failed) + "\n" * bool(failed)
+    write_text(Path(f"{stem}.md"), said + "".join(f"| {line} |\n" for line in text))
 
 
 def _numbers(mean: dict[str, Any], names: list[str]) -> list[str]:

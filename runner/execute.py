@@ -4,24 +4,25 @@ import errno
 import functools
 import importlib.metadata
 import json
-import os
 import platform
 import shutil
 import signal
-import subprocess
 import sys
 import time
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from runner import Failed, Refused, say
 from runner.artifacts import accept, contents, discard, put_in_place, recover, wear
+from runner.engine import Engine, Local, Needs, Task
 from runner.files import (
     CURES,
     MACHINE,
     RECEIPT,
+    files_below,
     hand_out,
     locked,
     read_json,
@@ -32,19 +33,34 @@ from runner.files import (
     write_text,
 )
 from runner.keys import Hashes, Inputs
+from runner.lost import take_over
 from runner.pipeline import SCENE
 from runner.plan import Decision, amount, decide, expected_seconds, partial_folder, plan, table
 from runner.resolve import Job, Request, ask, child, resolve
 
 PACKAGES = ("reffusion", "numpy", "torch", "numba", "diffusers", "transformers", "peft", "pycolmap", "gsplat")
 LITTLE = 2**20  # bytes: a disk with less is full
-GRACE = 20.0  # seconds an interrupted stage has to end by itself
 
 
-def run_stage(job: Job, stage: str, decision: Decision, earlier: dict[str, Decision], lock: int) -> Decision:
+@dataclass(frozen=True)
+class Work:
+    """How a job's stages are done. cores: of each of them, None: all there are. output: the file to which what they
+    print is added, None: where the runner's own goes. watch: told each stage and what becomes of it, waits, runs, done
+    (or it is cached, left out, or provided)."""
+
+    engine: Engine
+    cores: int | None = None
+    output: Path | None = None
+    watch: Callable[[str, str], None] = lambda stage, word: None
+
+
+def run_stage(
+    job: Job, stage: str, decision: Decision, earlier: dict[str, Decision], lock: int, work: Work
+) -> Decision:
     """Do the stage in `.partial-<stage>-<key>`, which may hold what an earlier try left, and put it in place."""
     assert decision.inputs
     partial, place = partial_folder(job, stage, decision.inputs.key), job.home / stage
+    take_over(partial)
     if not partial.exists() and (other := copied_from_variant(job, stage, decision.inputs.key, partial)):
         say(f"{stage}: the same as in {other}: copied")
     if not read_receipt(partial):  # it is there where the runner was killed just before the swap
@@ -52,7 +68,9 @@ def run_stage(job: Job, stage: str, decision: Decision, earlier: dict[str, Decis
         partial.mkdir(parents=True, exist_ok=True)
         seconds = expected_seconds(job, stage)
         say(f"{stage}: {decision.reason}" + (f"; about {seconds:.0f} s" if seconds is not None else ""))
-        result = {"resumed": resumed} | _in_child(job, stage, partial, earlier, lock)  # the last try's seconds only
+        result = {"resumed": resumed} | _done_by(
+            work, job, stage, partial, earlier, lock
+        )  # the last try's seconds only
         say(f"{stage}: done in {result['seconds']:.1f} s, {result['peak_memory_mb']} MB")
         refuse_lost(lock)
         write_json(partial / RECEIPT, _receipt(job, stage, decision.inputs, partial, result))
@@ -79,37 +97,18 @@ def copied_from_variant(job: Job, stage: str, key: str, to: Path) -> str | None:
     return None
 
 
-def _in_child(job: Job, stage: str, partial: Path, earlier: dict[str, Decision], lock: int) -> dict[str, Any]:
-    """The result the child told. Raises Failed with its error; an interrupt is passed on to it and raised again."""
+def _done_by(
+    work: Work, job: Job, stage: str, partial: Path, earlier: dict[str, Decision], lock: int
+) -> dict[str, Any]:
+    """The result the stage's process told. Raises Failed with its error, KeyboardInterrupt where it was interrupted."""
     log = job.home / f"{stage}.log"
     needs = {need: job.folder if need == SCENE else earlier[need].path for need in job.pipeline.stages[stage].takes}
-    heard, result = os.pipe()  # no file: that there is no room for one may be what must be told
-    task = {"stage": stage, "params": job.params[stage], "out": partial, "log": log, "result": result, "lock": lock}
-    line = json.dumps(task | {"needs": needs}, default=str)
-    # A process group of its own: Ctrl-C reaches it once, from here.
-    process = child(job.root, "run", pass_fds=(lock, result), process_group=0)
-    assert process.stdin
-    os.close(result)
-    answer: dict[str, Any] = {}
-    try:
-        with suppress(BrokenPipeError):  # a child that is gone already has its code below
-            process.stdin.write(line + "\n")
-            process.stdin.flush()  # and left open: the child ends when this process does
-        code = process.wait()
-    except KeyboardInterrupt:
-        process.send_signal(signal.SIGINT)
-        try:
-            process.wait(GRACE)
-        except (subprocess.TimeoutExpired, KeyboardInterrupt):
-            process.kill()
-            process.wait()
-        raise
-    finally:
-        with suppress(BrokenPipeError):
-            process.stdin.close()
-        os.set_blocking(heard, False)  # what a stage has started may live on, and hold its end open
-        with suppress(BlockingIOError), open(heard, "rb", buffering=0) as file:
-            answer = json.loads(file.read(1 << 16) or "{}")
+    line = {"stage": stage, "params": job.params[stage], "out": partial, "log": log, "needs": needs}
+    task = Task(job.root, json.loads(json.dumps(line, default=str)), work.output)
+    wanted = Needs(work.cores, int(job.params[stage].get("device") == "cuda"), memory_of(job, stage, needs))
+    work.watch(stage, "waits")
+    ended = work.engine.run(task, wanted, lock, lambda: work.watch(stage, "runs"))
+    code, answer = ended.code, ended.answer
     if code == 0 and answer:
         return answer
     how = f"ended by signal {-code} ({signal.Signals(-code).name})" if code < 0 else f"ended with code {code}"
@@ -118,6 +117,18 @@ def _in_child(job: Job, stage: str, partial: Path, earlier: dict[str, Decision],
     if shutil.disk_usage(job.home).free < LITTLE and CURES[errno.ENOSPC] not in said:  # libraries do not tell
         said += f"; the disk is full: {CURES[errno.ENOSPC]}"
     raise Failed(f"{stage}: {said} (all of it in {shown(log)})")
+
+
+def memory_of(job: Job, stage: str, needs: dict[str, Path | None]) -> int:
+    """MB of the CPU's that a stage may take: a tenth above what it last took for this scene, or a variant of it; where
+    it has not run yet by pipeline.yaml's `memory`, from the size of the files that it reads."""
+    places = [job.runs / job.base.name, *job.runs.glob(f"{job.base.name}@*")]
+    took = [r["peak_memory_mb"] for place in places if (r := read_receipt(place / stage)) and r.get("peak_memory_mb")]
+    if took:
+        return round(1.1 * max(took))
+    each = job.pipeline.memory.get(stage)
+    read = (path for folder in needs.values() if folder for path in files_below(folder))
+    return round(each.mb + each.each * sum(path.stat().st_size for path in read) / 2**20) if each else 0
 
 
 def _receipt(job: Job, stage: str, inputs: Inputs, folder: Path, result: dict[str, Any]) -> dict[str, Any]:
@@ -146,10 +157,13 @@ def _installed() -> dict[str, str]:
     return found
 
 
-def run_scene(request: Request, target: str, hashes: Hashes | None = None) -> dict[str, Path | None]:
+def run_scene(
+    request: Request, target: str, hashes: Hashes | None = None, work: Work | None = None
+) -> dict[str, Path | None]:
     """Bring `target` and what it needs up to date; stage -> its artifact's folder, None where it is left out.
 
     Raises Refused before any work, Failed where a stage fails."""
+    work = work or Work(Local())
     job = resolve(request, hashes)
     stages = job.pipeline.closure(target)
     with ExitStack() as held:
@@ -173,12 +187,13 @@ def run_scene(request: Request, target: str, hashes: Hashes | None = None) -> di
                 for line in read_json(done[stage].path / "warnings.json") or ():
                     say(f"warning: {line}")
             if done[stage].word == "run":
-                done[stage] = run_stage(job, stage, done[stage], done, lock)
+                done[stage] = run_stage(job, stage, done[stage], done, lock, work)
                 if any(planned[later].word == "undecided" for later in stages[position + 1 :]):
                     planned = plan(job, stages, done)
                     if not any(planned[later].word == "undecided" for later in stages[position + 1 :]):
                         say(table(job, {later: planned[later] for later in stages[position + 1 :]}))
                     refuse_missing(job, planned)
+            work.watch(stage, "done")
         job.hashes.save()
     return {stage: decision.path for stage, decision in done.items()}
 

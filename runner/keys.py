@@ -4,6 +4,8 @@ import ast
 import hashlib
 import json
 import os
+import threading
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -39,7 +41,8 @@ class Hashes:
     """Hashes of files, remembered in a JSON file for as long as inode, size and time of change stay the same; beside
     them what stages say of themselves (`resolve`)."""
 
-    LIMIT = 100_000  # entries kept, the latest
+    LIMIT = 1_000_000  # entries kept, the latest; a demo scene and its results are 1,000
+    SLOW, SHARE = 0.1, 50  # a save that took so many seconds is not repeated before so many times that
 
     def __init__(self, path: Path, afresh: bool = False):
         """afresh: compute all that is asked for, once; `rotten` are files that changed though nothing else says so."""
@@ -47,7 +50,8 @@ class Hashes:
         self.rotten: list[Path] = []
         found = read_json(path)
         self.known: dict[str, Any] = found if isinstance(found, dict) else {}
-        self._saved = 0 if afresh else len(self.known)
+        self._saved, self._saving = 0 if afresh else len(self.known), threading.Lock()
+        self._took, self._at = 0.0, 0.0  # seconds of the last save, and when it was
         self._runs: dict[tuple[Path, str], list[Path]] = {}  # a module with its fingerprint -> see `module`
 
     def _remember(self, kind: str, path: Path, compute: Any) -> Any:
@@ -94,14 +98,17 @@ class Hashes:
         return self.file(folder) if folder.is_file() else self.files(folder, read)
 
     def save(self) -> None:
-        if len(self.known) == self._saved:
+        began = time.monotonic()
+        if len(self.known) == self._saved or (self._took > self.SLOW and began - self._at < self.SHARE * self._took):
             return
-        kept = dict(list(self.known.items())[-self.LIMIT :])
-        with suppress(OSError):  # a full disk, or one that is only read: they are computed again the next time
+        kept = dict(list(self.known.copy().items())[-self.LIMIT :])  # other threads may add to it
+        # A full disk, or one that is only read: they are computed again the next time.
+        with suppress(OSError), self._saving:
             partial = self.path.with_name(f"{self.path.name}.{os.getpid()}")  # runners of other scenes do the same
             write_text(partial, json.dumps(kept))
             os.replace(partial, self.path)
-            self._saved = len(self.known)
+            self._saved, self._at = len(self.known), time.monotonic()
+            self._took = self._at - began
 
 
 def outside(value: Any, folder: Path) -> Iterator[Path]:

@@ -92,15 +92,23 @@ class Stage(Strict):
         return (*self.needs, *self.optional)
 
 
+class Memory(Strict):
+    """What a stage takes of the CPU's: MB of itself, and MB for each MB of the files that it reads."""
+
+    mb: Annotated[float, Field(gt=0)]
+    each: Annotated[float, Field(ge=0)] = 0
+
+
 class Pipeline(Strict):
     """The stages in order; parameters by profile and by variant; the keys of scene.yaml and the stage they go to; the
-    parts of a time budget that stages get."""
+    parts of a time budget that stages get; what memory they take, where no earlier run tells."""
 
     stages: dict[str, Stage]
     scene_keys: dict[str, tuple[str, ...]]
     profiles: dict[str, Overrides]
     variants: dict[str, Overrides] = {}
     budget: dict[str, Annotated[float, Field(gt=0)]] = {}
+    memory: dict[str, Memory] = {}
 
     @model_validator(mode="after")
     def _names_are_known(self) -> Self:
@@ -116,6 +124,7 @@ class Pipeline(Strict):
         tables: dict[str, Iterable[str]] = {
             "scene_keys": self.scene_keys,
             "budget": self.budget,
+            "memory": self.memory,
             **self.profiles,
             **self.variants,
         }

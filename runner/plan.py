@@ -160,10 +160,13 @@ def _harm(job: Job, worn: Wear) -> list[str]:
 
 def _with_device(job: Job, stage: str, decision: Decision) -> Decision:
     """The decision, or `missing` for work on a GPU where there is none; what is cached holds on any machine."""
-    if decision.word not in TO_DO or job.params[stage].get("device") != "cuda" or has_cuda():
+    if decision.word not in TO_DO or job.params[stage].get("device") != "cuda":
+        return decision
+    if has_cuda() if job.cuda is None else job.cuda:
         return decision
     cure = f'profile=laptop, or set="{stage}.device=cpu"'
-    return Decision("missing", f"{stage}.device is cuda, and this machine has no CUDA driver: {cure}")
+    where = "this machine has no CUDA driver" if job.cuda is None else "no machine of the cluster has a card"
+    return Decision("missing", f"{stage}.device is cuda, and {where}: {cure}")
 
 
 def amount(count: int | None) -> str:
@@ -211,7 +214,7 @@ def _answered(job: Job, question: dict[str, Any], decision: Decision, answer: di
     needed, notes = (tuple(answer.get(name, ())) for name in ("needed", "notes"))
     if decision.word not in TO_DO:
         return replace(decision, needed=needed)
-    if absent := tuple(answer.get("lacks", ())):
+    if job.cuda is None and (absent := tuple(answer.get("lacks", ()))):  # of this machine
         reason = f"{question['stage']}.device is cuda, and {absent[0]}"
         return Decision("missing", reason, needed=needed, lacks=absent)
     cure, lacks = f"`make weights profile={job.profile}` fetches it", [need for need in needed if need["problem"]]

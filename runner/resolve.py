@@ -46,6 +46,7 @@ class Request:
     set: str = ""
     budget: str | None = None
     keep: bool = False
+    cuda: bool | None = None  # is there a card where stages run? None: where this runs; see `has_cuda`
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,7 @@ class Job:
     brings: frozenset[str]  # the keys of scene.yaml that have values
     hashes: Hashes
     keep: bool = False  # what people changed in artifacts
+    cuda: bool | None = None  # as in Request
     stages: dict[str, Described] = field(default_factory=dict)
     broken: dict[str, str] = field(default_factory=dict)  # stages that cannot be described -> what is wrong
 
@@ -123,7 +125,7 @@ def _draft(request: Request, hashes: Hashes, scene: bool) -> Job:
     if variant and variant not in pipeline.variants:
         raise Refused(f"{root / 'pipeline.yaml'}: {unknown('variant', variant, pipeline.variants)}")
     home = base.with_name(f"{base.name}@{variant}") if variant else base
-    profile, why = choose_profile(request.profile, found, [home / "profile", base / "profile"], pipeline)
+    profile, why = choose_profile(request.profile, found, [home / "profile", base / "profile"], pipeline, request.cuda)
     layer = (pipeline, found, profile, variant, parse_set(request.set, pipeline))
     layers = layered(*layer, {})
     if request.budget or found.budget is not None:
@@ -144,10 +146,13 @@ def _draft(request: Request, hashes: Hashes, scene: bool) -> Job:
         keys,
         hashes,
         request.keep,
+        request.cuda,
     )
 
 
-def choose_profile(asked: str | None, scene: SceneFile, pinned: list[Path], pipeline: Pipeline) -> tuple[str, str]:
+def choose_profile(
+    asked: str | None, scene: SceneFile, pinned: list[Path], pipeline: Pipeline, cuda: bool | None = None
+) -> tuple[str, str]:
     """The profile asked for, else scene.yaml's, else the one this scene was run with, else by the machine; and why."""
     origin = "profile" if asked else f"{scene.path}: profile"
     why = "asked for" if asked else f"{scene.path.name} says so"
@@ -156,7 +161,9 @@ def choose_profile(asked: str | None, scene: SceneFile, pinned: list[Path], pipe
         origin, profile, why = "profile", "laptop", "no CUDA driver on this machine"
         if record := next((path for path in pinned if read_text(path)), None):
             origin, profile, why = str(record), read_text(record), "this scene was run with it"
-        elif has_cuda():
+        elif cuda:
+            profile, why = "paper", "the cluster has cards"
+        elif cuda is None and has_cuda():
             profile, why = "paper", "this machine has a CUDA driver"
     if profile not in pipeline.profiles:
         raise Refused(f"{origin}: {unknown('profile', profile, [AUTO, *pipeline.profiles])}")

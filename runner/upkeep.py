@@ -12,9 +12,10 @@ from runner.keys import HASHES, Hashes
 from runner.pipeline import NAME, Pipeline, find_scene, load_pipeline, scene_name, unknown
 from runner.resolve import FRAMES, Request, one_folder_a_name
 
-RECORDS = ("profile", "source", "plan.json", "turntable.webm", "check.png")
+RECORDS = ("profile", "source", "plan.json", "output.log", "turntable.webm", "check.png")
 PAGES = (*(f"compare.{kind}" for kind in ("json", "csv", "md", "html")), "compare-runs.csv", "compare-runs.md",
-         "compare/*.png", "adapted/sheet.png", "adapted/*/*.png", "adapted/adapted.json",
+         "compare/*.png", "study/index.html", "study/clips/*.webm", "study/clips/*.png", "study-key.json",
+         "adapted/sheet.png", "adapted/*/*.png", "adapted/adapted.json",
          "sds-variance/sds_variance.json", "report.html", "report/index.html", "report/*.png",
          "frames/frames.json", "frames/frames.csv", "frames/images/frame_*.jpg",
          "patch/patched.ply", "patch/new.ply",
@@ -61,7 +62,7 @@ def clean(request: Request) -> None:
                 path.unlink(missing_ok=True)
             for folder in (path for pattern in WORKING for path in home.glob(pattern)):
                 discard(folder)
-            _remove_empty(home)
+            remove_empty(home)
             if home.exists():
                 say(f"kept, as it was not made by the runner: {listed(shown(path) for path in files_below(home))}")
     if not homes:
@@ -72,7 +73,7 @@ def _homes(request: Request) -> list[Path]:
     """The folders that the runner made for a scene and its variants, or for one variant; none for a scene that is
     there and was not run. The scene may be gone."""
     name, runs = scene_name(Path(request.scene).expanduser()), request.runs
-    made = sorted(path.name for path in (runs.iterdir() if runs.is_dir() else ()) if _is_home(path))
+    made = sorted(path.name for path in (runs.iterdir() if runs.is_dir() else ()) if is_home(path))
     scenes = list(dict.fromkeys(each.partition("@")[0] for each in made))
     if not NAME.fullmatch(name):
         raise Refused(
@@ -94,7 +95,7 @@ def _homes(request: Request) -> list[Path]:
     return [runs / each for each in names]
 
 
-def _is_home(folder: Path) -> bool:
+def is_home(folder: Path) -> bool:
     """Is there anything that says that the runner made it?"""
     own = folder.is_dir() and not folder.is_symlink() and folder.name[0] != "."
     return own and ((folder / "source").is_file() or any(folder.glob(f"*/{RECEIPT}")))
@@ -109,16 +110,22 @@ def _made(home: Path, pipeline: Pipeline, hashes: Hashes) -> Iterator[Path]:
         if folder.is_symlink():  # a person's: what it leads to may be another scene's
             yield folder
             continue
-        worn, listing = wear(folder, hashes), hashes.listing(folder)
-        theirs = {*worn.changed, *worn.added, *worn.by_hand}
+        listing = hashes.listing(folder)
         for name in pipeline.stages[folder.name].hands_out if folder.name in pipeline.stages else ():
             twins = {path.relative_to(home): hashes.file(path) for path in files_below(home / name)}
             yield from (home / path for path, own in twins.items() if listing.get(str(path)) == own)
-        yield from (folder / name for name in listing if name not in theirs and name != RECEIPT)
-        yield folder / RECEIPT
+        yield from made_of(folder, hashes)
 
 
-def _remove_empty(home: Path) -> None:
+def made_of(folder: Path, hashes: Hashes) -> Iterator[Path]:
+    """The files of an artifact that are as its receipt says, and that last."""
+    worn = wear(folder, hashes)
+    theirs = {*worn.changed, *worn.added, *worn.by_hand}
+    yield from (folder / name for name in hashes.listing(folder) if name not in theirs and name != RECEIPT)
+    yield folder / RECEIPT
+
+
+def remove_empty(home: Path) -> None:
     for place, _, _ in os.walk(home, topdown=False):
         if not any(os.scandir(place)):
             os.rmdir(place)

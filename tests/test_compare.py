@@ -61,7 +61,7 @@ class Params(BaseModel, extra="forbid"):
 
 def run(params, out, *, scene):
     from PIL import Image
-    (out / "images").mkdir()
+    (out / "images").mkdir(exist_ok=True)
     number = int((scene / "number.txt").read_text())
     for view in VIEWS:
         Image.new("RGB", (40, 30), (number, 200, 90)).save(out / "images" / f"{view}.png")
@@ -195,7 +195,7 @@ def test_a_folder_of_scenes_killed_and_started_again_nothing_runs_twice(tmp_path
     slow = root / "data/toy-1/scene.yaml"
     slow.write_text("stages: {distill: {pause: 60}}")
     command = [sys.executable, "-m", "runner", "compare", "--data", str(root / "data"), "--root", str(root)]
-    command += ["--profile", "laptop", "--variants", "better"]
+    command += ["--profile", "laptop", "--variants", "better", "--cores", "64"]
     environment = {**os.environ, "PYTHONPATH": str(REPO)}
     process = subprocess.Popen(command, cwd=REPO, env=environment, stdout=subprocess.PIPE, text=True)
     assert any("compare: full on toy-1, 3 of 6" in line for line in process.stdout)
@@ -242,7 +242,18 @@ def test_three_made_scenes_of_spin_nerfs_layout_by_the_real_stages(tmp_path, gen
     assert sum("8 training and 3 test views" in line for line in spinnerf.told(tmp_path / "data")) == 3
     small = "fit.iterations=60 personalize.steps=4 personalize.optimizer.batch=1 distill.iterations=4"
     command = [sys.executable, "-m", "reffusion.command", "compare", "--data", str(tmp_path / "data")]
-    command += ["--runs", str(tmp_path / "runs"), "--profile", "laptop", "--variants", "masked", "--set", small]
+    command += [
+        "--runs",
+        str(tmp_path / "runs"),
+        "--profile",
+        "laptop",
+        "--variants",
+        "masked",
+        "--set",
+        small,
+        "--cores",
+        "64",
+    ]
     process = subprocess.Popen(command, cwd=REPO, stdout=subprocess.PIPE, text=True)
     assert any("compare: full on 2, 3 of 6" in line for line in process.stdout)
     while not list((tmp_path / "runs/2").glob(".partial-fit-*")):

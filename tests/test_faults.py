@@ -375,7 +375,7 @@ def test_what_is_typed_is_no_command(stub, typed):
     assert made("scene=x", *(f"{name}={typed}" for name in names), "all") == f"run|all|--scene=x|{given}|\n"
     assert f"--variants={typed}|--seeds={typed}|" in made("scene=x", f"variants={typed}", f"seeds={typed}", "compare")
     assert made("scene=x", f"port={typed}", "view") == f"view|--scene=x|--port={typed}|\n"
-    assert made(f"data={typed}", "batch") == f"batch|--data={typed}|\n"
+    assert made(f"data={typed}", "batch") == f"batch|--data={typed}|\nbatch-page|\n"
     assert made(f"scene=demo-1{typed}", "plan").startswith(f"plan|--scene=demo-1{typed}|")
     assert f"--out=data/{typed}|--seed={typed}|" in made(f"name={typed}", f"seed={typed}", "demo")
     assert "which scene" not in made("plan", typed)

@@ -1,0 +1,156 @@
+"""What a preference study says: how often the method was preferred to each other, with intervals over participants.
+
+python -m report.votes ANSWERS.json ... --key runs/X/study-key.json (`reffusion study-votes`)
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import binomtest, bootstrap
+
+from reffusion.io.arrays import load_json
+from reffusion.seeding import seed_for
+from report import page
+
+QUESTIONS = {"overall": "looks better overall", "faithful": "more faithful to the reference"}
+LEVEL = 0.95
+RESAMPLES = 5000
+
+
+@dataclass(frozen=True)
+class Preference:
+    """How often the method was preferred to `method`; parts of 1. low, high: the 95 % interval; `votes` of
+    `participants`."""
+
+    method: str
+    question: str
+    share: float
+    low: float
+    high: float
+    votes: int
+    participants: int
+
+
+def counted(answers: list[dict[str, Any]], key: dict[str, Any]) -> tuple[list[Preference], list[str]]:
+    """Preferences, and those who are left out for failing an attention check, in words.
+
+    Args:
+        answers: what the page saved, one for each participant. key: study-key.json.
+
+    Raises:
+        ValueError: answers of another study, of one participant twice, or to what is no question of it.
+    """
+    taken, left_out, names = [], [], set()
+    for said in answers:
+        name = said["participant"]
+        if said["study"] != key["study"]:
+            raise ValueError(f"{name}: answers to another study than this key's")
+        if name in names:
+            raise ValueError(f"{name}: two files of one participant; keep one")
+        names.add(name)
+        checks = [answer for answer in said["answers"] if answer["trial"] in key["checks"]]
+        right = [answer["overall"] == key["checks"][answer["trial"]]["right"] for answer in checks]
+        if len(right) < len(key["checks"]):
+            left_out.append(f"{name}: not to its end")
+        elif not all(right):
+            left_out.append(f"{name}: {right.count(False)} of {len(right)} attention checks failed")
+        else:
+            taken.append([answer for answer in said["answers"] if answer["trial"] not in key["checks"]])
+    methods = list(dict.fromkeys(pair["method"] for pair in key["pairs"].values()))
+    found = [_preference(taken, key, method, question) for method in methods for question in QUESTIONS]
+    return [each for each in found if each], left_out
+
+
+def _preference(
+    taken: list[list[dict[str, Any]]], key: dict[str, Any], method: str, question: str
+) -> Preference | None:
+    """One row; None where nobody was asked."""
+    counts = []
+    for each in taken:
+        pairs = [(answer, _pair(key, answer["trial"])) for answer in each if question in answer]
+        won = [answer[question] == pair["full"] for answer, pair in pairs if pair["method"] == method]
+        if won:
+            counts.append((sum(won), len(won)))
+    if not counts:
+        return None
+    wins, totals = np.array(counts, float).T
+    low, high = interval(wins, totals, seed_for(0, "votes", method, question))
+    share = float(wins.sum() / totals.sum())
+    return Preference(method, question, share, low, high, int(totals.sum()), len(counts))
+
+
+def _pair(key: dict[str, Any], trial: str) -> dict[str, str]:
+    if trial not in key["pairs"]:
+        raise ValueError(f"{trial}: no pair of this study")
+    return key["pairs"][trial]
+
+
+def interval(wins: np.ndarray, totals: np.ndarray, seed: int) -> tuple[float, float]:
+    """Of the share of all votes won: a bootstrap over participants, for one's votes are not independent; where all
+    agree, which a bootstrap takes for certain, or there is but one, Wilson's for one vote a participant. [n], [n] ->
+    parts of 1."""
+    people, share = len(wins), wins.sum() / totals.sum()
+    agreed = (wins.min() == 0 and wins.max() == 0) or bool((wins == totals).all())
+    if people < 2 or agreed:
+        wilson = binomtest(round(share * people), people).proportion_ci(LEVEL, "wilson")
+        return float(wilson.low), float(wilson.high)
+    ratio = lambda won, all_votes, axis=-1: won.sum(axis) / all_votes.sum(axis)
+    found = bootstrap(
+        (wins, totals),
+        ratio,
+        paired=True,
+        vectorized=True,
+        confidence_level=LEVEL,
+        n_resamples=RESAMPLES,
+        method="percentile",
+        rng=np.random.default_rng(seed),
+    ).confidence_interval
+    return float(found.low), float(found.high)
+
+
+def table(found: list[Preference]) -> str:
+    """Markdown."""
+    header = ["preferred to", "question", "share", "95 % interval", "votes", "participants"]
+    percent = lambda part: f"{100 * part:.1f} %"
+    rows = [
+        [
+            each.method,
+            QUESTIONS[each.question],
+            percent(each.share),
+            f"{percent(each.low)} to {percent(each.high)}",
+            str(each.votes),
+            str(each.participants),
+        ]
+        for each in found
+    ]
+    return page.markdown(header, rows)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="reffusion study-votes", description=__doc__.split("\n")[0])
+    parser.add_argument("answers", type=Path, nargs="+", help="files that the page saved")
+    parser.add_argument("--key", type=Path, required=True, help="runs/X/study-key.json")
+    given = parser.parse_args()
+    try:
+        found, left_out = counted([_read(path) for path in given.answers], load_json(given.key))
+    except (ValueError, OSError) as error:
+        raise SystemExit(f"error: {error}") from None
+    print(table(found), end="")
+    for words in left_out:
+        print(f"left out: {words}")
+
+
+def _read(path: Path) -> dict[str, Any]:
+    said = load_json(path)
+    if not isinstance(said, dict) or not {"study", "participant", "answers"} <= set(said):
+        raise ValueError(f"{path}: not a file of answers that the study's page saved")
+    return said
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,197 @@
+"""Several scenes at once on a toy pipeline: cores, memory, what is told, what a second call runs."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from browser import visiting
+from test_compare import FILES, written
+from test_compare import request as asked
+
+from report import batch as page
+from runner import Refused
+from runner.compare import By, batch, compare
+from runner.engine import Local, chosen
+from runner.execute import run_scene
+from runner.progress import Progress
+from runner.resolve import Request
+
+REPO = Path(__file__).resolve().parent.parent
+STAGE = FILES["stages/distill.py"].replace(
+    "    time.sleep(params.pause)\n",
+    """    import os
+    begun = time.time()
+    (out.parent.parent / f"begun-{out.parent.name}").touch()
+    while len(list(out.parent.parent.glob("begun-*"))) < params.meet and time.time() < begun + 60:
+        time.sleep(0.05)
+    time.sleep(params.pause)
+    threads, cores = os.environ.get("OMP_NUM_THREADS"), sorted(os.sched_getaffinity(0))
+    with open(out.parent.parent / "spans.txt", "a") as file:
+        file.write(json.dumps([begun, time.time(), threads, cores]) + "\\n")
+""",
+)
+SCENES = ("a", "b", "c", "d")
+
+
+def toys(root: Path, pause: float = 0.0, memory: str = "", meet: int = 0) -> Path:
+    """Scenes a to d, of which c cannot be read. `distill` waits until `meet` of them are at it, and takes `pause` s."""
+    written(root)
+    (root / "stages/distill.py").write_text(
+        STAGE.replace("pause: float = 0.0", f"pause: float = {pause}\n    meet: int = {meet}")
+    )
+    if memory:
+        with open(root / "pipeline.yaml", "a") as file:
+            file.write(memory)
+    for number, name in enumerate(SCENES):
+        (root / "many" / name).mkdir(parents=True)
+        (root / "many" / name / "number.txt").write_text("none" if name == "c" else str(10 * number))
+    return root
+
+
+def spans(root: Path) -> list[list]:
+    return [json.loads(line) for line in (root / "runs/spans.txt").read_text().splitlines()]
+
+
+def most_at_once(found: list[list]) -> int:
+    return max(sum(a <= begun < b for a, b, *_ in found) for begun, *_ in found)
+
+
+def machine(cores: int, memory_mb: int = 10_000) -> Local:
+    """One with so many cores, whatever this one has."""
+    real = sorted(os.sched_getaffinity(0))
+    return Local([real[n % len(real)] for n in range(cores)], memory_mb, [])
+
+
+def test_several_at_once_and_a_second_call_runs_what_failed(tmp_path, capsys):
+    root = toys(tmp_path, meet=3)
+    assert batch(asked(root, ""), root / "many", By(machine(4))) == 1
+    output = capsys.readouterr().out
+    assert "4 scenes, 4 at once, 1 core each" in output
+    assert re.search(r"^\d\d:\d\d:\d\d a: distill", output, re.MULTILINE)
+    assert "failed: c: poses: ValueError" in output or "failed: c: poses: invalid literal" in output
+    found = spans(root)
+    assert len(found) == 3 and most_at_once(found) == 3
+    assert {threads for _, _, threads, _ in found} == {"1"} and {len(cores) for *_, cores in found} == {1}
+    runs = {run["scene"]: run for run in json.loads((root / "runs/results.json").read_text())["runs"]}
+    assert runs["c"]["state"] == "failed" and "invalid literal" in runs["c"]["error"]
+    assert (root / "runs/results.md").read_text().startswith("- c failed: poses: ")
+    assert "c,failed," in (root / "runs/results.csv").read_text()
+    assert "poses: done in" in (root / "runs/a/output.log").read_text()
+    (root / "many/c/number.txt").write_text("20")
+    assert batch(asked(root, ""), root / "many", By(machine(4))) == 0
+    assert len(spans(root)) == 4 and "failed" not in (root / "runs/results.md").read_text()
+    alone = Request(root, root / "alone", str(root / "many/b"), "laptop")
+    run_scene(alone, "all")
+    for path in (root / "alone/b").glob("*/*.json"):
+        if path.name not in ("receipt.json", "compare.json"):
+            assert path.read_bytes() == (root / "runs/b" / path.relative_to(root / "alone/b")).read_bytes()
+
+
+@pytest.mark.parametrize("cores, memory_mb, most", [(2, 10_000, 2), (4, 1300, 2), (4, 100, 1)])
+def test_never_more_than_there_are_cores_or_memory(tmp_path, cores, memory_mb, most):
+    """By pipeline.yaml 500 MB, and 100 for each MB of what poses wrote (next to nothing); then by what it last took."""
+    root = toys(tmp_path, 0.5, "memory: {distill: {mb: 600, each: 100}}\n")
+    batch(asked(root, ""), root / "many", By(machine(cores, memory_mb), 1))
+    assert len(spans(root)) == 3 and most_at_once(spans(root)) <= most
+
+
+def test_what_is_killed_beside_others_goes_on_alone(tmp_path):
+    """As where memory runs out: the one whose number is highest is killed while others are at it."""
+    root = toys(tmp_path, meet=3)
+    stage = (root / "stages/distill.py").read_text()
+    kill = """    if out.parent.name == "d" and not (out.parent.parent / "killed").exists():
+        (out.parent.parent / "killed").touch()
+        os.kill(os.getpid(), 9)
+    while not (out.parent.parent / "killed").exists():
+        time.sleep(0.05)
+    time.sleep(params.pause)
+"""
+    (root / "stages/distill.py").write_text(stage.replace("    time.sleep(params.pause)\n", kill))
+    assert batch(asked(root, ""), root / "many", By(machine(4))) == 1
+    assert len(spans(root)) == 3 and most_at_once(spans(root)[-1:]) == 1
+
+
+def test_cores_are_as_asked_for(tmp_path):
+    root = toys(tmp_path, 0.0)
+    batch(asked(root, "", variant="better"), root / "many", By(machine(4), 2))
+    assert {threads for _, _, threads, _ in spans(root)} == {"2"}
+    assert (root / "runs/results@better.csv").is_file()
+
+
+def test_variants_of_several_scenes_at_once(tmp_path):
+    root = toys(tmp_path, 0.1)
+    assert compare(asked(root, ""), "better,twin", data=root / "many", by=By(machine(4))) == 3  # of scene c
+    lines = (root / "runs/ran.txt").read_text().splitlines()
+    assert sorted(lines) == sorted(set(lines)), "what is equal is done once"
+    record = json.loads((root / "runs/compare/compare.json").read_text())
+    assert [run["state"] for run in record["runs"]].count("done") == 9
+
+
+def test_stopped_while_several_run(tmp_path):
+    root = toys(tmp_path, 60)
+    code = "import sys; from test_batch import *; batch(asked(Path(sys.argv[1]), ''), Path(sys.argv[1]) / 'many',"
+    code = f"{code} By(machine(4)))"
+    environment = {**os.environ, "PYTHONPATH": f"{REPO}:{REPO}/tests"}
+    process = subprocess.Popen([sys.executable, "-c", code, str(root)], env=environment, stderr=subprocess.DEVNULL)
+    until = time.monotonic() + 60
+    while len(list((root / "runs").glob("*/.partial-distill-*"))) < 3:
+        assert time.monotonic() < until and process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(30) != 0
+    assert not (root / "runs/spans.txt").exists()
+    assert not subprocess.run(["pgrep", "-f", f"runner.child run.*{root}"], capture_output=True).stdout
+    (root / "stages/distill.py").write_text(FILES["stages/distill.py"])
+    assert batch(asked(root, ""), root / "many", By(machine(4))) == 1
+    assert (root / "runs/ran.txt").read_text().count("poses") == 3
+
+
+def test_the_live_table(tmp_path):
+    receipt = dict.fromkeys(("key", "params", "needs", "weights", "code", "output"), "") | {"seconds": 60.0}
+    for stage in ("fit", "evaluate"):
+        (tmp_path / "old" / stage).mkdir(parents=True)
+        (tmp_path / "old" / stage / "receipt.json").write_text(json.dumps(receipt))
+    names = ["garden", "bear", "statue", "fox"]
+    progress = Progress(names, [tmp_path / "old"], ["fit", "evaluate"], 2, "4 scenes")
+    progress.stage(0, "fit", "runs")
+    progress.stage(1, "fit", "waits")
+    progress.ended(2, "fit: masks/x.png has another size", 3.0)
+    lines = progress.table(80, 24)
+    assert lines[0].startswith("0 of 4 done, 1 failed, 180 s left") or lines[0].startswith(
+        "0 of 4 done, 1 failed, 3 min"
+    )
+    assert lines[1].startswith("garden  fit          for 0 s; ") and "left of all its stages" in lines[1]
+    assert lines[2].split() == ["bear", "fit", "waits", "for", "cores", "or", "memory"]
+    assert lines[3] == "statue  failed: fit: masks/x.png has another size"
+    assert [len(line) <= 19 for line in progress.table(20, 24)] == [True] * 4
+    assert progress.table(80, 5)[-1] == "and 1 more"
+
+
+def test_the_page_of_a_batch(tmp_path, capsys):
+    root = toys(tmp_path, 0.0)
+    batch(asked(root, ""), root / "many", By(machine(2)))
+    made = page.make(root / "runs/results.json")
+    with visiting(made.as_uri()) as browser:
+        assert "3 of 4 scenes done, 1 failed" in browser.inner_text("body")
+        assert "failed: poses: " in browser.inner_text("tr:has-text('c') td.text")
+        assert browser.evaluate("[...document.images].every(i => i.naturalWidth == 240)")
+        assert browser.locator("img").count() == 3
+    with pytest.raises(ValueError, match="`make data=FOLDER batch` writes it"):
+        page.make(tmp_path / "none/results.json")
+
+
+@pytest.mark.parametrize(
+    "name, address, message",
+    [("slrum", None, "unknown"), (None, "here:6379", "of which engine"), ("local", "here", "of which engine")],
+)
+def test_engines_that_are_not_there(tmp_path, name, address, message):
+    with pytest.raises(Refused, match=message):
+        chosen(name, address, tmp_path, tmp_path)

@@ -1,0 +1,228 @@
+"""Engines other than this machine: a local Ray cluster of three nodes, submitit's local executor; work that is lost."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from test_batch import FILES, spans, toys, written
+from test_compare import request as asked
+from test_faults import assert_whole
+
+from runner.compare import By, compare
+from runner.engine import Ended, Local, Needs, Task, chosen
+from runner.execute import Work, run_scene
+from runner.lost import attempt, take_over
+
+REPO = Path(__file__).resolve().parent.parent
+slow = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="takes minutes; set REFFUSION_SLOW=1")
+
+
+def results(runs: Path) -> dict[str, str]:
+    """Every file of every artifact with its hash, as receipts have them."""
+    receipts = {path.parent.relative_to(runs): json.loads(path.read_text()) for path in runs.glob("*/*/receipt.json")}
+    return {f"{place}/{name}": file for place, each in receipts.items() for name, file in each["files"].items()}
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """Three nodes with a core each."""
+    pytest.importorskip("ray", reason="ray is not installed")
+    from ray.cluster_utils import Cluster
+
+    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    made.others = [made.add_node(num_cpus=1) for _ in range(2)]
+    yield made
+    made.shutdown()
+
+
+@pytest.fixture
+def on_ray(cluster, tmp_path):
+    import ray
+
+    yield chosen("ray", cluster.address, tmp_path, tmp_path / "runs")
+    ray.shutdown()
+
+
+# ------------------------------------------------------------------------------------------------------- what was lost
+
+
+def stage_task(root: Path) -> Task:
+    line = {"stage": "distill", "params": {"gain": 1, "pause": 0}, "out": str(root / "runs/toy/.partial-distill-1")}
+    line |= {"needs": {"poses": str(root)}, "log": str(root / "distill.log")}
+    return Task(root, line, root / "output.log")
+
+
+def test_an_attempt_works_in_a_folder_of_its_own_and_goes_on_from_the_one_before(tmp_path):
+    root = written(tmp_path)
+    out = root / "runs/toy/.partial-distill-1"
+    lost = out.with_name(out.name + ".0abc")
+    lost.mkdir(parents=True)
+    (lost / "checkpoint.pt").write_text("half")
+    (lost / "checkpoint.pt.writing").write_text("ha")
+    ended = attempt(stage_task(root))
+    assert ended.code == 0 and ended.answer["seconds"] >= 0
+    assert (out / "checkpoint.pt").read_text() == "half" and (out / "gain.txt").exists()
+    assert not (out / "checkpoint.pt.writing").exists() and not lost.exists()
+    assert [path.name for path in out.parent.iterdir()] == [out.name]
+
+
+def test_one_that_was_given_up_for_lost_writes_nowhere(tmp_path, monkeypatch):
+    """While it works, another takes over and ends."""
+    root = written(tmp_path)
+    out = root / "runs/toy/.partial-distill-1"
+
+    def work(task: Task) -> Ended:
+        mine = Path(task.line["out"])
+        assert mine != out and not out.exists()
+        take_over(out)
+        (out / "theirs.txt").touch()
+        with pytest.raises(FileNotFoundError):
+            (mine / "trace.jsonl").write_text("late")
+        return Ended({}, 0)
+
+    monkeypatch.setattr("runner.lost.carry_out", work)
+    attempt(stage_task(root))
+    assert [path.name for path in out.iterdir()] == ["theirs.txt"]
+
+
+def test_this_machine_goes_on_with_what_a_cluster_left(tmp_path, capsys):
+    root = written(tmp_path)
+    run_scene(asked(root), "poses")
+    (root / "data/toy/scene.yaml").write_text("stages: {distill: {gain: -1}}")
+    with pytest.raises(Exception, match="a gain below 0"):
+        run_scene(asked(root), "distill")
+    (partial,) = (root / "runs/toy").glob(".partial-distill-*")
+    partial.rename(partial.with_name(partial.name + ".77"))
+    (partial.with_name(partial.name + ".77") / "left.txt").touch()
+    (root / "stages/distill.py").touch()
+    with pytest.raises(Exception, match="a gain below 0"):
+        run_scene(asked(root), "distill")
+    assert (partial / "left.txt").exists() and not list((root / "runs/toy").glob(".partial-distill-*.77"))
+
+
+# ----------------------------------------------------------------------------------------------------------------- Ray
+
+
+def twelve(root: Path) -> Path:
+    """Twelve scenes of the toy pipeline."""
+    written(root)
+    for number in range(12):
+        (root / f"many/s{number:02}").mkdir(parents=True)
+        (root / f"many/s{number:02}/number.txt").write_text(str(10 * number))
+    return root
+
+
+@slow
+def test_twelve_scenes_with_three_variants_on_ray_are_those_of_one_machine(tmp_path, on_ray, cluster):
+    """A node is killed while it works."""
+    root = twelve(tmp_path)
+    there = root / "runs"
+
+    def kill() -> None:
+        while len(list(there.glob("*/distill/receipt.json"))) < 3 or not list(there.glob("*/.partial-*.*")):
+            time.sleep(0.01)
+        cluster.remove_node(cluster.others.pop(), allow_graceful=False)
+
+    killer = threading.Thread(target=kill, daemon=True)
+    killer.start()
+    assert compare(asked(root, "", cuda=on_ray.cuda), "better,none", data=root / "many", by=By(on_ray, 1)) == 0
+    killer.join()
+    cluster.others.append(cluster.add_node(num_cpus=1))
+    equals_one_machine(root, "better,none", 300)
+
+
+def equals_one_machine(root: Path, variants: str, least: int) -> None:
+    """runs/ holds what one machine makes, file by file; and nothing of it is run again by that machine."""
+    there = root / "runs"
+    local = type(asked(root, ""))(root, root / "alone", "", "laptop")
+    assert compare(local, variants, data=root / "many", by=By(Local(), 1)) == 0
+    here, away = results(root / "alone"), results(there)
+    different = sorted(name for name in {*here, *away} if here.get(name) != away.get(name))
+    assert len(here) >= least and not [name for name in different if not name.endswith("metrics.json")]
+    for name in different:  # it holds the stages' seconds
+        one, other = (json.loads((place / name).read_text()) for place in (root / "alone", there))
+        assert one["mean"] == other["mean"] and one["gaussians"] == other["gaussians"]
+    assert_whole(there)
+    times = {path: path.stat().st_mtime_ns for path in there.glob("*/*/receipt.json")}
+    assert compare(asked(root, ""), variants, data=root / "many", by=By(Local(), 1)) == 0
+    assert {path: path.stat().st_mtime_ns for path in there.glob("*/*/receipt.json")} == times
+
+
+DRIVER = """
+import sys
+from test_cluster import *
+from runner.compare import batch
+root = Path(sys.argv[1])
+engine = chosen("ray", sys.argv[2], root, root / "runs")
+sys.exit(batch(asked(root, "", cuda=engine.cuda), root / "many", By(engine, 1)))
+"""
+
+
+@slow
+@pytest.mark.parametrize("send", [signal.SIGKILL, signal.SIGINT])
+def test_the_driver_killed_and_started_again(tmp_path, cluster, send):
+    root = toys(tmp_path, 5.0)
+    environment = {**os.environ, "PYTHONPATH": f"{REPO}:{REPO}/tests"}
+    command = [sys.executable, "-c", DRIVER, str(root), cluster.address]
+    process = subprocess.Popen(command, env=environment)
+    while not list((root / "runs").glob("begun-*")):
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(send)
+    process.wait(60)
+    before = (root / "runs/ran.txt").read_text().splitlines()
+    time.sleep(6)  # what was running is ended with its driver
+    assert (root / "runs/ran.txt").read_text().splitlines() == before
+    assert subprocess.run(command, env=environment, timeout=300).returncode == 1  # scene c
+    lines = (root / "runs/ran.txt").read_text().splitlines()
+    assert sorted(lines) == sorted(set(lines)) and len(lines) == 9
+    assert_whole(root / "runs")
+
+
+@slow
+def test_ray_adds_little_and_a_stage_has_the_cores_it_was_given(tmp_path, on_ray, capsys):
+    root = toys(tmp_path)
+    run_scene(asked(root, str(root / "many/a"), cuda=on_ray.cuda), "poses", None, Work(on_ray, 1))
+    begun = time.monotonic()
+    run_scene(asked(root, str(root / "many/a"), cuda=on_ray.cuda), "distill", None, Work(on_ray, 1))
+    took = time.monotonic() - begun
+    print(f"one stage by Ray, planning and all: {took:.2f} s")
+    assert [threads for _, _, threads, _ in spans(root)] == ["1"]
+    run_scene(asked(root, str(root / "many/a"), cuda=False), "all")
+    assert len(spans(root)) == 1
+
+
+# --------------------------------------------------------------------------------------------------------------- Slurm
+
+
+def test_slurm_by_submitits_local_executor(tmp_path, capsys):
+    pytest.importorskip("submitit", reason="submitit is not installed")
+    root = written(tmp_path)
+    engine = chosen("slurm", "local", root, root / "runs")
+    folders = run_scene(asked(root), "distill", None, Work(engine, 1))
+    assert (folders["distill"] / "gain.txt").read_text() == "1"
+    (root / "stages/poses.py").write_text(FILES["stages/poses.py"].replace("    number =", "    boom\n    number ="))
+    with pytest.raises(Exception, match="poses: NameError: name 'boom' is not defined"):
+        run_scene(asked(root), "poses", None, Work(engine, 1))
+    engine.stop()
+    with pytest.raises(KeyboardInterrupt):
+        engine.run(stage_task(root), Needs(1, 0, 100), 0, lambda: None)
+
+
+def test_a_cluster_that_is_not_there_is_told_in_a_line(tmp_path):
+    pytest.importorskip("submitit", reason="submitit is not installed")
+    command = [sys.executable, "-m", "runner", "run", "--scene", "x", "--engine", "slurm"]
+    done = subprocess.run(command, cwd=REPO, capture_output=True, text=True)
+    if shutil.which("srun"):
+        pytest.skip("there is a Slurm here")
+    assert done.returncode == 2 and "address=local tries it without a cluster" in done.stderr
+    assert done.stderr.count("\n") == 1 and not (tmp_path / "runs").exists()
