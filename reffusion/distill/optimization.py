@@ -25,6 +25,7 @@ from reffusion.splat.rasterizer import render
 from reffusion.types import Camera, Gaussians
 
 GROW_SCALE3D = 0.01  # standard deviation from which a Gaussian is split, not cloned
+DENSIFY_UNTIL = 0.5  # part of the run after which no Gaussian is added
 DENSIFIED = 0.05  # share of the masked Gaussians that are cloned or split each time
 PRUNE_OPA = 0.005  # fainter Gaussians are pruned when others are added
 SNAPSHOTS = 4  # parts of the run, after each but the last of which the masked Gaussians are kept
@@ -80,7 +81,7 @@ def distill(
         line = step_of(optimizer, step, job)
         run.step = done = step + 1
         if settings.densify.every and done % settings.densify.every == 0:
-            if done <= settings.densify.stop * settings.iterations:
+            if done <= DENSIFY_UNTIL * settings.iterations:
                 _densify(optimizer, settings.densify, seeding.generator(settings.seed, "distill", "densify", done))
         if region is not None and (done % REGION_EVERY == 0 or done == settings.iterations):
             optimizer.select(~changed_region(region, optimizer.gaussians.means.detach(), optimizer.masked))

@@ -14,6 +14,7 @@ from reffusion.prior import lora
 from reffusion.prior.crops import Batch, Picture, draw_samples
 from reffusion.prior.denoising import denoising_error, held_out_error, held_out_samples, latent_shape, spread_timesteps
 from reffusion.prior.model import Prior
+from reffusion.prior.threads import Threads
 from reffusion.seeding import generator as seeded
 
 # PAPER leaves open: both; RealFill's.
@@ -40,7 +41,7 @@ def personalize(
     settings: Params,
     folder: Path,
 ) -> None:
-    """Train the prior's LoRA in place; resumes from `folder`'s checkpoint, bit for bit on the CPU.
+    """Train the prior's LoRA in place; resumes from `folder`'s checkpoint, bit for bit on one thread of the CPU.
 
     Args:
         trained: what `lora.add` returned.
@@ -63,23 +64,26 @@ def personalize(
         start, seconds = state["step"], state["seconds"]
     log, checkpoints = trace.Trace(folder, seconds, start), trace.Checkpoints(folder, settings.checkpoint_seconds)
     held_out = held_out_samples(references, prior.native_size, settings.seed)
+    threads = Threads(steps - start, prior.device)
 
     def measure(step: int) -> None:
         end = {"reason": "finished"} if step == steps else {}
         with log.paused():
             log.log(step, **held_out_error(prior, held_out, settings.seed), **end)
 
-    for step in trace.progress(steps, "personalize", start):
-        if trace.log_spaced(step, steps, per_octave=1):
-            measure(step)
-        factor = learning_rate_factor(step, steps, chosen.warm_up, chosen.schedule)
-        for group, rate in zip(optimizer.param_groups, rates, strict=True):
-            group["lr"] = rate * factor
-        train_step(prior, optimizer, references, settings, step)
-        if checkpoints.due:
-            done = {"optimizer": optimizer.state_dict(), "step": step + 1, "seconds": log.seconds}
-            checkpoints.save(lambda done=done: done | {"lora": lora.state(prior)})
-    measure(steps)
+    with threads:
+        for step in trace.progress(steps, "personalize", start):
+            if trace.log_spaced(step, steps, per_octave=1):
+                measure(step)
+            factor = learning_rate_factor(step, steps, chosen.warm_up, chosen.schedule)
+            for group, rate in zip(optimizer.param_groups, rates, strict=True):
+                group["lr"] = rate * factor
+            with threads.step(step - start):
+                train_step(prior, optimizer, references, settings, step)
+            if checkpoints.due:
+                done = {"optimizer": optimizer.state_dict(), "step": step + 1, "seconds": log.seconds}
+                checkpoints.save(lambda done=done: done | {"lora": lora.state(prior)})
+        measure(steps)
     lora.set_dropout(prior, False)
 
 
