@@ -85,8 +85,6 @@ def run(
         drawn_there = {name: each.invent & (name not in scene.clean) for name, each in sets.items()}
         shown = replace(around, cameras=[camera for camera in around.cameras if camera.name not in scene.blank])
         gaussians = settled(params, out, gaussians, [each for each in true if each.mask.any()], shown, drawn_there)
-    gain = may_gain(params, gaussians, train, sets, around)
-    print(f"SDS {'may' if gain.may else 'cannot'} gain: {gain.says}")
     save_ply(out / "gaussians.ply", gaussians)
     save_labels(out / "labels.npy", new.cpu())
     uncovered = {each.name: filling.uncovered(gaussians, each, sets[each.name].consistent) for each in train}
@@ -95,18 +93,19 @@ def run(
     facts["further"] = {
         each.camera.name: float(each.mask.sum() / sets[each.camera.name].consistent.sum()) for each in further
     }
-    facts |= {"sds_may_gain": gain.may, "sds_says": gain.says, "beside_psnr": gain.beside}
+    facts |= sds_facts(params, gaussians, train, sets, around)
     facts["uncovered_share"] = sum(uncovered.values()) / max(len(uncovered), 1)
     save_json(out / "facts.json", facts)
     if bare := [f"{name} ({share:.1%})" for name, share in uncovered.items() if share > WARN_FROM]:
         print(f"uncovered in {len(bare)} views: {', '.join(bare)}: complete another view and add it to the references")
 
 
-def may_gain(params: Params, gaussians, train, sets, around) -> Gain:
+def sds_facts(params: Params, gaussians, train, sets, around) -> dict:
     """What SDS may add to the initialization; only one from references is told."""
-    if around is None or params.start != "reference":
-        return Gain(True, f"initialize.start is {params.start}", None)
-    return estimated(gaussians, train, sets, around.photos)
+    told = around is not None and params.start == "reference"
+    gain = estimated(gaussians, train, sets, around.photos) if told else Gain(True, f"start is {params.start}", None)
+    print(f"SDS {'may' if gain.may else 'cannot'} gain: {gain.says}")
+    return {"sds_may_gain": gain.may, "sds_says": gain.says, "beside_psnr": gain.beside}
 
 
 def surroundings(params: Params, scene, gaussians, thing, sets, poses: Path, fit: Path):

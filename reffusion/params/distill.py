@@ -114,7 +114,7 @@ class Densify(Settings):
     cloned or split, a share of them, for the SDS gradient has no scale a threshold could refer to."""
 
     every: int = Field(0, ge=0, description="steps between densifications of masked Gaussians; 0: never")
-    cap_max: int = Field(2_000_000, ge=1, description="most Gaussians")
+    stop: float = Field(0.5, ge=0, le=1, description="part of the run after which no Gaussian is added")
 
 
 class Params(Settings):

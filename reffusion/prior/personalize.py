@@ -55,8 +55,7 @@ def personalize(
     _refuse_size(prior, _side(prior, settings))
     rates = (chosen.lr_unet, chosen.lr_text)
     groups = [{"params": trained[part], "lr": rate} for part, rate in zip(("unet", "text"), rates, strict=True)]
-    fused = prior.device.type == "cuda"  # one kernel for all layers; the CPU's results stay as they are
-    optimizer = torch.optim.AdamW(groups, betas=chosen.betas, weight_decay=WEIGHT_DECAY, fused=fused)
+    optimizer = torch.optim.AdamW(groups, betas=chosen.betas, weight_decay=WEIGHT_DECAY, fused=True)
     state, start, seconds = trace.load_checkpoint(folder), 0, 0.0
     if state is not None:
         lora.load_state(prior, state["lora"])
