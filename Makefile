@@ -17,7 +17,7 @@ PYTHON ?= python3
 VENV ?= .venv
 PY := $(VENV)/bin/python
 RUN := $(VENV)/bin/reffusion
-STAGES := poses fit masks reference lift personalize initialize distill evaluate
+STAGES := poses fit masks reference lift initialize personalize distill evaluate
 
 of = --scene="$$scene"
 where = $(if $(variant),--variant="$$variant") $(if $(runs),--runs="$$runs")
