@@ -157,7 +157,7 @@ def test_flip_is_zero_for_identical_one_for_the_worst_and_grows_between():
 
 
 def test_flip_is_that_of_its_authors():
-    """The mean and every pixel as flip-evaluator computes them, of pictures of every colour, odd sizes and flat parts."""
+    """The mean and every pixel as flip-evaluator computes them, of all colours, odd sizes and flat parts."""
     import flip_evaluator
 
     draw = np.random.default_rng(3)

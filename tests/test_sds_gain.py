@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from small_params import altered
-from small_scene import CAMERAS, TRAIN, gaussians, photo, true_mask
+from small_scene import CAMERAS, TRAIN, gaussians, true_mask
 
 from reffusion.initialize.gain import TAUGHT, VIEWS, WORSE, estimated
 from reffusion.io.arrays import save_json

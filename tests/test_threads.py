@@ -6,15 +6,17 @@ import torch
 
 from reffusion.prior.threads import MEASURED, RECENT, WORTH, Threads
 
+STEPS = 12
 
-def used(seconds, steps=WORTH, device="cpu", count=12):
-    """The threads of each of `count` steps, which take `seconds[threads]`."""
+
+def used(seconds, steps=WORTH, device="cpu"):
+    """The threads of each of `STEPS` steps, which take `seconds[threads]`."""
     before, found = torch.get_num_threads(), []
     torch.set_num_threads(2)
     try:
         with Threads(steps, torch.device(device)) as threads:
-            for done in range(count):
-                with threads.step(done):
+            for _ in range(STEPS):
+                with threads.step():
                     found.append(torch.get_num_threads())
                     time.sleep(seconds[found[-1]])
         assert torch.get_num_threads() == 2
@@ -24,13 +26,12 @@ def used(seconds, steps=WORTH, device="cpu", count=12):
 
 
 def test_all_threads_are_used_while_they_pay():
-    assert used({1: 0.02, 2: 0.002}) == [2] + [1] * len(MEASURED) + [2] * 9
+    assert used({1: 0.1, 2: 0.0}) == [1] * MEASURED + [2] * (STEPS - MEASURED)
 
 
 def test_one_thread_is_used_where_the_others_hold_it_up():
-    slow = len(MEASURED) + 1 + RECENT
-    assert used({1: 0.002, 2: 0.02}) == [2] + [1] * len(MEASURED) + [2] * RECENT + [1] * (12 - slow)
+    assert used({1: 0.0, 2: 0.1}) == [1] * MEASURED + [2] * RECENT + [1] * (STEPS - MEASURED - RECENT)
 
 
 def test_little_work_and_gpus_are_not_measured():
-    assert used({1: 0.0, 2: 0.001}, steps=WORTH - 1) == [2] * 12 == used({1: 0.0, 2: 0.001}, device="meta")
+    assert used({1: 0.0, 2: 0.0}, steps=WORTH - 1) == [2] * STEPS == used({1: 0.0, 2: 0.0}, device="meta")

@@ -1,4 +1,4 @@
-"""What personalization is for, measured while it learns: the reference's hole, and holes in photographs it never saw."""
+"""What personalization is for, measured while it learns: the reference's hole, and holes in other photographs."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def personalize(
             factor = learning_rate_factor(step, steps, chosen.warm_up, chosen.schedule)
             for group, rate in zip(optimizer.param_groups, rates, strict=True):
                 group["lr"] = rate * factor
-            with threads.step(step - start):
+            with threads.step():
                 train_step(prior, optimizer, references, settings, step)
             if checkpoints.due:
                 done = {"optimizer": optimizer.state_dict(), "step": step + 1, "seconds": log.seconds}
