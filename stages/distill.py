@@ -76,10 +76,12 @@ def run(
 
 def without_sds(params: Params, initialize: Path) -> tuple[Params, str]:
     """The parameters, of SDS the weight 0 where it is not to run, and in words whether it runs."""
-    told = load_json(initialize / "facts.json") if params.sds.run == "auto" else {"sds_may_gain": False}
-    if params.sds.weight == 0 or params.sds.run == "always" or told["sds_may_gain"]:
+    if params.sds.weight == 0 or params.sds.run == "always":
         return params, "runs" if params.sds.weight else "weight 0"
-    said = f"left out: {told.get('sds_says', 'distill.sds.run is never')}"
+    told = load_json(initialize / "facts.json") if params.sds.run == "auto" else {"sds_says": "distill.sds.run is never"}
+    if told.get("sds_may_gain"):
+        return params, f"runs: {told['sds_says']}"
+    said = f"left out: {told['sds_says']}"
     print(f"SDS {said}", flush=True)
     return params.model_copy(update={"sds": params.sds.model_copy(update={"weight": 0.0})}), said
 

@@ -21,7 +21,7 @@ from reffusion.seeding import generator as seeded
 # PAPER leaves open: both; RealFill's.
 WEIGHT_DECAY = 1e-2  # AdamW's
 CLIP = 1.0  # the largest norm of the gradient
-MEASURED_FROM = 8  # steps from which the error is measured in each doubling
+MEASURED_FROM = 4  # steps from which the error is measured in each doubling
 
 
 def learning_rate_factor(step: int, steps: int, warm_up: int, schedule: str) -> float:
