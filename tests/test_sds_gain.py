@@ -72,7 +72,7 @@ def test_distillation_reads_what_the_initialization_says(tmp_path, run, may, wei
     asked = altered(Params(), sds={"run": run, "weight": 1})
     params, said = distill.without_sds(asked, tmp_path)
     assert params == altered(asked, sds={"weight": weight})
-    assert ("40.0 dB" in said) == (run == "auto" and not may)
+    assert ("40.0 dB" in said) == (run == "auto") and ("left out" in said) == (weight == 0)
 
 
 def test_a_prior_that_is_never_asked_need_not_be_there():
