@@ -78,7 +78,8 @@ def without_sds(params: Params, initialize: Path) -> tuple[Params, str]:
     """The parameters, of SDS the weight 0 where it is not to run, and in words whether it runs."""
     if params.sds.weight == 0 or params.sds.run == "always":
         return params, "runs" if params.sds.weight else "weight 0"
-    told = load_json(initialize / "facts.json") if params.sds.run == "auto" else {"sds_says": "distill.sds.run is never"}
+    never = {"sds_says": "distill.sds.run is never"}
+    told = load_json(initialize / "facts.json") if params.sds.run == "auto" else never
     if told.get("sds_may_gain"):
         return params, f"runs: {told['sds_says']}"
     said = f"left out: {told['sds_says']}"
