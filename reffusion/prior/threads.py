@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Self
 
 import torch
@@ -12,10 +14,21 @@ import torch
 MEASURED = 3  # steps at first that are done on one thread, to know what that takes
 RECENT = 2  # steps whose fastest is compared: one that was held up by chance counts for nothing
 WORTH = 50  # steps from which it is worth to measure
+FREE = 0.8  # part of a core's time that nobody wants, from which it counts as free
+
+
+def idle_seconds() -> float:
+    """Since the machine was started, summed over its cores; infinite where that is not told."""
+    try:
+        ticks = [int(word) for word in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:]]
+    except (OSError, ValueError):
+        return float("inf")
+    return (ticks[3] + ticks[4]) / os.sysconf("SC_CLK_TCK")
 
 
 class Threads:
-    """Torch's threads for the steps of a long work on the CPU: all, until those take longer than one takes.
+    """Torch's threads for the steps of a long work on the CPU: all, where cores are free while one thread works at
+    first, and until all take longer than that one did. Beside a busy core a step of two threads may take ten times as long.
 
     A context, after which torch has as many as before. A step's sums are rounded differently by another number.
 
@@ -23,14 +36,15 @@ class Threads:
         all: torch's own number at the beginning. now: that of the next step.
     """
 
-    def __init__(self, steps: int, device: torch.device):
+    def __init__(self, steps: int, device: torch.device, idle: Callable[[], float] = idle_seconds):
         self.all = self.now = torch.get_num_threads()
         self._choosing = steps >= WORTH and self.all > 1 and device.type == "cpu"
         self._one, self._recent = float("inf"), list[float]()
-        self._done = 0
+        self._done, self._idle, self._began = 0, idle, (0.0, 0.0)
 
     def __enter__(self) -> Self:
         self._take(1 if self._choosing else self.all)
+        self._began = self._idle(), time.perf_counter()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -51,9 +65,16 @@ class Threads:
             return
         if self._done <= MEASURED:
             self._one = min(self._one, seconds)
-            self._take(1 if self._done < MEASURED else self.all)
+            if self._done == MEASURED:
+                self._choosing = self._others_are_free()
+                self._take(self.all if self._choosing else 1)
             return
         self._recent = [*self._recent, seconds][-RECENT:]
         if len(self._recent) == RECENT and min(self._recent) > self._one:
             self._take(1)
             self._choosing = False
+
+    def _others_are_free(self) -> bool:
+        idle, began = self._began
+        wanted = FREE * (self.all - 1) * (time.perf_counter() - began)
+        return idle == float("inf") or self._idle() - idle >= wanted
