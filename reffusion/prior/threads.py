@@ -28,7 +28,7 @@ def idle_seconds() -> float:
 
 class Threads:
     """Torch's threads for the steps of a long work on the CPU: all, where cores are free while one thread works at
-    first, and until all take longer than that one did. Beside a busy core a step of two threads may take ten times as long.
+    first, and until all take longer than that one did. Beside a busy core two may take ten times as long as one.
 
     A context, after which torch has as many as before. A step's sums are rounded differently by another number.
 
