@@ -4,7 +4,8 @@ import time
 
 import torch
 
-from reffusion.prior.threads import MEASURED, RECENT, WORTH, Threads, idle_seconds
+from reffusion.io.machine import idle_seconds
+from reffusion.prior.threads import MEASURED, RECENT, WORTH, Threads
 
 STEPS = 12
 

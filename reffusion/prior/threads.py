@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Self
 
 import torch
+
+from reffusion.io.machine import idle_seconds
 
 MEASURED = 3  # steps at first that are done on one thread, to know what that takes
 RECENT = 2  # steps whose fastest is compared: one that was held up by chance counts for nothing
 WORTH = 50  # steps from which it is worth to measure
 FREE = 0.8  # part of a core's time that nobody wants, from which it counts as free
-
-
-def idle_seconds() -> float:
-    """Since the machine was started, summed over its cores; infinite where that is not told."""
-    try:
-        ticks = [int(word) for word in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:]]
-    except (OSError, ValueError):
-        return float("inf")
-    return (ticks[3] + ticks[4]) / os.sysconf("SC_CLK_TCK")
 
 
 class Threads:
