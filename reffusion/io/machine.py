@@ -150,7 +150,7 @@ def _nvcc() -> str | None:
 
 
 def idle_seconds() -> float:
-    """What its processors did nothing for since this machine was started, over all cores; infinite where that is not told."""
+    """How long its cores have done nothing since it was started, added up; infinite where that is not told."""
     try:
         ticks = [int(word) for word in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:]]
     except (OSError, ValueError):
