@@ -17,7 +17,7 @@ PYTHON ?= python3
 VENV ?= .venv
 PY := $(VENV)/bin/python
 RUN := $(VENV)/bin/reffusion
-STAGES := poses fit masks reference lift personalize initialize distill evaluate
+STAGES := poses fit masks reference lift initialize personalize distill evaluate
 
 of = --scene="$$scene"
 where = $(if $(variant),--variant="$$variant") $(if $(runs),--runs="$$runs")
@@ -215,14 +215,14 @@ prior-report: data/demo/.generated setup
 
 # On any scene; what it lacks of personalization and initialization is made first.
 sds-variance: ready
-	@$(RUN) run personalize $(of) $(options)
+	@$(RUN) run personalize $(of) $(options) --set="distill.sds.run=always $$set"
 	@$(RUN) run initialize $(of) $(options)
 	$(PY) -m benchmarks.studies.sds_variance --run="$${runs:-runs}/$$(basename "$$scene")" $(on)
 
 # Where a study computes; what is made first runs where the profile says.
 on = $(if $(device),--device="$$device") $(if $(dtype),--dtype="$$dtype")
 adapted: ready
-	@$(RUN) run personalize $(of) $(options)
+	@$(RUN) run personalize $(of) $(options) --set="distill.sds.run=always $$set"
 	$(PY) -m benchmarks.studies.adapted --run="$${runs:-runs}/$$(basename "$$scene")" $(on) $(if $(steps),--steps="$$steps")
 
 # Of a made scene demo-sparse, with seeds=3 of two others too: scores against the number of photographs (hours).

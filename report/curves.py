@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Lines = list[dict[str, Any]]  # of one series of a trace
-PANELS = 3  # errors of a stage at most
+PANELS = 4  # errors of a stage at most
 LEFT_OUT = ("sds_gradient_mean", "sds_gradient_max", "gaussians", "masked_gaussians")  # no errors
 
 

@@ -11,7 +11,7 @@ from reffusion.io.traces import load_trace
 from report import curves, sheet
 from report.results import load_receipts
 
-ORDER = ("poses", "fit", "masks", "reference", "lift", "personalize", "initialize", "distill", "evaluate")
+ORDER = ("poses", "fit", "masks", "reference", "lift", "initialize", "personalize", "distill", "evaluate")
 
 
 @dataclass(frozen=True)

@@ -99,7 +99,8 @@ def shared_out(pipeline: Pipeline, values: Overrides, seconds: float) -> Overrid
     if not pipeline.budget:
         raise Refused("pipeline.yaml: a budget is asked for, and there is no table `budget` that shares it out")
     asked = {f"{stage}.{name}": value for stage in values for name, value in leaves(values[stage]).items()}
-    holds = lambda c: c.param and all(asked.get(param, ...) == c.equals for param in c.param)
+    is_so = lambda wanted: all(asked.get(param, ...) == value for param, value in wanted.items())
+    holds = lambda c: c.param and is_so(dict.fromkeys(c.param, c.equals) | c.only)
     stays = [name for name in pipeline.budget if not any(holds(c) for c in pipeline.stages[name].left_out)]
     if not stays:
         return {}

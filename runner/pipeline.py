@@ -28,13 +28,14 @@ class Strict(BaseModel, extra="forbid", frozen=True):
 class Condition(Strict):
     """A reason to leave a stage out: one question, by `fact`, `param` or `empty`, whose answer is yes."""
 
-    because: str
+    because: str  # may name facts of that stage in braces
     fact: str | None = None  # <stage>.<name>: of an earlier stage's facts.json, is `equals`
     # <stage>.<name>, or a list of them: parameters of any stage, each `equals`
     param: Annotated[tuple[str, ...], BeforeValidator(lambda said: (said,) if isinstance(said, str) else said)] = ()
     equals: Any = None
     empty: str | None = None  # <stage>/<folder>: of an earlier artifact, is without a file
     unless: tuple[str, ...] = ()  # ignored where the scene brings one of these keys
+    only: dict[str, Any] = {}  # ignored unless each <stage>.<name>, a parameter, has this value
 
     @model_validator(mode="after")
     def _one_question(self) -> Self:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import string
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -44,9 +45,9 @@ def decide(job: Job, stage: str, earlier: dict[str, Decision]) -> Decision:
     unknown_yet = []
     for condition in spec.left_out:
         if holds := _holds(job, condition, earlier):
-            return Decision("skip", condition.because, settled=True)
+            return Decision("skip", _because(condition, earlier), settled=True)
         if holds is None:
-            unknown_yet.append(f"left out if {condition.because}: known after {condition.names[0]}")
+            unknown_yet.append(f"left out if {condition.because.split(':')[0]}: known after {condition.names[0]}")
     needs = {need: earlier[need] for need in spec.takes if need != SCENE}
     for need in (need for need in spec.needs if need != SCENE):
         if needs[need].word == "skip":
@@ -77,6 +78,8 @@ def _holds(job: Job, condition: Condition, earlier: dict[str, Decision]) -> bool
     stage, name = condition.names
     if job.brings.intersection(condition.unless):
         return False
+    if not all(_is(job, param, value) for param, value in condition.only.items()):
+        return False
     if condition.param:
         return all(_is(job, param, condition.equals) for param in condition.param)
     source = earlier[stage]
@@ -86,12 +89,21 @@ def _holds(job: Job, condition: Condition, earlier: dict[str, Decision]) -> bool
         return None
     if condition.empty:
         return not any(files_below(source.path / name))
+    return _fact(source.path, name) == condition.equals
+
+
+def _fact(folder: Path, name: str) -> Any:
     try:
-        return json.loads((source.path / "facts.json").read_text())[name] == condition.equals
+        return json.loads((folder / "facts.json").read_text())[name]
     except (OSError, ValueError, KeyError):
-        raise Refused(
-            f"{source.path / 'facts.json'}: has no {name!r}, which pipeline.yaml asks for; `verify` it"
-        ) from None
+        raise Refused(f"{folder / 'facts.json'}: has no {name!r}, which pipeline.yaml asks for; `verify` it") from None
+
+
+def _because(condition: Condition, earlier: dict[str, Decision]) -> str:
+    """The reason, with the facts that it names."""
+    names = [name for _, name, _, _ in string.Formatter().parse(condition.because) if name]
+    folder = earlier[condition.names[0]].path if names else None
+    return condition.because.format(**{name: _fact(folder, name) for name in names}) if folder else condition.because
 
 
 def _is(job: Job, param: str, value: Any) -> bool:

@@ -48,6 +48,7 @@ def run(
 ) -> None:
     rasterizer.prepare(params.device)
     began = time.monotonic()
+    params, said = without_sds(params, initialize)
     scene = load_scene(poses)
     initial, masked, holes = start(params, scene, reference, initialize)
     prior, text = adapted_prior(params, personalize)
@@ -69,8 +70,21 @@ def run(
     save_ply(out / "gaussians.ply", gaussians.map(lambda p: p.cpu()))
     save_labels(out / "labels.npy", masked.cpu())
     painted = load_json(lift / "facts.json")["inpainter"] if lift else None
-    save_json(out / "facts.json", {"inpainter": painted, "perceptual": named})
+    save_json(out / "facts.json", {"inpainter": painted, "perceptual": named, "sds": said})
     trace.clear_checkpoint(out)
+
+
+def without_sds(params: Params, initialize: Path) -> tuple[Params, str]:
+    """The parameters, of SDS the weight 0 where it is not to run, and in words whether it runs."""
+    if params.sds.weight == 0 or params.sds.run == "always":
+        return params, "runs" if params.sds.weight else "weight 0"
+    never = {"sds_says": "distill.sds.run is never"}
+    told = load_json(initialize / "facts.json") if params.sds.run == "auto" else never
+    if told.get("sds_may_gain"):
+        return params, f"runs: {told['sds_says']}"
+    said = f"left out: {told['sds_says']}"
+    print(f"SDS {said}", flush=True)
+    return params.model_copy(update={"sds": params.sds.model_copy(update={"weight": 0.0})}), said
 
 
 def start(params: Params, scene: Scene, reference: Path, initialize: Path) -> tuple[Gaussians, Tensor, list[Hole]]:

@@ -121,9 +121,9 @@ def prepared(
 def rendered(work: Work, camera: Camera) -> tuple[Shown, dict[str, np.ndarray]]:
     """The view as the result shows it, saved; and stage -> uint8 [H, W, 3], its own rendering, saved too."""
     file = f"{camera.name}.png"
-    pictures = {s: drawn(gaussians, camera, work.out / FOLDERS[s] / file) for s, gaussians in work.gaussians.items()}
-    mask = mask_of(camera, work.poses, work.masks)
-    shown = view_of(work.gaussians[work.result], camera, pictures[work.result], mask)
+    drawings = {s: drawn(gaussians, camera, work.out / FOLDERS[s] / file) for s, gaussians in work.gaussians.items()}
+    pictures = {stage: picture for stage, (picture, _) in drawings.items()}
+    shown = Shown(camera, *drawings[work.result], mask_of(camera, work.poses, work.masks))
     if work.painter:
         picture = work.painter.paint(shown.picture, shown.mask)
         shown = shown._replace(picture=picture, depth=consistency.depth_through(shown.depth, shown.mask))
@@ -182,11 +182,14 @@ def captured_by(
     return captured, cameras, hidden
 
 
-def drawn(gaussians: Gaussians, camera: Camera, path: Path) -> np.ndarray:
-    """Render to `path`, and give back what the file holds: scores are of the 8-bit picture that anyone can open."""
+def drawn(gaussians: Gaussians, camera: Camera, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Render to `path`, and give back what the file holds: scores are of the 8-bit picture that anyone can open; and
+    the depth, [H, W] float64, 0 where hardly anything is, for the comparison with a view's neighbour."""
     with torch.no_grad():
-        save_image(path, rasterizer.render(gaussians, camera).color.cpu().numpy())
-    return load_image(path)
+        drawing = rasterizer.render(gaussians, camera)
+    save_image(path, drawing.color.cpu().numpy())
+    depth, alpha = drawing.depth.double().cpu().numpy(), drawing.alpha.cpu().numpy()
+    return load_image(path), np.where(alpha > consistency.SOLID, depth, 0.0)
 
 
 def truth_of(camera: Camera, poses: Path) -> np.ndarray | None:
@@ -210,14 +213,6 @@ def mask_of(camera: Camera, poses: Path, masks: Path | None) -> np.ndarray:
     found = [path for path in given if path.exists()]
     raw = {} if found else load_raw_masks(poses, [camera.name])
     return load_mask(found[0], size) if found else raw.get(camera.name, np.zeros(size, bool))
-
-
-def view_of(gaussians: Gaussians, camera: Camera, picture: np.ndarray, mask: np.ndarray) -> Shown:
-    """The view with its rendered depth, for the comparison with its neighbour."""
-    with torch.no_grad():
-        drawing = rasterizer.render(gaussians, camera, sh_degree=0)
-    depth, alpha = drawing.depth.double().cpu().numpy(), drawing.alpha.cpu().numpy()
-    return consistency.Shown(camera, picture, np.where(alpha > consistency.SOLID, depth, 0.0), mask)
 
 
 def used(painter: str | None, distill: Path | None) -> dict[str, str | None]:

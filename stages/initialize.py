@@ -15,6 +15,7 @@ from reffusion.depth.behind import Completion
 from reffusion.fit import exposure
 from reffusion.gaussians.sheets import Sheets
 from reffusion.initialize import coverage, filling, scatter
+from reffusion.initialize.gain import Gain, estimated
 from reffusion.initialize.settle import Known, settle
 from reffusion.io.arrays import load_json, load_labels, save_json, save_labels
 from reffusion.io.images import save_exr, save_image, save_mask
@@ -92,10 +93,19 @@ def run(
     facts["further"] = {
         each.camera.name: float(each.mask.sum() / sets[each.camera.name].consistent.sum()) for each in further
     }
+    facts |= sds_facts(params, gaussians, train, sets, around)
     facts["uncovered_share"] = sum(uncovered.values()) / max(len(uncovered), 1)
     save_json(out / "facts.json", facts)
     if bare := [f"{name} ({share:.1%})" for name, share in uncovered.items() if share > WARN_FROM]:
         print(f"uncovered in {len(bare)} views: {', '.join(bare)}: complete another view and add it to the references")
+
+
+def sds_facts(params: Params, gaussians, train, sets, around) -> dict:
+    """What SDS may add to the initialization; only one from references is told."""
+    told = around is not None and params.start == "reference"
+    gain = estimated(gaussians, train, sets, around.photos) if told else Gain(True, f"start is {params.start}", None)
+    print(f"SDS {'may' if gain.may else 'cannot'} gain: {gain.says}")
+    return {"sds_may_gain": gain.may, "sds_says": gain.says, "beside_psnr": gain.beside}
 
 
 def surroundings(params: Params, scene, gaussians, thing, sets, poses: Path, fit: Path):

@@ -55,6 +55,15 @@ def test_the_pipeline_leaves_diffusion_out_where_nothing_is_to_be_invented():
         assert "masks.invent_pixels" in facts, name
 
 
+def test_personalization_is_left_out_where_sds_cannot_gain_and_the_profile_asks():
+    pipeline = yaml.safe_load((ROOT / "pipeline.yaml").read_text())
+    (asked,) = (c for c in pipeline["stages"]["personalize"]["left_out"] if c.get("fact") == "initialize.sds_may_gain")
+    assert asked["equals"] is False and "{sds_says}" in asked["because"]
+    assert asked["only"] == {"distill.sds.run": "auto", "distill.depth.weight": 0}  # the depth term asks the prior too
+    runs = {name: profile["distill"].get("sds", {}).get("run") for name, profile in pipeline["profiles"].items()}
+    assert runs == {"paper": None, "best": None, "laptop": "auto", "paper-terms": None}
+
+
 def test_few_unseen_pixels_are_negligible_and_it_can_be_forced(tmp_path):
     poses, fitted, _ = small.write(tmp_path, 0.8)
 

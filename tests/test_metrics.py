@@ -156,6 +156,21 @@ def test_flip_is_zero_for_identical_one_for_the_worst_and_grows_between():
     assert 0.9 < metrics.flip(white, black) <= 1.0
 
 
+def test_flip_is_that_of_its_authors():
+    """The mean and every pixel as flip-evaluator computes them, of all colours, odd sizes and flat parts."""
+    import flip_evaluator
+
+    draw = np.random.default_rng(3)
+    rough, smooth = draw.random((67, 121, 3)), np.linspace(0, 1, 90 * 80 * 3).reshape(90, 80, 3)
+    for truth, image in [(rough, draw.random(rough.shape)), (smooth, smooth[::-1]), (smooth, 0.9 * smooth + 0.05)]:
+        pair = (np.ascontiguousarray(x, np.float32) for x in (truth, image))
+        settings = {"ppd": metrics.PIXELS_PER_DEGREE}
+        theirs = flip_evaluator.evaluate(*pair, "LDR", applyMagma=False, computeMeanError=False, parameters=settings)
+        ours = metrics.flip_map(image, truth)
+        assert np.abs(ours - theirs[0].reshape(ours.shape)).max() < 1e-4 and ours.dtype == np.float32
+        assert abs(ours.mean() - theirs[0].mean()) < 2e-6
+
+
 def test_flip_of_one_pixel_and_of_a_view_into_a_larger_array():
     black, white = np.zeros((1, 1, 3), np.uint8), np.full((1, 1, 3), 255, np.uint8)
     assert metrics.flip(black, black) == 0.0 < metrics.flip(white, black)

@@ -92,6 +92,7 @@ ABSENT = {
     "initialize.gloss": False,
     "initialize.further": 0,
     "initialize.settle": 0,
+    "distill.sds.run": "always",
     "distill.sds.within": 180,
     "distill.sds.keep_contrast": False,
     "distill.reference.weight": 0,

@@ -9,8 +9,9 @@ from small_prior import small_prior
 
 from reffusion import trace
 from reffusion.params.personalize import Params, Samples
-from reffusion.prior import crops, denoising, diffusion, lora
+from reffusion.prior import crops, denoising, diffusion, held_out, lora
 from reffusion.prior import personalize as P
+from reffusion.prior.windows import two_scale_masks
 from reffusion.seeding import generator
 from reffusion.trace import load_checkpoint, read_trace
 
@@ -142,6 +143,29 @@ def test_training_learns_the_reference_and_logs_it(tiny, tmp_path):
     assert records[-1]["target_mse"] < 0.9 * records[0]["target_mse"]
     assert records[-1]["clean_latent_mse"] < records[0]["clean_latent_mse"]
     assert not tiny.unet.training
+
+
+def test_photographs_are_measured_by_and_not_learnt_from(tiny, tmp_path):
+    """Its hole lies beside the object; what is painted there, and nothing else, counts."""
+    reference = striped()
+    thing = torch.zeros(70, 90, dtype=torch.bool)
+    thing[:, :45] = True
+    photograph = reference.image.flip(2)
+    held = held_out.held_out([reference], [(photograph, thing)], NATIVE, 0)
+    assert len(held.pictures) == 2 and not (held.holes[1] * two_scale_masks(thing, [], NATIVE)[0]).any()
+    assert held.holes[1].any() and (held.repaint[1] >= held.holes[1]).all()
+
+    def learnt(folder, photographs):
+        folder.mkdir()
+        prior = small_prior()
+        trained = lora.add(prior, 4, 8, 0.0, "attention", 0)
+        P.personalize(prior, trained, [reference], TRAINING, folder, photographs)
+        return lora.state(prior), read_trace(folder / "trace.jsonl")[-1]
+
+    (alone, said), (measured, also) = learnt(tmp_path / "a", []), learnt(tmp_path / "b", [(photograph, thing)])
+    assert all(torch.equal(alone[name], measured[name]) for name in alone)
+    assert said["hole_psnr"] == pytest.approx(also["hole_psnr"], abs=3) and "photo_psnr" in also.keys() - said.keys()
+    assert {"clean_latent_mse", "crop_latent_mse"} <= said.keys()
 
 
 def test_interrupted_training_resumes_to_the_same_weights(tmp_path, monkeypatch):

@@ -412,6 +412,18 @@ def test_a_condition_may_ask_for_two_parameters(root):
         words(root, set="distill.gain=0")
 
 
+def test_a_condition_may_hold_for_some_parameters_only_and_name_facts(root, capsys):
+    plain = "{fact: masks.invent, equals: 0, because: nothing to invent}"
+    named = '{fact: masks.invent, equals: 0, only: {distill.gain: 2}, because: "nothing to gain: {invent} of 9"}'
+    write(root, {"pipeline.yaml": FILES["pipeline.yaml"].replace(plain, named)})
+    nothing = "masks.threshold=1 "
+    assert words(root, set=nothing + "distill.gain=2")["distill"].endswith("if nothing to gain: known after masks")
+    assert words(root, set=nothing + "distill.gain=3")["distill"].startswith("run")
+    ran(capsys, root, set=nothing + "distill.gain=2")
+    assert words(root, set=nothing + "distill.gain=2")["distill"] == "skip nothing to gain: 0 of 9"
+    assert words(root, set=nothing + "distill.gain=3")["distill"].startswith("run")
+
+
 def test_scene_yaml_stages_rerun_only_their_stage(root, capsys):
     write(root, {"data/toy/scene.yaml": "profile: laptop\nstages: {distill: {gain: 3}}\n"})
     assert ran(capsys, root) == ["distill", "evaluate"]

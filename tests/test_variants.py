@@ -42,7 +42,7 @@ FILLED = ("reference", "personalize", "initialize", "distill")
 PLANS = {
     "no_personalization": (AFTER, ("personalize",)),
     "no_splitting": (AFTER, ()),
-    "no_reference_init": (("initialize", *AFTER), ()),
+    "no_reference_init": (("initialize", "personalize", *AFTER), ()),  # the latter waits for what the former says
     "no_local_sds": ((), ()),  # the laptop profile has none of these three
     "no_adversarial": ((), ()),
     "no_depth": ((), ()),
@@ -80,7 +80,7 @@ def capture(tmp_path_factory):
             place = runs / "scene" / stage
             (place / "masks").mkdir(parents=True)
             (place / "masks" / "v00.png").write_text(stage)
-            (place / "facts.json").write_text(json.dumps({"invent_pixels": 7}))
+            (place / "facts.json").write_text(json.dumps({"invent_pixels": 7, "sds_may_gain": True}))
             inputs = said[stage].inputs
             receipt = asdict(inputs) | {"key": inputs.key, "output": job.hashes.folder(place)}
             (place / "receipt.json").write_text(json.dumps(receipt))

@@ -42,7 +42,8 @@ def before_and_after(given: argparse.Namespace) -> tuple[dict[str, Prior], str]:
     such device."""
     adapted: Path = given.run / "personalize"
     if not adapted.is_dir():
-        raise ValueError(f"{adapted} is missing: run `make scene={given.run.name} personalize` first")
+        make = f"make scene={given.run.name} personalize set=distill.sds.run=always"
+        raise ValueError(f"{adapted} is missing: run `{make}` first")
     if given.device == "cuda" and not torch.cuda.is_available():
         raise ValueError("device=cuda: torch finds no CUDA device here; device=cpu")
     if given.device == "cpu" and given.dtype == "float16":

@@ -92,12 +92,7 @@ def ssim_map(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 def flip_map(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """[H, W] LDR-FLIP, with the viewing distance of `metrics.flip`."""
-    import flip_evaluator
-
-    pair = [np.ascontiguousarray(x / 255.0, np.float32) for x in (truth, picture)]
-    settings = {"ppd": metrics.PIXELS_PER_DEGREE}
-    values = flip_evaluator.evaluate(*pair, "LDR", applyMagma=False, computeMeanError=False, parameters=settings)
-    return values[0][..., 0]
+    return metrics.flip_map(picture, truth)
 
 
 def gradient_energy(picture: np.ndarray, hole: np.ndarray) -> float:

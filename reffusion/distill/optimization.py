@@ -19,13 +19,14 @@ from reffusion.gaussians.densify import densify, prune
 from reffusion.gaussians.optimize import GaussianOptimizer, Rates
 from reffusion.geometry import cameras_extent
 from reffusion.io.ply import save_ply
-from reffusion.params.distill import Densify, LearningRates, Params
+from reffusion.params.distill import LearningRates, Params
 from reffusion.prior.model import Prior
 from reffusion.splat.rasterizer import render
 from reffusion.types import Camera, Gaussians
 
 GROW_SCALE3D = 0.01  # standard deviation from which a Gaussian is split, not cloned
 DENSIFIED = 0.05  # share of the masked Gaussians that are cloned or split each time
+CAP_MAX = 2_000_000  # most Gaussians
 PRUNE_OPA = 0.005  # fainter Gaussians are pruned when others are added
 SNAPSHOTS = 4  # parts of the run, after each but the last of which the masked Gaussians are kept
 REGION_EVERY = 50  # steps between prunings of Gaussians that changed region
@@ -81,7 +82,7 @@ def distill(
         run.step = done = step + 1
         if settings.densify.every and done % settings.densify.every == 0:
             if done <= settings.densify.stop * settings.iterations:
-                _densify(optimizer, settings.densify, seeding.generator(settings.seed, "distill", "densify", done))
+                _densify(optimizer, seeding.generator(settings.seed, "distill", "densify", done))
         if region is not None and (done % REGION_EVERY == 0 or done == settings.iterations):
             optimizer.select(~changed_region(region, optimizer.gaussians.means.detach(), optimizer.masked))
         if trace.log_spaced(done, settings.iterations, per_octave=4):
@@ -163,14 +164,14 @@ def _counts(optimizer: GaussianOptimizer) -> dict[str, int]:
     return {"gaussians": len(optimizer.masked), "masked_gaussians": int(optimizer.masked.sum())}
 
 
-def _densify(optimizer: GaussianOptimizer, chosen: Densify, noise: torch.Generator) -> None:
+def _densify(optimizer: GaussianOptimizer, noise: torch.Generator) -> None:
     """Clone or split the share of the masked Gaussians pulled hardest on the screen; only they have been observed."""
     if not optimizer.masked.any():
         return
     pulls = (optimizer.grad2d_sum / optimizer.grad2d_count.clamp(min=1))[optimizer.masked]
     threshold = float(pulls.kthvalue(max(1, round((1 - DENSIFIED) * len(pulls)))).values)
     threshold = max(threshold, torch.finfo(pulls.dtype).tiny)  # what is not pulled at all stays single
-    densify(optimizer, threshold, GROW_SCALE3D, chosen.cap_max, noise)
+    densify(optimizer, threshold, GROW_SCALE3D, CAP_MAX, noise)
     prune(optimizer, PRUNE_OPA, float("inf"))
 
 

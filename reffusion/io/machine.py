@@ -147,3 +147,12 @@ def _nvcc() -> str | None:
     with suppress(OSError, ValueError, KeyError):
         return str(json.loads((home / "version.json").read_text())["cuda"]["version"])
     return ""
+
+
+def idle_seconds() -> float:
+    """How long its cores have done nothing since it was started, added up; infinite where that is not told."""
+    try:
+        ticks = [int(word) for word in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:]]
+    except (OSError, ValueError):
+        return float("inf")
+    return (ticks[3] + ticks[4]) / os.sysconf("SC_CLK_TCK")

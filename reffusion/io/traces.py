@@ -30,8 +30,11 @@ QUANTITIES = {
     "loss": Quantity("", "less", "reconstruction loss"),
     "psnr": Quantity("dB", "more", "PSNR of training views before their step"),
     "psnr_held_out": Quantity("dB", "more", "PSNR of held-out views"),
+    "photo_psnr": Quantity("dB", "more", "unseen holes"),
+    "hole_psnr": Quantity("dB", "more", "reference's hole"),
+    "clean_latent_mse": Quantity("1", "less", "latent, whole view"),
+    "crop_latent_mse": Quantity("1", "less", "latent, crop"),
     "target_mse": Quantity("1", "less", "squared error of the UNet's target"),
-    "clean_latent_mse": Quantity("1", "less", "squared error of the clean latent"),
     "reference_psnr": Quantity("dB", "more", "PSNR in the references' holes"),
     "reconstruction": Quantity("", "less", "reconstruction term"),
     "sds_gradient_mean": Quantity("1", "", "mean norm of the SDS gradient"),
@@ -44,7 +47,7 @@ QUANTITIES = {
 
 MAIN = {  # stage -> the quantities that stand for its error, the first that a trace has
     "fit": ("psnr_held_out", "psnr"),
-    "personalize": ("clean_latent_mse",),
+    "personalize": ("photo_psnr", "hole_psnr"),
     "distill": ("reference_psnr",),
     "initialize": ("disparity_error", "residual"),
 }

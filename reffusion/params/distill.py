@@ -24,6 +24,10 @@ class Sds(Settings):
     """Multi-scale score distillation (section 4.2)."""
 
     weight: float = Field(1e-3, ge=0, description="lambda of the SDS term; 0 leaves it out")
+    # The paper always distils. What it could gain at most is told by `initialize`: reffusion.initialize.gain.
+    run: Literal["auto", "always", "never"] = Field(
+        "always", description="auto: where the initialization is not yet better than what the embedded prior paints"
+    )
     patches: int = Field(2, ge=0, description="local patches beside the whole view; 0 leaves the local term out")
     # The paper confines it to masked ones. Background that was seen through the hole wears the object's tint.
     reaches: Literal["masked", "all"] = Field("masked", description="Gaussians it moves; all: all that show there")
@@ -111,7 +115,6 @@ class Densify(Settings):
 
     every: int = Field(0, ge=0, description="steps between densifications of masked Gaussians; 0: never")
     stop: float = Field(0.5, ge=0, le=1, description="part of the run after which no Gaussian is added")
-    cap_max: int = Field(2_000_000, ge=1, description="most Gaussians")
 
 
 class Params(Settings):

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from reffusion.prior import diffusion, lora
+from reffusion.prior import diffusion
 from reffusion.prior.crops import GLOBAL, LOCAL, PROMPTS, Batch, Picture
 from reffusion.prior.model import Prior
 from reffusion.prior.windows import two_scale_masks, two_scales, window_around
@@ -71,20 +71,3 @@ def one_sample(prior: Prior, references: Sequence[Picture], seed: int) -> None:
     sample = Batch(*(tensor[:1] for tensor in held_out_samples(references, prior.native_size, seed)))
     noise = torch.zeros(1, *latent_shape(prior, prior.native_size))
     denoising_error(prior, sample, torch.zeros(1, dtype=torch.long), noise)[0].sum().backward()
-
-
-@torch.no_grad()
-def held_out_error(prior: Prior, samples: Batch, seed: int) -> dict[str, float]:
-    """{"target_mse", "clean_latent_mse"} at three fixed timesteps with fixed noise: comparable through the training.
-
-    It costs a small model about a step of training.
-    """
-    lora.set_dropout(prior, False)
-    errors = []
-    for level in (0.2, 0.55, 0.9):
-        timesteps = torch.full((len(samples.prompts),), round(level * (prior.timesteps - 1)))
-        draw = seeded(seed, "personalize", "held out", level)
-        noise = torch.randn(len(samples.prompts), *latent_shape(prior, samples.images.shape[-1]), generator=draw)
-        errors.append(torch.stack(denoising_error(prior, samples, timesteps, noise)))
-    target, clean = torch.stack(errors).mean((0, 2)).tolist()
-    return {"target_mse": target, "clean_latent_mse": clean}

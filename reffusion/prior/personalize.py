@@ -12,13 +12,16 @@ from reffusion import trace
 from reffusion.params.personalize import Params
 from reffusion.prior import lora
 from reffusion.prior.crops import Batch, Picture, draw_samples
-from reffusion.prior.denoising import denoising_error, held_out_error, held_out_samples, latent_shape, spread_timesteps
+from reffusion.prior.denoising import denoising_error, latent_shape, spread_timesteps
+from reffusion.prior.held_out import held_out, measured
 from reffusion.prior.model import Prior
+from reffusion.prior.threads import Threads
 from reffusion.seeding import generator as seeded
 
 # PAPER leaves open: both; RealFill's.
 WEIGHT_DECAY = 1e-2  # AdamW's
 CLIP = 1.0  # the largest norm of the gradient
+MEASURED_FROM = 4  # steps from which the error is measured in each doubling
 
 
 def learning_rate_factor(step: int, steps: int, warm_up: int, schedule: str) -> float:
@@ -39,13 +42,15 @@ def personalize(
     references: Sequence[Picture],
     settings: Params,
     folder: Path,
+    photographs: Sequence[tuple[torch.Tensor, torch.Tensor]] = (),
 ) -> None:
-    """Train the prior's LoRA in place; resumes from `folder`'s checkpoint, bit for bit on the CPU.
+    """Train the prior's LoRA in place; resumes from `folder`'s checkpoint, bit for bit on one thread of the CPU.
 
     Args:
         trained: what `lora.add` returned.
         references: see `draw_samples`.
-        folder: gets trace.jsonl (`held_out_error`, measured with the clock stopped) and checkpoints.
+        folder: gets trace.jsonl (`held_out.measured`, with the clock stopped) and checkpoints.
+        photographs: see `held_out.held_out`; nothing is learnt from them.
     Raises:
         ValueError: samples larger than the prior's native size.
         FloatingPointError: a loss or gradient is not finite; names the step.
@@ -54,32 +59,34 @@ def personalize(
     _refuse_size(prior, _side(prior, settings))
     rates = (chosen.lr_unet, chosen.lr_text)
     groups = [{"params": trained[part], "lr": rate} for part, rate in zip(("unet", "text"), rates, strict=True)]
-    fused = prior.device.type == "cuda"  # one kernel for all layers; the CPU's results stay as they are
-    optimizer = torch.optim.AdamW(groups, betas=chosen.betas, weight_decay=WEIGHT_DECAY, fused=fused)
+    optimizer = torch.optim.AdamW(groups, betas=chosen.betas, weight_decay=WEIGHT_DECAY, fused=True)
     state, start, seconds = trace.load_checkpoint(folder), 0, 0.0
     if state is not None:
         lora.load_state(prior, state["lora"])
         optimizer.load_state_dict(state["optimizer"])
         start, seconds = state["step"], state["seconds"]
     log, checkpoints = trace.Trace(folder, seconds, start), trace.Checkpoints(folder, settings.checkpoint_seconds)
-    held_out = held_out_samples(references, prior.native_size, settings.seed)
+    held = held_out(references, photographs, prior.native_size, settings.seed)
+    threads = Threads(steps - start, prior.device)
 
     def measure(step: int) -> None:
         end = {"reason": "finished"} if step == steps else {}
         with log.paused():
-            log.log(step, **held_out_error(prior, held_out, settings.seed), **end)
+            log.log(step, **measured(prior, held, settings.seed), **end)
 
-    for step in trace.progress(steps, "personalize", start):
-        if trace.log_spaced(step, steps, per_octave=1):
-            measure(step)
-        factor = learning_rate_factor(step, steps, chosen.warm_up, chosen.schedule)
-        for group, rate in zip(optimizer.param_groups, rates, strict=True):
-            group["lr"] = rate * factor
-        train_step(prior, optimizer, references, settings, step)
-        if checkpoints.due:
-            done = {"optimizer": optimizer.state_dict(), "step": step + 1, "seconds": log.seconds}
-            checkpoints.save(lambda done=done: done | {"lora": lora.state(prior)})
-    measure(steps)
+    with threads:
+        for step in trace.progress(steps, "personalize", start):
+            if trace.log_spaced(step, steps, per_octave=1, first=MEASURED_FROM):
+                measure(step)
+            factor = learning_rate_factor(step, steps, chosen.warm_up, chosen.schedule)
+            for group, rate in zip(optimizer.param_groups, rates, strict=True):
+                group["lr"] = rate * factor
+            with threads.step():
+                train_step(prior, optimizer, references, settings, step)
+            if checkpoints.due:
+                done = {"optimizer": optimizer.state_dict(), "step": step + 1, "seconds": log.seconds}
+                checkpoints.save(lambda done=done: done | {"lora": lora.state(prior)})
+        measure(steps)
     lora.set_dropout(prior, False)
 
 

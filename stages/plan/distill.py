@@ -14,7 +14,7 @@ __all__ = ["Params", "cost", "lacks", "needed_weights"]
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
     """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
-    asked = params.sds.weight > 0 or params.depth.weight > 0
+    asked = (params.sds.weight > 0 and params.sds.run != "never") or params.depth.weight > 0
     found = [local.of_model(params.prior, params.dtype)] if asked else []
     estimates = params.depth.weight > 0 and params.depth.model
     return found + ([local.of_model(params.depth.model, "float32")] if estimates else [])

@@ -1,0 +1,81 @@
+"""Can SDS gain? What the initialization shows beside the hole, and who reads the answer."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from small_params import altered
+from small_scene import CAMERAS, TRAIN, gaussians, true_mask
+
+from reffusion.initialize.gain import TAUGHT, VIEWS, WORSE, estimated
+from reffusion.io.arrays import save_json
+from reffusion.params.distill import Params
+from reffusion.splat import rasterizer
+from reffusion.types import MaskSet
+from stages import distill
+from stages.plan import distill as told
+
+AT, TRAINED = 0.8, [CAMERAS[name] for name in TRAIN]
+
+
+@pytest.fixture(scope="module")
+def given():
+    """The wall without its square, masks, and photographs that show just what it does."""
+    scene, labels = gaussians(AT)
+    wall = scene.map(lambda p: p[~labels])
+    hidden = {camera.name: true_mask(camera, AT) for camera in TRAINED}
+    sets = {name: MaskSet(mask, mask, mask, mask) for name, mask in hidden.items()}
+    drawn = lambda camera: rasterizer.render(wall, camera).color.clamp(0, 1)
+    photos = {camera.name: (255 * drawn(camera)).round().to(torch.uint8).numpy() for camera in TRAINED}
+    return wall, sets, photos
+
+
+def test_renders_that_show_the_photographs_cannot_gain(given):
+    wall, sets, photos = given
+    found = estimated(wall, TRAINED, sets, photos)
+    assert not found.may and found.beside > 45 and f"{found.beside - WORSE:.1f} dB" in found.says
+
+
+def test_what_is_wrong_in_the_hole_or_far_from_it_does_not_count_and_beside_it_does(given):
+    wall, sets, photos = given
+    rows = np.arange(photos["a0"].shape[0])[:, None]
+    in_hole = {name: np.where(sets[name].consistent[..., None], 0, image) for name, image in photos.items()}
+    far = {name: np.where((rows < 8)[..., None], 0, image).astype(np.uint8) for name, image in photos.items()}
+    assert not estimated(wall, TRAINED, sets, in_hole).may and not estimated(wall, TRAINED, sets, far).may
+    brighter = {name: np.where(image > 215, 255, image + 40).astype(np.uint8) for name, image in photos.items()}
+    found = estimated(wall, TRAINED, sets, brighter)
+    assert found.may and found.beside - WORSE < TAUGHT
+
+
+def test_a_few_views_are_looked_at_and_without_any_it_may_gain(given):
+    wall, sets, photos = given
+    many = [replace(TRAINED[k % 5], name=f"v{k}") for k in range(3 * VIEWS)]
+    repeated = {camera.name: TRAIN[k % 5] for k, camera in enumerate(many)}
+    looked = []
+
+    class Photos(dict):
+        def __getitem__(self, name):
+            looked.append(name)
+            return photos[repeated[name]]
+
+    estimated(wall, many, {n: sets[o] for n, o in repeated.items()}, Photos(repeated))
+    assert len(looked) == VIEWS and looked[0] == "v0" and looked[-1] == many[-1].name
+    assert estimated(wall, TRAINED, sets, {}).may and estimated(wall, TRAINED, sets, {}).beside is None
+
+
+@pytest.mark.parametrize(
+    ("run", "may", "weight"), [("always", False, 1), ("never", True, 0), ("auto", True, 1), ("auto", False, 0)]
+)
+def test_distillation_reads_what_the_initialization_says(tmp_path, run, may, weight):
+    save_json(tmp_path / "facts.json", {"sds_may_gain": may, "sds_says": "too good at 40.0 dB"})
+    asked = altered(Params(), sds={"run": run, "weight": 1})
+    params, said = distill.without_sds(asked, tmp_path)
+    assert params == altered(asked, sds={"weight": weight})
+    assert ("40.0 dB" in said) == (run == "auto") and ("left out" in said) == (weight == 0)
+
+
+def test_a_prior_that_is_never_asked_need_not_be_there():
+    nothing = altered(Params(), sds={"run": "never"}, depth={"weight": 0})
+    assert told.needed_weights(nothing, frozenset()) == []
+    assert told.needed_weights(altered(nothing, sds={"run": "auto"}), frozenset()) != []

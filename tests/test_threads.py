@@ -1,0 +1,44 @@
+"""How many threads the steps of a long work on the CPU take."""
+
+import time
+
+import torch
+
+from reffusion.io.machine import idle_seconds
+from reffusion.prior.threads import MEASURED, RECENT, WORTH, Threads
+
+STEPS = 12
+
+
+def used(seconds, steps=WORTH, device="cpu", idle=time.perf_counter):
+    """The threads of each of `STEPS` steps, which take `seconds[threads]`, while a core is idle, or as `idle` says."""
+    before, found = torch.get_num_threads(), []
+    torch.set_num_threads(2)
+    try:
+        with Threads(steps, torch.device(device), idle) as threads:
+            for _ in range(STEPS):
+                with threads.step():
+                    found.append(torch.get_num_threads())
+                    time.sleep(seconds[found[-1]])
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+    return found
+
+
+def test_all_threads_are_used_while_they_pay():
+    assert used({1: 0.1, 2: 0.0}) == [1] * MEASURED + [2] * (STEPS - MEASURED)
+
+
+def test_one_thread_is_used_where_the_others_hold_it_up():
+    assert used({1: 0.0, 2: 0.1}) == [1] * MEASURED + [2] * RECENT + [1] * (STEPS - MEASURED - RECENT)
+
+
+def test_a_core_that_others_use_is_left_to_them():
+    assert used({1: 0.01, 2: 0.0}, idle=lambda: 0.5 * time.perf_counter()) == [1] * STEPS
+    assert used({1: 0.1, 2: 0.0}, idle=lambda: float("inf"))[-1] == 2  # where nobody tells
+    assert 0 < idle_seconds() < float("inf")
+
+
+def test_little_work_and_gpus_are_not_measured():
+    assert used({1: 0.0, 2: 0.0}, steps=WORTH - 1) == [2] * STEPS == used({1: 0.0, 2: 0.0}, device="meta")
