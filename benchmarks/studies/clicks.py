@@ -33,9 +33,9 @@ def iou(found: np.ndarray, true: np.ndarray) -> float:
 def next_click(found: np.ndarray, true: np.ndarray) -> tuple[float, float, bool]:
     """(x, y, on the object) of the pixel that lies deepest in what is missing, or in what is too much."""
     depths = [ndimage.distance_transform_edt(np.pad(wrong, 1))[1:-1, 1:-1] for wrong in (found & ~true, true & ~found)]
-    missing = depths[1].max() >= depths[0].max()
+    missing = bool(depths[1].max() >= depths[0].max())
     row, column = np.unravel_index(depths[missing].argmax(), true.shape)
-    return column + 0.5, row + 0.5, bool(missing)
+    return column + 0.5, row + 0.5, missing
 
 
 def clicked(image: np.ndarray, true: np.ndarray, most: int) -> Clicks:

@@ -10,6 +10,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from reffusion.clicks import spread
 from reffusion.clicks.graph import attached, least_cut
 from reffusion.clicks.marks import Clicks, marked
 from reffusion.clicks.picture import corrected, refined, shrunk, view_mask
@@ -24,6 +25,8 @@ SEEN = 1.0  # px of blending weight from which a Gaussian is shown to be the obj
 UNSURE = 0.006  # of the picture's larger side: pixels this near to a mask's rim do not vote
 AROUND = 0.05  # of the picture's larger side: the ring around a mask that a test photograph is judged by
 ABSENT, LEVEL = 3.0, 0.02  # times as far off as in that ring, beside a part of white: the object is not there
+ROUNDS = 1
+COLOR = 1.0
 SHOWN = 0.5  # of a pixel: the object covers it
 
 
@@ -86,27 +89,51 @@ def solved(
     order = sorted(clicks, key=lambda name: (-int(clicks[name].positive.sum()), name))
     masks, labels = dict(given), torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
     if masks:
-        labels = labelled(gaussians, near, cameras, masks)
+        labels = labelled(gaussians, near, cameras, masks, image_of)
     for name in order:
         if labels.any():
             before = voting.label_view(gaussians, labels, cameras[name]) > SHOWN
-            masks[name] = corrected(image_of(name), before, clicks[name])
+            masks[name] = corrected(image_of(name), before, clicks[name], relief(gaussians, cameras[name]))
         else:
-            masks[name] = view_mask(image_of(name), clicks[name])
-        labels = labelled(gaussians, near, cameras, masks)
+            masks[name] = view_mask(image_of(name), clicks[name], relief(gaussians, cameras[name]))
+        labels = labelled(gaussians, near, cameras, masks, image_of)
     return Solved(labels, masks)
 
 
+@torch.no_grad()
+def relief(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+    """float64 [H, W], logarithm of the depth times the focal length, px: its slope is that of surfaces, whatever their
+    distance. Where nothing is drawn it is as far as the farthest."""
+    depth = rasterizer.render(gaussians, camera, sh_degree=0).depth.double().cpu().numpy()
+    if not (depth > 0).any():
+        return np.zeros_like(depth)
+    return np.log(np.where(depth > 0, depth, depth.max())) * camera.fx
+
+
 def labelled(
-    gaussians: Gaussians, near: Neighbours, cameras: Mapping[str, Camera], masks: Mapping[str, np.ndarray]
+    gaussians: Gaussians,
+    near: Neighbours,
+    cameras: Mapping[str, Camera],
+    masks: Mapping[str, np.ndarray],
+    image_of: Callable[[str], np.ndarray],
 ) -> Tensor:
-    """bool [N]: the object, where the views with masks show the Gaussians by their votes, elsewhere by neighbours."""
+    """bool [N]: the object, where the views with masks show the Gaussians by their votes, elsewhere by neighbours and
+    by the colours of the other photographs."""
     sure = np.zeros((len(gaussians), 2))
     for name, mask in masks.items():
         ballots = torch.as_tensor(np.stack([_sure(mask), _sure(~mask)], -1), device=gaussians.means.device)
         sure += rasterizer.accumulate(gaussians, cameras[name], ballots.to(gaussians.means.dtype)).cpu().numpy()
     inside, outside = sure.T
-    labels = least_cut(np.minimum(outside, MOST), np.minimum(inside, MOST), near.pairs, near.likeness)
+    margin = max(1, round(UNSURE * max(next(iter(masks.values())).shape)))
+    never = spread.beside(gaussians, cameras, masks, margin) & (inside < SEEN)
+    inside, outside = np.minimum(inside, MOST), np.where(never, MOST, np.minimum(outside, MOST))
+    others = {name: camera for name, camera in cameras.items() if name not in masks}
+    for _ in range(ROUNDS):
+        known = spread.Known(inside > np.maximum(SEEN, outside), outside > np.maximum(SEEN, inside))
+        says, much = spread.told(gaussians, known, others, image_of).T
+        weight = np.minimum(COLOR * much, MOST) * ~(known.inside | known.outside)
+        for_it, against = inside + weight * np.maximum(says, 0), outside + weight * np.maximum(-says, 0)
+        labels = least_cut(against, for_it, near.pairs, near.likeness)
     labels = attached(labels, near.pairs, inside > np.maximum(SEEN, outside))
     return torch.as_tensor(labels, device=gaussians.means.device)
 
