@@ -39,8 +39,8 @@ class Known:
 def beside(
     gaussians: Gaussians, cameras: Mapping[str, Camera], masks: Mapping[str, np.ndarray], margin: int
 ) -> np.ndarray:
-    """bool [N]: centres that a view with a mask sees beside the object, or behind what it sees there, unless that stands
-    before the object and may hide it.
+    """bool [N]: centres that a view with a mask sees beside the object, or behind what it sees there, unless that
+    stands before the object and may hide it.
 
     Args:
         masks: view -> bool [H, W]; margin: px around one that say nothing.
@@ -73,8 +73,9 @@ def told(
     features = torch.as_tensor(np.stack([known.inside, known.outside], 1)).to(own)
     some = [names[i] for i in np.unique(np.linspace(0, len(names) - 1, min(VIEWS, len(names))).round().astype(int))]
     for name in some:
-        factor = min(1.0, LONGEST / max(cameras[name].width, cameras[name].height))
-        camera = cameras[name].resized(*(max(1, round(s * factor)) for s in (cameras[name].width, cameras[name].height)))
+        width, height = cameras[name].width, cameras[name].height
+        factor = min(1.0, LONGEST / max(width, height))
+        camera = cameras[name].resized(max(1, round(width * factor)), max(1, round(height * factor)))
         with torch.no_grad():
             drawn = rasterizer.render(gaussians, camera, features=features, sh_degree=0).features.cpu().numpy()
         image = cv2.resize(image_of(name), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
