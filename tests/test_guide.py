@@ -1,4 +1,5 @@
-"""docs/guide.md: every command in it is run, as it stands there, on a small scene. The longer ones with REFFUSION_SLOW=1."""
+"""docs/guide.md: every command in it is run as it stands there, on a small scene; with REFFUSION_SLOW=1 the longer
+ones, too."""
 
 from __future__ import annotations
 
