@@ -12,6 +12,7 @@ from reffusion.clicks.marks import OBJECT, OTHER, UNKNOWN, Clicks, marked
 LONGEST = 256  # px, the larger side of the picture that is cut
 BAND = 0.008  # of the picture's larger side: how far its edges may lie from the mask
 STEEP = 4.0, 10.0  # px of depth a pixel: a surface still, and no surface any more
+STANDS_OUT = 0.25  # share of an object's rim beyond which something lies behind, from which its relief is believed
 MARGIN = 3  # bands around a mask whose colours count
 
 
@@ -29,8 +30,14 @@ def view_mask(image: np.ndarray, clicks: Clicks, relief: np.ndarray | None = Non
     lab, small, marks = _small(image, clicks)
     border = np.ones(small, bool)
     border[1:-1, 1:-1] = False
-    grid = _grid(small)
-    mask = grown(lab, *grid, marks.ravel(), border.ravel(), _torn(relief, small, *grid)).reshape(small)
+    pairs, length = _grid(small)
+    torn = _torn(relief, small, pairs, length)
+    cut = lambda torn: grown(lab, pairs, length, marks.ravel(), border.ravel(), torn)
+    mask = cut(torn)
+    rim = mask[pairs[:, 0]] != mask[pairs[:, 1]]
+    if torn is not None and torn[rim].sum() < STANDS_OUT * rim.sum():
+        mask = cut(None)  # the fit does not know it as a thing of its own
+    mask = mask.reshape(small)
     mask |= ndimage.binary_fill_holes(mask) & ~_around(marks == OTHER, mask)
     return refined(image, _enlarged(mask, shape), marked(clicks, shape))
 
