@@ -9,13 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from torch import Tensor
 
 from reffusion.capture.clicked import as_photographed, photographed, straightened
 from reffusion.capture.lenses import load_lenses, photograph_sizes
 from reffusion.capture.reading import read_scene
 from reffusion.clicks import everywhere
 from reffusion.clicks.marks import Clicks
-from reffusion.clicks.picture import view_mask
+from reffusion.clicks.picture import corrected, view_mask
 from reffusion.command import root
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.files import BadInput
@@ -82,7 +83,8 @@ def _saved(folder: Path) -> dict:
 class Session:
     """The clicks on a scene; safe to call from several threads.
 
-    Masks are made for a view at once. Where the fit is there, a thread of its own makes those of all others.
+    Masks are made for a view at once. Where the fit is there, a thread of its own then asks the Gaussians, and makes
+    those of all views.
     """
 
     def __init__(self, capture: Capture, fitted: Callable[[], bool]):
@@ -96,6 +98,8 @@ class Session:
         self.gaussians = self.near = None
         self.todo: list[str] = []  # views whose masks are not yet those of the latest labels
         self.labels = None
+        self.reliefs: dict[str, np.ndarray] = {}
+        self.made, self.solved = 0, 0  # how often clicks changed, and up to which change they are in the labels
         self.unsaved = False
         self.turn, self.asked = threading.RLock(), threading.Event()
         for name, points in _saved(capture.folder)["clicks"].items():
@@ -124,12 +128,10 @@ class Session:
             self.clicks[name] = points
             if not points:
                 del self.clicks[name]
-            if self.gaussians is not None:
-                self._solve()
-                if name not in self.clicks and self.labels is not None:
-                    self._refine(name)
-            else:
-                self._show(name, view_mask(self.images[name], self._clicks_on(name)) if points else None)
+            if points or self.gaussians is None:
+                self._show(name, self._at_once(name))
+            self.made += 1
+            self.asked.set()
 
     def save(self) -> dict[str, int]:
         """Write masks and clicks.json; how many masks were "written", and "kept" because the page did not write them.
@@ -141,6 +143,8 @@ class Session:
             masks = {name: mask for name, mask in self.masks.items() if name not in self.capture.given}
             if not any(mask.any() for mask in masks.values()):
                 raise ValueError("nothing to save yet: click on the object first")
+            if self.gaussians is not None and self.solved < self.made:
+                self._take(self._solver()(), self.made)
             for name in list(self.todo):
                 self._refine(name)
             masks = {name: mask for name, mask in self.masks.items() if name not in self.capture.given}
@@ -173,7 +177,7 @@ class Session:
             return {
                 "views": views,
                 "fit": self.gaussians is not None,
-                "busy": len(self.todo),
+                "busy": len(self.todo) or int(self.gaussians is not None and self.solved < self.made),
                 "unsaved": self.unsaved,
                 "folder": str(self.capture.masks),
             }
@@ -197,21 +201,43 @@ class Session:
             self.masks[name] = mask
         self.versions[name] += 1
 
-    def _solve(self) -> None:
-        """The object by all clicks; masks of the views with clicks at once, those of all others are `todo`."""
-        clicks, given = {name: self._clicks_on(name) for name in self.clicks}, self.capture.given
+    def _at_once(self, name: str) -> np.ndarray | None:
+        """A view's mask by the clicks on it, before the Gaussians are asked."""
+        clicks, image, relief = self._clicks_on(name), self.images[name], None
+        if clicks is None:
+            return None
+        if self.gaussians is not None:
+            if name not in self.reliefs:
+                self.reliefs[name] = everywhere.relief(self.gaussians, self.scene.cameras[name])
+            relief = self.reliefs[name]
+        alone = not self.capture.given and everywhere.in_order(self._all_clicks())[0] == name
+        if alone or name not in self.masks:
+            return view_mask(image, clicks, relief)
+        return corrected(image, self.masks[name], clicks, relief)
+
+    def _all_clicks(self) -> dict[str, Clicks]:
+        return {name: self._clicks_on(name) for name in self.clicks}
+
+    def _solver(self) -> Callable[[], Tensor | None]:
+        """What finds the object by all clicks there are now, bool [N]; None where nothing says what it is."""
+        clicks, given = self._all_clicks(), self.capture.given
         if not any(each.positive.any() for each in clicks.values()) and not given:
-            self.labels, self.todo = None, []
+            return lambda: None
+        shown = {name: self.scene.cameras[name] for name in {*self.views, *given}}
+        ask = (self.gaussians, self.near, shown, self.images.__getitem__, clicks, given)
+        return lambda: everywhere.solved(*ask).labels
+
+    def _take(self, labels: Tensor | None, made: int) -> None:
+        """Show the labels that follow from so many changes of clicks: those views first that were clicked on."""
+        self.labels, self.solved = labels, made
+        if labels is None:
+            self.todo = []
             for name in self.views:
                 self._show(name, None)
             return
-        cameras = self.scene.cameras
-        found = everywhere.solved(self.gaussians, self.near, cameras, self.images.__getitem__, clicks, given)
-        self.labels = found.labels
-        for name in clicks:
+        for name in self.clicks:
             self._refine(name)
-        self.todo = [name for name in self.views if name not in clicks and name not in given]
-        self.asked.set()
+        self.todo = [name for name in self.views if name not in self.clicks and name not in self.capture.given]
 
     def _refine(self, name: str) -> None:
         camera, image, on = self.scene.cameras[name], self.images[name], self._clicks_on(name)
@@ -223,13 +249,21 @@ class Session:
         while True:
             if self.gaussians is None:
                 self.asked.wait(1.0)
+                self.asked.clear()
                 self._load()
+            elif self.solved < self.made:
+                with self.turn:
+                    made, solve = self.made, self._solver()
+                labels = solve()
+                with self.turn:
+                    if made == self.made > self.solved:
+                        self._take(labels, made)
             elif not self.todo:
                 self.asked.wait()
                 self.asked.clear()
             else:
                 with self.turn:
-                    if self.todo:
+                    if self.todo and self.solved == self.made:
                         self._refine(self.todo[0])
 
     def _load(self) -> None:
@@ -238,5 +272,4 @@ class Session:
             near = everywhere.neighbours(gaussians)
             with self.turn:
                 self.gaussians, self.near = gaussians, near
-                if self.clicks:
-                    self._solve()
+                self.made += bool(self.clicks)

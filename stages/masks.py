@@ -111,7 +111,8 @@ def clicked(
     """
     clicks = {name: Clicks(*points) for name, points in to_views(poses, params.clicks).items()}
     image_of = lambda name: load_views(poses, [name])[name]
-    found = everywhere.solved(gaussians, everywhere.neighbours(gaussians), scene.cameras, image_of, clicks, given)
+    show_it = {name: scene.cameras[name] for name in scene.train if name in given or name not in scene.clean}
+    found = everywhere.solved(gaussians, everywhere.neighbours(gaussians), show_it, image_of, clicks, given)
     if not found.labels.any():
         raise ValueError("scene.yaml: clicks: the views show nothing there; click in the middle of the object")
     names, masks = [name for name in (*scene.train, *scene.test) if name not in {*given, *scene.clean}], dict(given)

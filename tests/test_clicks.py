@@ -19,8 +19,11 @@ from reffusion.clicks.picture import corrected, view_mask
 from reffusion.io.files import BadInput
 from reffusion.io.images import load_image, load_mask, save_image, save_mask, to_uint8
 from reffusion.io.scene import load_mask_sets
+from reffusion.masks import voting
 from reffusion.params.poses import Params as Poses
 from reffusion.splat import rasterizer
+from reffusion.splat.conventions import SH0
+from reffusion.types import Gaussians
 from report.clicking import Capture, Session
 from report.mask import Server
 from stages import masks, poses
@@ -68,6 +71,17 @@ def test_one_click_finds_what_is_of_one_colour_and_another_the_rest():
     assert small.iou(view_mask(picture, on((150, 85), (150, 155), (150, 120))), disk) > 0.97
     assert not view_mask(picture, on((10, 10, False))).any()
     assert not view_mask(picture, Clicks(np.zeros((0, 2)), np.zeros(0, bool))).any()
+
+
+def test_where_the_depth_is_known_a_click_goes_as_far_as_the_surface():
+    picture, disk = scenery()
+    picture[:, 180:] = picture[70:90, 140:160].mean((0, 1))  # what stands behind has the disk's colour, and touches it
+    relief = np.where(disk, 0.0, 300.0)
+    alone, flat = view_mask(picture, on((150, 85))), view_mask(picture, on((150, 85)), 0 * relief)
+    assert small.iou(alone, disk) < 0.9 and (alone == flat).all()
+    assert small.iou(view_mask(picture, on((150, 85)), relief), disk) > 0.95
+    half = disk & (np.mgrid[:240, :320][1] < 150)
+    assert small.iou(corrected(picture, half, on((165, 90)), relief), disk) > 0.9
 
 
 def test_a_click_takes_back_what_it_is_on():
@@ -133,6 +147,39 @@ def test_a_mask_in_one_view_stays_as_it_was_given(scene):
     assert (found.masks["a1"] == truth("a1")).all()
     shown = everywhere.shown(everything, found.labels, small.CAMERAS["a4"], image_of("a4"))
     assert small.iou(shown, truth("a4")) > 0.9
+
+
+def sheet(origin, along, up, color, step=0.04):
+    """Small round Gaussians on a parallelogram: means [n, 3] and colours [n, 3]."""
+    origin, along, up = (np.array(each, float) for each in (origin, along, up))
+    rows, columns = (np.arange(step / 2, np.linalg.norm(each), step) / np.linalg.norm(each) for each in (up, along))
+    means = (origin + rows[:, None, None] * up + columns[None, :, None] * along).reshape(-1, 3)
+    return means, np.broadcast_to(color, means.shape)
+
+
+def test_sides_that_no_click_shows_are_found_by_the_other_photographs():
+    parts = [
+        sheet((-4, -2, 4), (8, 0, 0), (0, 4, 0), (0.2, 0.3, 0.7)),  # the wall
+        sheet((-0.5, -0.5, 2.5), (1, 0, 0), (0, 1, 0), (0.8, 0.5, 0.2)),  # a box: its front, and its sides in shade
+        sheet((-0.5, -0.5, 2.5), (0, 0, 0.8), (0, 1, 0), (0.5, 0.3, 0.12)),
+        sheet((0.5, -0.5, 2.5), (0, 0, 0.8), (0, 1, 0), (0.5, 0.3, 0.12)),
+    ]
+    means, colors = (torch.tensor(np.concatenate(each), dtype=torch.float32) for each in zip(*parts, strict=True))
+    count = len(means)
+    scene = Gaussians(
+        means,
+        torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        torch.full((count, 3), np.log(0.025)),
+        torch.full((count,), 4.0),
+        ((colors - 0.5) / SH0)[:, None],
+    )
+    cameras = {name: small.camera(name, x) for name, x in (("left", -1.6), ("middle", 0.0), ("right", 1.6))}
+    with torch.no_grad():
+        images = {n: to_uint8(rasterizer.render(scene, c).color.clamp(0, 1).numpy()) for n, c in cameras.items()}
+    box = torch.arange(count) >= len(parts[0][0])
+    near, mask = everywhere.neighbours(scene), voting.label_view(scene, box, cameras["middle"]) > 0.5
+    found = everywhere.labelled(scene, near, cameras, {"middle": mask}, images.__getitem__)
+    assert (found & box).sum() > 0.95 * box.sum() and (found & ~box).sum() < 0.01 * box.sum()
 
 
 # ---------------------------------------------------------------------------------------------- what a scene brings

@@ -33,19 +33,19 @@ def iou(found: np.ndarray, true: np.ndarray) -> float:
 def next_click(found: np.ndarray, true: np.ndarray) -> tuple[float, float, bool]:
     """(x, y, on the object) of the pixel that lies deepest in what is missing, or in what is too much."""
     depths = [ndimage.distance_transform_edt(np.pad(wrong, 1))[1:-1, 1:-1] for wrong in (found & ~true, true & ~found)]
-    missing = depths[1].max() >= depths[0].max()
+    missing = bool(depths[1].max() >= depths[0].max())
     row, column = np.unravel_index(depths[missing].argmax(), true.shape)
-    return column + 0.5, row + 0.5, bool(missing)
+    return column + 0.5, row + 0.5, missing
 
 
-def clicked(image: np.ndarray, true: np.ndarray, most: int) -> Clicks:
-    """The clicks that a person would make on a view, with what comes of each printed."""
+def clicked(image: np.ndarray, true: np.ndarray, most: int, relief: np.ndarray) -> Clicks:
+    """The clicks that a person would make on a view, with what comes of each printed; relief: `view_mask` has it."""
     chosen, found = [], np.zeros_like(true)
     while len(chosen) < most and iou(found, true) < RIGHT:
         chosen.append(next_click(found, true))
         clicks = Clicks(np.array([each[:2] for each in chosen]), np.array([each[2] for each in chosen]))
         began = time.monotonic()
-        found = view_mask(image, clicks)
+        found = view_mask(image, clicks, relief)
         print(f"  click {len(chosen)}: {iou(found, true):.3f}, {time.monotonic() - began:.1f} s", flush=True)
     return clicks
 
@@ -58,11 +58,12 @@ def measured(run: Path, most: int, sheet: Path | None) -> str:
         raise ValueError(f"{run / 'poses/masks'}: no masks to compare with")
     names = sorted(true)
     view, images = names[len(names) // 2], load_views(run / "poses", names)
-    clicks = clicked(images[view], true[view], most)
-    gaussians, began = load_ply(run / "fit/gaussians.ply"), time.monotonic()
+    gaussians = load_ply(run / "fit/gaussians.ply")
+    clicks = clicked(images[view], true[view], most, everywhere.relief(gaussians, scene.cameras[view]))
+    began, cameras = time.monotonic(), {name: scene.cameras[name] for name in names}
     near = everywhere.neighbours(gaussians)
-    solved = everywhere.solved(gaussians, near, scene.cameras, images.__getitem__, {view: clicks}, {})
-    shown = lambda name: everywhere.shown(gaussians, solved.labels, scene.cameras[name], images[name])
+    solved = everywhere.solved(gaussians, near, cameras, images.__getitem__, {view: clicks}, {})
+    shown = lambda name: everywhere.shown(gaussians, solved.labels, cameras[name], images[name])
     found = {name: shown(name) for name in names}
     seconds = time.monotonic() - began
     shares = {name: iou(found[name], true[name]) for name in names}

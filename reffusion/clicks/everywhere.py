@@ -10,7 +10,8 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from reffusion.clicks.graph import attached, least_cut
+from reffusion.clicks import spread
+from reffusion.clicks.graph import attached, least_cut, nearer
 from reffusion.clicks.marks import Clicks, marked
 from reffusion.clicks.picture import corrected, refined, shrunk, view_mask
 from reffusion.masks import voting
@@ -24,6 +25,10 @@ SEEN = 1.0  # px of blending weight from which a Gaussian is shown to be the obj
 UNSURE = 0.006  # of the picture's larger side: pixels this near to a mask's rim do not vote
 AROUND = 0.05  # of the picture's larger side: the ring around a mask that a test photograph is judged by
 ABSENT, LEVEL = 3.0, 0.02  # times as far off as in that ring, beside a part of white: the object is not there
+ROUNDS = 3  # at most, of colours, each by the labels of the one before
+COLOR = 1.0  # of a pixel in the mean view: what the colours of other views weigh
+UNLIKE = 1.0  # how much longer a way is where colours differ as neighbours do on average
+NEARER = 3.0  # what the way to the object, or to what it is not, may tell, beside what colours do
 SHOWN = 0.5  # of a pixel: the object covers it
 
 
@@ -34,10 +39,12 @@ class Neighbours:
     Attributes:
         pairs: [E, 2] int, each pair once.
         likeness: [E] in (0, 1].
+        way: [E] > 0, how far it is from one to the other: their distance, longer where their colours differ.
     """
 
     pairs: np.ndarray
     likeness: np.ndarray
+    way: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -61,7 +68,9 @@ def neighbours(gaussians: Gaussians) -> Neighbours:
     pairs = np.unique(np.sort(np.stack([own, near.ravel()], 1), 1), axis=0)
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
     square = ((color[pairs[:, 0]] - color[pairs[:, 1]]) ** 2).sum(1)
-    return Neighbours(pairs, np.exp(-square / (2 * square.sum() / max(len(square), 1) + 1e-12)))
+    unlike = square / (square.sum() / max(len(square), 1) + 1e-12)
+    apart = np.linalg.norm(means[pairs[:, 0]] - means[pairs[:, 1]], axis=1)
+    return Neighbours(pairs, np.exp(-unlike / 2), apart * (1 + UNLIKE * np.sqrt(unlike)) + 1e-12)
 
 
 def solved(
@@ -79,35 +88,66 @@ def solved(
 
     Args:
         near: `neighbours` of the Gaussians.
+        cameras: of the views whose photographs show the object.
         image_of: view -> uint8 [H, W, 3].
         clicks: view -> clicks in its undistorted pixels.
         given: view -> bool [H, W], taken as they are.
     """
-    order = sorted(clicks, key=lambda name: (-int(clicks[name].positive.sum()), name))
     masks, labels = dict(given), torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
     if masks:
-        labels = labelled(gaussians, near, cameras, masks)
-    for name in order:
+        labels = labelled(gaussians, near, cameras, masks, image_of)
+    for name in in_order(clicks):
         if labels.any():
             before = voting.label_view(gaussians, labels, cameras[name]) > SHOWN
-            masks[name] = corrected(image_of(name), before, clicks[name])
+            masks[name] = corrected(image_of(name), before, clicks[name], relief(gaussians, cameras[name]))
         else:
-            masks[name] = view_mask(image_of(name), clicks[name])
-        labels = labelled(gaussians, near, cameras, masks)
+            masks[name] = view_mask(image_of(name), clicks[name], relief(gaussians, cameras[name]))
+        labels = labelled(gaussians, near, cameras, masks, image_of)
     return Solved(labels, masks)
 
 
+@torch.no_grad()
+def relief(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+    """float64 [H, W], logarithm of the depth times the focal length, px: its slope is that of surfaces, whatever their
+    distance. Where nothing is drawn it is as far as the farthest."""
+    depth = rasterizer.render(gaussians, camera, sh_degree=0).depth.double().cpu().numpy()
+    if not (depth > 0).any():
+        return np.zeros_like(depth)
+    return np.log(np.where(depth > 0, depth, depth.max())) * camera.fx
+
+
+def in_order(clicks: Mapping[str, Clicks]) -> list[str]:
+    """The views, those first with most clicks on the object."""
+    return sorted(clicks, key=lambda name: (-int(clicks[name].positive.sum()), name))
+
+
 def labelled(
-    gaussians: Gaussians, near: Neighbours, cameras: Mapping[str, Camera], masks: Mapping[str, np.ndarray]
+    gaussians: Gaussians,
+    near: Neighbours,
+    cameras: Mapping[str, Camera],
+    masks: Mapping[str, np.ndarray],
+    image_of: Callable[[str], np.ndarray],
 ) -> Tensor:
-    """bool [N]: the object, where the views with masks show the Gaussians by their votes, elsewhere by neighbours."""
+    """bool [N]: the object, where the views with masks show the Gaussians by their votes, elsewhere by neighbours and
+    by the colours of the other photographs."""
     sure = np.zeros((len(gaussians), 2))
     for name, mask in masks.items():
         ballots = torch.as_tensor(np.stack([_sure(mask), _sure(~mask)], -1), device=gaussians.means.device)
         sure += rasterizer.accumulate(gaussians, cameras[name], ballots.to(gaussians.means.dtype)).cpu().numpy()
     inside, outside = sure.T
-    labels = least_cut(np.minimum(outside, MOST), np.minimum(inside, MOST), near.pairs, near.likeness)
-    labels = attached(labels, near.pairs, inside > np.maximum(SEEN, outside))
+    margin = max(1, round(UNSURE * max(next(iter(masks.values())).shape)))
+    never = spread.beside(gaussians, cameras, masks, margin) & (inside < SEEN)
+    inside, outside = np.minimum(inside, MOST), np.where(never, MOST, np.minimum(outside, MOST))
+    others = {name: camera for name, camera in cameras.items() if name not in masks}
+    known = spread.Known(inside > np.maximum(SEEN, outside), outside > np.maximum(SEEN, inside))
+    side, labels = nearer(near.pairs, near.way, known.inside, known.outside), known.inside
+    for _ in range(ROUNDS):
+        says, much = spread.told(gaussians, spread.Known(labels, known.outside), others, image_of).T
+        gain = np.minimum(COLOR * much, MOST) * (says + NEARER * side) * ~(known.inside | known.outside)
+        before, against, for_it = labels, outside + np.maximum(-gain, 0), inside + np.maximum(gain, 0)
+        labels = attached(least_cut(against, for_it, near.pairs, near.likeness), near.pairs, known.inside)
+        if (labels == before).all():
+            break
     return torch.as_tensor(labels, device=gaussians.means.device)
 
 

@@ -13,6 +13,7 @@ HARD = 1e4  # a cost that no sum of links outweighs
 BINS = 20  # of colours, a side of L*a*b* of 8 bit
 ROUNDS = 3  # of distances and colours, each by the labels of the one before
 BY_COLOR, BY_LIKELIHOOD = 0.3, 100.0  # what a way costs from the second round on: a step of colour, of likelihood
+ON_ONE, TORN = 0.35, 60.0  # where surfaces are known: what a step of colour counts on one, and what leaving one counts
 SMOOTH = 5.0  # cost of a border between two that look alike
 REACH = 150.0  # of colour and pixels, how far a click goes that corrects
 MOST = 3.0  # that colour may cost, natural logarithm of a ratio
@@ -42,7 +43,14 @@ def least_cut(object_cost: np.ndarray, other_cost: np.ndarray, pairs: np.ndarray
     return np.isin(nodes, reached)
 
 
-def grown(lab: np.ndarray, pairs: np.ndarray, length: np.ndarray, seeds: np.ndarray, weak: np.ndarray) -> np.ndarray:
+def grown(
+    lab: np.ndarray,
+    pairs: np.ndarray,
+    length: np.ndarray,
+    seeds: np.ndarray,
+    weak: np.ndarray,
+    torn: np.ndarray | None = None,
+) -> np.ndarray:
     """bool [N]: the object, grown from few seeds: a geodesic graph cut, whose colours follow from its own labels.
 
     Args:
@@ -50,34 +58,48 @@ def grown(lab: np.ndarray, pairs: np.ndarray, length: np.ndarray, seeds: np.ndar
         pairs: [E, 2] int, neighbours, each pair once; length: [E] > 0, how far apart they are, 1 = next to each other.
         seeds: int8 [N], OBJECT, OTHER or UNKNOWN; at least one OBJECT.
         weak: bool [N], the object less likely than not.
+        torn: [E] in [0, 1], 1 where two do not lie on one surface; None: not known.
     """
-    step = np.linalg.norm(lab[pairs[:, 0]] - lab[pairs[:, 1]], axis=1)
+    step = steps(lab, pairs, torn)
     smooth = _smoothness(step, length)
     other = (seeds == OTHER) | (weak & (seeds != OBJECT))
-    bins = tuple((lab * (BINS / 256)).astype(int).clip(0, BINS - 1).T)
     cost, labels = step, None
     for _ in range(ROUNDS):
         side = nearer(pairs, (cost + 1.0) * length, seeds == OBJECT, other)
         inside = np.maximum(side, 0) if labels is None else labels * (0.5 + side).clip(0.1, 1)
         outside = np.maximum(-side, 0) if labels is None else ~labels * (0.5 - side).clip(0.1, 1)
-        like, unlike = (_frequency(bins, weight) for weight in (inside, outside))
+        like, unlike = (frequency(lab, weight) for weight in (inside, outside))
         gain = 2 * side + np.log(like / unlike).clip(-MOST, MOST)
         against = np.where(seeds == OTHER, HARD, np.maximum(-gain, 0) * (seeds != OBJECT))
         against_other = np.where(seeds == OBJECT, HARD, np.maximum(gain, 0) * (seeds != OTHER))
         labels = least_cut(against, against_other, pairs, smooth)
         likelihood = like / (like + unlike)
-        cost = BY_COLOR * step + BY_LIKELIHOOD * np.abs(likelihood[pairs[:, 0]] - likelihood[pairs[:, 1]])
+        change = np.abs(likelihood[pairs[:, 0]] - likelihood[pairs[:, 1]])
+        cost = BY_COLOR * step + BY_LIKELIHOOD * (change if torn is None else ON_ONE * change)
     return attached(labels, pairs, seeds == OBJECT)
 
 
-def regrown(lab: np.ndarray, pairs: np.ndarray, length: np.ndarray, seeds: np.ndarray, was: np.ndarray) -> np.ndarray:
+def steps(lab: np.ndarray, pairs: np.ndarray, torn: np.ndarray | None) -> np.ndarray:
+    """[E] >= 0, how unlike neighbours are, in colour; where surfaces are known, in these first of all."""
+    color = np.linalg.norm(lab[pairs[:, 0]] - lab[pairs[:, 1]], axis=1)
+    return color if torn is None else ON_ONE * color + TORN * torn
+
+
+def regrown(
+    lab: np.ndarray,
+    pairs: np.ndarray,
+    length: np.ndarray,
+    seeds: np.ndarray,
+    was: np.ndarray,
+    torn: np.ndarray | None = None,
+) -> np.ndarray:
     """bool [N]: the labels `was`, but for what seeds that say otherwise reach without crossing a change of colour.
 
     Args:
-        lab, pairs, length, seeds: as `grown` takes them.
+        lab, pairs, length, seeds, torn: as `grown` takes them.
         was: bool [N].
     """
-    step = np.linalg.norm(lab[pairs[:, 0]] - lab[pairs[:, 1]], axis=1)
+    step = steps(lab, pairs, torn)
     smooth = _smoothness(step, length)
     wrong = (seeds == OBJECT) & ~was | (seeds == OTHER) & was
     right = (seeds == OBJECT) & was | (seeds == OTHER) & ~was
@@ -122,8 +144,9 @@ def _distance(way: sparse.csr_array, start: np.ndarray) -> np.ndarray:
     return np.where(reached, found, 2 * found[reached].max() + 1)
 
 
-def _frequency(bins: tuple[np.ndarray, ...], weight: np.ndarray) -> np.ndarray:
-    """[N], how frequent the colour of each is among all by weight; never 0."""
+def frequency(lab: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """[N], how frequent the colour of each is among all by weight; never 0. lab: [N, 3], L*a*b* of 8 bit."""
+    bins = tuple((lab * (BINS / 256)).astype(int).clip(0, BINS - 1).T)
     count = np.zeros((BINS,) * 3)
     np.add.at(count, bins, weight)
     count = ndimage.gaussian_filter(count, 0.7, mode="nearest")

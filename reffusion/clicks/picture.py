@@ -11,15 +11,18 @@ from reffusion.clicks.marks import OBJECT, OTHER, UNKNOWN, Clicks, marked
 
 LONGEST = 256  # px, the larger side of the picture that is cut
 BAND = 0.008  # of the picture's larger side: how far its edges may lie from the mask
+STEEP = 4.0, 10.0  # px of depth a pixel: a surface still, and no surface any more
+STANDS_OUT = 0.25  # share of an object's rim beyond which something lies behind, from which its relief is believed
 MARGIN = 3  # bands around a mask whose colours count
 
 
-def view_mask(image: np.ndarray, clicks: Clicks) -> np.ndarray:
+def view_mask(image: np.ndarray, clicks: Clicks, relief: np.ndarray | None = None) -> np.ndarray:
     """bool [H, W], True = the object that clicks are on; empty without a click on the object.
 
     Args:
         image: uint8 [H, W, 3].
         clicks: in its pixels.
+        relief: [H, W], logarithm of the depth times the focal length in pixels, where the scene has been fitted.
     """
     shape = image.shape[:2]
     if not clicks.positive.any():
@@ -27,19 +30,28 @@ def view_mask(image: np.ndarray, clicks: Clicks) -> np.ndarray:
     lab, small, marks = _small(image, clicks)
     border = np.ones(small, bool)
     border[1:-1, 1:-1] = False
-    mask = grown(lab, *_grid(small), marks.ravel(), border.ravel()).reshape(small)
+    pairs, length = _grid(small)
+    torn = _torn(relief, small, pairs, length)
+    cut = lambda torn: grown(lab, pairs, length, marks.ravel(), border.ravel(), torn)
+    mask = cut(torn)
+    rim = mask[pairs[:, 0]] != mask[pairs[:, 1]]
+    if torn is not None and torn[rim].sum() < STANDS_OUT * rim.sum():
+        mask = cut(None)  # the fit does not know it as a thing of its own
+    mask = mask.reshape(small)
     mask |= ndimage.binary_fill_holes(mask) & ~_around(marks == OTHER, mask)
     return refined(image, _enlarged(mask, shape), marked(clicks, shape))
 
 
-def corrected(image: np.ndarray, before: np.ndarray, clicks: Clicks) -> np.ndarray:
-    """bool [H, W]: the mask `before` [H, W] with what clicks say against it, which reaches to where colours change."""
+def corrected(image: np.ndarray, before: np.ndarray, clicks: Clicks, relief: np.ndarray | None = None) -> np.ndarray:
+    """bool [H, W]: the mask `before` [H, W] with what clicks say against it, which reaches to where colours change, and
+    to the edges of surfaces where their relief is known."""
     lab, small, marks = _small(image, clicks)
     was = cv2.resize(before.astype(np.float32), small[::-1], interpolation=cv2.INTER_AREA) > 0.5
     wrong = np.where((marks == OBJECT) & ~was | (marks == OTHER) & was, marks, UNKNOWN)
     if not wrong.any():
         return refined(image, before, marked(clicks, before.shape))
-    mask = regrown(lab, *_grid(small), marks.ravel(), was.ravel()).reshape(small)
+    grid = _grid(small)
+    mask = regrown(lab, *grid, marks.ravel(), was.ravel(), _torn(relief, small, *grid)).reshape(small)
     same = _enlarged(mask == was, before.shape)
     return refined(image, np.where(same, before, ~before), marked(clicks, before.shape))
 
@@ -82,6 +94,19 @@ def refined(image: np.ndarray, mask: np.ndarray, marks: np.ndarray) -> np.ndarra
 def shrunk(mask: np.ndarray, by: int) -> np.ndarray:
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * by + 1,) * 2)
     return cv2.erode(mask.astype(np.uint8), kernel, borderValue=1) > 0
+
+
+def _torn(
+    relief: np.ndarray | None, small: tuple[int, int], pairs: np.ndarray, length: np.ndarray
+) -> np.ndarray | None:
+    """[E] in [0, 1]: how surely neighbours lie on two surfaces, one behind the other; `view_mask` has the relief."""
+    if relief is None:
+        return None
+    size = small[::-1]
+    seen = cv2.resize(relief.astype(np.float32), size, interpolation=cv2.INTER_AREA) * (size[0] / relief.shape[1])
+    seen = cv2.medianBlur(seen, 3).ravel()
+    slope = np.abs(seen[pairs[:, 0]] - seen[pairs[:, 1]]) / length
+    return ((slope - STEEP[0]) / (STEEP[1] - STEEP[0])).clip(0, 1)
 
 
 def _around(marks: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -1,0 +1,77 @@
+"""docs/guide.md: every command in it is run as it stands there, on a small scene; with REFFUSION_SLOW=1 the longer
+ones, too."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+GUIDE = (ROOT / "docs/guide.md").read_text(encoding="utf-8")
+COMMANDS = [line.split("#")[0].strip() for line in re.findall(r"^make .*", GUIDE, re.MULTILINE)]
+QUICK = ("plan", "check", "mask")
+LITTLE = "fit.iterations=20 personalize.steps=2 distill.iterations=2"
+
+pytestmark = pytest.mark.skipif(
+    not Path(sys.prefix, ".ready").exists(), reason="the tests do not run in an environment that make has set up"
+)
+
+
+@pytest.fixture(scope="module")
+def mine(generate, tmp_path_factory) -> Path:
+    """A folder with photographs, and masks of them."""
+    folder = tmp_path_factory.mktemp("guide") / "my-photos"
+    generate.generate(folder, 0, generate.KINDS["mini"])
+    return folder
+
+
+def as_typed(command: str, mine: Path) -> list[str]:
+    words = [f"scene={mine}" if word.startswith("scene=") else word for word in command.split()]
+    return [*words, f"runs={mine.parent / 'runs'}", "profile=laptop", f"set={LITTLE}", f"VENV={sys.prefix}"]
+
+
+def ran(command: str, mine: Path) -> str:
+    done = subprocess.run(as_typed(command, mine), cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_the_guide_names_these_commands():
+    assert {command.split()[-1] for command in COMMANDS} == {*QUICK, "reference", "all", "report"}
+    assert all(command.split()[1] == "scene=my-photos" for command in COMMANDS)
+
+
+def test_before_any_long_work(mine):
+    assert "fit" in ran(*(c for c in COMMANDS if c.endswith("plan")), mine)
+    ran(*(c for c in COMMANDS if c.endswith("check")), mine)
+    assert (mine.parent / "runs/my-photos/check.png").is_file()
+
+
+def test_the_mask_page(mine):
+    (command,) = (c for c in COMMANDS if c.endswith("mask"))
+    group = {"start_new_session": True, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
+    with subprocess.Popen([*as_typed(command, mine), "port=18390"], cwd=ROOT, **group) as serving:
+        try:
+            address = next(found[0] for line in serving.stdout if (found := re.findall(r"http://127\S+", line)))
+            assert "What shall go?" in urllib.request.urlopen(address, timeout=20).read().decode()
+        finally:
+            os.killpg(serving.pid, signal.SIGINT)
+
+
+@pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="a minute; set REFFUSION_SLOW=1")
+def test_to_the_end(mine):
+    for goal, made in (("reference", "to_paint"), ("all", "evaluate/scene.ply"), ("report", "report.html")):
+        ran(*(c for c in COMMANDS if c.endswith(goal)), mine)
+        assert goal == "reference" or (mine.parent / "runs/my-photos" / made).exists()
+
+
+def test_pictures_are_there_and_small():
+    pictures = [ROOT / "docs" / name for name in re.findall(r"\]\((images/[^)]+)\)", GUIDE)]
+    assert len(pictures) == 4 and sum(path.stat().st_size for path in pictures) < 300_000
