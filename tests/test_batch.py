@@ -137,7 +137,8 @@ def test_variants_of_several_scenes_at_once(tmp_path):
 
 def test_stopped_while_several_run(tmp_path):
     root = toys(tmp_path, 60)
-    code = "import sys; from test_batch import *; batch(asked(Path(sys.argv[1]), ''), Path(sys.argv[1]) / 'many',"
+    code = "import sys; from test_batch import *; signal.signal(signal.SIGINT, signal.default_int_handler);"
+    code = f"{code} batch(asked(Path(sys.argv[1]), ''), Path(sys.argv[1]) / 'many',"
     code = f"{code} By(machine(4)))"
     environment = {**os.environ, "PYTHONPATH": f"{REPO}:{REPO}/tests"}
     process = subprocess.Popen([sys.executable, "-c", code, str(root)], env=environment, stderr=subprocess.DEVNULL)

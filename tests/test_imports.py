@@ -175,11 +175,12 @@ def test_the_command_starts_at_once():
 @pytest.mark.parametrize("path", sources("report"), ids=named)
 def test_report_reads_through_io(path):
     own = {name for name in imports(path) if name.split(".")[0] in OWN - {"report"}}
-    draws = ("flight", "turntable", "view", "drawn", "layers", "unseen")
+    draws = ("flight", "turntable", "view", "drawn", "layers", "unseen", "study")
     drawing = ("reffusion.splat.rasterizer", "reffusion.types", "reffusion.score.sight") if path.stem in draws else ()
     clicked = ("reffusion.clicks", "reffusion.capture", "reffusion.params", "reffusion.command")
     making = clicked if path.stem == "clicking" else ()  # masks
-    assert all(name.startswith(("reffusion.io", *drawing, *making)) for name in own), own
+    chance = ("reffusion.seeding",)
+    assert all(name.startswith(("reffusion.io", *chance, *drawing, *making)) for name in own), own
 
 
 @pytest.mark.parametrize("path", sources("reffusion"), ids=named)
