@@ -88,6 +88,9 @@ def test_several_at_once_and_a_second_call_runs_what_failed(tmp_path, capsys):
     (root / "many/c/number.txt").write_text("20")
     assert batch(asked(root, ""), root / "many", By(machine(4))) == 0
     assert len(spans(root)) == 4 and "failed" not in (root / "runs/results.md").read_text()
+    (root / "alone").mkdir()
+    for other in "ac":  # it waits for three
+        (root / f"alone/begun-{other}").touch()
     alone = Request(root, root / "alone", str(root / "many/b"), "laptop")
     run_scene(alone, "all")
     for path in (root / "alone/b").glob("*/*.json"):
