@@ -160,6 +160,7 @@ def equals_one_machine(root: Path, variants: str, least: int) -> None:
 DRIVER = """
 import sys
 from test_cluster import *
+signal.signal(signal.SIGINT, signal.default_int_handler)
 from runner.compare import batch
 root = Path(sys.argv[1])
 engine = chosen("ray", sys.argv[2], root, root / "runs")
@@ -174,7 +175,7 @@ def test_the_driver_killed_and_started_again(tmp_path, cluster, send):
     environment = {**os.environ, "PYTHONPATH": f"{REPO}:{REPO}/tests"}
     command = [sys.executable, "-c", DRIVER, str(root), cluster.address]
     process = subprocess.Popen(command, env=environment)
-    while not list((root / "runs").glob("begun-*")):
+    while len(list((root / "runs").glob("begun-*"))) < 3:  # `poses` of all three is in place
         assert process.poll() is None
         time.sleep(0.05)
     process.send_signal(send)
