@@ -7,9 +7,8 @@ from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
 from reffusion.clicks.marks import OBJECT, OTHER
+from reffusion.cuts import HARD, least_cut
 
-UNIT = 1000  # of capacity: a cost of 1 in whole numbers
-HARD = 1e4  # a cost that no sum of links outweighs
 BINS = 20  # of colours, a side of L*a*b* of 8 bit
 ROUNDS = 3  # of distances and colours, each by the labels of the one before
 BY_COLOR, BY_LIKELIHOOD = 0.3, 100.0  # what a way costs from the second round on: a step of colour, of likelihood
@@ -17,30 +16,6 @@ ON_ONE, TORN = 0.35, 60.0  # where surfaces are known: what a step of colour cou
 SMOOTH = 5.0  # cost of a border between two that look alike
 REACH = 150.0  # of colour and pixels, how far a click goes that corrects
 MOST = 3.0  # that colour may cost, natural logarithm of a ratio
-
-
-def least_cut(object_cost: np.ndarray, other_cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray) -> np.ndarray:
-    """bool [N], True = the object: the labels of the least total cost.
-
-    Args:
-        object_cost, other_cost: [N] >= 0, cost of being the object, and of not being it.
-        pairs: [E, 2] int, neighbours, each pair once.
-        strength: [E] >= 0, cost of a pair with different labels.
-    """
-    count = len(object_cost)
-    source, sink, nodes = count, count + 1, np.arange(count)
-    shared = np.minimum(object_cost, other_cost)
-    whole = lambda cost: np.minimum(np.round(cost * UNIT), HARD * UNIT).astype(np.int32)
-    capacity = [whole(other_cost - shared), whole(object_cost - shared), whole(strength), whole(strength)]
-    first = [np.full(count, source), nodes, pairs[:, 0], pairs[:, 1]]
-    second = [nodes, np.full(count, sink), pairs[:, 1], pairs[:, 0]]
-    links = tuple(np.concatenate(each) for each in (first, second))
-    network = sparse.coo_array((np.concatenate(capacity), links), (count + 2, count + 2)).tocsr()
-    left = network - csgraph.maximum_flow(network, source, sink).flow
-    left.data = (left.data > 0).astype(np.int32)
-    left.eliminate_zeros()
-    reached = csgraph.breadth_first_order(left, source, return_predecessors=False)
-    return np.isin(nodes, reached)
 
 
 def grown(

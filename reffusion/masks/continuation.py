@@ -34,6 +34,8 @@ STAYS = 0.05  # weight of the plane as it was, within the hole, against what is 
 ACROSS = 0.9  # cosine of the angle between two planes under which they cross
 RATHER = 1.0  # cosine to a plane over that to another, from which a surface faces rather as the one does
 EVENED = 0.01  # of the image's width: the scale on which a surface's direction is taken
+WIDER = 2.0  # times as wide a map on which what the plane surrounds is told
+SURROUNDS = 0.5  # share of the border of what views look through that must be seen to be of the plane
 TOUCHING = 0.25  # share of an unknown patch's border that must be seen for the plane to go on into it
 
 
@@ -49,6 +51,7 @@ class Plane:
             polished part look like a pit.
         free: bool [CELLS, CELLS], where views look through it: there it is not.
         seen: bool [CELLS, CELLS], where views show it.
+        pit: bool [CELLS, CELLS], `free` cells that the plane surrounds: a mirror in it, or a window.
     """
 
     normal: np.ndarray
@@ -60,6 +63,7 @@ class Plane:
     within: np.ndarray
     free: np.ndarray
     seen: np.ndarray
+    pit: np.ndarray
 
     def depth(self, camera: Camera) -> np.ndarray:
         """[H, W] camera z where a view's rays meet the plane; inf where they do not."""
@@ -225,13 +229,36 @@ def _mapped(
     along = np.stack([first / np.linalg.norm(first), np.cross(normal, first / np.linalg.norm(first))])
     origin, pitch = centre - (centre @ normal - height) * normal, 2 * reach / CELLS
     nowhere = np.zeros((CELLS, CELLS), bool)
-    plane = Plane(normal, height, origin, along, pitch, nowhere, nowhere, nowhere, nowhere)
+    plane = Plane(normal, height, origin, along, pitch, nowhere, nowhere, nowhere, nowhere, nowhere)
     # On the object's side: a table's underside, seen from below, is not the top under the object.
     facing = normal if centre @ normal > height else -normal
+    seen, free, hidden = _looked_at(plane, facing, views)
+    wider = replace(plane, pitch=WIDER * pitch)
+    pit = wider.in_cells(_surrounded(*_looked_at(wider, facing, views)[:2]), plane.cells.reshape(-1, 3))
+    pit = free & ndimage.binary_dilation(pit.reshape(free.shape), iterations=2)
+    return replace(plane, seen=seen, free=free, pit=pit), hidden
+
+
+def _looked_at(
+    plane: Plane, facing: np.ndarray, views: Sequence[Witness]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """bool [CELLS, CELLS] each: where views show the plane, from the side that `facing` [3] points to, where they look
+    through it, and where the object hides it from some."""
     said = votes(plane.cells.reshape(-1, 3), views, np.broadcast_to(facing, (CELLS * CELLS, 3)))
-    seen = ((said.seen >= 1) & (said.seen >= said.free)).reshape(nowhere.shape)
-    free = ((said.free >= 2) & (said.free > said.seen)).reshape(nowhere.shape)
-    return replace(plane, seen=seen, free=free), (said.hidden > 0).reshape(nowhere.shape)
+    seen, free = (said.seen >= 1) & (said.seen >= said.free), (said.free >= 2) & (said.free > said.seen)
+    return tuple(each.reshape(CELLS, CELLS) for each in (seen, free, said.hidden > 0))
+
+
+def _surrounded(seen: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """bool [CELLS, CELLS]: the patches of free cells that seen ones surround."""
+    patches, count = ndimage.label(np.pad(free, 1, constant_values=True))
+    found = np.zeros(patches.shape, bool)
+    around = np.pad(seen, 1)
+    for patch in set(range(1, count + 1)) - {patches[0, 0]}:
+        inside = patches == patch
+        border = ndimage.binary_dilation(inside) & ~inside
+        found |= inside & (around[border].mean() > SURROUNDS)
+    return found[1:-1, 1:-1]
 
 
 def _continued(

@@ -9,12 +9,20 @@ from scipy.sparse.linalg import splu
 ABSOLUTE = 0.02  # weight of the patches' own colours against their changes: far from the border they hold
 
 
-def blended(known: np.ndarray, hole: np.ndarray, right: np.ndarray, below: np.ndarray, own: np.ndarray) -> np.ndarray:
+def blended(
+    known: np.ndarray,
+    hole: np.ndarray,
+    right: np.ndarray,
+    below: np.ndarray,
+    own: np.ndarray,
+    beside: np.ndarray | None = None,
+) -> np.ndarray:
     """[N, 3], the colours of the hole's pixels in reading order (screened Poisson, as in Perez et al. 2003).
 
     Args:
         known: [H, W, 3], read beside the hole. hole: bool [H, W].
         right, below: [H, W, 3], wanted change to the next pixel. own: [H, W, 3], wanted colours.
+        beside: bool [H, W], which pixels outside the hole go on in it; None: all.
     """
     rows, columns = np.nonzero(hole)
     index = np.full(hole.shape, -1)
@@ -23,6 +31,8 @@ def blended(known: np.ndarray, hole: np.ndarray, right: np.ndarray, below: np.nd
     for down, along, change in ((0, 1, right), (0, -1, right), (1, 0, below), (-1, 0, below)):
         row, column = rows + down, columns + along
         here = np.flatnonzero((row >= 0) & (column >= 0) & (row < hole.shape[0]) & (column < hole.shape[1]))
+        if beside is not None:
+            here = here[(hole | beside)[row[here], column[here]]]
         row, column = row[here], column[here]
         first = np.minimum(rows[here], row), np.minimum(columns[here], column)
         total[here] += 1

@@ -20,8 +20,7 @@ from reffusion.paint.paint2d import blanked, telea
 from reffusion.texture import search, votes
 from reffusion.texture.blending import blended
 from reffusion.texture.matches import NONE, PATCH, Choice, Compared, Hole, Match, Pictures
-from reffusion.texture.regular import Regular, nothing
-from reffusion.texture.shown import Shown, planes_of
+from reffusion.texture.shown import Shown
 
 COARSEST = 40.0  # px that the hole may be wide at the coarsest level: there its parts are laid out
 SMALL = 16.0  # px: a wider hole has two levels at least
@@ -46,12 +45,7 @@ class Completed:
 
 
 def complete(
-    target: Shown,
-    hole: np.ndarray,
-    sources: Sequence[Shown],
-    smooth: Sequence[int] = (),
-    seed: int = 0,
-    repeats: Regular | None = None,
+    target: Shown, hole: np.ndarray, sources: Sequence[Shown], smooth: Sequence[int] = (), seed: int = 0
 ) -> Completed:
     """The target with its hole filled by patches of the sources, which may be the target itself.
 
@@ -59,7 +53,6 @@ def complete(
         target: its image is read outside the hole only. hole: bool [H, W].
         smooth: numbers of the planes along which patches are carried; on rough ground that would smear grass.
         seed: of the search.
-        repeats: how smooth planes repeat themselves (`how_they_repeat`).
     """
     if not hole.any():
         return Completed(target.image.copy(), 0.0)
@@ -68,12 +61,11 @@ def complete(
     if not levels:
         return Completed(telea(target.image, hole), float(NONE))
     state = np.array([seeding.seed_for(seed, "texture") | 1], np.uint64)
-    repeats = repeats or nothing(planes_of([target, *sources]))
     match = before = None
     for k, (now, mask, pictures) in enumerate(levels):
         first, last = k == 0, k == len(levels) - 1
-        pixels = _pixels(target, mask, 2 ** (len(levels) - 1 - k), smooth, pictures, repeats)
-        of = Compared(pixels, pictures, now, _trust(mask), repeats)
+        pixels = _pixels(target, mask, 2 ** (len(levels) - 1 - k), smooth, pictures)
+        of = Compared(pixels, pictures, now, _trust(mask))
         choice = _choice(pictures, int(pixels.surface.max()))
         if first:
             match = _laid_out(of, mask, choice, state)
@@ -115,7 +107,7 @@ def _levels(target: Shown, hole: np.ndarray, sources: Sequence[Shown], smooth: S
     levels = []
     for _ in range(count):
         marked = [_marked(values, each, smooth, scale) for (values, _), each in zip(seen, sources, strict=True)]
-        pictures = _pictures(marked, [masked for _, masked in seen], sources, scale, planes_of([target, *sources]))
+        pictures = _pictures(marked, [masked for _, masked in seen], sources, scale)
         if (pictures.surface >= 0).sum() < FEWEST:
             break
         levels.append((_marked(now, target, smooth, scale), mask, pictures))
@@ -158,14 +150,14 @@ def _halved(values: np.ndarray, masked: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _pictures(
-    marked: Sequence[np.ndarray], masks: Sequence[np.ndarray], sources: Sequence[Shown], scale: int, planes: int
+    marked: Sequence[np.ndarray], masks: Sequence[np.ndarray], sources: Sequence[Shown], scale: int
 ) -> Pictures:
     """The sources at 1 / `scale` of their size; `marked` values [h, w, C] and `masks` [h, w] have it already."""
     height, width = (max(masked.shape[axis] for masked in masks) for axis in (0, 1))
     shape = (len(masks), height, width)
     found = Pictures(
         np.zeros((*shape, 6), np.float32), np.full(shape, -1, np.int32), np.zeros((*shape, 4), np.float32),
-        np.ones(shape, np.float32), np.zeros((*shape, 2), np.float32), np.zeros((len(masks), planes + 1, 3, 3)),
+        np.ones(shape, np.float32),
     )  # fmt: skip
     for k, (values, masked, source) in enumerate(zip(marked, masks, sources, strict=True)):
         here = (k, slice(masked.shape[0]), slice(masked.shape[1]))
@@ -175,23 +167,7 @@ def _pictures(
         found.surface[here] = np.where(clear & source.usable[every], source.surface[every], -1)
         found.to_pixels[here] = _inverse(scale * source.to_plane[every]).reshape(*masked.shape, 4)
         found.size[here] = scale * source.size[every]
-        found.place[here] = source.place[every]
-        for plane in range(1, planes + 1):
-            found.across[k, plane] = _across(found.surface[k] == plane, found.place[k])
     return found
-
-
-def _across(shown: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """[3, 3] float64, from places [H, W, 2] on a plane to the pixels, bool [H, W], that show it; zeros for too few."""
-    rows, columns = np.nonzero(shown)
-    if len(rows) < FEWEST:
-        return np.zeros((3, 3))
-    some = np.linspace(0, len(rows) - 1, FEWEST).astype(int)
-    rows, columns = rows[some], columns[some]
-    found, _ = cv2.findHomography(
-        place[rows, columns].astype(np.float64), np.stack([columns, rows], 1).astype(float), 0
-    )
-    return np.zeros((3, 3)) if found is None else found
 
 
 def _inverse(matrices: np.ndarray) -> np.ndarray:
@@ -202,9 +178,7 @@ def _inverse(matrices: np.ndarray) -> np.ndarray:
     return np.divide(adjugate, area[..., None, None], out=np.zeros(matrices.shape), where=area[..., None, None] != 0)
 
 
-def _pixels(
-    target: Shown, mask: np.ndarray, scale: int, smooth: Sequence[int], pictures: Pictures, repeats: Regular
-) -> Hole:
+def _pixels(target: Shown, mask: np.ndarray, scale: int, smooth: Sequence[int], pictures: Pictures) -> Hole:
     """The hole's pixels at 1 / `scale` of the target's size. Along planes that hardly any source shows nothing is
     carried."""
     rows, columns = np.nonzero(mask)
@@ -215,8 +189,7 @@ def _pixels(
     carried = [k for k in smooth if (pictures.surface == k).sum() >= FEWEST]
     to_plane = (scale * target.to_plane[at]).reshape(-1, 4).astype(np.float32)
     size = (scale * target.size[at]).astype(np.float32)
-    planar, place = np.isin(surface, carried), target.place[at].astype(np.float32)
-    return Hole(rows, columns, index, surface, planar, to_plane, size, place, repeats.turning, repeats.centre)
+    return Hole(rows, columns, index, surface, np.isin(surface, carried), to_plane, size)
 
 
 def _choice(pictures: Pictures, most: int) -> Choice:

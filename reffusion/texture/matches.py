@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from reffusion.kernels.compiled import inlined
-from reffusion.texture.regular import Regular
 
 PATCH = 3  # pixels from a patch's middle to its border
 TURN = 0.15  # radians by which a patch may be turned in its plane
@@ -27,17 +26,12 @@ class Pictures(NamedTuple):
         surface: [K, H, W] int32, the plane shown, 1, 2, ...; 0: none; -1: no patch may have its middle here.
         to_pixels: [K, H, W, 4] float32, rows of the matrix from the plane's coordinates to pixels.
         size: [K, H, W] float32, the world's length of a pixel.
-        place: [K, H, W, 2] float32, where on its plane a pixel lies.
-        across: [K, S, 3, 3] float64, from places on each plane to pixels (x, y, 1); zeros where a picture shows too
-            little of it.
     """
 
     values: np.ndarray
     surface: np.ndarray
     to_pixels: np.ndarray
     size: np.ndarray
-    place: np.ndarray
-    across: np.ndarray
 
 
 class Hole(NamedTuple):
@@ -47,8 +41,6 @@ class Hole(NamedTuple):
         row, column: [N] int64. index: [H, W] int64, a pixel's number, or -1.
         surface: [N] int32 as in `Pictures`. planar: [N] bool, whether patches may be carried along the plane.
         to_plane: [N, 4] float32, rows of the matrix from pixels to the plane's coordinates. size: [N] float32.
-        place: [N, 2] float32 as in `Pictures`. turning: [S] bool, centre: [S, 2] float32: whether, and about what, a
-            plane maps itself onto itself (`Regular`).
     """
 
     row: np.ndarray
@@ -58,9 +50,6 @@ class Hole(NamedTuple):
     planar: np.ndarray
     to_plane: np.ndarray
     size: np.ndarray
-    place: np.ndarray
-    turning: np.ndarray
-    centre: np.ndarray
 
 
 class Compared(NamedTuple):
@@ -70,14 +59,12 @@ class Compared(NamedTuple):
         hole: its pixels. pictures: the sources.
         now: [H, W, C] float32, the picture as it is now.
         weight: [H, W] float32, how much each of its pixels counts.
-        regular: which motions along the planes map them onto themselves.
     """
 
     hole: Hole
     pictures: Pictures
     now: np.ndarray
     weight: np.ndarray
-    regular: Regular
 
 
 class Match(NamedTuple):
@@ -105,18 +92,6 @@ class Choice(NamedTuple):
 
 
 @inlined
-def moved(hole, n, place):
-    """From pixel n's place on its plane to another: the two parts of the offset (`Regular`), and the turn in it."""
-    surface, here = hole.surface[n], hole.place[n]
-    if not hole.turning[surface]:
-        return place[0] - here[0], place[1] - here[1], np.float32(0)
-    centre = hole.centre[surface]
-    x, y, u, v = here[0] - centre[0], here[1] - centre[1], place[0] - centre[0], place[1] - centre[1]
-    turn = math.atan2(x * v - y * u, x * u + y * v)
-    return math.sqrt(u * u + v * v) - math.sqrt(x * x + y * y), np.float32(turn), np.float32(turn)
-
-
-@inlined
 def carried(hole, n, pictures, planar, picture, row, column, angle):
     """Whether the scale is within bounds, and by rows the matrix from steps around pixel n to steps in the picture."""
     if not planar:
@@ -125,8 +100,7 @@ def carried(hole, n, pictures, planar, picture, row, column, angle):
         if abs(scale - 1) < SAME_SCALE:
             scale = np.float32(1)
         return True, scale, np.float32(0), np.float32(0), scale
-    _, _, turn = moved(hole, n, pictures.place[picture, row, column])
-    cosine, sine = np.float32(math.cos(angle + turn)), np.float32(math.sin(angle + turn))
+    cosine, sine = np.float32(math.cos(angle)), np.float32(math.sin(angle))
     b, f = hole.to_plane[n], pictures.to_pixels[picture, row, column]
     r0, r1 = cosine * b[0] - sine * b[2], cosine * b[1] - sine * b[3]
     r2, r3 = sine * b[0] + cosine * b[2], sine * b[1] + cosine * b[3]

@@ -1,62 +1,66 @@
 """Motions along a plane that map what it shows onto itself: planks onto planks, tiles onto tiles.
 
-Offsets between like patches of a picture crowd at a few values (after He and Sun 2012); on a plane they are taken in
-its own metric coordinates, so that they hold in every picture of it. Where the lines of a plane meet in a point, as the
-joints of a round table do, they are turns about that point, and offsets away from it. A hole is best filled by patches
-moved so.
+What is seen of the plane is drawn in the plane's own metric coordinates and compared with itself, moved: the motions by
+which it looks most like itself repeat it, in every picture of it. Where the lines of a plane meet in a point, as the
+joints of a round table do, it is turned about that point instead of shifted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from scipy import ndimage
-from scipy.spatial import cKDTree
 
 from reffusion import seeding
 
 SIDE = 224  # cells at most a side of a plane's map
-PATCH = 8  # cells a side of what is compared
-COMPONENTS = 16  # of its principal ones
-ASKED = 4000  # patches for which like ones are looked for
-LIKE = 40  # nearest in looks, of which the first that lies far enough away counts
-AWAY = 0.06  # of the map's side, at least: nearer everything is like itself
-TILE = 16  # cells a side: like patches in one tile, which overlap, count once for an offset
-BINS = 96  # cells from the middle of the table of offsets to its border
-SHARP, EVEN = 2.0, 9.0  # cells, widths over which offsets are counted, and over which chance would even them out
-CHANCE, SURE = 5.0, 12.0  # standard deviations above chance up to which an offset is none, and from which it is regular
-LONE = 0.02  # offsets a bin that chance brings at least
-FEWEST = 400  # cells with a whole patch, without which nothing can be said
-PEAKS = 60  # offsets that are tried
-KNOWN = 7.0  # standard deviations above chance from which they are
+FEWEST = 400  # cells that must be seen of the plane for anything to be said
+BOTH = 0.1  # of the cells seen, and as many at least, that must be seen of it moved, too
+EVEN = 6.0  # cells: what changes over more is shading, and is not compared
+AWAY = 3  # cells, at least: nearer everything is like itself
+ALIKE = 0.6  # correlation of the motion by which a plane looks most like itself; stone reaches 0.5, planks 0.7
+OF_BEST = 0.5  # of the highest correlation, which the others must reach
+FIRST = 0.75  # of it, from which the smallest turn is the one that the others are multiples of
+ASIDE = 0.2  # of that turn, by which a multiple may lie beside where it is expected
+MOST = 60  # motions
+SEVERAL = 4  # shifts that a plane must have: both ways, and twice as far, say
 GAP = 9  # px: narrower gaps in what is shown of a plane, where its depth is uneven, close
 LINES, PAIRS = 3000, 400  # steepest cells that tell of lines, and pairs of them that tell where lines meet
 STRAIGHT = 0.035  # sine of the angle by which a line may miss that point
 MEETING = 1.25  # times as many lines that must go through a point as in one direction
 NEAR = 3.0  # map sides from the map's middle within which they meet
+LEAST = 16  # cells a side of a map
 SEED = 0  # of what is drawn
 
 
-class Regular(NamedTuple):
-    """What is known of S planes, the first of which, number 0, stands for none.
+@dataclass(frozen=True)
+class Repeats:
+    """How a plane repeats itself.
 
     Attributes:
-        table: [S, 2 BINS + 1, 2 BINS + 1] float32 in [0, 1], how regular an offset is; its middle is no offset.
-        pitch: [S, 2] float32, a bin's sides; 0 where nothing is known.
-        peaks: [P, 2] float32, the most regular offsets of all planes. starts: [S + 1] int64, where each one's begin.
-        turning: [S] bool. centre: [S, 2] float32: offsets are (along x, along y) in the plane's unit, or, turning,
-            (away from the centre in it, about it in radians).
+        centre: [2], the place about which it is turned; None: it is shifted.
+        motions: [M, 2], shifts in the plane's unit; or [M, 1], turns in radians.
+        cell: length to which they are known, in the plane's unit, at most of what is seen of it.
     """
 
-    table: np.ndarray
-    pitch: np.ndarray
-    peaks: np.ndarray
-    starts: np.ndarray
-    turning: np.ndarray
-    centre: np.ndarray
+    centre: np.ndarray | None
+    motions: np.ndarray
+    cell: float
+
+    def moved(self, places: np.ndarray, motion: np.ndarray) -> np.ndarray:
+        """Places [N, 2] on the plane, moved."""
+        if self.centre is None:
+            return places + motion
+        cosine, sine = np.cos(motion[0]), np.sin(motion[0])
+        return (places - self.centre) @ np.array([[cosine, sine], [-sine, cosine]]) + self.centre
+
+    def turn(self, motion: np.ndarray) -> np.ndarray:
+        """[2, 2], by which a motion turns a step on the plane."""
+        angle = 0.0 if self.centre is None else motion[0]
+        return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
 class Seen(NamedTuple):
@@ -75,32 +79,70 @@ class Map(NamedTuple):
     pitch: np.ndarray
 
 
-def nothing(planes: int) -> Regular:
-    """Of planes numbered up to `planes`, that nothing is known."""
-    count, side = planes + 1, 2 * BINS + 1
-    table, pitch, centre = (np.zeros((count, *shape), np.float32) for shape in ((side, side), (2,), (2,)))
-    return Regular(table, pitch, np.zeros((0, 2), np.float32), np.zeros(count + 1, int), np.zeros(count, bool), centre)
+def repeats(seen: Seen) -> Repeats | None:
+    """How the plane repeats itself, after what a picture shows of it; None: it does not."""
+    low, high = seen.places.min(0), seen.places.max(0)
+    flat = _map(seen, low, high)
+    if flat is None:
+        return None
+    found = _centre(flat, np.random.default_rng(seeding.seed_for(SEED, "lines")))
+    if found is None:
+        motions = _shifts(_likeness(flat)) * flat.pitch
+        return Repeats(None, motions, flat.pitch[0]) if len(motions) else None
+    centre = low + found * flat.pitch
+    unrolled = _unrolled(seen, centre)
+    if unrolled is None:
+        return None
+    motions = _turns(_likeness(unrolled)[:, 0], 2 * np.pi / unrolled.pitch[1]) * unrolled.pitch[1]
+    return Repeats(centre, motions[:, None], unrolled.pitch[0]) if len(motions) else None
 
 
-def regular(planes: int, seen: Mapping[int, Seen]) -> Regular:
-    """The regular offsets of those planes, of numbers up to `planes`, of which a picture is given."""
-    found, peaks = nothing(planes), [np.zeros((0, 2), np.float32)] * (planes + 1)
-    for number, picture in seen.items():
-        draws = np.random.default_rng(seeding.seed_for(SEED, "regular", str(number)))
-        low, high = picture.places.min(0), picture.places.max(0)
-        flat = _map(picture, low, high)
-        if flat is None:
-            continue
-        centre = _centre(flat, draws)
-        if centre is not None:
-            found.turning[number], found.centre[number] = True, low + centre * flat.pitch
-            flat = _unrolled(picture, found.centre[number])
-        if flat is not None:
-            above = _offsets(flat, draws)
-            found.table[number], found.pitch[number] = ((above - CHANCE) / (SURE - CHANCE)).clip(0, 1), flat.pitch
-            peaks[number] = _peaks(above) * flat.pitch
-    starts = np.cumsum([0] + [len(each) for each in peaks])
-    return found._replace(peaks=np.concatenate(peaks).astype(np.float32), starts=starts)
+def _likeness(flat: Map) -> np.ndarray:
+    """[h, w], correlation of a map with itself, moved by a row and a column (negative ones from the end); 0 where too
+    little of both is known."""
+    known = cv2.erode(flat.known.astype(np.uint8), np.ones((5, 5)), borderValue=0) > 0
+    grey = flat.values.mean(2)
+    fine = np.where(known, grey - cv2.GaussianBlur(grey, (0, 0), EVEN), 0.0).astype(np.float64)
+    size = [cv2.getOptimalDFTSize(2 * side) for side in fine.shape]
+    picture, mask, power = (np.fft.rfft2(each, size) for each in (fine, known.astype(float), fine**2))
+    back = lambda spectrum: np.fft.irfft2(spectrum, size)
+    both = np.sqrt(np.maximum(back(power * mask.conj()) * back(power.conj() * mask), 1e-6))
+    return np.where(back(np.abs(mask) ** 2) > max(FEWEST, BOTH * known.sum()), back(np.abs(picture) ** 2) / both, 0.0)
+
+
+def _shifts(likeness: np.ndarray) -> np.ndarray:
+    """[M, 2], the shifts (x, y) in cells by which a map looks most like itself, the best first."""
+    height, width = (side // 2 for side in likeness.shape)
+    near = np.fft.fftshift(likeness)
+    peak = (near == ndimage.maximum_filter(near, 5)) & (near > OF_BEST * ALIKE)
+    peak[height - AWAY : height + AWAY + 1, width - AWAY : width + AWAY + 1] = False
+    rows, columns = np.nonzero(peak)
+    order = np.argsort(-near[rows, columns], kind="stable")[:MOST]
+    if len(order) < SEVERAL or near[rows, columns].max() < ALIKE:
+        return np.zeros((0, 2))
+    return np.stack([columns[order] - width, rows[order] - height], 1).astype(np.float64)
+
+
+def _turns(likeness: np.ndarray, whole: float) -> np.ndarray:
+    """[M], the turns in rows by which a map of directions looks like itself: multiples, either way, of the smallest
+    that is about as good as any.
+
+    Args:
+        likeness: [h], by turn. whole: rows of a whole turn.
+    """
+    some = likeness[: min(len(likeness) // 2, int(whole / 2) + 1)]
+    rows = np.arange(AWAY, len(some) - 1)
+    rows = rows[(some[rows] > some[rows - 1]) & (some[rows] >= some[rows + 1]) & (some[rows] > OF_BEST * ALIKE)]
+    if not len(rows) or some[rows].max() < ALIKE:
+        return np.zeros(0)
+    before, at, after = (some[rows + step] for step in (-1, 0, 1))
+    exact = rows + 0.5 * (before - after) / (before - 2 * at + after)
+    first = exact[some[rows] > FIRST * some[rows].max()].min()
+    found = []
+    for k in range(1, int(whole / 2 / first) + 1):
+        beside = np.abs(exact - k * first)
+        found.append(exact[beside.argmin()] if beside.min() < ASIDE * first else k * first)
+    return np.array([way * turn for turn in found[: MOST // 2] for way in (1, -1)])
 
 
 def _map(seen: Seen, low: np.ndarray, high: np.ndarray) -> Map | None:
@@ -135,7 +177,7 @@ def _drawn(seen: Seen, places: np.ndarray, pitch: np.ndarray) -> Map | None:
     """What the picture shows at places [h, w, 2]."""
     some = np.linspace(0, len(seen.places) - 1, min(len(seen.places), 2000)).astype(int)
     across, _ = cv2.findHomography(seen.places[some].astype(np.float64), seen.pixels[some].astype(np.float64), 0)
-    if across is None or min(places.shape[:2]) < 2 * PATCH:
+    if across is None or min(places.shape[:2]) < LEAST:
         return None
     at = cv2.perspectiveTransform(places.reshape(1, -1, 2), across).reshape(places.shape).astype(np.float32)
     shown = np.zeros(seen.image.shape[:2], np.uint8)
@@ -174,7 +216,7 @@ def _centre(flat: Map, draws: np.random.Generator) -> np.ndarray | None:
     best = points[int(np.argmax([mine.sum() for mine in through]))]
     for _ in range(5):
         mine = _through(best, at, across)
-        weight = 1 / np.maximum(np.linalg.norm(at[mine] - best, axis=1), PATCH)[:, None]
+        weight = 1 / np.maximum(np.linalg.norm(at[mine] - best, axis=1), LEAST / 2)[:, None]
         best = np.linalg.lstsq(across[mine] * weight, heights[mine, None] * weight, rcond=None)[0][:, 0]
     return best if _through(best, at, across).sum() > MEETING * parallel else None
 
@@ -183,40 +225,3 @@ def _through(point: np.ndarray, at: np.ndarray, across: np.ndarray) -> np.ndarra
     """bool [L]: lines at [L, 2], normal to `across` [L, 2], that go through the point."""
     away = point - at
     return np.abs((across * away).sum(1)) < STRAIGHT * np.linalg.norm(away, axis=1)
-
-
-def _offsets(flat: Map, draws: np.random.Generator) -> np.ndarray:
-    """[2 BINS + 1, 2 BINS + 1], by how many standard deviations a map's offsets are more than chance brings."""
-    table = np.zeros((2 * BINS + 1,) * 2, np.float32)
-    whole = cv2.erode(flat.known.astype(np.uint8), np.ones((PATCH, PATCH)), anchor=(0, 0), borderValue=0) > 0
-    rows, columns = np.nonzero(whole[: 1 - PATCH, : 1 - PATCH])
-    if len(rows) < FEWEST:
-        return table
-    patches = np.lib.stride_tricks.sliding_window_view(flat.values, (PATCH, PATCH), (0, 1))
-    looks = _reduced(patches[rows, columns].reshape(len(rows), -1))
-    asked = draws.permutation(len(rows))[:ASKED]
-    _, near = cKDTree(looks).query(looks[asked], min(LIKE, len(rows)), eps=1.0)
-    places = np.stack([columns, rows], 1)
-    offsets = places[near] - places[asked][:, None]
-    far = np.abs(offsets).max(-1) > max(PATCH, AWAY * max(whole.shape))
-    first = offsets[np.arange(len(asked)), far.argmax(1)]
-    counted = np.unique(np.concatenate([first, places[asked] // TILE], 1)[far.any(1)], axis=0)[:, :2]
-    inside = counted[(np.abs(counted) <= BINS).all(1)]
-    np.add.at(table, (inside[:, 1] + BINS, inside[:, 0] + BINS), 1)
-    sharp, even = (ndimage.gaussian_filter(table + table[::-1, ::-1], sigma) for sigma in (SHARP, EVEN))
-    deviation = np.sqrt(np.maximum(even, LONE) / (2 * np.pi * SHARP**2))  # of counts by chance, each of them twice
-    return (sharp - even) / deviation
-
-
-def _reduced(patches: np.ndarray) -> np.ndarray:
-    """[N, COMPONENTS] float32 of patches [N, D]."""
-    centred = patches - patches.mean(0)
-    _, vectors = np.linalg.eigh(centred.T @ centred)
-    return np.ascontiguousarray((centred @ vectors[:, -COMPONENTS:]).astype(np.float32))
-
-
-def _peaks(above: np.ndarray) -> np.ndarray:
-    """[P, 2], the offsets (x, y), in bins, that are more frequent than their neighbours, at most PEAKS."""
-    rows, columns = np.nonzero((above == ndimage.maximum_filter(above, 5)) & (above > KNOWN))
-    order = np.argsort(-above[rows, columns], kind="stable")[:PEAKS]
-    return np.stack([columns[order] - BINS, rows[order] - BINS], 1).astype(np.float32)

@@ -11,14 +11,11 @@ import math
 import numpy as np
 
 from reffusion.kernels.compiled import FREE_ROUNDING, inlined, kernel
-from reffusion.texture.matches import FARTHEST, NEAREST, NONE, PATCH, TURN, carried, carried_match, moved
-from reffusion.texture.regular import BINS
+from reffusion.texture.matches import FARTHEST, NEAREST, NONE, PATCH, TURN, carried, carried_match
 
 ELSEWHERE = 1.5  # times that a patch of another surface counts, or of one much nearer or farther
 BEFORE = 1.25  # scale from which a patch is so much nearer that it would have been seen
 FOREIGN = 4.0  # times that such a patch counts besides, or one of another plane
-IRREGULAR = 3.0  # times that a patch of the same plane counts that is moved as nothing on it repeats, or turned
-STEADY = 0.05  # radians by which a patch is turned at most that is moved as the plane repeats itself
 
 
 @inlined
@@ -39,21 +36,6 @@ def _price(hole, n, surface, size):
     price = np.float32(1) if same and FARTHEST < ratio < NEAREST else np.float32(ELSEWHERE)
     foreign = ratio > BEFORE or (not same and surface > 0 and hole.surface[n] > 0)
     return price * np.float32(FOREIGN) if foreign else price
-
-
-@inlined
-def _irregularity(n, picture, row, column, angle, of):
-    """How many times a patch of the pixel's own plane counts: 1 where it is moved as the plane repeats itself."""
-    surface, regular = of.hole.surface[n], of.regular
-    pitch = regular.pitch[surface]
-    if pitch[0] <= 0:
-        return np.float32(1)
-    along, about, _ = moved(of.hole, n, of.pictures.place[picture, row, column])
-    x, y = math.floor(along / pitch[0] + 0.5) + BINS, math.floor(about / pitch[1] + 0.5) + BINS
-    if x < 0 or y < 0 or x > 2 * BINS or y > 2 * BINS:
-        return np.float32(IRREGULAR)
-    share = regular.table[surface, y, x] * max(np.float32(0), 1 - abs(angle) / np.float32(STEADY))
-    return np.float32(IRREGULAR) - np.float32(IRREGULAR - 1) * share
 
 
 def misfit(n, planar, picture, y, x, angle, limit, of):
@@ -80,8 +62,6 @@ def misfit(n, planar, picture, y, x, angle, limit, of):
         for dx in range(left, right + 1):
             mass += of.weight[middle_row + dy, middle_column + dx]
     price = _price(hole, n, surface, pictures.size[picture, row, column])
-    if planar:
-        price *= _irregularity(n, picture, row, column, angle, of)
     most = limit * mass / price
     for dy in range(top, bottom + 1):
         for dx in range(left, right + 1):
@@ -162,30 +142,6 @@ def _anywhere(match, n, of, choice, state):
         _tried(match, n, planar, place[0], place[1], place[2], angle, of)
 
 
-@inlined
-def _regularly(match, n, of, state):
-    """A place on the pixel's own plane, moved as the plane repeats itself."""
-    surface = of.hole.surface[n]
-    first, count = of.regular.starts[surface], of.regular.starts[surface + 1] - of.regular.starts[surface]
-    peak = of.regular.peaks[first + min(int(_uniform(state) * count), count - 1)]
-    picture = min(int(_uniform(state) * len(of.pictures.across)), len(of.pictures.across) - 1)
-    across, place = of.pictures.across[picture, surface], of.hole.place[n]
-    u, v = place[0] + peak[0], place[1] + peak[1]
-    if of.hole.turning[surface]:
-        centre = of.hole.centre[surface]
-        x, y = place[0] - centre[0], place[1] - centre[1]
-        distance = math.sqrt(x * x + y * y)
-        grown = (distance + peak[0]) / max(distance, 1e-9)
-        u = centre[0] + grown * (math.cos(peak[1]) * x - math.sin(peak[1]) * y)
-        v = centre[1] + grown * (math.sin(peak[1]) * x + math.cos(peak[1]) * y)
-    scale = across[2, 0] * u + across[2, 1] * v + across[2, 2]
-    if scale != 0:
-        x = (across[0, 0] * u + across[0, 1] * v + across[0, 2]) / scale
-        y = (across[1, 0] * u + across[1, 1] * v + across[1, 2]) / scale
-        if abs(x) < 1e6 and abs(y) < 1e6:
-            _tried(match, n, True, np.int32(picture), np.float32(y), np.float32(x), np.float32(0), of)
-
-
 @kernel
 def search(todo, rounds, tries, match, of, choice, state):
     """Better patches for the pixels `todo`, as in PatchMatch: propagation, places nearby, and `tries` anywhere.
@@ -206,11 +162,5 @@ def search(todo, rounds, tries, match, of, choice, state):
             match.misfit[n] = now
             _propagated(match, n, of)
             _nearby(match, n, span, of, state)
-            repeats = (
-                of.hole.planar[n] and of.regular.starts[of.hole.surface[n]] < of.regular.starts[of.hole.surface[n] + 1]
-            )
             for _ in range(tries):
-                if repeats and _uniform(state) < 0.5:
-                    _regularly(match, n, of, state)
-                else:
-                    _anywhere(match, n, of, choice, state)
+                _anywhere(match, n, of, choice, state)

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-
-from reffusion.texture.regular import FEWEST, Regular, Seen, regular
 
 
 @dataclass(frozen=True)
@@ -39,21 +36,3 @@ def alone(image: np.ndarray, hole: np.ndarray) -> Shown:
     return Shown(
         image, hole, ~hole, np.zeros(hole.shape, np.int64), unit, np.ones(hole.shape), np.zeros((*hole.shape, 2))
     )
-
-
-def planes_of(pictures: Sequence[Shown]) -> int:
-    """The largest number of a plane."""
-    return max(int(each.surface.max()) for each in pictures)
-
-
-def how_they_repeat(target: Shown, sources: Sequence[Shown], smooth: Sequence[int]) -> Regular:
-    """How smooth planes repeat themselves, each by the source that shows most of it."""
-    seen = {}
-    for plane in smooth:
-        shown = [source.usable & ~source.masked & (source.surface == plane) for source in sources]
-        most = int(np.argmax([mask.sum() for mask in shown])) if shown else 0
-        if shown and shown[most].sum() >= FEWEST:
-            rows, columns = np.nonzero(shown[most])
-            pixels = np.stack([columns, rows], 1)
-            seen[plane] = Seen(pixels, sources[most].place[rows, columns], sources[most].image)
-    return regular(planes_of([target, *sources]), seen)

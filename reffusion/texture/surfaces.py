@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -17,8 +17,9 @@ from reffusion.masks.witness import Witness, pixels, witnesses
 from reffusion.paint.margin import hull, widened
 from reffusion.paint.painting import drawn_across
 from reffusion.texture.completion import Completed, complete
-from reffusion.texture.regular import Regular
-from reffusion.texture.shown import Shown, how_they_repeat
+from reffusion.texture.montage import montage
+from reffusion.texture.regular import FEWEST, Repeats, Seen, repeats
+from reffusion.texture.shown import Shown
 from reffusion.types import Camera, Gaussians
 
 OTHERS = 3  # photographs beside the view's own that patches are taken from
@@ -102,38 +103,57 @@ def completions(
     Args:
         hole: bool [H, W]. hidden: bool [H, W], C: where the photograph shows the object.
     """
-    target, sources, smooth, repeats = _told(image, hole, camera, hidden, around)
-    return [complete(target, hole, sources, smooth, seed, repeats) for seed in seeds]
+    target, sources, smooth, how = _told(image, hole, camera, hidden, around)
+    for plane, each in how.items():
+        picture, filled = montage(target, hole, sources, plane, each)
+        hole = hole & ~filled
+        target = replace(target, image=picture, masked=target.masked & ~filled, usable=target.usable | filled)
+    return [complete(target, hole, sources, smooth, seed) for seed in seeds]
 
 
 def _told(
     image: np.ndarray, hole: np.ndarray, camera: Camera, hidden: np.ndarray, around: Around
-) -> tuple[Shown, list[Shown], list[int], Regular]:
-    """The view, the pictures that it is filled from, the planes along which patches are carried, and how these repeat
-    themselves; see `completions`."""
+) -> tuple[Shown, list[Shown], list[int], dict[int, Repeats]]:
+    """The view, the pictures that it is filled from, the view's own photograph first, the planes along which patches
+    are carried, and how those that repeat themselves do; see `completions`."""
     own = next(view for view in around.views if view.camera.name == camera.name)
-    surface, depth = _behind(own, hidden, around.planes)
+    surface, depth = _behind(own, hidden, hole | hidden, around.planes)
     frames, places = (of(surface, camera, around.planes) for of in (_frames, _places))
     target = Shown(image, hole, ~hole, surface, frames, depth / camera.fx, places)
     shown = [(view, around.photos[view.camera.name]) for view in (own, *_others(own, around.views))]
     sources = [_source(*each, around) for each in (*shown, *around.completed)]
     roughness = {k: _roughness(plane, around) for k, plane in enumerate(around.planes, start=1)}
-    repeats = how_they_repeat(target, sources, [k for k, rough in roughness.items() if rough < LAID])
-    smooth = [k for k, rough in roughness.items() if rough < SMOOTH or repeats.starts[k + 1] > repeats.starts[k]]
-    return target, sources, smooth, repeats
+    even = [k for k, rough in roughness.items() if rough < LAID and (surface == k)[hole].any()]
+    how = {k: found for k in even if (found := _how_it_repeats(k, sources)) is not None}
+    return target, sources, [k for k, rough in roughness.items() if rough < SMOOTH or k in how], how
 
 
-def _behind(own: Witness, hidden: np.ndarray, planes: Sequence[Plane]) -> tuple[np.ndarray, np.ndarray]:
+def _how_it_repeats(plane: int, sources: Sequence[Shown]) -> Repeats | None:
+    """By the source that shows most of it."""
+    shown = [source.usable & ~source.masked & (source.surface == plane) for source in sources]
+    most = int(np.argmax([mask.sum() for mask in shown]))
+    rows, columns = np.nonzero(shown[most])
+    if len(rows) < FEWEST:
+        return None
+    return repeats(Seen(np.stack([columns, rows], 1), sources[most].place[rows, columns], sources[most].image))
+
+
+def _behind(
+    own: Witness, hidden: np.ndarray, asked: np.ndarray, planes: Sequence[Plane]
+) -> tuple[np.ndarray, np.ndarray]:
     """What a view shows without the object: planes' numbers, int [H, W], and depth, [H, W] float64.
 
-    In C the nearest plane that is seen there by others or goes on there; where there is none, see `_drawn`.
+    Where it is `asked` for, bool [H, W], C and its rim, the nearest plane that is seen there by others or goes on there; where there is none, see `_drawn`.
     """
-    known = (own.depth > 0) & ~hidden
-    depth = _drawn(own.depth.astype(np.float64), known, hidden) if known.any() else np.ones(hidden.shape)
-    surface, nearest = np.where(hidden, 0, _labelled(own.depth, own.camera, planes)), np.full(hidden.shape, np.inf)
+    shown = _without_pits(own, planes)
+    known = (shown > 0) & ~hidden
+    depth = _drawn(shown, known, hidden) if known.any() else np.ones(hidden.shape)
+    surface, nearest = np.where(hidden, 0, _labelled(shown, own.camera, planes)), np.full(hidden.shape, np.inf)
     for k, plane in enumerate(planes, start=1):
         at = plane.depth(own.camera)
-        there = plane.on(plane.seen | plane.within | plane.goes_on, at, own.camera, hidden) & (at < nearest)
+        whole = plane.seen | plane.within | plane.goes_on | plane.pit
+        before = hidden | (at < (1 + ON) * shown)
+        there = plane.on(whole, at, own.camera, asked & before) & (at < nearest)
         surface[there], nearest[there] = k, at[there]
     return surface, np.where(np.isfinite(nearest), nearest, depth)
 
@@ -158,13 +178,24 @@ def _drawn(depth: np.ndarray, known: np.ndarray, hidden: np.ndarray) -> np.ndarr
 
 def _source(view: Witness, picture: np.ndarray, around: Around) -> Shown:
     """A view's picture as a source of patches: what it shows near the object, beside its mask."""
-    depth = view.depth.astype(np.float64)
+    depth = _without_pits(view, around.planes)
     points = geometry.unproject(depth, view.camera)
     near = np.linalg.norm(points - around.centre, axis=-1) < NEARBY * around.radius
     surface = _labelled(depth, view.camera, around.planes)
     size = np.where(depth > 0, depth, 1.0) / view.camera.fx
     frames, places = (of(surface, view.camera, around.planes) for of in (_frames, _places))
     return Shown(picture, widened(view.hidden, BESIDE), near & (depth > 0), surface, frames, size, places)
+
+
+def _without_pits(view: Witness, planes: Sequence[Plane]) -> np.ndarray:
+    """[H, W] float64, the depth that a view shows; that of the plane around it where it looks into a mirror: what is
+    polished, too, repeats itself along the plane."""
+    depth = view.depth.astype(np.float64)
+    for plane in planes:
+        at = plane.depth(view.camera)
+        mirrored = plane.on(plane.pit, at, view.camera, at < depth)
+        depth[mirrored] = at[mirrored]
+    return depth
 
 
 def _others(own: Witness, views: Sequence[Witness]) -> list[Witness]:
