@@ -121,6 +121,9 @@ class Local:
                 process.send_signal(signal.SIGINT)
         try:
             yield
+        except KeyboardInterrupt:
+            self._stopped = True  # what was finished all the same is put in place, and nothing begun after it
+            raise
         finally:
             with self._change:
                 self._running.discard(process)
@@ -177,10 +180,17 @@ def visible_cards() -> list[str]:
     return sorted((path.name.removeprefix("nvidia") for path in Path("/dev").glob("nvidia[0-9]*")), key=int)
 
 
-def carry_out(task: Task, lock: int | None = None, follow: Callable[[Any], Any] = nullcontext) -> Ended:
-    """Do a task in a fresh process of this machine, and wait for its end. An interrupt is passed on and raised again.
+def carry_out(
+    task: Task,
+    lock: int | None = None,
+    follow: Callable[[Any], Any] = nullcontext,
+    told: Callable[[], bool] | None = None,
+) -> Ended:
+    """Do a task in a fresh process of this machine, and wait for its end. An interrupt is passed on to it, and shows in
+    its exit code alone: one that had finished has done so.
 
-    lock: an open file that the process holds, too. follow: a context, given the process, while that runs."""
+    lock: an open file that the process holds, too. follow: a context, given the process, while that runs. told: asked
+    every second whether to interrupt it, where no signal comes."""
     heard, result = os.pipe()  # no file: that there is no room for one may be what must be told
     line = json.dumps(task.line | {"result": result, "lock": lock})
     answer: dict[str, Any] = {}
@@ -195,16 +205,9 @@ def carry_out(task: Task, lock: int | None = None, follow: Callable[[Any], Any] 
             with suppress(BrokenPipeError):  # a child that is gone already has its code below
                 process.stdin.write(line + "\n")
                 process.stdin.flush()  # and left open: the child ends when this process does
-            # Ray's interrupt is seen between waits only; here a signal ends the wait.
-            code = process.wait() if lock is not None else _polled(process)
+            code = _code_of(process, told) if told else process.wait()
     except KeyboardInterrupt:
-        process.send_signal(signal.SIGINT)
-        try:
-            process.wait(GRACE)
-        except (subprocess.TimeoutExpired, KeyboardInterrupt):
-            process.kill()
-            process.wait()
-        raise
+        code = _interrupted(process)
     finally:
         with suppress(BrokenPipeError):
             process.stdin.close()
@@ -214,10 +217,20 @@ def carry_out(task: Task, lock: int | None = None, follow: Callable[[Any], Any] 
     return Ended(answer, code)
 
 
-def _polled(process: "subprocess.Popen[str]") -> int:
-    while True:
+def _code_of(process: "subprocess.Popen[str]", told: Callable[[], bool]) -> int:
+    while not told():
         with suppress(subprocess.TimeoutExpired):
             return process.wait(1.0)
+    return _interrupted(process)
+
+
+def _interrupted(process: "subprocess.Popen[str]") -> int:
+    process.send_signal(signal.SIGINT)
+    try:
+        return process.wait(GRACE)
+    except (subprocess.TimeoutExpired, KeyboardInterrupt):
+        process.kill()
+        return process.wait()
 
 
 ENGINES = {"ray": ("Ray", "ray"), "slurm": ("Slurm", "submitit")}  # name -> class in on_<name>.py, what it imports
