@@ -45,10 +45,11 @@ class Task:
 @dataclass(frozen=True)
 class Ended:
     """What a stage's process told (see child.run), empty where it told nothing, and its exit code; negative: by a
-    signal."""
+    signal. interrupted: who waited for it was."""
 
     answer: dict[str, Any]
     code: int
+    interrupted: bool = False
 
 
 class Engine(Protocol):
@@ -101,6 +102,8 @@ class Local:
             where |= {"cards": ",".join(cards)} if cards and self._all_cards > 1 else {}
             ended = carry_out(replace(task, line=task.line | where), lock, self._follow)
             beside = len(self._given) - 1
+        if ended.interrupted:
+            self._stopped = True  # what had finished is put in place, and nothing begun after it
         if self._stopped and ended.code != 0:
             raise KeyboardInterrupt
         return ended, beside
@@ -121,9 +124,6 @@ class Local:
                 process.send_signal(signal.SIGINT)
         try:
             yield
-        except KeyboardInterrupt:
-            self._stopped = True  # what was finished all the same is put in place, and nothing begun after it
-            raise
         finally:
             with self._change:
                 self._running.discard(process)
@@ -186,14 +186,15 @@ def carry_out(
     follow: Callable[[Any], Any] = nullcontext,
     told: Callable[[], bool] | None = None,
 ) -> Ended:
-    """Do a task in a fresh process of this machine, and wait for its end. An interrupt is passed on to it, and shows in
-    its exit code alone: one that had finished has done so.
+    """Do a task in a fresh process of this machine, and wait for its end. An interrupt is passed on to it, and not
+    raised: it may have finished.
 
     lock: an open file that the process holds, too. follow: a context, given the process, while that runs. told: asked
     every second whether to interrupt it, where no signal comes."""
     heard, result = os.pipe()  # no file: that there is no room for one may be what must be told
     line = json.dumps(task.line | {"result": result, "lock": lock})
     answer: dict[str, Any] = {}
+    interrupted = False
     with open(task.output, "a") if task.output else nullcontext() as output:
         # A process group of its own: Ctrl-C reaches it once, from here.
         held = (result,) if lock is None else (lock, result)
@@ -207,14 +208,14 @@ def carry_out(
                 process.stdin.flush()  # and left open: the child ends when this process does
             code = _code_of(process, told) if told else process.wait()
     except KeyboardInterrupt:
-        code = _interrupted(process)
+        code, interrupted = _interrupted(process), True
     finally:
         with suppress(BrokenPipeError):
             process.stdin.close()
         os.set_blocking(heard, False)  # what a stage has started may live on, and hold its end open
         with suppress(BlockingIOError), open(heard, "rb", buffering=0) as file:
             answer = json.loads(file.read(1 << 16) or "{}")
-    return Ended(answer, code)
+    return Ended(answer, code, interrupted)
 
 
 def _code_of(process: "subprocess.Popen[str]", told: Callable[[], bool]) -> int:
