@@ -91,8 +91,8 @@ _told = threading.Event()  # in a process of Ray's that works for this runner: i
 
 
 def work(task: Task) -> Ended:
-    """On the machine that works. Ray cancels by a KeyboardInterrupt in this thread, wherever it is, and throws away what
-    was finished just then; so it is made a word that is heeded when there is something to end."""
+    """On the machine that works. Ray cancels by a KeyboardInterrupt in this thread, wherever it is, and what has just
+    been finished is thrown away; so it is made a word that is heeded where there is something to end."""
     signal.signal(signal.SIGINT, lambda *_: _told.set())
     if _told.is_set():
         return Ended({}, -signal.SIGINT)
