@@ -225,6 +225,7 @@ def _done(job: dict[str, Any], log: TextIO) -> dict[str, Any]:
         stage = importlib.import_module(f"stages.{job['stage']}")
         needs = {name: path and Path(path) for name, path in job["needs"].items()}
         stage.run(params, Path(job["out"]), **needs)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # it is done, and that will be told
     except Exception as error:
         log.write(traceback.format_exc())
         return {"error": told(error)[:9999]}  # what a pipe holds

@@ -45,10 +45,11 @@ class Task:
 @dataclass(frozen=True)
 class Ended:
     """What a stage's process told (see child.run), empty where it told nothing, and its exit code; negative: by a
-    signal."""
+    signal. interrupted: who waited for it was."""
 
     answer: dict[str, Any]
     code: int
+    interrupted: bool = False
 
 
 class Engine(Protocol):
@@ -101,6 +102,8 @@ class Local:
             where |= {"cards": ",".join(cards)} if cards and self._all_cards > 1 else {}
             ended = carry_out(replace(task, line=task.line | where), lock, self._follow)
             beside = len(self._given) - 1
+        if ended.interrupted:
+            self._stopped = True  # what had finished is put in place, and nothing begun after it
         if self._stopped and ended.code != 0:
             raise KeyboardInterrupt
         return ended, beside
@@ -177,13 +180,21 @@ def visible_cards() -> list[str]:
     return sorted((path.name.removeprefix("nvidia") for path in Path("/dev").glob("nvidia[0-9]*")), key=int)
 
 
-def carry_out(task: Task, lock: int | None = None, follow: Callable[[Any], Any] = nullcontext) -> Ended:
-    """Do a task in a fresh process of this machine, and wait for its end. An interrupt is passed on and raised again.
+def carry_out(
+    task: Task,
+    lock: int | None = None,
+    follow: Callable[[Any], Any] = nullcontext,
+    told: Callable[[], bool] | None = None,
+) -> Ended:
+    """Do a task in a fresh process of this machine, and wait for its end. An interrupt is passed on to it, and not
+    raised: it may have finished.
 
-    lock: an open file that the process holds, too. follow: a context, given the process, while that runs."""
+    lock: an open file that the process holds, too. follow: a context, given the process, while that runs. told: asked
+    every second whether to interrupt it, where no signal comes."""
     heard, result = os.pipe()  # no file: that there is no room for one may be what must be told
     line = json.dumps(task.line | {"result": result, "lock": lock})
     answer: dict[str, Any] = {}
+    interrupted = False
     with open(task.output, "a") if task.output else nullcontext() as output:
         # A process group of its own: Ctrl-C reaches it once, from here.
         held = (result,) if lock is None else (lock, result)
@@ -195,29 +206,32 @@ def carry_out(task: Task, lock: int | None = None, follow: Callable[[Any], Any] 
             with suppress(BrokenPipeError):  # a child that is gone already has its code below
                 process.stdin.write(line + "\n")
                 process.stdin.flush()  # and left open: the child ends when this process does
-            # Ray's interrupt is seen between waits only; here a signal ends the wait.
-            code = process.wait() if lock is not None else _polled(process)
+            code = _code_of(process, told) if told else process.wait()
     except KeyboardInterrupt:
-        process.send_signal(signal.SIGINT)
-        try:
-            process.wait(GRACE)
-        except (subprocess.TimeoutExpired, KeyboardInterrupt):
-            process.kill()
-            process.wait()
-        raise
+        code, interrupted = _interrupted(process), True
     finally:
         with suppress(BrokenPipeError):
             process.stdin.close()
         os.set_blocking(heard, False)  # what a stage has started may live on, and hold its end open
         with suppress(BlockingIOError), open(heard, "rb", buffering=0) as file:
             answer = json.loads(file.read(1 << 16) or "{}")
-    return Ended(answer, code)
+    return Ended(answer, code, interrupted)
 
 
-def _polled(process: "subprocess.Popen[str]") -> int:
-    while True:
+def _code_of(process: "subprocess.Popen[str]", told: Callable[[], bool]) -> int:
+    while not told():
         with suppress(subprocess.TimeoutExpired):
             return process.wait(1.0)
+    return _interrupted(process)
+
+
+def _interrupted(process: "subprocess.Popen[str]") -> int:
+    process.send_signal(signal.SIGINT)
+    try:
+        return process.wait(GRACE)
+    except (subprocess.TimeoutExpired, KeyboardInterrupt):
+        process.kill()
+        return process.wait()
 
 
 ENGINES = {"ray": ("Ray", "ray"), "slurm": ("Slurm", "submitit")}  # name -> class in on_<name>.py, what it imports

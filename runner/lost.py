@@ -4,22 +4,23 @@ the machines that work."""
 
 import shutil
 import uuid
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 from runner.engine import Ended, Task, carry_out
 
 
-def attempt(task: Task) -> Ended:
+def attempt(task: Task, told: Callable[[], bool] | None = None) -> Ended:
     """Do a task on this machine in a folder that no other attempt writes to, and which is called as the task says again
-    when it ends; begins with what an earlier one left."""
+    when it ends; begins with what an earlier one left. told: see carry_out."""
     out = Path(task.line["out"])
     mine = out.with_name(f"{out.name}.{uuid.uuid4().hex[:8]}")
     take_over(out)
     out.mkdir(parents=True, exist_ok=True)
     out.rename(mine)
     try:
-        return carry_out(replace(task, line=task.line | {"out": str(mine)}))
+        return carry_out(replace(task, line=task.line | {"out": str(mine)}), told=told)
     finally:
         if mine.exists() and not out.exists():  # else it was given up for lost, and another is at work
             mine.rename(out)

@@ -4,6 +4,8 @@ Ray places each stage's process by its cores, cards and memory, and places it an
 
 import logging
 import os
+import signal
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,7 +13,7 @@ import ray
 from ray.exceptions import RayError, TaskCancelledError
 
 from runner import Failed, Refused
-from runner.engine import Ended, Needs, Task
+from runner.engine import GRACE, Ended, Needs, Task
 from runner.files import told
 from runner.lost import attempt
 
@@ -54,20 +56,30 @@ class Ray:
         line = task.line | {"cores": cores}
         ref = _work.options(**options, name=str(line["stage"])).remote(Task(task.root, line, task.output))
         self._refs.add(ref)
+        if self._stopped:  # meanwhile
+            ray.cancel(ref)
         begun()
         try:
-            return ray.get(ref)
-        except TaskCancelledError:
+            ended = self._ended(ref)
+        except TaskCancelledError:  # before it began
             raise KeyboardInterrupt from None
         except RayError as error:
             if self._stopped:
                 raise KeyboardInterrupt from None
             raise Failed(f"{line['stage']}: its machine was lost {RETRIES + 1} times: {told(error)[:400]}") from None
-        except KeyboardInterrupt:
-            self.stop()
-            raise
         finally:
             self._refs.discard(ref)
+        if self._stopped and ended.code != 0:
+            raise KeyboardInterrupt
+        return ended
+
+    def _ended(self, ref: "ray.ObjectRef[Ended]") -> Ended:
+        """Interrupted, it waits for the stage to have ended: with this process Ray would end it at once."""
+        try:
+            return ray.get(ref)
+        except KeyboardInterrupt:
+            self.stop()
+            return ray.get(ref, timeout=GRACE + 5)
 
     def stop(self) -> None:
         self._stopped = True
@@ -75,7 +87,16 @@ class Ray:
             ray.cancel(ref)
 
 
-@ray.remote(max_retries=RETRIES)
-def _work(task: Task) -> Ended:
-    """On the machine that works."""
-    return attempt(task)
+_told = threading.Event()  # in a process of Ray's that works for this runner: it is to stop, for good
+
+
+def work(task: Task) -> Ended:
+    """On the machine that works. Ray cancels by a KeyboardInterrupt in this thread, wherever it is, and what has just
+    been finished is thrown away; so it is made a word that is heeded where there is something to end."""
+    signal.signal(signal.SIGINT, lambda *_: _told.set())
+    if _told.is_set():
+        return Ended({}, -signal.SIGINT)
+    return attempt(task, _told.is_set)
+
+
+_work = ray.remote(max_retries=RETRIES)(work)

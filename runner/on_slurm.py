@@ -2,6 +2,7 @@
 share. Slurm places them; a stage whose node was lost is sent again. No cluster has run this: tests use submitit's own
 executor of this machine (address=local)."""
 
+import math
 import os
 import subprocess
 import time
@@ -13,7 +14,7 @@ from typing import Any
 import submitit
 
 from runner import Failed, Refused
-from runner.engine import Ended, Needs, Task
+from runner.engine import GRACE, Ended, Needs, Task
 from runner.files import shown, told
 from runner.lost import attempt
 
@@ -48,6 +49,7 @@ class Slurm:
         asked |= {"timeout_min": MINUTES, "name": str(task.line["stage"])}
         asked |= {"slurm_partition": self._partition} if self._partition and not self._local else {}
         work = partial(attempt, Task(task.root, task.line | {"cores": cores}, task.output))
+        ended = None
         for _ in range(RETRIES + 1):
             if self._stopped:
                 raise KeyboardInterrupt
@@ -56,20 +58,32 @@ class Slurm:
             self._jobs.add(job)
             begun()
             try:
-                while not job.done():
-                    time.sleep(EVERY)
-                return job.result()
+                ended = self._ended(job)
+                break
             except (submitit.core.utils.UncompletedJobError, submitit.core.utils.FailedJobError) as error:
                 lost = error
-            except KeyboardInterrupt:
-                self.stop()
-                raise
             finally:
                 self._jobs.discard(job)
-        if self._stopped:
+        if self._stopped and (ended is None or ended.code != 0):
             raise KeyboardInterrupt
+        if ended:
+            return ended
         said = f"{told(lost)[:300]} (all of it in {shown(self._folder)})"
         raise Failed(f"{task.line['stage']}: its job was lost {RETRIES + 1} times: {said}")
+
+    def _ended(self, job: submitit.Job[Any]) -> Ended:
+        """Interrupted, it gives the stage time to end."""
+        until = math.inf
+        while not job.done() and time.monotonic() < until:
+            try:
+                time.sleep(EVERY)
+            except KeyboardInterrupt:
+                self.stop()
+                until = time.monotonic() + GRACE + 5
+        if not job.done():
+            raise KeyboardInterrupt
+        ended: Ended = job.result()
+        return ended
 
     def stop(self) -> None:
         self._stopped = True

@@ -158,6 +158,26 @@ def test_stopped_while_several_run(tmp_path):
     assert (root / "runs/ran.txt").read_text().count("poses") == 3
 
 
+def test_what_ended_when_the_runner_was_interrupted_is_not_done_again(tmp_path):
+    """`distill` takes no notice of Ctrl-C; `evaluate` after it is not begun."""
+    root = toys(tmp_path, 0.0)
+    takes = "    import signal\n    signal.signal(2, signal.SIG_IGN)\n    (out / 'begun').touch()\n    time.sleep(2)\n"
+    stage = FILES["stages/distill.py"].replace("    time.sleep(params.pause)\n", takes)
+    (root / "stages/distill.py").write_text(stage)
+    code = "import sys; from test_batch import *; signal.signal(signal.SIGINT, signal.default_int_handler);"
+    code = f"{code} run_scene(asked(Path(sys.argv[1])), 'all')"
+    environment = {**os.environ, "PYTHONPATH": f"{REPO}:{REPO}/tests"}
+    process = subprocess.Popen([sys.executable, "-c", code, str(root)], env=environment, stderr=subprocess.DEVNULL)
+    until = time.monotonic() + 60
+    while not list((root / "runs").glob("*/.partial-distill-*/begun")):
+        assert time.monotonic() < until and process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(30) != 0
+    assert (root / "runs/toy/distill/receipt.json").exists()
+    assert (root / "runs/ran.txt").read_text().split() == ["toy", "poses", "toy", "distill"]
+
+
 def test_the_live_table(tmp_path):
     receipt = dict.fromkeys(("key", "params", "needs", "weights", "code", "output"), "") | {"seconds": 60.0}
     for stage in ("fit", "evaluate"):

@@ -17,6 +17,7 @@ from test_batch import FILES, spans, toys, written
 from test_compare import request as asked
 from test_faults import assert_whole
 
+from runner.child import INTERRUPTED
 from runner.compare import By, compare
 from runner.engine import Ended, Local, Needs, Task, chosen
 from runner.execute import Work, run_scene
@@ -80,7 +81,7 @@ def test_one_that_was_given_up_for_lost_writes_nowhere(tmp_path, monkeypatch):
     root = written(tmp_path)
     out = root / "runs/toy/.partial-distill-1"
 
-    def work(task: Task) -> Ended:
+    def work(task: Task, told=None) -> Ended:
         mine = Path(task.line["out"])
         assert mine != out and not out.exists()
         take_over(out)
@@ -92,6 +93,24 @@ def test_one_that_was_given_up_for_lost_writes_nowhere(tmp_path, monkeypatch):
     monkeypatch.setattr("runner.lost.carry_out", work)
     attempt(stage_task(root))
     assert [path.name for path in out.iterdir()] == ["theirs.txt"]
+
+
+@pytest.mark.parametrize("heeds", [True, False])
+def test_one_that_is_told_to_end_is_interrupted_and_one_that_had_finished_has(tmp_path, heeds):
+    root = written(tmp_path)
+    out = root / "runs/toy/.partial-distill-1"
+    wait = """    try:
+        (out / "checkpoint.pt").touch()
+        time.sleep(60)
+    except KeyboardInterrupt:
+        if HEEDS:
+            raise
+"""
+    stage = FILES["stages/distill.py"].replace("    time.sleep(params.pause)\n", wait.replace("HEEDS", str(heeds)))
+    (root / "stages/distill.py").write_text(stage)
+    ended = attempt(stage_task(root), lambda: bool(list(out.parent.glob("*/checkpoint.pt"))))
+    assert ended.code == (INTERRUPTED if heeds else 0) and bool(ended.answer) != heeds
+    assert (out / "checkpoint.pt").exists() and (out / "gain.txt").exists() != heeds
 
 
 def test_this_machine_goes_on_with_what_a_cluster_left(tmp_path, capsys):
@@ -185,6 +204,24 @@ def test_the_driver_killed_and_started_again(tmp_path, cluster, send):
     assert (root / "runs/ran.txt").read_text().splitlines() == before
     assert subprocess.run(command, env=environment, timeout=300).returncode == 1  # scene c
     lines = (root / "runs/ran.txt").read_text().splitlines()
+    assert sorted(lines) == sorted(set(lines)) and len(lines) == 9
+    assert_whole(root / "runs")
+
+
+@slow
+@pytest.mark.parametrize("last", ["poses", "distill", "evaluate"])
+def test_what_ended_when_the_driver_was_interrupted_is_not_done_again(tmp_path, cluster, last):
+    root = toys(tmp_path)
+    environment = {**os.environ, "PYTHONPATH": f"{REPO}:{REPO}/tests"}
+    command = [sys.executable, "-c", DRIVER, str(root), cluster.address]
+    process, ran = subprocess.Popen(command, env=environment), root / "runs/ran.txt"
+    while not ran.exists() or last not in ran.read_text():
+        assert process.poll() is None
+        time.sleep(0.002)
+    process.send_signal(signal.SIGINT)
+    process.wait(60)
+    assert subprocess.run(command, env=environment, timeout=300).returncode == 1  # scene c
+    lines = ran.read_text().splitlines()
     assert sorted(lines) == sorted(set(lines)) and len(lines) == 9
     assert_whole(root / "runs")
 

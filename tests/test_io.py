@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -149,6 +150,9 @@ def test_exr_keeps_every_bit(tmp_path):
     depth[0, 0] = 0.0
     save_exr(tmp_path / "sub" / "depth.exr", depth)
     assert np.array_equal(load_exr(tmp_path / "sub" / "depth.exr"), depth)
+    time.sleep(1.1)  # the format has a date, in seconds
+    save_exr(tmp_path / "again.exr", depth)
+    assert (tmp_path / "again.exr").read_bytes() == (tmp_path / "sub" / "depth.exr").read_bytes()
 
 
 def test_json_and_labels(tmp_path):

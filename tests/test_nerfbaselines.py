@@ -70,7 +70,7 @@ def test_the_scene_itself_can_be_scored_on(finished):
 def test_nerfbaselines_own_table(finished):
     table = asked(finished, "nerfbaselines", "generate-dataset-results", "--results", str(finished / "out/results"),
                   "--dataset", "spinnerf", "--scenes", "book")  # fmt: skip
-    assert "RefFusion" in table and f"{scores(finished)['psnr']:.2f}" in table
+    assert "RefFusion" in table and f"{scores(finished)['psnr']:.3f}" in table
 
 
 @pytest.mark.skipif(not CHROMIUM, reason="no Chromium is installed")

@@ -175,6 +175,7 @@ def save_exr(path: Path, depth: np.ndarray) -> None:
     spec = oiio.ImageSpec(depth.shape[1], depth.shape[0], 1, oiio.FLOAT)
     spec.channelnames = ("Z",)
     spec.attribute("compression", "zip")
+    spec.attribute("DateTime", "1970:01:01 00:00:00")  # else that of now is written: equal depths, unequal files
     file = oiio.ImageOutput.create(str(path))
     if file is None or not file.open(str(path), spec) or not file.write_image(depth[..., None]) or not file.close():
         raise ValueError(f"{path}: cannot be written ({file.geterror() if file else oiio.geterror()})")
