@@ -13,9 +13,9 @@ from browser import visiting
 
 from reffusion.capture.clicked import as_photographed, photographed, straightened
 from reffusion.clicks import everywhere
-from reffusion.clicks.graph import least_cut
 from reffusion.clicks.marks import Clicks
 from reffusion.clicks.picture import corrected, view_mask
+from reffusion.cuts import least_cut
 from reffusion.io.files import BadInput
 from reffusion.io.images import load_image, load_mask, save_image, save_mask, to_uint8
 from reffusion.io.scene import load_mask_sets

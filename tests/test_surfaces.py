@@ -83,7 +83,9 @@ def test_photographs_tell_the_depth_that_splats_show_too_near(views):
 def plane(height: float, tilt: float) -> continuation.Plane:
     normal = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
     cells = np.ones((continuation.CELLS,) * 2, bool)
-    return continuation.Plane(normal, height, np.zeros(3), np.eye(3)[:2], 0.05, cells, cells, ~cells, cells)
+    return continuation.Plane(
+        normal, height, np.zeros(3), np.eye(3)[:2], 0.05, cells, cells, ~cells, cells, np.zeros_like(cells)
+    )
 
 
 def test_a_plane_moves_onto_what_is_known_around_the_hole():

@@ -15,7 +15,8 @@ from reffusion.texture import completion, search, surfaces
 from reffusion.texture.blending import blended
 from reffusion.texture.completion import complete
 from reffusion.texture.matches import NONE, PATCH, Compared
-from reffusion.texture.regular import BINS, FEWEST, Seen, nothing, regular
+from reffusion.texture.montage import montage
+from reffusion.texture.regular import FEWEST, Seen, repeats
 from reffusion.texture.shown import alone
 from reffusion.types import Camera
 
@@ -109,7 +110,7 @@ def camera(name: str, centre: tuple[float, float, float], at=(0.0, 0.0, 0.0)) ->
 CAMERAS = [camera("a", (0.0, -1.2, 0.7)), camera("b", (0.7, -1.0, 0.8)), camera("c", (-0.8, -0.9, 0.6))]
 EVERYWHERE, NOWHERE = np.ones((CELLS, CELLS), bool), np.zeros((CELLS, CELLS), bool)
 FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0, np.zeros(3), np.eye(3)[:2], 4 / CELLS, EVERYWHERE, EVERYWHERE, NOWHERE,
-              EVERYWHERE)  # fmt: skip
+              EVERYWHERE, NOWHERE)  # fmt: skip
 
 
 def planks(view: Camera) -> np.ndarray:
@@ -155,28 +156,64 @@ def seen_plane(picture: np.ndarray, view: Camera) -> Seen:
 
 
 def test_a_floor_of_planks_repeats_itself_by_their_width():
-    found = regular(1, {1: seen_plane(planks(CAMERAS[0]), CAMERAS[0])})
-    across = (found.peaks @ (1.0, 0.3)) / 0.12  # planks' widths that each offset goes across them
-    assert len(found.peaks) > 5 and np.abs(across - across.round()).max() < 0.25
-    middle = round(0.06 / found.pitch[1, 0])  # half a plank's width
-    assert found.table[1, BINS, BINS + middle] < 0.1
-    assert (found.starts == (0, 0, len(found.peaks))).all()
+    found = repeats(seen_plane(planks(CAMERAS[0]), CAMERAS[0]))
+    across = (found.motions @ (1.0, 0.3)) / 0.12  # planks' widths that each shift goes across them
+    assert found.centre is None and len(found.motions) > 5 and np.abs(across - across.round()).max() < 0.25
+    assert np.abs(across).max() > 2
 
 
-def test_what_does_not_repeat_itself_has_no_regular_offsets():
+def tabletop(view: Camera) -> np.ndarray:
+    """Twenty planks that meet in a point, and a plate of another colour where they do."""
+    depth = FLOOR.depth(view)
+    x, y, _ = np.moveaxis(geometry.unproject(np.where(np.isfinite(depth), depth, 1.0), view), -1, 0)
+    away, turn = np.hypot(x - 0.1, y - 0.4), np.arctan2(y - 0.4, x - 0.1) / (np.pi / 10)
+    tone = np.where(np.abs(turn % 1 - 0.5) > 0.42, 40, 150 + 12 * np.sin(11 * np.floor(turn)))
+    return np.where(away < 0.3, 215, tone)[..., None].repeat(3, 2).astype(np.uint8)
+
+
+def test_planks_that_meet_in_a_point_are_turned_about_it():
+    found = repeats(seen_plane(tabletop(CAMERAS[0]), CAMERAS[0]))
+    turns = found.motions[:, 0] / (np.pi / 10)
+    assert np.linalg.norm(found.centre - (0.1, 0.4)) < 0.03
+    assert np.abs(turns - turns.round()).max() < 0.15 and np.abs(turns).min() > 0.5 and np.abs(turns).max() > 4
+    places = np.random.default_rng(0).normal(size=(50, 2))
+    moved, step = found.moved(places, found.motions[0]), 1e-4 * np.array([0.6, 0.8])
+    assert np.allclose(found.moved(moved, -found.motions[0]), places), "a turn and its opposite"
+    slope = (found.moved(places + step, found.motions[0]) - moved) @ found.turn(found.motions[0])
+    assert np.allclose(slope, step, atol=1e-9), "turn() is the derivative of moved()"
+
+
+def test_what_does_not_repeat_itself_is_not_said_to():
     noise = np.random.default_rng(0).integers(0, 256, (SIDE, SIDE, 3), np.uint8)
-    assert len(regular(1, {1: seen_plane(noise, CAMERAS[0])}).peaks) == 0
     some = seen_plane(noise, CAMERAS[0])
-    few = Seen(some.pixels[:FEWEST], some.places[:FEWEST], some.image)
-    assert not regular(2, {2: few}).pitch[1].any() and len(regular(2, {2: few}).peaks) == 0
+    assert repeats(some) is None
+    smooth = np.repeat(np.linspace(0, 255, SIDE)[None, :, None], SIDE, 0).repeat(3, 2).astype(np.uint8)
+    assert repeats(seen_plane(smooth, CAMERAS[0])) is None
+    assert repeats(Seen(some.pixels[:FEWEST], some.places[:FEWEST], some.image)) is None
 
 
-def test_joints_stay_straight_where_a_floor_repeats_itself():
+@pytest.mark.parametrize("shown", [planks, tabletop])
+def test_joints_and_round_borders_go_on_where_a_floor_repeats_itself(shown):
+    around = replace(floor(), photos={view.name: shown(view) for view in CAMERAS})
+    truth = shown(CAMERAS[0]).astype(int)
+    image = np.where(hidden()[..., None], np.uint8(RED), shown(CAMERAS[0]))
+    target, sources, smooth, how = surfaces._told(image, hidden(), CAMERAS[0], hidden(), around)
+    picture, filled = montage(target, hidden(), sources, 1, how[1])
+    assert filled[hidden()].mean() > 0.9 and not filled[~hidden()].any() and (picture[~filled] == image[~filled]).all()
+    dark = lambda done: done.mean(-1)[filled] < 90  # joints; and what is bright is the plate
+    kind = lambda done: dark(done).astype(int) + 2 * (done.mean(-1)[filled] > 195)
+    wrong = lambda done: (kind(done) != kind(truth)).mean()
+    patches = np.mean([wrong(complete(target, hidden(), sources, smooth, k).image) for k in range(3)])
+    assert wrong(picture) < 0.7 * patches
+
+
+def test_a_hole_without_anything_to_move_into_it_is_left():
     image = np.where(hidden()[..., None], np.uint8(RED), planks(CAMERAS[0]))
-    target, sources, smooth, repeats = surfaces._told(image, hidden(), CAMERAS[0], hidden(), floor())
-    off = lambda done: np.abs(done.image.astype(int) - planks(CAMERAS[0]))[hidden()].mean()
-    wrong = lambda repeats: np.mean([off(complete(target, hidden(), sources, smooth, k, repeats)) for k in range(4)])
-    assert wrong(repeats) < 0.9 * wrong(nothing(1))
+    target, sources, _, how = surfaces._told(image, hidden(), CAMERAS[0], hidden(), floor())
+    picture, filled = montage(
+        target, hidden(), [replace(s, usable=np.zeros_like(hidden())) for s in sources], 1, how[1]
+    )
+    assert not filled.any() and picture is image
 
 
 def test_frames_are_the_derivative_of_a_planes_coordinates():
@@ -208,16 +245,15 @@ def test_the_misfit_is_the_mean_square_by_weight():
     own, other = (surfaces._source(view, around.photos[view.camera.name], around) for view in around.views[:2])
     seen = [(completion._values(each.image, each.masked), each.masked) for each in (own, other)]
     marked = [completion._marked(values, each, [1], 1) for (values, _), each in zip(seen, (own, other), strict=True)]
-    pictures = completion._pictures(marked, [masked for _, masked in seen], [own, other], 1, 1)
+    pictures = completion._pictures(marked, [masked for _, masked in seen], [own, other], 1)
     mask = np.zeros((SIDE, SIDE), bool)
     mask[70, 62] = True
     target = replace(own, surface=np.ones((SIDE, SIDE), np.int64))
-    on_floor = lambda of: of(target.surface, CAMERAS[0], [FLOOR])
-    target = replace(target, to_plane=on_floor(surfaces._frames), place=on_floor(surfaces._places))
-    pixels = completion._pixels(target, mask, 1, [1], pictures, nothing(1))
+    target = replace(target, to_plane=surfaces._frames(target.surface, CAMERAS[0], [FLOOR]))
+    pixels = completion._pixels(target, mask, 1, [1], pictures)
     now, weight = marked[0], np.random.default_rng(0).random((SIDE, SIDE)).astype(np.float32)
     row, column, angle = 100.0, 40.0, 0.2
-    of = Compared(pixels, pictures, now, weight, nothing(1))
+    of = Compared(pixels, pictures, now, weight)
     found = search.misfit(0, True, 1, row, column, np.float32(angle), NONE, of)
     assert search.misfit(0, False, 1, row, column, np.float32(0), NONE, of) == NONE, "along a plane nothing is shifted"
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])

@@ -11,9 +11,10 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from reffusion.clicks import spread
-from reffusion.clicks.graph import attached, least_cut, nearer
+from reffusion.clicks.graph import attached, nearer
 from reffusion.clicks.marks import Clicks, marked
 from reffusion.clicks.picture import corrected, refined, shrunk, view_mask
+from reffusion.cuts import least_cut
 from reffusion.masks import voting
 from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0

@@ -146,9 +146,10 @@ class Surroundings:
         return Around(self.views, self.planes, self.photos, self.centre, self.radius)
 
     def photographed(self, camera: Camera) -> np.ndarray:
-        """[H, W] depth that a training view shows outside its mask; 0 elsewhere."""
+        """[H, W] depth that a training view shows beside its mask, of a mirror its plane's; 0 elsewhere."""
         nothing = np.zeros((camera.height, camera.width))
-        return with_photographed_depth(nothing, camera, self.views)
+        shown = with_photographed_depth(nothing, camera, self.views)
+        return continuation.without_pits(shown, camera, self.planes)
 
     def looked_past(self, camera: Camera, depth: np.ndarray) -> np.ndarray:
         """bool [H, W], where other views look past a surface at this depth of a view, and few show it."""

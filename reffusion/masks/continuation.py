@@ -35,6 +35,7 @@ ACROSS = 0.9  # cosine of the angle between two planes under which they cross
 RATHER = 1.0  # cosine to a plane over that to another, from which a surface faces rather as the one does
 EVENED = 0.01  # of the image's width: the scale on which a surface's direction is taken
 WIDER = 2.0  # times as wide a map on which what the plane surrounds is told
+POLISHED = 0.03  # of the cells seen of a plane: smaller ones that it surrounds are unevenness
 SURROUNDS = 0.5  # share of the border of what views look through that must be seen to be of the plane
 TOUCHING = 0.25  # share of an unknown patch's border that must be seen for the plane to go on into it
 
@@ -167,6 +168,17 @@ def aligned(plane: Plane, depth: np.ndarray, camera: Camera, hole: np.ndarray) -
     return moved if far < FAR else plane
 
 
+def without_pits(depth: np.ndarray, camera: Camera, planes: Sequence[Plane]) -> np.ndarray:
+    """[H, W] float64, the depth that a view shows; that of the plane around it where it looks into a mirror: what is
+    polished goes on, and repeats itself, along the plane."""
+    depth = depth.astype(np.float64)
+    for plane in planes:
+        at = plane.depth(camera)
+        mirrored = plane.on(plane.pit, at, camera, at < depth)
+        depth[mirrored] = at[mirrored]
+    return depth
+
+
 def _samples(centre: np.ndarray, reach: float, views: Sequence[Witness], seed: int) -> np.ndarray:
     """[S, 3] points of the surfaces that views show around their masks, within reach."""
     draws, found = np.random.default_rng(seeding.seed_for(seed, "surfaces around")), [np.zeros((0, 3))]
@@ -239,9 +251,7 @@ def _mapped(
     return replace(plane, seen=seen, free=free, pit=pit), hidden
 
 
-def _looked_at(
-    plane: Plane, facing: np.ndarray, views: Sequence[Witness]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _looked_at(plane: Plane, facing: np.ndarray, views: Sequence[Witness]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """bool [CELLS, CELLS] each: where views show the plane, from the side that `facing` [3] points to, where they look
     through it, and where the object hides it from some."""
     said = votes(plane.cells.reshape(-1, 3), views, np.broadcast_to(facing, (CELLS * CELLS, 3)))
@@ -250,14 +260,15 @@ def _looked_at(
 
 
 def _surrounded(seen: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """bool [CELLS, CELLS]: the patches of free cells that seen ones surround."""
+    """bool [CELLS, CELLS]: the large patches of free cells that seen ones surround."""
     patches, count = ndimage.label(np.pad(free, 1, constant_values=True))
     found = np.zeros(patches.shape, bool)
     around = np.pad(seen, 1)
     for patch in set(range(1, count + 1)) - {patches[0, 0]}:
         inside = patches == patch
         border = ndimage.binary_dilation(inside) & ~inside
-        found |= inside & (around[border].mean() > SURROUNDS)
+        large = inside.sum() > POLISHED * seen.sum()
+        found |= inside & (large and around[border].mean() > SURROUNDS)
     return found[1:-1, 1:-1]
 
 
@@ -273,21 +284,22 @@ def _continued(
         band: distance from these up to which a view that seems to show the one may show the other.
     """
     # Neither a thin rim nor a crossing tells where the plane goes on to.
-    own = plane.seen.copy()
+    seen, free = plane.seen | plane.pit, plane.free & ~plane.pit
+    own = seen.copy()
     for other in others:
         own &= np.abs(plane.cells @ other.normal - other.height) >= band
-    unknown = ~plane.seen & ~plane.free & hidden
+    unknown = ~seen & ~free & hidden
     patches, count = ndimage.label(unknown)
     goes_on, ends = np.zeros((2, *hidden.shape), bool)
     for patch in range(1, count + 1):
         inside = patches == patch
         border = ndimage.binary_dilation(inside, iterations=2) & ~inside
-        if inside.sum() >= 4 and plane.seen[border].mean() > TOUCHING:
-            beyond = between(inside, _solid(own), plane.free) < 0.5
+        if inside.sum() >= 4 and seen[border].mean() > TOUCHING:
+            beyond = between(inside, _solid(own), free) < 0.5
             goes_on |= inside & ~beyond
             ends |= inside & beyond
-    goes_on &= _hull(plane, own if grounds else plane.seen, grounds)
-    within = goes_on | (ndimage.binary_fill_holes(plane.seen | goes_on) & ~plane.seen & ~ends & hidden)
+    goes_on &= _hull(plane, own if grounds else seen, grounds)
+    within = goes_on | (ndimage.binary_fill_holes(seen | goes_on) & ~seen & ~ends & hidden)
     return replace(plane, goes_on=goes_on, within=within)
 
 

@@ -19,7 +19,7 @@ from reffusion.texture.blending import blended
 from reffusion.texture.regular import Repeats
 from reffusion.texture.shown import Shown
 
-RING = 3  # px around the hole in which pieces are compared with what is known
+RING = 6  # px around the hole in which pieces are compared with what is known
 CLEAR = 2  # px that a piece's source stays away from what is masked
 MOST = 15000  # pixels that pieces are laid out for: of a larger hole every second, third ...
 PIECES = 48  # ways of moving that are tried together
@@ -63,7 +63,7 @@ class Way:
 @dataclass(frozen=True)
 class Laid:
     """Pixels (rows, columns: [N]) to be filled or compared, their places [N, 2], the change of the place by a pixel
-    [N, 2, 2], which of them are in the hole, and what is known of the others [N, 3] each: colours and their finer part."""
+    [N, 2, 2], which of them are in the hole, and of the others colours and their finer part, [N, 3] each."""
 
     rows: np.ndarray
     columns: np.ndarray
@@ -211,9 +211,7 @@ def _put_right(ring: Laid, way: Way, seen: Sequence[Source], how: Repeats) -> Wa
 _SIDES = ((1, 0), (-1, 0), (0, 1), (0, -1))
 
 
-def _best(
-    ring: Laid, ways: Sequence[Way], seen: Sequence[Source], how: Repeats, most: int
-) -> list[Way]:
+def _best(ring: Laid, ways: Sequence[Way], seen: Sequence[Source], how: Repeats, most: int) -> list[Way]:
     """Those that together fit what is known around the hole best, each somewhere in it."""
     (top, left), side = (ring.rows.min(), ring.columns.min()), AROUND // 2
     shape = (ring.rows.max() - top + 1, ring.columns.max() - left + 1)
@@ -329,7 +327,10 @@ def _drawn(
     for k, way in enumerate(ways):
         at, source = _at(laid, way, seen, how), seen[way.source]
         picture, valid = np.zeros_like(own), np.zeros_like(hole)
-        picture[laid.rows, laid.columns], valid[laid.rows, laid.columns] = _taken(at, source.colors), _shown(at, source.clear)
+        picture[laid.rows, laid.columns], valid[laid.rows, laid.columns] = (
+            _taken(at, source.colors),
+            _shown(at, source.clear),
+        )
         mine = valid & (label == k)
         own[mine & hole], shows = picture[mine & hole], shows | mine
         for axis, (down, along) in enumerate(sides):

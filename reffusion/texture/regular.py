@@ -26,6 +26,7 @@ OF_BEST = 0.5  # of the highest correlation, which the others must reach
 FIRST = 0.75  # of it, from which the smallest turn is the one that the others are multiples of
 ASIDE = 0.2  # of that turn, by which a multiple may lie beside where it is expected
 MOST = 60  # motions
+DISTINCT = 9  # cells a side of a window in which one shift stands for all
 SEVERAL = 4  # shifts that a plane must have: both ways, and twice as far, say
 GAP = 9  # px: narrower gaps in what is shown of a plane, where its depth is uneven, close
 LINES, PAIRS = 3000, 400  # steepest cells that tell of lines, and pairs of them that tell where lines meet
@@ -33,6 +34,7 @@ STRAIGHT = 0.035  # sine of the angle by which a line may miss that point
 MEETING = 1.25  # times as many lines that must go through a point as in one direction
 NEAR = 3.0  # map sides from the map's middle within which they meet
 LEAST = 16  # cells a side of a map
+STEPS, LEAST_GAIN = (2.0, 1.0, 0.5), 1e-3  # cells by which that point is put right, while likeness grows so much
 SEED = 0  # of what is drawn
 
 
@@ -89,12 +91,34 @@ def repeats(seen: Seen) -> Repeats | None:
     if found is None:
         motions = _shifts(_likeness(flat)) * flat.pitch
         return Repeats(None, motions, flat.pitch[0]) if len(motions) else None
-    centre = low + found * flat.pitch
-    unrolled = _unrolled(seen, centre)
+    centre, unrolled = _put_right(seen, low + found * flat.pitch, flat.pitch[0])
     if unrolled is None:
         return None
     motions = _turns(_likeness(unrolled)[:, 0], 2 * np.pi / unrolled.pitch[1]) * unrolled.pitch[1]
     return Repeats(centre, motions[:, None], unrolled.pitch[0]) if len(motions) else None
+
+
+def _put_right(seen: Seen, centre: np.ndarray, cell: float) -> tuple[np.ndarray, Map | None]:
+    """The centre about which what is seen, turned, looks most like itself, from one that lines tell; and the map
+    unrolled about it."""
+
+    def judged(at: np.ndarray) -> tuple[float, Map | None]:
+        flat = _unrolled(seen, at)
+        return (-1.0 if flat is None else float(_peak(_likeness(flat)[:, 0])), flat)
+
+    best, flat = judged(centre)
+    for step in STEPS:
+        for side in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+            while (found := judged(centre + step * cell * np.array(side)))[0] > best + LEAST_GAIN:
+                (best, flat), centre = found, centre + step * cell * np.array(side)
+    return centre, flat
+
+
+def _peak(likeness: np.ndarray) -> float:
+    """The highest of the local maxima of [h], by turn; 0 where there is none."""
+    some = likeness[AWAY : len(likeness) // 2]
+    peaks = some[1:-1][(some[1:-1] > some[:-2]) & (some[1:-1] >= some[2:])]
+    return peaks.max() if len(peaks) else 0.0
 
 
 def _likeness(flat: Map) -> np.ndarray:
@@ -114,7 +138,7 @@ def _shifts(likeness: np.ndarray) -> np.ndarray:
     """[M, 2], the shifts (x, y) in cells by which a map looks most like itself, the best first."""
     height, width = (side // 2 for side in likeness.shape)
     near = np.fft.fftshift(likeness)
-    peak = (near == ndimage.maximum_filter(near, 5)) & (near > OF_BEST * ALIKE)
+    peak = (near == ndimage.maximum_filter(near, DISTINCT)) & (near > OF_BEST * ALIKE)
     peak[height - AWAY : height + AWAY + 1, width - AWAY : width + AWAY + 1] = False
     rows, columns = np.nonzero(peak)
     order = np.argsort(-near[rows, columns], kind="stable")[:MOST]

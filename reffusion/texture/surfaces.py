@@ -11,7 +11,7 @@ from torch import Tensor
 
 from reffusion import geometry
 from reffusion.depth.layers import pieces
-from reffusion.masks.continuation import Plane, planes_around
+from reffusion.masks.continuation import Plane, planes_around, without_pits
 from reffusion.masks.voting import extent
 from reffusion.masks.witness import Witness, pixels, witnesses
 from reffusion.paint.margin import hull, widened
@@ -143,9 +143,10 @@ def _behind(
 ) -> tuple[np.ndarray, np.ndarray]:
     """What a view shows without the object: planes' numbers, int [H, W], and depth, [H, W] float64.
 
-    Where it is `asked` for, bool [H, W], C and its rim, the nearest plane that is seen there by others or goes on there; where there is none, see `_drawn`.
+    Where it is `asked` for, bool [H, W], C and its rim, the nearest plane that is seen there by others or goes on
+    there; where there is none, see `_drawn`.
     """
-    shown = _without_pits(own, planes)
+    shown = without_pits(own.depth, own.camera, planes)
     known = (shown > 0) & ~hidden
     depth = _drawn(shown, known, hidden) if known.any() else np.ones(hidden.shape)
     surface, nearest = np.where(hidden, 0, _labelled(shown, own.camera, planes)), np.full(hidden.shape, np.inf)
@@ -178,24 +179,13 @@ def _drawn(depth: np.ndarray, known: np.ndarray, hidden: np.ndarray) -> np.ndarr
 
 def _source(view: Witness, picture: np.ndarray, around: Around) -> Shown:
     """A view's picture as a source of patches: what it shows near the object, beside its mask."""
-    depth = _without_pits(view, around.planes)
+    depth = without_pits(view.depth, view.camera, around.planes)
     points = geometry.unproject(depth, view.camera)
     near = np.linalg.norm(points - around.centre, axis=-1) < NEARBY * around.radius
     surface = _labelled(depth, view.camera, around.planes)
     size = np.where(depth > 0, depth, 1.0) / view.camera.fx
     frames, places = (of(surface, view.camera, around.planes) for of in (_frames, _places))
     return Shown(picture, widened(view.hidden, BESIDE), near & (depth > 0), surface, frames, size, places)
-
-
-def _without_pits(view: Witness, planes: Sequence[Plane]) -> np.ndarray:
-    """[H, W] float64, the depth that a view shows; that of the plane around it where it looks into a mirror: what is
-    polished, too, repeats itself along the plane."""
-    depth = view.depth.astype(np.float64)
-    for plane in planes:
-        at = plane.depth(view.camera)
-        mirrored = plane.on(plane.pit, at, view.camera, at < depth)
-        depth[mirrored] = at[mirrored]
-    return depth
 
 
 def _others(own: Witness, views: Sequence[Witness]) -> list[Witness]:
