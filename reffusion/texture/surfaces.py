@@ -120,8 +120,9 @@ def _told(
     surface, depth = _behind(own, hidden, hole | hidden, around.planes)
     frames, places = (of(surface, camera, around.planes) for of in (_frames, _places))
     target = Shown(image, hole, ~hole, surface, frames, depth / camera.fx, places)
-    shown = [(view, around.photos[view.camera.name]) for view in (own, *_others(own, around.views))]
-    sources = [_source(*each, around) for each in (*shown, *around.completed)]
+    others = [(view, around.photos[view.camera.name]) for view in _others(own, around.views)]
+    sources = [_source(own, around.photos[camera.name], around, mirrors=True)]
+    sources += [_source(*each, around) for each in (*others, *around.completed)]
     roughness = {k: _roughness(plane, around) for k, plane in enumerate(around.planes, start=1)}
     even = [k for k, rough in roughness.items() if rough < LAID and (surface == k)[hole].any()]
     how = {k: found for k in even if (found := _how_it_repeats(k, sources)) is not None}
@@ -177,15 +178,17 @@ def _drawn(depth: np.ndarray, known: np.ndarray, hidden: np.ndarray) -> np.ndarr
     return found
 
 
-def _source(view: Witness, picture: np.ndarray, around: Around) -> Shown:
-    """A view's picture as a source of patches: what it shows near the object, beside its mask."""
+def _source(view: Witness, picture: np.ndarray, around: Around, mirrors: bool = False) -> Shown:
+    """A view's picture as a source of patches: what it shows near the object, beside its mask; without its `mirrors`,
+    which show something else from elsewhere."""
     depth = without_pits(view.depth, view.camera, around.planes)
     points = geometry.unproject(depth, view.camera)
     near = np.linalg.norm(points - around.centre, axis=-1) < NEARBY * around.radius
+    usable = near & (depth > 0) & (mirrors | (depth == view.depth))
     surface = _labelled(depth, view.camera, around.planes)
     size = np.where(depth > 0, depth, 1.0) / view.camera.fx
     frames, places = (of(surface, view.camera, around.planes) for of in (_frames, _places))
-    return Shown(picture, widened(view.hidden, BESIDE), near & (depth > 0), surface, frames, size, places)
+    return Shown(picture, widened(view.hidden, BESIDE), usable, surface, frames, size, places)
 
 
 def _others(own: Witness, views: Sequence[Witness]) -> list[Witness]:
