@@ -20,7 +20,8 @@ from reffusion.io.arrays import load_json, load_labels, save_json, save_labels
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_fill, load_raw_masks, load_scene, load_views, objects_of, save_mask_sets
 from reffusion.masks import brought, regions, undecided, voting, witness
-from reffusion.masks.continuation import Plane, planes_around
+from reffusion.masks.continuation import planes_around
+from reffusion.masks.plane import Plane
 from reffusion.masks.regions import Filled, Region
 from reffusion.masks.voting import Votes, extent
 from reffusion.masks.witness import Witness

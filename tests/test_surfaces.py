@@ -7,6 +7,7 @@ import torch
 from reffusion import geometry
 from reffusion.initialize import gloss, sweep
 from reffusion.masks import continuation
+from reffusion.masks.plane import CELLS, Plane
 from reffusion.masks.witness import Witness, surface_range, widened
 from reffusion.splat.conventions import SH0
 from reffusion.splat.reference import colors, harmonics
@@ -80,12 +81,10 @@ def test_photographs_tell_the_depth_that_splats_show_too_near(views):
     assert not sweep.swept(photos["v0"], rough(true), ring, view, views[:1], photos).any()
 
 
-def plane(height: float, tilt: float) -> continuation.Plane:
+def plane(height: float, tilt: float) -> Plane:
     normal = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
-    cells = np.ones((continuation.CELLS,) * 2, bool)
-    return continuation.Plane(
-        normal, height, np.zeros(3), np.eye(3)[:2], 0.05, cells, cells, ~cells, cells, np.zeros_like(cells)
-    )
+    cells = np.ones((CELLS,) * 2, bool)
+    return Plane(normal, height, np.zeros(3), np.eye(3)[:2], 0.05, cells, cells, ~cells, cells, np.zeros_like(cells))
 
 
 def test_a_plane_moves_onto_what_is_known_around_the_hole():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from reffusion import geometry
-from reffusion.masks.continuation import CELLS, Plane
+from reffusion.masks.plane import CELLS, Plane
 from reffusion.masks.witness import Witness, surface_range
 from reffusion.paint.paint2d import telea
 from reffusion.texture import completion, search, surfaces

@@ -16,7 +16,7 @@ from reffusion.depth.solverlog import SolverLog
 from reffusion.gaussians.sheets import Sheets, surface
 from reffusion.initialize import gloss, sweep
 from reffusion.masks import continuation
-from reffusion.masks.continuation import Plane
+from reffusion.masks.plane import Plane, without_pits
 from reffusion.masks.witness import Witness, votes, widened, with_photographed_depth
 from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
@@ -149,7 +149,7 @@ class Surroundings:
         """[H, W] depth that a training view shows beside its mask, of a mirror its plane's; 0 elsewhere."""
         nothing = np.zeros((camera.height, camera.width))
         shown = with_photographed_depth(nothing, camera, self.views)
-        return continuation.without_pits(shown, camera, self.planes)
+        return without_pits(shown, camera, self.planes)
 
     def looked_past(self, camera: Camera, depth: np.ndarray) -> np.ndarray:
         """bool [H, W], where other views look past a surface at this depth of a view, and few show it."""

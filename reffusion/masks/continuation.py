@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -13,6 +13,7 @@ from reffusion import geometry, seeding
 from reffusion.depth.behind import grown
 from reffusion.gaussians.surfels import surface_normals
 from reffusion.masks.borders import RIM, between
+from reffusion.masks.plane import CELLS, Plane
 from reffusion.masks.witness import SURFACE, Witness, seen_by, votes
 from reffusion.paint.margin import hull
 from reffusion.types import Camera
@@ -25,7 +26,6 @@ TOLERANCE = 0.08  # of the object's radius: distance within which a sample belon
 TRIALS = 300  # draws of three samples for each plane
 LEAST_SHARE = 0.1  # of the samples that a plane must explain
 MOST = 5  # planes
-CELLS = 160  # a side of a plane's map
 LARGE = 0.05  # of the largest patch of seen cells: smaller ones are no part of the plane
 WITHIN = (0.05, 0.03, 0.015, 0.015)  # relative depth within which a view's pixels belong to a plane, step by step
 ENOUGH = 200  # pixels that must
@@ -38,66 +38,6 @@ WIDER = 2.0  # times as wide a map on which what the plane surrounds is told
 POLISHED = 0.03  # of the cells seen of a plane: smaller ones that it surrounds are unevenness
 SURROUNDS = 0.5  # share of the border of what views look through that must be seen to be of the plane
 TOUCHING = 0.25  # share of an unknown patch's border that must be seen for the plane to go on into it
-
-
-@dataclass(frozen=True)
-class Plane:
-    """A plane in the world, and a map of what is known on it.
-
-    Attributes:
-        normal: [3], of unit length. height: normal . x on the plane.
-        origin: [3] on the plane, the map's middle. along: [2, 3], the map's axes. pitch: side of a cell.
-        goes_on: bool [CELLS, CELLS], unknown cells into which the plane continues.
-        within: bool [CELLS, CELLS], these and what they enclose with what is seen of the plane: mirrored light makes a
-            polished part look like a pit.
-        free: bool [CELLS, CELLS], where views look through it: there it is not.
-        seen: bool [CELLS, CELLS], where views show it.
-        pit: bool [CELLS, CELLS], `free` cells that the plane surrounds: a mirror in it, or a window.
-    """
-
-    normal: np.ndarray
-    height: float
-    origin: np.ndarray
-    along: np.ndarray
-    pitch: float
-    goes_on: np.ndarray
-    within: np.ndarray
-    free: np.ndarray
-    seen: np.ndarray
-    pit: np.ndarray
-
-    def depth(self, camera: Camera) -> np.ndarray:
-        """[H, W] camera z where a view's rays meet the plane; inf where they do not."""
-        rays = geometry.pixel_rays(camera) @ camera.world_to_camera[:3, :3]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            depth = (self.height - camera.center @ self.normal) / (rays @ self.normal)
-        return np.where(np.isfinite(depth) & (depth > 0), depth, np.inf)
-
-    def on(self, cells_meant: np.ndarray, depth: np.ndarray, camera: Camera, asked: np.ndarray) -> np.ndarray:
-        """bool [H, W]: pixels of those asked, bool [H, W], whose rays meet the plane, at `depth`, in one of the cells
-        meant (bool [CELLS, CELLS])."""
-        asked = asked & np.isfinite(depth)
-        rays = geometry.pixel_rays(camera)[asked] @ camera.world_to_camera[:3, :3]
-        found = np.zeros_like(asked)
-        found[asked] = self.in_cells(cells_meant, camera.center + rays * depth[asked, None])
-        return found
-
-    def in_cells(self, cells_meant: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """bool [P]: points [P, 3] that lie over one of the cells meant (bool [CELLS, CELLS])."""
-        cells = self.cell_of(points)
-        inside = ((cells >= 0) & (cells < CELLS)).all(-1)
-        row, column = np.where(inside[:, None], cells, 0).T
-        return inside & cells_meant[row, column]
-
-    def cell_of(self, points: np.ndarray) -> np.ndarray:
-        """[P, 2], row and column of the cells that points [P, 3] lie over, perhaps outside the map."""
-        return np.floor((points - self.origin) @ self.along.T / self.pitch + CELLS / 2).astype(np.int64)
-
-    @property
-    def cells(self) -> np.ndarray:
-        """[CELLS, CELLS, 3], the middle of each cell in the world."""
-        steps = (np.arange(CELLS) + 0.5 - CELLS / 2) * self.pitch
-        return self.origin + steps[:, None, None] * self.along[0] + steps[None, :, None] * self.along[1]
 
 
 def planes_around(centre: np.ndarray, radius: float, views: Sequence[Witness], seed: int = 0) -> list[Plane]:
@@ -166,17 +106,6 @@ def aligned(plane: Plane, depth: np.ndarray, camera: Camera, hole: np.ndarray) -
     there = hole & np.isfinite(at)
     far = np.abs(moved.depth(camera)[there] / at[there] - 1).max() if there.any() else 0.0
     return moved if far < FAR else plane
-
-
-def without_pits(depth: np.ndarray, camera: Camera, planes: Sequence[Plane]) -> np.ndarray:
-    """[H, W] float64, the depth that a view shows; that of the plane around it where it looks into a mirror: what is
-    polished goes on, and repeats itself, along the plane."""
-    depth = depth.astype(np.float64)
-    for plane in planes:
-        at = plane.depth(camera)
-        mirrored = plane.on(plane.pit, at, camera, at < depth)
-        depth[mirrored] = at[mirrored]
-    return depth
 
 
 def _samples(centre: np.ndarray, reach: float, views: Sequence[Witness], seed: int) -> np.ndarray:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import torch
 
-from reffusion.masks.continuation import Plane
+from reffusion.masks.plane import Plane
 from reffusion.masks.witness import (
     OPAQUE,
     SURFACE,

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from reffusion import geometry
 from reffusion.depth.layers import pieces
-from reffusion.masks.continuation import Plane, planes_around, without_pits
+from reffusion.masks.continuation import planes_around
+from reffusion.masks.plane import Plane, without_pits
 from reffusion.masks.voting import extent
 from reffusion.masks.witness import Witness, pixels, witnesses
 from reffusion.paint.margin import hull, widened
