@@ -7,7 +7,7 @@ import torch
 from reffusion import geometry
 from reffusion.initialize import gloss, sweep
 from reffusion.masks import continuation
-from reffusion.masks.plane import CELLS, Plane
+from reffusion.masks.plane import CELLS, Plane, without_pits
 from reffusion.masks.witness import Witness, surface_range, widened
 from reffusion.splat.conventions import SH0
 from reffusion.splat.reference import colors, harmonics
@@ -160,3 +160,29 @@ def test_harmonics_are_orthonormal():
     basis = harmonics(ways, 3)
     gram = 4 * np.pi * basis.T @ basis / len(ways)
     torch.testing.assert_close(gram, torch.eye(16, dtype=torch.float64), atol=0.03, rtol=0)
+
+
+def test_what_a_plane_surrounds_is_told_from_what_lies_beyond_it():
+    rows, columns = np.mgrid[:CELLS, :CELLS] - CELLS / 2
+    away = np.hypot(rows, columns)
+    seen = (away > 20) & (away < 60)
+    free = (away < 20) | (away > 60)
+    free[95, 120], seen[95, 120] = True, False
+    assert (continuation._surrounded(seen, free) == (away < 20)).all(), "a plate in a table, no speck, nor the garden"
+    open_to_a_side = seen & ~((np.abs(rows) < 6) & (columns > 0))
+    assert not continuation._surrounded(open_to_a_side, free | ~open_to_a_side).any()
+
+
+def test_a_mirror_has_the_depth_of_its_plane():
+    view = Camera("a", 64, 64, 70.0, 70.0, 32.0, 32.0, np.eye(4))
+    whole, nowhere = np.ones((CELLS,) * 2, bool), np.zeros((CELLS,) * 2, bool)
+    plate = nowhere.copy()
+    plate[CELLS // 2 - 10 : CELLS // 2 + 10, CELLS // 2 - 10 : CELLS // 2 + 10] = True
+    wall = Plane(
+        np.array([0.0, 0, 1]), 2.0, np.array([0.0, 0, 2]), np.eye(3)[:2], 0.02, nowhere, nowhere, plate, whole, plate
+    )
+    mirrored = wall.on(plate, wall.depth(view), view, np.ones((64, 64), bool))
+    depth = np.where(mirrored, 3.5, 2.0)
+    depth[:, :30] = 1.5  # something stands before the left of it
+    found = without_pits(depth, view, [wall])
+    assert 100 < mirrored.sum() < 2000 and (found == np.minimum(depth, 2.0)).all()
