@@ -256,7 +256,7 @@ def test_clicks_in_a_browser_make_masks_that_are_saved(page, tmp_path, width):
         tab.wait_for_function("!pending && !state.busy && state.views.every(v => v.mask !== null)", timeout=60_000)
         assert small.iou(page.session.masks[name], truth(name)) > 0.9
         tab.mouse.click(*at, button="right")
-        tab.wait_for_function("!pending && of(view).clicks.length === 2")
+        tab.wait_for_function("!pending && !state.busy && of(view).clicks.length === 2")
         assert not page.session.masks[name][round(row * small.HEIGHT), round(column * small.WIDTH)]
         tab.keyboard.press("Control+z")
         tab.wait_for_function("!pending && !state.busy && of(view).clicks.length === 1")
