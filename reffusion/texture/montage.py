@@ -68,7 +68,7 @@ def montage(
     label[coarse.rows, coarse.columns] = _cut(coarse, ways, seen, how, hole.shape, stride)
     nearest = ndimage.distance_transform_edt(label < 0, return_distances=False, return_indices=True)
     label = np.where(there & (label < 0), label[tuple(nearest)], label)
-    return _drawn(target, hole, there, label, ways, seen, how)
+    return _drawn(target, laid, hole, there, label, ways, seen, how)
 
 
 def _laid(target: Shown, hole: np.ndarray, there: np.ndarray) -> Laid:
@@ -155,6 +155,7 @@ def _expanded(cost: np.ndarray, look: np.ndarray, pairs: np.ndarray) -> np.ndarr
 
 def _drawn(
     target: Shown,
+    laid: Laid,
     hole: np.ndarray,
     there: np.ndarray,
     label: np.ndarray,
@@ -164,17 +165,14 @@ def _drawn(
 ) -> tuple[np.ndarray, np.ndarray]:
     """See `montage`: the pieces, blended by their changes."""
     own = target.image.astype(np.float32)
-    laid = _laid(target, hole, there)
     shows = np.zeros_like(hole)
     changes, counts = np.zeros((2, *own.shape), np.float32), np.zeros((2, *hole.shape), np.float32)
     sides = ((0, 1), (1, 0))
     for k, way in enumerate(ways):
         at, source = taken_from(laid, way, seen, how), seen[way.source]
         picture, valid = np.zeros_like(own), np.zeros_like(hole)
-        picture[laid.rows, laid.columns], valid[laid.rows, laid.columns] = (
-            values_at(at, source.colors),
-            shown_at(at, source.clear),
-        )
+        picture[laid.rows, laid.columns] = values_at(at, source.colors)
+        valid[laid.rows, laid.columns] = shown_at(at, source.clear)
         mine = valid & (label == k)
         own[mine & hole], shows = picture[mine & hole], shows | mine
         for axis, (down, along) in enumerate(sides):

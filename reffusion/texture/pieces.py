@@ -63,6 +63,7 @@ class Laid:
 
 
 def solid(mask: np.ndarray) -> np.ndarray:
+    """bool [H, W], without specks and without holes of a pixel or two."""
     return cv2.medianBlur(mask.astype(np.uint8), 5) > 0
 
 
@@ -85,10 +86,15 @@ def source_of(shown: Shown, plane: int) -> Source | None:
     return None if across is None else Source(*values_of(shown.image, shown.masked), clear, across)
 
 
+def _moved(laid: Laid, way: Way, how: Repeats) -> np.ndarray:
+    """[N, 2], where on the plane a way takes pixels from."""
+    return how.moved(laid.places.astype(np.float64), way.motion) + way.shift
+
+
 def taken_from(laid: Laid, way: Way, seen: Sequence[Source], how: Repeats) -> np.ndarray:
     """[N, 2] float32, where (x, y) in its source a way takes pixels from."""
-    places = how.moved(laid.places.astype(np.float64), way.motion) + way.shift
-    return cv2.perspectiveTransform(places[None], seen[way.source].across)[0].clip(-1e6, 1e6).astype(np.float32)
+    at = cv2.perspectiveTransform(_moved(laid, way, how)[None], seen[way.source].across)[0]
+    return at.clip(-1e6, 1e6).astype(np.float32)
 
 
 def shown_at(at: np.ndarray, clear: np.ndarray) -> np.ndarray:
@@ -110,8 +116,7 @@ def values_at(at: np.ndarray, picture: np.ndarray) -> np.ndarray:
 
 def scales(laid: Laid, at: np.ndarray, way: Way, seen: Sequence[Source], how: Repeats) -> tuple[np.ndarray, ...]:
     """[N] each: the fewest and the most source pixels along a pixel of the hole."""
-    places = how.moved(laid.places.astype(np.float64), way.motion) + way.shift
-    across = seen[way.source].across
+    places, across = _moved(laid, way, how), seen[way.source].across
     weight = places @ across[2, :2] + across[2, 2]
     slope = (across[None, :2, :2] - at[:, :, None] * across[2, :2]) / weight[:, None, None]
     change = slope @ how.turn(way.motion) @ laid.steps
@@ -126,9 +131,8 @@ def ways_of(laid: Laid, seen: Sequence[Source], how: Repeats) -> list[Way]:
     ring = ring.of(np.linspace(0, len(ring.rows) - 1, min(len(ring.rows), COMPARED)).astype(int))
     inside = inside.of(np.linspace(0, len(inside.rows) - 1, min(len(inside.rows), COMPARED)).astype(int))
     ways = [Way(number, motion, np.zeros(2)) for number in range(len(seen)) for motion in how.motions]
-    ways = [
-        way for way in ways if shown_at(taken_from(inside, way, seen, how), seen[way.source].clear).mean() >= COVERS
-    ]
+    covered = lambda way: shown_at(taken_from(inside, way, seen, how), seen[way.source].clear).mean()
+    ways = [way for way in ways if covered(way) >= COVERS]
     ways = _best(ring, ways, seen, how, 2 * PIECES)
     return _best(ring, [_put_right(ring, way, seen, how) for way in ways], seen, how, PIECES)
 
@@ -162,10 +166,10 @@ def _put_right(ring: Laid, way: Way, seen: Sequence[Source], how: Repeats) -> Wa
 
 def _best(ring: Laid, ways: Sequence[Way], seen: Sequence[Source], how: Repeats, most: int) -> list[Way]:
     """Those that together fit what is known around the hole best, each somewhere in it."""
-    (top, left), side = (ring.rows.min(), ring.columns.min()), AROUND // 2
+    top, left = ring.rows.min(), ring.columns.min()
     shape = (ring.rows.max() - top + 1, ring.columns.max() - left + 1)
     at = ring.rows - top, ring.columns - left
-    blur = lambda a: cv2.blur(a, (2 * side + 1,) * 2, borderType=cv2.BORDER_CONSTANT)[at]
+    blur = lambda a: cv2.blur(a, (AROUND, AROUND), borderType=cv2.BORDER_CONSTANT)[at]
     near = []
     for way in ways:
         differs, told = _off(ring, way, seen, how)
