@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from reffusion.io.arrays import load_json, save_json
 from reffusion.io.images import load_image, load_mask, save_image
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_raw_masks, load_scene, shows_object
+from reffusion.kernels.compiled import side_by_side
 from reffusion.paint import paint2d
 from reffusion.paint.paint2d import Painter
 from reffusion.params.evaluate import Params
@@ -22,6 +24,7 @@ from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Scene
 
 FOLDERS = {"fit": "renders_fit", "initialize": "renders_initialize", "distill": "renders"}
+MOST_AT_ONCE = 4  # views, each with all its pictures in memory
 LEAST_UNSEEN = 0.005  # mean share of a test view's pixels from which the scene is closed by a backdrop
 
 
@@ -75,14 +78,15 @@ def run(
     names, kind = views_of(scene)
     work, counts = prepared(params, scene, out, needs, tested=kind == "test")
     scored, before = [], None
-    for index in trace.progress(len(names), "evaluate"):
-        camera = scene.cameras[names[index]]
-        shown, pictures = rendered(work, camera)
-        if before:
-            rows.add_consistency(scored[-1], before, shown)
-        before, truth = shown, truth_for(work, camera)
-        save_side_by_side(out, pictures["fit"], truth.picture, shown)
-        scored.append(rows.row_of(shown, pictures.get("initialize"), truth, models))
+    looked = lambda name: looked_at(work, scene.cameras[name], models)
+    at_once = MOST_AT_ONCE if params.device == "cpu" else 1
+    with closing(side_by_side(looked, names, at_once)) as views:
+        for _ in trace.progress(len(names), "evaluate"):
+            shown, row = next(views)
+            if before:
+                rows.add_consistency(scored[-1], before, shown)
+            before = shown
+            scored.append(row)
 
     (out / "per_view.csv").write_text(metrics.table(scored))
     save_ply(out / "scene.ply", work.gaussians[work.result], similarity=scene.similarity)
@@ -110,12 +114,21 @@ def prepared(
     result, captured, counts = made[-1], gaussians["fit"], {stage: len(value) for stage, value in gaussians.items()}
     unseen = unseen_in(scene, captured, poses, masks) if tested else {}
     # Brought Gaussians may know more than these views do.
-    if params.beyond and reaches_beyond(unseen) and not (poses / "gaussians.ply").exists():
+    hidden = {name: mask_of(scene.cameras[name], poses, masks) for name in unseen}
+    if params.beyond and reaches_beyond(unseen, hidden) and not (poses / "gaussians.ply").exists():
         # What was made up in views without pixels is as good as seen.
         views = (*scene.train, *scene.blank) if needs["reference"] else scene.train
         gaussians |= finished([scene.cameras[name] for name in views], gaussians, result)
     painter = paint2d.load(params.lama, params.device) if params.inpaint else None
     return Work(out, poses, masks, gaussians, result, painter, tested, unseen), counts
+
+
+def looked_at(work: Work, camera: Camera, models: dict) -> tuple[Shown, dict[str, Any]]:
+    """The view as the result shows it, saved with all that goes with it; and its row of scores."""
+    shown, pictures = rendered(work, camera)
+    truth = truth_for(work, camera)
+    save_side_by_side(work.out, pictures["fit"], truth.picture, shown)
+    return shown, rows.row_of(shown, pictures.get("initialize"), truth, models)
 
 
 def rendered(work: Work, camera: Camera) -> tuple[Shown, dict[str, np.ndarray]]:
@@ -162,9 +175,11 @@ def unseen_in(scene: Scene, captured: Gaussians, poses: Path, masks: Path | None
     return {name: sight.unseen(captured, scene.cameras[name], seen_by) for name in scene.test}
 
 
-def reaches_beyond(unseen: dict[str, np.ndarray]) -> bool:
-    """Do the test views show enough that no training view saw for a backdrop to be worth it? Without any: perhaps."""
-    return not unseen or float(np.mean([each.mean() for each in unseen.values()])) > LEAST_UNSEEN
+def reaches_beyond(unseen: dict[str, np.ndarray], hidden: dict[str, np.ndarray]) -> bool:
+    """Do the test views show enough that no training view saw for a backdrop to be worth it? Without any: perhaps.
+
+    Not counted is where they show the object (`hidden`), which no training view shows beside its mask."""
+    return not unseen or float(np.mean([(each & ~hidden[name]).mean() for name, each in unseen.items()])) > LEAST_UNSEEN
 
 
 def finished(cameras: list[Camera], gaussians: dict[str, Gaussians], result: str) -> dict[str, Gaussians]:

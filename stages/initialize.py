@@ -23,7 +23,7 @@ from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_mask_sets, load_object, load_references, load_scene
 from reffusion.masks import regions, taint, undecided, voting
 from reffusion.masks.witness import with_photographed_depth
-from reffusion.paint import margin
+from reffusion.paint import margin, paint2d
 from reffusion.params.initialize import Params
 from reffusion.prior import inpaint
 from reffusion.splat import rasterizer
@@ -147,7 +147,9 @@ def filled(params: Params, out: Path, gaussians, new, reference, around, network
     sheets = Sheets(gloss=params.gloss and not farthest)  # a sliver tells nothing of shine
     hole = filling.to_fill(gaussians, new, reference, hidden, COVERED)
     remaining = gaussians.map(lambda p: p[~new])
-    near, told = around.compared(camera, hole) if params.depth.sweep else (around, None)
+    # A gap that is left open at last is too narrow for the comparison to tell of its rim.
+    swept = params.depth.sweep and not (farthest and coverage.narrow(hole))
+    near, told = around.compared(camera, hole) if swept else (around, None)
     continued = undecided.behind(remaining, camera, hidden, near.views, near.planes).continued
     past = (lambda depth: near.looked_past(camera, depth)) if params.depth.sweep else None
     hints = behind.Hints(continued, near.photographed(camera), told, past)
@@ -246,8 +248,11 @@ def completed_further(params: Params, out: Path, gaussians, new, around, true):
         rimmed = margin.widened(hidden, surfaces.RIM)
         base = inpaint.background(gaussians, camera, around.photos[camera.name], rimmed)
         hole = surfaces.with_rim(mask, hidden)
-        (completed,) = surfaces.completions(base, hole, camera, hidden, looked, [SEED])
-        reference = Reference(camera, completed.image, mask)
+        if coverage.narrow(mask):  # in a gap there is no room for texture, only for what is beside it
+            picture = paint2d.telea(base, hole)
+        else:
+            picture = surfaces.completions(base, hole, camera, hidden, looked, [SEED])[0].image
+        reference = Reference(camera, picture, mask)
         print(f"further view {camera.name}: {mask.sum() / hidden.sum():.1%} of the mask is covered by nothing")
         try:
             gaussians, new = filled(params, out, gaussians, new, reference, around, None, None, farthest=True)
@@ -255,7 +260,7 @@ def completed_further(params: Params, out: Path, gaussians, new, around, true):
             print(f"left as it is: {error}")
             found[camera.name] = np.zeros_like(mask)
             continue
-        save_image(out / "further" / f"{camera.name}.png", completed.image)
+        save_image(out / "further" / f"{camera.name}.png", picture)
         further.append(reference)
         found |= coverage.open_pixels(gaussians, around, [c for c in around.cameras if found[c.name].any()])
     return gaussians, new, further

@@ -4,6 +4,7 @@ invent mask."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from reffusion.fit import exposure
 from reffusion.io.arrays import load_json, load_labels, save_json, save_labels
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_fill, load_raw_masks, load_scene, load_views, objects_of, save_mask_sets
+from reffusion.kernels.compiled import side_by_side
 from reffusion.masks import brought, regions, undecided, voting, witness
 from reffusion.masks.continuation import planes_around
 from reffusion.masks.plane import Plane
@@ -31,6 +33,7 @@ from reffusion.types import Camera, Gaussians, MaskSet, Scene
 
 BURIED = 0.1  # blending weight in all views up to which a Gaussian votes by where it stands
 SPECK, GAP = 0.01, 0.02  # of the image's width: islands of a mask below this diameter go, holes in it close
+MOST_AT_ONCE = 4  # views, each with its pixels as points in memory
 SEED = 0  # of the draws that find planes
 LOOKED_AT = 8  # views, with which Gaussians that the scene brings are compared
 
@@ -170,15 +173,18 @@ def classified(
     fill: Filled,
 ) -> dict[str, MaskSet]:
     """The masks of each view: what other views show behind the object is decided, and is not invented."""
-    names, sets = list(scene.cameras), {}
-    for k in trace.progress(len(names), "masks"):
-        name, camera = names[k], scene.cameras[names[k]]
+    names = list(scene.cameras)
+
+    def masks_of(name: str) -> MaskSet:
+        camera = scene.cameras[name]
         found = undecided.behind(remaining, camera, consistent[name], views, planes)
         unknown = tidied(params, found.undecided) & consistent[name] & (name not in scene.clean)
         invent = consistent[name] & (name not in scene.clean) if params.invent == "consistent" else unknown
         invent = invent | fill.shown(camera, found.depth)
-        sets[name] = MaskSet(raw.get(name, np.zeros_like(unknown)), consistent[name], unknown, invent)
-    return sets
+        return MaskSet(raw.get(name, np.zeros_like(unknown)), consistent[name], unknown, invent)
+
+    with closing(side_by_side(masks_of, names, MOST_AT_ONCE if params.device == "cpu" else 1)) as found:
+        return {names[k]: next(found) for k in trace.progress(len(names), "masks")}
 
 
 def of_blank_views(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -19,12 +20,15 @@ def samples(
     weights: Mapping[str, np.ndarray],
     steps: range,
     seed: int,
+    coarse: int = 0,
 ) -> Iterator[tuple[Camera, Tensor, Tensor | None]]:
-    """What each of the steps sees, prepared by a thread of its own while the step before it runs."""
+    """What each of the steps sees, prepared by a thread of its own while the step before it runs; before step `coarse`
+    at half the size."""
 
     def prepared(i: int) -> tuple[Camera, Tensor, Tensor | None]:
         camera = cameras[seeding.in_epochs(i, len(cameras), seed, "views")]
-        return sample(camera, images[camera.name], weights.get(camera.name))
+        view = camera, images[camera.name], weights.get(camera.name)
+        return sample(*(halved(*view) if i < coarse else view))
 
     with ThreadPoolExecutor(1, thread_name_prefix="fit") as ahead:
         coming = ahead.submit(prepared, steps.start)
@@ -38,6 +42,18 @@ def sample(camera: Camera, image: np.ndarray, weights: np.ndarray | None) -> tup
     """The view as the step sees it: camera, image in [0, 1], weights."""
     counts = None if weights is None else torch.from_numpy(np.asarray(weights, np.float32))
     return camera, torch.from_numpy(image).float() / 255, counts
+
+
+def halved(
+    camera: Camera, image: np.ndarray, weights: np.ndarray | None
+) -> tuple[Camera, np.ndarray, np.ndarray | None]:
+    """The view at half its size, rounded up; a pixel counts as the least that it holds."""
+    size = (camera.width + 1) // 2, (camera.height + 1) // 2
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    if weights is not None:
+        lowest = cv2.erode(np.asarray(weights, np.float32), np.ones((3, 3), np.uint8))
+        weights = cv2.resize(lowest, size, interpolation=cv2.INTER_NEAREST)
+    return camera.resized(*size), small, weights
 
 
 def check_sizes(cameras: Sequence[Camera], images: Mapping[str, np.ndarray], weights: Mapping[str, np.ndarray]) -> None:

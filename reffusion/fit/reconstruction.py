@@ -14,7 +14,7 @@ from torch import Tensor
 from reffusion import trace
 from reffusion.fit.exposure import Exposures
 from reffusion.fit.feed import check_sizes, sample, samples
-from reffusion.fit.step import adapt, degree_at, rates_of, squared_error, step
+from reffusion.fit.step import adapt, coarse_steps, degree_at, rates_of, squared_error, step
 from reffusion.gaussians.optimize import GaussianOptimizer, Rates
 from reffusion.params.fit import Params
 from reffusion.splat.rasterizer import render
@@ -66,7 +66,7 @@ def fit(
         _write_line(log, run, *measured)
     for i, (camera, target, counts) in zip(
         trace.progress(settings.iterations, "fit", run.iteration),
-        samples(cameras, images, weights, range(run.iteration, settings.iterations), settings.seed),
+        samples(cameras, images, weights, range(run.iteration, settings.iterations), settings.seed, coarse_steps(settings)),
         strict=True,
     ):
         seen = camera, _move(target, optimizer), _move(counts, optimizer)

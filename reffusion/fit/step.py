@@ -91,6 +91,11 @@ def squared_error(image: Tensor, target: Tensor, counts: Tensor | None) -> float
     return float(squared[inside].mean()) if inside.any() else 0.0
 
 
+def coarse_steps(settings: Params) -> int:
+    import os
+    return round(float(os.environ.get("COARSE", "0")) * settings.iterations) if settings.init.flow_cell else 0
+
+
 def degree_at(settings: Params, i: int) -> int:
     """Of the spherical harmonics in step `i`."""
     if settings.sh.every == 0:

@@ -17,6 +17,7 @@ from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Reference
 
 EDGE = 0.03  # relative depth: of a step between two things, and within which two surfaces are the same
+NARROW = 0.02  # of the image's width: a gap up to so wide shows no texture
 ENOUGH = 0.001  # share of a view's C under which what is open is left to its neighbours
 
 
@@ -60,6 +61,12 @@ def barest(around: Surroundings, found: Mapping[str, np.ndarray]) -> Camera | No
     """The view with the most open pixels; None where in each they are too few to count."""
     bare = [c for c in around.cameras if found[c.name].sum() > ENOUGH * max(around.hidden[c.name].sum(), 1)]
     return max(bare, key=lambda camera: int(found[camera.name].sum()), default=None)
+
+
+def narrow(mask: np.ndarray) -> bool:
+    """Whether what is open, bool [H, W], is nowhere wider than a gap."""
+    inside = cv2.distanceTransform(np.pad(mask.astype(np.uint8), 1), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return 2 * float(inside.max()) <= NARROW * mask.shape[1]
 
 
 @torch.no_grad()

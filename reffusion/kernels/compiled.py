@@ -9,20 +9,22 @@ import os
 import shutil
 import threading
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numba
 import numpy as np
 import torch
 
+T, R = TypeVar("T"), TypeVar("R")
 _LARGE, _BLOCKS = 2**16, 24  # numbers of an array worth keeping; how many are kept, some two steps' worth
 FEW = 8000  # Gaussians for which waking another thread takes longer than it saves
 # Rounding may vary, but NaN and infinity stay what they are: `fit` looks for them.
 FREE_ROUNDING = "contract", "reassoc", "nsz", "arcp"
-_ROOMS = "kernels", "splat", "gaussians", "texture"  # the packages that have kernels
+_ROOMS = "kernels", "splat", "gaussians", "texture", "masks"  # the packages that have kernels
 _CACHE = "splat-"  # folders of machine code in __pycache__, one per state of these sources
 
 
@@ -119,6 +121,16 @@ def parallel_for(function: Callable, *arguments, gaussians: int = FEW) -> None:
     for future in pending:
         if not future.cancel():  # a helper that never woke up has nothing left to do
             future.result()
+
+
+def side_by_side(function: Callable[[T], R], items: Iterable[T], most: int = 8) -> Iterator[R]:
+    """`function` of each item in their order, as many at once as there are threads, `most` at most: for work whose
+    array operations let other threads run. Where it is left early, what has not begun is not done."""
+    with ThreadPoolExecutor(max(1, min(threads(), most)), thread_name_prefix="beside") as pool:
+        try:
+            yield from pool.map(function, items)
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
 
 
 @functools.lru_cache(maxsize=1)

@@ -11,6 +11,7 @@ import torch
 
 from reffusion import geometry
 from reffusion.gaussians.surfels import surface_normals
+from reffusion.masks.asked import SEEN, ask
 from reffusion.paint import margin
 from reffusion.splat import rasterizer
 from reffusion.splat.reference import colors
@@ -119,31 +120,21 @@ def votes(points: np.ndarray, views: Sequence[Witness], normals: np.ndarray | No
         normals: [P, 3], of the surface that the points lie on, towards the side asked about; a view from the other
             side does not count, so that the underside of a table is no witness of its top.
     """
-    seen, free, behind, hidden = np.zeros((4, len(points)), np.int64)
+    counts = np.zeros((4, len(points)), np.int64)
     for view in views:
-        uv, z = geometry.project(points, view.camera)
-        masked, inside = geometry.sample_nearest(view.hidden, uv)
-        nearest, _ = geometry.sample_nearest(view.nearest, uv)
-        farthest, _ = geometry.sample_nearest(view.farthest, uv)
-        shown = inside & ~masked & (z > 0) & (nearest > 0)
-        on = seen_by(view, points)
-        if normals is not None:
-            on &= ((view.camera.center - points) * normals).sum(-1) > 0
-        seen += on
-        free += shown & (nearest > z * (1 + FREE))
-        behind += shown & (z > farthest * (1 + SURFACE))
-        hidden += inside & masked & (z > 0)
-    return Votes(seen, free, behind, hidden)
+        _ask(view, points, normals, counts)
+    return Votes(*counts)
 
 
 def seen_by(view: Witness, points: np.ndarray) -> np.ndarray:
     """bool [P]: the view shows a surface at the points [P, 3], not before and not behind them."""
-    uv, z = geometry.project(points, view.camera)
-    masked, inside = geometry.sample_nearest(view.hidden, uv)
-    nearest, _ = geometry.sample_nearest(view.nearest, uv)
-    farthest, _ = geometry.sample_nearest(view.farthest, uv)
-    shown = inside & ~masked & (z > 0) & (nearest > 0)
-    return shown & (z > nearest * (1 - SURFACE)) & (z < farthest * (1 + SURFACE))
+    counts = np.zeros((4, len(points)), np.int64)
+    _ask(view, points, None, counts)
+    return counts[SEEN] > 0
+
+
+def _ask(view: Witness, points: np.ndarray, normals: np.ndarray | None, counts: np.ndarray) -> None:
+    ask(points, normals, view.camera, (view.nearest, view.farthest, view.hidden), (SURFACE, FREE), counts)
 
 
 def smoothed_surface(depth: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:

@@ -68,16 +68,19 @@ def unseen(gaussians: Gaussians, camera: Camera, seen_by: Sequence[SeenView]) ->
         gaussians: the fit that the training views were drawn of.
     """
     depth, alpha = _depth(gaussians, camera)
-    open_, points = depth > 0, geometry.unproject(np.where(depth > 0, depth, 1.0), camera)
+    places = np.flatnonzero(depth > 0)
+    points = geometry.unproject(np.where(depth > 0, depth, 1.0), camera).reshape(-1, 3)[places]
     missed = np.ones(depth.shape, bool)
     # From the nearest on: it has seen most, and only the rest is looked for in the others.
     for view in sorted(seen_by, key=lambda v: float(np.linalg.norm(v.camera.center - camera.center))):
-        uv, z = geometry.project(points[open_], view.camera)
+        if not len(places):
+            break
+        uv, z = geometry.project(points, view.camera)
         surface, framed = geometry.sample_nearest(view.depth, uv)
         hidden, _ = geometry.sample_nearest(view.hidden, uv)
         found = framed & ~hidden & (z < (1 + TOLERANCE) * surface)
-        rows, columns = (index[found] for index in np.nonzero(open_))
-        missed[rows, columns] = open_[rows, columns] = False
+        missed.flat[places[found]] = False
+        places, points = places[~found], points[~found]
     return ndimage.median_filter(missed | (alpha < COVERED), SPECKS)
 
 
