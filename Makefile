@@ -76,6 +76,9 @@ help:
 
 setup: $(VENV)/.ready
 
+# Bytecode is written by what is imported first; where Python is told not to, each stage would compile its libraries anew.
+bytecode := $(if $(PYTHONDONTWRITEBYTECODE),,--no-compile)
+
 # Only where there is none: an environment that exists is never emptied.
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -83,23 +86,23 @@ $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV) || { rm -f $@; exit 1; }
 
 $(VENV)/.ready: pyproject.toml constraints.txt | $(VENV)/bin/python
-	$(PY) -m pip install --quiet --no-compile --constraint constraints.txt --editable .
+	$(PY) -m pip install --quiet $(bytecode) --constraint constraints.txt --editable .
 	@touch $@
 
 $(VENV)/.ready-view: $(VENV)/.ready
-	$(PY) -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[view]'
+	$(PY) -m pip install --quiet $(bytecode) --constraint constraints.txt --editable '.[view]'
 	@touch $@
 
 $(VENV)/.ready-export: $(VENV)/.ready
-	$(PY) -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[export]'
+	$(PY) -m pip install --quiet $(bytecode) --constraint constraints.txt --editable '.[export]'
 	@touch $@
 
 $(VENV)/.ready-cluster: $(VENV)/.ready
-	$(PY) -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[cluster]'
+	$(PY) -m pip install --quiet $(bytecode) --constraint constraints.txt --editable '.[cluster]'
 	@touch $@
 
 $(VENV)/.ready-dev: $(VENV)/.ready
-	$(PY) -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[dev]'
+	$(PY) -m pip install --quiet $(bytecode) --constraint constraints.txt --editable '.[dev]'
 	@touch $@
 
 # --------------------------------------------------------------------------------------------------------- scenes
@@ -254,7 +257,7 @@ stability: $(VENV)/.ready-dev
 # First what cannot be mended by installing; MAX_JOBS bounds the compilers, each of which takes up to 1 GB.
 gpu: $(VENV)/.ready
 	@$(PY) -m benchmarks.gpu.ready --before
-	$(PY) -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[gpu]'
+	$(PY) -m pip install --quiet $(bytecode) --constraint constraints.txt --editable '.[gpu]'
 	@$(PY) -m benchmarks.gpu.ready
 
 gpu-check: $(VENV)/.ready

@@ -11,14 +11,16 @@ STEPS = 12
 
 
 def used(seconds, steps=WORTH, device="cpu", idle=time.perf_counter):
-    """The threads of each of `STEPS` steps, which take `seconds[threads]`, while a core is idle, or as `idle` says."""
+    """The parts at once of each of `STEPS` steps, which take `seconds[parts]`; a core is idle, or as `idle` says."""
     before, found = torch.get_num_threads(), []
     torch.set_num_threads(2)
     try:
         with Threads(steps, torch.device(device), idle) as threads:
             for _ in range(STEPS):
                 with threads.step():
-                    found.append(torch.get_num_threads())
+                    found.append(threads.now)
+                    of_torch = set(threads.map(lambda _: torch.get_num_threads(), range(4)))
+                    assert of_torch == ({1} if steps >= WORTH and device == "cpu" else {2})
                     time.sleep(seconds[found[-1]])
         assert torch.get_num_threads() == 2
     finally:
@@ -40,5 +42,5 @@ def test_a_core_that_others_use_is_left_to_them():
     assert 0 < idle_seconds() < float("inf")
 
 
-def test_little_work_and_gpus_are_not_measured():
-    assert used({1: 0.0, 2: 0.0}, steps=WORTH - 1) == [2] * STEPS == used({1: 0.0, 2: 0.0}, device="meta")
+def test_little_work_and_gpus_are_left_to_torch():
+    assert used({1: 0.0, 2: 0.0}, steps=WORTH - 1) == [1] * STEPS == used({1: 0.0, 2: 0.0}, device="meta")

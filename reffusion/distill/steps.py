@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from reffusion.distill.confinement import (
     reference_term,
     sds_term,
 )
+from reffusion.distill.crew import Crew
 from reffusion.distill.depth_term import Estimator, depth_term
 from reffusion.distill.lift import lift_term
 from reffusion.distill.perceptual import Distance
@@ -44,6 +46,7 @@ class Job:
         distance: of patches, for lifted pictures; None where they are compared by their squared error.
         adversary: the critic; None where it has no part.
         tally: what there is to log of steps gone by, of terms that not every step has.
+        crew: who does SDS beside the other terms.
     """
 
     views: Sequence[TrainView]
@@ -58,6 +61,7 @@ class Job:
     adversary: Adversary | None
     settings: Params
     tally: dict[str, float]
+    crew: Crew
 
 
 def job_of(
@@ -91,9 +95,10 @@ def job_of(
     references = [camera for camera, _, _ in holes]
     distilled = near_a_reference(painted, references, initial.means[masked], settings.sds.within)
     photographed = [view for view in views if view.supervises.any()]
-    return Job(
-        views, photographed, painted, distilled, holes, prior, text, estimator, distance, adversary, settings, {}
-    )
+    # The depth term asks the prior too, the critic draws from its own state, and a card does one thing after another.
+    alone = not distilled or settings.depth.weight > 0 or adversary is not None or initial.means.is_cuda
+    given = views, photographed, painted, distilled, holes, prior, text, estimator, distance, adversary, settings
+    return Job(*given, {}, Crew(1 if alone or settings.sds.weight == 0 else torch.get_num_threads()))
 
 
 def near_a_reference(
@@ -117,12 +122,19 @@ def step_of(optimizer: GaussianOptimizer, step: int, job: Job) -> dict[str, floa
     where this step is without it.
     """
     moved, line = torch.zeros_like(optimizer.masked), {}
-    # SDS first: it logs what has been gathered.
-    for term in (_sds, _depth, _adversarial, _reference, _lift, _reconstruction):
-        done = term(optimizer, step, job)
+    apart = copy.copy(optimizer)  # SDS gathers for itself, and logs what that is
+    apart.gaussians = optimizer.gaussians.map(lambda p: p.detach().requires_grad_())
+    rest = lambda: [term(optimizer, step, job) for term in (_depth, _adversarial, _reference, _lift, _reconstruction)]
+    with job.crew.beside(lambda: _sds(apart, step, job)) as sds:
+        terms = rest()
+    for done in (sds(), *terms):
         if done is not None:
             moved |= done[0]
             line |= done[1]
+    for name in PARAMETERS:
+        parameter, gradient = getattr(optimizer.gaussians, name), getattr(apart.gaussians, name).grad
+        if gradient is not None:
+            parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
     optimizer.step(step / job.settings.iterations, visible=moved)
     return line
 

@@ -64,9 +64,10 @@ def fit(
     checkpoints, measured = trace.Checkpoints(folder, settings.checkpoint_seconds), (held_out, images, settings, impl)
     if run.iteration == 0:
         _write_line(log, run, *measured)
+    steps = range(run.iteration, settings.iterations)
     for i, (camera, target, counts) in zip(
         trace.progress(settings.iterations, "fit", run.iteration),
-        samples(cameras, images, weights, range(run.iteration, settings.iterations), settings.seed, coarse_steps(settings)),
+        samples(cameras, images, weights, steps, settings.seed, coarse_steps(settings)),
         strict=True,
     ):
         seen = camera, _move(target, optimizer), _move(counts, optimizer)

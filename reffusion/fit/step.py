@@ -28,6 +28,7 @@ GENTLE = Rates(
     sh_dc=5e-3,
     sh_rest=5e-4,
 )
+COARSE = 0.3  # of the steps, that look at half the size
 GROW_SCALE3D = 0.01  # deviation / distance from which on a Gaussian is split, not cloned
 
 
@@ -92,8 +93,9 @@ def squared_error(image: Tensor, target: Tensor, counts: Tensor | None) -> float
 
 
 def coarse_steps(settings: Params) -> int:
-    import os
-    return round(float(os.environ.get("COARSE", "0")) * settings.iterations) if settings.init.flow_cell else 0
+    """How many of the first steps look at views of half the size. A start with a point every few pixels has its places:
+    it is sizes and colours that are learnt first, and those a small view tells as well."""
+    return round(COARSE * settings.iterations) if settings.init.flow_cell else 0
 
 
 def degree_at(settings: Params, i: int) -> int:

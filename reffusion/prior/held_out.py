@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -58,22 +59,32 @@ def held_out(
     return HeldOut(own, *(torch.stack(each) for each in (pictures, repaint, holes)))
 
 
-@torch.no_grad()
-def measured(prior: Prior, held: HeldOut, seed: int) -> dict[str, float]:
+def measured(prior: Prior, held: HeldOut, seed: int, each: Callable[..., Iterable] = map) -> dict[str, float]:
     """The errors of docs/traces.md, with fixed noise: comparable through the training. A small model takes about the
-    time of a step of training."""
+    time of a step of training.
+
+    Args:
+        each: like `map`; may do several at once.
+    """
     lora.set_dropout(prior, False)
-    samples, errors = held.reference, []
-    for level in LEVELS:
-        timesteps = torch.full((len(samples.prompts),), round(level * (prior.timesteps - 1)))
-        draw = seeded(seed, "personalize", "held out", level)
-        noise = torch.randn(len(samples.prompts), *latent_shape(prior, samples.images.shape[-1]), generator=draw)
-        errors.append(torch.stack(denoising_error(prior, samples, timesteps, noise, outside_weight=0)))
+    parts = [partial(_errors, prior, held, seed, level) for level in LEVELS] + [partial(_expected, prior, held, seed)]
+    *errors, expected = each(lambda part: part(), parts)
     target, clean = torch.stack(errors).mean(0)
     said = {"target_mse": float(target[0]), "clean_latent_mse": float(clean[0]), "crop_latent_mse": float(clean[1])}
-    return said | _expected(prior, held, seed)
+    return said | expected
 
 
+@torch.no_grad()
+def _errors(prior: Prior, held: HeldOut, seed: int, level: float) -> Tensor:
+    """[2, B]: those of the reference's own hole, at a level of the noise; see `denoising_error`."""
+    samples = held.reference
+    timesteps = torch.full((len(samples.prompts),), round(level * (prior.timesteps - 1)))
+    draw = seeded(seed, "personalize", "held out", level)
+    noise = torch.randn(len(samples.prompts), *latent_shape(prior, samples.images.shape[-1]), generator=draw)
+    return torch.stack(denoising_error(prior, samples, timesteps, noise, outside_weight=0))
+
+
+@torch.no_grad()
 def _expected(prior: Prior, held: HeldOut, seed: int) -> dict[str, float]:
     """PSNR of the reference's hole, and of those in photographs, as the prior expects them from pure noise, in a step:
     the mean of what it would paint."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import cos, isfinite, pi
+from math import ceil, cos, isfinite, pi
 from pathlib import Path
 
 import torch
@@ -72,7 +72,7 @@ def personalize(
     def measure(step: int) -> None:
         end = {"reason": "finished"} if step == steps else {}
         with log.paused():
-            log.log(step, **measured(prior, held, settings.seed), **end)
+            log.log(step, **measured(prior, held, settings.seed, threads.map), **end)
 
     with threads:
         for step in trace.progress(steps, "personalize", start):
@@ -82,7 +82,7 @@ def personalize(
             for group, rate in zip(optimizer.param_groups, rates, strict=True):
                 group["lr"] = rate * factor
             with threads.step():
-                train_step(prior, optimizer, references, settings, step)
+                train_step(prior, optimizer, references, settings, step, threads)
             if checkpoints.due:
                 done = {"optimizer": optimizer.state_dict(), "step": step + 1, "seconds": log.seconds}
                 checkpoints.save(lambda done=done: done | {"lora": lora.state(prior)})
@@ -109,28 +109,40 @@ def train_step(
     references: Sequence[Picture],
     settings: Params,
     step: int,
+    threads: Threads | None = None,
 ) -> float:
     """One optimiser step; the mean loss. Its draws depend on `step`, not on what was drawn before.
+
+    Args:
+        threads: share out the samples; None: one takes all.
 
     Raises:
         FloatingPointError: naming the step; the weights are as before it.
     """
     lora.set_dropout(prior, True)
-    optimizer.zero_grad(set_to_none=True)
     samples, size, count, total = settings.samples, _side(prior, settings), settings.optimizer.batch, 0.0
     draw = seeded(settings.seed, "personalize", step, 0)
     batch = draw_samples(references, prior.native_size, size, count, samples, draw)
     timesteps = spread_timesteps(count, prior.timesteps, draw)
     noise = torch.randn(count, *latent_shape(prior, size), generator=draw)
-    # LoRA's dropout takes no generator of its own: seed the global one from the step's.
+    # LoRA's dropout takes no generator of its own: seed the global one from the step's, and draw in order.
     torch.manual_seed(int(torch.randint(2**62, (), generator=draw)))
-    for rows in torch.arange(count).split(prior.rows_graded or count):
+    shared = threads if threads is not None and not settings.lora.dropout else None
+    trained = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+
+    def graded(rows: torch.Tensor) -> tuple[float, tuple[torch.Tensor | None, ...]]:
         some = Batch(*(tensor[rows] for tensor in batch))
         error, _ = denoising_error(prior, some, timesteps[rows], noise[rows], samples.outside_weight)
         loss = error.sum() / count
-        loss.backward()
-        total += loss.item()
-    trained = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+        return loss.item(), torch.autograd.grad(loss, trained, allow_unused=True)
+
+    optimizer.zero_grad(set_to_none=True)
+    parts = torch.arange(count).split(min(prior.rows_graded or count, ceil(count / (shared.now if shared else 1))))
+    for loss, gradients in shared.map(graded, parts) if shared else map(graded, parts):
+        total += loss
+        for parameter, gradient in zip(trained, gradients, strict=True):
+            if gradient is not None:
+                parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
     norm = float(torch.nn.utils.clip_grad_norm_(trained, CLIP))
     if not (isfinite(norm) and isfinite(total)):
         where = f"personalization, step {step}"

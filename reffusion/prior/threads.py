@@ -1,11 +1,13 @@
-"""As many threads as pay: small maps leave little to share, and one that waits for a busy core holds up the rest."""
+"""As many threads as pay, each with samples of its own: the maps of one are too small to be shared, and threads that
+wait for each other in each of them are held up by any other process."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Self
+from typing import Any, Self
 
 import torch
 
@@ -18,32 +20,37 @@ FREE = 0.8  # part of a core's time that nobody wants, from which it counts as f
 
 
 class Threads:
-    """Torch's threads for the steps of a long work on the CPU: all, where cores are free while one thread works at
-    first, and until all take longer than that one did. Beside a busy core two may take ten times as long as one.
+    """The threads for the steps of a long work on the CPU: as many as torch has, where cores are free while one thread
+    works at first, and until all take longer than that one did.
 
-    A context, after which torch has as many as before. A step's sums are rounded differently by another number.
+    A context, in which torch itself takes one thread for each of them, and after which it has as many as before. A
+    step's sums are rounded differently by another number. Short works, and those on a card, are left to torch.
 
     Attributes:
-        all: torch's own number at the beginning. now: that of the next step.
+        all: torch's own number at the beginning. now: how many parts of the next step are done at once.
     """
 
     def __init__(self, steps: int, device: torch.device, idle: Callable[[], float] = idle_seconds):
-        self.all = self.now = torch.get_num_threads()
+        self.all, self.now = torch.get_num_threads(), 1
         self._choosing = steps >= WORTH and self.all > 1 and device.type == "cpu"
         self._one, self._recent = float("inf"), list[float]()
         self._done, self._idle, self._began = 0, idle, (0.0, 0.0)
 
     def __enter__(self) -> Self:
-        self._take(1 if self._choosing else self.all)
+        if self._choosing:
+            torch.set_num_threads(1)
+        self._pool = ThreadPoolExecutor(self.all, initializer=torch.set_num_threads, initargs=(1,))
         self._began = self._idle(), time.perf_counter()
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._pool.shutdown()
         torch.set_num_threads(self.all)
 
-    def _take(self, count: int) -> None:
-        self.now = count
-        torch.set_num_threads(count)
+    def map(self, function: Callable[[Any], Any], parts: Iterable[Any]) -> Iterator[Any]:
+        """`function` of each part, in their order; `now` at once. What torch keeps for each thread, such as no_grad, is
+        the function's to say."""
+        return self._pool.map(function, parts) if self.now > 1 else map(function, parts)
 
     @contextmanager
     def step(self) -> Iterator[None]:
@@ -58,12 +65,11 @@ class Threads:
             self._one = min(self._one, seconds)
             if self._done == MEASURED:
                 self._choosing = self._others_are_free()
-                self._take(self.all if self._choosing else 1)
+                self.now = self.all if self._choosing else 1
             return
         self._recent = [*self._recent, seconds][-RECENT:]
         if len(self._recent) == RECENT and min(self._recent) > self._one:
-            self._take(1)
-            self._choosing = False
+            self.now, self._choosing = 1, False
 
     def _others_are_free(self) -> bool:
         idle, began = self._began
