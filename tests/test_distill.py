@@ -205,6 +205,19 @@ def run(folder, prior, text, settings=SETTINGS, views=None, gaussians=None):
     return D.distill(gaussians or start, masked, views, holes, prior, text, settings, folder)
 
 
+def test_sds_beside_the_other_terms_gives_the_same_bits(prior, text, tmp_path):
+    before, found = torch.get_num_threads(), []
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        try:
+            found.append(run(tmp_path / str(threads), prior, text, altered(SETTINGS, adversarial=OFF))[0])
+            assert torch.get_num_threads() == threads
+        finally:
+            torch.set_num_threads(before)
+    for name in PARAMETERS:
+        assert (getattr(found[0], name) == getattr(found[1], name)).all(), name
+
+
 def test_interrupted_distillation_resumes_to_the_same_gaussians(prior, text, tmp_path, monkeypatch):
     monkeypatch.setattr(trace, "WORTH", 0)  # a checkpoint after every step
     monkeypatch.setattr(D, "REGION_EVERY", 2)
