@@ -39,12 +39,14 @@ class Behind:
         undecided: bool [H, W], inside C: no photograph tells what is to be seen there.
         continued: [H, W], depth of the plane that goes on there; inf where none does, or outside `undecided`.
         depth, alpha: [H, W] float64, as rendered; outside the mask the photographed depth.
+        planes: depth [H, W] of each plane that goes on there, everywhere; inf where a ray does not meet it.
     """
 
     undecided: np.ndarray
     continued: np.ndarray
     depth: np.ndarray
     alpha: np.ndarray
+    planes: tuple[np.ndarray, ...] = ()
 
 
 @torch.no_grad()
@@ -72,7 +74,7 @@ def behind(
         said = votes(points, views, normals)
         undecided[rows, columns] = said.seen < np.maximum(1, TRUSTED * (said.seen + said.behind))
     depth = with_photographed_depth(depth, camera, views)
-    hides, reach = np.zeros_like(hidden), np.full(hidden.shape, np.inf)
+    hides, reach, onward = np.zeros_like(hidden), np.full(hidden.shape, np.inf), []
     for plane in planes:
         at = plane.depth(camera)
         before = plane.on(plane.goes_on, at, camera, hidden & (at < BEFORE * np.where(depth > 0, depth, np.inf)))
@@ -80,9 +82,10 @@ def behind(
         beneath = plane.on(plane.within, at, camera, undecided & ((at < depth / BEFORE) | (alpha <= OPAQUE)))
         if _grows_out_of(before | beneath, plane, at, camera, depth, ~hidden & (alpha > OPAQUE)):
             hides |= before
+            onward.append(at)
             reach = np.where(before | beneath, np.minimum(reach, at), reach)
     undecided = without_slivers(undecided | hides) & hidden
-    return Behind(undecided, np.where(undecided, reach, np.inf), depth, alpha)
+    return Behind(undecided, np.where(undecided, reach, np.inf), depth, alpha, tuple(onward))
 
 
 def _grows_out_of(

@@ -100,7 +100,7 @@ class Votes:
     Attributes:
         seen: [P], views that show a surface there. With normals: a surface that faces them.
         free: [P], views that look past the point onto something farther.
-        behind: [P], views in which something stands before the point.
+        behind: [P], views in which something stands before the point. With normals: of those that the surface faces.
         hidden: [P], views that see the object in the point's direction.
     """
 
@@ -117,7 +117,8 @@ def votes(points: np.ndarray, views: Sequence[Witness], normals: np.ndarray | No
 
     Args:
         normals: [P, 3], of the surface that the points lie on, towards the side asked about; a view from the other
-            side does not count, so that the underside of a table is no witness of its top.
+            side does not count, so that the underside of a table is no witness of its top, nor does a vase that hides
+            its own far side speak against it.
     """
     seen, free, behind, hidden = np.zeros((4, len(points)), np.int64)
     for view in views:
@@ -127,11 +128,13 @@ def votes(points: np.ndarray, views: Sequence[Witness], normals: np.ndarray | No
         farthest, _ = geometry.sample_nearest(view.farthest, uv)
         shown = inside & ~masked & (z > 0) & (nearest > 0)
         on = seen_by(view, points)
+        before = shown & (z > farthest * (1 + SURFACE))
         if normals is not None:
-            on &= ((view.camera.center - points) * normals).sum(-1) > 0
+            faced = ((view.camera.center - points) * normals).sum(-1) > 0
+            on, before = on & faced, before & faced
         seen += on
         free += shown & (nearest > z * (1 + FREE))
-        behind += shown & (z > farthest * (1 + SURFACE))
+        behind += before
         hidden += inside & masked & (z > 0)
     return Votes(seen, free, behind, hidden)
 
