@@ -32,3 +32,33 @@ def least_cut(true_cost: np.ndarray, false_cost: np.ndarray, pairs: np.ndarray, 
     left.eliminate_zeros()
     reached = csgraph.breadth_first_order(left, source, return_predecessors=False)
     return np.isin(nodes, reached)
+
+
+def least_labels(cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """int [N], labels of a low total cost, by expansion moves (Boykov et al. 2001): each takes one label as far as that
+    pays, until none does.
+
+    Args:
+        cost: [K, N] >= 0 of each label. start: int [N], labels to begin with.
+        pairs: [E, 2] int, neighbours, each pair once. strength: [E] >= 0, cost of a pair with different labels.
+    """
+    labels, changed = start.copy(), True
+    here, there = pairs.T
+    while changed:
+        changed = False
+        for label in range(len(cost)):
+            apart = labels[here] != labels[there]
+            keep = cost[labels, np.arange(len(labels))]
+            # Neighbours that differ pay once unless both move: half of it is a gain for each that does.
+            gain = np.bincount(pairs[apart].T.ravel(), np.tile(strength[apart] / 2, 2), len(labels))
+            stay = np.where(labels == label, HARD, keep)  # what has the label is as if it had moved
+            moves = least_cut(cost[label] - gain, stay, pairs, np.where(apart, strength / 2, strength))
+            moved = np.where(moves, label, labels)
+            if _total(cost, pairs, strength, moved) < _total(cost, pairs, strength, labels) - 1 / UNIT:
+                labels, changed = moved, True
+    return labels
+
+
+def _total(cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray, labels: np.ndarray) -> float:
+    between = strength[labels[pairs[:, 0]] != labels[pairs[:, 1]]]
+    return float(cost[labels, np.arange(len(labels))].sum() + between.sum())

@@ -150,9 +150,9 @@ def filled(params: Params, out: Path, gaussians, new, reference, around, network
     # A gap that is left open at last is too narrow for the comparison to tell of its rim.
     swept = params.depth.sweep and not (farthest and coverage.narrow(hole))
     near, told = around.compared(camera, hole) if swept else (around, None)
-    continued = undecided.behind(remaining, camera, hidden, near.views, near.planes).continued
+    onward = undecided.behind(remaining, camera, hidden, near.views, near.planes)
     past = (lambda depth: near.looked_past(camera, depth)) if params.depth.sweep else None
-    hints = behind.Hints(continued, near.photographed(camera), told, past)
+    hints = behind.Hints(onward.continued, onward.planes, near.photographed(camera), told, past)
     estimate = estimate_of(network, reference)
     depth, made_up, said = filling.depth_behind(
         remaining, reference, hole, hidden, around.points, HOW, estimate, log, hints, farthest

@@ -238,3 +238,10 @@ def test_the_sheet_names_what_is_missing(done, tmp_path):
         sheet.make(tmp_path / "nowhere", tmp_path / "sheet.png")
     with pytest.raises(ValueError, match=r"has no view9; it has view0 ... view2"):
         sheet.make(done, tmp_path / "sheet.png", views=["view0", "view9"])
+
+
+def test_what_stands_behind_the_object_asks_for_no_backdrop():
+    unseen, hidden = np.zeros((20, 20), bool), np.zeros((20, 20), bool)
+    unseen[5:10, 5:10] = True
+    assert evaluate.reaches_beyond({"v": unseen}, {"v": hidden}) and evaluate.reaches_beyond({}, {})
+    assert not evaluate.reaches_beyond({"v": unseen}, {"v": unseen})

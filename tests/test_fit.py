@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from reffusion import seeding, trace
-from reffusion.fit import exposure, step
+from reffusion.fit import exposure, feed, step
 from reffusion.fit import reconstruction as fitting
 from reffusion.fit.reconstruction import fit
 from reffusion.fit.start import initial_gaussians
@@ -17,7 +17,7 @@ from reffusion.io.arrays import load_json
 from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_views, save_scene
-from reffusion.params.fit import Densify, LearningRates, Params, SphericalHarmonics
+from reffusion.params.fit import Densify, Init, LearningRates, Params, SphericalHarmonics
 from reffusion.splat.rasterizer import render
 from reffusion.types import PARAMETERS, Camera, Gaussians, Scene, Similarity
 from stages import fit as stage
@@ -304,3 +304,17 @@ def test_the_stage_takes_over_a_scene_of_gaussians(tmp_path):
     stage.run(stage.Params(), out, poses=poses)
     assert torch.equal(load_ply(out / "gaussians.ply").means, truth().means)
     assert "no optimisation" in plan.preview(stage.Params(), poses=poses)[0]
+
+
+def test_a_dense_start_looks_at_half_the_size_first():
+    camera = Camera("v", 7, 4, 5.0, 5.0, 3.5, 2.0, np.eye(4))
+    image, counts = np.arange(84, dtype=np.uint8).reshape(4, 7, 3), np.ones((4, 7), np.float32)
+    counts[0, 0] = 0
+    given = [camera], {"v": image}, {"v": counts}, range(3), 0
+    sizes = [(c.width, c.height, tuple(t.shape), tuple(w.shape)) for c, t, w in feed.samples(*given, coarse=2)]
+    assert sizes == [(4, 2, (2, 4, 3), (2, 4))] * 2 + [(7, 4, (4, 7, 3), (4, 7))]
+    small, _, weights = feed.halved(camera, image, counts)
+    assert weights[0, 0] == 0 and weights[1, 2] == 1 and small.cy == 1.0
+    assert (
+        step.coarse_steps(Params(iterations=10)) == 0 < step.coarse_steps(Params(iterations=10, init=Init(flow_cell=3)))
+    )

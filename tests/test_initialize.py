@@ -12,9 +12,10 @@ from reffusion.depth import behind
 from reffusion.depth.behind import Completion
 from reffusion.gaussians.sheets import Sheets
 from reffusion.gaussians.surfels import surface_gaussians, surface_normals
+from reffusion.gaussians.optimize import reconstruction_loss
 from reffusion.initialize import coverage
 from reffusion.initialize import filling as rules
-from reffusion.initialize.settle import Known, turns_of
+from reffusion.initialize.settle import Known, around, turns_of
 from reffusion.io.arrays import load_json, load_labels, save_labels
 from reffusion.io.images import load_exr
 from reffusion.io.ply import load_ply
@@ -272,6 +273,32 @@ def test_a_few_pixels_of_a_further_view_do_not_cost_the_reference_its_turns():
     assert turns_of(shown(large, few, few, few)) == [20, 1, 1, 1]
     assert turns_of(shown(large, large)) == [10, 10]
     assert turns_of(shown()) == []
+
+
+def test_a_gap_is_narrow_and_a_hole_is_not():
+    gap, hole = np.zeros((100, 200), bool), np.zeros((100, 200), bool)
+    gap[10:90, 50:54], hole[40:50, 50:60] = True, True
+    assert coverage.narrow(gap) and not coverage.narrow(hole) and not coverage.narrow(gap | hole)
+    gap[:, 54:58] = True
+    assert not coverage.narrow(gap)
+
+
+def test_a_completed_view_pulls_by_its_window_as_by_the_whole():
+    """The same loss and gradient within, whichever is drawn."""
+    view, wall = small.camera("v", 0.0), small.plane(small.WALL, 2.0, 1.4, small.texture)
+    noise, mask = np.random.default_rng(0), np.zeros((small.HEIGHT, small.WIDTH), bool)
+    mask[10:20, 12:30] = True
+    picture = noise.integers(0, 256, (*mask.shape, 3), dtype=np.uint8)
+    window, part, counts = around(Reference(view, picture, mask))
+    assert window.width * window.height < 0.6 * mask.size
+    found = []
+    for camera, image, weights in ((view, picture, mask.astype(np.float32)), (window, part, counts)):
+        leaves = wall.map(lambda p: p.clone().requires_grad_())
+        drawn = rasterizer.render(leaves, camera).color
+        loss = reconstruction_loss(drawn, torch.from_numpy(image) / 255, torch.from_numpy(weights))
+        loss.backward()
+        found.append((loss.detach(), leaves.sh.grad))
+    torch.testing.assert_close(found[0], found[1], rtol=1e-3, atol=1e-7)
 
 
 def test_the_back_of_a_thing_is_drawn_though_its_front_shows_from_behind():

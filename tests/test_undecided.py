@@ -12,7 +12,7 @@ from reffusion.gaussians.surfels import surface_gaussians
 from reffusion.masks import taint
 from reffusion.masks.continuation import planes_around
 from reffusion.masks.undecided import behind
-from reffusion.masks.witness import Witness, surface_range, unlike, votes, without_slivers
+from reffusion.masks.witness import FREE, SURFACE, Witness, seen_by, surface_range, unlike, votes, without_slivers
 from reffusion.types import Camera, Gaussians
 
 TOP, FLOOR, EDGE, BOX, HIGH = 0.0, -1.0, 1.0, 0.3, 0.5  # z of table top and floor; half sides; height of the box
@@ -238,3 +238,26 @@ def test_what_has_other_colours_than_gravel_is_debris():
     assert unlike(Gaussians(*parts), [witness], {"v": photo}).tolist() == [0, 0, 1, 1]
     smooth = Witness(view, depth.astype(np.float32), *surface_range(np.full_like(depth, depth[80, 80])), witness.hidden)
     assert not unlike(Gaussians(*parts), [smooth], {"v": photo}).any()
+
+
+def test_views_say_of_points_what_the_formulas_say(views):
+    """Points on both surfaces, before, behind and beside them, behind the cameras and nowhere; with and without a side."""
+    noise = np.random.default_rng(0)
+    points = np.concatenate([noise.uniform(-1.5, 1.5, (3000, 3)) * (1, 1, 0.7), [[9, 0, 0.5], [np.nan, 0, 0]]])
+    points[:1000, 2], points[1000:1500, 2] = TOP, FLOOR
+    normals = noise.normal(size=points.shape)
+    for sides in (None, normals):
+        said, expected = votes(points, views, sides), np.zeros((4, len(points)), int)
+        for view in views:
+            uv, z = geometry.project(points, view.camera)
+            maps = (view.hidden, view.nearest, view.farthest)
+            (hidden, inside), (nearest, _), (farthest, _) = (geometry.sample_nearest(each, uv) for each in maps)
+            faced = True if sides is None else ((view.camera.center - points) * sides).sum(-1) > 0
+            shown = inside & ~hidden & (z > 0) & (nearest > 0)
+            on = (z > nearest * (1 - SURFACE)) & (z < farthest * (1 + SURFACE))
+            behind_it = z > farthest * (1 + SURFACE)
+            free = nearest > z * (1 + FREE)
+            expected += [shown & on & faced, shown & free, shown & behind_it & faced, inside & hidden & (z > 0)]
+            assert (seen_by(view, points) == (shown & on)).all()
+        for name, count in zip(("seen", "free", "behind", "hidden"), expected, strict=True):
+            assert (getattr(said, name) == count).all() and count.any(), name

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,7 @@ from scipy import ndimage
 from reffusion import geometry, seeding
 from reffusion.depth import bilateral, planes
 from reffusion.depth.completion import Plate, complete
-from reffusion.depth.layers import shared_out
+from reffusion.depth.layers import of_planes, shared_out
 from reffusion.depth.solverlog import SILENT, SolverLog
 from reffusion.types import Camera, Rendering
 
@@ -70,12 +70,14 @@ class Hints:
 
     Attributes:
         continued: [H, W] depth of planes that go on in the hole, inf where none does (`undecided.Behind`).
+        planes: depth [H, W] of each of these planes, everywhere.
         outer: [H, W] depth that is better known than the rendering's, above 0 where there is one.
         told: bool [H, W], pixels of `outer` that other photographs agree on (`reffusion.initialize.sweep`).
         looked_past: depth [H, W] -> bool [H, W], where other views look past such a surface.
     """
 
     continued: np.ndarray | None = None
+    planes: Sequence[np.ndarray] = ()
     outer: np.ndarray | None = None
     told: np.ndarray | None = None
     looked_past: Callable[[np.ndarray], np.ndarray] | None = None
@@ -169,12 +171,14 @@ def continued(
     guide = guide() if callable(guide) else guide
     plate = Plate(how.ring, how.stiffness, how.edge, how.unknowns)
     given = view.known | view.anchored
-    surfaces = shared_out(view.disparity, given & grown(view.hole, how.ring), view.hole, guide)
+    around, hole = given & grown(view.hole, how.ring), grown(view.hole, how.margin)
+    planes = () if farthest else view.hints.planes
+    surfaces = shared_out(view.disparity, around, hole, guide, planes, view.anchored)
     if surfaces.max() > 1 and farthest:
         far = complete(view.disparity, given & (surfaces == _farthest(view, surfaces, given)), guide, plate)
         return np.where(view.anchored, view.disparity, far), f"{said}: the farthest of {surfaces.max()} surfaces"
     if surfaces.max() > 1:
-        layered, said = _layered(view, given, surfaces, guide, plate), f"{said}: {surfaces.max()} surfaces continued"
+        layered, said = _layered(view, surfaces, planes, guide, plate), f"{said}: {surfaces.max()} surfaces continued"
         solvers.solved("completion", layered)
         return layered, said
     fitted = complete(view.disparity, given, guide, plate, keep=False)
@@ -194,8 +198,13 @@ def _farthest(view: Seen, surfaces: np.ndarray, given: np.ndarray) -> int:
     return min(present, key=median)
 
 
-def _layered(view: Seen, given: np.ndarray, surfaces: np.ndarray, guide: np.ndarray, plate: Plate) -> np.ndarray:
-    """[H, W] disparity: each surface continued smoothly by itself, with a step where two meet."""
+def _layered(
+    view: Seen, surfaces: np.ndarray, planes: Sequence[np.ndarray], guide: np.ndarray, plate: Plate
+) -> np.ndarray:
+    """[H, W] disparity: each surface continued smoothly by itself, with a step where two meet. One that has taken what
+    was supposed to be a plane's stands before the plane."""
+    taken = view.anchored & (of_planes(view.disparity, view.anchored, surfaces, planes) != surfaces)
+    given = view.known | (view.anchored & ~taken)
     found = np.where(given, view.disparity, 0.0)
     for surface in range(1, surfaces.max() + 1):
         own, part = surfaces == surface, view.hole & (surfaces == surface) & ~given
@@ -205,6 +214,7 @@ def _layered(view: Seen, given: np.ndarray, surfaces: np.ndarray, guide: np.ndar
         done = complete(view.disparity, given & own, guide, plate)
         low, high = np.percentile(view.disparity[given & own], [1, 99])
         found[part] = done[part].clip(low / STRETCH, high * STRETCH)
+    found = np.where(taken, np.maximum(found, view.disparity), found)
     rest = ~given & (found <= 0)
     return np.where(rest, complete(found, found > 0, guide, plate), found) if rest.any() else found
 

@@ -2,56 +2,103 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy import ndimage, sparse
-from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.sparse.csgraph import connected_components
 
+from reffusion.cuts import HARD, least_labels
 from reffusion.depth.completion import unit_range
 
 STEP = 0.025  # relative disparity between neighbours from which they belong to two surfaces
 LEAST = 0.03  # of the known pixels around a hole: smaller pieces are no surface of their own
-EDGE = 40.0  # px that a step of 1 in the picture's colour is worth on the way to a surface
+COLOR = 0.1  # weight of a pixel's colour against a link to one of its neighbours
+ALIKE = 0.05  # least cost of parting neighbours, of that where the picture is even
+BINS = 12  # of colour, along each of red, green and blue
+ON = 0.02  # relative disparity within which a pixel lies on a plane
+NEARLY = 0.04  # median relative disparity from a plane under which a piece beside it is an unevenness of it
+SUPPOSED = 0.5  # cost of a pixel that is not of the plane which is supposed to go on there
 
 
-def shared_out(disparity: np.ndarray, known: np.ndarray, hole: np.ndarray, guide: np.ndarray) -> np.ndarray:
+def shared_out(
+    disparity: np.ndarray,
+    known: np.ndarray,
+    hole: np.ndarray,
+    guide: np.ndarray,
+    planes: Sequence[np.ndarray] = (),
+    supposed: np.ndarray | None = None,
+) -> np.ndarray:
     """The surface that each pixel belongs to, int [H, W]: 1, 2, ... where known or in the hole, 0 elsewhere.
 
-    Known pixels are split where disparity jumps. A pixel of the hole goes to the surface that is nearest to it by a way
-    that crosses few edges of the picture: there, depth may step.
+    Known pixels are split into those on a plane, and the rest, where disparity jumps. The hole is cut
+    where the picture has edges, there depth may step, and where its colours are those of one surface or of another.
 
     PAPER leaves open: the completion of depth.
 
     Args:
         disparity: [H, W], read where known.
         known: bool [H, W], the pixels around (or within) the hole that are continued.
-        hole: bool [H, W].
+        hole: bool [H, W]; what lies between it and the known pixels belongs to it.
         guide: [H, W, 3] picture, uint8 or [0, 1].
+        planes: depth [H, W] of planes that stand around the hole.
+        supposed: bool [H, W], those of the known pixels that are only supposed to be of the plane they lie on.
     """
-    surfaces = pieces(disparity, known)
-    todo = hole & ~known
-    if surfaces.max() < 2 or not todo.any():
-        return np.where(known | hole, 1, 0) if surfaces.max() < 2 else surfaces
-    colors = ndimage.gaussian_filter(unit_range(guide), (1, 1, 0))
-    domain = todo | (surfaces > 0)
-    index = np.full(domain.shape, -1)
+    supposed = np.zeros_like(hole) if supposed is None else supposed & known
+    surfaces = pieces(disparity, known & ~supposed, planes)
+    count = int(surfaces.max())
+    todo = hole & ~(known & ~supposed)
+    if count < 2 or not todo.any():
+        return np.where(known | hole, 1, 0) if count < 2 else surfaces
+    index, beside = np.full(hole.shape, -1), ndimage.binary_dilation(todo, np.ones((3, 3)))
+    domain = todo | (beside & (surfaces > 0))
     index[domain] = np.arange(domain.sum())
-    rows, columns, lengths = [], [], []
+    colors = ndimage.gaussian_filter(unit_range(guide), (1, 1, 0))
+    cost = COLOR * _unlike(colors, surfaces, domain)
+    own, of = _at(surfaces, domain) - 1, of_planes(disparity, supposed, surfaces, planes)[domain] - 1
+    for k in range(count):
+        cost[k] += SUPPOSED * ((of >= 0) & (of != k)) + HARD * ((own >= 0) & (own != k))
+    pairs, strength = _links(index, colors)
+    start = np.where(own >= 0, own, np.where(of >= 0, of, cost.argmin(0)))
+    found = surfaces.copy()
+    found[domain] = least_labels(cost, pairs, strength, start) + 1
+    return found
+
+
+def _links(index: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs [E, 2] of neighbours among the pixels that `index` [H, W] numbers, and what it costs to part them [E]:
+    little across edges of the picture."""
+    rows, columns, apart = [], [], []
     for ahead in ((0, 1), (1, 0), (1, 1), (1, -1)):
         here, there = _pairs(index, ahead)
-        steps = np.abs(_at(colors, domain)[here] - _at(colors, domain)[there]).max(-1)
         rows, columns = [*rows, here], [*columns, there]
-        lengths.append(np.hypot(*ahead) + EDGE * steps)
-    size = int(domain.sum())
-    graph = sparse.csr_matrix(
-        (np.concatenate(lengths), (np.concatenate(rows), np.concatenate(columns))), shape=(size, size)
-    )
-    seeds = np.flatnonzero(_at(surfaces, domain))
-    _, _, nearest = dijkstra(graph, directed=False, indices=seeds, min_only=True, return_predecessors=True)
-    found = surfaces.copy()
-    reached = nearest >= 0
-    labels = np.zeros(size, np.int64)
-    labels[reached] = _at(surfaces, domain)[nearest[reached]]
-    found[domain] = np.where(_at(surfaces, domain) > 0, _at(surfaces, domain), labels)
+        apart.append(np.full(len(here), np.hypot(*ahead)))
+    pairs, length = np.stack([np.concatenate(rows), np.concatenate(columns)], 1), np.concatenate(apart)
+    inside = _at(colors, index >= 0)
+    steps = ((inside[pairs[:, 0]] - inside[pairs[:, 1]]) ** 2).sum(-1)
+    return pairs, (ALIKE + np.exp(-steps / max(2 * steps.mean(), 1e-12))) / length
+
+
+def _unlike(colors: np.ndarray, surfaces: np.ndarray, asked: np.ndarray) -> np.ndarray:
+    """[K, P]: how unlike each of the K surfaces the colours [P, 3] asked are: -log of its share, were all as large."""
+    cells = (colors * BINS).astype(np.int64).clip(0, BINS - 1)
+    counts = np.zeros((int(surfaces.max()), BINS, BINS, BINS))
+    for k in range(len(counts)):
+        np.add.at(counts[k], tuple(cells[surfaces == k + 1].T), 1.0)
+        counts[k] = ndimage.gaussian_filter(counts[k] / counts[k].sum(), 1, mode="constant")
+    told = counts[:, *cells[asked].T] + 1e-4
+    return -np.log(told / told.sum(0))
+
+
+def of_planes(
+    disparity: np.ndarray, asked: np.ndarray, surfaces: np.ndarray, planes: Sequence[np.ndarray]
+) -> np.ndarray:
+    """int [H, W]: for the pixels asked, the surface that is made of their plane; 0 where none is."""
+    found = np.zeros_like(surfaces)
+    for depth in planes:
+        of = surfaces[_on(disparity, depth) & (surfaces > 0)]
+        if of.size:
+            found[asked & _on(disparity, depth) & (found == 0)] = np.bincount(of).argmax()
     return found
 
 
@@ -70,25 +117,37 @@ def _pairs(index: np.ndarray, ahead: tuple[int, int]) -> tuple[np.ndarray, np.nd
     return here[both], there[both]
 
 
-def pieces(disparity: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """int [H, W]: the known pixels' connected pieces without jumps, 1, 2, ... from the largest on; 0: too small."""
+def pieces(disparity: np.ndarray, known: np.ndarray, planes: Sequence[np.ndarray] = ()) -> np.ndarray:
+    """int [H, W]: the known pixels' pieces, 1, 2, ... from the largest on; 0: too small. A piece is what lies on one of
+    the planes (depth [H, W] each), or else is connected without jumps."""
     index = np.full(known.shape, -1)
     index[known] = np.arange(known.sum())
-    values, rows, columns = disparity[known], [], []
+    values, on, rows, columns = disparity[known], np.zeros(int(known.sum()), np.int64), [], []
+    for k, depth in enumerate(planes, start=1):
+        on[(on == 0) & _on(disparity, depth)[known]] = k
     for ahead in ((0, 1), (1, 0)):
         here, there = _pairs(index, ahead)
         near = np.abs(values[here] - values[there]) < STEP * np.maximum(values[here], values[there])
         rows, columns = [*rows, here[near]], [*columns, there[near]]
-    size = len(values)
-    joined = sparse.csr_matrix(
-        (np.ones(sum(map(len, rows))), (np.concatenate(rows), np.concatenate(columns))), shape=(size, size)
-    )
-    _, piece = connected_components(joined, directed=False)
+    here, there = np.concatenate(rows), np.concatenate(columns)
+    joined = lambda pairs: sparse.csr_matrix((np.ones(pairs.sum()), (here[pairs], there[pairs])), shape=(len(on),) * 2)
+    _, piece = connected_components(joined((on[here] == 0) & (on[there] == 0)), directed=False)
+    for k, depth in enumerate(planes, start=1):
+        off = np.abs(values * np.where(np.isfinite(depth), depth, 0)[known] - 1)
+        middle = ndimage.median(off, piece, np.arange(piece.max() + 1))
+        on[(on == 0) & (middle < NEARLY)[piece]] = k
+    piece = np.where(on > 0, len(on) + on, piece)  # a plane is one piece, however it is cut up
+    piece = np.unique(piece, return_inverse=True)[1]
     counts = np.bincount(piece, minlength=1)
     order = np.argsort(-counts, kind="stable")
     number = np.zeros(len(counts), np.int64)
-    large = order[counts[order] >= LEAST * max(size, 1)]
+    large = order[counts[order] >= LEAST * max(len(on), 1)]
     number[large] = np.arange(1, len(large) + 1)
     found = np.zeros(known.shape, np.int64)
     found[known] = number[piece]
     return found
+
+
+def _on(disparity: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """bool [H, W]: the pixels on a surface of this depth [H, W], inf where it is not."""
+    return np.isfinite(depth) & (np.abs(disparity * np.where(np.isfinite(depth), depth, 0) - 1) < ON)

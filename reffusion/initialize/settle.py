@@ -48,7 +48,7 @@ def settle(gaussians: Gaussians, known: Known, steps: int, seed: int, folder: Pa
     views, images = list(known.cameras), dict(known.photos)
     weights = {name: (~mask).astype(np.float32) for name, mask in known.hidden.items()}
     for number, (reference, turns) in enumerate(zip(known.references, turns_of(known), strict=True)):
-        window, image, counts = _around(reference)
+        window, image, counts = around(reference)
         for copy in range(turns):
             name = f"{window.name} completed {number}.{copy}"
             views.append(replace(window, name=name))
@@ -63,7 +63,7 @@ def settle(gaussians: Gaussians, known: Known, steps: int, seed: int, folder: Pa
     return fit(views, images, gaussians, settings, folder=folder, weights=weights, rates=GENTLE)
 
 
-def _around(reference: Reference) -> tuple[Camera, np.ndarray, np.ndarray]:
+def around(reference: Reference) -> tuple[Camera, np.ndarray, np.ndarray]:
     """Camera, picture and weights of the part of a completed view that counts; a pixel pulls as it would in the whole,
     and Gaussians beside it are not moved by what is left of their momentum."""
     box, camera = mask_box(reference.mask, REACHED), reference.camera

@@ -62,10 +62,10 @@ def _ask(tickets, points, normals, inner, pose, centre, nearest, farthest, hidde
             near, far = nearest[row, column], farthest[row, column]
             if not near > 0:
                 continue
-            on = ahead > near * before and ahead < far * after
-            if on and len(normals):
+            faced = True
+            if len(normals):
                 nx, ny, nz = normals[i]
-                on = (centre[0] - x) * nx + (centre[1] - y) * ny + (centre[2] - z) * nz > 0
-            counts[SEEN, i] += on
+                faced = (centre[0] - x) * nx + (centre[1] - y) * ny + (centre[2] - z) * nz > 0
+            counts[SEEN, i] += faced and ahead > near * before and ahead < far * after
             counts[FREE, i] += near > ahead * (1 + free)
-            counts[BEHIND, i] += ahead > far * after
+            counts[BEHIND, i] += faced and ahead > far * after

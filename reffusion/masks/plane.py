@@ -11,6 +11,7 @@ from reffusion import geometry
 from reffusion.types import Camera
 
 CELLS = 160  # a side of a plane's map
+BEFORE = 0.97  # of the depth shown: a plane must be nearer than that to hide it
 
 
 @dataclass(frozen=True)
@@ -74,11 +75,11 @@ class Plane:
 
 
 def without_pits(depth: np.ndarray, camera: Camera, planes: Sequence[Plane]) -> np.ndarray:
-    """[H, W] float64, the depth that a view shows; that of the plane around it where it looks into a mirror: what is
-    polished goes on, and repeats itself, along the plane."""
+    """[H, W] float64, the depth that a view shows; that of a plane where it looks into a mirror in it, for what is
+    polished goes on, and repeats itself, along the plane; or past it, where most views show the plane."""
     depth = depth.astype(np.float64)
     for plane in planes:
         at = plane.depth(camera)
-        mirrored = plane.on(plane.pit, at, camera, at < depth)
-        depth[mirrored] = at[mirrored]
+        wrong = plane.on(plane.pit, at, camera, at < depth) | plane.on(plane.seen, at, camera, at < BEFORE * depth)
+        depth[wrong] = at[wrong]
     return depth

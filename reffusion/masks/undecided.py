@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import torch
 
-from reffusion.masks.plane import Plane
+from reffusion.masks.plane import BEFORE, Plane
 from reffusion.masks.witness import (
     OPAQUE,
     SURFACE,
@@ -23,12 +23,10 @@ from reffusion.masks.witness import (
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
-BEFORE = 0.97  # of the depth shown: a continuation must be nearer than that to hide it
 BESIDE = 0.03  # of the image's width: how far around a plane's patch it is compared with what is shown
 ROUGHEST = 0.06  # of the depth: a wider range around a pixel is no rough surface, but a depth edge
 TRUSTED = 0.25  # share of the views that look its way in which a surface must be seen, not stand behind another
-AGREES = 0.5  # share of these pixels that must lie on the plane
-GRAVEL, MOSTLY = 1.1, 0.75  # farthest over nearest depth, and share of these pixels, from which the ground is rough
+AGREES = 0.6  # share of these pixels that must lie on the plane
 
 
 @dataclass(frozen=True)
@@ -39,12 +37,14 @@ class Behind:
         undecided: bool [H, W], inside C: no photograph tells what is to be seen there.
         continued: [H, W], depth of the plane that goes on there; inf where none does, or outside `undecided`.
         depth, alpha: [H, W] float64, as rendered; outside the mask the photographed depth.
+        planes: depth [H, W] of each plane that goes on there, everywhere; inf where a ray does not meet it.
     """
 
     undecided: np.ndarray
     continued: np.ndarray
     depth: np.ndarray
     alpha: np.ndarray
+    planes: tuple[np.ndarray, ...] = ()
 
 
 @torch.no_grad()
@@ -72,7 +72,7 @@ def behind(
         said = votes(points, views, normals)
         undecided[rows, columns] = said.seen < np.maximum(1, TRUSTED * (said.seen + said.behind))
     depth = with_photographed_depth(depth, camera, views)
-    hides, reach = np.zeros_like(hidden), np.full(hidden.shape, np.inf)
+    hides, reach, onward = np.zeros_like(hidden), np.full(hidden.shape, np.inf), []
     for plane in planes:
         at = plane.depth(camera)
         before = plane.on(plane.goes_on, at, camera, hidden & (at < BEFORE * np.where(depth > 0, depth, np.inf)))
@@ -80,16 +80,18 @@ def behind(
         beneath = plane.on(plane.within, at, camera, undecided & ((at < depth / BEFORE) | (alpha <= OPAQUE)))
         if _grows_out_of(before | beneath, plane, at, camera, depth, ~hidden & (alpha > OPAQUE)):
             hides |= before
+            onward.append(at)
             reach = np.where(before | beneath, np.minimum(reach, at), reach)
     undecided = without_slivers(undecided | hides) & hidden
-    return Behind(undecided, np.where(undecided, reach, np.inf), depth, alpha)
+    return Behind(undecided, np.where(undecided, reach, np.inf), depth, alpha, tuple(onward))
 
 
 def _grows_out_of(
     patch: np.ndarray, plane: Plane, at: np.ndarray, camera: Camera, depth: np.ndarray, known: np.ndarray
 ) -> bool:
-    """Does the plane, at depth `at`, lie at the rendered depth around the patch of it (bool [H, W])? One that only cuts
-    through what stands there does not. Where views look through the plane, nothing is compared."""
+    """Does the plane, at depth `at`, lie around the patch of it (bool [H, W]) at the rendered depth, or where most views
+    show it? One that only cuts through what stands there does not. Where views look through the plane, nothing is
+    compared."""
     if not patch.any():
         return False
     reach = max(3, round(BESIDE * patch.shape[1]))
@@ -99,8 +101,7 @@ def _grows_out_of(
     if not beside.any():
         return False
     nearest, farthest = surface_range(depth)
-    within = (at > nearest * (1 - SURFACE)) & (at < farthest * (1 + SURFACE))
-    lies = np.abs(at - depth) < ROUGHEST * depth
-    if (farthest > nearest * GRAVEL)[beside].mean() > MOSTLY:  # on rough ground one view may be wrong: others tell
-        lies |= plane.on(plane.seen, at, camera, beside)
-    return float((within & lies)[beside].mean()) > AGREES
+    lies = (at > nearest * (1 - SURFACE)) & (at < farthest * (1 + SURFACE)) & (np.abs(at - depth) < ROUGHEST * depth)
+    # One view may be wrong about rough ground, or look through what shines: others tell.
+    lies |= plane.on(plane.seen, at, camera, beside)
+    return float(lies[beside].mean()) > AGREES

@@ -101,7 +101,7 @@ class Votes:
     Attributes:
         seen: [P], views that show a surface there. With normals: a surface that faces them.
         free: [P], views that look past the point onto something farther.
-        behind: [P], views in which something stands before the point.
+        behind: [P], views in which something stands before the point. With normals: of those that the surface faces.
         hidden: [P], views that see the object in the point's direction.
     """
 
@@ -118,7 +118,8 @@ def votes(points: np.ndarray, views: Sequence[Witness], normals: np.ndarray | No
 
     Args:
         normals: [P, 3], of the surface that the points lie on, towards the side asked about; a view from the other
-            side does not count, so that the underside of a table is no witness of its top.
+            side does not count, so that the underside of a table is no witness of its top, nor does a vase that hides
+            its own far side speak against it.
     """
     counts = np.zeros((4, len(points)), np.int64)
     for view in views:
