@@ -10,9 +10,9 @@ import torch
 from reffusion import geometry
 from reffusion.depth import behind
 from reffusion.depth.behind import Completion
+from reffusion.gaussians.optimize import reconstruction_loss
 from reffusion.gaussians.sheets import Sheets
 from reffusion.gaussians.surfels import surface_gaussians, surface_normals
-from reffusion.gaussians.optimize import reconstruction_loss
 from reffusion.initialize import coverage
 from reffusion.initialize import filling as rules
 from reffusion.initialize.settle import Known, around, turns_of

@@ -241,10 +241,10 @@ def test_what_has_other_colours_than_gravel_is_debris():
 
 
 def test_views_say_of_points_what_the_formulas_say(views):
-    """Points on both surfaces, before, behind and beside them, behind the cameras and nowhere; with and without a side."""
+    """Points on both surfaces, before, behind and beside them, behind cameras and nowhere; with and without a side."""
     noise = np.random.default_rng(0)
-    points = np.concatenate([noise.uniform(-1.5, 1.5, (3000, 3)) * (1, 1, 0.7), [[9, 0, 0.5], [np.nan, 0, 0]]])
-    points[:1000, 2], points[1000:1500, 2] = TOP, FLOOR
+    points = noise.uniform(-1.5, 1.5, (3000, 3)) * (1, 1, 0.7)
+    points[:1000, 2], points[1000:1500, 2], points[-2], points[-1] = TOP, FLOOR, (9, 0, 0.5), np.nan
     normals = noise.normal(size=points.shape)
     for sides in (None, normals):
         said, expected = votes(points, views, sides), np.zeros((4, len(points)), int)
