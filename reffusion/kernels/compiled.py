@@ -19,7 +19,8 @@ import numba
 import numpy as np
 import torch
 
-T, R = TypeVar("T"), TypeVar("R")
+T = TypeVar("T")
+R = TypeVar("R")
 _LARGE, _BLOCKS = 2**16, 24  # numbers of an array worth keeping; how many are kept, some two steps' worth
 FEW = 8000  # Gaussians for which waking another thread takes longer than it saves
 # Rounding may vary, but NaN and infinity stay what they are: `fit` looks for them.
