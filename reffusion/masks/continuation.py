@@ -36,7 +36,9 @@ RATHER = 1.0  # cosine to a plane over that to another, from which a surface fac
 EVENED = 0.01  # of the image's width: the scale on which a surface's direction is taken
 WIDER = 2.0  # times as wide a map on which what the plane surrounds is told
 POLISHED = 0.03  # of the cells seen of a plane: smaller ones that it surrounds are unevenness
-SURROUNDS = 0.8  # share of the border of what views look through that must be seen to be of the plane: a recess has less
+SURROUNDS = (
+    0.8  # share of the border of what views look through that must be seen to be of the plane: a recess has less
+)
 TOUCHING = 0.25  # share of an unknown patch's border that must be seen for the plane to go on into it
 
 
