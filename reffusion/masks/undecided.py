@@ -104,9 +104,9 @@ def _beneath(planes: Sequence[Plane], camera: Camera, depth: np.ndarray, asked: 
 def _grows_out_of(
     patch: np.ndarray, plane: Plane, at: np.ndarray, camera: Camera, depth: np.ndarray, known: np.ndarray
 ) -> bool:
-    """Does the plane, at depth `at`, lie around the patch of it (bool [H, W]) at the rendered depth, or where most views
-    show it? One that only cuts through what stands there does not. Where views look through the plane, nothing is
-    compared."""
+    """Does the plane, at depth `at`, lie at the rendered depth around the patch of it (bool [H, W]), or do most views
+    show it there? One that only cuts through what stands there does not. Where views look through the plane, nothing
+    is compared."""
     if not patch.any():
         return False
     reach = max(3, round(BESIDE * patch.shape[1]))
