@@ -152,7 +152,7 @@ def filled(params: Params, out: Path, gaussians, new, reference, around, network
     near, told = around.compared(camera, hole) if swept else (around, None)
     onward = undecided.behind(remaining, camera, hidden, near.views, near.planes)
     past = (lambda depth: near.looked_past(camera, depth)) if params.depth.sweep else None
-    hints = behind.Hints(onward.continued, onward.planes, near.photographed(camera), told, past)
+    hints = behind.Hints(onward.continued, onward.planes, onward.witnessed, near.photographed(camera), told, past)
     estimate = estimate_of(network, reference)
     depth, made_up, said = filling.depth_behind(
         remaining, reference, hole, hidden, around.points, HOW, estimate, log, hints, farthest

@@ -70,7 +70,8 @@ class Hints:
 
     Attributes:
         continued: [H, W] depth of planes that go on in the hole, inf where none does (`undecided.Behind`).
-        planes: depth [H, W] of each of these planes, everywhere.
+        planes: depth [H, W] of each of these planes, everywhere. witnessed: bool [H, W], pixels of the hole whose
+            rendered depth other views show.
         outer: [H, W] depth that is better known than the rendering's, above 0 where there is one.
         told: bool [H, W], pixels of `outer` that other photographs agree on (`reffusion.initialize.sweep`).
         looked_past: depth [H, W] -> bool [H, W], where other views look past such a surface.
@@ -78,6 +79,7 @@ class Hints:
 
     continued: np.ndarray | None = None
     planes: Sequence[np.ndarray] = ()
+    witnessed: np.ndarray | None = None
     outer: np.ndarray | None = None
     told: np.ndarray | None = None
     looked_past: Callable[[np.ndarray], np.ndarray] | None = None
@@ -93,7 +95,7 @@ class Seen:
     Attributes:
         camera: the view.
         depth: [H, W] float64 camera z as rendered.
-        known: bool [H, W], the pixels whose depth is the scene's: covered, and not beside the hole.
+        known: bool [H, W], the pixels whose depth is the scene's: covered, and not beside the hole; or witnessed in it.
         hole: bool [H, W], the pixels to be filled. hidden: bool [H, W], C: where the object stood.
         anchored: bool [H, W], pixels of the hole whose `depth` is that of a plane which goes on there.
         hints: what else is known.
@@ -134,7 +136,9 @@ def seen(
     if outer is not None:
         depth, alpha = np.where(outer > 0, outer, depth), np.where(outer > 0, 1.0, alpha)
     known = (alpha > how.explained) & (depth > 0) & ~grown(hole, how.margin)
-    anchored = hole & np.isfinite(continued) if continued is not None else np.zeros_like(hole)
+    if hints.witnessed is not None:
+        known |= hole & hints.witnessed
+    anchored = hole & ~known & np.isfinite(continued) if continued is not None else np.zeros_like(hole)
     depth = np.where(anchored, continued, depth) if anchored.any() else depth
     return Seen(camera, depth, known, hole, hidden, anchored, hints)
 

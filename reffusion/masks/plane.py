@@ -11,6 +11,7 @@ from reffusion import geometry
 from reffusion.types import Camera
 
 CELLS = 160  # a side of a plane's map
+LARGE = 0.5  # of the cells seen of the largest plane: a smaller one may cut through a round thing
 BEFORE = 0.97  # of the depth shown: a plane must be nearer than that to hide it
 
 
@@ -76,10 +77,12 @@ class Plane:
 
 def without_pits(depth: np.ndarray, camera: Camera, planes: Sequence[Plane]) -> np.ndarray:
     """[H, W] float64, the depth that a view shows; that of a plane where it looks into a mirror in it, for what is
-    polished goes on, and repeats itself, along the plane; or past it, where most views show the plane."""
-    depth = depth.astype(np.float64)
+    polished goes on, and repeats itself, along the plane; or past a large plane, where most views show that."""
+    depth, most = depth.astype(np.float64), max((plane.seen.sum() for plane in planes), default=0)
     for plane in planes:
         at = plane.depth(camera)
-        wrong = plane.on(plane.pit, at, camera, at < depth) | plane.on(plane.seen, at, camera, at < BEFORE * depth)
+        wrong = plane.on(plane.pit, at, camera, at < depth)
+        if plane.seen.sum() > LARGE * most:
+            wrong |= plane.on(plane.seen, at, camera, at < BEFORE * depth)
         depth[wrong] = at[wrong]
     return depth

@@ -26,6 +26,7 @@ from reffusion.types import Camera, Gaussians
 BESIDE = 0.03  # of the image's width: how far around a plane's patch it is compared with what is shown
 ROUGHEST = 0.06  # of the depth: a wider range around a pixel is no rough surface, but a depth edge
 TRUSTED = 0.25  # share of the views that look its way in which a surface must be seen, not stand behind another
+WITNESSES = 3  # views that must show a surface for it to be there, though most around it is undecided
 AGREES = 0.6  # share of these pixels that must lie on the plane
 
 
@@ -38,13 +39,15 @@ class Behind:
         continued: [H, W], depth of the plane that goes on there; inf where none does, or outside `undecided`.
         depth, alpha: [H, W] float64, as rendered; outside the mask the photographed depth.
         planes: depth [H, W] of each plane that goes on there, everywhere; inf where a ray does not meet it.
+        witnessed: bool [H, W], inside C: a few views show the surface that is rendered there; specks are left out.
     """
 
     undecided: np.ndarray
     continued: np.ndarray
     depth: np.ndarray
     alpha: np.ndarray
-    planes: tuple[np.ndarray, ...] = ()
+    planes: tuple[np.ndarray, ...]
+    witnessed: np.ndarray
 
 
 @torch.no_grad()
@@ -66,11 +69,13 @@ def behind(
     drawn = rasterizer.render(remaining, camera, sh_degree=0)
     depth, alpha = (t.double().cpu().numpy() for t in (drawn.depth, drawn.alpha))
     rows, columns = np.nonzero(hidden & (alpha > OPAQUE))
-    undecided = hidden.copy()
+    undecided, witnessed = hidden.copy(), np.zeros_like(hidden)
     if len(rows):
         points, normals = (each[rows, columns] for each in smoothed_surface(depth, camera))
         said = votes(points, views, normals)
-        undecided[rows, columns] = said.seen < np.maximum(1, TRUSTED * (said.seen + said.behind))
+        trusted = TRUSTED * (said.seen + said.behind)
+        undecided[rows, columns] = said.seen < np.maximum(1, trusted)
+        witnessed[rows, columns] = said.seen >= np.maximum(WITNESSES, trusted)
     depth = with_photographed_depth(depth, camera, views)
     hides, reach, onward = np.zeros_like(hidden), np.full(hidden.shape, np.inf), []
     for plane in planes:
@@ -83,15 +88,25 @@ def behind(
             onward.append(at)
             reach = np.where(before | beneath, np.minimum(reach, at), reach)
     undecided = without_slivers(undecided | hides) & hidden
-    return Behind(undecided, np.where(undecided, reach, np.inf), depth, alpha, tuple(onward))
+    witnessed = without_slivers(witnessed & ~hides & ~_beneath(planes, camera, depth, hidden)) & hidden
+    return Behind(undecided, np.where(undecided, reach, np.inf), depth, alpha, tuple(onward), witnessed)
+
+
+def _beneath(planes: Sequence[Plane], camera: Camera, depth: np.ndarray, asked: np.ndarray) -> np.ndarray:
+    """bool [H, W]: of the pixels asked, those that show what lies beneath a plane, or is mirrored in it."""
+    found = np.zeros_like(asked)
+    for plane in planes:
+        at = plane.depth(camera)
+        found |= plane.on(plane.pit | plane.within | plane.seen, at, camera, asked & (at < BEFORE * depth))
+    return found
 
 
 def _grows_out_of(
     patch: np.ndarray, plane: Plane, at: np.ndarray, camera: Camera, depth: np.ndarray, known: np.ndarray
 ) -> bool:
-    """Does the plane, at depth `at`, lie around the patch of it (bool [H, W]) at the rendered depth, or where most views
-    show it? One that only cuts through what stands there does not. Where views look through the plane, nothing is
-    compared."""
+    """Does the plane, at depth `at`, lie at the rendered depth around the patch of it (bool [H, W]), or do most views
+    show it there? One that only cuts through what stands there does not. Where views look through the plane, nothing
+    is compared."""
     if not patch.any():
         return False
     reach = max(3, round(BESIDE * patch.shape[1]))

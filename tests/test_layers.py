@@ -1,0 +1,100 @@
+"""Which surface a hole's pixels belong to, and what depth they have: analytic steps, a vase on a table, a recess."""
+
+import itertools
+
+import numpy as np
+
+from reffusion.cuts import least_labels
+from reffusion.depth.behind import Completion, Hints, Seen, continued, grown
+from reffusion.depth.layers import shared_out
+from reffusion.masks.continuation import _surrounded
+from reffusion.types import Camera
+
+
+def step_scene():
+    """Disparity with a step at column 60 that goes on through a hole, and a picture whose edge is there."""
+    rows, columns = np.mgrid[:100, :120]
+    disparity = np.where(columns < 60, 1.0 + 0.001 * rows, 0.6 + 0.0005 * columns)
+    picture = np.where((columns < 60)[..., None], (0.8, 0.3, 0.2), (0.2, 0.5, 0.3))
+    hole = (np.abs(rows - 50) < 25) & (np.abs(columns - 62) < 22)
+    return disparity, picture, hole
+
+
+def test_a_hole_is_shared_out_along_the_pictures_edge():
+    disparity, picture, hole = step_scene()
+    surfaces = shared_out(disparity, ~hole, hole, picture)
+    left = np.arange(120) < 60
+    assert surfaces.max() == 2
+    assert (surfaces[hole & left] == surfaces[0, 0]).mean() > 0.97
+    assert (surfaces[hole & ~left] == surfaces[0, -1]).mean() > 0.97
+
+
+def vase_on_a_table():
+    """Depths [H, W] of a table's plane, and of what stands on it from column 80 on, nearer but touching it at row 90;
+    a picture in three colours, for a plate lies on the table; and a hole that hides the vase's left rim."""
+    rows, columns = np.mgrid[:100, :120]
+    table = 1 / (0.4 + 0.006 * rows)
+    vase = (columns >= 80) & (rows < 90)
+    depth = np.where(vase, table[90, 0], table)
+    plate = (rows > 50) & (columns > 40)
+    picture = np.where(vase[..., None], (0.5, 0.3, 0.2), np.where(plate[..., None], (0.3, 0.35, 0.4), (0.7, 0.65, 0.6)))
+    hole = (np.abs(rows - 60) < 25) & (np.abs(columns - 65) < 22)
+    return table, depth, vase, picture, hole
+
+
+def test_what_stands_on_a_plane_that_goes_on_keeps_its_hidden_rim():
+    """Beside the hole nothing is known for some pixels, the vase touches the table, and the plane is supposed to go on
+    everywhere: under the vase's rim, too."""
+    table, depth, vase, picture, hole = vase_on_a_table()
+    view = Camera("v", 120, 100, 100.0, 100.0, 60.0, 50.0, np.eye(4))
+    how = Completion(planar_share=2.0, ring=0.2, margin=0.03)
+    known, hints = ~grown(hole, how.margin), Hints(np.where(hole, table, np.inf), (table,))
+    seen = Seen(view, np.where(hole, table, depth), known, hole, hole, hole, hints)
+    found, said = continued(seen, picture, np.zeros((0, 3)), how)
+    assert "2 surfaces" in said
+    error = np.abs(found * depth - 1)[hole]
+    assert (hole & vase).sum() > 200 and np.quantile(error, 0.97) < 0.01, said
+
+
+def test_a_tuft_of_the_grounds_own_colours_takes_nothing_of_the_ground():
+    table, depth, vase, _, hole = vase_on_a_table()
+    grass = np.random.default_rng(0).uniform(0.2, 0.6, (100, 120, 3))
+    known = ~grown(hole, 0.03)
+    surfaces = shared_out(1 / depth, known, grown(hole, 0.03), grass, (table,), np.zeros_like(hole))
+    assert (surfaces[hole & ~vase] == surfaces[95, 5]).mean() > 0.95
+
+
+def test_labels_of_the_least_cost_are_found():
+    draws = np.random.default_rng(0)
+    for _ in range(20):
+        cost, pairs = draws.random((3, 7)), np.array(list(itertools.combinations(range(7), 2)))
+        pairs = pairs[draws.random(len(pairs)) < 0.5]
+        strength = draws.random(len(pairs)) / 2
+
+        def total(labels, cost=cost, pairs=pairs, strength=strength):
+            apart = labels[pairs[:, 0]] != labels[pairs[:, 1]]
+            return cost[labels, np.arange(7)].sum() + strength[apart].sum()
+
+        found = least_labels(cost, pairs, strength, cost.argmin(0))
+        least = min(total(np.array(labels)) for labels in itertools.product(range(3), repeat=7))
+        assert total(found) < least + 0.02  # capacities are whole thousandths
+
+
+def test_depth_steps_where_the_picture_has_an_edge():
+    disparity, picture, hole = step_scene()
+    view = Camera("v", 120, 100, 100.0, 100.0, 60.0, 50.0, np.eye(4))
+    seen = Seen(view, 1 / disparity, ~hole, hole, hole, np.zeros_like(hole))
+    found, said = continued(seen, picture, np.zeros((0, 3)), Completion(planar_share=2.0, ring=0.2))
+    assert "2 surfaces" in said
+    error = np.abs(found / disparity - 1)[hole]
+    assert np.quantile(error, 0.95) < 0.01
+
+
+def test_a_mirror_is_surrounded_and_a_recess_is_not():
+    """The wall of an L-shaped room is looked past beside its corner, between furniture, floor and picture."""
+    rows, columns = np.mgrid[:100, :100]
+    round_plate = np.hypot(rows - 50, columns - 50) < 20
+    hidden = (rows > 60) & (columns < 40)
+    assert _surrounded(~round_plate & ~hidden, round_plate).sum() > 0.95 * round_plate.sum()
+    recess = (columns < 50) & (columns > 10) & (rows > 20) & (rows < 80)
+    assert not _surrounded((columns >= 50) | (rows >= 80), recess).any()
