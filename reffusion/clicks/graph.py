@@ -16,7 +16,8 @@ ON_ONE, TORN = 0.35, 60.0  # where surfaces are known: what a step of colour cou
 SMOOTH = 5.0  # cost of a border between two that look alike
 REACHES = 0.5, 0.44, 0.37, 0.3  # shares of the way from a click to what is not the object
 REACH = 150.0  # of colour and pixels, how far a click goes that corrects
-SMALLER = 0.1  # what an object e times as large is worth less
+CHANGE = 10.0  # of colour, in L*a*b* of 8 bit, that an edge of a thing shows
+SMALLER = 0.05  # what an object e times as large is worth less
 MOST = 3.0  # that colour may cost, natural logarithm of a ratio
 
 
@@ -93,8 +94,8 @@ def _cut_within(
 def merit(
     labels: np.ndarray, around: np.ndarray, lab: np.ndarray, pairs: np.ndarray, torn: np.ndarray
 ) -> float:
-    """How well labels stand for a thing of its own: its rim is where surfaces end, not its inside; its colours are not
-    those around it; and of two as good it is the smaller. -inf where there is nothing.
+    """How well labels stand for a thing of its own: its rim is where surfaces end or colours change, and none end within
+    it; its colours are not those around it; and of two as good it is the smaller. -inf where there is nothing.
 
     Args:
         labels: bool [N]; around: bool [N], its surroundings.
@@ -105,7 +106,8 @@ def merit(
         return -np.inf
     of, off = (histogram(lab, each.astype(float)) for each in (labels, around))
     alike = float(np.minimum(of / of.sum(), off / off.sum()).sum())
-    return float(torn[rim].mean() - torn[inside].mean()) - alike - SMALLER * float(np.log(labels.sum()))
+    edge = np.maximum(torn[rim], (steps(lab, pairs[rim], None) / CHANGE).clip(0, 1))
+    return float(edge.mean() - torn[inside].mean()) - alike - SMALLER * float(np.log(labels.sum()))
 
 
 def steps(lab: np.ndarray, pairs: np.ndarray, torn: np.ndarray | None) -> np.ndarray:
