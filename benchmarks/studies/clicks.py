@@ -2,7 +2,8 @@
 
 Of each run the stages `poses`, with true masks, and `fit` are needed. Clicks are put where a person would correct: each
 in the middle of the largest error of the middle view's mask so far, until that is right or there are --clicks. Prints
-the view's IoU after each, then mean and worst IoU over all views with masks; --sheets: the masks over three views and the worst.
+the view's IoU after each, then mean and worst IoU over all views with masks; --sheets: the masks over three
+views and the worst.
 """
 
 from __future__ import annotations

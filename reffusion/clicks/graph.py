@@ -73,7 +73,9 @@ def enclosed(
         gain = 2 * (side - (1 - 2 * share))
         against = np.where(seeds == OTHER, HARD, np.maximum(-gain, 0) * (seeds != OBJECT))
         for_it = np.where(seeds == OBJECT, HARD, np.maximum(gain, 0) * (seeds != OTHER))
-        within = _cut_within(within, against, for_it, pairs, smooth)  # what costs more to take is part of what costs less
+        within = _cut_within(
+            within, against, for_it, pairs, smooth
+        )  # what costs more to take is part of what costs less
         found.append(attached(within, pairs, seeds == OBJECT))
     return found
 
@@ -91,11 +93,9 @@ def _cut_within(
     return found
 
 
-def merit(
-    labels: np.ndarray, around: np.ndarray, lab: np.ndarray, pairs: np.ndarray, torn: np.ndarray
-) -> float:
-    """How well labels stand for a thing of its own: its rim is where surfaces end or colours change, and none end within
-    it; its colours are not those around it; and of two as good it is the smaller. -inf where there is nothing.
+def merit(labels: np.ndarray, around: np.ndarray, lab: np.ndarray, pairs: np.ndarray, torn: np.ndarray) -> float:
+    """How well labels stand for a thing of its own: its rim is where surfaces end or colours change, and none end
+    within it; its colours are not those around it; and of two as good it is the smaller. -inf where there is nothing.
 
     Args:
         labels: bool [N]; around: bool [N], its surroundings.
