@@ -16,7 +16,7 @@ from reffusion.capture.lenses import load_lenses, photograph_sizes
 from reffusion.capture.reading import read_scene
 from reffusion.clicks import everywhere
 from reffusion.clicks.marks import Clicks
-from reffusion.clicks.network import Looked, Segmenter, look, network_mask
+from reffusion.clicks.network import SOURCE, Looked, Segmenter, load_segmenter, look, network_mask
 from reffusion.clicks.picture import corrected, view_mask
 from reffusion.command import root
 from reffusion.io.arrays import load_json, save_json
@@ -66,6 +66,14 @@ def capture_of(home: Path) -> Capture:
     theirs = [name for name, path in files.items() if written.get(_named(path, folder)) != digest(path)]
     place = next((path.parent for path in files.values()), folder / (params.masks or "masks"))
     return Capture(folder, place, poses, sheet.stage_folder(home, "fit"), load_raw_masks(poses, theirs))
+
+
+def segmenter_here() -> Segmenter | None:
+    """The segmentation network whose weights are on this machine. ValueError where they are not whole."""
+    found = load_segmenter()
+    if found is not None:
+        print(f"clicks are answered by {SOURCE}", flush=True)
+    return found
 
 
 def digest(path: Path) -> str:

@@ -18,9 +18,8 @@ from urllib.parse import unquote, urlsplit
 import numpy as np
 from PIL import Image
 
-from reffusion.clicks.network import SOURCE, load_segmenter
 from report import command
-from report.clicking import Session, capture_of
+from report.clicking import Session, capture_of, segmenter_here
 
 PORT = 8090
 PAGE = Path(__file__).with_name("mask.html")
@@ -155,14 +154,12 @@ def main() -> None:
     if status := subprocess.run(run("poses", arguments)).returncode:
         raise SystemExit(status)
     try:
-        capture, segmenter = capture_of(command.home(arguments)), load_segmenter()
+        capture, segmenter = capture_of(command.home(arguments)), segmenter_here()
         fit = subprocess.Popen(run("fit", arguments))
         session = Session(capture, lambda: fit.poll() == 0, segmenter)
         server = Server(session, arguments.port, fit)
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
-    if segmenter is not None:
-        print(f"clicks are answered by {SOURCE}")
     print(f"{server.address}  (Ctrl-C ends)", flush=True)
     try:
         server.serve_forever()
