@@ -16,6 +16,7 @@ from reffusion.capture.lenses import load_lenses, photograph_sizes
 from reffusion.capture.reading import read_scene
 from reffusion.clicks import everywhere
 from reffusion.clicks.marks import Clicks
+from reffusion.clicks.network import SOURCE, Looked, Segmenter, load_segmenter, look, network_mask
 from reffusion.clicks.picture import corrected, view_mask
 from reffusion.command import root
 from reffusion.io.arrays import load_json, save_json
@@ -67,6 +68,14 @@ def capture_of(home: Path) -> Capture:
     return Capture(folder, place, poses, sheet.stage_folder(home, "fit"), load_raw_masks(poses, theirs))
 
 
+def segmenter_here() -> Segmenter | None:
+    """The segmentation network whose weights are on this machine. ValueError where they are not whole."""
+    found = load_segmenter()
+    if found is not None:
+        print(f"clicks are answered by {SOURCE}", flush=True)
+    return found
+
+
 def digest(path: Path) -> str:
     """Of a file's content."""
     return hashlib.blake2b(path.read_bytes(), digest_size=10).hexdigest()
@@ -83,12 +92,14 @@ def _saved(folder: Path) -> dict:
 class Session:
     """The clicks on a scene; safe to call from several threads.
 
-    Masks are made for a view at once. Where the fit is there, a thread of its own then asks the Gaussians, and makes
-    those of all views.
+    Masks are made for a view at once, by a segmentation network where there is one. Where the fit is there, a thread of
+    its own then asks the Gaussians, and makes those of all views.
     """
 
-    def __init__(self, capture: Capture, fitted: Callable[[], bool]):
+    def __init__(self, capture: Capture, fitted: Callable[[], bool], segmenter: Segmenter | None = None):
         self.capture, self.scene = capture, load_scene(capture.poses)
+        self.segmenter = segmenter
+        self.looked: dict[str, Looked] = {}  # what the network made of the views that were clicked on
         self.fitted = fitted  # is the fit there that belongs to these poses? one of earlier poses may be, in its place
         self.views = [name for name in self.scene.train if name not in self.scene.clean]
         self.lenses, self.sizes = load_lenses(capture.poses)[0], photograph_sizes(capture.poses)
@@ -108,7 +119,7 @@ class Session:
                 self.clicks[name] = [(*xy, p[2] == "+") for xy, p in zip(at.tolist(), points, strict=True)]
         threading.Thread(target=self._follow, daemon=True).start()
         for name in self.clicks:
-            self._show(name, view_mask(self.images[name], self._clicks_on(name)))
+            self._show(name, self._at_once(name))
 
     def click(self, name: str, points: list[tuple[float, float, bool]]) -> None:
         """All clicks on a view, in its undistorted pixels, in place of those before.
@@ -206,6 +217,8 @@ class Session:
         clicks, image, relief = self._clicks_on(name), self.images[name], None
         if clicks is None:
             return None
+        if self._asks_network(clicks):
+            return self._by_network(name, clicks)
         if self.gaussians is not None:
             if name not in self.reliefs:
                 self.reliefs[name] = everywhere.relief(self.gaussians, self.scene.cameras[name])
@@ -215,6 +228,15 @@ class Session:
             return view_mask(image, clicks, relief)
         return corrected(image, self.masks[name], clicks, relief)
 
+    def _asks_network(self, clicks: Clicks) -> bool:
+        """It knows nothing of what is taken back in one view from the mask of others."""
+        return self.segmenter is not None and bool(clicks.positive.any())
+
+    def _by_network(self, name: str, clicks: Clicks) -> np.ndarray:
+        if name not in self.looked:
+            self.looked[name] = look(self.segmenter, self.images[name])
+        return network_mask(self.segmenter, self.looked[name], clicks)
+
     def _all_clicks(self) -> dict[str, Clicks]:
         return {name: self._clicks_on(name) for name in self.clicks}
 
@@ -223,6 +245,8 @@ class Session:
         clicks, given = self._all_clicks(), self.capture.given
         if not any(each.positive.any() for each in clicks.values()) and not given:
             return lambda: None
+        asked = [name for name, on in clicks.items() if self._asks_network(on)]
+        given = given | {name: self._by_network(name, clicks.pop(name)) for name in asked}
         shown = {name: self.scene.cameras[name] for name in {*self.views, *given}}
         ask = (self.gaussians, self.near, shown, self.images.__getitem__, clicks, given)
         return lambda: everywhere.solved(*ask).labels

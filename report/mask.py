@@ -19,7 +19,7 @@ import numpy as np
 from PIL import Image
 
 from report import command
-from report.clicking import Session, capture_of
+from report.clicking import Session, capture_of, segmenter_here
 
 PORT = 8090
 PAGE = Path(__file__).with_name("mask.html")
@@ -154,9 +154,9 @@ def main() -> None:
     if status := subprocess.run(run("poses", arguments)).returncode:
         raise SystemExit(status)
     try:
-        capture = capture_of(command.home(arguments))
+        capture, segmenter = capture_of(command.home(arguments)), segmenter_here()
         fit = subprocess.Popen(run("fit", arguments))
-        session = Session(capture, lambda: fit.poll() == 0)
+        session = Session(capture, lambda: fit.poll() == 0, segmenter)
         server = Server(session, arguments.port, fit)
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None

@@ -20,7 +20,7 @@ DOORS = {
     "pycolmap": ("reffusion/capture/sfm.py",),
     "diffusers": ("reffusion/prior/model.py",),
     "peft": ("reffusion/prior/lora.py",),
-    "transformers": ("reffusion/prior/model.py", "reffusion/depth/monocular.py"),
+    "transformers": ("reffusion/prior/model.py", "reffusion/depth/monocular.py", "reffusion/clicks/network.py"),
     "huggingface_hub": ("reffusion/weights/download.py",),
     "onnxruntime": ("reffusion/paint/onnx_model.py",),
     "gsply": ("reffusion/io/compressed.py",),

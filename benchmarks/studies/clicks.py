@@ -2,7 +2,8 @@
 
 Of each run the stages `poses`, with true masks, and `fit` are needed. Clicks are put where a person would correct: each
 in the middle of the largest error of the middle view's mask so far, until that is right or there are --clicks. Prints
-the view's IoU after each, then mean and worst IoU over all views with masks; --sheets: the masks over four views.
+the view's IoU after each, then mean and worst IoU over all views with masks; --sheets: the masks over three
+views and the worst.
 """
 
 from __future__ import annotations
@@ -67,10 +68,10 @@ def measured(run: Path, most: int, sheet: Path | None) -> str:
     found = {name: shown(name) for name in names}
     seconds = time.monotonic() - began
     shares = {name: iou(found[name], true[name]) for name in names}
-    if sheet:
-        some = names[:: max(1, len(names) // 4)][:4]
-        save_image(sheet, np.hstack([tinted(images[name], found[name]) for name in some]))
     worst = min(shares, key=shares.__getitem__)
+    if sheet:
+        some = [*names[:: max(1, len(names) // 3)][:3], worst]
+        save_image(sheet, np.hstack([tinted(images[name], found[name]) for name in some]))
     mean = float(np.mean(list(shares.values())))
     return f"{run.name}: {len(clicks)} clicks, mean {mean:.3f}, worst {shares[worst]:.3f} ({worst}), {seconds:.1f} s"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -56,14 +57,14 @@ def to_views(poses: Path, clicks: Clicked) -> dict[str, tuple[np.ndarray, np.nda
 
 def straightened(points: np.ndarray, lens: Lens, size: tuple[int, int]) -> np.ndarray:
     """Pixels [K, 2] of the photograph of `size` (width, height) -> pixels of its undistorted picture."""
-    pinhole = undoing(lens)[0]
+    pinhole, _ = _straight(lens)
     directions = to_directions(points * (lens.width / size[0], lens.height / size[1]), lens)
     return directions * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)
 
 
 def photographed(points: np.ndarray, lens: Lens, size: tuple[int, int]) -> np.ndarray:
     """Inverse of `straightened`."""
-    pinhole = undoing(lens)[0]
+    pinhole, _ = _straight(lens)
     directions = (points - (pinhole.cx, pinhole.cy)) / (pinhole.fx, pinhole.fy)
     return to_pixels(directions, lens) * (size[0] / lens.width, size[1] / lens.height)
 
@@ -73,12 +74,19 @@ def as_photographed(mask: np.ndarray, lens: Lens, size: tuple[int, int]) -> np.n
     picture shows nothing of it, its rim goes on."""
     import cv2
 
-    pinhole, where = undoing(lens)
-    at = None if where is None else _back(lens, pinhole)
+    at = _straight(lens)[1]
     soft = mask.astype(np.float32)
     if at is not None:
         soft = cv2.remap(soft, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return cv2.resize(soft, size, interpolation=cv2.INTER_LINEAR) > 0.5
+
+
+@lru_cache(maxsize=4)
+def _straight(lens: Lens) -> tuple[Lens, np.ndarray | None]:
+    """The pinhole that replaces a lens, and `_back`, None where nothing moves. One lens took most captures, and
+    inverting it takes longer than all else here."""
+    pinhole, where = undoing(lens)
+    return pinhole, None if where is None else _back(lens, pinhole)
 
 
 def _back(lens: Lens, pinhole: Lens) -> np.ndarray:

@@ -39,9 +39,10 @@ def oddities(scene: Scene, masks: Mapping[str, np.ndarray], image_of: Callable[[
 
 
 def _covering(masks: Mapping[str, np.ndarray]) -> list[str]:
-    """Masks that cover most of their pictures."""
+    """Masks that cover most of their pictures and of their borders: a thing seen from near leaves much of these."""
     shares = {name: float(mask.mean()) for name, mask in masks.items()}
-    large = sorted(name for name, share in shares.items() if share > LARGE)
+    border = lambda mask: np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean()
+    large = sorted(name for name, share in shares.items() if share > LARGE and border(masks[name]) > LARGE)
     if not large:
         return []
     middle = float(np.median(list(shares.values())))

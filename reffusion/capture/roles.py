@@ -226,9 +226,9 @@ def _mask_files(folder: Path, capture: Capture, masks: str | None, region: bool)
         if region:
             return {}
         raise BadInput(
-            f"{folder}: no mask at all (looked for {', '.join(str(p.relative_to(folder)) for p in usual)}); add a mask "
-            "for each picture, name their folder as `masks` or a box as `region` in scene.yaml, or say `masks: none` "
-            "to fit and render only"
+            f"{folder}: no mask at all (looked for {', '.join(str(p.relative_to(folder)) for p in usual)}); click on "
+            f"the object (`make scene={folder} mask`, or `clicks` in scene.yaml), add a mask for each picture, name "
+            "their folder as `masks` or a box as `region` in scene.yaml, or say `masks: none` to fit and render only"
         )
     return {thing: masks_of(pictures, capture) for thing, pictures in _objects_in(found).items()}
 

@@ -14,7 +14,10 @@ ROUNDS = 3  # of distances and colours, each by the labels of the one before
 BY_COLOR, BY_LIKELIHOOD = 0.3, 100.0  # what a way costs from the second round on: a step of colour, of likelihood
 ON_ONE, TORN = 0.35, 60.0  # where surfaces are known: what a step of colour counts on one, and what leaving one counts
 SMOOTH = 5.0  # cost of a border between two that look alike
+REACHES = 0.5, 0.44, 0.37, 0.3  # shares of the way from a click to what is not the object
 REACH = 150.0  # of colour and pixels, how far a click goes that corrects
+CHANGE = 10.0  # of colour, in L*a*b* of 8 bit, that an edge of a thing shows
+SMALLER = 0.05  # what an object e times as large is worth less
 MOST = 3.0  # that colour may cost, natural logarithm of a ratio
 
 
@@ -52,6 +55,59 @@ def grown(
         change = np.abs(likelihood[pairs[:, 0]] - likelihood[pairs[:, 1]])
         cost = BY_COLOR * step + BY_LIKELIHOOD * (change if torn is None else ON_ONE * change)
     return attached(labels, pairs, seeds == OBJECT)
+
+
+def enclosed(
+    lab: np.ndarray, pairs: np.ndarray, length: np.ndarray, seeds: np.ndarray, weak: np.ndarray, torn: np.ndarray
+) -> list[np.ndarray]:
+    """What clicks may mean by surfaces alone, from the most to the least: bool [N] each, each within the one before.
+
+    Args:
+        lab, pairs, length, seeds, weak, torn: as `grown` takes them.
+    """
+    step = steps(lab, pairs, torn)
+    smooth = _smoothness(step, length)
+    side = nearer(pairs, (step + 1.0) * length, seeds == OBJECT, (seeds == OTHER) | (weak & (seeds != OBJECT)))
+    within, found = np.ones(len(lab), bool), []
+    for share in REACHES:
+        gain = 2 * (side - (1 - 2 * share))
+        against = np.where(seeds == OTHER, HARD, np.maximum(-gain, 0) * (seeds != OBJECT))
+        for_it = np.where(seeds == OBJECT, HARD, np.maximum(gain, 0) * (seeds != OTHER))
+        within = _cut_within(
+            within, against, for_it, pairs, smooth
+        )  # what costs more to take is part of what costs less
+        found.append(attached(within, pairs, seeds == OBJECT))
+    return found
+
+
+def _cut_within(
+    within: np.ndarray, true_cost: np.ndarray, false_cost: np.ndarray, pairs: np.ndarray, strength: np.ndarray
+) -> np.ndarray:
+    """bool [N]: `least_cut` of those in `within`, the others being False."""
+    ends, at = within[pairs], np.cumsum(within) - 1
+    both, crossing = ends.all(1), ends[:, 0] != ends[:, 1]
+    inner = np.where(ends[crossing, 0], pairs[crossing, 0], pairs[crossing, 1])
+    border = np.bincount(inner, strength[crossing], len(within))
+    found = np.zeros(len(within), bool)
+    found[within] = least_cut((true_cost + border)[within], false_cost[within], at[pairs[both]], strength[both])
+    return found
+
+
+def merit(labels: np.ndarray, around: np.ndarray, lab: np.ndarray, pairs: np.ndarray, torn: np.ndarray) -> float:
+    """How well labels stand for a thing of its own: its rim is where surfaces end or colours change, and none end
+    within it; its colours are not those around it; and of two as good it is the smaller. -inf where there is nothing.
+
+    Args:
+        labels: bool [N]; around: bool [N], its surroundings.
+    """
+    ends = labels[pairs]
+    inside, rim = ends.all(1), ends[:, 0] != ends[:, 1]
+    if not inside.any() or not rim.any() or not around.any():
+        return -np.inf
+    of, off = (histogram(lab, each.astype(float)) for each in (labels, around))
+    alike = float(np.minimum(of / of.sum(), off / off.sum()).sum())
+    edge = np.maximum(torn[rim], (steps(lab, pairs[rim], None) / CHANGE).clip(0, 1))
+    return float(edge.mean() - torn[inside].mean()) - alike - SMALLER * float(np.log(labels.sum()))
 
 
 def steps(lab: np.ndarray, pairs: np.ndarray, torn: np.ndarray | None) -> np.ndarray:
@@ -121,8 +177,16 @@ def _distance(way: sparse.csr_array, start: np.ndarray) -> np.ndarray:
 
 def frequency(lab: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """[N], how frequent the colour of each is among all by weight; never 0. lab: [N, 3], L*a*b* of 8 bit."""
-    bins = tuple((lab * (BINS / 256)).astype(int).clip(0, BINS - 1).T)
+    count = histogram(lab, weight)
+    return (count / max(count.sum(), 1e-9))[_bins(lab)] + 1e-5
+
+
+def histogram(lab: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """[BINS, BINS, BINS], the weight of each colour, blurred."""
     count = np.zeros((BINS,) * 3)
-    np.add.at(count, bins, weight)
-    count = ndimage.gaussian_filter(count, 0.7, mode="nearest")
-    return (count / max(count.sum(), 1e-9))[bins] + 1e-5
+    np.add.at(count, _bins(lab), weight)
+    return ndimage.gaussian_filter(count, 0.7, mode="nearest")
+
+
+def _bins(lab: np.ndarray) -> tuple[np.ndarray, ...]:
+    return tuple((lab * (BINS / 256)).astype(int).clip(0, BINS - 1).T)

@@ -6,13 +6,15 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-from reffusion.clicks.graph import grown, regrown
+from reffusion.clicks.graph import enclosed, grown, merit, regrown
 from reffusion.clicks.marks import OBJECT, OTHER, UNKNOWN, Clicks, marked
 
-LONGEST = 256  # px, the larger side of the picture that is cut
+LONGEST = 192  # px, the larger side of the picture that is cut
 BAND = 0.008  # of the picture's larger side: how far its edges may lie from the mask
 STEEP = 4.0, 10.0  # px of depth a pixel: a surface still, and no surface any more
 STANDS_OUT = 0.25  # share of an object's rim beyond which something lies behind, from which its relief is believed
+HEEDED = 12  # px of the picture that is cut, around each click
+RING = 0.25  # of the square root of a mask's pixels: how far around it colours are compared
 MARGIN = 3  # bands around a mask whose colours count
 
 
@@ -31,15 +33,45 @@ def view_mask(image: np.ndarray, clicks: Clicks, relief: np.ndarray | None = Non
     border = np.ones(small, bool)
     border[1:-1, 1:-1] = False
     pairs, length = _grid(small)
-    torn = _torn(relief, small, pairs, length)
-    cut = lambda torn: grown(lab, pairs, length, marks.ravel(), border.ravel(), torn)
-    mask = cut(torn)
-    rim = mask[pairs[:, 0]] != mask[pairs[:, 1]]
-    if torn is not None and torn[rim].sum() < STANDS_OUT * rim.sum():
-        mask = cut(None)  # the fit does not know it as a thing of its own
-    mask = mask.reshape(small)
-    mask |= ndimage.binary_fill_holes(mask) & ~_around(marks == OTHER, mask)
+    torn, given = _torn(relief, small, pairs, length), (lab, pairs, length, marks.ravel(), border.ravel())
+    found = None if torn is None else _standing([*enclosed(*given, torn), grown(*given, torn)], marks, lab, pairs, torn)
+    mask = _whole(grown(*given), marks) if found is None else found
     return refined(image, _enlarged(mask, shape), marked(clicks, shape))
+
+
+def _standing(
+    some: list[np.ndarray], marks: np.ndarray, lab: np.ndarray, pairs: np.ndarray, torn: np.ndarray
+) -> np.ndarray | None:
+    """bool [h, w]: of some labels those that most stand for a thing of its own; None where the fit does not know one.
+    Arguments as in `graph`, marks [h, w]."""
+    whole = [each for each in (_whole(labels, marks) for labels in some) if _heeds(each, marks)]
+    if not whole:
+        return None
+    merits = [merit(each.ravel(), _ring(each).ravel(), lab, pairs, torn) for each in whole]
+    best = whole[int(np.argmax(merits))]
+    rim = best.ravel()[pairs[:, 0]] != best.ravel()[pairs[:, 1]]
+    return best if max(merits) > -np.inf and torn[rim].mean() >= STANDS_OUT else None
+
+
+def _heeds(mask: np.ndarray, marks: np.ndarray) -> bool:
+    """Is there more around each mark than the mark?"""
+    for side, kind in ((mask, OBJECT), (~mask, OTHER)):
+        parts, _ = ndimage.label(side, np.ones((3, 3)))
+        if np.bincount(parts.ravel())[parts[(marks == kind) & side]].min(initial=HEEDED) < HEEDED:
+            return False
+    return True
+
+
+def _whole(labels: np.ndarray, marks: np.ndarray) -> np.ndarray:
+    """bool [h, w]: labels without the holes that no mark lies in."""
+    mask = labels.reshape(marks.shape)
+    return mask | (ndimage.binary_fill_holes(mask) & ~_around(marks == OTHER, mask))
+
+
+def _ring(mask: np.ndarray) -> np.ndarray:
+    """bool [h, w], around a mask, as far as it is large."""
+    far = max(3, round(RING * float(np.sqrt(mask.sum()))))
+    return ~shrunk(~mask, far) & shrunk(~mask, 1)
 
 
 def corrected(image: np.ndarray, before: np.ndarray, clicks: Clicks, relief: np.ndarray | None = None) -> np.ndarray:

@@ -1,0 +1,37 @@
+"""What a click means where the depth is known: the thing that stands for itself, however rough what is around it."""
+
+from __future__ import annotations
+
+import numpy as np
+import small_scene as small
+
+from reffusion.clicks.marks import Clicks
+from reffusion.clicks.picture import view_mask
+
+
+def chequered_on_gravel():
+    """A chequered disk before gravel, whose depth and colours are noise; picture, relief, disk."""
+    draw, (rows, columns) = np.random.default_rng(3), np.mgrid[:256, :256]
+    disk = np.hypot(rows - 150, columns - 110) < 26
+    picture = np.repeat(draw.integers(60, 180, (256, 256, 1)), 3, 2)
+    cheques = (rows // 9 + columns // 9) % 2 > 0
+    picture[disk & cheques], picture[disk & ~cheques] = (150, 110, 80), (90, 60, 40)
+    relief = np.where(disk, 0.0, 60 + draw.normal(0, 8, (256, 256)).cumsum(1).clip(-40, 40))
+    return picture.astype(np.uint8), relief, disk
+
+
+def test_one_click_finds_a_chequered_thing_on_rough_ground():
+    picture, relief, disk = chequered_on_gravel()
+    found = view_mask(picture, Clicks(np.array([[110.5, 150.5]]), np.array([True])), relief)
+    assert small.iou(found, disk) > 0.9
+
+
+def test_a_further_click_never_loses_what_was_clicked_before():
+    """A second part is no reason to keep of the first only the pixel that was clicked."""
+    picture, relief, disk = chequered_on_gravel()
+    rows, columns = np.mgrid[:256, :256]
+    other = np.hypot(rows - 80, columns - 200) < 20
+    picture[other], relief[other] = (200, 40, 40), 0
+    clicks = Clicks(np.array([[110.5, 150.5], [200.5, 80.5]]), np.array([True, True]))
+    found = view_mask(picture, clicks, relief)
+    assert small.iou(found & disk, disk) > 0.9 and small.iou(found & other, other) > 0.9
