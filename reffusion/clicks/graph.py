@@ -73,9 +73,8 @@ def enclosed(
         gain = 2 * (side - (1 - 2 * share))
         against = np.where(seeds == OTHER, HARD, np.maximum(-gain, 0) * (seeds != OBJECT))
         for_it = np.where(seeds == OBJECT, HARD, np.maximum(gain, 0) * (seeds != OTHER))
-        within = _cut_within(
-            within, against, for_it, pairs, smooth
-        )  # what costs more to take is part of what costs less
+        # What costs more to take is part of what costs less.
+        within = _cut_within(within, against, for_it, pairs, smooth)
         found.append(attached(within, pairs, seeds == OBJECT))
     return found
 
