@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from reffusion import trace
+from reffusion.fit import exposure
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.images import load_image, load_mask, save_image
 from reffusion.io.ply import load_ply, save_ply
@@ -38,6 +39,7 @@ class Work(NamedTuple):
         painter: what inpaints the rendered views; None where nothing does.
         tested: the views are test views, and scored where they have a picture.
         unseen: test view -> bool [H, W], pixels that no training view saw.
+        exposures: view -> [3, 4], how it is exposed; none where the photographs' were not fitted.
     """
 
     out: Path
@@ -48,6 +50,7 @@ class Work(NamedTuple):
     painter: Painter | None
     tested: bool
     unseen: dict[str, np.ndarray]
+    exposures: dict[str, np.ndarray]
 
 
 def run(
@@ -120,7 +123,8 @@ def prepared(
         views = (*scene.train, *scene.blank) if needs["reference"] else scene.train
         gaussians |= finished([scene.cameras[name] for name in views], gaussians, result)
     painter = paint2d.load(params.lama, params.device) if params.inpaint else None
-    return Work(out, poses, masks, gaussians, result, painter, tested, unseen), counts
+    exposures = exposure.of_views(needs["fit"], list(scene.cameras.values()))
+    return Work(out, poses, masks, gaussians, result, painter, tested, unseen, exposures), counts
 
 
 def looked_at(work: Work, camera: Camera, models: dict) -> tuple[Shown, dict[str, Any]]:
@@ -133,10 +137,10 @@ def looked_at(work: Work, camera: Camera, models: dict) -> tuple[Shown, dict[str
 
 def rendered(work: Work, camera: Camera) -> tuple[Shown, dict[str, np.ndarray]]:
     """The view as the result shows it, saved; and stage -> uint8 [H, W, 3], its own rendering, saved too."""
-    file = f"{camera.name}.png"
-    drawings = {s: drawn(gaussians, camera, work.out / FOLDERS[s] / file) for s, gaussians in work.gaussians.items()}
+    file, how = f"{camera.name}.png", work.exposures.get(camera.name)
+    drawings = {s: drawn(each, camera, work.out / FOLDERS[s] / file, how) for s, each in work.gaussians.items()}
     pictures = {stage: picture for stage, (picture, _) in drawings.items()}
-    shown = Shown(camera, *drawings[work.result], mask_of(camera, work.poses, work.masks))
+    shown = Shown(camera, *drawings[work.result], mask_of(camera, work.poses, work.masks), how)
     if work.painter:
         picture = work.painter.paint(shown.picture, shown.mask)
         shown = shown._replace(picture=picture, depth=consistency.depth_through(shown.depth, shown.mask))
@@ -197,12 +201,14 @@ def captured_by(
     return captured, cameras, hidden
 
 
-def drawn(gaussians: Gaussians, camera: Camera, path: Path) -> tuple[np.ndarray, np.ndarray]:
+def drawn(
+    gaussians: Gaussians, camera: Camera, path: Path, exposed: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Render to `path`, and give back what the file holds: scores are of the 8-bit picture that anyone can open; and
     the depth, [H, W] float64, 0 where hardly anything is, for the comparison with a view's neighbour."""
     with torch.no_grad():
         drawing = rasterizer.render(gaussians, camera)
-    save_image(path, drawing.color.cpu().numpy())
+    save_image(path, exposure.exposed(drawing.color, exposed).clamp(0, 1).cpu().numpy())
     depth, alpha = drawing.depth.double().cpu().numpy(), drawing.alpha.cpu().numpy()
     return load_image(path), np.where(alpha > consistency.SOLID, depth, 0.0)
 

@@ -12,10 +12,13 @@ import numpy as np
 
 from reffusion import seeding, trace
 from reffusion.capture import stereo, support
+from reffusion.capture.gains import gains, uneven
 from reffusion.fit import few
+from reffusion.fit.exposure import UNEVEN
 from reffusion.fit.reconstruction import fit
 from reffusion.fit.start import initial_gaussians
 from reffusion.fit.step import GENTLE
+from reffusion.io.images import to_uint8
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_raw_masks, load_scene, load_views
 from reffusion.masks import voting
@@ -37,18 +40,22 @@ def run(params: Params, out: Path, *, poses: Path) -> None:
     images = load_views(poses, scene.train)
     hidden = hidden_pixels(poses, scene) if params.pixels == "unmasked" else {}
     images |= {name: paint2d.telea(images[name], mask) for name, mask in hidden.items()}  # flow looks at them too
-    params, first = capped(params, cameras), on_surfaces(params, scene, cameras, images, hidden)
+    exposed = exposures(params, scene, cameras, images)
+    even = images if exposed is None else evened(images, cameras, exposed)
+    params, first = capped(params, cameras), on_surfaces(params, scene, cameras, even, hidden)
     rates = None
     if first is not None:
         params, rates = few.gently(params), GENTLE
     elif (out / trace.CHECKPOINT).exists():  # of what it starts from only the degree and the device still matter
         first = start(params, scene.points, scene.point_colors)
     else:
-        first = start(params, *start_points(params, scene, cameras, images, hidden))
+        first = start(params, *start_points(params, scene, cameras, even, hidden))
     views = (cameras, images, first)
     weights = {name: (~mask).astype("float32") for name, mask in hidden.items()}
     spent, lasting = lambda: time.monotonic() - began, lambda steps: params.changed({"iterations": steps})
-    tried = lambda folder, steps: fit(*views, lasting(steps), folder=folder, weights=weights, rates=rates)
+    tried = lambda folder, steps: fit(
+        *views, lasting(steps), folder=folder, weights=weights, rates=rates, gains=exposed
+    )
     steps = trace.affordable(out, params.iterations, params.seconds, spent, tried)
     gaussians = fit(
         *views,
@@ -56,6 +63,7 @@ def run(params: Params, out: Path, *, poses: Path) -> None:
         folder=out,
         weights=weights,
         rates=rates,
+        gains=exposed,
         held_out=[scene.cameras[name] for name in held_out],
         spent=spent(),
     )
@@ -73,6 +81,26 @@ def supported(params: Params, scene: Scene) -> Params:
         return params
     print(f"spherical harmonics of degree {degree}: a typical point is in {views} views", flush=True)
     return params.changed({"sh.degree": degree})
+
+
+def exposures(
+    params: Params, scene: Scene, cameras: list[Camera], images: Mapping[str, np.ndarray]
+) -> np.ndarray | None:
+    """[V, 3], how bright each view is beside the others; None where their exposures are not fitted."""
+    if params.exposure == "never":
+        return None
+    found = gains(scene.points, cameras, images)
+    differ = uneven(found)
+    if params.exposure == "auto" and differ < UNEVEN:
+        return None
+    print(f"exposures are fitted: the brightness of the same points differs by {differ:.1%} between views", flush=True)
+    return found
+
+
+def evened(images: Mapping[str, np.ndarray], cameras: list[Camera], exposed: np.ndarray) -> dict[str, np.ndarray]:
+    """View name -> uint8 [H, W, 3], the pictures as bright as each other."""
+    bright = {camera.name: gain for camera, gain in zip(cameras, exposed, strict=True)}
+    return {name: to_uint8(image / 255.0 / bright.get(name, 1.0)) for name, image in images.items()}
 
 
 def on_surfaces(params: Params, scene: Scene, cameras: list[Camera], images, hidden) -> Gaussians | None:

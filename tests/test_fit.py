@@ -93,10 +93,10 @@ class Killed(Exception):
     pass
 
 
-@pytest.mark.parametrize("settings", [SETTINGS, SETTINGS.changed({"exposure": True})], ids=["plain", "exposure"])
-def test_a_resumed_fit_is_the_unbroken_one_bit_for_bit(tmp_path, monkeypatch, settings):
+@pytest.mark.parametrize("gains", [None, np.linspace(0.8, 1.2, 15).reshape(5, 3)], ids=["plain", "exposure"])
+def test_a_resumed_fit_is_the_unbroken_one_bit_for_bit(tmp_path, monkeypatch, gains):
     monkeypatch.setattr(trace, "WORTH", 0)  # a checkpoint after every step
-    unbroken = run(tmp_path / "unbroken", settings=settings)
+    unbroken = run(tmp_path / "unbroken", gains=gains)
     adapt, folder = fitting.adapt, tmp_path / "resumed"
     for moment in (3, 4, 13, 18):  # before the first checkpoint of a run, twice in a row, around densifications
 
@@ -107,23 +107,23 @@ def test_a_resumed_fit_is_the_unbroken_one_bit_for_bit(tmp_path, monkeypatch, se
 
         monkeypatch.setattr(fitting, "adapt", killing)
         with pytest.raises(Killed):
-            run(folder, settings=settings.changed({"checkpoint_seconds": 1e-9}))
+            run(folder, settings=SETTINGS.changed({"checkpoint_seconds": 1e-9}), gains=gains)
         assert trace.load_checkpoint(folder)["iteration"] == moment - 1
     monkeypatch.setattr(fitting, "adapt", adapt)
-    resumed = run(folder, initial=start(truth().means.numpy()[:5].astype(np.float64)), settings=settings)
+    resumed = run(folder, initial=start(truth().means.numpy()[:5].astype(np.float64)), gains=gains)
     for name in PARAMETERS:
         assert torch.equal(getattr(unbroken, name), getattr(resumed, name)), name
     broken, whole = (trace.read_trace(tmp_path / k / "trace.jsonl") for k in ("resumed", "unbroken"))
     drop = lambda lines: [{k: v for k, v in line.items() if k != "seconds"} for line in lines]
     assert drop(broken) == drop(whole)
-    if settings.exposure:
+    if gains is not None:
         first, second = (load_json(tmp_path / k / exposure.FILE) for k in ("unbroken", "resumed"))
         assert first == second
 
 
 def test_exposures_are_found_and_taken_out_again(tmp_path):
-    """Photographs of which each has another exposure: with the param the held-out view, exposed as on average, is
-    right; without it, it is not; and the photographs come back as if none had differed."""
+    """Photographs of which each has another exposure: where it is fitted the held-out view, exposed as on average, is
+    right; where not, it is not; and the photographs come back as if none had differed."""
     held, cameras = ring_of_cameras(9)[4], [c for k, c in enumerate(ring_of_cameras(9)) if k != 4]
     pictures, gains = photos([*cameras, held]), (0.7, 1.2, 0.8, 1.25, 1.1, 0.85, 1.15, 0.95)
     poses = tmp_path / "poses"
@@ -137,7 +137,7 @@ def test_exposures_are_found_and_taken_out_again(tmp_path):
     for on in (False, True):
         folder = tmp_path / str(on)
         folder.mkdir()
-        fit(cameras, shown, start(), settings.changed({"exposure": on}), folder=folder, held_out=[held])
+        fit(cameras, shown, start(), settings, folder=folder, held_out=[held], gains=np.ones((8, 3)) if on else None)
         scores.append(trace.read_trace(folder / "trace.jsonl")[-1]["psnr_held_out"])
     assert scores[1] > scores[0] + 2
     away = lambda views: np.mean([np.abs(v.astype(float) - pictures[n]).mean() for n, v in views.items()])
@@ -146,6 +146,30 @@ def test_exposures_are_found_and_taken_out_again(tmp_path):
     for view, image in exposure.load_views(poses, tmp_path / "False", names).items():
         assert np.array_equal(image, shown[view])
     assert exposure.normalised(pictures[held.name], tmp_path / "True", held.name) is pictures[held.name]
+
+
+def test_a_view_is_exposed_as_the_photographs_next_to_it(tmp_path):
+    """Where neighbours are alike the nearest tell; where they are not, all do."""
+    cameras = ring_of_cameras(12)
+    seen = [camera for k, camera in enumerate(cameras) if k % 3 != 1]
+
+    def told(gain_of) -> dict[str, float]:
+        bright = np.array([[gain_of(cameras.index(camera))] * 3 for camera in seen])
+        exposure.Exposures([camera.name for camera in seen], gains=bright).save(tmp_path)
+        return {name: matrix[0, 0] for name, matrix in exposure.of_views(tmp_path, cameras).items()}
+
+    assert exposure.of_views(tmp_path, cameras) == {}
+    steps = told(lambda k: 0.7 if k < 6 else 1.3)
+    assert steps["view0"] == pytest.approx(0.7) and steps["view11"] == pytest.approx(1.3)
+    assert steps["view1"] == pytest.approx(0.7, abs=0.05) and steps["view10"] == pytest.approx(1.3, abs=0.05)
+    draws = np.random.default_rng(0).choice([0.8, 1.2], 12)
+    mixed = told(lambda k: draws[k])
+    assert all(0.85 < mixed[f"view{k}"] < 1.15 for k in (4, 7))
+    color = torch.rand(2, 3, 3)
+    matrix = exposure.of_views(tmp_path, cameras)["view4"]
+    shown = exposure.exposed(color, matrix)
+    np.testing.assert_allclose(exposure.undone(shown.numpy(), matrix), color, atol=1e-6)
+    assert exposure.exposed(color, None) is color
 
 
 def test_exposures_stay_the_identity_on_average():

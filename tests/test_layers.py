@@ -6,7 +6,7 @@ import numpy as np
 
 from reffusion.cuts import least_labels
 from reffusion.depth.behind import Completion, Hints, Seen, continued, grown
-from reffusion.depth.layers import shared_out
+from reffusion.depth.layers import pieces, shared_out
 from reffusion.masks.continuation import _surrounded
 from reffusion.types import Camera
 
@@ -62,6 +62,24 @@ def test_a_tuft_of_the_grounds_own_colours_takes_nothing_of_the_ground():
     known = ~grown(hole, 0.03)
     surfaces = shared_out(1 / depth, known, grown(hole, 0.03), grass, (table,), np.zeros_like(hole))
     assert (surfaces[hole & ~vase] == surfaces[95, 5]).mean() > 0.95
+
+
+def test_a_plinth_that_touches_the_lawn_at_its_foot_is_a_piece_of_its_own():
+    """A statue stands on a plinth on a lawn: around its mask both are connected, through the plinth's foot."""
+    rows, columns = np.mgrid[:160, :160]
+    lawn = 0.2 + 0.005 * rows
+    plinth = (rows >= 90) & (rows < 130) & (np.abs(columns - 80) < 40)
+    disparity = np.where(plinth, lawn[130, 0], lawn)
+    hole = (np.abs(columns - 80) < 25) & (rows >= 40) & (rows < 100)
+    around = ~hole & (rows > 15)
+    assert pieces(disparity, around).max() == 1
+    found = pieces(disparity, around, hole=hole)
+    assert found.max() == 2
+    own = np.bincount(found[plinth & around]).argmax()
+    assert (found[plinth & around] == own).mean() > 0.99
+    assert (found[around & (rows < 90)] != own).all()
+    left_out = pieces(lawn, around, hole=hole)  # the lawn alone stands before nothing
+    assert left_out.max() == 1
 
 
 def test_labels_of_the_least_cost_are_found():

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 import cv2
 import numpy as np
 
+from reffusion.capture.gains import shown_at
 from reffusion.geometry import pixel_rays, project, sample_nearest
 from reffusion.types import Camera, Scene
 
@@ -124,19 +125,10 @@ def _contradicting(cameras: list[Camera], points: np.ndarray, image_of: Callable
 
 def _brightness(camera: Camera, points: np.ndarray, image: np.ndarray) -> np.ndarray:
     """[P, 2] what the photograph shows where its pose puts the points: brightness, and what of it is finer than a
-    quarter of the picture (a floor is dark in every view, whatever the pose). NaN outside, and behind nearer points."""
+    quarter of the picture (a floor is dark in every view, whatever the pose). NaN where it does not show them."""
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     near, wide = (cv2.blur(gray, (max(3, camera.width // part),) * 2) for part in (40, 4))
-    uv, depth = project(points, camera)
-    values, inside = sample_nearest(np.stack([near, near - wide], -1), uv)
-    cell = max(1.0, camera.width / 40)
-    index = np.zeros(len(points), int)
-    index[inside] = (uv[inside] // cell).astype(int) @ (10_000, 1)
-    order = np.argsort(depth)
-    cells, first = np.unique(index[order], return_index=True)
-    nearest = depth[order][first][np.searchsorted(cells, index)]
-    shown = inside & (depth < 1.15 * np.maximum(nearest, 0))
-    return np.where(shown[:, None], values, np.nan)
+    return shown_at(camera, points, np.stack([near, near - wide], -1))
 
 
 def _exposed(ratios: Mapping[str, float]) -> list[str]:
@@ -147,7 +139,7 @@ def _exposed(ratios: Mapping[str, float]) -> list[str]:
     who = f"{len(jumps)} of {len(ratios)} photographs are" if len(jumps) > 1 else "a photograph is"
     return [
         f"{who} exposed otherwise than the rest ({_listed(sorted(jumps))}; {worst} is {jumps[worst]:.2g} times as "
-        "bright): take them with a fixed exposure, or try fit.exposure"
+        "bright): take them with a fixed exposure, or have each one's fitted (fit.exposure)"
     ]
 
 

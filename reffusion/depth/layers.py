@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy import ndimage, sparse
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import connected_components, dijkstra
 
 from reffusion.cuts import HARD, least_labels
 from reffusion.depth.completion import unit_range
@@ -18,6 +18,9 @@ ALIKE = 0.05  # least cost of parting neighbours, of that where the picture is e
 BINS = 12  # of colour, along each of red, green and blue
 ON = 0.02  # relative disparity within which a pixel lies on a plane
 NEARLY = 0.04  # median relative disparity from a plane under which a piece beside it is an unevenness of it
+BESIDE = 0.03  # of the width: how far around a hole its surfaces meet what goes on in it
+TOUCHING = 3  # px within which two pieces beside the hole meet
+BEFORE = 1.05  # relative disparity of a piece there over all that it meets, from which it stands before them
 SUPPOSED = 0.5  # cost of a pixel that is not of the plane which is supposed to go on there
 
 
@@ -45,7 +48,7 @@ def shared_out(
         supposed: bool [H, W], those of the known pixels that are only supposed to be of the plane they lie on.
     """
     supposed = np.zeros_like(hole) if supposed is None else supposed & known
-    surfaces = pieces(disparity, known & ~supposed, planes)
+    surfaces = pieces(disparity, known & ~supposed, planes, hole)
     count = int(surfaces.max())
     todo = hole & ~(known & ~supposed)
     if count < 2 or not todo.any():
@@ -117,9 +120,15 @@ def _pairs(index: np.ndarray, ahead: tuple[int, int]) -> tuple[np.ndarray, np.nd
     return here[both], there[both]
 
 
-def pieces(disparity: np.ndarray, known: np.ndarray, planes: Sequence[np.ndarray] = ()) -> np.ndarray:
-    """int [H, W]: the known pixels' pieces, 1, 2, ... from the largest on; 0: too small. A piece is what lies on one of
-    the planes (depth [H, W] each), or else is connected without jumps."""
+def pieces(
+    disparity: np.ndarray, known: np.ndarray, planes: Sequence[np.ndarray] = (), hole: np.ndarray | None = None
+) -> np.ndarray:
+    """int [H, W]: the known pixels' pieces, 1, 2, ... from the largest on; 0: too small.
+
+    A piece is what lies on one of the planes (depth [H, W] each), or else is connected without jumps. A plinth is
+    connected with the lawn at its foot; where it stands before all that is around it beside the hole, bool [H, W], it is
+    a piece of its own.
+    """
     index = np.full(known.shape, -1)
     index[known] = np.arange(known.sum())
     values, on, rows, columns = disparity[known], np.zeros(int(known.sum()), np.int64), [], []
@@ -131,7 +140,11 @@ def pieces(disparity: np.ndarray, known: np.ndarray, planes: Sequence[np.ndarray
         rows, columns = [*rows, here[near]], [*columns, there[near]]
     here, there = np.concatenate(rows), np.concatenate(columns)
     joined = lambda pairs: sparse.csr_matrix((np.ones(pairs.sum()), (here[pairs], there[pairs])), shape=(len(on),) * 2)
-    _, piece = connected_components(joined((on[here] == 0) & (on[there] == 0)), directed=False)
+    smooth = joined((on[here] == 0) & (on[there] == 0))
+    _, piece = connected_components(smooth, directed=False)
+    if hole is not None and hole.any():
+        beside = known & (ndimage.distance_transform_edt(~hole) <= BESIDE * hole.shape[1])
+        piece = _parted(piece, smooth, disparity, known, beside)
     for k, depth in enumerate(planes, start=1):
         off = np.abs(values * np.where(np.isfinite(depth), depth, 0)[known] - 1)
         middle = ndimage.median(off, piece, np.arange(piece.max() + 1))
@@ -146,6 +159,40 @@ def pieces(disparity: np.ndarray, known: np.ndarray, planes: Sequence[np.ndarray
     found = np.zeros(known.shape, np.int64)
     found[known] = number[piece]
     return found
+
+
+def _parted(
+    piece: np.ndarray, smooth: sparse.csr_matrix, disparity: np.ndarray, known: np.ndarray, beside: np.ndarray
+) -> np.ndarray:
+    """The numbers of the known pixels' pieces [P], anew for what stands before all that it meets beside the hole; what
+    is `smooth`ly connected to that, and nearer to it than to anything else there, belongs to it."""
+    band = np.flatnonzero(beside[known])
+    _, part = connected_components(smooth[band][:, band], directed=False)
+    sizes = np.bincount(part, minlength=1)
+    large = np.flatnonzero(sizes >= LEAST * len(band))
+    seeds = [band[part == k] for k in large]
+    masks = np.zeros((len(seeds), *known.shape), bool)
+    for mask, seed in zip(masks, seeds, strict=True):
+        mask[known] = np.isin(np.arange(len(piece)), seed)
+    first = [k for k in range(len(seeds)) if _stands_before(k, masks, disparity)]
+    if not first:
+        return piece
+    of, found = np.full(len(piece) + 1, -1), piece.copy()
+    for k, seed in enumerate(seeds):
+        of[seed] = k
+    _, _, source = dijkstra(smooth, False, np.concatenate(seeds), return_predecessors=True, min_only=True)
+    nearest = of[np.where(source >= 0, source, len(piece))]
+    for k in first:
+        found[nearest == k] = piece.max() + 1 + k
+    return found
+
+
+def _stands_before(k: int, masks: np.ndarray, disparity: np.ndarray) -> bool:
+    """Is the k-th of the masks, bool [K, H, W], nearer than every other where they meet, and does it meet any?"""
+    wide = [ndimage.binary_dilation(mask, np.ones((3, 3)), TOUCHING) for mask in masks]
+    met = [j for j in range(len(masks)) if j != k and (wide[k] & masks[j]).any() and (wide[j] & masks[k]).any()]
+    steps = [np.median(disparity[masks[k] & wide[j]]) / np.median(disparity[masks[j] & wide[k]]) for j in met]
+    return bool(met) and min(steps) > BEFORE
 
 
 def _on(disparity: np.ndarray, depth: np.ndarray) -> np.ndarray:

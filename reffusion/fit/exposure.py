@@ -2,6 +2,7 @@
 
 A phone re-exposes while it walks round. Without compensation Gaussians take the mean, or colours that change with the
 direction; with it they have one exposure, and the photographs are brought to that one wherever they are used later.
+Views that were not photographed, and test views, are drawn as the nearest photographs are exposed.
 """
 
 from __future__ import annotations
@@ -15,9 +16,12 @@ from torch import Tensor
 
 from reffusion.io.images import to_uint8
 from reffusion.splat import rasterizer
+from reffusion.types import Camera
 
 FILE = "exposures.json"
 RATE, RATE_LAST = 1e-2, 1e-3  # Adam's step size at the start and at the end
+UNEVEN = 0.05  # deviation of the log of the photographs' brightness from which their exposures are fitted, too
+REACHES = (0.5, 1.0, 2.0, 4.0, 16.0)  # of the mean way to the nearest photograph: how far one tells of another's exposure
 _IDENTITY = torch.eye(3, 4)
 
 
@@ -28,8 +32,14 @@ class Exposures:
     identity. PAPER leaves open: any exposure.
     """
 
-    def __init__(self, names: Iterable[str], device: torch.device | str = "cpu"):
-        self._matrices = {name: _IDENTITY.to(device).clone().requires_grad_() for name in names}
+    def __init__(self, names: Iterable[str], device: torch.device | str = "cpu", gains: np.ndarray | None = None):
+        """Args: gains: [V, 3], how bright each view's red, green and blue are, to start from; None: all alike."""
+        names = list(names)
+        first = np.ones((len(names), 3)) if gains is None else gains / gains.mean(0)
+        start = lambda gain: torch.diag(torch.from_numpy(gain).float()) @ _IDENTITY
+        self._matrices = {
+            name: start(gain).to(device).requires_grad_() for name, gain in zip(names, first, strict=True)
+        }
         # a parameter for each view: Adam leaves those alone that got no gradient, and counts each one's steps
         self._adam = torch.optim.Adam(list(self._matrices.values()), lr=RATE, eps=1e-15)
 
@@ -64,6 +74,54 @@ class Exposures:
         from reffusion.io.arrays import save_json
 
         save_json(folder / FILE, {name: matrix.detach().cpu().tolist() for name, matrix in self._matrices.items()})
+
+
+def of_views(fit: Path, cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
+    """View name -> [3, 4], how a view is exposed: as was fitted, and other views as the photographs next to them; none
+    where no exposures were fitted.
+
+    PAPER leaves open: any exposure.
+
+    Args:
+        cameras: of all views, the fitted ones among them.
+    """
+    from reffusion.io.arrays import load_json
+
+    path = Path(fit) / FILE
+    fitted = {name: np.array(matrix) for name, matrix in load_json(path).items()} if path.exists() else {}
+    known = [camera for camera in cameras if camera.name in fitted]
+    if not known:
+        return {}
+    away, matrices = _apart(known, known), np.stack([fitted[camera.name] for camera in known])
+    np.fill_diagonal(away, np.inf)
+    unit = float(np.mean(away.min(1))) if len(known) > 1 else 1.0
+    blended = lambda away, reach: np.einsum("vk,kij->vij", _shares(away / (reach * unit)), matrices)
+    # How far photographs tell of each other is what tells each of them best by the others.
+    misses = lambda reach: float(np.square(blended(away, reach) - matrices).sum())
+    reach = min(REACHES, key=misses) if len(known) > 2 else REACHES[0]
+    others = [camera for camera in cameras if camera.name not in fitted]
+    told = blended(_apart(others, known), reach) if others else []
+    return fitted | {camera.name: matrix for camera, matrix in zip(others, told, strict=True)}
+
+
+def _apart(views: Sequence[Camera], known: Sequence[Camera]) -> np.ndarray:
+    """[V, K]: how far views stand from others, and, in the same unit of the normalised frame, how unlike they look."""
+    placed = lambda cameras: np.array([[*camera.center, *camera.world_to_camera[2, :3]] for camera in cameras])
+    return np.linalg.norm(placed(views)[:, None] - placed(known)[None], axis=-1)
+
+
+def _shares(away: np.ndarray) -> np.ndarray:
+    """[V, K]: what each of K has to say, falling with its distance [V, K]; sums to 1."""
+    weight = np.exp(-(away**2 - np.square(away.min(1, keepdims=True))) / 2)
+    return weight / weight.sum(1, keepdims=True)
+
+
+def exposed(color: Tensor, matrix: np.ndarray | None) -> Tensor:
+    """[H, W, 3], colours of the Gaussians as a view of this exposure, [3, 4], shows them."""
+    if matrix is None:
+        return color
+    of = torch.from_numpy(matrix).to(color)
+    return color @ of[:, :3].T + of[:, 3]
 
 
 def load_views(poses: Path, fit: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
@@ -106,5 +164,9 @@ def normalised(image: np.ndarray, fit: Path, name: str) -> np.ndarray:
     matrix = np.array(matrices[name])
     if abs(np.linalg.det(matrix[:, :3])) < 1e-3:
         raise ValueError(f"{path}: the exposure of view '{name}' cannot be undone; fit again without `fit.exposure`")
-    colors = (image / 255.0 - matrix[:, 3]) @ np.linalg.inv(matrix[:, :3]).T
-    return to_uint8(colors)
+    return to_uint8(undone(image / 255.0, matrix))
+
+
+def undone(color: np.ndarray, matrix: np.ndarray | None) -> np.ndarray:
+    """[H, W, 3], the inverse of `exposed`."""
+    return color if matrix is None else (color - matrix[:, 3]) @ np.linalg.inv(matrix[:, :3]).T

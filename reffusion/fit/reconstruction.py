@@ -33,6 +33,7 @@ def fit(
     weights: Mapping[str, np.ndarray] | None = None,
     held_out: Sequence[Camera] = (),
     rates: Rates | None = None,
+    gains: np.ndarray | None = None,
     spent: float = 0.0,
     impl: str = "auto",
 ) -> Gaussians:
@@ -48,6 +49,8 @@ def fit(
             A view without an entry counts as a whole.
         held_out: views that are only measured.
         rates: Adam's step sizes where they are not those of `settings.lr`.
+        gains: [V, 3], by how much each view of `cameras` is brighter than the others: its exposure is fitted from there
+            on; None: all are exposed alike.
         spent: seconds that making `initial` took; the trace counts from there.
 
     Raises:
@@ -57,8 +60,9 @@ def fit(
     weights = weights or {}
     _refuse_misfits(cameras, held_out, images, weights)
     state = trace.load_checkpoint(folder)
-    run = _Run.begun(initial, cameras, settings, rates or rates_of(settings.lr, cameras), state, spent)
-    optimizer, exposures = run.optimizer, run.exposures
+    exposures = None if gains is None else Exposures([camera.name for camera in cameras], initial.means.device, gains)
+    run = _Run.begun(initial, exposures, settings, rates or rates_of(settings.lr, cameras), state, spent)
+    optimizer = run.optimizer
     log = trace.Trace(folder, run.seconds, run.iteration + 1 if run.iteration else 0)
     centers = torch.tensor(np.stack([camera.center for camera in cameras]), dtype=torch.float32)
     checkpoints, measured = trace.Checkpoints(folder, settings.checkpoint_seconds), (held_out, images, settings, impl)
@@ -121,14 +125,13 @@ class _Run:
     def begun(
         cls,
         initial: Gaussians,
-        cameras: Sequence[Camera],
+        exposures: Exposures | None,
         settings: Params,
         rates: Rates,
         state: dict[str, Any] | None,
         spent: float,
     ) -> _Run:
         """From the start, or from a checkpoint's state."""
-        exposures = Exposures((camera.name for camera in cameras), initial.means.device) if settings.exposure else None
         optimizer = GaussianOptimizer(initial, rates=rates, betas=settings.lr.betas)
         run = cls(optimizer, exposures, len(initial), spent)
         if state is not None:

@@ -74,7 +74,11 @@ class Params(Settings):
     # after this one would read as places that no Gaussian explains.
     random_background: bool = Field(True, description="a new background colour each step, instead of black")
     antialiased: bool = Field(False, description="a Gaussian adds up to the same from any distance (Mip-Splatting)")
-    exposure: bool = Field(False, description="fit each view's exposure too; later stages see the views without it")
+    exposure: Literal["never", "auto", "always"] = Field(
+        "never",
+        description="fit each view's exposure too; later stages see the views without it; auto: where the photographs "
+        "of the same points differ in brightness",
+    )
     few_views: Literal["as_many", "fewer_harmonics", "surfaces"] = Field(
         "fewer_harmonics",
         description="what views too few for it change: nothing; no degree of spherical harmonics that they do not "

@@ -9,6 +9,7 @@ from scipy.ndimage import map_coordinates
 
 from reffusion import geometry
 from reffusion.depth.completion import complete
+from reffusion.fit.exposure import undone
 from reffusion.types import Camera
 
 TOLERANCE = 0.02  # relative depth by which a point may lie behind the neighbour's surface and still be visible
@@ -31,12 +32,19 @@ class Shown(NamedTuple):
         picture: uint8 [H, W, 3].
         depth: [H, W] camera z; 0 where nothing is, or too little to have a depth.
         mask: bool [H, W], the pixels to compare.
+        exposed: [3, 4], the exposure that it was drawn with, see `fit.exposure`; None: the Gaussians' own.
     """
 
     camera: Camera
     picture: np.ndarray
     depth: np.ndarray
     mask: np.ndarray
+    exposed: np.ndarray | None = None
+
+    @property
+    def color(self) -> np.ndarray:
+        """[H, W, 3] in [0, 1] as the Gaussians are exposed, so that views of other exposures can be compared."""
+        return undone(self.picture / 255.0, self.exposed)
 
 
 def difference(first: Shown, second: Shown, tolerance: float = TOLERANCE) -> tuple[float | None, float | None]:
@@ -58,8 +66,8 @@ def difference(first: Shown, second: Shown, tolerance: float = TOLERANCE) -> tup
     if not seen.any():
         return None, 0.0
     column, row = uv[seen].T - 0.5
-    there = np.stack([map_coordinates(second.picture[..., c] / 255.0, (row, column), order=1) for c in range(3)], -1)
-    here = first.picture[chosen][seen] / 255.0
+    there = np.stack([map_coordinates(second.color[..., c], (row, column), order=1) for c in range(3)], -1)
+    here = first.color[chosen][seen]
     return float(np.abs(here - there).mean()), float(seen.sum() / asked)
 
 

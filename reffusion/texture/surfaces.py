@@ -170,7 +170,7 @@ def _drawn(depth: np.ndarray, known: np.ndarray, hidden: np.ndarray) -> np.ndarr
     across = drawn_across(depth, known)
     found = np.where(across > 0, across, np.median(depth[known]))
     ring = known & widened(hidden, RING)
-    piece = pieces(geometry.reciprocal(depth), ring)
+    piece = pieces(geometry.reciprocal(depth), ring, hole=hidden)
     away = lambda k: -float(np.median(depth[piece == k]))
     for nearer, k in enumerate(sorted(range(1, piece.max() + 1), key=away)):
         own = drawn_across(depth, piece == k)

@@ -1,0 +1,55 @@
+"""How bright each photograph is beside the others, from the points that they share."""
+
+import numpy as np
+import pytest
+
+from reffusion.capture.gains import gains, uneven
+from reffusion.io.scene import load_scene, load_views
+from reffusion.params.fit import Params
+from stages import fit as stage
+from tests import small_scene
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory):
+    poses, _, _ = small_scene.write(tmp_path_factory.mktemp("gains") / "wall", 1.5)
+    scene = load_scene(poses)
+    return scene, [scene.cameras[name] for name in scene.train], load_views(poses, scene.train)
+
+
+def dimmed(photos, bright):
+    return {n: (photo * gain).round().clip(0, 255).astype(np.uint8) for (n, photo), gain in zip(photos.items(), bright, strict=True)}
+
+
+def test_gains_are_found_though_some_photographs_show_something_else(shown):
+    scene, cameras, photos = shown
+    bright = np.exp(np.random.default_rng(0).normal(0, 0.15, (len(cameras), 3)))
+    bright /= bright.max() * 1.05
+    told = dimmed({camera.name: photos[camera.name] for camera in cameras}, bright)
+    for photo in list(told.values())[::3]:  # a thing before a quarter of the picture
+        photo[: photo.shape[0] // 2, : photo.shape[1] // 2] = 200
+    found = gains(scene.points, cameras, told)
+    expected = bright / np.exp(np.log(bright).mean(0))
+    assert np.abs(np.log(found / expected)).max() < 0.06
+    assert uneven(found) > 0.05 > uneven(gains(scene.points, cameras, photos))
+
+
+def test_where_nothing_is_known_all_are_alike(shown):
+    scene, cameras, photos = shown
+    assert np.array_equal(gains(np.zeros((0, 3)), cameras, photos), np.ones((len(cameras), 3)))
+    black = {name: np.zeros_like(photo) for name, photo in photos.items()}
+    assert np.array_equal(gains(scene.points, cameras, black), np.ones((len(cameras), 3)))
+
+
+def test_the_stage_fits_exposures_where_photographs_differ(shown, capsys):
+    scene, cameras, photos = shown
+    asked = lambda how, images: stage.exposures(Params(exposure=how), scene, cameras, images)
+    bright = np.where(np.arange(len(cameras)) % 2, 0.6, 0.9)[:, None]
+    uneven_ones = dimmed({camera.name: photos[camera.name] for camera in cameras}, bright)
+    assert asked("auto", photos) is None and asked("never", uneven_ones) is None
+    assert asked("always", photos) is not None
+    found = asked("auto", uneven_ones)
+    assert uneven(found) == pytest.approx(np.log(bright).std(), abs=0.01)
+    assert "exposures are fitted: the brightness of the same points differs by" in capsys.readouterr().out
+    even = stage.evened(uneven_ones, cameras, found)
+    assert uneven(gains(scene.points, cameras, even)) < 0.02
