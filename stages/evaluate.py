@@ -99,6 +99,7 @@ def run(
         "result": work.result,
         "consistency": rows.consistency_of(scored),
         **used(work.painter and work.painter.name, distill),
+        "exposure": exposure.PROTOCOL if work.exposures else None,
         "lpips_unavailable": "; ".join(reason for _, reason in loaded.values() if reason) or None,
         "gaussians": counts,
         "seconds": seconds(needs),

@@ -82,6 +82,18 @@ def test_while_an_object_is_kept_nothing_is_scored(tmp_path, folders):
     assert found["mean"].get("psnr_box") is None and (tmp_path / "out/renders/view0.png").exists()
 
 
+def test_views_are_drawn_as_the_photographs_next_to_them_are_exposed(tmp_path, folders, done):
+    """And are as consistent as without: their exposures are no disagreement."""
+    names = [f"view{k}" for k in range(3, 8)]
+    dark = np.diag([0.5, 0.6, 0.7]) @ np.eye(3, 4)
+    save_json(folders["fit"] / "exposures.json", {name: dark.tolist() for name in names})
+    found, plain = run(tmp_path / "out", folders), load_json(done / "evaluate/metrics.json")
+    shown, before = (load_image(home / "renders/view0.png") for home in (tmp_path / "out", done / "evaluate"))
+    assert np.abs(shown - before * [0.5, 0.6, 0.7]).max() < 1.01
+    assert "next to them" in found["exposure"] and plain["exposure"] is None
+    assert found["consistency"]["consistency"] == pytest.approx(plain["consistency"]["consistency"], abs=2e-3)
+
+
 @pytest.fixture
 def folders(tmp_path):
     return write_stages(tmp_path)

@@ -18,7 +18,8 @@ def shown(tmp_path_factory):
 
 
 def dimmed(photos, bright):
-    return {n: (photo * gain).round().clip(0, 255).astype(np.uint8) for (n, photo), gain in zip(photos.items(), bright, strict=True)}
+    shown = lambda photo, gain: (photo * gain).round().clip(0, 255).astype(np.uint8)
+    return {name: shown(photos[name], gain) for name, gain in zip(photos, bright, strict=True)}
 
 
 def test_gains_are_found_though_some_photographs_show_something_else(shown):

@@ -126,8 +126,8 @@ def pieces(
     """int [H, W]: the known pixels' pieces, 1, 2, ... from the largest on; 0: too small.
 
     A piece is what lies on one of the planes (depth [H, W] each), or else is connected without jumps. A plinth is
-    connected with the lawn at its foot; where it stands before all that is around it beside the hole, bool [H, W], it is
-    a piece of its own.
+    connected with the lawn at its foot; where it stands before all that is around it beside the hole, bool [H, W],
+    it is a piece of its own.
     """
     index = np.full(known.shape, -1)
     index[known] = np.arange(known.sum())

@@ -21,7 +21,8 @@ from reffusion.types import Camera
 FILE = "exposures.json"
 RATE, RATE_LAST = 1e-2, 1e-3  # Adam's step size at the start and at the end
 UNEVEN = 0.05  # deviation of the log of the photographs' brightness from which their exposures are fitted, too
-REACHES = (0.5, 1.0, 2.0, 4.0, 16.0)  # of the mean way to the nearest photograph: how far one tells of another's exposure
+REACHES = (0.5, 1.0, 2.0, 4.0, 16.0)  # of the mean way to the nearest photograph: how far exposures tell
+PROTOCOL = "test views are drawn as the photographs next to them are exposed, by nothing of their own pictures"
 _IDENTITY = torch.eye(3, 4)
 
 
