@@ -17,6 +17,7 @@ from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_raw_masks, load_scene, shows_object
 from reffusion.kernels.compiled import side_by_side
 from reffusion.paint import paint2d
+from reffusion.paint.margin import widened
 from reffusion.paint.paint2d import Painter
 from reffusion.params.evaluate import Params
 from reffusion.score import beyond, consistency, lpips, metrics, rows, sight
@@ -130,15 +131,26 @@ def prepared(
 
 def looked_at(work: Work, camera: Camera, models: dict) -> tuple[Shown, dict[str, Any]]:
     """The view as the result shows it, saved with all that goes with it; and its row of scores."""
-    shown, pictures = rendered(work, camera)
     truth = truth_for(work, camera)
+    shown, pictures = rendered(work, camera, exposure_of(work, camera, truth.picture))
     save_side_by_side(work.out, pictures["fit"], truth.picture, shown)
     return shown, rows.row_of(shown, pictures.get("initialize"), truth, models)
 
 
-def rendered(work: Work, camera: Camera) -> tuple[Shown, dict[str, np.ndarray]]:
-    """The view as the result shows it, saved; and stage -> uint8 [H, W, 3], its own rendering, saved too."""
-    file, how = f"{camera.name}.png", work.exposures.get(camera.name)
+@torch.no_grad()
+def exposure_of(work: Work, camera: Camera, photo: np.ndarray | None) -> np.ndarray | None:
+    """[3, 4], how the view is drawn, see `exposure.PROTOCOL`; None where the photographs are exposed alike."""
+    told = work.exposures.get(camera.name)
+    if told is None or photo is None:
+        return told
+    color = exposure.exposed(rasterizer.render(work.gaussians["fit"], camera).color, told).cpu().numpy()
+    outside = ~widened(mask_of(camera, work.poses, work.masks), rows.OUTSIDE_MARGIN)
+    return exposure.matched(told, color, photo, outside)
+
+
+def rendered(work: Work, camera: Camera, how: np.ndarray | None) -> tuple[Shown, dict[str, np.ndarray]]:
+    """The view, exposed so, as the result shows it, saved; and stage -> uint8 [H, W, 3], its own rendering, saved."""
+    file = f"{camera.name}.png"
     drawings = {s: drawn(each, camera, work.out / FOLDERS[s] / file, how) for s, each in work.gaussians.items()}
     pictures = {stage: picture for stage, (picture, _) in drawings.items()}
     shown = Shown(camera, *drawings[work.result], mask_of(camera, work.poses, work.masks), how)

@@ -2,7 +2,7 @@
 
 A phone re-exposes while it walks round. Without compensation Gaussians take the mean, or colours that change with the
 direction; with it they have one exposure, and the photographs are brought to that one wherever they are used later.
-Views that were not photographed, and test views, are drawn as the nearest photographs are exposed.
+Views that were not photographed are drawn as the nearest photographs are exposed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,11 @@ FILE = "exposures.json"
 RATE, RATE_LAST = 1e-2, 1e-3  # Adam's step size at the start and at the end
 UNEVEN = 0.05  # deviation of the log of the photographs' brightness from which their exposures are fitted, too
 REACHES = (0.5, 1.0, 2.0, 4.0, 16.0)  # of the mean way to the nearest photograph: how far exposures tell
-PROTOCOL = "test views are drawn as the photographs next to them are exposed, by nothing of their own pictures"
+DARK, BRIGHT = 8, 247  # levels of 255 beyond which a photograph is too dark, or clipped, to tell
+PROTOCOL = (
+    "the photographs differ in brightness: each channel of a test view is as bright as its photograph is outside the "
+    "mask (median ratio to the fit); of one without a photograph, as those next to it are"
+)
 _IDENTITY = torch.eye(3, 4)
 
 
@@ -123,6 +127,18 @@ def exposed(color: Tensor, matrix: np.ndarray | None) -> Tensor:
         return color
     of = torch.from_numpy(matrix).to(color)
     return color @ of[:, :3].T + of[:, 3]
+
+
+def matched(matrix: np.ndarray, color: np.ndarray, photo: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """[3, 4], an exposure brightened, each channel by one factor, to that of a photograph.
+
+    Args:
+        color: [H, W, 3] in [0, 1], the view so exposed. photo: uint8 [H, W, 3]. pixels: bool [H, W], those compared.
+    """
+    told = pixels[..., None] & (photo > DARK) & (photo < BRIGHT) & (color > DARK / 255)
+    ratio = np.where(told, photo / 255.0, np.nan) / np.where(told, color, 1.0)
+    gain = np.array([np.nanmedian(ratio[..., c]) if told[..., c].any() else 1.0 for c in range(3)])
+    return gain[:, None] * matrix
 
 
 def load_views(poses: Path, fit: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
