@@ -300,7 +300,8 @@ def test_a_nearer_surface_ends_at_the_prolongation_of_its_border():
     depth[60:] = 1.0
     hidden = np.zeros((120, 160), bool)
     hidden[30:90, 60:100] = True
-    found = surfaces._drawn(depth, ~hidden, hidden)
+    found, layer = surfaces._drawn(depth, ~hidden, hidden)
     assert np.allclose(found[30:60, 60:100], 4, rtol=0.01) and np.allclose(found[61:90, 60:100], 1, rtol=0.01)
-    alone = surfaces._drawn(np.full((120, 160), 2.0), ~hidden, hidden)
-    assert np.allclose(alone, 2, rtol=0.01)
+    assert (layer[61:90, 60:100] == 1).all() and (layer[30:60, 60:100] == 0).all() and layer[0, 0] == -1
+    alone, layer = surfaces._drawn(np.full((120, 160), 2.0), ~hidden, hidden)
+    assert np.allclose(alone, 2, rtol=0.01) and layer.max() == 0

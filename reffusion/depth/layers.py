@@ -131,20 +131,16 @@ def pieces(
     """
     index = np.full(known.shape, -1)
     index[known] = np.arange(known.sum())
-    values, on, rows, columns = disparity[known], np.zeros(int(known.sum()), np.int64), [], []
+    values, on = disparity[known], np.zeros(int(known.sum()), np.int64)
     for k, depth in enumerate(planes, start=1):
         on[(on == 0) & _on(disparity, depth)[known]] = k
-    for ahead in ((0, 1), (1, 0)):
-        here, there = _pairs(index, ahead)
-        near = np.abs(values[here] - values[there]) < STEP * np.maximum(values[here], values[there])
-        rows, columns = [*rows, here[near]], [*columns, there[near]]
-    here, there = np.concatenate(rows), np.concatenate(columns)
+    here, there = _smooth_pairs(index, values)
     joined = lambda pairs: sparse.csr_matrix((np.ones(pairs.sum()), (here[pairs], there[pairs])), shape=(len(on),) * 2)
     smooth = joined((on[here] == 0) & (on[there] == 0))
     _, piece = connected_components(smooth, directed=False)
     if hole is not None and hole.any():
-        beside = known & (ndimage.distance_transform_edt(~hole) <= BESIDE * hole.shape[1])
-        piece = _parted(piece, smooth, disparity, known, beside)
+        before = _standing(smooth, disparity, known, hole)
+        piece = np.where(before > 0, piece.max() + before, piece)
     for k, depth in enumerate(planes, start=1):
         off = np.abs(values * np.where(np.isfinite(depth), depth, 0)[known] - 1)
         middle = ndimage.median(off, piece, np.arange(piece.max() + 1))
@@ -161,11 +157,34 @@ def pieces(
     return found
 
 
-def _parted(
-    piece: np.ndarray, smooth: sparse.csr_matrix, disparity: np.ndarray, known: np.ndarray, beside: np.ndarray
+def standing(disparity: np.ndarray, known: np.ndarray, hole: np.ndarray) -> np.ndarray:
+    """int [H, W]: the things, 1, 2, ..., that stand before all that they meet beside the hole, see `pieces`; 0: the
+    rest, and what is not known."""
+    found, index = np.zeros(known.shape, np.int64), np.full(known.shape, -1)
+    index[known] = np.arange(known.sum())
+    if known.any() and hole.any():
+        here, there = _smooth_pairs(index, disparity[known])
+        links = sparse.csr_matrix((np.ones(len(here)), (here, there)), shape=(int(known.sum()),) * 2)
+        found[known] = _standing(links, disparity, known, hole)
+    return found
+
+
+def _smooth_pairs(index: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of neighbours among the pixels that `index` [H, W] numbers between which disparity, [P], does not jump."""
+    rows, columns = [], []
+    for ahead in ((0, 1), (1, 0)):
+        here, there = _pairs(index, ahead)
+        near = np.abs(values[here] - values[there]) < STEP * np.maximum(values[here], values[there])
+        rows, columns = [*rows, here[near]], [*columns, there[near]]
+    return np.concatenate(rows), np.concatenate(columns)
+
+
+def _standing(
+    smooth: sparse.csr_matrix, disparity: np.ndarray, known: np.ndarray, hole: np.ndarray
 ) -> np.ndarray:
-    """The numbers of the known pixels' pieces [P], anew for what stands before all that it meets beside the hole; what
-    is `smooth`ly connected to that, and nearer to it than to anything else there, belongs to it."""
+    """[P], for each known pixel: of the things that stand before all that they meet beside the hole, 1, 2, ..., the one
+    that it belongs to, being smoothly connected to it and nearer to it than to anything else there; or 0."""
+    beside = known & (ndimage.distance_transform_edt(~hole) <= BESIDE * hole.shape[1])
     band = np.flatnonzero(beside[known])
     _, part = connected_components(smooth[band][:, band], directed=False)
     sizes = np.bincount(part, minlength=1)
@@ -173,18 +192,15 @@ def _parted(
     seeds = [band[part == k] for k in large]
     masks = np.zeros((len(seeds), *known.shape), bool)
     for mask, seed in zip(masks, seeds, strict=True):
-        mask[known] = np.isin(np.arange(len(piece)), seed)
+        mask[known] = np.isin(np.arange(smooth.shape[0]), seed)
     first = [k for k in range(len(seeds)) if _stands_before(k, masks, disparity)]
+    of = np.zeros(smooth.shape[0] + 1, np.int64)
     if not first:
-        return piece
-    of, found = np.full(len(piece) + 1, -1), piece.copy()
-    for k, seed in enumerate(seeds):
-        of[seed] = k
+        return of[:-1]
+    for number, k in enumerate(first, start=1):
+        of[seeds[k]] = number
     _, _, source = dijkstra(smooth, False, np.concatenate(seeds), return_predecessors=True, min_only=True)
-    nearest = of[np.where(source >= 0, source, len(piece))]
-    for k in first:
-        found[nearest == k] = piece.max() + 1 + k
-    return found
+    return of[np.where(source >= 0, source, smooth.shape[0])]
 
 
 def _stands_before(k: int, masks: np.ndarray, disparity: np.ndarray) -> bool:

@@ -26,6 +26,7 @@ COARSEST = 40.0  # px that the hole may be wide at the coarsest level: there its
 SMALL = 16.0  # px: a wider hole has two levels at least
 ROUGHNESS = 2.0  # weight of the local mean gradient beside the colours: what tells gravel from a wall of its colour
 APART = 50.0  # difference of two planes beside that of colours
+BEFORE = 75.0  # the same, of what stands before the rest
 AROUND = 15  # px, a side of the window of that mean
 FADING = 1.2  # factor by which trust falls with each pixel from the hole's border
 LEAST_TRUST = 0.02
@@ -132,11 +133,12 @@ def _values(image: np.ndarray, masked: np.ndarray) -> np.ndarray:
 
 
 def _marked(values: np.ndarray, shown: Shown, smooth: Sequence[int], scale: int) -> np.ndarray:
-    """[H, W, 6], the plane in the last channel: where two meet, patches must show the same edge."""
+    """[H, W, 6], the plane, and what stands before the rest, in the last channel: where two meet, patches must show the
+    same edge."""
     of = np.zeros(max([*smooth, int(shown.surface.max())]) + 1, np.float32)
     of[list(smooth)] = APART * np.arange(1, len(smooth) + 1)
-    plane = cv2.medianBlur(of[shown.surface], 5)[::scale, ::scale]
-    return np.concatenate([values, plane[..., None]], -1)
+    marks = of[shown.surface] + BEFORE * shown.layer.astype(np.float32)
+    return np.concatenate([values, cv2.medianBlur(marks, 5)[::scale, ::scale, None]], -1)
 
 
 def _halved(values: np.ndarray, masked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -19,6 +19,7 @@ class Shown:
         to_plane: [H, W, 2, 2], change of the plane's coordinates with (x, y) in pixels; any regular matrix off planes.
         size: [H, W], the world's length of a pixel.
         place: [H, W, 2], where on its plane a pixel lies; anything off planes.
+        layer: int [H, W], of things that stand before what is around them, 1, 2, ..., the one shown; 0: none.
     """
 
     image: np.ndarray
@@ -28,11 +29,10 @@ class Shown:
     to_plane: np.ndarray
     size: np.ndarray
     place: np.ndarray
+    layer: np.ndarray
 
 
 def alone(image: np.ndarray, hole: np.ndarray) -> Shown:
     """A picture of which nothing else is known."""
-    unit = np.broadcast_to(np.eye(2), (*hole.shape, 2, 2))
-    return Shown(
-        image, hole, ~hole, np.zeros(hole.shape, np.int64), unit, np.ones(hole.shape), np.zeros((*hole.shape, 2))
-    )
+    unit, none = np.broadcast_to(np.eye(2), (*hole.shape, 2, 2)), np.zeros(hole.shape, np.int64)
+    return Shown(image, hole, ~hole, none, unit, np.ones(hole.shape), np.zeros((*hole.shape, 2)), none)

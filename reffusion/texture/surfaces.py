@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from reffusion import geometry
-from reffusion.depth.layers import pieces
+from reffusion.depth.layers import pieces, standing
 from reffusion.masks.continuation import planes_around
 from reffusion.masks.plane import Plane, without_pits
 from reffusion.masks.voting import extent
@@ -118,12 +119,14 @@ def _told(
     """The view, the pictures that it is filled from, the view's own photograph first, the planes along which patches
     are carried, and how those that repeat themselves do; see `completions`."""
     own = next(view for view in around.views if view.camera.name == camera.name)
-    surface, depth = _behind(own, hidden, hole | hidden, around.planes)
+    surface, depth, layer = _behind(own, hidden, hole | hidden, around.planes)
+    nearest = _Nearest(geometry.unproject(depth, camera), layer) if layer.max() > 0 else None
     frames, places = (of(surface, camera, around.planes) for of in (_frames, _places))
-    target = Shown(image, hole, ~hole, surface, frames, depth / camera.fx, places)
+    whole = layer.clip(0) if nearest is None else np.where(layer >= 0, layer, nearest.of(own))
+    target = Shown(image, hole, ~hole, surface, frames, depth / camera.fx, places, whole)
     others = [(view, around.photos[view.camera.name]) for view in _others(own, around.views)]
-    sources = [_source(own, around.photos[camera.name], around, mirrors=True)]
-    sources += [_source(*each, around) for each in (*others, *around.completed)]
+    sources = [_source(own, around.photos[camera.name], around, nearest, mirrors=True)]
+    sources += [_source(*each, around, nearest) for each in (*others, *around.completed)]
     roughness = {k: _roughness(plane, around) for k, plane in enumerate(around.planes, start=1)}
     even = [k for k, rough in roughness.items() if rough < LAID and (surface == k)[hole].any()]
     how = {k: found for k in even if (found := _how_it_repeats(k, sources)) is not None}
@@ -142,15 +145,16 @@ def _how_it_repeats(plane: int, sources: Sequence[Shown]) -> Repeats | None:
 
 def _behind(
     own: Witness, hidden: np.ndarray, asked: np.ndarray, planes: Sequence[Plane]
-) -> tuple[np.ndarray, np.ndarray]:
-    """What a view shows without the object: planes' numbers, int [H, W], and depth, [H, W] float64.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What a view shows without the object: planes' numbers, int [H, W], depth, [H, W] float64, and what stands before
+    the rest, int [H, W], see `_drawn`.
 
     Where it is `asked` for, bool [H, W], C and its rim, the nearest plane that is seen there by others or goes on
     there; where there is none, see `_drawn`.
     """
     shown = without_pits(own.depth, own.camera, planes)
     known = (shown > 0) & ~hidden
-    depth = _drawn(shown, known, hidden) if known.any() else np.ones(hidden.shape)
+    depth, layer = _drawn(shown, known, hidden)
     surface, nearest = np.where(hidden, 0, _labelled(shown, own.camera, planes)), np.full(hidden.shape, np.inf)
     for k, plane in enumerate(planes, start=1):
         at = plane.depth(own.camera)
@@ -158,30 +162,54 @@ def _behind(
         before = hidden | (at < (1 + ON) * shown)
         there = plane.on(whole, at, own.camera, asked & before) & (at < nearest)
         surface[there], nearest[there] = k, at[there]
-    return surface, np.where(np.isfinite(nearest), nearest, depth)
+    layer[np.isfinite(nearest) & hidden] = 0
+    return surface, np.where(np.isfinite(nearest), nearest, depth), layer
 
 
-def _drawn(depth: np.ndarray, known: np.ndarray, hidden: np.ndarray) -> np.ndarray:
-    """Depth [H, W], drawn across what is `hidden` from what is around it.
+def _drawn(depth: np.ndarray, known: np.ndarray, hidden: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Depth [H, W], drawn across what is `hidden` from what is around it; and int [H, W], what stands before all that
+    is around it beside the hidden, 1, 2, ..., the rest, 0, and what is too far away to be told, -1.
 
     Where it jumps, what is around falls into pieces. A nearer one goes on as far as its convex hull in the picture, so
     that it ends at the straight prolongation of its visible borders; beyond, the farther ones do.
     """
+    if not known.any():
+        return np.ones(depth.shape), np.zeros(depth.shape, np.int64)
     across = drawn_across(depth, known)
     found = np.where(across > 0, across, np.median(depth[known]))
     ring = known & widened(hidden, RING)
-    piece = pieces(geometry.reciprocal(depth), ring, hole=hidden)
+    disparity = geometry.reciprocal(depth)
+    piece, before = pieces(disparity, ring, hole=hidden), standing(disparity, ring, hidden)
+    layer = np.where(ring, before, np.where(hidden, 0, -1))
     away = lambda k: -float(np.median(depth[piece == k]))
     for nearer, k in enumerate(sorted(range(1, piece.max() + 1), key=away)):
         own = drawn_across(depth, piece == k)
         there = hidden & (own > 0) & (hull(piece == k) if nearer else True)
-        found[there] = own[there]
-    return found
+        found[there], layer[there] = own[there], np.bincount(before[piece == k]).argmax()
+    return found, layer
 
 
-def _source(view: Witness, picture: np.ndarray, around: Around, mirrors: bool = False) -> Shown:
+class _Nearest:
+    """What stands before the rest, as one view tells it, in the world."""
+
+    def __init__(self, points: np.ndarray, layer: np.ndarray):
+        """Args: points: [H, W, 3]. layer: int [H, W], -1 where it is not told."""
+        told = (layer >= 0) & (np.indices(layer.shape).sum(0) % 2 == 0)
+        self._tree, self._layer = cKDTree(points[told]), layer[told]
+
+    def of(self, view: Witness) -> np.ndarray:
+        """int [H, W]: what the nearest point is of; 0 where the view shows nothing."""
+        found = np.zeros(view.depth.shape, np.int64)
+        shown = view.depth > 0
+        found[shown] = self._layer[self._tree.query(geometry.unproject(view.depth, view.camera)[shown])[1]]
+        return found
+
+
+def _source(
+    view: Witness, picture: np.ndarray, around: Around, nearest: _Nearest | None = None, mirrors: bool = False
+) -> Shown:
     """A view's picture as a source of patches: what it shows near the object, beside its mask; without its `mirrors`,
-    which show something else from elsewhere."""
+    which show something else from elsewhere. `nearest`: of what stands before the rest."""
     depth = without_pits(view.depth, view.camera, around.planes)
     points = geometry.unproject(depth, view.camera)
     near = np.linalg.norm(points - around.centre, axis=-1) < NEARBY * around.radius
@@ -189,7 +217,8 @@ def _source(view: Witness, picture: np.ndarray, around: Around, mirrors: bool = 
     surface = _labelled(depth, view.camera, around.planes)
     size = np.where(depth > 0, depth, 1.0) / view.camera.fx
     frames, places = (of(surface, view.camera, around.planes) for of in (_frames, _places))
-    return Shown(picture, widened(view.hidden, BESIDE), usable, surface, frames, size, places)
+    layer = np.zeros_like(surface) if nearest is None else nearest.of(view)
+    return Shown(picture, widened(view.hidden, BESIDE), usable, surface, frames, size, places, layer)
 
 
 def _others(own: Witness, views: Sequence[Witness]) -> list[Witness]:
