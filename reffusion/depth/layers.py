@@ -170,7 +170,7 @@ def standing(disparity: np.ndarray, known: np.ndarray, hole: np.ndarray) -> np.n
 
 
 def _smooth_pairs(index: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers of neighbours among the pixels that `index` [H, W] numbers between which disparity, [P], does not jump."""
+    """Numbers of neighbours, among the pixels that `index` [H, W] numbers, whose disparities [P] are alike."""
     rows, columns = [], []
     for ahead in ((0, 1), (1, 0)):
         here, there = _pairs(index, ahead)
