@@ -179,9 +179,7 @@ def _smooth_pairs(index: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np
     return np.concatenate(rows), np.concatenate(columns)
 
 
-def _standing(
-    smooth: sparse.csr_matrix, disparity: np.ndarray, known: np.ndarray, hole: np.ndarray
-) -> np.ndarray:
+def _standing(smooth: sparse.csr_matrix, disparity: np.ndarray, known: np.ndarray, hole: np.ndarray) -> np.ndarray:
     """[P], for each known pixel: of the things that stand before all that they meet beside the hole, 1, 2, ..., the one
     that it belongs to, being smoothly connected to it and nearer to it than to anything else there; or 0."""
     beside = known & (ndimage.distance_transform_edt(~hole) <= BESIDE * hole.shape[1])
