@@ -6,7 +6,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-ABSOLUTE = 0.02  # weight of the patches' own colours against their changes: far from the border they hold
+ABSOLUTE = 0.005  # weight of the patches' own colours against their changes: far from the border they hold
 
 
 def blended(
@@ -16,6 +16,7 @@ def blended(
     below: np.ndarray,
     own: np.ndarray,
     beside: np.ndarray | None = None,
+    absolute: float = ABSOLUTE,
 ) -> np.ndarray:
     """[N, 3], the colours of the hole's pixels in reading order (screened Poisson, as in Perez et al. 2003).
 
@@ -23,11 +24,12 @@ def blended(
         known: [H, W, 3], read beside the hole. hole: bool [H, W].
         right, below: [H, W, 3], wanted change to the next pixel. own: [H, W, 3], wanted colours.
         beside: bool [H, W], which pixels outside the hole go on in it; None: all.
+        absolute: weight of the wanted colours against the wanted changes.
     """
     rows, columns = np.nonzero(hole)
     index = np.full(hole.shape, -1)
     index[rows, columns] = np.arange(len(rows))
-    total, wanted, links = np.full(len(rows), ABSOLUTE), ABSOLUTE * own[rows, columns].astype(np.float64), []
+    total, wanted, links = np.full(len(rows), absolute), absolute * own[rows, columns].astype(np.float64), []
     for down, along, change in ((0, 1, right), (0, -1, right), (1, 0, below), (-1, 0, below)):
         row, column = rows + down, columns + along
         here = np.flatnonzero((row >= 0) & (column >= 0) & (row < hole.shape[0]) & (column < hole.shape[1]))

@@ -40,6 +40,7 @@ SHARP = 0.8  # source pixels for one of the hole below which it is blurred
 SMALLEST, LARGEST = 0.35, 3.0  # bounds of these, along any direction
 OTHER = 6.0  # cost of a pixel from another photograph: its light may be another
 UNKNOWN = 500.0  # cost of a pixel that a way does not show
+TONE = 3e-4  # weight of the pieces' own tone: what a plane shines with is told by what is around the hole
 ROUNDS = 2  # of expansion over all ways
 SCALE = 0.1  # of costs, so that their sum fits whole numbers of 32 bits
 
@@ -188,6 +189,6 @@ def _drawn(
     right, below = changes / np.maximum(counts, 1)[..., None]
     beside = ~hole & there & ~target.masked
     image = target.image.copy()
-    colors = blended(own, filled, right, below, own, beside)
+    colors = blended(own, filled, right, below, own, beside, TONE)
     image[filled] = colors.clip(0, 255).round().astype(np.uint8)
     return image, filled
