@@ -4,6 +4,7 @@ import json
 import re
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -170,6 +171,22 @@ def test_a_view_is_exposed_as_the_photographs_next_to_it(tmp_path):
     shown = exposure.exposed(color, matrix)
     np.testing.assert_allclose(exposure.undone(shown.numpy(), matrix), color, atol=1e-6)
     assert exposure.exposed(color, None) is color
+
+
+def test_a_photograph_tells_how_its_view_is_exposed_though_it_is_sharper_and_shows_something_else():
+    draws = np.random.default_rng(0)
+    smooth = cv2.GaussianBlur(draws.random((60, 80, 3)), (0, 0), 5)
+    smooth = 0.2 + 0.5 * (smooth - smooth.min()) / np.ptp(smooth)
+    photo = smooth * [0.7, 0.9, 1.1] + [0.1, 0.05, 0.0] + 0.08 * draws.standard_normal((60, 80, 1))
+    photo[:20, :30] = 0.9  # where the mask is
+    photo[50:, 60:] = 0.5  # and somebody has walked into the picture
+    pixels = np.ones((60, 80), bool)
+    pixels[:20, :30] = False
+    found = exposure.matched(np.eye(3, 4), smooth, (photo.clip(0, 1) * 255).astype(np.uint8), pixels)
+    assert np.abs(np.diag(found[:, :3]) - [0.7, 0.9, 1.1]).max() < 0.08
+    assert np.abs(found[:, 3] - [0.1, 0.05, 0.0]).max() < 0.04
+    nothing = exposure.matched(np.eye(3, 4), smooth, np.zeros((60, 80, 3), np.uint8), pixels)
+    assert np.array_equal(nothing, np.eye(3, 4))
 
 
 def test_exposures_stay_the_identity_on_average():

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -23,9 +24,13 @@ RATE, RATE_LAST = 1e-2, 1e-3  # Adam's step size at the start and at the end
 UNEVEN = 0.05  # deviation of the log of the photographs' brightness from which their exposures are fitted, too
 REACHES = (0.5, 1.0, 2.0, 4.0, 16.0)  # of the mean way to the nearest photograph: how far exposures tell
 DARK, BRIGHT = 8, 247  # levels of 255 beyond which a photograph is too dark, or clipped, to tell
+BLUR = 0.01  # of the width, under which a view is compared with its photograph
+WITHIN, ENOUGH = 0.5, 100  # share of a pixel's surroundings that must be compared, and how many such pixels
+OFF, ROUNDS = 0.03, 8  # difference from which a pixel counts less, and rounds of reweighting
+GAINS, LEAST_SPREAD = (0.4, 2.5), 0.02  # bounds of a gain, and deviation of the colours that tell one beside an offset
 PROTOCOL = (
     "the photographs differ in brightness: each channel of a test view is as bright as its photograph is outside the "
-    "mask (median ratio to the fit); of one without a photograph, as those next to it are"
+    "mask (gain and offset, by the fit, blurred); of one without a photograph, as those next to it are"
 )
 _IDENTITY = torch.eye(3, 4)
 
@@ -130,15 +135,42 @@ def exposed(color: Tensor, matrix: np.ndarray | None) -> Tensor:
 
 
 def matched(matrix: np.ndarray, color: np.ndarray, photo: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """[3, 4], an exposure brightened, each channel by one factor, to that of a photograph.
+    """[3, 4], an exposure brought to that of a photograph, each channel by a factor and an offset; as it is where too
+    little can be compared.
+
+    Both are blurred first: what one of them does not show sharply would make the other's contrast seem higher.
 
     Args:
         color: [H, W, 3] in [0, 1], the view so exposed. photo: uint8 [H, W, 3]. pixels: bool [H, W], those compared.
     """
-    told = pixels[..., None] & (photo > DARK) & (photo < BRIGHT) & (color > DARK / 255)
-    ratio = np.where(told, photo / 255.0, np.nan) / np.where(told, color, 1.0)
-    gain = np.array([np.nanmedian(ratio[..., c]) if told[..., c].any() else 1.0 for c in range(3)])
-    return gain[:, None] * matrix
+    found = np.array(matrix, np.float64)
+    told = pixels & (photo > DARK).all(-1) & (photo < BRIGHT).all(-1)
+    soft = lambda image: cv2.GaussianBlur(image.astype(np.float64), (0, 0), max(1.0, BLUR * told.shape[1]))
+    mass = soft(told)
+    rows, columns = np.nonzero(told & (mass > WITHIN))
+    if len(rows) < ENOUGH:
+        return found
+    for channel in range(3):
+        ours, theirs = (
+            (soft(image[..., channel] * told) / np.maximum(mass, 1e-6))[rows, columns] for image in (color, photo / 255.0)
+        )
+        gain, offset = _line(ours, theirs)
+        found[channel] *= gain
+        found[channel, 3] += offset
+    return found
+
+
+def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
+    """Gain and offset of y by x, robust; the gain within what an exposure may be."""
+    weight, gain, offset = np.ones_like(x), 1.0, 0.0
+    for _ in range(ROUNDS):
+        mean_x, mean_y = np.average(x, weights=weight), np.average(y, weights=weight)
+        spread = np.average((x - mean_x) ** 2, weights=weight)
+        gain = np.average((x - mean_x) * (y - mean_y), weights=weight) / max(spread, 1e-9)
+        gain = float(np.clip(gain, *GAINS)) if spread > LEAST_SPREAD**2 else mean_y / max(mean_x, 1e-3)
+        offset = mean_y - gain * mean_x
+        weight = 1 / np.maximum(np.abs(y - gain * x - offset) / OFF, 1.0)
+    return float(gain), float(offset)
 
 
 def load_views(poses: Path, fit: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
