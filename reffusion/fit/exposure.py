@@ -150,11 +150,9 @@ def matched(matrix: np.ndarray, color: np.ndarray, photo: np.ndarray, pixels: np
     rows, columns = np.nonzero(told & (mass > WITHIN))
     if len(rows) < ENOUGH:
         return found
+    at = lambda image: (soft(image * told) / np.maximum(mass, 1e-6))[rows, columns]
     for channel in range(3):
-        ours, theirs = (
-            (soft(image[..., channel] * told) / np.maximum(mass, 1e-6))[rows, columns] for image in (color, photo / 255.0)
-        )
-        gain, offset = _line(ours, theirs)
+        gain, offset = _line(at(color[..., channel]), at(photo[..., channel] / 255.0))
         found[channel] *= gain
         found[channel, 3] += offset
     return found
