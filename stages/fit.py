@@ -12,9 +12,9 @@ import numpy as np
 
 from reffusion import seeding, trace
 from reffusion.capture import stereo, support
-from reffusion.capture.gains import gains, uneven
 from reffusion.fit import few
 from reffusion.fit.exposure import UNEVEN
+from reffusion.fit.gains import gains, uneven
 from reffusion.fit.reconstruction import fit
 from reffusion.fit.start import initial_gaussians
 from reffusion.fit.step import GENTLE

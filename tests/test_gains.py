@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from reffusion.capture.gains import gains, uneven
+from reffusion.fit.gains import gains, uneven
 from reffusion.io.scene import load_scene, load_views
 from reffusion.params.fit import Params
 from stages import fit as stage

@@ -78,6 +78,7 @@ FIXED = {
 ABSENT = {
     "poses.detail": 0,
     "poses.refine": False,
+    "fit.exposure": "never",
     "fit.few_views": "as_many",
     "fit.init.flow_cell": 0,
     "fit.densify.per_pixel": 0,

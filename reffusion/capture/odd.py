@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 import cv2
 import numpy as np
 
-from reffusion.capture.gains import shown_at
+from reffusion.capture.support import shown_at
 from reffusion.geometry import pixel_rays, project, sample_nearest
 from reffusion.types import Camera, Scene
 

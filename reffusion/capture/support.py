@@ -1,4 +1,5 @@
-"""What a capture's views support: no finer pictures, no more spherical harmonics than they can tell apart."""
+"""What a capture's views support: no finer pictures, no more spherical harmonics than they can tell apart; and what
+they show at its points."""
 
 from __future__ import annotations
 
@@ -9,6 +10,9 @@ import numpy as np
 
 from reffusion import geometry
 from reffusion.types import Camera
+
+CELLS = 40  # along a view's width, in each of which the nearest points hide those behind them
+NEARLY = 1.15  # times as far as these: what is shown too
 
 
 def enlarged(images: Iterable[np.ndarray], detail: float) -> bool:
@@ -53,3 +57,17 @@ def harmonics(points: np.ndarray, cameras: Sequence[Camera], most: int) -> tuple
     views determine; and in how many views that point is (the median over points [P, 3])."""
     views = views_of(points, cameras)
     return min(most, max(isqrt(views) - 1, 0)), views
+
+
+def shown_at(camera: Camera, points: np.ndarray, picture: np.ndarray) -> np.ndarray:
+    """[P, C] what a view's picture [H, W, C] shows at the points [P, 3]; NaN outside it, and behind nearer points."""
+    uv, depth = geometry.project(points, camera)
+    values, inside = geometry.sample_nearest(picture, uv)
+    cell = max(1.0, camera.width / CELLS)
+    index = np.zeros(len(points), int)
+    index[inside] = (uv[inside] // cell).astype(int) @ (10_000, 1)
+    order = np.argsort(depth)
+    cells, first = np.unique(index[order], return_index=True)
+    nearest = depth[order][first][np.searchsorted(cells, index)]
+    shown = inside & (depth < NEARLY * np.maximum(nearest, 0))
+    return np.where(shown[:, None], values, np.nan)

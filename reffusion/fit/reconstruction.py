@@ -49,8 +49,7 @@ def fit(
             A view without an entry counts as a whole.
         held_out: views that are only measured.
         rates: Adam's step sizes where they are not those of `settings.lr`.
-        gains: [V, 3], by how much each view of `cameras` is brighter than the others: its exposure is fitted from there
-            on; None: all are exposed alike.
+        gains: [V, 3], of `cameras`: exposures are fitted, and start from these; None: they are not.
         spent: seconds that making `initial` took; the trace counts from there.
 
     Raises:
@@ -60,8 +59,7 @@ def fit(
     weights = weights or {}
     _refuse_misfits(cameras, held_out, images, weights)
     state = trace.load_checkpoint(folder)
-    exposures = None if gains is None else Exposures([camera.name for camera in cameras], initial.means.device, gains)
-    run = _Run.begun(initial, exposures, settings, rates or rates_of(settings.lr, cameras), state, spent)
+    run = _Run.begun(initial, cameras, gains, settings, rates or rates_of(settings.lr, cameras), state, spent)
     optimizer = run.optimizer
     log = trace.Trace(folder, run.seconds, run.iteration + 1 if run.iteration else 0)
     centers = torch.tensor(np.stack([camera.center for camera in cameras]), dtype=torch.float32)
@@ -75,7 +73,7 @@ def fit(
         strict=True,
     ):
         seen = camera, _move(target, optimizer), _move(counts, optimizer)
-        run.count(*step(optimizer, exposures, *seen, settings, i, impl))
+        run.count(*step(optimizer, run.exposures, *seen, settings, i, impl))
         adapt(optimizer, centers, run.started_with, settings, run.iteration)
         line_due = trace.log_spaced(run.iteration, settings.iterations, first=FIRST_MOMENT)
         save_due = checkpoints.due and run.iteration < settings.iterations
@@ -84,9 +82,7 @@ def fit(
             _write_line(log, run, *measured)
         if save_due:
             checkpoints.save(lambda: run.state_dict() | {"seconds": log.seconds})
-    if exposures is not None:
-        exposures.save(folder)
-    return optimizer.gaussians.map(Tensor.detach)
+    return run.finished(folder)
 
 
 def _refuse_misfits(
@@ -125,13 +121,16 @@ class _Run:
     def begun(
         cls,
         initial: Gaussians,
-        exposures: Exposures | None,
+        cameras: Sequence[Camera],
+        gains: np.ndarray | None,
         settings: Params,
         rates: Rates,
         state: dict[str, Any] | None,
         spent: float,
     ) -> _Run:
         """From the start, or from a checkpoint's state."""
+        names, device = [camera.name for camera in cameras], initial.means.device
+        exposures = None if gains is None else Exposures(names, device, gains)
         optimizer = GaussianOptimizer(initial, rates=rates, betas=settings.lr.betas)
         run = cls(optimizer, exposures, len(initial), spent)
         if state is not None:
@@ -146,6 +145,12 @@ class _Run:
         """One step more, of this loss and mean squared error."""
         self.iteration, self.steps = self.iteration + 1, self.steps + 1
         self.loss, self.error = self.loss + loss, self.error + error
+
+    def finished(self, folder: Path) -> Gaussians:
+        """What was fitted; exposures are saved."""
+        if self.exposures is not None:
+            self.exposures.save(folder)
+        return self.optimizer.gaussians.map(Tensor.detach)
 
     def state_dict(self) -> dict[str, Any]:
         state = {"optimizer": self.optimizer.state_dict(), "exposures": self.exposures and self.exposures.state_dict()}

@@ -7,13 +7,11 @@ from collections.abc import Mapping, Sequence
 import cv2
 import numpy as np
 
-from reffusion.geometry import project, sample_nearest
+from reffusion.capture.support import shown_at
 from reffusion.types import Camera
 
 POINTS = 5000  # at most, at which photographs are compared
 BLUR = 0.004  # of the width: a point is compared by what is so near around it
-CELLS = 40  # along a view's width, in each of which the nearest points hide those behind them
-NEARLY = 1.15  # times as far as these: what is shown too
 DARK, BRIGHT = 8, 247  # levels of 255 beyond which a photograph is too dark, or clipped, to tell
 ROUNDS = 10  # of reweighting
 OFF = 0.1  # log difference from which on a point counts less: it is hidden, or shines
@@ -43,20 +41,6 @@ def gains(points: np.ndarray, cameras: Sequence[Camera], photos: Mapping[str, np
 def uneven(found: np.ndarray) -> float:
     """How much the views' brightness differs: the standard deviation of the log of their gains [V, 3]."""
     return float(np.log(found).mean(1).std()) if len(found) else 0.0
-
-
-def shown_at(camera: Camera, points: np.ndarray, picture: np.ndarray) -> np.ndarray:
-    """[P, C] what a view's picture [H, W, C] shows at the points [P, 3]; NaN outside it, and behind nearer points."""
-    uv, depth = project(points, camera)
-    values, inside = sample_nearest(picture, uv)
-    cell = max(1.0, camera.width / CELLS)
-    index = np.zeros(len(points), int)
-    index[inside] = (uv[inside] // cell).astype(int) @ (10_000, 1)
-    order = np.argsort(depth)
-    cells, first = np.unique(index[order], return_index=True)
-    nearest = depth[order][first][np.searchsorted(cells, index)]
-    shown = inside & (depth < NEARLY * np.maximum(nearest, 0))
-    return np.where(shown[:, None], values, np.nan)
 
 
 def _evened(photo: np.ndarray) -> np.ndarray:
