@@ -6,7 +6,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-ABSOLUTE = 0.005  # weight of the patches' own colours against their changes: far from the border they hold
+ABSOLUTE = 0.02  # weight of the patches' own colours against their changes: far from the border they hold
 
 
 def blended(
