@@ -47,7 +47,7 @@ class Completion:
     explained: float = 0.5
     margin: float = 0.01
     ring: float = 0.08
-    planar_share: float = 0.7
+    planar_share: float = 0.8
     planar_tolerance: float = 0.01
     stiffness: float = 100.0
     edge: float = 0.1

@@ -21,6 +21,7 @@ from reffusion.types import Camera
 
 FILE = "exposures.json"
 RATE, RATE_LAST = 1e-2, 1e-3  # Adam's step size at the start and at the end
+SINGULAR = 1e-5  # determinant of an exposure under which it is a black picture
 UNEVEN = 0.05  # deviation of the log of the photographs' brightness from which their exposures are fitted, too
 REACHES = (0.5, 1.0, 2.0, 4.0, 16.0)  # of the mean way to the nearest photograph: how far exposures tell
 DARK, BRIGHT = 8, 247  # levels of 255 beyond which a photograph is too dark, or clipped, to tell
@@ -209,8 +210,8 @@ def normalised(image: np.ndarray, fit: Path, name: str) -> np.ndarray:
     if name not in matrices:
         return image
     matrix = np.array(matrices[name])
-    if abs(np.linalg.det(matrix[:, :3])) < 1e-3:
-        raise ValueError(f"{path}: the exposure of view '{name}' cannot be undone; fit again without `fit.exposure`")
+    if abs(np.linalg.det(matrix[:, :3])) < SINGULAR:
+        raise ValueError(f"{path}: view '{name}' is too dark to undo its exposure; leave it out, or fit.exposure=never")
     return to_uint8(undone(image / 255.0, matrix))
 
 
