@@ -188,10 +188,11 @@ def _standing(smooth: sparse.csr_matrix, disparity: np.ndarray, known: np.ndarra
     sizes = np.bincount(part, minlength=1)
     large = np.flatnonzero(sizes >= LEAST * len(band))
     seeds = [band[part == k] for k in large]
-    masks = np.zeros((len(seeds), *known.shape), bool)
+    masks, places = np.zeros((len(seeds), *known.shape), bool), np.argwhere(known)
     for mask, seed in zip(masks, seeds, strict=True):
-        mask[known] = np.isin(np.arange(smooth.shape[0]), seed)
-    first = [k for k in range(len(seeds)) if _stands_before(k, masks, disparity)]
+        mask[tuple(places[seed].T)] = True
+    wide = [ndimage.binary_dilation(mask, np.ones((3, 3)), TOUCHING) for mask in masks]
+    first = [k for k in range(len(seeds)) if _stands_before(k, masks, wide, disparity)]
     of = np.zeros(smooth.shape[0] + 1, np.int64)
     if not first:
         return of[:-1]
@@ -201,9 +202,9 @@ def _standing(smooth: sparse.csr_matrix, disparity: np.ndarray, known: np.ndarra
     return of[np.where(source >= 0, source, smooth.shape[0])]
 
 
-def _stands_before(k: int, masks: np.ndarray, disparity: np.ndarray) -> bool:
-    """Is the k-th of the masks, bool [K, H, W], nearer than every other where they meet, and does it meet any?"""
-    wide = [ndimage.binary_dilation(mask, np.ones((3, 3)), TOUCHING) for mask in masks]
+def _stands_before(k: int, masks: np.ndarray, wide: Sequence[np.ndarray], disparity: np.ndarray) -> bool:
+    """Is the k-th of the masks, bool [K, H, W], nearer than every other where they meet, and does it meet any? `wide`:
+    each with what it touches."""
     met = [j for j in range(len(masks)) if j != k and (wide[k] & masks[j]).any() and (wide[j] & masks[k]).any()]
     steps = [np.median(disparity[masks[k] & wide[j]]) / np.median(disparity[masks[j] & wide[k]]) for j in met]
     return bool(met) and min(steps) > BEFORE

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from reffusion.fit.gains import BRIGHT, DARK
 from reffusion.io.images import to_uint8
 from reffusion.splat import rasterizer
 from reffusion.types import Camera
@@ -24,7 +25,6 @@ RATE, RATE_LAST = 1e-2, 1e-3  # Adam's step size at the start and at the end
 SINGULAR = 1e-5  # determinant of an exposure under which it is a black picture
 UNEVEN = 0.05  # deviation of the log of the photographs' brightness from which their exposures are fitted, too
 REACHES = (0.5, 1.0, 2.0, 4.0, 16.0)  # of the mean way to the nearest photograph: how far exposures tell
-DARK, BRIGHT = 8, 247  # levels of 255 beyond which a photograph is too dark, or clipped, to tell
 BLUR = 0.01  # of the width, under which a view is compared with its photograph
 WITHIN, ENOUGH = 0.5, 100  # share of a pixel's surroundings that must be compared, and how many such pixels
 OFF, ROUNDS = 0.03, 8  # difference from which a pixel counts less, and rounds of reweighting
@@ -90,8 +90,6 @@ class Exposures:
 def of_views(fit: Path, cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
     """View name -> [3, 4], how a view is exposed: as was fitted, and other views as the photographs next to them; none
     where no exposures were fitted.
-
-    PAPER leaves open: any exposure.
 
     Args:
         cameras: of all views, the fitted ones among them.

@@ -65,8 +65,8 @@ def difference(first: Shown, second: Shown, tolerance: float = TOLERANCE) -> tup
     seen = framed & ((surface == 0) | (z <= (1 + tolerance) * surface))
     if not seen.any():
         return None, 0.0
-    column, row = uv[seen].T - 0.5
-    there = np.stack([map_coordinates(second.color[..., c], (row, column), order=1) for c in range(3)], -1)
+    (column, row), color = uv[seen].T - 0.5, second.color
+    there = np.stack([map_coordinates(color[..., c], (row, column), order=1) for c in range(3)], -1)
     here = first.color[chosen][seen]
     return float(np.abs(here - there).mean()), float(seen.sum() / asked)
 
