@@ -27,6 +27,8 @@ SMALL = 16.0  # px: a wider hole has two levels at least
 ROUGHNESS = 2.0  # weight of the local mean gradient beside the colours: what tells gravel from a wall of its colour
 APART = 50.0  # difference of two planes beside that of colours
 BEFORE = 75.0  # the same, of what stands before the rest
+LIES = 40.0  # the same, of normals, by their difference
+CHANNELS, VOTED = 9, 5  # of what is compared, and the first of them, which patches say; the others are known
 AROUND = 15  # px, a side of the window of that mean
 FADING = 1.2  # factor by which trust falls with each pixel from the hole's border
 LEAST_TRUST = 0.02
@@ -133,12 +135,13 @@ def _values(image: np.ndarray, masked: np.ndarray) -> np.ndarray:
 
 
 def _marked(values: np.ndarray, shown: Shown, smooth: Sequence[int], scale: int) -> np.ndarray:
-    """[H, W, 6], the plane, and what stands before the rest, in the last channel: where two meet, patches must show the
-    same edge."""
+    """[H, W, 9], the plane, and what stands before the rest, in one channel more: where two meet, patches must show the
+    same edge. Then how the surface lies."""
     of = np.zeros(max([*smooth, int(shown.surface.max())]) + 1, np.float32)
     of[list(smooth)] = APART * np.arange(1, len(smooth) + 1)
     marks = of[shown.surface] + BEFORE * shown.layer.astype(np.float32)
-    return np.concatenate([values, cv2.medianBlur(marks, 5)[::scale, ::scale, None]], -1)
+    marks, lies = cv2.medianBlur(marks, 5)[..., None], LIES * shown.normal
+    return np.concatenate([values, *(each[::scale, ::scale] for each in (marks, lies))], -1)
 
 
 def _halved(values: np.ndarray, masked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -158,7 +161,7 @@ def _pictures(
     height, width = (max(masked.shape[axis] for masked in masks) for axis in (0, 1))
     shape = (len(masks), height, width)
     found = Pictures(
-        np.zeros((*shape, 6), np.float32), np.full(shape, -1, np.int32), np.zeros((*shape, 4), np.float32),
+        np.zeros((*shape, CHANNELS), np.float32), np.full(shape, -1, np.int32), np.zeros((*shape, 4), np.float32),
         np.ones(shape, np.float32),
     )  # fmt: skip
     for k, (values, masked, source) in enumerate(zip(marked, masks, sources, strict=True)):
@@ -240,7 +243,7 @@ def _voted(of: Compared, match: Match, trust: np.ndarray, spread: float, todo: n
     """`of.now` with its hole, or the pixels `todo` of it, as the patches say; but the planes, which are known."""
     todo, voted = np.arange(len(of.hole.row)) if todo is None else todo, of.now.copy()
     votes.vote(todo, match, of.hole, trust, of.pictures, spread, voted)
-    of.now[..., :-1] = voted[..., :-1]
+    of.now[..., :VOTED] = voted[..., :VOTED]
 
 
 def _depth(mask: np.ndarray) -> np.ndarray:

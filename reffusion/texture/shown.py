@@ -20,6 +20,7 @@ class Shown:
         size: [H, W], the world's length of a pixel.
         place: [H, W, 2], where on its plane a pixel lies; anything off planes.
         layer: int [H, W], of things that stand before what is around them, 1, 2, ..., the one shown; 0: none.
+        normal: [H, W, 3], how the surface shown lies in space, see `slopes`; zeros where nothing is known.
     """
 
     image: np.ndarray
@@ -30,9 +31,11 @@ class Shown:
     size: np.ndarray
     place: np.ndarray
     layer: np.ndarray
+    normal: np.ndarray
 
 
 def alone(image: np.ndarray, hole: np.ndarray) -> Shown:
     """A picture of which nothing else is known."""
     unit, none = np.broadcast_to(np.eye(2), (*hole.shape, 2, 2)), np.zeros(hole.shape, np.int64)
-    return Shown(image, hole, ~hole, none, unit, np.ones(hole.shape), np.zeros((*hole.shape, 2)), none)
+    place, normal = np.zeros((*hole.shape, 2)), np.zeros((*hole.shape, 3), np.float32)
+    return Shown(image, hole, ~hole, none, unit, np.ones(hole.shape), place, none, normal)

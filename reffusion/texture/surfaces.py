@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from scipy import ndimage
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -21,7 +22,9 @@ from reffusion.paint.painting import drawn_across
 from reffusion.texture.completion import Completed, complete
 from reffusion.texture.montage import montage
 from reffusion.texture.regular import FEWEST, Repeats, Seen, repeats
+from reffusion.texture.shifts import shifted
 from reffusion.texture.shown import Shown
+from reffusion.texture.slopes import slopes
 from reffusion.types import Camera, Gaussians
 
 OTHERS = 3  # photographs beside the view's own that patches are taken from
@@ -36,6 +39,7 @@ REACH = 2.5  # radii of the object around its middle within which it is
 SMOOTH = 0.01  # median distance from it, relative to depth, up to which it is: not grass, nor rock
 LAID = 0.02  # the same, where it repeats itself as planks and tiles do, and grass does not
 SOME = 200  # pixels of a view that tell
+GOES_ON = 0.02  # share of the hole below which what stands before the rest is of no account: it ends beside it
 
 
 @dataclass(frozen=True)
@@ -109,8 +113,22 @@ def completions(
     for plane, each in how.items():
         picture, filled = montage(target, hole, sources, plane, each)
         hole = hole & ~filled
-        target = replace(target, image=picture, masked=target.masked & ~filled, usable=target.usable | filled)
-    return [complete(target, hole, sources, smooth, seed) for seed in seeds]
+        target = _painted(target, picture, filled)
+    return [_completed(target, hole, sources, smooth, seed) for seed in seeds]
+
+
+def _completed(
+    target: Shown, hole: np.ndarray, sources: Sequence[Shown], smooth: Sequence[int], seed: int
+) -> Completed:
+    """What is on no smooth plane from large pieces of the own photograph, the rest from patches."""
+    moved = shifted(target, hole & ~np.isin(target.surface, smooth), sources[0], seed)
+    found = complete(_painted(target, moved.image, moved.filled), hole & ~moved.filled, sources, smooth, seed)
+    return replace(found, misfit=found.misfit + moved.misfit**2)
+
+
+def _painted(target: Shown, image: np.ndarray, filled: np.ndarray) -> Shown:
+    """The target with a picture of which more is filled, bool [H, W]."""
+    return replace(target, image=image, masked=target.masked & ~filled, usable=target.usable | filled)
 
 
 def _told(
@@ -120,12 +138,16 @@ def _told(
     are carried, and how those that repeat themselves do; see `completions`."""
     own = next(view for view in around.views if view.camera.name == camera.name)
     surface, depth, layer = _behind(own, hidden, hole | hidden, around.planes)
+    layer[np.isin(layer, [k for k in range(1, layer.max() + 1) if (layer == k)[hole].mean() < GOES_ON])] = 0
     nearest = _Nearest(geometry.unproject(depth, camera), layer) if layer.max() > 0 else None
     frames, places = (of(surface, camera, around.planes) for of in (_frames, _places))
     whole = layer.clip(0) if nearest is None else np.where(layer >= 0, layer, nearest.of(own))
-    target = Shown(image, hole, ~hole, surface, frames, depth / camera.fx, places, whole)
+    lies = slopes(depth, np.ones_like(hole), camera)
+    target = Shown(image, hole, ~hole, surface, frames, depth / camera.fx, places, whole, lies)
     others = [(view, around.photos[view.camera.name]) for view in _others(own, around.views)]
-    sources = [_source(own, around.photos[camera.name], around, nearest, mirrors=True)]
+    first = _source(own, around.photos[camera.name], around, nearest, mirrors=True)
+    beside = ndimage.distance_transform_edt(~hole) < np.sqrt(hole.sum())
+    sources = [replace(first, usable=first.usable | beside & (own.depth > 0))]
     sources += [_source(*each, around, nearest) for each in (*others, *around.completed)]
     roughness = {k: _roughness(plane, around) for k, plane in enumerate(around.planes, start=1)}
     even = [k for k, rough in roughness.items() if rough < LAID and (surface == k)[hole].any()]
@@ -218,7 +240,8 @@ def _source(
     size = np.where(depth > 0, depth, 1.0) / view.camera.fx
     frames, places = (of(surface, view.camera, around.planes) for of in (_frames, _places))
     layer = np.zeros_like(surface) if nearest is None else nearest.of(view)
-    return Shown(picture, widened(view.hidden, BESIDE), usable, surface, frames, size, places, layer)
+    lies = slopes(depth, (depth > 0) & ~view.hidden, view.camera)
+    return Shown(picture, widened(view.hidden, BESIDE), usable, surface, frames, size, places, layer, lies)
 
 
 def _others(own: Witness, views: Sequence[Witness]) -> list[Witness]:
