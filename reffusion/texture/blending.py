@@ -7,6 +7,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 ABSOLUTE = 0.02  # weight of the patches' own colours against their changes: far from the border they hold
+LEAST = 1e-9  # of them, so that a hole that nothing lies beside is 0
 
 
 def blended(
@@ -46,3 +47,9 @@ def blended(
     here, there = np.concatenate(links, 1)
     matrix = sparse.csc_matrix((-np.ones(len(here)), (here, there)), (len(rows),) * 2) + sparse.diags(total)
     return splu(matrix.tocsc()).solve(wanted)
+
+
+def evenly(values: np.ndarray, hole: np.ndarray, beside: np.ndarray) -> np.ndarray:
+    """[N, 3], what is known `beside` a hole, bool [H, W], drawn evenly across it: at its pixels in reading order."""
+    even = np.zeros(values.shape, np.float32)
+    return blended(values, hole, even, even, even, beside, LEAST)

@@ -19,17 +19,18 @@ NEAREST = 8.0  # px, the same at least
 SPREAD, DISTINCT = 1.5, 9  # px: shifts so near to each other count together, and so wide a window has one peak
 
 
-def frequent(values: np.ndarray, clear: np.ndarray, hole: np.ndarray, seed: int) -> np.ndarray:
+def frequent(values: np.ndarray, clear: np.ndarray, away: np.ndarray, width: float, seed: int) -> np.ndarray:
     """[M, 2] (rows, columns), the shifts between like patches, and back, the most frequent first (after He and Sun
     2012).
 
     Args:
-        values: [H, W, C], what is compared. clear: bool [H, W], where. hole: bool [H, W]: patches near it ask.
+        values: [H, W, C], what is compared. clear: bool [H, W], where.
+        away: [H, W], px from the hole: patches near it ask. width: of the hole, px.
         seed: of the draw of those.
     """
     draws = np.random.default_rng(seeding.seed_for(seed, "offsets"))
     rows, columns = np.nonzero(ndimage.binary_erosion(clear, iterations=ARM + 1))
-    if len(rows) < FEWEST or not hole.any():
+    if len(rows) < FEWEST:
         return np.zeros((0, 2), int)
     step = max(1, int(np.sqrt(len(rows) / PLACES)))
     some = (rows % step == 0) & (columns % step == 0)
@@ -37,16 +38,16 @@ def frequent(values: np.ndarray, clear: np.ndarray, hole: np.ndarray, seed: int)
     small = cv2.blur(values.astype(np.float32), (ARM, ARM))
     points = (-ARM, 0, ARM)
     patches = np.concatenate([small[rows + down, columns + along] for down in points for along in points], 1)
-    away = ndimage.distance_transform_edt(~hole)[rows, columns] + draws.uniform(0, WANDER, len(rows))
-    asked = np.argsort(away, kind="stable")[:ASKED]
-    far = max(FAR * np.sqrt(hole.sum()), NEAREST)
+    turn = away[rows, columns] + draws.uniform(0, WANDER, len(rows))
+    asked = np.argsort(turn, kind="stable")[:ASKED]
+    far = max(FAR * width, NEAREST)
     square, found = (patches**2).sum(1), []
     for part in np.array_split(asked, -(-len(asked) // TOGETHER)):
         unlike = square - 2 * patches[part] @ patches.T
         unlike[(rows[part][:, None] - rows) ** 2 + (columns[part][:, None] - columns) ** 2 < far**2] = np.inf
         alike = unlike.argmin(1)
         found.append(np.stack([rows[alike] - rows[part], columns[alike] - columns[part]], 1))
-    return _peaks(np.concatenate(found), hole.shape)
+    return _peaks(np.concatenate(found), clear.shape)
 
 
 def _peaks(found: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

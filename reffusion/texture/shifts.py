@@ -7,16 +7,17 @@ other, and grass stays as sharp as it is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from scipy import ndimage
 
-from reffusion.texture.blending import blended
+from reffusion.texture.blending import evenly
 from reffusion.texture.cutting import apart, assembled, expanded, looks, side_by_side
 from reffusion.texture.offsets import frequent
-from reffusion.texture.pieces import APART, CLEAR, MOST, values_of
+from reffusion.texture.pieces import APART, CLEAR, COMPARED, MOST, values_of
 from reffusion.texture.shown import Shown
 
 OFFSETS = 60  # that are tried together
@@ -25,8 +26,9 @@ RING = 6  # px around the hole in which pieces are compared with what is known
 KNOWN = 3.0  # weight of that comparison
 ALIKE = 30.0  # levels that a difference of normals counts, where patches are compared
 LIES = 20.0  # cost of a pixel by the squared difference of normals
+STRETCHED, EVEN = 40.0, 0.1  # the same, of how a plane that both lie on is stretched; not counted up to this
 DISTANCE, SAME_DISTANCE = 12.0, 0.3  # the same, for each time that it is twice as far away; not counted up to this
-UNLIKE = 40.0  # both together at most: what is in the hole is a guess
+UNLIKE = 40.0  # these together at most: what is in the hole is a guess
 UNKNOWN = 500.0  # cost of a pixel that an offset does not show
 TONE, FINE = 0.4, 6.0  # weight of the difference from the tone around the hole, of what is blurred by so many pixels
 OWN = 0.003  # weight of the pieces' own tone, blended
@@ -44,86 +46,124 @@ class Moved:
 
 @dataclass(frozen=True)
 class _Laid:
-    """Pixels of the hole and the ring around it, [N] rows and columns, which are inside, and how far apart they lie."""
+    """Pixels, [N] rows and columns, of the hole and the ring around it, and which are inside."""
 
     rows: np.ndarray
     columns: np.ndarray
     inside: np.ndarray
-    stride: int
 
-    def at(self, offset: np.ndarray, clear: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """[N] rows and columns that an offset takes them from, and bool [N], whether these may be read."""
-        height, width = clear.shape
-        row, column = self.rows + offset[0], self.columns + offset[1]
+    def of(self, which: np.ndarray) -> _Laid:
+        return _Laid(self.rows[which], self.columns[which], self.inside[which])
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """The view, `target`; of its own photograph colours, their finer part and the tone, [H, W, 3] each, what may be
+    taken, bool [H, W], and what stands before the rest, int [H, W]; smooth planes, int [H, W]; and the tone around the
+    hole, [H, W, 3]."""
+
+    target: Shown
+    colors: np.ndarray
+    fine: np.ndarray
+    tone: np.ndarray
+    clear: np.ndarray
+    layer: np.ndarray
+    plane: np.ndarray
+    around: np.ndarray
+
+    def taken(self, laid: _Laid, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """[N] rows and columns that an offset takes pixels from, and what that costs: `UNKNOWN` where it may not."""
+        (height, width), target = self.clear.shape, self.target
+        row, column = laid.rows + offset[0], laid.columns + offset[1]
         there = (row >= 0) & (column >= 0) & (row < height) & (column < width)
         row, column = row.clip(0, height - 1), column.clip(0, width - 1)
-        return row, column, there & clear[row, column]
+        there &= self.clear[row, column] & (self.layer[row, column] == target.layer[laid.rows, laid.columns])
+        here, plane = (laid.rows, laid.columns), self.plane[row, column]
+        there &= (plane == 0) | (self.plane[here] == 0) | (plane == self.plane[here])
+        lies = LIES * ((target.normal[row, column] - target.normal[here]) ** 2).sum(1)
+        lies += np.minimum(STRETCHED * np.maximum(_stretched(target, (row, column), here) - EVEN, 0), 2 * LIES)
+        farther = np.abs(np.log2(target.size[row, column] / target.size[here]))
+        cost = np.minimum(lies + DISTANCE * np.maximum(farther - SAME_DISTANCE, 0), UNLIKE)
+        cost += TONE * np.abs(self.tone[row, column] - self.around[here]).mean(1)
+        return row, column, np.where(there, cost, UNKNOWN)
 
 
-def shifted(target: Shown, hole: np.ndarray, own: Shown, seed: int = 0) -> Moved:
+def shifted(target: Shown, hole: np.ndarray, own: Shown, smooth: Sequence[int] = (), seed: int = 0) -> Moved:
     """The target with its hole, bool [H, W], put together from pieces of its own photograph, `own`; not where no piece
     shows what it should.
 
     Args:
         target: its image is read outside the hole, and what it says of surfaces everywhere.
+        smooth: numbers of the planes that another of them is never taken for.
         seed: of the draw of patches that are compared.
     """
-    missing = hole | target.masked
-    colors, fine = values_of(target.image, missing)
-    clear = ndimage.binary_erosion(~own.masked & ~missing, iterations=CLEAR) & own.usable
-    near = ndimage.distance_transform_edt(~hole) <= RING if hole.any() else hole
+    nothing = Moved(target.image, np.zeros_like(hole), 0.0)
+    if not hole.any():
+        return nothing
+    seen = _seen(target, hole, own, smooth)
+    away = ndimage.distance_transform_edt(~hole)
+    near = away <= RING
     rows, columns = np.nonzero(near & (hole | ~target.masked))
-    stride = max(1, int(np.ceil(np.sqrt(len(rows) / MOST))))
-    some = (rows % stride == 0) & (columns % stride == 0)
-    laid = _Laid(rows[some], columns[some], hole[rows[some], columns[some]], stride)
-    offsets = frequent(np.concatenate([colors, ALIKE * target.normal], -1), clear, hole, seed)
-    covers = lambda offset: laid.at(offset, clear)[2][laid.inside].mean() >= COVERS
-    offsets = [offset for offset in offsets if covers(offset)][:OFFSETS]
+    laid = _Laid(rows, columns, hole[rows, columns])
+    values = np.concatenate([seen.colors, ALIKE * target.normal], -1)
+    offsets = _covering(seen, laid, frequent(values, seen.clear, away, np.sqrt(hole.sum()), seed))
     if not offsets or laid.inside.all():
-        return Moved(target.image, np.zeros_like(hole), 0.0)
-    taken, cost = _cut(laid, offsets, replace(target, image=colors), own, clear, hole, fine)
+        return nothing
+    stride = max(1, int(np.ceil(np.sqrt(len(rows) / MOST))))
+    laid = laid.of((rows % stride == 0) & (columns % stride == 0))
+    taken, cost = _cut(seen, laid, offsets, stride)
     label = np.full(hole.shape, -1)
     label[laid.rows, laid.columns] = taken
     nearest = ndimage.distance_transform_edt(label < 0, return_distances=False, return_indices=True)
     label = np.where(near, label[tuple(nearest)], -1)
-    return Moved(*_drawn(target, hole, label, [(_moved(colors, o), _moved(clear, o)) for o in offsets]), cost)
+    pieces = [(_moved(seen.colors, offset), _moved(seen.clear, offset)) for offset in offsets]
+    return Moved(*_drawn(target, hole, label, pieces), cost)
 
 
-def _cut(
-    laid: _Laid,
-    offsets: list[np.ndarray],
-    target: Shown,
-    own: Shown,
-    clear: np.ndarray,
-    hole: np.ndarray,
-    fine: np.ndarray,
-) -> tuple[np.ndarray, float]:
-    """[N], the number of the offset that each pixel takes, and what that costs by pixel of the hole.
+def _seen(target: Shown, hole: np.ndarray, own: Shown, smooth: Sequence[int]) -> _Seen:
+    missing = hole | target.masked
+    colors, fine = values_of(target.image, missing)
+    tone = _blurred(colors, missing)
+    clear = ndimage.binary_erosion(~own.masked & ~missing, iterations=CLEAR) & own.usable
+    plane = np.where(np.isin(target.surface, smooth), target.surface, 0)
+    return _Seen(target, colors, fine, tone, clear, own.layer, plane, _around(tone, hole, target))
 
-    Args: target: with its colours for image. clear: bool [H, W], what of `own` may be taken. fine: [H, W, 3].
-    """
-    here, colors, shape = (laid.rows, laid.columns), target.image, hole.shape
-    tone = _blurred(colors, hole | target.masked)
-    around = _around(tone, hole, target)[here]
-    look_at = lambda row, column: looks(*here, colors[row, column], fine[row, column], shape, laid.stride)
-    costs, seen = [], []
+
+def _covering(seen: _Seen, laid: _Laid, offsets: np.ndarray) -> list[np.ndarray]:
+    """Of offsets, [M, 2], the first that cover something of the hole."""
+    inside = laid.of(np.flatnonzero(laid.inside))
+    inside = inside.of(np.linspace(0, len(inside.rows) - 1, min(len(inside.rows), COMPARED)).astype(int))
+    return [each for each in offsets if (seen.taken(inside, each)[2] < UNKNOWN).mean() >= COVERS][:OFFSETS]
+
+
+def _cut(seen: _Seen, laid: _Laid, offsets: list[np.ndarray], stride: int) -> tuple[np.ndarray, float]:
+    """[N], the number of the offset that each pixel takes, one more than there are for none, and what that costs by
+    pixel of the hole."""
+    shape = seen.clear.shape
+    look_at = lambda *at: looks(laid.rows, laid.columns, seen.colors[at], seen.fine[at], shape, stride)
+    costs, found = [], []
     for offset in offsets:
-        row, column, there = laid.at(offset, clear)
-        lies = ((target.normal[row, column] - target.normal[here]) ** 2).sum(1)
-        farther = np.abs(np.log2(target.size[row, column] / target.size[here]))
-        cost = np.minimum(LIES * lies + DISTANCE * np.maximum(farther - SAME_DISTANCE, 0), UNLIKE)
-        cost += TONE * np.abs(tone[row, column] - around).mean(1)
-        costs.append(np.where(there & (own.layer[row, column] == target.layer[here]), cost, UNKNOWN))
-        seen.append(look_at(row, column))
-    cost, look = np.array(costs), np.array(seen)
-    off = KNOWN * np.minimum(apart(look, look_at(*here)), 2 * APART)
+        row, column, cost = seen.taken(laid, offset)
+        costs.append(cost)
+        found.append(look_at(row, column))
+    cost, look = np.array(costs), np.array(found)
+    off = KNOWN * np.minimum(apart(look, look_at(laid.rows, laid.columns)), 2 * APART)
     cost += np.where(laid.inside | (cost >= UNKNOWN), 0, off)
-    pairs = side_by_side(*here, shape, laid.stride)
+    pairs = side_by_side(laid.rows, laid.columns, shape, stride)
     taken = expanded(cost, look, pairs)
     first, second = pairs.T
     seams = sum(apart(look[taken[first], at], look[taken[second], at]).sum() for at in (first, second))
     paid = cost[taken, np.arange(len(taken))]
     return np.where(paid < UNKNOWN, taken, len(offsets)), float((paid.sum() + seams) / laid.inside.sum())
+
+
+def _stretched(target: Shown, there: tuple[np.ndarray, ...], here: tuple[np.ndarray, ...]) -> np.ndarray:
+    """[N], how much a step of a pixel along a plane differs between two pixels (rows, columns) on it; 0 off planes."""
+    found = np.zeros(len(here[0]))
+    on = (target.surface[here] > 0) & (target.surface[here] == target.surface[there])
+    change, step = (target.to_plane[where[0][on], where[1][on]] for where in (there, here))
+    found[on] = np.linalg.norm(np.linalg.solve(change, step) - np.eye(2), axis=(1, 2))
+    return found
 
 
 def _drawn(
@@ -158,9 +198,9 @@ def _blurred(colors: np.ndarray, missing: np.ndarray) -> np.ndarray:
 
 def _around(tone: np.ndarray, hole: np.ndarray, target: Shown) -> np.ndarray:
     """[H, W, 3], the tone around the hole, drawn evenly across it; of what stands before the rest by itself."""
-    found, even = tone.copy(), np.zeros_like(tone)
+    found = tone.copy()
     for k in np.unique(target.layer[hole]):
         mine, beside = hole & (target.layer == k), ~hole & ~target.masked & (target.layer == k)
         if beside.any():
-            found[mine] = blended(tone, mine, even, even, even, beside, 1e-9)
+            found[mine] = evenly(tone, mine, beside)
     return found

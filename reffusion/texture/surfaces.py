@@ -120,8 +120,8 @@ def completions(
 def _completed(
     target: Shown, hole: np.ndarray, sources: Sequence[Shown], smooth: Sequence[int], seed: int
 ) -> Completed:
-    """What is on no smooth plane from large pieces of the own photograph, the rest from patches."""
-    moved = shifted(target, hole & ~np.isin(target.surface, smooth), sources[0], seed)
+    """From large pieces of the own photograph; what these do not fill from patches."""
+    moved = shifted(target, hole, sources[0], smooth, seed)
     found = complete(_painted(target, moved.image, moved.filled), hole & ~moved.filled, sources, smooth, seed)
     return replace(found, misfit=found.misfit + moved.misfit**2)
 
