@@ -11,7 +11,7 @@ from reffusion import geometry
 from reffusion.masks.plane import CELLS, Plane
 from reffusion.masks.witness import Witness, surface_range
 from reffusion.paint.paint2d import telea
-from reffusion.texture import completion, search, surfaces
+from reffusion.texture import along, completion, search, surfaces
 from reffusion.texture.blending import blended
 from reffusion.texture.completion import complete
 from reffusion.texture.matches import NONE, PATCH, Compared
@@ -144,13 +144,13 @@ def test_planks_run_on_in_their_own_perspective():
         return np.mean([np.abs(each.image.astype(int) - planks(CAMERAS[0]))[hidden()].mean() for each in found])
 
     plain = np.abs(telea(image, hidden()).astype(int) - planks(CAMERAS[0]))[hidden()].mean()
-    along, shifted = off(floor()), off(replace(floor(), planes=[]))
-    assert along < 0.9 * shifted and along < 0.6 * plain
+    carried, shifted = off(floor()), off(replace(floor(), planes=[]))
+    assert carried < 0.9 * shifted and carried < 0.6 * plain
 
 
 def seen_plane(picture: np.ndarray, view: Camera) -> Seen:
     """The floor within 1.2 of its middle, as a picture shows it."""
-    places = surfaces._places(np.ones((SIDE, SIDE), np.int64), view, [FLOOR])
+    places = along.places_of(np.ones((SIDE, SIDE), np.int64), view, [FLOOR])
     rows, columns = np.nonzero((np.linalg.norm(places, axis=-1) < 1.2) & np.isfinite(FLOOR.depth(view)))
     return Seen(np.stack([columns, rows], 1), places[rows, columns], picture)
 
@@ -218,7 +218,7 @@ def test_a_hole_without_anything_to_move_into_it_is_left():
 
 def test_frames_are_the_derivative_of_a_planes_coordinates():
     view, h = CAMERAS[1], 1e-4
-    frames = surfaces._frames(np.ones((SIDE, SIDE), np.int64), view, [FLOOR])
+    frames = along.frames_of(np.ones((SIDE, SIDE), np.int64), view, [FLOOR])
     for row, column in ((80, 30), (100, 90)):
         for axis, (dx, dy) in enumerate(((h, 0), (0, h))):
             coordinates = []
@@ -249,7 +249,7 @@ def test_the_misfit_is_the_mean_square_by_weight():
     mask = np.zeros((SIDE, SIDE), bool)
     mask[70, 62] = True
     target = replace(own, surface=np.ones((SIDE, SIDE), np.int64))
-    target = replace(target, to_plane=surfaces._frames(target.surface, CAMERAS[0], [FLOOR]))
+    target = replace(target, to_plane=along.frames_of(target.surface, CAMERAS[0], [FLOOR]))
     pixels = completion._pixels(target, mask, 1, [1], pictures)
     now, weight = marked[0], np.random.default_rng(0).random((SIDE, SIDE)).astype(np.float32)
     row, column, angle = 100.0, 40.0, 0.2

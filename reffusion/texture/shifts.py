@@ -29,8 +29,9 @@ LIES = 20.0  # cost of a pixel by the squared difference of normals
 STRETCHED, EVEN = 40.0, 0.1  # the same, of how a plane that both lie on is stretched; not counted up to this
 DISTANCE, SAME_DISTANCE = 12.0, 0.3  # the same, for each time that it is twice as far away; not counted up to this
 UNLIKE = 40.0  # these together at most: what is in the hole is a guess
+ELSEWHERE = 15.0  # cost of a pixel of a plane taken from beside that plane
 UNKNOWN = 500.0  # cost of a pixel that an offset does not show
-TONE, FINE = 0.4, 6.0  # weight of the difference from the tone around the hole, of what is blurred by so many pixels
+TONE, FINE = 0.2, 6.0  # weight of the difference from the tone around the hole, of what is blurred by so many pixels
 OWN = 0.003  # weight of the pieces' own tone, blended
 
 
@@ -84,6 +85,8 @@ class _Seen:
         lies += np.minimum(STRETCHED * np.maximum(_stretched(target, (row, column), here) - EVEN, 0), 2 * LIES)
         farther = np.abs(np.log2(target.size[row, column] / target.size[here]))
         cost = np.minimum(lies + DISTANCE * np.maximum(farther - SAME_DISTANCE, 0), UNLIKE)
+        other = (target.surface[here] > 0) & (target.surface[row, column] != target.surface[here])
+        cost += ELSEWHERE * other
         cost += TONE * np.abs(self.tone[row, column] - self.around[here]).mean(1)
         return row, column, np.where(there, cost, UNKNOWN)
 

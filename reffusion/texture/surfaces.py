@@ -19,6 +19,7 @@ from reffusion.masks.voting import extent
 from reffusion.masks.witness import Witness, pixels, witnesses
 from reffusion.paint.margin import hull, widened
 from reffusion.paint.painting import drawn_across
+from reffusion.texture.along import ON, frames_of, labelled, places_of
 from reffusion.texture.completion import Completed, complete
 from reffusion.texture.montage import montage
 from reffusion.texture.regular import FEWEST, Repeats, Seen, repeats
@@ -33,7 +34,6 @@ NEARBY = 4.0  # radii of the object around its middle within which they are take
 RIM = 0.006  # of the image's width, painted anew around what is unknown
 NARROW = 0.02  # of it: the radius of a disk that what is decided must have room for, not to be painted over
 BESIDE = 0.008  # of the image's width: so near to a mask a photograph shows a mixture
-ON = 0.03  # relative depth within which a pixel lies on a plane
 LOOSE = 0.06  # the same, of what is asked whether a plane is smooth
 REACH = 2.5  # radii of the object around its middle within which it is
 SMOOTH = 0.01  # median distance from it, relative to depth, up to which it is: not grass, nor rock
@@ -140,7 +140,7 @@ def _told(
     surface, depth, layer = _behind(own, hidden, hole | hidden, around.planes)
     layer[np.isin(layer, [k for k in range(1, layer.max() + 1) if (layer == k)[hole].mean() < GOES_ON])] = 0
     nearest = _Nearest(geometry.unproject(depth, camera), layer) if layer.max() > 0 else None
-    frames, places = (of(surface, camera, around.planes) for of in (_frames, _places))
+    frames, places = (of(surface, camera, around.planes) for of in (frames_of, places_of))
     whole = layer.clip(0) if nearest is None else np.where(layer >= 0, layer, nearest.of(own))
     lies = slopes(depth, np.ones_like(hole), camera)
     target = Shown(image, hole, ~hole, surface, frames, depth / camera.fx, places, whole, lies)
@@ -177,7 +177,7 @@ def _behind(
     shown = without_pits(own.depth, own.camera, planes)
     known = (shown > 0) & ~hidden
     depth, layer = _drawn(shown, known, hidden)
-    surface, nearest = np.where(hidden, 0, _labelled(shown, own.camera, planes)), np.full(hidden.shape, np.inf)
+    surface, nearest = np.where(hidden, 0, labelled(shown, own.camera, planes)), np.full(hidden.shape, np.inf)
     for k, plane in enumerate(planes, start=1):
         at = plane.depth(own.camera)
         whole = plane.seen | plane.within | plane.goes_on | plane.pit
@@ -236,9 +236,9 @@ def _source(
     points = geometry.unproject(depth, view.camera)
     near = np.linalg.norm(points - around.centre, axis=-1) < NEARBY * around.radius
     usable = near & (depth > 0) & (mirrors | (depth == view.depth))
-    surface = _labelled(depth, view.camera, around.planes)
+    surface = labelled(depth, view.camera, around.planes)
     size = np.where(depth > 0, depth, 1.0) / view.camera.fx
-    frames, places = (of(surface, view.camera, around.planes) for of in (_frames, _places))
+    frames, places = (of(surface, view.camera, around.planes) for of in (frames_of, places_of))
     layer = np.zeros_like(surface) if nearest is None else nearest.of(view)
     lies = slopes(depth, (depth > 0) & ~view.hidden, view.camera)
     return Shown(picture, widened(view.hidden, BESIDE), usable, surface, frames, size, places, layer, lies)
@@ -250,42 +250,6 @@ def _others(own: Witness, views: Sequence[Witness]) -> list[Witness]:
     rest = sorted((view for view in views if view is not own), key=away)
     chosen = {int(k) for k in np.linspace(1, len(rest) - 1, OTHERS)} if len(rest) > OTHERS else range(len(rest))
     return [rest[k] for k in sorted(chosen)]
-
-
-def _labelled(depth: np.ndarray, camera: Camera, planes: Sequence[Plane]) -> np.ndarray:
-    """int [H, W]: the plane that each pixel lies on, 1, 2, ...; 0: none."""
-    surface, nearest = np.zeros(depth.shape, np.int64), np.full(depth.shape, ON)
-    for k, plane in enumerate(planes, start=1):
-        off = np.abs(depth / plane.depth(camera) - 1)
-        mine = (off < nearest) & (depth > 0)
-        surface[mine], nearest[mine] = k, off[mine]
-    return surface
-
-
-def _frames(surface: np.ndarray, camera: Camera, planes: Sequence[Plane]) -> np.ndarray:
-    """[H, W, 2, 2]: change of the coordinates along a pixel's plane with x and y in pixels; the identity off planes."""
-    frames = np.broadcast_to(np.eye(2), (*surface.shape, 2, 2)).copy()
-    rays = geometry.pixel_rays(camera) @ camera.world_to_camera[:3, :3]
-    steps = camera.world_to_camera[:2, :3] / np.array([[camera.fx], [camera.fy]])
-    for k, plane in enumerate(planes, start=1):
-        mine = surface == k
-        slope = rays[mine] @ plane.normal
-        distance = (plane.height - camera.center @ plane.normal) / slope
-        for axis, step in enumerate(steps):
-            moved = step - rays[mine] * (step @ plane.normal / slope)[:, None]
-            frames[mine, :, axis] = distance[:, None] * moved @ plane.along.T
-    return frames
-
-
-def _places(surface: np.ndarray, camera: Camera, planes: Sequence[Plane]) -> np.ndarray:
-    """[H, W, 2]: where on its plane each pixel lies, in the plane's own coordinates; 0 off planes."""
-    places = np.zeros((*surface.shape, 2))
-    rays = geometry.pixel_rays(camera) @ camera.world_to_camera[:3, :3]
-    for k, plane in enumerate(planes, start=1):
-        mine = surface == k
-        distance = (plane.height - camera.center @ plane.normal) / (rays[mine] @ plane.normal)
-        places[mine] = (camera.center + rays[mine] * distance[:, None] - plane.origin) @ plane.along.T
-    return places
 
 
 def _roughness(plane: Plane, around: Around) -> float:

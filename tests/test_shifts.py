@@ -1,0 +1,111 @@
+"""Holes put together from large pieces of their own photograph."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from reffusion import geometry
+from reffusion.texture.offsets import frequent
+from reffusion.texture.shifts import shifted
+from reffusion.texture.shown import alone
+from reffusion.texture.slopes import slopes
+from reffusion.types import Camera
+
+HEIGHT, WIDTH = 120, 200
+PATH = slice(40, 56)
+
+
+def lawn(path: bool = True) -> np.ndarray:
+    """Grass, and a pale path across, uint8 [H, W, 3]."""
+    draws = np.random.default_rng(0)
+    green = np.array([70, 110, 50]) + draws.normal(0, 18, (HEIGHT, WIDTH, 1))
+    if path:
+        green[PATH] = np.array([170, 165, 160]) + draws.normal(0, 6, (16, WIDTH, 1))
+    return green.clip(0, 255).astype(np.uint8)
+
+
+def hole() -> np.ndarray:
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    return (rows - 58) ** 2 + (columns - 100) ** 2 < 27**2
+
+
+def marked(image: np.ndarray, seed: int = 0, **fields) -> tuple[np.ndarray, np.ndarray]:
+    shown = replace(alone(image, hole()), **fields)  # type: ignore[arg-type]
+    found = shifted(shown, hole(), shown, seed=seed)
+    return found.image, found.filled
+
+
+def energy(image: np.ndarray) -> float:
+    inner = hole()[1:, 1:]
+    grey = image.astype(float).mean(2)
+    return float((np.diff(grey, axis=0)[:, 1:][inner] ** 2 + np.diff(grey, axis=1)[1:][inner] ** 2).mean())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_path_goes_on_and_the_lawn_stays_as_sharp_as_it_is(seed):
+    truth = lawn()
+    image = np.where(hole()[..., None], np.uint8((255, 0, 0)), truth)
+    painted, filled = marked(image, seed)
+    assert filled[hole()].all() and (painted[~hole()] == image[~hole()]).all()
+    inside = hole().copy()
+    inside[:42], inside[54:] = False, False
+    assert np.abs(painted[inside].mean(0) - truth[inside].mean(0)).max() < 6, "the path"
+    below = hole().copy()
+    below[:60] = False
+    assert np.abs(painted[below].mean(0) - truth[below].mean(0)).max() < 6, "the lawn"
+    assert 0.8 < energy(painted) / energy(truth) < 1.15
+    assert (marked(image, seed)[0] == painted).all(), "the same seed, the same picture"
+
+
+def test_what_lies_otherwise_or_stands_before_the_rest_is_not_taken():
+    """The lower half of the picture is bark of the lawn's colour; patches alone would not tell."""
+    truth = lawn(path=False)
+    truth[80:] = (90, 100, 90)
+    image = np.where(hole()[..., None], np.uint8((255, 0, 0)), truth)
+    normal = np.zeros((HEIGHT, WIDTH, 3), np.float32)
+    normal[..., 2] = 1
+    normal[80:] = (0, 1, 0)
+    normal[hole()] = (0, 0, 1)
+    assert energy(marked(image, normal=normal)[0]) > 0.8 * energy(truth)
+    layer = np.zeros((HEIGHT, WIDTH), np.int64)
+    layer[hole()] = 1
+    assert not marked(image, layer=layer)[1].any(), "nothing else of it is shown"
+
+
+def test_nothing_is_said_where_there_is_nothing_to_take():
+    image = lawn()
+    nowhere = np.zeros((HEIGHT, WIDTH), bool)
+    none = shifted(alone(image, nowhere), nowhere, alone(image, nowhere))
+    assert not none.filled.any() and (none.image == image).all()
+    assert not marked(image, usable=nowhere)[1].any()
+    everywhere = ~nowhere
+    assert not shifted(alone(image, everywhere), everywhere, alone(image, everywhere)).filled.any()
+
+
+def test_stripes_repeat_by_their_period():
+    stripes = np.broadcast_to((np.arange(WIDTH) % 20 < 7)[None, :, None] * 100.0, (HEIGHT, WIDTH, 3))
+    stripes = stripes + np.random.default_rng(0).normal(0, 1, stripes.shape)
+    found = frequent(stripes, np.ones((HEIGHT, WIDTH), bool), np.zeros((HEIGHT, WIDTH)), 64, seed=0)
+    beside = np.abs(found[:20, 1] - 20 * np.round(found[:20, 1] / 20))
+    assert beside.max() <= 1
+
+
+def test_slopes_are_those_of_the_ground_and_short_among_leaves():
+    tilt, pose = np.deg2rad(60.0), np.eye(4)
+    pose[:3, :3] = [[1, 0, 0], [0, -np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), -np.cos(tilt)]]
+    pose[:3, 3] = -pose[:3, :3] @ np.array([0.0, 0.0, 1.0])
+    view = Camera("a", WIDTH, HEIGHT, 150.0, 150.0, WIDTH / 2, HEIGHT / 2, pose)
+    rays = geometry.pixel_rays(view) @ pose[:3, :3]
+    depth = np.where(rays[..., 2] < -0.05, 1.0 / np.maximum(-rays[..., 2], 0.05), 0.0)
+    known = (depth > 0) & (depth < 3)
+    found = slopes(depth, known, view)
+    middle = found[HEIGHT // 2 : -20, 40:-40].reshape(-1, 3)
+    assert np.abs(middle - (0, 0, 1)).max() < 0.02
+    rough = 1 + cv2.GaussianBlur(np.random.default_rng(0).normal(0, 1, depth.shape), (0, 0), 4)
+    leaves = slopes(depth * rough, known, view)[HEIGHT // 2 : -20, 40:-40]
+    assert np.linalg.norm(leaves, axis=-1).mean() < 0.8
+    assert (slopes(depth, np.zeros_like(known), view) == 0).all()
