@@ -48,27 +48,30 @@ def side_by_side(rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int], 
 def expanded(cost: np.ndarray, look: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """[N], labels of low total cost: [L, N] each, and between neighbours the difference of what both labels show
     ([L, N, 8]) in both places."""
-    first, second = pairs.T
-    seam = lambda one, two: sum(apart(look[one, at], look[two, at]) for at in (first, second))
-    pixels = np.arange(cost.shape[1])
-    energy = lambda labels: cost[labels, pixels].sum() + seam(labels[first], labels[second]).sum()
-    labels = cost.argmin(0)
-    least = energy(labels)
+    (first, second), pixels, labels = pairs.T, np.arange(cost.shape[1]), cost.argmin(0)
+    at_both = lambda taken: (look[taken, first], look[taken, second])
+    differ = lambda one, two: apart(one[0], two[0]) + apart(one[1], two[1])
+    here, there = at_both(labels[first]), at_both(labels[second])
+    stays = differ(here, there)
+    least = cost[labels, pixels].sum() + stays.sum()
     for piece in list(range(len(cost))) * ROUNDS:
-        stays, first_moves, second_moves = (
-            seam(labels[first], labels[second]), seam(np.full(len(first), piece), labels[second]),
-            seam(labels[first], np.full(len(first), piece)),
-        )  # fmt: skip
+        shown = at_both(piece)
+        first_moves, second_moves = differ(shown, there), differ(here, shown)
         keep, move = cost[labels, pixels].copy(), cost[piece].copy()
         # As in Kolmogorov and Zabih 2004: what a pair costs more than its parts is the cost of a border in it.
         border = np.maximum(first_moves + second_moves - stays, 0) / 2
         np.add.at(move, first, first_moves - stays - border)
         np.add.at(move, second, border - first_moves)
         shared = np.minimum(keep, move)
-        moves = least_cut(SCALE * (move - shared), SCALE * (keep - shared), pairs, SCALE * border)
-        found = np.where(moves, piece, labels)
-        if (total := energy(found)) < least:
-            labels, least = found, total
+        found = np.where(
+            least_cut(SCALE * (move - shared), SCALE * (keep - shared), pairs, SCALE * border), piece, labels
+        )
+        if (found == labels).all():
+            continue
+        moved = at_both(found[first]), at_both(found[second])
+        total = cost[found, pixels].sum() + differ(*moved).sum()
+        if total < least:
+            labels, least, (here, there), stays = found, total, moved, differ(*moved)
     return labels
 
 
