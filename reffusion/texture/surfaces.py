@@ -122,8 +122,10 @@ def _completed(
 ) -> Completed:
     """From large pieces of the own photograph; what these do not fill from patches."""
     moved = shifted(target, hole, sources[0], smooth, seed)
-    found = complete(_painted(target, moved.image, moved.filled), hole & ~moved.filled, sources, smooth, seed)
-    return replace(found, misfit=found.misfit + moved.misfit**2)
+    rest = hole & ~moved.filled
+    found = complete(_painted(target, moved.image, moved.filled), rest, sources, smooth, seed)
+    share = float(rest.sum() / max(hole.sum(), 1))
+    return replace(found, misfit=share * found.misfit + (1 - share) * moved.misfit**2)
 
 
 def _painted(target: Shown, image: np.ndarray, filled: np.ndarray) -> Shown:
