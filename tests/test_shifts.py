@@ -109,3 +109,11 @@ def test_slopes_are_those_of_the_ground_and_short_among_leaves():
     leaves = slopes(depth * rough, known, view)[HEIGHT // 2 : -20, 40:-40]
     assert np.linalg.norm(leaves, axis=-1).mean() < 0.8
     assert (slopes(depth, np.zeros_like(known), view) == 0).all()
+
+
+def test_where_all_lies_otherwise_patches_are_left_to_do_it():
+    normal = np.zeros((HEIGHT, WIDTH, 3), np.float32)
+    normal[..., 2] = 1
+    normal[hole()] = (0, 1, 0)
+    image = np.where(hole()[..., None], np.uint8((255, 0, 0)), lawn())
+    assert not marked(image, normal=normal)[1].any()

@@ -30,6 +30,7 @@ STRETCHED, EVEN = 40.0, 0.1  # the same, of how a plane that both lie on is stre
 DISTANCE, SAME_DISTANCE = 12.0, 0.3  # the same, for each time that it is twice as far away; not counted up to this
 UNLIKE = 40.0  # these together at most: what is in the hole is a guess
 ELSEWHERE = 15.0  # cost of a pixel of a plane taken from beside that plane
+DEAR = 15.0  # what half of the hole must pay less than, or nothing is put together: there is nothing like it
 UNKNOWN = 500.0  # cost of a pixel that an offset does not show
 TONE, FINE = 0.2, 6.0  # weight of the difference from the tone around the hole, of what is blurred by so many pixels
 OWN = 0.003  # weight of the pieces' own tone, blended
@@ -157,7 +158,8 @@ def _cut(seen: _Seen, laid: _Laid, offsets: list[np.ndarray], stride: int) -> tu
     first, second = pairs.T
     seams = sum(apart(look[taken[first], at], look[taken[second], at]).sum() for at in (first, second))
     paid = cost[taken, np.arange(len(taken))]
-    return np.where(paid < UNKNOWN, taken, len(offsets)), float((paid.sum() + seams) / laid.inside.sum())
+    dear = np.median(paid[laid.inside]) > DEAR
+    return np.where((paid < UNKNOWN) & ~dear, taken, len(offsets)), float((paid.sum() + seams) / laid.inside.sum())
 
 
 def _stretched(target: Shown, there: tuple[np.ndarray, ...], here: tuple[np.ndarray, ...]) -> np.ndarray:

@@ -186,7 +186,9 @@ def _behind(
         before = hidden | (at < (1 + ON) * shown)
         there = plane.on(whole, at, own.camera, asked & before) & (at < nearest)
         surface[there], nearest[there] = k, at[there]
-    layer[np.isfinite(nearest) & hidden] = 0
+    for k in range(1, len(planes) + 1):
+        beside = (surface == k) & ~hidden & (layer >= 0)
+        layer[hidden & (surface == k)] = np.bincount(layer[beside]).argmax() if beside.any() else 0
     return surface, np.where(np.isfinite(nearest), nearest, depth), layer
 
 
