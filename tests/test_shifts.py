@@ -117,3 +117,11 @@ def test_where_all_lies_otherwise_patches_are_left_to_do_it():
     normal[hole()] = (0, 1, 0)
     image = np.where(hole()[..., None], np.uint8((255, 0, 0)), lawn())
     assert not marked(image, normal=normal)[1].any()
+
+
+def test_a_plane_seen_edge_on_stops_nothing():
+    surface, flat = np.ones((HEIGHT, WIDTH), np.int64), np.broadcast_to(np.eye(2), (HEIGHT, WIDTH, 2, 2)).copy()
+    flat[:, :60], flat[:20] = 0.0, np.inf
+    image = np.where(hole()[..., None], np.uint8((255, 0, 0)), lawn())
+    painted, filled = marked(image, surface=surface, to_plane=flat)
+    assert filled[hole()].all() and energy(painted) > 0.8 * energy(lawn())

@@ -96,6 +96,8 @@ def assembled(
     changes, counts = np.zeros((2, *own.shape), np.float32), np.zeros((2, *hole.shape), np.float32)
     for k, (picture, valid) in enumerate(shown):
         mine = valid & (label == k)
+        if not mine.any():
+            continue
         own[mine & hole], shows = picture[mine & hole], shows | mine
         for axis, (down, along) in enumerate(((0, 1), (1, 0))):
             before = (slice(None, -down or None), slice(None, -along or None))

@@ -119,9 +119,7 @@ def shifted(target: Shown, hole: np.ndarray, own: Shown, smooth: Sequence[int] =
     label = np.full(hole.shape, -1)
     label[laid.rows, laid.columns] = taken
     nearest = ndimage.distance_transform_edt(label < 0, return_distances=False, return_indices=True)
-    label = np.where(near, label[tuple(nearest)], -1)
-    pieces = [(_moved(seen.colors, offset), _moved(seen.clear, offset)) for offset in offsets]
-    return Moved(*_drawn(target, hole, label, pieces), cost)
+    return Moved(*_drawn(seen, hole, np.where(near, label[tuple(nearest)], -1), offsets), cost)
 
 
 def _seen(target: Shown, hole: np.ndarray, own: Shown, smooth: Sequence[int]) -> _Seen:
@@ -163,34 +161,46 @@ def _cut(seen: _Seen, laid: _Laid, offsets: list[np.ndarray], stride: int) -> tu
 
 
 def _stretched(target: Shown, there: tuple[np.ndarray, ...], here: tuple[np.ndarray, ...]) -> np.ndarray:
-    """[N], how much a step of a pixel along a plane differs between two pixels (rows, columns) on it; 0 off planes."""
+    """[N], how much a step of a pixel along a plane differs between two pixels (rows, columns) on it; 0 off planes,
+    infinite where one sees the plane edge on."""
     found = np.zeros(len(here[0]))
     on = (target.surface[here] > 0) & (target.surface[here] == target.surface[there])
-    change, step = (target.to_plane[where[0][on], where[1][on]] for where in (there, here))
-    found[on] = np.linalg.norm(np.linalg.solve(change, step) - np.eye(2), axis=(1, 2))
-    return found
+    (a, b), (c, d) = np.moveaxis(target.to_plane[there[0][on], there[1][on]], 0, -1)
+    adjugate, area = np.stack([np.stack([d, -b], -1), np.stack([-c, a], -1)], -2), a * d - b * c
+    with np.errstate(all="ignore"):
+        change = adjugate @ target.to_plane[here[0][on], here[1][on]] / area[:, None, None]
+        found[on] = np.linalg.norm(change - np.eye(2), axis=(1, 2))
+    return np.where(np.isfinite(found), found, np.inf)
 
 
 def _drawn(
-    target: Shown, hole: np.ndarray, label: np.ndarray, shown: list[tuple[np.ndarray, np.ndarray]]
+    seen: _Seen, hole: np.ndarray, label: np.ndarray, offsets: list[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The picture and what of its hole is filled; what stands before the rest does not blend with it."""
-    image, filled = target.image, np.zeros_like(hole)
+    """The picture and what of its hole is filled, of the number of the offset that each pixel takes, int [H, W]; what
+    stands before the rest does not blend with it."""
+    window = ndimage.find_objects((label >= 0).astype(int))[0]
+    shown = lambda: ((_moved(seen.colors, offset, window), _moved(seen.clear, offset, window)) for offset in offsets)
+    image, filled, target = seen.target.image.copy(), np.zeros_like(hole), seen.target
     for k in np.unique(target.layer[hole]):
-        mine = target.layer == k
-        image, more = assembled(image, hole & mine, ~hole & mine & ~target.masked, label, shown, OWN)
-        filled |= more
+        mine = target.layer[window] == k
+        beside = ~hole[window] & mine & ~target.masked[window]
+        image[window], more = assembled(image[window], hole[window] & mine, beside, label[window], shown(), OWN)
+        filled[window] |= more
     return image, filled
 
 
-def _moved(values: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """[H, W, ...]: at each pixel the value that lies an offset away; zero where that is outside."""
-    found = np.zeros_like(values)
-    (rows, from_rows), (columns, from_columns) = (
-        (slice(max(0, -by), size - max(0, by)), slice(max(0, by), size - max(0, -by)))
-        for by, size in zip(offset.tolist(), values.shape[:2], strict=True)
-    )
-    found[rows, columns] = values[from_rows, from_columns]
+def _moved(values: np.ndarray, offset: np.ndarray, window: tuple[slice, slice]) -> np.ndarray:
+    """[h, w, ...]: at each pixel of a window the value that lies an offset away; zero where that is outside."""
+    start = [side.start + int(by) for side, by in zip(window, offset, strict=True)]
+    sizes = [side.stop - side.start for side in window]
+    found = np.zeros((*sizes, *values.shape[2:]), values.dtype)
+    low = [max(0, -at) for at in start]
+    high = [min(size, most - at) for size, most, at in zip(sizes, values.shape[:2], start, strict=True)]
+    if low[0] < high[0] and low[1] < high[1]:
+        to, source = (
+            tuple(slice(by + a, by + b) for by, a, b in zip(shift, low, high, strict=True)) for shift in ((0, 0), start)
+        )
+        found[to] = values[source]
     return found
 
 
