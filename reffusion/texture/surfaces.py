@@ -140,7 +140,8 @@ def _told(
     are carried, and how those that repeat themselves do; see `completions`."""
     own = next(view for view in around.views if view.camera.name == camera.name)
     surface, depth, layer = _behind(own, hidden, hole | hidden, around.planes)
-    layer[np.isin(layer, [k for k in range(1, layer.max() + 1) if (layer == k)[hole].mean() < GOES_ON])] = 0
+    within = np.bincount(layer[hole].clip(0), minlength=layer.max() + 1)
+    layer[(layer > 0) & (within < GOES_ON * hole.sum())[layer]] = 0
     nearest = _Nearest(geometry.unproject(depth, camera), layer) if layer.max() > 0 else None
     frames, places = (of(surface, camera, around.planes) for of in (frames_of, places_of))
     whole = layer.clip(0) if nearest is None else np.where(layer >= 0, layer, nearest.of(own))
