@@ -4,10 +4,12 @@ import time
 import urllib.request
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 import small_scene
 import torch
+from browser import visiting
 
 from reffusion.io.arrays import save_json, save_labels
 from reffusion.io.images import save_image, save_mask
@@ -143,6 +145,29 @@ def test_a_visitor_gets_a_small_picture_at_once_then_the_whole_and_another_when_
     assert drawn[-1].mean() < drawn[1].mean(), "the wall is gone"
     monkeypatch.setattr(window.server, "get_clients", dict)
     wait(lambda: 7 not in window.asked)
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_a_browser_shows_the_result_without_what_is_unchecked_and_before_distillation(window, width):
+    """The square, added by distillation, is red and in the middle of the picture; the page asks no other machine."""
+    with visiting(f"http://127.0.0.1:{window.server.get_port()}", width) as page:
+        page.wait_for_selector("canvas", timeout=60000)
+
+        def red() -> bool:
+            data = np.frombuffer(page.screenshot(), np.uint8)
+            blue, green, red = cv2.imdecode(data, cv2.IMREAD_COLOR)[380:420, width // 2 - 40 : width // 2 - 20].mean(
+                (0, 1)
+            )
+            return red > 150 > 100 > max(blue, green)
+
+        wait(red)
+        added = page.get_by_role("checkbox").nth(1)
+        added.uncheck()
+        wait(lambda: not red())
+        added.check()
+        wait(red)
+        page.get_by_role("slider").press("ArrowLeft")
+        page.wait_for_function("document.body.innerText.match(/initialization/g).length > 1")
 
 
 def wait(done):
