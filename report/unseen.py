@@ -48,9 +48,9 @@ def noted(picture: np.ndarray, gaussians: Gaussians, camera: Camera, seen_by: li
         line = found & (place >= offset) & (place < offset + LINE)
         marked[line] = (0.45 * marked[line] + 0.55 * level).astype(np.uint8)
     canvas = Image.fromarray(marked)
-    draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(max(11, picture.shape[0] // 32))
-    at = (8, picture.shape[0] - 8)
-    left, top, right, bottom = draw.textbbox(at, WORDS, font, anchor="ls")
+    size = min(picture.shape[0] // 32, picture.shape[1] // 20)  # a phone held upright is narrow
+    draw, font, at = ImageDraw.Draw(canvas), ImageFont.load_default(max(11, size)), (8, 8)  # axes stand below
+    left, top, right, bottom = draw.textbbox(at, WORDS, font, anchor="la")
     draw.rectangle((left - 4, top - 4, right + 4, bottom + 4), "#222")
-    draw.text(at, WORDS, "white", font, anchor="ls")
+    draw.text(at, WORDS, "white", font, anchor="la")
     return np.asarray(canvas)

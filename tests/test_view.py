@@ -103,7 +103,7 @@ def test_what_no_photograph_shows_is_hatched(tmp_path):
     drawn = view.picture(gaussians, camera)
     noted = unseen.noted(drawn, gaussians, camera, seen_by)
     changed = (noted != drawn).any(-1)
-    assert changed[: camera.height // 2, :8].mean() > 0.15 and not changed[: camera.height // 2, -20:].any()
+    assert changed[camera.height // 2 :, :8].mean() > 0.15 and not changed[camera.height // 2 :, -20:].any()
     assert unseen.photographed(tmp_path / "y", scene) == []
 
 
