@@ -47,3 +47,13 @@ def places_of(surface: np.ndarray, camera: Camera, planes: Sequence[Plane]) -> n
         distance = (plane.height - camera.center @ plane.normal) / (rays[mine] @ plane.normal)
         places[mine] = (camera.center + rays[mine] * distance[:, None] - plane.origin) @ plane.along.T
     return places
+
+
+def inverse(matrices: np.ndarray) -> np.ndarray:
+    """Of [..., 2, 2]; zeros for one that has none, as where a plane is seen edge on."""
+    (a, b), (c, d) = (np.moveaxis(matrices[..., row, :], -1, 0) for row in (0, 1))
+    with np.errstate(invalid="ignore"):
+        area = a * d - b * c
+    known = np.isfinite(area) & (area != 0)
+    adjugate = np.stack([np.stack([d, -b], -1), np.stack([-c, a], -1)], -2)
+    return np.divide(adjugate, area[..., None, None], out=np.zeros(matrices.shape), where=known[..., None, None])

@@ -18,6 +18,7 @@ from scipy import ndimage
 from reffusion import seeding
 from reffusion.paint.paint2d import blanked, telea
 from reffusion.texture import search, votes
+from reffusion.texture.along import inverse
 from reffusion.texture.blending import blended
 from reffusion.texture.matches import NONE, PATCH, Choice, Compared, Hole, Match, Pictures
 from reffusion.texture.shown import Shown
@@ -170,17 +171,9 @@ def _pictures(
         clear = ndimage.distance_transform_edt(np.pad(~masked, 1))[1:-1, 1:-1] > CLEAR * PATCH
         found.values[here] = values
         found.surface[here] = np.where(clear & source.usable[every], source.surface[every], -1)
-        found.to_pixels[here] = _inverse(scale * source.to_plane[every]).reshape(*masked.shape, 4)
+        found.to_pixels[here] = inverse(scale * source.to_plane[every]).reshape(*masked.shape, 4)
         found.size[here] = scale * source.size[every]
     return found
-
-
-def _inverse(matrices: np.ndarray) -> np.ndarray:
-    """Of [..., 2, 2]; zeros for one that has none."""
-    (a, b), (c, d) = (np.moveaxis(matrices[..., row, :], -1, 0) for row in (0, 1))
-    area = a * d - b * c
-    adjugate = np.stack([np.stack([d, -b], -1), np.stack([-c, a], -1)], -2)
-    return np.divide(adjugate, area[..., None, None], out=np.zeros(matrices.shape), where=area[..., None, None] != 0)
 
 
 def _pixels(target: Shown, mask: np.ndarray, scale: int, smooth: Sequence[int], pictures: Pictures) -> Hole:
@@ -240,7 +233,7 @@ def _from_coarser(match: Match, before: Hole, of: Compared) -> Match:
 
 
 def _voted(of: Compared, match: Match, trust: np.ndarray, spread: float, todo: np.ndarray | None = None) -> None:
-    """`of.now` with its hole, or the pixels `todo` of it, as the patches say; but the planes, which are known."""
+    """`of.now` with its hole, or the pixels `todo` of it, as the patches say; but surfaces, which are known."""
     todo, voted = np.arange(len(of.hole.row)) if todo is None else todo, of.now.copy()
     votes.vote(todo, match, of.hole, trust, of.pictures, spread, voted)
     of.now[..., :VOTED] = voted[..., :VOTED]

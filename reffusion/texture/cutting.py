@@ -9,6 +9,8 @@ import numpy as np
 from reffusion.cuts import least_cut
 from reffusion.texture.blending import blended
 
+RING = 6  # px around a hole in which pieces are compared with what is known
+UNKNOWN = 500.0  # cost of a pixel that a piece does not show
 COLOR, CHANGE = 0.7, 2.0  # weight of the tone, and of changes from pixel to pixel, beside finer colour
 ROUNDS = 2  # of expansion over all pieces
 SCALE = 0.1  # of costs, so that their sum fits whole numbers of 32 bits

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import ndimage
 
-from reffusion.texture.cutting import apart, assembled, expanded, looks, side_by_side
+from reffusion.texture.cutting import RING, UNKNOWN, apart, assembled, expanded, looks, side_by_side
 from reffusion.texture.pieces import (
     APART,
     MOST,
@@ -32,12 +32,10 @@ from reffusion.texture.pieces import (
 from reffusion.texture.regular import Repeats
 from reffusion.texture.shown import Shown
 
-RING = 6  # px around the hole in which pieces are compared with what is known
 BLUR = 12.0  # cost of a pixel for each time that its source shows it at half the size
 SHARP = 0.8  # source pixels for one of the hole below which it is blurred
 SMALLEST, LARGEST = 0.35, 3.0  # bounds of these, along any direction
 OTHER = 6.0  # cost of a pixel from another photograph: its light may be another
-UNKNOWN = 500.0  # cost of a pixel that a way does not show
 TONE = 3e-4  # weight of the pieces' own tone: what a plane shines with is told by what is around the hole
 
 

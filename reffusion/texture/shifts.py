@@ -14,15 +14,15 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
+from reffusion.texture.along import inverse
 from reffusion.texture.blending import evenly
-from reffusion.texture.cutting import apart, assembled, expanded, looks, side_by_side
+from reffusion.texture.cutting import RING, UNKNOWN, apart, assembled, expanded, looks, side_by_side
 from reffusion.texture.offsets import frequent
 from reffusion.texture.pieces import APART, CLEAR, COMPARED, MOST, values_of
 from reffusion.texture.shown import Shown
 
 OFFSETS = 60  # that are tried together
 COVERS = 0.05  # share of the hole that one must cover
-RING = 6  # px around the hole in which pieces are compared with what is known
 KNOWN = 3.0  # weight of that comparison
 ALIKE = 30.0  # levels that a difference of normals counts, where patches are compared
 LIES = 20.0  # cost of a pixel by the squared difference of normals
@@ -31,7 +31,6 @@ DISTANCE, SAME_DISTANCE = 12.0, 0.3  # the same, for each time that it is twice 
 UNLIKE = 40.0  # these together at most: what is in the hole is a guess
 ELSEWHERE = 15.0  # cost of a pixel of a plane taken from beside that plane
 DEAR = 20.0  # what half of the hole must pay less than, or nothing is put together: there is nothing like it
-UNKNOWN = 500.0  # cost of a pixel that an offset does not show
 TONE, FINE = 0.2, 6.0  # weight of the difference from the tone around the hole, of what is blurred by so many pixels
 OWN = 0.003  # weight of the pieces' own tone, blended
 
@@ -162,13 +161,11 @@ def _cut(seen: _Seen, laid: _Laid, offsets: list[np.ndarray], stride: int) -> tu
 
 def _stretched(target: Shown, there: tuple[np.ndarray, ...], here: tuple[np.ndarray, ...]) -> np.ndarray:
     """[N], how much a step of a pixel along a plane differs between two pixels (rows, columns) on it; 0 off planes,
-    infinite where one sees the plane edge on."""
+    much where the plane is seen edge on."""
     found = np.zeros(len(here[0]))
     on = (target.surface[here] > 0) & (target.surface[here] == target.surface[there])
-    (a, b), (c, d) = np.moveaxis(target.to_plane[there[0][on], there[1][on]], 0, -1)
-    adjugate, area = np.stack([np.stack([d, -b], -1), np.stack([-c, a], -1)], -2), a * d - b * c
-    with np.errstate(all="ignore"):
-        change = adjugate @ target.to_plane[here[0][on], here[1][on]] / area[:, None, None]
+    with np.errstate(invalid="ignore"):
+        change = inverse(target.to_plane[there[0][on], there[1][on]]) @ target.to_plane[here[0][on], here[1][on]]
         found[on] = np.linalg.norm(change - np.eye(2), axis=(1, 2))
     return np.where(np.isfinite(found), found, np.inf)
 
