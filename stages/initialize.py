@@ -32,6 +32,7 @@ from reffusion.types import Reference
 
 WARN_FROM = 0.01  # share of C that shows nothing, from which a view is named
 LEAK = 1.0  # weight in undecided over other pixels from which Gaussians are haze
+LITTLE = 0.5  # share of what was open in a view that may still be when it is completed
 OVERLAP = 0.006  # of the image's width: how far new Gaussians reach beyond the hole
 COVERED = 0.9  # alpha below which the reference also fills pixels of C
 SEEN_THROUGH = 0.5  # alpha in C of any view below which there is a gap to fill
@@ -118,9 +119,9 @@ def surroundings(params: Params, scene, gaussians, thing, sets, poses: Path, fit
         photos[name] = inpaint.background(gaussians, scene.cameras[name], np.zeros((1, 1, 3), np.uint8), everything)
     found = surfaces.looked_around(gaussians, thing, train, hidden, photos, SEED)
     consistent = {name: each.consistent for name, each in sets.items()}
-    return filling.Surroundings(
-        train, consistent, photos, found.views, found.planes, scene.points, found.centre, found.radius
-    )
+    unknown = {name: each.undecided for name, each in sets.items()}
+    place = (found.planes, scene.points, found.centre, found.radius, found.mirrors)
+    return filling.Surroundings(train, consistent, photos, found.views, *place, unknown)
 
 
 def at_random(params: Params, removed, remaining, scene, sets, poses: Path):
@@ -146,11 +147,12 @@ def filled(params: Params, out: Path, gaussians, new, reference, around, network
     camera, hidden = reference.camera, around.hidden[reference.camera.name]
     sheets = Sheets(gloss=params.gloss and not farthest)  # a sliver tells nothing of shine
     hole = filling.to_fill(gaussians, new, reference, hidden, COVERED)
+    hole |= farthest & reference.mask  # also where something lies there, but behind a mirror image
     remaining = gaussians.map(lambda p: p[~new])
     # A gap that is left open at last is too narrow for the comparison to tell of its rim.
     swept = params.depth.sweep and not (farthest and coverage.narrow(hole))
     near, told = around.compared(camera, hole) if swept else (around, None)
-    onward = undecided.behind(remaining, camera, hidden, near.views, near.planes)
+    onward = undecided.behind(remaining, camera, hidden, near.views, near.planes, near.mirrors)
     past = (lambda depth: near.looked_past(camera, depth)) if params.depth.sweep else None
     hints = behind.Hints(onward.continued, onward.planes, onward.witnessed, near.photographed(camera), told, past)
     estimate = estimate_of(network, reference)
@@ -238,7 +240,7 @@ def completed_further(params: Params, out: Path, gaussians, new, around, true):
     """Views put together from patches of the photographs and of the `true` pictures, the one with most that nothing
     covers first; the Gaussians with what they show, the labels, and the views."""
     further: list[Reference] = []
-    found = coverage.open_pixels(gaussians, around, around.cameras)
+    found = coverage.open_pixels(gaussians, new, around, around.cameras)
     haze = coverage.haze(gaussians, new, around, found, LEAK)
     gaussians, new = gaussians.map(lambda p: p[~haze]), new[~haze]
     looked = replace(around.looked(), completed=coverage.completed(true, gaussians, around))
@@ -262,7 +264,9 @@ def completed_further(params: Params, out: Path, gaussians, new, around, true):
             continue
         save_image(out / "further" / f"{camera.name}.png", picture)
         further.append(reference)
-        found |= coverage.open_pixels(gaussians, around, [c for c in around.cameras if found[c.name].any()])
+        found |= coverage.open_pixels(gaussians, new, around, [c for c in around.cameras if found[c.name].any()])
+        if found[camera.name].sum() > LITTLE * mask.sum():  # once more would find as little
+            found[camera.name] = np.zeros_like(mask)
     return gaussians, new, further
 
 

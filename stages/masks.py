@@ -25,6 +25,7 @@ from reffusion.masks import brought, regions, undecided, voting, witness
 from reffusion.masks.continuation import planes_around
 from reffusion.masks.plane import Plane
 from reffusion.masks.regions import Filled, Region
+from reffusion.masks.symmetry import Mirror, mirrors_around
 from reffusion.masks.voting import Votes, extent
 from reffusion.masks.witness import Witness
 from reffusion.params.masks import Params
@@ -70,11 +71,14 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
     hidden = {name: empty[name] if name in scene.clean else consistent[name] for name in scene.cameras}
     views = witness.witnesses(gaussians, train, hidden)
     planes = continuations(params, gaussians, labels, views)
+    photos = exposure.load_views(poses, fit, scene.train) if planes or params.debris else {}
     if params.debris and (raw or deleted is not None):
-        debris = witness.debris(gaussians, labels, views, hidden, exposure.load_views(poses, fit, scene.train))
+        debris = witness.debris(gaussians, labels, views, hidden, photos)
         save_labels(out / "debris.npy", debris.cpu())
         labels |= debris
-    sets = classified(params, scene, gaussians.map(lambda p: p[~labels]), raw, consistent, views, planes, fill)
+    remaining = gaussians.map(lambda p: p[~labels])
+    mirrors = mirrors_around(remaining, *extent(gaussians.means[labels]), views, planes, photos)
+    sets = classified(params, scene, remaining, raw, consistent, views, planes, mirrors, fill)
     sets |= of_blank_views(params, scene, gaussians, hidden, sets)
     distilled = (*scene.train, *scene.blank)
     undecided = share_undecided(sets, distilled)
@@ -170,6 +174,7 @@ def classified(
     consistent: dict[str, np.ndarray],
     views: list[Witness],
     planes: list[Plane],
+    mirrors: list[Mirror],
     fill: Filled,
 ) -> dict[str, MaskSet]:
     """The masks of each view: what other views show behind the object is decided, and is not invented."""
@@ -177,7 +182,7 @@ def classified(
 
     def masks_of(name: str) -> MaskSet:
         camera = scene.cameras[name]
-        found = undecided.behind(remaining, camera, consistent[name], views, planes)
+        found = undecided.behind(remaining, camera, consistent[name], views, planes, mirrors)
         unknown = tidied(params, found.undecided) & consistent[name] & (name not in scene.clean)
         invent = consistent[name] & (name not in scene.clean) if params.invent == "consistent" else unknown
         invent = invent | fill.shown(camera, found.depth)

@@ -12,9 +12,10 @@ from torch import Tensor
 
 from reffusion.initialize.filling import Surroundings
 from reffusion.masks import voting
+from reffusion.masks.symmetry import imaged
 from reffusion.masks.witness import OPAQUE, Witness
 from reffusion.splat import rasterizer
-from reffusion.types import Camera, Gaussians, Reference
+from reffusion.types import Camera, Gaussians, Reference, Rendering
 
 EDGE = 0.03  # relative depth: of a step between two things, and within which two surfaces are the same
 NARROW = 0.02  # of the image's width: a gap up to so wide shows no texture
@@ -22,18 +23,32 @@ ENOUGH = 0.001  # share of a view's C under which what is open is left to its ne
 
 
 @torch.no_grad()
-def open_pixels(gaussians: Gaussians, around: Surroundings, cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
-    """View name -> bool [H, W], pixels of C that nothing covers.
+def open_pixels(
+    gaussians: Gaussians, new: Tensor, around: Surroundings, cameras: Sequence[Camera]
+) -> dict[str, np.ndarray]:
+    """View name -> bool [H, W], pixels of C that nothing covers, or that show something else than a mirror image which
+    is supposed to be there.
 
     Only these are made up: without a true picture a made-up surface is worse than what stands there, undecided or not.
     """
     found = {}
     for camera in cameras:
         hidden = around.hidden[camera.name]
-        alpha = rasterizer.render(gaussians, camera, sh_degree=0).alpha.cpu().numpy()
+        drawn = rasterizer.render(gaussians, camera, features=new[:, None].to(gaussians.means.dtype), sh_degree=0)
+        bare = drawn.alpha.cpu().numpy() <= OPAQUE
+        if around.mirrors:
+            bare |= _else_than_image(drawn, camera, around)
         speck, gap = 0.01 * camera.width, 0.02 * camera.width
-        found[camera.name] = voting.tidy(hidden & (alpha <= OPAQUE), speck, gap) & hidden
+        found[camera.name] = voting.tidy(hidden & bare, speck, gap) & hidden
     return found
+
+
+def _else_than_image(drawn: Rendering, camera: Camera, around: Surroundings) -> np.ndarray:
+    """bool [H, W]: before the image stands what no photograph shows, and no reference put there, or nothing does."""
+    depth, new = (each.cpu().numpy() for each in (drawn.depth, drawn.features[..., 0] > 0.5))
+    image = imaged(around.mirrors, camera, around.hidden[camera.name], around.views).supposed
+    before = (depth < (1 - EDGE) * image) & ~new & around.undecided[camera.name]
+    return np.isfinite(image) & (before | (image < (1 - EDGE) * depth))
 
 
 def haze(

@@ -17,6 +17,7 @@ from reffusion.gaussians.sheets import Sheets, surface
 from reffusion.initialize import gloss, sweep
 from reffusion.masks import continuation
 from reffusion.masks.plane import Plane, without_pits
+from reffusion.masks.symmetry import Mirror
 from reffusion.masks.witness import Witness, votes, widened, with_photographed_depth
 from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
@@ -130,6 +131,7 @@ class Surroundings:
         views: the training views as witnesses. planes: those that go on into what nobody saw.
         points: [P, 3] sparse points of the scene.
         centre: [3], the object's middle. radius: of most of it; infinite where there is none.
+        mirrors: of things around the object. undecided: view name -> bool [H, W], what of C no photograph shows.
     """
 
     cameras: Sequence[Camera]
@@ -140,10 +142,12 @@ class Surroundings:
     points: np.ndarray
     centre: np.ndarray
     radius: float
+    mirrors: Sequence[Mirror]
+    undecided: Mapping[str, np.ndarray]
 
     def looked(self) -> Around:
         """What of this pictures are completed by."""
-        return Around(self.views, self.planes, self.photos, self.centre, self.radius)
+        return Around(self.views, self.planes, self.photos, self.centre, self.radius, mirrors=self.mirrors)
 
     def photographed(self, camera: Camera) -> np.ndarray:
         """[H, W] depth that a training view shows beside its mask, of a mirror its plane's; 0 elsewhere."""

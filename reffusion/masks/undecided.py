@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from reffusion.masks.plane import BEFORE, Plane
+from reffusion.masks.symmetry import Mirror, imaged
 from reffusion.masks.witness import (
     OPAQUE,
     SURFACE,
@@ -36,9 +37,10 @@ class Behind:
 
     Attributes:
         undecided: bool [H, W], inside C: no photograph tells what is to be seen there.
-        continued: [H, W], depth of the plane that goes on there; inf where none does, or outside `undecided`.
+        continued: [H, W], depth of the plane that goes on there, or of a mirror image; inf where there is none, or
+            outside `undecided`.
         depth, alpha: [H, W] float64, as rendered; outside the mask the photographed depth.
-        planes: depth [H, W] of each plane that goes on there, everywhere; inf where a ray does not meet it.
+        planes: depth [H, W] of each of these, everywhere; inf where a ray does not meet it.
         witnessed: bool [H, W], inside C: a few views show the surface that is rendered there; specks are left out.
     """
 
@@ -57,6 +59,7 @@ def behind(
     hidden: np.ndarray,
     views: Sequence[Witness],
     planes: Sequence[Plane],
+    mirrors: Sequence[Mirror] = (),
 ) -> Behind:
     """A pixel of C is decided if its ray meets no continuation of a surface before one that other views show,
     unmasked, at that depth and from the same side: a quarter of those in which it or something before it is seen. What
@@ -65,6 +68,7 @@ def behind(
     Args:
         remaining: the M Gaussians without the object.
         hidden: bool [H, W], C of that view.
+        mirrors: of things around: a pixel in which something's image stands before what is rendered is not decided.
     """
     drawn = rasterizer.render(remaining, camera, sh_degree=0)
     depth, alpha = (t.double().cpu().numpy() for t in (drawn.depth, drawn.alpha))
@@ -87,6 +91,12 @@ def behind(
             hides |= before
             onward.append(at)
             reach = np.where(before | beneath, np.minimum(reach, at), reach)
+    if mirrors:
+        image = imaged(mirrors, camera, hidden, views)
+        hides |= image.supposed < BEFORE * np.where((depth > 0) & (alpha > OPAQUE), depth, np.inf)
+        onward.append(image.depth)
+        rather = (hides | undecided) & (image.supposed < (1 + SURFACE) * reach)  # a plane may cut through a round thing
+        reach = np.where(rather, image.supposed, reach)
     undecided = without_slivers(undecided | hides) & hidden
     witnessed = without_slivers(witnessed & ~hides & ~_beneath(planes, camera, depth, hidden)) & hidden
     return Behind(undecided, np.where(undecided, reach, np.inf), depth, alpha, tuple(onward), witnessed)

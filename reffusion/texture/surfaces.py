@@ -15,11 +15,13 @@ from reffusion import geometry
 from reffusion.depth.layers import pieces, standing
 from reffusion.masks.continuation import planes_around
 from reffusion.masks.plane import Plane, without_pits
+from reffusion.masks.symmetry import Drawn, Mirror, imaged, mirrors_around
 from reffusion.masks.voting import extent
 from reffusion.masks.witness import Witness, pixels, witnesses
 from reffusion.paint.margin import hull, widened
 from reffusion.paint.painting import drawn_across
 from reffusion.texture.along import ON, frames_of, labelled, places_of
+from reffusion.texture.blending import blended
 from reffusion.texture.completion import Completed, complete
 from reffusion.texture.montage import montage
 from reffusion.texture.regular import FEWEST, Repeats, Seen, repeats
@@ -39,6 +41,7 @@ REACH = 2.5  # radii of the object around its middle within which it is
 SMOOTH = 0.01  # median distance from it, relative to depth, up to which it is: not grass, nor rock
 LAID = 0.02  # the same, where it repeats itself as planks and tiles do, and grass does not
 SOME = 200  # pixels of a view that tell
+TONE = 0.02  # weight of a mirror image's own colours against their changes
 GOES_ON = 0.02  # share of the hole below which what stands before the rest is of no account: it ends beside it
 
 
@@ -51,6 +54,7 @@ class Around:
         photos: view name -> uint8 [H, W, 3], exposed alike.
         centre: [3], the object's middle. radius: of most of it; infinite where there is none.
         completed: views completed before, without the object, and their pictures, uint8 [H, W, 3].
+        mirrors: of things around the object.
     """
 
     views: Sequence[Witness]
@@ -59,6 +63,7 @@ class Around:
     centre: np.ndarray
     radius: float
     completed: Sequence[tuple[Witness, np.ndarray]] = ()
+    mirrors: Sequence[Mirror] = ()
 
 
 def looked_around(
@@ -80,7 +85,9 @@ def looked_around(
     if not thing.any():
         return Around(views, [], photos, np.zeros(3), np.inf)
     centre, radius = extent(gaussians.means[thing])
-    return Around(views, planes_around(centre, radius, views, seed), photos, centre, radius)
+    planes = planes_around(centre, radius, views, seed)
+    mirrors = mirrors_around(gaussians.map(lambda p: p[~thing]), centre, radius, views, planes, photos)
+    return Around(views, planes, photos, centre, radius, mirrors=mirrors)
 
 
 def to_paint(hidden: np.ndarray, unknown: np.ndarray) -> np.ndarray:
@@ -109,7 +116,12 @@ def completions(
     Args:
         hole: bool [H, W]. hidden: bool [H, W], C: where the photograph shows the object.
     """
-    target, sources, smooth, how = _told(image, hole, camera, hidden, around)
+    mirrored = imaged(around.mirrors, camera, hidden, around.views)
+    target, sources, smooth, how = _told(image, hole, camera, hidden, around, mirrored)
+    depth = target.size * camera.fx
+    shown = hole & mirrored.told & (mirrored.supposed < (1 + ON) * depth)
+    if shown.any():
+        target, hole = _painted(target, _joined(target, mirrored, shown, depth), shown), hole & ~shown
     for plane, each in how.items():
         picture, filled = montage(target, hole, sources, plane, each)
         hole = hole & ~filled
@@ -128,18 +140,32 @@ def _completed(
     return replace(found, misfit=share * found.misfit + (1 - share) * moved.misfit**2)
 
 
+def _joined(target: Shown, mirrored: Drawn, there: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """The target's picture with what is `there`, bool [H, W], of a mirror image, in the tone of the thing beside it."""
+    beside = ~target.masked & _near(depth, mirrored.depth)
+    across, down = (np.diff(mirrored.picture.astype(np.float32), axis=axis, append=0) for axis in (1, 0))
+    image = target.image.copy()
+    image[there] = blended(image, there, across, down, mirrored.picture, beside, TONE).clip(0, 255).round()
+    return image
+
+
+def _near(depth: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """bool [H, W], where a depth map is that of another one, inf where this is not."""
+    return np.abs(depth - np.where(np.isfinite(other), other, 0.0)) < ON * depth
+
+
 def _painted(target: Shown, image: np.ndarray, filled: np.ndarray) -> Shown:
     """The target with a picture of which more is filled, bool [H, W]."""
     return replace(target, image=image, masked=target.masked & ~filled, usable=target.usable | filled)
 
 
 def _told(
-    image: np.ndarray, hole: np.ndarray, camera: Camera, hidden: np.ndarray, around: Around
+    image: np.ndarray, hole: np.ndarray, camera: Camera, hidden: np.ndarray, around: Around, mirrored: Drawn
 ) -> tuple[Shown, list[Shown], list[int], dict[int, Repeats]]:
     """The view, the pictures that it is filled from, the view's own photograph first, the planes along which patches
     are carried, and how those that repeat themselves do; see `completions`."""
     own = next(view for view in around.views if view.camera.name == camera.name)
-    surface, depth, layer = _behind(own, hidden, hole | hidden, around.planes)
+    surface, depth, layer = _behind(own, hidden, hole | hidden, around.planes, mirrored)
     within = np.bincount(layer[hole].clip(0), minlength=layer.max() + 1)
     layer[(layer > 0) & (within < GOES_ON * hole.sum())[layer]] = 0
     nearest = _Nearest(geometry.unproject(depth, camera), layer) if layer.max() > 0 else None
@@ -169,7 +195,7 @@ def _how_it_repeats(plane: int, sources: Sequence[Shown]) -> Repeats | None:
 
 
 def _behind(
-    own: Witness, hidden: np.ndarray, asked: np.ndarray, planes: Sequence[Plane]
+    own: Witness, hidden: np.ndarray, asked: np.ndarray, planes: Sequence[Plane], mirrored: Drawn
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What a view shows without the object: planes' numbers, int [H, W], depth, [H, W] float64, and what stands before
     the rest, int [H, W], see `_drawn`.
@@ -190,6 +216,11 @@ def _behind(
     for k in range(1, len(planes) + 1):
         beside = (surface == k) & ~hidden & (layer >= 0)
         layer[hidden & (surface == k)] = np.bincount(layer[beside]).argmax() if beside.any() else 0
+    image = mirrored.supposed < (1 + ON) * nearest  # a plane may cut through a round thing
+    if image.any():
+        of = known & (layer >= 0) & _near(shown, mirrored.depth)
+        layer[image] = np.bincount(layer[of]).argmax() if of.any() else 0
+        surface[image], nearest[image] = 0, mirrored.supposed[image]
     return surface, np.where(np.isfinite(nearest), nearest, depth), layer
 
 
