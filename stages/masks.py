@@ -23,9 +23,10 @@ from reffusion.io.scene import load_fill, load_raw_masks, load_scene, load_views
 from reffusion.kernels.compiled import side_by_side
 from reffusion.masks import brought, regions, undecided, voting, witness
 from reffusion.masks.continuation import planes_around
+from reffusion.masks.mirrors import Mirror
 from reffusion.masks.plane import Plane
 from reffusion.masks.regions import Filled, Region
-from reffusion.masks.symmetry import Mirror, mirrors_around
+from reffusion.masks.symmetry import mirrors_around
 from reffusion.masks.voting import Votes, extent
 from reffusion.masks.witness import Witness
 from reffusion.params.masks import Params

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from reffusion import geometry
+from reffusion.masks.mirrors import imaged
 from reffusion.masks.plane import CELLS, Plane
 from reffusion.masks.witness import Witness, surface_range
 from reffusion.paint.paint2d import telea
@@ -197,7 +198,9 @@ def test_joints_and_round_borders_go_on_where_a_floor_repeats_itself(shown):
     around = replace(floor(), photos={view.name: shown(view) for view in CAMERAS})
     truth = shown(CAMERAS[0]).astype(int)
     image = np.where(hidden()[..., None], np.uint8(RED), shown(CAMERAS[0]))
-    target, sources, smooth, how = surfaces._told(image, hidden(), CAMERAS[0], hidden(), around)
+    target, sources, smooth, how = surfaces._told(
+        image, hidden(), CAMERAS[0], hidden(), around, imaged([], CAMERAS[0], hidden(), [])
+    )
     picture, filled = montage(target, hidden(), sources, 1, how[1])
     assert filled[hidden()].mean() > 0.9 and not filled[~hidden()].any() and (picture[~filled] == image[~filled]).all()
     dark = lambda done: done.mean(-1)[filled] < 90  # joints; and what is bright is the plate
@@ -209,7 +212,9 @@ def test_joints_and_round_borders_go_on_where_a_floor_repeats_itself(shown):
 
 def test_a_hole_without_anything_to_move_into_it_is_left():
     image = np.where(hidden()[..., None], np.uint8(RED), planks(CAMERAS[0]))
-    target, sources, _, how = surfaces._told(image, hidden(), CAMERAS[0], hidden(), floor())
+    target, sources, _, how = surfaces._told(
+        image, hidden(), CAMERAS[0], hidden(), floor(), imaged([], CAMERAS[0], hidden(), [])
+    )
     picture, filled = montage(
         target, hidden(), [replace(s, usable=np.zeros_like(hidden())) for s in sources], 1, how[1]
     )

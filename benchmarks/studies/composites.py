@@ -29,6 +29,7 @@ CHOOSE = (
 REPORT = (
     Place("table-rim", "garden", "frame_00151", (377, 343), 0.12, 60, 34, 5),
     Place("table-vase", "garden", "frame_00120", (234, 285), 0.12, 50, 34, 8),
+    Place("vase-front", "garden", "frame_00128", (290, 285), 0.12, 50, 34, 6),
     Place("bear-back", "bear", "frame_00037", (110, 390), 0.12, 90, 40, 4),
     Place("bear-rim", "bear", "frame_00061", (400, 366), 0.12, 45, 40, 4),
     Place("dino-gravel", "dinosaur", "frame_00055", (343, 423), 0.12, 60, 40, 6, near=40),

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from reffusion.initialize.filling import Surroundings
 from reffusion.masks import voting
-from reffusion.masks.symmetry import imaged
+from reffusion.masks.mirrors import imaged
 from reffusion.masks.witness import OPAQUE, Witness
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Reference, Rendering

@@ -16,8 +16,8 @@ from reffusion.depth.solverlog import SolverLog
 from reffusion.gaussians.sheets import Sheets, surface
 from reffusion.initialize import gloss, sweep
 from reffusion.masks import continuation
+from reffusion.masks.mirrors import Mirror
 from reffusion.masks.plane import Plane, without_pits
-from reffusion.masks.symmetry import Mirror
 from reffusion.masks.witness import Witness, votes, widened, with_photographed_depth
 from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0

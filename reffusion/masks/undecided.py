@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import torch
 
+from reffusion.masks.mirrors import Mirror, imaged
 from reffusion.masks.plane import BEFORE, Plane
-from reffusion.masks.symmetry import Mirror, imaged
 from reffusion.masks.witness import (
     OPAQUE,
     SURFACE,

@@ -49,6 +49,16 @@ def blended(
     return splu(matrix.tocsc()).solve(wanted)
 
 
+def laid_over(image: np.ndarray, picture: np.ndarray, there: np.ndarray, both: np.ndarray) -> np.ndarray:
+    """[H, W, 3] uint8, an image with what is `there`, bool [H, W], of a picture, in the tone that the image has beside
+    the picture's where `both` are known, bool [H, W]."""
+    apart = image[both].astype(np.float64) - picture[both]
+    tone = np.median(apart, 0) if len(apart) else np.zeros(3)
+    found = image.copy()
+    found[there] = (picture[there] + tone).clip(0, 255).round()
+    return found
+
+
 def evenly(values: np.ndarray, hole: np.ndarray, beside: np.ndarray) -> np.ndarray:
     """[N, 3], what is known `beside` a hole, bool [H, W], drawn evenly across it: at its pixels in reading order."""
     even = np.zeros(values.shape, np.float32)

@@ -14,14 +14,15 @@ from torch import Tensor
 from reffusion import geometry
 from reffusion.depth.layers import pieces, standing
 from reffusion.masks.continuation import planes_around
+from reffusion.masks.mirrors import Drawn, Mirror, imaged
 from reffusion.masks.plane import Plane, without_pits
-from reffusion.masks.symmetry import Drawn, Mirror, imaged, mirrors_around
+from reffusion.masks.symmetry import mirrors_around
 from reffusion.masks.voting import extent
 from reffusion.masks.witness import Witness, pixels, witnesses
 from reffusion.paint.margin import hull, widened
 from reffusion.paint.painting import drawn_across
 from reffusion.texture.along import ON, frames_of, labelled, places_of
-from reffusion.texture.blending import blended
+from reffusion.texture.blending import laid_over
 from reffusion.texture.completion import Completed, complete
 from reffusion.texture.montage import montage
 from reffusion.texture.regular import FEWEST, Repeats, Seen, repeats
@@ -41,7 +42,6 @@ REACH = 2.5  # radii of the object around its middle within which it is
 SMOOTH = 0.01  # median distance from it, relative to depth, up to which it is: not grass, nor rock
 LAID = 0.02  # the same, where it repeats itself as planks and tiles do, and grass does not
 SOME = 200  # pixels of a view that tell
-TONE = 0.02  # weight of a mirror image's own colours against their changes
 GOES_ON = 0.02  # share of the hole below which what stands before the rest is of no account: it ends beside it
 
 
@@ -121,7 +121,9 @@ def completions(
     depth = target.size * camera.fx
     shown = hole & mirrored.told & (mirrored.supposed < (1 + ON) * depth)
     if shown.any():
-        target, hole = _painted(target, _joined(target, mirrored, shown, depth), shown), hole & ~shown
+        beside = ~target.masked & _near(depth, mirrored.depth)
+        target = _painted(target, laid_over(target.image, mirrored.picture, shown, beside), shown)
+        hole = hole & ~shown
     for plane, each in how.items():
         picture, filled = montage(target, hole, sources, plane, each)
         hole = hole & ~filled
@@ -138,15 +140,6 @@ def _completed(
     found = complete(_painted(target, moved.image, moved.filled), rest, sources, smooth, seed)
     share = float(rest.sum() / max(hole.sum(), 1))
     return replace(found, misfit=share * found.misfit + (1 - share) * moved.misfit**2)
-
-
-def _joined(target: Shown, mirrored: Drawn, there: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """The target's picture with what is `there`, bool [H, W], of a mirror image, in the tone of the thing beside it."""
-    beside = ~target.masked & _near(depth, mirrored.depth)
-    across, down = (np.diff(mirrored.picture.astype(np.float32), axis=axis, append=0) for axis in (1, 0))
-    image = target.image.copy()
-    image[there] = blended(image, there, across, down, mirrored.picture, beside, TONE).clip(0, 255).round()
-    return image
 
 
 def _near(depth: np.ndarray, other: np.ndarray) -> np.ndarray:

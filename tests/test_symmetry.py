@@ -1,0 +1,176 @@
+"""What nobody saw of a thing: its mirror image, where photographs agree; a vase by a box, seen by analytic views."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from reffusion import geometry
+from reffusion.masks.continuation import planes_around
+from reffusion.masks.mirrors import Mirror, imaged
+from reffusion.masks.symmetry import mirrors_around
+from reffusion.masks.undecided import behind
+from reffusion.masks.witness import Witness
+from reffusion.splat import rasterizer
+from reffusion.splat.conventions import SH0
+from reffusion.types import Camera, Gaussians
+
+SIZE, FOCAL = 320, 330.0
+WIDE, DEEP, HIGH = 0.4, 0.25, 0.7  # half axes of the vase, and its height
+LOW, UPPER = np.array([-0.75, -0.75, 0.0]), np.array([-0.2, -0.3, 0.5])  # corners of the box before its left half
+CENTRE, RADIUS = (LOW + UPPER) / 2, 0.45
+
+
+def camera(name: str, azimuth: float, height: float = 1.3, away: float = 3.0) -> Camera:
+    """Looks at the vase; azimuth in degrees; z is up in the world."""
+    angle = np.radians(azimuth)
+    center = np.array([away * np.cos(angle), away * np.sin(angle), height])
+    forward = np.array([0, 0, 0.2]) - center
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, (0, 0, 1.0))
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ center
+    return Camera(name, SIZE, SIZE, FOCAL, FOCAL, SIZE / 2, SIZE / 2, pose)
+
+
+def on_vase(rays: np.ndarray, center: np.ndarray, cut: bool) -> np.ndarray:
+    """[H, W] along the rays to the vase, an elliptic cylinder, inf beside it; cut: without its right, aslant."""
+    scale = np.array([1 / WIDE, 1 / DEEP])
+    d, o = rays[..., :2] * scale, center[:2] * scale
+    a, b, c = (d * d).sum(-1), (d * o).sum(-1), o @ o - 1
+    root = np.sqrt(np.maximum(b * b - a * c, 0))
+    near = np.where(b * b > a * c, (-b - root) / a, np.inf)
+    top = (HIGH - center[2]) / rays[..., 2]
+    at = lambda t: center + rays * np.where(np.isfinite(t), t, 0)[..., None]
+    inside = lambda p: ((p[..., :2] * scale) ** 2).sum(-1) < 1
+    side = np.where((at(near)[..., 2] > 0) & (at(near)[..., 2] < HIGH), near, np.inf)
+    lid = np.where((top > 0) & inside(at(top)), top, np.inf)
+    if cut:
+        slant, end = np.array([1.0, 0.0, 0.7]), WIDE
+        side, lid = (np.where(at(t) @ slant > end, np.inf, t) for t in (side, lid))
+        face = (end - center @ slant) / (rays @ slant)
+        shown = (face > 0) & inside(at(face)) & (at(face)[..., 2] > 0) & (at(face)[..., 2] < HIGH)
+        side = np.minimum(side, np.where(shown, face, np.inf))
+    return np.minimum(side, lid)
+
+
+def drawn(view: Camera, cut: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Depth [H, W] without the box, where the box hides it, where the vase is shown without it."""
+    rays = geometry.pixel_rays(view) @ view.world_to_camera[:3, :3]
+    ground = np.where(rays[..., 2] < 0, -view.center[2] / np.minimum(rays[..., 2], -1e-9), 50.0).clip(0, 50)
+    vase = on_vase(rays, view.center, cut)
+    depth = np.minimum(ground, vase)
+    bounds = np.stack([(LOW - view.center) / rays, (UPPER - view.center) / rays])
+    enter, leave = bounds.min(0).max(-1), bounds.max(0).min(-1)
+    return depth, (enter < leave) & (leave > 0) & (enter < depth), vase < ground
+
+
+def witness(view: Camera, cut: bool = False) -> Witness:
+    depth, hidden, _ = drawn(view, cut)
+    kernel = np.ones((3, 3))
+    wide = cv2.dilate(hidden.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    return Witness(view, depth, cv2.erode(depth, kernel), cv2.dilate(depth, kernel), wide)
+
+
+def colour(points: np.ndarray, halved: bool) -> np.ndarray:
+    """[..., 3]: bands that climb; in a vase that is halved, one half is of other colours than the other."""
+    bands = 0.5 + 0.3 * np.sin(9 * points[..., 2])
+    half = np.where(points[..., 0] > 0, 1 - bands, bands) if halved else bands
+    return np.stack([half, 0.8 * half, 0.5 * bands], -1)
+
+
+def scene(cut: bool = False, halved: bool = False):
+    """Witnesses, photographs, and Gaussians of all that they show of vase and ground."""
+    views = [witness(camera(f"v{k}", azimuth), cut) for k, azimuth in enumerate(np.linspace(-150, -30, 11))]
+    photos, seen = {}, []
+    for view in views:
+        points = geometry.unproject(view.depth, view.camera)
+        photos[view.camera.name] = (255 * colour(points, halved)).astype(np.uint8)
+        seen.append(points[::2, ::2][(~view.hidden & (view.depth < 6))[::2, ::2]])
+    points = np.concatenate(seen)
+    points = points[np.unique(np.floor(points / 0.02), axis=0, return_index=True)[1]]
+    count = len(points)
+    tensor = lambda values: torch.tensor(np.asarray(values), dtype=torch.float32)
+    gaussians = Gaussians(
+        tensor(points),
+        tensor(np.tile([1.0, 0, 0, 0], (count, 1))),
+        tensor(np.full((count, 3), np.log(0.012))),
+        tensor(np.full(count, 6.0)),
+        tensor((colour(points, halved) - 0.5) / SH0)[:, None],
+    )
+    return views, photos, gaussians
+
+
+def sideways(mirrors: list[Mirror]) -> list[Mirror]:
+    """Those of left and right, not of front and back."""
+    return [mirror for mirror in mirrors if abs(mirror.normal[0]) > 0.8]
+
+
+@pytest.fixture(scope="module")
+def whole():
+    views, photos, gaussians = scene()
+    planes = planes_around(CENTRE, RADIUS, views)
+    return views, gaussians, planes, mirrors_around(gaussians, CENTRE, RADIUS, views, planes, photos)
+
+
+def test_a_vase_is_its_own_mirror_image(whole):
+    _, _, _, mirrors = whole
+    found = sideways(mirrors)
+    assert len(found) == 1 and len(mirrors) <= 2  # its back is like its front, too
+    assert abs(found[0].normal[0]) > 0.995 and abs(found[0].height) < 0.02
+
+
+def test_the_half_that_the_box_hides_stands_where_it_is(whole):
+    views, _, _, mirrors = whole
+    for view in views[::3]:
+        true, hidden, vase = drawn(view.camera)
+        found = imaged(mirrors, view.camera, hidden, views).supposed
+        behind_box = cv2.erode((hidden & vase).astype(np.uint8), np.ones((7, 7))) > 0
+        if behind_box.sum() < 100:
+            continue
+        told = np.isfinite(found) & behind_box
+        assert told.sum() > 0.5 * behind_box.sum()
+        assert np.median(np.abs(found / true - 1)[told]) < 0.01
+        wrong = np.isfinite(found) & ~(cv2.dilate(vase.astype(np.uint8), np.ones((9, 9))) > 0)
+        assert wrong.sum() < 0.02 * behind_box.sum()
+
+
+def test_its_pixels_are_undecided_and_have_its_depth(whole):
+    views, gaussians, planes, mirrors = whole
+    view = views[5]
+    true, hidden, vase = drawn(view.camera)
+    supposed = np.isfinite(imaged(mirrors, view.camera, hidden, views).supposed) & vase
+    inside = cv2.erode(supposed.astype(np.uint8), np.ones((9, 9))) > 0
+    found = behind(gaussians, view.camera, hidden, views, planes, mirrors)
+    inside &= found.depth > 1.05 * true  # the ground behind it is seen by others, but not from here
+    assert inside.sum() > 200 and found.undecided[inside].mean() > 0.9
+    assert np.median(np.abs(found.continued / true - 1)[inside & found.undecided]) < 0.01
+
+
+@pytest.mark.parametrize("how", [{"cut": True}, {"halved": True}])
+def test_what_is_unlike_on_its_other_side_has_no_mirror(how):
+    views, photos, gaussians = scene(**how)
+    planes = planes_around(CENTRE, RADIUS, views)
+    assert not sideways(mirrors_around(gaussians, CENTRE, RADIUS, views, planes, photos))
+
+
+def test_nothing_stands_there_and_nothing_is_asked():
+    views, photos, gaussians = scene()
+    assert mirrors_around(gaussians, CENTRE, RADIUS, views, [], photos) == []
+    assert mirrors_around(gaussians, CENTRE, np.inf, views, planes_around(CENTRE, RADIUS, views), photos) == []
+
+
+def test_a_camera_behind_the_mirror_shows_the_image_with_its_sides_swapped():
+    draws, view = np.random.default_rng(3), camera("v", -70)
+    means = torch.tensor(draws.uniform(-0.4, 0.4, (60, 3)), dtype=torch.float32)
+    colors = torch.tensor(draws.uniform(-1, 1, (60, 1, 3)), dtype=torch.float32)
+    balls = Gaussians(means, torch.eye(4)[:1].repeat(60, 1), torch.full((60, 3), -3.0), torch.full((60,), 2.0), colors)
+    normal = np.array([0.6, 0.64, 0.48])
+    mirror = Mirror(balls, normal, 0.13)
+    image = torch.tensor(mirror.image_of(means.double().numpy()), dtype=torch.float32)
+    direct = rasterizer.render(balls.map(lambda p: image if p is means else p), view)
+    across = rasterizer.render(balls, mirror.behind(view))
+    assert torch.allclose(direct.color, across.color.flip(1), atol=2e-4)
+    assert np.allclose(mirror.image_of(mirror.image_of(means.numpy())), means, atol=1e-6)
