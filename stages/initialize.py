@@ -32,7 +32,7 @@ from reffusion.types import Reference
 
 WARN_FROM = 0.01  # share of C that shows nothing, from which a view is named
 LEAK = 1.0  # weight in undecided over other pixels from which Gaussians are haze
-LITTLE = 0.5  # share of what was open in a view that may still be when it is completed
+LITTLE = 0.9  # share of what was open in a view that may still be when it is completed
 OVERLAP = 0.006  # of the image's width: how far new Gaussians reach beyond the hole
 COVERED = 0.9  # alpha below which the reference also fills pixels of C
 SEEN_THROUGH = 0.5  # alpha in C of any view below which there is a gap to fill
@@ -147,7 +147,8 @@ def filled(params: Params, out: Path, gaussians, new, reference, around, network
     camera, hidden = reference.camera, around.hidden[reference.camera.name]
     sheets = Sheets(gloss=params.gloss and not farthest)  # a sliver tells nothing of shine
     hole = filling.to_fill(gaussians, new, reference, hidden, COVERED)
-    hole |= farthest & reference.mask  # also where something lies there, but behind a mirror image
+    if farthest and around.mirrors:
+        hole |= reference.mask  # also where something lies there, but behind a mirror image
     remaining = gaussians.map(lambda p: p[~new])
     # A gap that is left open at last is too narrow for the comparison to tell of its rim.
     swept = params.depth.sweep and not (farthest and coverage.narrow(hole))

@@ -78,7 +78,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
         save_labels(out / "debris.npy", debris.cpu())
         labels |= debris
     remaining = gaussians.map(lambda p: p[~labels])
-    mirrors = mirrors_around(remaining, *extent(gaussians.means[labels]), views, planes, photos)
+    mirrors = mirrors_around(remaining, *extent(gaussians.means[labels]), views, planes, photos) if planes else []
     sets = classified(params, scene, remaining, raw, consistent, views, planes, mirrors, fill)
     sets |= of_blank_views(params, scene, gaussians, hidden, sets)
     distilled = (*scene.train, *scene.blank)
