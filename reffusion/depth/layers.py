@@ -65,7 +65,21 @@ def shared_out(
     start = np.where(own >= 0, own, np.where(of >= 0, of, cost.argmin(0)))
     found = surfaces.copy()
     found[domain] = least_labels(cost, pairs, strength, start) + 1
-    return found
+    return _grown_in(found, surfaces, todo)
+
+
+def _grown_in(found: np.ndarray, surfaces: np.ndarray, todo: np.ndarray) -> np.ndarray:
+    """int [H, W]: the surfaces found, without islands: what is `todo`, bool [H, W], and does not touch what is known of
+    its own surface, int [H, W], is of the one around it. A pattern may have the colours of something else."""
+    island = np.zeros_like(todo)
+    for surface in range(1, int(surfaces.max()) + 1):
+        part, _ = ndimage.label(found == surface, np.ones((3, 3)))
+        reached = np.isin(part, np.unique(part[surfaces == surface]))
+        island |= (part > 0) & ~reached & todo
+    if not island.any() or island.all():
+        return found
+    nearest = ndimage.distance_transform_edt(island | (found == 0), return_distances=False, return_indices=True)
+    return np.where(island, found[tuple(nearest)], found)
 
 
 def _links(index: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

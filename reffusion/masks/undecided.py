@@ -28,7 +28,8 @@ BESIDE = 0.03  # of the image's width: how far around a plane's patch it is comp
 ROUGHEST = 0.06  # of the depth: a wider range around a pixel is no rough surface, but a depth edge
 TRUSTED = 0.25  # share of the views that look its way in which a surface must be seen, not stand behind another
 WITNESSES = 3  # views that must show a surface for it to be there, though most around it is undecided
-AGREES = 0.6  # share of these pixels that must lie on the plane
+AGREES = 0.6  # share of the pixels beside a plane's patch that must lie on it, of those where nothing stands before it
+OPEN = 0.3  # the same, of all of them
 
 
 @dataclass(frozen=True)
@@ -129,4 +130,6 @@ def _grows_out_of(
     lies = (at > nearest * (1 - SURFACE)) & (at < farthest * (1 + SURFACE)) & (np.abs(at - depth) < ROUGHEST * depth)
     # One view may be wrong about rough ground, or look through what shines: others tell.
     lies |= plane.on(plane.seen, at, camera, beside)
-    return float(lies[beside].mean()) > AGREES
+    wrong = ~lies & (depth > at)  # where something stands before the plane it may go on
+    share, against = float(lies[beside].mean()), float(wrong[beside].mean())
+    return share > OPEN and share > AGREES * (share + against)
