@@ -29,6 +29,15 @@ def test_a_hole_is_shared_out_along_the_pictures_edge():
     assert (surfaces[hole & ~left] == surfaces[0, -1]).mean() > 0.97
 
 
+def test_a_pattern_in_the_colours_of_another_surface_is_no_island_of_it():
+    """Stars on a wall are as bright as the floor: nothing of the floor stands in the middle of the wall."""
+    disparity, picture, hole = step_scene()
+    rows, columns = np.mgrid[:100, :120]
+    star = (np.abs(rows - 45) + np.abs(columns - 50)) < 7
+    surfaces = shared_out(disparity, ~hole, hole, np.where(star[..., None], (0.2, 0.5, 0.3), picture))
+    assert (hole & star).sum() > 50 and (surfaces[star] == surfaces[0, 0]).all()
+
+
 def vase_on_a_table():
     """Depths [H, W] of a table's plane, and of what stands on it from column 80 on, nearer but touching it at row 90;
     a picture in three colours, for a plate lies on the table; and a hole that hides the vase's left rim."""

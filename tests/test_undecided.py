@@ -9,7 +9,8 @@ from reffusion import geometry
 from reffusion.gaussians.surfels import surface_gaussians
 from reffusion.masks import taint
 from reffusion.masks.continuation import planes_around
-from reffusion.masks.undecided import behind
+from reffusion.masks.plane import CELLS, Plane
+from reffusion.masks.undecided import _grows_out_of, behind
 from reffusion.masks.witness import FREE, SURFACE, Witness, seen_by, surface_range, unlike, votes, without_slivers
 from reffusion.types import Camera, Gaussians
 
@@ -160,6 +161,21 @@ def test_what_lies_beneath_the_table_in_all_views_but_one_is_not_what_is_behind_
     all_of_them = behind(left, camera, hidden, [*map(shows_it, above)], [])
     assert asked.sum() > 100
     assert one.undecided[asked].mean() > 0.75 and all_of_them.undecided[asked].mean() < 0.1
+
+
+def test_what_stands_before_a_plane_does_not_speak_against_it():
+    """Half of what is around the patch is a ball before the wall; behind, it would be one that cuts through."""
+    view, everywhere, nowhere = camera("v", 0, 0.0), np.ones((CELLS, CELLS), bool), np.zeros((CELLS, CELLS), bool)
+    wall = Plane(
+        np.array([1.0, 0, 0]), 0.0, np.zeros(3), np.eye(3)[1:], 0.05, nowhere, everywhere, nowhere, nowhere, nowhere
+    )
+    at = wall.depth(view)
+    patch = np.zeros((SIZE, SIZE), bool)
+    patch[60:100, 60:100] = True
+    half, full = np.arange(SIZE) < 78, np.ones(SIZE, bool)
+    agrees = lambda rate, where: _grows_out_of(patch, wall, at, view, np.where(where, rate * at, at), ~patch)
+    assert agrees(0.7, half) and not agrees(1.4, half)
+    assert not agrees(0.7, full)  # nothing of it is seen there
 
 
 def test_slivers_go_and_patches_stay():
