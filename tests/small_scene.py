@@ -22,6 +22,19 @@ def camera(name: str, x: float, y: float = 0.0, z: float = 0.0) -> Camera:
     return Camera(name, WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, pose)
 
 
+def looking(name: str, azimuth: float, height: float, away: float, at: np.ndarray, size: int, focal: float) -> Camera:
+    """A square view of the point `at` [3], from the height, `away` from the z axis, which is up; azimuth in degrees."""
+    angle = np.radians(azimuth)
+    center = np.array([away * np.cos(angle), away * np.sin(angle), height])
+    forward = (at - center) / np.linalg.norm(at - center)
+    right = np.cross(forward, (0, 0, 1.0))
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ center
+    return Camera(name, size, size, focal, focal, size / 2, size / 2, pose)
+
+
 CAMERAS = {c.name: c for c in [*(camera(f"a{k}", x) for k, x in enumerate((-0.3, -0.15, 0.0, 0.15, 0.3))),
                                camera("t0", 0.07), camera("t1", -0.2, 0.05)]}  # fmt: skip
 TRAIN, TEST = ("a0", "a1", "a2", "a3", "a4"), ("t0", "t1")

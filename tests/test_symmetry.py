@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+import small_scene
 import torch
 
 from reffusion import geometry
@@ -23,16 +24,7 @@ CENTRE, RADIUS = (LOW + UPPER) / 2, 0.45
 
 def camera(name: str, azimuth: float, height: float = 1.3, away: float = 3.0) -> Camera:
     """Looks at the vase; azimuth in degrees; z is up in the world."""
-    angle = np.radians(azimuth)
-    center = np.array([away * np.cos(angle), away * np.sin(angle), height])
-    forward = np.array([0, 0, 0.2]) - center
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, (0, 0, 1.0))
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    pose[:3, 3] = -pose[:3, :3] @ center
-    return Camera(name, SIZE, SIZE, FOCAL, FOCAL, SIZE / 2, SIZE / 2, pose)
+    return small_scene.looking(name, azimuth, height, away, np.array([0, 0, 0.2]), SIZE, FOCAL)
 
 
 def on_vase(rays: np.ndarray, center: np.ndarray, cut: bool) -> np.ndarray:

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+import small_scene
 import torch
 
 from reffusion import geometry
@@ -20,15 +21,7 @@ SIZE, FOCAL = 160, 150.0
 
 def camera(name: str, azimuth: float, height: float, away: float = 3.5) -> Camera:
     """Looks at the middle of the table; azimuth in degrees; z is up in the world."""
-    angle = np.radians(azimuth)
-    center = np.array([away * np.cos(angle), away * np.sin(angle), height])
-    forward = -center / np.linalg.norm(center)
-    right = np.cross(forward, (0, 0, 1.0))
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    pose[:3, 3] = -pose[:3, :3] @ center
-    return Camera(name, SIZE, SIZE, FOCAL, FOCAL, SIZE / 2, SIZE / 2, pose)
+    return small_scene.looking(name, azimuth, height, away, np.zeros(3), SIZE, FOCAL)
 
 
 def drawn(view: Camera, notched: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

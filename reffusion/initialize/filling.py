@@ -157,8 +157,7 @@ class Surroundings:
 
     def looked_past(self, camera: Camera, depth: np.ndarray) -> np.ndarray:
         """bool [H, W], where other views look past a surface at this depth of a view, and few show it."""
-        said = votes(geometry.unproject(depth, camera).reshape(-1, 3), self.views)
-        return ((said.free >= 2) & (said.free > said.seen)).reshape(depth.shape)
+        return votes(geometry.unproject(depth, camera).reshape(-1, 3), self.views).empty.reshape(depth.shape)
 
     def compared(self, camera: Camera, hole: np.ndarray) -> tuple[Surroundings, np.ndarray]:
         """The same, but around a hole of a training view depth and planes are where the photographs agree best; and

@@ -186,7 +186,7 @@ def _looked_at(plane: Plane, facing: np.ndarray, views: Sequence[Witness]) -> tu
     """bool [CELLS, CELLS] each: where views show the plane, from the side that `facing` [3] points to, where they look
     through it, and where the object hides it from some."""
     said = votes(plane.cells.reshape(-1, 3), views, np.broadcast_to(facing, (CELLS * CELLS, 3)))
-    seen, free = (said.seen >= 1) & (said.seen >= said.free), (said.free >= 2) & (said.free > said.seen)
+    seen, free = (said.seen >= 1) & (said.seen >= said.free), said.empty
     return tuple(each.reshape(CELLS, CELLS) for each in (seen, free, said.hidden > 0))
 
 

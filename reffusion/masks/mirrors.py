@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import torch
 
-from reffusion.masks.witness import Votes, Witness, pixels, smoothed_surface, votes
+from reffusion.masks.witness import Witness, pixels, smoothed_surface, votes
 from reffusion.paint.painting import drawn_across
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
@@ -18,7 +18,6 @@ HALF = 0.5  # alpha from which a thing's image is there
 GAP = 0.01  # of the image's width: the radius of gaps in what is seen of a thing that are of no account
 WINDOW = 0.025  # the same, of those that its image does not have, but for their texture
 DEEPER = 1.02  # of the depth around, from which a place is such a window
-TRUSTED = 0.25  # share of the views that look its way in which a surface must be seen, not stand behind another
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,7 @@ class Mirror:
 
     def image_of(self, points: np.ndarray) -> np.ndarray:
         """The mirror images of points [..., 3]."""
-        return points - 2 * ((points @ self.normal) - self.height)[..., None] * self.normal
+        return reflected(points, self.normal, self.height)
 
     def behind(self, camera: Camera) -> Camera:
         """The camera's mirror image. It sees the thing as the camera sees the thing's image, left and right swapped."""
@@ -75,10 +74,10 @@ class Mirror:
         picture = (image.color / image.alpha.clamp_min(HALF)[..., None]).clamp(0, 1).cpu().numpy()
         rows, columns = np.nonzero(asked[:, ::-1] & (depth > 0))
         points, normals = (each[rows, columns] for each in smoothed_surface(depth, across))
-        facing = normals - 2 * (normals @ self.normal)[:, None] * self.normal
+        facing = reflected(normals, self.normal, 0.0)
         possible, told = np.zeros((2, *depth.shape), bool)
-        possible[rows, columns] = ~empty(votes(self.image_of(points), views, facing))
-        told[rows, columns] = shown(votes(points, views, normals))
+        possible[rows, columns] = ~votes(self.image_of(points), views, facing).empty
+        told[rows, columns] = votes(points, views, normals).shown
         told &= depth < DEEPER * _opened(depth, WINDOW)
         whole = _closed(told, WINDOW)
         depth = np.where(whole & ~told, drawn_across(depth, told), depth) if told.any() else depth
@@ -86,6 +85,11 @@ class Mirror:
         everywhere = flipped(np.where(depth > 0, depth, np.inf))
         supposed = np.where(flipped(whole & possible), everywhere, np.inf)
         return Drawn(everywhere, supposed, flipped(_closed(told, GAP)), flipped((picture * 255 + 0.5).astype(np.uint8)))
+
+
+def reflected(points: np.ndarray, normal: np.ndarray, height: float) -> np.ndarray:
+    """The images of points [..., 3] in the mirror normal . x = height."""
+    return points - 2 * (points @ normal - height)[..., None] * normal
 
 
 def imaged(mirrors: Sequence[Mirror], camera: Camera, asked: np.ndarray, views: Sequence[Witness]) -> Drawn:
@@ -102,16 +106,6 @@ def imaged(mirrors: Sequence[Mirror], camera: Camera, asked: np.ndarray, views: 
             np.where(first[..., None], each.picture, found.picture),
         )
     return found
-
-
-def shown(said: Votes) -> np.ndarray:
-    """bool [P]: enough views show a surface there."""
-    return said.seen >= np.maximum(1, TRUSTED * (said.seen + said.behind))
-
-
-def empty(said: Votes) -> np.ndarray:
-    """bool [P]: views look past it."""
-    return (said.free >= 2) & (said.free > said.seen)
 
 
 def _closed(mask: np.ndarray, fraction: float) -> np.ndarray:

@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
 from reffusion import geometry
-from reffusion.masks.mirrors import Mirror, empty, shown
+from reffusion.masks.mirrors import Mirror, reflected
 from reffusion.masks.plane import Plane, without_pits
 from reffusion.masks.witness import Witness, seen_by, votes
 from reffusion.splat.conventions import SH0
@@ -95,7 +95,7 @@ def _things(
     number, of, count = np.unique(np.ravel_multi_index(at.T, at.max(0) + 1), return_inverse=True, return_counts=True)
     middles = np.stack([np.bincount(of, points[:, k]) / count for k in range(3)], 1)
     said = votes(middles, views)
-    there = shown(said) & (count >= SEEN_SO_OFTEN) & (said.seen >= 2) & (said.seen > said.free)
+    there = said.shown & (count >= SEEN_SO_OFTEN) & (said.seen >= 2) & (said.seen > said.free)
     filled = np.zeros(at.max(0) + 1, bool)
     filled.ravel()[number[there]] = True
     thing = ndimage.label(filled, np.ones((3, 3, 3)))[0].ravel()[number[there]]
@@ -141,10 +141,10 @@ def _chosen(
     while agreeing and len(found) < MOST:
         gains = []
         for normal, height in agreeing:
-            images = points - 2 * (points @ normal - height)[:, None] * normal
+            images = reflected(points, normal, height)
             said = votes(images, views)
             far = cKDTree(known).query(images, distance_upper_bound=NEAR * cell)[0] > NEAR * cell
-            gains.append(images[far & ~shown(said) & ~empty(said) & (said.hidden > 0)])
+            gains.append(images[far & ~said.shown & ~said.empty & (said.hidden > 0)])
         best = max(range(len(gains)), key=lambda k: len(gains[k]))
         if len(gains[best]) < GAINS * len(points):
             break
@@ -168,9 +168,9 @@ def _agreeing(
         """Shares of the cells whose images lie elsewhere on the thing, and in empty space."""
         normal = normal_at(angle)
         moved = np.abs(asked @ normal - height) > NEAR * cell
-        images = asked - 2 * (asked @ normal - height)[:, None] * normal
+        images = reflected(asked, normal, height)
         on = tree.query(images, distance_upper_bound=NEAR * cell)[0] < NEAR * cell
-        return float((on & moved).mean()), float((empty(votes(images, some)) & ~on & moved).mean())
+        return float((on & moved).mean()), float((votes(images, some).empty & ~on & moved).mean())
 
     def cost(mirror: Sequence[float]) -> float:
         on, bare = told(*mirror)
@@ -197,7 +197,7 @@ def _alike(
     tree, anywhere, found = cKDTree(points), np.random.default_rng(0).permutation(len(points)), []
     for normal, height in mirrors:
         moved = np.abs(points @ normal - height) > NEAR * cell
-        images = points - 2 * (points @ normal - height)[:, None] * normal
+        images = reflected(points, normal, height)
         far, at = tree.query(images, distance_upper_bound=NEAR * cell)
         on = np.flatnonzero(np.isfinite(far) & moved)
         if len(on) < FEWEST / 4:

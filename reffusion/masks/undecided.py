@@ -26,7 +26,6 @@ from reffusion.types import Camera, Gaussians
 
 BESIDE = 0.03  # of the image's width: how far around a plane's patch it is compared with what is shown
 ROUGHEST = 0.06  # of the depth: a wider range around a pixel is no rough surface, but a depth edge
-TRUSTED = 0.25  # share of the views that look its way in which a surface must be seen, not stand behind another
 WITNESSES = 3  # views that must show a surface for it to be there, though most around it is undecided
 AGREES = 0.6  # share of the pixels beside a plane's patch that must lie on it, of those where nothing stands before it
 OPEN = 0.3  # the same, of all of them
@@ -78,9 +77,8 @@ def behind(
     if len(rows):
         points, normals = (each[rows, columns] for each in smoothed_surface(depth, camera))
         said = votes(points, views, normals)
-        trusted = TRUSTED * (said.seen + said.behind)
-        undecided[rows, columns] = said.seen < np.maximum(1, trusted)
-        witnessed[rows, columns] = said.seen >= np.maximum(WITNESSES, trusted)
+        undecided[rows, columns] = ~said.shown
+        witnessed[rows, columns] = said.shown & (said.seen >= WITNESSES)
     depth = with_photographed_depth(depth, camera, views)
     hides, reach, onward = np.zeros_like(hidden), np.full(hidden.shape, np.inf), []
     for plane in planes:

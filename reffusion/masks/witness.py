@@ -24,6 +24,7 @@ ROUGH = 0.006  # of the image's width: how far around a pixel the range of a vie
 TONE = 10.0  # levels of 255 beyond those that a view shows around a point, from which a Gaussian has another colour
 UNEVEN = 1.05  # farthest over nearest depth around a point from which a surface is rough
 UNLIKE = 0.5  # share of the views that show a surface there, in which it must, to be debris
+TRUSTED = 0.25  # share of the views that look its way in which a surface must be seen, not stand behind another
 MARGIN = 0.004  # of the image's width: a view says nothing so near to its mask, where object and background mix
 
 
@@ -109,6 +110,21 @@ class Votes:
     free: np.ndarray
     behind: np.ndarray
     hidden: np.ndarray
+
+    @property
+    def trusted(self) -> np.ndarray:
+        """[P], how many views must show a surface there: what lies beneath another in nearly all is not believed."""
+        return TRUSTED * (self.seen + self.behind)
+
+    @property
+    def shown(self) -> np.ndarray:
+        """bool [P]: enough views show a surface there."""
+        return self.seen >= np.maximum(1, self.trusted)
+
+    @property
+    def empty(self) -> np.ndarray:
+        """bool [P]: views look past it, more than show it."""
+        return (self.free >= 2) & (self.free > self.seen)
 
 
 def votes(points: np.ndarray, views: Sequence[Witness], normals: np.ndarray | None = None) -> Votes:
