@@ -1,12 +1,16 @@
 """Few photographs: depth between sparse points has edges, and a fit on it shows other views."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from small_scene import camera
 
 from reffusion import geometry
-from reffusion.depth.between import SparsePoints, depth_between
+from reffusion.depth import between, patchmatch
+from reffusion.depth.agreed import agreed
+from reffusion.depth.between import SparsePoints, known
 from reffusion.fit import few
 from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply
@@ -18,6 +22,10 @@ from stages import fit as stage
 
 WALL, NEAR, HALF = 2.0, 1.5, 0.2  # depth of the wall and of a square before it; half its side
 NONE: dict[str, np.ndarray] = {}
+
+
+def depth_between(points, view, picture):
+    return between.depth_between(known(points, view, picture), view, picture)
 
 
 def shown(view):
@@ -71,6 +79,88 @@ def test_too_few_points_tell_nothing():
     assert few.surfaces([view], {"a": shown(view)[1]}, positions[:10], colors[:10], NONE, params) is None
     behind = positions * (1, 1, -1)
     assert few.surfaces([view], {"a": shown(view)[1]}, behind, colors, NONE, params) is None
+
+
+def rough(points):
+    """uint8 [..., 3]: a pattern in space that never repeats itself."""
+    x, y, z = np.moveaxis(points, -1, 0)
+    waves = [np.sin(31 * x + 17 * y + 9 * z), np.sin(23 * y - 29 * x + 5), np.sin(41 * x * y + 37 * y), np.cos(53 * x)]
+    return (127 + 30 * np.stack([waves[0] + waves[2], waves[1] + waves[3], waves[2] + waves[3]], -1)).astype(np.uint8)
+
+
+def slanted(view):
+    """Depth [H, W] and picture uint8 [H, W, 3] of the plane z = 2 + 0.5 x - 0.3 y."""
+    rays = geometry.pixel_rays(view) @ view.world_to_camera[:3, :3]
+    normal = np.array([0.5, -0.3, -1.0])
+    depth = -(view.center @ normal + 2) / (rays @ normal)
+    return depth, rough(view.center + rays * depth[..., None])
+
+
+def test_photographs_tell_a_slanted_plane_within_a_thousandth():
+    views = [camera(name, x, y) for name, x, y in (("a", 0.0, 0.0), ("b", 0.5, 0.05), ("c", -0.4, 0.1))]
+    (true, picture), *others = map(slanted, views)
+    seen = [(view, image) for view, (_, image) in zip(views[1:], others, strict=True)]
+    rays, draw = geometry.pixel_rays(views[0]), np.random.default_rng(0)
+    planes = patchmatch.fitted(views[0], picture, seen, 1.06 * true, draw)
+    error = np.abs(1 / (planes * rays).sum(-1) / true - 1)[8:-8, 8:-8]
+    assert np.median(error) < 1e-3 and (error < 5e-3).mean() > 0.97, (np.median(error), (error < 5e-3).mean())
+
+
+def test_where_photographs_show_nothing_what_is_believed_stays():
+    views, grey = [camera("a", 0.0), camera("b", 0.2)], np.full((72, 96, 3), 90, np.uint8)
+    believed = np.full((72, 96), 2.0)
+    planes = patchmatch.fitted(views[0], grey, [(views[1], grey)], believed, np.random.default_rng(0))
+    depth = 1 / (planes * geometry.pixel_rays(views[0])).sum(-1)
+    assert np.abs(depth / believed - 1).max() < 1e-6
+    away = camera("away", 50.0)  # shows nothing of it
+    planes = patchmatch.fitted(views[0], grey, [(away, grey)], believed, np.random.default_rng(0))
+    assert np.abs((planes * geometry.pixel_rays(views[0])).sum(-1) - 0.5).max() < 1e-6
+
+
+def test_other_photographs_may_be_of_another_size_and_threads_do_not_matter():
+    views = [camera("a", 0.0), camera("b", 0.5), replace(camera("c", -0.4), width=60, height=72, cx=30.0)]
+    (true, picture), *others = map(slanted, views)
+    seen = [(view, image) for view, (_, image) in zip(views[1:], others, strict=True)]
+    found, before = [], torch.get_num_threads()
+    for count in (1, 2):
+        torch.set_num_threads(count)
+        found.append(patchmatch.fitted(views[0], picture, seen, 1.06 * true, np.random.default_rng(3)))
+    torch.set_num_threads(before)
+    assert np.array_equal(*found)
+    depth = 1 / (found[0] * geometry.pixel_rays(views[0])).sum(-1)
+    assert np.median(np.abs(depth / true - 1)) < 1e-3
+
+
+def before_wall(view):
+    """Depth [H, W] and picture of a wall and a square before it, both of one pattern."""
+    rays = geometry.pixel_rays(view) @ view.world_to_camera[:3, :3]
+    at = lambda z: view.center + rays * ((z - view.center[2]) / rays[..., 2:])
+    square = (np.abs(at(NEAR)[..., :2]) < HALF).all(-1)
+    depth = np.where(square, NEAR, WALL) - view.center[2]
+    return depth, rough(view.center + rays * depth[..., None])
+
+
+def test_points_that_lie_behind_what_is_seen_are_refuted_by_the_photographs():
+    draw = np.random.default_rng(0)
+    wall = np.column_stack([draw.uniform(-1.2, 1.2, 900), draw.uniform(-0.9, 0.9, 900), np.full(900, WALL)])
+    square = np.column_stack([draw.uniform(-HALF, HALF, (25, 2)), np.full(25, NEAR)])
+    views = [camera("a", 0.0), camera("b", 0.3), camera("c", -0.25, 0.05)]
+    pictures = {view.name: before_wall(view)[1] for view in views}
+    positions = np.concatenate([wall, square])
+    colors = rough(positions)
+    uv, _ = geometry.project(wall, views[0])  # of the colour of what hides them, and more than there are before them
+    behind = (np.abs(wall[:, :2]) < HALF * WALL / NEAR).all(1)
+    colors[: len(wall)][behind] = geometry.sample_nearest(pictures["a"], uv)[0][behind]
+    points = SparsePoints.of(positions, colors)
+    told = agreed(points, views, pictures, NONE, seed=0)
+    true, inner = before_wall(views[0])[0], (slice(22, 50), slice(34, 62))
+    wrong = lambda depth: (np.abs(depth / true - 1) > 0.02)[inner].mean()
+    assert wrong(told["a"].depth) < 0.2 < 0.4 < wrong(depth_between(points, views[0], pictures["a"]))
+    assert (np.abs(told["a"].depth / true - 1) < 0.01)[told["a"].sure].mean() > 0.97
+    alone = agreed(points, views[:1], pictures, NONE, seed=0)["a"]
+    assert not alone.sure.any() and not alone.wrong.any(), "one photograph alone is sure of nothing"
+    hidden = {"a": np.ones(true.shape, bool)}
+    assert not agreed(points, views, pictures, hidden, seed=0)["a"].sure.any()
 
 
 def test_a_further_view_adds_what_those_before_do_not_show():

@@ -58,36 +58,66 @@ class SparsePoints:
         return cls(positions, colors, normals)
 
 
-def depth_between(points: SparsePoints, camera: Camera, image: np.ndarray) -> np.ndarray | None:
-    """[H, W] float64 camera z of a photograph, everywhere; None where it shows too few points.
+@dataclass(frozen=True)
+class Known:
+    """What is known of a view's depth in some of its pixels.
 
-    Each pixel asks the points nearest to it in the picture and in colour, so that those across an edge have no say.
-    Each point answers with the depth of its own plane there; the weighted median is taken, so that depth steps from
-    one surface to the next and does not slope.
+    Attributes:
+        pixels: [S, 2] coordinates (x, y). planes: [S, 3], of the surface there: plane . (x, y, 1) along a ray is 1/z.
+        disparity: [S], of the plane at the pixel.
+    """
+
+    pixels: np.ndarray
+    planes: np.ndarray
+    disparity: np.ndarray
+
+    def taken(self, which: np.ndarray) -> Known:
+        return Known(self.pixels[which], self.planes[which], self.disparity[which])
+
+    def and_(self, more: Known) -> Known:
+        both = zip((self.pixels, self.planes, self.disparity), (more.pixels, more.planes, more.disparity), strict=True)
+        return Known(*(np.concatenate(each) for each in both))
+
+
+def known(points: SparsePoints, camera: Camera, image: np.ndarray) -> Known:
+    """The points that a photograph (uint8 [H, W, 3]) shows: in its frame, not behind what most points around them lie
+    on, and of the colour that is seen there."""
+    pixels, disparity, number = _shown(points, camera, image)
+    normals = points.normals[number]
+    reach = ((points.positions[number] - camera.center) * normals).sum(1, keepdims=True)
+    planes = np.divide(normals, reach, out=np.zeros_like(normals), where=np.abs(reach) > 1e-9)
+    return Known(pixels, planes @ camera.world_to_camera[:3, :3].T, disparity)
+
+
+def depth_between(said: Known, camera: Camera, image: np.ndarray) -> np.ndarray | None:
+    """[H, W] float64 camera z of a photograph, everywhere; None where too little is known.
+
+    Each pixel asks what is known nearest to it in the picture and in colour, so that what lies across an edge has no
+    say. Each answers with the depth of its own plane there; the weighted median is taken, so that depth steps from one
+    surface to the next and does not slope.
 
     Args:
         image: uint8 [H, W, 3], what the camera shows.
     """
-    pixels, disparity, shown = _shown(points, camera, image)
-    if len(pixels) < ENOUGH:
+    if len(said.pixels) < ENOUGH:
         return None
     lab = cv2.cvtColor(cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
     unit = UNIT / camera.width
-    columns, rows = pixels.astype(int).T
+    columns, rows = said.pixels.astype(int).T
     height, width = lab.shape[:2]
     centres = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1)
     described = np.concatenate([unit * centres, COLOUR * lab], -1)
-    known = np.column_stack([unit * pixels, COLOUR * lab[rows, columns]])
-    asked = min(ASKED, len(known))
-    away, index = cKDTree(known).query(described.reshape(-1, known.shape[1]), k=asked)
-    answers = _answers(points, camera, shown, disparity, index)
+    there = np.column_stack([unit * said.pixels, COLOUR * lab[rows, columns]])
+    asked = min(ASKED, len(there))
+    away, index = cKDTree(there).query(described.reshape(-1, there.shape[1]), k=asked)
+    rays, own = geometry.pixel_rays(camera).reshape(-1, 3), said.disparity[index]
+    answers = np.einsum("pi,pki->pk", rays, said.planes[index]).clip(own / TILT, own * TILT)
     found = _weighted_median(answers, 1 / (away**2 + CLOSEST**2))
     return 1.0 / cv2.medianBlur(found.reshape(height, width).astype(np.float32), SMOOTHED).astype(np.float64)
 
 
 def _shown(points: SparsePoints, camera: Camera, image: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixels [S, 2], disparities [S] and numbers [S] of the points that the photograph shows: in its frame, not behind
-    what most points around them lie on, and of the colour that is seen there."""
+    """Pixels [S, 2], disparities [S] and numbers [S] of what `known` tells."""
     uv, z = geometry.project(points.positions, camera)
     with np.errstate(invalid="ignore"):
         framed = (z > 0) & (uv >= 0).all(1) & (uv < (camera.width, camera.height)).all(1)
@@ -105,19 +135,6 @@ def _shown(points: SparsePoints, camera: Camera, image: np.ndarray) -> tuple[np.
         around.append(np.abs(seen - levels).max(1))
     kept = ~behind & (np.min(around, axis=0) <= UNLIKE)
     return uv[kept], disparity[kept], number[kept]
-
-
-def _answers(
-    points: SparsePoints, camera: Camera, shown: np.ndarray, disparity: np.ndarray, index: np.ndarray
-) -> np.ndarray:
-    """[pixels, asked]: disparity of each asked point's plane at the pixel; near the point's own."""
-    rays = (geometry.pixel_rays(camera) @ camera.world_to_camera[:3, :3]).reshape(-1, 3)
-    normals = points.normals[shown]
-    reach = ((points.positions[shown] - camera.center) * normals).sum(1)
-    slope = np.einsum("pi,pki->pk", rays, normals[index])
-    planes = np.divide(slope, reach[index], out=np.zeros_like(slope), where=np.abs(reach[index]) > 1e-9)
-    own = disparity[index]
-    return planes.clip(own / TILT, own * TILT)
 
 
 def _weighted_median(values: np.ndarray, weights: np.ndarray) -> np.ndarray:

@@ -13,7 +13,8 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from reffusion.depth.between import NORMAL_FROM, SparsePoints, depth_between
+from reffusion.depth.agreed import agreed
+from reffusion.depth.between import NORMAL_FROM, SparsePoints
 from reffusion.gaussians.sheets import Sheets, surface
 from reffusion.params.fit import Params
 from reffusion.splat import rasterizer
@@ -45,20 +46,21 @@ def surfaces(
     """
     if len(points) <= NORMAL_FROM:
         return None
-    sparse, found = SparsePoints.of(points, colors), None
-    for camera in cameras:
-        image = images[camera.name]
-        depth = depth_between(sparse, camera, image)
-        if depth is None:
-            continue
-        wanted = ~hidden.get(camera.name, np.zeros(depth.shape, bool)) & ~beside_nearer(depth)
-        if found is not None:
-            drawn = rasterizer.render(found, camera, sh_degree=0)
-            there, thick = drawn.depth.cpu().numpy(), drawn.alpha.cpu().numpy() >= COVERED
-            wanted &= ~(thick & (there < BEFORE * depth))
-        added = surface(image, depth, wanted, camera, (params.sh.degree + 1) ** 2, Sheets())
-        added = replace(added.map(lambda p: p.to(params.device)), antialiased=params.antialiased)
-        found = added if found is None else found.zipped(added, lambda a, b: torch.cat([a, b]))
+    told, found = agreed(SparsePoints.of(points, colors), cameras, images, hidden, params.seed), None
+    for certain in (True, False):
+        for camera in cameras:
+            if camera.name not in told:
+                continue
+            image, depth = images[camera.name], told[camera.name].depth
+            wanted = told[camera.name].sure if certain else ~told[camera.name].sure & ~told[camera.name].wrong
+            wanted &= ~hidden.get(camera.name, np.zeros(depth.shape, bool)) & ~beside_nearer(depth)
+            if found is not None:
+                drawn = rasterizer.render(found, camera, sh_degree=0)
+                there, thick = drawn.depth.cpu().numpy(), drawn.alpha.cpu().numpy() >= COVERED
+                wanted &= ~(thick & (there < BEFORE * depth))
+            added = surface(image, depth, wanted, camera, (params.sh.degree + 1) ** 2, Sheets())
+            added = replace(added.map(lambda p: p.to(params.device)), antialiased=params.antialiased)
+            found = added if found is None else found.zipped(added, lambda a, b: torch.cat([a, b]))
     return found
 
 

@@ -25,7 +25,7 @@ _LARGE, _BLOCKS = 2**16, 24  # numbers of an array worth keeping; how many are k
 FEW = 8000  # Gaussians for which waking another thread takes longer than it saves
 # Rounding may vary, but NaN and infinity stay what they are: `fit` looks for them.
 FREE_ROUNDING = "contract", "reassoc", "nsz", "arcp"
-_ROOMS = "kernels", "splat", "gaussians", "texture", "masks"  # the packages that have kernels
+_ROOMS = "kernels", "splat", "gaussians", "depth", "texture", "masks"  # the packages that have kernels
 _CACHE = "splat-"  # folders of machine code in __pycache__, one per state of these sources
 
 
