@@ -48,6 +48,12 @@ def test_what_is_wrong_in_the_hole_or_far_from_it_does_not_count_and_beside_it_d
     assert found.may and found.beside - WORSE < TAUGHT
 
 
+def test_beside_what_is_put_in_where_nothing_was_removed(given):
+    wall, sets, photos = given
+    put_in = {name: replace(each, consistent=np.zeros_like(each.invent)) for name, each in sets.items()}
+    assert estimated(wall, TRAINED, put_in, photos) == estimated(wall, TRAINED, sets, photos)
+
+
 def test_a_few_views_are_looked_at_and_without_any_it_may_gain(given):
     wall, sets, photos = given
     many = [replace(TRAINED[k % 5], name=f"v{k}") for k in range(3 * VIEWS)]

@@ -115,9 +115,8 @@ def main() -> None:
                 for what in ("cpu", "seconds", "mb"):
                     row[what].append(told[what])
         for stage, row in stages.items():
-            print(
-                f"{of}, {stage}: CPU {exponent(row['size'], row['cpu']):.2f}, memory {exponent(row['size'], row['mb']):.2f}"
-            )
+            cpu, mb = (exponent(row["size"], row[what]) for what in ("cpu", "mb"))
+            print(f"{of}, {stage}: CPU {cpu:.2f}, memory {mb:.2f}")
     save_json(out / "growth.json", found)
     draw(found, out / "growth.png")
     if given.largest:

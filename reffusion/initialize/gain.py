@@ -46,7 +46,8 @@ def estimated(
     """
     asked = [camera for camera in cameras if camera.name in photos and sets[camera.name].invent.any()]
     some = [asked[k] for k in np.unique(np.linspace(0, len(asked) - 1, VIEWS).round().astype(int))] if asked else []
-    found = [_beside(gaussians, each, sets[each.name].consistent, photos[each.name]) for each in some]
+    made_up = lambda name: sets[name].consistent | sets[name].invent  # what is put in has nothing removed behind it
+    found = [_beside(gaussians, each, made_up(each.name), photos[each.name]) for each in some]
     squared = torch.cat(found) if found else torch.zeros(0)
     if not len(squared):
         return Gain(True, "no photograph tells how good the initialization is", None)
