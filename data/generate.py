@@ -13,7 +13,7 @@ A furnished room is ray-cast with and without one object. Kinds:
   sparse  nothing to remove; of four training views alone the pixels may be used, the others are cameras
   grass   an object on a lawn before a hedge: thousands of blades and leaves, nothing flat
   insert  the same turned round: an object on the floor, in the test views and four references only; it is to be put in
-  outpaint  the room as photographed, and a sphere beyond which it is to be continued from four references
+  outpaint  the room as photographed, and a sphere beyond which it is to be continued from references that show all of that
   photos  26 larger photographs and masks without poses, for structure from motion
 
 Poses are written in a scene frame of arbitrary scale, rotation and origin, as SfM leaves it. As in SPIn-NeRF the
@@ -186,7 +186,7 @@ def _ask_outpainting(out: Path, session: Session, kind: Kind, world: World, fram
     masks = [beyond(camera, kind, world, center, SPHERE) for camera in session.cameras[: session.test]]
     _write_test_masks(out, session, masks)
     middle = session.middle - session.test
-    chosen = covering(session.cameras[session.test :], kind, world, center, middle, kind.references)
+    chosen = covering(session.cameras[session.test :], kind, world, center, middle)
     whole = {session.test + k: session.photos[session.test + k] for k in chosen}
     sphere = {"view": session.names[session.middle], "distance": frame.scale * AWAY}
     sphere |= {"radius": frame.scale * SPHERE, "outside": True}

@@ -26,7 +26,7 @@ class Kind:
         task: what the scene asks for: "remove" the object; "insert" it: the training views are without it, the test
             views and the references with it; "outpaint" what lies beyond a sphere, nothing else is changed; "sparse":
             nothing is changed, but few views have pixels.
-        references: how many views the scene brings completed.
+        references: how many views the scene brings completed; to be continued beyond a sphere, as many as show it all.
         shown: of so many training views the pixels may be used, the others are cameras only; 0: of all.
         least: share of the masks that no training view may show, at least.
         low: metres above the floor of the lowest cameras; None: all at the height of a person's eyes.
@@ -68,7 +68,7 @@ KINDS = {
     "corner": Kind(spread=30.0, place="corner", least=0.25),
     "grass": Kind(samples=2, spread=30.0, node=0.08, place="grass"),
     "insert": Kind(place="floor", task="insert", least=0, references=4),
-    "outpaint": Kind(spread=16.0, task="outpaint", least=0, references=4),
+    "outpaint": Kind(spread=16.0, task="outpaint", least=0),
     "pair": Kind(spread=30.0, place="pair", least=0.2, references=2),
     "sparse": Kind(spread=30.0, task="sparse", least=0, shown=4),
     "photos": Kind(width=480, height=360, train=26, test=0, photos=True, texture=2048, node=0.025),

@@ -11,6 +11,7 @@ from world import World
 
 ROOM_FOR_IT = 1.08  # radius of the region over that of the object within
 GRID, NEAR = 61, 0.03  # every so many-th pixel tells what is covered; relative depth within which a point is shown
+COVERED = 0.995  # of what lies beyond the sphere and the views show: what references show of it, at least
 SPHERE = 0.95  # metres: radius of the sphere beyond which the scene is to be continued
 
 
@@ -49,9 +50,9 @@ def beyond(camera: np.ndarray, kind: Kind, world: World, center: np.ndarray, rad
     return offset @ offset - (along @ offset) ** 2 > radius**2
 
 
-def covering(cameras: np.ndarray, kind: Kind, world: World, center: np.ndarray, first: int, count: int) -> list[int]:
-    """So many cameras, `first` and then each the one that shows most of what lies beyond the sphere and no earlier one
-    shows."""
+def covering(cameras: np.ndarray, kind: Kind, world: World, center: np.ndarray, first: int) -> list[int]:
+    """Cameras that show `COVERED` of what lies beyond the sphere: `first`, and then each the one that shows most of what
+    no earlier one shows."""
     depths, pooled = [], []
     for camera in cameras:
         points, _ = rays(camera, kind, world)
@@ -60,7 +61,7 @@ def covering(cameras: np.ndarray, kind: Kind, world: World, center: np.ndarray, 
     points = np.concatenate(pooled)
     shown = np.stack([_seen(points, *each, kind) for each in zip(cameras, depths, strict=True)])
     chosen = [first]
-    while len(chosen) < count:
+    while shown[chosen].any(0).mean() < COVERED * shown.any(0).mean():
         chosen.append(int((shown & ~shown[chosen].any(0)).sum(1).argmax()))
     return chosen
 

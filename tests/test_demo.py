@@ -210,7 +210,7 @@ def test_insertion_and_outpainting_are_asked_for_by_scene_files(generate, tmp_pa
     assert 0.02 < differs.mean() < 0.25 and said["insert"]["region"]["radius"] > 0
     assert np.median(depth[differs]) < 0.9 * np.median(depth[~differs])
     mask = load_mask(tmp_path / "outpaint/images_4/test_label/out_00000.png")
-    assert not mask[24, 32] and mask[0, 0] and len(said["outpaint"]["reference"]) == 4
+    assert not mask[24, 32] and mask[0, 0] and 3 <= len(said["outpaint"]["reference"]) <= 9
     assert said["outpaint"]["region"]["outside"]
 
 
