@@ -13,7 +13,7 @@ A furnished room is ray-cast with and without one object. Kinds:
   sparse  nothing to remove; of four training views alone the pixels may be used, the others are cameras
   grass   an object on a lawn before a hedge: thousands of blades and leaves, nothing flat
   insert  the same turned round: an object on the floor, in the test views and four references only; it is to be put in
-  outpaint  the room as photographed, and a sphere beyond which it is to be continued from references that show all of that
+  outpaint  the room as photographed, and a sphere beyond which references that show all of that continue it
   photos  26 larger photographs and masks without poses, for structure from motion
 
 Poses are written in a scene frame of arbitrary scale, rotation and origin, as SfM leaves it. As in SPIn-NeRF the

@@ -51,8 +51,8 @@ def beyond(camera: np.ndarray, kind: Kind, world: World, center: np.ndarray, rad
 
 
 def covering(cameras: np.ndarray, kind: Kind, world: World, center: np.ndarray, first: int) -> list[int]:
-    """Cameras that show `COVERED` of what lies beyond the sphere: `first`, and then each the one that shows most of what
-    no earlier one shows."""
+    """Cameras that show `COVERED` of what lies beyond the sphere: `first`, then each the one that shows most of what no
+    earlier one shows."""
     depths, pooled = [], []
     for camera in cameras:
         points, _ = rays(camera, kind, world)
