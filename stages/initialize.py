@@ -241,7 +241,8 @@ def completed_further(params: Params, out: Path, gaussians, new, around, true):
     """Views put together from patches of the photographs and of the `true` pictures, the one with most that nothing
     covers first; the Gaussians with what they show, the labels, and the views."""
     further: list[Reference] = []
-    found = coverage.open_pixels(gaussians, new, around, around.cameras)
+    images = coverage.mirrored(around)
+    found = coverage.open_pixels(gaussians, new, around, around.cameras, images)
     haze = coverage.haze(gaussians, new, around, found, LEAK)
     gaussians, new = gaussians.map(lambda p: p[~haze]), new[~haze]
     looked = replace(around.looked(), completed=coverage.completed(true, gaussians, around))
@@ -265,7 +266,8 @@ def completed_further(params: Params, out: Path, gaussians, new, around, true):
             continue
         save_image(out / "further" / f"{camera.name}.png", picture)
         further.append(reference)
-        found |= coverage.open_pixels(gaussians, new, around, [c for c in around.cameras if found[c.name].any()])
+        bare = [each for each in around.cameras if found[each.name].any()]
+        found |= coverage.open_pixels(gaussians, new, around, bare, images)
         if found[camera.name].sum() > LITTLE * mask.sum():  # once more would find as little
             found[camera.name] = np.zeros_like(mask)
     return gaussians, new, further

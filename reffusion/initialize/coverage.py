@@ -22,9 +22,20 @@ NARROW = 0.02  # of the image's width: a gap up to so wide shows no texture
 ENOUGH = 0.001  # share of a view's C under which what is open is left to its neighbours
 
 
+def mirrored(around: Surroundings) -> dict[str, np.ndarray]:
+    """View name -> [H, W], the depth of the mirror images that are supposed to be in C, infinite elsewhere; none where
+    nothing is mirrored."""
+    image = lambda camera: imaged(around.mirrors, camera, around.hidden[camera.name], around.views).supposed
+    return {camera.name: image(camera) for camera in around.cameras} if around.mirrors else {}
+
+
 @torch.no_grad()
 def open_pixels(
-    gaussians: Gaussians, new: Tensor, around: Surroundings, cameras: Sequence[Camera]
+    gaussians: Gaussians,
+    new: Tensor,
+    around: Surroundings,
+    cameras: Sequence[Camera],
+    mirrored: Mapping[str, np.ndarray],
 ) -> dict[str, np.ndarray]:
     """View name -> bool [H, W], pixels of C that nothing covers, or that show something else than a mirror image which
     is supposed to be there.
@@ -36,18 +47,17 @@ def open_pixels(
         hidden = around.hidden[camera.name]
         drawn = rasterizer.render(gaussians, camera, features=new[:, None].to(gaussians.means.dtype), sh_degree=0)
         bare = drawn.alpha.cpu().numpy() <= OPAQUE
-        if around.mirrors:
-            bare |= _else_than_image(drawn, camera, around)
+        if camera.name in mirrored:
+            bare |= _else_than(mirrored[camera.name], drawn, around.undecided[camera.name])
         speck, gap = 0.01 * camera.width, 0.02 * camera.width
         found[camera.name] = voting.tidy(hidden & bare, speck, gap) & hidden
     return found
 
 
-def _else_than_image(drawn: Rendering, camera: Camera, around: Surroundings) -> np.ndarray:
+def _else_than(image: np.ndarray, drawn: Rendering, undecided: np.ndarray) -> np.ndarray:
     """bool [H, W]: before the image stands what no photograph shows, and no reference put there, or nothing does."""
     depth, new = (each.cpu().numpy() for each in (drawn.depth, drawn.features[..., 0] > 0.5))
-    image = imaged(around.mirrors, camera, around.hidden[camera.name], around.views).supposed
-    before = (depth < (1 - EDGE) * image) & ~new & around.undecided[camera.name]
+    before = (depth < (1 - EDGE) * image) & ~new & undecided
     return np.isfinite(image) & (before | (image < (1 - EDGE) * depth))
 
 
