@@ -121,7 +121,7 @@ def surroundings(params: Params, scene, gaussians, thing, sets, poses: Path, fit
     consistent = {name: each.consistent for name, each in sets.items()}
     unknown = {name: each.undecided for name, each in sets.items()}
     place = (found.planes, scene.points, found.centre, found.radius, found.mirrors)
-    return filling.Surroundings(train, consistent, photos, found.views, *place, unknown)
+    return filling.Surroundings(train, consistent, photos, found.views, *place, unknown, frozenset(scene.blank))
 
 
 def at_random(params: Params, removed, remaining, scene, sets, poses: Path):
@@ -246,7 +246,8 @@ def completed_further(params: Params, out: Path, gaussians, new, around, true):
     haze = coverage.haze(gaussians, new, around, found, LEAK)
     gaussians, new = gaussians.map(lambda p: p[~haze]), new[~haze]
     looked = replace(around.looked(), completed=coverage.completed(true, gaussians, around))
-    while len(further) < params.further and (camera := coverage.barest(around, found)):
+    cameras = coverage.beside_photographs(around)
+    while len(further) < params.further and (camera := coverage.barest(cameras, around, found)):
         mask, hidden = found[camera.name], around.hidden[camera.name]
         # Just outside C a photograph may still show the object's rim, which would be repeated.
         rimmed = margin.widened(hidden, surfaces.RIM)
@@ -266,7 +267,7 @@ def completed_further(params: Params, out: Path, gaussians, new, around, true):
             continue
         save_image(out / "further" / f"{camera.name}.png", picture)
         further.append(reference)
-        bare = [each for each in around.cameras if found[each.name].any()]
+        bare = [each for each in cameras if found[each.name].any()]
         found |= coverage.open_pixels(gaussians, new, around, bare, images)
         if found[camera.name].sum() > LITTLE * mask.sum():  # once more would find as little
             found[camera.name] = np.zeros_like(mask)

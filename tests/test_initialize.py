@@ -166,7 +166,7 @@ def test_what_is_painted_on_the_new_surface_stays_in_place_from_the_other_side()
     depth, picture = floor(view)
     reference = Reference(view, (picture * 255).round().astype(np.uint8), np.ones(depth.shape, bool))
     nothing = surface_gaussians(picture, depth, np.zeros(depth.shape, bool), view, sh_count=1)
-    around, errors = rules.Surroundings([], {}, {}, [], [], np.zeros((0, 3)), np.zeros(3), 1.0, [], {}), []
+    around, errors = rules.Surroundings([], {}, {}, [], [], np.zeros((0, 3)), np.zeros(3), 1.0, [], {}, frozenset()), []
     for how in (replace(SHEETS, opacity=0.95, sunk=0.0, spread=0.4), SHEETS):
         drawn, _ = rules.placed(
             nothing, torch.zeros(0, dtype=torch.bool), reference, depth, reference.mask, around, how

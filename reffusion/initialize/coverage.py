@@ -19,6 +19,7 @@ from reffusion.types import Camera, Gaussians, Reference, Rendering
 
 EDGE = 0.03  # relative depth: of a step between two things, and within which two surfaces are the same
 NARROW = 0.02  # of the image's width: a gap up to so wide shows no texture
+BESIDE = 45.0  # degrees between the axis of a camera without a photograph and that of the nearest with one
 ENOUGH = 0.001  # share of a view's C under which what is open is left to its neighbours
 
 
@@ -82,9 +83,18 @@ def completed(
     return found
 
 
-def barest(around: Surroundings, found: Mapping[str, np.ndarray]) -> Camera | None:
-    """The view with the most open pixels; None where in each they are too few to count."""
-    bare = [c for c in around.cameras if found[c.name].sum() > ENOUGH * max(around.hidden[c.name].sum(), 1)]
+def beside_photographs(around: Surroundings) -> list[Camera]:
+    """The cameras from where views are completed: not those without a photograph that look from another side than all
+    photographs. What is made up there knows nothing of what stands there, and may hide what photographs show."""
+    axis = lambda camera: camera.world_to_camera[2, :3]
+    taken = np.stack([axis(camera) for camera in around.cameras if camera.name not in around.blank])
+    near = lambda camera: float((taken @ axis(camera)).max()) > np.cos(np.radians(BESIDE))
+    return [camera for camera in around.cameras if camera.name not in around.blank or near(camera)]
+
+
+def barest(cameras: Sequence[Camera], around: Surroundings, found: Mapping[str, np.ndarray]) -> Camera | None:
+    """The camera of whose view most is open; None where in each it is too little to count."""
+    bare = [c for c in cameras if found[c.name].sum() > ENOUGH * max(around.hidden[c.name].sum(), 1)]
     return max(bare, key=lambda camera: int(found[camera.name].sum()), default=None)
 
 

@@ -132,6 +132,7 @@ class Surroundings:
         points: [P, 3] sparse points of the scene.
         centre: [3], the object's middle. radius: of most of it; infinite where there is none.
         mirrors: of things around the object. undecided: view name -> bool [H, W], what of C no photograph shows.
+        blank: names of the cameras without a photograph.
     """
 
     cameras: Sequence[Camera]
@@ -144,6 +145,7 @@ class Surroundings:
     radius: float
     mirrors: Sequence[Mirror]
     undecided: Mapping[str, np.ndarray]
+    blank: frozenset[str]
 
     def looked(self) -> Around:
         """What of this pictures are completed by."""
