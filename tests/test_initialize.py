@@ -160,6 +160,17 @@ def floor(view: Camera) -> tuple[np.ndarray, np.ndarray]:
     return depth, np.repeat(light[..., None], 3, 2)
 
 
+def test_no_view_is_completed_from_behind_where_nobody_photographed():
+    at = np.array([0.0, 0.0, 0.2])
+    turns = {"photographed": 0, "beside": 40, "before the other": 205, "behind": 110, "the other": 180}
+    cameras = [small.looking(name, angle, 0.5, 2.0, at, 32, 40.0) for name, angle in turns.items()]
+    blank = frozenset({"beside", "before the other", "behind"})
+    around = rules.Surroundings(cameras, {}, {}, [], [], np.zeros((0, 3)), at, 1.0, [], {}, blank)
+    assert [camera.name for camera in coverage.beside_photographs(around)] == [n for n in turns if n != "behind"]
+    everywhere = replace(around, blank=frozenset())
+    assert coverage.beside_photographs(everywhere) == cameras, "with photographs all views are"
+
+
 def test_what_is_painted_on_the_new_surface_stays_in_place_from_the_other_side():
     """Opaque neighbours hide each other: colours that are right in the reference slide away in the opposite view."""
     view, opposite = floor_view(0.0), floor_view(180.0)

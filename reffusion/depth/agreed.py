@@ -14,21 +14,23 @@ import numpy as np
 
 from reffusion import geometry, seeding
 from reffusion.depth import patchmatch
-from reffusion.depth.between import Known, SparsePoints, depth_between, known
+from reffusion.depth.between import UNIT, Known, SparsePoints, depth_between, known
 from reffusion.kernels.compiled import side_by_side
 from reffusion.types import Camera
 
 COMPARED, APART = 3, 70.0  # so many others, whose axes differ by less than so many degrees
 CONFIRMED = 0.01  # relative depth within which two photographs' surfaces are the same
 CONTRADICTED = 0.05  # relative depth by which another photograph sees farther
-SPACING = 3  # px of a picture `patchmatch.UNIT` wide: the grid of what photographs agree on that others ask
+SPACING = 3  # px of a picture `UNIT` wide: the grid of what photographs agree on that others ask
 
 
 @dataclass(frozen=True)
 class Agreed:
-    """Attributes:
-    depth: [H, W] float64 camera z. sure: bool [H, W], another photograph shows the same surface there.
-    wrong: bool [H, W], another one that is sure sees past it.
+    """What is known of a view's depth.
+
+    Attributes:
+        depth: [H, W] float64 camera z. sure: bool [H, W], another photograph shows the same surface there.
+        wrong: bool [H, W], not sure, and another photograph that is sees past it.
     """
 
     depth: np.ndarray
@@ -118,10 +120,10 @@ def _beside(
         return depth
     columns, rows = said.pixels.astype(int).T
     refuted = sure[rows, columns]  # or as good as told by the pixel itself
-    spacing = max(1, round(SPACING * view.width / patchmatch.UNIT))
+    spacing = max(1, round(SPACING * view.width / UNIT))
     grid = np.zeros(sure.shape, bool)
     grid[::spacing, ::spacing] = True
     at = np.argwhere(sure & grid)
     found = Known(at[:, ::-1] + 0.5, planes[tuple(at.T)], 1 / depth[tuple(at.T)])
-    between = depth_between(said.taken(~refuted).and_(found), view, image)
+    between = depth_between(said.taken(~refuted).joined(found), view, image)
     return depth if between is None else np.where(sure, depth, between)

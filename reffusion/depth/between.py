@@ -74,7 +74,7 @@ class Known:
     def taken(self, which: np.ndarray) -> Known:
         return Known(self.pixels[which], self.planes[which], self.disparity[which])
 
-    def and_(self, more: Known) -> Known:
+    def joined(self, more: Known) -> Known:
         both = zip((self.pixels, self.planes, self.disparity), (more.pixels, more.planes, more.disparity), strict=True)
         return Known(*(np.concatenate(each) for each in both))
 

@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 
 from reffusion import geometry
+from reffusion.depth.between import UNIT
 from reffusion.kernels.compiled import kernel, parallel_for
 from reffusion.kernels.vectors import take_ticket
 from reffusion.types import Camera
 
-ROUNDS = 3  # each halves what a plane is changed by
-HALF, STRIDE = 5, 2  # of pixels `UNIT` wide: a window's half side, and the way from sample to sample
-UNIT = 320  # pixels are counted as if pictures were so wide
+ROUNDS = 3
+HALF, STRIDE = 5, 2  # px of a picture `UNIT` wide: a window's half side, and the way from sample to sample
 COLOUR, REACH = 36.0, 8.0  # levels (the sum of three channels) and pixels over which a sample's weight falls to 1/e
 FLAT = 2.0  # levels of 255: what deviates less looks like anything
 DOUBT, FAR = 0.1, 0.02  # a cost for depth that is not the believed one, in full at this relative disparity
@@ -62,12 +62,10 @@ def tangents(disparity: np.ndarray, rays: np.ndarray) -> np.ndarray:
     """[H, W, 3]: the planes that touch a map of disparity [H, W]; at a step, those of the flatter side."""
     slopes = []
     for axis, apart in ((1, rays[0, 1, 0] - rays[0, 0, 0]), (0, rays[1, 0, 1] - rays[0, 0, 1])):
-        change = np.diff(disparity, axis=axis)
-        ends = [(0, 0), (0, 0)]
-        before, after = list(ends), list(ends)
-        before[axis], after[axis] = (1, 0), (0, 1)
-        behind, ahead = (np.pad(change, each, mode="edge") for each in (before, after))
-        flatter = np.where(np.abs(behind) < np.abs(ahead), behind, ahead) / apart
+        change = np.diff(disparity, axis=axis) / apart
+        first, last = (np.take(change, [end], axis) for end in (0, -1))
+        behind, ahead = np.concatenate([first, change], axis), np.concatenate([change, last], axis)
+        flatter = np.where(np.abs(behind) < np.abs(ahead), behind, ahead)
         slopes.append(cv2.medianBlur(flatter.astype(np.float32), 5).astype(np.float64))
     x, y = slopes
     return np.stack([x, y, disparity - x * rays[..., 0] - y * rays[..., 1]], -1)

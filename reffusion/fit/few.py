@@ -35,8 +35,8 @@ def surfaces(
     hidden: Mapping[str, np.ndarray],
     params: Params,
 ) -> Gaussians | None:
-    """All that the first view shows, and of each further one what those before it do not; None where the scene has too
-    few sparse points for that.
+    """What photographs agree on: all that the first view shows of it, and of each further one what those before it do
+    not; then the rest likewise. None where the scene has too few sparse points for that.
 
     Args:
         cameras: the training views. images: view name -> uint8 [H, W, 3].
@@ -47,20 +47,19 @@ def surfaces(
     if len(points) <= NORMAL_FROM:
         return None
     told, found = agreed(SparsePoints.of(points, colors), cameras, images, hidden, params.seed), None
-    for certain in (True, False):
-        for camera in cameras:
-            if camera.name not in told:
-                continue
-            image, depth = images[camera.name], told[camera.name].depth
-            wanted = told[camera.name].sure if certain else ~told[camera.name].sure & ~told[camera.name].wrong
-            wanted &= ~hidden.get(camera.name, np.zeros(depth.shape, bool)) & ~beside_nearer(depth)
-            if found is not None:
-                drawn = rasterizer.render(found, camera, sh_degree=0)
-                there, thick = drawn.depth.cpu().numpy(), drawn.alpha.cpu().numpy() >= COVERED
-                wanted &= ~(thick & (there < BEFORE * depth))
-            added = surface(image, depth, wanted, camera, (params.sh.degree + 1) ** 2, Sheets())
-            added = replace(added.map(lambda p: p.to(params.device)), antialiased=params.antialiased)
-            found = added if found is None else found.zipped(added, lambda a, b: torch.cat([a, b]))
+    looked = [camera for camera in cameras if camera.name in told]
+    passes = [(camera, told[camera.name].sure) for camera in looked]
+    passes += [(camera, ~told[camera.name].sure & ~told[camera.name].wrong) for camera in looked]
+    for camera, pixels in passes:
+        depth = told[camera.name].depth
+        wanted = pixels & ~beside_nearer(depth) & np.logical_not(hidden.get(camera.name, False))
+        if found is not None:
+            drawn = rasterizer.render(found, camera, sh_degree=0)
+            there, thick = drawn.depth.cpu().numpy(), drawn.alpha.cpu().numpy() >= COVERED
+            wanted &= ~(thick & (there < BEFORE * depth))
+        added = surface(images[camera.name], depth, wanted, camera, (params.sh.degree + 1) ** 2, Sheets())
+        added = replace(added.map(lambda p: p.to(params.device)), antialiased=params.antialiased)
+        found = added if found is None else found.zipped(added, lambda a, b: torch.cat([a, b]))
     return found
 
 
