@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[2]
 STAGES = ("poses", "fit", "masks", "reference", "initialize", "personalize", "distill", "evaluate")
 VIEWS, PIXELS = (30, 60, 120, 300), (0.3, 0.6, 1.2, 2.0)  # megapixels
 WIDE, HIGH = 4, 3
-TENTH = "fit.iterations=190 personalize.steps=15 distill.iterations=15 initialize.settle=30 poses.longest=0 "
+TENTH = "fit.iterations=190 personalize.steps=15 distill.iterations=15 initialize.settle=30 poses.longest=4000 "
 TENTH += "distill.sds.run=always"
 SAMPLES, TEST = 1, 4  # rays a side of a pixel, so that large scenes are made in minutes; test views
 MAKE = """
@@ -101,8 +101,8 @@ def main() -> None:
     out = given.out.resolve()
     os.makedirs(out / "runs", exist_ok=True)
     asked = {
-        "training views of 0.3 megapixels": [(views, given.pixels[0]) for views in given.views],
-        "megapixels of 30 views": [(given.views[0], each) for each in given.pixels],
+        f"training views of {given.pixels[0]} megapixels": [(views, given.pixels[0]) for views in given.views],
+        f"megapixels of {given.views[0]} views": [(given.views[0], each) for each in given.pixels],
     }
     found: dict[str, dict[str, dict[str, list[float]]]] = {}
     for axis, (of, scenes) in enumerate(asked.items()):
