@@ -85,7 +85,7 @@ def draw(found: dict[str, dict[str, dict[str, list[float]]]], path: Path) -> Non
                 axes.plot(told["size"], told[what], "o-", label=f"{stage} {exponent(told['size'], told[what]):.2f}")
             axes.set(xscale="log", yscale="log", xlabel=of, ylabel={"cpu": "CPU seconds", "mb": "memory (MB)"}[what])
             charts.plain_ticks(axes)
-            axes.legend(frameon=False, fontsize=7)
+            axes.legend(frameon=False, fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
     charts.save(made, path)
 
 
