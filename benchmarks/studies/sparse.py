@@ -80,6 +80,8 @@ def draw(found: dict[str, dict[str, list[dict[str, float]]]], path: Path) -> Non
             axes.plot([int(count) for count in counts], means, "o-", color=COLOURS[way], label=way)
         axes.set(xscale="log", xlabel="views with pixels", ylabel=title)
         charts.plain_ticks(axes)
+        counts = sorted({int(count) for each in found.values() for count in each})
+        axes.set_xticks(counts, [str(count) for count in counts])
     grid[0, 0].legend(frameon=False, fontsize=9)
     charts.save(made, path)
 
