@@ -51,7 +51,7 @@ def run(params: Params, out: Path, *, poses: Path) -> None:
     else:
         first = start(params, *start_points(params, scene, cameras, even, hidden))
     views = (cameras, images, first)
-    weights = {name: (~mask).astype("float32") for name, mask in hidden.items()}
+    weights = {name: ~mask for name, mask in hidden.items()}
     spent, lasting = lambda: time.monotonic() - began, lambda steps: params.changed({"iterations": steps})
     tried = lambda folder, steps: fit(
         *views, lasting(steps), folder=folder, weights=weights, rates=rates, gains=exposed

@@ -46,7 +46,7 @@ def settle(gaussians: Gaussians, known: Known, steps: int, seed: int, folder: Pa
         FloatingPointError: see `fit`.
     """
     views, images = list(known.cameras), dict(known.photos)
-    weights = {name: (~mask).astype(np.float32) for name, mask in known.hidden.items()}
+    weights = {name: ~mask for name, mask in known.hidden.items()}
     for number, (reference, turns) in enumerate(zip(known.references, turns_of(known), strict=True)):
         window, image, counts = around(reference)
         for copy in range(turns):

@@ -66,12 +66,12 @@ def planes_around(centre: np.ndarray, radius: float, views: Sequence[Witness], s
     mapped = [_mapped(*plane, centre, REACH * radius, views) for plane in found]
     planes = [plane for plane, _ in mapped]
     grounds = [_crossing(plane, planes[:k]) for k, plane in enumerate(planes)]
-    facings = [_facing(view) for view in views] if any(grounds) else []
+    # What may be the one or the other is the better supported one's, unless it faces as this one does.
+    faced = _faced(planes, grounds, views)
     whole = []
-    for (plane, hidden), below in zip(mapped, grounds, strict=True):
-        if below:  # what may be the one or the other is the better supported one's, unless it faces as this one does
-            plane = replace(plane, seen=plane.seen & _faces_so(plane, below, views, facings))
-        whole.append(_continued(plane, hidden, below, _crossing(plane, planes), band))
+    for (plane, hidden), below, so in zip(mapped, grounds, faced, strict=True):
+        own = replace(plane, seen=plane.seen & so)
+        whole.append(_continued(own, hidden, below, _crossing(own, planes), band))
     return whole
 
 
@@ -234,20 +234,28 @@ def _continued(
     return replace(plane, goes_on=goes_on, within=within)
 
 
-def _faces_so(
-    plane: Plane, others: Sequence[Plane], views: Sequence[Witness], facings: Sequence[np.ndarray]
-) -> np.ndarray:
-    """bool [CELLS, CELLS]: of the views that show a surface at a cell, most show one that faces rather as the plane
-    does than as one of the others, which cross it."""
-    points = plane.cells.reshape(-1, 3)
-    likewise, shown = np.zeros((2, len(points)), np.int64)
-    for view, facing in zip(views, facings, strict=True):
-        on = seen_by(view, points)
-        there, _ = geometry.sample_nearest(facing, geometry.project(points, view.camera)[0])
-        shown += on
-        other = np.max([np.abs(there @ each.normal) for each in others], 0)
-        likewise += on & (np.abs(there @ plane.normal) > RATHER * other)
-    return (2 * likewise > shown).reshape(plane.seen.shape)
+def _faced(planes: Sequence[Plane], grounds: Sequence[Sequence[Plane]], views: Sequence[Witness]) -> list[np.ndarray]:
+    """For each plane bool [CELLS, CELLS]: of the views that show a surface at a cell, most show one that faces rather
+    as the plane does than as one of its grounds, which cross it; everywhere where it has none.
+
+    A view's normals take more room than all else that is known of it, so they are there for one at a time.
+    """
+    cells = [plane.cells.reshape(-1, 3) for plane in planes]
+    likewise, shown = ([np.zeros(len(points), np.int64) for points in cells] for _ in range(2))
+    for view in views if any(grounds) else ():
+        facing = _facing(view)
+        for k, (plane, below) in enumerate(zip(planes, grounds, strict=True)):
+            if not below:
+                continue
+            on = seen_by(view, cells[k])
+            there, _ = geometry.sample_nearest(facing, geometry.project(cells[k], view.camera)[0])
+            other = np.max([np.abs(there @ each.normal) for each in below], 0)
+            shown[k] += on
+            likewise[k] += on & (np.abs(there @ plane.normal) > RATHER * other)
+    return [
+        (2 * likewise[k] > shown[k]).reshape(plane.seen.shape) if grounds[k] else np.ones_like(plane.seen)
+        for k, plane in enumerate(planes)
+    ]
 
 
 def _facing(view: Witness) -> np.ndarray:
