@@ -137,7 +137,7 @@ def train_views(
         if name in shadowed:
             supervises &= ~load_mask(shadowed[name])
         lifted = place(painted[name]) / 255 if name in painted else None
-        photo = place(photos.get(name, np.zeros((*repaint.shape, 3), np.uint8))) / 255
+        photo = place(photos.get(name, np.zeros((*repaint.shape, 3), np.uint8)))
         views.append(TrainView(scene.cameras[name], photo, place(supervises), place(repaint), clean, lifted))
     return views
 

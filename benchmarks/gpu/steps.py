@@ -45,7 +45,7 @@ def reconstruction(bench: Bench) -> dict[str, Any]:
 
 def reference(bench: Bench) -> dict[str, Any]:
     (scene, masked), view = bench.scene(), full_size.train_view(bench.sizes.rows, bench.device)
-    return bench.measured(lambda: term(scene, reference_term(scene, masked, view.camera, view.photo, view.repaint)[0]))
+    return bench.measured(lambda: term(scene, reference_term(scene, masked, view.camera, view.picture, view.repaint)[0]))
 
 
 def personalization(bench: Bench) -> dict[str, Any]:
@@ -101,7 +101,7 @@ def adversarial(bench: Bench) -> dict[str, Any]:
 
     def step() -> dict[str, float]:
         draw = generator(0, "patches")
-        loss, _, said = adversarial_term(scene, masked, view, view.photo, view.repaint, critic, draw)
+        loss, _, said = adversarial_term(scene, masked, view, view.picture, view.repaint, critic, draw)
         term(scene, loss)
         return said
 

@@ -38,7 +38,7 @@ class TrainView:
 
     Attributes:
         camera: the view.
-        photo: [H, W, 3] float32 in [0, 1].
+        photo: [H, W, 3] uint8, which of hundreds of views takes a quarter of the room, or float32 in [0, 1].
         supervises: [H, W] bool, the pixels whose photo may be reconstructed: outside C, all of a clean view.
         repaint: [H, W] bool, what is made up, and the UNet repaints; empty where the view is not distilled.
         clean: the object is absent from this view.
@@ -52,6 +52,11 @@ class TrainView:
     clean: bool
     lifted: Tensor | None = None
 
+    @property
+    def picture(self) -> Tensor:
+        """The photo, [H, W, 3] float32 in [0, 1]."""
+        return self.photo / 255 if self.photo.dtype == torch.uint8 else self.photo
+
 
 def reconstruction_term(
     gaussians: Gaussians, masked: Tensor, view: TrainView, probe: Tensor | None = None
@@ -62,7 +67,7 @@ def reconstruction_term(
     """
     select = torch.ones_like(masked) if view.clean else ~masked
     rendering = render(confine(gaussians, select), view.camera, probe=probe)
-    return reconstruction_loss(rendering.color, view.photo, view.supervises), rendering
+    return reconstruction_loss(rendering.color, view.picture, view.supervises), rendering
 
 
 def reference_term(
@@ -111,7 +116,7 @@ def sds_term(
     rendering = render(confine(gaussians, masked), view.camera, probe=reached)
     color = displayed(rendering.color)
     drawn = enlarged(color.permute(2, 0, 1) * 2 - 1, size)
-    shown = torch.where(view.supervises[..., None], view.photo, color.detach())
+    shown = torch.where(view.supervises[..., None], view.picture, color.detach())
     shown = enlarged(shown.permute(2, 0, 1) * 2 - 1, size)
     hole = enlarged(view.repaint.to(drawn)[None], size)[0] > 1e-4
 
