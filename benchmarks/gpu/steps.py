@@ -45,7 +45,9 @@ def reconstruction(bench: Bench) -> dict[str, Any]:
 
 def reference(bench: Bench) -> dict[str, Any]:
     (scene, masked), view = bench.scene(), full_size.train_view(bench.sizes.rows, bench.device)
-    return bench.measured(lambda: term(scene, reference_term(scene, masked, view.camera, view.picture, view.repaint)[0]))
+    return bench.measured(
+        lambda: term(scene, reference_term(scene, masked, view.camera, view.picture, view.repaint)[0])
+    )
 
 
 def personalization(bench: Bench) -> dict[str, Any]:
