@@ -14,15 +14,14 @@ from reffusion.depth import behind, billboard, monocular
 from reffusion.depth.behind import Completion
 from reffusion.fit import exposure
 from reffusion.gaussians.sheets import Sheets
-from reffusion.initialize import coverage, filling, scatter
+from reffusion.initialize import coverage, filling, scatter, shadows, sharing
 from reffusion.initialize.gain import Gain, estimated
 from reffusion.initialize.settle import Known, settle
 from reffusion.io.arrays import load_json, load_labels, save_json, save_labels
 from reffusion.io.images import save_exr, save_image, save_mask
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_mask_sets, load_object, load_references, load_scene
-from reffusion.masks import regions, taint, undecided, voting
-from reffusion.masks.witness import with_photographed_depth
+from reffusion.masks import regions, undecided, voting
 from reffusion.paint import margin, paint2d
 from reffusion.params.initialize import Params
 from reffusion.prior import inpaint
@@ -64,16 +63,16 @@ def run(
     if params.tidy and params.start != "nothing":  # where nothing is put in its place, haze is better than a black hole
         haze = voting.leaking(gaussians, train, {c.name: sets[c.name].undecided for c in train}, LEAK)
     gaussians, new = gaussians.map(lambda p: p[~haze]), new[~haze]
-    best = load_json(masks / "facts.json")["best_reference"]
-    log = trace.Trace(out) if references else None
-    holes = [each for each in references if each.mask.any()]
-    for each in sorted(holes, key=lambda r: (r.camera.name != best, -int(r.mask.sum()))):
-        gaussians, new = filled(params, out, gaussians, new, each, around, network, log)
+    if references:
+        best = load_json(masks / "facts.json")["best_reference"]
+        gaussians, new = from_references(params, out, gaussians, new, references, best, around, network)
     if references and params.start == "reference":
         sets = narrowed(out, gaussians, new, sets, around.cameras)
     true = true_pictures(reference, references, around) if references and params.start == "reference" else []
     if true and params.settle:
-        true, around = without_shadows(out, true, gaussians, around)
+        true, around, marks = shadows.without_shadows(true, gaussians, around)
+        for name, mask in marks.items():
+            save_mask(out / "tainted" / f"{name}.png", mask)
     further = []
     if true and params.further:
         gaussians, new, further = completed_further(params, out, gaussians, new, around, true)
@@ -142,10 +141,24 @@ def at_random(params: Params, removed, remaining, scene, sets, poses: Path):
     return added.map(lambda p: p.to(params.device))
 
 
-def filled(params: Params, out: Path, gaussians, new, reference, around, network, log, farthest=False):
-    """The Gaussians with those of one reference, on what is still empty in its mask, and the labels."""
+def from_references(params: Params, out: Path, gaussians, new, references, best, around, network):
+    """The Gaussians with those of the references, the `best` first, and the labels."""
+    log, shares = trace.Trace(out), {}
+    holes = [each for each in references if each.mask.any()]
+    holes.sort(key=lambda r: (r.camera.name != best, -int(r.mask.sum())))
+    if params.tidy:
+        shares = sharing.shares(gaussians, holes, around, HOW)
+    for each in holes:
+        share = shares.get(each.camera.name)
+        gaussians, new = filled(params, out, gaussians, new, each, around, network, log, share=share)
+    return gaussians, new
+
+
+def filled(params: Params, out: Path, gaussians, new, reference, around, network, log, farthest=False, share=None):
+    """The Gaussians with those of one reference, on what is still empty in its mask, or its share; and the labels."""
     camera, hidden = reference.camera, around.hidden[reference.camera.name]
-    sheets = Sheets(gloss=params.gloss and not farthest)  # a sliver tells nothing of shine
+    stays = reference.mask & ~hidden  # what is put in there has a shine of its own; and a sliver tells nothing of it
+    sheets = Sheets(gloss=params.gloss and not farthest and not stays.any())
     hole = filling.to_fill(gaussians, new, reference, hidden, COVERED)
     if farthest and around.mirrors:
         hole |= reference.mask  # also where something lies there, but behind a mirror image
@@ -161,7 +174,8 @@ def filled(params: Params, out: Path, gaussians, new, reference, around, network
         remaining, reference, hole, hidden, around.points, HOW, estimate, log, hints, farthest
     )
     drawn_over = over = np.zeros_like(hole)
-    if (stays := reference.mask & ~hidden).any():
+    leaves = share.leaves if share else drawn_over
+    if stays.any():
         shown = rasterizer.render(remaining, camera, sh_degree=0).depth.double().cpu().numpy()
         behind_it, drawn_over = np.where(shown > 0, shown, depth), hole & stays
         if reference.depth is None and estimate is None:
@@ -169,12 +183,12 @@ def filled(params: Params, out: Path, gaussians, new, reference, around, network
             depth, made_up = (np.where(drawn_over, stands, each) for each in (depth, made_up))
             said = f"{said}; a billboard, good within {billboard.GOOD_WITHIN} degrees, stands where the scene goes on"
         else:
-            back = coverage.before(gaussians, made_up, reference, hidden) & ~hole
-            drawn_over, depth = drawn_over | back, np.where(back, made_up, depth)
+            back = share.draws if share else coverage.before(gaussians, made_up, reference, hidden) & ~hole
+            drawn_over, depth = drawn_over & ~leaves | back, np.where(back, made_up, depth)
         over = drawn_over & ~coverage.beside_edges(depth, behind_it)
     print(f"depth of reference {camera.name}: {said}")
     save_exr(out / "depth" / f"{camera.name}.exr", depth.astype("float32"))
-    pixels = behind.grown(hole & ~drawn_over, OVERLAP) | over
+    pixels = behind.grown(hole & ~drawn_over & ~leaves, OVERLAP) & ~leaves | over
     gaussians, new = filling.placed(gaussians, new, reference, depth, pixels, around, sheets)
     if farthest or not params.tidy:  # what is open still is asked for view by view, or left
         return gaussians, new
@@ -204,37 +218,6 @@ def true_pictures(reference: Path, references: list, around) -> list:
     given = load_json(facts)["given"] if facts.exists() else []
     whole = lambda each: replace(each, mask=each.mask | around.hidden[each.camera.name])
     return [whole(each) if each.camera.name in given else each for each in references]
-
-
-def without_shadows(out: Path, true: list, gaussians, around):
-    """The references, standing also for what the object had tainted, and the surroundings with photographs in their
-    light; these say nothing where it is not known. Writes tainted/<view>.png where there is something."""
-    marks = {camera.name: np.zeros((camera.height, camera.width), bool) for camera in around.cameras}
-    silent, photos = dict(marks), dict(around.photos)
-    pictures = []
-    for each in true:
-        name = each.camera.name
-        hidden = around.hidden[name]
-        shown = inpaint.background(gaussians, each.camera, photos[name], hidden)
-        found = taint.tainted(each.image, shown, hidden)
-        if (each.mask & ~hidden).any():  # it draws something over what stays, which is no shadow, nor is its rim
-            found &= hidden
-        pictures.append(replace(each, mask=each.mask | found))
-        if not found.any():
-            continue
-        print(f"reference {name}: beside the hole {found.sum()} px differ from what is seen, a shadow perhaps")
-        depth = rasterizer.render(gaussians, each.camera, sh_degree=0).depth.double().cpu().numpy()
-        depth = with_photographed_depth(depth, each.camera, around.views)
-        brighter = taint.light(each.image, shown)
-        for view, (mask, light) in taint.carried(found, brighter, depth, each.camera, around.views).items():
-            photos[view] = taint.relit(photos[view], light)
-            marks[view], silent[view] = marks[view] | mask, silent[view] | (mask & np.isnan(light).any(-1))
-    if not any(mask.any() for mask in marks.values()):
-        return true, around
-    for name, mask in marks.items():
-        save_mask(out / "tainted" / f"{name}.png", mask)
-    views = [replace(view, hidden=view.hidden | silent[view.camera.name]) for view in around.views]
-    return pictures, replace(around, views=views, photos=photos)
 
 
 def completed_further(params: Params, out: Path, gaussians, new, around, true):

@@ -191,6 +191,7 @@ def test_depth_in_the_scenes_unit_stays_as_it_is():
     seen = z * rng.normal(1.01, 0.05, z.shape)
     everywhere = np.ones(z.shape, bool)
     assert np.array_equal(alignment.align_either(z, seen, everywhere)[0], z)
+    assert np.array_equal(alignment.align_either(z, 1.015 * z, everywhere)[0], z)  # no chance, though a line is exact
     other, _ = alignment.align_either(3 * z, seen, everywhere)
     assert 0.9 < np.median(other / z) < 1.1 and not np.array_equal(other, z)
 

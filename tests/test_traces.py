@@ -2,7 +2,6 @@
 
 import copy
 import json
-import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace

@@ -21,7 +21,7 @@ from reffusion.io.images import load_image, save_image
 SAMPLES = 3  # rays a side of a pixel
 DARKEST, SQUARES = 0.45, 3  # of the object's light; of its pattern, over half an edge
 LIGHT = (0.9, -0.2, 1.0)  # along the object's axes
-CELL = 12  # px: of so many a side the nearest sparse point counts
+CELL = 12  # px: of so many a side the nearest sparse points count
 SHADOW_AT, SHADOW_REACH = (-0.8, 0.15), (0.95, 0.8)  # of the object's height, along its first two axes
 
 
@@ -100,29 +100,26 @@ def drawn_into(
     return (both * 255 + 0.5).clip(0, 255).astype(np.uint8), (cover > 0).astype(np.uint8) * 255
 
 
-def depth(view: Pictured, camera: np.ndarray, thing: placing.Thing, ground: float) -> np.ndarray:
-    """[H, W] camera z of the object, of the surface up to `ground` times its height around its foot, elsewhere between
-    the sparse points that the view shows; NaN beyond them."""
+def depth(view: Pictured, camera: np.ndarray, thing: placing.Thing) -> np.ndarray:
+    """[H, W] camera z of the object, and elsewhere between the sparse points that the view shows; NaN beyond them."""
     ways, shape = view.coarse @ camera[:3, :3].T, (view.capture.height, view.capture.width)
     start = (camera[:3, 3] - thing.middle) @ thing.axes.T / thing.half
     far, hit, _, _ = (_cube if thing.shape == "box" else _ball)(ways @ thing.axes.T / thing.half, start, thing.half)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        surface = ((thing.foot - camera[:3, 3]) @ thing.normal) / (ways @ thing.normal)
-    at = camera[:3, 3] + np.where(np.isfinite(surface), surface, 0)[:, None] * ways
-    near = (surface > 0) & (np.linalg.norm(at - thing.foot, axis=1) < ground * thing.height)
-    return np.where(hit, far, np.where(near, surface, between_points(view, camera).ravel())).reshape(shape)
+    return np.where(hit, far, between_points(view, camera).ravel()).reshape(shape)
 
 
 def between_points(view: Pictured, camera: np.ndarray) -> np.ndarray:
-    """[H, W] camera z, linear between the capture's sparse points, of each CELL pixels the nearest; NaN beyond them."""
+    """[H, W] camera z, linear between the capture's sparse points, in CELL pixels those of the surface in front; NaN
+    beyond them."""
     image, z = view.capture.project(camera, view.capture.points)
     size = np.array([view.capture.width, view.capture.height])
     image, z = (each[(z > 0) & ((image >= 0) & (image < size)).all(1)] for each in (image, z))
-    order = np.argsort(z)
-    _, first = np.unique(image[order] // CELL, axis=0, return_index=True)
-    of = order[first]
+    _, cell = np.unique(image // CELL, axis=0, return_inverse=True)
+    nearest = np.full(cell.max() + 1, np.inf)
+    np.minimum.at(nearest, cell, z)
+    front = z < placing.SLACK * nearest[cell]
     columns, rows = np.meshgrid(*(np.arange(side) + 0.5 for side in size))
-    return LinearNDInterpolator(image[of], z[of])(columns, rows)
+    return LinearNDInterpolator(image[front], z[front])(columns, rows)
 
 
 def _cube(ways: np.ndarray, start: np.ndarray, half: np.ndarray):

@@ -1,9 +1,10 @@
 """An object removed from one place of a real capture and put in at another: `python -m benchmarks.studies.moving`.
 
-The training photographs show the object where it stood, with masks; three pictures of it at the other place are the
-references, each with the depth of the object, of the ground around its foot and between sparse points. The
-same object drawn there into all photographs is the truth, and a fit to them the ceiling. Writes moving.json and a sheet
-of all test views (truth, as photographed, ours, ceiling, difference) to --out.
+The training photographs show the object where it stood, with masks; as many pictures of it at the other place
+as show all of it are the references, each with its depth, around it between the sparse points. The same object
+drawn there into all photographs is the truth, and a fit to them the ceiling. Cameras stay as given, for by these the
+object was drawn. Writes moving.json and a sheet of all test views (truth, as photographed, ours, ceiling, difference)
+to --out.
 """
 
 from __future__ import annotations
@@ -19,8 +20,36 @@ from reffusion.io.arrays import save_json
 from reffusion.io.images import save_image
 
 ROOM_FOR_IT = 1.08  # radius of the region over that of the object
-GROUND = 0.9  # of the object's height: how far around its foot the depth of the ground is told
-REFERENCES = 3
+COVERED = 0.995  # of what photographs show of the object: what the references show of it, at least
+GRID = 12  # points along each edge of a face, by which is told how well a picture shows the object
+
+
+def showing(capture: placing.Photographs, thing: placing.Thing, names: list[str]) -> list[str]:
+    """The photographs that show `COVERED` of what all of them show of the object: each next one is that by which its
+    surface is seen most finely, each point in the picture that shows it best, beside the best of all."""
+    ticks = (np.arange(GRID) + 0.5) / GRID * 2 - 1
+    sides = np.stack(np.meshgrid(ticks, ticks), -1).reshape(-1, 2)
+    faces = [(axis, end) for axis in range(3) for end in (-1, 1) if (axis, end) != (2, -1)]  # it stands on that one
+    at = np.concatenate([np.insert(sides, axis, end, 1) for axis, end in faces])
+    normals = np.repeat(np.array([end * thing.axes[axis] for axis, end in faces]), len(sides), 0)
+    fine = np.stack(
+        [_fineness(capture, name, thing.middle + (at * thing.half) @ thing.axes, normals) for name in names]
+    )
+    fine = fine[:, fine.any(0)] / fine.max(0)[fine.any(0)]
+    chosen: list[int] = []
+    while (best := fine[chosen].max(0, initial=0)).astype(bool).mean() < COVERED:
+        chosen.append(int(np.maximum(fine, best).sum(1).argmax()))
+    return [names[k] for k in chosen]
+
+
+def _fineness(capture: placing.Photographs, name: str, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """[P], how finely a photograph shows points of these normals, [P, 3] both; 0 where it does not."""
+    camera = capture.cameras[name]
+    image, z = capture.project(camera, points)
+    framed = ((image >= 0) & (image < (capture.width, capture.height))).all(1) & (z > 0)
+    ways = camera[:3, 3] - points
+    facing = (ways * normals).sum(1) / np.linalg.norm(ways, axis=1)
+    return np.where(framed, np.sqrt(facing.clip(0)) / np.abs(z), 0)
 
 
 def write(start: placing.Place, goal: placing.Place, capture: placing.Photographs, out: Path) -> Path:
@@ -31,7 +60,7 @@ def write(start: placing.Place, goal: placing.Place, capture: placing.Photograph
     tints = np.random.default_rng(0).uniform(0.35, 0.9, (3, 3))
     scene, ceiling = (out / f"{start.name}-to-{goal.name}{end}" for end in ("", "-untouched"))
     train = [name for name in views.all if name not in views.test]
-    asked = [train[k] for k in np.linspace(0, len(train) - 1, REFERENCES).round().astype(int)]
+    asked = showing(capture, after, train)
     for folder in (scene, ceiling):
         shutil.rmtree(folder, ignore_errors=True)
     for name in views.all:
@@ -48,10 +77,10 @@ def write(start: placing.Place, goal: placing.Place, capture: placing.Photograph
         save_image(scene / f"masks/{name}.png", mask)
         if name in asked:
             save_image(scene / f"references/{name}.png", shown)
-            np.save(scene / f"references/{name}.npy", drawing.depth(pictured, camera, after, GROUND))
+            np.save(scene / f"references/{name}.npy", drawing.depth(pictured, camera, after))
     for folder in (scene, ceiling):
         drawing.write_meta(capture, views, folder)
-    tested = f"test_masks: test_masks\ntest: {drawing.listed(views.test)}\n"
+    tested = f"test_masks: test_masks\ntest: {drawing.listed(views.test)}\nstages: {{poses: {{refine: false}}}}\n"
     (ceiling / "scene.yaml").write_text(f"masks: none\n{tested}")
     given = "".join(
         f'- {{view: "{name}", image: references/{name}.png, depth: references/{name}.npy}}\n' for name in asked

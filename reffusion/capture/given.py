@@ -141,8 +141,8 @@ def load_depth(path: Path) -> np.ndarray:
     with np.errstate(over="ignore"):
         values = values.astype(np.float32)
     values[empty | ~np.isfinite(values)] = np.nan
-    if np.isnan(values).mean() > 0.9:
-        raise BadInput(f"{path}: nine tenths of it are 0 or not finite; a depth map needs values over the whole view")
+    if np.isnan(values).mean() > 0.99:
+        raise BadInput(f"{path}: hardly a pixel is more than 0 and finite; a depth map needs what is drawn, and around")
     if np.nanmin(values) == np.nanmax(values):
         raise BadInput(f"{path}: all its values are {np.nanmin(values):g}; that is no depth map")
     return values

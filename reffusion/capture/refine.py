@@ -62,8 +62,11 @@ def refined(cameras: Sequence[Camera], images: Mapping[str, np.ndarray]) -> Refi
     odd = [((m.pixels // cell).sum(1) % 2).astype(bool) for m in matches]
     fitted = [_part(m, ~o) for m, o in zip(matches, odd, strict=True)]
     kept = [_part(m, o) for m, o in zip(matches, odd, strict=True)]
+    before = misfit(kept, given, cell)  # of neighbours: those of the few views lie farther apart
+    if not before > ENOUGH:
+        return Refined(given, before, None)
     adjusted = _aligned(_adjusted(fitted, given), given)
-    before, after = misfit(kept, given, cell), misfit(kept, adjusted, cell)
+    after = misfit(kept, adjusted, cell)
     return Refined(adjusted, before, after) if after < GAIN * before else Refined(given, before, None)
 
 

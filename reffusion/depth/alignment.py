@@ -21,6 +21,7 @@ JURY = 500  # pixels that judge a trial: of 10% inliers 50 agree with the right 
 SUPPORTS = 32  # numbers of agreeing pixels that are looked at
 DISAGREES = 0.7  # of the spread of what is known: half the pixels missing by more, and a map says nothing of the scene
 AS_IT_IS = 1.5  # times the best fit's error, up to which a map counts as being in the scene's unit
+BY_CHANCE = 0.03  # relative error of a map as it is, up to which that it is in the scene's unit is no chance
 LEAST_DISPARITY = 0.02  # relative; a scene that varies less is flat, and any map that is right to this fits
 
 
@@ -254,6 +255,7 @@ def align_either(estimate: np.ndarray, depth: np.ndarray, known: np.ndarray) -> 
             f"disparity or more, and the scene's own varies by {spread / np.median(disparity):.0%}"
         )
     given = estimate[shown]
-    if (estimate[said] > 0).all() and np.median(np.abs(1 / given - disparity)) <= AS_IT_IS * error:
+    off = float(np.median(np.abs(geometry.reciprocal(given) - disparity)))
+    if (estimate[said] > 0).all() and off <= max(AS_IT_IS * error, BY_CHANCE * float(np.median(disparity))):
         return np.where(said, estimate, np.nan), "depth"
     return np.where(said, aligned, np.nan), space

@@ -1,0 +1,92 @@
+"""Of several references that bring their depth, who draws what: surfaces in closed form, seen by two cameras."""
+
+import numpy as np
+import pytest
+import small_scene as small
+
+from reffusion import geometry
+from reffusion.initialize.sharing import Shown, finest, unchanged_rim
+
+SIZE = 64
+
+
+def view(name, azimuth, height, away=3.0):
+    return small.looking(name, azimuth, height, away, np.zeros(3), SIZE, 90.0)
+
+
+FRONT, SIDE = view("front", 0.0, 3.0), view("side", 0.0, 0.4)
+
+
+def floor(camera, z=0.0):
+    """[H, W] depth of the plane at that height, 0 above the horizon."""
+    rays = geometry.unproject(np.ones((SIZE, SIZE)), camera) - camera.center
+    with np.errstate(divide="ignore"):
+        depth = (z - camera.center[2]) / rays[..., 2]
+    return np.where(depth > 0, depth, 0.0)
+
+
+def shown(camera, depth, pixels=None):
+    told = depth > 0
+    return Shown(camera, depth, told if pixels is None else told & pixels)
+
+
+def near_middle(camera, depth, radius):
+    points = geometry.unproject(np.where(depth > 0, depth, 1e6), camera)
+    return np.linalg.norm(points, axis=-1) < radius
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_a_surface_is_drawn_by_the_view_that_shows_it_most_finely(order):
+    views = [shown(camera, floor(camera), near_middle(camera, floor(camera), 0.5)) for camera in (FRONT, SIDE)]
+    drawn = dict(zip(order, finest([views[k] for k in order]), strict=True))
+    assert (drawn[0] == views[0].pixels).mean() > 0.98
+    assert drawn[1].sum() < 0.1 * views[1].pixels.sum()  # a border, to a pixel
+
+
+def test_of_two_alike_the_earlier_draws():
+    same = shown(FRONT, floor(FRONT))
+    first, second = finest([same, same])
+    assert np.array_equal(first, same.pixels) and not second.any()
+
+
+def test_what_only_one_shows_stays_its_own():
+    wide = shown(SIDE, floor(SIDE), near_middle(SIDE, floor(SIDE), 0.5))
+    narrow = shown(FRONT, floor(FRONT), near_middle(FRONT, floor(FRONT), 0.2))
+    _, left = finest([narrow, wide])
+    away = near_middle(SIDE, floor(SIDE), 0.25)
+    assert np.array_equal(left & ~away, wide.pixels & ~away)
+    assert left[near_middle(SIDE, floor(SIDE), 0.15)].mean() < 0.05
+
+
+def test_nothing_stands_where_another_looks_past_it():
+    """A sheet that one view has in mid-air, where the other sees the floor."""
+    sheet = floor(SIDE, z=0.2)
+    hanging = near_middle(SIDE, sheet, 0.4)
+    depth = np.where(hanging, sheet, floor(SIDE))
+    drawn, _ = finest([shown(SIDE, depth, hanging), shown(FRONT, floor(FRONT), np.zeros((SIZE, SIZE), bool))])
+    assert not drawn[hanging].any()
+
+
+def test_without_depth_nothing_is_said():
+    empty = np.zeros((SIZE, SIZE))
+    whole = shown(SIDE, floor(SIDE))
+    drawn, nothing = finest([whole, Shown(FRONT, empty, np.zeros((SIZE, SIZE), bool))])
+    assert np.array_equal(drawn, whole.pixels) and not nothing.any()
+    assert np.isinf(Shown(FRONT, empty, whole.pixels).widths).all()
+
+
+def test_a_pixel_is_as_wide_as_its_slant_makes_it():
+    depth = floor(SIDE)
+    row = SIZE * 3 // 4
+    below, above = geometry.unproject(depth, SIDE)[[row, row + 1], SIZE // 2]
+    assert shown(SIDE, depth).widths[row, SIZE // 2] == pytest.approx(np.linalg.norm(below - above), rel=0.1)
+
+
+def test_a_rim_that_looks_like_the_photograph_is_left():
+    random = np.random.default_rng(0)
+    photo = random.integers(0, 256, (40, 40, 3), np.uint8)
+    image, drawn, thing = photo.copy(), np.zeros((40, 40), bool), np.zeros((40, 40), bool)
+    drawn[8:32, 8:32] = thing[12:28, 12:28] = True
+    image[thing] = (photo[thing].astype(int) + 128) % 256
+    image[18:22, 18:22] = photo[18:22, 18:22]  # inside it is the thing's own colour by chance
+    assert np.array_equal(unchanged_rim(image, photo, drawn), drawn & ~thing)
