@@ -222,6 +222,13 @@ def test_what_is_no_depth_map_is_refused(tmp_path, name, write, message):
         load_depth(tmp_path / name)
 
 
+def test_the_depth_of_an_object_alone_is_a_depth_map(tmp_path):
+    depth = np.full((40, 40), np.nan, np.float32)
+    depth[10:20, 10:20] = np.arange(100).reshape(10, 10) + 1
+    np.save(tmp_path / "thing.npy", depth)
+    assert np.array_equal(load_depth(tmp_path / "thing.npy"), depth, equal_nan=True)
+
+
 # ------------------------------------------------------------------------------------- refusals, before any work
 
 

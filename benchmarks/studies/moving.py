@@ -65,19 +65,21 @@ def write(start: placing.Place, goal: placing.Place, capture: placing.Photograph
         shutil.rmtree(folder, ignore_errors=True)
     for name in views.all:
         camera, photo = capture.cameras[name], drawing.photograph(capture, name) / 255
-        shown, mask = drawing.drawn_into(photo, pictured, camera, after, tints)
+        shown, at_goal = drawing.drawn_into(photo, pictured, camera, after, tints)
         save_image(ceiling / f"images/{name}.png", shown)
         if name in views.test:
             save_image(scene / f"images/{name}.png", shown)
             for folder in (scene, ceiling):
-                save_image(folder / f"test_masks/{name}.png", mask)
+                save_image(folder / f"test_masks/{name}.png", at_goal)
             continue
         with_it, mask = drawing.drawn_into(photo, pictured, camera, before, tints)
         save_image(scene / f"images/{name}.png", with_it)
         save_image(scene / f"masks/{name}.png", mask)
         if name in asked:
             save_image(scene / f"references/{name}.png", shown)
-            np.save(scene / f"references/{name}.npy", drawing.depth(pictured, camera, after))
+            depth = drawing.depth(pictured, camera, after)
+            depth[(mask > 0) & (at_goal == 0)] = np.nan  # nobody knows where it stood
+            np.save(scene / f"references/{name}.npy", depth)
     for folder in (scene, ceiling):
         drawing.write_meta(capture, views, folder)
     tested = f"test_masks: test_masks\ntest: {drawing.listed(views.test)}\nstages: {{poses: {{refine: false}}}}\n"

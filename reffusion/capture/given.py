@@ -142,7 +142,9 @@ def load_depth(path: Path) -> np.ndarray:
         values = values.astype(np.float32)
     values[empty | ~np.isfinite(values)] = np.nan
     if np.isnan(values).mean() > 0.99:
-        raise BadInput(f"{path}: hardly a pixel is more than 0 and finite; a depth map needs what is drawn, and around")
+        raise BadInput(
+            f"{path}: hardly a pixel is known (0 or not finite); depth is needed of what is drawn, and around"
+        )
     if np.nanmin(values) == np.nanmax(values):
         raise BadInput(f"{path}: all its values are {np.nanmin(values):g}; that is no depth map")
     return values
