@@ -1,10 +1,9 @@
 """An object removed from one place of a real capture and put in at another: `python -m benchmarks.studies.moving`.
 
-The training photographs show the object where it stood, with masks; as many pictures of it at the other place
-as show all of it are the references, each with its depth, around it between the sparse points. The same object
-drawn there into all photographs is the truth, and a fit to them the ceiling. Cameras stay as given, for by these the
-object was drawn. Writes moving.json and a sheet of all test views (truth, as photographed, ours, ceiling, difference)
-to --out.
+The training photographs show the object where it stood, with masks; as many pictures of it at the other place as show
+all of it are the references, each with its depth, around it between the sparse points. The same object drawn there into
+all photographs is the truth, and a fit to them the ceiling. Cameras stay as given, for by these the object was drawn.
+Writes moving.json and a sheet of all test views (truth, as photographed, ours, ceiling, difference) to --out.
 """
 
 from __future__ import annotations
@@ -32,9 +31,8 @@ def showing(capture: placing.Photographs, thing: placing.Thing, names: list[str]
     faces = [(axis, end) for axis in range(3) for end in (-1, 1) if (axis, end) != (2, -1)]  # it stands on that one
     at = np.concatenate([np.insert(sides, axis, end, 1) for axis, end in faces])
     normals = np.repeat(np.array([end * thing.axes[axis] for axis, end in faces]), len(sides), 0)
-    fine = np.stack(
-        [_fineness(capture, name, thing.middle + (at * thing.half) @ thing.axes, normals) for name in names]
-    )
+    points = thing.middle + (at * thing.half) @ thing.axes
+    fine = np.stack([_fineness(capture, name, points, normals) for name in names])
     fine = fine[:, fine.any(0)] / fine.max(0)[fine.any(0)]
     chosen: list[int] = []
     while (best := fine[chosen].max(0, initial=0)).astype(bool).mean() < COVERED:

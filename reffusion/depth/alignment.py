@@ -21,7 +21,7 @@ JURY = 500  # pixels that judge a trial: of 10% inliers 50 agree with the right 
 SUPPORTS = 32  # numbers of agreeing pixels that are looked at
 DISAGREES = 0.7  # of the spread of what is known: half the pixels missing by more, and a map says nothing of the scene
 AS_IT_IS = 1.5  # times the best fit's error, up to which a map counts as being in the scene's unit
-BY_CHANCE = 0.03  # relative error of a map as it is, up to which that it is in the scene's unit is no chance
+BY_CHANCE = 0.03  # relative error of a map as it is: one in another unit would hardly come as near by chance
 LEAST_DISPARITY = 0.02  # relative; a scene that varies less is flat, and any map that is right to this fits
 
 
@@ -216,7 +216,8 @@ def align_either(estimate: np.ndarray, depth: np.ndarray, known: np.ndarray) -> 
 
     It is taken as depth and as disparity, each with a scale and an offset, robustly; of the two that rise with the
     scene's the one that comes nearer in disparity is kept. One that is in the scene's unit stays as it is, if it fits
-    hardly worse: two such maps agree with each other, while each fitted by itself would be off by its own noise.
+    hardly worse, or within `BY_CHANCE`: two such maps agree with each other, while each fitted by itself would be off
+    by its own noise.
 
     Args:
         estimate: [H, W], depth or disparity of any scale and offset; NaN where it says nothing.
