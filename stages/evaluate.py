@@ -157,7 +157,8 @@ def rendered(work: Work, camera: Camera, how: np.ndarray | None) -> tuple[Shown,
     if work.painter:
         picture = work.painter.paint(shown.picture, shown.mask)
         shown = shown._replace(picture=picture, depth=consistency.depth_through(shown.depth, shown.mask))
-    save_image(work.out / "renders" / file, shown.picture)
+    if work.painter or FOLDERS[work.result] != "renders":
+        save_image(work.out / "renders" / file, shown.picture)
     return shown, pictures
 
 
@@ -201,8 +202,8 @@ def reaches_beyond(unseen: dict[str, np.ndarray], hidden: dict[str, np.ndarray])
 
 def finished(cameras: list[Camera], gaussians: dict[str, Gaussians], result: str) -> dict[str, Gaussians]:
     """Stage -> its Gaussians completed by what lies beyond the capture: of the result, and of the initialization."""
-    stages = [stage for stage in ("initialize", result) if stage in gaussians]
-    return {stage: beyond.completed(gaussians[stage], cameras) for stage in dict.fromkeys(stages)}
+    stages = list(dict.fromkeys(stage for stage in (result, "initialize") if stage in gaussians))
+    return dict(zip(stages, beyond.completed([gaussians[stage] for stage in stages], cameras), strict=True))
 
 
 def captured_by(

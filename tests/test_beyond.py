@@ -46,7 +46,7 @@ def with_more(gaussians: Gaussians, mean, sizes, color) -> Gaussians:
 
 def test_beyond_the_capture_the_picture_goes_on_softly_and_seen_pixels_stay():
     scene = wall()
-    done = beyond.completed(scene, TRAIN)
+    done = beyond.completed([scene], TRAIN)[0]
     for camera in TRAIN:
         assert np.abs(picture(done, camera) - picture(scene, camera)).max() < 0.02
     away = turned(75)
@@ -64,7 +64,7 @@ def test_beyond_the_capture_the_picture_goes_on_softly_and_seen_pixels_stay():
 def test_each_direction_takes_the_colours_that_lie_there():
     left, right = (0.9, 0.1, 0.1), (0.1, 0.1, 0.9)
     color = lambda x, y: np.where(x[..., None] < 0, left, right)
-    done = beyond.completed(small_scene.plane(small_scene.WALL, 2.0, 1.4, color), TRAIN)
+    done = beyond.completed([small_scene.plane(small_scene.WALL, 2.0, 1.4, color)], TRAIN)[0]
     to_the_left, to_the_right = (picture(done, turned(angle)).mean((0, 1)) for angle in (-80, 80))
     assert to_the_left[0] > 2 * to_the_left[2] and to_the_right[2] > 2 * to_the_right[0]
 
@@ -73,24 +73,24 @@ def test_needles_beyond_the_capture_go():
     needle = with_more(wall(), [5.0, 0.0, 2.0], [0.8, 0.01, 0.01], [0.0, 1.0, 0.0])
     away = turned(65)
     assert (picture(needle, away)[..., 1] - picture(wall(), away)[..., 1]).max() > 0.5
-    with_it, without = (picture(beyond.completed(scene, TRAIN), away) for scene in (needle, wall()))
+    with_it, without = (picture(beyond.completed([scene], TRAIN)[0], away) for scene in (needle, wall()))
     assert np.abs(with_it - without).max() < 0.05
 
 
 def test_what_one_training_view_shows_stays():
     spot = with_more(wall(), [0.9, 0.0, 1.9], [0.02, 0.02, 0.02], [0.0, 1.0, 0.0])
     assert any(np.abs(picture(spot, camera) - picture(wall(), camera)).max() > 0.3 for camera in TRAIN)
-    done = beyond.completed(spot, TRAIN)
+    done = beyond.completed([spot], TRAIN)[0]
     assert (done.means == spot.means[-1]).all(1).any()
 
 
 def test_a_scene_without_training_views_or_gaussians_is_left_alone():
     scene = wall()
-    assert beyond.completed(scene, []) is scene
+    assert beyond.completed([scene], [])[0] is scene
     nothing = scene.map(lambda p: p[:0])
-    assert len(beyond.completed(nothing, TRAIN)) == 0
+    assert len(beyond.completed([nothing], TRAIN)[0]) == 0
     behind = Camera("b", 8, 8, 8.0, 8.0, 4.0, 4.0, np.diag([-1.0, 1.0, -1.0, 1.0]))
-    assert len(beyond.completed(scene, [behind])) == len(scene)  # it sees none: nothing to continue
+    assert len(beyond.completed([scene], [behind])[0]) == len(scene)  # it sees none: nothing to continue
 
 
 # --- what was seen

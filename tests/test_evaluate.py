@@ -156,7 +156,7 @@ def test_scores_are_those_of_the_saved_pictures(done):
 def test_the_scene_is_exported_in_its_own_frame(done):
     exported, result = load_ply(done / "evaluate" / "scene.ply"), load_ply(done / "distill" / "gaussians.ply")
     scene = load_scene(done / "poses")
-    result = beyond.completed(result, [scene.cameras[name] for name in scene.train])
+    (result,) = beyond.completed([result], [scene.cameras[name] for name in scene.train])
     back = SIMILARITY.apply(exported.means.double().numpy())
     # 500 km away a float of the scene's own frame is worth 0.03 units, 6e-4 of the normalised frame.
     assert np.abs(back - result.means.double().numpy()).max() < 1e-3

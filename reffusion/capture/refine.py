@@ -28,6 +28,8 @@ ROUNDS = 2  # the second with the matches that the first one's cameras agree wit
 BLOCK = 8  # cells a side, over which flow's noise is averaged away by the median
 LEAST_IN_BLOCK = 15
 LOOKED_AT = 8  # views for the first look
+CELLS = 64  # of it, along a picture's longer side; in larger pictures flow's noise, too, is more pixels wide
+LEAST_CELL = 8  # px
 FARTHEST_SHIFT = 0.02  # of the longer side; a principal point that wants to go farther, beyond stabilisers, stays
 
 
@@ -55,7 +57,8 @@ def refined(cameras: Sequence[Camera], images: Mapping[str, np.ndarray]) -> Refi
     given = {camera.name: camera for camera in cameras}
     cell = max(4, round((sum(c.width * c.height for c in cameras) / (2 * TRACKS)) ** 0.5))
     few = cameras[:: -(-len(cameras) // LOOKED_AT)]
-    before = misfit(list(stereo.match(few, cameras, images, 8)), given, 8)
+    coarse = max(LEAST_CELL, round(max(max(camera.width, camera.height) for camera in cameras) / CELLS))
+    before = misfit(list(stereo.match(few, cameras, images, coarse)), given, coarse)
     if not before > ENOUGH:
         return Refined(given, before, None)
     matches = list(stereo.match(cameras, cameras, images, cell))

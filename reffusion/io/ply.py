@@ -105,7 +105,7 @@ def _arrays(path: Path, table: np.ndarray, similarity: Similarity | None) -> lis
     arrays = []
     for name, array in zip(_FIELDS, (means, take(ROTATION), log_scales, table["opacity"], sh), strict=True):
         with np.errstate(over="ignore"):
-            arrays.append(np.array(array, np.float32))
+            arrays.append(np.array(array, np.float32, order="C"))
         if not np.isfinite(arrays[-1]).all():
             raise BadInput(f"{path}: {name} holds values that are not finite, or too large for 32 bits")
     return arrays

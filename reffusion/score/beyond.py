@@ -43,38 +43,43 @@ class Patches(NamedTuple):
     blur: np.ndarray
 
 
-def completed(gaussians: Gaussians, cameras: Sequence[Camera]) -> Gaussians:
-    """The supported of N Gaussians, in their order, and behind them the backdrop.
+def completed(scenes: Sequence[Gaussians], cameras: Sequence[Camera]) -> list[Gaussians]:
+    """The supported Gaussians of each scene, in their order, and behind them the backdrop of the first.
 
     Pixels that the training views see keep their colours: what leaves is not seen there, and what comes lies behind.
 
     Args:
-        gaussians: a finished scene. cameras: its training views; without any, nothing changes.
+        scenes: states of one scene, the finished one first. cameras: its training views; without any, nothing changes.
     """
-    if not cameras or not len(gaussians):
-        return gaussians
-    support, patches = look(gaussians, cameras)
-    supported = support > SUPPORT
-    kept, rest = gaussians.map(lambda p: p[supported]), gaussians.map(lambda p: p[~supported])
-    if not len(kept) or not len(patches.colors):
-        return gaussians
+    if not cameras:
+        return list(scenes)
+    small = [reduced(camera, LONGEST) for camera in cameras]
+    pixels = [of.width * of.height / (at.width * at.height) for of, at in zip(cameras, small, strict=True)]
+    supported = [support(gaussians, small, pixels) > SUPPORT for gaussians in scenes]
+    kept = [gaussians.map(lambda p, stays=stays: p[stays]) for gaussians, stays in zip(scenes, supported, strict=True)]
+    patches = look(scenes[0], small)
+    if not len(kept[0]) or not len(patches.colors):
+        return list(scenes)
+    rest = scenes[0].map(lambda p: p[~supported[0]])
     behind = backdrop(kept, cameras, joined([patches, brought(rest, cameras)]))
-    return kept.zipped(behind, lambda a, b: torch.cat([a, b.to(a)]))
+    return [each.zipped(behind, lambda a, b: torch.cat([a, b.to(a)])) for each in kept]
+
+
+def support(gaussians: Gaussians, cameras: Sequence[Camera], pixels: Sequence[float]) -> torch.Tensor:
+    """[N] the blending weight of each Gaussian, summed over the views; `pixels`: for how many one of a view stands."""
+    total = gaussians.means.new_zeros(len(gaussians))
+    for camera, share in zip(cameras, pixels, strict=True):
+        ones = total.new_ones(camera.height, camera.width, 1)
+        total += share * rasterizer.accumulate(gaussians, camera, ones)[:, 0]
+    return total
 
 
 @torch.no_grad()
-def look(gaussians: Gaussians, cameras: Sequence[Camera]) -> tuple[torch.Tensor, Patches]:
-    """What these views show, drawn `LONGEST` px large at most: [N] the blending weight of each Gaussian, summed over
-    the views in their own pixels, and patches of what one sees."""
-    support, patches = gaussians.means.new_zeros(len(gaussians)), []
-    for camera in cameras:
-        small = reduced(camera, LONGEST)
-        drawn = rasterizer.render(gaussians, small)
-        ones = torch.ones(small.height, small.width, 1, dtype=support.dtype, device=support.device)
-        pixels = camera.width * camera.height / (small.width * small.height)
-        support += pixels * rasterizer.accumulate(gaussians, small, ones)[:, 0]
-        patches.append(_patches(small, drawn.color.double().cpu().numpy(), drawn.alpha.double().cpu().numpy()))
-    return support, joined(patches)
+def look(gaussians: Gaussians, cameras: Sequence[Camera]) -> Patches:
+    """What one sees in these views."""
+    drawings = ((camera, rasterizer.render(gaussians, camera)) for camera in cameras)
+    seen = [_patches(c, d.color.double().cpu().numpy(), d.alpha.double().cpu().numpy()) for c, d in drawings]
+    return joined(seen)
 
 
 def brought(gaussians: Gaussians, cameras: Sequence[Camera]) -> Patches:
@@ -115,26 +120,26 @@ def _patches(camera: Camera, color: np.ndarray, alpha: np.ndarray) -> Patches:
     return Patches(np.broadcast_to(camera.center, colors.shape), rays, colors.clip(0, 1), blur)
 
 
-def backdrop(gaussians: Gaussians, cameras: Sequence[Camera], patches: Patches) -> Gaussians:
+def backdrop(scenes: Sequence[Gaussians], cameras: Sequence[Camera], patches: Patches) -> Gaussians:
     """`DISKS` soft disks, float32 on the CPU, on a sphere that lies behind all the Gaussians and all the cameras.
 
     A disk's colour is the mean of the patches' colours, each where its ray meets the sphere, by nearness on it.
     """
     centers = np.stack([camera.center for camera in cameras])
     middle = centers.mean(0)
-    means = gaussians.means.double().cpu().numpy()
-    radius = CLEAR * max(np.linalg.norm(points - middle, axis=1).max() for points in (means, centers))
+    means = [gaussians.means.double().cpu().numpy() for gaussians in scenes if len(gaussians)]
+    radius = CLEAR * max(np.linalg.norm(points - middle, axis=1).max() for points in (*means, centers))
     towards = _spread_directions(DISKS)
     places = _met((patches.origins - middle) / radius, patches.directions)
     colors = _continued(towards, places, patches.colors, patches.blur)
-    sh = np.zeros((DISKS, gaussians.sh.shape[1], 3))
+    sh = np.zeros((DISKS, scenes[0].sh.shape[1], 3))
     sh[:, 0] = (colors - 0.5) / SH0
     sizes = radius * APART * np.array([0.8, 0.8, 0.05])
     # The shortest turn from z to the direction; straight backwards any half turn will do.
     turns = np.concatenate([1 + towards[:, 2:], np.cross([0.0, 0.0, 1.0], towards)], 1)
     logits = np.full(DISKS, math.log(0.98 / 0.02))
     arrays = (middle + radius * towards, turns, np.log(np.tile(sizes, (DISKS, 1))), logits, sh)
-    return Gaussians(*(torch.from_numpy(array).float() for array in arrays), antialiased=gaussians.antialiased)
+    return Gaussians(*(torch.from_numpy(array).float() for array in arrays), antialiased=scenes[0].antialiased)
 
 
 def _spread_directions(count: int) -> np.ndarray:
