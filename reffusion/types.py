@@ -23,6 +23,7 @@ class Camera:
         width, height: image size in pixels.
         fx, fy, cx, cy: focal lengths and principal point in pixels.
         world_to_camera: [4, 4] float64 rigid transform; the camera looks along +z, x right, y down.
+        every: 1; of a view `sampled` from another, how many of that one's pixels lie from one pixel to the next.
     """
 
     name: str
@@ -33,6 +34,7 @@ class Camera:
     cx: float
     cy: float
     world_to_camera: np.ndarray
+    every: int = 1
 
     @cached_property
     def intrinsics(self) -> np.ndarray:
@@ -50,6 +52,21 @@ class Camera:
         sx, sy = width / self.width, height / self.height
         return replace(
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
+        )
+
+    def sampled(self, every: int, left: int, top: int) -> Camera:
+        """Every so manieth pixel of this view each way, from (left, top) on: what is drawn is what is drawn there, with
+        Gaussians as wide as in this view."""
+        sparse = lambda at, first: (at - first - 0.5) / every + 0.5  # the centre of the first pixel stays at 0.5
+        return replace(
+            self,
+            width=-(-(self.width - left) // every),
+            height=-(-(self.height - top) // every),
+            fx=self.fx / every,
+            fy=self.fy / every,
+            cx=sparse(self.cx, left),
+            cy=sparse(self.cy, top),
+            every=self.every * every,
         )
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:

@@ -13,6 +13,8 @@ from torch import Tensor
 from reffusion import seeding
 from reffusion.types import Camera
 
+SPARED = 200_000  # pixels of a view from which on a step can do without most of them
+
 
 def samples(
     cameras: Sequence[Camera],
@@ -21,14 +23,20 @@ def samples(
     steps: range,
     seed: int,
     coarse: int = 0,
+    sparse: int = 0,
 ) -> Iterator[tuple[Camera, Tensor, Tensor | None]]:
-    """What each of the steps sees, prepared by a thread of its own while the step before it runs; before step `coarse`
-    at half the size."""
+    """What each of the steps sees, prepared by a thread of its own while the step before it runs: before step `coarse`
+    at half the size, then before step `sparse` every second pixel each way, where there are enough, in four turns all."""
 
     def prepared(i: int) -> tuple[Camera, Tensor, Tensor | None]:
         camera = cameras[seeding.in_epochs(i, len(cameras), seed, "views")]
         view = camera, images[camera.name], weights.get(camera.name)
-        return sample(*(halved(*view) if i < coarse else view))
+        if i < coarse:
+            return sample(*halved(*view))
+        if i < sparse and camera.width * camera.height >= SPARED:
+            turn = seeding.in_epochs(i // len(cameras), 4, seed, "pixels", camera.name)
+            return sample(*every_second(*view, turn % 2, turn // 2))
+        return sample(*view)
 
     with ThreadPoolExecutor(1, thread_name_prefix="fit") as ahead:
         coming = ahead.submit(prepared, steps.start)
@@ -54,6 +62,14 @@ def halved(
         lowest = cv2.erode(np.asarray(weights, np.float32), np.ones((3, 3), np.uint8))
         weights = cv2.resize(lowest, size, interpolation=cv2.INTER_NEAREST)
     return camera.resized(*size), small, weights
+
+
+def every_second(
+    camera: Camera, image: np.ndarray, weights: np.ndarray | None, left: int, top: int
+) -> tuple[Camera, np.ndarray, np.ndarray | None]:
+    """Every second pixel of the view each way, from (left, top) on: a quarter of the work, all of the sharpness."""
+    weights = None if weights is None else weights[top::2, left::2]
+    return camera.sampled(2, left, top), np.ascontiguousarray(image[top::2, left::2]), weights
 
 
 def check_sizes(cameras: Sequence[Camera], images: Mapping[str, np.ndarray], weights: Mapping[str, np.ndarray]) -> None:

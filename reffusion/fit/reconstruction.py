@@ -14,7 +14,7 @@ from torch import Tensor
 from reffusion import trace
 from reffusion.fit.exposure import Exposures
 from reffusion.fit.feed import check_sizes, sample, samples
-from reffusion.fit.step import adapt, coarse_steps, degree_at, rates_of, squared_error, step
+from reffusion.fit.step import adapt, coarse_steps, degree_at, rates_of, sparse_steps, squared_error, step
 from reffusion.gaussians.optimize import GaussianOptimizer, Rates
 from reffusion.params.fit import Params
 from reffusion.splat.rasterizer import render
@@ -66,10 +66,10 @@ def fit(
     checkpoints, measured = trace.Checkpoints(folder, settings.checkpoint_seconds), (held_out, images, settings, impl)
     if run.iteration == 0:
         _write_line(log, run, *measured)
-    steps = range(run.iteration, settings.iterations)
+    steps, until = range(run.iteration, settings.iterations), (coarse_steps(settings), sparse_steps(settings))
     for i, (camera, target, counts) in zip(
         trace.progress(settings.iterations, "fit", run.iteration),
-        samples(cameras, images, weights, steps, settings.seed, coarse_steps(settings)),
+        samples(cameras, images, weights, steps, settings.seed, *until),
         strict=True,
     ):
         seen = camera, _move(target, optimizer), _move(counts, optimizer)

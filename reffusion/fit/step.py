@@ -98,6 +98,11 @@ def coarse_steps(settings: Params) -> int:
     return round(COARSE * settings.iterations) if settings.init.flow_cell else 0
 
 
+def sparse_steps(settings: Params) -> int:
+    """Before which step views are looked at in every second pixel each way."""
+    return round(settings.sparse * settings.iterations)
+
+
 def degree_at(settings: Params, i: int) -> int:
     """Of the spherical harmonics in step `i`."""
     if settings.sh.every == 0:

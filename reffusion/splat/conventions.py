@@ -1,7 +1,7 @@
 """The constants of the splatting model, shared by its implementations (docs/splatting.md)."""
 
 NEAR = 0.01  # camera z below which a Gaussian is left out, in units of the normalised frame
-LOW_PASS = 0.3  # px^2 added to the diagonal of the 2D covariance
+LOW_PASS = 0.3  # px^2 added to the diagonal of the 2D covariance; of a sampled view, px of the view it is of
 MIN_ALPHA = 1.0 / 255.0  # fainter contributions are skipped
 MAX_ALPHA = 0.999  # stronger ones are cut; their gradient is then zero. gsplat has this value compiled in
 MIN_TRANSMITTANCE = 1e-4  # the Gaussian that would go below is not blended, and the pixel is finished

@@ -24,7 +24,8 @@ _LEAST_LEVEL = math.log2(MIN_ALPHA)
 
 
 def view_numbers(camera: Camera, antialiased: bool) -> np.ndarray:
-    """[23] float64: rotation rows, translation, fx, fy, cx, cy, clamping range of x/z and y/z, size, antialiased."""
+    """[24] float64: rotation rows, translation, fx, fy, cx, cy, clamping range of x/z and y/z, size, antialiased,
+    low-pass."""
     half_x, half_y = camera.width / 2 / camera.fx, camera.height / 2 / camera.fy
     return np.array(
         [
@@ -35,7 +36,7 @@ def view_numbers(camera: Camera, antialiased: bool) -> np.ndarray:
             (camera.width - camera.cx) / camera.fx + JACOBIAN_MARGIN * half_x,
             -camera.cy / camera.fy - JACOBIAN_MARGIN * half_y,
             (camera.height - camera.cy) / camera.fy + JACOBIAN_MARGIN * half_y,
-            *(camera.width, camera.height, antialiased),
+            *(camera.width, camera.height, antialiased, LOW_PASS / camera.every**2),
         ],
         np.float64,
     )
@@ -132,7 +133,7 @@ def _cross(a, b):
 
 
 @inlined
-def _covariance(a, b):
+def _covariance(a, b, low):
     """Of root [2, 3] with rows a and b: xx, xy, yy and determinant of root rootᵀ, and the determinant with low-pass.
 
     Cauchy-Binet: the sum of the squared 2x2 minors has no cancellation where xx yy - xy^2 loses everything.
@@ -140,7 +141,7 @@ def _covariance(a, b):
     xx, xy, yy = _dot(a, a), _dot(a, b), _dot(b, b)
     m0, m1, m2 = _cross(a, b)
     sharp = m0 * m0 + m1 * m1 + m2 * m2
-    return xx, xy, yy, sharp, sharp + LOW_PASS * (xx + yy) + LOW_PASS * LOW_PASS
+    return xx, xy, yy, sharp, sharp + low * (xx + yy) + low * low
 
 
 @inlined
@@ -173,9 +174,9 @@ def project(view, mean, quaternions, log_scales, opacity_logits, row, last):
     x, y, z = camera_point(view, mean)
     z_inverse = 1.0 / z
     _, _, _, _, a, b = _frame(view, x, y, z_inverse, quaternions, log_scales, row, last)
-    xx, xy, yy, sharp, determinant = _covariance(a, b)
+    xx, xy, yy, sharp, determinant = _covariance(a, b, view[23])
     kept = (z >= NEAR) & (xx < MAX_VARIANCE) & (yy < MAX_VARIANCE)
-    xx, yy = xx + LOW_PASS, yy + LOW_PASS
+    xx, yy = xx + view[23], yy + view[23]
     mean_x, mean_y = view[12] * x * z_inverse + view[14], view[13] * y * z_inverse + view[15]
     opacity = 1.0 / (1.0 + exponential(0.0 - widen(load_column(opacity_logits, 1, 0, row, last))))
     opacity = opacity * root(maximum(1.0 - view[22] * (1.0 - sharp / determinant), 0.0))
@@ -218,8 +219,8 @@ def project_backward(view, mean, quaternions, log_scales, opacity_logits, row, l
     x, y, z = camera_point(view, mean)
     z_inverse = 1.0 / z
     quaternion, rotation, projector, scales, a, b = _frame(view, x, y, z_inverse, quaternions, log_scales, row, last)
-    _, xy, yy, sharp, determinant = _covariance(a, b)
-    yy = yy + LOW_PASS
+    _, xy, yy, sharp, determinant = _covariance(a, b, view[23])
+    yy = yy + view[23]
     slant, lx, ly = xy / yy, root(yy / determinant), 1.0 / root(yy)
 
     # 2D mean: u = lx (dx - slant dy), v = ly dy, ln alpha = ln opacity - (u^2 + v^2) / 2
@@ -228,7 +229,7 @@ def project_backward(view, mean, quaternions, log_scales, opacity_logits, row, l
 
     grad_a, grad_b = _root_backward(a, b, slant, lx, ly, moments)
     grad_a, grad_b = _compensation_backward(
-        a, b, sharp, determinant, view[22] * _column(moments, SUM_G), grad_a, grad_b
+        a, b, sharp, determinant, view[23], view[22] * _column(moments, SUM_G), grad_a, grad_b
     )
     grad_log_scales = (
         grad_a[0] * a[0] + grad_b[0] * b[0],
@@ -272,14 +273,14 @@ def _root_backward(a, b, slant, lx, ly, moments):
 
 
 @inlined
-def _compensation_backward(a, b, sharp, determinant, grad, grad_a, grad_b):
+def _compensation_backward(a, b, sharp, determinant, low, grad, grad_a, grad_b):
     """Add what ln sqrt(sharp / determinant) owes to root: `grad` times half the gradients of the two logarithms.
 
     The minors' gradient is a cross product, again without cancellation. Where sharp is 0, nothing is drawn: grad is 0.
     """
     m = _cross(a, b)
     sharpness = grad * (1.0 / maximum(sharp, 1e-300) - 1.0 / determinant)
-    width = grad * (LOW_PASS / determinant)
+    width = grad * (low / determinant)
     by_a, by_b = _cross(b, m), _cross(m, a)
     return (
         _moved_row(grad_a, by_a, sharpness, a, width),

@@ -132,8 +132,9 @@ def project(gaussians: Gaussians, camera: Camera, probe: Tensor | None) -> tuple
     # Cauchy-Binet: det(root rootᵀ) is the sum of the squared 2x2 minors, without the cancellation of xx·yy - xy².
     minors = torch.linalg.cross(root[:, 0], root[:, 1])
     sharp = minors.square().sum(1)
-    determinants = sharp + LOW_PASS * (xx + yy) + LOW_PASS**2
-    covariances = torch.stack((xx + LOW_PASS, xy, yy + LOW_PASS), 1)
+    low = LOW_PASS / camera.every**2
+    determinants = sharp + low * (xx + yy) + low**2
+    covariances = torch.stack((xx + low, xy, yy + low), 1)
     opacities = torch.sigmoid(gaussians.opacity_logits[index])
     if gaussians.antialiased:
         opacities = opacities * torch.where(sharp > 0, sharp / determinants, 1).sqrt() * (sharp > 0)
