@@ -26,7 +26,7 @@ def samples(
     sparse: int = 0,
 ) -> Iterator[tuple[Camera, Tensor, Tensor | None]]:
     """What each of the steps sees, prepared by a thread of its own while the step before it runs: before step `coarse`
-    at half the size, then before step `sparse` every second pixel each way, where there are enough, in four turns all."""
+    at half the size; before step `sparse` every second pixel each way, where there are enough, in four turns all."""
 
     def prepared(i: int) -> tuple[Camera, Tensor, Tensor | None]:
         camera = cameras[seeding.in_epochs(i, len(cameras), seed, "views")]
