@@ -24,7 +24,7 @@ from reffusion.distill.confinement import (
     sds_term,
 )
 from reffusion.distill.steps import near_a_reference
-from reffusion.gaussians.optimize import Rates
+from reffusion.gaussians.optimize import Rates, reconstruction_loss
 from reffusion.io.arrays import load_labels, save_json, save_labels
 from reffusion.io.images import load_image, load_mask, save_image
 from reffusion.io.ply import load_ply, save_ply
@@ -341,6 +341,22 @@ def test_the_reference_term_draws_the_reference(prior, text, tmp_path):
     records = read_trace(tmp_path / "trace.jsonl")
     assert records[-1]["reference_psnr"] > records[0]["reference_psnr"] + 1
     assert len(ended) == len(start)
+
+
+def test_the_reference_term_is_that_of_the_whole_view():
+    start, masked = wall()
+    image, chosen = torch.rand(HEIGHT, WIDTH, 3, generator=generator(3)), torch.ones_like(masked)
+    part, whole = leaves(start), leaves(start)
+    loss, _ = reference_term(part, chosen, camera(), image, hole())
+    expected = reconstruction_loss(render(whole, camera()).color, image, hole())
+    loss.backward()
+    expected.backward()
+    assert float(loss) == pytest.approx(float(expected), rel=1e-3)  # slopes are clamped at another border
+    for name in PARAMETERS:
+        apart = (getattr(part, name).grad - getattr(whole, name).grad).norm()
+        assert apart < 0.01 * getattr(whole, name).grad.norm(), name
+    nothing, _ = reference_term(part, chosen, camera(), image, torch.zeros_like(hole()))
+    assert float(nothing) == 0
 
 
 def test_a_number_that_is_none_names_step_term_and_view(prior, text, tmp_path):

@@ -366,11 +366,13 @@ def test_sparse_steps_look_at_every_pixel_in_four_turns(monkeypatch):
     image, counts = np.zeros((5, 7, 3), np.uint8), np.arange(35, dtype=np.float32).reshape(5, 7)
     image[..., 0] = counts
     given = [camera], {"v": image}, {"v": counts}, range(5), 0
-    assert all(look[0] == camera for look in feed.samples(*given, sparse=4))  # too small to do without
+    assert all(look[0] == camera for look in feed.samples(*given, sparse=range(4)))  # too small to do without
     monkeypatch.setattr(feed, "SPARED", 35)
-    looks = list(feed.samples(*given, sparse=4))
+    looks = list(feed.samples(*given, sparse=range(4)))
     assert sorted(np.concatenate([weights.flatten() for _, _, weights in looks[:4]])) == list(range(35))
     for seen, target, weights in looks[:4]:
         assert target.shape[:2] == weights.shape == (seen.height, seen.width) and seen.every == 2
         assert torch.equal((255 * target[..., 0]).round(), weights)
     assert looks[4][0] == camera
+    settings = Params(iterations=10, init=Init(flow_cell=3), densify=Densify(stop=0.5))
+    assert step.sparse_steps(settings) == range(5, 9) and not step.sparse_steps(Params(iterations=10))

@@ -81,7 +81,6 @@ ABSENT = {
     "fit.exposure": "never",
     "fit.few_views": "as_many",
     "fit.init.flow_cell": 0,
-    "fit.sparse": 0,
     "fit.densify.per_pixel": 0,
     "masks.tidy": False,
     "masks.hull": 1,

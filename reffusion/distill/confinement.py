@@ -26,6 +26,7 @@ from reffusion.params.distill import Sds
 from reffusion.prior import diffusion
 from reffusion.prior.model import Prior
 from reffusion.prior.windows import enlarged, two_scale_masks, two_scales, window_around, windows_around
+from reffusion.score.metrics import mask_box
 from reffusion.splat.rasterizer import render
 from reffusion.types import PARAMETERS, Camera, Gaussians, Rendering
 
@@ -80,9 +81,17 @@ def reference_term(
 
     Args:
         image: [H, W, 3] in [0, 1], the reference. hole: [H, W] bool, the pixels it stands for.
+    Returns:
+        The loss, as of the whole view, and the rendering of the part of it that holds the hole.
     """
-    rendering = render(confine(gaussians, masked), camera)
-    return reconstruction_loss(rendering.color, image, hole), rendering
+    box = mask_box(hole.cpu().numpy(), dilation=0)
+    if box is None:
+        rendering = render(confine(gaussians, masked), camera)
+        return 0 * rendering.color.sum(), rendering
+    part = camera.cropped(box.left, box.top, box.right - box.left, box.bottom - box.top)
+    rendering = render(confine(gaussians, masked), part)
+    loss = reconstruction_loss(rendering.color, box.crop(image), box.crop(hole))
+    return loss * (part.width * part.height / hole.numel()), rendering
 
 
 def sds_term(

@@ -23,17 +23,17 @@ def samples(
     steps: range,
     seed: int,
     coarse: int = 0,
-    sparse: int = 0,
+    sparse: range = range(0),
 ) -> Iterator[tuple[Camera, Tensor, Tensor | None]]:
     """What each of the steps sees, prepared by a thread of its own while the step before it runs: before step `coarse`
-    at half the size; before step `sparse` every second pixel each way, where there are enough, in four turns all."""
+    at half the size; in the steps `sparse` every second pixel each way, where there are enough, in four turns all."""
 
     def prepared(i: int) -> tuple[Camera, Tensor, Tensor | None]:
         camera = cameras[seeding.in_epochs(i, len(cameras), seed, "views")]
         view = camera, images[camera.name], weights.get(camera.name)
         if i < coarse:
             return sample(*halved(*view))
-        if i < sparse and camera.width * camera.height >= SPARED:
+        if i in sparse and camera.width * camera.height >= SPARED:
             turn = seeding.in_epochs(i // len(cameras), 4, seed, "pixels", camera.name)
             return sample(*every_second(*view, turn % 2, turn // 2))
         return sample(*view)

@@ -29,6 +29,7 @@ GENTLE = Rates(
     sh_rest=5e-4,
 )
 COARSE = 0.3  # of the steps, that look at half the size
+SPARSE = 0.9  # of the steps, up to which they look at every second pixel
 GROW_SCALE3D = 0.01  # deviation / distance from which on a Gaussian is split, not cloned
 
 
@@ -98,9 +99,12 @@ def coarse_steps(settings: Params) -> int:
     return round(COARSE * settings.iterations) if settings.init.flow_cell else 0
 
 
-def sparse_steps(settings: Params) -> int:
-    """Before which step views are looked at in every second pixel each way."""
-    return round(settings.sparse * settings.iterations)
+def sparse_steps(settings: Params) -> range:
+    """Which of the steps look at every second pixel each way: of those after the coarse ones, once no Gaussian is added
+    any more, all but the last. None without such a start, as in 3DGS."""
+    if not settings.init.flow_cell:
+        return range(0)
+    return range(round(settings.densify.stop * settings.iterations), round(SPARSE * settings.iterations))
 
 
 def degree_at(settings: Params, i: int) -> int:

@@ -70,9 +70,6 @@ class Params(Settings):
     init: Init = Init()
     densify: Densify = Densify()
     lr: LearningRates = LearningRates()
-    sparse: float = Field(
-        0.0, ge=0, le=1, description="part of the run in which steps look at every 2nd pixel each way"
-    )
     # PAPER leaves open: 3DGS takes black by default. Dark texture is then drawn by leaving holes, which the stages
     # after this one would read as places that no Gaussian explains.
     random_background: bool = Field(True, description="a new background colour each step, instead of black")

@@ -10,7 +10,7 @@ import csv
 from importlib.metadata import version
 from io import StringIO
 from math import ceil, floor, inf, log10
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -64,6 +64,9 @@ PROTOCOL = {
 }
 
 
+Pixels = TypeVar("Pixels", np.ndarray, torch.Tensor)
+
+
 class Box(NamedTuple):
     """Pixel columns left..right-1 and rows top..bottom-1."""
 
@@ -72,7 +75,7 @@ class Box(NamedTuple):
     right: int
     bottom: int
 
-    def crop(self, array: np.ndarray) -> np.ndarray:
+    def crop(self, array: Pixels) -> Pixels:
         """[H, W, ...] -> the part inside."""
         return array[self.top : self.bottom, self.left : self.right]
 
