@@ -102,7 +102,11 @@ def time_axis(axes: Axes, seconds: np.ndarray) -> None:
 
 
 def job_chart(
-    seconds: dict[str, float], traces: dict[str, Lines], box: dict[str, float | None], path: Path
+    seconds: dict[str, float],
+    traces: dict[str, Lines],
+    box: dict[str, float | None],
+    path: Path,
+    ceiling: float | None = None,
 ) -> dict[str, float]:
     """PSNR against seconds since the beginning, above a bar for each stage; gives back the stages' beginnings.
 
@@ -110,6 +114,7 @@ def job_chart(
         seconds: stage -> of its receipt, in order.
         traces: stage -> its lines; drawn are those whose main quantity is in dB.
         box: stage -> the mean PSNR in the box of the test views with what it made.
+        ceiling: the same of a fit to photographs without the object, where there is one.
     """
     begins = dict(zip(seconds, np.cumsum([0.0, *seconds.values()]), strict=False))
     curves = {}
@@ -124,6 +129,10 @@ def job_chart(
     made, grid = figure(sum(ratios), rows, 1, sharex=True, height_ratios=ratios)
     if rows == 2:
         _errors(grid[0, 0], curves, ends, sum(seconds.values()))
+        if ceiling is not None:
+            grid[0, 0].axhline(ceiling, color="#bbbbbb", linewidth=1.2, linestyle="--", zorder=0)
+            words = f"box, a fit to photographs without the object: {ceiling:.2f}"
+            write(grid[0, 0], words, (0, ceiling), (4, 6))
     _bars(grid[-1, 0], seconds, begins)
     save(made, path)
     return begins

@@ -89,19 +89,24 @@ def said(job: Job) -> list[str]:
 
 def whole(job: Job, out: Path) -> list[str]:
     """The whole job against the clock, and the scores of initialization and result."""
-    seconds = {stage: receipt["seconds"] for stage, receipt in job.receipts.items()}
-    lines = {stage: series.get("", []) for stage, series in job.traces.items()}
-    result = job.metrics.get("result", "")
-    box = {"initialize": job.metrics.get("initialize", {}).get("psnr_box")}
-    box |= {result: job.metrics.get("mean", {}).get("psnr_box")}
-    curves.job_chart(seconds, {stage: own for stage, own in lines.items() if own}, box, out / "job.png")
+    draw(job, out / "job.png")
     parts = [page.heading("The whole job"), inside.chart(out / "job.png", "PSNR and stages against seconds")]
-    if any(stage in lines for stage in ("fit", "distill")):
+    if any(stage in job.traces for stage in ("fit", "distill")):
         words = (
             "Curves: each stage's own error, on training views or references. Test views are only scored at the end."
         )
         parts.append(page.paragraph(words, quiet=True))
     return parts + scores(job)
+
+
+def draw(job: Job, path: Path, ceiling: float | None = None) -> None:
+    """PSNR and stages against seconds; `ceiling`: see `curves.job_chart`."""
+    seconds = {stage: receipt["seconds"] for stage, receipt in job.receipts.items()}
+    lines = {stage: series.get("", []) for stage, series in job.traces.items()}
+    result = job.metrics.get("result", "")
+    box = {"initialize": job.metrics.get("initialize", {}).get("psnr_box")}
+    box |= {result: job.metrics.get("mean", {}).get("psnr_box")}
+    curves.job_chart(seconds, {stage: own for stage, own in lines.items() if own}, box, path, ceiling)
 
 
 def scores(job: Job) -> list[str]:

@@ -3,8 +3,9 @@
 An object that is not there is drawn into the training photographs of a nerfstudio capture; the untouched photographs
 are the exact truth of what it hides. For each place: the scene, the job on it (given the true reference, unless
 --alone), and a fit to the untouched photographs of the same views, scored in the same boxes: the ceiling.
-Writes composites.md, composites.json and a sheet of all test views a place (truth, with the object, ours, ceiling,
-difference) to --out. Settings are chosen on the places that run without --report; those with it are for reporting.
+Writes to --out composites.md, composites.json and for each place a sheet of all test views (truth, with the object,
+ours, ceiling, difference) and a chart of errors against seconds. Settings are chosen on the places that run without
+--report; those with it are for reporting.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from pathlib import Path
 from benchmarks.studies import drawing, judging, placing
 from benchmarks.studies.placing import Place
 from reffusion.io.images import save_image
+from report.job import draw
+from report.loading import load_job
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -65,11 +68,13 @@ def job(scene: Path, runs: Path, profile: str) -> Path:
 
 
 def measured(place: Place, captures: Path, options: drawing.Options, out: Path, profile: str) -> dict:
-    """The place's row of the table; its sheet is saved."""
+    """The place's row of the table; its sheet is saved, and its errors against seconds."""
     scene, untouched = made(place, captures, options, out)
     run, ceiling = (judging.Run.at(job(folder, out / "runs", profile)) for folder in (scene, untouched))
     save_image(out / f"{scene.name}.png", judging.sheet(run, ceiling))
-    return {"place": scene.name, **judging.scores(run, ceiling)}
+    told = judging.scores(run, ceiling)
+    draw(load_job(run.folder), out / f"{scene.name}-seconds.png", ceiling.metrics["mean"]["psnr_box"])
+    return {"place": scene.name, **told}
 
 
 def chosen(names: str, report: bool) -> tuple[Place, ...]:
