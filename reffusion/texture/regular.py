@@ -34,7 +34,8 @@ STRAIGHT = 0.035  # sine of the angle by which a line may miss that point
 MEETING = 1.25  # times as many lines that must go through a point as in one direction
 NEAR = 3.0  # map sides from the map's middle within which they meet
 LEAST = 16  # cells a side of a map
-STEPS, LEAST_GAIN = (2.0, 1.0, 0.5), 1e-3  # cells by which that point is put right, while likeness grows so much
+REACH = 8.0  # cells to each side of it within which that point is looked for
+STEPS, LEAST_GAIN = (2.0, 1.0, 0.5), 1e-3  # cells by which it is put right, while likeness grows so much
 SEED = 0  # of what is drawn
 
 
@@ -99,26 +100,32 @@ def repeats(seen: Seen) -> Repeats | None:
 
 
 def _put_right(seen: Seen, centre: np.ndarray, cell: float) -> tuple[np.ndarray, Map | None]:
-    """The centre about which what is seen, turned, looks most like itself, from one that lines tell; and the map
-    unrolled about it."""
+    """The centre about which what is seen looks like itself at every turn, near one that lines tell; and the map
+    unrolled about it. About a wrong one it may look like itself once: a short arc fits many circles."""
 
     def judged(at: np.ndarray) -> tuple[float, Map | None]:
         flat = _unrolled(seen, at)
-        return (-1.0 if flat is None else float(_peak(_likeness(flat)[:, 0])), flat)
+        return (-1.0 if flat is None else _steady(_likeness(flat)[:, 0], 2 * np.pi / flat.pitch[1]), flat)
 
+    coarse = np.arange(-REACH, REACH + 1, STEPS[0])
+    starts = [centre + cell * np.array([x, y]) for y in coarse for x in coarse]
+    likely = [judged(start)[0] for start in starts]
+    if max(likely) > 0:
+        centre = starts[int(np.argmax(likely))]
     best, flat = judged(centre)
-    for step in STEPS:
+    for step in STEPS[1:]:
         for side in ((1, 0), (-1, 0), (0, 1), (0, -1)):
             while (found := judged(centre + step * cell * np.array(side)))[0] > best + LEAST_GAIN:
                 (best, flat), centre = found, centre + step * cell * np.array(side)
     return centre, flat
 
 
-def _peak(likeness: np.ndarray) -> float:
-    """The highest of the local maxima of [h], by turn; 0 where there is none."""
-    some = likeness[AWAY : len(likeness) // 2]
-    peaks = some[1:-1][(some[1:-1] > some[:-2]) & (some[1:-1] >= some[2:])]
-    return peaks.max() if len(peaks) else 0.0
+def _steady(likeness: np.ndarray, whole: float) -> float:
+    """Mean likeness, [h] by turn, over all turns that repeat a map and of which enough is seen; 0 for fewer than 2."""
+    turns = _turns(likeness, whole)
+    told = np.interp(turns[turns > 0], np.arange(len(likeness)), likeness)
+    told = told[told != 0]
+    return float(told.mean()) if len(told) > 1 else 0.0
 
 
 def _likeness(flat: Map) -> np.ndarray:
