@@ -12,7 +12,7 @@ from reffusion.masks.mirrors import imaged
 from reffusion.masks.plane import CELLS, Plane
 from reffusion.masks.witness import Witness, surface_range
 from reffusion.paint.paint2d import telea
-from reffusion.texture import along, completion, search, surfaces
+from reffusion.texture import along, completion, regular, search, surfaces
 from reffusion.texture.blending import blended
 from reffusion.texture.completion import complete
 from reffusion.texture.matches import NONE, PATCH, Compared
@@ -182,6 +182,15 @@ def test_planks_that_meet_in_a_point_are_turned_about_it():
     assert np.allclose(found.moved(moved, -found.motions[0]), places), "a turn and its opposite"
     slope = (found.moved(places + step, found.motions[0]) - moved) @ found.turn(found.motions[0])
     assert np.allclose(slope, step, atol=1e-9), "turn() is the derivative of moved()"
+
+
+def test_the_centre_is_found_from_afar_though_a_part_of_the_top_is_seen():
+    whole = seen_plane(tabletop(CAMERAS[0]), CAMERAS[0])
+    right = whole.places[:, 0] > -0.1
+    seen, cell = Seen(whole.pixels[right], whole.places[right], whole.image), 2.4 / regular.SIDE
+    for away in ((6, -5), (-4, 6)):
+        centre, flat = regular._put_right(seen, np.array([0.1, 0.4]) + cell * np.array(away), cell)
+        assert flat is not None and np.linalg.norm(centre - (0.1, 0.4)) < 2 * cell, away
 
 
 def test_what_does_not_repeat_itself_is_not_said_to():
