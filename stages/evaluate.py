@@ -157,7 +157,7 @@ def rendered(work: Work, camera: Camera, how: np.ndarray | None) -> tuple[Shown,
     if work.painter:
         picture = work.painter.paint(shown.picture, shown.mask)
         shown = shown._replace(picture=picture, depth=consistency.depth_through(shown.depth, shown.mask))
-    if work.painter or FOLDERS[work.result] != "renders":
+    if work.painter or FOLDERS[work.result] != "renders":  # else it lies there
         save_image(work.out / "renders" / file, shown.picture)
     return shown, pictures
 

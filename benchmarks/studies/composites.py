@@ -72,9 +72,8 @@ def measured(place: Place, captures: Path, options: drawing.Options, out: Path, 
     scene, untouched = made(place, captures, options, out)
     run, ceiling = (judging.Run.at(job(folder, out / "runs", profile)) for folder in (scene, untouched))
     save_image(out / f"{scene.name}.png", judging.sheet(run, ceiling))
-    told = judging.scores(run, ceiling)
     draw(load_job(run.folder), out / f"{scene.name}-seconds.png", ceiling.metrics["mean"]["psnr_box"])
-    return {"place": scene.name, **told}
+    return {"place": scene.name, **judging.scores(run, ceiling)}
 
 
 def chosen(names: str, report: bool) -> tuple[Place, ...]:

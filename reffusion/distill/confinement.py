@@ -26,7 +26,7 @@ from reffusion.params.distill import Sds
 from reffusion.prior import diffusion
 from reffusion.prior.model import Prior
 from reffusion.prior.windows import enlarged, two_scale_masks, two_scales, window_around, windows_around
-from reffusion.score.metrics import mask_box
+from reffusion.score.metrics import Box, mask_box
 from reffusion.splat.rasterizer import render
 from reffusion.types import PARAMETERS, Camera, Gaussians, Rendering
 
@@ -84,10 +84,7 @@ def reference_term(
     Returns:
         The loss, as of the whole view, and the rendering of the part of it that holds the hole.
     """
-    box = mask_box(hole.cpu().numpy(), dilation=0)
-    if box is None:
-        rendering = render(confine(gaussians, masked), camera)
-        return 0 * rendering.color.sum(), rendering
+    box = mask_box(hole.cpu().numpy(), dilation=0) or Box(0, 0, camera.width, camera.height)
     part = camera.cropped(box.left, box.top, box.right - box.left, box.bottom - box.top)
     rendering = render(confine(gaussians, masked), part)
     loss = reconstruction_loss(rendering.color, box.crop(image), box.crop(hole))

@@ -101,7 +101,8 @@ def repeats(seen: Seen) -> Repeats | None:
 
 def _put_right(seen: Seen, centre: np.ndarray, cell: float) -> tuple[np.ndarray, Map | None]:
     """The centre about which what is seen looks like itself at every turn, near one that lines tell; and the map
-    unrolled about it. About a wrong one it may look like itself once: a short arc fits many circles."""
+    unrolled about it. About a wrong one it may look like itself once: a short arc fits many circles. Where no two turns
+    are seen, that of the lines stays."""
 
     def judged(at: np.ndarray) -> tuple[float, Map | None]:
         flat = _unrolled(seen, at)
