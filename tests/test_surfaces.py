@@ -61,7 +61,7 @@ WAVES = [(np.array([np.cos(a), np.sin(a)]) * f, a * 7) for f in (9.0, 17.0, 31.0
 @pytest.fixture(scope="module")
 def views() -> list[Witness]:
     depths = [ground(view)[0].astype(np.float32) for view in CAMERAS]
-    return [Witness(view, depth, *surface_range(depth), HOLE) for view, depth in zip(CAMERAS, depths, strict=True)]
+    return [Witness.of(view, depth, surface_range(depth), HOLE) for view, depth in zip(CAMERAS, depths, strict=True)]
 
 
 def rough(depth: np.ndarray) -> np.ndarray:

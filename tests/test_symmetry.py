@@ -63,7 +63,7 @@ def witness(view: Camera, cut: bool = False) -> Witness:
     depth, hidden, _ = drawn(view, cut)
     kernel = np.ones((3, 3))
     wide = cv2.dilate(hidden.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    return Witness(view, depth, cv2.erode(depth, kernel), cv2.dilate(depth, kernel), wide)
+    return Witness.of(view, depth, (cv2.erode(depth, kernel), cv2.dilate(depth, kernel)), wide)
 
 
 def colour(points: np.ndarray, halved: bool) -> np.ndarray:

@@ -133,7 +133,7 @@ def floor() -> surfaces.Around:
     for view in CAMERAS:
         depth = FLOOR.depth(view)
         depth = np.where(np.isfinite(depth) & (depth < 5), depth, 0).astype(np.float32)
-        views.append(Witness(view, depth, *surface_range(depth), hidden()))
+        views.append(Witness.of(view, depth, surface_range(depth), hidden()))
     return surfaces.Around(views, [FLOOR], {view.name: planks(view) for view in CAMERAS}, np.zeros(3), 1.0)
 
 

@@ -45,7 +45,7 @@ def witness(view: Camera, notched: bool = False) -> Witness:
     depth, hidden, _ = drawn(view, notched)
     kernel = np.ones((3, 3))
     wide = cv2.dilate(hidden.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    return Witness(view, depth, cv2.erode(depth, kernel), cv2.dilate(depth, kernel), wide)
+    return Witness.of(view, depth, (cv2.erode(depth, kernel), cv2.dilate(depth, kernel)), wide)
 
 
 @pytest.fixture(scope="module")
@@ -113,9 +113,8 @@ def beside_a_plinth(view: Camera) -> Witness:
     bounds = np.stack([(low - view.center) / rays, (high - view.center) / rays])
     enter, leave = bounds.min(0).max(-1), bounds.max(0).min(-1)
     wide = cv2.dilate(((enter < leave) & (leave > 0)).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    return Witness(
-        view, depth, 0.94 * cv2.erode(depth, np.ones((3, 3))), 1.06 * cv2.dilate(depth, np.ones((3, 3))), wide
-    )
+    near, far = 0.94 * cv2.erode(depth, np.ones((3, 3))), 1.06 * cv2.dilate(depth, np.ones((3, 3)))
+    return Witness.of(view, depth, (near, far), wide)
 
 
 def test_a_wall_does_not_go_on_along_the_ground_where_it_was_never_seen():
@@ -144,7 +143,7 @@ def test_what_lies_beneath_the_table_in_all_views_but_one_is_not_what_is_behind_
     def shows_it(view):
         rays = geometry.pixel_rays(view.camera) @ view.camera.world_to_camera[:3, :3]
         depth = (-0.2 - view.camera.center[2]) / np.minimum(rays[..., 2], -1e-3)
-        return Witness(view.camera, depth, depth, depth, view.hidden)
+        return Witness.of(view.camera, depth, (depth, depth), view.hidden)
 
     above = views[:12]
     others = votes(geometry.unproject(beneath, camera)[hidden], above[4:]).behind
@@ -181,7 +180,8 @@ def test_slivers_go_and_patches_stay():
 
 def test_a_vase_that_hides_its_far_side_does_not_speak_against_it(views):
     """Half of the views look at the box's side from behind: something stands before it there."""
-    whole = [Witness(v.camera, *(drawn_with_the_box(v.camera),) * 3, np.zeros_like(v.hidden)) for v in views[:12]]
+    exact = lambda depth: (depth, (depth, depth))
+    whole = [Witness.of(v.camera, *exact(drawn_with_the_box(v.camera)), np.zeros_like(v.hidden)) for v in views[:12]]
     point, side = np.array([[BOX, 0.0, 0.25]]), np.array([[1.0, 0.0, 0.0]])
     plain, faced = votes(point, whole), votes(point, whole, side)
     assert plain.behind[0] >= 4 and faced.behind[0] == 0 and faced.seen[0] >= 3
@@ -225,14 +225,14 @@ def test_what_has_other_colours_than_gravel_is_debris():
     view = camera("v", 0, 2.0)
     depth, _, _ = drawn(view)
     rough = (depth * (1 + 0.1 * np.random.default_rng(0).random(depth.shape))).astype(np.float32)
-    witness = Witness(view, rough, *surface_range(rough), np.zeros_like(rough, bool))
+    witness = Witness.of(view, rough, surface_range(rough), np.zeros_like(rough, bool))
     photo = np.random.default_rng(1).integers(90, 160, (*rough.shape, 3)).astype(np.uint8)
     place = geometry.unproject(rough.astype(float), view)[80:84, 80]
     sh = torch.zeros(4, 1, 3)
     sh[2:, 0] = torch.tensor([-1.2, 0.6, 0.6])  # teal; the others are grey
     parts = torch.tensor(place).float(), torch.zeros(4, 4), torch.full((4, 3), -4.0), torch.zeros(4), sh
     assert unlike(Gaussians(*parts), [witness], {"v": photo}).tolist() == [0, 0, 1, 1]
-    smooth = Witness(view, depth.astype(np.float32), *surface_range(np.full_like(depth, depth[80, 80])), witness.hidden)
+    smooth = Witness.of(view, depth, surface_range(np.full_like(depth, depth[80, 80])), witness.hidden)
     assert not unlike(Gaussians(*parts), [smooth], {"v": photo}).any()
 
 

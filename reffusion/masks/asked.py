@@ -9,6 +9,7 @@ from reffusion.kernels.vectors import take_ticket
 from reffusion.types import Camera
 
 SEEN, FREE, BEHIND, HIDDEN = range(4)  # rows of the counts, see `masks.witness.Votes`
+SHARES = 65535  # what a share of 1 is kept as
 _CHUNK = 2048  # points that a thread takes at once
 
 
@@ -16,7 +17,7 @@ def ask(
     points: np.ndarray,
     normals: np.ndarray | None,
     camera: Camera,
-    shown: tuple[np.ndarray, np.ndarray, np.ndarray],
+    shown: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
     margins: tuple[float, float],
     counts: np.ndarray,
 ) -> None:
@@ -24,7 +25,7 @@ def ask(
 
     Args:
         points: [P, 3] float64. normals: [P, 3] or None, see `masks.witness.votes`.
-        shown: nearest and farthest, [H, W] float32, and hidden, bool [H, W], of a witness.
+        shown: of a witness `depth`, `closer`, `farther` and `hidden`.
         margins: relative depth within which a point is on the surface, and beyond which the view looks past it.
         counts: [4, P] int64, changed in place.
     """
@@ -37,7 +38,7 @@ def ask(
 
 
 @kernel
-def _ask(tickets, points, normals, inner, pose, centre, nearest, farthest, hidden, surface, free, counts):
+def _ask(tickets, points, normals, inner, pose, centre, depth, closer, farther, hidden, surface, free, counts):
     height, width = hidden.shape
     fx, fy, cx, cy = inner
     # Depth maps are compared in their own precision.
@@ -59,7 +60,8 @@ def _ask(tickets, points, normals, inner, pose, centre, nearest, farthest, hidde
             if hidden[row, column]:
                 counts[HIDDEN, i] += 1
                 continue
-            near, far = nearest[row, column], farthest[row, column]
+            near = depth[row, column] * (np.float32(closer[row, column]) / np.float32(SHARES))
+            far = depth[row, column] * (np.float32(SHARES) / np.float32(max(farther[row, column], 1)))
             if not near > 0:
                 continue
             faced = True

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import cv2
 import numpy as np
@@ -11,7 +12,7 @@ import torch
 
 from reffusion import geometry
 from reffusion.gaussians.surfels import surface_normals
-from reffusion.masks.asked import SEEN, ask
+from reffusion.masks.asked import SEEN, SHARES, ask
 from reffusion.paint import margin
 from reffusion.splat import rasterizer
 from reffusion.splat.reference import colors
@@ -25,6 +26,7 @@ TONE = 10.0  # levels of 255 beyond those that a view shows around a point, from
 UNEVEN = 1.05  # farthest over nearest depth around a point from which a surface is rough
 UNLIKE = 0.5  # share of the views that show a surface there, in which it must, to be debris
 TRUSTED = 0.25  # share of the views that look its way in which a surface must be seen, not stand behind another
+TINY = 1e-30  # of depth, so that none is no division by zero
 MARGIN = 0.004  # of the image's width: a view says nothing so near to its mask, where object and background mix
 
 
@@ -35,15 +37,35 @@ class Witness:
     Attributes:
         camera: the view.
         depth: [H, W] float32 of the surface shown, 0 where the view shows nothing opaque.
-        nearest, farthest: [H, W] float32, see `surface_range`.
+        closer, farther: [H, W] uint16, `surface_range` in shares that need half of its memory, of hundreds of views the
+            most there is: the nearest depth around over `depth`, and `depth` over the farthest, in `asked.SHARES`.
         hidden: bool [H, W], where it shows the object, and a margin around.
     """
 
     camera: Camera
     depth: np.ndarray
-    nearest: np.ndarray
-    farthest: np.ndarray
+    closer: np.ndarray
+    farther: np.ndarray
     hidden: np.ndarray
+
+    @classmethod
+    def of(cls, camera: Camera, depth: np.ndarray, surface: tuple[np.ndarray, np.ndarray], hidden: np.ndarray) -> Self:
+        """The view as a witness, of the nearest and the farthest depth around each pixel, [H, W]."""
+        nearest, farthest = surface
+        known = np.maximum(depth, TINY)
+        closer = np.rint(SHARES * np.minimum(nearest / known, 1))
+        farther = np.rint(SHARES * np.minimum(known / np.maximum(farthest, TINY), 1))
+        return cls(camera, depth.astype(np.float32), closer.astype(np.uint16), farther.astype(np.uint16), hidden)
+
+    @property
+    def nearest(self) -> np.ndarray:
+        """[H, W] float32, the nearest depth around each pixel, 0 where nothing is shown."""
+        return self.depth * (self.closer / np.float32(SHARES))
+
+    @property
+    def farthest(self) -> np.ndarray:
+        """[H, W] float32, the farthest depth around each pixel, 0 where nothing is shown."""
+        return self.depth * (SHARES / np.maximum(self.farther, 1).astype(np.float32))
 
 
 @torch.no_grad()
@@ -62,7 +84,7 @@ def witnesses(
         drawn = rasterizer.render(gaussians, camera, sh_degree=0)
         depth = torch.where(drawn.alpha > OPAQUE, drawn.depth, 0).cpu().numpy().astype(np.float32)
         wide = widened(hidden[camera.name], margin)
-        found.append(Witness(camera, depth, *surface_range(depth), wide))
+        found.append(Witness.of(camera, depth, surface_range(depth), wide))
     return found
 
 
@@ -151,7 +173,8 @@ def seen_by(view: Witness, points: np.ndarray) -> np.ndarray:
 
 
 def _ask(view: Witness, points: np.ndarray, normals: np.ndarray | None, counts: np.ndarray) -> None:
-    ask(points, normals, view.camera, (view.nearest, view.farthest, view.hidden), (SURFACE, FREE), counts)
+    shown = view.depth, view.closer, view.farther, view.hidden
+    ask(points, normals, view.camera, shown, (SURFACE, FREE), counts)
 
 
 def smoothed_surface(depth: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
