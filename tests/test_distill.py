@@ -205,12 +205,13 @@ def run(folder, prior, text, settings=SETTINGS, views=None, gaussians=None):
     return D.distill(gaussians or start, masked, views, holes, prior, text, settings, folder)
 
 
-def test_sds_beside_the_other_terms_gives_the_same_bits(prior, text, tmp_path):
+@pytest.mark.parametrize("off", [{"adversarial": OFF}, {"sds": OFF}], ids=["SDS beside the other terms", "a critic"])
+def test_any_number_of_threads_gives_the_same_bits(prior, text, tmp_path, off):
     before, found = torch.get_num_threads(), []
     for threads in (1, 2):
         torch.set_num_threads(threads)
         try:
-            found.append(run(tmp_path / str(threads), prior, text, altered(SETTINGS, adversarial=OFF))[0])
+            found.append(run(tmp_path / str(threads), prior, text, altered(SETTINGS, **off))[0])
             assert torch.get_num_threads() == threads
         finally:
             torch.set_num_threads(before)

@@ -26,6 +26,7 @@ from reffusion.distill.lift import lift_term
 from reffusion.distill.perceptual import Distance
 from reffusion.gaussians.optimize import GaussianOptimizer
 from reffusion.geometry import Degenerate, angle_between_views
+from reffusion.kernels.compiled import torch_on_one_thread
 from reffusion.params.distill import Params
 from reffusion.prior.model import Prior
 from reffusion.types import PARAMETERS, Camera, Gaussians
@@ -135,7 +136,8 @@ def step_of(optimizer: GaussianOptimizer, step: int, job: Job) -> dict[str, floa
         parameter, gradient = getattr(optimizer.gaussians, name), getattr(apart.gaussians, name).grad
         if gradient is not None:
             parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
-    optimizer.step(step / job.settings.iterations, visible=moved)
+    with torch_on_one_thread():
+        optimizer.step(step / job.settings.iterations, visible=moved)
     return line
 
 
@@ -185,6 +187,7 @@ def _depth(optimizer: GaussianOptimizer, step: int, job: Job) -> _Done:
     return reached & (rendering.radii > 0), {}
 
 
+@torch_on_one_thread()
 def _adversarial(optimizer: GaussianOptimizer, step: int, job: Job) -> _Done:
     gaussians, masked, settings, adversary = optimizer.gaussians, optimizer.masked, job.settings, job.adversary
     if adversary is None or step < ADVERSARIAL_FROM * settings.iterations or not masked.any():
@@ -199,6 +202,7 @@ def _adversarial(optimizer: GaussianOptimizer, step: int, job: Job) -> _Done:
     return reached & (rendering.radii > 0), line
 
 
+@torch_on_one_thread()
 def _reference(optimizer: GaussianOptimizer, step: int, job: Job) -> _Done:
     gaussians, masked, reference = optimizer.gaussians, optimizer.masked, job.settings.reference
     if not (reference.weight > 0 and masked.any()):
@@ -224,6 +228,7 @@ def _lift(optimizer: GaussianOptimizer, step: int, job: Job) -> _Done:
     return reached & (rendering.radii > 0), {"lift": float(loss.detach())}
 
 
+@torch_on_one_thread()
 def _reconstruction(optimizer: GaussianOptimizer, step: int, job: Job) -> _Done:
     gaussians, settings, every = optimizer.gaussians, job.settings, job.settings.reconstruction.every
     if not every or step % every or not job.photographed:

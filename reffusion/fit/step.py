@@ -13,6 +13,7 @@ from reffusion.fit.exposure import Exposures
 from reffusion.gaussians.densify import densify, prune, viewing_distance
 from reffusion.gaussians.optimize import GaussianOptimizer, Rates, reconstruction_loss
 from reffusion.geometry import cameras_extent
+from reffusion.kernels.compiled import torch_on_one_thread
 from reffusion.params.fit import LearningRates, Params
 from reffusion.splat.rasterizer import render
 from reffusion.types import Camera
@@ -46,6 +47,7 @@ def rates_of(lr: LearningRates, cameras: Sequence[Camera]) -> Rates:
     return rates.in_units_of(cameras_extent(cameras)) if lr.means_unit == "cameras" else rates
 
 
+@torch_on_one_thread()
 def step(
     optimizer: GaussianOptimizer,
     exposures: Exposures | None,

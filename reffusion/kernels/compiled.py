@@ -11,6 +11,7 @@ import threading
 import weakref
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -26,6 +27,7 @@ FEW = 8000  # Gaussians for which waking another thread takes longer than it sav
 # Rounding may vary, but NaN and infinity stay what they are: `fit` looks for them.
 FREE_ROUNDING = "contract", "reassoc", "nsz", "arcp"
 _ROOMS = "kernels", "splat", "gaussians", "depth", "texture", "masks"  # the packages that have kernels
+_OUTSIDE = threading.local()  # `threads`: torch's number outside of `torch_on_one_thread`, by thread as torch's is
 _CACHE = "splat-"  # folders of machine code in __pycache__, one per state of these sources
 
 
@@ -102,8 +104,24 @@ def _blocks() -> tuple[list[_Block], threading.Lock]:
 
 
 def threads() -> int:
-    """How many threads kernels use: torch's number, so one setting (or OMP_NUM_THREADS) rules both."""
-    return torch.get_num_threads()
+    """How many threads kernels use: torch's number, so one setting (or OMP_NUM_THREADS) rules both; inside
+    `torch_on_one_thread` what that was before."""
+    return getattr(_OUTSIDE, "threads", None) or torch.get_num_threads()
+
+
+@contextmanager
+def torch_on_one_thread() -> Iterator[None]:
+    """For work that mostly draws; a decorator, too. What torch itself does between kernels is little: its threads wait
+    for each other in each operation, which takes longer than it saves, and far longer where another process has one of
+    their cores. Besides, the same is computed with any number of threads."""
+    given, of_torch = getattr(_OUTSIDE, "threads", None), torch.get_num_threads()
+    _OUTSIDE.threads = given or of_torch
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        _OUTSIDE.threads = given
+        torch.set_num_threads(of_torch)
 
 
 def parallel_for(function: Callable, *arguments, gaussians: int = FEW) -> None:
