@@ -16,6 +16,7 @@ from reffusion.io.images import load_image, load_mask, save_image
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_raw_masks, load_scene, shows_object
 from reffusion.kernels.compiled import side_by_side
+from reffusion.masks.witness import OPAQUE
 from reffusion.paint import paint2d
 from reffusion.paint.margin import widened
 from reffusion.paint.paint2d import Painter
@@ -143,9 +144,10 @@ def exposure_of(work: Work, camera: Camera, photo: np.ndarray | None) -> np.ndar
     told = work.exposures.get(camera.name)
     if told is None or photo is None:
         return told
-    color = exposure.exposed(rasterizer.render(work.gaussians["fit"], camera).color, told).cpu().numpy()
+    drawn = rasterizer.render(work.gaussians["fit"], camera)
+    color, there = exposure.exposed(drawn.color, told).cpu().numpy(), drawn.alpha.cpu().numpy() > OPAQUE
     outside = ~widened(mask_of(camera, work.poses, work.masks), rows.OUTSIDE_MARGIN)
-    return exposure.matched(told, color, photo, outside)
+    return exposure.matched(told, color, photo, outside & there)
 
 
 def rendered(work: Work, camera: Camera, how: np.ndarray | None) -> tuple[Shown, dict[str, np.ndarray]]:

@@ -3,6 +3,7 @@
 import csv
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_scene, save_mask_sets, save_scene
 from reffusion.paint.margin import widened
 from reffusion.score import beyond, metrics, rows, sight
+from reffusion.splat.rasterizer import render
 from reffusion.types import Camera, Gaussians, MaskSet, Scene, Similarity
 from report import sheet
 from stages import evaluate
@@ -82,19 +84,26 @@ def test_while_an_object_is_kept_nothing_is_scored(tmp_path, folders):
     assert found["mean"].get("psnr_box") is None and (tmp_path / "out/renders/view0.png").exists()
 
 
-def test_views_are_drawn_as_bright_as_photographs_are(tmp_path, folders, done):
+def test_views_are_drawn_as_bright_as_photographs_are(folders, tmp_path):
     """As their own outside the mask, or else as those next to them; and they are as consistent as without."""
     names = [f"view{k}" for k in range(3, 8)]
     dark = np.diag([0.5, 0.6, 0.7]) @ np.eye(3, 4)
-    save_json(folders["fit"] / "exposures.json", {name: dark.tolist() for name in names})
     (folders["poses"] / "images/view2.png").unlink()
-    own = load_image(done / "evaluate/renders_fit/view0.png") * [0.3, 0.4, 0.8]
-    own[10:30, 5:35] = 255  # the mask's pixels tell nothing
-    save_image(folders["poses"] / "images/view0.png", own.round().astype(np.uint8))
-    shutil.copy(done / "evaluate/renders_fit/view1.png", folders["poses"] / "images/view1.png")
-    found, plain = run(tmp_path / "out", folders), load_json(done / "evaluate/metrics.json")
+    many = blobs(400)
+    many = replace(many, log_scales=many.log_scales + 1.0, opacity_logits=torch.full_like(many.opacity_logits, 3.0))
+    save_ply(folders["fit"] / "gaussians.ply", many)
+    for name, gain in (("view0", [0.3, 0.4, 0.8]), ("view1", [1.0, 1.0, 1.0])):
+        drawn = render(many, load_scene(folders["poses"]).cameras[name])
+        own, shown = 255 * drawn.color.detach().numpy() * gain, drawn.alpha.detach().numpy() > 0.9
+        own[~shown] = 240  # where the fit shows nothing it tells nothing, nor do the mask's pixels
+        own[10:30, 5:35] = 255
+        assert 0.05 < (~shown).mean() < 0.5
+        save_image(folders["poses"] / f"images/{name}.png", own.clip(0, 255).round().astype(np.uint8))
+    plain = run(tmp_path / "plain", folders)
+    save_json(folders["fit"] / "exposures.json", {name: dark.tolist() for name in names})
+    found = run(tmp_path / "out", folders)
     for name, gain in (("view0", [0.3, 0.4, 0.8]), ("view2", [0.5, 0.6, 0.7])):
-        shown, before = (load_image(k / f"renders/{name}.png") for k in (tmp_path / "out", done / "evaluate"))
+        shown, before = (load_image(tmp_path / f"{k}/renders/{name}.png") for k in ("out", "plain"))
         assert np.abs(shown - before * gain).max() < 2.5, name
     assert "next to it" in found["exposure"] and plain["exposure"] is None
     assert found["consistency"]["consistency"] == pytest.approx(plain["consistency"]["consistency"], abs=5e-3)
