@@ -13,6 +13,7 @@ from reffusion import geometry, seeding
 from reffusion.depth.behind import grown
 from reffusion.gaussians.surfels import surface_normals
 from reffusion.masks.borders import RIM, between
+from reffusion.masks.corners import reached, third_faces
 from reffusion.masks.plane import CELLS, Plane
 from reffusion.masks.witness import SURFACE, Witness, seen_by, votes
 from reffusion.paint.margin import hull
@@ -61,17 +62,22 @@ def planes_around(centre: np.ndarray, radius: float, views: Sequence[Witness], s
             break
         found.append((normal, height))
         free &= np.abs(samples @ normal - height) >= 1.5 * near
+    thirds = third_faces(samples, free, found, centre, radius, near)
+    third = [False] * len(found) + [True] * len(thirds)
+    found += thirds
     away = [np.linalg.norm(view.camera.center - centre) for view in views]
     band = max(1.5 * near, SURFACE * float(np.median(away))) if found else 0.0
-    mapped = [_mapped(*plane, centre, REACH * radius, views) for plane in found]
+    mapped = [_mapped(*plane, centre, REACH * radius, views, so) for plane, so in zip(found, third, strict=True)]
     planes = [plane for plane, _ in mapped]
     grounds = [_crossing(plane, planes[:k]) for k, plane in enumerate(planes)]
     # What may be the one or the other is the better supported one's, unless it faces as this one does.
     faced = _faced(planes, grounds, views)
-    whole = []
-    for (plane, hidden), below, so in zip(mapped, grounds, faced, strict=True):
+    whole: list[Plane] = []
+    for (plane, hidden), below, so, narrow in zip(mapped, grounds, faced, third, strict=True):
         own = replace(plane, seen=plane.seen & so)
-        whole.append(_continued(own, hidden, below, _crossing(own, planes), band))
+        if narrow:
+            hidden &= reached(own, whole, views)
+        whole.append(_continued(own, hidden, below, _crossing(own, planes), band, narrow))
     return whole
 
 
@@ -164,7 +170,7 @@ def _solid(seen: np.ndarray) -> np.ndarray:
 
 
 def _mapped(
-    normal: np.ndarray, height: float, centre: np.ndarray, reach: float, views: Sequence[Witness]
+    normal: np.ndarray, height: float, centre: np.ndarray, reach: float, views: Sequence[Witness], third: bool
 ) -> tuple[Plane, np.ndarray]:
     """The plane with a map of where views show it and where they look through it; and bool [CELLS, CELLS], where
     the object hides it from some."""
@@ -173,9 +179,12 @@ def _mapped(
     origin, pitch = centre - (centre @ normal - height) * normal, 2 * reach / CELLS
     nowhere = np.zeros((CELLS, CELLS), bool)
     plane = Plane(normal, height, origin, along, pitch, nowhere, nowhere, nowhere, nowhere, nowhere)
-    # On the object's side: a table's underside, seen from below, is not the top under the object.
+    # On the object's side: a table's underside, seen from below, is not the top under the object. An object before a
+    # wall's edge stands to both sides of the third face: on that from where more of it is seen.
     facing = normal if centre @ normal > height else -normal
     seen, free, hidden = _looked_at(plane, facing, views)
+    if third and (other := _looked_at(plane, -facing, views))[0].sum() > seen.sum():
+        facing, (seen, free, hidden) = -facing, other
     wider = replace(plane, pitch=WIDER * pitch)
     pit = wider.in_cells(_surrounded(*_looked_at(wider, facing, views)[:2]), plane.cells.reshape(-1, 3))
     pit = free & ndimage.binary_dilation(pit.reshape(free.shape), iterations=2)
@@ -204,7 +213,7 @@ def _surrounded(seen: np.ndarray, free: np.ndarray) -> np.ndarray:
 
 
 def _continued(
-    plane: Plane, hidden: np.ndarray, grounds: Sequence[Plane], others: Sequence[Plane], band: float
+    plane: Plane, hidden: np.ndarray, grounds: Sequence[Plane], others: Sequence[Plane], band: float, narrow: bool
 ) -> Plane:
     """The plane with where it goes on: a patch of it that nobody saw, because the object was in the way, and that
     touches what was seen of it, belongs to it up to its border; where views look through it, it is not.
@@ -213,11 +222,13 @@ def _continued(
         hidden: bool [CELLS, CELLS], where the object hides it.
         others: planes that cross it. grounds: those of them with more samples.
         band: distance from these up to which a view that seems to show the one may show the other.
+        narrow: of a patch's border only what is known of tells whether it touches what was seen: most of the rest is
+            within walls.
     """
     # Neither a thin rim nor a crossing tells where the plane goes on to.
     seen, free = plane.seen | plane.pit, plane.free & ~plane.pit
     own = seen.copy()
-    for other in others:
+    for other in others if not narrow else ():
         own &= np.abs(plane.cells @ other.normal - other.height) >= band
     unknown = ~seen & ~free & hidden
     patches, count = ndimage.label(unknown)
@@ -225,7 +236,8 @@ def _continued(
     for patch in range(1, count + 1):
         inside = patches == patch
         border = ndimage.binary_dilation(inside, iterations=2) & ~inside
-        if inside.sum() >= 4 and seen[border].mean() > TOUCHING:
+        told = border & (seen | free) if narrow else border
+        if inside.sum() >= 4 and seen[told].sum() > TOUCHING * told.sum():
             beyond = between(inside, _solid(own), free) < 0.5
             goes_on |= inside & ~beyond
             ends |= inside & beyond

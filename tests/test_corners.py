@@ -1,0 +1,71 @@
+"""A wall that comes forward: its side, narrow in all photographs, goes on behind what stands before it."""
+
+import numpy as np
+import pytest
+
+from reffusion import geometry
+from reffusion.masks.continuation import planes_around
+from reffusion.masks.corners import third_faces
+from reffusion.masks.witness import Witness, surface_range
+from reffusion.types import Camera
+
+SIZE, DEEP = 160, 0.35  # px; how far the wall comes forward of the one behind it
+LOW, HIGH = np.array([-0.25, -0.45, 0.0]), np.array([0.35, -0.15, 0.45])  # what stands before the edge
+
+
+def camera(turn):
+    """Looks at the edge from before the wall and from the left, from where its side shows."""
+    place = np.array([-2.2 * np.sin(turn), -2.2 * np.cos(turn), 0.9])
+    ahead = np.array([0.0, 0.0, 0.3]) - place
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, [0, 0, 1.0])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(ahead, right), ahead])
+    pose[:3, 3] = -pose[:3, :3] @ place
+    return Camera(f"v{turn:.2f}", SIZE, SIZE, 170.0, 170.0, SIZE / 2, SIZE / 2, pose)
+
+
+def witness(view):
+    rays = geometry.pixel_rays(view) @ view.world_to_camera[:3, :3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        floor, front, behind, side = (
+            (value - view.center[axis]) / rays[..., axis] for axis, value in ((2, 0.0), (1, 0.0), (1, DEEP), (0, 0.0))
+        )
+        place = lambda way: view.center + rays * way[..., None]
+        front = np.where((front > 0) & (place(front)[..., 0] > 0), front, np.inf)
+        beside = place(side)[..., 1]
+        side = np.where((side > 0) & (beside > 0) & (beside < DEEP), side, np.inf)
+        depth = np.min([np.where(each > 0, each, np.inf) for each in (floor, front, behind, side)], axis=0)
+        bounds = np.stack([(LOW - view.center) / rays, (HIGH - view.center) / rays])
+    enter, leave = bounds.min(0).max(-1), bounds.max(0).min(-1)
+    return Witness.of(view, depth, surface_range(depth.astype(np.float32)), (enter < leave) & (leave > 0))
+
+
+@pytest.fixture(scope="module")
+def planes():
+    views = [witness(camera(turn)) for turn in np.linspace(0.1, 0.6, 12)]
+    return planes_around((LOW + HIGH) / 2, 0.3, views)
+
+
+def test_the_side_of_a_wall_goes_on_behind_a_thing_down_to_the_floor_and_not_into_the_wall(planes):
+    sides = [plane for plane in planes if abs(plane.normal[0]) > 0.99]
+    assert len(sides) == 1 and abs(sides[0].height) < 0.01
+    _, y, z = np.moveaxis(sides[0].cells, -1, 0)
+    known = sides[0].goes_on | sides[0].seen
+    assert known[(y > 0.03) & (y < DEEP - 0.03) & (z > 0.03) & (z < 0.6)].mean() > 0.95
+    assert sides[0].goes_on.sum() > 100
+    assert not known[(y < -0.05) | (y > DEEP + 0.05) | (z < -0.05)].any()
+
+
+def test_leaves_have_no_third_face():
+    draws = np.random.default_rng(0)
+    found = [(np.array([0.0, 0.0, 1.0]), 0.0), (np.array([0.0, 1.0, 0.0]), 0.0)]
+    leaves = draws.uniform(-1, 1, (4000, 3))
+    face = np.stack([draws.normal(0.1, 0.004, 200), *draws.uniform(-0.5, 0.5, (2, 200))], 1)
+    free = np.ones(4200, bool)
+    asked = lambda samples: third_faces(samples, free[: len(samples)], found, np.zeros(3), 0.5, 0.02)
+    assert asked(leaves) == []
+    ((normal, height),) = asked(np.concatenate([leaves[:1500], face]))
+    assert height * normal[0] == pytest.approx(0.1, abs=0.005)
+    assert third_faces(face, free[:200], found[:1], np.zeros(3), 0.5, 0.02) == [], "one plane has no corner"
