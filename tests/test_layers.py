@@ -38,6 +38,32 @@ def test_a_pattern_in_the_colours_of_another_surface_is_no_island_of_it():
     assert (hole & star).sum() > 50 and (surfaces[star] == surfaces[0, 0]).all()
 
 
+def test_where_other_views_look_past_a_surface_its_colours_are_another_ones():
+    """Leaves on the ground, brown as the post beside them, do not stand up."""
+    disparity, picture, hole = step_scene()
+    rows, columns = np.mgrid[:100, :120]
+    leaves = (np.abs(rows - 45) < 8) & (columns >= 60) & (columns < 78)
+    picture = np.where(leaves[..., None], picture[0, 0], picture)
+    view = Camera("v", 120, 100, 100.0, 100.0, 60.0, 50.0, np.eye(4))
+    past = lambda depth: (columns >= 62) & (depth < 0.97 / disparity)
+    how = Completion(planar_share=2.0, ring=0.2, margin=0.01)
+    wrong = []
+    for looked_past in (None, past):
+        seen = Seen(
+            view,
+            1 / disparity,
+            ~grown(hole, how.margin),
+            hole,
+            hole,
+            np.zeros_like(hole),
+            Hints(looked_past=looked_past),
+        )
+        found, said = continued(seen, picture, np.zeros((0, 3)), how)
+        assert "2 surfaces" in said
+        wrong.append((np.abs(found / disparity - 1)[leaves & hole] > 0.1).mean())
+    assert wrong[0] > 0.8 and wrong[1] < 0.2
+
+
 def vase_on_a_table():
     """Depths [H, W] of a table's plane, and of what stands on it from column 80 on, nearer but touching it at row 90;
     a picture in three colours, for a plate lies on the table; and a hole that hides the vase's left rim."""

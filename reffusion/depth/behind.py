@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy import ndimage
@@ -177,12 +178,16 @@ def continued(
     given = view.known | view.anchored
     around, hole = given & grown(view.hole, how.ring), grown(view.hole, how.margin)
     planes = () if farthest else view.hints.planes
-    surfaces = shared_out(view.disparity, around, hole, guide, planes, view.anchored)
+    share = partial(shared_out, view.disparity, around, hole, guide, planes, view.anchored)
+    surfaces = share()
     if surfaces.max() > 1 and farthest:
         far = complete(view.disparity, given & (surfaces == _farthest(view, surfaces, given)), guide, plate)
         return np.where(view.anchored, view.disparity, far), f"{said}: the farthest of {surfaces.max()} surfaces"
     if surfaces.max() > 1:
         layered, said = _layered(view, surfaces, planes, guide, plate), f"{said}: {surfaces.max()} surfaces continued"
+        barred = np.where(_looked_past(view, layered) & (surfaces != _farthest(view, surfaces, given)), surfaces, 0)
+        if barred.any():
+            layered = _layered(view, share(barred), planes, guide, plate)
         solvers.solved("completion", layered)
         return layered, said
     fitted = complete(view.disparity, given, guide, plate, keep=False)
@@ -228,10 +233,15 @@ def _refuted(view: Seen, disparity: np.ndarray) -> float:
     it: the planes of a post and of the ground meet in front of the ground behind the post."""
     if not view.hole.any():
         return 0.0
-    wrong = view.anchored & (disparity > view.disparity * NEARER)
-    if view.hints.looked_past is not None:
-        wrong |= view.hints.looked_past(1 / np.maximum(disparity, view.least_disparity))
+    wrong = (view.anchored & (disparity > view.disparity * NEARER)) | _looked_past(view, disparity)
     return float(wrong[view.hole].mean())
+
+
+def _looked_past(view: Seen, disparity: np.ndarray) -> np.ndarray:
+    """bool [H, W]: pixels of the hole in which other views look past a surface of this disparity."""
+    if view.hints.looked_past is None:
+        return np.zeros_like(view.hole)
+    return view.hole & view.hints.looked_past(1 / np.maximum(disparity, view.least_disparity))
 
 
 def points_around(view: Seen, points: np.ndarray, how: Completion) -> tuple[np.ndarray, np.ndarray]:

@@ -31,6 +31,7 @@ def shared_out(
     guide: np.ndarray,
     planes: Sequence[np.ndarray] = (),
     supposed: np.ndarray | None = None,
+    barred: np.ndarray | None = None,
 ) -> np.ndarray:
     """The surface that each pixel belongs to, int [H, W]: 1, 2, ... where known or in the hole, 0 elsewhere.
 
@@ -46,6 +47,7 @@ def shared_out(
         guide: [H, W, 3] picture, uint8 or [0, 1].
         planes: depth [H, W] of planes that stand around the hole.
         supposed: bool [H, W], those of the known pixels that are only supposed to be of the plane they lie on.
+        barred: int [H, W], a surface that a pixel must not be of, numbered as by a call without; 0: it may be of each.
     """
     supposed = np.zeros_like(hole) if supposed is None else supposed & known
     surfaces = pieces(disparity, known & ~supposed, planes, hole)
@@ -61,6 +63,8 @@ def shared_out(
     own, of = _at(surfaces, domain) - 1, of_planes(disparity, supposed, surfaces, planes)[domain] - 1
     for k in range(count):
         cost[k] += SUPPOSED * ((of >= 0) & (of != k)) + HARD * ((own >= 0) & (own != k))
+        if barred is not None:
+            cost[k] += HARD * ((own < 0) & (barred[domain] == k + 1))
     pairs, strength = _links(index, colors)
     start = np.where(own >= 0, own, np.where(of >= 0, of, cost.argmin(0)))
     found = surfaces.copy()
