@@ -144,8 +144,11 @@ def parallel_for(function: Callable, *arguments, gaussians: int = FEW) -> None:
 
 def side_by_side(function: Callable[[T], R], items: Iterable[T], most: int = 8) -> Iterator[R]:
     """`function` of each item in their order, as many at once as there are threads, `most` at most: for work whose
-    array operations let other threads run. Where it is left early, what has not begun is not done."""
-    with ThreadPoolExecutor(max(1, min(threads(), most)), thread_name_prefix="beside") as pool:
+    array operations let other threads run; these share out the threads that there are. Where it is left early, what
+    has not begun is not done."""
+    workers = max(1, min(threads(), most))
+    own = max(1, threads() // workers)
+    with ThreadPoolExecutor(workers, "beside", initializer=torch.set_num_threads, initargs=(own,)) as pool:
         try:
             yield from pool.map(function, items)
         finally:
