@@ -26,6 +26,7 @@ SOME_FAILED = 3  # compare: done, but for some variants
 
 def main() -> int:
     arguments = _parser().parse_args()
+    arguments.set = " ".join(arguments.set)
     root = arguments.root.resolve()
     runs = (arguments.runs or workplace(root) / "runs").resolve()
     names = ("scene", "profile", "variant", "trust", "set", "budget", "keep")
@@ -98,7 +99,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--engine", help=f"where stages run: local (default), {', '.join(ENGINES)}")
     parser.add_argument("--address", help="of the engine: ray://HOST:10001 or HOST:6379; a partition of Slurm")
     parser.add_argument("--offline", action="store_true", help="weights: only say what is missing")
-    parser.add_argument("--set", default="", help="stage.parameter=value ...")
+    parser.add_argument("--set", action="append", default=[], help="stage.parameter=value ...")
     parser.add_argument("--yes", action="store_true", help="gc: remove what it lists, without asking")
     parser.add_argument("--root", type=Path, default=Path(__file__).parent.parent, help="where pipeline.yaml is")
     parser.add_argument("--runs", type=Path, help="where artifacts go; root/runs, installed ./runs")

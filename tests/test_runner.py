@@ -479,7 +479,7 @@ def test_ctrl_c(root):
 
 
 def test_two_runners_on_one_scene(root):
-    first = start(root, "--scene", "toy", "--set", "fit.pause=0.2 fit.iterations=8")
+    first = start(root, "--scene", "toy", "--set", "fit.pause=0.2", "--set", "fit.iterations=8")
     wait_for(lambda: list((root / "runs/toy").glob(".partial-fit-*")))
     first.send_signal(signal.SIGSTOP)  # until the second has had to wait
     with pytest.raises(Refused, match=f"toy is in use by process {first.pid}"):
