@@ -185,7 +185,9 @@ def continued(
         return np.where(view.anchored, view.disparity, far), f"{said}: the farthest of {surfaces.max()} surfaces"
     if surfaces.max() > 1:
         layered, said = _layered(view, surfaces, planes, guide, plate), f"{said}: {surfaces.max()} surfaces continued"
-        barred = np.where(_looked_past(view, layered) & (surfaces != _farthest(view, surfaces, given)), surfaces, 0)
+        # Of planes that go on their maps tell; and views look into a mirror that is a part of one.
+        wrong = _looked_past(view, layered) & ~view.anchored & (surfaces != _farthest(view, surfaces, given))
+        barred = np.where(wrong, surfaces, 0)
         if barred.any():
             layered = _layered(view, share(barred), planes, guide, plate)
         solvers.solved("completion", layered)
