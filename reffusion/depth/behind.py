@@ -187,9 +187,8 @@ def continued(
         layered, said = _layered(view, surfaces, planes, guide, plate), f"{said}: {surfaces.max()} surfaces continued"
         # Of planes that go on their maps tell; and views look into a mirror that is a part of one.
         wrong = _looked_past(view, layered) & ~view.anchored & (surfaces != _farthest(view, surfaces, given))
-        barred = np.where(wrong, surfaces, 0)
-        if barred.any():
-            layered = _layered(view, share(barred), planes, guide, plate)
+        if wrong.any():
+            layered = _layered(view, share(np.where(wrong, surfaces, 0)), planes, guide, plate)
         solvers.solved("completion", layered)
         return layered, said
     fitted = complete(view.disparity, given, guide, plate, keep=False)
@@ -233,10 +232,8 @@ def _layered(
 def _refuted(view: Seen, disparity: np.ndarray) -> float:
     """The share of the hole in which a surface of this disparity hides a plane that goes on, or other views look past
     it: the planes of a post and of the ground meet in front of the ground behind the post."""
-    if not view.hole.any():
-        return 0.0
     wrong = (view.anchored & (disparity > view.disparity * NEARER)) | _looked_past(view, disparity)
-    return float(wrong[view.hole].mean())
+    return float(wrong[view.hole].mean()) if view.hole.any() else 0.0
 
 
 def _looked_past(view: Seen, disparity: np.ndarray) -> np.ndarray:
