@@ -39,10 +39,12 @@ def third_faces(
     """
     enough, more = max(FEWEST, LEAST_SHARE * len(samples)), []
     for (one, _), (other, _) in combinations(found, 2):
-        normal = np.cross(one, other)
-        if abs(one @ other) > SQUARE or any(abs(normal @ known) > 1 - SQUARE for known, _ in more):
+        if abs(one @ other) > SQUARE:
             continue
+        normal = np.cross(one, other)
         normal /= np.linalg.norm(normal)
+        if any(abs(normal @ known) > 1 - SQUARE for known, _ in more):
+            continue
         away = np.sort((samples[free] - centre) @ normal)
         within = lambda low, high, away=away: np.searchsorted(away, high) - np.searchsorted(away, low)
         tried = np.arange(-NEAR * radius, NEAR * radius, near / STEPS)
