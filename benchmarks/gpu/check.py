@@ -28,6 +28,7 @@ import torch
 
 from benchmarks.gpu import exact, steps
 from benchmarks.gpu.bench import PAPER, TOY, Bench
+from reffusion.gaussians.ssim import triton_works
 from reffusion.io.machine import lacks
 from reffusion.io.machine import machine as facts_of_machine
 from reffusion.params.distill import Params as Distill
@@ -119,6 +120,7 @@ def machine(device: str) -> dict[str, Any]:
         "driver": facts_of_machine().driver,
         "gsplat": importlib.metadata.version("gsplat"),
         "extension": _backend._C is not None,
+        "triton": triton_works(),
         "extension_seconds": round(time.perf_counter() - began, 1),
         "tf32_products": tf32[0].allow_tf32,
         "tf32_convolutions": tf32[1].allow_tf32,

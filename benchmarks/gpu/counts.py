@@ -152,7 +152,7 @@ def adam_of_a_gaussian() -> dict[str, float]:
         rows = [optimize._rows(getattr(each, name)) for each in optimizer._states()]
         updates.append(optimize.Update(*rows, torch.zeros_like(rows[0]), rates[name], 1.0))
     everyone, steps = torch.ones(GAUSSIANS, dtype=torch.bool), torch.ones(GAUSSIANS, dtype=torch.int32)
-    given = (steps, everyone, ~everyone, *optimize._unbiasing((0.9, 0.999), 1), 0.9, 0.999, 1e-15)
+    given = (steps, everyone, ~everyone, *optimize._unbiasing((0.9, 0.999), 1, steps.device), 0.9, 0.999, 1e-15)
     return _scaled(counted(lambda: optimize._adam(updates, *given)), GAUSSIANS)
 
 

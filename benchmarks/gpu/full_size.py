@@ -164,10 +164,11 @@ def living(shape: Shape, dtype: torch.dtype) -> dict[str, float]:
 
 
 def build(shape: Shape, dtype: torch.dtype, device: str = "cpu", seed: int = 0) -> Prior:
-    """A prior of random weights, the same for equal seeds."""
-    with torch.random.fork_rng():
+    """A prior of random weights, made on the device: the same there for equal seeds."""
+    with torch.random.fork_rng(), torch.device(device):
         torch.manual_seed(seed)
-        return assembled(shape, networks(shape, dtype), device)
+        made = networks(shape, dtype)
+    return assembled(shape, made, device)
 
 
 def assembled(shape: Shape, made: dict[str, torch.nn.Module], device: str) -> Prior:

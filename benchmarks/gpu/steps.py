@@ -126,6 +126,7 @@ def depth_estimator(sizes: Sizes, device: str) -> tuple[Estimator, str]:
             backbone_config=backbone, reassemble_hidden_size=384, neck_hidden_sizes=[48, 96, 192, 384],
             fusion_hidden_size=64, head_hidden_size=32, initializer_range=0.1,
         ))  # fmt: skip
+        torch.nn.init.constant_(model.head.conv3.bias, 1e4)  # whose last layer would else cut nearly all to 0
         network, source = monocular.make_network(model, device), "random"
     tries = [by_network(lambda image, sign=sign: sign * monocular.disparity(network, image), Completion())
              for sign in (1, -1)]  # fmt: skip

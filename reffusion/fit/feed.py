@@ -24,19 +24,21 @@ def samples(
     seed: int,
     coarse: int = 0,
     sparse: range = range(0),
+    device: torch.device | str = "cpu",
 ) -> Iterator[tuple[Camera, Tensor, Tensor | None]]:
-    """What each of the steps sees, prepared by a thread of its own while the step before it runs: before step `coarse`
-    at half the size; in the steps `sparse` every second pixel each way, where there are enough, in four turns all."""
+    """What each of the steps sees, on `device`, prepared by a thread of its own while the step before it runs: before
+    step `coarse` at half the size; in the steps `sparse` every second pixel each way, where there are enough, in four
+    turns all."""
 
     def prepared(i: int) -> tuple[Camera, Tensor, Tensor | None]:
         camera = cameras[seeding.in_epochs(i, len(cameras), seed, "views")]
         view = camera, images[camera.name], weights.get(camera.name)
         if i < coarse:
-            return sample(*halved(*view))
+            return sample(*halved(*view), device)
         if i in sparse and camera.width * camera.height >= SPARED:
             turn = seeding.in_epochs(i // len(cameras), 4, seed, "pixels", camera.name)
-            return sample(*every_second(*view, turn % 2, turn // 2))
-        return sample(*view)
+            return sample(*every_second(*view, turn % 2, turn // 2), device)
+        return sample(*view, device)
 
     with ThreadPoolExecutor(1, thread_name_prefix="fit") as ahead:
         coming = ahead.submit(prepared, steps.start)
@@ -46,10 +48,12 @@ def samples(
             yield ready
 
 
-def sample(camera: Camera, image: np.ndarray, weights: np.ndarray | None) -> tuple[Camera, Tensor, Tensor | None]:
-    """The view as the step sees it: camera, image in [0, 1], weights."""
-    counts = None if weights is None else torch.from_numpy(np.asarray(weights, np.float32))
-    return camera, torch.from_numpy(image).float() / 255, counts
+def sample(
+    camera: Camera, image: np.ndarray, weights: np.ndarray | None, device: torch.device | str
+) -> tuple[Camera, Tensor, Tensor | None]:
+    """The view as the step sees it: camera, image in [0, 1], weights. Bytes go to a card, a quarter of the floats."""
+    counts = None if weights is None else torch.from_numpy(np.asarray(weights, np.float32)).to(device)
+    return camera, torch.from_numpy(image).to(device).float() / 255, counts
 
 
 def halved(

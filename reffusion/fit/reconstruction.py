@@ -69,11 +69,10 @@ def fit(
     steps, until = range(run.iteration, settings.iterations), (coarse_steps(settings), sparse_steps(settings))
     for i, (camera, target, counts) in zip(
         trace.progress(settings.iterations, "fit", run.iteration),
-        samples(cameras, images, weights, steps, settings.seed, *until),
+        samples(cameras, images, weights, steps, settings.seed, *until, optimizer.masked.device),
         strict=True,
     ):
-        seen = camera, _move(target, optimizer), _move(counts, optimizer)
-        run.count(*step(optimizer, run.exposures, *seen, settings, i, impl))
+        run.count(*step(optimizer, run.exposures, camera, target, counts, settings, i, impl))
         adapt(optimizer, centers, run.started_with, settings, run.iteration)
         line_due = trace.log_spaced(run.iteration, settings.iterations, first=FIRST_MOMENT)
         save_due = checkpoints.due and run.iteration < settings.iterations
@@ -172,10 +171,6 @@ def _write_line(
     run.loss, run.error, run.steps = 0.0, 0.0, 0
 
 
-def _move(tensor: Tensor | None, optimizer: GaussianOptimizer) -> Tensor | None:
-    return None if tensor is None else tensor.to(optimizer.masked.device, non_blocking=True)
-
-
 def _summary(
     run: _Run, held_out: Sequence[Camera], images: Mapping[str, np.ndarray], settings: Params, impl: str
 ) -> dict[str, Any]:
@@ -189,7 +184,7 @@ def _summary(
     psnr = []
     for camera in held_out:
         image = render(gaussians, camera, impl=impl, sh_degree=degree).color.clamp(0, 1)
-        target = _move(sample(camera, images[camera.name], None)[1], run.optimizer)
+        _, target, _ = sample(camera, images[camera.name], None, gaussians.means.device)
         psnr.append(trace.decibels(squared_error(image, target, None)))
     return line | {"psnr_held_out": sum(psnr) / len(psnr)}
 

@@ -5,14 +5,16 @@ the pixels that count and are divided by the window's weight there. A pixel of w
 neither are the pixels outside the image (3DGS counts those as black). The other way, setting both images equal where
 masked, would paint an edge that both share into the windows around a mask and so flatter them.
 
-`dssim` runs a numba kernel on float32 CPU tensors and plain torch everywhere else; both are the same formula.
+`dssim` runs a numba kernel on float32 CPU tensors, one of Triton's on a card, and plain torch everywhere else; all are
+the same formula.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import lru_cache, partial
+from functools import cache, lru_cache, partial
+from importlib.util import find_spec
 
 import numpy as np
 import torch
@@ -26,7 +28,8 @@ RADIUS, SIGMA = 5, 1.5
 C1, C2 = 0.01**2, 0.03**2
 
 
-def _window() -> np.ndarray:
+def window() -> np.ndarray:
+    """The taps along one axis, of sum 1."""
     taps = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2)
     return taps / taps.sum()
 
@@ -47,7 +50,21 @@ def dssim(image: Tensor, target: Tensor, weights: Tensor | None = None) -> Tenso
         image, target = torch.where(counts, image, 0.0), torch.where(counts, target, 0.0)
     if image.device.type == "cpu" and image.dtype == torch.float32:
         return _FastDssim.apply(image, target.detach(), weights)
+    if image.is_cuda and image.dtype == torch.float32 and triton_works():
+        from reffusion.gaussians import card
+
+        return card.Dssim.apply(image, target.detach(), weights, window(), (C1, C2))
     return dssim_torch(image, target.detach(), weights)
+
+
+@cache
+def triton_works() -> bool:
+    """Are there a card and Triton, which comes with torch's CUDA builds, for `gaussians.card`?"""
+    if not torch.cuda.is_available() or find_spec("triton") is None:
+        return False
+    from reffusion.gaussians import card
+
+    return card.works()
 
 
 def dssim_torch(image: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
@@ -71,11 +88,11 @@ class _Windowed(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, fields: Tensor) -> Tensor:
-        window = torch.as_tensor(_window(), dtype=fields.dtype, device=fields.device)
+        taps = torch.as_tensor(window(), dtype=fields.dtype, device=fields.device)
         planes = fields.permute(2, 0, 1)[:, None]
         with no_tf32():
-            planes = F.conv2d(planes, window.view(1, 1, 1, -1), padding=(0, RADIUS))
-            planes = F.conv2d(planes, window.view(1, 1, -1, 1), padding=(RADIUS, 0))
+            planes = F.conv2d(planes, taps.view(1, 1, 1, -1), padding=(0, RADIUS))
+            planes = F.conv2d(planes, taps.view(1, 1, -1, 1), padding=(RADIUS, 0))
         return planes[:, 0].permute(1, 2, 0)
 
     @staticmethod
@@ -141,7 +158,7 @@ def _unmasked_rows(height: int, width: int, channels: int) -> tuple[np.ndarray, 
 # The kernels hold an image as H rows of W * C numbers, so that each inner loop runs along memory. Rows of a field are
 # filtered along the row first, then columns; both are symmetric, so each is its own adjoint (borders count as 0).
 # Threads share out rows.
-_K0, _K1, _K2, _K3, _K4, _K5 = (np.float32(k) for k in _window()[RADIUS:])
+_K0, _K1, _K2, _K3, _K4, _K5 = (np.float32(k) for k in window()[RADIUS:])
 _jit = partial(kernel, fastmath=FREE_ROUNDING)
 
 

@@ -1,0 +1,223 @@
+"""D-SSIM and Adam on a CUDA card, each in a few passes over memory: Triton kernels (it comes with torch's CUDA builds).
+
+In plain torch the windows of SSIM and its products, and the gathering of the visible rows for Adam, are three quarters
+of a fit's step on a card (docs/production.md). The formulas are those of `gaussians.ssim` and `gaussians.optimize`.
+"""
+
+from __future__ import annotations
+
+import functools
+import sys
+
+import numpy as np
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+_BLOCK = 1024  # numbers that a program of a kernel works on
+
+
+@functools.cache
+def works() -> bool:
+    """Can the kernels be compiled for this machine's card? Said once where not."""
+    try:
+        probe = torch.zeros(4, 4, 1, device="cuda")
+        dssim_and_gradient(probe, probe, None, np.ones(1), (1.0, 1.0))
+    except Exception as error:  # of Triton's compiler or of the driver, of many kinds
+        reason = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
+        print(f"Triton does not work here ({reason}): SSIM and Adam take plain torch, slower", file=sys.stderr)
+        return False
+    return True
+
+
+class Dssim(torch.autograd.Function):
+    """See `gaussians.ssim.dssim`; float32 on the card. The other arguments are those of `dssim_and_gradient`."""
+
+    @staticmethod
+    def forward(ctx, image: Tensor, target: Tensor, weights: Tensor | None, taps: np.ndarray, constants) -> Tensor:
+        value, ctx.gradient = dssim_and_gradient(image, target, weights, taps, constants)
+        return value
+
+    @staticmethod
+    def backward(ctx, upstream: Tensor):
+        return ctx.gradient * upstream, None, None, None, None
+
+
+@torch.no_grad()
+def dssim_and_gradient(
+    image: Tensor, target: Tensor, weights: Tensor | None, window: np.ndarray, constants: tuple[float, float]
+) -> tuple[Tensor, Tensor]:
+    """(mean of weights * (1 - SSIM), its gradient by the image [H, W, C]), float32.
+
+    Args:
+        weights: [H, W], or None. window: [2 R + 1], the taps along one axis. constants: SSIM's C1 and C2.
+    """
+    channels, count, row = image.shape[2], image.numel(), image.shape[1] * image.shape[2]
+    x, y = image.contiguous(), target.contiguous()
+    counts = x if weights is None else weights.contiguous()  # not read where there are none
+    taps = torch.as_tensor(window, dtype=torch.float32).to(x.device)
+    fields, slopes = x.new_empty(5, count), x.new_empty(3, count)
+    programs = triton.cdiv(count, _BLOCK)
+    sums, gradient = x.new_empty(programs), torch.empty_like(x)
+    given = {"BLOCK": _BLOCK, "RADIUS": len(window) // 2, "WEIGHTED": weights is not None}
+    _products_along_rows[(programs,)](x, y, counts, taps, fields, count, row, channels, **given)
+    _compared_down_columns[(programs,)](counts, taps, fields, slopes, sums, count, row, channels, *constants, **given)
+    _slopes_along_rows[(programs,)](taps, slopes, fields, count, row, channels, _BLOCK, len(window) // 2)
+    _gathered_down_columns[(programs,)](x, y, counts, taps, fields, gradient, count, row, channels, **given)
+    return (sums.double().sum() / count).to(x.dtype), gradient.div_(count)
+
+
+@triton.jit
+def _products_along_rows(
+    x, y, weights, taps, fields, count, row, channels, BLOCK: tl.constexpr, RADIUS: tl.constexpr, WEIGHTED: tl.constexpr
+):
+    """fields [5, H, W * C] = weights * (x, y, x^2 + y^2, x y, 1), filtered along each row of `row` numbers."""
+    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    column = at % row
+    mean_x = tl.zeros((BLOCK,), tl.float32)
+    mean_y = tl.zeros((BLOCK,), tl.float32)
+    squares = tl.zeros((BLOCK,), tl.float32)
+    product = tl.zeros((BLOCK,), tl.float32)
+    total = tl.zeros((BLOCK,), tl.float32)
+    for k in tl.static_range(2 * RADIUS + 1):
+        step = (k - RADIUS) * channels
+        inside = (at < count) & (column + step >= 0) & (column + step < row)
+        a = tl.load(x + at + step, mask=inside, other=0.0)
+        b = tl.load(y + at + step, mask=inside, other=0.0)
+        weight = tl.where(inside, tl.load(taps + k), 0.0)
+        if WEIGHTED:
+            weight *= tl.load(weights + (at + step) // channels, mask=inside, other=0.0)
+        mean_x += weight * a
+        mean_y += weight * b
+        squares += weight * (a * a + b * b)
+        product += weight * a * b
+        total += weight
+    tl.store(fields + at, mean_x, mask=at < count)
+    tl.store(fields + count + at, mean_y, mask=at < count)
+    tl.store(fields + 2 * count + at, squares, mask=at < count)
+    tl.store(fields + 3 * count + at, product, mask=at < count)
+    tl.store(fields + 4 * count + at, total, mask=at < count)
+
+
+@triton.jit
+def _compared_down_columns(
+    weights, taps, fields, slopes, sums, count, row, channels, c1, c2,
+    BLOCK: tl.constexpr, RADIUS: tl.constexpr, WEIGHTED: tl.constexpr,
+):  # fmt: skip
+    """Each program's sum of weights * (1 - SSIM), and slopes [3, H, W * C]: by the windows of x, x^2 + y^2 and x y."""
+    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    mean_x = tl.zeros((BLOCK,), tl.float32)
+    mean_y = tl.zeros((BLOCK,), tl.float32)
+    squares = tl.zeros((BLOCK,), tl.float32)
+    product = tl.zeros((BLOCK,), tl.float32)
+    total = tl.zeros((BLOCK,), tl.float32)
+    for k in tl.static_range(2 * RADIUS + 1):
+        to = at + (k - RADIUS) * row
+        inside = (at < count) & (to >= 0) & (to < count)
+        weight = tl.load(taps + k)
+        mean_x += weight * tl.load(fields + to, mask=inside, other=0.0)
+        mean_y += weight * tl.load(fields + count + to, mask=inside, other=0.0)
+        squares += weight * tl.load(fields + 2 * count + to, mask=inside, other=0.0)
+        product += weight * tl.load(fields + 3 * count + to, mask=inside, other=0.0)
+        total += weight * tl.load(fields + 4 * count + to, mask=inside, other=0.0)
+    inverse = 1.0 / tl.where(total > 0, total, 1.0)
+    mean_x *= inverse
+    mean_y *= inverse
+    light = 2.0 * mean_x * mean_y + c1
+    structure = 2.0 * (product * inverse - mean_x * mean_y) + c2
+    brightness = mean_x * mean_x + mean_y * mean_y
+    contrast = squares * inverse - brightness + c2
+    brightness += c1
+    over = 1.0 / (brightness * contrast)
+    similarity = light * structure * over
+    pixel = tl.where(at < count, 1.0, 0.0)
+    if WEIGHTED:
+        pixel = tl.load(weights + at // channels, mask=at < count, other=0.0)
+    tl.store(sums + tl.program_id(0), tl.sum(pixel * (1.0 - similarity), 0))
+    part = -pixel * inverse
+    by_mean = 2.0 * over * (mean_y * (structure - light) + mean_x * similarity * (brightness - contrast))
+    tl.store(slopes + at, part * by_mean, mask=at < count)
+    tl.store(slopes + count + at, -part * similarity * brightness * over, mask=at < count)
+    tl.store(slopes + 2 * count + at, part * 2.0 * light * over, mask=at < count)
+
+
+@triton.jit
+def _slopes_along_rows(taps, slopes, filtered, count, row, channels, BLOCK: tl.constexpr, RADIUS: tl.constexpr):
+    """filtered [3, H, W * C] = slopes, filtered along each row."""
+    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    column = at % row
+    by_mean = tl.zeros((BLOCK,), tl.float32)
+    by_squares = tl.zeros((BLOCK,), tl.float32)
+    by_product = tl.zeros((BLOCK,), tl.float32)
+    for k in tl.static_range(2 * RADIUS + 1):
+        step = (k - RADIUS) * channels
+        inside = (at < count) & (column + step >= 0) & (column + step < row)
+        weight = tl.load(taps + k)
+        by_mean += weight * tl.load(slopes + at + step, mask=inside, other=0.0)
+        by_squares += weight * tl.load(slopes + count + at + step, mask=inside, other=0.0)
+        by_product += weight * tl.load(slopes + 2 * count + at + step, mask=inside, other=0.0)
+    tl.store(filtered + at, by_mean, mask=at < count)
+    tl.store(filtered + count + at, by_squares, mask=at < count)
+    tl.store(filtered + 2 * count + at, by_product, mask=at < count)
+
+
+@triton.jit
+def _gathered_down_columns(
+    x, y, weights, taps, filtered, gradient, count, row, channels,
+    BLOCK: tl.constexpr, RADIUS: tl.constexpr, WEIGHTED: tl.constexpr,
+):  # fmt: skip
+    """gradient [H, W * C] = d(sum of weights * (1 - SSIM)) / dx."""
+    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    by_mean = tl.zeros((BLOCK,), tl.float32)
+    by_squares = tl.zeros((BLOCK,), tl.float32)
+    by_product = tl.zeros((BLOCK,), tl.float32)
+    for k in tl.static_range(2 * RADIUS + 1):
+        to = at + (k - RADIUS) * row
+        inside = (at < count) & (to >= 0) & (to < count)
+        weight = tl.load(taps + k)
+        by_mean += weight * tl.load(filtered + to, mask=inside, other=0.0)
+        by_squares += weight * tl.load(filtered + count + to, mask=inside, other=0.0)
+        by_product += weight * tl.load(filtered + 2 * count + to, mask=inside, other=0.0)
+    a = tl.load(x + at, mask=at < count, other=0.0)
+    b = tl.load(y + at, mask=at < count, other=0.0)
+    slope = by_mean + 2.0 * a * by_squares + b * by_product
+    if WEIGHTED:
+        slope *= tl.load(weights + at // channels, mask=at < count, other=0.0)
+    tl.store(gradient + at, slope, mask=at < count)
+
+
+@torch.no_grad()
+def adam(updates, steps, visible, masked, unbias1, unbias2, beta1, beta2, epsilon) -> None:
+    """`gaussians.optimize._adam` in one pass over memory."""
+    for parameter, first, second, gradient, rates, masked_factor in updates:
+        count, wide = parameter.numel(), parameter.shape[1]
+        tables = parameter, first, second, gradient.contiguous(), rates.to(parameter)
+        rows = steps, visible, masked, unbias1, unbias2
+        numbers = masked_factor, beta1, beta2, epsilon, count, wide, len(rates)
+        _adam_kernel[(triton.cdiv(count, _BLOCK),)](*tables, *rows, *numbers, BLOCK=_BLOCK)
+
+
+@triton.jit
+def _adam_kernel(
+    parameters, firsts, seconds, gradients, rates, steps, visible, masked, unbias1, unbias2,
+    masked_factor, beta1, beta2, epsilon, count, wide, moving, BLOCK: tl.constexpr,
+):  # fmt: skip
+    at = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    row, column = at // wide, at % wide
+    moves = (at < count) & (column < moving)
+    moves = moves & (tl.load(visible + row, mask=moves, other=0) != 0)
+    t = tl.load(steps + row, mask=moves, other=1)
+    rate = tl.load(rates + column, mask=moves, other=0.0)
+    rate = tl.where(tl.load(masked + row, mask=moves, other=0) != 0, rate * masked_factor, rate)
+    rate *= tl.load(unbias1 + t, mask=moves, other=1.0)
+    g = tl.load(gradients + at, mask=moves, other=0.0)
+    m = tl.load(firsts + at, mask=moves, other=0.0)
+    v = tl.load(seconds + at, mask=moves, other=0.0)
+    m += (1.0 - beta1) * (g - m)
+    v = beta2 * v + (1.0 - beta2) * g * g
+    tl.store(firsts + at, m, mask=moves)
+    tl.store(seconds + at, v, mask=moves)
+    unbiased = v * tl.load(unbias2 + t, mask=moves, other=1.0)
+    moved = tl.load(parameters + at, mask=moves, other=0.0) - rate * m / (tl.sqrt(unbiased) + epsilon)
+    tl.store(parameters + at, moved, mask=moves)
