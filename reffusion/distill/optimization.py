@@ -29,6 +29,7 @@ DENSIFIED = 0.05  # share of the masked Gaussians that are cloned or split each 
 CAP_MAX = 2_000_000  # most Gaussians
 PRUNE_OPA = 0.005  # fainter Gaussians are pruned when others are added
 SNAPSHOTS = 4  # parts of the run, after each but the last of which the masked Gaussians are kept
+AVERAGED = 2 / 3  # of the steps of a run that adds no Gaussian, from which on their mean is what it ends with
 REGION_EVERY = 50  # steps between prunings of Gaussians that changed region
 
 
@@ -83,6 +84,10 @@ def distill(
         if settings.densify.every and done % settings.densify.every == 0:
             if done <= settings.densify.stop * settings.iterations:
                 _densify(optimizer, seeding.generator(settings.seed, "distill", "densify", done))
+        if not settings.densify.every and done > AVERAGED * settings.iterations:
+            optimizer.remember()
+        if done == settings.iterations:
+            optimizer.take_mean()
         if region is not None and (done % REGION_EVERY == 0 or done == settings.iterations):
             optimizer.select(~changed_region(region, optimizer.gaussians.means.detach(), optimizer.masked))
         if trace.log_spaced(done, settings.iterations, per_octave=4):

@@ -31,6 +31,7 @@ GENTLE = Rates(
 )
 COARSE = 0.3  # of the steps, that look at half the size
 SPARSE = 0.9  # of the steps, up to which they look at every second pixel
+AVERAGED = 0.9  # of the steps, from which on the Gaussians' mean is what a fit ends with
 GROW_SCALE3D = 0.01  # deviation / distance from which on a Gaussian is split, not cloned
 
 
@@ -107,6 +108,14 @@ def sparse_steps(settings: Params) -> range:
     if not settings.init.flow_cell:
         return range(0)
     return range(round(settings.densify.stop * settings.iterations), round(SPARSE * settings.iterations))
+
+
+def remembered(settings: Params, done: int) -> bool:
+    """Do the Gaussians after so many steps count in the mean that a fit ends with? In the last steps every second, once
+    none is added any more; in runs as 3DGS's own, which begins with few, never."""
+    many = settings.init.flow_cell or settings.densify.stop == 0
+    begin = max(AVERAGED, settings.densify.stop) * settings.iterations
+    return bool(many) and done > begin and (settings.iterations - done) % 2 == 0
 
 
 def degree_at(settings: Params, i: int) -> int:

@@ -124,6 +124,7 @@ class GaussianOptimizer:
         self._first = gaussians.map(_zeros)
         self._second = gaussians.map(_zeros)
         self._steps = torch.zeros(len(gaussians), dtype=torch.int32, device=self.masked.device)
+        self._mean, self._meant = None, 0
         self.forget_grad2d()
 
     def observe(self, probe_gradient: Tensor, radii: Tensor, width: int, height: int) -> None:
@@ -183,14 +184,36 @@ class GaussianOptimizer:
         for name in PARAMETERS:
             getattr(self.gaussians, name).grad = None
 
+    @torch.no_grad()
+    def remember(self) -> None:
+        """Take the present Gaussians into the mean that `take_mean` puts in their place."""
+        self._meant += 1
+        if self._mean is None:
+            self._mean = self.gaussians.map(lambda p: p.detach().clone())
+        else:
+            for name in PARAMETERS:
+                getattr(self._mean, name).lerp_(getattr(self.gaussians, name), 1 / self._meant)
+
+    @torch.no_grad()
+    def take_mean(self) -> None:
+        """The mean of all that was remembered, where anything was, becomes the Gaussians. One view a step, and at
+        Adam's step sizes, Gaussians wander about the place where they settle: their mean lies nearer to it than the
+        last of them (Polyak, Ruppert)."""
+        if self._mean is not None:
+            for name in PARAMETERS:
+                getattr(self.gaussians, name).copy_(getattr(self._mean, name))
+
     def select(self, keep: Tensor) -> None:
-        """Keep the rows that `keep` ([N] bool, or indices [M]) names; labels and moments with them."""
+        """Keep the rows that `keep` ([N] bool, or indices [M]) names; labels, moments and the mean with them."""
         self._replace(lambda p: p[keep])
+        self._mean = self._mean and self._mean.map(lambda p: p[keep])
         for name in self._COUNTERS:
             setattr(self, name, getattr(self, name)[keep])
 
     def append(self, gaussians: Gaussians, masked: Tensor) -> None:
-        """Add Gaussians after the present ones, with labels `masked` [M] bool and empty moments."""
+        """Add Gaussians after the present ones, with labels `masked` [M] bool and empty moments; what was remembered is
+        forgotten."""
+        self._mean, self._meant = None, 0
         self.gaussians = self.gaussians.zipped(gaussians, lambda a, b: _leaf(torch.cat([a, b])))
         empty = gaussians.map(_zeros)
         self._first = self._first.zipped(empty, lambda a, b: torch.cat([a, b]))
@@ -212,16 +235,19 @@ class GaussianOptimizer:
     def state_dict(self) -> dict[str, Any]:
         """Tensors from which `load_state_dict` continues bit for bit."""
         parts = {"parameters": self.gaussians, "first": self._first, "second": self._second}
+        parts |= {"mean": self._mean} if self._mean is not None else {}
         state: dict[str, Any] = {
             part: {name: getattr(g, name).detach().clone() for name in PARAMETERS} for part, g in parts.items()
         }
-        return state | {name: getattr(self, name).clone() for name in self._COUNTERS}
+        return state | {name: getattr(self, name).clone() for name in self._COUNTERS} | {"meant": self._meant}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a `state_dict`, of any number of Gaussians."""
         self.gaussians = Gaussians(**state["parameters"], antialiased=self.gaussians.antialiased).map(_leaf)
         self._first = Gaussians(**state["first"]).map(torch.clone)
         self._second = Gaussians(**state["second"]).map(torch.clone)
+        self._mean = Gaussians(**state["mean"]).map(torch.clone) if "mean" in state else None
+        self._meant = state["meant"]
         for name in self._COUNTERS:
             setattr(self, name, state[name].clone())
 
