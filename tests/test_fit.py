@@ -376,3 +376,10 @@ def test_sparse_steps_look_at_every_pixel_in_four_turns(monkeypatch):
     assert looks[4][0] == camera
     settings = Params(iterations=10, init=Init(flow_cell=3), densify=Densify(stop=0.5))
     assert step.sparse_steps(settings) == range(5, 9) and not step.sparse_steps(Params(iterations=10))
+
+
+def test_the_end_of_a_fit_is_a_mean_where_no_gaussian_is_added_any_more():
+    counted = lambda **changed: [k for k in range(1, 101) if step.remembered(Params(iterations=100, **changed), k)]
+    assert counted() == [], "as 3DGS"
+    assert counted(init=Init(flow_cell=3)) == counted(densify=Densify(stop=0.0)) == [92, 94, 96, 98, 100]
+    assert counted(init=Init(flow_cell=3), densify=Densify(stop=0.95)) == [96, 98, 100]

@@ -274,6 +274,30 @@ def test_state_continues_bit_for_bit():
 # ---------------------------------------------------------------------------------------------- densification
 
 
+def test_the_mean_of_what_was_remembered():
+    """It loses the rows that are lost, survives a checkpoint, and ends where Gaussians are added."""
+    optimizer, seen = GaussianOptimizer(random_gaussians(6)), []
+    optimizer.take_mean()  # of nothing: nothing changes
+    for step in range(4):
+        pretend_gradients(optimizer, step)
+        optimizer.step(0.0)
+        if step != 1:
+            optimizer.remember()
+            seen.append(optimizer.gaussians.map(torch.clone))
+    keep = torch.tensor([True, False, True, True, False, True])
+    optimizer.select(keep)
+    other = GaussianOptimizer(random_gaussians(4))
+    other.load_state_dict(optimizer.state_dict())
+    other.take_mean()
+    for name in PARAMETERS:
+        mean = torch.stack([getattr(each, name).double() for each in seen]).mean(0)[keep]
+        assert torch.allclose(getattr(other.gaussians, name).double(), mean, atol=1e-6), name
+    last = optimizer.gaussians.means.detach().clone()
+    optimizer.append(random_gaussians(2), torch.zeros(2, dtype=torch.bool))
+    optimizer.take_mean()
+    assert torch.equal(optimizer.gaussians.means[:4], last)
+
+
 def observed(gaussians: Gaussians, slopes: list[float], masked=None) -> GaussianOptimizer:
     optimizer = GaussianOptimizer(gaussians, masked)
     optimizer.grad2d_sum = torch.tensor(slopes) * 4
