@@ -81,13 +81,8 @@ def distill(
     for step in trace.progress(settings.iterations, "distill", run.step):
         line = step_of(optimizer, step, job)
         run.step = done = step + 1
-        if settings.densify.every and done % settings.densify.every == 0:
-            if done <= settings.densify.stop * settings.iterations:
-                _densify(optimizer, seeding.generator(settings.seed, "distill", "densify", done))
-        if not settings.densify.every and done > AVERAGED * settings.iterations:
-            optimizer.remember()
-        if done == settings.iterations:
-            optimizer.take_mean()
+        _densify_where_due(optimizer, settings, done)
+        _average(optimizer, settings, done)
         if region is not None and (done % REGION_EVERY == 0 or done == settings.iterations):
             optimizer.select(~changed_region(region, optimizer.gaussians.means.detach(), optimizer.masked))
         if trace.log_spaced(done, settings.iterations, per_octave=4):
@@ -97,6 +92,20 @@ def distill(
             run.seconds = log.seconds
             checkpoints.save(run.state_dict)
     return optimizer.gaussians.map(Tensor.detach), optimizer.masked
+
+
+def _densify_where_due(optimizer: GaussianOptimizer, settings: Params, done: int) -> None:
+    every, last = settings.densify.every, settings.densify.stop * settings.iterations
+    if every and done % every == 0 and done <= last:
+        _densify(optimizer, seeding.generator(settings.seed, "distill", "densify", done))
+
+
+def _average(optimizer: GaussianOptimizer, settings: Params, done: int) -> None:
+    """A run that adds no Gaussian ends with the mean of those after its last steps."""
+    if not settings.densify.every and done > AVERAGED * settings.iterations:
+        optimizer.remember()
+    if done == settings.iterations:
+        optimizer.take_mean()
 
 
 def _save_snapshot(optimizer: GaussianOptimizer, folder: Path, done: int, steps: int) -> None:

@@ -14,7 +14,7 @@ from torch import Tensor
 from reffusion import trace
 from reffusion.fit.exposure import Exposures
 from reffusion.fit.feed import check_sizes, sample, samples
-from reffusion.fit.step import adapt, coarse_steps, degree_at, rates_of, remembered, sparse_steps, squared_error, step
+from reffusion.fit.step import adapt, average, coarse_steps, degree_at, rates_of, sparse_steps, squared_error, step
 from reffusion.gaussians.optimize import GaussianOptimizer, Rates
 from reffusion.params.fit import Params
 from reffusion.splat.rasterizer import render
@@ -74,10 +74,7 @@ def fit(
     ):
         run.count(*step(optimizer, run.exposures, camera, target, counts, settings, i, impl))
         adapt(optimizer, centers, run.started_with, settings, run.iteration)
-        if remembered(settings, run.iteration):
-            optimizer.remember()
-        if run.iteration == settings.iterations:
-            optimizer.take_mean()
+        average(optimizer, settings, run.iteration)
         line_due = trace.log_spaced(run.iteration, settings.iterations, first=FIRST_MOMENT)
         save_due = checkpoints.due and run.iteration < settings.iterations
         _check(optimizer.gaussians, i, camera, values=line_due or save_due)

@@ -110,6 +110,14 @@ def sparse_steps(settings: Params) -> range:
     return range(round(settings.densify.stop * settings.iterations), round(SPARSE * settings.iterations))
 
 
+def average(optimizer: GaussianOptimizer, settings: Params, done: int) -> None:
+    """Remember the Gaussians after `done` steps where they count, and put the mean in their place after the last."""
+    if remembered(settings, done):
+        optimizer.remember()
+    if done == settings.iterations:
+        optimizer.take_mean()
+
+
 def remembered(settings: Params, done: int) -> bool:
     """Do the Gaussians after so many steps count in the mean that a fit ends with? In the last steps every second, once
     none is added any more; in runs as 3DGS's own, which begins with few, never."""
