@@ -20,7 +20,7 @@ import torch
 import yaml
 
 from reffusion import trace
-from reffusion.distill.optimization import masked_factors
+from reffusion.distill.optimization import average, masked_factors
 from reffusion.distill.steps import job_of, step_of
 from reffusion.gaussians.optimize import GaussianOptimizer
 from reffusion.io.arrays import load_json, save_json
@@ -116,6 +116,7 @@ def curve(overrides: dict, run: Path, start: Path, views: list[tuple]) -> list[d
                     log.log(step, **scored(optimizer.gaussians, views))
             if step < max(MOMENTS):
                 step_of(optimizer, step, job)
+                average(optimizer, params, step + 1)
         return trace.read_trace(log.path)
 
 

@@ -82,7 +82,7 @@ def distill(
         line = step_of(optimizer, step, job)
         run.step = done = step + 1
         _densify_where_due(optimizer, settings, done)
-        _average(optimizer, settings, done)
+        average(optimizer, settings, done)
         if region is not None and (done % REGION_EVERY == 0 or done == settings.iterations):
             optimizer.select(~changed_region(region, optimizer.gaussians.means.detach(), optimizer.masked))
         if trace.log_spaced(done, settings.iterations, per_octave=4):
@@ -100,7 +100,7 @@ def _densify_where_due(optimizer: GaussianOptimizer, settings: Params, done: int
         _densify(optimizer, seeding.generator(settings.seed, "distill", "densify", done))
 
 
-def _average(optimizer: GaussianOptimizer, settings: Params, done: int) -> None:
+def average(optimizer: GaussianOptimizer, settings: Params, done: int) -> None:
     """A run that adds no Gaussian ends with the mean of those after its last steps."""
     if not settings.densify.every and done > AVERAGED * settings.iterations:
         optimizer.remember()
