@@ -33,7 +33,7 @@ from stages import evaluate
 
 ROOT = Path(__file__).resolve().parents[2]
 
-MOMENTS = (0, 5, 10, 20, 40, 75, 110, 150)  # steps done
+MOMENTS = (0, 5, 10, 20, 40, 70, 100)  # steps done
 VIEWS = 10  # test views, evenly over all
 SCORES = ("psnr_box", "ssim_box", "flip_box")
 NEEDS = ("poses", "fit", "masks", "reference", "initialize")
