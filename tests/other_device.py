@@ -19,7 +19,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 from reffusion.fit import feed
-from reffusion.gaussians import optimize, ssim
+from reffusion.gaussians import adam, ssim
 from reffusion.splat import cpu, cuda
 from reffusion.types import Rendering
 
@@ -125,6 +125,6 @@ def card() -> Iterator[None]:
         patched.setattr(cuda, "render", render)
         patched.setattr(cuda, "accumulate", accumulate)
         patched.setattr(ssim, "triton_works", lambda: False)
-        patched.setattr(optimize, "triton_works", lambda: False)
+        patched.setattr(adam, "triton_works", lambda: False)
         patched.setattr(feed, "ThreadPoolExecutor", partial(ThreadPoolExecutor, initializer=Card().__enter__))
         yield

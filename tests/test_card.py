@@ -8,7 +8,7 @@ import pytest
 import torch
 from other_device import there_is_one
 
-from reffusion.gaussians import optimize
+from reffusion.gaussians import adam, optimize
 from reffusion.gaussians.ssim import C1, C2, dssim_torch, window
 from reffusion.seeding import generator
 from reffusion.types import PARAMETERS, Gaussians
@@ -41,8 +41,8 @@ def test_ssim_and_its_gradient(size, masked):
 
 def test_adam(monkeypatch):
     count, found = 700, []
-    for update in (optimize._adam, card.adam):
-        monkeypatch.setattr(optimize, "_adam_of", lambda device, update=update: update)
+    for update in (adam.adam, card.adam):
+        monkeypatch.setattr(adam, "fastest", lambda device, update=update: update)
         draw = generator(0, "adam")
         normal = lambda *shape, draw=draw: torch.randn(*shape, generator=draw).to(DEVICE)
         scene = Gaussians(normal(count, 3), normal(count, 4), normal(count, 3), normal(count), normal(count, 16, 3))

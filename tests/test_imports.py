@@ -136,7 +136,7 @@ def test_a_folder_is_seen_at_a_glance():
         assert folder.name == "reffusion" or not (folder / "__init__.py").read_text().strip(), folder
 
 
-KERNELS = ("reffusion/kernels/", "reffusion/splat/", "reffusion/gaussians/optimize.py", "reffusion/gaussians/ssim.py")
+KERNELS = ("reffusion/kernels/", "reffusion/splat/", "reffusion/gaussians/adam.py", "reffusion/gaussians/ssim.py")
 
 
 @pytest.mark.parametrize("path", sources("reffusion", "stages", "runner", "report"), ids=named)

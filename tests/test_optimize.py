@@ -6,13 +6,11 @@ import torch
 
 from reffusion import seeding
 from reffusion.gaussians import ssim
+from reffusion.gaussians.adam import Update, adam, adam_cpu
 from reffusion.gaussians.densify import SHRINK, densify, prune, rotate, split
 from reffusion.gaussians.optimize import (
     GaussianOptimizer,
     Rates,
-    Update,
-    _adam,
-    _adam_cpu,
     confine,
     reconstruction_loss,
 )
@@ -202,14 +200,14 @@ def test_plain_and_compiled_adam_agree():
     steps, visible = torch.arange(1500, dtype=torch.int32) % 40, torch.rand(1500, generator=generator) > 0.3
     masked, unbias = torch.rand(1500, generator=generator) > 0.5, list(1 + torch.rand(2, 40, generator=generator))
     results = []
-    for adam, dtype in ((_adam, torch.float64), (_adam_cpu, torch.float32)):
+    for step, dtype in ((adam, torch.float64), (adam_cpu, torch.float32)):
         generator = seeding.generator(3, "parameters")
         updates = []
         for width in (1, 3, 27):
             rows = [torch.randn(1500, width, generator=generator).to(dtype) for _ in range(4)]
             rows[2].abs_().add_(0.1)
             updates.append(Update(*rows, torch.rand(width, generator=generator), masked_factor=1 / width))
-        adam(updates, steps, visible, masked, *unbias, 0.875, 1 - 2**-10, 1e-15)  # exact in float32, too
+        step(updates, steps, visible, masked, *unbias, 0.875, 1 - 2**-10, 1e-15)  # exact in float32, too
         results.append([tensor.float() for update in updates for tensor in update[:3]])
     for plain, compiled in zip(*results, strict=True):
         assert torch.allclose(plain, compiled, rtol=1e-5, atol=1e-6)

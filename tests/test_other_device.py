@@ -91,8 +91,8 @@ def test_initialize_on_a_card(ready, tmp_path, changed):
     assert torch.equal(load_labels(cpu / "labels.npy"), load_labels(cuda / "labels.npy"))
     before, after = (load_ply(folder / "gaussians.ply") for folder in (cpu, cuda))
     for name in PARAMETERS:  # settling takes other kernels of SSIM and Adam there, which round otherwise
-        differs = (getattr(before, name) - getattr(after, name)).abs() > 2e-2
-        assert differs.float().mean() <= (0.01 if there_is_one() else 0), name
+        near = (getattr(before, name) - getattr(after, name)).abs() <= 2e-2  # not where one is NaN
+        assert (~near).float().mean() <= (0.01 if there_is_one() else 0), name
 
 
 def test_a_fit_on_a_card(ready, tmp_path):

@@ -120,8 +120,8 @@ def machine(device: str) -> dict[str, Any]:
         "driver": facts_of_machine().driver,
         "gsplat": importlib.metadata.version("gsplat"),
         "extension": _backend._C is not None,
-        "triton": triton_works(),
         "extension_seconds": round(time.perf_counter() - began, 1),
+        "triton": triton_works(),
         "tf32_products": tf32[0].allow_tf32,
         "tf32_convolutions": tf32[1].allow_tf32,
     }

@@ -20,7 +20,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.gpu import full_size
 from reffusion.distill.discriminator import Critic, critic_loss, generator_loss, gradient_penalty
-from reffusion.gaussians import optimize
+from reffusion.gaussians import adam, optimize
 from reffusion.gaussians.ssim import dssim_torch
 from reffusion.prior import denoising, diffusion
 from reffusion.prior.model import Prior
@@ -150,10 +150,10 @@ def adam_of_a_gaussian() -> dict[str, float]:
     updates = []
     for name in optimize.PARAMETERS:
         rows = [optimize._rows(getattr(each, name)) for each in optimizer._states()]
-        updates.append(optimize.Update(*rows, torch.zeros_like(rows[0]), rates[name], 1.0))
+        updates.append(adam.Update(*rows, torch.zeros_like(rows[0]), rates[name], 1.0))
     everyone, steps = torch.ones(GAUSSIANS, dtype=torch.bool), torch.ones(GAUSSIANS, dtype=torch.int32)
-    given = (steps, everyone, ~everyone, *optimize._unbiasing((0.9, 0.999), 1, steps.device), 0.9, 0.999, 1e-15)
-    return _scaled(counted(lambda: optimize._adam(updates, *given)), GAUSSIANS)
+    given = (steps, everyone, ~everyone, *adam.unbiasing((0.9, 0.999), 1, steps.device), 0.9, 0.999, 1e-15)
+    return _scaled(counted(lambda: adam.adam(updates, *given)), GAUSSIANS)
 
 
 def _scaled(found: dict[str, float], count: int) -> dict[str, float]:

@@ -1,12 +1,11 @@
 """D-SSIM and Adam on a CUDA card, each in a few passes over memory: Triton kernels (it comes with torch's CUDA builds).
 
 In plain torch the windows of SSIM and its products, and the gathering of the visible rows for Adam, are three quarters
-of a fit's step on a card (docs/production.md). The formulas are those of `gaussians.ssim` and `gaussians.optimize`.
+of a fit's step on a card (docs/production.md). The formulas are those of `gaussians.ssim` and `gaussians.adam`.
 """
 
 from __future__ import annotations
 
-import functools
 import sys
 
 import numpy as np
@@ -18,7 +17,6 @@ from torch import Tensor
 _BLOCK = 1024  # numbers that a program of a kernel works on
 
 
-@functools.cache
 def works() -> bool:
     """Can the kernels be compiled for this machine's card? Said once where not."""
     try:
@@ -101,26 +99,27 @@ def _products_along_rows(
 
 
 @triton.jit
+def _filtered(field, taps, at, step, low, high, BLOCK: tl.constexpr, RADIUS: tl.constexpr):
+    """The window's sum around `at`, its pixels `step` numbers apart; outside `low` to `high` they count as 0."""
+    total = tl.zeros((BLOCK,), tl.float32)
+    for k in tl.static_range(2 * RADIUS + 1):
+        to = at + (k - RADIUS) * step
+        total += tl.load(taps + k) * tl.load(field + to, mask=(to >= low) & (to < high), other=0.0)
+    return total
+
+
+@triton.jit
 def _compared_down_columns(
     weights, taps, fields, slopes, sums, count, row, channels, c1, c2,
     BLOCK: tl.constexpr, RADIUS: tl.constexpr, WEIGHTED: tl.constexpr,
 ):  # fmt: skip
     """Each program's sum of weights * (1 - SSIM), and slopes [3, H, W * C]: by the windows of x, x^2 + y^2 and x y."""
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    mean_x = tl.zeros((BLOCK,), tl.float32)
-    mean_y = tl.zeros((BLOCK,), tl.float32)
-    squares = tl.zeros((BLOCK,), tl.float32)
-    product = tl.zeros((BLOCK,), tl.float32)
-    total = tl.zeros((BLOCK,), tl.float32)
-    for k in tl.static_range(2 * RADIUS + 1):
-        to = at + (k - RADIUS) * row
-        inside = (at < count) & (to >= 0) & (to < count)
-        weight = tl.load(taps + k)
-        mean_x += weight * tl.load(fields + to, mask=inside, other=0.0)
-        mean_y += weight * tl.load(fields + count + to, mask=inside, other=0.0)
-        squares += weight * tl.load(fields + 2 * count + to, mask=inside, other=0.0)
-        product += weight * tl.load(fields + 3 * count + to, mask=inside, other=0.0)
-        total += weight * tl.load(fields + 4 * count + to, mask=inside, other=0.0)
+    mean_x = _filtered(fields, taps, at, row, 0, count, BLOCK, RADIUS)
+    mean_y = _filtered(fields + count, taps, at, row, 0, count, BLOCK, RADIUS)
+    squares = _filtered(fields + 2 * count, taps, at, row, 0, count, BLOCK, RADIUS)
+    product = _filtered(fields + 3 * count, taps, at, row, 0, count, BLOCK, RADIUS)
+    total = _filtered(fields + 4 * count, taps, at, row, 0, count, BLOCK, RADIUS)
     inverse = 1.0 / tl.where(total > 0, total, 1.0)
     mean_x *= inverse
     mean_y *= inverse
@@ -146,20 +145,11 @@ def _compared_down_columns(
 def _slopes_along_rows(taps, slopes, filtered, count, row, channels, BLOCK: tl.constexpr, RADIUS: tl.constexpr):
     """filtered [3, H, W * C] = slopes, filtered along each row."""
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    column = at % row
-    by_mean = tl.zeros((BLOCK,), tl.float32)
-    by_squares = tl.zeros((BLOCK,), tl.float32)
-    by_product = tl.zeros((BLOCK,), tl.float32)
-    for k in tl.static_range(2 * RADIUS + 1):
-        step = (k - RADIUS) * channels
-        inside = (at < count) & (column + step >= 0) & (column + step < row)
-        weight = tl.load(taps + k)
-        by_mean += weight * tl.load(slopes + at + step, mask=inside, other=0.0)
-        by_squares += weight * tl.load(slopes + count + at + step, mask=inside, other=0.0)
-        by_product += weight * tl.load(slopes + 2 * count + at + step, mask=inside, other=0.0)
-    tl.store(filtered + at, by_mean, mask=at < count)
-    tl.store(filtered + count + at, by_squares, mask=at < count)
-    tl.store(filtered + 2 * count + at, by_product, mask=at < count)
+    low = at - at % row
+    high = tl.minimum(low + row, count)
+    for field in tl.static_range(3):
+        along = _filtered(slopes + field * count, taps, at, channels, low, high, BLOCK, RADIUS)
+        tl.store(filtered + field * count + at, along, mask=at < count)
 
 
 @triton.jit
@@ -169,16 +159,9 @@ def _gathered_down_columns(
 ):  # fmt: skip
     """gradient [H, W * C] = d(sum of weights * (1 - SSIM)) / dx."""
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    by_mean = tl.zeros((BLOCK,), tl.float32)
-    by_squares = tl.zeros((BLOCK,), tl.float32)
-    by_product = tl.zeros((BLOCK,), tl.float32)
-    for k in tl.static_range(2 * RADIUS + 1):
-        to = at + (k - RADIUS) * row
-        inside = (at < count) & (to >= 0) & (to < count)
-        weight = tl.load(taps + k)
-        by_mean += weight * tl.load(filtered + to, mask=inside, other=0.0)
-        by_squares += weight * tl.load(filtered + count + to, mask=inside, other=0.0)
-        by_product += weight * tl.load(filtered + 2 * count + to, mask=inside, other=0.0)
+    by_mean = _filtered(filtered, taps, at, row, 0, count, BLOCK, RADIUS)
+    by_squares = _filtered(filtered + count, taps, at, row, 0, count, BLOCK, RADIUS)
+    by_product = _filtered(filtered + 2 * count, taps, at, row, 0, count, BLOCK, RADIUS)
     a = tl.load(x + at, mask=at < count, other=0.0)
     b = tl.load(y + at, mask=at < count, other=0.0)
     slope = by_mean + 2.0 * a * by_squares + b * by_product
@@ -189,7 +172,7 @@ def _gathered_down_columns(
 
 @torch.no_grad()
 def adam(updates, steps, visible, masked, unbias1, unbias2, beta1, beta2, epsilon) -> None:
-    """`gaussians.optimize._adam` in one pass over memory."""
+    """`gaussians.adam.adam` in one pass over memory."""
     for parameter, first, second, gradient, rates, masked_factor in updates:
         count, wide = parameter.numel(), parameter.shape[1]
         tables = parameter, first, second, gradient.contiguous(), rates.to(parameter)

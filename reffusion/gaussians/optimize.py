@@ -5,22 +5,17 @@ Shared by `fit` and `distill`. Everything here takes tensors and plain numbers.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from reffusion.gaussians.ssim import dssim, triton_works
-from reffusion.kernels.compiled import FREE_ROUNDING, kernel, parallel_for
-from reffusion.kernels.vectors import take_ticket
+from reffusion.gaussians import adam
+from reffusion.gaussians.ssim import dssim
 from reffusion.types import PARAMETERS, Gaussians
-
-_CHUNK = 512  # rows that a thread takes at once
-_jit = partial(kernel, fastmath=FREE_ROUNDING)
 
 
 def reconstruction_loss(image: Tensor, target: Tensor, weights: Tensor | None = None, share: float = 0.2) -> Tensor:
@@ -166,15 +161,15 @@ class GaussianOptimizer:
         if visible is None:
             visible = torch.ones_like(self.masked)
         self._steps += visible
-        unbias = _unbiasing(self.betas, 1 + int(self._steps.max()) // 1024, self._steps.device)
+        unbias = adam.unbiasing(self.betas, 1 + int(self._steps.max()) // 1024, self._steps.device)
         rates = self.rates.at(progress, self.gaussians)
         updates = []
         for name, gradient in gradients.items():
             if gradient is not None:
                 rows = (_rows(t) for t in (*(getattr(g, name) for g in self._states()), gradient))
                 moving = rates[name] if name != "sh" or sh_degree is None else rates[name][: 3 * (sh_degree + 1) ** 2]
-                updates.append(Update(*rows, moving, self.masked_factors.get(name, 1.0)))
-        _adam_of(self.masked.device)(updates, self._steps, visible, self.masked, *unbias, *self.betas, self.epsilon)
+                updates.append(adam.Update(*rows, moving, self.masked_factors.get(name, 1.0)))
+        adam.fastest(self.masked.device)(updates, self._steps, visible, self.masked, *unbias, *self.betas, self.epsilon)
         self.forget_gradients()
 
     def _states(self) -> tuple[Gaussians, Gaussians, Gaussians]:
@@ -265,13 +260,6 @@ def refuse_not_finite(gradients: Mapping[str, Tensor | None]) -> None:
             raise FloatingPointError(f"the gradient of the Gaussians' {name} is not finite")
 
 
-@lru_cache(maxsize=4)
-def _unbiasing(betas: tuple[float, float], kilo: int, device: torch.device) -> list[Tensor]:
-    """1 / (1 - beta^t) for t = 0 (which is never used) to 1024 `kilo` - 1, for each beta."""
-    t = torch.arange(1024 * kilo, dtype=torch.float64).clamp(min=1)
-    return [(1 / (1 - beta**t)).float().to(device) for beta in betas]
-
-
 def _leaf(parameter: Tensor) -> Tensor:
     return parameter.detach().clone().contiguous().requires_grad_()
 
@@ -282,88 +270,3 @@ def _zeros(parameter: Tensor) -> Tensor:
 
 def _rows(parameter: Tensor) -> Tensor:
     return parameter.detach().contiguous().view(parameter.shape[0], -1)
-
-
-class Update(NamedTuple):
-    """What a step of Adam needs for one parameter.
-
-    Attributes:
-        parameter, first, second: it and its two moments [N, D], changed in place; gradient: [N, D].
-        rates: step sizes [d] of the first d columns; the others stay. masked_factor: the factor on them in masked rows.
-    """
-
-    parameter: Tensor
-    first: Tensor
-    second: Tensor
-    gradient: Tensor
-    rates: Tensor
-    masked_factor: float
-
-
-def _adam_of(device: torch.device) -> Callable[..., None]:
-    """The fastest that works there; all are the same formula."""
-    if device.type == "cpu":
-        return _adam_cpu
-    if device.type == "cuda" and triton_works():
-        from reffusion.gaussians import card
-
-        return card.adam
-    return _adam
-
-
-@torch.no_grad()
-def _adam(updates: list[Update], steps, visible, masked, unbias1, unbias2, beta1, beta2, epsilon) -> None:
-    """One Adam step on the visible rows; `unbias` [T] is 1 / (1 - beta^t), `steps` [N] each row's t."""
-    rows = visible.nonzero()[:, 0]
-    first_unbias, second_unbias = unbias1[steps[rows], None], unbias2[steps[rows], None]
-    for *tables, rates, masked_factor in updates:
-        parameter, first, second, gradient = (table[:, : len(rates)] for table in tables)
-        g = gradient[rows]
-        m = first[rows].lerp_(g, 1 - beta1)
-        v = second[rows].mul_(beta2).addcmul_(g, g, value=1 - beta2)
-        first[rows], second[rows] = m, v
-        factor = torch.where(masked[rows], masked_factor, 1.0)[:, None]
-        parameter[rows] -= rates.to(g) * factor * first_unbias * m / ((v * second_unbias).sqrt() + epsilon)
-
-
-def _adam_cpu(updates: list[Update], steps, visible, masked, unbias1, unbias2, beta1, beta2, epsilon) -> None:
-    """`_adam` in one pass over memory, for float32."""
-    if not updates:
-        return
-    columns = [tuple(t.numpy() for t in kind) for kind in list(zip(*updates, strict=True))[:5]]
-    factors = np.array([update.masked_factor for update in updates], np.float32)
-    rows = tuple(t.numpy() for t in (steps, visible, masked, unbias1, unbias2))
-    parallel_for(_adam_kernel, *columns, factors, rows, (np.float32(beta1), np.float32(beta2), np.float32(epsilon)))
-
-
-@_jit
-def _adam_kernel(tickets, parameters, firsts, seconds, gradients, rates, factors, rows, numbers):
-    count = len(rows[0])
-    chunks = (count + _CHUNK - 1) // _CHUNK
-    while True:
-        ticket = take_ticket(tickets)
-        if ticket >= chunks * len(parameters):
-            return
-        kind, start = ticket // chunks, ticket % chunks * _CHUNK
-        tables = parameters[kind], firsts[kind], seconds[kind], gradients[kind]
-        _adam_rows(start, min(start + _CHUNK, count), tables, rates[kind], factors[kind], rows, numbers)
-
-
-@_jit
-def _adam_rows(begin, end, tables, rates, masked_factor, rows, numbers):
-    parameter, first, second, gradient = tables
-    steps, visible, masked, unbias1, unbias2 = rows
-    beta1, beta2, epsilon = numbers
-    new1, new2 = np.float32(1) - beta1, np.float32(1) - beta2
-    least = np.float32(1e-30)  # below it a first moment would soon be denormal, on which processors are slow
-    for i in range(begin, end):
-        if not visible[i]:
-            continue
-        factor, over = unbias1[steps[i]] * (masked_factor if masked[i] else np.float32(1)), unbias2[steps[i]]
-        for j in range(len(rates)):
-            g = gradient[i, j]
-            a = beta1 * first[i, j] + new1 * g
-            a = np.float32(0) if abs(a) < least else a
-            b = beta2 * second[i, j] + new2 * g * g
-            first[i, j], second[i, j] = a, b
-            parameter[i, j] -= factor * rates[j] * a / (np.sqrt(b * over) + epsilon)
