@@ -69,14 +69,18 @@ def project_and_bin(
     parameters: list[np.ndarray], antialiased: bool, probe: np.ndarray, camera: Camera, degree: int
 ) -> View:
     """Project, sort and bin; `parameters` in the order of `types.PARAMETERS`."""
-    count, width = len(parameters[0]), 3 * parameters[4].shape[1]
-    rows = footprints.padded(count)
+    count, rows = len(parameters[0]), footprints.padded(len(parameters[0]))
     drawn, radii = empty_aligned(rows * FOOTPRINT), np.zeros(rows, np.int32)
-    flat, numbers = (array.reshape(-1) for array in parameters), view_numbers(camera, antialiased)
-    arguments = width, degree, probe.reshape(-1), numbers, camera.center, drawn, radii
-    parallel_for(footprints.draw, *flat, *arguments, gaussians=count)
+    seen_from = view_numbers(camera, antialiased), camera.center
+    parallel_for(
+        footprints.draw, _flat(parameters, degree), probe.reshape(-1), *seen_from, drawn, radii, gaussians=count
+    )
     order = binning.depth_order(radii[:count], drawn)
     return View(drawn, radii, binning.bin_footprints(drawn, order, count, camera.width, camera.height))
+
+
+def _flat(parameters: list[np.ndarray], degree: int) -> footprints.Parameters:
+    return footprints.Parameters(*(array.reshape(-1) for array in parameters), 3 * parameters[4].shape[1], degree)
 
 
 class _Splat(torch.autograd.Function):
@@ -126,7 +130,7 @@ def _to_parameters(
     count, rows = len(parameters[0]), footprints.padded(len(parameters[0]))
     shapes = [(rows, *array.shape[1:]) for array in parameters] + [(rows, channels), (rows if want_probe else 0, 2)]
     out = [empty_aligned(*shape) for shape in shapes]
-    flat_out = [array.reshape(-1) for array in out]
+    flat = [array.reshape(-1) for array in out]
     parallel_for(
         footprints.draw_backward,
         records.reshape(-1),
@@ -135,13 +139,9 @@ def _to_parameters(
         records.shape[1],
         view.radii,
         view.footprints,
-        *(array.reshape(-1) for array in parameters),
-        3 * parameters[4].shape[1],
-        degree,
+        _flat(parameters, degree),
         numbers,
         center,
-        *flat_out[:5],
-        out[5],
-        flat_out[6],
+        footprints.Gradients(*flat[:5], out[5], flat[6]),
     )
     return [array[:count] for array in out]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from reffusion.kernels.compiled import inlined, kernel
@@ -44,6 +46,50 @@ from reffusion.splat.layout import (
 )
 
 
+class Parameters(NamedTuple):
+    """Those of N Gaussians, flat, and how their colours are read.
+
+    Attributes:
+        means, ..., sh: float32, in the order of `types.PARAMETERS`.
+        width: numbers in a row of sh. degree: of the harmonics that are drawn.
+    """
+
+    means: np.ndarray
+    quaternions: np.ndarray
+    log_scales: np.ndarray
+    opacity_logits: np.ndarray
+    sh: np.ndarray
+    width: int
+    degree: int
+
+
+class Gradients(NamedTuple):
+    """Of the same, [padded(N), columns] flat.
+
+    Attributes:
+        features: [padded(N), C], not flat. probe: of what was added to the 2D means, or empty.
+    """
+
+    means: np.ndarray
+    quaternions: np.ndarray
+    log_scales: np.ndarray
+    opacity_logits: np.ndarray
+    sh: np.ndarray
+    features: np.ndarray
+    probe: np.ndarray
+
+
+class Room(NamedTuple):
+    """To work in, LANES numbers to a column: the harmonics' basis and what leads along it, a row of sh, the sums over a
+    footprint's pixels by Gaussian and by column."""
+
+    basis: np.ndarray
+    along: np.ndarray
+    coefficients: np.ndarray
+    sums: np.ndarray
+    moments: np.ndarray
+
+
 def padded(count: int) -> int:
     """Rows of an array that kernels write LANES rows at a time."""
     return -(-count // LANES) * LANES
@@ -59,29 +105,26 @@ def next_part(tickets, count):
 
 
 @kernel
-def draw(
-    tickets, means, quaternions, log_scales, opacity_logits, sh, width, degree, probe, view, center, footprints, radii
-):
+def draw(tickets, parameters, probe, view, center, footprints, radii):
     """Footprints of all Gaussians.
 
     Args:
-        means, ..., sh: the parameters, flat; width: of a row of sh.
-        probe: added to the 2D means, flat, or empty.
+        parameters: `Parameters`. probe: added to the 2D means, flat, or empty.
         view: see `projection.view_numbers`; center: the camera's.
         footprints: [padded(N), FOOTPRINT] float32 flat, written for groups with a Gaussian that reaches the image.
         radii: [padded(N)] int32 zeros, written for the same.
     """
     basis, drawn = np.zeros(16 * LANES, np.float32), np.zeros(FOOTPRINT * LANES, np.float32)
-    coefficients = np.zeros(width * LANES, np.float32)
-    last = opacity_logits.shape[0] - 1
+    coefficients = np.zeros(parameters.width * LANES, np.float32)
+    last = parameters.opacity_logits.shape[0] - 1
     while True:
         begin, end = next_part(tickets, radii.shape[0] // LANES)
         if begin < 0:
             return
         for row in range(begin * LANES, end * LANES, LANES):
-            mean = projection.three_columns(means, row, last)
+            mean = projection.three_columns(parameters.means, row, last)
             kept, mean_x, mean_y, slant, whiten_x, whiten_y, level, z, reach_x, reach_y = projection.project(
-                view, mean, quaternions, log_scales, opacity_logits, row, last
+                view, mean, parameters.quaternions, parameters.log_scales, parameters.opacity_logits, row, last
             )
             if probe.shape[0] > 0:
                 mean_x = mean_x + widen(load_column(probe, 2, 0, row, last))
@@ -92,29 +135,36 @@ def draw(
             radius = minimum(maximum(maximum(reach_x, reach_y), 1.0), 1073741824.0)
             store_whole(radii, row, select(kept, radius, 0.0))
             dx, dy, dz, _ = harmonics.direction(mean, center)
-            harmonics.fill_basis(degree, dx, dy, dz, basis)
-            _read_rows(sh, width, row, last, coefficients)
-            red, green, blue = harmonics.colors(degree, basis, coefficients)
-            shape = narrow(slant), narrow(whiten_x), narrow(whiten_y), narrow(level)
-            half_width, half_height, tilt, column = ellipse(shape[0], shape[1], shape[2], shape[3])
-            x, y, u, v = projection.anchor(view, mean_x, mean_y, slant, whiten_x, whiten_y)
-            store(drawn, ANCHOR_X * LANES, narrow(x))
-            store(drawn, ANCHOR_Y * LANES, narrow(y))
-            store(drawn, ANCHOR_U * LANES, narrow(u))
-            store(drawn, ANCHOR_V * LANES, narrow(v))
-            store(drawn, SLANT * LANES, shape[0])
-            store(drawn, WHITEN_X * LANES, shape[1])
-            store(drawn, WHITEN_Y * LANES, shape[2])
-            store(drawn, LEVEL * LANES, shape[3])
-            store(drawn, DEPTH * LANES, narrow(z))
-            store(drawn, HALF_WIDTH * LANES, half_width)
-            store(drawn, HALF_HEIGHT * LANES, half_height)
-            store(drawn, TILT * LANES, tilt)
-            store(drawn, COLUMN * LANES, column)
-            store(drawn, RED * LANES, red)
-            store(drawn, GREEN * LANES, green)
-            store(drawn, BLUE * LANES, blue)
+            harmonics.fill_basis(parameters.degree, dx, dy, dz, basis)
+            _read_rows(parameters.sh, parameters.width, row, last, coefficients)
+            colors = harmonics.colors(parameters.degree, basis, coefficients)
+            anchor = projection.anchor(view, mean_x, mean_y, slant, whiten_x, whiten_y)
+            _fill_footprint(drawn, anchor, (slant, whiten_x, whiten_y, level), z, colors)
             _write_rows(footprints, FOOTPRINT, row, drawn)
+
+
+@inlined
+def _fill_footprint(drawn, anchor, ellipse_numbers, z, colors):
+    """The numbers of LANES footprints, see `layout`."""
+    slant, whiten_x, whiten_y, level = ellipse_numbers
+    shape = narrow(slant), narrow(whiten_x), narrow(whiten_y), narrow(level)
+    half_width, half_height, tilt, column = ellipse(shape[0], shape[1], shape[2], shape[3])
+    store(drawn, ANCHOR_X * LANES, narrow(anchor[0]))
+    store(drawn, ANCHOR_Y * LANES, narrow(anchor[1]))
+    store(drawn, ANCHOR_U * LANES, narrow(anchor[2]))
+    store(drawn, ANCHOR_V * LANES, narrow(anchor[3]))
+    store(drawn, SLANT * LANES, shape[0])
+    store(drawn, WHITEN_X * LANES, shape[1])
+    store(drawn, WHITEN_Y * LANES, shape[2])
+    store(drawn, LEVEL * LANES, shape[3])
+    store(drawn, DEPTH * LANES, narrow(z))
+    store(drawn, HALF_WIDTH * LANES, half_width)
+    store(drawn, HALF_HEIGHT * LANES, half_height)
+    store(drawn, TILT * LANES, tilt)
+    store(drawn, COLUMN * LANES, column)
+    store(drawn, RED * LANES, colors[0])
+    store(drawn, GREEN * LANES, colors[1])
+    store(drawn, BLUE * LANES, colors[2])
 
 
 @kernel
@@ -177,97 +227,88 @@ def add_all_records(tickets, records, written, first_slots, gathered):
 
 @kernel
 def draw_backward(
-    tickets,
-    records,
-    written,
-    first_slots,
-    columns,
-    radii,
-    footprints,
-    means,
-    quaternions,
-    log_scales,
-    opacity_logits,
-    sh,
-    width,
-    degree,
-    view,
-    center,
-    grad_means,
-    grad_quaternions,
-    grad_scales,
-    grad_opacities,
-    grad_sh,
-    grad_features,
-    grad_probe,
+    tickets, records, written, first_slots, columns, radii, footprints, parameters, view, center, gradients
 ):
     """From the records of each footprint to the gradients of all parameters.
 
     Args:
         records, written, first_slots: see `backward.blend_backward`; columns: of a record.
         radii, footprints: as `draw` left them.
-        means, ..., sh: the parameters, flat.
-        grad_means, ...: [padded(N), columns] flat, written; grad_features [padded(N), C] not flat; grad_probe may be
-            empty.
+        parameters, gradients: `Parameters`; `Gradients`, written.
     """
-    basis, along = np.zeros(16 * LANES, np.float32), np.zeros(16 * LANES, np.float32)
-    coefficients = np.zeros(width * LANES, np.float32)
-    sums, moments = np.zeros(LANES * columns, np.float32), np.zeros(columns * LANES, np.float32)
-    last = opacity_logits.shape[0] - 1
+    room = Room(
+        np.zeros(16 * LANES, np.float32),
+        np.zeros(16 * LANES, np.float32),
+        np.zeros(parameters.width * LANES, np.float32),
+        np.zeros(LANES * columns, np.float32),
+        np.zeros(columns * LANES, np.float32),
+    )
     while True:
         begin, end = next_part(tickets, radii.shape[0] // LANES)
         if begin < 0:
             return
         for row in range(begin * LANES, end * LANES, LANES):
-            add_records(records, written, first_slots, columns, row, sums)
+            add_records(records, written, first_slots, columns, row, room.sums)
             for lane in range(LANES):
-                for c in range(grad_features.shape[1]):
-                    grad_features[row + lane, c] = sums[lane * columns + GRAD_FEATURES + c]
+                for c in range(gradients.features.shape[1]):
+                    gradients.features[row + lane, c] = room.sums[lane * columns + GRAD_FEATURES + c]
             seen = load_mask(radii, row)
-            if not some(seen):
-                _store_zeros(grad_probe, 2 if grad_probe.shape[0] > 0 else 0, row)
-                _store_zeros(grad_means, 3, row)
-                _store_zeros(grad_quaternions, 4, row)
-                _store_zeros(grad_scales, 3, row)
-                _store_zeros(grad_opacities, 1, row)
-                _store_zeros(grad_sh, width, row)
-                continue
-            _read_rows(sums, columns, 0, LANES - 1, moments)
-            mean = projection.three_columns(means, row, last)
-            _read_rows(sh, width, row, last, coefficients)
-            # The direction's way, from the colours to the mean.
-            x, y, z = _colors_backward(degree, mean, center, seen, moments, footprints, row, basis, along, coefficients)
-            _write_rows(grad_sh, width, row, coefficients)
-            to_mean, to_quaternion, to_scales, to_logit, to_probe = projection.project_backward(
-                view, mean, quaternions, log_scales, opacity_logits, row, last, moments
-            )
-            _store_three(
-                grad_means, 3, row, seen, narrow(to_mean[0]) + x, narrow(to_mean[1]) + y, narrow(to_mean[2]) + z
-            )
-            w, i, j, k = to_quaternion
-            _store_three(grad_quaternions, 4, row, seen, narrow(w), narrow(i), narrow(j))
-            _store_one(grad_quaternions, 4, 3, row, seen, narrow(k))
-            _store_three(grad_scales, 3, row, seen, narrow(to_scales[0]), narrow(to_scales[1]), narrow(to_scales[2]))
-            _store_one(grad_opacities, 1, 0, row, seen, narrow(to_logit))
-            if grad_probe.shape[0] > 0:
-                _store_one(grad_probe, 2, 0, row, seen, narrow(to_probe[0]))
-                _store_one(grad_probe, 2, 1, row, seen, narrow(to_probe[1]))
+            if some(seen):
+                _read_rows(room.sums, columns, 0, LANES - 1, room.moments)
+                _rows_backward(row, seen, footprints, parameters, view, center, room, gradients)
+            else:
+                _clear_rows(row, parameters.width, gradients)
 
 
 @inlined
-def _colors_backward(degree, mean, center, seen, moments, footprints, row, basis, along, coefficients):
-    """From the gradients of the colours to those of the harmonics, in the place of their coefficients, and of the mean.
-    `basis`, `along`: room to work in."""
+def _rows_backward(row, seen, footprints, parameters, view, center, room, gradients):
+    """LANES rows of all gradients but the features', from `room.moments`."""
+    last = parameters.opacity_logits.shape[0] - 1
+    mean = projection.three_columns(parameters.means, row, last)
+    _read_rows(parameters.sh, parameters.width, row, last, room.coefficients)
+    # The direction's way, from the colours to the mean.
+    x, y, z = _colors_backward(parameters.degree, mean, center, seen, footprints, row, room)
+    _write_rows(gradients.sh, parameters.width, row, room.coefficients)
+    to_mean, to_quaternion, to_scales, to_logit, to_probe = projection.project_backward(
+        view, mean, parameters.quaternions, parameters.log_scales, parameters.opacity_logits, row, last, room.moments
+    )
+    means = narrow(to_mean[0]) + x, narrow(to_mean[1]) + y, narrow(to_mean[2]) + z
+    w, i, j, k = to_quaternion
+    _store_three(gradients.means, 3, row, seen, means[0], means[1], means[2])
+    _store_three(gradients.quaternions, 4, row, seen, narrow(w), narrow(i), narrow(j))
+    _store_one(gradients.quaternions, 4, 3, row, seen, narrow(k))
+    _store_three(gradients.log_scales, 3, row, seen, narrow(to_scales[0]), narrow(to_scales[1]), narrow(to_scales[2]))
+    _store_one(gradients.opacity_logits, 1, 0, row, seen, narrow(to_logit))
+    if gradients.probe.shape[0] > 0:
+        _store_one(gradients.probe, 2, 0, row, seen, narrow(to_probe[0]))
+        _store_one(gradients.probe, 2, 1, row, seen, narrow(to_probe[1]))
+
+
+@inlined
+def _clear_rows(row, width, gradients):
+    """LANES rows without a Gaussian that is seen."""
+    _store_zeros(gradients.probe, 2 if gradients.probe.shape[0] > 0 else 0, row)
+    _store_zeros(gradients.means, 3, row)
+    _store_zeros(gradients.quaternions, 4, row)
+    _store_zeros(gradients.log_scales, 3, row)
+    _store_zeros(gradients.opacity_logits, 1, row)
+    _store_zeros(gradients.sh, width, row)
+
+
+@inlined
+def _colors_backward(degree, mean, center, seen, footprints, row, room):
+    """From the gradients of the colours to those of the harmonics, in the place of their coefficients, and of the
+    mean."""
     x, y, z, inverse = harmonics.direction(mean, center)
     zero, used = splat(0.0), 3 * (degree + 1) * (degree + 1)
     x, y, z = select(seen, x, zero), select(seen, y, zero), select(seen, z, zero)
-    harmonics.fill_basis(degree, x, y, z, basis)
-    red = _color_gradient(moments, GRAD_RED, footprints, RED, seen, row)
-    green = _color_gradient(moments, GRAD_GREEN, footprints, GREEN, seen, row)
-    blue = _color_gradient(moments, GRAD_BLUE, footprints, BLUE, seen, row)
-    harmonics.colors_backward(degree, basis, coefficients, red, green, blue, along)
-    coefficients[used * LANES :] = np.float32(0.0)
-    return harmonics.direction_backward(degree, x, y, z, inverse, along)
+    harmonics.fill_basis(degree, x, y, z, room.basis)
+    red = _color_gradient(room.moments, GRAD_RED, footprints, RED, seen, row)
+    green = _color_gradient(room.moments, GRAD_GREEN, footprints, GREEN, seen, row)
+    blue = _color_gradient(room.moments, GRAD_BLUE, footprints, BLUE, seen, row)
+    harmonics.colors_backward(degree, room.basis, room.coefficients, red, green, blue, room.along)
+    room.coefficients[used * LANES :] = np.float32(0.0)
+    return harmonics.direction_backward(degree, x, y, z, inverse, room.along)
 
 
 @inlined
