@@ -116,7 +116,7 @@ def surroundings(params: Params, scene, gaussians, thing, sets, poses: Path, fit
     for name in scene.blank:  # the Gaussians' own picture; what no photograph shows of it is hidden
         everything = np.ones_like(hidden[name])
         photos[name] = inpaint.background(gaussians, scene.cameras[name], np.zeros((1, 1, 3), np.uint8), everything)
-    found = surfaces.looked_around(gaussians, thing, train, hidden, photos, SEED)
+    found = surfaces.looked_around(gaussians, thing, train, hidden, photos, scene.points, SEED)
     consistent = {name: each.consistent for name, each in sets.items()}
     unknown = {name: each.undecided for name, each in sets.items()}
     place = (found.planes, scene.points, found.centre, found.radius, found.mirrors)

@@ -71,7 +71,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
     )
     hidden = {name: empty[name] if name in scene.clean else consistent[name] for name in scene.cameras}
     views = witness.witnesses(gaussians, train, hidden)
-    planes = continuations(params, gaussians, labels, views)
+    planes = continuations(gaussians, labels, views, scene.points)
     photos = exposure.load_views(poses, fit, scene.train) if planes or params.debris else {}
     if params.debris and (raw or deleted is not None):
         debris = witness.debris(gaussians, labels, views, hidden, photos)
@@ -207,9 +207,9 @@ def of_blank_views(
     return {name: union(name, mask) for name, mask in found.items()}
 
 
-def continuations(params: Params, gaussians: Gaussians, labels: Tensor, views: list[Witness]) -> list[Plane]:
+def continuations(gaussians: Gaussians, labels: Tensor, views: list[Witness], points: np.ndarray) -> list[Plane]:
     """The planes around the object; none where there is none."""
-    return planes_around(*extent(gaussians.means[labels]), views, SEED) if labels.any() else []
+    return planes_around(*extent(gaussians.means[labels]), views, points, SEED) if labels.any() else []
 
 
 def tidied(params: Params, mask: np.ndarray) -> np.ndarray:

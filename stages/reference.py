@@ -160,7 +160,8 @@ def surfaces_around(scene: Scene, poses: Path, fit: Path, masks: Path) -> surfac
     sets, train = load_mask_sets(masks, scene.train), [scene.cameras[name] for name in scene.train]
     hidden = {name: each.consistent & (name not in scene.clean) for name, each in sets.items()}
     photos = exposure.load_views(poses, fit, scene.train)
-    return surfaces.looked_around(load_ply(fit / "gaussians.ply"), load_object(masks), train, hidden, photos)
+    gaussians, thing = load_ply(fit / "gaussians.ply"), load_object(masks)
+    return surfaces.looked_around(gaussians, thing, train, hidden, photos, scene.points)
 
 
 def from_photographs(

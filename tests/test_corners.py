@@ -45,7 +45,7 @@ def witness(view):
 @pytest.fixture(scope="module")
 def planes():
     views = [witness(camera(turn)) for turn in np.linspace(0.1, 0.6, 12)]
-    return planes_around((LOW + HIGH) / 2, 0.3, views)
+    return planes_around((LOW + HIGH) / 2, 0.3, views, np.zeros((0, 3)))
 
 
 def test_the_side_of_a_wall_goes_on_behind_a_thing_down_to_the_floor_and_not_into_the_wall(planes):
@@ -69,3 +69,26 @@ def test_leaves_have_no_third_face():
     ((normal, height),) = asked(np.concatenate([leaves[:1500], face]))
     assert height * normal[0] == pytest.approx(0.1, abs=0.005)
     assert third_faces(face, free[:200], found[:1], np.zeros(3), 0.5, 0.02) == [], "one plane has no corner"
+
+
+def test_sparse_points_tell_where_planes_lie_that_are_drawn_too_near():
+    views = []
+    for turn in np.linspace(0.1, 0.6, 12):
+        true = witness(camera(turn))
+        rows = np.linspace(0, 0.02, SIZE)[:, None]  # haze: the farther up, so farther off, the nearer it is drawn
+        depth = true.depth * (1 - rows[::-1])
+        views.append(Witness.of(true.camera, depth, surface_range(depth.astype(np.float32)), true.hidden))
+    draws, count = np.random.default_rng(0), 150
+    floor = np.stack([*draws.uniform(-0.5, 0.5, (2, count)), np.zeros(count)], 1)
+    front = np.stack([draws.uniform(0, 0.5, count), np.zeros(count), draws.uniform(0, 0.6, count)], 1)
+    points = np.concatenate([floor, front]) + draws.normal(0, 1e-3, (2 * count, 3))
+    points = np.concatenate([points, draws.uniform(-0.6, 0.6, (100, 3))])
+    told, untold = (planes_around((LOW + HIGH) / 2, 0.3, views, each) for each in (points, np.zeros((0, 3))))
+    for axis in (2, 1):
+        off = lambda plane, axis=axis: np.degrees(np.arccos(abs(plane.normal[axis])))
+        of_points, of_views = (min(planes, key=off) for planes in (told, untold))
+        assert off(of_points) < 0.2 and abs(of_points.height) < 2e-3
+        assert off(of_views) > 2 * off(of_points)
+    line = np.stack([np.linspace(-0.5, 0.5, 200), np.zeros(200), np.zeros(200)], 1)  # tells no direction across
+    few = planes_around((LOW + HIGH) / 2, 0.3, views, line)
+    assert all(np.allclose(a.normal, b.normal) for a, b in zip(few, untold, strict=True))

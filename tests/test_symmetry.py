@@ -103,7 +103,7 @@ def sideways(mirrors: list[Mirror]) -> list[Mirror]:
 @pytest.fixture(scope="module")
 def whole():
     views, photos, gaussians = scene()
-    planes = planes_around(CENTRE, RADIUS, views)
+    planes = planes_around(CENTRE, RADIUS, views, np.zeros((0, 3)))
     return views, gaussians, planes, mirrors_around(gaussians, CENTRE, RADIUS, views, planes, photos)
 
 
@@ -144,14 +144,17 @@ def test_its_pixels_are_undecided_and_have_its_depth(whole):
 @pytest.mark.parametrize("how", [{"cut": True}, {"halved": True}])
 def test_what_is_unlike_on_its_other_side_has_no_mirror(how):
     views, photos, gaussians = scene(**how)
-    planes = planes_around(CENTRE, RADIUS, views)
+    planes = planes_around(CENTRE, RADIUS, views, np.zeros((0, 3)))
     assert not sideways(mirrors_around(gaussians, CENTRE, RADIUS, views, planes, photos))
 
 
 def test_nothing_stands_there_and_nothing_is_asked():
     views, photos, gaussians = scene()
     assert mirrors_around(gaussians, CENTRE, RADIUS, views, [], photos) == []
-    assert mirrors_around(gaussians, CENTRE, np.inf, views, planes_around(CENTRE, RADIUS, views), photos) == []
+    assert (
+        mirrors_around(gaussians, CENTRE, np.inf, views, planes_around(CENTRE, RADIUS, views, np.zeros((0, 3))), photos)
+        == []
+    )
 
 
 def test_a_camera_behind_the_mirror_shows_the_image_with_its_sides_swapped():

@@ -73,7 +73,7 @@ def test_a_surface_does_not_face_views_from_its_other_side(views):
 
 
 def test_the_table_goes_on_under_the_box_and_ends_at_its_edge(views):
-    planes = planes_around(np.array([0.0, 0.0, HIGH / 2]), 0.45, views)
+    planes = planes_around(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, np.zeros((0, 3)))
     table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.height))
     assert abs(table.normal[2]) > 0.999 and abs(table.height) < 0.01
     view = camera("new", 15.0, 1.6)
@@ -92,7 +92,7 @@ def test_borders_that_are_visible_go_on_under_the_box():
     """The box hides the inner corner of an L-shaped table: what is beyond the line between its visible edges is free,
     though the convex hull of the table has it."""
     views = [witness(camera(f"a{k}", 30 * k, 1.6), notched=True) for k in range(12)]
-    planes = planes_around(np.array([0.0, 0.0, HIGH / 2]), 0.45, views)
+    planes = planes_around(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, np.zeros((0, 3)))
     table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.height))
     steps = (np.arange(len(table.goes_on)) + 0.5 - len(table.goes_on) / 2) * table.pitch
     points = table.origin + steps[:, None, None] * table.along[0] + steps[None, :, None] * table.along[1]
@@ -120,7 +120,7 @@ def beside_a_plinth(view: Camera) -> Witness:
 def test_a_wall_does_not_go_on_along_the_ground_where_it_was_never_seen():
     """Near their crossing, and beneath it, rough ground looks like the wall's: on both sides of the box."""
     views = [beside_a_plinth(camera(f"a{k}", 200 + 12 * k, 1.4)) for k in range(12)]
-    planes = planes_around(np.array([0.0, 0.0, HIGH / 2]), 0.45, views)
+    planes = planes_around(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, np.zeros((0, 3)))
     face = max(planes, key=lambda plane: abs(plane.normal[1]))
     assert abs(face.normal[1]) > 0.99
     right = face.cells[..., 0] > -0.8 * BOX
@@ -129,6 +129,22 @@ def test_a_wall_does_not_go_on_along_the_ground_where_it_was_never_seen():
     ground = max(planes, key=lambda plane: abs(plane.normal[2]))
     under = (np.abs(ground.cells[..., :2]) < 0.8 * BOX).all(-1)
     assert ground.goes_on[under].mean() > 0.95
+
+
+def test_a_plane_goes_on_from_what_other_views_show_of_it_within_the_mask(views):
+    """Outside the mask nothing is drawn that could tell."""
+    camera, hidden = views[0].camera, views[0].hidden
+    planes = planes_around(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, np.zeros((0, 3)))
+    table = max(planes, key=lambda plane: plane.seen.sum())
+    at = table.depth(camera)
+    seen, unknown = (table.on(cells, at, camera, hidden & np.isfinite(at)) for cells in (table.seen, table.goes_on))
+    assert seen.sum() > 100 and unknown.sum() > 100
+    grey = np.full((SIZE, SIZE, 3), 128, np.uint8)
+    left = surface_gaussians(grey, np.where(hidden, at, 1.0), seen & ~unknown, camera, sh_count=1, spread=0.6)
+    found = behind(left, camera, hidden, views, [table])
+    goes_on = unknown & found.undecided
+    np.testing.assert_allclose(found.continued[goes_on], at[goes_on])
+    assert goes_on.sum() > 0.9 * unknown.sum()
 
 
 def test_what_lies_beneath_the_table_in_all_views_but_one_is_not_what_is_behind_the_box(views):

@@ -1,8 +1,8 @@
 """What a stage takes on a card: operations and bytes counted at full size (counts.py), over the card's peaks.
 
 Of each peak two fifths are reached, and computing and moving do not overlap: so it was on the one kind of card that was
-timed, an H200, to a tenth to a fifth (docs/production.md). What the numbers stand for otherwise, where a plan cannot know
-it yet: `BASIS`. The CPU's part of a stage is left out.
+timed, an H200, to a tenth to a fifth (docs/production.md). What the numbers stand for otherwise, where a plan cannot
+know it yet: `BASIS`. The CPU's part of a stage is left out.
 """
 
 from __future__ import annotations

@@ -10,21 +10,18 @@ import numpy as np
 from scipy import ndimage
 
 from reffusion import geometry, seeding
-from reffusion.depth.behind import grown
 from reffusion.gaussians.surfels import surface_normals
 from reffusion.masks.borders import RIM, between
 from reffusion.masks.corners import reached, third_faces
 from reffusion.masks.plane import CELLS, Plane
+from reffusion.masks.sampled import best_plane, surface_samples, told
 from reffusion.masks.witness import SURFACE, Witness, seen_by, votes
 from reffusion.paint.margin import hull
 from reffusion.types import Camera
 
 REACH = 2.5  # radii of the object around its middle within which surfaces are looked for
-RING = 0.12  # of the image's width: how far around the masks surfaces are sampled
-VIEWS = 12  # views that are sampled
-SAMPLES = 1500  # of each
 TOLERANCE = 0.08  # of the object's radius: distance within which a sample belongs to a plane
-TRIALS = 300  # draws of three samples for each plane
+SPREAD = 0.25  # of the object's radius: how far from their middle points must lie to all sides to tell where a plane is
 LEAST_SHARE = 0.1  # of the samples that a plane must explain
 MOST = 5  # planes
 LARGE = 0.05  # of the largest patch of seen cells: smaller ones are no part of the plane
@@ -43,24 +40,29 @@ SURROUNDS = (
 TOUCHING = 0.25  # share of an unknown patch's border that must be seen for the plane to go on into it
 
 
-def planes_around(centre: np.ndarray, radius: float, views: Sequence[Witness], seed: int = 0) -> list[Plane]:
+def planes_around(
+    centre: np.ndarray, radius: float, views: Sequence[Witness], points: np.ndarray, seed: int = 0
+) -> list[Plane]:
     """The planes around what is removed, those with the most samples first.
 
     Found in the world, from the surfaces that several views show around their masks: one view's depth alone is rough,
-    and a plane seen at a slant by one is seen well by another.
+    and a plane seen at a slant by one is seen well by another. Where they lie sparse points tell, if there are enough.
 
     Args:
         centre: [3], the middle of what is removed. radius: of most of it.
+        points: [P, 3], the scene's sparse points; P = 0 allowed.
     """
-    samples = _samples(centre, REACH * radius, views, seed)
+    samples = surface_samples(centre, REACH * radius, views, seed)
+    points = points[np.linalg.norm(points - centre, axis=1) < REACH * radius]
     near, free = TOLERANCE * radius, np.ones(len(samples), bool)
     found: list[tuple[np.ndarray, float]] = []
     draws = np.random.default_rng(seeding.seed_for(seed, "planes around"))
     while free.sum() >= max(50, LEAST_SHARE * len(samples)) and len(found) < MOST:
-        normal, height, support = _best_plane(samples[free], near, draws)
+        normal, height, support = best_plane(samples[free], near, draws)
         if support < LEAST_SHARE * len(samples):
             break
-        found.append((normal, height))
+        found.append(told(normal, height, points, near, SPREAD * radius))
+        points = points[np.abs(points @ found[-1][0] - found[-1][1]) >= 1.5 * near]
         free &= np.abs(samples @ normal - height) >= 1.5 * near
     thirds = third_faces(samples, free, found, centre, radius, near)
     third = [False] * len(found) + [True] * len(thirds)
@@ -114,39 +116,6 @@ def aligned(plane: Plane, depth: np.ndarray, camera: Camera, hole: np.ndarray) -
     there = hole & np.isfinite(at)
     far = np.abs(moved.depth(camera)[there] / at[there] - 1).max() if there.any() else 0.0
     return moved if far < FAR else plane
-
-
-def _samples(centre: np.ndarray, reach: float, views: Sequence[Witness], seed: int) -> np.ndarray:
-    """[S, 3] points of the surfaces that views show around their masks, within reach."""
-    draws, found = np.random.default_rng(seeding.seed_for(seed, "surfaces around")), [np.zeros((0, 3))]
-    for view in views[:: max(1, len(views) // VIEWS)]:
-        rows, columns = np.nonzero(grown(view.hidden, RING) & ~view.hidden & (view.depth > 0))
-        if len(rows):
-            chosen = draws.choice(len(rows), min(SAMPLES, len(rows)), replace=False)
-            found.append(geometry.unproject(view.depth, view.camera)[rows[chosen], columns[chosen]])
-    points = np.concatenate(found)
-    return points[np.linalg.norm(points - centre, axis=1) < reach]
-
-
-def _best_plane(points: np.ndarray, near: float, draws: np.random.Generator) -> tuple[np.ndarray, float, int]:
-    """Normal, height and support of the plane through three of the points that most are near to, fitted to its own."""
-    first, second, third = (points[draws.integers(len(points), size=TRIALS)] for _ in range(3))
-    normals = np.cross(second - first, third - first)
-    length = np.linalg.norm(normals, axis=1)
-    normals = normals[length > 1e-12] / length[length > 1e-12, None]
-    if not len(normals):
-        return np.array([0.0, 0.0, 1.0]), 0.0, 0
-    heights = (normals * first[length > 1e-12]).sum(1)
-    support = (np.abs(points @ normals.T - heights) < near).sum(0)
-    normal, height = normals[support.argmax()], heights[support.argmax()]
-    for _ in range(5):
-        own = points[np.abs(points @ normal - height) < near]
-        if len(own) < 3:
-            break
-        middle = own.mean(0)
-        normal = np.linalg.svd(own - middle, full_matrices=False)[2][2]
-        height = float(middle @ normal)
-    return normal, float(height), int((np.abs(points @ normal - height) < near).sum())
 
 
 def _hull(plane: Plane, seen: np.ndarray, grounds: Sequence[Plane]) -> np.ndarray:

@@ -72,6 +72,7 @@ def looked_around(
     cameras: Sequence[Camera],
     hidden: Mapping[str, np.ndarray],
     photos: Mapping[str, np.ndarray],
+    points: np.ndarray,
     seed: int = 0,
 ) -> Around:
     """What the training views, `cameras`, show around the object.
@@ -79,13 +80,14 @@ def looked_around(
     Args:
         gaussians: N of them, the object included. thing: [N] bool, the object's.
         hidden: view name -> bool [H, W], where the photograph shows the object. photos: see `Around`.
+        points: [P, 3], the scene's sparse points.
         seed: of the draws that find planes.
     """
     views = witnesses(gaussians, cameras, hidden)
     if not thing.any():
         return Around(views, [], photos, np.zeros(3), np.inf)
     centre, radius = extent(gaussians.means[thing])
-    planes = planes_around(centre, radius, views, seed)
+    planes = planes_around(centre, radius, views, points, seed)
     mirrors = mirrors_around(gaussians.map(lambda p: p[~thing]), centre, radius, views, planes, photos)
     return Around(views, planes, photos, centre, radius, mirrors=mirrors)
 
