@@ -150,7 +150,7 @@ def nothing_remains() -> float:
     votes say otherwise."""
     nobody = cloud().map(lambda p: p[:0])
     views = witness.witnesses(nobody, NAMED, {view.name: FULL for view in NAMED})
-    planes = continuation.planes_around(np.zeros(3), 1.0, views)
+    planes = continuation.planes_around(np.zeros(3), 1.0, views, np.zeros((0, 3)))
     found = undecided.behind(nobody, NAMED[0], FULL, views, planes)
     said = witness.votes(np.zeros((1, 3)), views)
     return float((~found.undecided).sum() + np.isfinite(found.continued).sum() + said.seen.sum() + said.free.sum())
