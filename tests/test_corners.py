@@ -92,3 +92,6 @@ def test_sparse_points_tell_where_planes_lie_that_are_drawn_too_near():
     line = np.stack([np.linspace(-0.5, 0.5, 200), np.zeros(200), np.zeros(200)], 1)  # tells no direction across
     few = planes_around((LOW + HIGH) / 2, 0.3, views, line)
     assert all(np.allclose(a.normal, b.normal) for a, b in zip(few, untold, strict=True))
+    grass = np.stack([*draws.uniform(-0.5, 0.5, (2, 600)), draws.uniform(-0.05, 0.05, 600)], 1)  # lies sharply nowhere
+    rough = planes_around((LOW + HIGH) / 2, 0.3, views, grass)
+    assert all(np.allclose(a.normal, b.normal) for a, b in zip(rough, untold, strict=True))

@@ -131,22 +131,6 @@ def test_a_wall_does_not_go_on_along_the_ground_where_it_was_never_seen():
     assert ground.goes_on[under].mean() > 0.95
 
 
-def test_a_plane_goes_on_from_what_other_views_show_of_it_within_the_mask(views):
-    """Outside the mask nothing is drawn that could tell."""
-    camera, hidden = views[0].camera, views[0].hidden
-    planes = planes_around(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, np.zeros((0, 3)))
-    table = max(planes, key=lambda plane: plane.seen.sum())
-    at = table.depth(camera)
-    seen, unknown = (table.on(cells, at, camera, hidden & np.isfinite(at)) for cells in (table.seen, table.goes_on))
-    assert seen.sum() > 100 and unknown.sum() > 100
-    grey = np.full((SIZE, SIZE, 3), 128, np.uint8)
-    left = surface_gaussians(grey, np.where(hidden, at, 1.0), seen & ~unknown, camera, sh_count=1, spread=0.6)
-    found = behind(left, camera, hidden, views, [table])
-    goes_on = unknown & found.undecided
-    np.testing.assert_allclose(found.continued[goes_on], at[goes_on])
-    assert goes_on.sum() > 0.9 * unknown.sum()
-
-
 def test_what_lies_beneath_the_table_in_all_views_but_one_is_not_what_is_behind_the_box(views):
     """Left there by a fit that is wrong about the ground in one view."""
     camera = views[0].camera

@@ -15,8 +15,9 @@ VIEWS = 12  # views that are sampled
 SAMPLES = 1500  # of each
 TRIALS = 300  # draws of three samples for each plane
 # Of the distance within which a sample belongs to a plane, that within which a sparse point does, step by step; how
-# many must, and the cosine of the angle by which they may turn it.
-CLOSER, TELLING, TURNED = (1.0, 0.5, 0.25), 50, 0.98
+# many must; their share of those within all of it, a quarter where no plane is; and the cosine of the angle by which
+# they may turn it.
+CLOSER, TELLING, SHARP, TURNED = (1.0, 0.5, 0.25), 50, 0.5, 0.98
 
 
 def surface_samples(centre: np.ndarray, reach: float, views: Sequence[Witness], seed: int) -> np.ndarray:
@@ -47,9 +48,9 @@ def best_plane(points: np.ndarray, near: float, draws: np.random.Generator) -> t
 
 
 def told(normal: np.ndarray, height: float, points: np.ndarray, near: float, spread: float) -> tuple[np.ndarray, float]:
-    """Normal and height of the plane through the sparse points [P, 3] near to it, if they are enough and lie to all
-    sides. What is rendered lies too near wherever haze hangs before a plain surface, the more the more it is seen at a
-    slant; that turns a plane by a degree or more.
+    """Normal and height of the plane through the sparse points [P, 3] near to it, if they are enough, lie to all sides,
+    and sharply on it: grass is no plane, though some of its points lie on any. What is rendered lies too near wherever
+    haze hangs before a plain surface, the more the more it is seen at a slant; that turns a plane by a degree or more.
 
     Args:
         near: distance within which a sample belongs to the plane.
@@ -58,8 +59,9 @@ def told(normal: np.ndarray, height: float, points: np.ndarray, near: float, spr
     turned, moved = normal, height
     for share in CLOSER:
         turned, moved = _settled(turned, moved, points, share * near)
-    own = points[np.abs(points @ turned - moved) < CLOSER[-1] * near]
-    if len(own) < TELLING or abs(turned @ normal) < TURNED:
+    away = np.abs(points @ turned - moved)
+    own = points[away < CLOSER[-1] * near]
+    if len(own) < max(TELLING, SHARP * (away < near).sum()) or abs(turned @ normal) < TURNED:
         return normal, height
     narrowest = np.linalg.svd(own - own.mean(0), compute_uv=False)[1] / np.sqrt(len(own))
     return (turned, moved) if narrowest > spread else (normal, height)

@@ -86,7 +86,7 @@ def behind(
         before = plane.on(plane.goes_on, at, camera, hidden & (at < BEFORE * np.where(depth > 0, depth, np.inf)))
         # Where nothing is known the plane goes on too, but not behind something that stands before it.
         beneath = plane.on(plane.within, at, camera, undecided & ((at < depth / BEFORE) | (alpha <= OPAQUE)))
-        if _grows_out_of(before | beneath, plane, at, camera, depth, (~hidden | witnessed) & (alpha > OPAQUE)):
+        if _grows_out_of(before | beneath, plane, at, camera, depth, ~hidden & (alpha > OPAQUE)):
             hides |= before
             onward.append(at)
             reach = np.where(before | beneath, np.minimum(reach, at), reach)
