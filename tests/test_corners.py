@@ -9,6 +9,7 @@ from reffusion.masks.corners import third_faces
 from reffusion.masks.witness import Witness, surface_range
 from reffusion.types import Camera
 
+NO_POINTS = np.zeros((0, 3))
 SIZE, DEEP = 160, 0.35  # px; how far the wall comes forward of the one behind it
 LOW, HIGH = np.array([-0.25, -0.45, 0.0]), np.array([0.35, -0.15, 0.45])  # what stands before the edge
 
@@ -45,7 +46,7 @@ def witness(view):
 @pytest.fixture(scope="module")
 def planes():
     views = [witness(camera(turn)) for turn in np.linspace(0.1, 0.6, 12)]
-    return planes_around((LOW + HIGH) / 2, 0.3, views, np.zeros((0, 3)))
+    return planes_around((LOW + HIGH) / 2, 0.3, views, NO_POINTS)
 
 
 def test_the_side_of_a_wall_goes_on_behind_a_thing_down_to_the_floor_and_not_into_the_wall(planes):
@@ -83,7 +84,7 @@ def test_sparse_points_tell_where_planes_lie_that_are_drawn_too_near():
     front = np.stack([draws.uniform(0, 0.5, count), np.zeros(count), draws.uniform(0, 0.6, count)], 1)
     points = np.concatenate([floor, front]) + draws.normal(0, 1e-3, (2 * count, 3))
     points = np.concatenate([points, draws.uniform(-0.6, 0.6, (100, 3))])
-    told, untold = (planes_around((LOW + HIGH) / 2, 0.3, views, each) for each in (points, np.zeros((0, 3))))
+    told, untold = (planes_around((LOW + HIGH) / 2, 0.3, views, each) for each in (points, NO_POINTS))
     for axis in (2, 1):
         off = lambda plane, axis=axis: np.degrees(np.arccos(abs(plane.normal[axis])))
         of_points, of_views = (min(planes, key=off) for planes in (told, untold))

@@ -16,6 +16,7 @@ from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians
 
+NO_POINTS = np.zeros((0, 3))
 SIZE, FOCAL = 320, 330.0
 WIDE, DEEP, HIGH = 0.4, 0.25, 0.7  # half axes of the vase, and its height
 LOW, UPPER = np.array([-0.75, -0.75, 0.0]), np.array([-0.2, -0.3, 0.5])  # corners of the box before its left half
@@ -103,7 +104,7 @@ def sideways(mirrors: list[Mirror]) -> list[Mirror]:
 @pytest.fixture(scope="module")
 def whole():
     views, photos, gaussians = scene()
-    planes = planes_around(CENTRE, RADIUS, views, np.zeros((0, 3)))
+    planes = planes_around(CENTRE, RADIUS, views, NO_POINTS)
     return views, gaussians, planes, mirrors_around(gaussians, CENTRE, RADIUS, views, planes, photos)
 
 
@@ -144,17 +145,15 @@ def test_its_pixels_are_undecided_and_have_its_depth(whole):
 @pytest.mark.parametrize("how", [{"cut": True}, {"halved": True}])
 def test_what_is_unlike_on_its_other_side_has_no_mirror(how):
     views, photos, gaussians = scene(**how)
-    planes = planes_around(CENTRE, RADIUS, views, np.zeros((0, 3)))
+    planes = planes_around(CENTRE, RADIUS, views, NO_POINTS)
     assert not sideways(mirrors_around(gaussians, CENTRE, RADIUS, views, planes, photos))
 
 
 def test_nothing_stands_there_and_nothing_is_asked():
     views, photos, gaussians = scene()
     assert mirrors_around(gaussians, CENTRE, RADIUS, views, [], photos) == []
-    assert (
-        mirrors_around(gaussians, CENTRE, np.inf, views, planes_around(CENTRE, RADIUS, views, np.zeros((0, 3))), photos)
-        == []
-    )
+    planes = planes_around(CENTRE, RADIUS, views, NO_POINTS)
+    assert mirrors_around(gaussians, CENTRE, np.inf, views, planes, photos) == []
 
 
 def test_a_camera_behind_the_mirror_shows_the_image_with_its_sides_swapped():

@@ -15,6 +15,7 @@ from reffusion.masks.undecided import _grows_out_of, behind
 from reffusion.masks.witness import FREE, SURFACE, Witness, seen_by, surface_range, unlike, votes, without_slivers
 from reffusion.types import Camera, Gaussians
 
+NO_POINTS = np.zeros((0, 3))
 TOP, FLOOR, EDGE, BOX, HIGH = 0.0, -1.0, 1.0, 0.3, 0.5  # z of table top and floor; half sides; height of the box
 SIZE, FOCAL = 160, 150.0
 
@@ -73,7 +74,7 @@ def test_a_surface_does_not_face_views_from_its_other_side(views):
 
 
 def test_the_table_goes_on_under_the_box_and_ends_at_its_edge(views):
-    planes = planes_around(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, np.zeros((0, 3)))
+    planes = planes_around(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, NO_POINTS)
     table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.height))
     assert abs(table.normal[2]) > 0.999 and abs(table.height) < 0.01
     view = camera("new", 15.0, 1.6)
@@ -92,7 +93,7 @@ def test_borders_that_are_visible_go_on_under_the_box():
     """The box hides the inner corner of an L-shaped table: what is beyond the line between its visible edges is free,
     though the convex hull of the table has it."""
     views = [witness(camera(f"a{k}", 30 * k, 1.6), notched=True) for k in range(12)]
-    planes = planes_around(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, np.zeros((0, 3)))
+    planes = planes_around(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, NO_POINTS)
     table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.height))
     steps = (np.arange(len(table.goes_on)) + 0.5 - len(table.goes_on) / 2) * table.pitch
     points = table.origin + steps[:, None, None] * table.along[0] + steps[None, :, None] * table.along[1]
@@ -120,7 +121,7 @@ def beside_a_plinth(view: Camera) -> Witness:
 def test_a_wall_does_not_go_on_along_the_ground_where_it_was_never_seen():
     """Near their crossing, and beneath it, rough ground looks like the wall's: on both sides of the box."""
     views = [beside_a_plinth(camera(f"a{k}", 200 + 12 * k, 1.4)) for k in range(12)]
-    planes = planes_around(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, np.zeros((0, 3)))
+    planes = planes_around(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, NO_POINTS)
     face = max(planes, key=lambda plane: abs(plane.normal[1]))
     assert abs(face.normal[1]) > 0.99
     right = face.cells[..., 0] > -0.8 * BOX

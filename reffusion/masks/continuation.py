@@ -46,7 +46,8 @@ def planes_around(
     """The planes around what is removed, those with the most samples first.
 
     Found in the world, from the surfaces that several views show around their masks: one view's depth alone is rough,
-    and a plane seen at a slant by one is seen well by another. Where they lie sparse points tell, if there are enough.
+    and a plane seen at a slant by one is seen well by another. Where a plane lies sparse points tell, if enough lie
+    sharply on it (`sampled.told`).
 
     Args:
         centre: [3], the middle of what is removed. radius: of most of it.
@@ -61,8 +62,10 @@ def planes_around(
         normal, height, support = best_plane(samples[free], near, draws)
         if support < LEAST_SHARE * len(samples):
             break
-        found.append(told(normal, height, points, near, SPREAD * radius))
-        points = points[np.abs(points @ found[-1][0] - found[-1][1]) >= 1.5 * near]
+        turned, moved = told(normal, height, points, near, SPREAD * radius)
+        found.append((turned, moved))
+        # Each has its own points, and its own samples, which lie about the plane as it is drawn.
+        points = points[np.abs(points @ turned - moved) >= 1.5 * near]
         free &= np.abs(samples @ normal - height) >= 1.5 * near
     thirds = third_faces(samples, free, found, centre, radius, near)
     third = [False] * len(found) + [True] * len(thirds)
