@@ -99,12 +99,12 @@ def test_loss_is_the_priors_own_and_its_clean_latent_error_is_predicts(tiny, kin
     samples = crops.draw_samples([striped()], NATIVE, SIZE, 3, Samples(), draw)
     t, noise = torch.tensor([10, 500, 950]), torch.randn(3, 4, SIZE, SIZE, generator=draw)
     with torch.no_grad():
-        error, clean = denoising.denoising_error(prior, samples, t, noise)
+        words = diffusion.embed_text(prior, list(crops.PROMPTS))
+        error, clean = denoising.denoising_error(prior, samples, words, t, noise)
         latents = diffusion.encode(prior, samples.images)
         noisy = diffusion.add_noise(prior, latents, noise, t)
         condition = diffusion.conditioning(prior, samples.images, samples.masks)
-        text = diffusion.embed_text(prior, [crops.PROMPTS[p] for p in samples.prompts])
-        eps, x0 = diffusion.predict(prior, noisy, t, condition, text)
+        eps, x0 = diffusion.predict(prior, noisy, t, condition, words[samples.prompts])
     torch.testing.assert_close(clean, (x0 - latents).square().mean((1, 2, 3)), rtol=1e-3, atol=1e-5)
     if kind == "epsilon":
         torch.testing.assert_close(error, (eps - noise).square().mean((1, 2, 3)))
@@ -118,11 +118,11 @@ def test_what_a_mask_leaves_to_be_seen_counts_by_its_weight(tiny):
         latents = diffusion.encode(tiny, samples.images)
         condition = diffusion.conditioning(tiny, samples.images, samples.masks)
         noisy = diffusion.add_noise(tiny, latents, noise, t)
-        text = diffusion.embed_text(tiny, [crops.PROMPTS[p] for p in samples.prompts])
-        wrong = diffusion.raw_prediction(tiny, noisy, t, condition, text)
+        words = diffusion.embed_text(tiny, list(crops.PROMPTS))
+        wrong = diffusion.raw_prediction(tiny, noisy, t, condition, words[samples.prompts])
         wrong = (wrong - diffusion.training_target(tiny, latents, noise, t)).square().mean(1, keepdim=True)
         for weight in (1.0, 0.2, 1e-6):
-            error, _ = denoising.denoising_error(tiny, samples, t, noise, weight)
+            error, _ = denoising.denoising_error(tiny, samples, words, t, noise, weight)
             of_each = samples.masks + weight * (1 - samples.masks)
             torch.testing.assert_close(error, (of_each * wrong).sum((1, 2, 3)) / of_each.sum((1, 2, 3)))
 

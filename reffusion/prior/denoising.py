@@ -27,7 +27,7 @@ def latent_shape(prior: Prior, size: int) -> tuple[int, int, int]:
 
 
 def denoising_error(
-    prior: Prior, samples: Batch, timesteps: Tensor, noise: Tensor, outside_weight: float = 1.0
+    prior: Prior, samples: Batch, text: Tensor, timesteps: Tensor, noise: Tensor, outside_weight: float = 1.0
 ) -> tuple[Tensor, Tensor]:
     """([B], [B]): mean squared error of the prior's own target over the whole image, and of the clean latent.
 
@@ -35,6 +35,7 @@ def denoising_error(
     (its prior predicts eps) and whether the loss covers the whole image or the mask; as in RealFill it covers all.
 
     Args:
+        text: [3, L, D], PROMPTS embedded.
         timesteps: [B] long.
         noise: [B, C, h, w] standard normal, shaped as the latents.
         outside_weight: of latents that are given anyway; those to repaint have weight 1. The mean is over the weights.
@@ -46,8 +47,7 @@ def denoising_error(
         condition = diffusion.conditioning(prior, images, masks)
         noisy = diffusion.add_noise(prior, latents, noise, timesteps)
         target = diffusion.training_target(prior, latents, noise, timesteps)
-    text = diffusion.embed_text(prior, list(PROMPTS))[samples.prompts.to(prior.device)]
-    output = diffusion.raw_prediction(prior, noisy, timesteps, condition, text)
+    output = diffusion.raw_prediction(prior, noisy, timesteps, condition, text[samples.prompts.to(prior.device)])
     weight = torch.where(condition[:, :1] > 0.5, 1.0, outside_weight)  # the mask comes first
     error = (weight * (output - target).square()).mean((1, 2, 3)) / weight.mean((1, 2, 3))
     # z_t is given, so both targets are linear in the clean latent: an error of 1 in it is one of a/s in eps, 1/s in v.
@@ -70,4 +70,5 @@ def one_sample(prior: Prior, references: Sequence[Picture], seed: int) -> None:
     """Loss and gradient of one sample: what `memory.fitted` measures."""
     sample = Batch(*(tensor[:1] for tensor in held_out_samples(references, prior.native_size, seed)))
     noise = torch.zeros(1, *latent_shape(prior, prior.native_size))
-    denoising_error(prior, sample, torch.zeros(1, dtype=torch.long), noise)[0].sum().backward()
+    text = diffusion.embed_text(prior, list(PROMPTS))
+    denoising_error(prior, sample, text, torch.zeros(1, dtype=torch.long), noise)[0].sum().backward()

@@ -81,7 +81,8 @@ def _errors(prior: Prior, held: HeldOut, seed: int, level: float) -> Tensor:
     timesteps = torch.full((len(samples.prompts),), round(level * (prior.timesteps - 1)))
     draw = seeded(seed, "personalize", "held out", level)
     noise = torch.randn(len(samples.prompts), *latent_shape(prior, samples.images.shape[-1]), generator=draw)
-    return torch.stack(denoising_error(prior, samples, timesteps, noise, outside_weight=0))
+    text = diffusion.embed_text(prior, list(PROMPTS))
+    return torch.stack(denoising_error(prior, samples, text, timesteps, noise, outside_weight=0))
 
 
 @torch.no_grad()

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from math import ceil, cos, isfinite, pi
 from pathlib import Path
 
@@ -10,8 +11,8 @@ import torch
 
 from reffusion import trace
 from reffusion.params.personalize import Params
-from reffusion.prior import lora
-from reffusion.prior.crops import Batch, Picture, draw_samples
+from reffusion.prior import diffusion, lora
+from reffusion.prior.crops import PROMPTS, Batch, Picture, draw_samples
 from reffusion.prior.denoising import denoising_error, latent_shape, spread_timesteps
 from reffusion.prior.held_out import held_out, measured
 from reffusion.prior.model import Prior
@@ -67,6 +68,7 @@ def personalize(
         start, seconds = state["step"], state["seconds"]
     log, checkpoints = trace.Trace(folder, seconds, start), trace.Checkpoints(folder, settings.checkpoint_seconds)
     held = held_out(references, photographs, prior.native_size, settings.seed)
+    references = [replace(each, image=each.image.to(prior.device)) for each in references]
     threads = Threads(steps - start, prior.device)
 
     def measure(step: int) -> None:
@@ -120,7 +122,7 @@ def train_step(
         FloatingPointError: naming the step; the weights are as before it.
     """
     lora.set_dropout(prior, True)
-    samples, size, count, total = settings.samples, _side(prior, settings), settings.optimizer.batch, 0.0
+    samples, size, count = settings.samples, _side(prior, settings), settings.optimizer.batch
     draw = seeded(settings.seed, "personalize", step, 0)
     batch = draw_samples(references, prior.native_size, size, count, samples, draw)
     timesteps = spread_timesteps(count, prior.timesteps, draw)
@@ -128,24 +130,34 @@ def train_step(
     # LoRA's dropout takes no generator of its own: seed the global one from the step's, and draw in order.
     torch.manual_seed(int(torch.randint(2**62, (), generator=draw)))
     shared = threads if threads is not None and not settings.lora.dropout else None
-    trained = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    of_unet, of_text = (group["params"] for group in optimizer.param_groups)
+    text = diffusion.embed_text(prior, list(PROMPTS))
+    told = text.detach().requires_grad_()
 
-    def graded(rows: torch.Tensor) -> tuple[float, tuple[torch.Tensor | None, ...]]:
+    def graded(rows: torch.Tensor) -> tuple[torch.Tensor, tuple[torch.Tensor | None, ...]]:
         some = Batch(*(tensor[rows] for tensor in batch))
-        error, _ = denoising_error(prior, some, timesteps[rows], noise[rows], samples.outside_weight)
+        error, _ = denoising_error(prior, some, told, timesteps[rows], noise[rows], samples.outside_weight)
         loss = error.sum() / count
-        return loss.item(), torch.autograd.grad(loss, trained, allow_unused=True)
+        return loss.detach(), torch.autograd.grad(loss, [told, *of_unet], allow_unused=True)
 
-    optimizer.zero_grad(set_to_none=True)
-    parts = torch.arange(count).split(min(prior.rows_graded or count, ceil(count / (shared.now if shared else 1))))
-    for loss, gradients in shared.map(graded, parts) if shared else map(graded, parts):
-        total += loss
-        for parameter, gradient in zip(trained, gradients, strict=True):
-            if gradient is not None:
-                parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
+    most = min(prior.rows_graded or count, ceil(count / (shared.now if shared else 1)))
+    parts = torch.arange(count).chunk(ceil(count / most))
+    losses, gradients = zip(*(shared.map(graded, parts) if shared else map(graded, parts)), strict=True)
+    of_told, *found = map(_summed, zip(*gradients, strict=True))
+    found += torch.autograd.grad(text, of_text, of_told, allow_unused=True)
+    trained = [*of_unet, *of_text]
+    for parameter, gradient in zip(trained, found, strict=True):
+        parameter.grad = gradient
+    total = float(sum(losses))
     norm = float(torch.nn.utils.clip_grad_norm_(trained, CLIP))
     if not (isfinite(norm) and isfinite(total)):
         where = f"personalization, step {step}"
         raise FloatingPointError(f"{where}: loss {total}, gradient norm {norm}; lower the learning rates")
     optimizer.step()
     return total
+
+
+def _summed(parts: Iterable[torch.Tensor | None]) -> torch.Tensor | None:
+    """Gradients of one parameter, from each part of a batch; None where it takes no part."""
+    some = [part for part in parts if part is not None]
+    return torch.stack(some).sum(0) if some else None
