@@ -93,17 +93,19 @@ def run(
     facts["further"] = {
         each.camera.name: float(each.mask.sum() / sets[each.camera.name].consistent.sum()) for each in further
     }
-    facts |= sds_facts(params, gaussians, train, sets, around)
+    facts |= sds_facts(params, gaussians, train, sets, around, max(facts["further"].values(), default=0.0))
     facts["uncovered_share"] = sum(uncovered.values()) / max(len(uncovered), 1)
     save_json(out / "facts.json", facts)
     if bare := [f"{name} ({share:.1%})" for name, share in uncovered.items() if share > WARN_FROM]:
         print(f"uncovered in {len(bare)} views: {', '.join(bare)}: complete another view and add it to the references")
 
 
-def sds_facts(params: Params, gaussians, train, sets, around) -> dict:
+def sds_facts(params: Params, gaussians, train, sets, around, guessed: float) -> dict:
     """What SDS may add to the initialization; only one from references is told."""
-    told = around is not None and params.start == "reference"
-    gain = estimated(gaussians, train, sets, around.photos) if told else Gain(True, f"start is {params.start}", None)
+    if around is not None and params.start == "reference":
+        gain = estimated(gaussians, train, sets, around.photos, guessed)
+    else:
+        gain = Gain(True, f"start is {params.start}", None)
     print(f"SDS {'may' if gain.may else 'cannot'} gain: {gain.says}")
     return {"sds_may_gain": gain.may, "sds_says": gain.says, "beside_psnr": gain.beside}
 

@@ -8,7 +8,7 @@ import torch
 from small_params import altered
 from small_scene import CAMERAS, TRAIN, gaussians, true_mask
 
-from reffusion.initialize.gain import TAUGHT, VIEWS, WORSE, estimated
+from reffusion.initialize.gain import GUESSED, TAUGHT, VIEWS, WORSE, estimated
 from reffusion.io.arrays import save_json
 from reffusion.params.distill import Params
 from reffusion.splat import rasterizer
@@ -35,6 +35,13 @@ def test_renders_that_show_the_photographs_cannot_gain(given):
     wall, sets, photos = given
     found = estimated(wall, TRAINED, sets, photos)
     assert not found.may and found.beside > 45 and f"{found.beside - WORSE:.1f} dB" in found.says
+
+
+def test_what_no_reference_covers_may_gain_however_good_the_rest(given):
+    wall, sets, photos = given
+    assert not estimated(wall, TRAINED, sets, photos, guessed=GUESSED).may
+    found = estimated(wall, TRAINED, sets, photos, guessed=0.19)
+    assert found.may and "19%" in found.says and found.beside > 45
 
 
 def test_what_is_wrong_in_the_hole_or_far_from_it_does_not_count_and_beside_it_does(given):
