@@ -84,7 +84,8 @@ def run(
     if true and params.settle:
         drawn_there = {name: each.invent & (name not in scene.clean) for name, each in sets.items()}
         shown = replace(around, cameras=[camera for camera in around.cameras if camera.name not in scene.blank])
-        gaussians = settled(params, out, gaussians, [each for each in true if each.mask.any()], shown, drawn_there)
+        pictures = [each for each in true if each.mask.any()]
+        gaussians = settled(params, out, gaussians, new, pictures, shown, drawn_there)
     save_ply(out / "gaussians.ply", gaussians)
     save_labels(out / "labels.npy", new.cpu())
     uncovered = {each.name: filling.uncovered(gaussians, each, sets[each.name].consistent) for each in train}
@@ -259,7 +260,7 @@ def completed_further(params: Params, out: Path, gaussians, new, around, true):
     return gaussians, new, further
 
 
-def settled(params: Params, out: Path, gaussians, references, around, drawn_there):
+def settled(params: Params, out: Path, gaussians, new, references, around, drawn_there):
     """The Gaussians after `params.settle` steps of reconstruction; see `reffusion.initialize.settle`.
 
     `drawn_there`: view name -> bool [H, W], where something is to be drawn that no photograph shows.
@@ -267,7 +268,7 @@ def settled(params: Params, out: Path, gaussians, references, around, drawn_ther
     hidden = {view.camera.name: view.hidden | drawn_there[view.camera.name] for view in around.views}
     work = out / ".settle"  # hidden: its trace tells seconds, which are no part of the artifact's content
     work.mkdir(exist_ok=True)
-    done = settle(gaussians, Known(around.cameras, around.photos, hidden, references), params.settle, SEED, work)
+    done = settle(gaussians, new, Known(around.cameras, around.photos, hidden, references), params.settle, SEED, work)
     shutil.rmtree(work)
     return done
 

@@ -34,6 +34,7 @@ def fit(
     held_out: Sequence[Camera] = (),
     rates: Rates | None = None,
     gains: np.ndarray | None = None,
+    still: Tensor | None = None,
     spent: float = 0.0,
     impl: str = "auto",
 ) -> Gaussians:
@@ -50,6 +51,7 @@ def fit(
         held_out: views that are only measured.
         rates: Adam's step sizes where they are not those of `settings.lr`.
         gains: [V, 3], of `cameras`: exposures are fitted, and start from these; None: they are not.
+        still: [N] bool, of `initial`: Gaussians that stay where they are. None are added or removed then.
         spent: seconds that making `initial` took; the trace counts from there.
 
     Raises:
@@ -59,7 +61,8 @@ def fit(
     weights = weights or {}
     _refuse_misfits(cameras, held_out, images, weights)
     state = trace.load_checkpoint(folder)
-    run = _Run.begun(initial, cameras, gains, settings, rates or rates_of(settings.lr, cameras), state, spent)
+    rates = rates or rates_of(settings.lr, cameras)
+    run = _Run.begun(initial, cameras, gains, still, settings, rates, state, spent)
     optimizer = run.optimizer
     log = trace.Trace(folder, run.seconds, run.iteration + 1 if run.iteration else 0)
     centers = torch.tensor(np.stack([camera.center for camera in cameras]), dtype=torch.float32)
@@ -123,6 +126,7 @@ class _Run:
         initial: Gaussians,
         cameras: Sequence[Camera],
         gains: np.ndarray | None,
+        still: Tensor | None,
         settings: Params,
         rates: Rates,
         state: dict[str, Any] | None,
@@ -131,7 +135,7 @@ class _Run:
         """From the start, or from a checkpoint's state."""
         names, device = [camera.name for camera in cameras], initial.means.device
         exposures = None if gains is None else Exposures(names, device, gains)
-        optimizer = GaussianOptimizer(initial, rates=rates, betas=settings.lr.betas)
+        optimizer = GaussianOptimizer(initial, still, rates, {"means": 0.0}, settings.lr.betas)
         run = cls(optimizer, exposures, len(initial), spent)
         if state is not None:
             optimizer.load_state_dict(state["optimizer"])
