@@ -84,17 +84,15 @@ def run(
     if true and params.settle:
         drawn_there = {name: each.invent & (name not in scene.clean) for name, each in sets.items()}
         shown = replace(around, cameras=[camera for camera in around.cameras if camera.name not in scene.blank])
-        pictures = [each for each in true if each.mask.any()]
-        gaussians = settled(params, out, gaussians, new, pictures, shown, drawn_there)
+        exact = new & all(each.depth is not None for each in references)
+        gaussians = settled(params, out, gaussians, exact, true, shown, drawn_there)
     save_ply(out / "gaussians.ply", gaussians)
     save_labels(out / "labels.npy", new.cpu())
     uncovered = {each.name: filling.uncovered(gaussians, each, sets[each.name].consistent) for each in train}
     facts = {"new_gaussians": int(new.sum()), "removed_gaussians": int(labels.sum()), "haze": int(haze.sum())}
     facts |= {"completed": [each.camera.name for each in true], "uncovered": uncovered}
-    facts["further"] = {
-        each.camera.name: float(each.mask.sum() / sets[each.camera.name].consistent.sum()) for each in further
-    }
-    facts |= sds_facts(params, gaussians, train, sets, around, max(facts["further"].values(), default=0.0))
+    shares = {each.camera.name: float(each.mask.sum() / sets[each.camera.name].consistent.sum()) for each in further}
+    facts |= {"further": shares} | sds_facts(params, gaussians, train, sets, around, max(shares.values(), default=0.0))
     facts["uncovered_share"] = sum(uncovered.values()) / max(len(uncovered), 1)
     save_json(out / "facts.json", facts)
     if bare := [f"{name} ({share:.1%})" for name, share in uncovered.items() if share > WARN_FROM]:
@@ -260,15 +258,17 @@ def completed_further(params: Params, out: Path, gaussians, new, around, true):
     return gaussians, new, further
 
 
-def settled(params: Params, out: Path, gaussians, new, references, around, drawn_there):
+def settled(params: Params, out: Path, gaussians, exact, references, around, drawn_there):
     """The Gaussians after `params.settle` steps of reconstruction; see `reffusion.initialize.settle`.
 
-    `drawn_there`: view name -> bool [H, W], where something is to be drawn that no photograph shows.
+    `exact`: [N] bool, whose depth references brought. `drawn_there`: view name -> bool [H, W], where something is to be
+    drawn that no photograph shows.
     """
     hidden = {view.camera.name: view.hidden | drawn_there[view.camera.name] for view in around.views}
     work = out / ".settle"  # hidden: its trace tells seconds, which are no part of the artifact's content
     work.mkdir(exist_ok=True)
-    done = settle(gaussians, new, Known(around.cameras, around.photos, hidden, references), params.settle, SEED, work)
+    known = Known(around.cameras, around.photos, hidden, [each for each in references if each.mask.any()])
+    done = settle(gaussians, exact, known, params.settle, SEED, work)
     shutil.rmtree(work)
     return done
 

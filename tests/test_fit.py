@@ -12,7 +12,7 @@ import torch
 from reffusion import seeding, trace
 from reffusion.fit import exposure, feed, step
 from reffusion.fit import reconstruction as fitting
-from reffusion.fit.reconstruction import fit
+from reffusion.fit.reconstruction import KNOWN_PLACE, fit
 from reffusion.fit.start import initial_gaussians
 from reffusion.io.arrays import load_json
 from reffusion.io.images import save_image
@@ -205,6 +205,16 @@ def test_seeds_matter_and_repeat(tmp_path):
     other = run(tmp_path / "c", settings=SETTINGS.changed({"seed": 1}))
     assert torch.equal(first.means, again.means)
     assert len(other) != len(first) or not torch.equal(first.means, other.means)
+
+
+def test_gaussians_whose_places_are_known_move_a_tenth_as_far(tmp_path):
+    settings = SETTINGS.changed({"iterations": 1, "densify.stop": 0.0, "densify.start": 0.0})
+    known = torch.arange(40) % 2 == 0
+    free, held = run(tmp_path / "a", settings=settings), run(tmp_path / "b", settings=settings, placed=known)
+    moved, hardly = free.means - start().means, held.means - start().means
+    assert moved.abs().max() > 1e-3 and torch.equal(hardly[~known], moved[~known])
+    torch.testing.assert_close(hardly[known], KNOWN_PLACE * moved[known], rtol=1e-3, atol=1e-7)
+    assert torch.equal(free.sh, held.sh) and torch.equal(free.log_scales, held.log_scales)
 
 
 def test_masked_pixels_do_not_matter_to_the_fit(tmp_path):

@@ -20,6 +20,7 @@ from reffusion.params.fit import Params
 from reffusion.splat.rasterizer import render
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
+KNOWN_PLACE = 0.1  # of a step's length, by which Gaussians move whose places are known
 FIRST_MOMENT = 16  # of the trace, after the start: measuring held-out views takes as long as several steps
 
 
@@ -34,7 +35,7 @@ def fit(
     held_out: Sequence[Camera] = (),
     rates: Rates | None = None,
     gains: np.ndarray | None = None,
-    still: Tensor | None = None,
+    placed: Tensor | None = None,
     spent: float = 0.0,
     impl: str = "auto",
 ) -> Gaussians:
@@ -44,14 +45,12 @@ def fit(
         images: view name -> uint8 [H, W, 3], for `cameras` and `held_out`.
         initial: the Gaussians to start from; the work is done on their device. Where there is a checkpoint, only their
             degree, device and way of being drawn still matter.
-        folder: gets trace.jsonl (loss, psnr of the steps since the last line, gaussians, psnr_held_out), checkpoints,
-            and exposures.json where they are fitted.
+        folder: gets trace.jsonl (loss, psnr since the last, gaussians, psnr_held_out), checkpoints, exposures.json.
         weights: view name -> [H, W], how much each pixel counts; pixels of weight 0, and they alone, influence nothing.
             A view without an entry counts as a whole.
-        held_out: views that are only measured.
-        rates: Adam's step sizes where they are not those of `settings.lr`.
+        held_out: views that are only measured. rates: Adam's step sizes where they are not those of `settings.lr`.
         gains: [V, 3], of `cameras`: exposures are fitted, and start from these; None: they are not.
-        still: [N] bool, of `initial`: Gaussians that stay where they are. None are added or removed then.
+        placed: [N] bool, of `initial`: Gaussians whose places are known. They move `KNOWN_PLACE` as far as the others.
         spent: seconds that making `initial` took; the trace counts from there.
 
     Raises:
@@ -61,8 +60,7 @@ def fit(
     weights = weights or {}
     _refuse_misfits(cameras, held_out, images, weights)
     state = trace.load_checkpoint(folder)
-    rates = rates or rates_of(settings.lr, cameras)
-    run = _Run.begun(initial, cameras, gains, still, settings, rates, state, spent)
+    run = _Run.begun(initial, placed, cameras, gains, settings, rates or rates_of(settings.lr, cameras), state, spent)
     optimizer = run.optimizer
     log = trace.Trace(folder, run.seconds, run.iteration + 1 if run.iteration else 0)
     centers = torch.tensor(np.stack([camera.center for camera in cameras]), dtype=torch.float32)
@@ -124,9 +122,9 @@ class _Run:
     def begun(
         cls,
         initial: Gaussians,
+        placed: Tensor | None,
         cameras: Sequence[Camera],
         gains: np.ndarray | None,
-        still: Tensor | None,
         settings: Params,
         rates: Rates,
         state: dict[str, Any] | None,
@@ -135,7 +133,7 @@ class _Run:
         """From the start, or from a checkpoint's state."""
         names, device = [camera.name for camera in cameras], initial.means.device
         exposures = None if gains is None else Exposures(names, device, gains)
-        optimizer = GaussianOptimizer(initial, still, rates, {"means": 0.0}, settings.lr.betas)
+        optimizer = GaussianOptimizer(initial, placed, rates, {"means": KNOWN_PLACE}, settings.lr.betas)
         run = cls(optimizer, exposures, len(initial), spent)
         if state is not None:
             optimizer.load_state_dict(state["optimizer"])

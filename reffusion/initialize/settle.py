@@ -37,15 +37,15 @@ class Known:
     references: Sequence[Reference]
 
 
-def settle(gaussians: Gaussians, new: Tensor, known: Known, steps: int, seed: int, folder: Path) -> Gaussians:
+def settle(gaussians: Gaussians, exact: Tensor, known: Known, steps: int, seed: int, folder: Path) -> Gaussians:
     """The Gaussians after `steps` of reconstruction, as many as before and in their order; resumes from `folder`.
 
     The photographs supervise outside the masks, completed views where they were completed. What is left of the
     object's blurred rim, and what hid in its shadow, is so put right; surfaces old and new grow together at the seam.
 
     Args:
-        new: [N] bool, what was completed. It stays in its place: one view shows it, which says nothing of depth, and
-            disks that drift leave gaps to be seen through from nearer by.
+        exact: [N] bool, Gaussians whose depth was brought. They hardly move: disks that drift apart leave gaps to be
+            seen through from nearer by. Where depth is a guess it is better that they may.
     Raises:
         FloatingPointError: see `fit`.
     """
@@ -64,7 +64,7 @@ def settle(gaussians: Gaussians, new: Tensor, known: Known, steps: int, seed: in
         densify=Densify(stop=0.0, reset_every=0.0),
         lr=LearningRates(betas=BETAS),
     )
-    return fit(views, images, gaussians, settings, folder=folder, weights=weights, rates=GENTLE, still=new)
+    return fit(views, images, gaussians, settings, folder=folder, weights=weights, rates=GENTLE, placed=exact)
 
 
 def around(reference: Reference) -> tuple[Camera, np.ndarray, np.ndarray]:
