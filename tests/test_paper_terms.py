@@ -79,11 +79,11 @@ def test_a_view_without_invented_pixels_is_distilled_where_c_is_repainted(views_
 
 def test_settling_leaves_what_is_to_be_drawn_alone(tmp_path, monkeypatch):
     said = {}
-    monkeypatch.setattr(initialize, "settle", lambda gaussians, known, *_: said.update(known.hidden) or gaussians)
+    monkeypatch.setattr(initialize, "settle", lambda gaussians, exact, known, *_: said.update(known.hidden) or gaussians)
     hidden, drawn = np.eye(4, dtype=bool), np.eye(4, dtype=bool)[::-1]
     view = type("View", (), {"camera": camera(), "hidden": hidden})
     around = type("Around", (), {"cameras": [camera()], "photos": {}, "views": [view]})
-    initialize.settled(initialize.Params(settle=1), tmp_path, None, [], around, {"a": drawn})
+    initialize.settled(initialize.Params(settle=1), tmp_path, None, None, [], around, {"a": drawn})
     assert (said["a"] == hidden | drawn).all()
 
 
