@@ -26,7 +26,7 @@ TAUGHT = 26.0  # dB
 WORSE = 8.5  # dB
 BESIDE = 4  # px of the reduced view: how far from the mask
 VIEWS = 12  # that are looked at, spread evenly
-GUESSED = 0.05  # of what a view's mask hides: 0.19 where SDS gained (`demo-corner`), 0.02 and less where it did not
+GUESSED = 0.05  # of what a view's mask hides: 0.19 where SDS gained (`demo-corner`), below 0.03 elsewhere
 
 
 class Gain(NamedTuple):
