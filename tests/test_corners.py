@@ -27,13 +27,16 @@ def camera(turn):
     return Camera(f"v{turn:.2f}", SIZE, SIZE, 170.0, 170.0, SIZE / 2, SIZE / 2, pose)
 
 
-def witness(view):
+def witness(view, step=0.0):
+    """Args: step: height of every second board of the floor."""
     rays = geometry.pixel_rays(view) @ view.world_to_camera[:3, :3]
     with np.errstate(divide="ignore", invalid="ignore"):
         floor, front, behind, side = (
             (value - view.center[axis]) / rays[..., axis] for axis, value in ((2, 0.0), (1, 0.0), (1, DEEP), (0, 0.0))
         )
         place = lambda way: view.center + rays * way[..., None]
+        raised = (step - view.center[2]) / rays[..., 2]
+        floor = np.where((raised > 0) & (place(raised)[..., 0] % 0.3 < 0.15), raised, floor)
         front = np.where((front > 0) & (place(front)[..., 0] > 0), front, np.inf)
         beside = place(side)[..., 1]
         side = np.where((side > 0) & (beside > 0) & (beside < DEEP), side, np.inf)
@@ -96,3 +99,18 @@ def test_sparse_points_tell_where_planes_lie_that_are_drawn_too_near():
     grass = np.stack([*draws.uniform(-0.5, 0.5, (2, 600)), draws.uniform(-0.05, 0.05, 600)], 1)  # lies sharply nowhere
     rough = planes_around((LOW + HIGH) / 2, 0.3, views, grass)
     assert all(np.allclose(a.normal, b.normal) for a, b in zip(rough, untold, strict=True))
+
+
+def test_a_floor_that_is_drawn_twice_is_one_unless_points_tell_a_step():
+    step = 0.033
+    views = [witness(camera(turn), step) for turn in np.linspace(0.1, 0.6, 12)]
+    draws, count = np.random.default_rng(0), 300
+    floor = np.stack([*draws.uniform(-0.5, 0.3, (2, count)), draws.normal(0, 5e-4, count)], 1)
+    boards = floor[:, :1] % 0.3 < 0.15
+    heights = lambda points: sorted(
+        abs(plane.height)
+        for plane in planes_around(np.array([0.0, -0.3, 0.1]), 0.15, views, points)
+        if abs(plane.normal[2]) > 0.99
+    )
+    assert heights(floor) == pytest.approx([0], abs=2e-3)
+    assert heights(floor + boards * [0, 0, step]) == pytest.approx([0, step], abs=2e-3)

@@ -1,5 +1,7 @@
 """What photographs say of the space behind an object: a table with free space under it, seen by analytic views."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -87,6 +89,22 @@ def test_the_table_goes_on_under_the_box_and_ends_at_its_edge(views):
     assert goes_on[footprint].mean() > 0.95
     assert not (goes_on & beyond).any()
     np.testing.assert_allclose(at[footprint], depth[footprint], rtol=0.01)
+
+
+@pytest.mark.parametrize(("wide", "through"), [(0.15, False), (0.4, True)])
+def test_a_speck_that_views_look_through_is_no_hole(wide, through):
+    """Beside the box's edge views' depth is rough."""
+    views = []
+    for turn in range(0, 360, 30):
+        view = witness(camera(f"a{turn}", turn, 1.6))
+        rays = geometry.pixel_rays(view.camera) @ view.camera.world_to_camera[:3, :3]
+        place = view.camera.center - rays * (view.camera.center[2] / rays[..., 2])[..., None]
+        spot = (np.abs(place[..., :2] - [BOX + wide, 0]) < wide / 2).all(-1)
+        views.append(replace(view, depth=np.where(spot, 2 * view.depth, view.depth)))
+    planes = planes_around(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, NO_POINTS)
+    table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.height))
+    middle = np.array([[BOX + wide, 0.0, 0.0]])
+    assert table.in_cells(table.free, middle)[0] == through
 
 
 def test_borders_that_are_visible_go_on_under_the_box():

@@ -14,7 +14,7 @@ from reffusion.gaussians.surfels import surface_normals
 from reffusion.masks.borders import RIM, between
 from reffusion.masks.corners import reached, third_faces
 from reffusion.masks.plane import CELLS, Plane
-from reffusion.masks.sampled import best_plane, surface_samples, told
+from reffusion.masks.sampled import TURNED, best_plane, surface_samples, told
 from reffusion.masks.witness import SURFACE, Witness, seen_by, votes
 from reffusion.paint.margin import hull
 from reffusion.types import Camera
@@ -34,6 +34,7 @@ RATHER = 1.0  # cosine to a plane over that to another, from which a surface fac
 EVENED = 0.01  # of the image's width: the scale on which a surface's direction is taken
 WIDER = 2.0  # times as wide a map on which what the plane surrounds is told
 POLISHED = 0.03  # of the cells seen of a plane: smaller ones that it surrounds are unevenness
+SPECK = 0.01  # of the cells seen of a plane: smaller patches that views look through are none
 SURROUNDS = (
     0.8  # share of the border of what views look through that must be seen to be of the plane: a recess has less
 )
@@ -56,22 +57,24 @@ def planes_around(
     samples = surface_samples(centre, REACH * radius, views, seed)
     points = points[np.linalg.norm(points - centre, axis=1) < REACH * radius]
     near, free = TOLERANCE * radius, np.ones(len(samples), bool)
+    away = float(np.median([np.linalg.norm(view.camera.center - centre) for view in views])) if views else 0.0
     found: list[tuple[np.ndarray, float]] = []
     draws = np.random.default_rng(seeding.seed_for(seed, "planes around"))
     while free.sum() >= max(50, LEAST_SHARE * len(samples)) and len(found) < MOST:
         normal, height, support = best_plane(samples[free], near, draws)
         if support < LEAST_SHARE * len(samples):
             break
-        turned, moved = told(normal, height, points, near, SPREAD * radius)
-        found.append((turned, moved))
+        by_points = told(normal, height, points, near, SPREAD * radius)
+        turned, moved = by_points or (normal, height)
+        if by_points or not _drawn_again(normal, height, found, centre, SURFACE * away):
+            found.append((turned, moved))
         # Each has its own points, and its own samples, which lie about the plane as it is drawn.
         points = points[np.abs(points @ turned - moved) >= 1.5 * near]
         free &= np.abs(samples @ normal - height) >= 1.5 * near
     thirds = third_faces(samples, free, found, centre, radius, near)
     third = [False] * len(found) + [True] * len(thirds)
     found += thirds
-    away = [np.linalg.norm(view.camera.center - centre) for view in views]
-    band = max(1.5 * near, SURFACE * float(np.median(away))) if found else 0.0
+    band = max(1.5 * near, SURFACE * away)
     mapped = [_mapped(*plane, centre, REACH * radius, views, so) for plane, so in zip(found, third, strict=True)]
     planes = [plane for plane, _ in mapped]
     grounds = [_crossing(plane, planes[:k]) for k, plane in enumerate(planes)]
@@ -84,6 +87,17 @@ def planes_around(
             hidden &= reached(own, whole, views)
         whole.append(_continued(own, hidden, below, _crossing(own, planes), band, narrow))
     return whole
+
+
+def _drawn_again(
+    normal: np.ndarray, height: float, found: Sequence[tuple[np.ndarray, float]], centre: np.ndarray, within: float
+) -> bool:
+    """Whether a plane that no sparse points tell is a found one, drawn a little before or behind it."""
+    for other, there in found:
+        beneath = centre - (centre @ other - there) * other
+        if abs(normal @ other) > TURNED and abs(normal @ beneath - height) < within:
+            return True
+    return False
 
 
 def _crossing(plane: Plane, others: Sequence[Plane]) -> list[Plane]:
@@ -160,7 +174,14 @@ def _mapped(
     wider = replace(plane, pitch=WIDER * pitch)
     pit = wider.in_cells(_surrounded(*_looked_at(wider, facing, views)[:2]), plane.cells.reshape(-1, 3))
     pit = free & ndimage.binary_dilation(pit.reshape(free.shape), iterations=2)
-    return replace(plane, seen=seen, free=free, pit=pit), hidden
+    return replace(plane, seen=seen, free=free & ~_specks(free, SPECK * seen.sum()), pit=pit), hidden
+
+
+def _specks(free: np.ndarray, small: float) -> np.ndarray:
+    """bool [CELLS, CELLS]: patches of free cells smaller than this: beside the object's edge views are rough."""
+    patches, count = ndimage.label(np.pad(free, 1, constant_values=True))  # beyond the map a patch may go on
+    areas = np.bincount(patches.ravel(), minlength=count + 1)
+    return free & (areas < small)[patches][1:-1, 1:-1]
 
 
 def _looked_at(plane: Plane, facing: np.ndarray, views: Sequence[Witness]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

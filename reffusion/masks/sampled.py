@@ -47,10 +47,14 @@ def best_plane(points: np.ndarray, near: float, draws: np.random.Generator) -> t
     return normal, height, int((np.abs(points @ normal - height) < near).sum())
 
 
-def told(normal: np.ndarray, height: float, points: np.ndarray, near: float, spread: float) -> tuple[np.ndarray, float]:
-    """Normal and height of the plane through the sparse points [P, 3] near to it, if they are enough, lie to all sides,
-    and sharply on it: grass is no plane, though some of its points lie on any. What is rendered lies too near wherever
-    haze hangs before a plain surface, the more the more it is seen at a slant; that turns a plane by a degree or more.
+def told(
+    normal: np.ndarray, height: float, points: np.ndarray, near: float, spread: float
+) -> tuple[np.ndarray, float] | None:
+    """Normal and height of the plane through the sparse points [P, 3] near to it; None unless they are enough, lie to
+    all sides, and sharply on it: grass is no plane, though some of its points lie on any.
+
+    What is rendered lies too near wherever haze hangs before a plain surface, the more the more it is seen at a slant;
+    that turns a plane by a degree or more.
 
     Args:
         near: distance within which a sample belongs to the plane.
@@ -62,9 +66,9 @@ def told(normal: np.ndarray, height: float, points: np.ndarray, near: float, spr
     away = np.abs(points @ turned - moved)
     own = points[away < CLOSER[-1] * near]
     if len(own) < max(TELLING, SHARP * (away < near).sum()) or abs(turned @ normal) < TURNED:
-        return normal, height
+        return None
     narrowest = np.linalg.svd(own - own.mean(0), compute_uv=False)[1] / np.sqrt(len(own))
-    return (turned, moved) if narrowest > spread else (normal, height)
+    return (turned, moved) if narrowest > spread else None
 
 
 def _settled(normal: np.ndarray, height: float, points: np.ndarray, near: float) -> tuple[np.ndarray, float]:
