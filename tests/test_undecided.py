@@ -91,6 +91,13 @@ def test_the_table_goes_on_under_the_box_and_ends_at_its_edge(views):
     np.testing.assert_allclose(at[footprint], depth[footprint], rtol=0.01)
 
 
+def test_a_table_is_seen_from_above_though_what_stands_beside_it_is_lower(views):
+    above = [view for view in views if view.camera.name.startswith("a")]
+    planes = planes_around(np.array([0.0, 0.0, -0.2]), 0.45, above, NO_POINTS)
+    table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.height))
+    assert table.in_cells(table.seen, np.array([[0.7, 0.7, 0.0]]))[0]
+
+
 @pytest.mark.parametrize(("wide", "through"), [(0.15, False), (0.4, True)])
 def test_a_speck_that_views_look_through_is_no_hole(wide, through):
     """Beside the box's edge views' depth is rough."""

@@ -168,6 +168,8 @@ def _mapped(
     # On the object's side: a table's underside, seen from below, is not the top under the object. An object before a
     # wall's edge stands to both sides of the third face: on that from where more of it is seen.
     facing = normal if centre @ normal > height else -normal
+    if not any(view.camera.center @ facing > plane.origin @ facing for view in views):
+        facing = -facing  # a table's top is seen from above only, also where what stands before it is lower
     seen, free, hidden = _looked_at(plane, facing, views)
     if third and (other := _looked_at(plane, -facing, views))[0].sum() > seen.sum():
         facing, (seen, free, hidden) = -facing, other
