@@ -92,7 +92,8 @@ def planes_around(
 def _drawn_again(
     normal: np.ndarray, height: float, found: Sequence[tuple[np.ndarray, float]], centre: np.ndarray, within: float
 ) -> bool:
-    """Whether a plane that no sparse points tell is a found one, drawn a little before or behind it."""
+    """Whether a plane that no sparse points tell is a found one, drawn a little before or behind it: `within` the
+    distance that views tell apart."""
     for other, there in found:
         beneath = centre - (centre @ other - there) * other
         if abs(normal @ other) > TURNED and abs(normal @ beneath - height) < within:
@@ -180,7 +181,7 @@ def _mapped(
 
 
 def _specks(free: np.ndarray, small: float) -> np.ndarray:
-    """bool [CELLS, CELLS]: patches of free cells smaller than this: beside the object's edge views are rough."""
+    """bool [CELLS, CELLS]: patches of fewer than `small` free cells. Beside the object's edge a view's depth errs."""
     patches, count = ndimage.label(np.pad(free, 1, constant_values=True))  # beyond the map a patch may go on
     areas = np.bincount(patches.ravel(), minlength=count + 1)
     return free & (areas < small)[patches][1:-1, 1:-1]
