@@ -18,7 +18,7 @@ from reffusion.capture.lens import undoing
 from reffusion.capture.lenses import save_lenses
 from reffusion.capture.reading import check_brought, read_scene, unphotographed
 from reffusion.capture.refine import refined
-from reffusion.capture.roles import NONE, Roles
+from reffusion.capture.roles import Roles
 from reffusion.capture.undistorted import check_masks, fitting_size, lens_of, load_at, save_undistorted
 from reffusion.capture.views import known
 from reffusion.gaussians import matching
@@ -49,8 +49,9 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     capture, roles = read_scene(params, scene)
     said = [*capture.warnings, *roles.warnings]
     sizes = {name: image_size(path, upright=capture.upright) for name, path in capture.pictures.items()}
-    for files in (*roles.masks.values(), roles.fill):
-        check_masks(files)
+    for files in roles.masks.values():
+        check_masks(files, roles.values)
+    check_masks(roles.fill)
     if params.gaussians is not None:
         load_ply(scene / params.gaussians)
     if capture.poses is None:
@@ -171,7 +172,7 @@ def _save_region(params: Params, out: Path, scene: Scene) -> None:
         return
     size = [side * scale for side in region.size or [2 * region.radius] * 3]
     said = {"center": center.tolist(), "size": size, "round": region.size is None}
-    save_json(out / "region.json", {**said, "holds": (params.masks or "").lower() != NONE})
+    save_json(out / "region.json", {**said, "holds": params.has_masks})
 
 
 def _supported_size(params: Params, capture: Capture, roles: Roles) -> int:

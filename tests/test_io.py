@@ -104,8 +104,8 @@ def test_unreadable_pictures_are_named(tmp_path):
     pixels = np.random.default_rng(0).integers(0, 256, (50, 50, 3)).astype(np.uint8)
     save_image(tmp_path / "whole.png", pixels)
     (tmp_path / "cut.png").write_bytes((tmp_path / "whole.png").read_bytes()[:2000])
-    Image.fromarray(np.zeros((4, 4), np.uint16)).save(tmp_path / "deep.png")
-    for name in ("text.png", "cut.png", "absent.png", "deep.png"):
+    Image.fromarray(np.zeros((4, 4), np.float32)).save(tmp_path / "deep.tiff")
+    for name in ("text.png", "cut.png", "absent.png", "deep.tiff"):
         with pytest.raises(ValueError, match=name):
             load_image(tmp_path / name)
     with pytest.raises(ValueError, match="not finite"):

@@ -28,6 +28,11 @@ def mirrored_pose(record):
 
 
 def same_stem(folder: Path) -> None:
+    write_pictures(folder / "images", ["v00"], ending=".bmp")
+    edit_transforms(lambda r: r["frames"][0].update(file_path="images/v00.bmp"))(folder)
+
+
+def mask_of_two(folder: Path) -> None:
     write_pictures(folder / "other", ["v00"])
     edit_transforms(lambda r: r["frames"][0].update(file_path="other/v00.png"))(folder)
 
@@ -61,6 +66,7 @@ REFUSALS = [
     ("NaN pose", edit_transforms(nan_pose), {}, r"transforms\.json.*'v03' is not finite"),
     ("mirrored pose", edit_transforms(mirrored_pose), {}, "'v03' is no rotation"),
     ("two views of a name", same_stem, {}, "view name 'v00' is also"),
+    ("a mask of two views", mask_of_two, {}, r"masks/v00\.png: images-v00 and other-v00 are called so"),
     ("no intrinsics", edit_transforms(lambda r: r.pop("fl_x")), {}, "neither fl_x nor camera_angle_x"),
     ("unknown camera model", edit_transforms(lambda r: r.update(camera_model="X")), {}, "camera_model X"),
     ("other proportions than the camera", edit_transforms(lambda r: r.update(w=50)), {}, "other proportions"),

@@ -11,7 +11,7 @@ from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.lens import Lens, to_directions, to_pixels, undoing
 from reffusion.capture.lenses import load_lenses, photograph_sizes
 from reffusion.capture.roles import Roles
-from reffusion.capture.views import known
+from reffusion.capture.views import find_view, known
 from reffusion.io.files import BadInput
 from reffusion.io.images import image_size
 from reffusion.params.clicks import Clicked
@@ -47,8 +47,7 @@ def to_views(poses: Path, clicks: Clicked) -> dict[str, tuple[np.ndarray, np.nda
     lenses, _ = load_lenses(poses)
     sizes, found = photograph_sizes(poses), {}
     for said, points in clicks.items():
-        name = said if said in lenses else Path(said).stem
-        if name in lenses:
+        if name := find_view(said, lenses):
             at = straightened(np.array([point[:2] for point in points]).reshape(-1, 2), lenses[name], sizes[name])
             inside = ((at >= 0) & (at <= (lenses[name].width, lenses[name].height))).all(1)
             found[name] = at[inside], np.array([point[2] == "+" for point in points], bool)[inside]

@@ -92,6 +92,8 @@ _COLMAP = {
     "RADIAL": (True, False, ("k1", "k2")),
     "OPENCV": (False, False, ("k1", "k2", "p1", "p2")),
     "FULL_OPENCV": (False, False, ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
+    "SIMPLE_FISHEYE": (True, True, ()),
+    "FISHEYE": (False, True, ()),
     "SIMPLE_RADIAL_FISHEYE": (True, True, ("k1",)),
     "RADIAL_FISHEYE": (True, True, ("k1", "k2")),
     "OPENCV_FISHEYE": (False, True, ("k1", "k2", "k3", "k4")),

@@ -14,18 +14,24 @@ from reffusion.io.files import BadInput, there, understood
 
 __all__ = ["LAYOUTS", "Capture", "Poses", "load_capture", "pictures_in", "recognise"]
 
-READERS = {"colmap": colmap.read, "transforms": transforms.read, "photos": photos.read}
-LAYOUTS = ("llff", *READERS)
+LAYOUTS = ("llff", "colmap", "transforms", "photos")
 LONGEST = 1600  # px: the paper's
 
 
-def load_capture(folder: Path, layout: str | None = None, images: str | None = None, longest: int = LONGEST) -> Capture:
+def load_capture(
+    folder: Path,
+    layout: str | None = None,
+    images: str | None = None,
+    longest: int = LONGEST,
+    references: frozenset[Path] = frozenset(),
+) -> Capture:
     """Read a scene folder, recognising its layout unless it is named.
 
     Args:
         layout: one of LAYOUTS, or None.
         images: the folder of pictures, relative to the scene, where it is not the usual one.
         longest: larger image side in px that is asked for; chooses among folders of the same pictures (LLFF).
+        references: pictures that may lie among the photographs and are none.
 
     Raises:
         BadInput: naming the file and the remedy, where the folder is no capture, two pictures share a view name,
@@ -40,7 +46,11 @@ def load_capture(folder: Path, layout: str | None = None, images: str | None = N
     if images is not None and not (folder / images).is_dir():
         raise BadInput(f"{folder / images}: no such folder; correct `images` in scene.yaml")
     with understood(_source(folder, layout), "a capture that can be read"):
-        return llff.read(folder, images, longest) if layout == "llff" else READERS[layout](folder, images)
+        if layout == "llff":
+            return llff.read(folder, images, longest, references)
+        if layout == "transforms":
+            return transforms.read(folder, images)
+        return colmap.read(folder, images) if layout == "colmap" else photos.read(folder, images, references)
 
 
 def _source(folder: Path, layout: str) -> Path:
@@ -50,13 +60,14 @@ def _source(folder: Path, layout: str) -> Path:
 
 
 def recognise(folder: Path) -> str:
-    """The layout by the files that are there: poses_bounds.npy, transforms.json, a COLMAP model, else photos.
+    """The layout by the files that are there: poses_bounds.npy, transforms.json (or Blender's transforms_train.json), a
+    COLMAP model, else photos.
 
     A COLMAP model beside masks of `images_4` is SPIn-NeRF's, whose poses_bounds.npy is not needed then."""
     if there(folder / "poses_bounds.npy"):
         return "llff"
     if (folder / "images_4" / "label").is_dir() and colmap.model_folder(folder) is not None:
         return "llff"
-    if there(folder / "transforms.json"):
+    if transforms.split_files(folder):
         return "transforms"
     return "colmap" if colmap.model_folder(folder) is not None else "photos"

@@ -8,10 +8,12 @@ from pathlib import Path
 from reffusion.capture.clicked import check_clicks
 from reffusion.capture.given import listed
 from reffusion.capture.layouts.cameras import has_pictures
-from reffusion.capture.layouts.capture import Capture, pictures_in
+from reffusion.capture.layouts.capture import Capture
+from reffusion.capture.layouts.mask_files import objects_of_masks
+from reffusion.capture.layouts.names import list_pictures
 from reffusion.capture.lens import without_distortion
 from reffusion.capture.load import load_capture
-from reffusion.capture.roles import NONE, Roles, load_roles, masks_of
+from reffusion.capture.roles import Roles, load_roles
 from reffusion.capture.views import known
 from reffusion.io.files import BadInput, there
 from reffusion.io.ply import check_gaussians
@@ -20,7 +22,10 @@ from reffusion.params.poses import Params
 
 def read_scene(params: Params, scene: Path) -> tuple[Capture, Roles]:
     """The capture and its views' roles; BadInput naming the file and the remedy where one is wrong."""
-    capture = load_capture(scene, params.layout, params.images, params.longest)
+    references = frozenset(
+        scene / name for each in listed(params.reference) for name in (each.image, each.depth) if name is not None
+    )
+    capture = load_capture(scene, params.layout, params.images, params.longest, references)
     roles = load_roles(
         scene,
         capture,
@@ -73,14 +78,15 @@ def unphotographed(params: Params, scene: Path) -> bool:
     if params.cleaned is None or params.images is not None or has_pictures(scene, frozenset(named)):
         return False
     for key in ("test_masks", "train", "test", "cameras_only", "fill", "remove", "region", "clean", "masks"):
-        if (said := getattr(params, key)) and said != NONE:
+        if getattr(params, key) and (key != "masks" or params.has_masks):
             raise BadInput(f"scene.yaml: {key}: the scene has no photographs; add them, or remove the key")
     return True
 
 
 def _to_fill(folder: Path, capture: Capture, roles: Roles) -> dict[str, Path]:
     """Training view -> mask of what is to be filled; BadInput where one has none."""
-    files = masks_of(pictures_in(folder) if folder.is_dir() else {}, capture)
+    found = objects_of_masks(folder, list_pictures(folder, nested=True), capture)
+    files = {name: path for views in found.values() for name, path in views.items()}
     if lacking := [name for name in roles.train if name not in {*files, *roles.clean}]:
         raise BadInput(
             f"{folder}: no mask for {len(lacking)} of {len(roles.train)} training views, '{lacking[0]}' for one; each "

@@ -8,12 +8,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from reffusion.capture.layouts.capture import Capture, pictures_in
+from reffusion.capture.layouts.mask_files import NONE, find_masks, match_masks
 from reffusion.capture.views import Views, check_proportions, known
 from reffusion.io.files import BadInput
-from reffusion.io.images import image_size
+from reffusion.io.images import WHITE, MaskValues, image_size
+from reffusion.params.poses import Masks
 
 LEAST_TRAINING_VIEWS = 3  # but for a scene with views that are cameras only
-NONE = "none"
 OTHERS = "others"
 
 
@@ -28,6 +29,7 @@ class Roles:
         test_masks: where a test view shows the object, or would show it; what its box comes from.
         warnings: what is odd.
         blank: names of views without pixels, beside training and test views.
+        values: which pixel values of `masks` are the object.
         fill: training view -> file, a mask of what is to be filled whatever its photograph shows there.
     """
 
@@ -38,6 +40,7 @@ class Roles:
     test_masks: dict[str, Path]
     warnings: tuple[str, ...]
     blank: tuple[str, ...] = ()
+    values: MaskValues = WHITE
     fill: dict[str, Path] = field(default_factory=dict)
 
     def among(self, names: set[str]) -> Roles:
@@ -65,7 +68,7 @@ def load_roles(
     folder: Path,
     capture: Capture,
     *,
-    masks: str | None = None,
+    masks: str | Masks | None = None,
     test_masks: str | None = None,
     train: Sequence[str] | str | None = None,
     test: Sequence[str] | str | None = None,
@@ -77,11 +80,12 @@ def load_roles(
     """The roles of the capture's views, from scene.yaml's keys and the folder's usual places.
 
     Test views: those named; else, where the folder has test masks (`<pictures>/test_label`), the views without a
-    mask, or where some training masks are missing the first ones in order of names; else none. Training views:
-    those named, else all others. A view that is neither is left out of the scene.
+    mask, or where some training masks are missing the first ones in order of names; else those that the layout holds
+    out. Training views: those named, else all others. A view that is neither is left out of the scene.
 
     Args:
-        masks: folder of masks; "none" for a scene without; None looks into <pictures>/label, masks, mask, label.
+        masks: folder of masks, and which numbers in them are the object; "none" for a scene without; None looks into
+            <pictures>/label, masks, mask, label, for `A_mask.png` beside `A.png`, and for masks that the layout names.
         test_masks: folder of the test views' masks, named like the views or in their order; "none"; None looks.
         train, test: names, or "every 8" (the first of each eight in order of names), or None.
         region: the scene names a 3D region, so it may lack masks.
@@ -93,7 +97,8 @@ def load_roles(
             at all, an unknown view, a view for both training and test, fewer than 3 training views.
     """
     folder = Path(folder)
-    of_objects = _mask_files(folder, capture, masks, region or cameras_only is not None)
+    found = find_masks(folder, capture, masks, optional=region or cameras_only is not None)
+    of_objects = found.files
     _check_objects(remove, of_objects)
     mask_files = {name: path for files in of_objects.values() for name, path in files.items()}
     label_files = _test_mask_files(folder, capture, test_masks)
@@ -112,8 +117,8 @@ def load_roles(
         check_proportions(path, name, _size_of(name, capture), 0.10, "mask")
     bare = [name for name in train_named if name not in kept and name not in clean_views]
     warning = f"{len(bare)} training views have no mask: {', '.join(bare)}" if kept and bare else None
-    said = (warning,) if warning else ()
-    return Roles(tuple(train_named), tuple(test_views), clean_views, ours, beside, said, blank)
+    said = tuple(filter(None, (found.warning, warning)))
+    return Roles(tuple(train_named), tuple(test_views), clean_views, ours, beside, said, blank, found.values)
 
 
 def _clean(clean: Sequence[str], train: list[str], capture: Capture) -> frozenset[str]:
@@ -161,8 +166,9 @@ def _size_of(name: str, capture: Capture) -> tuple[int, int]:
 def _parted(
     train: list[str] | None, test: list[str] | None, labelled: list[str] | None, blank: list[str], capture: Capture
 ) -> tuple[list[str], list[str]]:
-    """Training and test views from those named, None where they are not, and those that test masks tell of."""
-    test_views = test if test is not None else (labelled or [])
+    """Training and test views from those named, None where they are not, those that test masks are of, and those that
+    the layout holds out."""
+    test_views = test if test is not None else (labelled or [*capture.test])
     if train is None:
         train = [name for name in capture.pictures if name not in {*test_views, *blank}]
     elif test is None:
@@ -211,58 +217,6 @@ def _chosen(value: Sequence[str] | str | None, capture: Capture, key: str) -> li
     return names
 
 
-def _mask_files(folder: Path, capture: Capture, masks: str | None, region: bool) -> dict[str, dict[str, Path]]:
-    """Object -> view name -> mask, each mask checked to have its picture; see `Roles`."""
-    if masks is not None and masks.lower() == NONE:
-        return {}
-    if masks is None:
-        usual = (capture.label_folder / "label", folder / "masks", folder / "mask", folder / "label")
-        found = next((p for p in usual if p != capture.label_folder and _objects_in(p)), None)
-    else:
-        found = folder / masks
-        if not _objects_in(found):
-            raise BadInput(f"{found}: no masks there; correct `masks` in scene.yaml")
-    if found is None:
-        if region:
-            return {}
-        raise BadInput(
-            f"{folder}: no mask at all (looked for {', '.join(str(p.relative_to(folder)) for p in usual)}); click on "
-            f"the object (`make scene={folder} mask`, or `clicks` in scene.yaml), add a mask for each picture, name "
-            "their folder as `masks` or a box as `region` in scene.yaml, or say `masks: none` to fit and render only"
-        )
-    return {thing: masks_of(pictures, capture) for thing, pictures in _objects_in(found).items()}
-
-
-def _objects_in(folder: Path) -> dict[str, dict[str, Path]]:
-    """Object -> stem -> mask: of a folder with masks, or with a folder of masks for each object."""
-    if not folder.is_dir():
-        return {}
-    inside = sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
-    named = {path.name: pictures for path in inside if (pictures := pictures_in(path))}
-    loose = pictures_in(folder)
-    if loose and named:
-        raise BadInput(
-            f"{folder}: holds masks and folders of masks ({', '.join(named)}); put them into one folder for each "
-            "object, or all into one"
-        )
-    return {"": loose} if loose else named
-
-
-def masks_of(pictures: dict[str, Path], capture: Capture) -> dict[str, Path]:
-    """View name -> mask, of masks by stem; BadInput where one belongs to no picture, or two to one."""
-    result: dict[str, Path] = {}
-    for stem, path in pictures.items():
-        # COLMAP's masks are called <picture with its ending>.png
-        name = next((n for n in (stem, Path(stem).stem) if n in capture.pictures or n in capture.left_out), None)
-        if name is None:
-            raise BadInput(f"{path}: a mask for no picture; name it like its picture, or remove it")
-        if name in capture.pictures:
-            if name in result:
-                raise BadInput(f"{path}: '{name}' has another mask, {result[name]}; remove one")
-            result[name] = path
-    return dict(sorted(result.items()))
-
-
 def _test_mask_files(folder: Path, capture: Capture, test_masks: str | None) -> list[Path] | None:
     """The test views' masks in order of their names, or None."""
     if test_masks is not None and test_masks.lower() == NONE:
@@ -276,8 +230,9 @@ def _test_mask_files(folder: Path, capture: Capture, test_masks: str | None) -> 
 
 def _labelled(capture: Capture, masks: dict[str, Path], labels: list[Path], test_named: list[str] | None) -> list[str]:
     """The views that the test masks stand for, one for each, in their order."""
-    if all(path.stem in capture.pictures for path in labels):
-        return [path.stem for path in labels]
+    named = match_masks(labels[0].parent, [path.name for path in labels], capture, strict=False)
+    if all(view in capture.pictures for view in named.values()) and len(named) == len(labels):
+        return [named[path.name] for path in labels]
     without = [name for name in capture.pictures if name not in masks]
     first = list(capture.pictures)[: len(labels)]
     for candidate in (without, first):

@@ -11,7 +11,7 @@ from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.lens import Lens, undistort_image, undistort_mask, undoing
 from reffusion.capture.roles import Roles
 from reffusion.io.files import BadInput
-from reffusion.io.images import image_size, load_image, load_mask, resized, save_image, save_mask
+from reffusion.io.images import WHITE, MaskValues, image_size, load_image, load_mask, resized, save_image, save_mask
 
 
 def fitting_size(width: int, height: int, longest: int) -> tuple[int, int]:
@@ -54,20 +54,26 @@ def save_undistorted(out: Path, name: str, capture: Capture, roles: Roles, longe
         raise BadInput(f"{capture.brought_by or capture.pictures[name]}: view '{name}': {error}") from error
     save_image(out / "images" / f"{name}.png", image if where is None else undistort_image(image, where))
     masks = {f"masks/{thing}": files for thing, files in roles.masks.items()}
+    own = {path for files in masks.values() for path in files.values()}
     for folder, files in (*masks.items(), ("test_masks", roles.test_masks), ("fill", roles.fill)):
         if name in files:
-            mask = load_mask(files[name], (size[1], size[0]))
+            values = roles.values if files[name] in own else WHITE
+            mask = load_mask(files[name], (size[1], size[0]), values)
             save_mask(out / folder / f"{name}.png", mask if where is None else undistort_mask(mask, where))
     return lens, pinhole
 
 
-def check_masks(masks: Mapping[str, Path]) -> None:
+def check_masks(masks: Mapping[str, Path], values: MaskValues = WHITE) -> None:
     """BadInput where masks are given and not one of them holds a masked pixel, or all hold nothing else, or one is
     unreadable."""
-    shares = [load_mask(path).mean() for path in masks.values()]
+    shares = [load_mask(path, values=values).mean() for path in masks.values()]
     if shares and (max(shares) == 0 or min(shares) == 1):
-        state = "empty" if max(shares) == 0 else "full"
+        state, folder = "empty" if max(shares) == 0 else "full", next(iter(masks.values())).parent
+        if values.ids:
+            numbers = ", ".join(map(str, values.ids))
+            raise BadInput(
+                f"{folder}: all {len(shares)} masks are {state} for the id {numbers}; correct `masks: {{id: ...}}`"
+            )
         raise BadInput(
-            f"{next(iter(masks.values())).parent}: all {len(shares)} masks are {state}; mark the object, and nothing "
-            "else, with 255 (or 1)"
+            f"{folder}: all {len(shares)} masks are {state}; mark the object, and nothing else, with 255 (or 1)"
         )

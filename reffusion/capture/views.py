@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 
+from reffusion.capture.layouts.names import flatten, normalize_path, strip_ending
 from reffusion.capture.lenses import load_lenses
 from reffusion.io.arrays import load_json
 from reffusion.io.files import BadInput
@@ -42,8 +43,8 @@ def placed_views(poses_dir: Path) -> Views:
 
 
 def known(name: str, names: Collection[str], key: str) -> str:
-    """The view of that name, an ending allowed; ValueError with the nearest names where there is none."""
-    if found := _found(name, names):
+    """The view of that name, or of the picture of that path; BadInput with the nearest names where there is none."""
+    if found := find_view(name, names):
         return found
     raise BadInput(f"scene.yaml: {key}: there is no view '{name}'; views are named like {_near(name, names)}")
 
@@ -52,7 +53,7 @@ def known_for(path: Path, name: str, views: Views, key: str) -> str:
     """`known`, of the view that the file at `path` is made for."""
     if not views.placed:
         return known(name, views.names, key)
-    if found := _found(name, views.names):
+    if found := find_view(name, views.names):
         return found
     raise not_placed(path, name, views)
 
@@ -64,8 +65,11 @@ def not_placed(path: Path, name: str, views: Views) -> BadInput:
     )
 
 
-def _found(name: str, names: Collection[str]) -> str | None:
-    return next((candidate for candidate in (name, Path(name).stem) if candidate in names), None)
+def find_view(name: str, names: Collection[str]) -> str | None:
+    """The view that a name, a file name or a path means: `cam0/0001.png` is `cam0-0001`; None where there is none."""
+    path = strip_ending(normalize_path(name))
+    spellings = (name, path, flatten(path), path.rpartition("/")[2], Path(name).stem)
+    return next((candidate for candidate in spellings if candidate in names), None)
 
 
 def _near(name: str, names: Collection[str]) -> str:

@@ -6,6 +6,7 @@ import logging
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,11 @@ HEIC = (".heic", ".heif")  # of phones
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", *HEIC)  # of pictures, in small letters
 
 # What is read under these names; other kinds that Pillow knows call programs, or are not for photographs.
+FLAT = 0.002  # share of a mask that a value fills where it is a number and no soft edge
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM", "HEIF")
+_HEIC_BRANDS = tuple(
+    b"ftyp" + brand for brand in (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1", b"hevc", b"hevx")
+)
 logging.getLogger("PIL").addHandler(logging.NullHandler())  # what it says on standard error is in our line too
 Image.MAX_IMAGE_PIXELS = None  # `opened` looks at the size itself: with one limit, and without a warning below it
 
@@ -26,9 +31,12 @@ Image.MAX_IMAGE_PIXELS = None  # `opened` looks at the size itself: with one lim
 def opened(path: Path, what: str = "a readable image") -> Iterator[Image.Image]:
     """A picture of which the header was read; BadInput naming the file for all that is wrong with it, here or inside
     the block, and for more than `MOST_PIXELS`."""
-    if Path(path).suffix.lower() in HEIC:
-        _learn_heic(path)
-    with reading(path, what), Image.open(path, formats=_FORMATS) as image:
+    with reading(path, what):
+        with open(path, "rb") as file:
+            if file.read(12)[4:12] in _HEIC_BRANDS:  # whatever it is called
+                _learn_heic(path)
+        known = [each for each in _FORMATS if each != "HEIF" or each in Image.OPEN]
+    with reading(path, what), Image.open(path, formats=known) as image:
         check_pixels(path, *image.size)
         yield image
 
@@ -58,19 +66,35 @@ def image_size(path: Path, upright: bool = False) -> tuple[int, int]:
 
 
 def load_image(path: Path, upright: bool = False) -> np.ndarray:
-    """Read an 8-bit picture as uint8 [H, W, 3], sRGB.
+    """Read a picture as uint8 [H, W, 3], sRGB.
 
-    Grey becomes RGB and an alpha channel is dropped. The camera's orientation tag is ignored, because poses
-    that come with photographs refer to the stored pixels; `upright=True` obeys it.
+    Grey becomes RGB, 16-bit grey levels are divided by 257, and an alpha channel is dropped. The camera's orientation
+    tag is ignored, because poses that come with photographs refer to the stored pixels; `upright=True` obeys it.
 
     Raises:
-        BadInput: naming the file, where it is absent, cut off, or not an 8-bit picture.
+        BadInput: naming the file, where it is absent, cut off, or has pixels of more than 16 bits or of floats.
     """
     with opened(path) as image:
-        if image.mode[0] in "IF":
-            raise BadInput(f"{path}: {image.mode} pixels; save it as an 8-bit picture")
         turned = ImageOps.exif_transpose(image) if upright else image
-        return np.array(turned.convert("RGB"))
+        if image.mode[0] not in "IF":
+            return np.array(turned.convert("RGB"))
+        levels = np.array(turned)
+        if image.mode == "F" or levels.min() < 0 or levels.max() > 65535:
+            raise BadInput(f"{path}: {image.mode} pixels; save it as a picture of 8 or 16 bits")
+        return np.repeat(np.round(levels / 257).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def load_thumbnail(path: Path, side: int) -> np.ndarray:
+    """The picture as uint8 [h, w, 3], its longer side at most `side` px; of the stored pixels. Imports no OpenCV."""
+    with opened(path) as image:
+        if image.mode[0] not in "IF":
+            image.draft("RGB", (2 * side, 2 * side))  # JPEGs are decoded at a fraction of their size
+            image = image.convert("RGB")
+            image.thumbnail((side, side), Image.Resampling.BOX)
+            return np.array(image)
+    whole = load_image(path)
+    step = max(1, -(-max(whole.shape[:2]) // side))
+    return np.ascontiguousarray(whole[::step, ::step])
 
 
 def save_image(path: Path, array: np.ndarray) -> None:
@@ -108,35 +132,99 @@ def _is_png(path: Path) -> bool:
     return Path(path).suffix.lower() == ".png"
 
 
-def load_mask(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
+@dataclass(frozen=True)
+class MaskValues:
+    """Which pixels of a mask file are the object.
+
+    Attributes:
+        ids: these numbers (of palettes: these entries); empty: white, as `load_mask` understands it.
+        inverted: all other pixels instead.
+    """
+
+    ids: tuple[int, ...] = ()
+    inverted: bool = False
+
+
+WHITE = MaskValues()  # the object is white
+
+
+def load_mask(path: Path, size: tuple[int, int] | None = None, values: MaskValues = WHITE) -> np.ndarray:
     """Read a mask as bool [H, W], True = masked.
 
-    Understood are files of {0, 1}, of {0, 255} (cut at 128, so lossy and soft edges do no harm), one-bit files
-    and palettes (any entry but the first). Of colours the brightest channel counts; alpha is ignored, but not where
-    the mask can only be there: which of its ends is the object differs from tool to tool.
+    Understood are files of {0, 1}, of {0, 255} (cut at 128, so lossy and soft edges do no harm), one-bit files, and
+    palettes and colours of which black is the background. Of grey colours the brightest channel counts; alpha is
+    ignored, but not where the mask can only be there: which of its ends is the object differs from tool to tool.
 
     Args:
         size: (height, width) to resize to, nearest neighbour; None keeps the file's.
+        values: which pixels are the object.
 
     Raises:
-        BadInput: naming the file, where it is unreadable, in its alpha, or its values are neither {0, 1} nor {0, 255}.
+        BadInput: naming the file, where it is unreadable, in its alpha, or a map of object numbers without `ids`.
     """
     with opened(path, "a readable mask") as image:
-        mode, array = image.mode, np.array(image)
+        if values.ids:
+            mask = np.isin(_numbers(path, image), values.ids)
+        else:
+            mask = _white(path, image)
+    mask = mask ^ values.inverted
+    return mask if size is None else resize_nearest(mask, size)
+
+
+def _numbers(path: Path, image: Image.Image) -> np.ndarray:
+    """[H, W], the object numbers of a map: grey levels, or the entries of a palette."""
+    array = np.array(image)
+    if array.ndim == 3 and (array[..., :1] == array[..., : min(3, array.shape[2])]).all():
+        array = array[..., 0]
+    if array.ndim != 2:
+        raise BadInput(f"{path}: {image.mode} colours are no object numbers; save grey levels or a palette, or no `id`")
+    return array
+
+
+def _white(path: Path, image: Image.Image) -> np.ndarray:
+    mode = image.mode
+    array = np.array(image.convert("RGB") if mode in ("P", "PA") else image)
     if array.ndim == 3:
         colors = array[..., : 3 if array.shape[2] >= 3 else 1]
         if mode in ("RGBA", "LA") and (colors == colors[0, 0]).all() and np.ptp(array[..., -1]):
             raise BadInput(f"{path}: its alpha differs, its colours do not; write 255 where the object is, 0 elsewhere")
+        if image.format != "JPEG" and np.ptp(colors, axis=2).any():
+            _check_colors(path, mode, colors)
+            if mode in ("P", "PA"):
+                return colors.any(axis=2)
         array = colors.max(axis=2)
-    if mode == "P" or array.dtype == np.bool_ or array.max() <= 1:
-        mask = array > 0
-    elif array.max() >= 128:
-        mask = array >= (32768 if array.max() > 255 else 128)
-    else:
+    if array.dtype == np.bool_ or array.max() <= 1:
+        return array > 0
+    half = 32768 if array.max() > 255 else 128
+    levels = _flat_levels(array) if image.format != "JPEG" else []
+    inner = [level for level in levels if level > 0.03 * 2 * half]
+    if array.max() < half or len(inner) > 1:
+        found = ", ".join(str(level) for level in ([level for level in levels if level] or [array.max()])[:6])
         raise BadInput(
-            f"{path}: its values reach {array.max()}, neither 0/1 nor 0/255; write 255 where the object is, 0 elsewhere"
+            f"{path}: its values ({found}) are neither 0/1 nor 0/255; write 255 where the object is, 0 elsewhere, or "
+            "name the object's numbers in scene.yaml: `masks: {id: ...}`"
         )
-    return mask if size is None else resize_nearest(mask, size)
+    return array >= half
+
+
+def _check_colors(path: Path, mode: str, colors: np.ndarray) -> None:
+    """BadInput where a picture [H, W, 3] has areas of several colours beside black: which is the object?"""
+    found = [color for color in _flat_levels(colors.astype(np.int32) @ (65536, 256, 1)) if color]
+    if len(found) > 1:
+        numbers = ", or name the object's entries in scene.yaml: `masks: {id: ...}`" if mode in ("P", "PA") else ""
+        raise BadInput(
+            f"{path}: {len(found)} colours beside black; write white where the object is, black elsewhere{numbers}"
+        )
+
+
+def _flat_levels(array: np.ndarray) -> list[int]:
+    """The values that fill areas, ascending: soft edges pass through the others only."""
+    same = np.ones(array.shape, bool)
+    same[1:] &= array[1:] == array[:-1]
+    same[:, 1:] &= array[:, 1:] == array[:, :-1]
+    same[1:, 1:] &= array[1:, 1:] == array[:-1, :-1]
+    levels, counts = np.unique(array[same], return_counts=True)
+    return [int(level) for level, count in zip(levels, counts, strict=True) if count > FLAT * array.size]
 
 
 def resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:

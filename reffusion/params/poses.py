@@ -34,10 +34,25 @@ class Region(Settings):
         return self
 
 
+class Masks(Settings):
+    """Where masks lie, and which numbers in them are the object."""
+
+    folder: str | None = Field(None, description="relative to the scene; None: the usual ones")
+    id: int | list[int] | None = Field(
+        None, description="of maps of object numbers, and of palettes: the numbers that are the object"
+    )
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        return () if self.id is None else (self.id,) if isinstance(self.id, int) else tuple(self.id)
+
+
 class Params(Settings):
     layout: Literal["llff", "colmap", "transforms", "photos"] | None = Field(None, description="None: recognised")
     images: str | None = Field(None, description="folder of pictures, relative to the scene; None: the usual ones")
-    masks: str | None = Field(None, description='folder of masks; "none": the scene has none; None: the usual ones')
+    masks: str | Masks | None = Field(
+        None, description='folder of masks, or {folder, id}; "none": the scene has none; None: the usual ones'
+    )
     test_masks: str | None = Field(None, description="folder of masks of test views, by name or in their order")
     train: list[str] | str | None = Field(None, description='view names, or "every N"; None: all that are not test')
     test: list[str] | str | None = Field(None, description='view names, or "every N"; None: those of the test masks')
@@ -64,3 +79,8 @@ class Params(Settings):
     # PAPER leaves open: pictures that are blurred or were enlarged. It takes 1600 px; half of them may show as much.
     detail: float = Field(0.0, ge=0, description="pictures of less are halved, see reffusion.capture.support; 0: never")
     refine: bool = Field(False, description="adjust cameras, the principal point of each view too, that flow belies")
+
+    @property
+    def has_masks(self) -> bool:
+        """Does the scene not say that it has no masks?"""
+        return not (isinstance(self.masks, str) and self.masks.lower() == "none")

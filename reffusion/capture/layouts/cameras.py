@@ -6,7 +6,7 @@ from pathlib import Path
 
 from reffusion.capture.layouts import colmap, transforms
 from reffusion.capture.layouts.capture import Poses
-from reffusion.io.files import BadInput, there
+from reffusion.io.files import BadInput
 from reffusion.io.images import ENDINGS
 
 FOLDERS = ("images", "images_2", "images_4", "images_8", "photos", "input")
@@ -15,7 +15,7 @@ LEAST = 3
 
 def has_pictures(folder: Path, but: frozenset[str] = frozenset()) -> bool:
     """Is there a photograph where a layout looks for one? `but`: names of pictures in the folder that are none."""
-    if there(folder / "transforms.json") and transforms.has_pictures(folder):
+    if transforms.split_files(folder) and transforms.has_pictures(folder):
         return True
     beside = (path for path in folder.iterdir() if path.name not in but and not path.name.startswith("."))
     within = (path for name in FOLDERS for path in (folder / name).rglob("*"))
@@ -30,8 +30,8 @@ def read(folder: Path) -> tuple[Poses, Path] | None:
         BadInput: as of a capture with pictures; or there are fewer than three.
     """
     model = colmap.model_folder(folder)
-    if there(folder / "transforms.json"):
-        poses, source = transforms.read_cameras(folder), folder / "transforms.json"
+    if sources := transforms.split_files(folder):
+        poses, source = transforms.read_cameras(folder), next(iter(sources.values()))
     elif model is not None:
         poses, source = colmap.read_cameras(model), model
     else:

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from reffusion.capture.layouts.names import list_pictures, name_views, normalize_path
 from reffusion.capture.lens import Lens, from_colmap
 from reffusion.io.colmap import ModelCamera
 from reffusion.io.files import BadInput
-from reffusion.io.images import ENDINGS, image_size
+from reffusion.io.images import image_size
 
-NO_POINTS = (np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+Brought = tuple[np.ndarray, np.ndarray]  # points: positions [P, 3] float64 and colours [P, 3] uint8
+NO_POINTS: Brought = (np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
 
 
 @dataclass(frozen=True)
@@ -40,22 +41,28 @@ class Capture:
 
     Attributes:
         layout: llff, colmap, transforms or photos.
-        pictures: view name -> picture file, sorted by name; all of them have poses, if any has.
+        pictures: view name -> picture file, in the order of the files' paths; all of them have poses, if any has.
+        paths: name of a view, or of one that is left out -> the paths by which its mask may call it.
         poses: None where they must be found by structure from motion.
         brought_by: the file the poses come from, for messages; None without poses.
         label_folder: where masks (`label`) and test masks (`test_label`) are looked for: the pictures' folder, or that
             of the same pictures at another size.
         left_out: names of views that have a picture but no pose, or a pose but no picture.
         warnings: what the user should know, each one sentence.
+        test: names of the views that the layout itself holds out (Blender's transforms_test.json).
+        ignore_masks: view name -> the mask that the layout names for it, black where training ignores the picture.
     """
 
     layout: str
     pictures: dict[str, Path]
+    paths: dict[str, tuple[str, ...]]
     poses: Poses | None
     brought_by: Path | None
     label_folder: Path
     left_out: frozenset[str]
     warnings: tuple[str, ...]
+    test: tuple[str, ...] = ()
+    ignore_masks: dict[str, Path] = field(default_factory=dict)
 
     @property
     def upright(self) -> bool:
@@ -63,27 +70,33 @@ class Capture:
         return self.layout == "photos"
 
 
-def pictures_in(folder: Path) -> dict[str, Path]:
-    """View name (file name without ending) -> picture, sorted by name. BadInput where two share a name."""
-    files = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in ENDINGS and not p.name.startswith(".")]
-    return unique((p.stem, p) for p in files)
+def pictures_in(folder: Path, nested: bool = False) -> dict[str, Path]:
+    """View name -> picture, in the order of their paths (`list_pictures`); none where the folder is not there.
+
+    Raises:
+        BadInput: two pictures share a name.
+    """
+    return {name: folder / path for name, path in name_views(list_pictures(folder, nested)).items()}
 
 
-def unique(named: Iterable[tuple[str, Path]]) -> dict[str, Path]:
-    """A dictionary sorted by name; BadInput where a name comes twice."""
-    result: dict[str, Path] = {}
-    for name, path in named:
-        if name in result:
-            raise BadInput(f"{path}: the view name '{name}' is also that of {result[name]}; rename one of them")
-        result[name] = path
-    return dict(sorted(result.items()))
+def has_pictures(folder: Path, nested: bool = False) -> bool:
+    return bool(list_pictures(folder, nested))
+
+
+def paths_below(folder: Path, pictures: dict[str, Path]) -> dict[str, tuple[str, ...]]:
+    """`Capture.paths` of pictures below a folder: their paths, and their views' names with their endings."""
+    below = {name: normalize_path(path.relative_to(folder).as_posix()) for name, path in pictures.items()}
+    return {name: (path, name + Path(path).suffix) for name, path in below.items()}
 
 
 def image_folder_of(folder: Path, images: str | None, usual: tuple[str, ...]) -> Path:
-    """The named folder; or the first usual one that holds pictures, one with a `label` folder inside first."""
+    """The named folder; or the first usual one that holds pictures, one with a `label` folder inside first.
+
+    Pictures may lie in its sub-folders, but not where it is the scene's own folder, which holds masks and more.
+    """
     if images is not None:
         return folder / images
-    there = [folder / name for name in usual if (folder / name).is_dir() and pictures_in(folder / name)]
+    there = [folder / name for name in usual if has_pictures(folder / name, nested=name != ".")]
     if not there:
         raise BadInput(f"{folder}: no pictures in {', '.join(usual)}; name their folder as `images` in scene.yaml")
     return next((path for path in there if (path / "label").is_dir()), there[0])

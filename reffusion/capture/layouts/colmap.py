@@ -2,27 +2,60 @@
 
 from __future__ import annotations
 
-from collections import Counter
+import re
 from pathlib import Path
 
 from reffusion.capture.layouts.capture import (
     NO_POINTS,
+    Brought,
     Capture,
     Poses,
     counted,
     fitted,
     image_folder_of,
     lens_of,
-    pictures_in,
+    paths_below,
 )
-from reffusion.io.colmap import is_model, load_cameras, load_images, load_model_points, model_file
+from reffusion.capture.layouts.names import (
+    list_pictures,
+    name_views,
+    normalize_path,
+    pair_pictures,
+)
+from reffusion.capture.layouts.points import are_tracks_inside, contradicts_order, keep_points_in_frame
+from reffusion.io.colmap import ModelImage, is_model, load_cameras, load_images, load_model_points, model_file
 from reffusion.io.files import BadInput
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap", ".")
+RENAMED = re.compile(r"image\d+")  # what LLFF calls its copies of smaller size, in the order of the originals' names
 
 
 def model_folder(folder: Path) -> Path | None:
-    return next((folder / name for name in MODEL_FOLDERS if is_model(folder / name)), None)
+    """The model with most images, of equal ones the first; None where there is none."""
+    return max(found, key=found.__getitem__) if (found := _count_images(folder)) else None
+
+
+def other_models(folder: Path, model: Path) -> str | None:
+    """A sentence about the models that are not taken, or None."""
+    found = _count_images(folder)
+    others = [f"{_below(folder, path)} ({count})" for path, count in found.items() if path != model]
+    if not others:
+        return None
+    return f"{_below(folder, model)} is taken, which has most images ({found[model]}); not {', '.join(others)}"
+
+
+def _below(folder: Path, path: Path) -> str:
+    return path.relative_to(folder).as_posix()
+
+
+def _count_images(folder: Path) -> dict[Path, int]:
+    """Model folder -> number of its images; of one model written as .bin and .txt, or found twice, once."""
+    numbered = sorted(path for place in ("sparse", "colmap/sparse") for path in (folder / place).glob("[0-9]*"))
+    places = dict.fromkeys([*(folder / name for name in MODEL_FOLDERS), *numbered])
+    models = [place for place in places if is_model(place)]
+    if len(models) < 2:
+        return dict.fromkeys(models, 0)
+    return {model: len(load_images(model_file(model, "images"))) for model in models}
 
 
 def read(folder: Path, images: str | None) -> Capture:
@@ -35,62 +68,115 @@ def read(folder: Path, images: str | None) -> Capture:
 
 
 def from_model(folder: Path, model: Path, image_folder: Path, layout: str, label_folder: Path) -> Capture:
-    """Pictures matched to the model's images by name without ending; failing that, by order where the counts agree."""
-    source = model_file(model, "images")
-    registered = sorted(load_images(source).values(), key=lambda image: image.name)
-    stems = Counter(Path(image.name).stem for image in registered)
-    if twice := [stem for stem, count in stems.items() if count > 1]:
-        raise BadInput(f"{source}: two images are called '{twice[0]}', but for their endings or folders; rename one")
-    by_name = {Path(image.name).stem: Path(image.name) for image in registered}
-    images = {Path(image.name).stem: image for image in registered}
-    found = _pictures_of_model(image_folder, by_name)
-    if not found.keys() & images.keys() and len(found) == len(images):
-        # LLFF's downscaled copies are renamed image000.png, image001.png, ...: the order is all that is left.
-        images = dict(zip(found, (images[name] for name in sorted(images)), strict=True))
-    pictures = {name: path for name, path in found.items() if name in images}
-    if not pictures:
-        raise BadInput(f"{source}: none of its images is in {image_folder}; name their folder as `images`")
-    camera_file = model_file(model, "cameras")
-    cameras = load_cameras(camera_file)
-    lenses, poses = {}, {}
-    for name, path in pictures.items():
-        camera = cameras.get(images[name].camera_id)
+    """Pictures paired with the model's images by their paths (`pair_pictures`).
+
+    Only LLFF's renamed copies, `image000.png` and so on, are paired by order, with a warning.
+    """
+    source, camera_file = model_file(model, "images"), model_file(model, "cameras")
+    images, identities = _images_by_name(source)
+    files = _pictures_of_model(folder, image_folder, list(images))
+    pairs, warnings = pair_pictures({name: name for name in images}, files), [other_models(folder, model)]
+    if by_order := not pairs and len(files) == len(images) and all(RENAMED.match(Path(f).name) for f in files):
+        pairs = dict(zip(sorted(images), files, strict=True))
+        warnings.append(f"{image_folder}: renamed pictures, paired with the images of {source.name} in order of names")
+    if not pairs:
+        raise BadInput(f"{source}: {_unpaired(image_folder, list(images), files)}")
+    views = name_views(pairs.values())
+    of_file = {file: images[name] for name, file in pairs.items()}
+    pictures = {view: image_folder / file for view, file in views.items()}
+    cameras, lenses, poses = load_cameras(camera_file), {}, {}
+    for view, file in views.items():
+        camera = cameras.get(of_file[file].camera_id)
         if camera is None:
-            raise BadInput(f"{source}: the camera {images[name].camera_id} of '{name}' is missing in the model")
-        lenses[name] = fitted(lens_of(camera, camera_file), path)
-        poses[name] = images[name].world_to_camera
-    file = model_file(model, "points3D")
-    points = load_model_points(file) if file else None
-    brought = (points.positions, points.colors) if points else NO_POINTS
-    warnings = (
-        counted("images of the model have no picture", sorted(images.keys() - found.keys())),
-        counted("pictures are not in the model and are left out", sorted(found.keys() - images.keys())),
-    )
+            raise BadInput(f"{source}: the camera {of_file[file].camera_id} of '{view}' is missing in the model")
+        lenses[view] = fitted(lens_of(camera, camera_file), pictures[view])
+        poses[view] = of_file[file].world_to_camera
+    found = Poses(lenses, poses, *NO_POINTS, {})
+    points, said = _points(model, found, pictures, {v: identities[of_file[f].name] for v, f in views.items()})
+    if by_order and contradicts_order([*pictures.values()], [*lenses.values()], [*poses.values()], points):
+        raise BadInput(
+            f"{image_folder}: its pictures are not in the order of the images of {source}: they show the model's "
+            "points elsewhere; give them the names that the model has"
+        )
+    unplaced, lost = sorted(set(files) - set(pairs.values())), sorted(images.keys() - pairs.keys())
+    warnings += [
+        counted("images of the model have no picture", [_stem(name) for name in lost]),
+        counted("pictures are not in the model and are left out", [_stem(file) for file in unplaced]),
+        said,
+    ]
+    paths = paths_below(image_folder, pictures)
+    paths = {view: (*paths[view], of_file[file].name) for view, file in views.items()}
+    rest = {path: (path,) for path in (*lost, *unplaced)}
     return Capture(
         layout,
         pictures,
-        Poses(lenses, poses, *brought, {}),
+        paths | rest,
+        Poses(lenses, poses, *points, {}),
         source,
         label_folder,
-        frozenset(images.keys() ^ found.keys()),
+        frozenset(rest),
         tuple(filter(None, warnings)),
     )
+
+
+def _images_by_name(source: Path) -> tuple[dict[str, ModelImage], dict[str, int]]:
+    """Name -> image, and name -> its number; BadInput where a name comes twice."""
+    images: dict[str, ModelImage] = {}
+    identities: dict[str, int] = {}
+    for identity, image in load_images(source).items():
+        if image.name in images:
+            raise BadInput(f"{source}: two images are called '{image.name}'; rename one")
+        images[image.name], identities[image.name] = image, identity
+    return images, identities
+
+
+def _stem(path: str) -> str:
+    return Path(normalize_path(path)).stem
+
+
+def _unpaired(image_folder: Path, images: list[str], files: list[str]) -> str:
+    """Why no image of a model could be paired, and what would help."""
+    if not files:
+        return f"none of its images is in {image_folder}; name their folder as `images` in scene.yaml"
+    ours, theirs = (", ".join(sorted(names)[:3]) for names in (files, images))
+    return (
+        f"none of its {len(images)} images ({theirs}, ...) is called like a picture in {image_folder} ({ours}, ...); "
+        "name the right folder as `images` in scene.yaml, or give the pictures the names that the model has"
+    )
+
+
+def _points(
+    model: Path, poses: Poses, pictures: dict[str, Path], identities: dict[str, int]
+) -> tuple[Brought, str | None]:
+    """The model's points, none where they are not in the frame of its cameras; and a sentence where they are not."""
+    file = model_file(model, "points3D")
+    if file is None:
+        return NO_POINTS, None
+    found = load_model_points(file)
+    by_id = {identity: (poses.lenses[v], poses.world_to_camera[v]) for v, identity in identities.items()}
+    if not are_tracks_inside(found, by_id):
+        return NO_POINTS, f"{file}: its points are not in the frame of the cameras and are not used"
+    return keep_points_in_frame(file, (found.positions, found.colors), poses, pictures)
 
 
 def read_cameras(model: Path) -> Poses:
     """The lenses and poses alone, of a model whose pictures are not there."""
     source, camera_file = model_file(model, "images"), model_file(model, "cameras")
-    images = {Path(image.name).stem: image for image in load_images(source).values()}
+    images, _ = _images_by_name(source)
     cameras = load_cameras(camera_file)
     if lost := [name for name, image in images.items() if image.camera_id not in cameras]:
         raise BadInput(f"{source}: the camera of '{lost[0]}' is missing in the model")
-    names = sorted(images)
-    lenses = {name: lens_of(cameras[images[name].camera_id], camera_file) for name in names}
-    return Poses(lenses, {name: images[name].world_to_camera for name in names}, *NO_POINTS, {})
+    views = {view: images[name] for view, name in name_views(list(images)).items()}
+    lenses = {view: lens_of(cameras[image.camera_id], camera_file) for view, image in views.items()}
+    return Poses(lenses, {view: image.world_to_camera for view, image in views.items()}, *NO_POINTS, {})
 
 
-def _pictures_of_model(image_folder: Path, by_name: dict[str, Path]) -> dict[str, Path]:
-    """Pictures of the folder; those that the model names in sub-folders are found there."""
-    if all(len(path.parts) == 1 for path in by_name.values()):
-        return pictures_in(image_folder)
-    return {name: image_folder / path for name, path in by_name.items() if (image_folder / path).is_file()}
+def _pictures_of_model(folder: Path, image_folder: Path, names: list[str]) -> list[str]:
+    """Paths of pictures below a folder that a model may mean: in its sub-folders too where the model's names have
+    folders or it holds no pictures itself; in the scene's own folder only those that the model names exactly."""
+    loose = list_pictures(image_folder)
+    in_folders = any("/" in normalize_path(name) for name in names)
+    if image_folder.samefile(folder):
+        named = [path for path in map(normalize_path, names) if "/" in path and (image_folder / path).is_file()]
+        return sorted({*loose, *named})
+    return list_pictures(image_folder, nested=True) if in_folders or not loose else loose

@@ -13,12 +13,14 @@ import numpy as np
 from reffusion.capture.frame import depths_in_view
 from reffusion.capture.layouts.capture import (
     NO_POINTS,
+    Brought,
     Capture,
     Poses,
     fitted,
     image_folder_of,
     inverse,
     lens_of,
+    paths_below,
     pictures_in,
     rigid,
 )
@@ -32,7 +34,7 @@ from reffusion.io.images import image_size
 USUAL = ("images_4", "images_2", "images_8", "images")
 
 
-def read(folder: Path, images: str | None, longest: int) -> Capture:
+def read(folder: Path, images: str | None, longest: int, references: frozenset[Path] = frozenset()) -> Capture:
     """See `load_capture`."""
     source = folder / "poses_bounds.npy"
     label_folder = _label_folder(folder, images)
@@ -43,12 +45,13 @@ def read(folder: Path, images: str | None, longest: int) -> Capture:
         return replace(found, warnings=(*warnings, *found.warnings))
     if not there(source):
         raise BadInput(f"{source}: missing, and there is no complete COLMAP model in {folder / 'sparse/0'}")
-    pictures = pictures_in(image_folder)
-    rows = _poses_bounds(source)
+    pictures, rows = pictures_in(image_folder), _poses_bounds(source)
+    if len(rows) != len(pictures):
+        pictures = {name: path for name, path in pictures.items() if path not in references}
     if len(rows) != len(pictures):
         raise BadInput(
             f"{source}: {len(rows)} poses, but {image_folder} holds {len(pictures)} pictures; "
-            "one pose a picture is needed, in order of the sorted names"
+            "one pose a picture is needed, in the order of the file names"
         )
     lenses, poses, bounds = {}, {}, {}
     for row, (name, path) in zip(rows, pictures.items(), strict=True):
@@ -66,7 +69,8 @@ def read(folder: Path, images: str | None, longest: int) -> Capture:
     lenses = _lens_of_partial_model(partial, lenses, pictures, warnings)
     points = _points_of_partial_model(partial, lenses, poses, bounds, warnings)
     brought = Poses(lenses, poses, *points, bounds)
-    return Capture("llff", pictures, brought, source, label_folder, frozenset(), tuple(warnings))
+    paths = paths_below(image_folder, pictures)
+    return Capture("llff", pictures, paths, brought, source, label_folder, frozenset(), tuple(warnings))
 
 
 def _label_folder(folder: Path, images: str | None) -> Path:
@@ -135,7 +139,7 @@ def _points_of_partial_model(
     poses: dict[str, np.ndarray],
     bounds: dict[str, tuple[float, float]],
     warnings: list[str],
-) -> tuple[np.ndarray, np.ndarray]:
+) -> Brought:
     """Its points where they are in the frame of the poses, else none.
 
     By tracks, where as many images are seen in them as there are poses: of the observations, 95% must lie in front

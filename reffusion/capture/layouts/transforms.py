@@ -1,92 +1,134 @@
-"""nerfstudio's transforms.json."""
+"""nerfstudio's transforms.json, and Blender's transforms_train.json with _test and _val."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from reffusion.capture.frame import depths_in_view
 from reffusion.capture.layouts.capture import (
     NO_POINTS,
+    Brought,
     Capture,
     Poses,
     counted,
-    fitted,
     inverse,
+    paths_below,
     rigid,
-    unique,
 )
-from reffusion.capture.lens import Lens
+from reffusion.capture.layouts.depth_maps import points_from_depth
+from reffusion.capture.layouts.frame_lens import frame_lens, load_frame_lens, read_number
+from reffusion.capture.layouts.names import list_pictures, name_views, normalize_path, pair_pictures
+from reffusion.capture.layouts.points import keep_points_in_frame
 from reffusion.io.arrays import load_json
 from reffusion.io.files import BadInput, shortened, there, understood
-from reffusion.io.images import ENDINGS, image_size
+from reffusion.io.images import ENDINGS
 from reffusion.io.ply import load_points
 
-MODELS = (
-    "SIMPLE_PINHOLE",
-    "PINHOLE",
-    "SIMPLE_RADIAL",
-    "RADIAL",
-    "OPENCV",
-    "FULL_OPENCV",
-    "OPENCV_FISHEYE",
-    "SIMPLE_RADIAL_FISHEYE",
-    "RADIAL_FISHEYE",
-)
+SPLITS = ("train", "test", "val")
+USUAL = ("images", "images_2", "images_4", "images_8", "input", "rgb")  # folders of pictures
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame of a transforms file.
+
+    Attributes:
+        values: its keys over the file's.
+        listed: its file_path.
+        source: the file.
+        split: "", or of Blender's files "train", "test" or "val".
+    """
+
+    values: dict[str, Any]
+    listed: str
+    source: Path
+    split: str
+
+
+def split_files(folder: Path) -> dict[str, Path]:
+    """Split -> file: {"": transforms.json}, or Blender's transforms_train.json with _test and _val; empty without."""
+    if there(folder / "transforms.json"):
+        return {"": folder / "transforms.json"}
+    found = {
+        split: folder / f"transforms_{split}.json" for split in SPLITS if there(folder / f"transforms_{split}.json")
+    }
+    return found if "train" in found else {}
 
 
 def read(folder: Path, images: str | None) -> Capture:
-    """See `load_capture`."""
-    source = folder / "transforms.json"
-    record = load_json(source)
-    frames = _frames(record, source)
-    files = [_frame_file(folder, images, frame["file_path"]) for frame in frames]
-    missing = [frame["file_path"] for frame, path in zip(frames, files, strict=True) if path is None]
-    placed = [(frame, path) for frame, path in zip(frames, files, strict=True) if path is not None]
-    if not placed:
+    """See `load_capture`. Of Blender's splits, test views are those of _test, without it those of _val."""
+    sources = split_files(folder)
+    unread = [sources.pop("val").name] if {"test", "val"} <= sources.keys() else []
+    frames = [frame for split, source in sources.items() for frame in _load_frames(source, split)]
+    source = next(iter(sources.values()))
+    files = _find_pictures(folder, images, frames)
+    if not files:
         raise BadInput(f"{source}: none of its {len(frames)} frames has a picture; name their folder as `images`")
-    pictures = unique((path.stem, path) for _, path in placed)
-    lenses, poses = {}, {}
-    for frame, path in placed:
-        lenses[path.stem] = _frame_lens({**record, **frame}, path, source)
-        poses[path.stem] = _frame_pose(frame, path.stem, source)
-    points, warning = _points(source, folder, record, lenses, poses)
-    warnings = counted(f"of the {len(frames)} frames in {source.name} have no picture", sorted(missing)), warning
-    in_order = lambda values: {name: values[name] for name in pictures}
+    missing = [frame.listed for k, frame in enumerate(frames) if k not in files]
+    root = Path(os.path.commonpath([path.parent for path in files.values()]))
+    of_path = {path.relative_to(root).as_posix(): frames[k] for k, path in files.items()}
+    if len(of_path) < len(files):
+        raise BadInput(f"{source}: two of its frames are the same picture; remove one")
+    views = name_views(list(of_path))
+    pictures = {view: root / path for view, path in views.items()}
+    placed = {view: of_path[path] for view, path in views.items()}
+    lenses = {view: load_frame_lens(each.values, pictures[view], each.source) for view, each in placed.items()}
+    poses = {view: _frame_pose(each.values, view, each.source) for view, each in placed.items()}
+    found = Poses(lenses, poses, *NO_POINTS, {})
+    points, said = _points(folder, source, frames[0].values, placed, found, pictures)
+    paths = paths_below(root, pictures)
+    warnings = (
+        counted(f"of the {len(frames)} frames in {source.name} have no picture", sorted(missing)),
+        counted("beside the test views are left out", unread),
+        *said,
+    )
     return Capture(
         "transforms",
         pictures,
-        Poses(in_order(lenses), in_order(poses), *points, {}),
+        {view: (*paths[view], each.listed) for view, each in placed.items()} | {path: (path,) for path in missing},
+        replace(found, points=points[0], colors=points[1]),
         source,
-        next(iter(pictures.values())).parent,
-        frozenset(Path(path).stem for path in missing),
+        next(iter(pictures.values())).parent if len({path.parent for path in pictures.values()}) == 1 else root,
+        frozenset(missing),
         tuple(filter(None, warnings)),
+        tuple(view for view, each in placed.items() if each.split in ("test", "val")),
+        _named_files(folder, placed, "mask_path"),
     )
 
 
 def read_cameras(folder: Path) -> Poses:
     """The lenses and poses alone, of a capture whose pictures are not there; their sizes are the file's w and h."""
-    source = folder / "transforms.json"
-    record = load_json(source)
+    frames = [each for split, source in split_files(folder).items() for each in _load_frames(source, split)]
+    listed = {normalize_path(each.listed): each for each in frames}
+    if len(listed) < len(frames):
+        twice = next(path for path in listed if sum(normalize_path(each.listed) == path for each in frames) > 1)
+        raise BadInput(f"{frames[0].source}: two frames are called '{Path(twice).stem}'; rename one")
     lenses, poses = {}, {}
-    for frame in _frames(record, source):
-        path, values = Path(frame["file_path"].replace("\\", "/")), {**record, **frame}
-        if path.stem in lenses:
-            raise BadInput(f"{source}: two frames are called '{path.stem}'; rename one")
-        if "w" not in values or "h" not in values:
-            raise BadInput(f"{source}: neither pictures nor w and h of '{path.name}'; give its size in pixels")
-        lenses[path.stem] = _valid(_lens(values, path, source, (0, 0)), path, source)
-        poses[path.stem] = _frame_pose(frame, path.stem, source)
-    in_order = lambda values: dict(sorted(values.items()))
-    return Poses(in_order(lenses), in_order(poses), *NO_POINTS, {})
+    for view, path in name_views(list(listed)).items():
+        each = listed[path]
+        if "w" not in each.values or "h" not in each.values:
+            raise BadInput(
+                f"{each.source}: neither pictures nor w and h of '{Path(path).name}'; give its size in pixels"
+            )
+        lenses[view] = frame_lens(each.values, Path(path), each.source, (0, 0))
+        poses[view] = _frame_pose(each.values, view, each.source)
+    return Poses(lenses, poses, *NO_POINTS, {})
 
 
 def has_pictures(folder: Path) -> bool:
     """Is a picture of one of its frames there?"""
-    source = folder / "transforms.json"
-    return any(_frame_file(folder, None, frame["file_path"]) for frame in _frames(load_json(source), source))
+    frames = [each for split, source in split_files(folder).items() for each in _load_frames(source, split)]
+    return bool(_find_pictures(folder, None, frames))
+
+
+def _load_frames(source: Path, split: str) -> list[Frame]:
+    record = load_json(source)
+    return [Frame({**record, **frame}, frame["file_path"], source, split) for frame in _frames(record, source)]
 
 
 def _frames(record: object, source: Path) -> list[dict]:
@@ -103,16 +145,37 @@ def _is_path(value: object) -> bool:
     return isinstance(value, str) and bool(Path(value).name) and "\0" not in value
 
 
-def _frame_file(folder: Path, images: str | None, listed: str) -> Path | None:
-    """The frame's picture: as listed, or by its name in the folder `images`; usual endings are tried."""
-    listed_path = Path(listed.replace("\\", "/"))
-    base = folder / listed_path if images is None else folder / images / listed_path.name
+def _find_pictures(folder: Path, images: str | None, frames: list[Frame]) -> dict[int, Path]:
+    """Number of a frame -> its picture, of those that have one.
+
+    As listed, the ending may be missing; with `images`, or where none is as listed, the pictures of that folder or of a
+    usual one that are called like it (`pair_pictures`): paths of another machine, or of another size's folder.
+    """
+    listed = {k: path for k, frame in enumerate(frames) if (path := _as_listed(folder, frame.listed)) is not None}
+    if images is None and listed:
+        return listed
+    for place in [images] if images is not None else USUAL:
+        names = list_pictures(folder / place, nested=True)
+        pairs = pair_pictures({k: frame.listed for k, frame in enumerate(frames)}, names)
+        if pairs:
+            return {k: folder / place / name for k, name in sorted(pairs.items())}
+    return {}
+
+
+def _as_listed(folder: Path, listed: str) -> Path | None:
+    """The file of a path in the record, usual endings tried; None where it is not there."""
+    base = folder / listed.replace("\\", "/")
     if base.suffix.lower() in ENDINGS:
         there(base)  # a folder or a pipe of that name is no missing picture
     candidates = [base, *(base.with_name(base.name + end) for e in ENDINGS for end in (e, e.upper()))]
-    if images is not None:
-        candidates += [base.with_suffix(end) for e in ENDINGS for end in (e, e.upper())]
     return next((path for path in candidates if path.is_file()), None)
+
+
+def _named_files(folder: Path, placed: Mapping[str, Frame], key: str) -> dict[str, Path]:
+    """View name -> the file that its frame names under a key (`mask_path`, `depth_file_path`), where it is there."""
+    named = {view: each.values[key] for view, each in placed.items() if _is_path(each.values.get(key))}
+    files = {view: folder / path.replace("\\", "/") for view, path in named.items()}
+    return {view: path for view, path in files.items() if path.is_file()}
 
 
 def _frame_pose(frame: dict, name: str, source: Path) -> np.ndarray:
@@ -129,89 +192,35 @@ def _frame_pose(frame: dict, name: str, source: Path) -> np.ndarray:
     return inverse(rigid(camera_to_world, name, source))
 
 
-def _frame_lens(values: dict, picture: Path, source: Path) -> Lens:
-    """The lens from the frame's keys over the file's, at the size of the picture."""
-    return fitted(_valid(_lens(values, picture, source, image_size(picture)), picture, source), picture)
-
-
-def _valid(lens: Lens, picture: Path, source: Path) -> Lens:
-    if min(lens.fx, lens.fy) <= 0:
-        raise BadInput(f"{source}: the focal length (or angle) of '{picture.name}' is not positive")
-    if lens.width < 1 or lens.height < 1:
-        raise BadInput(f"{source}: w and h of '{picture.name}' are {lens.width}x{lens.height}; give its size in pixels")
-    return lens
-
-
-def _number(values: dict, key: str, default: float, picture: Path, source: Path) -> float:
-    value = values.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e12:
-        raise BadInput(f"{source}: {key} = {shortened(value)} of '{picture.name}' is no finite number")
-    return float(value)
-
-
-def _lens(values: dict, picture: Path, source: Path, size: tuple[int, int]) -> Lens:
-    number = lambda key, default=0.0: _number(values, key, default, picture, source)
-    width, height = number("w", size[0]), number("h", size[1])
-    fx = _focal_length(values, "x", width, number)
-    if fx is None:
-        raise BadInput(f"{source}: neither fl_x nor camera_angle_x for '{picture.name}'; one of them is needed")
-    fy = _focal_length(values, "y", height, number)
-    model = values.get("camera_model", "OPENCV")
-    model = model.upper() if isinstance(model, str) else shortened(model)
-    fisheye = "FISHEYE" in model or bool(values.get("is_fisheye", False))
-    if model not in MODELS:
-        raise BadInput(f"{source}: camera_model {shortened(model)} is not understood; one of {', '.join(MODELS)}")
-    k = [number(f"k{i}") for i in range(1, 7)]
-    rational = model == "FULL_OPENCV"
-    return Lens(
-        round(width),
-        round(height),
-        fx,
-        fx if fy is None else fy,
-        number("cx", width / 2),
-        number("cy", height / 2),
-        radial=_trimmed(k[:3] if rational else k[:4]),
-        denominator=_trimmed(k[3:]) if rational else (),
-        tangential=(0.0, 0.0) if fisheye else (number("p1"), number("p2")),
-        fisheye=fisheye,
-        model=model,
-    )
-
-
-def _focal_length(values: dict, axis: str, extent: float, number: Callable[..., float]) -> float | None:
-    """Pixels along one axis of `extent` pixels, from the focal length or else the angle of view; None without."""
-    if f"fl_{axis}" in values:
-        return number(f"fl_{axis}")
-    if f"camera_angle_{axis}" in values:
-        angle = number(f"camera_angle_{axis}")
-        return 0.5 * extent / float(np.tan(0.5 * angle)) if 0 < angle < np.pi else 0.0
-    return None
-
-
-def _trimmed(coefficients: list[float]) -> tuple[float, ...]:
-    """Without the zeros at the end."""
-    while coefficients and coefficients[-1] == 0.0:
-        coefficients = coefficients[:-1]
-    return tuple(coefficients)
-
-
 def _points(
-    source: Path, folder: Path, record: dict, lenses: dict[str, Lens], poses: dict[str, np.ndarray]
-) -> tuple[tuple[np.ndarray, np.ndarray], str | None]:
-    """The points of `ply_file_path` (or sparse_pc.ply), in the frame of the poses; and a warning, or None.
+    folder: Path,
+    source: Path,
+    record: dict[str, Any],
+    placed: Mapping[str, Frame],
+    poses: Poses,
+    pictures: Mapping[str, Path],
+) -> tuple[Brought, list[str | None]]:
+    """The points of `ply_file_path` (or sparse_pc.ply) in the frame of the poses, else of the frames' depth maps; and
+    sentences about what is not used.
 
     `applied_transform` and `applied_scale` say what was done to poses and points alike: there is nothing to undo.
     """
     listed = record.get("ply_file_path")
     if listed is not None and not _is_path(listed):
         raise BadInput(f"{source}: ply_file_path = {shortened(listed)} is no file's name")
-    path = folder / (listed or "sparse_pc.ply")
-    if not there(path):
-        return NO_POINTS, f"{path}: named by transforms.json, but missing" if listed else None
-    points, colors = load_points(path)
-    finite = np.isfinite(points).all(axis=1)
-    points, colors = points[finite], colors[finite]
-    shares = [len(depths_in_view(points, poses[name], lens)) for name, lens in lenses.items()]
-    if len(points) == 0 or np.median(shares) < 0.02 * len(points):
-        return NO_POINTS, f"{path}: its points are not in the frame of the poses and are not used"
-    return (points, colors), None
+    path = folder / (listed.replace("\\", "/") if listed else "sparse_pc.ply")
+    said: list[str | None] = []
+    if there(path):
+        points, refused = keep_points_in_frame(path, load_points(path), poses, pictures)
+        if len(points[0]):
+            return points, []
+        said.append(refused)
+    elif listed:
+        said.append(f"{path}: named by {source.name}, but missing")
+    if depths := _named_files(folder, placed, "depth_file_path"):
+        scale = read_number(record, "integer_depth_scale", 1e-3, path, source)
+        made = points_from_depth(depths, scale, pictures, poses.lenses, poses.world_to_camera)
+        kept, refused = keep_points_in_frame(next(iter(depths.values())).parent, made, poses, pictures)
+        said.append(refused or f"{len(kept[0])} points are made of the depth maps that {source.name} names")
+        return kept, said
+    return NO_POINTS, said

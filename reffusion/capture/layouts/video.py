@@ -68,6 +68,11 @@ def take(video: Path, folder: Path, content: str) -> str:
         BadInput: it is no video, too short, shows the same all the time, or is blurred throughout.
     """
     seen = look(video)
+    if not seen:
+        raise BadInput(
+            f"{video}: OpenCV opens it and decodes no frame of it (codec {_codec(video)}); convert it, as in "
+            f"`ffmpeg -i {video.name} -c:v libx264 {video.stem}-h264.mp4`"
+        )
     if len(seen) < FEWEST:
         raise BadInput(f"{video}: {len(seen)} frames; a video that walks around the scene has hundreds")
     if seen[-1].way < STILL:
@@ -108,6 +113,14 @@ def _count(video: Path) -> int:
         count = sum(1 for _ in iter(opened.grab, False))
     opened.release()
     return count
+
+
+def _codec(video: Path) -> str:
+    """Four letters, as `av01`."""
+    opened = _opened(video)
+    code = int(opened.get(cv2.CAP_PROP_FOURCC))
+    opened.release()
+    return "".join(letter for k in range(4) if (letter := chr(code >> 8 * k & 255)).isalnum()) or "unknown"
 
 
 def sharpness(gray: np.ndarray) -> float:

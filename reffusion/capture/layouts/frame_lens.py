@@ -1,0 +1,103 @@
+"""Lenses as the frames of transforms.json give them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reffusion.capture.layouts.capture import fitted
+from reffusion.capture.lens import Lens
+from reffusion.io.files import BadInput, shortened
+from reffusion.io.images import image_size
+
+MODELS = (
+    "SIMPLE_PINHOLE",
+    "PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "FULL_OPENCV",
+    "OPENCV_FISHEYE",
+    "SIMPLE_FISHEYE",
+    "FISHEYE",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+)
+
+
+def load_frame_lens(values: dict[str, Any], picture: Path, source: Path) -> Lens:
+    """The lens of a frame at the size of its picture; see `frame_lens`."""
+    return fitted(frame_lens(values, picture, source, image_size(picture)), picture)
+
+
+def frame_lens(values: dict[str, Any], picture: Path, source: Path, size: tuple[int, int]) -> Lens:
+    """The lens that a frame's keys give.
+
+    Args:
+        values: the frame's keys over the file's.
+        picture, source: for messages.
+        size: (width, height) where w and h are missing.
+    """
+    lens = _lens(values, picture, source, size)
+    if min(lens.fx, lens.fy) <= 0:
+        raise BadInput(f"{source}: the focal length (or angle) of '{picture.name}' is not positive")
+    if lens.width < 1 or lens.height < 1:
+        raise BadInput(f"{source}: w and h of '{picture.name}' are {lens.width}x{lens.height}; give its size in pixels")
+    return lens
+
+
+def read_number(values: dict[str, Any], key: str, default: float, picture: Path, source: Path) -> float:
+    """A number of a frame; BadInput where it is none, or not finite."""
+    value = values.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e12:
+        raise BadInput(f"{source}: {key} = {shortened(value)} of '{picture.name}' is no finite number")
+    return float(value)
+
+
+def _lens(values: dict[str, Any], picture: Path, source: Path, size: tuple[int, int]) -> Lens:
+    number = lambda key, default=0.0: read_number(values, key, default, picture, source)
+    width, height = number("w", size[0]), number("h", size[1])
+    fx = _focal_length(values, "x", width, number)
+    if fx is None:
+        raise BadInput(f"{source}: neither fl_x nor camera_angle_x for '{picture.name}'; one of them is needed")
+    fy = _focal_length(values, "y", height, number)
+    model = values.get("camera_model", "OPENCV")
+    model = model.upper() if isinstance(model, str) else shortened(model)
+    fisheye = "FISHEYE" in model or bool(values.get("is_fisheye", False))
+    if model not in MODELS:
+        raise BadInput(f"{source}: camera_model {shortened(model)} is not understood; one of {', '.join(MODELS)}")
+    k = [number(f"k{i}") for i in range(1, 7)]
+    rational = model == "FULL_OPENCV"
+    return Lens(
+        round(width),
+        round(height),
+        fx,
+        fx if fy is None else fy,
+        number("cx", width / 2),
+        number("cy", height / 2),
+        radial=_trimmed(k[:3] if rational else k[:4]),
+        denominator=_trimmed(k[3:]) if rational else (),
+        tangential=(0.0, 0.0) if fisheye else (number("p1"), number("p2")),
+        fisheye=fisheye,
+        model=model,
+    )
+
+
+def _focal_length(values: dict[str, Any], axis: str, extent: float, number: Callable[..., float]) -> float | None:
+    """Pixels along one axis of `extent` pixels, from the focal length or else the angle of view; None without."""
+    if f"fl_{axis}" in values:
+        return number(f"fl_{axis}")
+    if f"camera_angle_{axis}" in values:
+        angle = number(f"camera_angle_{axis}")
+        return 0.5 * extent / float(np.tan(0.5 * angle)) if 0 < angle < np.pi else 0.0
+    return None
+
+
+def _trimmed(coefficients: list[float]) -> tuple[float, ...]:
+    """Without the zeros at the end."""
+    while coefficients and coefficients[-1] == 0.0:
+        coefficients = coefficients[:-1]
+    return tuple(coefficients)

@@ -1,0 +1,158 @@
+"""Masks that a scene brings: where they lie, which view each belongs to, and which of them are of one object."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from reffusion.capture.layouts.capture import Capture
+from reffusion.capture.layouts.names import is_mask_of_another, pair_masks, strip_ending
+from reffusion.io.files import BadInput
+from reffusion.io.images import ENDINGS, WHITE, MaskValues
+from reffusion.params.poses import Masks
+
+NONE = "none"
+USUAL = ("masks", "mask", "label")  # of the scene's folder, after `label` inside the folder of pictures
+
+
+@dataclass(frozen=True)
+class FoundMasks:
+    """Attributes:
+    files: object -> view -> mask; "" is the object of masks that tell none apart. Empty without masks.
+    values: which pixel values are the object.
+    warning: what the user should know, a sentence, or None.
+    """
+
+    files: dict[str, dict[str, Path]]
+    values: MaskValues = WHITE
+    warning: str | None = None
+
+
+def find_masks(folder: Path, capture: Capture, asked: str | Masks | None, optional: bool) -> FoundMasks:
+    """The masks of a scene, each checked to have its picture.
+
+    Args:
+        asked: the parameter `masks` (`reffusion.params.poses`).
+        optional: the scene may lack masks.
+
+    Raises:
+        BadInput: naming the file or folder and the remedy.
+    """
+    named = asked if isinstance(asked, Masks) else Masks(folder=asked)
+    if named.folder is not None and named.folder.lower() == NONE:
+        return FoundMasks({})
+    values = MaskValues(named.numbers)
+    if named.folder is not None:
+        place = folder / named.folder
+        if not (files := _files_of(place, capture)):
+            inside = any(place in path.parents for path in capture.pictures.values())
+            why = (
+                "it holds photographs, and no mask beside one (A_mask.png beside A.png)" if inside else "no masks there"
+            )
+            raise BadInput(f"{place}: {why}; correct `masks` in scene.yaml")
+        return FoundMasks(objects_of_masks(place, files, capture), values)
+    places = [capture.label_folder / "label", *(folder / name for name in USUAL)]
+    beside = _pictures_folder(capture)
+    ignored = set(capture.ignore_masks.values())
+    for place in (*(p for p in places if p != capture.label_folder), *([beside] if beside else [])):
+        files = _files_of(place, capture)
+        if files and not {place / path for path in files} <= ignored:
+            return FoundMasks(objects_of_masks(place, files, capture), values)
+    if ignored:
+        said = f"mask_path of {capture.brought_by.name}: black, which training ignores, is taken for the object"
+        return FoundMasks({"": capture.ignore_masks}, MaskValues(named.numbers, inverted=True), said)
+    if optional:
+        return FoundMasks({})
+    raise BadInput(
+        f"{folder}: no mask at all (looked for {', '.join(str(p.relative_to(folder)) for p in places)}); click on "
+        f"the object (`make scene={folder} mask`, or `clicks` in scene.yaml), add a mask for each picture, name "
+        "their folder as `masks` or a box as `region` in scene.yaml, or say `masks: none` to fit and render only"
+    )
+
+
+def _pictures_folder(capture: Capture) -> Path | None:
+    """The folder that all pictures lie in, or None."""
+    parents = {path.parent for path in capture.pictures.values()}
+    return parents.pop() if len(parents) == 1 else None
+
+
+def _files_of(place: Path, capture: Capture) -> list[str]:
+    """Paths of the masks below a folder; where photographs lie too, only those called `A_mask.png` beside `A.png`."""
+    if not place.is_dir():
+        return []
+    found = sorted(
+        path.relative_to(place).as_posix()
+        for path in place.rglob("*")
+        if path.suffix.lower() in ENDINGS and not any(part.startswith(".") for part in path.relative_to(place).parts)
+    )
+    if not {place / path for path in found} & set(capture.pictures.values()):
+        return found
+    stems = {strip_ending(path) for path in found}
+    return [path for path in found if is_mask_of_another(strip_ending(path), stems)]
+
+
+def objects_of_masks(place: Path, files: Collection[str], capture: Capture) -> dict[str, dict[str, Path]]:
+    """Object -> view -> mask of the files below a folder.
+
+    Sub-folders are objects where a view has masks in several of them, or where there is only one. Sub-folders of which
+    each view has a mask in one hold the masks of one object: those of pictures that lie in folders themselves.
+
+    Raises:
+        BadInput: a mask belongs to no picture, or two to one; masks lie beside folders of masks.
+    """
+    folders = {PurePosixPath(path).parts[0] for path in files if "/" in path}
+    if not folders or _hold_pictures(folders, capture):
+        return {"": _checked(place, match_masks(place, files, capture), capture)}
+    if any("/" not in path for path in files):
+        raise BadInput(
+            f"{place}: holds masks and folders of masks ({', '.join(sorted(folders))}); put them into one folder for "
+            "each object, or all into one"
+        )
+    whole = match_masks(place, files, capture, strict=False)
+    if len(folders) > 1 and len(set(whole.values())) == len(files):
+        return {"": _checked(place, whole, capture)}
+    found = {}
+    for name in sorted(folders):
+        mine = [path.removeprefix(f"{name}/") for path in files if path.startswith(f"{name}/")]
+        found[name] = _checked(place / name, match_masks(place / name, mine, capture), capture)
+    return found
+
+
+def _hold_pictures(folders: Collection[str], capture: Capture) -> bool:
+    """Are they all folders in which pictures lie?"""
+    ours = {part for paths in capture.paths.values() for path in paths for part in PurePosixPath(path).parent.parts}
+    return set(folders) <= ours
+
+
+def match_masks(place: Path, files: Collection[str], capture: Capture, strict: bool = True) -> dict[str, str]:
+    """Mask -> the view, or the picture that is left out, it belongs to.
+
+    Raises:
+        BadInput: with `strict`, where one belongs to none.
+    """
+    everything = {name: (name, *paths) for name, paths in capture.paths.items()}
+    found = pair_masks(files, everything)
+    views = {name: paths for name, paths in everything.items() if name in capture.pictures}
+    found |= pair_masks([path for path in files if path not in found], views)
+    if strict and (lone := sorted(set(files) - found.keys())):
+        if view := pair_masks(lone[:1], everything).get(lone[0]):
+            twin = next(path for path in files if path != lone[0] and pair_masks([path], everything).get(path) == view)
+            raise BadInput(f"{place / lone[0]}: the view '{view}' has another mask, {place / twin}; remove one")
+        name = PurePosixPath(strip_ending(lone[0])).name
+        if several := sorted(v for v in views if name in {PurePosixPath(strip_ending(p)).name for p in views[v]}):
+            raise BadInput(
+                f"{place / lone[0]}: {' and '.join(several)} are called so; put masks into folders as pictures are"
+            )
+        raise BadInput(f"{place / lone[0]}: a mask for no picture; name it like its picture, or remove it")
+    return found
+
+
+def _checked(place: Path, views: Mapping[str, str], capture: Capture) -> dict[str, Path]:
+    """View -> mask, sorted; BadInput where a view has two."""
+    result: dict[str, Path] = {}
+    for path, view in sorted(views.items()):
+        if view in result:
+            raise BadInput(f"{place / path}: '{view}' has another mask, {result[view]}; remove one")
+        result[view] = place / path
+    return {view: result[view] for view in sorted(result) if view in capture.pictures}

@@ -1,0 +1,117 @@
+"""Whether sparse points lie in the frame of the cameras, and in that of their pictures.
+
+People replace the points of a model by another cloud, or the order of its pictures is lost. Where the geometry cannot
+tell (a cloud of another scale around the same middle), colours can: a point shows in its views what it is coloured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from reffusion.capture.frame import depths_in_view
+from reffusion.capture.layouts.capture import NO_POINTS, Brought, Poses
+from reffusion.capture.lens import Lens, to_pixels
+from reffusion.io.colmap import ModelPoints
+from reffusion.io.images import load_thumbnail
+
+INSIDE = 0.02  # share of the points that the median view must show
+TRACKED = 0.9  # share of the observations that must lie inside the view that made them
+VIEWS, POINTS = 8, 4000  # that colours are compared in, spread evenly
+SIDE = 320  # px, the longer side of the pictures that colours are read from
+LEAST_POINTS = 50  # in a view
+LEAST_CONTRAST = 6.0  # levels of 255: standard deviation, of points and picture, from which they can be compared
+CORRELATED = 0.2  # median correlation under which the colours contradict the frame; right ones have 0.6 and more
+GREY = np.full(3, 1 / 3)  # weights of red, green and blue
+BETTER = 0.05  # by how much another view's points must fit a picture better than its own
+
+
+def keep_points_in_frame(
+    path: Path, points: Brought, poses: Poses, pictures: Mapping[str, Path]
+) -> tuple[Brought, str | None]:
+    """The points, none where they are not in the frame of the poses; and a sentence where they are not used."""
+    finite = np.isfinite(points[0]).all(axis=1)
+    positions, colors = points[0][finite], points[1][finite]
+    refused = NO_POINTS, f"{path}: its points are not in the frame of the cameras and are not used"
+    if not len(positions):
+        return NO_POINTS, None
+    counts = [len(depths_in_view(positions, poses.world_to_camera[n], lens)) for n, lens in poses.lenses.items()]
+    if np.median(counts) < INSIDE * len(positions):
+        return refused
+    if _has_contrast(colors @ GREY):
+        names = list(pictures)[:: -(-len(pictures) // VIEWS)]
+        of_view = lambda n: (read_grey(pictures[n]), poses.lenses[n], poses.world_to_camera[n])
+        fits = np.array([correlate_colors(*of_view(name), positions, colors) for name in names])
+        if (known := ~np.isnan(fits)).any() and np.median(fits[known]) < CORRELATED:
+            return refused
+    return (positions, colors), None
+
+
+def are_tracks_inside(points: ModelPoints, poses: Mapping[int, tuple[Lens, np.ndarray]]) -> bool:
+    """Whether the points lie in front of and inside the images that their tracks name; True where none names any.
+
+    Args:
+        poses: image id -> its lens and [4, 4] world-to-camera.
+    """
+    inside = seen = 0
+    for identity, (lens, pose) in poses.items():
+        mine = points.positions[points.track_points[points.track_images == identity]]
+        inside += len(depths_in_view(mine, pose, lens))
+        seen += len(mine)
+    return inside >= TRACKED * seen
+
+
+def contradicts_order(
+    pictures: Sequence[Path], lenses: Sequence[Lens], poses: Sequence[np.ndarray], points: Brought
+) -> bool:
+    """Whether most of the pictures show the points as another view's pose puts them, rather than as their own does.
+
+    Args:
+        pictures, lenses, poses: the view k has pictures[k], lenses[k] and the [4, 4] world-to-camera poses[k].
+    """
+    if not _has_contrast(points[1] @ GREY):
+        return False
+    chosen = range(0, len(pictures), -(-len(pictures) // VIEWS))
+    wrong = said = 0
+    for k in chosen:
+        grey = read_grey(pictures[k])
+        fits = np.array([correlate_colors(grey, lens, pose, *points) for lens, pose in zip(lenses, poses, strict=True)])
+        if np.isnan(fits[k]) or np.isnan(fits).sum() > len(fits) / 2:
+            continue
+        said += 1
+        wrong += np.nanmax(fits) > fits[k] + BETTER
+    return bool(said) and 2 * wrong > said
+
+
+def correlate_colors(
+    grey: np.ndarray, lens: Lens, pose: np.ndarray, positions: np.ndarray, colors: np.ndarray
+) -> float:
+    """Correlation of the points' brightness with a picture's, where the pose puts them; NaN where too few are seen or
+    either is plain.
+
+    Args:
+        grey: [H, W] of any size. lens: of the same view at any size. pose: [4, 4] world-to-camera.
+        positions: [P, 3]. colors: uint8 [P, 3].
+    """
+    some = slice(None, None, max(1, len(positions) // POINTS))
+    at = positions[some] @ pose[:3, :3].T + pose[:3, 3]
+    front = at[:, 2] > 1e-9
+    with np.errstate(all="ignore"):
+        uv = to_pixels(at[front, :2] / at[front, 2:], lens) / (lens.width, lens.height)
+        shown = ((uv > 0) & (uv < 1)).all(axis=1)
+    columns, rows = ((uv[shown] * grey.shape[::-1]).astype(int).T) if shown.any() else np.zeros((2, 0), int)
+    seen, own = grey[rows, columns], colors[some][front][shown] @ GREY
+    if len(own) < LEAST_POINTS or not (_has_contrast(seen) and _has_contrast(own)):
+        return float("nan")
+    return float(np.corrcoef(seen, own)[0, 1])
+
+
+def read_grey(path: Path) -> np.ndarray:
+    """float64 [h, w], at most `SIDE` px."""
+    return load_thumbnail(path, SIDE) @ GREY
+
+
+def _has_contrast(values: np.ndarray) -> bool:
+    return len(values) > 0 and float(values.std()) > LEAST_CONTRAST
