@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from small_capture import HEIGHT, WIDTH, Truth, run
+from small_capture import HEIGHT, WIDTH, Truth, reprojection_error, run
 
 from reffusion.io import colmap
 from reffusion.io.files import BadInput
@@ -26,12 +26,13 @@ OBJECT[HEIGHT // 4 : HEIGHT // 2, WIDTH // 4 : WIDTH // 2] = True
 
 
 def attempt(folder: Path, **params) -> tuple[Scene, Path, list[str]]:
-    """Preview and run `poses`: the scene, its folder, and all sentences that either says."""
+    """Preview and run `poses`: the scene, its folder, and all sentences that either says, paths below `folder`."""
     sentences = preview(poses.Params(**params), folder)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         scene, out = run(folder, **params)
-    return scene, out, [*sentences, *(str(each.message) for each in caught)]
+    sentences += [str(each.message) for each in caught]
+    return scene, out, [each.replace(str(folder), "") for each in sentences]  # whose path may hold any word or number
 
 
 def assert_sentence(sentences: Iterable[str], *words: str) -> None:
@@ -58,8 +59,19 @@ def refusal_before_work(folder: Path, **params) -> str:
         warnings.simplefilter("ignore")
         preview(poses.Params(**params), folder)
         poses.run(poses.Params(**params), out, scene=folder)
-    assert "\n" not in str(caught.value) and not list(out.iterdir())
+    written = sorted(path.name for path in out.iterdir())
+    assert "\n" not in str(caught.value) and not written, (str(caught.value), written)
     return str(caught.value)
+
+
+def assert_cameras(scene: Scene, truth: Truth) -> None:
+    """Poses and, of pinhole cameras, intrinsics are those of the truth."""
+    assert reprojection_error(scene, truth) < EXACT
+    at = truth.lens
+    for name in truth.world_to_camera:
+        camera = scene.cameras[name]
+        found = (camera.fx, camera.fy, camera.cx, camera.cy)
+        assert found == pytest.approx((at.fx, at.fy, at.cx, at.cy), abs=EXACT), name
 
 
 def renamed(truth: Truth, names: Mapping[str, str]) -> Truth:
@@ -109,5 +121,6 @@ def masked_views(out: Path) -> list[str]:
 def assert_masked(out: Path, views: Iterable[str], share: float = SHARE) -> None:
     """Exactly these views have a mask, of the share, and no objects are told apart."""
     views = sorted(views)
-    assert masked_views(out) == views
-    assert [masked_share(out, view) for view in views] == pytest.approx([share] * len(views), abs=1e-3)
+    assert masked_views(out) == views, masked_views(out)
+    shares = [masked_share(out, view) for view in views]
+    assert shares == pytest.approx([share] * len(views), abs=1e-3), shares
