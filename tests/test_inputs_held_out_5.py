@@ -1,0 +1,94 @@
+"""Held-out variants of the inputs that people bring, rows K and R: photographs without poses of other formats, and of
+two orientations.
+
+The letter in a test's name is its row in the list of inputs that went wrong.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from held_out import attempt
+from PIL import Image
+from test_sfm import draw_corner, errors_after_alignment, noise, walk
+
+ORIENTATION, EXIF_FOLDER, FOCAL_35_MM = 0x0112, 0x8769, 0xA405
+
+
+def textures() -> np.ndarray:
+    generator = np.random.default_rng(0)
+    return np.stack([noise(generator) for _ in range(3)])
+
+
+def exif(orientation: int = 1) -> Image.Exif:
+    """As of a phone whose focal length is the drawn one, 170 px of 200."""
+    result = Image.Exif()
+    result[ORIENTATION] = orientation
+    result.get_ifd(EXIF_FOLDER)[FOCAL_35_MM] = round(36 * 170 / 200)
+    return result
+
+
+def save_walk(folder: Path, ending: str, **options) -> dict[str, np.ndarray]:
+    truth, surfaces = walk(6), textures()
+    folder.mkdir(parents=True)
+    for name, pose in truth.items():
+        Image.fromarray(draw_corner(pose, surfaces)).save(folder / f"{name}{ending}", **options)
+    return truth
+
+
+def assert_placed(scene, truth: dict[str, np.ndarray]) -> None:
+    """All views, rotations within 2 degrees and centres within 2 % of their extent."""
+    assert sorted(scene.train) == sorted(truth)
+    degrees, shifts = errors_after_alignment(scene, truth)
+    assert degrees.max() < 2 and shifts.max() < 0.02
+
+
+def test_K_lossy_webp_with_focal_lengths_in_capitals(tmp_path):
+    truth = save_walk(tmp_path / "s/images", ".WEBP", format="WEBP", quality=92, exif=exif())
+    scene, _, _ = attempt(tmp_path / "s", masks="none")
+    assert_placed(scene, truth)
+
+
+def test_K_webp_saved_by_a_browser_as_jpg(tmp_path):
+    truth = save_walk(tmp_path / "s", ".jpg", format="WEBP", lossless=True)
+    scene, _, _ = attempt(tmp_path / "s", masks="none")
+    assert_placed(scene, truth)
+
+
+def save_both_ways(folder: Path, portrait: set[int], save) -> dict[str, np.ndarray]:
+    """A walk of nine views, those in `portrait` with the phone upright; `save` takes path, picture, whether it is."""
+    truth, surfaces = walk(9), textures()
+    folder.mkdir(parents=True)
+    for k, (name, pose) in enumerate(truth.items()):
+        size = (150, 200) if k in portrait else (200, 150)
+        save(folder / name, Image.fromarray(draw_corner(pose, surfaces, size)), k in portrait)
+    return truth
+
+
+def assert_both_ways(scene, truth: dict[str, np.ndarray], portrait: set[int]) -> None:
+    assert_placed(scene, truth)
+    for k, name in enumerate(truth):
+        camera = scene.cameras[name]
+        assert (camera.width < camera.height) == (k in portrait), name
+
+
+def test_R_turned_by_their_tag(tmp_path):
+    """A phone stores all lying, and says in a tag which to turn."""
+
+    def save(path: Path, picture: Image.Image, upright: bool) -> None:
+        stored = picture.transpose(Image.Transpose.ROTATE_90) if upright else picture
+        stored.save(path.with_suffix(".jpg"), quality=95, exif=exif(6 if upright else 1))
+
+    portrait = {2, 5, 6, 8}
+    truth = save_both_ways(tmp_path / "s/images", portrait, save)
+    scene, _, _ = attempt(tmp_path / "s", masks="none")
+    assert_both_ways(scene, truth, portrait)
+
+
+def test_R_stored_upright_without_tags(tmp_path):
+    portrait = {0, 3, 4}
+    save = lambda path, picture, upright: picture.save(path.with_suffix(".png"))
+    truth = save_both_ways(tmp_path / "s/photos", portrait, save)
+    scene, _, _ = attempt(tmp_path / "s", masks="none")
+    assert_both_ways(scene, truth, portrait)
