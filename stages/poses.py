@@ -192,11 +192,14 @@ def _refined(scene: Scene, out: Path) -> Scene:
     """The scene with cameras that agree with optical flow; test views too, as they are in structure from motion."""
     shown = {name: camera for name, camera in scene.cameras.items() if name not in scene.blank}
     found = refined(list(shown.values()), load_views(out, shown))
-    if found.after is None:
+    if np.isnan(found.before):
+        print("cameras as given: optical flow matches nothing between the views", flush=True)
+    elif found.after is None:
         print(f"cameras as given: the views miss each other by {found.before:.2f} px", flush=True)
     else:
         print(f"cameras adjusted: views missed each other by {found.before:.2f} px, now {found.after:.2f}", flush=True)
-    save_json(out / "refine.json", {"before": found.before, "after": found.after})
+    before = None if np.isnan(found.before) else found.before
+    save_json(out / "refine.json", {"before": before, "after": found.after})
     return replace(scene, cameras=scene.cameras | found.cameras)
 
 

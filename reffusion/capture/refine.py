@@ -93,7 +93,7 @@ def _shift(camera: Camera, given: Camera) -> float:
 
 def misfit(matches: Sequence[stereo.Matches], cameras: Mapping[str, Camera], cell: int) -> float:
     """Mean over blocks of the pictures of the length of the median vector, px, by which flow misses the points that it
-    was triangulated to: what cameras get wrong, for flow's own noise has no direction. 0 where nothing matches.
+    was triangulated to: what cameras get wrong, for flow's own noise has no direction. NaN where nothing matches.
     """
     lengths = []
     for match in matches:
@@ -105,7 +105,7 @@ def misfit(matches: Sequence[stereo.Matches], cameras: Mapping[str, Camera], cel
                 here = vectors[usable & (block == index)]
                 if len(here) >= LEAST_IN_BLOCK:
                     lengths.append(np.linalg.norm(np.median(here, 0)))
-    return float(np.mean(lengths)) if lengths else 0.0
+    return float(np.mean(lengths)) if lengths else float("nan")
 
 
 def _tracks(matches: Sequence[stereo.Matches], cameras: Mapping[str, Camera]):

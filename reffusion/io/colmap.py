@@ -124,7 +124,7 @@ _ONE_FOCAL_LENGTH = (
 
 def _cameras_binary(path: Path) -> dict[int, ModelCamera]:
     file, cameras = Cursor(path), {}
-    for _ in range(file.count(48)):
+    for _ in range(file.count(40)):
         identity, model, width, height = file.read("IiQQ")
         if not 0 <= model < len(NAMES):
             raise BadInput(f"{path}: unknown camera model number {model}")

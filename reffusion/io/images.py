@@ -18,6 +18,7 @@ HEIC = (".heic", ".heif")  # of phones
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", *HEIC)  # of pictures, in small letters
 
 # What is read under these names; other kinds that Pillow knows call programs, or are not for photographs.
+DARK = 8  # levels up to which a mask's background may be grey
 FLAT = 0.002  # share of a mask that a value fills where it is a number and no soft edge
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM", "HEIF")
 _HEIC_BRANDS = tuple(
@@ -197,7 +198,7 @@ def _white(path: Path, image: Image.Image) -> np.ndarray:
         return array > 0
     half = 32768 if array.max() > 255 else 128
     levels = _flat_levels(array) if image.format != "JPEG" else []
-    inner = [level for level in levels if level > 0.03 * 2 * half]
+    inner = [level for level in levels if level > DARK]
     if array.max() < half or len(inner) > 1:
         found = ", ".join(str(level) for level in ([level for level in levels if level] or [array.max()])[:6])
         raise BadInput(

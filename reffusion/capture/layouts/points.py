@@ -11,21 +11,24 @@ from pathlib import Path
 
 import numpy as np
 
-from reffusion.capture.frame import depths_in_view
+from reffusion.capture.frame import camera_centers, depths_in_view
 from reffusion.capture.layouts.capture import NO_POINTS, Brought, Poses
 from reffusion.capture.lens import Lens, to_pixels
 from reffusion.io.colmap import ModelPoints
 from reffusion.io.images import load_thumbnail
 
 INSIDE = 0.02  # share of the points that the median view must show
+FARTHEST = 100.0  # times the cameras' distance from their middle: points farther away show no parallax
 TRACKED = 0.9  # share of the observations that must lie inside the view that made them
 VIEWS, POINTS = 8, 4000  # that colours are compared in, spread evenly
 SIDE = 320  # px, the longer side of the pictures that colours are read from
 LEAST_POINTS = 50  # in a view
 LEAST_CONTRAST = 6.0  # levels of 255: standard deviation, of points and picture, from which they can be compared
-CORRELATED = 0.2  # median correlation under which the colours contradict the frame; right ones have 0.6 and more
+CORRELATED = (
+    0.25  # median correlation under which colours contradict the frame: right clouds have .47 to .57, others up to .22
+)
 GREY = np.full(3, 1 / 3)  # weights of red, green and blue
-BETTER = 0.05  # by how much another view's points must fit a picture better than its own
+BETTER = 0.02  # by how much another view's points must fit a picture better than its own
 
 
 def keep_points_in_frame(
@@ -37,8 +40,12 @@ def keep_points_in_frame(
     refused = NO_POINTS, f"{path}: its points are not in the frame of the cameras and are not used"
     if not len(positions):
         return NO_POINTS, None
-    counts = [len(depths_in_view(positions, poses.world_to_camera[n], lens)) for n, lens in poses.lenses.items()]
-    if np.median(counts) < INSIDE * len(positions):
+    depths = [depths_in_view(positions, poses.world_to_camera[name], lens) for name, lens in poses.lenses.items()]
+    if np.median([len(z) for z in depths]) < INSIDE * len(positions):
+        return refused
+    centers = camera_centers(np.stack([*poses.world_to_camera.values()]))
+    apart = np.linalg.norm(centers - centers.mean(0), axis=1).max()
+    if apart > 0 and np.median([np.median(z) for z in depths if len(z)]) > FARTHEST * apart:
         return refused
     if _has_contrast(colors @ GREY):
         names = list(pictures)[:: -(-len(pictures) // VIEWS)]

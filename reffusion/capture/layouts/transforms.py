@@ -221,6 +221,6 @@ def _points(
         scale = read_number(record, "integer_depth_scale", 1e-3, path, source)
         made = points_from_depth(depths, scale, pictures, poses.lenses, poses.world_to_camera)
         kept, refused = keep_points_in_frame(next(iter(depths.values())).parent, made, poses, pictures)
-        said.append(refused or f"{len(kept[0])} points are made of the depth maps that {source.name} names")
+        said.append(refused or f"{len(kept[0])} points are made of the depth maps (depth_file_path) of {source.name}")
         return kept, said
     return NO_POINTS, said

@@ -1,0 +1,469 @@
+"""Captures as other programs write them: each is read with the right cameras and masks, or refused in one line."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import unicodedata
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from small_capture import (
+    HEIGHT,
+    PINHOLE,
+    WIDTH,
+    Truth,
+    prepare,
+    run,
+    some_truth,
+    write_masks,
+    write_model,
+    write_pictures,
+    write_poses_bounds,
+    write_transforms,
+)
+
+from reffusion.capture.lens import sampling_map, without_distortion
+from reffusion.capture.reading import read_scene
+from reffusion.io import colmap
+from reffusion.io.arrays import load_json
+from reffusion.io.files import BadInput
+from reffusion.io.images import load_mask
+from reffusion.io.ply import save_points
+from reffusion.io.scene import load_raw_masks, load_views, objects_of
+from reffusion.params.poses import Params
+from reffusion.types import Scene
+from stages.plan import poses as plan
+
+SHARE = 1 / 16  # of a picture that `write_masks` masks
+
+
+def read(folder: Path, **params) -> tuple[Scene, Path, str]:
+    """`poses` run on a folder: the scene, its artifact, and what it warns of."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        scene, out = run(folder, **params)
+    return scene, out, "\n".join(str(each.message) for each in said)
+
+
+def assert_cameras(scene: Scene, truth: Truth, views: dict[str, str]) -> None:
+    """Poses and intrinsics of `views` (ours -> the truth's)."""
+    assert sorted(scene.cameras) == sorted(views)
+    similarity, at = scene.similarity, without_distortion(truth.lens)
+    for view, name in views.items():
+        camera, pose = scene.cameras[view], truth.world_to_camera[name]
+        center = similarity.invert(camera.center[None])[0]
+        np.testing.assert_allclose(center, -pose[:3, :3].T @ pose[:3, 3], atol=1e-5)
+        np.testing.assert_allclose(camera.world_to_camera[:3, :3], pose[:3, :3], atol=1e-6)
+        np.testing.assert_allclose(
+            (camera.fx, camera.fy, camera.cx, camera.cy), (at.fx, at.fy, at.cx, at.cy), rtol=1e-6
+        )
+
+
+def mask_shares(out: Path) -> dict[str, float]:
+    return {
+        p.relative_to(out / "masks").as_posix(): load_mask(p).mean() for p in sorted((out / "masks").rglob("*.png"))
+    }
+
+
+def write_named_model(folder: Path, truth: Truth, names: dict[str, str]) -> None:
+    """A COLMAP model whose images are called `names`: view -> name."""
+    at = truth.lens
+    cameras = {1: colmap.ModelCamera("SIMPLE_PINHOLE", WIDTH, HEIGHT, (at.fx, at.cx, at.cy))}
+    images = {
+        k: colmap.ModelImage(names[view], 1, pose)
+        for k, (view, pose) in enumerate(sorted(truth.world_to_camera.items()), start=1)
+    }
+    colmap.save_model(folder, cameras, images, truth.points, np.full((len(truth.points), 3), 99, np.uint8))
+
+
+def write_textured(folder: Path, truth: Truth, names: dict[str, str]) -> np.ndarray:
+    """Pictures of a plane with blobs of brightness, and the colours of the truth's points on it: view -> file name."""
+    generator = np.random.default_rng(0)
+    waves = generator.normal(size=(12, 3)) * 7
+    phases = generator.uniform(0, 2 * np.pi, 12)
+    shade = lambda points: 128 + 90 * np.tanh(np.sin(points @ waves.T + phases).sum(-1) / 2)
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    at = truth.lens
+    for view, name in names.items():
+        pose = truth.world_to_camera[view]
+        local = np.stack([(columns - at.cx) / at.fx, (rows - at.cy) / at.fy, np.ones_like(rows)], -1) @ pose[:3, :3]
+        center = -pose[:3, :3].T @ pose[:3, 3]
+        points = center + local * (-center[2] / local[..., 2])[..., None]
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.repeat(shade(points)[..., None], 3, 2).astype(np.uint8)).save(path)
+    return np.repeat(shade(truth.points)[:, None], 3, 1).astype(np.uint8)
+
+
+def flat_truth(views: int = 12, points: int = 400) -> Truth:
+    """The cameras of `some_truth` before points on the plane z = 0."""
+    places = np.random.default_rng(5).uniform(-0.9, 0.9, (points, 3)) * (1, 1, 0)
+    return replace(some_truth(views=views), points=places)
+
+
+# ---------------------------------------------------------------------------------------------- A: which model
+
+
+def test_the_model_with_most_images_is_taken(tmp_path):
+    truth = some_truth(views=9)
+    folder = prepare(tmp_path / "s", "colmap", truth)
+    (folder / "sparse/0").rename(folder / "sparse/1")
+    write_model(folder / "sparse/0", replace(truth, world_to_camera=dict([*truth.world_to_camera.items()][:3])))
+    scene, _, said = read(folder)
+    assert_cameras(scene, truth, {view: view for view in truth.world_to_camera})
+    assert "sparse/1 is taken, which has most images (9); not sparse/0 (3)" in said
+
+
+def test_a_lone_model_with_another_number_is_found(tmp_path):
+    truth = some_truth()
+    folder = prepare(tmp_path / "s", "colmap txt", truth)
+    (folder / "sparse/0").rename(folder / "sparse/1")
+    scene, _, said = read(folder)
+    assert_cameras(scene, truth, {view: view for view in truth.world_to_camera})
+    assert "is taken" not in said
+
+
+# ---------------------------------------------------------------------------------------------- B, C: names, folders
+
+
+@pytest.mark.parametrize("name", ["day1/{}.png", "images/{}.png", "day1\\{}.png", "C:\\scans\\day1\\{}.PNG"])
+def test_names_of_the_model_with_folders(tmp_path, name):
+    truth = some_truth()
+    folder = prepare(tmp_path / "s", "transforms", truth)
+    (folder / "transforms.json").unlink()
+    write_named_model(folder / "sparse/0", truth, {view: name.format(view) for view in truth.world_to_camera})
+    scene, out, _ = read(folder)
+    assert_cameras(scene, truth, {view: view for view in truth.world_to_camera})
+    assert len(mask_shares(out)) == 6
+
+
+@pytest.mark.parametrize("flat", [False, True], ids=["model with folders", "flat model"])
+def test_pictures_in_folders(tmp_path, flat):
+    truth, folder = some_truth(), tmp_path / "s"
+    path = {view: f"day{k % 2}/{view}.png" for k, view in enumerate(sorted(truth.world_to_camera))}
+    for view, each in path.items():
+        write_pictures(folder / "images" / Path(each).parent, [view])
+        write_masks(folder / "masks" / Path(each).parent, [view])
+    write_named_model(folder / "sparse/0", truth, {view: f"{view}.png" if flat else path[view] for view in path})
+    scene, out, _ = read(folder)
+    assert_cameras(scene, truth, {view: view for view in path})
+    assert objects_of(out) == [] and len(load_raw_masks(out, scene.train)) == 6
+
+
+def test_equal_names_in_two_folders_are_called_by_their_paths(tmp_path):
+    truth, folder = some_truth(), tmp_path / "s"
+    path = {view: f"cam{k % 2}/{k // 2:04d}.png" for k, view in enumerate(sorted(truth.world_to_camera))}
+    for each in path.values():
+        write_pictures(folder / "images" / Path(each).parent, [Path(each).stem])
+        write_masks(folder / "masks" / Path(each).parent, [Path(each).stem])
+        (folder / "masks" / each).rename(folder / "masks" / f"{each}.png")  # COLMAP's rule
+    write_named_model(folder / "sparse/0", truth, path)
+    scene, out, _ = read(folder, test=["cam0/0001.png"], clean=["cam1-0002"])
+    assert_cameras(scene, truth, {each[:-4].replace("/", "-"): view for view, each in path.items()})
+    assert scene.test == ("cam0-0001",) and scene.clean == {"cam1-0002"}
+    assert set(mask_shares(out)) == {f"{view}.png" for view in scene.cameras}
+    with pytest.raises(BadInput, match=r"test: there is no view 'cam2/0001\.png'; views are named like cam"):
+        read_scene(Params(test=["cam2/0001.png"]), folder)
+
+
+def test_folders_of_masks_are_objects_where_a_view_has_several(tmp_path):
+    truth = some_truth()
+    folder = prepare(tmp_path / "s", "colmap", truth)
+    shutil.rmtree(folder / "masks")
+    for thing in ("box", "ball"):
+        write_masks(folder / "masks" / thing, truth.world_to_camera)
+    _, out, _ = read(folder)
+    assert objects_of(out) == ["ball", "box"]
+
+
+# ---------------------------------------------------------------------------------------------- D: Blender
+
+
+@pytest.mark.parametrize("splits", [("train", "test"), ("train", "val"), ("train", "test", "val")])
+def test_blenders_files_with_their_split(tmp_path, splits):
+    truth, folder = some_truth(views=8), tmp_path / "s"
+    views, flip = sorted(truth.world_to_camera), np.diag([1.0, -1, -1, 1])
+    for k, split in enumerate(splits):
+        mine = views[:4] if split == "train" else views[2 + 2 * k : 4 + 2 * k]
+        write_pictures(folder / split, [f"r_{n}" for n in range(len(mine))])
+        frames = [
+            {
+                "file_path": f"./{split}/r_{n}",
+                "transform_matrix": (np.linalg.inv(truth.world_to_camera[v]) @ flip).tolist(),
+            }
+            for n, v in enumerate(mine)
+        ]
+        record = {"camera_angle_x": 2 * np.arctan(WIDTH / 2 / truth.lens.fx), "frames": frames}
+        (folder / f"transforms_{split}.json").write_text(json.dumps(record))
+    scene, _, said = read(folder, masks="none")
+    of = {f"train-r_{n}": views[n] for n in range(4)} | {f"{splits[1]}-r_{n}": views[4 + n] for n in range(2)}
+    assert_cameras(scene, truth, of)
+    assert scene.test == tuple(sorted(view for view in of if not view.startswith("train")))
+    assert ("transforms_val.json" in said) == (len(splits) == 3)
+
+
+# ---------------------------------------------------------------------------------------------- F: what masks hold
+
+
+def test_a_palette_with_white_first(tmp_path):
+    folder = prepare(tmp_path / "s", "colmap", some_truth())
+    for path in (folder / "masks").iterdir():
+        Image.open(path).convert("RGB").quantize(2).save(path)
+        assert Image.open(path).getpalette()[:3] == [255, 255, 255]
+    assert np.allclose([*mask_shares(read(folder)[1]).values()], SHARE)
+
+
+def test_maps_of_object_numbers_ask_for_the_number(tmp_path):
+    folder = prepare(tmp_path / "s", "colmap", some_truth())
+    for path in (folder / "masks").iterdir():
+        numbers = np.full((HEIGHT, WIDTH), 30, np.uint8)
+        numbers[40:], numbers[18:36, 24:48] = 200, 32
+        Image.fromarray(numbers).save(path)
+    with pytest.raises(BadInput, match=r"v00\.png: its values \(30, 32, 200\) are neither.*`masks: \{id: \.\.\.\}`"):
+        read(folder)
+    assert np.allclose([*mask_shares(read(folder, masks={"id": 32})[1]).values()], SHARE)
+    both = mask_shares(read(folder, masks={"folder": "masks", "id": [32, 200]})[1])
+    assert np.allclose([*both.values()], SHARE + 32 / 72)
+    with pytest.raises(BadInput, match=r"masks: all 6 masks are empty for the id 7; correct `masks: \{id: \.\.\.\}`"):
+        read(folder, masks={"id": 7})
+
+
+def test_soft_edges_and_grey_objects_are_no_object_numbers(tmp_path):
+    rows, columns = np.mgrid[:100, :150]
+    soft = np.clip(400 - 8 * np.hypot(rows - 50, columns - 70), 0, 255).astype(np.uint8)
+    Image.fromarray(soft).save(tmp_path / "soft.png")
+    assert np.array_equal(load_mask(tmp_path / "soft.png"), soft >= 128)
+    Image.fromarray(np.where(soft >= 128, np.uint8(200), np.uint8(0))).save(tmp_path / "grey.png")
+    assert np.array_equal(load_mask(tmp_path / "grey.png"), soft >= 128)
+    Image.fromarray(soft).save(tmp_path / "lossy.jpg", quality=40)
+    assert (load_mask(tmp_path / "lossy.jpg") != (soft >= 128)).mean() < 0.01
+
+
+# ---------------------------------------------------------------------------------------------- G, J: beside photos
+
+
+def test_a_reference_among_bare_photographs_is_no_view(tmp_path):
+    write_pictures(tmp_path, [f"v{k:02d}" for k in range(6)] + ["reference"])
+    write_masks(tmp_path / "masks", [f"v{k:02d}" for k in range(6)])
+    roles = read_scene(Params(reference={"view": "v01", "image": "reference.png"}), tmp_path)[1]
+    assert roles.train == tuple(f"v{k:02d}" for k in range(6))
+
+
+def test_a_reference_among_the_photographs_of_poses_bounds(tmp_path):
+    folder = prepare(tmp_path / "s", "llff", some_truth())
+    write_pictures(folder / "images_4", ["reference"])
+    reference = {"view": "v01", "image": "images_4/reference.png"}
+    assert read_scene(Params(reference=reference), folder)[1].train == tuple(f"v{k:02d}" for k in range(6))
+
+
+@pytest.mark.parametrize("masks", ["images", None])
+def test_masks_beside_their_photographs(tmp_path, masks):
+    folder = prepare(tmp_path / "s", "colmap", some_truth())
+    for path in (folder / "masks").iterdir():
+        path.rename(folder / "images" / f"{path.stem}_mask.png")
+    scene, out, said = read(folder, masks=masks)
+    assert np.allclose([*mask_shares(out).values()], SHARE) and len(scene.train) == 6
+    assert "not in the model" not in said
+
+
+def test_photographs_are_not_their_own_masks(tmp_path):
+    folder = prepare(tmp_path / "s", "colmap", some_truth())
+    with pytest.raises(
+        BadInput, match=r"images: it holds photographs, and no mask beside one \(A_mask\.png beside A\.png\)"
+    ):
+        plan.preview(Params(masks="images"), folder)
+
+
+# ---------------------------------------------------------------------------------------------- H, I, L: order, points
+
+
+def test_names_that_do_not_match_are_not_paired_by_order(tmp_path):
+    truth, folder = some_truth(views=12), tmp_path / "s"
+    write_pictures(folder / "images", [f"{k + 1:04d}" for k in range(12)])
+    write_masks(folder / "masks", [f"{k + 1:04d}" for k in range(12)])
+    views = sorted(truth.world_to_camera)
+    write_named_model(folder / "sparse/0", truth, {view: f"frame{k + 1}.png" for k, view in enumerate(views)})
+    with pytest.raises(BadInput, match=r"none of its 12 images \(frame1\.png.*is called like a picture in .*0001\.png"):
+        plan.preview(Params(), folder)
+
+
+@pytest.mark.parametrize("numbered", [False, True])
+def test_renamed_copies_in_another_order_than_the_model_are_refused(tmp_path, numbered):
+    """LLFF sorts names as text; a model whose names sort otherwise gives each copy another view's pose."""
+    truth, folder = flat_truth(), tmp_path / "s"
+    views = sorted(truth.world_to_camera)
+    colors = write_textured(folder / "images_4", truth, {view: f"image{k:03d}.png" for k, view in enumerate(views)})
+    write_masks(folder / "images_4/label", [f"image{k:03d}" for k in range(12)])
+    at = truth.lens
+    images = {
+        k + 1: colmap.ModelImage(f"frame{k if numbered else f'{k:02d}'}.jpg", 1, truth.world_to_camera[view])
+        for k, view in enumerate(views)
+    }
+    cameras = {1: colmap.ModelCamera("SIMPLE_PINHOLE", WIDTH, HEIGHT, (at.fx, at.cx, at.cy))}
+    colmap.save_model(folder / "sparse/0", cameras, images, truth.points, colors)
+    write_poses_bounds(folder, truth)
+    if numbered:
+        with pytest.raises(BadInput, match=r"images_4: its pictures are not in the order of the images of"):
+            plan.preview(Params(), folder)
+    else:
+        scene, _, said = read(folder)
+        assert_cameras(scene, truth, {f"image{k:03d}": view for k, view in enumerate(views)})
+        assert "paired with the images of images.bin in order of names" in said
+
+
+@pytest.mark.parametrize("layout", ["colmap", "transforms"])
+@pytest.mark.parametrize("change", ["none", "moved", "scaled", "turned"])
+def test_points_of_another_frame_are_not_used(tmp_path, layout, change):
+    truth, folder = flat_truth(views=6), tmp_path / "s"
+    colors = write_textured(folder / "images", truth, {view: f"{view}.png" for view in truth.world_to_camera})
+    write_masks(folder / "masks", truth.world_to_camera)
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    points = {
+        "none": truth.points,
+        "moved": truth.points + 1000,
+        "scaled": truth.points / 2,
+        "turned": truth.points @ turn.T,
+    }[change]
+    if layout == "colmap":
+        names = {view: f"{view}.png" for view in truth.world_to_camera}
+        write_named_model(folder / "sparse/0", replace(truth, points=points), names)
+        images, cameras = (load(folder / f"sparse/0/{stem}.bin") for load, stem in
+                           ((colmap.load_images, "images"), (colmap.load_cameras, "cameras")))  # fmt: skip
+        colmap.save_model(folder / "sparse/0", cameras, images, points, colors)
+    else:
+        write_transforms(folder, truth)
+        save_points(folder / "sparse_pc.ply", points, colors)
+    capture, _ = read_scene(Params(), folder)
+    said = " ".join(capture.warnings)
+    assert len(capture.poses.points) == (400 if change == "none" else 0)
+    assert ("not in the frame of the cameras and are not used" in said) == (change != "none")
+
+
+def test_rows_of_poses_bounds_follow_the_file_names(tmp_path):
+    truth, folder = some_truth(), tmp_path / "s"
+    times = ("104212", "104300", "104400")
+    names = [name for time in times for name in (f"20220819_{time}(0)", f"20220819_{time}")]
+    assert [f"{name}.jpg" for name in names] == sorted(f"{name}.jpg" for name in names)
+    write_pictures(folder / "images_4", names, ending=".jpg")
+    write_masks(folder / "images_4/label", names)
+    write_poses_bounds(folder, truth)
+    scene, _, _ = read(folder)
+    assert_cameras(scene, truth, dict(zip(names, sorted(truth.world_to_camera), strict=True)))
+
+
+def test_nothing_matched_is_not_zero_pixels(tmp_path, capsys):
+    _, out, _ = read(prepare(tmp_path / "s", "colmap", some_truth()), refine=True)
+    assert "cameras as given: optical flow matches nothing between the views" in capsys.readouterr().out
+    assert load_json(out / "refine.json") == {"before": None, "after": None}
+
+
+# ---------------------------------------------------------------------------------------------- M, N: bytes
+
+
+def test_composed_and_decomposed_accents_are_one_name(tmp_path):
+    truth, folder = some_truth(), tmp_path / "s"
+    views = {view: f"Küche {view}" for view in truth.world_to_camera}
+    split = {view: unicodedata.normalize("NFD", name) for view, name in views.items()}
+    write_pictures(folder / "images", split.values())
+    write_masks(folder / "masks", split.values())
+    whole = {view: unicodedata.normalize("NFC", name) for view, name in views.items()}
+    write_named_model(folder / "sparse/0", truth, {view: f"{name}.png" for view, name in whole.items()})
+    scene, out, _ = read(folder, test=[split["v01"]])
+    assert_cameras(scene, truth, {name: view for view, name in whole.items()})
+    assert len(mask_shares(out)) == 6
+
+
+def test_what_is_no_picture_is_named(tmp_path, monkeypatch):
+    folder = prepare(tmp_path / "s", "colmap", some_truth())
+    monkeypatch.setattr(Image, "OPEN", {kind: opener for kind, opener in Image.OPEN.items() if kind != "HEIF"})
+    (folder / "images/v01.png").write_text("<html>404</html>")
+    with pytest.raises(BadInput, match=r"v01\.png: not a readable image \(UnidentifiedImageError"):
+        plan.preview(Params(), folder)
+
+
+@pytest.mark.parametrize(
+    ("model", "params"), [("SIMPLE_FISHEYE", (90.0, 48.0, 36.0)), ("FISHEYE", (90.0, 91.0, 47.0, 36.5))]
+)
+@pytest.mark.parametrize("text", [False, True])
+def test_colmaps_fisheyes_without_coefficients(tmp_path, model, params, text):
+    truth = some_truth((model, params))
+    folder = prepare(tmp_path / "s", "transforms", truth)
+    (folder / "transforms.json").unlink()
+    cameras = {1: colmap.ModelCamera(model, WIDTH, HEIGHT, params)}
+    images = {k: colmap.ModelImage(f"{v}.png", 1, pose) for k, (v, pose) in enumerate(truth.world_to_camera.items(), 1)}
+    colmap.save_model(folder / "sparse/0", cameras, images, truth.points, np.full((60, 3), 99, np.uint8))
+    if text:
+        (folder / "sparse/0/cameras.txt").write_text(f"1 {model} {WIDTH} {HEIGHT} {' '.join(map(str, params))}\n")
+        (folder / "sparse/0/cameras.bin").unlink()
+    scene, _, _ = read(folder)
+    assert_cameras(scene, truth, {view: view for view in truth.world_to_camera})
+    pinhole = without_distortion(truth.lens)  # a pixel of it is read where an equidistant fisheye shows its direction
+    at = sampling_map(truth.lens, pinhole)[10, 20]
+    x, y = (20.5 - pinhole.cx) / pinhole.fx, (10.5 - pinhole.cy) / pinhole.fy
+    stretch = np.arctan(np.hypot(x, y)) / np.hypot(x, y)
+    fx, fy, cx, cy = params if len(params) == 4 else (params[0], *params)
+    np.testing.assert_allclose(at, (fx * x * stretch + cx, fy * y * stretch + cy), atol=1e-9)
+
+
+@pytest.mark.parametrize("model", ["SIMPLE_DIVISION", "DIVISION", "EUCM", "EQUIRECTANGULAR"])
+def test_other_models_of_colmap_4_are_refused_by_name(tmp_path, model):
+    folder = prepare(tmp_path / "s", "colmap", some_truth())
+    params = (90.0, 90.0, 48.0, 36.0, 0.1, 1.0)[: colmap.MODELS[model]]
+    images = colmap.load_images(folder / "sparse/0/images.bin")
+    cameras = {1: colmap.ModelCamera(model, WIDTH, HEIGHT, params)}
+    colmap.save_model(folder / "sparse/0", cameras, images, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    with pytest.raises(BadInput, match=rf"cameras\.bin: camera model {model} is not understood; convert it to one of"):
+        plan.preview(Params(), folder)
+
+
+def test_windows_paths_in_transforms(tmp_path):
+    truth = some_truth()
+    folder = prepare(tmp_path / "s", "transforms", truth)
+    save_points(folder / "sparse_pc.ply", truth.points, np.full((60, 3), 99, np.uint8))
+    record = json.loads((folder / "transforms.json").read_text()) | {"ply_file_path": ".\\sparse_pc.ply"}
+    for frame in record["frames"]:
+        frame["file_path"] = "D:\\captures\\room\\" + frame["file_path"].replace("/", "\\")
+    (folder / "transforms.json").write_text(json.dumps(record))
+    capture, _ = read_scene(Params(), folder)
+    assert len(capture.poses.points) == 60 and not capture.warnings and len(capture.pictures) == 6
+
+
+# ---------------------------------------------------------------------------------------------- O, Q
+
+
+def test_mask_path_and_depth_file_path(tmp_path):
+    truth, folder = flat_truth(views=6), tmp_path / "s"
+    write_textured(folder / "images", truth, {view: f"{view}.png" for view in truth.world_to_camera})
+    write_masks(folder / "keep", truth.world_to_camera)
+    write_transforms(folder, truth)
+    record = json.loads((folder / "transforms.json").read_text())
+    for frame in record["frames"]:
+        view = Path(frame["file_path"]).stem
+        Image.fromarray(255 - np.array(Image.open(folder / f"keep/{view}.png"))).save(folder / f"keep/{view}.png")
+        pose, at = truth.world_to_camera[view], truth.lens
+        rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+        rays = np.stack([(columns - at.cx) / at.fx, (rows - at.cy) / at.fy, np.ones_like(rows)], -1) @ pose[:3, :3]
+        depth = -(-pose[:3, :3].T @ pose[:3, 3])[2] / rays[..., 2]
+        (folder / "depth").mkdir(exist_ok=True)
+        Image.fromarray(np.round(1000 * depth).astype(np.uint16)).save(folder / f"depth/{view}.png")
+        frame |= {"mask_path": f"keep/{view}.png", "depth_file_path": f"./depth/{view}.png"}
+    (folder / "transforms.json").write_text(json.dumps(record))
+    scene, out, said = read(folder)
+    assert np.allclose([*mask_shares(out).values()], SHARE)
+    assert "mask_path of transforms.json: black, which training ignores, is taken for the object" in said
+    points = scene.similarity.invert(scene.points)
+    assert len(points) > 5000 and np.abs(points[:, 2]).max() < 2e-3, "on the plane z = 0, to the millimetre"
+    assert f"{len(points)} points are made of the depth maps (depth_file_path) of transforms.json" in said
+
+
+def test_a_16_bit_grey_photograph(tmp_path):
+    folder = prepare(tmp_path / "s", "colmap", some_truth(PINHOLE))
+    levels = np.tile(np.linspace(0, 65535, WIDTH).astype(np.uint16), (HEIGHT, 1))
+    Image.fromarray(levels).save(folder / "images/v02.png")
+    _, out, _ = read(folder)
+    assert np.array_equal(load_views(out, ["v02"])["v02"][..., 1], np.round(levels / 257).astype(np.uint8))
