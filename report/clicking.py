@@ -21,7 +21,7 @@ from reffusion.clicks.picture import corrected, view_mask
 from reffusion.command import root
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.files import BadInput
-from reffusion.io.images import replace_image, to_uint8
+from reffusion.io.images import WHITE, replace_image, to_uint8
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_raw_masks, load_scene, load_views, objects_of
 from reffusion.params.clicks import CLICKS
@@ -57,14 +57,19 @@ def capture_of(home: Path) -> Capture:
         raise ValueError(f"{poses}: not there; run `make scene={home.name.split('@')[0]} mask`")
     folder = root() / (poses.parent / "source").read_text(encoding="utf-8").strip()
     params = Params(**load_json(poses / "receipt.json")["params"])
-    if params.masks is not None and params.masks.lower() == "none":
+    if not params.has_masks:
         raise BadInput(f"{folder / 'scene.yaml'}: it says `masks: none`; remove that line to make masks")
     if objects_of(poses):
         raise BadInput(f"{poses / 'masks'}: the masks tell objects apart, which clicks do not")
-    files = read_scene(params.changed({"clicks": {}}), folder)[1].masks.get("", {})
+    roles = read_scene(params.changed({"clicks": {}}), folder)[1]
+    if roles.values != WHITE:
+        raise BadInput(
+            f"{folder}: its masks hold object numbers, or are inverted; clicks make white masks: remove them"
+        )
+    files = roles.masks.get("", {})
     written = _saved(folder)["written"]
     theirs = [name for name, path in files.items() if written.get(_named(path, folder)) != digest(path)]
-    place = next((path.parent for path in files.values()), folder / (params.masks or "masks"))
+    place = next((path.parent for path in files.values()), folder / (params.mask_folder or "masks"))
     return Capture(folder, place, poses, sheet.stage_folder(home, "fit"), load_raw_masks(poses, theirs))
 
 

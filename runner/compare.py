@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from reffusion.command import installed, root
 from runner import Refused, say
 from runner.engine import Engine, Local
 from runner.files import RECEIPT, shown, write_json, write_text
@@ -21,6 +22,7 @@ FULL = "full"  # what the scene's own run, without a variant, is called beside t
 TOGETHER = "compare"  # the folder in runs/ of a comparison over a folder of scenes
 RECORD = "compare.json"
 RUNS = "compare-runs"  # .csv and .md: a row a run, written anew after each
+SCENE_FILE = "scene.ply"  # of the stage `evaluate`
 RESULTS = "results"  # .json, .csv and .md of a batch
 WAITING, DONE, FAILED = "not run yet", "done", "failed"
 
@@ -134,16 +136,27 @@ def _mean(evaluate: Path | None, of: str = "mean") -> dict[str, float | None]:
 
 
 def show_results(stage: str, folder: Path | None) -> None:
-    """Where the results are; after `evaluate` the mean metrics too, those of the initialization beside them."""
+    """Where the results are; after `evaluate` the mean scores too, those of the initialization beside them, and what to
+    open."""
     if folder is None:
         return
     if stage == "evaluate":
-        initial = _mean(folder, "initialize")
-        for name, value in _mean(folder).items():
+        initial, scores = _mean(folder, "initialize"), {n: v for n, v in _mean(folder).items() if v is not None}
+        for name, value in scores.items():
             before = f" initialization {_number(initial[name])}" if initial.get(name) is not None else ""
-            say(f"  {name:<16} {_number(value) or 'not available':<14}{before}")
+            say(f"  {name:<16} {_number(value):<14}{before}")
+        if not scores:
+            say("  no scores: no test view shows the scene without the object (`test` in scene.yaml)")
     names = (p.name + ("/" if p.is_dir() else "") for p in sorted(folder.iterdir()) if p.name != RECEIPT)
     say(f"results in {shown(folder)}/: {', '.join(names)}")
+    if stage == "evaluate" and (folder / SCENE_FILE).is_file():
+        scene, _, variant = folder.parent.name.partition("@")
+        words = f"scene={scene}" + (f" variant={variant}" if variant else "")
+        if installed(root()):
+            words = f"--scene {scene}" + (f" --variant {variant}" if variant else "")
+        tool = "reffusion {} " if installed(root()) else "make {} "
+        say(f"open {shown(folder / SCENE_FILE)} in any viewer of 3D Gaussian splats, or here:")
+        say(f"  {tool.format('view')}{words}    {tool.format('report')}{words}")
 
 
 def _number(value: Any) -> str:

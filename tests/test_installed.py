@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -94,6 +95,18 @@ def test_plan_in_any_folder(unpacked, tmp_path):
     assert done.returncode == 0, done.stderr
     assert "run       poses" in done.stdout and "run       fit" in done.stdout and "4 masks" in done.stdout
     assert (tmp_path / "runs").is_dir() and not (unpacked / "reffusion" / "app" / "runs").exists()
+
+
+def test_help_lists_every_command_and_version_says_which(unpacked, tmp_path):
+    listed = command(unpacked, tmp_path, "--help")
+    assert listed.returncode == 0 and command(unpacked, tmp_path).stdout == listed.stdout
+    for name in ("plan", "run", "mask", "check", "patch", "export", "report", "view", "compare", "batch", "weights"):
+        assert f"\n  {name} " in listed.stdout
+    assert re.fullmatch(r"reffusion \d+\.\d+\S*\n", command(unpacked, tmp_path, "--version").stdout)
+    wrong = command(unpacked, tmp_path, "masks")
+    assert (
+        wrong.returncode == 2 and wrong.stderr == "error: there is no command 'masks'; `reffusion --help` lists them\n"
+    )
 
 
 def test_a_demo_scene_needs_a_checkout(unpacked, tmp_path):

@@ -83,4 +83,8 @@ class Params(Settings):
     @property
     def has_masks(self) -> bool:
         """Does the scene not say that it has no masks?"""
-        return not (isinstance(self.masks, str) and self.masks.lower() == "none")
+        return (self.mask_folder or "").lower() != "none"
+
+    @property
+    def mask_folder(self) -> str | None:
+        return self.masks.folder if isinstance(self.masks, Masks) else self.masks
