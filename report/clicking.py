@@ -52,8 +52,7 @@ def capture_of(home: Path) -> Capture:
     Raises:
         ValueError: it has not run; the scene's own words leave the page no place to write to.
     """
-    poses = sheet.stage_folder(home, "poses")
-    if not (poses / "receipt.json").is_file():
+    if not ((poses := sheet.stage_folder(home, "poses")) / "receipt.json").is_file():
         raise ValueError(f"{poses}: not there; run `make scene={home.name.split('@')[0]} mask`")
     folder = root() / (poses.parent / "source").read_text(encoding="utf-8").strip()
     params = Params(**load_json(poses / "receipt.json")["params"])
@@ -75,8 +74,7 @@ def capture_of(home: Path) -> Capture:
 
 def segmenter_here() -> Segmenter | None:
     """The segmentation network whose weights are on this machine. ValueError where they are not whole."""
-    found = load_segmenter()
-    if found is not None:
+    if (found := load_segmenter()) is not None:
         print(f"clicks are answered by {SOURCE}", flush=True)
     return found
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from reffusion.command import installed, root
+from reffusion.command import command_line
 from runner import Refused, say
 from runner.engine import Engine, Local
 from runner.files import RECEIPT, shown, write_json, write_text
@@ -151,12 +151,8 @@ def show_results(stage: str, folder: Path | None) -> None:
     say(f"results in {shown(folder)}/: {', '.join(names)}")
     if stage == "evaluate" and (folder / SCENE_FILE).is_file():
         scene, _, variant = folder.parent.name.partition("@")
-        words = f"scene={scene}" + (f" variant={variant}" if variant else "")
-        if installed(root()):
-            words = f"--scene {scene}" + (f" --variant {variant}" if variant else "")
-        tool = "reffusion {} " if installed(root()) else "make {} "
         say(f"open {shown(folder / SCENE_FILE)} in any viewer of 3D Gaussian splats, or here:")
-        say(f"  {tool.format('view')}{words}    {tool.format('report')}{words}")
+        say(f"  {command_line('view', scene, variant)}    {command_line('report', scene, variant)}")
 
 
 def _number(value: Any) -> str:

@@ -95,7 +95,12 @@ def test_runner_knows_nothing_of_3d(path):
     clusters = {name for name, doors in DOORS.items() if named(path) in doors}
     assert outsiders(path, {"runner", "reffusion", "pydantic", "yaml"} | clusters) == set()
     own = {name for name in imports(path) if name.split(".")[0] == "reffusion"}
-    assert own <= {"reffusion.command", "reffusion.command.installed", "reffusion.command.workplace"}
+    assert own <= {
+        "reffusion.command",
+        "reffusion.command.installed",
+        "reffusion.command.workplace",
+        "reffusion.command.command_line",
+    }
 
 
 @pytest.mark.parametrize("path", sources("stages"), ids=named)
