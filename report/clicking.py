@@ -101,7 +101,7 @@ class Session:
 
     def __init__(self, capture: Capture, fitted: Callable[[], bool], segmenter: Segmenter | None = None):
         self.capture, self.scene = capture, load_scene(capture.poses)
-        self.segmenter = segmenter
+        self.segmenter, self.unsaved = segmenter, False
         self.looked: dict[str, Looked] = {}  # what the network made of the views that were clicked on
         self.fitted = fitted  # is the fit there that belongs to these poses? one of earlier poses may be, in its place
         self.views = [name for name in self.scene.train if name not in self.scene.clean]
@@ -109,12 +109,10 @@ class Session:
         self.images = load_views(capture.poses, self.views)
         self.clicks: dict[str, list[tuple[float, float, bool]]] = {}
         self.masks, self.versions = dict(capture.given), dict.fromkeys(self.views, 0)
-        self.gaussians = self.near = None
+        self.gaussians = self.near = self.labels = None
         self.todo: list[str] = []  # views whose masks are not yet those of the latest labels
-        self.labels = None
         self.reliefs: dict[str, np.ndarray] = {}
         self.made, self.solved = 0, 0  # how often clicks changed, and up to which change they are in the labels
-        self.unsaved = False
         self.turn, self.asked = threading.RLock(), threading.Event()
         for name, points in _saved(capture.folder)["clicks"].items():
             if name in self.views:
