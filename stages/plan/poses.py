@@ -10,9 +10,11 @@ from reffusion.capture.layouts import cameras
 from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.reading import check_brought, read_scene, unphotographed
 from reffusion.capture.roles import views_of
+from reffusion.io.images import load_mask
 from reffusion.params.clicks import CLICKS
 from reffusion.params.poses import Params
 
+LOOKED_INTO = 3  # masks of each object whose pixels are read: maps of object numbers are refused before any work
 # pictures count where they are photographs or masks; depth maps belong to references
 NOT_READ = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".npy", ".exr")
 
@@ -31,14 +33,14 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
     masks = {path for files in roles.masks.values() for path in files.values()}
     shown = {path for name, path in capture.pictures.items() if name not in roles.blank}
     read = {*shown, *masks, *roles.test_masks.values(), *roles.fill.values()}
-    read |= brought
+    read |= brought | set(capture.depth_maps)
     kept = [path for path in others if path.suffix.lower() not in NOT_READ or path.name == "poses_bounds.npy"]
     return sorted(read | {path for path in kept if path.parent != scene / PAINTED})
 
 
 def preview(params: Params, scene: Path) -> list[str]:
-    """What the stage will do, from headers alone. ValueError where it would refuse, or where a reference that the scene
-    brings, read by a later stage, belongs to none of its views."""
+    """What the stage will do, from headers and the pixels of a few masks. ValueError where it would refuse, or where a
+    reference that the scene brings, read by a later stage, belongs to none of its views."""
     if unphotographed(params, scene):
         check_brought(params, scene)
         found = cameras.read(scene)
@@ -46,6 +48,9 @@ def preview(params: Params, scene: Path) -> list[str]:
         return [f"no photographs: {who} look at renders of {params.gaussians} instead"]
     capture, roles = read_scene(params, scene)
     given = load_given(scene, views_of(capture, roles), params.reference)
+    for files in roles.masks.values():
+        for path in [*files.values()][:LOOKED_INTO]:
+            load_mask(path, values=roles.values)
     masks = sum(len(files) for files in roles.masks.values())
     apart = f" of {', '.join(roles.masks)}" if len(roles.masks) > 1 else ""
     notes = [f"{len(roles.train)} training and {len(roles.test)} test views, {masks} masks{apart}"]

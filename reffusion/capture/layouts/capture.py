@@ -50,6 +50,7 @@ class Capture:
         left_out: names of views that have a picture but no pose, or a pose but no picture.
         warnings: what the user should know, each one sentence.
         test: names of the views that the layout itself holds out (Blender's transforms_test.json).
+        depth_maps: files that points may be made of.
         ignore_masks: view name -> the mask that the layout names for it, black where training ignores the picture.
     """
 
@@ -63,6 +64,7 @@ class Capture:
     warnings: tuple[str, ...]
     test: tuple[str, ...] = ()
     ignore_masks: dict[str, Path] = field(default_factory=dict)
+    depth_maps: tuple[Path, ...] = ()
 
     @property
     def upright(self) -> bool:

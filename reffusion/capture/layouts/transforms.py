@@ -98,6 +98,7 @@ def read(folder: Path, images: str | None) -> Capture:
         tuple(filter(None, warnings)),
         tuple(view for view, each in placed.items() if each.split in ("test", "val")),
         _named_files(folder, placed, "mask_path"),
+        tuple(_named_files(folder, placed, "depth_file_path").values()),
     )
 
 
