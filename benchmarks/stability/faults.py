@@ -80,7 +80,7 @@ FAULTS = (
     Fault("an offset that is added, not taken off", "reffusion.capture.frame", "normalise_pose",
           lambda right: lambda pose, similarity: right(pose, replace(similarity, offset=-similarity.offset)),
           "offset 1e6 of the extent, normalised"),
-    Fault("positions of an export in float32 always", "reffusion.io.ply", "_write",
+    Fault("positions of an export in float32 always", "reffusion.io.ply", "save_vertices",
           lambda right: lambda path, table, comments: right(
               path, table.astype([(name, "f4") for name in table.dtype.names]), comments),
           "offset 1e6 of the extent, exported positions"),
