@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from reffusion.io import compressed
 from reffusion.io.compressed import PACKED
 from reffusion.io.files import BadInput, reading
 from reffusion.io.ply_table import load_header, load_vertices, save_vertices
+from reffusion.io.quantized import save_splat
+from reffusion.io.splat_rows import Rows
 from reffusion.io.splats import (
     ANTIALIASED,
     BLOCK,
     DC,
+    FORMATS,
     POSITION,
     RED_GREEN_BLUE,
     ROTATION,
@@ -70,6 +75,36 @@ def save_ply(
         for name in wanted:
             table[name][rows] = found[name] if name in NORMAL else found[name][rows]
     save_vertices(path, table, comments)
+
+
+def can_save(path: Path) -> None:
+    """BadInput where `save_splats` has no format of this ending, its library is missing, or the folder is no folder."""
+    name = Path(path).name.lower()
+    if not name.endswith(FORMATS):
+        raise BadInput(f"{path}: {Path(path).suffix or 'no ending'} is not written; one of {', '.join(FORMATS)} is")
+    if name.endswith((".compressed.ply", ".spz")):
+        compressed.load_library(path)
+    if Path(path).is_dir() or not (parent := Path(path).absolute().parent).is_dir():
+        raise BadInput(f"{path}: a folder; name a file" if Path(path).is_dir() else f"{parent}: no such folder")
+
+
+def save_splats(path: Path, gaussians: Gaussians, similarity: Similarity, properties: Sequence[str] = ()) -> None:
+    """Write Gaussians in the scene's own frame, in the format that the ending names, see `splats.FORMATS`.
+
+    Args:
+        properties: of a plain .ply, their order, as in `save_ply`.
+    """
+    name = Path(path).name.lower()
+    if name.endswith((".spz", ".splat")):
+        means, *others = (getattr(gaussians, field.name).detach().cpu().numpy() for field in fields(Rows))
+        rows = Rows(means.astype(np.float64), *others)
+        sizes = (rows.log_scales - np.log(similarity.scale)).astype(np.float32)
+        rows = replace(rows, means=similarity.invert(rows.means), log_scales=sizes)
+        (compressed.save_spz if name.endswith(".spz") else save_splat)(path, rows)
+    elif name.endswith(".compressed.ply"):
+        compressed.save_compressed(path, gaussians, similarity)
+    else:
+        save_ply(path, gaussians, similarity, properties)
 
 
 def load_ply(path: Path, similarity: Similarity | None = None) -> Gaussians:
