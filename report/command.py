@@ -6,9 +6,9 @@ import argparse
 from pathlib import Path
 
 
-def parser(name: str, description: str) -> argparse.ArgumentParser:
+def parser(name: str, description: str, needs_scene: bool = True) -> argparse.ArgumentParser:
     found = argparse.ArgumentParser(prog=f"reffusion {name}", description=description.split("\n")[0])
-    found.add_argument("--scene", type=Path, required=True, help="its name, or the path of its folder")
+    found.add_argument("--scene", type=Path, required=needs_scene, help="its name, or the path of its folder")
     found.add_argument("--variant", default="", help="of the scene")
     found.add_argument("--runs", type=Path, default=Path("runs"))
     return found

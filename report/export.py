@@ -8,12 +8,13 @@ from pathlib import Path
 from reffusion.io.cameras import save_cameras
 from reffusion.io.compressed import save_compressed
 from reffusion.io.lora import save_portable
-from reffusion.io.ply import load_ply
+from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import has_photograph, load_scene
 from report import command
 from report.sheet import stage_folder
 
-PLY, COMPRESSED, CAMERAS, IMAGES, LORA = "scene.ply", "scene.compressed.ply", "cameras", "images", "lora"
+PLY, COMPRESSED, WITH_OBJECT = "scene.ply", "scene.compressed.ply", "with_object.ply"
+CAMERAS, IMAGES, LORA = "cameras", "images", "lora"
 HEADER = 1000  # bytes of it that tell the type of x
 LORA_FILE = "pytorch_lora_weights.safetensors"
 
@@ -43,6 +44,14 @@ def make(home: Path) -> list[str]:
         shutil.copyfile(poses / "images" / f"{name}.png", out / CAMERAS / IMAGES / f"{name}.png")
     pictures = f"{len(pictured)} undistorted photographs" if pictured else "no photographs"
     said.append(f"{out / CAMERAS}: {len(scene.cameras)} pinholes, a COLMAP model and transforms.json; {pictures}")
+    fitted = stage_folder(home, "fit") / "gaussians.ply"
+    if fitted.exists():
+        save_ply(out / WITH_OBJECT, load_ply(fitted), scene.similarity)
+        command_line = f"reffusion patch {out / WITH_OBJECT} AFTER.ply --cameras {out / CAMERAS} --out patched.ply"
+        said.append(
+            f"{out / WITH_OBJECT}: the scene with the object, to be edited: delete something in an editor, save the "
+            f"rest as AFTER.ply, and `{command_line}` fills the hole"
+        )
     adapted = stage_folder(home, "personalize") / LORA_FILE
     if adapted.exists():
         save_portable(adapted, out / LORA / LORA_FILE)

@@ -1,26 +1,17 @@
-"""A patched hole as files for an editor: `python -m report.patch --scene X` (`make scene=X patch`)."""
+"""A patched hole as files for an editor: `python -m report.patch --scene X` (`make scene=X patch`), or of two files
+alone: `reffusion patch before.ply after.ply --out patched.ply`."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from reffusion.io.arrays import load_labels
-from reffusion.io.ply import load_ply, properties_of, save_ply
+from reffusion.io.ply import properties_of, save_ply
 from reffusion.io.scene import load_scene
-from report import command
-from report.results import load_receipts
-from report.sheet import stage_folder
+from report import command, patch_files
+from report.patch_result import check, load_result
 
 WHOLE, NEW = "patched.ply", "new.ply"
-
-
-def check(home: Path) -> None:
-    """ValueError where the scene does not say what was deleted, as far as its stage `poses` knows."""
-    if not (stage_folder(home, "poses") / "deleted.npy").is_file():
-        raise ValueError(
-            "scene.yaml: nothing says what was deleted; `gaussians: scene.ply` names the scene before, "
-            "`cleaned: cleaned.ply` what an editor left of it"
-        )
 
 
 def make(home: Path) -> str:
@@ -33,16 +24,12 @@ def make(home: Path) -> str:
     Raises:
         ValueError: nothing was deleted, or that stage has not run.
     """
-    check(home)
-    poses, finished = stage_folder(home, "poses"), home / "evaluate" / "scene.ply"
-    if not finished.exists():
-        raise ValueError(f"{finished} is missing; `make scene={home.name.split('@')[0]} patch` makes it")
-    similarity, properties = load_scene(poses).similarity, properties_of(poses / "gaussians.ply")
-    result, new = load_ply(finished, similarity), load_labels(last_of(home) / "labels.npy")
-    out = home / "patch"
+    found = load_result(home)
+    similarity, properties = load_scene(found.poses).similarity, properties_of(found.poses / "gaussians.ply")
+    result, new, out = found.gaussians, found.new, home / "patch"
     save_ply(out / WHOLE, result, similarity, properties)
     save_ply(out / NEW, result.map(lambda parameter: parameter[new]), similarity, properties)
-    kept, stayed = int((~load_labels(poses / "deleted.npy")).sum()), len(result) - int(new.sum())
+    kept, stayed = int((~load_labels(found.poses / "deleted.npy")).sum()), len(result) - int(new.sum())
     more = kept - stayed
     left = f"; {more} more than were deleted are gone: haze, and what the object hid" if more > 0 else ""
     return (
@@ -51,18 +38,23 @@ def make(home: Path) -> str:
     )
 
 
-def last_of(home: Path) -> Path:
-    """The folder of the stage whose Gaussians are the result."""
-    used = load_receipts({"evaluate": home / "evaluate"})["evaluate"]["needs"]
-    return stage_folder(home, next(stage for stage in ("distill", "initialize") if used.get(stage)))
-
-
 def main() -> None:
-    parser = command.parser("patch", __doc__)
+    parser = command.parser("patch", __doc__, needs_scene=False)
     parser.add_argument("--only-check", action="store_true", help="does the scene say what was deleted?")
+    files = "two files of splats, before and after the object was deleted (.ply, compressed .ply, .spz, .splat)"
+    parser.add_argument("files", type=Path, nargs="*", metavar="BEFORE AFTER", help=f"instead of --scene: {files}")
+    parser.add_argument("--out", type=Path, help="of two files: the filled scene, in the format of its ending")
+    parser.add_argument("--cameras", type=Path, help="of two files: a folder with cameras, as `export` writes it")
+    parser.add_argument("--profile", help="of two files: as of `run`, these three")
+    parser.add_argument("--budget", help="as of `run`")
+    parser.add_argument("--set", default="", help="as of `run`")
     arguments = parser.parse_args()
     try:
-        if arguments.only_check:
+        if arguments.files:
+            print(patch_files.make(arguments))
+        elif arguments.scene is None:
+            raise ValueError("name a scene (--scene), or two files: reffusion patch before.ply after.ply --out out.ply")
+        elif arguments.only_check:
             check(command.home(arguments))
         else:
             print(make(command.home(arguments)))

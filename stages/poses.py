@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +25,9 @@ from reffusion.gaussians import matching
 from reffusion.io.arrays import save_json, save_labels
 from reffusion.io.files import BadInput
 from reffusion.io.images import image_size, save_image, save_mask
-from reffusion.io.ply import load_ply, load_points, properties_of, save_ply
+from reffusion.io.ply import properties_of, save_ply
 from reffusion.io.scene import load_raw_masks, load_views, save_scene
+from reffusion.io.splats import Splats, load_splats
 from reffusion.masks import regions
 from reffusion.params.poses import Params
 from reffusion.splat.conventions import SH0
@@ -42,18 +43,16 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     """Write images/, masks/, test_masks/, sparse/0/, lenses.json, transform.json, views.json; refine.json where cameras
     were adjusted; gaussians.ply, deleted.npy and region.json where the scene brings them; warnings.json where
     something is odd."""
-    deleted = _deleted(params, scene)  # before the work, not after it
+    brought = _load_brought(params, scene)  # before the work, not after it
     if unphotographed(params, scene):
-        _save_unphotographed(params, out, scene, deleted)
+        _save_unphotographed(params, out, scene, brought)
         return
     capture, roles = read_scene(params, scene)
-    said = [*capture.warnings, *roles.warnings]
+    said = [*capture.warnings, *roles.warnings, *(brought.notes if brought else ())]
     sizes = {name: image_size(path, upright=capture.upright) for name, path in capture.pictures.items()}
     for files in roles.masks.values():
         check_masks(files, roles.values)
     check_masks(roles.fill)
-    if params.gaussians is not None:
-        load_ply(scene / params.gaussians)
     if capture.poses is None:
         everyone, capture = sorted(capture.pictures), _place(params, out, capture)
         if lost := [name for name in everyone if name not in capture.pictures]:
@@ -81,22 +80,46 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
         filled = frame.filled_up(shown, ranges[: len(views)], MORE_POINTS, draws, lambda v: load_views(out, [v])[v])
         normalised = replace(filled, cameras=normalised.cameras)
     save_scene(out, normalised)
-    if params.gaussians is not None:
-        _save_brought(params, out, scene, normalised, deleted)
+    if brought is not None:
+        _save_brought(out, normalised, brought)
     if params.region is not None:
         _save_region(params, out, normalised)
 
 
-def _deleted(params: Params, scene: Path) -> np.ndarray | None:
-    """bool [N], those of the scene's Gaussians that the cleaned ones lack; None where it brings none."""
+@dataclass(frozen=True)
+class Brought:
+    """The Gaussians that a scene brings.
+
+    Attributes:
+        splats: in the scene's own frame; properties: of its .ply, in order.
+        deleted: bool [N], those that `cleaned` lacks; None where the scene has none.
+        notes: sentences about both files.
+    """
+
+    splats: Splats
+    properties: tuple[str, ...]
+    deleted: np.ndarray | None
+    notes: tuple[str, ...]
+
+
+def _load_brought(params: Params, scene: Path) -> Brought | None:
+    """BadInput where `gaussians` or `cleaned` cannot be used. None where the scene has neither."""
     check_brought(params, scene)
-    if params.cleaned is None:
+    if params.gaussians is None:
         return None
-    files = scene / params.gaussians, scene / params.cleaned
-    whole, cleaned = (load_points(path)[0] for path in files)
-    for path, points in zip(files, (whole, cleaned), strict=True):
-        if not np.isfinite(points).all():
-            raise BadInput(f"{path}: positions that are not finite")
+    path = scene / params.gaussians
+    splats, deleted = load_splats(path), None
+    notes = [f"{path.name}: {note}" for note in splats.notes]
+    splats.gaussians()  # refused where its values are too large for 32 bits
+    if params.cleaned is not None:
+        cleaned = load_splats(scene / params.cleaned)
+        notes += [f"{params.cleaned}: {note}" for note in cleaned.notes]
+        deleted = _deleted((path, scene / params.cleaned), splats.rows.means, cleaned.rows.means)
+    return Brought(splats, properties_of(path), deleted, tuple(notes))
+
+
+def _deleted(files: tuple[Path, Path], whole: np.ndarray, cleaned: np.ndarray) -> np.ndarray:
+    """bool [N], those of the whole scene's positions [N, 3] that the cleaned scene's [M, 3] lack."""
     match = matching.matched(whole, cleaned)
     if match.found < matching.SAME:
         raise BadInput(
@@ -111,26 +134,23 @@ def _deleted(params: Params, scene: Path) -> np.ndarray | None:
     return match.deleted
 
 
-def _save_brought(params: Params, out: Path, scene: Path, placed: Scene, deleted: np.ndarray | None) -> None:
+def _save_brought(out: Path, placed: Scene, brought: Brought) -> None:
     """The scene's own Gaussians in the normalised frame, properties in the order of its file, and which of them were
     deleted."""
-    path = scene / params.gaussians
-    save_ply(out / "gaussians.ply", load_ply(path, placed.similarity), properties=properties_of(path))
-    if deleted is not None:
-        save_labels(out / "deleted.npy", deleted)
+    save_ply(out / "gaussians.ply", brought.splats.gaussians(placed.similarity), properties=brought.properties)
+    if brought.deleted is not None:
+        save_labels(out / "deleted.npy", brought.deleted)
 
 
-def _save_unphotographed(params: Params, out: Path, scene: Path, deleted: np.ndarray) -> None:
+def _save_unphotographed(params: Params, out: Path, scene: Path, brought: Brought) -> None:
     """The same without photographs: cameras that a capture left, or some around the hole; nothing in images/."""
-    gaussians = load_ply(scene / params.gaussians)
-    opaque = gaussians.opacity_logits.numpy() > 0
-    means, found = gaussians.means.double().numpy(), cameras.read(scene)
-    sizes = gaussians.log_scales.median(1).values.exp().numpy()
-    poses, source = found or (ring.cameras_around(means, sizes, opaque, deleted, params.longest), None)
+    rows, found = brought.splats.rows, cameras.read(scene)
+    means, opaque, sizes = rows.means, rows.opacity_logits > 0, np.exp(np.median(rows.log_scales, axis=1))
+    poses, source = found or (ring.cameras_around(means, sizes, opaque, brought.deleted, params.longest), None)
     some = np.flatnonzero(opaque)
     draws = seeding.generator(SEED, "poses", "points of Gaussians")
     some = some[torch.randperm(len(some), generator=draws)[:MORE_POINTS].numpy()]
-    colors = (255 * (0.5 + SH0 * gaussians.sh[some, 0]).clamp(0, 1)).round().byte().numpy()
+    colors = (255 * (0.5 + SH0 * rows.sh[some, 0]).clip(0, 1)).round().astype(np.uint8)
     poses = replace(poses, points=means[some], colors=colors)
     at = {n: each.resized(*fitting_size(each.width, each.height, params.longest)) for n, each in poses.lenses.items()}
     pinholes = {name: undoing(lens)[0] for name, lens in at.items()}
@@ -139,10 +159,11 @@ def _save_unphotographed(params: Params, out: Path, scene: Path, deleted: np.nda
     where = f"the {len(pinholes)} cameras of {source}" if source else f"{len(pinholes)} cameras around the hole"
     _save_warnings(out, [
         f"no photographs: {where} look at renders of {params.gaussians} instead; what it does not hold, or holds "
-        "blurred, stays so: with photographs results are sharper"
+        "blurred, stays so: with photographs results are sharper",
+        *brought.notes,
     ])  # fmt: skip
     save_scene(out, placed)
-    _save_brought(params, out, scene, placed, deleted)
+    _save_brought(out, placed, brought)
 
 
 def _oddities(scene: Scene, out: Path) -> list[str]:

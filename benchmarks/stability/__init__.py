@@ -19,6 +19,7 @@ SUBJECTS = (
     "diffusion",
     "metric_cases",
     "optimisation",
+    "splat_files",
 )
 
 

@@ -34,6 +34,15 @@ class Fault(NamedTuple):
     caught_by: str
 
 
+def fold_plainly(log_scales: np.ndarray, logits: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mip-Splatting's filter as its paper prints it: exponentials that overflow, and a quotient of products."""
+    with np.errstate(all="ignore"):
+        squares = np.exp(2 * np.asarray(log_scales, np.float64))
+        widened = squares + np.asarray(sizes, np.float64)[:, None] ** 2
+        opacity = np.sqrt(squares.prod(1) / widened.prod(1)) / (1 + np.exp(-np.asarray(logits, np.float64)))
+        return np.log(widened) / 2, np.log(opacity / (1 - opacity))
+
+
 def then(change: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """Right function -> one that changes its result."""
     return lambda right: lambda *given: change(right(*given))
@@ -80,10 +89,12 @@ FAULTS = (
     Fault("an offset that is added, not taken off", "reffusion.capture.frame", "normalise_pose",
           lambda right: lambda pose, similarity: right(pose, replace(similarity, offset=-similarity.offset)),
           "offset 1e6 of the extent, normalised"),
-    Fault("positions of an export in float32 always", "reffusion.io.ply", "_write",
+    Fault("positions of an export in float32 always", "reffusion.io.ply", "save_vertices",
           lambda right: lambda path, table, comments: right(
               path, table.astype([(name, "f4") for name in table.dtype.names]), comments),
           "offset 1e6 of the extent, exported positions"),
+    Fault("a 3D filter folded in without logarithms", "reffusion.io.splat_rows", "fold_filter",
+          lambda right: fold_plainly, "filter_3D, sizes from 0 to 1e8, scales e-40 to e40"),
     Fault("a gradient that nobody looks at", "reffusion.gaussians.optimize", "refuse_not_finite",
           lambda right: lambda gradients: None, "gradients that are not numbers"),
 )  # fmt: skip

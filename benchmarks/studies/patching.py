@@ -4,19 +4,26 @@ The fit of a finished scene is what an artist opens; a box around the object's s
 an editor does: in another order, quantised, without spherical harmonics. `write` makes three scenes of it in --out:
 with the photographs, with the capture's cameras alone, and with neither. `make scene=... patch` patches each; `score`
 renders the patched files from the test views, beside the run's own result: PSNR in the box, and a sheet of pictures.
+
+`command` measures `reffusion patch before.ply after.ply`: what `export` wrote is cut by another tool, npm's
+splat-transform, along the axes; the filled scene is opened by that tool again, and counted in `score`.
 """
 
 from __future__ import annotations
 
 import argparse
+import shlex
 import shutil
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from reffusion.io.arrays import load_labels, save_json, save_text
+from reffusion.io.arrays import load_json, load_labels, save_json, save_text
 from reffusion.io.compressed import save_compressed
 from reffusion.io.images import load_image, load_mask, save_image, to_uint8
 from reffusion.io.ply import load_ply, save_ply
@@ -24,8 +31,11 @@ from reffusion.io.scene import load_object, load_scene
 from reffusion.score import metrics
 from reffusion.splat import rasterizer
 from reffusion.types import Scene, Similarity
+from report import patch_files
 
 KINDS = ("photographs", "cameras", "neither")
+COMMANDS = ("command, cameras", "command, two files alone")
+TURNED = np.array([-1, -1, 1])  # splat-transform's frame of a .ply
 TRIMMED = 0.2  # percent of the object's splats on each side that are beyond the box: floaters
 SHOWN = 4  # test views on the sheet
 
@@ -72,11 +82,68 @@ def write(run: Path, scene: Path, out: Path) -> None:
     print(f"{int(deleted.sum())} of {len(gaussians)} splats deleted; the run itself removed {int(own.sum())}")
 
 
+def cut(run: Path, folder: Path, tool: list[str]) -> None:
+    """before.ply and after.ply in the scene's own frame: a box along the axes around the object's splats is deleted,
+    in six slabs, for splat-transform keeps what is inside a box, and compares x and y with their signs changed.
+    cameras/: the training views and their photographs."""
+    exported, placed = run / "export", load_scene(run / "poses")
+    means = load_ply(exported / "with_object.ply").means.numpy()
+    low, high = np.percentile(means[load_object(run / "masks").numpy()], (TRIMMED, 100 - TRIMMED), axis=0)
+    low, high = np.minimum(low * TURNED, high * TURNED), np.maximum(low * TURNED, high * TURNED)
+    shutil.rmtree(folder, ignore_errors=True)
+    (folder / "cameras").mkdir(parents=True)
+    shutil.copy(exported / "with_object.ply", folder / "before.ply")
+    pieces, inside = [], []
+    for axis, name in enumerate("xyz"):
+        for side, bound in (("lt", low[axis]), ("gt", high[axis])):
+            pieces += [str(folder / "before.ply"), *inside, "-V", f"{name},{side},{bound:.9g}"]
+        inside += ["-V", f"{name},gte,{low[axis]:.9g}", "-V", f"{name},lte,{high[axis]:.9g}"]
+    subprocess.run([*tool, "-q", "-w", *pieces, str(folder / "after.ply")], check=True)
+    cameras = load_json(exported / "cameras" / "transforms.json")
+    shown = {f"images/{name}.png" for name in placed.train}
+    cameras["frames"] = [frame for frame in cameras["frames"] if frame["file_path"] in shown]
+    save_json(folder / "cameras" / "transforms.json", cameras)
+    shutil.copy(exported / "cameras" / "sparse_pc.ply", folder / "cameras")
+    (folder / "cameras" / "images").mkdir()
+    for name in placed.train:
+        shutil.copy(exported / "cameras" / "images" / f"{name}.png", folder / "cameras" / "images")
+    kept = len(load_ply(folder / "after.ply"))
+    print(f"splat-transform deleted {len(means) - kept} of {len(means)} splats")
+
+
+def fill(run: Path, out: Path, runs: Path, tool: list[str], set_: str) -> None:
+    """Run the command with the cameras, photographs and the run's reference, and on the two files alone."""
+    folder = out / "command"
+    cut(run, folder, tool)
+    reference = next((run / "reference" / "references").glob("*.png"))
+    for kind in COMMANDS:
+        words = [str(folder / "before.ply"), str(folder / "after.ply"), "--profile", "laptop", "--set", set_]
+        words += ["--runs", str(runs / "cameras" if kind == COMMANDS[0] else runs / "alone")]
+        if kind == COMMANDS[0]:
+            words += ["--cameras", str(folder / "cameras")]
+            home = patch_files.folder_of(runs / "cameras", folder / "before.ply", folder / "after.ply")
+            (home / "painted").mkdir(parents=True, exist_ok=True)
+            shutil.copy(reference, home / "painted" / reference.name)
+        words += ["--out", str(filled(out, kind))]
+        began = time.monotonic()
+        subprocess.run([sys.executable, "-m", "reffusion.command", "patch", *words], check=True)
+        again = filled(out, kind).with_suffix(".compressed.ply")
+        subprocess.run([*tool, "-q", "-w", str(filled(out, kind)), str(again)], check=True)
+        count = len(load_ply(again))
+        print(f"{kind}: {time.monotonic() - began:.0f} s; splat-transform opens it, {count} splats", flush=True)
+
+
+def filled(out: Path, kind: str) -> Path:
+    """Where the command writes."""
+    return out / "command" / ("cameras.ply" if kind == COMMANDS[0] else "alone.ply")
+
+
 def score(run: Path, out: Path, runs: Path) -> None:
     """Write patching.json and patching.png to `out`."""
     placed = load_scene(run / "poses")
     files = {"own result": run / "evaluate" / "scene.ply", "as given": out / "patch-photographs" / "scene.ply"}
     files |= {kind: runs / f"patch-{kind}" / "patch" / "patched.ply" for kind in KINDS}
+    files |= {kind: filled(out, kind) for kind in COMMANDS}
     together = {title: (path,) for title, path in files.items()}
     for kind in KINDS:
         cleaned = out / f"patch-{kind}" / "cleaned.compressed.ply"
@@ -118,10 +185,14 @@ def main() -> None:
     parser.add_argument("--scene", type=Path, default=Path("data/demo"))
     parser.add_argument("--out", type=Path, default=Path("runs/patching"))
     parser.add_argument("--runs", type=Path, default=Path("runs"))
-    parser.add_argument("what", choices=("write", "score"))
+    parser.add_argument("--tool", default="npx --yes @playcanvas/splat-transform", help="how splat-transform is called")
+    parser.add_argument("--set", default="personalize.steps=4 distill.iterations=4", help="parameters of `command`")
+    parser.add_argument("what", choices=("write", "command", "score"))
     arguments = parser.parse_args()
     if arguments.what == "write":
         write(arguments.run, arguments.scene, arguments.out)
+    elif arguments.what == "command":
+        fill(arguments.run, arguments.out, arguments.runs, shlex.split(arguments.tool), arguments.set)
     else:
         score(arguments.run, arguments.out, arguments.runs)
 

@@ -16,7 +16,7 @@ from reffusion.capture.load import load_capture
 from reffusion.capture.roles import Roles, load_roles
 from reffusion.capture.views import known
 from reffusion.io.files import BadInput, there
-from reffusion.io.ply import check_gaussians
+from reffusion.io.splats import load_splats, summarize
 from reffusion.params.poses import Params
 
 
@@ -49,26 +49,32 @@ def read_scene(params: Params, scene: Path) -> tuple[Capture, Roles]:
     return capture, roles
 
 
-def check_brought(params: Params, scene: Path) -> None:
-    """BadInput where the Gaussians that the scene brings cannot be used, as far as their headers tell."""
-    counts = {}
+def check_brought(params: Params, scene: Path) -> list[str]:
+    """What reading the Gaussians that the scene brings will change in them; BadInput where they cannot be used: both as
+    far as their headers tell."""
+    counts, notes = {}, []
     for key, name in (("gaussians", params.gaussians), ("cleaned", params.cleaned)):
         if name is not None:
             if not there(scene / name):
                 raise BadInput(f"{scene / name}: no such file; correct `{key}` in scene.yaml")
-            counts[key] = check_gaussians(scene / name)
+            summary = summarize(scene / name)
+            counts[key], notes = summary.count, [*notes, *(f"{name}: {note}" for note in summary.notes)]
             if not counts[key]:
                 why = ": everything was deleted; delete the object only" if key == "cleaned" else ""
                 raise BadInput(f"{scene / name}: it holds no Gaussians{why}")
     if params.cleaned is None:
-        return
+        return notes
     if params.gaussians is None:
         raise BadInput("scene.yaml: cleaned: name the scene before anything was deleted too, as `gaussians`")
+    files = [scene / name for name in (params.gaussians, params.cleaned)]
+    if counts["cleaned"] >= counts["gaussians"]:  # rows that cannot be drawn count in neither
+        counts["gaussians"], counts["cleaned"] = (len(load_splats(path).rows) for path in files)
     if counts["cleaned"] >= counts["gaussians"]:
         raise BadInput(
-            f"{scene / params.cleaned}: {counts['cleaned']} splats, and {scene / params.gaussians} has "
-            f"{counts['gaussians']}: nothing was deleted; delete the object in an editor, and save what is left"
+            f"{files[1]}: {counts['cleaned']} splats, and {files[0]} has {counts['gaussians']}: nothing was deleted; "
+            "delete the object in an editor, and save what is left"
         )
+    return notes
 
 
 def unphotographed(params: Params, scene: Path) -> bool:

@@ -1,21 +1,28 @@
-"""Compressed .ply, as PlayCanvas's editor writes it: 256 Gaussians a chunk, quantised within its bounds.
+"""Files that gsply reads and writes: PlayCanvas's compressed .ply, 256 Gaussians a chunk, quantised within its bounds;
+and Niantic's .spz.
 
 The only importer of gsply.
 """
 
 from __future__ import annotations
 
+import struct
+import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from reffusion.io.files import BadInput, reading
+from reffusion.io.splat_rows import Rows
 
 if TYPE_CHECKING:
     from reffusion.types import Gaussians, Similarity
 
 PACKED = "packed_position"  # a property that only these files have
+SPZ_HEADER, SPZ_MAGIC = struct.Struct("<IIIBBBB"), 0x5053474E
+# Signs of the spherical harmonics under y, z -> -y, -z, in the order of 3DGS: degree 1 is y, z, x.
+TURNED_SH = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 
 
 def save_compressed(path: Path, gaussians: Gaussians, similarity: Similarity) -> None:
@@ -26,7 +33,7 @@ def save_compressed(path: Path, gaussians: Gaussians, similarity: Similarity) ->
     Raises:
         BadInput: gsply is not installed.
     """
-    gsply = _library(path)
+    gsply = load_library(path)
     order = np.argsort(_interleaved(gaussians.means.double().numpy()), kind="stable")
     arrays = {name: getattr(gaussians, name).double().numpy()[order] for name in ("means", "log_scales", "quaternions")}
     plain = lambda array: np.ascontiguousarray(array, np.float32)
@@ -45,30 +52,73 @@ def save_compressed(path: Path, gaussians: Gaussians, similarity: Similarity) ->
     Path(path).write_bytes(data)
 
 
-def load_table(path: Path) -> np.ndarray:
-    """[N] with the properties of the standard layout, float32. BadInput where it is broken, or gsply not installed."""
-    gsply = _library(path)
+def load_compressed(path: Path) -> Rows:
+    """The splats of a compressed .ply. BadInput where it is broken, or gsply is not installed."""
+    gsply = load_library(path)
     with reading(path, "a compressed .ply"):
-        data = gsply.plyread(str(path))
-        count, higher = len(data.means), 0 if data.shN is None else data.shN.shape[1]
-        columns = {name: data.means[:, k] for k, name in enumerate("xyz")}
-        columns |= {f"f_dc_{k}": data.sh0[:, k] for k in range(3)}
-        rest = np.zeros((count, 0)) if not higher else data.shN.transpose(0, 2, 1).reshape(count, 3 * higher)
-        columns |= {f"f_rest_{k}": rest[:, k] for k in range(rest.shape[1])}
-        columns |= {"opacity": data.opacities.reshape(-1)}
-        columns |= {f"scale_{k}": data.scales[:, k] for k in range(3)}
-        columns |= {f"rot_{k}": data.quats[:, k] for k in range(4)}
-    table = np.empty(count, [(name, "f4") for name in columns])
-    for name, column in columns.items():
-        table[name] = column
-    return table
+        return _rows(gsply.plyread(str(path)))
 
 
-def _library(path: Path):
+def load_spz_header(path: Path) -> tuple[int, int, bool]:
+    """The number of splats in a .spz, its version, and whether they are meant to be drawn antialiased."""
+    with reading(path, "a .spz file"), open(path, "rb") as file:
+        start = file.read(4096)
+        if start[:2] == b"\x1f\x8b":  # versions 1 to 3 are one gzip stream
+            start = zlib.decompressobj(31).decompress(start, SPZ_HEADER.size)
+        magic, version, count, degree, _, flags, _ = SPZ_HEADER.unpack_from(start)
+        if magic != SPZ_MAGIC:
+            raise BadInput(f"{path}: not a .spz file; it does not begin with NGSP")
+        if degree > 3:
+            raise BadInput(f"{path}: spherical harmonics of degree {degree}; convert it to .ply, or to degree 3")
+        return count, version, bool(flags & 1)
+
+
+def load_spz(path: Path) -> Rows:
+    """The splats of a .spz, in the frame of a .ply: the format holds them turned by 180 degrees about x (y up)."""
+    gsply = load_library(path)
+    with reading(path, "a .spz file"):
+        return _turned(_rows(gsply.read_spz(str(path))))
+
+
+def save_spz(path: Path, rows: Rows) -> None:
+    """Write rows in the frame of a .ply. Positions keep 24 bits, as fine as their extent allows."""
+    gsply = load_library(path)
+    turned = _turned(rows)
+    extent = float(np.abs(turned.means).max(initial=1e-6))
+    lengths = np.linalg.norm(turned.quaternions, axis=1, keepdims=True)
+    unit = np.where(lengths > 0, turned.quaternions / np.maximum(lengths, 1e-30), [1.0, 0.0, 0.0, 0.0])
+    plain = lambda array: np.ascontiguousarray(array, np.float32)
+    data = gsply.GSData.from_arrays(
+        means=plain(turned.means),
+        scales=turned.log_scales,
+        quats=plain(unit),
+        opacities=turned.opacity_logits,
+        sh0=plain(turned.sh[:, 0]),
+        shN=plain(turned.sh[:, 1:]) if turned.sh.shape[1] > 1 else None,
+        format="ply",
+    )
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    gsply.write_spz(str(path), data, fractional_bits=int(np.clip(22 - np.ceil(np.log2(extent)), 1, 20)))
+
+
+def _rows(data) -> Rows:
+    """What gsply read."""
+    sh = data.sh0[:, None] if data.shN is None else np.concatenate([data.sh0[:, None], data.shN], axis=1)
+    return Rows(data.means.astype(np.float64), data.quats, data.scales, data.opacities.reshape(-1), sh)
+
+
+def _turned(rows: Rows) -> Rows:
+    """Turned by 180 degrees about x: y and z change sign, and with them each odd spherical harmonic."""
+    means, quaternions = rows.means * (1, -1, -1), rows.quaternions * np.array([1, 1, -1, -1], np.float32)
+    return Rows(means, quaternions, rows.log_scales, rows.opacity_logits, rows.sh * TURNED_SH[: rows.sh.shape[1], None])
+
+
+def load_library(path: Path):
+    """gsply; BadInput where it is not installed."""
     try:
         import gsply
     except ImportError:
-        raise BadInput(f"{path}: a compressed .ply takes gsply: `pip install gsply`, or save it uncompressed") from None
+        raise BadInput(f"{path}: a quantised file takes gsply: `pip install gsply`, or save it as plain .ply") from None
     return gsply
 
 

@@ -42,10 +42,10 @@ def preview(params: Params, scene: Path) -> list[str]:
     """What the stage will do, from headers and the pixels of a few masks. ValueError where it would refuse, or where a
     reference that the scene brings, read by a later stage, belongs to none of its views."""
     if unphotographed(params, scene):
-        check_brought(params, scene)
+        brought = check_brought(params, scene)
         found = cameras.read(scene)
         who = f"{len(found[0].lenses)} cameras of {found[1].relative_to(scene)}" if found else "cameras around the hole"
-        return [f"no photographs: {who} look at renders of {params.gaussians} instead"]
+        return [f"no photographs: {who} look at renders of {params.gaussians} instead", *brought]
     capture, roles = read_scene(params, scene)
     given = load_given(scene, views_of(capture, roles), params.reference)
     for files in roles.masks.values():
@@ -57,7 +57,7 @@ def preview(params: Params, scene: Path) -> list[str]:
     notes += [f"{len(roles.blank)} views are cameras only"] if roles.blank else []
     notes += _of_poses(capture, scene)
     notes += [f"the scene brings a reference of {words(given)}"] if given else []
-    return [*notes, *capture.warnings, *roles.warnings]
+    return [*notes, *capture.warnings, *roles.warnings, *check_brought(params, scene)]
 
 
 def _of_poses(capture: Capture, scene: Path) -> list[str]:

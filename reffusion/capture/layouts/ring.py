@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cache
 from itertools import islice
 
 import numpy as np
@@ -14,21 +16,56 @@ from reffusion.io.files import BadInput
 ANGLE = np.radians(60)  # of view, across
 ASPECT = 4 / 3
 DIRECTIONS, MOST = 400, 40  # that are tried, all over the sphere, and views that are kept
-DISTANCES = (4.0, 2.8, 2.0)  # of the hole's radius, the first that will do
 BESIDE = 500  # splats next to the hole that tell which way is up
 RAYS, GRID = 24, (8, 6)  # to the hole, by which it is found whether something stands before it; over the picture
 CLOSE = 0.25  # of the hole's radius: what is that near to its splats is the ground they stand on
-FREE = 0.7  # of the former that must pass
-FILLED = 0.9  # of the latter that must meet something: where they do not, the scene was not photographed from
+CLEAR = 0.25  # of the hole's radius: so near to a camera there is no splat, or it would stand in a surface
 REACH = 2.0  # of a splat's standard deviation: so near to its middle a ray meets it
 FAR = 20.0  # of the hole's radius: where rays end
 MARCH = 80  # steps of a ray
 LEAST = 3  # views
 
 
+@dataclass(frozen=True)
+class Demands:
+    """What a place must offer to be a camera's.
+
+    Attributes:
+        distances: from the hole, in its radii; of each direction the first that will do is taken.
+        free: share of the rays to the hole that must pass.
+        filled: share of the rays over the picture that must meet something: where they do not, the scene was not
+            photographed from there.
+        height: cosine of the angle between the direction and up that it must exceed; 0 is level with the hole.
+    """
+
+    distances: tuple[float, ...]
+    free: float
+    filled: float
+    height: float
+
+
+# In turn, until three places will do: a table-top scene fills pictures from above only, a room with an open side or a
+# hole in its corner hardly from anywhere, and one between other things shows itself in part.
+RELAXED = (
+    Demands((4.0, 2.8, 2.0), 0.7, 0.9, 0.0),
+    Demands((4.0, 2.8, 2.0), 0.7, 0.8, 0.0),
+    Demands((6.0, 4.0, 2.8, 2.0, 1.5), 0.6, 0.65, 0.0),
+    Demands((6.0, 4.0, 2.8, 2.0, 1.5), 0.4, 0.5, -0.3),
+)
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What is seen from a place: the shares that `Demands` asks for."""
+
+    free: float
+    filled: float
+
+
 def cameras_around(means: np.ndarray, sizes: np.ndarray, opaque: np.ndarray, deleted: np.ndarray, width: int) -> Poses:
     """Views of the hole from all sides from which what stays does not hide it, and the scene fills the picture: so it
-    was photographed from there, or can be looked at from there.
+    was photographed from there, or can be looked at from there. Where fewer than three are found, `RELAXED` demands
+    less; no camera stands in a surface.
 
     Args:
         means: [N, 3], the whole scene's, in its own frame; sizes: [N], of each the middle one of its three standard
@@ -48,11 +85,22 @@ def cameras_around(means: np.ndarray, sizes: np.ndarray, opaque: np.ndarray, del
     up, aim = _up(hole, means[keep], center), hole[:: max(1, len(hole) // RAYS)][:RAYS]
     height, focal = round(width / ASPECT), width / 2 / np.tan(ANGLE / 2)
     lens = Lens(width, height, focal, focal, width / 2, height / 2)
-    found = []
-    for away in (each for each in _directions(DIRECTIONS) if each @ up > 0):
-        poses = (_looking(center + each * radius * away, center, up) for each in DISTANCES)
-        found += list(islice((pose for pose in poses if _shows(pose, lens, aim, stays, radius)), 1))
-    if len(found) < LEAST:
+    directions = _directions(DIRECTIONS)
+    pose = lambda direction, away: _looking(center + away * radius * directions[direction], center, up)
+
+    @cache
+    def sight(direction: int, away: float) -> Sight:
+        return _sight(pose(direction, away), lens, aim, stays, radius)
+
+    for demands in RELAXED:
+        found = []
+        for direction in np.flatnonzero(directions @ up > demands.height):
+            seen = ((away, sight(direction, away)) for away in demands.distances)
+            fits = (away for away, s in seen if s.free >= demands.free and s.filled >= demands.filled)
+            found += [pose(direction, away) for away in islice(fits, 1)]
+        if len(found) >= LEAST:
+            break
+    else:
         raise BadInput(
             "scene.yaml: cleaned: from hardly anywhere around it the hole is in sight and the scene whole; bring "
             "cameras, as transforms.json or a COLMAP model"
@@ -78,17 +126,22 @@ def _up(hole: np.ndarray, stays: np.ndarray, center: np.ndarray) -> np.ndarray:
     return normal if normal @ (center - middle) >= 0 else -normal
 
 
-def _shows(pose: np.ndarray, lens: Lens, aim: np.ndarray, stays: tuple[cKDTree, np.ndarray], radius: float) -> bool:
-    """Is the hole, its splats `aim` [P, 3], in sight from there, and the picture filled?"""
+def _sight(pose: np.ndarray, lens: Lens, aim: np.ndarray, stays: tuple[cKDTree, np.ndarray], radius: float) -> Sight:
+    """What a camera sees of the hole, its splats `aim` [P, 3], and of the scene; nothing where it stands in a
+    splat or right before one."""
     place = -pose[:3, :3].T @ pose[:3, 3]
+    distance, nearest = stays[0].query(place)
+    if distance < max(CLEAR * radius, stays[1][nearest]):
+        return Sight(0.0, 0.0)
     ways = aim - place
     lengths = np.linalg.norm(ways, axis=1)
-    if np.mean(~_met(place, ways, np.maximum(lengths - CLOSE * radius, 0), stays)) < FREE:
-        return False
+    free = float(np.mean(~_met(place, ways, np.maximum(lengths - CLOSE * radius, 0), stays)))
+    if free < min(demands.free for demands in RELAXED):
+        return Sight(free, 0.0)
     columns, rows = ((np.arange(n) + 0.5) / n for n in GRID)
     x, y = np.meshgrid((columns * lens.width - lens.cx) / lens.fx, (rows * lens.height - lens.cy) / lens.fy)
     rays = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3) @ pose[:3, :3]
-    return bool(np.mean(_met(place, rays, np.full(len(rays), FAR * radius), stays)) >= FILLED)
+    return Sight(free, float(np.mean(_met(place, rays, np.full(len(rays), FAR * radius), stays))))
 
 
 def _met(place: np.ndarray, ways: np.ndarray, ends: np.ndarray, stays: tuple[cKDTree, np.ndarray]) -> np.ndarray:

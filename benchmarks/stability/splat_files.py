@@ -1,0 +1,140 @@
+"""Cases of splat files: Mip-Splatting's filter folded in, values that editors clamp, quantised splats."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from decimal import Decimal, localcontext
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from benchmarks.stability.cases import EPS32, EPS64, EXACT, Case, largest
+from benchmarks.stability.splatting import camera, cloud
+from reffusion.io.compressed import load_spz, save_spz
+from reffusion.io.ply import save_ply
+from reffusion.io.quantized import open_splat, save_splat
+from reffusion.io.splat_rows import FLAT, MOST_LOGIT, Rows, fold_filter, valid
+from reffusion.io.splats import load_splats
+from reffusion.splat import rasterizer
+from reffusion.types import PARAMETERS, Gaussians
+
+# Log-scales, filters and logits: from a point to a star, from nothing to all, of like size and far apart.
+LOG_SCALES = (-40.0, -20.0, -5.0, 0.0, 7.0, 40.0)
+FILTERS = (0.0, 1e-30, 1e-8, 3e-3, 1.0, 1e8)
+LOGITS = (-90.0, -20.0, -1.0, 0.0, 4.0, 30.0)
+
+
+def folded_exactly(log_scale: float, size: float, logit: float) -> tuple[float, float, float]:
+    """The log-scale, and the logarithms of the opacity and of its complement, in 80 decimal digits, all axes alike."""
+    with localcontext() as context:
+        context.prec = 80
+        square, filter_ = (2 * Decimal(log_scale)).exp(), Decimal(size) ** 2
+        opacity = 1 / (1 + (-Decimal(logit)).exp()) * (square / (square + filter_)).sqrt() ** 3
+        return float((square + filter_).ln() / 2), float(opacity.ln()), float((1 - opacity).ln())
+
+
+def filter_off() -> float:
+    """The largest error of a folded log-scale, or of the logarithm of an opacity or of its complement, in units of
+    what a rounding of the inputs, or of a logarithm itself, makes of it."""
+    errors = []
+    for log_scale in LOG_SCALES:
+        for size in FILTERS:
+            for logit in LOGITS:
+                scales, logits = fold_filter(np.full((1, 3), log_scale), np.array([logit]), np.array([size]))
+                scale, opacity, clear = folded_exactly(log_scale, size, logit)
+                logs = -np.logaddexp(0, -logits[0]), -np.logaddexp(0, logits[0])
+                errors += [abs(scales[0, 0] - scale) / (1 + abs(scale)), abs(logs[0] - opacity) / (1 + abs(opacity))]
+                errors.append(abs(logs[1] - clear) / (1 + abs(clear)))
+    return largest(*errors)
+
+
+def filter_not_finite() -> float:
+    """How many values are not finite after reading rows of every extreme, infinite logits and flat axes too."""
+    grid = np.array(np.meshgrid([*LOG_SCALES, -np.inf], FILTERS, [*LOGITS, np.inf, -np.inf])).reshape(3, -1)
+    scales, logits = fold_filter(np.repeat(grid[0][:, None], 3, 1), grid[2], grid[1])
+    count = len(logits)
+    rows = Rows(np.ones((count, 3)), np.ones((count, 4), np.float32), scales.astype(np.float32),
+                logits.astype(np.float32), np.ones((count, 1, 3), np.float32))  # fmt: skip
+    found, _ = valid(rows)
+    lost = count - len(found)
+    return float(lost + (~np.isfinite(found.log_scales)).sum() + (~np.isfinite(found.opacity_logits)).sum())
+
+
+def rows_of(gaussians: Gaussians) -> Rows:
+    means, *others = (getattr(gaussians, name).numpy() for name in PARAMETERS)
+    return Rows(means.astype(np.float64), *others)
+
+
+def clamped_off(gradients: bool) -> float:
+    """Largest difference of a picture, or relative one of its gradients, with an opaque splat, a transparent one and
+    flat ones from the picture of their limits; infinite where one is not finite."""
+    given = cloud()
+    given.opacity_logits[:2] = torch.tensor([math.inf, -math.inf])
+    given.log_scales[2, 1] = given.log_scales[3, 0] = -math.inf
+    with tempfile.TemporaryDirectory() as folder:
+        save_ply(Path(folder) / "g.ply", given)
+        read = load_splats(Path(folder) / "g.ply").gaussians()
+    limit = read.map(torch.clone)
+    limit.opacity_logits[:2] = torch.tensor([2 * MOST_LOGIT, -2 * MOST_LOGIT])
+    limit.log_scales[2, 1] = limit.log_scales[3, 0] = 2 * FLAT
+    found = []
+    for gaussians in (read, limit):
+        leaves = gaussians.map(lambda p: p.requires_grad_())
+        picture = rasterizer.render(leaves, camera()).color
+        picture.square().sum().backward()
+        found.append((picture.detach(), [getattr(leaves, name).grad for name in PARAMETERS]))
+    (picture, slopes), (other, others) = found
+    if not gradients:
+        return (picture - other).abs().max().item()
+    return largest(*((a - b).norm().item() / max(b.norm().item(), 1e-5) for a, b in zip(slopes, others, strict=True)))
+
+
+def splat_off(what: str) -> float:
+    """Largest error of what a .splat keeps, after writing and reading, in steps of its format."""
+    given = cloud(500, degree=0)
+    given.opacity_logits[:2] = torch.tensor([MOST_LOGIT, -MOST_LOGIT])
+    given.log_scales[2] = FLAT
+    rows = rows_of(given)
+    with tempfile.TemporaryDirectory() as folder:
+        save_splat(Path(folder) / "s.splat", rows)
+        read, _ = valid(open_splat(Path(folder) / "s.splat")(slice(0, 500)))
+    sigmoid = lambda logits: 1 / (1 + np.exp(-logits.astype(np.float64)))
+    if what == "opacities":
+        return float(np.abs(sigmoid(read.opacity_logits) - sigmoid(rows.opacity_logits)).max() * 255)
+    return float(np.abs(read.log_scales - rows.log_scales).max())
+
+
+def spz_off(extent: float) -> float:
+    """Largest error of a position after a .spz, in extents; rows that are lost count as infinite."""
+    given = cloud(500, degree=3)
+    rows = rows_of(given)
+    rows = Rows(rows.means * extent, *list(vars(rows).values())[1:])
+    with tempfile.TemporaryDirectory() as folder:
+        save_spz(Path(folder) / "s.spz", rows)
+        read, _ = valid(load_spz(Path(folder) / "s.spz"))
+    return math.inf if len(read) < 500 else float(np.abs(read.means - rows.means).max() / extent)
+
+
+CASES = (
+    # A rounding of log(size) is 2^-53 of up to 70, twice that in the exponent, thrice in the product over axes.
+    Case("filter_3D, sizes from 0 to 1e8, scales e-40 to e40", "worst error of a logarithm, over 1 + its size",
+         2 * 3 * 70 * EPS64, filter_off),
+    Case("filter_3D with infinite logits and flat axes", "values that are not finite, and rows lost", EXACT,
+         filter_not_finite),
+    # The opacity is off by e^-20 = 2e-9, an axis by 2e-9 extents: below a rounding of float32 in what eight splats add.
+    Case("infinite opacities and flat scales, picture", "largest difference from their limits", 8 * EPS32,
+         partial(clamped_off, False)),
+    Case("infinite opacities and flat scales, gradients", "worst relative difference of a block from the limits'",
+         1e-3, partial(clamped_off, True)),
+    Case("quantised in a .splat, opacities", "worst error in steps of 1/255", 0.5 + 1e-3,
+         partial(splat_off, "opacities")),
+    # A size is a float32: its logarithm, of up to 20, is off by a rounding of the size and one of itself.
+    Case("quantised in a .splat, log-scales", "worst error", 21 * EPS32 + EPS32, partial(splat_off, "scales")),
+    # 24 bits with sign over the power of two above the extent, and one more: a step is 2^-21 of the largest coordinate,
+    # which is that of 500 normal ones of 0.25; bounded by 20 fractional bits.
+    *(Case(f"quantised in a .spz, extent {extent:g}", "worst error of a position in extents",
+           max(2**-21, 2**-21 / extent) + EPS32, partial(spz_off, extent)) for extent in (1e-2, 1.0, 1e4)),
+)  # fmt: skip

@@ -1,0 +1,110 @@
+"""PLY files as tables: the header, the vertices as a structured array, and writing one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from reffusion.io.files import BadInput, reading, shortened
+
+TYPES: dict[str, np.dtype] = {
+    **dict.fromkeys(("char", "int8"), np.dtype("i1")),
+    **dict.fromkeys(("uchar", "uint8"), np.dtype("u1")),
+    **dict.fromkeys(("short", "int16"), np.dtype("i2")),
+    **dict.fromkeys(("ushort", "uint16"), np.dtype("u2")),
+    **dict.fromkeys(("int", "int32"), np.dtype("i4")),
+    **dict.fromkeys(("uint", "uint32"), np.dtype("u4")),
+    **dict.fromkeys(("float", "float32"), np.dtype("f4")),
+    **dict.fromkeys(("double", "float64"), np.dtype("f8")),
+}
+LONGEST_LINE = 10_000  # of a header, in bytes
+
+
+@dataclass(frozen=True)
+class Header:
+    """The header of a PLY file.
+
+    Attributes:
+        text: the numbers are written as text.
+        elements: name, number of rows, and of each of its properties type and name; of a list ("list", name).
+        comments: the lines of comment.
+        at: where the data begins, in bytes.
+    """
+
+    text: bool
+    elements: tuple[tuple[str, int, tuple[tuple[str, str], ...]], ...]
+    comments: tuple[str, ...]
+    at: int
+
+    def least(self) -> int:
+        """Bytes that the data takes at least: a digit and a blank for each number of a text, one for a list's length.
+
+        An element without properties takes none, however many it is said to have: it counts as a byte each."""
+        size = lambda kind: 2 if self.text else TYPES[kind].itemsize if kind in TYPES else 1
+        rows = ((count, max(sum(size(kind) for kind, _ in each), 1)) for _, count, each in self.elements)
+        return sum(count * row for count, row in rows) - int(self.text)  # the last line may end without a break
+
+    def vertices(self) -> tuple[int, list[str]]:
+        """The number of vertices, and the names of their properties that are numbers."""
+        count, properties = next((c, p) for name, c, p in self.elements if name == "vertex")
+        return count, [name for kind, name in properties if kind in TYPES]
+
+
+def load_header(path: Path) -> Header:
+    """Raises BadInput, where it is none, or where the file is too short for what it declares."""
+    with reading(path, "a readable PLY file with vertices"), open(path, "rb") as file:
+        if file.readline(8).strip() != b"ply":
+            raise BadInput(f"{path}: not a PLY file; its first line is not `ply`")
+        form, elements, comments = "", [], []
+        for raw in iter(lambda: file.readline(LONGEST_LINE), b""):
+            words = raw.decode("ascii", "replace").split()
+            if words[:1] == ["format"]:
+                form = words[1]
+            elif words[:1] == ["comment"]:
+                comments.append(" ".join(words[1:]))
+            elif words[:1] == ["element"]:
+                elements.append((words[1], int(words[2]), []))
+            elif words[:1] == ["property"]:
+                elements[-1][2].append((words[1], words[-1]))
+            elif words[:1] == ["end_header"]:
+                break
+        else:
+            raise BadInput(f"{path}: cut off within its header")
+        held = tuple((name, count, tuple(properties)) for name, count, properties in elements)
+        header = Header(form == "ascii", held, tuple(comments), file.tell())
+        if form not in ("ascii", "binary_little_endian", "binary_big_endian"):
+            raise BadInput(f"{path}: not a readable PLY file with vertices: its format is '{shortened(form)}'")
+        if any(count < 0 for _, count, _ in held) or not any(name == "vertex" for name, _, _ in held):
+            raise BadInput(f"{path}: not a readable PLY file with vertices")
+        if header.at + header.least() > Path(path).stat().st_size:
+            raise BadInput(f"{path}: cut off: it is too short for what its header declares")
+        return header
+
+
+def load_vertices(path: Path, header: Header) -> np.ndarray:
+    """[N] structured, a property a field. Vertices of fixed size are mapped from the file, not held in memory."""
+    from plyfile import PlyData
+
+    with reading(path, "a readable PLY file with vertices"):
+        (name, count, properties), *_ = header.elements
+        if header.text and name == "vertex" and all(kind in TYPES for kind, _ in properties):
+            # numpy reads these forty times faster than plyfile, and nerfstudio writes its points as text
+            types = np.dtype([(n, "f8" if TYPES[kind].kind == "f" else "i8") for kind, n in properties])
+            with open(path, "rb") as file:
+                file.seek(header.at)
+                table = np.loadtxt(file, dtype=types, max_rows=count, ndmin=1) if count else np.empty(0, types)
+            if len(table) != count:
+                raise BadInput(f"{path}: cut off: {len(table)} of {count} vertices")
+            return table
+        return PlyData.read(str(path))["vertex"].data
+
+
+def save_vertices(path: Path, table: np.ndarray, comments: Sequence[str] = ()) -> None:
+    """Write a structured array [N] as the vertices of a PLY file, binary, little endian."""
+    from plyfile import PlyData, PlyElement
+
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    PlyData([PlyElement.describe(table, "vertex")], byte_order="<", comments=list(comments)).write(str(path))

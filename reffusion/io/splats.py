@@ -1,0 +1,204 @@
+"""Files of Gaussians in any layout that is read: .ply of 3DGS and its relatives, compressed .ply, .spz and .splat.
+
+Rows are read in blocks, so that beside the result only one block is held in memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from reffusion.io import compressed, quantized
+from reffusion.io.files import BadInput, reading, there
+from reffusion.io.ply_table import load_header, load_vertices
+from reffusion.io.splat_rows import BAD_SHARE, DEGREE, FLAT, Repairs, Rows, fold_filter, valid
+from reffusion.splat.conventions import SH0
+
+if TYPE_CHECKING:
+    from reffusion.types import Gaussians, Similarity
+
+POSITION = ("x", "y", "z")
+DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+SCALES = ("scale_0", "scale_1", "scale_2")
+ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+RED_GREEN_BLUE = ("red", "green", "blue")
+FILTER = "filter_3D"  # Mip-Splatting's standard deviation of each splat's smoothing filter
+ANTIALIASED = "antialiased"  # a comment that says how the Gaussians are meant to be drawn
+FORMATS = (".ply", ".compressed.ply", ".spz", ".splat")
+UNREAD = (".ksplat", ".sog", ".lcc", ".lcc2", ".glb", ".gltf", ".usdz", ".zip", ".json")
+BLOCK = 8192  # rows
+DEGREES = {3 * ((degree + 1) ** 2 - 1): degree for degree in range(11)}  # number of `f_rest` properties -> degree
+
+
+@dataclass(frozen=True)
+class Splats:
+    """The splats of a file, in its own frame, and what was changed when they were read.
+
+    Attributes:
+        rows: those that can be drawn, in the order of the file.
+        antialiased: they are meant to be drawn with Mip-Splatting's compensation.
+        notes: sentences without the file's name.
+    """
+
+    rows: Rows
+    antialiased: bool
+    notes: tuple[str, ...]
+
+    def gaussians(self, similarity: Similarity | None = None) -> Gaussians:
+        """Float32 on the CPU; with `similarity` in the normalised frame."""
+        import torch
+
+        from reffusion.types import Gaussians
+
+        means, log_scales = self.rows.means, self.rows.log_scales
+        if similarity is not None:
+            means, log_scales = similarity.apply(means), log_scales + np.float32(np.log(similarity.scale))
+        arrays = (means, self.rows.quaternions, log_scales, self.rows.opacity_logits, self.rows.sh)
+        plain = (torch.from_numpy(np.array(array, np.float32, order="C", copy=None)) for array in arrays)
+        return Gaussians(*plain, antialiased=self.antialiased)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What the header of a file of Gaussians says.
+
+    Attributes:
+        count: the number of rows.
+        notes: what reading will change, sentences without the file's name.
+        properties: names of a .ply's vertex properties, in order; none of a quantised file.
+        antialiased: as in `Splats`.
+    """
+
+    count: int
+    notes: tuple[str, ...] = ()
+    properties: tuple[str, ...] = ()
+    antialiased: bool = False
+
+
+def summarize(path: Path) -> Summary:
+    """What the header says. BadInput where the file is cut off, or no file of Gaussians."""
+    path = Path(path)
+    ending = path.suffix.lower()
+    if ending in UNREAD:
+        raise BadInput(
+            f"{path}: {ending} is not read; convert it to .ply, as with `npx @playcanvas/splat-transform "
+            f"{path.name} {path.stem}.ply`"
+        )
+    if ending == ".splat":
+        return Summary(quantized.count_splat(path))
+    if ending == ".spz":
+        count, _, antialiased = compressed.load_spz_header(path)
+        return Summary(count, antialiased=antialiased)
+    header = load_header(path)
+    count, names = header.vertices()
+    if compressed.PACKED in names:
+        return Summary(count)
+    notes = _check_properties(path, names)
+    smoothed = ANTIALIASED in header.comments or FILTER in names
+    return Summary(count, notes, tuple(names), smoothed)
+
+
+def load_splats(path: Path) -> Splats:
+    """Read the splats of a file; rows that cannot be drawn are dropped, see `splat_rows.valid`.
+
+    Raises:
+        BadInput: naming the file, where it is none of Gaussians, or more than half of its rows are invalid.
+    """
+    path = Path(path)
+    there(path)
+    summary, ending = summarize(path), path.suffix.lower()
+    with reading(path, "a file of Gaussians"):
+        if ending == ".splat":
+            read = quantized.open_splat(path)
+        elif ending == ".spz":
+            read = compressed.load_spz(path).take
+        elif not summary.properties:
+            read = compressed.load_compressed(path).take
+        else:
+            read = _open_ply(load_vertices(path, load_header(path)))
+        rows, repairs = _gather(path, summary.count, read)
+    said = repairs.sentence(summary.count)
+    return Splats(rows, summary.antialiased, (*summary.notes, *([said] if said else [])))
+
+
+def _gather(path: Path, count: int, read: Callable[[slice], Rows]) -> tuple[Rows, Repairs]:
+    """All valid rows of a file of `count` rows, of which `read` gives a block."""
+    first, repairs, at = read(slice(0, 0)), Repairs(), 0
+    whole = Rows(*(np.empty((count, *array.shape[1:]), array.dtype) for array in vars(first).values()))
+    for start in range(0, count, BLOCK):
+        found, done = valid(read(slice(start, min(start + BLOCK, count))))
+        repairs += done
+        for array, block in zip(vars(whole).values(), vars(found).values(), strict=True):
+            array[at : at + len(found)] = block
+        at += len(found)
+    if repairs.invalid > BAD_SHARE * count:
+        raise BadInput(
+            f"{path}: {repairs.invalid} of {count} splats hold NaN or infinite values: the file is damaged, or the "
+            "training that wrote it diverged; save it again"
+        )
+    if count and not at:
+        raise BadInput(f"{path}: it holds no Gaussians: {repairs.sentence(count)}")
+    return whole.take(slice(at)), repairs
+
+
+def _open_ply(table: np.ndarray) -> Callable[[slice], Rows]:
+    """A function from a range of rows to these rows."""
+    names = table.dtype.names
+    higher = sum(name.startswith("f_rest_") for name in names) // 3
+    used = min(higher, (DEGREE + 1) ** 2 - 1)
+    rest = [[f"f_rest_{channel * higher + k}" for channel in range(3)] for k in range(used)]
+
+    def take(block: np.ndarray, columns: Sequence[str], kind: str) -> np.ndarray:
+        found = np.empty((len(block), len(columns)), kind)
+        with np.errstate(over="ignore"):
+            for column, name in enumerate(columns):
+                found[:, column] = block[name]
+        return found
+
+    def read(chosen: slice) -> Rows:
+        block = np.array(table[chosen])  # mapped: from the disk once, not once for each property
+        logits = take(block, ["opacity"], "f8")[:, 0]
+        scales = take(block, [name for name in SCALES if name in names], "f8")
+        if scales.shape[1] == 2:
+            scales = np.column_stack([scales, np.full(len(block), FLAT)])
+        if FILTER in names:
+            scales, logits = fold_filter(scales, logits, block[FILTER])
+        sh = np.empty((len(block), 1 + used, 3), np.float32)
+        sh[:, 0] = take(block, DC, "f4") if DC[0] in names else _color_coefficients(block)
+        for k, columns in enumerate(rest):
+            sh[:, 1 + k] = take(block, columns, "f4")
+        with np.errstate(over="ignore"):
+            narrow = scales.astype(np.float32), logits.astype(np.float32)
+        return Rows(take(block, POSITION, "f8"), take(block, ROTATION, "f4"), *narrow, sh)
+
+    return read
+
+
+def _color_coefficients(block: np.ndarray) -> np.ndarray:
+    """[N, 3] float32, the constant coefficient of each colour: bytes, or floats from 0 to 1."""
+    colors = np.stack([block[name] for name in RED_GREEN_BLUE], axis=1)
+    unit = colors if np.issubdtype(colors.dtype, np.floating) else colors / 255
+    return ((unit - 0.5) / SH0).astype(np.float32)
+
+
+def _check_properties(path: Path, names: Sequence[str]) -> tuple[str, ...]:
+    """What reading will change, by the names of the properties; BadInput where they are not those of Gaussians."""
+    others = (*POSITION, "opacity", *SCALES[:2], *ROTATION)
+    colored = {*others, *RED_GREEN_BLUE} <= {*names} and DC[0] not in names  # as nerfstudio writes on request
+    missing = [n for n in (*others, *(() if colored else DC)) if n not in names]
+    if missing:
+        raise BadInput(f"{path}: not a file of Gaussians, it lacks {', '.join(missing)}")
+    count = sum(n.startswith("f_rest_") for n in names)
+    if count not in DEGREES or any(f"f_rest_{k}" not in names for k in range(count)):
+        raise BadInput(f"{path}: {count} f_rest properties; 0, 9, 24, 45 or 72 belong to degrees 0 to 4")
+    if len(set(names)) < len(names):
+        raise BadInput(f"{path}: a property comes twice")
+    notes = ["the 3D filter of Mip-Splatting is folded into scales and opacities"] if FILTER in names else []
+    notes += ["it has two scales, as 2DGS writes: the third axis is flat"] if SCALES[2] not in names else []
+    if DEGREES[count] > DEGREE:
+        notes.append(f"spherical harmonics of degree {DEGREES[count]} are cut to degree {DEGREE}")
+    return tuple(notes)

@@ -1,0 +1,109 @@
+"""`reffusion patch before.ply after.ply --out patched.ply`: a hole is filled without a folder or a scene.yaml.
+
+The two files, and cameras where they come along, are linked into runs/patches/<name>/, which is a scene's folder as any
+other: there a person paints a reference, and the same command goes on from what runs/<name>/ holds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+from reffusion.io.arrays import save_text
+from reffusion.io.files import BadInput
+from reffusion.io.ply import can_save, properties_of, save_splats
+from reffusion.io.scene import load_scene
+from reffusion.io.splats import summarize
+from report.patch_result import load_result
+
+BEFORE, AFTER, PATCHES = "before", "after", "patches"
+OWN = (BEFORE, AFTER, "painted", "scene.yaml")  # names in the folder that no link to a camera replaces
+
+
+def check(arguments: argparse.Namespace) -> None:
+    """ValueError where the files cannot be used, as far as their headers tell, or the result could not be written."""
+    if len(arguments.files) != 2:
+        raise BadInput(f"{arguments.files[0]}: name two files, the scene before and after the object was deleted")
+    if arguments.scene or arguments.variant:
+        raise BadInput("--scene, --variant: a scene's folder names its files in scene.yaml; give it, or two files")
+    if arguments.out is None:
+        raise BadInput("--out: name the file to write, as --out patched.ply")
+    for file in arguments.files:
+        summarize(file)
+    can_save(arguments.out)
+    if arguments.cameras is not None and not arguments.cameras.is_dir():
+        raise BadInput(f"{arguments.cameras}: no such folder; --cameras names one with transforms.json or sparse/0")
+
+
+def prepare(arguments: argparse.Namespace) -> Path:
+    """The scene's folder, written anew but for what a person painted."""
+    files = [file.expanduser().resolve() for file in arguments.files]
+    folder, names = folder_of(arguments.runs, *files), {}
+    for key, file in zip((BEFORE, AFTER), files, strict=True):
+        names[key] = f"{key}/{file.name}"
+        _link(folder / names[key], file)
+    for path in folder.iterdir():
+        if path.is_symlink():
+            path.unlink()
+    for path in sorted(arguments.cameras.expanduser().resolve().iterdir()) if arguments.cameras else ():
+        if path.name not in OWN and not path.name.startswith("."):
+            _link(folder / path.name, path)
+    said = f"gaussians: {json.dumps(names[BEFORE])}\ncleaned: {json.dumps(names[AFTER])}\nmasks: none\n"
+    scene = folder / "scene.yaml"
+    if not scene.is_file() or scene.read_text(encoding="utf-8") != said:
+        save_text(scene, said)
+    return folder
+
+
+def folder_of(runs: Path, before: Path, after: Path) -> Path:
+    """The scene's folder of two files: the same for as long as they lie where they are."""
+    files = [file.expanduser().resolve() for file in (before, after)]
+    identity = hashlib.blake2b("\n".join(map(str, files)).encode(), digest_size=3).hexdigest()
+    stem = re.sub(r"[^\w.,+'() -]", "_", files[0].name.split(".")[0]) or "scene"
+    return runs.resolve() / PATCHES / f"{stem}-patch-{identity}"
+
+
+def _link(place: Path, file: Path) -> None:
+    place.parent.mkdir(parents=True, exist_ok=True)
+    if place.is_symlink() or place.exists():
+        place.unlink()
+    place.symlink_to(file)
+
+
+def make(arguments: argparse.Namespace) -> str:
+    """Fill the hole and write `out`; what to say of it.
+
+    Raises:
+        ValueError: the files cannot be used; SystemExit: a stage was refused, failed or was interrupted.
+    """
+    check(arguments)
+    folder = prepare(arguments)
+    run_all(folder, arguments)
+    home = arguments.runs / folder.name
+    result = load_result(home)
+    similarity = load_scene(result.poses).similarity
+    save_splats(arguments.out, result.gaussians, similarity, properties_of(arguments.files[0]))
+    return (
+        f"{arguments.out}: the whole scene, {len(result.gaussians)} splats, {int(result.new.sum())} of them new\n"
+        f"another filling: paint one of {home / 'to_paint'}, save it as {folder / 'painted'}/<view>.png, and give the "
+        "same command again"
+    )
+
+
+def run_all(folder: Path, arguments: argparse.Namespace) -> None:
+    """All stages; SystemExit with the runner's code where it ends without a result, its line being on the screen."""
+    given = {"--profile": arguments.profile, "--budget": arguments.budget, "--set": arguments.set}
+    said = [word for name, value in given.items() if value for word in (name, value)]
+    words = ["run", "all", "--scene", str(folder), "--runs", str(arguments.runs.resolve()), *said]
+    process = subprocess.Popen([sys.executable, "-m", "reffusion.command", *words])
+    try:
+        status = process.wait()
+    except KeyboardInterrupt:  # which the runner has got, too: it says that the same command goes on
+        status = process.wait()
+    if status:
+        raise SystemExit(status)

@@ -1,0 +1,55 @@
+"""The result of a scene from which something was deleted: what the stages made of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from reffusion.io.arrays import load_labels
+from reffusion.io.ply import load_ply
+from reffusion.io.scene import load_scene
+from report.results import load_receipts
+from report.sheet import stage_folder
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from reffusion.types import Gaussians
+
+
+@dataclass(frozen=True)
+class Result:
+    """A filled scene.
+
+    Attributes:
+        gaussians: in the normalised frame; new: bool [N], those that fill the hole; poses: that stage's folder.
+    """
+
+    gaussians: Gaussians
+    new: Tensor
+    poses: Path
+
+
+def load_result(home: Path) -> Result:
+    """Of runs/<scene> or runs/<scene>@<variant>. ValueError where nothing was deleted, or `evaluate` has not run."""
+    check(home)
+    poses, finished = stage_folder(home, "poses"), home / "evaluate" / "scene.ply"
+    if not finished.exists():
+        raise ValueError(f"{finished} is missing; `make scene={home.name.split('@')[0]} patch` makes it")
+    return Result(load_ply(finished, load_scene(poses).similarity), load_labels(last_of(home) / "labels.npy"), poses)
+
+
+def check(home: Path) -> None:
+    """ValueError where the scene does not say what was deleted, as far as its stage `poses` knows."""
+    if not (stage_folder(home, "poses") / "deleted.npy").is_file():
+        raise ValueError(
+            "scene.yaml: nothing says what was deleted; `gaussians: scene.ply` names the scene before, "
+            "`cleaned: cleaned.ply` what an editor left of it"
+        )
+
+
+def last_of(home: Path) -> Path:
+    """The folder of the stage whose Gaussians are the result."""
+    used = load_receipts({"evaluate": home / "evaluate"})["evaluate"]["needs"]
+    return stage_folder(home, next(stage for stage in ("distill", "initialize") if used.get(stage)))

@@ -1,0 +1,365 @@
+"""Files of splats as editors and other trainers write them: each read to the right values, or refused in one line."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import struct
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData, PlyElement
+from small_capture import prepare, some_truth
+from test_io import some_gaussians
+from test_patch import edited
+
+from reffusion.io.arrays import load_labels
+from reffusion.io.compressed import load_spz, save_spz
+from reffusion.io.files import BadInput
+from reffusion.io.ply import check_gaussians, load_ply, load_points, save_ply
+from reffusion.io.quantized import save_splat
+from reffusion.io.splats import load_splats
+from reffusion.splat import rasterizer
+from reffusion.types import Camera, Gaussians
+from stages import poses
+from stages.plan import poses as planned
+
+SH0 = 0.28209479177387814
+COUNT = 40
+
+
+def table_of(path) -> np.ndarray:
+    return PlyData.read(str(path), mmap=False)["vertex"].data
+
+
+def save_table(path, table, text=False) -> None:
+    PlyData([PlyElement.describe(table, "vertex")], text=text, byte_order="<").write(str(path))
+
+
+def with_columns(table: np.ndarray, columns: dict[str, np.ndarray], leave_out: tuple[str, ...] = ()) -> np.ndarray:
+    kept = [name for name in table.dtype.names if name not in (*columns, *leave_out)]
+    made = np.empty(
+        len(table), [(name, table.dtype[name]) for name in kept] + [(n, c.dtype) for n, c in columns.items()]
+    )
+    for name in kept:
+        made[name] = table[name]
+    for name, column in columns.items():
+        made[name] = column
+    return made
+
+
+@pytest.fixture
+def file(tmp_path):
+    """A .ply of 40 splats of degree 2, and its rows."""
+    save_ply(tmp_path / "g.ply", some_gaussians(COUNT, 2))
+    return tmp_path / "g.ply", table_of(tmp_path / "g.ply")
+
+
+def picture(gaussians: Gaussians) -> np.ndarray:
+    pose = np.eye(4)
+    pose[2, 3] = 6.0
+    return rasterizer.render(gaussians, Camera("v", 48, 36, 40.0, 40.0, 24.0, 18.0, pose)).color.numpy()
+
+
+# ---------------------------------------------------------------------------------------------- rows
+
+
+def test_infinite_opacities_and_flat_scales_look_as_their_limits(file):
+    path, table = file
+    table["opacity"][3], table["opacity"][4], table["scale_2"][5], table["scale_0"][6] = np.inf, -np.inf, -np.inf, -1e30
+    save_table(path, table)
+    found = load_splats(path)
+    assert found.notes == ("2 infinite opacities and 1 scales of minus infinity are clamped to finite values that look "
+                           "the same",)  # fmt: skip
+    made = found.gaussians()
+    assert len(made) == COUNT and made.opacity_logits[3:5].tolist() == [20, -20]
+    assert made.log_scales[5, 2] == made.log_scales[6, 0] == -20
+    opaque, flat = made.opacity_logits.clone(), made.log_scales.clone()
+    opaque[3], flat[5, 2], flat[6, 0] = 80.0, -60.0, -60.0
+    limit = Gaussians(made.means, made.quaternions, flat, opaque, made.sh)
+    kept = limit.map(lambda p: p[torch.arange(COUNT) != 4])  # transparent: as if it were not there
+    np.testing.assert_allclose(picture(made), picture(kept), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [(name, value) for name in ("x", "rot_2", "f_dc_1", "f_rest_20") for value in (np.nan, np.inf, -np.inf)]
+    + [("opacity", np.nan), ("scale_1", np.nan), ("scale_1", np.inf), ("scale_1", 1e30)],
+)
+@pytest.mark.parametrize("text", [False, True])
+def test_rows_that_hold_no_number_are_dropped_with_their_number(file, column, value, text):
+    path, table = file
+    table[column][[2, 30]] = value
+    save_table(path, table, text)
+    found = load_splats(path)
+    assert found.notes == ("2 of 40 splats are dropped: 2 with NaN or infinite values",)
+    kept = np.delete(np.arange(COUNT), [2, 30])
+    np.testing.assert_allclose(found.rows.means[:, 1], table["y"][kept], rtol=1e-6)
+    np.testing.assert_allclose(found.rows.sh[:, 3, 1], table["f_rest_10"][kept], rtol=1e-6)
+
+
+def test_padding_is_dropped_and_a_zero_quaternion_is_the_identity(file):
+    path, table = file
+    for name in table.dtype.names:
+        table[name][7] = 0
+    table["x"][8] = np.nan
+    for axis in range(4):
+        table[f"rot_{axis}"][9] = 0
+    save_table(path, table)
+    found = load_splats(path)
+    assert found.notes == ("2 of 40 splats are dropped: 1 with NaN or infinite values and 1 of zeros only (padding)",)
+    made = found.gaussians()
+    assert not made.quaternions[7].any()
+    turned = made.quaternions.clone()
+    turned[7] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    np.testing.assert_array_equal(picture(made), picture(replace(made, quaternions=turned)))
+
+
+def test_a_file_of_mostly_invalid_rows_is_refused(file):
+    path, table = file
+    table["scale_0"][:21] = np.nan
+    save_table(path, table)
+    with pytest.raises(BadInput, match=r"g\.ply: 21 of 40 splats hold NaN or infinite values: the file is damaged"):
+        load_ply(path)
+    table["scale_0"][0] = 0.5
+    save_table(path, table)
+    assert len(load_ply(path)) == 20
+    for name in table.dtype.names:
+        table[name] = 0
+    save_table(path, table)
+    with pytest.raises(BadInput, match=r"it holds no Gaussians: 40 of 40 splats are dropped: 40 of zeros only"):
+        load_ply(path)
+
+
+# ---------------------------------------------------------------------------------------------- other trainers
+
+
+def test_the_filter_of_mip_splatting_is_folded_in(file):
+    path, table = file
+    sizes = np.random.default_rng(0).uniform(0.01, 2.0, COUNT).astype(np.float32)
+    save_table(path, with_columns(table, {"filter_3D": sizes}))
+    found = load_splats(path)
+    assert found.notes == ("the 3D filter of Mip-Splatting is folded into scales and opacities",) and found.antialiased
+    scales = np.exp(np.stack([table[f"scale_{k}"] for k in range(3)], 1).astype(np.float64))
+    widened = np.sqrt(scales**2 + sizes[:, None].astype(np.float64) ** 2)
+    opacity = 1 / (1 + np.exp(-table["opacity"].astype(np.float64)))
+    opacity *= np.sqrt(np.prod(scales**2, 1) / np.prod(widened**2, 1))
+    np.testing.assert_allclose(np.exp(found.rows.log_scales), widened, rtol=1e-6)
+    np.testing.assert_allclose(1 / (1 + np.exp(-found.rows.opacity_logits.astype(np.float64))), opacity, rtol=2e-6)
+    save_table(path, with_columns(table, {"filter_3D": np.zeros(COUNT, np.float32)}))
+    plain = load_splats(path).rows
+    np.testing.assert_allclose(plain.log_scales[:, 0], table["scale_0"], rtol=1e-6)
+    np.testing.assert_allclose(plain.opacity_logits, table["opacity"], rtol=1e-5, atol=1e-6)
+
+
+def test_two_scales_are_a_flat_splat(file):
+    path, table = file
+    save_table(path, with_columns(table, {}, leave_out=("scale_2",)))
+    found = load_splats(path)
+    assert found.notes == ("it has two scales, as 2DGS writes: the third axis is flat",)
+    made = found.gaussians()
+    assert (made.log_scales[:, 2] == -20).all()
+    np.testing.assert_array_equal(made.log_scales[:, 1], table["scale_1"])
+    thin = made.log_scales.clone()
+    thin[:, 2] = made.log_scales[:, :2].min(1).values - 9
+    np.testing.assert_allclose(picture(made), picture(replace(made, log_scales=thin)), atol=1e-4)
+
+
+@pytest.mark.parametrize("degree", [4, 5])
+def test_higher_harmonics_are_cut_to_degree_3(file, degree):
+    path, table = file
+    higher = (degree + 1) ** 2 - 1
+    draws = np.random.default_rng(0).normal(size=(3 * higher, COUNT)).astype(np.float32)
+    rest = {f"f_rest_{k}": draws[k] for k in range(3 * higher)}
+    save_table(path, with_columns(table, rest))
+    found = load_splats(path)
+    assert found.notes == (f"spherical harmonics of degree {degree} are cut to degree 3",)
+    expected = draws.reshape(3, higher, COUNT)[:, :15].transpose(2, 1, 0)
+    np.testing.assert_array_equal(found.rows.sh[:, 1:], expected)
+    save_table(path, with_columns(table, {"f_rest_70": draws[70]}))
+    with pytest.raises(BadInput, match="25 f_rest properties; 0, 9, 24, 45 or 72 belong to degrees 0 to 4"):
+        check_gaussians(path)
+
+
+def test_colours_in_bytes_stand_for_the_constant_harmonic(file):
+    path, table = file
+    colors = np.random.default_rng(0).integers(0, 256, (3, COUNT)).astype(np.uint8)
+    without = tuple(n for n in table.dtype.names if n.startswith("f_"))
+    save_table(path, with_columns(table, dict(zip(("red", "green", "blue"), colors, strict=True)), without))
+    made = load_ply(path)
+    assert made.sh.shape == (COUNT, 1, 3)
+    np.testing.assert_allclose(0.5 + SH0 * made.sh[:, 0], colors.T / 255, atol=1e-6)
+    save_table(path, with_columns(table, {}, ("f_dc_1",)))
+    with pytest.raises(BadInput, match="not a file of Gaussians, it lacks f_dc_1"):
+        check_gaussians(path)
+
+
+# ---------------------------------------------------------------------------------------------- quantised files
+
+
+def test_records_of_32_bytes_are_read(tmp_path):
+    record = lambda *values: struct.pack("<3f3f4B4B", *values)
+    path = tmp_path / "s.splat"
+    path.write_bytes(
+        record(1.5, -2, 3, 0.1, 0.2, 0.0, 255, 0, 51, 255, 255, 128, 64, 0)
+        + record(0, 0, 0, 1, 1, 1, 128, 128, 128, 51, 128, 128, 128, 255)
+        + bytes(32)
+    )
+    assert check_gaussians(path) == 3
+    found = load_splats(path)
+    assert found.notes == ("1 of 3 splats are dropped: 1 of zeros only (padding); 1 infinite opacities and 1 scales of "
+                           "minus infinity are clamped to finite values that look the same",)  # fmt: skip
+    made = found.gaussians()
+    np.testing.assert_array_equal(made.means, [[1.5, -2, 3], [0, 0, 0]])
+    np.testing.assert_allclose(made.log_scales[0], [np.log(0.1), np.log(0.2), -20], rtol=1e-6)
+    np.testing.assert_allclose(made.opacity_logits, [20, np.log(0.2 / 0.8)], rtol=1e-6)
+    np.testing.assert_allclose(made.quaternions[0], [127 / 128, 0, -0.5, -1])
+    np.testing.assert_allclose(0.5 + SH0 * made.sh[0, 0], [1, 0, 0.2], atol=1e-6)
+    path.write_bytes(path.read_bytes()[:-5])
+    with pytest.raises(BadInput, match=r"s\.splat: cut off, or no \.splat file: 91 bytes are no multiple of 32"):
+        check_gaussians(path)
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_spz_is_read_in_the_frame_of_a_ply(tmp_path, version):
+    """The format has y up: its own writer turns a .ply by 180 degrees about x, rotations and harmonics too."""
+    gsply, made, path = pytest.importorskip("gsply"), some_gaussians(300, 3), tmp_path / "s.spz"
+    made = replace(made, sh=0.3 * made.sh.clamp(-3, 3))  # the format holds -1 to 1
+    save_spz(path, load_rows(tmp_path, made))
+    raw = gsply.read_spz(str(path))
+    np.testing.assert_allclose(raw.means, made.means.numpy() * (1, -1, -1), atol=1e-5)
+    if version == 4:
+        gsply.write_spz(str(path), raw, version=4)
+    assert check_gaussians(path) == 300
+    again = load_ply(path)
+    np.testing.assert_allclose(again.means, made.means, atol=3e-4)
+    np.testing.assert_allclose(again.log_scales, made.log_scales, atol=1 / 32 + 1e-4)
+    assert np.abs(picture(again) - picture(made)).mean() < 0.01
+    blind = replace(again, sh=torch.cat([again.sh[:, :1], -again.sh[:, 1:]], 1))
+    assert np.abs(picture(blind) - picture(made)).mean() > 0.03
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(BadInput, match=r"s\.spz: not a \.spz file"):
+        load_spz(path)
+    path.write_bytes(b"NGSP")
+    with pytest.raises(BadInput, match=r"s\.spz: not a \.spz file"):
+        check_gaussians(path)
+
+
+def load_rows(folder, gaussians):
+    save_ply(folder / "rows.ply", gaussians)
+    return load_splats(folder / "rows.ply").rows
+
+
+def test_splat_is_written_as_it_is_read(tmp_path):
+    made = some_gaussians(300, 1)
+    save_splat(tmp_path / "s.splat", load_rows(tmp_path, made))
+    again = load_ply(tmp_path / "s.splat")
+    np.testing.assert_array_equal(again.means, made.means)
+    np.testing.assert_allclose(again.log_scales, made.log_scales, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(again.opacity_logits.sigmoid(), made.opacity_logits.sigmoid(), atol=0.5 / 255 + 1e-6)
+    unit = torch.nn.functional.normalize(made.quaternions)
+    assert (torch.nn.functional.normalize(again.quaternions) * unit).sum(1).abs().min() > 0.999
+
+
+@pytest.mark.parametrize("ending", ["ksplat", "sog"])
+def test_other_formats_are_refused_with_what_converts_them(tmp_path, ending):
+    path = tmp_path / f"scene.{ending}"
+    path.write_bytes(bytes(4096))
+    with pytest.raises(BadInput, match=rf"\.{ending} is not read; convert it to \.ply, as with `npx "
+                       rf"@playcanvas/splat-transform scene\.{ending} scene\.ply`"):  # fmt: skip
+        check_gaussians(path)
+
+
+# ---------------------------------------------------------------------------------------------- the stage `poses`
+
+
+def test_rows_dropped_leave_what_was_deleted_consistent(tmp_path, recwarn):
+    """Both files hold invalid rows and padding; the mask has a value for each splat that stays."""
+    folder = tmp_path / "s"
+    whole, deleted = edited(folder)
+    table = table_of(folder / "scene.ply")
+    table["opacity"][[1, 2000]] = np.nan
+    table["x"][3999] = np.inf
+    table["opacity"][:1] = np.inf
+    save_table(folder / "scene.ply", table)
+    left = table_of(folder / "cleaned.ply")
+    padding = np.zeros(1500, left.dtype)  # more rows than were deleted
+    save_table(folder / "cleaned.ply", np.concatenate([left, padding]))
+    (out := tmp_path / "out").mkdir()
+    params = poses.Params(gaussians="scene.ply", cleaned="cleaned.ply", masks="none")
+    planned.preview(params, folder)
+    poses.run(params, out, scene=folder)
+    kept = np.delete(np.arange(len(whole)), [1, 2000, 3999])
+    np.testing.assert_array_equal(load_labels(out / "deleted.npy").numpy(), deleted[kept])
+    assert len(load_ply(out / "gaussians.ply")) == 3997
+    said = json.loads((out / "warnings.json").read_text())
+    assert said[0] == ("scene.ply: 3 of 4000 splats are dropped: 3 with NaN or infinite values; 1 infinite opacities "
+                       "are clamped to finite values that look the same")  # fmt: skip
+    rows = len(left) + 1500
+    assert said[1] == f"cleaned.ply: 1500 of {rows} splats are dropped: 1500 of zeros only (padding)"
+
+
+@pytest.mark.parametrize("ending", ["splat", "spz"])
+def test_what_was_deleted_is_found_in_quantised_files(tmp_path, ending, capsys):
+    if ending == "spz":
+        pytest.importorskip("gsply")
+    folder = tmp_path / "s"
+    _, deleted = edited(folder)
+    left = load_splats(folder / "cleaned.ply").rows
+    (save_splat if ending == "splat" else save_spz)(folder / f"cleaned.{ending}", left)
+    (out := tmp_path / "out").mkdir()
+    poses.run(poses.Params(gaussians="scene.ply", cleaned=f"cleaned.{ending}", masks="none"), out, scene=folder)
+    assert np.count_nonzero(load_labels(out / "deleted.npy").numpy() != deleted) <= 2
+    assert "of 4000 splats were deleted" in capsys.readouterr().out
+
+
+def test_plan_says_what_reading_changes(tmp_path):
+    folder = prepare(tmp_path / "s", "transforms", some_truth())
+    save_ply(folder / "g.ply", some_gaussians(COUNT, 0))
+    table = table_of(folder / "g.ply")
+    rest = {f"f_rest_{k}": np.zeros(COUNT, np.float32) for k in range(72)}
+    save_table(folder / "g.ply", with_columns(table, rest | {"filter_3D": np.ones(COUNT, np.float32)}, ("scale_2",)))
+    notes = planned.preview(poses.Params(gaussians="g.ply"), folder)
+    for note in ("the 3D filter of Mip-Splatting is folded into scales and opacities",
+                 "it has two scales, as 2DGS writes: the third axis is flat",
+                 "spherical harmonics of degree 4 are cut to degree 3"):  # fmt: skip
+        assert f"g.ply: {note}" in notes
+
+
+def test_points_of_a_cloud_are_not_touched(tmp_path):
+    table = np.zeros(3, [(axis, "f4") for axis in "xyz"])
+    save_table(tmp_path / "p.ply", table)
+    assert len(load_points(tmp_path / "p.ply")[0]) == 3
+
+
+@pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="asks npm; set REFFUSION_SLOW=1")
+def test_splat_transform_and_we_read_the_same(tmp_path):
+    if not (npx := shutil.which("npx")):
+        pytest.skip("there is no npm")
+    convert = lambda source, target: subprocess.run(
+        [npx, "--yes", "@playcanvas/splat-transform", "-w", str(tmp_path / source), str(tmp_path / target)],
+        check=True, capture_output=True,
+    )  # fmt: skip
+    made = some_gaussians(300, 3)
+    made = replace(made, sh=0.3 * made.sh.clamp(-3, 3))
+    save_ply(tmp_path / "made.ply", made)
+    rows = load_rows(tmp_path, made)
+    save_splat(tmp_path / "ours.splat", rows)
+    save_spz(tmp_path / "ours.spz", rows)
+    convert("ours.splat", "from_splat.ply")
+    convert("ours.spz", "from_spz.ply")
+    convert("made.ply", "theirs.spz")
+    for name, harmonics in (("from_splat.ply", 1), ("from_spz.ply", 16), ("theirs.spz", 16)):
+        read = load_ply(tmp_path / name)
+        nearest = torch.cdist(made.means, read.means).argmin(1)
+        assert sorted(nearest.tolist()) == list(range(300)), name
+        np.testing.assert_allclose(read.means[nearest], made.means, atol=3e-4, err_msg=name)
+        np.testing.assert_allclose(read.log_scales[nearest], made.log_scales, atol=1 / 32 + 1e-3, err_msg=name)
+        unit = torch.nn.functional.normalize(made.quaternions)
+        theirs = torch.nn.functional.normalize(read.quaternions[nearest])
+        assert (unit * theirs).sum(1).abs().min() > 0.999, name
+        np.testing.assert_allclose(read.sh[nearest][:, :harmonics], made.sh[:, :harmonics], atol=0.07, err_msg=name)
