@@ -5,21 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from reffusion.capture.layouts.capture import Capture, image_folder_of, pictures_in
-from reffusion.io.files import BadInput
 from reffusion.io.images import image_size
 
 
 def read(folder: Path, images: str | None) -> Capture:
-    """See `load_capture`."""
+    """See `load_capture`. Sizes may differ, so a phone may be held both ways."""
     image_folder = image_folder_of(folder, images, ("images", "photos", "input", "."))
     pictures = pictures_in(image_folder)
-    sizes: dict[tuple[int, int], list[str]] = {}
-    for name, path in pictures.items():
-        sizes.setdefault(image_size(path, upright=True), []).append(name)
-    if len(sizes) > 1:
-        shown = "; ".join(f"{w}x{h}: {', '.join(names[:3])}" for (w, h), names in sizes.items())
-        raise BadInput(
-            f"{image_folder}: pictures of {len(sizes)} sizes and no intrinsics ({shown}); "
-            "bring poses and intrinsics (COLMAP or transforms.json), or photos of one size"
-        )
+    for path in pictures.values():
+        image_size(path)  # an unreadable one is refused here, before any work
     return Capture("photos", pictures, None, None, image_folder, frozenset(), ())
