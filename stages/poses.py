@@ -219,6 +219,7 @@ def _with_flow_points(scene: Scene, out: Path) -> Scene:
 def _place(params: Params, out: Path, capture: Capture) -> Capture:
     """The capture with poses by structure from motion, of the views that it places."""
     found = sfm.solve(capture.pictures, params.longest, out / "sfm", SEED)
-    print(sfm.summary(found.facts()), flush=True)
-    save_json(out / SOLVED, found.facts())
+    facts = found.facts()
+    print(facts["summary"], flush=True)
+    save_json(out / SOLVED, facts)
     return replace(capture, pictures={name: capture.pictures[name] for name in found.poses.lenses}, poses=found.poses)

@@ -42,26 +42,20 @@ class Solution:
     track_length: float
     residual: float
 
-    def facts(self) -> dict[str, float]:
-        """The figures of `summary`, by name."""
+    def facts(self) -> dict[str, float | str]:
+        """The figures by name, and one line of them for people."""
+        lenses = "one lens" if self.lenses == 1 else f"{self.lenses} lenses"
+        placed, points = len(self.poses.lenses), len(self.poses.points)
         return {
             "photographs": self.photographs,
-            "placed": len(self.poses.lenses),
+            "placed": placed,
             "lenses": self.lenses,
-            "points": len(self.poses.points),
+            "points": points,
             "mean_track_length": self.track_length,
             "mean_residual_px": self.residual,
+            "summary": f"structure from motion: {placed} of {self.photographs} photographs with {lenses}, {points:,} points "
+            f"in {self.track_length:.1f} views each, {self.residual:.2f} px mean reprojection error",
         }
-
-
-def summary(facts: Mapping[str, float]) -> str:
-    """One line for people, of `Solution.facts`."""
-    lenses = "one lens" if facts["lenses"] == 1 else f"{facts['lenses']} lenses"
-    return (
-        f"structure from motion: {facts['placed']} of {facts['photographs']} photographs with {lenses}, "
-        f"{facts['points']:,} points in {facts['mean_track_length']:.1f} views each, "
-        f"{facts['mean_residual_px']:.2f} px mean reprojection error"
-    )
 
 
 def solve(photographs: Mapping[str, Path], longest: int, work: Path, seed: int = 0) -> Solution:
