@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -197,23 +198,28 @@ def focal_of(photograph: Path, work: Path) -> float | None:
     """Focal length over the longer side, from EXIF and COLMAP's table of sensors; None where unknown.
 
     COLMAP does not read every kind of picture (WebP, HEIC): it sees a blank JPEG with the photograph's tags, which is
-    made in `work`.
+    made in the folder `work`.
     """
+    with opened(photograph) as image:
+        exif = image.getexif()
+        part = exif.get_ifd(EXIF_PART)
+        camera = tuple((tag, exif[tag]) for tag in (MAKER, MODEL) if exif.get(tag))
+        focal = tuple((tag, part[tag]) for tag in FOCAL_TAGS if part.get(tag))
+        return _focal_of_tags(image.size, camera, focal, work) if focal else None
+
+
+@lru_cache(maxsize=64)  # most photographs of a capture have the same tags
+def _focal_of_tags(size: tuple[int, int], camera: tuple, focal: tuple, work: Path) -> float | None:
     import pycolmap
 
     tags = Image.Exif()
-    with opened(photograph) as image:
-        size, exif = image.size, image.getexif()
-        part = exif.get_ifd(EXIF_PART)
-        tags.get_ifd(EXIF_PART).update({tag: part[tag] for tag in FOCAL_TAGS if part.get(tag)})
-        tags.update({tag: exif[tag] for tag in (MAKER, MODEL) if exif.get(tag)})
-    if not tags.get_ifd(EXIF_PART):
-        return None
+    tags.update(camera)
+    tags.get_ifd(EXIF_PART).update(focal)
     blank = work / "exif.jpg"
     Image.new("L", size).save(blank, exif=tags)
-    camera = pycolmap.infer_camera_from_image(blank)
+    found = pycolmap.infer_camera_from_image(blank)
     blank.unlink()
-    return camera.mean_focal_length() / max(camera.width, camera.height) if camera.has_prior_focal_length else None
+    return found.mean_focal_length() / max(found.width, found.height) if found.has_prior_focal_length else None
 
 
 def bundle_adjusted(
