@@ -70,11 +70,13 @@ def arranged(cells: list[tuple[str, np.ndarray, str]]) -> np.ndarray:
 
 
 def main() -> None:
-    arguments = command.parser("check", __doc__).parse_args()
+    home = command.home(command.parser("check", __doc__).parse_args())
     try:
-        path, said = make(command.home(arguments))
+        path, said = make(home)
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
+    if (solved := sheet.stage_folder(home, "poses") / "sfm.json").is_file():
+        print(load_json(solved)["summary"])
     for line in said:
         print(f"odd: {line}")
     print(f"{len(said) or 'nothing'} odd; every mask over its photograph: {path}")

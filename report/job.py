@@ -79,11 +79,13 @@ def unfinished(job: Job) -> list[str]:
 
 
 def said(job: Job) -> list[str]:
-    """What was odd about the photographs, and which frames of a video were taken."""
+    """Which frames of a video were taken, how structure from motion went, and what was odd about the photographs."""
     record = job.home.with_name(job.home.name.split("@")[0]) / "frames" / "frames.json"
     lines = [load_json(record)["said"]] if record.is_file() else []
-    warnings = job.folders.get("poses", Path()) / "warnings.json"
-    lines += load_json(warnings) if "poses" in job.folders and warnings.is_file() else []
+    if "poses" in job.folders:
+        solved, warnings = (job.folders["poses"] / name for name in ("sfm.json", "warnings.json"))
+        lines += [load_json(solved)["summary"]] if solved.is_file() else []
+        lines += load_json(warnings) if warnings.is_file() else []
     return [page.bullets(lines)] if lines else []
 
 

@@ -37,6 +37,7 @@ LEAST_POINTS = 100  # with fewer sparse points, some of optical flow are added t
 MORE_POINTS = 10_000  # how many at most; random ones, where flow finds too few
 SEED = 0
 WARNINGS = "warnings.json"  # sentences
+SOLVED = "sfm.json"  # `sfm.Solution.facts`
 
 
 def run(params: Params, out: Path, *, scene: Path) -> None:
@@ -65,7 +66,6 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     for name in roles.blank:
         lenses[name], pinholes[name] = lens_of(name, capture, longest)
     save_lenses(out, lenses, capture.upright, {name: sizes[name] for name in lenses})
-    shutil.rmtree(out / "sfm", ignore_errors=True)
     normalised = frame.normalised(capture.poses, pinholes, roles.train, roles.test, roles.clean)
     normalised = replace(normalised, blank=roles.blank)
     if params.refine and params.gaussians is None:  # Gaussians that the scene brings were fitted with its cameras
@@ -242,10 +242,9 @@ def _with_flow_points(scene: Scene, out: Path) -> Scene:
 
 
 def _place(params: Params, out: Path, capture: Capture) -> Capture:
-    """The capture with poses by structure from motion, its pictures upright and at their final size."""
-    work = out / "sfm"
-    prepared = {name: work / "images" / f"{name}.png" for name in capture.pictures}
-    for name, path in prepared.items():
-        save_image(path, load_at(capture.pictures[name], params.longest, upright=True))
-    poses = sfm.solve(prepared, capture.pictures, work / "colmap", SEED)
-    return replace(capture, pictures={name: prepared[name] for name in poses.lenses}, poses=poses)
+    """The capture with poses by structure from motion, of the views that it places."""
+    found = sfm.solve(capture.pictures, params.longest, out / "sfm", SEED)
+    facts = found.facts()
+    print(facts["summary"], flush=True)
+    save_json(out / SOLVED, facts)
+    return replace(capture, pictures={name: capture.pictures[name] for name in found.poses.lenses}, poses=found.poses)

@@ -48,11 +48,6 @@ def drop_masks(folder: Path) -> None:
         path.unlink()
 
 
-def drop_poses(folder: Path) -> None:
-    (folder / "transforms.json").unlink()
-    write_pictures(folder / "images", ["v03"], (HEIGHT, HEIGHT))
-
-
 REFUSALS = [
     ("mask for no picture", lambda f: write_masks(f / "masks", ["zz"]), {}, r"zz\.png.*no picture"),
     ("no mask at all", drop_masks, {}, "no mask at all.*masks: none"),
@@ -61,7 +56,6 @@ REFUSALS = [
     ("mask of other proportions", lambda f: write_masks(f / "masks", ["v01"], (HEIGHT, WIDTH)), {}, r"v01\.png.*72x96"),
     ("two training views", drop_views, {}, "2 training views.*at least 3"),
     ("all views are test views", None, {"test": "every 1"}, "0 training views.*at least 3"),
-    ("mixed sizes, no intrinsics", drop_poses, {}, "2 sizes and no intrinsics"),
     ("unreadable picture", lambda f: (f / "images" / "v01.png").write_text("x"), {}, r"v01\.png.*readable image"),
     ("NaN pose", edit_transforms(nan_pose), {}, r"transforms\.json.*'v03' is not finite"),
     ("mirrored pose", edit_transforms(mirrored_pose), {}, "'v03' is no rotation"),

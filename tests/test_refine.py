@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import cache
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -119,3 +120,19 @@ def test_the_same_pictures_give_the_same_cameras():
     for name in first:
         assert np.array_equal(first[name].world_to_camera, second[name].world_to_camera)
         assert (first[name].cx, first[name].cy) == (second[name].cx, second[name].cy)
+
+
+def test_what_no_camera_explains_moves_no_camera():
+    """Leaves in the wind, a rolling shutter: each picture is bent by another half a pixel, the cameras are exact."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
+    rng, pictures = np.random.default_rng(7), {}
+    for name, picture in PHOTOS.items():
+        fields = [0.0, 0.0]
+        for axis in (0, 1):
+            for k in rng.normal(0, 2 * np.pi / 90, (4, 2)):
+                fields[axis] = fields[axis] + 0.45 * np.sin(k[0] * x + k[1] * y + rng.uniform(0, 6.3))
+        bent = cv2.remap(picture, x + fields[0].astype(np.float32), y + fields[1].astype(np.float32), cv2.INTER_CUBIC)
+        pictures[name] = bent
+    found = refine.refined(EXACT, pictures)
+    assert found.before > refine.ENOUGH and found.after is None
+    assert all(found.cameras[view.name] is view for view in EXACT)

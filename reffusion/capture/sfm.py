@@ -4,34 +4,75 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from reffusion.capture.layouts.capture import Poses
 from reffusion.capture.lens import from_colmap
+from reffusion.capture.undistorted import load_at
 from reffusion.io.files import BadInput
-from reffusion.io.images import HEIC, focal_of_heic
+from reffusion.io.images import image_size, opened, save_image
 from reffusion.types import Camera
 
 LEAST_VIEWS = 3
 LEAST_SIGHTINGS = 100
+SAME_FOCAL = 1.01  # ratio of EXIF focal lengths up to which photographs count as taken at one zoom
+EXIF_PART, MAKER, MODEL = 0x8769, 0x010F, 0x0110  # EXIF tags: the camera's part, and what names the camera
+FOCAL_TAGS = (0x920A, 0xA405, 0xA20E, 0xA210)  # mm; mm of 35 mm film; pixels per unit of the sensor; that unit
 
 
-def solve(pictures: Mapping[str, Path], originals: Mapping[str, Path], work: Path, seed: int = 0) -> Poses:
-    """Find lenses, poses and sparse points of photographs of one size.
+@dataclass(frozen=True)
+class Solution:
+    """What structure from motion found.
 
-    All views share one SIMPLE_RADIAL lens, unless the originals' EXIF focal lengths differ by more than 1%. The
-    arithmetic order is fixed (one thread where it matters, seeded), so the same pictures give the same poses.
+    Attributes:
+        poses: lenses, poses and points, in an arbitrary frame, of the views that were placed.
+        photographs: how many views there were.
+        lenses: how many different ones were solved for.
+        track_length: mean number of views that show a point.
+        residual: mean reprojection error, px of the pictures that were looked at.
+    """
+
+    poses: Poses
+    photographs: int
+    lenses: int
+    track_length: float
+    residual: float
+
+    def facts(self) -> dict[str, float | str]:
+        """The figures by name, and one line of them for people."""
+        lenses = "one lens" if self.lenses == 1 else f"{self.lenses} lenses"
+        placed, points = len(self.poses.lenses), len(self.poses.points)
+        return {
+            "photographs": self.photographs,
+            "placed": placed,
+            "lenses": self.lenses,
+            "points": points,
+            "mean_track_length": self.track_length,
+            "mean_residual_px": self.residual,
+            "summary": f"structure from motion: {placed} of {self.photographs} photographs with {lenses}, {points:,} points "
+            f"in {self.track_length:.1f} views each, {self.residual:.2f} px mean reprojection error",
+        }
+
+
+def solve(photographs: Mapping[str, Path], longest: int, work: Path, seed: int = 0) -> Solution:
+    """Find lenses, poses and sparse points of photographs, upright as their orientation tags say.
+
+    Photographs of one size and one EXIF focal length share a SIMPLE_RADIAL lens; a portrait format is the landscape
+    one turned. The arithmetic order is fixed (one thread where it matters, seeded), so the same pictures give the same
+    poses.
 
     Args:
-        pictures: view name -> upright picture file, all in one folder and of one size.
-        originals: view name -> the photograph as taken, of which only the EXIF focal length is read.
-        work: a folder for the database; made, and removed at the end.
+        photographs: view name -> file; sizes may differ.
+        longest: px to which the longer side is reduced.
+        work: a folder for pictures and the database; made, and removed at the end.
 
     Returns:
-        Poses of the views that were placed, in an arbitrary frame; fewer than `pictures` where some were not.
+        The solution at the reduced size; fewer views than `photographs` where some were not placed.
 
     Raises:
         BadInput: naming the views that were not placed, where fewer than 3 were.
@@ -39,13 +80,38 @@ def solve(pictures: Mapping[str, Path], originals: Mapping[str, Path], work: Pat
     import pycolmap
 
     shutil.rmtree(work, ignore_errors=True)
-    work.mkdir(parents=True)
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value if hasattr(pycolmap.logging, "ERROR") else 2
+    pictures, database = work / "images", work / "database.db"
+    pictures.mkdir(parents=True)
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
     pycolmap.set_random_seed(seed)
-    names = {path.name: name for name, path in pictures.items()}
-    folder = next(iter(pictures.values())).parent
-    database = work / "database.db"
-    _extract(pycolmap, database, folder, pictures, originals)
+    for group, focal in lens_groups(photographs, work):
+        for name in group:
+            image = load_at(photographs[name], longest, upright=True)
+            save_image(pictures / _file_of(name), np.rot90(image) if _is_portrait(image.shape[1::-1]) else image)
+        _extract(database, pictures, [_file_of(name) for name in group], focal)
+    model = _mapped(database, pictures, work, seed)
+    images = {} if model is None else {image.name: image for image in model.images.values() if image.has_pose}
+    placed = {name: images[_file_of(name)] for name in sorted(photographs) if _file_of(name) in images}
+    if len(placed) < LEAST_VIEWS:
+        folder, lost = next(iter(photographs.values())).parent, sorted(set(photographs) - set(placed))
+        raise BadInput(
+            f"structure from motion placed {len(placed)} of {len(photographs)} views in {folder}; not "
+            f"{', '.join(lost)}. "
+            "Take more photos that overlap by two thirds, sharp and of things that do not move, or bring poses"
+        )
+    upright = {name: image_size(photographs[name], upright=True) for name in placed}
+    lenses = len({image.camera_id for image in placed.values()})
+    poses = _poses_of(model, placed, {name for name, size in upright.items() if _is_portrait(size)})
+    shutil.rmtree(work)
+    return Solution(
+        poses, len(photographs), lenses, model.compute_mean_track_length(), model.compute_mean_reprojection_error()
+    )
+
+
+def _mapped(database: Path, pictures: Path, work: Path, seed: int):
+    """COLMAP's reconstruction of most views; None where it finds none."""
+    import pycolmap
+
     matching = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=1)
     geometry = pycolmap.TwoViewGeometryOptions()
     geometry.ransac.random_seed = seed
@@ -53,24 +119,37 @@ def solve(pictures: Mapping[str, Path], originals: Mapping[str, Path], work: Pat
     options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=seed, min_model_size=LEAST_VIEWS)
     options.mapper.random_seed = options.triangulation.random_seed = seed
     options.mapper.num_threads = 1
-    models = pycolmap.incremental_mapping(database, folder, work, options)
-    best = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
-    placed = [] if best is None else [image for image in best.images.values() if image.has_pose]
-    if len(placed) < LEAST_VIEWS:
-        lost = sorted(set(pictures) - {names[image.name] for image in placed})
-        raise BadInput(
-            f"structure from motion placed {len(placed)} of {len(pictures)} views in {folder}; not {', '.join(lost)}. "
-            "Take more photos that overlap by two thirds, sharp and of things that do not move, or bring poses"
-        )
+    models = pycolmap.incremental_mapping(database, pictures, work, options)
+    return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+
+
+def _is_portrait(size: tuple[int, int]) -> bool:
+    return size[1] > size[0]
+
+
+def _file_of(view: str) -> str:
+    """The name of its picture in the database; a view may be called by its path."""
+    return f"{view}.png"
+
+
+def _poses_of(model, images: Mapping[str, object], turned: Collection[str]) -> Poses:
+    """Lenses, poses and points of a COLMAP reconstruction.
+
+    Args:
+        images: view name -> its image. turned: views whose pictures were turned by 90 degrees counterclockwise.
+    """
+    back = np.array([[0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], np.float64)  # x right, y down
     poses, lenses = {}, {}
-    for image in sorted(placed, key=lambda image: image.name):
-        name, camera = names[image.name], best.cameras[image.camera_id]
+    for name, image in images.items():
+        camera = model.cameras[image.camera_id]
         matrix = np.eye(4)
         matrix[:3] = image.cam_from_world().matrix()
-        poses[name] = matrix
-        lenses[name] = from_colmap(camera.model.name, camera.width, camera.height, tuple(map(float, camera.params)))
-    points = [best.points3D[k] for k in sorted(best.points3D)]
-    shutil.rmtree(work)
+        poses[name] = back @ matrix if name in turned else matrix
+        lens = from_colmap(camera.model.name, camera.width, camera.height, tuple(map(float, camera.params)))
+        # a radial lens with its axis in the middle stays what it is when it is turned
+        across = replace(lens, width=lens.height, height=lens.width, cx=lens.cy, cy=lens.cx)
+        lenses[name] = across if name in turned else lens
+    points = [model.points3D[k] for k in sorted(model.points3D)]
     return Poses(
         lenses,
         poses,
@@ -80,41 +159,67 @@ def solve(pictures: Mapping[str, Path], originals: Mapping[str, Path], work: Pat
     )
 
 
-def _extract(pycolmap, database: Path, folder: Path, pictures: Mapping[str, Path], originals: Mapping[str, Path]):
-    """SIFT into the database, one camera for all views or, where they were zoomed differently, one each."""
-    focals = {name: focal_of(path) for name, path in originals.items()}
-    given = [focal for focal in focals.values() if focal is not None]
-    zoomed = bool(given) and (max(given) > 1.01 * min(given) or len(given) < len(focals))
-    mode = pycolmap.CameraMode.PER_IMAGE if zoomed else pycolmap.CameraMode.SINGLE
+def lens_groups(photographs: Mapping[str, Path], work: Path) -> list[tuple[list[str], float | None]]:
+    """Names of views that share a lens, and its focal length over the longer side where EXIF tells it.
+
+    They have the same size, portrait or landscape, and EXIF focal lengths that agree within 1%. `work`: see `focal_of`.
+    """
+    groups: list[tuple[list[str], float | None]] = []
+    last: tuple[list[int], float] | None = None
+    found = [(sorted(image_size(path)), focal_of(path, work), name) for name, path in photographs.items()]
+    for size, focal, name in sorted(found, key=lambda each: (each[0], each[1] or 0.0, each[2])):
+        if last is None or size != last[0] or (focal or 0.0) > SAME_FOCAL * last[1]:
+            groups.append(([], focal))
+            last = size, focal or 0.0
+        groups[-1][0].append(name)
+    return groups
+
+
+def _extract(database: Path, folder: Path, files: Sequence[str], focal: float | None) -> None:
+    """SIFT of pictures that share a lens into the database; `focal`: over the longer side, where it is known."""
+    import pycolmap
+
+    reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
+    if focal is not None:
+        width, height = image_size(folder / files[0])
+        reader.camera_params = f"{focal * max(width, height)},{width / 2},{height / 2},0"
     pycolmap.extract_features(
         database,
         folder,
-        image_names=sorted(path.name for path in pictures.values()),
-        camera_mode=mode,
-        reader_options=pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL"),
+        image_names=sorted(files),
+        camera_mode=pycolmap.CameraMode.SINGLE,
+        reader_options=reader,
         extraction_options=pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=1),
         device=pycolmap.Device.cpu,
     )
-    if not given:
-        return
-    names = {path.name: name for name, path in pictures.items()}
-    with pycolmap.Database.open(database) as opened:
-        for image in opened.read_all_images():
-            focal, camera = focals[names[image.name]], opened.read_camera(image.camera_id)
-            if focal is not None:
-                camera.params = [focal * max(camera.width, camera.height), *camera.params[1:]]
-                camera.has_prior_focal_length = True
-                opened.update_camera(camera)
 
 
-def focal_of(photograph: Path) -> float | None:
-    """Focal length over the longer side, from EXIF and COLMAP's table of sensors; None where unknown."""
+def focal_of(photograph: Path, work: Path) -> float | None:
+    """Focal length over the longer side, from EXIF and COLMAP's table of sensors; None where unknown.
+
+    COLMAP does not read every kind of picture (WebP, HEIC): it sees a blank JPEG with the photograph's tags, which is
+    made in the folder `work`.
+    """
+    with opened(photograph) as image:
+        exif = image.getexif()
+        part = exif.get_ifd(EXIF_PART)
+        camera = tuple((tag, exif[tag]) for tag in (MAKER, MODEL) if exif.get(tag))
+        focal = tuple((tag, part[tag]) for tag in FOCAL_TAGS if part.get(tag))
+        return _focal_of_tags(image.size, camera, focal, work) if focal else None
+
+
+@lru_cache(maxsize=64)  # most photographs of a capture have the same tags
+def _focal_of_tags(size: tuple[int, int], camera: tuple, focal: tuple, work: Path) -> float | None:
     import pycolmap
 
-    if photograph.suffix.lower() in HEIC:  # which COLMAP does not read
-        return focal_of_heic(photograph)
-    camera = pycolmap.infer_camera_from_image(photograph)
-    return camera.mean_focal_length() / max(camera.width, camera.height) if camera.has_prior_focal_length else None
+    tags = Image.Exif()
+    tags.update(camera)
+    tags.get_ifd(EXIF_PART).update(focal)
+    blank = work / "exif.jpg"
+    Image.new("L", size).save(blank, exif=tags)
+    found = pycolmap.infer_camera_from_image(blank)
+    blank.unlink()
+    return found.mean_focal_length() / max(found.width, found.height) if found.has_prior_focal_length else None
 
 
 def bundle_adjusted(

@@ -51,13 +51,6 @@ def _learn_heic(path: Path) -> None:
     pi_heif.register_heif_opener()
 
 
-def focal_of_heic(path: Path) -> float | None:
-    """Focal length over the longer side, from the EXIF tag that gives it for film of 36 mm; None where unknown."""
-    with opened(path) as image:
-        focal = image.getexif().get_ifd(0x8769).get(0xA405)
-        return float(focal) / 36 if focal else None
-
-
 def image_size(path: Path, upright: bool = False) -> tuple[int, int]:
     """(width, height) in pixels, from the file's header alone. `upright` as in `load_image`."""
     with opened(path) as image:

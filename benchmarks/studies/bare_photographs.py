@@ -1,0 +1,112 @@
+"""Poses found for photographs that bring none: `python -m benchmarks.studies.bare_photographs ../shared/data/fox`.
+
+Photographs of captures whose poses are known go through the stage `poses` without them. After the best similarity,
+centres are compared with the known ones in % of the extent (the greatest distance between two centres), rotations in
+degrees. A principal point off the middle, which structure from motion does not look for, counts as a rotation. Two
+lines a capture: before and after the adjustment to optical flow (`poses.refine`). Writes bare_photographs.json to --out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from reffusion.capture.frame import camera_centers
+from reffusion.capture.load import load_capture
+from reffusion.io.arrays import load_json
+from reffusion.io.scene import load_scene
+from stages import poses
+
+COLUMNS = ("capture", "views", "cameras", "center_median", "center_worst", "rotation_median", "rotation_worst", "points",
+           "residual_px", "seconds")  # fmt: skip
+
+
+def pose_errors(found: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of the views that both have, after the similarity that brings the centres closest.
+
+    Args:
+        found, truth: view -> world-to-camera [4, 4].
+
+    Returns:
+        [V] distances of centres in % of the extent of the true ones, and [V] rotation errors in degrees.
+    """
+    names = sorted(set(found) & set(truth))
+    here, there = (np.stack([poses[name] for name in names]) for poses in (found, truth))
+    a, b = camera_centers(here), camera_centers(there)
+    a, b = a - a.mean(0), b - b.mean(0)
+    u, stretch, v = np.linalg.svd(b.T @ a)
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
+    turn = u @ np.diag(sign) @ v
+    aligned = (stretch * sign).sum() / (a**2).sum() * a @ turn.T
+    extent = np.linalg.norm(b[:, None] - b, axis=-1).max()
+    rotations = Rotation.from_matrix(there[:, :3, :3] @ turn @ here[:, :3, :3].transpose(0, 2, 1))
+    return 100 * np.linalg.norm(aligned - b, axis=1) / extent, np.degrees(rotations.magnitude())
+
+
+def rows(folder: Path, images: str | None, every: int, longest: int) -> list[dict]:
+    """The capture's lines of the table: poses as solved and, where flow changes them, as adjusted."""
+    capture = load_capture(folder, images=images)
+    names = sorted(capture.pictures)[::every]
+    truth = {name: capture.poses.world_to_camera[name] for name in names}
+    result = []
+    with tempfile.TemporaryDirectory() as work:
+        scene = Path(work) / "scene"
+        (scene / "images").mkdir(parents=True)
+        for name in names:
+            shutil.copy(capture.pictures[name], scene / "images")
+        for refine in (False, True):
+            out = Path(work) / f"poses-{refine}"
+            out.mkdir()
+            start = time.process_time()
+            poses.run(poses.Params(masks="none", longest=longest, refine=refine), out, scene=scene)
+            seconds, facts = time.process_time() - start, load_json(out / "sfm.json")
+            adjusted = refine and load_json(out / "refine.json")["after"] is not None
+            found = {name: camera.world_to_camera for name, camera in load_scene(out).cameras.items()}
+            centers, degrees = pose_errors(found, truth)
+            values = (
+                f"{folder.name}/{every}",
+                f"{facts['placed']} of {facts['photographs']}",
+                "adjusted to flow" if adjusted else "left by flow" if refine else "solved",
+                *(float(reduced) for each in (centers, degrees) for reduced in (np.median(each), each.max())),
+                facts["points"],
+                facts["mean_residual_px"],
+                seconds,
+            )
+            result.append(dict(zip(COLUMNS, values, strict=True)))
+    return result
+
+
+def line(row: dict) -> str:
+    """A row of the table in Markdown."""
+    cells = (f"{value:.2f}" if isinstance(value, float) else str(value) for value in row.values())
+    return f"| {' | '.join(cells)} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("captures", type=Path, nargs="+", help="folders with photographs and poses")
+    parser.add_argument("--every", type=int, default=2, help="take every so manieth photograph by name")
+    parser.add_argument("--images", help="folder of pictures inside the capture")
+    parser.add_argument("--longest", type=int, default=640, help="px of the longer side, as poses.longest")
+    parser.add_argument("--out", type=Path, default=Path("runs/bare_photographs"))
+    given = parser.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
+    print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}")
+    table = []
+    for folder in given.captures:
+        for row in rows(folder, given.images, given.every, given.longest):
+            table.append(row)
+            print(line(row), flush=True)
+    (given.out / "bare_photographs.json").write_text(json.dumps(table, indent=1))
+
+
+if __name__ == "__main__":
+    main()
