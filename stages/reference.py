@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,15 +15,18 @@ from reffusion.capture.straight import load_straight, load_straight_depth
 from reffusion.capture.views import placed_views
 from reffusion.fit import exposure
 from reffusion.io.arrays import load_json, load_labels, save_json, save_text
+from reffusion.io.files import BadInput
 from reffusion.io.images import save_image, save_mask
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import has_photograph, load_mask_sets, load_object, load_scene, load_views, save_references
 from reffusion.masks import taint
-from reffusion.paint import agreement, feedforward, painting, registration
+from reffusion.paint import agreement, feedforward, painting
 from reffusion.params.base import REFINED_FROM
 from reffusion.params.reference import Params
 from reffusion.prior import inpaint, memory
 from reffusion.prior.model import load_prior
+from reffusion.references import color, registration
+from reffusion.references.registration import Registration
 from reffusion.texture import surfaces
 from reffusion.types import Camera, MaskSet, Reference, Scene
 from reffusion.weights.published import PAINTERS
@@ -30,6 +34,7 @@ from reffusion.weights.published import PAINTERS
 TO_PAINT, VIEWS_TO_PAINT = "to_paint", 4
 MARGIN, BLEND = 0.01, 0.01  # of it: taken from a reference from elsewhere around the hole, and blended beyond
 WHOLE = 0.9  # share of the hole that a reference from elsewhere must have
+NEIGHBOURS = 4  # nearest views whose photographs a reference that fits its own is compared with
 
 
 def run(params: Params, out: Path, *, scene: Path, poses: Path, fit: Path, masks: Path) -> None:
@@ -57,7 +62,7 @@ def taken_over(
         # A clean photograph shows what elsewhere has to be invented.
         sets = replace(sets, invent=sets.consistent) if each.view in scene.clean else sets
         if sets.invent.any() or each.view in scene.clean:  # one without a hole teaches the prior all the same
-            reference, fits[each.view] = fitted(each, sets, scene, poses, fit)
+            reference, fits[each.view] = fitted(each, sets, scene, poses, fit, masks)
             references.append(reference)
         else:
             print(f"reference {each.view} is left out: nothing has to be invented in its view")
@@ -84,7 +89,9 @@ def refuse_contradictions(references: list[Reference], scene: Scene, fit: Path, 
         )
 
 
-def fitted(given: GivenReference, sets: MaskSet, scene: Scene, poses: Path, fit: Path) -> tuple[Reference, str]:
+def fitted(
+    given: GivenReference, sets: MaskSet, scene: Scene, poses: Path, fit: Path, masks: Path
+) -> tuple[Reference, str]:
     """One of them, registered to its photograph: as it is where it is the photograph outside the object, else only the
     hole of it, its shadow and a blended rim; and how it fits."""
     lenses, upright = load_lenses(poses)
@@ -94,26 +101,60 @@ def fitted(given: GivenReference, sets: MaskSet, scene: Scene, poses: Path, fit:
     photo, hidden = views[given.view], sets.raw | sets.consistent | sets.invent
     image, inside = load_straight(given, lens, upright)
     found = registration.register(image, photo, hidden)
-    if not found.fits:
-        raise ValueError(
-            f"{given.path}: does not fit its view '{given.view}': {found.misfit}; "
-            "is it of another view, or of another scene?"
-        )
+    if not found.untouched:
+        found = checked(given, found, image, scene, poses, masks)
     print(f"reference {given.view}: {found}", flush=True)
+    usual = 0.0
     if not found.untouched:
         image, inside = load_straight(given, lens, upright, found.moved)
-        image = registration.recolored(image, found.gain, found.offset)
+        image = color.recolor(image, found.gain, found.offset)
         margin, blend = (share * camera.width for share in (MARGIN, BLEND))
+        usual = taint.redrawn_difference(image, photo, inside & ~hidden)
         hole = hidden | taint.tainted(image, photo, hidden) & inside
-        image = registration.cut_in(image, photo, hole, inside, margin, blend)
+        image = color.paste(image, photo, hole, inside, margin, blend)
     if sets.invent.any() and (share := inside[sets.invent].mean()) < WHOLE:
         raise ValueError(f"{given.path}: shows only {share:.0%} of the hole in '{given.view}'; crop less")
-    drawn = sets.consistent | taint.changed(image, photo, sets.invent)
+    drawn = sets.consistent | taint.changed(image, photo, sets.invent, usual)
     image = image if given.painted else exposure.normalised(image, fit, given.view)
     depth = load_straight_depth(given, lens, upright, found.moved)
     if depth is not None:  # where it is in the scene's own unit, it is in this frame's now
         depth = depth * scene.similarity.scale
     return Reference(camera, image, sets.invent & inside & drawn, depth), str(found)
+
+
+def checked(
+    given: GivenReference, found: Registration, image: np.ndarray, scene: Scene, poses: Path, masks: Path
+) -> Registration:
+    """How the picture lies over its photograph; as it is, where it does not fit and scene.yaml trusts it.
+
+    Raises:
+        BadInput: it does not show its view, or shows another one better, and is not trusted.
+    """
+    others = [name for name in scene.train if name != given.view and has_photograph(poses, name)]
+    others.sort(key=lambda name: view_distance(scene.cameras[name], scene.cameras[given.view]))
+    others = others[:NEIGHBOURS] if found.fits else others
+    loaded = ((name, load_views(poses, [name])[name], all_masks(masks, name)) for name in others)
+    closer = registration.closer_view(image, found, loaded)
+    if found.fits and closer is None:
+        return found
+    problem = f"{given.path}: does not fit its view '{given.view}': {found if found.fits else found.misfit}"
+    problem += f"; it fits the view '{closer[0]}' better ({closer[1]:.0%})" if closer else ""
+    if given.trust:
+        warnings.warn(f"{problem}; taken all the same: scene.yaml says `trust: true`", stacklevel=1)
+        return found if found.fits else replace(found, moved=None, gain=np.ones(3), offset=np.zeros(3))
+    raise BadInput(f"{problem}; is it of another view, or of another scene? If it is right, {given.way_to_trust}")
+
+
+def all_masks(masks: Path, view: str) -> np.ndarray:
+    """bool [H, W], pixels of the view that may show the object."""
+    sets = load_mask_sets(masks, [view])[view]
+    return sets.raw | sets.consistent | sets.invent
+
+
+def view_distance(a: Camera, b: Camera) -> float:
+    """Of two views: between their centres, of the scene's extent, plus radians between their optical axes."""
+    cosine = a.world_to_camera[2, :3] @ b.world_to_camera[2, :3]
+    return float(np.linalg.norm(a.center - b.center) + np.arccos(np.clip(cosine, -1, 1)))
 
 
 def lay_out(folder: Path, painted: list[str], scene: Scene, poses: Path, fit: Path, masks: Path) -> None:

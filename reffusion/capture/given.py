@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +29,7 @@ class GivenReference:
         depth: its depth or disparity, over the picture; or None.
         undistorted: the picture was painted over an undistorted image, not over the photograph.
         painted: it lies in `painted`, over what `reference` wrote to be painted: the view's exposure is taken out.
+        trust: it is taken even where it does not seem to show its view.
     """
 
     view: str
@@ -36,6 +37,15 @@ class GivenReference:
     depth: Path | None = None
     undistorted: bool = False
     painted: bool = False
+    trust: bool = False
+
+    @property
+    def way_to_trust(self) -> str:
+        """What to write in scene.yaml to have it taken whatever is measured, in words."""
+        if not self.painted:
+            return "write `trust: true` beside it in scene.yaml"
+        line = f"{{view: {self.view}, image: {PAINTED}/{self.path.name}, trust: true}}"
+        return f"write `reference: {line}` in scene.yaml"
 
 
 def listed(asked: Given | Sequence[Given] | None) -> list[Given]:
@@ -64,9 +74,10 @@ def load_given(folder: Path, views: Views, asked: Given | Sequence[Given] | None
         if name in found:
             raise BadInput(f"scene.yaml: reference: two for the view '{name}'; keep one")
         depth = None if each.depth is None else folder / each.depth
-        found[name] = GivenReference(name, path, depth, each.undistorted)
+        found[name] = GivenReference(name, path, depth, each.undistorted, trust=each.trust)
     for given in _paintings(paintings_in(folder), views):
-        found[given.view] = given
+        named = found.get(given.view)
+        found[given.view] = replace(given, trust=named is not None and named.trust and named.path == given.path)
     for given in found.values():
         _check(given, views)
     return sorted(found.values(), key=lambda given: given.view)

@@ -22,17 +22,35 @@ SHADOW = 0.02  # of the mask's area, that must differ beside it
 WIDER = 0.012  # of the image's width: a shadow's soft rim beyond what is found
 
 FINE, CHANGED = 0.003, 8  # of the image's width: a finer blur; levels of 255 from which a pixel was drawn anew
+DOUBT = 4.0  # times the usual difference of brightness from which a pixel is tainted, of a redrawn picture
+REDRAWN = 0.9  # quantile of the difference of a redrawn picture from its photograph that says nothing
 SPECK, CLOSED = 0.015, 0.01  # of it: islands below this diameter are none; notches twice as wide are closed
 
 
-def changed(reference: np.ndarray, photo: np.ndarray, within: np.ndarray) -> np.ndarray:
-    """bool [H, W]: pixels of `within` where a completed view shows something else than its photograph, holes filled."""
-    sigma = pixels(FINE, within.shape[1])
-    soft = lambda image: cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma)
-    differs = within & (np.abs(soft(reference) - soft(photo)).max(-1) > CHANGED)
+def redrawn_difference(reference: np.ndarray, photo: np.ndarray, known: np.ndarray) -> float:
+    """Levels of 255 by which a picture differs from its photograph where it shows the same: an autoencoder's texture.
+
+    `known`: bool [H, W], pixels without the object.
+    """
+    return float(np.quantile(_fine_difference(reference, photo)[known], REDRAWN)) if known.any() else 0.0
+
+
+def changed(reference: np.ndarray, photo: np.ndarray, within: np.ndarray, usual: float = 0.0) -> np.ndarray:
+    """bool [H, W]: pixels of `within` where a completed view shows something else than its photograph, holes filled.
+
+    `usual`: levels of 255, `redrawn_difference`.
+    """
+    differs = within & (_fine_difference(reference, photo) > max(CHANGED, usual))
     # What was drawn in may here and there look like what it hides.
     closed = ~widened(~widened(tidy(differs, SPECK * within.shape[1], 0), CLOSED), CLOSED)
     return ndimage.binary_fill_holes(closed & within)
+
+
+def _fine_difference(reference: np.ndarray, photo: np.ndarray) -> np.ndarray:
+    """[H, W] levels of 255, of the channel that differs most."""
+    sigma = pixels(FINE, photo.shape[1])
+    soft = lambda image: cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma)
+    return np.abs(soft(reference) - soft(photo)).max(-1)
 
 
 def tainted(reference: np.ndarray, shown: np.ndarray, hidden: np.ndarray) -> np.ndarray:
@@ -45,8 +63,9 @@ def tainted(reference: np.ndarray, shown: np.ndarray, hidden: np.ndarray) -> np.
     """
     sigma = pixels(SOFT, hidden.shape[1])
     soft = lambda image: cv2.GaussianBlur(image.astype(np.float32).mean(2), (0, 0), sigma)
-    differs = np.abs(np.log((soft(reference) + DARK) / (soft(shown) + DARK))) > DARKER
-    near = widened(hidden, BESIDE)
+    ratio, near = np.abs(np.log((soft(reference) + DARK) / (soft(shown) + DARK))), widened(hidden, BESIDE)
+    usual = 1.4826 * float(np.median(ratio[~near])) if (~near).any() else 0.0  # 0 unless it was redrawn everywhere
+    differs = ratio > max(DARKER, DOUBT * usual)
     if (differs & ~near).sum() <= SHADOW * hidden.sum():  # no shadow: what differs within C is for other rules
         return np.zeros_like(hidden)
     pieces, _ = ndimage.label(differs | near)

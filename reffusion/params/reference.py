@@ -16,6 +16,7 @@ class Given(Settings):
     image: str = Field(description="picture, relative to the scene; of another size or cropped a little is fine")
     depth: str | None = Field(None, description="its depth or disparity, any scale: 16-bit .png, .npy or .exr")
     undistorted: bool = Field(False, description="painted over `poses`' own undistorted image, not over the photo")
+    trust: bool = Field(False, description="take it though it does not seem to show its view")
 
 
 class Params(Settings):

@@ -1,0 +1,247 @@
+"""Which references are accepted: `python -m benchmarks.studies.redrawn --captures ../shared/data`.
+
+Of each capture, for some of its views: ten pictures that an autoencoder and other tools could make of the photograph,
+which must be accepted; the photographs of the nearest views and of another capture, as they are and redrawn, which must
+be refused. Printed are shares of places in place, errors, and with --seconds the time that a registration takes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from reffusion.capture.load import load_capture
+from reffusion.io.images import load_image
+from reffusion.references import registration
+
+LONGER_SIDE = 640  # px to which photographs are reduced
+NEAREST = 3  # neighbouring views that are handed in as pictures of each view
+COMPARED = 4  # neighbouring photographs that the stage `reference` compares with
+CHOSEN_ON = ("bear", "garden", "statue")  # captures on which thresholds are chosen; the others are for reporting
+
+
+def redraw(photo: np.ndarray, seed: int = 0) -> np.ndarray:
+    """A picture with the photograph's low frequencies and other high ones, as an autoencoder writes it."""
+    height, width = photo.shape[:2]
+    half = cv2.resize(photo, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
+    low = cv2.resize(half, (width, height), interpolation=cv2.INTER_CUBIC).astype(np.float32)
+    high = np.fft.fft2(photo - low, axes=(0, 1))
+    phase = np.angle(np.fft.fft2(np.random.default_rng(seed).normal(size=(height, width))))
+    texture = np.fft.ifft2(np.abs(high) * np.exp(1j * phase)[..., None], axes=(0, 1)).real
+    return _to_picture(low + texture)
+
+
+def resize_to_multiple(image: np.ndarray, of: int) -> np.ndarray:
+    """The picture at the nearest size of which both sides are multiples."""
+    size = [max(of, round(side / of) * of) for side in image.shape[1::-1]]
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
+def compress(image: np.ndarray, quality: int = 60) -> np.ndarray:
+    """The picture saved as JPEG and read again."""
+    file = io.BytesIO()
+    Image.fromarray(image).save(file, "JPEG", quality=quality)
+    return np.array(Image.open(file).convert("RGB"))
+
+
+def shift(image: np.ndarray, across: float, down: float) -> np.ndarray:
+    """The picture displaced by so many px."""
+    size = (image.shape[1], image.shape[0])
+    return cv2.warpAffine(image, np.array([[1, 0, across], [0, 1, down]]), size, borderMode=cv2.BORDER_REPLICATE)
+
+
+def sharpen(image: np.ndarray) -> np.ndarray:
+    """The picture with unsharp masking, 100 % of 1.5 px."""
+    return _to_picture(2 * image.astype(np.float32) - cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.5))
+
+
+def tint(image: np.ndarray) -> np.ndarray:
+    """The picture with a warm cast."""
+    return _to_picture(image * np.array([1.08, 1.0, 0.88]) + np.array([0, 4, 8]))
+
+
+def darken(image: np.ndarray) -> np.ndarray:
+    """The picture at nine tenths of its brightness."""
+    return _to_picture(image * 0.9)
+
+
+def _to_picture(values: np.ndarray) -> np.ndarray:
+    return np.clip(np.round(values), 0, 255).astype(np.uint8)
+
+
+VARIANTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "redrawn": redraw,
+    "sides multiples of 8": lambda photo: resize_to_multiple(redraw(photo), 8),
+    "sides multiples of 64": lambda photo: resize_to_multiple(redraw(photo), 64),
+    "JPEG 60": lambda photo: compress(redraw(photo)),
+    "shifted by 4 px": lambda photo: shift(redraw(photo), 3.3, -2.2),
+    "gain 0.9": lambda photo: darken(redraw(photo)),
+    "sharpened": lambda photo: sharpen(redraw(photo)),
+    "color cast": lambda photo: tint(redraw(photo)),
+    "64, cast, JPEG 60": lambda photo: compress(tint(resize_to_multiple(redraw(photo), 64))),
+    "8, shifted, gain, sharpened": lambda photo: sharpen(
+        darken(shift(resize_to_multiple(redraw(photo), 8), -2.5, 3.1))
+    ),
+}
+
+
+@dataclass
+class Photographs:
+    """A capture's photographs, reduced, read when asked for, and the distances between its views."""
+
+    files: dict[str, Path]
+    upright: bool
+    world_to_camera: dict[str, np.ndarray]
+    pictures: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def picture(self, view: str) -> np.ndarray:
+        """uint8 [H, W, 3]."""
+        if view not in self.pictures:
+            image = load_image(self.files[view], self.upright)
+            self.pictures[view] = reduce(image, LONGER_SIDE)
+        return self.pictures[view]
+
+    def nearest(self, view: str) -> list[str]:
+        """The other views by distance: between centres, of the median one, plus twice the radians between axes."""
+        centre = {name: -pose[:3, :3].T @ pose[:3, 3] for name, pose in self.world_to_camera.items()}
+        others = [name for name in self.files if name != view]
+        away = {name: float(np.linalg.norm(centre[name] - centre[view])) for name in others}
+        axis = self.world_to_camera[view][2, :3]
+        cosine = {name: np.clip(self.world_to_camera[name][2, :3] @ axis, -1, 1) for name in others}
+        usual = float(np.median(list(away.values())))
+        return sorted(others, key=lambda name: away[name] / usual + 2 * np.arccos(cosine[name]))
+
+
+def load(folder: Path) -> Photographs:
+    """Those of a capture that brings poses."""
+    capture = load_capture(folder)
+    if capture.poses is None:
+        raise ValueError(f"{folder} brings no poses: neighbouring views are not known")
+    poses = {name: np.asarray(capture.poses.world_to_camera[name]) for name in capture.pictures}
+    return Photographs(dict(capture.pictures), capture.upright, poses)
+
+
+def reduce(image: np.ndarray, longer: int) -> np.ndarray:
+    """The picture with its longer side so long, where it is longer."""
+    size = [round(side * min(1, longer / max(image.shape[:2]))) for side in image.shape[1::-1]]
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
+def make_hole(shape: Sequence[int], seed: int) -> np.ndarray:
+    """bool [H, W], a rectangle of 15 to 35 % of each side, anywhere."""
+    random, (height, width) = np.random.default_rng(seed), shape[:2]
+    high, wide = (int(side * random.uniform(0.15, 0.35)) for side in (height, width))
+    top, left = random.integers(0, height - high), random.integers(0, width - wide)
+    hole = np.zeros((height, width), bool)
+    hole[top : top + high, left : left + wide] = True
+    return hole
+
+
+@dataclass
+class Rates:
+    """Shares of places in place, and how many pictures were judged wrongly."""
+
+    own: list[float] = field(default_factory=list)  # of accepted kinds
+    other: list[float] = field(default_factory=list)  # of neighbouring views
+    foreign: list[float] = field(default_factory=list)  # of another capture
+    refused: int = 0
+    accepted_by_place: int = 0  # wrongly, were there no other photographs to compare with
+    accepted: int = 0  # wrongly
+
+    def row(self, name: str) -> str:
+        """Of the table."""
+        own, other, foreign = (np.array(each) for each in (self.own, self.other, self.foreign))
+        quantiles = lambda values, at: " / ".join(f"{100 * q:.1f}" for q in np.quantile(values, at))
+        return (
+            f"| {name} | {len(own)} | {quantiles(own, (0, 0.01, 0.5))} | {self.refused} | {len(other)} | "
+            f"{quantiles(other, (0.5, 0.99, 1))} | {self.accepted_by_place} | {self.accepted} | "
+            f"{len(foreign)} | {100 * foreign.max():.1f} |"
+        )
+
+
+HEADER = (
+    "| capture | own | in place, %: least / 1 % / median | refused | neighbours | in place, %: median / 99 % / most | "
+    "accepted by place | accepted | other scenes | in place, %: most |\n|" + "---|" * 10
+)
+
+
+def measure(capture: Photographs, foreign: np.ndarray, every: int) -> Rates:
+    """Over every so many views of a capture; `foreign`: a photograph of another one."""
+    rates = Rates()
+    for index, view in enumerate(list(capture.files)[::every]):
+        photo, nearest = capture.picture(view), capture.nearest(view)
+        hole = make_hole(photo.shape, index)
+        others = [(n, capture.picture(n), make_hole(capture.picture(n).shape, 0) & False) for n in nearest[:COMPARED]]
+        for make in VARIANTS.values():
+            image = fit_size(make(photo), photo)
+            found = registration.register(image, photo, hole)
+            wrong = not found.fits or registration.closer_view(image, found, others)
+            rates.own.append(found.in_place)
+            rates.refused += bool(wrong)
+        for number, name in enumerate(nearest[:NEAREST]):
+            image = fit_size(capture.picture(name) if number else redraw(capture.picture(name)), photo)
+            found = registration.register(image, photo, hole)
+            rates.other.append(found.in_place)
+            rates.accepted_by_place += found.fits
+            rates.accepted += found.fits and registration.closer_view(image, found, others) is None
+        found = registration.register(fit_size(foreign, photo), photo, hole)
+        rates.foreign.append(found.in_place)
+        rates.accepted += found.fits
+    return rates
+
+
+def fit_size(image: np.ndarray, photo: np.ndarray) -> np.ndarray:
+    """The picture at the photograph's size, as the stage reads it."""
+    return cv2.resize(image, (photo.shape[1], photo.shape[0]), interpolation=cv2.INTER_CUBIC)
+
+
+def measure_seconds(photo: np.ndarray) -> str:
+    """Of a registration at 640 and 1600 px, processor time."""
+    parts = []
+    for longer in (640, 1600):
+        scale = longer / max(photo.shape[:2])
+        image = cv2.resize(photo, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+        hole = make_hole(image.shape, 0)
+        for name, picture in (("its own", sharpen(shift(redraw(image), 2, 1))), ("another", image[:, ::-1].copy())):
+            start = time.process_time()
+            registration.register(picture, image, hole)
+            parts.append(f"{longer} px, {name}: {time.process_time() - start:.2f} s")
+    return "; ".join(parts)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--captures", type=Path, default=Path("../shared/data"), help="folder of captures")
+    parser.add_argument("--names", default="bear,garden,statue,dinosaur,fox", help="of captures, with commas between")
+    parser.add_argument("--every", type=int, default=1, help="take one view of so many")
+    parser.add_argument("--seconds", action="store_true", help="measure the time of a registration only")
+    given = parser.parse_args()
+    folders = [given.captures / name for name in given.names.split(",") if (given.captures / name).is_dir()]
+    if len(folders) < 2:
+        print(f"skipped: fewer than two captures in {given.captures}")
+        return 0
+    captures = {folder.name: load(folder) for folder in folders}
+    first = {name: capture.picture(next(iter(capture.files))) for name, capture in captures.items()}
+    if given.seconds:
+        print(measure_seconds(next(iter(first.values()))))
+        return 0
+    print(HEADER)
+    names = list(captures)
+    for name, capture in captures.items():
+        foreign = first[names[names.index(name) - 1]]
+        chosen = ", chosen on" if name in CHOSEN_ON else ""
+        print(measure(capture, foreign, given.every).row(name + chosen), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
