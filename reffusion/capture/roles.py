@@ -29,6 +29,7 @@ class Roles:
         warnings: what is odd.
         blank: names of views without pixels, beside training and test views.
         fill: training view -> file, a mask of what is to be filled whatever its photograph shows there.
+        keep: names of views that stay, even where their photographs contradict their poses.
     """
 
     train: tuple[str, ...]
@@ -39,6 +40,7 @@ class Roles:
     warnings: tuple[str, ...]
     blank: tuple[str, ...] = ()
     fill: dict[str, Path] = field(default_factory=dict)
+    keep: frozenset[str] = frozenset()
 
     def among(self, names: set[str]) -> Roles:
         """Without the views that are not in `names` (those that structure from motion could not place).

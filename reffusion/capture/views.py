@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -23,6 +23,7 @@ class Views:
         size_of: name -> (width, height) of its picture.
         upright: the camera's orientation tag is obeyed.
         placed: they are what `poses` wrote, so a view that is not among them may be the capture's all the same.
+        outliers: views that `poses` left out because their photographs contradict their poses.
     """
 
     names: Collection[str]
@@ -31,6 +32,7 @@ class Views:
     size_of: Callable[[str], tuple[int, int]]
     upright: bool
     placed: bool = False
+    outliers: Collection[str] = ()
 
 
 def placed_views(poses_dir: Path) -> Views:
@@ -38,12 +40,12 @@ def placed_views(poses_dir: Path) -> Views:
     lenses, upright = load_lenses(poses_dir)
     roles = load_json(Path(poses_dir) / "views.json")
     size_of = lambda name: (lenses[name].width, lenses[name].height)
-    return Views(lenses, roles["train"], roles["test"], size_of, upright, placed=True)
+    return Views(lenses, roles["train"], roles["test"], size_of, upright, True, roles.get("outliers", ()))
 
 
 def known(name: str, names: Collection[str], key: str) -> str:
     """The view of that name, an ending allowed; ValueError with the nearest names where there is none."""
-    if found := _found(name, names):
+    if found := find_view(name, names):
         return found
     raise BadInput(f"scene.yaml: {key}: there is no view '{name}'; views are named like {_near(name, names)}")
 
@@ -52,19 +54,37 @@ def known_for(path: Path, name: str, views: Views, key: str) -> str:
     """`known`, of the view that the file at `path` is made for."""
     if not views.placed:
         return known(name, views.names, key)
-    if found := _found(name, views.names):
+    if found := find_view(name, views.names):
         return found
     raise not_placed(path, name, views)
 
 
 def not_placed(path: Path, name: str, views: Views) -> BadInput:
+    if outlier := find_view(name, views.outliers):
+        return outlier_named(str(path), outlier)
     return BadInput(
         f"{path}: its view '{name}' could not be placed, or is neither a training nor a test view; "
         f"make it for another view: they are named like {_near(name, views.names)}"
     )
 
 
-def _found(name: str, names: Collection[str]) -> str | None:
+def check_outliers(key: str, names: Iterable[str], outliers: Collection[str]) -> None:
+    """BadInput where a key of scene.yaml names a view that is left out because its photograph contradicts its pose."""
+    for name in names:
+        if outlier := find_view(name, outliers):
+            raise outlier_named(f"scene.yaml: {key}", outlier)
+
+
+def outlier_named(where: str, name: str) -> BadInput:
+    """What is said of a file or key that stands for a view which is left out."""
+    return BadInput(
+        f"{where}: it is for the view '{name}', which is left out: its photograph contradicts its pose; choose another "
+        f'view, or add `keep: ["{name}"]` to scene.yaml'
+    )
+
+
+def find_view(name: str, names: Collection[str]) -> str | None:
+    """The view that a name or a file name means; None where there is none."""
     return next((candidate for candidate in (name, Path(name).stem) if candidate in names), None)
 
 
