@@ -107,6 +107,8 @@ class Scene:
         point_colors: [P, 3] uint8.
         similarity: from the scene's own frame to this one.
         blank: names of further views, without pixels: they are distilled, and supervise nothing.
+        suspects: names of the views here whose photographs contradict their poses.
+        outliers: names of the views that were left out for it; they have no camera here.
     """
 
     cameras: dict[str, Camera]
@@ -117,6 +119,8 @@ class Scene:
     point_colors: np.ndarray
     similarity: Similarity
     blank: tuple[str, ...] = ()
+    suspects: tuple[str, ...] = ()
+    outliers: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

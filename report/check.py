@@ -30,7 +30,8 @@ def make(home: Path) -> tuple[Path, list[str]]:
     if not (poses / "views.json").is_file():
         raise ValueError(f"{poses}: not there; run `make scene={home.name.split('@')[0]} poses` first")
     views, warnings = load_json(poses / "views.json"), poses / "warnings.json"
-    named = [name for name in sorted({*views["train"], *views["test"]}) if has_photograph(poses, name)]
+    there = {*views["train"], *views["test"], *views.get("outliers", ())}
+    named = [name for name in sorted(there) if has_photograph(poses, name)]
     if not named:
         raise ValueError(f"{poses}: the scene has no photographs to look at")
     cells = [(name, tinted(poses, name), kind_of(name, views)) for name in named]
@@ -39,6 +40,8 @@ def make(home: Path) -> tuple[Path, list[str]]:
 
 
 def kind_of(name: str, views: dict[str, list[str]]) -> str:
+    if name in views.get("outliers", ()):
+        return "left out"
     return "clean" if name in views["clean"] else "test" if name in views["test"] else "training"
 
 

@@ -99,6 +99,7 @@ def run(
         **metrics.summary(scored),
         "rendered": f"{len(names)} {kind} views",
         "result": work.result,
+        "suspects": [name for name in names if name in scene.suspects] or None,  # their photographs contradict poses
         "consistency": rows.consistency_of(scored),
         **used(work.painter and work.painter.name, distill),
         "exposure": exposure.PROTOCOL if work.exposures else None,

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from reffusion import trace
 from reffusion.capture.clicked import to_views
+from reffusion.capture.views import check_outliers
 from reffusion.clicks import everywhere
 from reffusion.clicks.marks import Clicks
 from reffusion.fit import exposure
@@ -118,6 +119,7 @@ def clicked(
     Raises:
         ValueError: the clicks lie where undistorted views show nothing, or on nothing that the Gaussians show.
     """
+    check_outliers("clicks", params.clicks, scene.outliers)
     clicks = {name: Clicks(*points) for name, points in to_views(poses, params.clicks).items()}
     image_of = lambda name: load_views(poses, [name])[name]
     show_it = {name: scene.cameras[name] for name in scene.train if name in given or name not in scene.clean}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,19 +11,21 @@ import torch
 
 from reffusion import seeding, trace
 from reffusion.capture import frame, odd, sfm, stereo, support
+from reffusion.capture.given import listed
 from reffusion.capture.layouts import cameras, ring
 from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.lens import undoing
 from reffusion.capture.lenses import save_lenses
+from reffusion.capture.pose_check import check_poses, judge
 from reffusion.capture.reading import check_brought, read_scene, unphotographed
 from reffusion.capture.refine import refined
 from reffusion.capture.roles import Roles
 from reffusion.capture.undistorted import check_masks, fitting_size, lens_of, load_at, save_undistorted
-from reffusion.capture.views import known
+from reffusion.capture.views import check_outliers, known
 from reffusion.gaussians import matching
 from reffusion.io.arrays import save_json, save_labels
 from reffusion.io.files import BadInput
-from reffusion.io.images import image_size, save_image, save_mask
+from reffusion.io.images import image_size, save_mask
 from reffusion.io.ply import properties_of, save_ply
 from reffusion.io.scene import load_raw_masks, load_views, save_scene
 from reffusion.io.splats import Splats, load_splats
@@ -65,14 +66,12 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
         lenses[views[k]], pinholes[views[k]] = save_undistorted(out, views[k], capture, roles, longest)
     for name in roles.blank:
         lenses[name], pinholes[name] = lens_of(name, capture, longest)
-    save_lenses(out, lenses, capture.upright, {name: sizes[name] for name in lenses})
     normalised = frame.normalised(capture.poses, pinholes, roles.train, roles.test, roles.clean)
-    normalised = replace(normalised, blank=roles.blank)
-    if params.refine and params.gaussians is None:  # Gaussians that the scene brings were fitted with its cameras
-        normalised = _refined(normalised, out)
-    if len(normalised.points) < LEAST_POINTS:
-        normalised = _with_flow_points(normalised, out)
-    _save_warnings(out, [*said, *_oddities(normalised, out)])
+    normalised, contradictions = _consistent(params, roles, replace(normalised, blank=roles.blank), out)
+    views = [name for name in views if name in normalised.cameras]
+    lenses, pinholes = ({n: each[n] for n in each if n in normalised.cameras} for each in (lenses, pinholes))
+    save_lenses(out, lenses, capture.upright, {name: sizes[name] for name in lenses})
+    _save_warnings(out, [*said, *contradictions, *_oddities(normalised, out)])
     if len(normalised.points) < LEAST_POINTS:
         ranges = frame.ranges_of(capture.poses, pinholes) * normalised.similarity.scale
         draws = seeding.generator(SEED, "poses", "random points")
@@ -164,6 +163,30 @@ def _save_unphotographed(params: Params, out: Path, scene: Path, brought: Brough
     ])  # fmt: skip
     save_scene(out, placed)
     _save_brought(out, placed, brought)
+
+
+def _consistent(params: Params, roles: Roles, scene: Scene, out: Path) -> tuple[Scene, list[str]]:
+    """The scene without the training views whose photographs contradict their poses, adjusted to the others; and
+    sentences about them."""
+    # Where there are no sparse points, those of flow tie the views together.
+    tied = scene if len(scene.points) >= LEAST_POINTS else _adjusted(params, scene, out)
+    shown = [camera for name, camera in tied.cameras.items() if name not in tied.blank]
+    check = check_poses(shown, tied.points, lambda name: load_views(out, [name])[name])
+    verdict = judge(check, tied, roles.keep, params.exclude)
+    check_outliers("reference", [each.view for each in listed(params.reference)], verdict.outliers)
+    check_outliers("clicks", params.clicks or (), verdict.outliers)
+    if params.region is not None and params.region.view is not None:
+        check_outliers("region", [params.region.view], verdict.outliers)
+    if verdict.outliers or tied is scene:
+        tied = _adjusted(params, verdict.applied_to(scene), out)
+    return replace(tied, suspects=verdict.suspects), list(verdict.sentences)
+
+
+def _adjusted(params: Params, scene: Scene, out: Path) -> Scene:
+    """The scene with cameras that agree with flow, and with points of flow where it has few."""
+    if params.refine and params.gaussians is None:  # Gaussians that the scene brings were fitted with its cameras
+        scene = _refined(scene, out)
+    return scene if len(scene.points) >= LEAST_POINTS else _with_flow_points(scene, out)
 
 
 def _oddities(scene: Scene, out: Path) -> list[str]:

@@ -91,7 +91,9 @@ def test_pose_errors_are_those_that_no_similarity_explains():
     found = {name: elsewhere(pose) for name, pose in truth.items()}
     for errors in pose_errors(found, truth):
         assert np.abs(errors).max() < 1e-4
-    found["p2"] = elsewhere(truth["p2"], (0.0, 0.0, 0.016))  # 1 % of the extent of 1.6, of which the similarity takes some
+    found["p2"] = elsewhere(
+        truth["p2"], (0.0, 0.0, 0.016)
+    )  # 1 % of the extent of 1.6, of which the similarity takes some
     shifts, _ = pose_errors(found, truth)
     assert shifts.argmax() == 2 and 0.5 < shifts.max() < 1.0
 

@@ -23,8 +23,6 @@ SUPPORTED = 0.3  # of a mask's pixels, under which it shows something else than 
 BRIGHTER = 1.5  # times as bright as the others
 POINTS = 5000  # at most, at which photographs are compared
 LEAST_SEEN = 50  # points in a view for anything to be said of it
-LEAST_CONTRAST = 6.0  # levels of 255, deviation over a view's points
-ALIKE = 0.25  # correlation of a view's fine detail with the others' at the same points, under which its pose is wrong
 
 
 def oddities(scene: Scene, masks: Mapping[str, np.ndarray], image_of: Callable[[str], np.ndarray]) -> list[str]:
@@ -35,8 +33,8 @@ def oddities(scene: Scene, masks: Mapping[str, np.ndarray], image_of: Callable[[
         masks: view name -> bool [H, W], True = the object.
         image_of: view name -> uint8 [H, W, 3].
     """
-    said = [*_covering(masks), *_disagreeing(scene, masks)]
-    return said + _contradicting([scene.cameras[n] for n in (*scene.train, *scene.test)], scene.points, image_of)
+    cameras = [scene.cameras[name] for name in (*scene.train, *scene.test) if name not in scene.suspects]
+    return [*_covering(masks), *_disagreeing(scene, masks), *_exposed(cameras, scene.points, image_of)]
 
 
 def _covering(masks: Mapping[str, np.ndarray]) -> list[str]:
@@ -103,35 +101,19 @@ def _along_rays(camera: Camera, mask: np.ndarray, points: np.ndarray) -> np.ndar
 # ---------------------------------------------------------------------------------------------- photographs
 
 
-def _contradicting(cameras: list[Camera], points: np.ndarray, image_of: Callable[[str], np.ndarray]) -> list[str]:
-    """Photographs of another exposure than the others, or that show something else where their poses put the points."""
+def _exposed(cameras: list[Camera], points: np.ndarray, image_of: Callable[[str], np.ndarray]) -> list[str]:
+    """Photographs of another exposure than the others, by what they show at the points."""
     points = points[:: max(1, -(-len(points) // POINTS))]
     if len(points) < LEAST_SEEN or len(cameras) < 3:
         return []
-    seen = np.stack([_brightness(camera, points, image_of(camera.name)) for camera in cameras])  # [V, P, 2]
-    known = ~np.isnan(seen[..., :1])
+    seen = np.stack([_brightness(camera, points, image_of(camera.name)) for camera in cameras])  # [V, P]
+    known = ~np.isnan(seen)
     total, count = np.where(known, seen, 0).sum(0), known.sum(0)
-    ratios, likeness = {}, {}
-    for camera, own, here in zip(cameras, seen, known[..., 0], strict=True):
-        here &= count[:, 0] > 1
-        if here.sum() < LEAST_SEEN:
-            continue
-        (mine, my_detail), (theirs, their_detail) = own[here].T, ((total - own)[here] / (count[here] - 1)).T
-        ratios[camera.name] = float(np.median((mine + 4) / (theirs + 4)))
-        if min(my_detail.std(), their_detail.std()) > LEAST_CONTRAST:
-            likeness[camera.name] = float(np.corrcoef(my_detail, their_detail)[0, 1])
-    return [*_exposed(ratios), *_elsewhere(likeness)]
-
-
-def _brightness(camera: Camera, points: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """[P, 2] what the photograph shows where its pose puts the points: brightness, and what of it is finer than a
-    quarter of the picture (a floor is dark in every view, whatever the pose). NaN where it does not show them."""
-    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    near, wide = (cv2.blur(gray, (max(3, camera.width // part),) * 2) for part in (40, 4))
-    return shown_at(camera, points, np.stack([near, near - wide], -1))
-
-
-def _exposed(ratios: Mapping[str, float]) -> list[str]:
+    ratios = {}
+    for camera, own, here in zip(cameras, seen, known & (count > 1), strict=True):
+        if here.sum() >= LEAST_SEEN:
+            others = (total - own)[here] / (count[here] - 1)
+            ratios[camera.name] = float(np.median((own[here] + 4) / (others + 4)))
     jumps = {name: ratio for name, ratio in ratios.items() if not 1 / BRIGHTER < ratio < BRIGHTER}
     if not jumps:
         return []
@@ -143,15 +125,10 @@ def _exposed(ratios: Mapping[str, float]) -> list[str]:
     ]
 
 
-def _elsewhere(likeness: Mapping[str, float]) -> list[str]:
-    lost = sorted(name for name, each in likeness.items() if each < ALIKE)
-    if not lost:
-        return []
-    if len(lost) > len(likeness) / 2:
-        return [
-            f"{len(lost)} of {len(likeness)} photographs contradict their poses; do poses and pictures belong together?"
-        ]
-    return [f"the photograph {name} contradicts its pose, or shows something else than the others" for name in lost]
+def _brightness(camera: Camera, points: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """[P] the photograph's brightness where its pose puts the points; NaN where it does not show them."""
+    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    return shown_at(camera, points, cv2.blur(gray, (max(3, camera.width // 40),) * 2)[..., None])[:, 0]
 
 
 def _listed(names: Iterable[str], most: int = 4) -> str:

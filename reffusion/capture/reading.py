@@ -38,6 +38,7 @@ def read_scene(params: Params, scene: Path) -> tuple[Capture, Roles]:
         cameras_only=params.cameras_only,
         remove=params.remove,
     )
+    capture, roles = _exclude(params, capture, roles)
     if params.fill is not None:
         roles = replace(roles, fill=_to_fill(scene / params.fill, capture, roles))
     if params.region is not None and params.region.view is not None:
@@ -47,6 +48,18 @@ def read_scene(params: Params, scene: Path) -> tuple[Capture, Roles]:
     check_brought(params, scene)
     _check_lenses(capture)
     return capture, roles
+
+
+def _exclude(params: Params, capture: Capture, roles: Roles) -> tuple[Capture, Roles]:
+    """The capture and its roles without the views that the scene excludes."""
+    excluded, kept = ({known(n, capture.pictures, key) for n in getattr(params, key)} for key in ("exclude", "keep"))
+    if both := sorted(excluded & kept):
+        raise BadInput(f"scene.yaml: {', '.join(both)} in both exclude and keep; name a view in one of them")
+    roles = replace(roles, keep=frozenset(kept))
+    if not excluded:
+        return capture, roles
+    pictures = {name: path for name, path in capture.pictures.items() if name not in excluded}
+    return replace(capture, pictures=pictures), roles.among(set(pictures))
 
 
 def check_brought(params: Params, scene: Path) -> list[str]:
@@ -83,7 +96,8 @@ def unphotographed(params: Params, scene: Path) -> bool:
     named = [each.image for each in listed(params.reference)]
     if params.cleaned is None or params.images is not None or has_pictures(scene, frozenset(named)):
         return False
-    for key in ("test_masks", "train", "test", "cameras_only", "fill", "remove", "region", "clean", "masks"):
+    about_views = ("train", "test", "clean", "cameras_only", "exclude", "keep")
+    for key in (*about_views, "test_masks", "fill", "remove", "region", "masks"):
         if getattr(params, key) and (key != "masks" or params.has_masks):
             raise BadInput(f"scene.yaml: {key}: the scene has no photographs; add them, or remove the key")
     return True

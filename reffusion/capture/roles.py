@@ -31,6 +31,7 @@ class Roles:
         blank: names of views without pixels, beside training and test views.
         values: which pixel values of `masks` are the object.
         fill: training view -> file, a mask of what is to be filled whatever its photograph shows there.
+        keep: names of views that stay, even where their photographs contradict their poses.
     """
 
     train: tuple[str, ...]
@@ -42,6 +43,7 @@ class Roles:
     blank: tuple[str, ...] = ()
     values: MaskValues = WHITE
     fill: dict[str, Path] = field(default_factory=dict)
+    keep: frozenset[str] = frozenset()
 
     def among(self, names: set[str]) -> Roles:
         """Without the views that are not in `names` (those that structure from motion could not place).

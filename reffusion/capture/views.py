@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -24,6 +24,7 @@ class Views:
         size_of: name -> (width, height) of its picture.
         upright: the camera's orientation tag is obeyed.
         placed: they are what `poses` wrote, so a view that is not among them may be the capture's all the same.
+        outliers: views that `poses` left out because their photographs contradict their poses.
     """
 
     names: Collection[str]
@@ -32,6 +33,7 @@ class Views:
     size_of: Callable[[str], tuple[int, int]]
     upright: bool
     placed: bool = False
+    outliers: Collection[str] = ()
 
 
 def placed_views(poses_dir: Path) -> Views:
@@ -39,7 +41,7 @@ def placed_views(poses_dir: Path) -> Views:
     lenses, upright = load_lenses(poses_dir)
     roles = load_json(Path(poses_dir) / "views.json")
     size_of = lambda name: (lenses[name].width, lenses[name].height)
-    return Views(lenses, roles["train"], roles["test"], size_of, upright, placed=True)
+    return Views(lenses, roles["train"], roles["test"], size_of, upright, True, roles.get("outliers", ()))
 
 
 def known(name: str, names: Collection[str], key: str) -> str:
@@ -59,9 +61,26 @@ def known_for(path: Path, name: str, views: Views, key: str) -> str:
 
 
 def not_placed(path: Path, name: str, views: Views) -> BadInput:
+    if outlier := find_view(name, views.outliers):
+        return outlier_named(str(path), outlier)
     return BadInput(
         f"{path}: its view '{name}' could not be placed, or is neither a training nor a test view; "
         f"make it for another view: they are named like {_near(name, views.names)}"
+    )
+
+
+def check_outliers(key: str, names: Iterable[str], outliers: Collection[str]) -> None:
+    """BadInput where a key of scene.yaml names a view that is left out because its photograph contradicts its pose."""
+    for name in names:
+        if outlier := find_view(name, outliers):
+            raise outlier_named(f"scene.yaml: {key}", outlier)
+
+
+def outlier_named(where: str, name: str) -> BadInput:
+    """What is said of a file or key that stands for a view which is left out."""
+    return BadInput(
+        f"{where}: it is for the view '{name}', which is left out: its photograph contradicts its pose; choose another "
+        f'view, or add `keep: ["{name}"]` to scene.yaml'
     )
 
 

@@ -36,7 +36,8 @@ def save_scene(poses_dir: Path, scene: Scene) -> None:
     similarity = {"scale": float(scene.similarity.scale), "offset": [float(v) for v in scene.similarity.offset]}
     save_json(poses_dir / "transform.json", similarity)
     views = {"train": list(scene.train), "test": list(scene.test), "clean": sorted(scene.clean)}
-    views |= {"cameras_only": list(scene.blank)} if scene.blank else {}
+    more = {"cameras_only": scene.blank, "suspects": scene.suspects, "outliers": scene.outliers}
+    views |= {key: list(names) for key, names in more.items() if names}
     save_json(poses_dir / "views.json", views)
 
 
@@ -66,6 +67,8 @@ def load_scene(poses_dir: Path) -> Scene:
         point_colors=points.colors,
         similarity=Similarity(similarity["scale"], np.array(similarity["offset"], np.float64)),
         blank=tuple(views.get("cameras_only", ())),
+        suspects=tuple(views.get("suspects", ())),
+        outliers=tuple(views.get("outliers", ())),
     )
 
 

@@ -60,6 +60,8 @@ class Params(Settings):
     cameras_only: list[str] | str | None = Field(
         None, description='views whose pixels are not used: names, "every N", or "others" than train and test'
     )
+    exclude: list[str] = Field([], description="views that are no part of the scene")
+    keep: list[str] = Field([], description="views that stay, even where their photographs contradict their poses")
     gaussians: str | None = Field(None, description=".ply the scene brings in its own frame, 3DGS layout")
     cleaned: str | None = Field(None, description="the same .ply after someone deleted splats: these are the object")
     region: Region | None = Field(None, description="box or sphere that holds the object, or is to be filled")

@@ -84,7 +84,9 @@ class Registration:
         moved = f"moved by up to {self.shift:.1f} px" if self.moved is not None else "not moved"
         brighter = (self.gain.mean() + self.offset.mean() - 1) * 100
         colors = f"colours matched ({brighter:+.0f} %)" if (self.gain != 1).any() or self.offset.any() else "as exposed"
-        return f"{moved}, {colors}; {self.in_place:.0%} of {self.places} places around the hole lie as in the photograph"
+        return (
+            f"{moved}, {colors}; {self.in_place:.0%} of {self.places} places around the hole lie as in the photograph"
+        )
 
 
 def register(picture: np.ndarray, photo: np.ndarray, hidden: np.ndarray, working: int = WORKING) -> Registration:

@@ -47,7 +47,6 @@ class Capture:
         brought_by: the file the poses come from, for messages; None without poses.
         label_folder: where masks (`label`) and test masks (`test_label`) are looked for: the pictures' folder, or that
             of the same pictures at another size.
-        left_out: names of views that have a picture but no pose, or a pose but no picture.
         warnings: what the user should know, each one sentence.
         test: names of the views that the layout itself holds out (Blender's transforms_test.json).
         depth_maps: files that points may be made of.
@@ -60,7 +59,6 @@ class Capture:
     poses: Poses | None
     brought_by: Path | None
     label_folder: Path
-    left_out: frozenset[str]
     warnings: tuple[str, ...]
     test: tuple[str, ...] = ()
     ignore_masks: dict[str, Path] = field(default_factory=dict)

@@ -114,7 +114,6 @@ def from_model(folder: Path, model: Path, image_folder: Path, layout: str, label
         Poses(lenses, poses, *points, {}),
         source,
         label_folder,
-        frozenset(rest),
         tuple(filter(None, warnings)),
     )
 

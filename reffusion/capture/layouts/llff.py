@@ -70,7 +70,7 @@ def read(folder: Path, images: str | None, longest: int, references: frozenset[P
     points = _points_of_partial_model(partial, lenses, poses, bounds, warnings)
     brought = Poses(lenses, poses, *points, bounds)
     paths = paths_below(image_folder, pictures)
-    return Capture("llff", pictures, paths, brought, source, label_folder, frozenset(), tuple(warnings))
+    return Capture("llff", pictures, paths, brought, source, label_folder, tuple(warnings))
 
 
 def _label_folder(folder: Path, images: str | None) -> Path:

@@ -17,4 +17,4 @@ def read(folder: Path, images: str | None, references: frozenset[Path] = frozens
     for path in pictures.values():
         image_size(path)  # an unreadable one is refused here, before any work
     paths = paths_below(image_folder, pictures)
-    return Capture("photos", pictures, paths, None, None, image_folder, frozenset(), ())
+    return Capture("photos", pictures, paths, None, None, image_folder, ())

@@ -94,7 +94,6 @@ def read(folder: Path, images: str | None) -> Capture:
         replace(found, points=points[0], colors=points[1]),
         source,
         next(iter(pictures.values())).parent if len({path.parent for path in pictures.values()}) == 1 else root,
-        frozenset(missing),
         tuple(filter(None, warnings)),
         tuple(view for view, each in placed.items() if each.split in ("test", "val")),
         _named_files(folder, placed, "mask_path"),

@@ -1,0 +1,245 @@
+"""Photographs that contradict their poses: another picture under the same name, a pose that is wrong by degrees.
+
+The sparse points tie the views together. Where two views see the same points, their pictures must show the same there.
+For each view we take what its nearest views show at the points, place that where the view's pose projects the points,
+and correlate it with the view's own picture at every shift of the picture. A right photograph correlates best at no
+shift, by a wide margin, whatever its exposure and however few points it shares. A photograph that belongs elsewhere
+correlates best at some other shift, or nowhere.
+
+PAPER leaves open: it takes photographs and poses as given.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import cv2
+import numpy as np
+
+from reffusion.capture.roles import LEAST_TRAINING_VIEWS
+from reffusion.capture.support import shown_at
+from reffusion.geometry import project
+from reffusion.types import Camera, Scene
+
+LONGER_SIDE = 128  # cells along a picture's longer side, at which pictures are compared
+WINDOW = 12  # cells: what varies over more is brightness, not detail
+NOISE = 4.0  # levels of 255 of deviation in a window, well under which there is no detail
+POINTS = 5000  # at most
+LEAST_POINTS = 50  # that a view has in common with another for it to tell anything of it
+NEIGHBOURS = 6  # views that each is compared with
+LEAST_NEIGHBOURS = 2
+LEAST_DETAIL = 0.2  # root mean square of the detail at the points, under which the pictures are too plain
+SAME, ELSEWHERE = 2, 4  # cells of shift up to which the pose is right, and from which it is wrong
+LEAST_MARGIN = 0.15  # of the correlation at the pose over that at the best other shift; right views have 0.22 to 0.7
+LEAST_OVERLAP = 0.5  # of the points that a shift must leave in the picture
+
+
+@dataclass(frozen=True)
+class PoseCheck:
+    """Attributes:
+    margins: view name -> correlation at its pose less that at the best other shift; only of the views that share
+        enough points with others to be judged.
+    contradicting: sorted names of the views whose photographs contradict their poses.
+    """
+
+    margins: dict[str, float]
+    contradicting: tuple[str, ...]
+
+    @property
+    def is_general(self) -> bool:
+        """More than half of the views contradict the others: which of them are right cannot be told."""
+        return len(self.contradicting) > len(self.margins) / 2
+
+
+def check_poses(cameras: Sequence[Camera], points: np.ndarray, image_of: Callable[[str], np.ndarray]) -> PoseCheck:
+    """Compare each photograph with those of the nearest views at the points that both see.
+
+    The worst view is set aside and its neighbours are compared again, until the rest agree. At last those set aside are
+    compared with the rest once more.
+
+    Args:
+        cameras: undistorted views in the normalised frame.
+        points: [P, 3] sparse points or those of flow.
+        image_of: view name -> uint8 [H, W, 3].
+    """
+    points = points[:: max(1, -(-len(points) // POINTS))]
+    views = {camera.name: _View.of(camera, points, image_of(camera.name)) for camera in cameras}
+    order = {name: _nearest(view, views.values()) for name, view in views.items()}
+    kept = set(views)
+    compare = lambda name: _margin(views[name], [views[other] for other in order[name] if other in kept][:NEIGHBOURS])
+    margins = {name: margin for name in sorted(views) if (margin := compare(name)) is not None}
+    judged, out = len(margins), {}
+    while margins and len(out) <= judged / 2:
+        worst = min(margins, key=margins.__getitem__)
+        if margins[worst] >= LEAST_MARGIN:
+            break
+        out[worst] = margins.pop(worst)
+        affected = [name for name in margins if worst in [n for n in order[name] if n in kept][:NEIGHBOURS]]
+        kept.remove(worst)
+        margins |= {name: margin for name in affected if (margin := compare(name)) is not None}
+    if len(out) <= judged / 2:
+        out |= {name: margin for name in out if (margin := compare(name)) is not None}
+    wrong = sorted(name for name, margin in out.items() if margin < LEAST_MARGIN)
+    return PoseCheck(margins | out, tuple(wrong))
+
+
+@dataclass(frozen=True)
+class _View:
+    """A view's picture in cells, and what it shows at the points.
+
+    Attributes:
+        cells: [P, 2] int, column and row of each point's cell; only where `seen`.
+        seen: [P] bool, the points that it shows.
+        detail: float32 [h, w], see `_detail`.
+        values: float32 [P], the detail at the points; 0 where they are not seen.
+    """
+
+    camera: Camera
+    cells: np.ndarray
+    seen: np.ndarray
+    detail: np.ndarray
+    values: np.ndarray
+
+    @classmethod
+    def of(cls, camera: Camera, points: np.ndarray, image: np.ndarray) -> _View:
+        detail = _detail(image)
+        height, width = detail.shape
+        at = project(points, camera)[0] * (width / camera.width, height / camera.height)
+        enlarged = cv2.resize(detail, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
+        values = shown_at(camera, points, enlarged[..., None])[:, 0]
+        seen = ~np.isnan(values)
+        cells = np.where(seen[:, None], at, 0).astype(int).clip(0, (width - 1, height - 1))
+        return cls(camera, cells, seen, detail, np.nan_to_num(values))
+
+    @property
+    def padded(self) -> tuple[int, int]:
+        """Rows and columns of the Fourier transforms, so that no shift wraps around."""
+        return 2 * self.detail.shape[0], 2 * self.detail.shape[1]
+
+    @cached_property
+    def spectra(self) -> list[np.ndarray]:
+        """Fourier transforms of the detail, of its square, and of the picture's area."""
+        pictures = (self.detail, self.detail**2, np.ones_like(self.detail))
+        return [np.fft.rfft2(each, self.padded) for each in pictures]
+
+    def distance(self, other: _View) -> float:
+        """How differently two cameras look: way between their places, and angle between their axes in radians."""
+        cosine = float(self.camera.world_to_camera[2, :3] @ other.camera.world_to_camera[2, :3])
+        return float(np.linalg.norm(self.camera.center - other.camera.center) + np.arccos(np.clip(cosine, -1, 1)))
+
+
+def _detail(image: np.ndarray) -> np.ndarray:
+    """float32 [h, w]: brightness in cells, less its mean in a window, over its deviation there: free of exposure and
+    shading, about -1 to 1, and near 0 where the picture is plain."""
+    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    factor = LONGER_SIDE / max(gray.shape)
+    size = max(1, round(gray.shape[1] * factor)), max(1, round(gray.shape[0] * factor))
+    gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+    detail = gray - cv2.blur(gray, (WINDOW, WINDOW))
+    return detail / (np.sqrt(cv2.blur(detail**2, (WINDOW, WINDOW))) + NOISE)
+
+
+def _nearest(view: _View, others: Collection[_View]) -> list[str]:
+    """Names of the views that share points with this one, those that look most like it first."""
+    shared = [each for each in others if each is not view and (each.seen & view.seen).sum() >= LEAST_POINTS]
+    return [each.camera.name for each in sorted(shared, key=lambda each: (view.distance(each), each.camera.name))]
+
+
+def _margin(view: _View, others: Sequence[_View]) -> float | None:
+    """The correlation at the view's pose less that at the best other shift; None where nothing can be told."""
+    if len(others) < LEAST_NEIGHBOURS:
+        return None
+    count = sum(each.seen & view.seen for each in others)
+    known = np.flatnonzero(count)
+    expected = sum(np.where(view.seen, each.values, 0) for each in others)[known] / count[known]
+    plain = min(np.sqrt(np.mean(each**2)) for each in (expected, view.values[known])) < LEAST_DETAIL
+    if len(known) < LEAST_POINTS or plain:
+        return None
+    correlation, shift = _correlations(view, view.cells[known], expected)
+    return float(correlation[shift <= SAME].max() - correlation[shift > ELSEWHERE].max())
+
+
+def _correlations(view: _View, cells: np.ndarray, expected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The correlation of `expected` [K] with the view's detail in the cells [K, 2], for every shift of these that
+    leaves enough of them in the picture; and the shifts' lengths in cells."""
+    templates = np.zeros((3, *view.padded))
+    for template, weight in zip(templates, (expected, np.ones_like(expected), expected**2), strict=True):
+        np.add.at(template, (cells[:, 1], cells[:, 0]), weight)
+    picture, square, area = view.spectra
+    spectra = np.conj(np.fft.rfft2(templates))
+    pairs = ((spectra[0], picture), (spectra[1], square), (spectra[2], area), (spectra[1], area))
+    product, energy, template_energy, inside = (np.fft.irfft2(one * other, view.padded) for one, other in pairs)
+    correlation = product / np.sqrt(np.maximum(energy, 1e-6) * np.maximum(template_energy, 1e-6))
+    rows, columns = (np.minimum(np.arange(n), n - np.arange(n)) for n in view.padded)
+    enough = inside >= LEAST_OVERLAP * len(cells)
+    return correlation[enough], np.hypot(rows[:, None], columns[None])[enough]
+
+
+# ---------------------------------------------------------------------------------------------- what follows from it
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Attributes:
+    outliers: training views to leave out of the scene, sorted.
+    suspects: views that contradict their poses and stay: test views, clean views, and all if too few would be left.
+    sentences: what the user should know, with the line of scene.yaml that decides otherwise.
+    """
+
+    outliers: tuple[str, ...] = ()
+    suspects: tuple[str, ...] = ()
+    sentences: tuple[str, ...] = ()
+
+    def applied_to(self, scene: Scene) -> Scene:
+        """The scene without the outliers."""
+        return replace(
+            scene,
+            cameras={name: camera for name, camera in scene.cameras.items() if name not in self.outliers},
+            train=tuple(name for name in scene.train if name not in self.outliers),
+            suspects=self.suspects,
+            outliers=self.outliers,
+        )
+
+
+def judge(check: PoseCheck, scene: Scene, keep: Collection[str] = (), exclude: Sequence[str] = ()) -> Verdict:
+    """Which views to leave out, and what to say about them.
+
+    Args:
+        keep: views that the user wants to stay.
+        exclude: what scene.yaml excludes already, to be repeated in the line that it needs.
+    """
+    wrong = [name for name in check.contradicting if name not in keep]
+    if not wrong:
+        return Verdict()
+    if check.is_general:
+        count = f"{len(check.contradicting)} of {len(check.margins)} photographs"
+        sentence = f"{count} contradict their poses; do poses and pictures belong together?"
+        return Verdict((), tuple(wrong), (sentence,))
+    clean = [name for name in wrong if name in scene.clean]
+    test = [name for name in wrong if name in scene.test]
+    train = [name for name in wrong if name not in {*clean, *test}]
+    least = 1 if scene.blank else LEAST_TRAINING_VIEWS
+    is_enough = len(scene.train) - len(train) >= least
+    fate = "are left out" if is_enough else f"are used all the same, for fewer than {least} would be left"
+    said = (
+        (train, "photographs", fate),
+        (test, "test photographs", "are scored all the same"),
+        (clean, "clean photographs", "are used all the same"),
+    )
+    sentences = [
+        f"{kind} that contradict their poses, or show something else than the others, {fate}: {', '.join(names)}; in "
+        f"scene.yaml, {_line('exclude', exclude, names)} leaves them out for good, {_line('keep', keep, names)} uses "
+        "them without this warning"
+        for names, kind, fate in said
+        if names
+    ]
+    outliers = tuple(train) if is_enough else ()
+    return Verdict(outliers, tuple(name for name in wrong if name not in outliers), tuple(sentences))
+
+
+def _line(key: str, named: Collection[str], names: Sequence[str]) -> str:
+    """The line of scene.yaml that names these views beside those that it names already."""
+    return f"`{key}: {json.dumps(sorted({*named, *names}), ensure_ascii=False)}`"
