@@ -11,7 +11,9 @@ from pathlib import Path
 import numpy as np
 from held_out import attempt
 from PIL import Image
-from test_sfm import draw_corner, errors_after_alignment, noise, walk
+from test_sfm import draw_corner, noise, walk
+
+from benchmarks.studies.bare_photographs import pose_errors
 
 ORIENTATION, EXIF_FOLDER, FOCAL_35_MM = 0x0112, 0x8769, 0xA405
 
@@ -40,8 +42,8 @@ def save_walk(folder: Path, ending: str, **options) -> dict[str, np.ndarray]:
 def assert_placed(scene, truth: dict[str, np.ndarray]) -> None:
     """All views, rotations within 2 degrees and centres within 2 % of their extent."""
     assert sorted(scene.train) == sorted(truth)
-    degrees, shifts = errors_after_alignment(scene, truth)
-    assert degrees.max() < 2 and shifts.max() < 0.02
+    percents, degrees = pose_errors({name: scene.cameras[name].world_to_camera for name in scene.train}, truth)
+    assert degrees.max() < 2 and percents.max() < 2
 
 
 def test_K_lossy_webp_with_focal_lengths_in_capitals(tmp_path):
