@@ -10,13 +10,14 @@ import numpy as np
 import torch
 
 from reffusion import seeding, trace
-from reffusion.capture import frame, odd, sfm, stereo, support
+from reffusion.capture import frame, sfm, stereo, support
+from reffusion.capture.checks import odd
+from reffusion.capture.checks.pose_check import check_poses, judge
 from reffusion.capture.given import listed
 from reffusion.capture.layouts import cameras, ring
 from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.lens import undoing
 from reffusion.capture.lenses import save_lenses
-from reffusion.capture.pose_check import check_poses, judge
 from reffusion.capture.reading import check_brought, read_scene, unphotographed
 from reffusion.capture.refine import refined
 from reffusion.capture.roles import Roles

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import small_scene
 
-from reffusion.capture import odd
-from reffusion.capture.odd import oddities
+from reffusion.capture.checks import odd
+from reffusion.capture.checks.odd import oddities
 from reffusion.geometry import pixel_rays
 from reffusion.io.arrays import save_json
 from reffusion.io.images import image_size
@@ -80,14 +80,6 @@ def test_exposure_that_jumps(brought):
     scene, masks, pictures = brought
     dark = (pictures["a2"] * 0.4).astype(np.uint8)
     assert "exposed otherwise than the rest (a2; a2 is 0.4" in said(scene, masks, pictures | {"a2": dark})
-
-
-def test_poses_that_the_photographs_contradict(brought):
-    scene, _, pictures = brought
-    noise = np.random.default_rng(0)
-    blocks = {n: np.kron(noise.integers(0, 256, (9, 12, 3)), np.ones((8, 8, 1))).astype(np.uint8) for n in pictures}
-    assert "the photograph a2 contradicts its pose" in said(scene, {}, pictures | {"a2": blocks["a2"]})
-    assert "photographs contradict their poses" in said(scene, {}, blocks)
 
 
 def test_the_sheet_shows_every_mask_over_its_photograph(tmp_path, brought):

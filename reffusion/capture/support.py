@@ -59,11 +59,12 @@ def harmonics(points: np.ndarray, cameras: Sequence[Camera], most: int) -> tuple
     return min(most, max(isqrt(views) - 1, 0)), views
 
 
-def shown_at(camera: Camera, points: np.ndarray, picture: np.ndarray) -> np.ndarray:
-    """[P, C] what a view's picture [H, W, C] shows at the points [P, 3]; NaN outside it, and behind nearer points."""
+def shown_at(camera: Camera, points: np.ndarray, picture: np.ndarray, cells: int = CELLS) -> np.ndarray:
+    """[P, C] what a view's picture [H, W, C] shows at the points [P, 3]; NaN outside it, and behind nearer points:
+    the nearest of each cell, of which there are `cells` along the picture's width, hide those behind them."""
     uv, depth = geometry.project(points, camera)
     values, inside = geometry.sample_nearest(picture, uv)
-    cell = max(1.0, camera.width / CELLS)
+    cell = max(1.0, camera.width / cells)
     index = np.zeros(len(points), int)
     index[inside] = (uv[inside] // cell).astype(int) @ (10_000, 1)
     order = np.argsort(depth)

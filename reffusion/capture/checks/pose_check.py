@@ -28,30 +28,32 @@ LONGER_SIDE = 128  # cells along a picture's longer side, at which pictures are 
 WINDOW = 12  # cells: what varies over more is brightness, not detail
 NOISE = 4.0  # levels of 255 of deviation in a window, well under which there is no detail
 POINTS = 5000  # at most
-LEAST_POINTS = 50  # that a view has in common with another for it to tell anything of it
+DENSITY = 12  # points in a cell of the picture, on average, so that the nearest of them hide those behind them
+LEAST_SHARED = 50  # points that a view has in common with another that it is compared with
+LEAST_POINTS = 250  # that it has in common with all of these: with fewer, chance correlates too
 NEIGHBOURS = 6  # views that each is compared with
 LEAST_NEIGHBOURS = 2
+TURN = np.cos(np.radians(35))  # views whose axes differ by more see other sides of things, and are not compared
 LEAST_DETAIL = 0.2  # root mean square of the detail at the points, under which the pictures are too plain
 SAME, ELSEWHERE = 2, 4  # cells of shift up to which the pose is right, and from which it is wrong
-LEAST_MARGIN = 0.15  # of the correlation at the pose over that at the best other shift; right views have 0.22 to 0.7
+LEAST_MARGIN = 0.1  # of the correlation at the pose over that at the best other shift; right views have 0.2 to 0.7
 LEAST_OVERLAP = 0.5  # of the points that a shift must leave in the picture
 
 
 @dataclass(frozen=True)
 class PoseCheck:
     """Attributes:
-    margins: view name -> correlation at its pose less that at the best other shift; only of the views that share
-        enough points with others to be judged.
+    judged: how many views share enough with others to be judged.
     contradicting: sorted names of the views whose photographs contradict their poses.
     """
 
-    margins: dict[str, float]
+    judged: int
     contradicting: tuple[str, ...]
 
     @property
     def is_general(self) -> bool:
-        """More than half of the views contradict the others: which of them are right cannot be told."""
-        return len(self.contradicting) > len(self.margins) / 2
+        """Half of the views contradict the others, or more: which of them are right cannot be told."""
+        return 2 * len(self.contradicting) >= max(self.judged, 1)
 
 
 def check_poses(cameras: Sequence[Camera], points: np.ndarray, image_of: Callable[[str], np.ndarray]) -> PoseCheck:
@@ -66,24 +68,29 @@ def check_poses(cameras: Sequence[Camera], points: np.ndarray, image_of: Callabl
         image_of: view name -> uint8 [H, W, 3].
     """
     points = points[:: max(1, -(-len(points) // POINTS))]
-    views = {camera.name: _View.of(camera, points, image_of(camera.name)) for camera in cameras}
+    cells = max(4, round((len(points) / DENSITY) ** 0.5))
+    views = {camera.name: _View.of(camera, points, image_of(camera.name), cells) for camera in cameras}
     order = {name: _nearest(view, views.values()) for name, view in views.items()}
     kept = set(views)
-    compare = lambda name: _margin(views[name], [views[other] for other in order[name] if other in kept][:NEIGHBOURS])
-    margins = {name: margin for name in sorted(views) if (margin := compare(name)) is not None}
-    judged, out = len(margins), {}
-    while margins and len(out) <= judged / 2:
-        worst = min(margins, key=margins.__getitem__)
-        if margins[worst] >= LEAST_MARGIN:
-            break
-        out[worst] = margins.pop(worst)
-        affected = [name for name in margins if worst in [n for n in order[name] if n in kept][:NEIGHBOURS]]
+    around = lambda name: [other for other in order[name] if other in kept][:NEIGHBOURS]
+    compare = lambda names: {name: _margin(views[name], [views[other] for other in around(name)]) for name in names}
+    margins = compare(sorted(views))
+    judged = sum(margin is not None for margin in margins.values())
+    out: list[str] = []
+    while 2 * len(out) < judged and (low := [(margins[name], name) for name in kept if _is_low(margins[name])]):
+        worst = min(low)[1]
+        affected = [name for name in kept if worst in around(name)]
         kept.remove(worst)
-        margins |= {name: margin for name in affected if (margin := compare(name)) is not None}
-    if len(out) <= judged / 2:
-        out |= {name: margin for name in out if (margin := compare(name)) is not None}
-    wrong = sorted(name for name, margin in out.items() if margin < LEAST_MARGIN)
-    return PoseCheck(margins | out, tuple(wrong))
+        out.append(worst)
+        margins |= compare(affected)
+    if 2 * len(out) < judged:
+        again = compare(out)
+        out = [name for name in out if again[name] is None or _is_low(again[name])]
+    return PoseCheck(judged, tuple(sorted(out)))
+
+
+def _is_low(margin: float | None) -> bool:
+    return margin is not None and margin < LEAST_MARGIN
 
 
 @dataclass(frozen=True)
@@ -91,28 +98,28 @@ class _View:
     """A view's picture in cells, and what it shows at the points.
 
     Attributes:
-        cells: [P, 2] int, column and row of each point's cell; only where `seen`.
+        places: [P, 2] int, column and row of the cell that shows each point; only where `seen`.
         seen: [P] bool, the points that it shows.
         detail: float32 [h, w], see `_detail`.
         values: float32 [P], the detail at the points; 0 where they are not seen.
     """
 
     camera: Camera
-    cells: np.ndarray
+    places: np.ndarray
     seen: np.ndarray
     detail: np.ndarray
     values: np.ndarray
 
     @classmethod
-    def of(cls, camera: Camera, points: np.ndarray, image: np.ndarray) -> _View:
+    def of(cls, camera: Camera, points: np.ndarray, image: np.ndarray, cells: int) -> _View:
         detail = _detail(image)
         height, width = detail.shape
         at = project(points, camera)[0] * (width / camera.width, height / camera.height)
         enlarged = cv2.resize(detail, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
-        values = shown_at(camera, points, enlarged[..., None])[:, 0]
+        values = shown_at(camera, points, enlarged[..., None], cells)[:, 0]
         seen = ~np.isnan(values)
-        cells = np.where(seen[:, None], at, 0).astype(int).clip(0, (width - 1, height - 1))
-        return cls(camera, cells, seen, detail, np.nan_to_num(values))
+        places = np.where(seen[:, None], at, 0).astype(int).clip(0, (width - 1, height - 1))
+        return cls(camera, places, seen, detail, np.nan_to_num(values))
 
     @property
     def padded(self) -> tuple[int, int]:
@@ -139,12 +146,14 @@ def _detail(image: np.ndarray) -> np.ndarray:
     size = max(1, round(gray.shape[1] * factor)), max(1, round(gray.shape[0] * factor))
     gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
     detail = gray - cv2.blur(gray, (WINDOW, WINDOW))
-    return detail / (np.sqrt(cv2.blur(detail**2, (WINDOW, WINDOW))) + NOISE)
+    return detail / (np.sqrt(np.maximum(cv2.blur(detail**2, (WINDOW, WINDOW)), 0)) + NOISE)
 
 
 def _nearest(view: _View, others: Collection[_View]) -> list[str]:
-    """Names of the views that share points with this one, those that look most like it first."""
-    shared = [each for each in others if each is not view and (each.seen & view.seen).sum() >= LEAST_POINTS]
+    """Names of the views that look the same way and share points with this one, the nearest first."""
+    axis = view.camera.world_to_camera[2, :3]
+    others = [each for each in others if each is not view and each.camera.world_to_camera[2, :3] @ axis > TURN]
+    shared = [each for each in others if (each.seen & view.seen).sum() >= LEAST_SHARED]
     return [each.camera.name for each in sorted(shared, key=lambda each: (view.distance(each), each.camera.name))]
 
 
@@ -158,23 +167,23 @@ def _margin(view: _View, others: Sequence[_View]) -> float | None:
     plain = min(np.sqrt(np.mean(each**2)) for each in (expected, view.values[known])) < LEAST_DETAIL
     if len(known) < LEAST_POINTS or plain:
         return None
-    correlation, shift = _correlations(view, view.cells[known], expected)
+    correlation, shift = _correlations(view, view.places[known], expected)
     return float(correlation[shift <= SAME].max() - correlation[shift > ELSEWHERE].max())
 
 
-def _correlations(view: _View, cells: np.ndarray, expected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The correlation of `expected` [K] with the view's detail in the cells [K, 2], for every shift of these that
+def _correlations(view: _View, places: np.ndarray, expected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The correlation of `expected` [K] with the view's detail in the places [K, 2], for every shift of these that
     leaves enough of them in the picture; and the shifts' lengths in cells."""
     templates = np.zeros((3, *view.padded))
     for template, weight in zip(templates, (expected, np.ones_like(expected), expected**2), strict=True):
-        np.add.at(template, (cells[:, 1], cells[:, 0]), weight)
+        np.add.at(template, (places[:, 1], places[:, 0]), weight)
     picture, square, area = view.spectra
     spectra = np.conj(np.fft.rfft2(templates))
     pairs = ((spectra[0], picture), (spectra[1], square), (spectra[2], area), (spectra[1], area))
     product, energy, template_energy, inside = (np.fft.irfft2(one * other, view.padded) for one, other in pairs)
     correlation = product / np.sqrt(np.maximum(energy, 1e-6) * np.maximum(template_energy, 1e-6))
     rows, columns = (np.minimum(np.arange(n), n - np.arange(n)) for n in view.padded)
-    enough = inside >= LEAST_OVERLAP * len(cells)
+    enough = inside >= LEAST_OVERLAP * len(places)
     return correlation[enough], np.hypot(rows[:, None], columns[None])[enough]
 
 
@@ -215,7 +224,7 @@ def judge(check: PoseCheck, scene: Scene, keep: Collection[str] = (), exclude: S
     if not wrong:
         return Verdict()
     if check.is_general:
-        count = f"{len(check.contradicting)} of {len(check.margins)} photographs"
+        count = f"at least {len(check.contradicting)} of {check.judged} photographs"
         sentence = f"{count} contradict their poses; do poses and pictures belong together?"
         return Verdict((), tuple(wrong), (sentence,))
     clean = [name for name in wrong if name in scene.clean]
