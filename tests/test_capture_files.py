@@ -34,7 +34,7 @@ from reffusion.io.arrays import load_json
 from reffusion.io.files import BadInput
 from reffusion.io.images import load_mask
 from reffusion.io.ply import save_points
-from reffusion.io.scene import load_raw_masks, load_views, objects_of
+from reffusion.io.scene import load_raw_masks, load_test_masks, load_views, objects_of
 from reffusion.params.poses import Params
 from reffusion.types import Scene
 from stages.plan import poses as plan
@@ -159,14 +159,16 @@ def test_equal_names_in_two_folders_are_called_by_their_paths(tmp_path):
     truth, folder = some_truth(), tmp_path / "s"
     path = {view: f"cam{k % 2}/{k // 2:04d}.png" for k, view in enumerate(sorted(truth.world_to_camera))}
     for each in path.values():
+        kind = "test_masks" if each == "cam0/0001.png" else "masks"
         write_pictures(folder / "images" / Path(each).parent, [Path(each).stem])
-        write_masks(folder / "masks" / Path(each).parent, [Path(each).stem])
-        (folder / "masks" / each).rename(folder / "masks" / f"{each}.png")  # COLMAP's rule
+        write_masks(folder / kind / Path(each).parent, [Path(each).stem])
+        (folder / kind / each).rename(folder / kind / f"{each}.png")  # COLMAP's rule
     write_named_model(folder / "sparse/0", truth, path)
-    scene, out, _ = read(folder, test=["cam0/0001.png"], clean=["cam1-0002"])
+    scene, out, _ = read(folder, test=["cam0/0001.png"], clean=["cam1-0002"], test_masks="test_masks")
     assert_cameras(scene, truth, {each[:-4].replace("/", "-"): view for view, each in path.items()})
     assert scene.test == ("cam0-0001",) and scene.clean == {"cam1-0002"}
-    assert set(mask_shares(out)) == {f"{view}.png" for view in scene.cameras}
+    assert set(mask_shares(out)) == {f"{view}.png" for view in scene.train}
+    assert [*load_test_masks(out)] == ["cam0-0001"]
     with pytest.raises(BadInput, match=r"test: there is no view 'cam2/0001\.png'; views are named like cam"):
         read_scene(Params(test=["cam2/0001.png"]), folder)
 

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from reffusion.capture.layouts.capture import Capture, pictures_in
+from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.layouts.mask_files import NONE, find_masks, match_masks
+from reffusion.capture.layouts.names import list_pictures
 from reffusion.capture.views import Views, check_proportions, known
 from reffusion.io.files import BadInput
 from reffusion.io.images import WHITE, MaskValues, image_size
@@ -103,9 +104,10 @@ def load_roles(
     of_objects = found.files
     _check_objects(remove, of_objects)
     mask_files = {name: path for files in of_objects.values() for name, path in files.items()}
-    label_files = _test_mask_files(folder, capture, test_masks)
+    label_folder = capture.label_folder / "test_label" if test_masks is None else folder / test_masks
+    label_files = _test_mask_files(label_folder, test_masks)
     train_named, test_named = (_chosen(value, capture, key) for key, value in (("train", train), ("test", test)))
-    labelled = None if label_files is None else _labelled(capture, mask_files, label_files, test_named)
+    labelled = None if label_files is None else _labelled(capture, mask_files, label_folder, label_files, test_named)
     asked = None if cameras_only in (None, OTHERS) else _chosen(cameras_only, capture, "cameras_only")
     train_named, test_views = _parted(train_named, test_named, labelled, asked or [], capture)
     _check_enough(train_named, cameras_only is not None)
@@ -219,22 +221,24 @@ def _chosen(value: Sequence[str] | str | None, capture: Capture, key: str) -> li
     return names
 
 
-def _test_mask_files(folder: Path, capture: Capture, test_masks: str | None) -> list[Path] | None:
-    """The test views' masks in order of their names, or None."""
+def _test_mask_files(found: Path, test_masks: str | None) -> list[Path] | None:
+    """The test views' masks below a folder, in order of their paths; None where the scene has none."""
     if test_masks is not None and test_masks.lower() == NONE:
         return None
-    found = capture.label_folder / "test_label" if test_masks is None else folder / test_masks
-    files = list(pictures_in(found).values()) if found.is_dir() else []
+    files = [found / path for path in list_pictures(found, nested=True)]
     if not files and test_masks is not None:
         raise BadInput(f"{found}: no masks there; correct `test_masks` in scene.yaml")
     return files or None
 
 
-def _labelled(capture: Capture, masks: dict[str, Path], labels: list[Path], test_named: list[str] | None) -> list[str]:
-    """The views that the test masks stand for, one for each, in their order."""
-    named = match_masks(labels[0].parent, [path.name for path in labels], capture, strict=False)
+def _labelled(
+    capture: Capture, masks: dict[str, Path], place: Path, labels: list[Path], test_named: list[str] | None
+) -> list[str]:
+    """The views that the test masks below a folder stand for, one for each, in their order."""
+    files = [path.relative_to(place).as_posix() for path in labels]
+    named = match_masks(place, files, capture, strict=False)
     if all(view in capture.pictures for view in named.values()) and len(named) == len(labels):
-        return [named[path.name] for path in labels]
+        return [named[file] for file in files]
     without = [name for name in capture.pictures if name not in masks]
     first = list(capture.pictures)[: len(labels)]
     for candidate in (without, first):
@@ -243,7 +247,7 @@ def _labelled(capture: Capture, masks: dict[str, Path], labels: list[Path], test
     if test_named is not None and len(test_named) == len(labels):
         return test_named
     raise BadInput(
-        f"{labels[0].parent}: {len(labels)} test masks, but {len(without)} views have no training mask and the first "
+        f"{place}: {len(labels)} test masks, but {len(without)} views have no training mask and the first "
         f"{len(labels)} in order of names are not all among them; name the test views as `test` in scene.yaml, or the "
         "masks like their views"
     )
