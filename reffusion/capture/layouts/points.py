@@ -25,8 +25,8 @@ SIDE = 320  # px, the longer side of the pictures that colours are read from
 LEAST_POINTS = 50  # in a view
 LEAST_CONTRAST = 6.0  # levels of 255: standard deviation, of points and picture, from which they can be compared
 CELLS, NEARLY = 40, 1.1  # along a side; times the depth of the nearest point of a cell, beyond which others are hidden
-# Median correlation under which colours contradict the frame. Right clouds of five captures have .38 to .86; scaled by 2,
-# turned, mirrored or moved ones up to .31.
+# Median correlation under which colours contradict the frame. Right clouds of five captures have .38 to .86; those that
+# were scaled by 2, turned, mirrored or moved have up to .31.
 CORRELATED = 0.25
 GREY = np.full(3, 1 / 3)  # weights of red, green and blue
 BETTER = 0.02  # by how much another view's points must fit a picture better than its own
