@@ -28,9 +28,12 @@ from reffusion.capture.given import load_depth
 from reffusion.capture.load import load_capture
 from reffusion.io.arrays import load_array, load_json
 from reffusion.io.colmap import ModelCamera, ModelImage, load_cameras, load_images, load_model_points, save_model
+from reffusion.io.compressed import save_spz
 from reffusion.io.files import BadInput
 from reffusion.io.images import image_size, load_exr, load_image, load_mask, save_exr
 from reffusion.io.ply import check_gaussians, load_ply, load_points, save_ply, save_points
+from reffusion.io.quantized import save_splat
+from reffusion.io.splats import load_splats
 from reffusion.types import Gaussians
 from runner import Refused
 from runner.handed import read_handed
@@ -76,6 +79,9 @@ def _files() -> dict[str, bytes]:
         save_points(folder / "points.ply", draw.normal(size=(3, 3)), np.zeros((3, 3), np.uint8))
         some = lambda *shape: torch.from_numpy(draw.normal(size=shape).astype(np.float32))
         save_ply(folder / "g.ply", Gaussians(some(3, 3), some(3, 4), some(3, 3), some(3), some(3, 4, 3)))
+        rows = load_splats(folder / "g.ply").rows
+        save_splat(folder / "g.splat", rows)
+        save_spz(folder / "g.spz", rows)
         return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
 
 
@@ -151,6 +157,10 @@ def readers() -> list[Reader]:
         for read in (check_gaussians, load_points, load_ply):
             _tried(read, path)
 
+    def any_splats(path: Path) -> None:
+        for read in (check_gaussians, load_ply):
+            _tried(read, path)
+
     def any_picture(path: Path) -> None:
         for read in (image_size, load_image, load_mask, lambda p: image_size(p, True), lambda p: load_image(p, True)):
             _tried(read, path)
@@ -166,6 +176,8 @@ def readers() -> list[Reader]:
         Reader("poses_bounds.npy", _capture("llff", made), of("poses_bounds.npy")),
         Reader("scene.yaml", lambda path: read_handed(path, ("stages",)), (SCENE,)),
         Reader("g.ply", any_ply, (*of("g.ply", "points.ply"), _ascii(made["g.ply"]), _ascii(made["points.ply"]))),
+        Reader("g.splat", any_splats, of("g.splat")),
+        Reader("g.spz", any_splats, of("g.spz")),
         Reader("p.png", any_picture, pictures),
         Reader("d.exr", load_depth, of("d.exr")),
         Reader("d.npy", load_depth, of("d.npy")),

@@ -98,14 +98,19 @@ class _Spaces:
 
     def __init__(self, whole: np.ndarray):
         self.tree = cKDTree(whole)
-        some = whole[:: max(1, len(whole) // SAMPLE)]
-        self._least = FLOOR * float(np.median(self.tree.query(some, 2)[0][:, 1]))
+        self._spacing = np.full(len(whole), np.nan, np.float32)  # to the nearest other one; computed when asked for
+        self._place = np.empty(len(whole), np.int32)
+        self._place[self.tree.indices] = np.arange(len(whole))
+        some = np.arange(0, len(whole), max(1, len(whole) // SAMPLE))
+        self._least = 0.0
+        self._least = FLOOR * float(np.median(self.near(some))) / APART
 
     def near(self, splats: np.ndarray) -> np.ndarray:
-        """float [K], for each splat of the tree in `splats` [K]."""
-        numbers, where = np.unique(splats, return_inverse=True)
-        spacing = self.tree.query(self.tree.data[numbers], 2, workers=-1)[0][:, 1]
-        return np.maximum(APART * spacing, self._least)[where]
+        """float32, in the shape of `splats`, numbers of splats of the tree."""
+        unknown = np.unique(splats[np.isnan(self._spacing[splats])])
+        unknown = unknown[np.argsort(self._place[unknown])]  # neighbours after each other, for the processor's cache
+        self._spacing[unknown] = self.tree.query(self.tree.data[unknown], 2, workers=-1)[0][:, 1]
+        return np.maximum(APART * self._spacing[splats], self._least)
 
     def share(self, points: np.ndarray) -> float:
         """Of the points, those that lie where a splat of the tree lies."""
@@ -117,11 +122,11 @@ def _candidates(spaces: _Spaces, points: np.ndarray) -> tuple[np.ndarray, np.nda
     """The nearest splats of each point: distances float32 [M, C], infinite where too far; int32 [M, C]."""
     count = min(NEIGHBOURS, spaces.tree.n)
     distances, candidates = np.empty((len(points), count), np.float32), np.empty((len(points), count), np.int32)
+    order = cKDTree(points).indices
     for start in range(0, len(points), BLOCK):
-        some = slice(start, start + BLOCK)
+        some = order[start : start + BLOCK]
         away, found = (each.reshape(-1, count) for each in spaces.tree.query(points[some], count, workers=-1))
-        near = spaces.near(found.ravel()).reshape(found.shape)
-        distances[some], candidates[some] = np.where(away <= near, away, np.inf), found
+        distances[some], candidates[some] = np.where(away <= spaces.near(found), away, np.inf), found
     return distances, candidates
 
 

@@ -6,6 +6,7 @@ The only importer of gsply.
 
 from __future__ import annotations
 
+import importlib.util
 import struct
 import zlib
 from pathlib import Path
@@ -33,7 +34,7 @@ def save_compressed(path: Path, gaussians: Gaussians, similarity: Similarity) ->
     Raises:
         BadInput: gsply is not installed.
     """
-    gsply = load_library(path)
+    gsply = _library(path)
     order = np.argsort(_interleaved(gaussians.means.double().numpy()), kind="stable")
     arrays = {name: getattr(gaussians, name).double().numpy()[order] for name in ("means", "log_scales", "quaternions")}
     plain = lambda array: np.ascontiguousarray(array, np.float32)
@@ -54,7 +55,7 @@ def save_compressed(path: Path, gaussians: Gaussians, similarity: Similarity) ->
 
 def load_compressed(path: Path) -> Rows:
     """The splats of a compressed .ply. BadInput where it is broken, or gsply is not installed."""
-    gsply = load_library(path)
+    gsply = _library(path)
     with reading(path, "a compressed .ply"):
         return _rows(gsply.plyread(str(path)))
 
@@ -75,14 +76,14 @@ def load_spz_header(path: Path) -> tuple[int, int, bool]:
 
 def load_spz(path: Path) -> Rows:
     """The splats of a .spz, in the frame of a .ply: the format holds them turned by 180 degrees about x (y up)."""
-    gsply = load_library(path)
+    gsply = _library(path)
     with reading(path, "a .spz file"):
         return _turned(_rows(gsply.read_spz(str(path))))
 
 
 def save_spz(path: Path, rows: Rows) -> None:
     """Write rows in the frame of a .ply. Positions keep 24 bits, as fine as their extent allows."""
-    gsply = load_library(path)
+    gsply = _library(path)
     turned = _turned(rows)
     extent = float(np.abs(turned.means).max(initial=1e-6))
     lengths = np.linalg.norm(turned.quaternions, axis=1, keepdims=True)
@@ -113,12 +114,16 @@ def _turned(rows: Rows) -> Rows:
     return Rows(means, quaternions, rows.log_scales, rows.opacity_logits, rows.sh * TURNED_SH[: rows.sh.shape[1], None])
 
 
-def load_library(path: Path):
-    """gsply; BadInput where it is not installed."""
-    try:
-        import gsply
-    except ImportError:
-        raise BadInput(f"{path}: a quantised file takes gsply: `pip install gsply`, or save it as plain .ply") from None
+def require_library(path: Path) -> None:
+    """BadInput where gsply is not installed, without importing it."""
+    if importlib.util.find_spec("gsply") is None:
+        raise BadInput(f"{path}: a quantised file takes gsply: `pip install gsply`, or save it as plain .ply")
+
+
+def _library(path: Path):
+    require_library(path)
+    import gsply
+
     return gsply
 
 

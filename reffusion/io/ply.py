@@ -83,7 +83,7 @@ def can_save(path: Path) -> None:
     if not name.endswith(FORMATS):
         raise BadInput(f"{path}: {Path(path).suffix or 'no ending'} is not written; one of {', '.join(FORMATS)} is")
     if name.endswith((".compressed.ply", ".spz")):
-        compressed.load_library(path)
+        compressed.require_library(path)
     if Path(path).is_dir() or not (parent := Path(path).absolute().parent).is_dir():
         raise BadInput(f"{path}: a folder; name a file" if Path(path).is_dir() else f"{parent}: no such folder")
 

@@ -91,11 +91,13 @@ def summarize(path: Path) -> Summary:
     if ending == ".splat":
         return Summary(quantized.count_splat(path))
     if ending == ".spz":
+        compressed.require_library(path)
         count, _, antialiased = compressed.load_spz_header(path)
         return Summary(count, antialiased=antialiased)
     header = load_header(path)
     count, names = header.vertices()
     if compressed.PACKED in names:
+        compressed.require_library(path)
         return Summary(count)
     notes = _check_properties(path, names)
     smoothed = ANTIALIASED in header.comments or FILTER in names

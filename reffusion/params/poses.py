@@ -62,8 +62,8 @@ class Params(Settings):
     )
     exclude: list[str] = Field([], description="views that are no part of the scene")
     keep: list[str] = Field([], description="views that stay, even where their photographs contradict their poses")
-    gaussians: str | None = Field(None, description=".ply the scene brings in its own frame, 3DGS layout")
-    cleaned: str | None = Field(None, description="the same .ply after someone deleted splats: these are the object")
+    gaussians: str | None = Field(None, description="splats the scene brings in its own frame: .ply, .spz or .splat")
+    cleaned: str | None = Field(None, description="the same file after someone deleted splats: these are the object")
     region: Region | None = Field(None, description="box or sphere that holds the object, or is to be filled")
     fill: str | None = Field(None, description="instead of a region: folder of masks, of what is to be filled")
     clicks: Clicked | None = Field(

@@ -23,6 +23,9 @@ CLEAR = 0.25  # of the hole's radius: so near to a camera there is no splat, or 
 REACH = 2.0  # of a splat's standard deviation: so near to its middle a ray meets it
 FAR = 20.0  # of the hole's radius: where rays end
 MARCH = 80  # steps of a ray
+AROUND, BESIDES = 16, 1.5  # rays past the hole, and how far from its middle they pass, in its radii
+BEYOND = 0.35  # of these that must come farther than the hole: before a camera behind a wall, all of them end in it
+NEAR, IN_FRONT = 0.5, 0.1  # of the way to the hole; share of the picture that may show what is nearer than that
 LEAST = 3  # views
 
 
@@ -56,7 +59,7 @@ RELAXED = (
 
 @dataclass(frozen=True)
 class Sight:
-    """What is seen from a place: the shares that `Demands` asks for."""
+    """What is seen from a place: the shares that `Demands` asks for; none of either where no camera can stand."""
 
     free: float
     filled: float
@@ -90,7 +93,7 @@ def cameras_around(means: np.ndarray, sizes: np.ndarray, opaque: np.ndarray, del
 
     @cache
     def sight(direction: int, away: float) -> Sight:
-        return _sight(pose(direction, away), lens, aim, stays, radius)
+        return _sight(pose(direction, away), away * radius, lens, aim, stays, radius)
 
     for demands in RELAXED:
         found = []
@@ -126,12 +129,19 @@ def _up(hole: np.ndarray, stays: np.ndarray, center: np.ndarray) -> np.ndarray:
     return normal if normal @ (center - middle) >= 0 else -normal
 
 
-def _sight(pose: np.ndarray, lens: Lens, aim: np.ndarray, stays: tuple[cKDTree, np.ndarray], radius: float) -> Sight:
-    """What a camera sees of the hole, its splats `aim` [P, 3], and of the scene; nothing where it stands in a
-    splat or right before one."""
+def _sight(
+    pose: np.ndarray, away: float, lens: Lens, aim: np.ndarray, stays: tuple[cKDTree, np.ndarray], radius: float
+) -> Sight:
+    """What a camera, `away` from the middle of the hole, sees of the hole, its splats `aim` [P, 3], and of the scene;
+    nothing where it stands in a splat, right before one, or behind the surface on which the hole is."""
     place = -pose[:3, :3].T @ pose[:3, 3]
     distance, nearest = stays[0].query(place)
     if distance < max(CLEAR * radius, stays[1][nearest]):
+        return Sight(0.0, 0.0)
+    turns = 2 * np.pi * np.arange(AROUND) / AROUND
+    past = np.array([0, 0, 1.0]) * away + BESIDES * radius * np.stack([np.cos(turns), np.sin(turns), 0 * turns], 1)
+    ends = np.linalg.norm(past, axis=1) * (1 - CLOSE * radius / away)
+    if np.mean(~_met(place, past @ pose[:3, :3], ends, stays)) < BEYOND:
         return Sight(0.0, 0.0)
     ways = aim - place
     lengths = np.linalg.norm(ways, axis=1)
@@ -141,6 +151,8 @@ def _sight(pose: np.ndarray, lens: Lens, aim: np.ndarray, stays: tuple[cKDTree, 
     columns, rows = ((np.arange(n) + 0.5) / n for n in GRID)
     x, y = np.meshgrid((columns * lens.width - lens.cx) / lens.fx, (rows * lens.height - lens.cy) / lens.fy)
     rays = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3) @ pose[:3, :3]
+    if np.mean(_met(place, rays, np.full(len(rays), NEAR * away), stays)) > IN_FRONT:
+        return Sight(0.0, 0.0)
     return Sight(free, float(np.mean(_met(place, rays, np.full(len(rays), FAR * radius), stays))))
 
 

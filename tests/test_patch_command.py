@@ -1,0 +1,245 @@
+"""`reffusion patch before.ply after.ply --out patched.ply`: refusals, the folder it works in, what it writes, and the
+cameras that it finds around a hole."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from test_io import some_gaussians
+from test_patch import edited, without_pictures
+
+from reffusion.capture.layouts import ring
+from reffusion.gaussians import matching
+from reffusion.io.arrays import load_labels
+from reffusion.io.files import BadInput
+from reffusion.io.ply import can_save, load_ply, properties_of, save_ply, save_splats
+from reffusion.io.scene import load_scene
+from reffusion.types import Similarity
+from report import export, patch_files
+from stages import poses
+from stages.plan import poses as planned
+
+ROOT = Path(__file__).resolve().parent.parent
+FRAME = Similarity(0.31, np.array([1.5, -20.0, 4.0]))
+
+
+def command(*words: object, cwd: Path = ROOT, **options) -> subprocess.CompletedProcess:
+    line = [sys.executable, "-m", "reffusion.command", "patch", *map(str, words)]
+    return subprocess.run(line, cwd=cwd, capture_output=True, text=True, **options)
+
+
+@pytest.fixture
+def files(tmp_path):
+    """before.ply and after.ply, 300 splats and 250."""
+    made = some_gaussians(300, 1)
+    save_ply(tmp_path / "before.ply", made)
+    save_ply(tmp_path / "after.ply", made.map(lambda p: p[50:]))
+    return tmp_path / "before.ply", tmp_path / "after.ply"
+
+
+def arguments(before, after, out, **others) -> argparse.Namespace:
+    given = {"scene": None, "variant": "", "runs": Path(before).parent / "runs", "cameras": None, "profile": "laptop"}
+    given |= {"budget": None, "set": "", **others}
+    return argparse.Namespace(files=[before, after], out=out, **given)
+
+
+def test_what_is_wrong_is_said_in_one_line(files, tmp_path):
+    before, after = files
+    out = tmp_path / "patched.ply"
+    (tmp_path / "s.ksplat").write_bytes(bytes(4096))
+    for given, message in (
+        ((), "name a scene (--scene), or two files: reffusion patch before.ply after.ply --out out.ply"),
+        ((before,), f"{before}: name two files, the scene before and after the object was deleted"),
+        ((before, after), "--out: name the file to write, as --out patched.ply"),
+        ((before, after, "--out", out, "--scene", "x"), "--scene, --variant: a scene's folder names its files in "
+         "scene.yaml; give it, or two files"),
+        ((before, tmp_path / "no.ply", "--out", out), f"{tmp_path / 'no.ply'}: no such file"),
+        ((before, tmp_path / "s.ksplat", "--out", out), f"{tmp_path / 's.ksplat'}: .ksplat is not read; convert it to "
+         ".ply, as with `npx @playcanvas/splat-transform s.ksplat s.ply`"),
+        ((before, after, "--out", tmp_path / "x.obj"), f"{tmp_path / 'x.obj'}: .obj is not written; one of .ply, "
+         ".compressed.ply, .spz, .splat is"),
+        ((before, after, "--out", tmp_path / "no" / "x.ply"), f"{tmp_path / 'no'}: no such folder"),
+        ((before, after, "--out", out, "--cameras", tmp_path / "no"), f"{tmp_path / 'no'}: no such folder; --cameras "
+         "names one with transforms.json or sparse/0"),
+    ):  # fmt: skip
+        ended = command(*given)
+        assert (ended.returncode, ended.stderr) == (2, f"error: {message}\n")
+        assert not (tmp_path / "runs").exists()
+
+
+def test_a_stage_that_refuses_ends_the_command(files, tmp_path):
+    before, after = files
+    ended = command(after, before, "--out", tmp_path / "x.ply", "--runs", tmp_path / "runs", "--profile", "laptop")
+    errors = [line for line in ended.stderr.splitlines() if line.startswith("error: ")]
+    assert ended.returncode == 2 and len(errors) == 1 and "nothing was deleted" in errors[0]
+    assert "Traceback" not in ended.stderr and not (tmp_path / "x.ply").exists()
+
+
+def test_the_folder_is_a_scene_and_keeps_what_a_person_painted(tmp_path):
+    """Two files alone, then with their cameras: the same folder."""
+    made = tmp_path / "made"
+    _, deleted = edited(made)
+    without_pictures(made)
+    asked = arguments(made / "scene.ply", made / "cleaned.ply", tmp_path / "out.ply")
+    patch_files.check(asked)
+    folder = patch_files.prepare(asked)
+    assert folder == patch_files.folder_of(asked.runs, *asked.files) and folder.name.startswith("scene-patch-")
+    said = (folder / "scene.yaml").read_text()
+    assert said == 'gaussians: "before/scene.ply"\ncleaned: "after/cleaned.ply"\nmasks: none\n'
+    params = poses.Params(gaussians="before/scene.ply", cleaned="after/cleaned.ply", masks="none", longest=64)
+    assert "cameras around the hole look at renders" in planned.preview(params, folder)[0]
+    (folder / "painted").mkdir()
+    (folder / "painted" / "around_00.png").write_text("mine")
+    (made / "cameras").mkdir()
+    (made / "transforms.json").rename(made / "cameras" / "transforms.json")
+    time = (folder / "scene.yaml").stat().st_mtime_ns
+    again = patch_files.prepare(arguments(*asked.files, asked.out, cameras=made / "cameras"))
+    assert again == folder and (folder / "painted" / "around_00.png").read_text() == "mine"
+    assert (folder / "scene.yaml").stat().st_mtime_ns == time
+    assert "no photographs: 6 cameras of transforms.json" in planned.preview(params, folder)[0]
+    (out := tmp_path / "poses").mkdir()
+    with pytest.warns(UserWarning, match="no photographs"):
+        poses.run(params, out, scene=folder)
+    np.testing.assert_array_equal(load_labels(out / "deleted.npy").numpy(), deleted)
+    assert len(load_scene(out).train) == 6
+    patch_files.prepare(asked)
+    assert not (folder / "transforms.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("ending", "within"), [(".ply", 1e-6), (".splat", 1e-6), (".spz", 2e-5), (".compressed.ply", 0.2)]
+)
+def test_the_ending_says_the_format(tmp_path, ending, within):
+    if ending in (".spz", ".compressed.ply"):
+        pytest.importorskip("gsply")
+    made, path = some_gaussians(300, 1), tmp_path / f"out{ending}"
+    can_save(path)
+    save_splats(path, made, FRAME, ("x", "y", "z", "opacity"))
+    read, means = load_ply(path), torch.from_numpy(FRAME.invert(made.means.double().numpy())).float()
+    nearest = torch.cdist(means, read.means).argmin(1)
+    assert sorted(nearest.tolist()) == list(range(300))
+    np.testing.assert_allclose(read.means[nearest], means, atol=within)
+    sizes = made.log_scales - np.float32(np.log(FRAME.scale))
+    np.testing.assert_allclose(read.log_scales[nearest], sizes, atol=0.04)
+    if ending == ".ply":
+        assert properties_of(path)[:4] == ("x", "y", "z", "opacity")
+
+
+def test_export_writes_the_scene_with_the_object_too(tmp_path):
+    pytest.importorskip("gsply")
+    from test_export import scene
+
+    from reffusion.io.scene import save_scene
+
+    home, given = tmp_path / "s", some_gaussians(200, 1)
+    save_scene(home / "poses", scene())
+    save_ply(home / "evaluate" / "scene.ply", some_gaussians(300, 1), FRAME)
+    save_ply(home / "fit" / "gaussians.ply", given)
+    said = export.make(home)
+    before, cameras = home / "export/with_object.ply", home / "export/cameras"
+    assert said[3] == (
+        f"{before}: the scene with the object, to be edited: delete something in an editor, save the rest as "
+        f"AFTER.ply, and `reffusion patch {before} AFTER.ply --cameras {cameras} --out patched.ply` fills the hole"
+    )
+    torch.testing.assert_close(load_ply(before, FRAME).means, given.means, rtol=0, atol=1e-5)
+    frames = json.loads((cameras / "transforms.json").read_text())["frames"]
+    assert len(frames) == 3
+
+
+# ---------------------------------------------------------------------------------------------- matching
+
+
+def test_many_splats_are_matched_by_their_exact_places():
+    draws = np.random.default_rng(0)
+    points = draws.normal(size=(200_000, 3)).astype(np.float32).astype(np.float64)
+    points[1000:1010] = points[2000:2010]  # at one place
+    points[5] = (0.0, -0.0, 0.0)
+    deleted = draws.random(len(points)) < 0.1
+    deleted[[5, *range(1000, 1010)]], deleted[2000:2010] = False, True
+    left = points[~deleted][draws.permutation(np.count_nonzero(~deleted))] * (-1, -1, 1)
+    found = matching.matched(points, left)
+    assert found.found == 1 and found.turn == (-1, -1, 1)
+    twins = [*range(1000, 1010), *range(2000, 2010)]
+    np.testing.assert_array_equal(np.delete(found.deleted, twins), np.delete(deleted, twins))
+    assert found.deleted[twins].sum() == 10
+
+
+def test_some_splats_that_moved_a_little_are_still_found():
+    draws = np.random.default_rng(0)
+    points = draws.normal(size=(5000, 3))
+    deleted = np.arange(len(points)) < 100
+    left = points[~deleted].copy()
+    left[:40] += 1e-5
+    found = matching.matched(points, left)
+    assert found.found == 1
+    np.testing.assert_array_equal(found.deleted, deleted)
+
+
+# ---------------------------------------------------------------------------------------------- cameras
+
+
+def room(*walls: str) -> tuple[np.ndarray, np.ndarray]:
+    """Splats of a floor and of walls, and of a ball on the floor in front of the wall at the back; bool, the ball's."""
+    draws = np.random.default_rng(0)
+    sheets = [draws.uniform((-1, -1, 0), (1, 1, 0), (6000, 3))]
+    sheets += [draws.uniform((-1, 1, 0), (1, 1, 1), (6000, 3))] if "back" in walls else []
+    sheets += [draws.uniform((-1, -1, 0), (-1, 1, 1), (6000, 3))] if "left" in walls else []
+    ball = draws.normal(size=(400, 3))
+    ball = (0.0, 0.6, 0.25) + 0.25 * ball / np.linalg.norm(ball, axis=1)[:, None]
+    means = np.concatenate([ball, *sheets])
+    return means, np.arange(len(means)) < len(ball)
+
+
+@pytest.mark.parametrize("walls", [(), ("back",), ("back", "left")])
+def test_cameras_of_an_open_room_stand_in_it(walls):
+    means, deleted = room(*walls)
+    found = ring.cameras_around(means, np.full(len(means), 0.02), np.ones(len(means), bool), deleted, 96)
+    assert len(found.lenses) >= 3
+    for pose in found.world_to_camera.values():
+        place = -pose[:3, :3].T @ pose[:3, 3]
+        assert place[2] > 0.05, "under the floor"
+        assert "back" not in walls or place[1] < 1, "behind the wall"
+        assert "left" not in walls or place[0] > -1, "behind the wall"
+        assert np.linalg.norm(means[~deleted] - place, axis=1).min() > 0.25 * 0.24, "in a surface"
+
+
+# ---------------------------------------------------------------------------------------------- the whole command
+
+
+@pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="minutes; set REFFUSION_SLOW=1")
+def test_the_command_fills_a_hole_and_goes_on(tmp_path):
+    means, deleted = room("back")
+    count = len(means)
+    draw = lambda *shape: torch.rand(*shape, generator=torch.Generator().manual_seed(0))
+    made = some_gaussians(count, 0)
+    whole = type(made)(
+        torch.from_numpy(means).float(), made.quaternions, torch.full((count, 3), np.log(0.03)).float(),
+        torch.full((count,), 4.0), draw(count, 1, 3) - 0.5,
+    )  # fmt: skip
+    save_ply(tmp_path / "before.ply", whole)
+    save_ply(tmp_path / "after.ply", whole.map(lambda p: p[torch.from_numpy(~deleted)].flip(0)))
+    words = [
+        tmp_path / "before.ply",
+        tmp_path / "after.ply",
+        "--out",
+        tmp_path / "out.ply",
+        "--runs",
+        tmp_path / "runs",
+    ]
+    words += ["--profile", "laptop", "--set", "poses.longest=96 initialize.settle=20 distill.iterations=4"]
+    first = command(*words)
+    assert first.returncode == 0, first.stdout + first.stderr
+    assert f"{tmp_path / 'out.ply'}: the whole scene" in first.stdout and "painted" in first.stdout
+    assert len(load_ply(tmp_path / "out.ply")) > np.count_nonzero(~deleted)
+    again = command(*words)
+    assert again.returncode == 0 and "no artifact yet" not in again.stdout
+    with pytest.raises(BadInput):
+        load_ply(tmp_path)
