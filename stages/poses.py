@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +23,7 @@ from reffusion.capture.views import known
 from reffusion.gaussians import matching
 from reffusion.io.arrays import save_json, save_labels
 from reffusion.io.files import BadInput
-from reffusion.io.images import image_size, save_image, save_mask
+from reffusion.io.images import image_size, save_mask
 from reffusion.io.ply import load_ply, load_points, properties_of, save_ply
 from reffusion.io.scene import load_raw_masks, load_views, save_scene
 from reffusion.masks import regions
