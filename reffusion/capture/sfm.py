@@ -59,8 +59,8 @@ class Solution:
             "points": points,
             "mean_track_length": self.track_length,
             "mean_residual_px": self.residual,
-            "summary": f"structure from motion: {placed} of {self.photographs} photographs, {lenses}, {points:,} points "
-            f"in {self.track_length:.1f} views each, {self.residual:.2f} px mean reprojection error",
+            "summary": f"structure from motion: {placed} of {self.photographs} photographs, {lenses}, {points:,} "
+            f"points in {self.track_length:.1f} views each, {self.residual:.2f} px mean reprojection error",
         }
 
 
