@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 from scipy.spatial.transform import Rotation
@@ -91,9 +92,7 @@ def test_pose_errors_are_those_that_no_similarity_explains():
     found = {name: elsewhere(pose) for name, pose in truth.items()}
     for errors in pose_errors(found, truth):
         assert np.abs(errors).max() < 1e-4
-    found["p2"] = elsewhere(
-        truth["p2"], (0.0, 0.0, 0.016)
-    )  # 1 % of the extent of 1.6, of which the similarity takes some
+    found["p2"] = elsewhere(truth["p2"], (0.0, 0.0, 0.016))  # 1 % of the extent; the similarity takes some
     shifts, _ = pose_errors(found, truth)
     assert shifts.argmax() == 2 and 0.5 < shifts.max() < 1.0
 
@@ -102,6 +101,15 @@ def run(folder: Path, out: Path, **params):
     out.mkdir()
     poses.run(poses.Params(**params), out, scene=folder)
     return load_scene(out)
+
+
+def solved_by(threads: int, photographs: dict[str, Path], work: Path) -> Poses:
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        return sfm.solve(photographs, 640, work / "work", seed=0).poses
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_a_walk_past_a_corner(tmp_path, capsys):
@@ -121,12 +129,10 @@ def test_a_walk_past_a_corner(tmp_path, capsys):
     assert facts["points"] == len(scene.points) and 2 < facts["mean_track_length"] < 6
     assert 0.05 < facts["mean_residual_px"] < 0.6
     said = capsys.readouterr().out
-    assert f"structure from motion: 6 of 7 photographs with one lens, {facts['points']:,} points in " in said
+    assert f"structure from motion: 6 of 7 photographs, 1 lens, {facts['points']:,} points in " in said
     assert sorted(scene.cameras) == sorted(truth) == list(scene.train)
     assert_accepted(scene, truth)
-    again, once_more = (
-        sfm.solve({n: folder / f"{n}.png" for n in truth}, 640, tmp_path / "work", seed=0).poses for _ in range(2)
-    )
+    again, once_more = (solved_by(threads, {n: folder / f"{n}.png" for n in truth}, tmp_path) for threads in (1, 3))
     assert all(np.array_equal(again.world_to_camera[n], once_more.world_to_camera[n]) for n in truth)
     assert np.array_equal(again.points, once_more.points)
     assert len(scene.points) > 300 and "stray" not in load_raw_masks(tmp_path / "out", ["stray"])

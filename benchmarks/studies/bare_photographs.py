@@ -3,7 +3,8 @@
 Photographs of captures whose poses are known go through the stage `poses` without them. After the best similarity,
 centres are compared with the known ones in % of the extent (the greatest distance between two centres), rotations in
 degrees. A principal point off the middle, which structure from motion does not look for, counts as a rotation. Two
-lines a capture: before and after the adjustment to optical flow (`poses.refine`). Writes bare_photographs.json to --out.
+lines a capture: before and after the adjustment to optical flow (`poses.refine`). Writes
+bare_photographs.json to --out.
 """
 
 from __future__ import annotations
@@ -25,8 +26,18 @@ from reffusion.io.arrays import load_json
 from reffusion.io.scene import load_scene
 from stages import poses
 
-COLUMNS = ("capture", "views", "cameras", "center_median", "center_worst", "rotation_median", "rotation_worst", "points",
-           "residual_px", "seconds")  # fmt: skip
+COLUMNS = (
+    "capture",
+    "views",
+    "cameras",
+    "center_median",
+    "center_worst",
+    "rotation_median",
+    "rotation_worst",
+    "points",
+    "residual_px",
+    "cpu_seconds",
+)
 
 
 def pose_errors(found: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

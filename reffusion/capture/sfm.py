@@ -7,8 +7,10 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from PIL import Image
 
 from reffusion.capture.layouts.capture import Poses
@@ -17,6 +19,9 @@ from reffusion.capture.undistorted import load_at
 from reffusion.io.files import BadInput
 from reffusion.io.images import image_size, opened, save_image
 from reffusion.types import Camera
+
+if TYPE_CHECKING:
+    import pycolmap
 
 LEAST_VIEWS = 3
 LEAST_SIGHTINGS = 100
@@ -45,7 +50,7 @@ class Solution:
 
     def facts(self) -> dict[str, float | str]:
         """The figures by name, and one line of them for people."""
-        lenses = "one lens" if self.lenses == 1 else f"{self.lenses} lenses"
+        lenses = "1 lens" if self.lenses == 1 else f"{self.lenses} lenses"
         placed, points = len(self.poses.lenses), len(self.poses.points)
         return {
             "photographs": self.photographs,
@@ -54,8 +59,8 @@ class Solution:
             "points": points,
             "mean_track_length": self.track_length,
             "mean_residual_px": self.residual,
-            "summary": f"structure from motion: {placed} of {self.photographs} photographs with {lenses}, {points:,} points "
-            f"in {self.track_length:.1f} views each, {self.residual:.2f} px mean reprojection error",
+            "summary": f"structure from motion: {placed} of {self.photographs} photographs, {lenses}, {points:,} "
+            f"points in {self.track_length:.1f} views each, {self.residual:.2f} px mean reprojection error",
         }
 
 
@@ -63,8 +68,7 @@ def solve(photographs: Mapping[str, Path], longest: int, work: Path, seed: int =
     """Find lenses, poses and sparse points of photographs, upright as their orientation tags say.
 
     Photographs of one size and one EXIF focal length share a SIMPLE_RADIAL lens; a portrait format is the landscape
-    one turned. The arithmetic order is fixed (one thread where it matters, seeded), so the same pictures give the same
-    poses.
+    one turned. The same pictures give the same poses: order, seeds and, where it matters, one thread are fixed.
 
     Args:
         photographs: view name -> file; sizes may differ.
@@ -88,7 +92,8 @@ def solve(photographs: Mapping[str, Path], longest: int, work: Path, seed: int =
         for name in group:
             image = load_at(photographs[name], longest, upright=True)
             save_image(pictures / _file_of(name), np.rot90(image) if _is_portrait(image.shape[1::-1]) else image)
-        _extract(database, pictures, [_file_of(name) for name in group], focal)
+        _register(database, pictures, [_file_of(name) for name in group], focal)
+    _match(database, pictures, seed)
     model = _mapped(database, pictures, work, seed)
     images = {} if model is None else {image.name: image for image in model.images.values() if image.has_pose}
     placed = {name: images[_file_of(name)] for name in sorted(photographs) if _file_of(name) in images}
@@ -108,17 +113,38 @@ def solve(photographs: Mapping[str, Path], longest: int, work: Path, seed: int =
     )
 
 
+def _register(database: Path, folder: Path, files: Sequence[str], focal: float | None) -> None:
+    """Pictures that share a lens into the database; `focal`: over the longer side, where it is known."""
+    import pycolmap
+
+    reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
+    if focal is not None:
+        width, height = image_size(folder / files[0])
+        reader.camera_params = f"{focal * max(width, height)},{width / 2},{height / 2},0"
+    pycolmap.Database.open(database).close()  # makes the file
+    pycolmap.import_images(database, folder, pycolmap.CameraMode.SINGLE, sorted(files), reader)
+
+
+def _match(database: Path, folder: Path, seed: int) -> None:
+    """SIFT of the registered pictures, and matches of all pairs; the same ones with any number of threads."""
+    import pycolmap
+
+    threads, cpu = torch.get_num_threads(), pycolmap.Device.cpu
+    features = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=threads)
+    pycolmap.extract_features(database, folder, extraction_options=features, device=cpu)
+    matching = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=threads)
+    geometry = pycolmap.TwoViewGeometryOptions()
+    geometry.ransac.random_seed = seed  # of each pair
+    pycolmap.match_exhaustive(database, matching, verification_options=geometry, device=cpu)
+
+
 def _mapped(database: Path, pictures: Path, work: Path, seed: int):
     """COLMAP's reconstruction of most views; None where it finds none."""
     import pycolmap
 
-    matching = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=1)
-    geometry = pycolmap.TwoViewGeometryOptions()
-    geometry.ransac.random_seed = seed
-    pycolmap.match_exhaustive(database, matching, verification_options=geometry, device=pycolmap.Device.cpu)
     options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=seed, min_model_size=LEAST_VIEWS)
     options.mapper.random_seed = options.triangulation.random_seed = seed
-    options.mapper.num_threads = 1
+    options.mapper.num_threads = 1  # the order of sums, and so the result, is fixed
     models = pycolmap.incremental_mapping(database, pictures, work, options)
     return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
 
@@ -132,7 +158,7 @@ def _file_of(view: str) -> str:
     return f"{view}.png"
 
 
-def _poses_of(model, images: Mapping[str, object], turned: Collection[str]) -> Poses:
+def _poses_of(model, images: Mapping[str, pycolmap.Image], turned: Collection[str]) -> Poses:
     """Lenses, poses and points of a COLMAP reconstruction.
 
     Args:
@@ -173,25 +199,6 @@ def lens_groups(photographs: Mapping[str, Path], work: Path) -> list[tuple[list[
             last = size, focal or 0.0
         groups[-1][0].append(name)
     return groups
-
-
-def _extract(database: Path, folder: Path, files: Sequence[str], focal: float | None) -> None:
-    """SIFT of pictures that share a lens into the database; `focal`: over the longer side, where it is known."""
-    import pycolmap
-
-    reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
-    if focal is not None:
-        width, height = image_size(folder / files[0])
-        reader.camera_params = f"{focal * max(width, height)},{width / 2},{height / 2},0"
-    pycolmap.extract_features(
-        database,
-        folder,
-        image_names=sorted(files),
-        camera_mode=pycolmap.CameraMode.SINGLE,
-        reader_options=reader,
-        extraction_options=pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=1),
-        device=pycolmap.Device.cpu,
-    )
 
 
 def focal_of(photograph: Path, work: Path) -> float | None:
