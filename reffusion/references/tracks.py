@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 LOW_PASS = 0.004  # of the longer side: 2 px of 512, a quarter of the resolution
-LEAST_LOW_PASS = 0.7  # px
+LEAST_LOW_PASS = 1.0  # px
 TEXTURE = 0.5  # levels of 255 a px, in every direction: the least gradient of a place that can be located
 SPACING = 0.014  # of the longer side: distance between places
 WINDOW = 0.041  # of the longer side: what is compared around a place
