@@ -36,7 +36,9 @@ def other_view(image: np.ndarray, parallax: float) -> np.ndarray:
     """The picture with depth in it, from beside: bands displaced by 4 px, and every second one by so many px more."""
     rows, columns = (grid.astype(np.float32) for grid in np.mgrid[: image.shape[0], : image.shape[1]])
     displaced = 4 + parallax * ((columns // 80).astype(int) % 2)
-    return cv2.remap(image, columns - displaced.astype(np.float32), rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    return cv2.remap(
+        image, columns - displaced.astype(np.float32), rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
+    )
 
 
 @pytest.mark.parametrize("variant", redrawn.VARIANTS)
@@ -141,7 +143,9 @@ def test_a_refusal_gives_numbers_the_better_view_and_the_way_out(wall, tmp_path)
 def test_a_person_overrules_a_refusal(wall, tmp_path):
     other, mask = pattern(5, (small.WIDTH, small.HEIGHT)), small.true_never_seen(small.CAMERAS["a2"], 1.6)
     save_image(wall["scene"] / "ref.png", other)
-    with pytest.warns(UserWarning, match=r"shows \d+% of \d+ places.*taken all the same: scene\.yaml says `trust: true`"):
+    with pytest.warns(
+        UserWarning, match=r"shows \d+% of \d+ places.*taken all the same: scene\.yaml says `trust: true`"
+    ):
         found = completed(wall, tmp_path / "out", **named("a2", trust=True))["a2"]
     assert mask.any() and np.array_equal(found.image[mask], other[mask]), "neither moved nor recolored"
     truth = small.photo(small.CAMERAS["a2"])

@@ -1,1 +1,0 @@
-"""Completed views that a scene brings: how they lie over their photographs, and their colours."""

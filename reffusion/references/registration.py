@@ -23,7 +23,7 @@ MARGIN = 0.01  # of the picture's width: pixels nearer to the object are not com
 IN_PLACE = 0.001  # of the longer side: a place displaced by less is where the photograph has it
 LEAST_IN_PLACE = 0.5  # px of the working size, where that is less: flow is no finer
 FEWEST = 20  # places; with fewer nothing can be said
-ACCEPTED = 0.6  # share of the places that must be in place
+ACCEPTED = 0.7  # share of the places that must be in place
 SURE = 0.95  # share from which no other map is tried
 REFINEMENTS = 3  # times that an affine map is estimated from what is left of the displacements
 AS_WELL = 0.2  # px of the working size: a map that moves no corner further is the identity
@@ -85,7 +85,9 @@ class Registration:
         moved = f"moved by up to {self.shift:.1f} px" if self.moved is not None else "not moved"
         brighter = (self.gain.mean() + self.offset.mean() - 1) * 100
         colors = f"colours matched ({brighter:+.0f} %)" if (self.gain != 1).any() or self.offset.any() else "as exposed"
-        return f"{moved}, {colors}; {self.in_place:.0%} of {self.places} places around the hole lie as in the photograph"
+        return (
+            f"{moved}, {colors}; {self.in_place:.0%} of {self.places} places around the hole lie as in the photograph"
+        )
 
 
 def register(picture: np.ndarray, photo: np.ndarray, hidden: np.ndarray, working: int = WORKING) -> Registration:
