@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io as buffers
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +14,7 @@ import torch
 import yaml
 from PIL import Image
 from small_capture import HEIGHT, OPENCV, WIDTH, prepare, run, some_truth, write_pictures, write_transforms
+from small_references import SIZE, completed, from_another_tool, named, pattern, psnr, write_wall
 
 from reffusion import geometry
 from reffusion.capture import lens
@@ -22,11 +22,12 @@ from reffusion.capture.given import GivenReference, load_depth
 from reffusion.capture.lenses import save_lenses
 from reffusion.capture.straight import load_straight, load_straight_depth
 from reffusion.depth import alignment
-from reffusion.io.arrays import save_json, save_labels
+from reffusion.io.arrays import save_json
 from reffusion.io.images import load_image, load_mask, save_exr, save_image, save_mask
-from reffusion.io.scene import load_references, load_scene, save_mask_sets
-from reffusion.paint import agreement, painting, registration
-from reffusion.types import MaskSet, Reference
+from reffusion.io.scene import load_references, load_scene
+from reffusion.paint import agreement, painting
+from reffusion.references import color, registration
+from reffusion.types import Reference
 from runner.execute import run_scene
 from runner.keys import Hashes, code_of
 from runner.plan import plan
@@ -38,29 +39,6 @@ from stages.plan import poses as plan_poses
 from stages.plan import reference as plan_reference
 
 ROOT = Path(__file__).resolve().parent.parent
-SIZE = (160, 120)
-
-
-def pattern(seed: int, size=SIZE) -> np.ndarray:
-    """uint8 [H, W, 3] with as much energy in each octave, as photographs have."""
-    rng, (width, height) = np.random.default_rng(seed), size
-    frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width)[None]).clip(1 / width)
-    fields = [np.fft.ifft2(np.fft.fft2(rng.normal(size=(height, width))) / frequency).real for _ in range(3)]
-    mixed = [fields[0] + 0.3 * field for field in fields]  # mostly grey, as photographs are
-    return np.stack([np.clip(128 + 40 * f / f.std(), 0, 255) for f in mixed], -1).astype(np.uint8)
-
-
-def from_another_tool(image: np.ndarray, scale=0.97, crop=5, quality=80, gain=0.92) -> np.ndarray:
-    """Resized, cropped at its upper left, darker, and saved as JPEG."""
-    size = tuple(round(side * scale) for side in image.shape[1::-1])
-    small_one = cv2.resize(image, size, interpolation=cv2.INTER_AREA)[crop:, crop:]
-    file = buffers.BytesIO()
-    Image.fromarray((small_one * gain).astype(np.uint8)).save(file, "JPEG", quality=quality)
-    return np.array(Image.open(file).convert("RGB"))
-
-
-def psnr(a: np.ndarray, b: np.ndarray, where: np.ndarray) -> float:
-    return float(10 * np.log10(255**2 / max(((a.astype(float) - b)[where] ** 2).mean(), 1e-3)))
 
 
 def object_at() -> np.ndarray:
@@ -82,7 +60,7 @@ def test_a_picture_from_another_tool_comes_back_onto_its_photograph(how):
     photo, changed = with_object(truth), from_another_tool(truth, **how)
     picture = cv2.resize(changed, size, interpolation=cv2.INTER_CUBIC)
     found = registration.register(picture, photo, object_at())
-    assert found.fits and found.agrees > 0.95
+    assert found.fits and found.in_place > 0.95
     crop, (height, width) = how.get("crop", 5), changed.shape[:2]
     scale = np.array([width + crop, height + crop]) / size * np.array(size) / (width, height)
     expected = np.stack([[scale[0], 0, -crop * size[0] / width], [0, scale[1], -crop * size[1] / height]])
@@ -90,9 +68,9 @@ def test_a_picture_from_another_tool_comes_back_onto_its_photograph(how):
     corners = np.array([(0, 0), (160, 0), (0, 120), (160, 120)])
     error = corners @ (moved - expected)[:, :2].T + (moved - expected)[:, 2]
     assert np.abs(error).max() < 0.25, "pixels"
-    result = registration.recolored(registration.warped(picture, moved)[0], found.gain, found.offset)
+    result = color.recolor(registration.warp(picture, moved)[0], found.gain, found.offset)
     gain = np.full(3, 1 / how.get("gain", 0.92))
-    ideal = registration.recolored(registration.warped(picture, expected)[0], gain, np.zeros(3))
+    ideal = color.recolor(registration.warp(picture, expected)[0], gain, np.zeros(3))
     assert psnr(result, truth, object_at()) > psnr(ideal, truth, object_at()) - 0.5 > psnr(picture, truth, object_at())
 
 
@@ -116,10 +94,10 @@ def test_what_was_repainted_elsewhere_moves_nothing():
 def test_another_picture_fits_badly_and_a_plain_one_cannot_be_told():
     photo = with_object(pattern(0))
     found = registration.register(pattern(1), photo, object_at())
-    assert not found.fits and found.agrees < 0.2 and f"only {found.agrees:.0%}" in found.misfit
+    assert not found.fits and found.in_place < 0.2 and f"shows {found.in_place:.0%} of" in found.misfit
     plain = np.full_like(photo, 90)
     found = registration.register(plain, with_object(plain + 20), object_at())
-    assert found.fits and np.isnan(found.agrees) and "too plain" in str(found)
+    assert found.fits and np.isnan(found.in_place) and "too plain" in str(found)
 
 
 def test_only_the_hole_and_its_rim_are_taken():
@@ -130,9 +108,9 @@ def test_only_the_hole_and_its_rim_are_taken():
     )
     hole = np.zeros((20, 20), bool)
     hole[8:12, 8:12] = True
-    result = registration.cut_in(picture, photo, hole, everywhere, margin=1, rim=3)[..., 0]
+    result = color.paste(picture, photo, hole, everywhere, margin=1, rim=3)[..., 0]
     assert (result[7:13, 8:12] == 200).all() and 0 < result[10, 14] < 200 and (result[:, 16:] == 0).all()
-    lacking = registration.cut_in(picture, photo, hole, ~hole, margin=1, rim=3)
+    lacking = color.paste(picture, photo, hole, ~hole, margin=1, rim=3)
     assert not lacking[hole].any()
 
 
@@ -230,10 +208,6 @@ def test_the_depth_of_an_object_alone_is_a_depth_map(tmp_path):
 
 
 # ------------------------------------------------------------------------------------- refusals, before any work
-
-
-def named(view, image="ref.png", **more):
-    return {"reference": {"view": view, "image": image, **more}}
 
 
 REFUSALS = [
@@ -340,28 +314,7 @@ def test_a_view_that_was_not_placed_is_told(tmp_path):
 
 @pytest.fixture
 def wall(tmp_path):
-    """The folders that the stage is handed, of the wall with a square before it; a2's hole is to be invented."""
-    made_poses, fitted, labels = small.write(tmp_path, 1.6)
-    small.write_photos(tmp_path / "scene", made_poses, small.CAMERAS)
-    sets = {}
-    for name, camera in small.CAMERAS.items():
-        mask, unseen = small.true_mask(camera, 1.6), small.true_never_seen(camera, 1.6)
-        sets[name] = MaskSet(mask, mask, unseen, unseen)
-        photo = np.where(mask[..., None], np.uint8([230, 26, 26]), small.photo(camera))
-        save_image(made_poses / "images" / f"{name}.png", photo)
-    save_mask_sets(tmp_path / "masks", sets)
-    save_labels(tmp_path / "masks" / "labels.npy", labels)
-    save_json(tmp_path / "masks" / "facts.json", {"best_reference": "a2"})
-    return {"scene": tmp_path / "scene", "poses": made_poses, "fit": fitted, "masks": tmp_path / "masks"}
-
-
-COMMON = {"inpainter": "exemplar"}
-
-
-def completed(wall, out: Path, **params):
-    out.mkdir()
-    reference.run(reference.Params(**COMMON, **params), out, **wall)
-    return {r.camera.name: r for r in load_references(out, load_scene(wall["poses"]))}
+    return write_wall(tmp_path)
 
 
 def test_a_reference_from_another_tool_ends_near_the_clean_one(wall, tmp_path):
@@ -375,7 +328,7 @@ def test_a_reference_from_another_tool_ends_near_the_clean_one(wall, tmp_path):
     away = cv2.dilate(mask.astype(np.uint8), np.ones((9, 9))) == 0
     assert np.array_equal(far.image[away], truth[away]), "the photograph elsewhere"
     save_image(wall["scene"] / "other.png", pattern(5, (small.WIDTH, small.HEIGHT)))
-    with pytest.raises(ValueError, match=r"other\.png: does not fit its view 'a2'.*only \d+%.*another view"):
+    with pytest.raises(ValueError, match=r"other\.png: does not fit its view 'a2'.*shows \d+% of .*another view"):
         completed(wall, tmp_path / "other", **named("a2", "other.png"))
 
 

@@ -23,7 +23,7 @@ WIDER = 0.012  # of the image's width: a shadow's soft rim beyond what is found
 
 FINE, CHANGED = 0.003, 8  # of the image's width: a finer blur; levels of 255 from which a pixel was drawn anew
 DOUBT = 4.0  # times the usual difference of brightness from which a pixel is tainted, of a redrawn picture
-REDRAWN = 0.9  # quantile of the difference of a redrawn picture from its photograph that says nothing
+REDRAWN = 0.99  # quantile of the difference of a redrawn picture from its photograph that says nothing
 SPECK, CLOSED = 0.015, 0.01  # of it: islands below this diameter are none; notches twice as wide are closed
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from reffusion.io.images import to_uint8
 
 VISIBLE = 1.0  # levels of 255: a change of colours up to which there is none
-SAMPLES = 20000  # pixels that are compared
+SAMPLES = 5000  # pixels that are compared
 FEWEST = 100  # pixels that determine a gain
 LEAST_GAIN, MOST_GAIN = 0.5, 2.0  # beyond, the pictures have nothing in common
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -20,9 +21,9 @@ WORKING = 512  # px, the longer side at which pictures are compared: no autoenco
 QUICK = 256  # px, the same where many views are compared
 MARGIN = 0.01  # of the picture's width: pixels nearer to the object are not compared, its blurred edge lies there
 IN_PLACE = 0.001  # of the longer side: a place displaced by less is where the photograph has it
-LEAST_IN_PLACE = 0.35  # px of the working size, where that is less: flow is no finer
+LEAST_IN_PLACE = 0.5  # px of the working size, where that is less: flow is no finer
 FEWEST = 20  # places; with fewer nothing can be said
-ACCEPTED = 0.6  # share of the places that must be in place
+ACCEPTED = 0.7  # share of the places that must be in place
 SURE = 0.95  # share from which no other map is tried
 REFINEMENTS = 3  # times that an affine map is estimated from what is left of the displacements
 AS_WELL = 0.2  # px of the working size: a map that moves no corner further is the identity
@@ -187,13 +188,22 @@ class _Pair:
         shift, displaced = (each * float(every.max()) for each in (_shift(moved, self.known.shape), displaced))
         return Registration(full, shift, gain, offset, places, in_place, displaced, untouched=False)
 
+    @cached_property
+    def as_it_lies(self) -> tuple[np.ndarray, np.ndarray, tracks.Tracks]:
+        """`compare`, where the picture is not moved."""
+        return self._compare(self.picture, self.known)
+
     def compare(self, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray, tracks.Tracks]:
         """(Gain, offset of the moved picture's colours, where it shows the places of the photograph)."""
-        read, inside = (self.picture, True) if moved is IDENTITY else warp(self.picture, moved)
-        known = self.known & inside
+        if moved is IDENTITY:
+            return self.as_it_lies
+        read, inside = warp(self.picture, moved)
+        return self._compare(read, self.known & inside)
+
+    def _compare(self, read: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray, tracks.Tracks]:
         gain, offset = match_colors(read, self.photo, known)
         there, here = (tracks.low_pass(_grey(image)) for image in (self.photo, recolor(read, gain, offset)))
-        here = np.where(self.known, here, there)  # the hole moves nothing
+        here = np.where(known, here, there)  # the hole and what is cropped off move nothing
         points = tracks.find_places(there, known)
         if len(points) >= FEWEST:
             return gain, offset, tracks.track(there, here, points)
@@ -206,10 +216,11 @@ class _Pair:
             yield found
 
     def refine(self, moved: np.ndarray) -> Registration | None:
-        """The map with the affine part of what is left of the displacements; None for one that people do not make."""
+        """The map with the affine part of what is left of the displacements; None for one that people do not make, and
+        where nothing has to be moved."""
         for _ in range(REFINEMENTS):
             left = self.compare(moved)[2].affine()
-            if left is None:
+            if left is None or (moved is IDENTITY and _shift(left, self.known.shape) < AS_WELL):
                 return None
             moved = _compose(moved, left)
             if not self.is_plausible(moved):

@@ -1,4 +1,4 @@
-"""Sparse optical flow between a photograph and another picture of the view, and the affine map that explains most of it.
+"""Sparse optical flow between a photograph and another picture of its view, and the affine map that explains most.
 
 Both are low-passed first, so that texture that an autoencoder redrew does not count: structure stays where it was.
 Pictures are float32 [H, W], grey, in levels of 255. An affine map [2, 3] takes a pixel (CONVENTIONS.md) of the
@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 LOW_PASS = 0.004  # of the longer side: 2 px of 512, a quarter of the resolution
-LEAST_LOW_PASS = 0.7  # px
+LEAST_LOW_PASS = 1.0  # px
 TEXTURE = 0.5  # levels of 255 a px, in every direction: the least gradient of a place that can be located
 SPACING = 0.014  # of the longer side: distance between places
 WINDOW = 0.041  # of the longer side: what is compared around a place

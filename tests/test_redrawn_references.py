@@ -1,0 +1,186 @@
+"""References whose texture was redrawn everywhere: accepted where they show their view, else refused with numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import small_scene as small
+from small_references import completed, named, pattern, psnr, write_wall
+
+from benchmarks.studies import redrawn
+from reffusion.capture.given import load_given
+from reffusion.capture.views import placed_views
+from reffusion.io.images import save_image
+from reffusion.masks import taint
+from reffusion.params.reference import Given
+from reffusion.references import color, registration
+
+CAPTURES = Path(__file__).resolve().parents[2] / "shared" / "data"
+SIZE = (480, 360)
+
+
+def hole_at(shape) -> np.ndarray:
+    hole = np.zeros(shape[:2], bool)
+    hole[120:220, 150:290] = True
+    return hole
+
+
+def with_object(image: np.ndarray) -> np.ndarray:
+    return np.where(hole_at(image.shape)[..., None], np.uint8([230, 26, 26]), image)
+
+
+def other_view(image: np.ndarray, parallax: float) -> np.ndarray:
+    """The picture with depth in it, from beside: bands displaced by 4 px, and every second one by so many px more."""
+    rows, columns = (grid.astype(np.float32) for grid in np.mgrid[: image.shape[0], : image.shape[1]])
+    displaced = 4 + parallax * ((columns // 80).astype(int) % 2)
+    return cv2.remap(
+        image, columns - displaced.astype(np.float32), rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
+    )
+
+
+@pytest.mark.parametrize("variant", redrawn.VARIANTS)
+def test_a_redrawn_picture_of_the_view_is_accepted(variant):
+    truth = pattern(0, SIZE)
+    photo, hole = with_object(truth), hole_at(truth.shape)
+    picture = redrawn.fit_size(redrawn.VARIANTS[variant](truth), photo)
+    found = registration.register(picture, photo, hole)
+    assert found.fits and found.in_place > 0.9 and not found.untouched
+    moved = registration.IDENTITY if found.moved is None else found.moved
+    expected = {"shifted by 4 px": (3.3, -2.2), "8, shifted, gain, sharpened": (-2.5, 3.1)}.get(variant, (0, 0))
+    np.testing.assert_allclose(moved[:, 2] + moved[:, :2] @ (240, 180) - (240, 180), expected, atol=0.2)
+    image = color.recolor(registration.warp(picture, moved)[0], found.gain, found.offset)
+    low = lambda picture: cv2.GaussianBlur(picture, (0, 0), 3)
+    assert psnr(low(image), low(truth), hole) > 35, "the colours and the place of what fills the hole"
+    assert (taint.tainted(image, photo, hole) & ~hole).mean() < 0.03, "redrawn texture is no shadow"
+    away = cv2.dilate(hole.astype(np.uint8), np.ones((17, 17))) == 0
+    usual = taint.redrawn_difference(image, photo, away)
+    assert taint.changed(image, photo, away, usual).mean() < 0.02, "and nothing that was drawn"
+
+
+@pytest.mark.parametrize("parallax", [2.0, 5.0])
+def test_another_view_of_the_scene_is_refused(parallax):
+    truth = pattern(0, SIZE)
+    photo, hole = with_object(truth), hole_at(truth.shape)
+    for picture in (other_view(truth, parallax), redrawn.redraw(other_view(truth, parallax))):
+        found = registration.register(picture, photo, hole)
+        assert not found.fits and found.in_place < 0.55
+    same = registration.register(other_view(truth, 0.0), photo, hole)
+    assert same.fits and same.shift == pytest.approx(4, abs=0.2), "displaced by 4 px everywhere, it would be accepted"
+
+
+def test_another_scene_and_a_plain_picture_are_refused():
+    photo, hole = with_object(pattern(0, SIZE)), hole_at(SIZE[::-1])
+    for picture in (redrawn.redraw(pattern(1, SIZE)), np.zeros_like(photo), photo[::-1, ::-1].copy()):
+        found = registration.register(picture, photo, hole)
+        assert not found.fits and found.in_place < 0.1
+    plain = np.full_like(photo, 120)
+    assert not registration.register(photo, plain, hole).fits, "a plain photograph shows nothing of such a picture"
+
+
+@pytest.mark.parametrize("size", [(8, 6), (64, 48), (480, 360)])
+@pytest.mark.parametrize("kind", ["equal", "black", "plain", "hole over all", "hole over nearly all"])
+def test_what_cannot_be_compared_is_accepted_and_says_so(size, kind):
+    photo = pattern(0, size)
+    hole = np.full(photo.shape[:2], kind == "hole over all")
+    if kind == "hole over nearly all":
+        hole[:, : -max(2, size[0] // 40)] = True
+    pictures = {"black": np.zeros_like(photo), "plain": np.full_like(photo, 77)}
+    picture = pictures.get(kind, photo)
+    photo = picture.copy() if kind in ("black", "plain") else photo
+    found = registration.register(picture, photo, hole)
+    assert found.fits and found.moved is None and np.isfinite([*found.gain, *found.offset, found.shift]).all()
+    assert "plain" in str(found) or kind == "equal"
+
+
+def test_the_nearest_photograph_tells_views_of_a_plane_apart():
+    """Views of a plane are displaced alike: only the photograph that the picture shows tells it from a crop."""
+    views = {name: small.photo(small.CAMERAS[name]) for name in ("a2", "a3")}
+    nothing = np.zeros(views["a2"].shape[:2], bool)
+    picture = redrawn.redraw(views["a3"])
+    found = registration.register(picture, views["a2"], nothing)
+    assert registration.closer_view(picture, found, [("a3", views["a3"], nothing)])[0] == "a3"
+    own = registration.register(redrawn.redraw(views["a2"]), views["a2"], nothing)
+    assert registration.closer_view(redrawn.redraw(views["a2"]), own, [("a3", views["a3"], nothing)]) is None
+
+
+# ------------------------------------------------------------------------------------------------------- the stage
+
+
+@pytest.fixture
+def wall(tmp_path):
+    return write_wall(tmp_path)
+
+
+def test_only_the_hole_of_a_redrawn_reference_is_taken(wall, tmp_path):
+    truth, mask = small.photo(small.CAMERAS["a2"]), small.true_mask(small.CAMERAS["a2"], 1.6)
+    picture = redrawn.darken(redrawn.redraw(truth))
+    noise = np.random.default_rng(0).normal(0, 6, truth.shape)
+    save_image(wall["scene"] / "ref.png", np.clip(picture + noise, 0, 255).astype(np.uint8))
+    found = completed(wall, tmp_path / "out", **named("a2"))["a2"]
+    away = cv2.dilate(mask.astype(np.uint8), np.ones((9, 9))) == 0
+    assert np.array_equal(found.image[away], truth[away]), "the photograph elsewhere"
+    low = lambda image: cv2.GaussianBlur(image, (0, 0), 3)
+    assert psnr(low(found.image), low(truth), mask) > 33, "its colours are the photograph's"
+
+
+def test_a_refusal_gives_numbers_the_better_view_and_the_way_out(wall, tmp_path):
+    save_image(wall["scene"] / "ref.png", small.photo(small.CAMERAS["a3"]))
+    with pytest.raises(ValueError, match=r"ref\.png: does not fit its view 'a2'.*view 'a3' better \(\d+%\)"):
+        completed(wall, tmp_path / "near", **named("a2"))
+    save_image(wall["scene"] / "ref.png", pattern(5, (small.WIDTH, small.HEIGHT)))
+    expected = (
+        r"ref\.png: does not fit its view 'a2': as it lies, it shows \d+% of \d+ places around the hole where the "
+        r"photograph has them \(at least \d+% must; .*\); is it of another view, or of another scene\? "
+        r"If it is right, write `trust: true` beside it in scene\.yaml$"
+    )
+    with pytest.raises(ValueError, match=expected):
+        completed(wall, tmp_path / "other", **named("a2"))
+
+
+def test_a_person_overrules_a_refusal(wall, tmp_path):
+    other, mask = pattern(5, (small.WIDTH, small.HEIGHT)), small.true_never_seen(small.CAMERAS["a2"], 1.6)
+    save_image(wall["scene"] / "ref.png", other)
+    with pytest.warns(
+        UserWarning, match=r"shows \d+% of \d+ places.*taken all the same: scene\.yaml says `trust: true`"
+    ):
+        found = completed(wall, tmp_path / "out", **named("a2", trust=True))["a2"]
+    assert mask.any() and np.array_equal(found.image[mask], other[mask]), "neither moved nor recolored"
+    truth = small.photo(small.CAMERAS["a2"])
+    away = cv2.dilate(small.true_mask(small.CAMERAS["a2"], 1.6).astype(np.uint8), np.ones((9, 9))) == 0
+    assert np.array_equal(found.image[away], truth[away])
+
+
+def test_a_painting_is_trusted_by_a_line_that_names_it(wall, tmp_path):
+    save_image(wall["scene"] / "painted" / "a2.png", pattern(5, (small.WIDTH, small.HEIGHT)))
+    line = r"write `reference: \{view: a2, image: painted/a2\.png, trust: true\}` in scene\.yaml"
+    with pytest.raises(ValueError, match=line):
+        completed(wall, tmp_path / "refused")
+    views = placed_views(wall["poses"])
+    of_painting = Given(view="a2", image="painted/a2.png", trust=True)
+    assert [each.trust for each in load_given(wall["scene"], views, of_painting)] == [True]
+    save_image(wall["scene"] / "ref.png", small.photo(small.CAMERAS["a2"]))
+    of_another = Given(view="a2", image="ref.png", trust=True)
+    assert [each.trust for each in load_given(wall["scene"], views, of_another)] == [False]
+
+
+# --------------------------------------------------------------------------------------------------- real captures
+
+
+@pytest.mark.parametrize("name", ["bear", "dinosaur", "fox", "garden", "statue"])
+def test_real_photographs(name):
+    """Every tenth view: its redrawn picture is accepted; its nearest views' photographs and another scene's are not."""
+    if not (CAPTURES / name).is_dir() or not (CAPTURES / "bear").is_dir():
+        pytest.skip("no ../shared/data")
+    capture, foreign = (redrawn.load(CAPTURES / each) for each in (name, "bear" if name != "bear" else "garden"))
+    photo_of_another = foreign.picture(next(iter(foreign.files)))
+    for view in list(capture.files)[5::40]:
+        photo, nearest = capture.picture(view), capture.nearest(view)[:2]
+        hole = redrawn.make_hole(photo.shape, 1)
+        for variant in ("redrawn", "64, cast, JPEG 60", "8, shifted, gain, sharpened"):
+            found = registration.register(redrawn.fit_size(redrawn.VARIANTS[variant](photo), photo), photo, hole)
+            assert found.in_place > 0.8, (view, variant)
+        for picture in (*(capture.picture(other) for other in nearest), photo_of_another):
+            assert not registration.register(redrawn.fit_size(picture, photo), photo, hole).fits, view
