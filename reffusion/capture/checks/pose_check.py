@@ -37,6 +37,7 @@ TURN = np.cos(np.radians(35))  # views whose axes differ by more see other sides
 LEAST_DETAIL = 0.2  # root mean square of the detail at the points, under which the pictures are too plain
 SAME, ELSEWHERE = 2, 4  # cells of shift up to which the pose is right, and from which it is wrong
 LEAST_MARGIN = 0.1  # of the correlation at the pose over that at the best other shift; right views have 0.2 to 0.7
+CLEAR = 0.4  # correlation at the pose from which another shift must be better, by this margin, to count
 LEAST_OVERLAP = 0.5  # of the points that a shift must leave in the picture
 
 
@@ -158,7 +159,8 @@ def _nearest(view: _View, others: Collection[_View]) -> list[str]:
 
 
 def _margin(view: _View, others: Sequence[_View]) -> float | None:
-    """The correlation at the view's pose less that at the best other shift; None where nothing can be told."""
+    """The correlation at the view's pose less that at the best other shift, and a bonus where it is clear; None where
+    nothing can be told."""
     if len(others) < LEAST_NEIGHBOURS:
         return None
     count = sum(each.seen & view.seen for each in others)
@@ -168,7 +170,9 @@ def _margin(view: _View, others: Sequence[_View]) -> float | None:
     if len(known) < LEAST_POINTS or plain:
         return None
     correlation, shift = _correlations(view, view.places[known], expected)
-    return float(correlation[shift <= SAME].max() - correlation[shift > ELSEWHERE].max())
+    here, elsewhere = correlation[shift <= SAME].max(), correlation[shift > ELSEWHERE].max()
+    # A pattern that repeats, bricks or tiles, correlates as well one period on.
+    return float(here - elsewhere + (2 * LEAST_MARGIN if here > CLEAR else 0))
 
 
 def _correlations(view: _View, places: np.ndarray, expected: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
