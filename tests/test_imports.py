@@ -157,9 +157,7 @@ def test_parameters_are_few():
 
     stages = [path.stem for path in sources("stages") if path.parent.name == "stages" and path.stem != "__init__"]
     assert len(stages) == 9
-    assert (
-        sum(leaves(importlib.import_module(f"reffusion.params.{stage}").Params) for stage in stages) <= 165
-    )
+    assert sum(leaves(importlib.import_module(f"reffusion.params.{stage}").Params) for stage in stages) <= 165
 
 
 @pytest.mark.parametrize("path", sources("reffusion"), ids=named)
