@@ -64,7 +64,9 @@ def outcome(job: Job) -> str:
     gaussians = f"{count:,} Gaussians" if count else "The result"
     if mean.get("psnr_box") is None:
         return f"{gaussians}; no ground truth, so no scores."
-    return f"{gaussians}; {mean['psnr_box']:.2f} dB and FLIP {mean['flip_box']:.3f} in the box of the test views."
+    suspects = ", ".join(job.metrics.get("suspects") or ())
+    but = f"; photographs of these contradict their poses: {suspects}" if suspects else ""
+    return f"{gaussians}; {mean['psnr_box']:.2f} dB and FLIP {mean['flip_box']:.3f} in the box of the test views{but}."
 
 
 # --------------------------------------------------------------------------------------------------------- sections

@@ -84,6 +84,12 @@ def test_while_an_object_is_kept_nothing_is_scored(tmp_path, folders):
     assert found["mean"].get("psnr_box") is None and (tmp_path / "out/renders/view0.png").exists()
 
 
+def test_test_views_that_contradict_their_poses_are_named(tmp_path, folders, done):
+    save_scene(folders["poses"], replace(load_scene(folders["poses"]), suspects=("view1", "view5")))
+    assert run(tmp_path / "out", folders)["suspects"] == ["view1"]
+    assert load_json(done / "evaluate" / "metrics.json")["suspects"] is None
+
+
 def test_views_are_drawn_as_bright_as_photographs_are(folders, tmp_path):
     """As their own outside the mask, or else as those next to them; and they are as consistent as without."""
     names = [f"view{k}" for k in range(3, 8)]

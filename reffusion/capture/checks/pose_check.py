@@ -37,7 +37,7 @@ TURN = np.cos(np.radians(35))  # views whose axes differ by more see other sides
 LEAST_DETAIL = 0.2  # root mean square of the detail at the points, under which the pictures are too plain
 SAME, ELSEWHERE = 2, 4  # cells of shift up to which the pose is right, and from which it is wrong
 LEAST_MARGIN = 0.1  # of the correlation at the pose over that at the best other shift; right views have 0.2 to 0.7
-CLEAR = 0.4  # correlation at the pose from which another shift must be better, by this margin, to count
+CLEAR = 0.6  # correlation at the pose from which another shift must be better, by this margin, to count
 LEAST_OVERLAP = 0.5  # of the points that a shift must leave in the picture
 
 
