@@ -93,6 +93,15 @@ def test_the_sheet_shows_every_mask_over_its_photograph(tmp_path, brought):
     assert (np.abs(shown.astype(int) - check.TINT).sum(-1) < 300).mean() > 0.5 * masks["a3"].mean()
 
 
+def test_check_says_how_structure_from_motion_went(tmp_path, monkeypatch, capsys):
+    poses, _, _ = small_scene.write(tmp_path / "wall", 1.5)
+    save_json(poses / "sfm.json", {"summary": "structure from motion: 3 of 4 photographs"})
+    monkeypatch.setattr("sys.argv", ["check", "--scene", "wall", "--runs", str(tmp_path)])
+    check.main()
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "structure from motion: 3 of 4 photographs" and "nothing odd" in lines[1]
+
+
 def test_the_sheet_needs_the_stage_poses(tmp_path):
     with pytest.raises(ValueError, match=r"run `make scene=x poses` first"):
         check.make(tmp_path / "x")

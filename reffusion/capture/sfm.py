@@ -88,10 +88,11 @@ def solve(photographs: Mapping[str, Path], longest: int, work: Path, seed: int =
     pictures.mkdir(parents=True)
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
     pycolmap.set_random_seed(seed)
+    turned = {name for name, path in photographs.items() if _is_portrait(image_size(path, upright=True))}
     for group, focal in lens_groups(photographs, work):
         for name in group:
             image = load_at(photographs[name], longest, upright=True)
-            save_image(pictures / _file_of(name), np.rot90(image) if _is_portrait(image.shape[1::-1]) else image)
+            save_image(pictures / _file_of(name), np.rot90(image) if name in turned else image)
         _register(database, pictures, [_file_of(name) for name in group], focal)
     _match(database, pictures, seed)
     model = _mapped(database, pictures, work, seed)
@@ -104,9 +105,8 @@ def solve(photographs: Mapping[str, Path], longest: int, work: Path, seed: int =
             f"{', '.join(lost)}. "
             "Take more photos that overlap by two thirds, sharp and of things that do not move, or bring poses"
         )
-    upright = {name: image_size(photographs[name], upright=True) for name in placed}
     lenses = len({image.camera_id for image in placed.values()})
-    poses = _poses_of(model, placed, {name for name, size in upright.items() if _is_portrait(size)})
+    poses = _poses_of(model, placed, turned)
     shutil.rmtree(work)
     return Solution(
         poses, len(photographs), lenses, model.compute_mean_track_length(), model.compute_mean_reprojection_error()
