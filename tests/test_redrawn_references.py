@@ -45,7 +45,7 @@ def other_view(image: np.ndarray, parallax: float) -> np.ndarray:
 def test_a_redrawn_picture_of_the_view_is_accepted(variant):
     truth = pattern(0, SIZE)
     photo, hole = with_object(truth), hole_at(truth.shape)
-    picture = redrawn.fit_size(redrawn.VARIANTS[variant](truth), photo)
+    picture = redrawn.fit_size(redrawn.VARIANTS[variant](redrawn.redraw(truth)), photo)
     found = registration.register(picture, photo, hole)
     assert found.fits and found.in_place > 0.9 and not found.untouched
     moved = registration.IDENTITY if found.moved is None else found.moved
@@ -180,7 +180,9 @@ def test_real_photographs(name):
         photo, nearest = capture.picture(view), capture.nearest(view)[:2]
         hole = redrawn.make_hole(photo.shape, 1)
         for variant in ("redrawn", "64, cast, JPEG 60", "8, shifted, gain, sharpened"):
-            found = registration.register(redrawn.fit_size(redrawn.VARIANTS[variant](photo), photo), photo, hole)
+            found = registration.register(
+                redrawn.fit_size(redrawn.VARIANTS[variant](redrawn.redraw(photo)), photo), photo, hole
+            )
             assert found.in_place > 0.8, (view, variant)
         for picture in (*(capture.picture(other) for other in nearest), photo_of_another):
             assert not registration.register(redrawn.fit_size(picture, photo), photo, hole).fits, view

@@ -24,7 +24,7 @@ from reffusion.io.images import load_image
 from reffusion.references import registration
 
 LONGER_SIDE = 640  # px to which photographs are reduced
-NEAREST = 3  # neighbouring views that are handed in as pictures of each view
+NEAREST = 2  # neighbouring views that are handed in as pictures of each view
 COMPARED = 4  # neighbouring photographs that the stage `reference` compares with
 CHOSEN_ON = ("bear", "garden", "statue")  # captures on which thresholds are chosen; the others are for reporting
 
@@ -78,19 +78,18 @@ def _to_picture(values: np.ndarray) -> np.ndarray:
     return np.clip(np.round(values), 0, 255).astype(np.uint8)
 
 
+# What tools do to a picture that an autoencoder has redrawn.
 VARIANTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "redrawn": redraw,
-    "sides multiples of 8": lambda photo: resize_to_multiple(redraw(photo), 8),
-    "sides multiples of 64": lambda photo: resize_to_multiple(redraw(photo), 64),
-    "JPEG 60": lambda photo: compress(redraw(photo)),
-    "shifted by 4 px": lambda photo: shift(redraw(photo), 3.3, -2.2),
-    "gain 0.9": lambda photo: darken(redraw(photo)),
-    "sharpened": lambda photo: sharpen(redraw(photo)),
-    "color cast": lambda photo: tint(redraw(photo)),
-    "64, cast, JPEG 60": lambda photo: compress(tint(resize_to_multiple(redraw(photo), 64))),
-    "8, shifted, gain, sharpened": lambda photo: sharpen(
-        darken(shift(resize_to_multiple(redraw(photo), 8), -2.5, 3.1))
-    ),
+    "redrawn": lambda picture: picture,
+    "sides multiples of 8": lambda picture: resize_to_multiple(picture, 8),
+    "sides multiples of 64": lambda picture: resize_to_multiple(picture, 64),
+    "JPEG 60": compress,
+    "shifted by 4 px": lambda picture: shift(picture, 3.3, -2.2),
+    "gain 0.9": darken,
+    "sharpened": sharpen,
+    "color cast": tint,
+    "64, cast, JPEG 60": lambda picture: compress(tint(resize_to_multiple(picture, 64))),
+    "8, shifted, gain, sharpened": lambda picture: sharpen(darken(shift(resize_to_multiple(picture, 8), -2.5, 3.1))),
 }
 
 
@@ -181,8 +180,9 @@ def measure(capture: Photographs, foreign: np.ndarray, every: int) -> Rates:
         photo, nearest = capture.picture(view), capture.nearest(view)
         hole = make_hole(photo.shape, index)
         others = [(n, capture.picture(n), np.zeros(capture.picture(n).shape[:2], bool)) for n in nearest[:COMPARED]]
+        redrawn = redraw(photo)
         for number, make in enumerate(VARIANTS.values()):
-            image = fit_size(make(photo), photo)
+            image = fit_size(make(redrawn), photo)
             found = registration.register(image, photo, hole)
             compare = number == index % len(VARIANTS)  # one of them with the neighbours, for time
             wrong = not found.fits or (compare and registration.closer_view(image, found, others))

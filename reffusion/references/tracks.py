@@ -1,4 +1,4 @@
-"""Sparse optical flow between a photograph and another picture of its view, and the affine map that explains most.
+"""Sparse optical flow between a photograph and a picture of its view, and the affine map that explains most of it.
 
 Both are low-passed first, so that texture that an autoencoder redrew does not count: structure stays where it was.
 Pictures are float32 [H, W], grey, in levels of 255. An affine map [2, 3] takes a pixel (CONVENTIONS.md) of the
