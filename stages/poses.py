@@ -109,12 +109,17 @@ def _load_brought(params: Params, scene: Path) -> Brought | None:
     path = scene / params.gaussians
     splats, deleted = load_splats(path), None
     notes = [f"{path.name}: {note}" for note in splats.notes]
-    splats.gaussians()  # refused where its values are too large for 32 bits
     if params.cleaned is not None:
-        cleaned = load_splats(scene / params.cleaned)
-        notes += [f"{params.cleaned}: {note}" for note in cleaned.notes]
-        deleted = _deleted((path, scene / params.cleaned), splats.rows.means, cleaned.rows.means)
+        cleaned, said = _load_positions(scene / params.cleaned)
+        notes += [f"{params.cleaned}: {note}" for note in said]
+        deleted = _deleted((path, scene / params.cleaned), splats.rows.means, cleaned)
     return Brought(splats, properties_of(path), deleted, tuple(notes))
+
+
+def _load_positions(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
+    """[M, 3], and what reading changed: the rest of millions of splats is not held while they are matched."""
+    splats = load_splats(path)
+    return splats.rows.means, splats.notes
 
 
 def _deleted(files: tuple[Path, Path], whole: np.ndarray, cleaned: np.ndarray) -> np.ndarray:
