@@ -120,19 +120,19 @@ def fill(run: Path, out: Path, runs: Path, tool: list[str], set_: str) -> None:
         words += ["--runs", str(runs / "cameras" if kind == COMMANDS[0] else runs / "alone")]
         if kind == COMMANDS[0]:
             words += ["--cameras", str(folder / "cameras")]
-            home = patch_files.folder_of(runs / "cameras", folder / "before.ply", folder / "after.ply")
+            home = patch_files.find_folder(runs / "cameras", folder / "before.ply", folder / "after.ply")
             (home / "painted").mkdir(parents=True, exist_ok=True)
             shutil.copy(reference, home / "painted" / reference.name)
-        words += ["--out", str(filled(out, kind))]
+        words += ["--out", str(output_file(out, kind))]
         began = time.monotonic()
         subprocess.run([sys.executable, "-m", "reffusion.command", "patch", *words], check=True)
-        again = filled(out, kind).with_suffix(".compressed.ply")
-        subprocess.run([*tool, "-q", "-w", str(filled(out, kind)), str(again)], check=True)
+        again = output_file(out, kind).with_suffix(".compressed.ply")
+        subprocess.run([*tool, "-q", "-w", str(output_file(out, kind)), str(again)], check=True)
         count = len(load_ply(again))
         print(f"{kind}: {time.monotonic() - began:.0f} s; splat-transform opens it, {count} splats", flush=True)
 
 
-def filled(out: Path, kind: str) -> Path:
+def output_file(out: Path, kind: str) -> Path:
     """Where the command writes."""
     return out / "command" / ("cameras.ply" if kind == COMMANDS[0] else "alone.ply")
 
@@ -142,7 +142,7 @@ def score(run: Path, out: Path, runs: Path) -> None:
     placed = load_scene(run / "poses")
     files = {"own result": run / "evaluate" / "scene.ply", "as given": out / "patch-photographs" / "scene.ply"}
     files |= {kind: runs / f"patch-{kind}" / "patch" / "patched.ply" for kind in KINDS}
-    files |= {kind: filled(out, kind) for kind in COMMANDS}
+    files |= {kind: output_file(out, kind) for kind in COMMANDS}
     together = {title: (path,) for title, path in files.items()}
     for kind in KINDS:
         cleaned = out / f"patch-{kind}" / "cleaned.compressed.ply"
