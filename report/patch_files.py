@@ -43,7 +43,7 @@ def check(arguments: argparse.Namespace) -> None:
 def prepare(arguments: argparse.Namespace) -> Path:
     """The scene's folder, written anew but for what a person painted."""
     files = [file.expanduser().resolve() for file in arguments.files]
-    folder, names = folder_of(arguments.runs, *files), {}
+    folder, names = find_folder(arguments.runs, *files), {}
     for key, file in zip((BEFORE, AFTER), files, strict=True):
         names[key] = f"{key}/{file.name}"
         _link(folder / names[key], file)
@@ -60,7 +60,7 @@ def prepare(arguments: argparse.Namespace) -> Path:
     return folder
 
 
-def folder_of(runs: Path, before: Path, after: Path) -> Path:
+def find_folder(runs: Path, before: Path, after: Path) -> Path:
     """The scene's folder of two files: the same for as long as they lie where they are."""
     files = [file.expanduser().resolve() for file in (before, after)]
     identity = hashlib.blake2b("\n".join(map(str, files)).encode(), digest_size=3).hexdigest()

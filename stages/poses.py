@@ -46,12 +46,12 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     """Write images/, masks/, test_masks/, sparse/0/, lenses.json, transform.json, views.json; refine.json where cameras
     were adjusted; gaussians.ply, deleted.npy and region.json where the scene brings them; warnings.json where
     something is odd."""
-    brought = _load_brought(params, scene)  # before the work, not after it
+    own = _load_own_splats(params, scene)  # before the work, not after it
     if unphotographed(params, scene):
-        _save_unphotographed(params, out, scene, brought)
+        _save_unphotographed(params, out, scene, own)
         return
     capture, roles = read_scene(params, scene)
-    said = [*capture.warnings, *roles.warnings, *(brought.notes if brought else ())]
+    said = [*capture.warnings, *roles.warnings, *(own.notes if own else ())]
     sizes = {name: image_size(path, upright=capture.upright) for name, path in capture.pictures.items()}
     for files in roles.masks.values():
         check_masks(files, roles.values)
@@ -80,14 +80,14 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
         filled = frame.filled_up(shown, ranges[: len(views)], MORE_POINTS, draws, lambda v: load_views(out, [v])[v])
         normalised = replace(filled, cameras=normalised.cameras)
     save_scene(out, normalised)
-    if brought is not None:
-        _save_brought(out, normalised, brought)
+    if own is not None:
+        _save_own_splats(out, normalised, own)
     if params.region is not None:
         _save_region(params, out, normalised)
 
 
 @dataclass(frozen=True)
-class Brought:
+class OwnSplats:
     """The Gaussians that a scene brings.
 
     Attributes:
@@ -102,7 +102,7 @@ class Brought:
     notes: tuple[str, ...]
 
 
-def _load_brought(params: Params, scene: Path) -> Brought | None:
+def _load_own_splats(params: Params, scene: Path) -> OwnSplats | None:
     """BadInput where `gaussians` or `cleaned` cannot be used. None where the scene has neither."""
     check_brought(params, scene)
     if params.gaussians is None:
@@ -110,12 +110,17 @@ def _load_brought(params: Params, scene: Path) -> Brought | None:
     path = scene / params.gaussians
     splats, deleted = load_splats(path), None
     notes = [f"{path.name}: {note}" for note in splats.notes]
-    splats.gaussians()  # refused where its values are too large for 32 bits
     if params.cleaned is not None:
-        cleaned = load_splats(scene / params.cleaned)
-        notes += [f"{params.cleaned}: {note}" for note in cleaned.notes]
-        deleted = _deleted((path, scene / params.cleaned), splats.rows.means, cleaned.rows.means)
-    return Brought(splats, properties_of(path), deleted, tuple(notes))
+        cleaned, said = _load_positions(scene / params.cleaned)
+        notes += [f"{params.cleaned}: {note}" for note in said]
+        deleted = _deleted((path, scene / params.cleaned), splats.rows.means, cleaned)
+    return OwnSplats(splats, properties_of(path), deleted, tuple(notes))
+
+
+def _load_positions(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
+    """[M, 3], and what reading changed: the rest of millions of splats is not held while they are matched."""
+    splats = load_splats(path)
+    return splats.rows.means, splats.notes
 
 
 def _deleted(files: tuple[Path, Path], whole: np.ndarray, cleaned: np.ndarray) -> np.ndarray:
@@ -134,19 +139,19 @@ def _deleted(files: tuple[Path, Path], whole: np.ndarray, cleaned: np.ndarray) -
     return match.deleted
 
 
-def _save_brought(out: Path, placed: Scene, brought: Brought) -> None:
+def _save_own_splats(out: Path, placed: Scene, own: OwnSplats) -> None:
     """The scene's own Gaussians in the normalised frame, properties in the order of its file, and which of them were
     deleted."""
-    save_ply(out / "gaussians.ply", brought.splats.gaussians(placed.similarity), properties=brought.properties)
-    if brought.deleted is not None:
-        save_labels(out / "deleted.npy", brought.deleted)
+    save_ply(out / "gaussians.ply", own.splats.gaussians(placed.similarity), properties=own.properties)
+    if own.deleted is not None:
+        save_labels(out / "deleted.npy", own.deleted)
 
 
-def _save_unphotographed(params: Params, out: Path, scene: Path, brought: Brought) -> None:
+def _save_unphotographed(params: Params, out: Path, scene: Path, own: OwnSplats) -> None:
     """The same without photographs: cameras that a capture left, or some around the hole; nothing in images/."""
-    rows, found = brought.splats.rows, cameras.read(scene)
+    rows, found = own.splats.rows, cameras.read(scene)
     means, opaque, sizes = rows.means, rows.opacity_logits > 0, np.exp(np.median(rows.log_scales, axis=1))
-    poses, source = found or (ring.cameras_around(means, sizes, opaque, brought.deleted, params.longest), None)
+    poses, source = found or (ring.cameras_around(means, sizes, opaque, own.deleted, params.longest), None)
     some = np.flatnonzero(opaque)
     draws = seeding.generator(SEED, "poses", "points of Gaussians")
     some = some[torch.randperm(len(some), generator=draws)[:MORE_POINTS].numpy()]
@@ -160,10 +165,10 @@ def _save_unphotographed(params: Params, out: Path, scene: Path, brought: Brough
     _save_warnings(out, [
         f"no photographs: {where} look at renders of {params.gaussians} instead; what it does not hold, or holds "
         "blurred, stays so: with photographs results are sharper",
-        *brought.notes,
+        *own.notes,
     ])  # fmt: skip
     save_scene(out, placed)
-    _save_brought(out, placed, brought)
+    _save_own_splats(out, placed, own)
 
 
 def _consistent(params: Params, roles: Roles, scene: Scene, out: Path) -> tuple[Scene, list[str]]:

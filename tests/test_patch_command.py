@@ -91,7 +91,7 @@ def test_the_folder_is_a_scene_and_keeps_what_a_person_painted(tmp_path):
     asked = arguments(made / "scene.ply", made / "cleaned.ply", tmp_path / "out.ply")
     patch_files.check(asked)
     folder = patch_files.prepare(asked)
-    assert folder == patch_files.folder_of(asked.runs, *asked.files) and folder.name.startswith("scene-patch-")
+    assert folder == patch_files.find_folder(asked.runs, *asked.files) and folder.name.startswith("scene-patch-")
     said = (folder / "scene.yaml").read_text()
     assert said == 'gaussians: "before/scene.ply"\ncleaned: "after/cleaned.ply"\nmasks: none\n'
     params = poses.Params(gaussians="before/scene.ply", cleaned="after/cleaned.ply", masks="none", longest=64)

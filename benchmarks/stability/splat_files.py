@@ -16,7 +16,7 @@ from benchmarks.stability.splatting import camera, cloud
 from reffusion.io.compressed import load_spz, save_spz
 from reffusion.io.ply import save_ply
 from reffusion.io.quantized import open_splat, save_splat
-from reffusion.io.splat_rows import FLAT, MOST_LOGIT, Rows, fold_filter, valid
+from reffusion.io.splat_rows import FLAT, MOST_LOGIT, Rows, drop_invalid, fold_filter
 from reffusion.io.splats import load_splats
 from reffusion.splat import rasterizer
 from reffusion.types import PARAMETERS, Gaussians
@@ -58,7 +58,7 @@ def filter_not_finite() -> float:
     count = len(logits)
     rows = Rows(np.ones((count, 3)), np.ones((count, 4), np.float32), scales.astype(np.float32),
                 logits.astype(np.float32), np.ones((count, 1, 3), np.float32))  # fmt: skip
-    found, _ = valid(rows)
+    found, _ = drop_invalid(rows)
     lost = count - len(found)
     return float(lost + (~np.isfinite(found.log_scales)).sum() + (~np.isfinite(found.opacity_logits)).sum())
 
@@ -100,7 +100,7 @@ def splat_off(what: str) -> float:
     rows = rows_of(given)
     with tempfile.TemporaryDirectory() as folder:
         save_splat(Path(folder) / "s.splat", rows)
-        read, _ = valid(open_splat(Path(folder) / "s.splat")(slice(0, 500)))
+        read, _ = drop_invalid(open_splat(Path(folder) / "s.splat")(slice(0, 500)))
     sigmoid = lambda logits: 1 / (1 + np.exp(-logits.astype(np.float64)))
     if what == "opacities":
         return float(np.abs(sigmoid(read.opacity_logits) - sigmoid(rows.opacity_logits)).max() * 255)
@@ -114,7 +114,7 @@ def spz_off(extent: float) -> float:
     rows = Rows(rows.means * extent, *list(vars(rows).values())[1:])
     with tempfile.TemporaryDirectory() as folder:
         save_spz(Path(folder) / "s.spz", rows)
-        read, _ = valid(load_spz(Path(folder) / "s.spz"))
+        read, _ = drop_invalid(load_spz(Path(folder) / "s.spz"))
     return math.inf if len(read) < 500 else float(np.abs(read.means - rows.means).max() / extent)
 
 

@@ -6,7 +6,7 @@ with the photographs, with the capture's cameras alone, and with neither. `make 
 renders the patched files from the test views, beside the run's own result: PSNR in the box, and a sheet of pictures.
 
 `command` measures `reffusion patch before.ply after.ply`: what `export` wrote is cut by another tool, npm's
-splat-transform, along the axes; the filled scene is opened by that tool again, and counted in `score`.
+splat-transform; the filled scene is opened by that tool again, and counted in `score`.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from reffusion.io.arrays import load_json, load_labels, save_json, save_text
 from reffusion.io.compressed import save_compressed
 from reffusion.io.images import load_image, load_mask, save_image, to_uint8
 from reffusion.io.ply import load_ply, save_ply
+from reffusion.io.ply_table import load_header, load_vertices, save_vertices
 from reffusion.io.scene import load_object, load_scene
 from reffusion.score import metrics
 from reffusion.splat import rasterizer
@@ -35,7 +36,6 @@ from report import patch_files
 
 KINDS = ("photographs", "cameras", "neither")
 COMMANDS = ("command, cameras", "command, two files alone")
-TURNED = np.array([-1, -1, 1])  # splat-transform's frame of a .ply
 TRIMMED = 0.2  # percent of the object's splats on each side that are beyond the box: floaters
 SHOWN = 4  # test views on the sheet
 
@@ -83,22 +83,21 @@ def write(run: Path, scene: Path, out: Path) -> None:
 
 
 def cut(run: Path, folder: Path, tool: list[str]) -> None:
-    """before.ply and after.ply in the scene's own frame: a box along the axes around the object's splats is deleted,
-    in six slabs, for splat-transform keeps what is inside a box, and compares x and y with their signs changed.
-    cameras/: the training views and their photographs."""
+    """before.ply and after.ply in the scene's own frame: splat-transform deletes what a person selected with a box
+    around the object, which is a column of the file that it reads. cameras/: the training views and photographs."""
     exported, placed = run / "export", load_scene(run / "poses")
-    means = load_ply(exported / "with_object.ply").means.numpy()
-    low, high = np.percentile(means[load_object(run / "masks").numpy()], (TRIMMED, 100 - TRIMMED), axis=0)
-    low, high = np.minimum(low * TURNED, high * TURNED), np.maximum(low * TURNED, high * TURNED)
     shutil.rmtree(folder, ignore_errors=True)
     (folder / "cameras").mkdir(parents=True)
     shutil.copy(exported / "with_object.ply", folder / "before.ply")
-    pieces, inside = [], []
-    for axis, name in enumerate("xyz"):
-        for side, bound in (("lt", low[axis]), ("gt", high[axis])):
-            pieces += [str(folder / "before.ply"), *inside, "-V", f"{name},{side},{bound:.9g}"]
-        inside += ["-V", f"{name},gte,{low[axis]:.9g}", "-V", f"{name},lte,{high[axis]:.9g}"]
-    subprocess.run([*tool, "-q", "-w", *pieces, str(folder / "after.ply")], check=True)
+    table = load_vertices(folder / "before.ply", load_header(folder / "before.ply"))
+    selected = in_box(load_ply(folder / "before.ply").means.double().numpy(), load_object(run / "masks").numpy())
+    marked = np.empty(len(table), [*table.dtype.descr, ("selected", "f4")])
+    for name in table.dtype.names:
+        marked[name] = table[name]
+    marked["selected"] = selected
+    save_vertices(folder / "selected.ply", marked)
+    line = [*tool, "-q", "-w", str(folder / "selected.ply"), "-V", "selected,lt,0.5", str(folder / "after.ply")]
+    subprocess.run(line, check=True)
     cameras = load_json(exported / "cameras" / "transforms.json")
     shown = {f"images/{name}.png" for name in placed.train}
     cameras["frames"] = [frame for frame in cameras["frames"] if frame["file_path"] in shown]
@@ -108,7 +107,7 @@ def cut(run: Path, folder: Path, tool: list[str]) -> None:
     for name in placed.train:
         shutil.copy(exported / "cameras" / "images" / f"{name}.png", folder / "cameras" / "images")
     kept = len(load_ply(folder / "after.ply"))
-    print(f"splat-transform deleted {len(means) - kept} of {len(means)} splats")
+    print(f"splat-transform deleted {len(table) - kept} of {len(table)} splats")
 
 
 def fill(run: Path, out: Path, runs: Path, tool: list[str], set_: str) -> None:
@@ -121,19 +120,19 @@ def fill(run: Path, out: Path, runs: Path, tool: list[str], set_: str) -> None:
         words += ["--runs", str(runs / "cameras" if kind == COMMANDS[0] else runs / "alone")]
         if kind == COMMANDS[0]:
             words += ["--cameras", str(folder / "cameras")]
-            home = patch_files.folder_of(runs / "cameras", folder / "before.ply", folder / "after.ply")
+            home = patch_files.find_folder(runs / "cameras", folder / "before.ply", folder / "after.ply")
             (home / "painted").mkdir(parents=True, exist_ok=True)
             shutil.copy(reference, home / "painted" / reference.name)
-        words += ["--out", str(filled(out, kind))]
+        words += ["--out", str(output_file(out, kind))]
         began = time.monotonic()
         subprocess.run([sys.executable, "-m", "reffusion.command", "patch", *words], check=True)
-        again = filled(out, kind).with_suffix(".compressed.ply")
-        subprocess.run([*tool, "-q", "-w", str(filled(out, kind)), str(again)], check=True)
+        again = output_file(out, kind).with_suffix(".compressed.ply")
+        subprocess.run([*tool, "-q", "-w", str(output_file(out, kind)), str(again)], check=True)
         count = len(load_ply(again))
         print(f"{kind}: {time.monotonic() - began:.0f} s; splat-transform opens it, {count} splats", flush=True)
 
 
-def filled(out: Path, kind: str) -> Path:
+def output_file(out: Path, kind: str) -> Path:
     """Where the command writes."""
     return out / "command" / ("cameras.ply" if kind == COMMANDS[0] else "alone.ply")
 
@@ -143,7 +142,7 @@ def score(run: Path, out: Path, runs: Path) -> None:
     placed = load_scene(run / "poses")
     files = {"own result": run / "evaluate" / "scene.ply", "as given": out / "patch-photographs" / "scene.ply"}
     files |= {kind: runs / f"patch-{kind}" / "patch" / "patched.ply" for kind in KINDS}
-    files |= {kind: filled(out, kind) for kind in COMMANDS}
+    files |= {kind: output_file(out, kind) for kind in COMMANDS}
     together = {title: (path,) for title, path in files.items()}
     for kind in KINDS:
         cleaned = out / f"patch-{kind}" / "cleaned.compressed.ply"

@@ -57,7 +57,7 @@ def matched(whole: np.ndarray, cleaned: np.ndarray) -> Match:
     owned = np.zeros(len(whole), bool)
     owned[found[found >= 0]] = True
     if len(left):
-        owned |= _owned(spaces or _Spaces(whole), cleaned[left] * turn, owned)
+        owned |= _match_one_to_one(spaces or _Spaces(whole), cleaned[left] * turn, owned)
     return Match(~owned, float(owned.sum() / len(cleaned)), turn)
 
 
@@ -130,7 +130,7 @@ def _candidates(spaces: _Spaces, points: np.ndarray) -> tuple[np.ndarray, np.nda
     return distances, candidates
 
 
-def _owned(spaces: _Spaces, points: np.ndarray, taken: np.ndarray) -> np.ndarray:
+def _match_one_to_one(spaces: _Spaces, points: np.ndarray, taken: np.ndarray) -> np.ndarray:
     """bool [N], the splats of the tree that are one of the points [M, 3], one to one; none of those `taken` [N]."""
     distances, candidates = _candidates(spaces, points)
     distances[taken[candidates]] = np.inf

@@ -57,7 +57,7 @@ def load_compressed(path: Path) -> Rows:
     """The splats of a compressed .ply. BadInput where it is broken, or gsply is not installed."""
     gsply = _library(path)
     with reading(path, "a compressed .ply"):
-        return _rows(gsply.plyread(str(path)))
+        return _to_rows(gsply.plyread(str(path)))
 
 
 def load_spz_header(path: Path) -> tuple[int, int, bool]:
@@ -78,13 +78,13 @@ def load_spz(path: Path) -> Rows:
     """The splats of a .spz, in the frame of a .ply: the format holds them turned by 180 degrees about x (y up)."""
     gsply = _library(path)
     with reading(path, "a .spz file"):
-        return _turned(_rows(gsply.read_spz(str(path))))
+        return _turn_about_x(_to_rows(gsply.read_spz(str(path))))
 
 
 def save_spz(path: Path, rows: Rows) -> None:
     """Write rows in the frame of a .ply. Positions keep 24 bits, as fine as their extent allows."""
     gsply = _library(path)
-    turned = _turned(rows)
+    turned = _turn_about_x(rows)
     extent = float(np.abs(turned.means).max(initial=1e-6))
     lengths = np.linalg.norm(turned.quaternions, axis=1, keepdims=True)
     unit = np.where(lengths > 0, turned.quaternions / np.maximum(lengths, 1e-30), [1.0, 0.0, 0.0, 0.0])
@@ -102,13 +102,13 @@ def save_spz(path: Path, rows: Rows) -> None:
     gsply.write_spz(str(path), data, fractional_bits=int(np.clip(22 - np.ceil(np.log2(extent)), 1, 20)))
 
 
-def _rows(data) -> Rows:
+def _to_rows(data) -> Rows:
     """What gsply read."""
     sh = data.sh0[:, None] if data.shN is None else np.concatenate([data.sh0[:, None], data.shN], axis=1)
     return Rows(data.means.astype(np.float64), data.quats, data.scales, data.opacities.reshape(-1), sh)
 
 
-def _turned(rows: Rows) -> Rows:
+def _turn_about_x(rows: Rows) -> Rows:
     """Turned by 180 degrees about x: y and z change sign, and with them each odd spherical harmonic."""
     means, quaternions = rows.means * (1, -1, -1), rows.quaternions * np.array([1, 1, -1, -1], np.float32)
     return Rows(means, quaternions, rows.log_scales, rows.opacity_logits, rows.sh * TURNED_SH[: rows.sh.shape[1], None])

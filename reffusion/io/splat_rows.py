@@ -70,7 +70,7 @@ class Repairs:
         return "; ".join(parts)
 
 
-def valid(rows: Rows) -> tuple[Rows, Repairs]:
+def drop_invalid(rows: Rows) -> tuple[Rows, Repairs]:
     """The rows that can be drawn, clamped, and what was done.
 
     Dropped are rows that hold NaN, an infinite position, rotation, colour or size, and rows of zeros only. A zero

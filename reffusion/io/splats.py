@@ -15,7 +15,7 @@ import numpy as np
 from reffusion.io import compressed, quantized
 from reffusion.io.files import BadInput, reading, there
 from reffusion.io.ply_table import load_header, load_vertices
-from reffusion.io.splat_rows import BAD_SHARE, DEGREE, FLAT, Repairs, Rows, fold_filter, valid
+from reffusion.io.splat_rows import BAD_SHARE, DEGREE, FLAT, Repairs, Rows, drop_invalid, fold_filter
 from reffusion.splat.conventions import SH0
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ def summarize(path: Path) -> Summary:
 
 
 def load_splats(path: Path) -> Splats:
-    """Read the splats of a file; rows that cannot be drawn are dropped, see `splat_rows.valid`.
+    """Read the splats of a file; rows that cannot be drawn are dropped, see `splat_rows.drop_invalid`.
 
     Raises:
         BadInput: naming the file, where it is none of Gaussians, or more than half of its rows are invalid.
@@ -132,7 +132,7 @@ def _gather(path: Path, count: int, read: Callable[[slice], Rows]) -> tuple[Rows
     first, repairs, at = read(slice(0, 0)), Repairs(), 0
     whole = Rows(*(np.empty((count, *array.shape[1:]), array.dtype) for array in vars(first).values()))
     for start in range(0, count, BLOCK):
-        found, done = valid(read(slice(start, min(start + BLOCK, count))))
+        found, done = drop_invalid(read(slice(start, min(start + BLOCK, count))))
         repairs += done
         for array, block in zip(vars(whole).values(), vars(found).values(), strict=True):
             array[at : at + len(found)] = block

@@ -49,7 +49,7 @@ class Demands:
 
 # In turn, until three places will do: a table-top scene fills pictures from above only, a room with an open side or a
 # hole in its corner hardly from anywhere, and one between other things shows itself in part.
-RELAXED = (
+DEMANDS = (
     Demands((4.0, 2.8, 2.0), 0.7, 0.9, 0.0),
     Demands((4.0, 2.8, 2.0), 0.7, 0.8, 0.0),
     Demands((6.0, 4.0, 2.8, 2.0, 1.5), 0.6, 0.65, 0.0),
@@ -67,7 +67,7 @@ class Sight:
 
 def cameras_around(means: np.ndarray, sizes: np.ndarray, opaque: np.ndarray, deleted: np.ndarray, width: int) -> Poses:
     """Views of the hole from all sides from which what stays does not hide it, and the scene fills the picture: so it
-    was photographed from there, or can be looked at from there. Where fewer than three are found, `RELAXED` demands
+    was photographed from there, or can be looked at from there. Where fewer than three are found, `DEMANDS` demands
     less; no camera stands in a surface.
 
     Args:
@@ -95,7 +95,7 @@ def cameras_around(means: np.ndarray, sizes: np.ndarray, opaque: np.ndarray, del
     def sight(direction: int, away: float) -> Sight:
         return _sight(pose(direction, away), away * radius, lens, aim, stays, radius)
 
-    for demands in RELAXED:
+    for demands in DEMANDS:
         found = []
         for direction in np.flatnonzero(directions @ up > demands.height):
             seen = ((away, sight(direction, away)) for away in demands.distances)
@@ -146,7 +146,7 @@ def _sight(
     ways = aim - place
     lengths = np.linalg.norm(ways, axis=1)
     free = float(np.mean(~_met(place, ways, np.maximum(lengths - CLOSE * radius, 0), stays)))
-    if free < min(demands.free for demands in RELAXED):
+    if free < min(demands.free for demands in DEMANDS):
         return Sight(free, 0.0)
     columns, rows = ((np.arange(n) + 0.5) / n for n in GRID)
     x, y = np.meshgrid((columns * lens.width - lens.cx) / lens.fx, (rows * lens.height - lens.cy) / lens.fy)
