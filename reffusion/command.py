@@ -52,13 +52,6 @@ def workplace(root: Path) -> Path:
     return Path.cwd() if installed(root) else root
 
 
-def command_line(name: str, scene: str, variant: str = "") -> str:
-    """What people type for a command on a scene: make in a checkout, `reffusion` where it is installed."""
-    if installed(root()):
-        return f"reffusion {name} --scene {scene}" + (f" --variant {variant}" if variant else "")
-    return f"make scene={scene}" + (f" variant={variant}" if variant else "") + f" {name}"
-
-
 def overview() -> str:
     """What `reffusion --help` prints."""
     width = max(map(len, COMMANDS))

@@ -45,7 +45,7 @@ def main() -> int:
             by = _by(arguments, request)
             request, work = replace(request, cuda=by.engine.cuda), Work(by.engine, by.cores)
             stage, folder = list(run_scene(request, arguments.stage, None, work).items())[-1]
-            show_results(stage, folder)
+            show_results(stage, folder, request)
         elif arguments.command == "compare":
             by = _by(arguments, request)
             request = replace(request, cuda=by.engine.cuda)

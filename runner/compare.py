@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from reffusion.command import command_line
+from reffusion.command import installed, workplace
 from runner import Refused, say
 from runner.engine import Engine, Local
 from runner.files import RECEIPT, shown, write_json, write_text
@@ -135,7 +135,7 @@ def _mean(evaluate: Path | None, of: str = "mean") -> dict[str, float | None]:
     return json.loads((evaluate / "metrics.json").read_text()).get(of, {}) if evaluate else {}
 
 
-def show_results(stage: str, folder: Path | None) -> None:
+def show_results(stage: str, folder: Path | None, request: Request) -> None:
     """Where the results are; after `evaluate` the mean scores too, those of the initialization beside them, and what to
     open."""
     if folder is None:
@@ -150,9 +150,18 @@ def show_results(stage: str, folder: Path | None) -> None:
     names = (p.name + ("/" if p.is_dir() else "") for p in sorted(folder.iterdir()) if p.name != RECEIPT)
     say(f"results in {shown(folder)}/: {', '.join(names)}")
     if stage == "evaluate" and (folder / SCENE_FILE).is_file():
-        scene, _, variant = folder.parent.name.partition("@")
         say(f"open {shown(folder / SCENE_FILE)} in any viewer of 3D Gaussian splats, or here:")
-        say(f"  {command_line('view', scene, variant)}    {command_line('report', scene, variant)}")
+        say(f"  {make_command(request, 'view')}    {make_command(request, 'report')}")
+
+
+def make_command(request: Request, command: str) -> str:
+    """What people type for another command on the same scene and results: make in a checkout, which installs what the
+    command needs, else `reffusion`."""
+    runs = "" if request.runs == workplace(request.root) / "runs" else shown(request.runs)
+    options = {"scene": request.scene, "variant": request.variant, "runs": runs}
+    if installed(request.root):
+        return f"reffusion {command} " + " ".join(f"--{name} {value}" for name, value in options.items() if value)
+    return "make " + " ".join(f"{name}={value}" for name, value in options.items() if value) + f" {command}"
 
 
 def _number(value: Any) -> str:

@@ -444,8 +444,13 @@ def test_variants_share_what_they_do_not_change(root, capsys):
     assert sorted(p.name for p in (root / "runs/toy@strong").iterdir() if p.is_dir()) == ["distill", "evaluate"]
     assert result(root, "toy@strong") == 50.0 and result(root) == 10.0
     assert set(words(root, variant="same").values()) == {"cached shared with toy"}
-    compare.show_results("evaluate", run_scene(request(root, variant="same"), "all")["evaluate"])
-    assert "runs/toy/evaluate/: metrics.json" in capsys.readouterr().out
+    same = request(root, variant="same")
+    folder = run_scene(same, "all")["evaluate"]
+    (folder / "scene.ply").touch()
+    compare.show_results("evaluate", folder, same)
+    said = capsys.readouterr().out
+    assert "runs/toy/evaluate/: metrics.json" in said
+    assert "make scene=toy variant=same view    make scene=toy variant=same report" in said
 
 
 # ----------------------------------------------------------------------------------------------- kills, locks, swaps
