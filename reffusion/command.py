@@ -6,6 +6,7 @@ Nothing but the standard library is imported here, so that the command starts at
 
 import runpy
 import sys
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -79,7 +80,8 @@ def installed_version() -> str:
 def main() -> None:
     asked = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if asked in ("--help", "-h", "help", "--version"):
-        print(installed_version() if asked == "--version" else overview())
+        with suppress(BrokenPipeError):  # as in `reffusion --help | head`
+            print(installed_version() if asked == "--version" else overview(), flush=True)
         return
     if asked not in COMMANDS:
         print(f"error: there is no command '{asked}'; `reffusion --help` lists them", file=sys.stderr)

@@ -10,9 +10,9 @@ from reffusion.capture.given import listed
 from reffusion.capture.layouts.cameras import has_pictures
 from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.layouts.mask_files import objects_of_masks
-from reffusion.capture.layouts.names import list_pictures
 from reffusion.capture.lens import without_distortion
 from reffusion.capture.load import load_capture
+from reffusion.capture.names import list_pictures
 from reffusion.capture.roles import Roles, load_roles
 from reffusion.capture.views import known
 from reffusion.io.files import BadInput, there

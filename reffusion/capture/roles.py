@@ -9,7 +9,7 @@ from pathlib import Path
 
 from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.layouts.mask_files import NONE, find_masks, match_masks
-from reffusion.capture.layouts.names import list_pictures
+from reffusion.capture.names import list_pictures
 from reffusion.capture.views import Views, check_proportions, known
 from reffusion.io.files import BadInput
 from reffusion.io.images import WHITE, MaskValues, image_size

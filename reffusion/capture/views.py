@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 
-from reffusion.capture.layouts.names import flatten, normalize_path, strip_ending
 from reffusion.capture.lenses import load_lenses
+from reffusion.capture.names import flatten, normalize_path, strip_ending
 from reffusion.io.arrays import load_json
 from reffusion.io.files import BadInput
 from reffusion.io.images import image_size

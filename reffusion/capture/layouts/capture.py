@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from reffusion.capture.layouts.names import list_pictures, name_views, normalize_path
 from reffusion.capture.lens import Lens, from_colmap
+from reffusion.capture.names import list_pictures, name_views, normalize_path
 from reffusion.io.colmap import ModelCamera
 from reffusion.io.files import BadInput
 from reffusion.io.images import image_size

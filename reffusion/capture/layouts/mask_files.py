@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from reffusion.capture.layouts.capture import Capture
-from reffusion.capture.layouts.names import is_mask_of_another, pair_masks, strip_ending
+from reffusion.capture.names import is_mask_of_another, pair_masks, strip_ending
 from reffusion.io.files import BadInput
 from reffusion.io.images import ENDINGS, WHITE, MaskValues
 from reffusion.params.poses import Masks

@@ -22,8 +22,8 @@ from reffusion.capture.layouts.capture import (
 )
 from reffusion.capture.layouts.depth_maps import points_from_depth
 from reffusion.capture.layouts.frame_lens import frame_lens, load_frame_lens, read_number
-from reffusion.capture.layouts.names import list_pictures, name_views, normalize_path, pair_pictures
 from reffusion.capture.layouts.points import keep_points_in_frame
+from reffusion.capture.names import list_pictures, name_views, normalize_path, pair_pictures
 from reffusion.io.arrays import load_json
 from reffusion.io.files import BadInput, shortened, there, understood
 from reffusion.io.images import ENDINGS
