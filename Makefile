@@ -49,6 +49,7 @@ help:
 	@echo 'make scene=X adapted           views painted by the adapted prior, beside the unadapted: runs/X/adapted/sheet.png'
 	@echo 'make data=FOLDER report        the same of all its scenes: runs/report/index.html'
 	@echo 'make scene=X patch             fill what was deleted in an editor (scene.yaml: gaussians, cleaned): runs/X/patch/'
+	@echo '                               two files are enough: reffusion patch before.ply after.ply --out patched.ply'
 	@echo 'make scene=X export            the finished scene for other tools, .ply, cameras, LoRA: runs/X/export/'
 	@echo 'make scene=X verify            hash all that was computed for it: is it as it was made?'
 	@echo 'make scene=X clean             remove what was computed for it'
