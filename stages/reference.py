@@ -101,6 +101,13 @@ def fitted(
     photo, hidden = views[given.view], sets.raw | sets.consistent | sets.invent
     image, inside = load_straight(given, lens, upright)
     found = registration.register(image, photo, hidden)
+    if not found.fits and not given.undistorted:
+        straight, _ = load_straight(replace(given, undistorted=True), lens, upright)
+        if registration.register(straight, photo, hidden).fits:
+            raise BadInput(
+                f"{given.path}: fits the undistorted picture of its view '{given.view}', not the photograph; write "
+                "`undistorted: true` beside it in scene.yaml"
+            )
     if not found.untouched:
         found = checked(given, found, image, scene, poses, masks)
     print(f"reference {given.view}: {found}", flush=True)

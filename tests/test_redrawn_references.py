@@ -13,6 +13,8 @@ from small_references import completed, named, pattern, psnr, write_wall
 from benchmarks.studies import redrawn
 from reffusion.capture.given import load_given
 from reffusion.capture.views import placed_views
+from reffusion.io.arrays import load_json, save_json
+from reffusion.io.files import BadInput
 from reffusion.io.images import save_image
 from reffusion.masks import taint
 from reffusion.params.reference import Given
@@ -138,6 +140,17 @@ def test_a_refusal_gives_numbers_the_better_view_and_the_way_out(wall, tmp_path)
     )
     with pytest.raises(ValueError, match=expected):
         completed(wall, tmp_path / "other", **named("a2"))
+
+
+def test_a_picture_of_the_undistorted_view_asks_for_its_key(wall, tmp_path):
+    file = wall["poses"] / "lenses.json"
+    record = load_json(file)
+    record["views"]["a2"]["radial"] = [-0.25]
+    save_json(file, record)
+    save_image(wall["scene"] / "ref.png", small.photo(small.CAMERAS["a2"]))
+    with pytest.raises(BadInput, match=r"ref\.png: fits the undistorted picture.*write `undistorted: true` beside it"):
+        completed(wall, tmp_path / "refused", **named("a2"))
+    assert "a2" in completed(wall, tmp_path / "out", **named("a2", undistorted=True))
 
 
 def test_a_person_overrules_a_refusal(wall, tmp_path):
