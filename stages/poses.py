@@ -68,7 +68,7 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     for name in roles.blank:
         lenses[name], pinholes[name] = lens_of(name, capture, longest)
     normalised = frame.normalised(capture.poses, pinholes, roles.train, roles.test, roles.clean)
-    normalised, contradictions = _consistent(params, roles, replace(normalised, blank=roles.blank), out)
+    normalised, contradictions = _drop_outliers(params, roles, replace(normalised, blank=roles.blank), out)
     views = [name for name in views if name in normalised.cameras]
     lenses, pinholes = ({n: each[n] for n in each if n in normalised.cameras} for each in (lenses, pinholes))
     save_lenses(out, lenses, capture.upright, {name: sizes[name] for name in lenses})
@@ -171,11 +171,11 @@ def _save_unphotographed(params: Params, out: Path, scene: Path, own: OwnSplats)
     _save_own_splats(out, placed, own)
 
 
-def _consistent(params: Params, roles: Roles, scene: Scene, out: Path) -> tuple[Scene, list[str]]:
+def _drop_outliers(params: Params, roles: Roles, scene: Scene, out: Path) -> tuple[Scene, list[str]]:
     """The scene without the training views whose photographs contradict their poses, adjusted to the others; and
     sentences about them."""
     # Where there are no sparse points, those of flow tie the views together.
-    tied = scene if len(scene.points) >= LEAST_POINTS else _adjusted(params, scene, out)
+    tied = scene if len(scene.points) >= LEAST_POINTS else _adjust_cameras(params, scene, out)
     shown = [camera for name, camera in tied.cameras.items() if name not in tied.blank]
     check = check_poses(shown, tied.points, lambda name: load_views(out, [name])[name])
     verdict = judge(check, tied, roles.keep, params.exclude)
@@ -184,11 +184,11 @@ def _consistent(params: Params, roles: Roles, scene: Scene, out: Path) -> tuple[
     if params.region is not None and params.region.view is not None:
         check_outliers("region", [params.region.view], verdict.outliers)
     if verdict.outliers or tied is scene:
-        tied = _adjusted(params, verdict.applied_to(scene), out)
+        tied = _adjust_cameras(params, verdict.applied_to(scene), out)
     return replace(tied, suspects=verdict.suspects), list(verdict.sentences)
 
 
-def _adjusted(params: Params, scene: Scene, out: Path) -> Scene:
+def _adjust_cameras(params: Params, scene: Scene, out: Path) -> Scene:
     """The scene with cameras that agree with flow, and with points of flow where it has few."""
     if params.refine and params.gaussians is None:  # Gaussians that the scene brings were fitted with its cameras
         scene = _refined(scene, out)

@@ -109,7 +109,7 @@ def fitted(
                 "`undistorted: true` beside it in scene.yaml"
             )
     if not found.untouched:
-        found = checked(given, found, image, scene, poses, masks)
+        found = check_reference(given, found, image, scene, poses, masks)
     print(f"reference {given.view}: {found}", flush=True)
     usual = 0.0
     if not found.untouched:
@@ -129,7 +129,7 @@ def fitted(
     return Reference(camera, image, sets.invent & inside & drawn, depth), str(found)
 
 
-def checked(
+def check_reference(
     given: GivenReference, found: Registration, image: np.ndarray, scene: Scene, poses: Path, masks: Path
 ) -> Registration:
     """How the picture lies over its photograph; as it is, where it does not fit and scene.yaml trusts it.

@@ -382,6 +382,7 @@ def test_composed_and_decomposed_accents_are_one_name(tmp_path):
 
 def test_what_is_no_picture_is_named(tmp_path, monkeypatch):
     folder = prepare(tmp_path / "s", "colmap", some_truth())
+    Image.init()  # every format registers now, not while the table is replaced
     monkeypatch.setattr(Image, "OPEN", {kind: opener for kind, opener in Image.OPEN.items() if kind != "HEIF"})
     (folder / "images/v01.png").write_text("<html>404</html>")
     with pytest.raises(BadInput, match=r"v01\.png: not a readable image \(UnidentifiedImageError"):

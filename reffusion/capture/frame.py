@@ -59,6 +59,17 @@ def depths_in_view(points: np.ndarray, world_to_camera: np.ndarray, lens: Lens) 
     return at[((uv >= 0) & (uv <= (lens.width, lens.height))).all(axis=1), 2]
 
 
+def nearest_depths(cells: np.ndarray, depths: np.ndarray) -> np.ndarray:
+    """[P] for each point the depth of the nearest one in its cell.
+
+    Args:
+        cells: int [P], the cell that each point falls into. depths: [P].
+    """
+    order = np.argsort(depths)
+    found, first = np.unique(cells[order], return_index=True)
+    return depths[order][first][np.searchsorted(found, cells)]
+
+
 def camera_centers(world_to_camera: np.ndarray) -> np.ndarray:
     """[V, 3] from [V, 4, 4]."""
     return -np.einsum("vji,vj->vi", world_to_camera[:, :3, :3], world_to_camera[:, :3, 3])

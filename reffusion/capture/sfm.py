@@ -95,7 +95,7 @@ def solve(photographs: Mapping[str, Path], longest: int, work: Path, seed: int =
             save_image(pictures / _file_of(name), np.rot90(image) if name in turned else image)
         _register(database, pictures, [_file_of(name) for name in group], focal)
     _match(database, pictures, seed)
-    model = _mapped(database, pictures, work, seed)
+    model = _reconstruct(database, pictures, work, seed)
     images = {} if model is None else {image.name: image for image in model.images.values() if image.has_pose}
     placed = {name: images[_file_of(name)] for name in sorted(photographs) if _file_of(name) in images}
     if len(placed) < LEAST_VIEWS:
@@ -138,7 +138,7 @@ def _match(database: Path, folder: Path, seed: int) -> None:
     pycolmap.match_exhaustive(database, matching, verification_options=geometry, device=cpu)
 
 
-def _mapped(database: Path, pictures: Path, work: Path, seed: int):
+def _reconstruct(database: Path, pictures: Path, work: Path, seed: int):
     """COLMAP's reconstruction of most views; None where it finds none."""
     import pycolmap
 

@@ -9,6 +9,7 @@ from math import isqrt
 import numpy as np
 
 from reffusion import geometry
+from reffusion.capture.frame import nearest_depths
 from reffusion.types import Camera
 
 CELLS = 40  # along a view's width, in each of which the nearest points hide those behind them
@@ -59,7 +60,7 @@ def harmonics(points: np.ndarray, cameras: Sequence[Camera], most: int) -> tuple
     return min(most, max(isqrt(views) - 1, 0)), views
 
 
-def shown_at(camera: Camera, points: np.ndarray, picture: np.ndarray, cells: int = CELLS) -> np.ndarray:
+def sample_visible(camera: Camera, points: np.ndarray, picture: np.ndarray, cells: int = CELLS) -> np.ndarray:
     """[P, C] what a view's picture [H, W, C] shows at the points [P, 3]; NaN outside it, and behind nearer points:
     the nearest of each cell, of which there are `cells` along the picture's width, hide those behind them."""
     uv, depth = geometry.project(points, camera)
@@ -67,8 +68,5 @@ def shown_at(camera: Camera, points: np.ndarray, picture: np.ndarray, cells: int
     cell = max(1.0, camera.width / cells)
     index = np.zeros(len(points), int)
     index[inside] = (uv[inside] // cell).astype(int) @ (10_000, 1)
-    order = np.argsort(depth)
-    cells, first = np.unique(index[order], return_index=True)
-    nearest = depth[order][first][np.searchsorted(cells, index)]
-    shown = inside & (depth < NEARLY * np.maximum(nearest, 0))
+    shown = inside & (depth < NEARLY * np.maximum(nearest_depths(index, depth), 0))
     return np.where(shown[:, None], values, np.nan)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import cv2
 import numpy as np
 
-from reffusion.capture.support import shown_at
+from reffusion.capture.support import sample_visible
 from reffusion.types import Camera
 
 POINTS = 5000  # at most, at which photographs are compared
@@ -31,7 +31,7 @@ def gains(points: np.ndarray, cameras: Sequence[Camera], photos: Mapping[str, np
     found = np.ones((len(cameras), 3))
     if not len(points):
         return found
-    seen = np.stack([shown_at(camera, points, _evened(photos[camera.name])) for camera in cameras])  # [V, P, 3]
+    seen = np.stack([sample_visible(camera, points, _evened(photos[camera.name])) for camera in cameras])  # [V, P, 3]
     told = (seen > DARK).all(-1) & (seen < BRIGHT).all(-1)  # NaN is neither
     for channel in range(3):
         found[:, channel] = np.exp(_offsets(np.log(np.where(told, seen[..., channel], 1.0)), told))

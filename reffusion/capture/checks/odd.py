@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 import cv2
 import numpy as np
 
-from reffusion.capture.support import shown_at
+from reffusion.capture.support import sample_visible
 from reffusion.geometry import pixel_rays, project, sample_nearest
 from reffusion.types import Camera, Scene
 
@@ -128,7 +128,7 @@ def _exposed(cameras: list[Camera], points: np.ndarray, image_of: Callable[[str]
 def _brightness(camera: Camera, points: np.ndarray, image: np.ndarray) -> np.ndarray:
     """[P] the photograph's brightness where its pose puts the points; NaN where it does not show them."""
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    return shown_at(camera, points, cv2.blur(gray, (max(3, camera.width // 40),) * 2)[..., None])[:, 0]
+    return sample_visible(camera, points, cv2.blur(gray, (max(3, camera.width // 40),) * 2)[..., None])[:, 0]
 
 
 def _listed(names: Iterable[str], most: int = 4) -> str:

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from reffusion.capture.roles import LEAST_TRAINING_VIEWS
-from reffusion.capture.support import shown_at
+from reffusion.capture.support import sample_visible
 from reffusion.geometry import project
 from reffusion.types import Camera, Scene
 
@@ -117,7 +117,7 @@ class _View:
         height, width = detail.shape
         at = project(points, camera)[0] * (width / camera.width, height / camera.height)
         enlarged = cv2.resize(detail, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
-        values = shown_at(camera, points, enlarged[..., None], cells)[:, 0]
+        values = sample_visible(camera, points, enlarged[..., None], cells)[:, 0]
         seen = ~np.isnan(values)
         places = np.where(seen[:, None], at, 0).astype(int).clip(0, (width - 1, height - 1))
         return cls(camera, places, seen, detail, np.nan_to_num(values))

@@ -103,7 +103,7 @@ def objects_of_masks(place: Path, files: Collection[str], capture: Capture) -> d
     """
     folders = {PurePosixPath(path).parts[0] for path in files if "/" in path}
     if not folders or _hold_pictures(folders, capture):
-        return {"": _checked(place, match_masks(place, files, capture), capture)}
+        return {"": _assign_masks(place, match_masks(place, files, capture), capture)}
     if any("/" not in path for path in files):
         raise BadInput(
             f"{place}: holds masks and folders of masks ({', '.join(sorted(folders))}); put them into one folder for "
@@ -111,11 +111,11 @@ def objects_of_masks(place: Path, files: Collection[str], capture: Capture) -> d
         )
     whole = match_masks(place, files, capture, strict=False)
     if len(folders) > 1 and len(set(whole.values())) == len(files):
-        return {"": _checked(place, whole, capture)}
+        return {"": _assign_masks(place, whole, capture)}
     found = {}
     for name in sorted(folders):
         mine = [path.removeprefix(f"{name}/") for path in files if path.startswith(f"{name}/")]
-        found[name] = _checked(place / name, match_masks(place / name, mine, capture), capture)
+        found[name] = _assign_masks(place / name, match_masks(place / name, mine, capture), capture)
     return found
 
 
@@ -148,7 +148,7 @@ def match_masks(place: Path, files: Collection[str], capture: Capture, strict: b
     return found
 
 
-def _checked(place: Path, views: Mapping[str, str], capture: Capture) -> dict[str, Path]:
+def _assign_masks(place: Path, views: Mapping[str, str], capture: Capture) -> dict[str, Path]:
     """View -> mask, sorted; BadInput where a view has two."""
     result: dict[str, Path] = {}
     for path, view in sorted(views.items()):

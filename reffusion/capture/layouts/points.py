@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from reffusion.capture.frame import camera_centers, depths_in_view
+from reffusion.capture.frame import camera_centers, depths_in_view, nearest_depths
 from reffusion.capture.layouts.capture import NO_POINTS, Brought, Poses
 from reffusion.capture.lens import Lens, to_pixels
 from reffusion.io.colmap import ModelPoints
@@ -121,10 +121,7 @@ def correlate_colors(
 def _are_nearest(uv: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """bool [P]: points that are not behind others in the same of `CELLS` x `CELLS` cells of the picture [0, 1]^2."""
     cells = (uv * CELLS).astype(int) @ (CELLS, 1)
-    order = np.argsort(depth, kind="stable")
-    found, first = np.unique(cells[order], return_index=True)
-    nearest = depth[order][first][np.searchsorted(found, cells)]
-    return depth < NEARLY * nearest
+    return depth < NEARLY * nearest_depths(cells, depth)
 
 
 def read_grey(path: Path) -> np.ndarray:
