@@ -17,7 +17,7 @@ PYTHON ?= python3
 VENV ?= .venv
 PY := $(VENV)/bin/python
 RUN := $(VENV)/bin/reffusion
-STAGES := poses fit masks reference lift initialize personalize distill evaluate
+STAGES := poses raw_masks fit masks reference lift initialize personalize distill evaluate
 
 of = --scene="$$scene"
 where = $(if $(variant),--variant="$$variant") $(if $(runs),--runs="$$runs")
@@ -139,7 +139,7 @@ plan: ready
 	@$(RUN) plan $(of) $(options) $(if $(card),--card="$$card")
 
 check: ready
-	@$(RUN) run poses $(of) $(options)
+	@$(RUN) run raw_masks $(of) $(options)
 	@$(RUN) check $(of) $(where)
 
 .PHONY: compare report

@@ -114,11 +114,12 @@ def rendered(job: Job) -> list[str]:
 
 def files_of(job: Job, name: str) -> dict[str, Path]:
     """Kind of picture (`TITLES`) -> file, of what there is of a view."""
-    evaluate, poses = job.folders["evaluate"], job.folders.get("poses", Path())
+    evaluate = job.folders["evaluate"]
+    poses, raw_masks = (job.folders.get(stage, Path()) for stage in ("poses", "raw_masks"))
     found = {kind: evaluate / kind / f"{name}.png" for kind in TITLES}
     views = poses / "views.json"
     if views.is_file():
-        clean = name in load_json(views)["test"] and not raw_mask_files(poses, name)
+        clean = name in load_json(views)["test"] and not raw_mask_files(raw_masks, name)
         found["truth" if clean else "photograph"] = poses / "images" / f"{name}.png"
     return {kind: path for kind, path in found.items() if path.is_file()}
 

@@ -1,4 +1,5 @@
-"""A look at what a scene brings: `python -m report.check --scene demo` (`make scene=X check`), after its stage `poses`.
+"""A look at what a scene brings: `python -m report.check --scene demo` (`make scene=X check`), after its stage
+`raw_masks`.
 
 Writes runs/<scene>/check.png, every mask over its photograph, and prints what is odd.
 """
@@ -12,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from reffusion.io.arrays import load_json
 from reffusion.io.images import load_image, load_mask, resize_nearest, resized, save_image
-from reffusion.io.scene import has_photograph
+from reffusion.io.scene import has_photograph, load_warnings
 from report import command, sheet
 
 WIDTH, HEIGHT, GAP = 240, 180, 4  # px of the room for a picture, and between them
@@ -24,19 +25,19 @@ def make(home: Path) -> tuple[Path, list[str]]:
     """Write check.png of runs/<scene>; its path, and what is odd, a sentence each.
 
     Raises:
-        ValueError: the stage `poses` has not run.
+        ValueError: the stage `raw_masks` has not run.
     """
-    poses = sheet.stage_folder(home, "poses")
-    if not (poses / "views.json").is_file():
-        raise ValueError(f"{poses}: not there; run `make scene={home.name.split('@')[0]} poses` first")
-    views, warnings = load_json(poses / "views.json"), poses / "warnings.json"
+    poses, raw_masks = (sheet.stage_folder(home, stage) for stage in ("poses", "raw_masks"))
+    if not (poses / "views.json").is_file() or not raw_masks.is_dir():
+        raise ValueError(f"{raw_masks}: not there; run `make scene={home.name.split('@')[0]} raw_masks` first")
+    views = load_json(poses / "views.json")
     there = {*views["train"], *views["test"], *views.get("outliers", ())}
     named = [name for name in sorted(there) if has_photograph(poses, name)]
     if not named:
         raise ValueError(f"{poses}: the scene has no photographs to look at")
-    cells = [(name, tinted(poses, name), kind_of(name, views)) for name in named]
+    cells = [(name, tinted(poses, raw_masks, name), kind_of(name, views)) for name in named]
     save_image(home / "check.png", arranged(cells))
-    return home / "check.png", load_json(warnings) if warnings.is_file() else []
+    return home / "check.png", [*load_warnings(poses), *load_warnings(raw_masks)]
 
 
 def kind_of(name: str, views: dict[str, list[str]]) -> str:
@@ -45,14 +46,14 @@ def kind_of(name: str, views: dict[str, list[str]]) -> str:
     return "clean" if name in views["clean"] else "test" if name in views["test"] else "training"
 
 
-def tinted(poses: Path, name: str) -> np.ndarray:
+def tinted(poses: Path, raw_masks: Path, name: str) -> np.ndarray:
     """uint8 [h, w, 3], at most `WIDTH` x `HEIGHT`: the photograph, its mask over it."""
     image = load_image(poses / "images" / f"{name}.png")
     factor = min(WIDTH / image.shape[1], HEIGHT / image.shape[0])
     size = max(1, round(image.shape[1] * factor)), max(1, round(image.shape[0] * factor))
     small = resized(image, size)
     for folder, tint in (("test_masks", [255 - level for level in TINT]), ("masks", TINT)):
-        if (path := poses / folder / f"{name}.png").is_file():
+        if (path := raw_masks / folder / f"{name}.png").is_file():
             mask = resize_nearest(load_mask(path), size[::-1])
             small[mask] = (small[mask] // 2 + np.array(tint, np.uint8) // 2).astype(np.uint8)
     return small

@@ -25,7 +25,7 @@ from reffusion.io.images import WHITE, replace_image, to_uint8
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_raw_masks, load_scene, load_views, objects_of
 from reffusion.params.clicks import CLICKS
-from reffusion.params.poses import Params
+from reffusion.params.raw_masks import Params
 from report import sheet
 
 
@@ -47,29 +47,28 @@ class Capture:
 
 
 def capture_of(home: Path) -> Capture:
-    """Of runs/<scene>, after its stage `poses`.
+    """Of runs/<scene>, after its stage `raw_masks`.
 
     Raises:
         ValueError: it has not run; the scene's own words leave the page no place to write to.
     """
-    if not ((poses := sheet.stage_folder(home, "poses")) / "receipt.json").is_file():
-        raise ValueError(f"{poses}: not there; run `make scene={home.name.split('@')[0]} mask`")
+    poses, raw_masks = (sheet.stage_folder(home, stage) for stage in ("poses", "raw_masks"))
+    if not (raw_masks / "receipt.json").is_file():
+        raise ValueError(f"{raw_masks}: not there; run `make scene={home.name.split('@')[0]} mask`")
     folder = root() / (poses.parent / "source").read_text(encoding="utf-8").strip()
-    params = Params(**load_json(poses / "receipt.json")["params"])
+    params = Params(**load_json(raw_masks / "receipt.json")["params"])
     if not params.has_masks:
         raise BadInput(f"{folder / 'scene.yaml'}: it says `masks: none`; remove that line to make masks")
-    if objects_of(poses):
-        raise BadInput(f"{poses / 'masks'}: the masks tell objects apart, which clicks do not")
+    if objects_of(raw_masks):
+        raise BadInput(f"{raw_masks / 'masks'}: the masks tell objects apart, which clicks do not")
     roles = read_scene(params.changed({"clicks": {}}), folder)[1]
     if roles.values != WHITE:
-        raise BadInput(
-            f"{folder}: its masks hold object numbers, or are inverted; clicks make white masks: remove them"
-        )
+        raise BadInput(f"{folder}: its masks hold object numbers, or are inverted; remove them: clicks make white ones")
     files = roles.masks.get("", {})
     written = _saved(folder)["written"]
     theirs = [name for name, path in files.items() if written.get(_named(path, folder)) != digest(path)]
     place = next((path.parent for path in files.values()), folder / (params.mask_folder or "masks"))
-    return Capture(folder, place, poses, sheet.stage_folder(home, "fit"), load_raw_masks(poses, theirs))
+    return Capture(folder, place, poses, sheet.stage_folder(home, "fit"), load_raw_masks(raw_masks, theirs))
 
 
 def segmenter_here() -> Segmenter | None:

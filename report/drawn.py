@@ -28,9 +28,9 @@ RESULTS = ("distill", "initialize", "fit")  # the last of what is there
 
 def masks(job: Job) -> list[str]:
     """Masks over photographs: the given ones tinted, what the stage masks made of them outlined."""
-    poses = job.folders.get("poses", Path())
+    poses, given = (job.folders.get(stage, Path()) for stage in ("poses", "raw_masks"))
     top = page.heading("Masks")
-    if not (poses / "views.json").is_file() or not any((poses / "masks").rglob("*.png")):
+    if not (poses / "views.json").is_file() or not any((given / "masks").rglob("*.png")):
         return [top, page.paragraph("None: nothing is marked in the photographs.")]
     views = load_json(poses / "views.json")
     shown = evenly(sorted(views["train"]), MOST_MASKS)
@@ -49,7 +49,7 @@ def masks(job: Job) -> list[str]:
 
 def outlined(job: Job, poses: Path, name: str) -> np.ndarray:
     """uint8 [h, w, 3]: the photograph, small, its mask over it, and the outlines of its pixel classes."""
-    small = np.ascontiguousarray(tinted(poses, name))
+    small = np.ascontiguousarray(tinted(poses, job.folders.get("raw_masks", Path()), name))
     for kind, colour in (("consistent", REMOVED), ("invent", INVENTED)):
         path = job.folders.get("masks", Path()) / kind / f"{name}.png"
         if "masks" in job.folders and path.is_file():

@@ -12,6 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from reffusion.io.arrays import load_json
+from reffusion.io.scene import load_warnings
 from report import before, command, covered, curves, drawn, inside, page, scenes, settings
 from report.loading import Job, load_job
 
@@ -85,9 +86,10 @@ def said(job: Job) -> list[str]:
     record = job.home.with_name(job.home.name.split("@")[0]) / "frames" / "frames.json"
     lines = [load_json(record)["said"]] if record.is_file() else []
     if "poses" in job.folders:
-        solved, warnings = (job.folders["poses"] / name for name in ("sfm.json", "warnings.json"))
+        solved = job.folders["poses"] / "sfm.json"
         lines += [load_json(solved)["summary"]] if solved.is_file() else []
-        lines += load_json(warnings) if warnings.is_file() else []
+    for stage in ("poses", "raw_masks"):
+        lines += load_warnings(job.folders[stage]) if stage in job.folders else []
     return [page.bullets(lines)] if lines else []
 
 

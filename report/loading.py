@@ -11,7 +11,9 @@ from reffusion.io.traces import load_trace
 from report import curves, sheet
 from report.results import load_receipts
 
-ORDER = ("poses", "fit", "masks", "reference", "lift", "initialize", "personalize", "distill", "evaluate")
+ORDER = (
+    "poses", "raw_masks", "fit", "masks", "reference", "lift", "initialize", "personalize", "distill", "evaluate",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

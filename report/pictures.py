@@ -49,7 +49,8 @@ def _cells(runs: list[Run], first: Run, view: str) -> list[tuple[str, np.ndarray
     photo, views = poses / "images" / f"{view}.png", poses / "views.json"
     cells = []
     if photo.exists() and views.exists():
-        with_object = view not in load_json(views)["test"] or shows_object(poses, first.folders.get("masks"), view)
+        raw_masks, masks = (first.folders.get(stage) for stage in ("raw_masks", "masks"))
+        with_object = view not in load_json(views)["test"] or shows_object(raw_masks or poses, masks, view)
         cells.append(("ground truth" if not with_object else "photograph, with the object", load_image(photo)))
     for run in runs:
         path = run.folders["evaluate"] / "renders" / f"{view}.png"

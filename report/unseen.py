@@ -26,7 +26,7 @@ def photographed(home: Path, scene: Scene) -> list[sight.SeenView]:
         return []
     consistent = stage_folder(home, "masks") / "consistent"
     train = [name for name in scene.train if name not in scene.clean]
-    masks = load_raw_masks(stage_folder(home, "poses"), train)
+    masks = load_raw_masks(stage_folder(home, "raw_masks"), train)
     masks |= {name: load_mask(path) for name in train if (path := consistent / f"{name}.png").exists()}
     return sight.seen_views(load_ply(fit), [scene.cameras[name] for name in scene.train], masks)
 

@@ -1,8 +1,8 @@
 """The process in which stages are imported: `describe` reads their parameters, `fetch` gets the weights they name,
 `run` does a stage's work, `frames` takes pictures from a video.
 
-What can be told of a stage before it runs (Params, needed_weights, lacks, cost, preview, scene_files) lies in
-stages/plan/<stage>.py where there is such a file, which imports nothing heavy, else in stages/<stage>.py itself.
+What can be told of a stage before it runs (Params, needed_weights, lacks, cost, preview, scene_files, scene_facts) lies
+in stages/plan/<stage>.py where there is such a file, which imports nothing heavy, else in stages/<stage>.py itself.
 """
 
 import ast
@@ -53,8 +53,8 @@ def describe() -> None:
 
 
 def _describe(asked: dict[str, Any]) -> dict[str, Any]:
-    """What `resolve.Described` holds, where `scene` is given with the files of it that are read; where `brings` is the
-    weights that are "needed", and what this machine "lacks" for CUDA; where `card` is its "cost" on that; where `needs`
+    """What `resolve.Described` holds, where `scene` is given with what it reads of it; where `brings` is the weights
+    that are "needed", and what this machine "lacks" for CUDA; where `card` is its "cost" on that; where `needs`
     is the preview's "notes" or "refusal"; or {"broken": why}; or {"errors": in the params, "known": names}."""
     stage, needs, brings, scene = (asked.get(name) for name in ("stage", "needs", "brings", "scene"))
     path = _described_in(stage)
@@ -87,6 +87,11 @@ def _describe(asked: dict[str, Any]) -> dict[str, Any]:
     if scene is not None and hasattr(planned, "scene_files"):
         files = planned.scene_files(resolved, Path(scene), list(files_below(Path(scene))))
         answer["reads"] = sorted(str(path) for path in files)
+    if scene is not None and hasattr(planned, "scene_facts"):
+        try:
+            answer["facts"] = planned.scene_facts(resolved, Path(scene))
+        except ValueError:  # its preview refuses the scene
+            answer["facts"] = {}
     if needs is not None and hasattr(planned, "preview"):
         try:
             answer["notes"] = list(planned.preview(resolved, **{n: p and Path(p) for n, p in needs.items()}))

@@ -18,7 +18,7 @@ from runner.files import RECEIPT, files_below, read_json, write_text
 
 OWN = ("reffusion", "stages")  # the packages whose modules count as a stage's code where it imports them
 HASHES = ".hashes.json"  # in runs/: where they are remembered
-NOT_CONTENT = (RECEIPT, "trace.jsonl", "checkpoint.pt", "checkpoint.pt.writing")
+NOT_CONTENT = (RECEIPT, "trace.jsonl", "warnings.json", "checkpoint.pt", "checkpoint.pt.writing")
 NOT_WEIGHTS = (".md", ".py", ".png", ".jpg")  # a model's card, its pictures, the scripts that trained it
 
 

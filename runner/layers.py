@@ -72,15 +72,25 @@ def layered(
         (f"pipeline.yaml: profile {profile}", pipeline.profiles[profile]),
         ("budget", shares),
         (str(scene.path), brought),
-        (f"{scene.path}: stages", scene.stages),
-        (f"pipeline.yaml: variant {variant}", pipeline.variants.get(variant or "", {})),
-        ("set", asked),
+        (f"{scene.path}: stages", spread(pipeline, scene.stages)),
+        (f"pipeline.yaml: variant {variant}", spread(pipeline, pipeline.variants.get(variant or "", {}))),
+        ("set", spread(pipeline, asked)),
     )
     values: Overrides = {name: {} for name in pipeline.stages}
     for _, layer in each:
         for stage, params in layer.items():
             values[stage] = merged(values[stage], params, keys.get(stage, ()))
     return Layers(values, each)
+
+
+def spread(pipeline: Pipeline, overrides: Overrides) -> Overrides:
+    """`overrides` with a key of scene.yaml set for every stage that reads it, where it is set for one of them."""
+    found = {stage: dict(params) for stage, params in overrides.items()}
+    for stage, params in overrides.items():
+        for key in (key for key in params if key in pipeline.scene_keys.get(stage, ())):
+            for other in (other for other, keys in pipeline.scene_keys.items() if key in keys):
+                found.setdefault(other, {}).setdefault(key, params[key])
+    return found
 
 
 def seconds_of(text: object, origin: str) -> float:

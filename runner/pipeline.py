@@ -66,11 +66,10 @@ class Provided(Strict):
 
 
 class Unread(Strict):
-    """Files and folders of an artifact that the stage does not read, while `param: <stage>.<name>` is `equals`: where
-    only they change, it need not run again."""
+    """An optional need that the stage does not read while `param: <stage>.<name>` is `equals`: it arrives as None, and
+    where it changes, the stage does not run again."""
 
     need: str
-    names: tuple[str, ...]
     param: str
     equals: Any
 

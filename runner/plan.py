@@ -12,7 +12,7 @@ from typing import Any
 from runner import Refused
 from runner.artifacts import Wear, listed, wear
 from runner.files import MACHINE, RECEIPT, files_below, read_receipt
-from runner.keys import NOT_CONTENT, Inputs, changes, code_changes, code_of, elsewhere, leaves, outside
+from runner.keys import Inputs, changes, code_changes, code_of, digest, elsewhere, leaves, outside
 from runner.pipeline import SCENE, Condition
 from runner.resolve import Job, ask, has_cuda
 
@@ -48,7 +48,7 @@ def decide(job: Job, stage: str, earlier: dict[str, Decision]) -> Decision:
             return Decision("skip", _because(condition, earlier), settled=True)
         if holds is None:
             unknown_yet.append(f"left out if {condition.because.split(':')[0]}: known after {condition.names[0]}")
-    needs = {need: earlier[need] for need in spec.takes if need != SCENE}
+    needs = {need: earlier[need] for need in read_needs(job, stage) if need != SCENE}
     for need in (need for need in spec.needs if need != SCENE):
         if needs[need].word == "skip":
             return Decision("skip", f"needs {need}, which is left out", settled=True)
@@ -71,6 +71,13 @@ def decide(job: Job, stage: str, earlier: dict[str, Decision]) -> Decision:
             return Decision("run", listed(known), path)
         return Decision("stale", f"waits for {', '.join(moving)}; kept if the new content is the same", path)
     return _compare(job, stage, _inputs(job, stage, {need: d.path for need, d in needs.items()}, code))
+
+
+def read_needs(job: Job, stage: str) -> list[str]:
+    """The needs of a stage, without one that its parameters leave unread."""
+    spec = job.pipeline.stages[stage]
+    unread = spec.unread and _is(job, spec.unread.param, spec.unread.equals) and spec.unread.need
+    return [need for need in spec.takes if need != unread]
 
 
 def _holds(job: Job, condition: Condition, earlier: dict[str, Decision]) -> bool | None:
@@ -128,10 +135,9 @@ def _weights(job: Job, stage: str) -> Iterator[tuple[str, str, Path | None]]:
 
 
 def _inputs(job: Job, stage: str, needs: dict[str, Path | None], code: dict[str, str]) -> Inputs:
-    own, unread = job.stages[stage], job.pipeline.stages[stage].unread
+    own = job.stages[stage]
     hashes = {need: path and job.hashes.folder(path) for need, path in needs.items()}
-    if unread and (path := needs[unread.need]) and _is(job, unread.param, unread.equals):
-        hashes[unread.need] = job.hashes.folder(path, (*NOT_CONTENT, *unread.names))
+    hashes |= {f"{SCENE}: {name}": digest(json.dumps(fact)) for name, fact in own.facts.items()}
     if own.reads is not None:
         hashes[SCENE] = job.hashes.files(job.folder, map(Path, own.reads))
     elif SCENE in job.pipeline.stages[stage].takes:

@@ -57,6 +57,7 @@ class Described:
     weights: tuple[str, ...] = ()  # dotted names of the parameters that name weights
     unkeyed: tuple[str, ...] = ()  # and of those that change nothing in the artifact
     reads: tuple[str, ...] | None = None  # the files of the scene that it reads; None for all of them
+    facts: dict[str, Any] = field(default_factory=dict)  # what it takes from other files, such as their names
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ class Work(NamedTuple):
     """What every view is drawn with and compared with.
 
     Attributes:
-        out, poses, masks: folders; masks may be None.
+        out, poses, raw_masks, masks: folders; masks may be None.
         gaussians: stage -> what is rendered of it.
         result: the stage whose Gaussians are the result.
         painter: what inpaints the rendered views; None where nothing does.
@@ -46,6 +46,7 @@ class Work(NamedTuple):
 
     out: Path
     poses: Path
+    raw_masks: Path
     masks: Path | None
     gaussians: dict[str, Gaussians]
     result: str
@@ -60,6 +61,7 @@ def run(
     out: Path,
     *,
     poses: Path,
+    raw_masks: Path,
     fit: Path,
     masks: Path | None = None,
     reference: Path | None = None,
@@ -75,8 +77,8 @@ def run(
     and test views without a picture are rendered and not scored. `reference`, `personalize` and `lift` give their
     seconds only.
     """
-    needs = {"poses": poses, "fit": fit, "masks": masks, "reference": reference, "personalize": personalize}
-    needs |= {"lift": lift, "initialize": initialize, "distill": distill}
+    needs = {"poses": poses, "raw_masks": raw_masks, "fit": fit, "masks": masks, "reference": reference}
+    needs |= {"personalize": personalize, "lift": lift, "initialize": initialize, "distill": distill}
     scene = load_scene(poses)
     loaded = {net: lpips.load(net, params.lpips_weights) for net in ("vgg", "alex")}
     models = {net: model for net, (model, _) in (loaded | {"st": lpips.load_st()}).items() if model}
@@ -115,20 +117,20 @@ def prepared(
     params: Params, scene: Scene, out: Path, needs: dict[str, Path | None], tested: bool
 ) -> tuple[Work, dict[str, int]]:
     """What the views are drawn with, and how many Gaussians each stage left."""
-    poses, masks = needs["poses"], needs["masks"]
+    poses, raw_masks, masks = needs["poses"], needs["raw_masks"], needs["masks"]
     made = [stage for stage in FOLDERS if needs[stage]]
     gaussians = {s: load_ply(needs[s] / "gaussians.ply").map(lambda p: p.to(params.device)) for s in made}
     result, captured, counts = made[-1], gaussians["fit"], {stage: len(value) for stage, value in gaussians.items()}
-    unseen = unseen_in(scene, captured, poses, masks) if tested else {}
+    unseen = unseen_in(scene, captured, raw_masks, masks) if tested else {}
     # Brought Gaussians may know more than these views do.
-    hidden = {name: mask_of(scene.cameras[name], poses, masks) for name in unseen}
+    hidden = {name: mask_of(scene.cameras[name], raw_masks, masks) for name in unseen}
     if params.beyond and reaches_beyond(unseen, hidden) and not (poses / "gaussians.ply").exists():
         # What was made up in views without pixels is as good as seen.
         views = (*scene.train, *scene.blank) if needs["reference"] else scene.train
         gaussians |= finished([scene.cameras[name] for name in views], gaussians, result)
     painter = paint2d.load(params.lama, params.device) if params.inpaint else None
     exposures = exposure.of_views(needs["fit"], list(scene.cameras.values()))
-    return Work(out, poses, masks, gaussians, result, painter, tested, unseen, exposures), counts
+    return Work(out, poses, raw_masks, masks, gaussians, result, painter, tested, unseen, exposures), counts
 
 
 def looked_at(work: Work, camera: Camera, models: dict) -> tuple[Shown, dict[str, Any]]:
@@ -147,7 +149,7 @@ def exposure_of(work: Work, camera: Camera, photo: np.ndarray | None) -> np.ndar
         return told
     drawn = rasterizer.render(work.gaussians["fit"], camera)
     color, there = exposure.exposed(drawn.color, told).cpu().numpy(), drawn.alpha.cpu().numpy() > OPAQUE
-    outside = ~widened(mask_of(camera, work.poses, work.masks), rows.OUTSIDE_MARGIN)
+    outside = ~widened(mask_of(camera, work.raw_masks, work.masks), rows.OUTSIDE_MARGIN)
     return exposure.matched(told, color, photo, outside & there)
 
 
@@ -156,7 +158,7 @@ def rendered(work: Work, camera: Camera, how: np.ndarray | None) -> tuple[Shown,
     file = f"{camera.name}.png"
     drawings = {s: drawn(each, camera, work.out / FOLDERS[s] / file, how) for s, each in work.gaussians.items()}
     pictures = {stage: picture for stage, (picture, _) in drawings.items()}
-    shown = Shown(camera, *drawings[work.result], mask_of(camera, work.poses, work.masks), how)
+    shown = Shown(camera, *drawings[work.result], mask_of(camera, work.raw_masks, work.masks), how)
     if work.painter:
         picture = work.painter.paint(shown.picture, shown.mask)
         shown = shown._replace(picture=picture, depth=consistency.depth_through(shown.depth, shown.mask))
@@ -172,7 +174,7 @@ def truth_for(work: Work, camera: Camera) -> rows.Truth:
     """
     kept = work.masks and load_json(work.masks / "facts.json").get("kept")
     picture = truth_of(camera, work.poses) if work.tested and not kept else None
-    with_object = shows_object(work.poses, work.masks, camera.name)
+    with_object = shows_object(work.raw_masks, work.masks, camera.name)
     return rows.Truth(picture, with_object, work.unseen.get(camera.name))
 
 
@@ -190,9 +192,9 @@ def views_of(scene: Scene) -> tuple[tuple[str, ...], str]:
     return (eighth, "training, every 8th") if len(eighth) >= 8 else (scene.train, "training")
 
 
-def unseen_in(scene: Scene, captured: Gaussians, poses: Path, masks: Path | None) -> dict[str, np.ndarray]:
+def unseen_in(scene: Scene, captured: Gaussians, raw_masks: Path, masks: Path | None) -> dict[str, np.ndarray]:
     """Test view -> bool [H, W], pixels that show what no training view saw."""
-    seen_by = sight.seen_views(*captured_by(scene, captured, poses, masks))
+    seen_by = sight.seen_views(*captured_by(scene, captured, raw_masks, masks))
     return {name: sight.unseen(captured, scene.cameras[name], seen_by) for name in scene.test}
 
 
@@ -210,11 +212,11 @@ def finished(cameras: list[Camera], gaussians: dict[str, Gaussians], result: str
 
 
 def captured_by(
-    scene: Scene, captured: Gaussians, poses: Path, masks: Path | None
+    scene: Scene, captured: Gaussians, raw_masks: Path, masks: Path | None
 ) -> tuple[Gaussians, list[Camera], dict[str, np.ndarray]]:
     """What `sight.seen_views` takes: the fit, the training views, and where those show the object."""
     cameras = [scene.cameras[name] for name in scene.train]
-    hidden = {camera.name: mask_of(camera, poses, masks) for camera in cameras if camera.name not in scene.clean}
+    hidden = {camera.name: mask_of(camera, raw_masks, masks) for camera in cameras if camera.name not in scene.clean}
     return captured, cameras, hidden
 
 
@@ -243,13 +245,13 @@ def truth_of(camera: Camera, poses: Path) -> np.ndarray | None:
     return image
 
 
-def mask_of(camera: Camera, poses: Path, masks: Path | None) -> np.ndarray:
+def mask_of(camera: Camera, raw_masks: Path, masks: Path | None) -> np.ndarray:
     """bool [H, W]: the view's test mask, else its consistent mask, else (a variant without the stage masks) its raw
     mask, else empty. Where there are test masks, every variant is so scored in the same box."""
     size, file = (camera.height, camera.width), f"{camera.name}.png"
-    given = [poses / "test_masks" / file, *([masks / "consistent" / file] if masks else [])]
+    given = [raw_masks / "test_masks" / file, *([masks / "consistent" / file] if masks else [])]
     found = [path for path in given if path.exists()]
-    raw = {} if found else load_raw_masks(poses, [camera.name])
+    raw = {} if found else load_raw_masks(raw_masks, [camera.name])
     return load_mask(found[0], size) if found else raw.get(camera.name, np.zeros(size, bool))
 
 

@@ -28,7 +28,7 @@ from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Scene
 
 
-def run(params: Params, out: Path, *, poses: Path) -> None:
+def run(params: Params, out: Path, *, poses: Path, raw_masks: Path | None = None) -> None:
     if (poses / "gaussians.ply").exists() and params.pixels == "all":
         save_ply(out / "gaussians.ply", load_ply(poses / "gaussians.ply"))
         return
@@ -38,7 +38,7 @@ def run(params: Params, out: Path, *, poses: Path) -> None:
     held_out = scene.train[params.holdout // 2 :: params.holdout] if params.holdout else ()
     cameras = [scene.cameras[name] for name in scene.train if name not in held_out]
     images = load_views(poses, scene.train)
-    hidden = hidden_pixels(poses, scene) if params.pixels == "unmasked" else {}
+    hidden = hidden_pixels(raw_masks, scene) if params.pixels == "unmasked" else {}
     images |= {name: paint2d.telea(images[name], mask) for name, mask in hidden.items()}  # flow looks at them too
     exposed = exposures(params, scene, cameras, images)
     even = images if exposed is None else evened(images, cameras, exposed)
@@ -114,11 +114,11 @@ def on_surfaces(params: Params, scene: Scene, cameras: list[Camera], images, hid
     return found
 
 
-def hidden_pixels(poses: Path, scene: Scene) -> dict[str, np.ndarray]:
+def hidden_pixels(raw_masks: Path, scene: Scene) -> dict[str, np.ndarray]:
     """View name -> bool [H, W], its raw mask; none for a view without one, or one marked clean."""
-    masks = load_raw_masks(poses, [name for name in scene.train if name not in scene.clean])
+    masks = load_raw_masks(raw_masks, [name for name in scene.train if name not in scene.clean])
     if not masks:
-        raise ValueError(f"{poses / 'masks'}: fit.pixels is 'unmasked', but the scene has no masks")
+        raise ValueError(f"{raw_masks / 'masks'}: fit.pixels is 'unmasked', but the scene has no masks")
     return masks
 
 

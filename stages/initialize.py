@@ -78,7 +78,7 @@ def run(
         gaussians, new, further = completed_further(params, out, gaussians, new, around, true)
         true += further
     if params.start == "random" and any(each.invent.any() for each in sets.values()):
-        added = at_random(params, removed, gaussians, scene, sets, poses)
+        added = at_random(params, removed, gaussians, scene, sets, masks)
         gaussians = gaussians.zipped(added, lambda a, b: torch.cat([a, b]))
         new = torch.cat([new, new.new_ones(len(added))])
     if true and params.settle:
@@ -124,12 +124,11 @@ def surroundings(params: Params, scene, gaussians, thing, sets, poses: Path, fit
     return filling.Surroundings(train, consistent, photos, found.views, *place, unknown, frozenset(scene.blank))
 
 
-def at_random(params: Params, removed, remaining, scene, sets, poses: Path):
+def at_random(params: Params, removed, remaining, scene, sets, masks: Path):
     """Gaussians at random in the region of the hole: that of the removed ones, or the box that the scene names."""
-    region, train = poses / "region.json", [scene.cameras[name] for name in scene.train]
-    if region.exists():
-        told = load_json(region)
-        box = scatter.box_around(told["center"], told["size"])
+    region, train = load_json(masks / "facts.json").get("region"), [scene.cameras[name] for name in scene.train]
+    if region:
+        box = scatter.box_around(region["center"], region["size"])
     elif len(removed):
         box = scatter.box_of(removed.means.double().cpu().numpy())
     else:

@@ -41,19 +41,18 @@ SEED = 0  # of the draws that find planes
 LOOKED_AT = 8  # views, with which Gaussians that the scene brings are compared
 
 
-def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
+def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -> None:
     scene, gaussians = load_scene(poses), load_ply(fit / "gaussians.ply").map(lambda p: p.to(params.device))
     train = [scene.cameras[name] for name in scene.train]
     check_brought(poses, fit, gaussians, train)
-    region = Region(**load_json(poses / "region.json")) if (poses / "region.json").exists() else None
-    objects = objects_of(poses)
+    region = load_region(raw_masks)
     deleted = deleted_from(poses, params.device)  # stands for votes
-    raw = {} if deleted is not None else brought_masks(params, scene, gaussians, poses)
+    raw = {} if deleted is not None else brought_masks(params, scene, gaussians, poses, raw_masks)
     empty = {name: np.zeros((camera.height, camera.width), bool) for name, camera in scene.cameras.items()}
     ballots = {name: raw[name] for name in scene.train if name in raw} | {name: empty[name] for name in scene.clean}
-    fill = Filled(region, load_fill(poses)) if params.invent != "undecided" else Filled(None, {})
+    fill = Filled(region, load_fill(raw_masks)) if params.invent != "undecided" else Filled(None, {})
     if deleted is None and not raw and region is None and not fill.masks and not scene.blank:
-        raise ValueError(f"{poses}: neither masks nor a region say what is to be changed: add masks, or a region")
+        raise ValueError(f"{raw_masks}: neither masks nor a region say what is to be changed: add masks, or a region")
 
     # Observation outside the masks is measured by weight, whatever the votes count.
     seen = voting.cast_votes(gaussians, train, ballots or empty, mode="weight")
@@ -90,7 +89,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
     save_mask_sets(out, sets)
     invents = {name: each.invent for name, each in sets.items()}
     facts = {
-        "kept": [name for name in objects if params.remove is not None and name not in params.remove],
+        "kept": [name for name in objects_of(raw_masks) if params.remove is not None and name not in params.remove],
         "masked_gaussians": int(torch.count_nonzero(labels)),
         "gaussians": len(gaussians),
         "voting_views": len(ballots),
@@ -99,15 +98,25 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path) -> None:
         "undecided_share": undecided,
         "invent_views": [name for name in distilled if invents[name].any()],
         "best_reference": voting.best_view(invents, scene.train),
+        "region": region and {"center": list(region.center), "size": list(region.size)},
     }
     save_json(out / "facts.json", facts)
 
 
-def brought_masks(params: Params, scene: Scene, gaussians: Gaussians, poses: Path) -> dict[str, np.ndarray]:
+def load_region(raw_masks: Path) -> Region | None:
+    path = raw_masks / "region.json"
+    return Region(**load_json(path)) if path.exists() else None
+
+
+def brought_masks(
+    params: Params, scene: Scene, gaussians: Gaussians, poses: Path, raw_masks: Path
+) -> dict[str, np.ndarray]:
     """View -> bool [H, W], the raw masks: those that the scene brings, and what clicks make of them."""
-    raw = load_raw_masks(poses, scene.train, params.remove)
-    if objects_of(poses) and not raw:
-        raise ValueError(f"{poses / 'masks'}: no view has a mask of each object; add empty ones where one is unseen")
+    raw = load_raw_masks(raw_masks, scene.train, params.remove)
+    if objects_of(raw_masks) and not raw:
+        raise ValueError(
+            f"{raw_masks / 'masks'}: no view has a mask of each object; add empty ones where one is unseen"
+        )
     return clicked(params, scene, gaussians, poses, raw) if params.clicks else raw
 
 

@@ -19,7 +19,7 @@ MEMORY = "personalize.memory_gb"  # what an error names
 HELD_OUT = 4  # photographs by which it is measured
 
 
-def run(params: Params, out: Path, *, poses: Path, reference: Path) -> None:
+def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, reference: Path) -> None:
     began = time.monotonic()
     if not params.steps:
         raise ValueError("personalize.steps is 0: there is nothing to learn, leave the stage out")
@@ -30,7 +30,7 @@ def run(params: Params, out: Path, *, poses: Path, reference: Path) -> None:
         crops.picture(torch.from_numpy(r.image), torch.from_numpy(r.mask), prior.native_size)
         for r in load_references(reference, scene)
     ]
-    photographs = others(scene, poses, [r.camera.name for r in load_references(reference, scene)])
+    photographs = others(scene, poses, raw_masks, [r.camera.name for r in load_references(reference, scene)])
     chosen = params.lora
     trained = lora.add(prior, chosen.rank, chosen.alpha, chosen.dropout, chosen.layers, params.seed)
 
@@ -50,9 +50,9 @@ def run(params: Params, out: Path, *, poses: Path, reference: Path) -> None:
     trace.clear_checkpoint(out)
 
 
-def others(scene: Scene, poses: Path, learnt: list[str]) -> list[tuple[torch.Tensor, torch.Tensor]]:
+def others(scene: Scene, poses: Path, raw_masks: Path, learnt: list[str]) -> list[tuple[torch.Tensor, torch.Tensor]]:
     """`HELD_OUT` photographs of views that are not references, [3, H, W] in [-1, 1], and the object in them [H, W]."""
-    masks = load_raw_masks(poses, scene.train)
+    masks = load_raw_masks(raw_masks, scene.train)
     names = [name for name in scene.train if name in masks and name not in learnt]
     photos = load_views(poses, names[:: max(1, len(names) // HELD_OUT)][:HELD_OUT])
     picture = lambda image: torch.from_numpy(image).permute(2, 0, 1).float() / 127.5 - 1

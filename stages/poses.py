@@ -1,4 +1,4 @@
-"""poses: pictures without distortion, cameras and sparse points in the normalised frame, masks, the split."""
+"""poses: pictures without distortion, cameras and sparse points in the normalised frame, the split."""
 
 from __future__ import annotations
 
@@ -21,16 +21,15 @@ from reffusion.capture.lenses import save_lenses
 from reffusion.capture.reading import check_brought, read_scene, unphotographed
 from reffusion.capture.refine import refined
 from reffusion.capture.roles import Roles
-from reffusion.capture.undistorted import check_masks, fitting_size, lens_of, load_at, save_undistorted
-from reffusion.capture.views import check_outliers, known
+from reffusion.capture.undistorted import fitting_size, lens_of, load_at, save_undistorted
+from reffusion.capture.views import check_outliers
 from reffusion.gaussians import matching
 from reffusion.io.arrays import save_json, save_labels
 from reffusion.io.files import BadInput
-from reffusion.io.images import image_size, save_mask
+from reffusion.io.images import image_size
 from reffusion.io.ply import properties_of, save_ply
-from reffusion.io.scene import load_raw_masks, load_views, save_scene
+from reffusion.io.scene import WARNINGS, load_views, save_scene
 from reffusion.io.splats import Splats, load_splats
-from reffusion.masks import regions
 from reffusion.params.poses import Params
 from reffusion.splat.conventions import SH0
 from reffusion.types import Scene
@@ -38,24 +37,19 @@ from reffusion.types import Scene
 LEAST_POINTS = 100  # with fewer sparse points, some of optical flow are added to them
 MORE_POINTS = 10_000  # how many at most; random ones, where flow finds too few
 SEED = 0
-WARNINGS = "warnings.json"  # sentences
 SOLVED = "sfm.json"  # `sfm.Solution.facts`
 
 
 def run(params: Params, out: Path, *, scene: Path) -> None:
-    """Write images/, masks/, test_masks/, sparse/0/, lenses.json, transform.json, views.json; refine.json where cameras
-    were adjusted; gaussians.ply, deleted.npy and region.json where the scene brings them; warnings.json where
-    something is odd."""
+    """Write images/, sparse/0/, lenses.json, transform.json, views.json; refine.json where cameras were adjusted;
+    gaussians.ply and deleted.npy where the scene brings them; warnings.json where something is odd."""
     own = _load_own_splats(params, scene)  # before the work, not after it
     if unphotographed(params, scene):
         _save_unphotographed(params, out, scene, own)
         return
-    capture, roles = read_scene(params, scene)
-    said = [*capture.warnings, *roles.warnings, *(own.notes if own else ())]
+    capture, roles = read_scene(params, scene, params.longest)
+    said = [*capture.warnings, *(own.notes if own else ())]
     sizes = {name: image_size(path, upright=capture.upright) for name, path in capture.pictures.items()}
-    for files in roles.masks.values():
-        check_masks(files, roles.values)
-    check_masks(roles.fill)
     if capture.poses is None:
         everyone, capture = sorted(capture.pictures), _place(params, out, capture)
         if lost := [name for name in everyone if name not in capture.pictures]:
@@ -64,7 +58,7 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     views, longest = sorted({*roles.train, *roles.test}), _supported_size(params, capture, roles)
     lenses, pinholes = {}, {}
     for k in trace.progress(len(views), "poses"):
-        lenses[views[k]], pinholes[views[k]] = save_undistorted(out, views[k], capture, roles, longest)
+        lenses[views[k]], pinholes[views[k]] = save_undistorted(out, views[k], capture, longest)
     for name in roles.blank:
         lenses[name], pinholes[name] = lens_of(name, capture, longest)
     normalised = frame.normalised(capture.poses, pinholes, roles.train, roles.test, roles.clean)
@@ -82,8 +76,6 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
     save_scene(out, normalised)
     if own is not None:
         _save_own_splats(out, normalised, own)
-    if params.region is not None:
-        _save_region(params, out, normalised)
 
 
 @dataclass(frozen=True)
@@ -196,7 +188,7 @@ def _adjust_cameras(params: Params, scene: Scene, out: Path) -> Scene:
 
 
 def _oddities(scene: Scene, out: Path) -> list[str]:
-    return odd.oddities(scene, load_raw_masks(out, scene.train), lambda name: load_views(out, [name])[name])
+    return odd.odd_exposures(scene, lambda name: load_views(out, [name])[name])
 
 
 def _save_warnings(out: Path, said: list[str]) -> None:
@@ -205,24 +197,6 @@ def _save_warnings(out: Path, said: list[str]) -> None:
         warnings.warn(line, stacklevel=1)
     if said:
         save_json(out / WARNINGS, said)
-
-
-def _save_region(params: Params, out: Path, scene: Scene) -> None:
-    """The region that the scene names, as region.json; or the masks of what lies beyond it."""
-    region, scale = params.region, scene.similarity.scale
-    if region.view is not None:
-        center = regions.on_axis(scene.cameras[known(region.view, scene.cameras, "region")], region.distance * scale)
-    else:
-        center = scene.similarity.apply(region.center)
-    if region.outside:
-        given = load_raw_masks(out, scene.train)
-        for name in scene.train:
-            mask = regions.beyond(center, region.radius * scale, scene.cameras[name])
-            save_mask(out / "masks" / f"{name}.png", mask | given.get(name, mask))
-        return
-    size = [side * scale for side in region.size or [2 * region.radius] * 3]
-    said = {"center": center.tolist(), "size": size, "round": region.size is None}
-    save_json(out / "region.json", {**said, "holds": params.has_masks})
 
 
 def _supported_size(params: Params, capture: Capture, roles: Roles) -> int:

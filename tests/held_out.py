@@ -11,13 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from small_capture import HEIGHT, WIDTH, Truth, reprojection_error, run
+from small_capture import HEIGHT, WIDTH, Truth, preview, reprojection_error, run, run_stages
 
 from reffusion.io import colmap
 from reffusion.io.files import BadInput
 from reffusion.types import Scene
-from stages import poses
-from stages.plan.poses import preview
 
 SHARE = 1 / 16  # of a view, the rectangle that `small_capture.write_masks` masks
 EXACT = 0.01  # px, between a pinhole camera and the truth
@@ -27,7 +25,7 @@ OBJECT[HEIGHT // 4 : HEIGHT // 2, WIDTH // 4 : WIDTH // 2] = True
 
 def attempt(folder: Path, **params) -> tuple[Scene, Path, list[str]]:
     """Preview and run `poses`: the scene, its folder, and all sentences that either says, paths below `folder`."""
-    sentences = preview(poses.Params(**params), folder)
+    sentences = preview(folder, **params)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         scene, out = run(folder, **params)
@@ -46,7 +44,7 @@ def assert_sentence(sentences: Iterable[str], *words: str) -> None:
 def refusal(folder: Path, **params) -> str:
     """The one line with which `preview` refuses."""
     with pytest.raises(BadInput) as caught:
-        preview(poses.Params(**params), folder)
+        preview(folder, **params)
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
@@ -57,8 +55,8 @@ def refusal_before_work(folder: Path, **params) -> str:
     out.mkdir()
     with pytest.raises(BadInput) as caught, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        preview(poses.Params(**params), folder)
-        poses.run(poses.Params(**params), out, scene=folder)
+        preview(folder, **params)
+        run_stages(folder, out, **params)
     written = sorted(path.name for path in out.iterdir())
     assert "\n" not in str(caught.value) and not written, (str(caught.value), written)
     return str(caught.value)

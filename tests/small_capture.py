@@ -1,4 +1,4 @@
-"""A small capture with known truth, written in any layout, and `poses` run on it."""
+"""A small capture with known truth, written in any layout, and `poses` and `raw_masks` run on it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from reffusion.capture import lens
 from reffusion.io import colmap
 from reffusion.io.images import save_image
 from reffusion.io.scene import load_scene
-from stages import poses
+from stages import poses, raw_masks
+from stages.plan import poses as poses_plan
+from stages.plan import raw_masks as raw_masks_plan
 
 WIDTH, HEIGHT = 96, 72
 FISHEYE = ("OPENCV_FISHEYE", (60.0, 61.0, 48.5, 35.0, 0.02, -0.01, 0.002, 0.001))
@@ -140,10 +142,28 @@ def write_spin_nerf(folder: Path, test=2, full=True, mask_value=1, label_size=(W
 
 
 def run(folder: Path, **params):
+    """The scene, and the folder in which both stages leave what they make of it."""
     out = folder.parent / (folder.name + "_out")
     out.mkdir(exist_ok=True)
-    poses.run(poses.Params(**params), out, scene=folder)
+    run_stages(folder, out, **params)
     return load_scene(out), out
+
+
+def run_stages(folder: Path, out: Path, **params) -> None:
+    """`poses` and `raw_masks` into the same folder, after the preview of the masks, which `poses` does not read."""
+    raw_masks_plan.preview(_mask_params(params), scene=folder)
+    poses.run(poses.Params(**params), out, scene=folder)
+    raw_masks.run(_mask_params(params), out, scene=folder, poses=out)
+
+
+def preview(folder: Path, **params) -> list[str]:
+    """What both stages say before they run."""
+    notes = poses_plan.preview(poses.Params(**params), folder)
+    return notes + raw_masks_plan.preview(_mask_params(params), scene=folder)
+
+
+def _mask_params(params: dict) -> raw_masks.Params:
+    return raw_masks.Params(**{key: value for key, value in params.items() if key in raw_masks.Params.model_fields})
 
 
 def reprojection_error(scene, truth: Truth) -> float:

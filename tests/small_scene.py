@@ -95,8 +95,10 @@ def photo(view: Camera) -> np.ndarray:
 
 
 def write(folder, square_at: float, masks=None, clean=()):
-    """`poses` and `fit` folders of the scene; masks: view name -> bool, default the true ones of all training views."""
+    """`poses` and `fit` folders of the scene, raw_masks/ beside them; masks: view name -> bool, default the true ones
+    of all training views."""
     poses, fit = folder / "poses", folder / "fit"
+    (folder / "raw_masks").mkdir(parents=True, exist_ok=True)
     masks = {name: true_mask(CAMERAS[name], square_at) for name in TRAIN} if masks is None else masks
     points = np.stack([*(a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 25), np.linspace(-0.7, 0.7, 19))),
                        np.full(475, WALL)], -1)  # fmt: skip
@@ -107,7 +109,7 @@ def write(folder, square_at: float, masks=None, clean=()):
     for name, view in CAMERAS.items():
         save_image(poses / "images" / f"{name}.png", photo(view))
     for name, mask in masks.items():
-        save_mask(poses / "masks" / f"{name}.png", mask)
+        save_mask(folder / "raw_masks" / "masks" / f"{name}.png", mask)
     fit.mkdir(parents=True, exist_ok=True)
     everything, labels = gaussians(square_at)
     save_ply(fit / "gaussians.ply", everything)

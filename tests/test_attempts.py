@@ -30,7 +30,7 @@ def run(tmp_path_factory):
     for name in ("masks", "initialize"):
         (home / name).mkdir()
     folders = {"poses": poses, "fit": fitted, "masks": home / "masks", "reference": home / "reference"}
-    masks.run(masks.Params(), home / "masks", poses=poses, fit=fitted)
+    masks.run(masks.Params(), home / "masks", poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fitted)
     view = small.CAMERAS["a2"]
     invent = load_mask_sets(home / "masks", ["a2"])["a2"].invent
     save_references(home / "reference", [Reference(view, small.photo(view), invent)])

@@ -28,13 +28,12 @@ from reffusion.capture.straight import GivenReference
 from reffusion.io.files import BadInput
 from reffusion.io.images import load_image, save_exr, save_image
 from reffusion.io.ply import save_ply
-from reffusion.params.poses import Params
 from reffusion.types import Gaussians
 from runner import Refused, child
 from runner.layers import layered, parse_set, seconds_of
 from runner.pipeline import load_pipeline, load_scene_file
 from runner.resolve import choose_profile
-from stages import poses
+from stages import poses, raw_masks
 
 ROOT = Path(__file__).resolve().parent.parent
 PIPELINE = load_pipeline(ROOT)
@@ -65,7 +64,7 @@ def told(folder: Path, out: Path, set_: str = "") -> str | None:
         return str(error)
     for stage, spec in PIPELINE.stages.items():
         asked = {"stage": stage, "params": layers.values[stage], "takes": spec.takes}
-        if "scene" in spec.takes and stage == "poses":
+        if "scene" in spec.takes and stage in ("poses", "raw_masks"):
             asked |= {"scene": str(folder), "needs": {"scene": str(folder)}}
         try:
             answer = child._describe(asked)
@@ -79,7 +78,8 @@ def told(folder: Path, out: Path, set_: str = "") -> str | None:
             return answer["refusal"]
         assert not any("preview failed" in note for note in answer.get("notes", ())), answer["notes"]
     try:
-        poses.run(Params(**layers.values["poses"]), out, scene=folder)
+        poses.run(poses.Params(**layers.values["poses"]), out, scene=folder)
+        raw_masks.run(raw_masks.Params(**layers.values["raw_masks"]), out, scene=folder, poses=out)
     except BadInput as error:
         return str(error)
     return None
@@ -818,9 +818,9 @@ def test_depth_maps(captures, tmp_path, name, change):
     change(folder)
     began = time.monotonic()
     with pytest.raises(BadInput, match=name):
-        capture, roles = read_scene(Params(), folder)
+        capture, roles = read_scene(poses.Params(), folder)
         given = {"view": "v01", "image": "images/v01.png", "depth": name}
-        found = load_given(folder, views_of(capture, roles), Params(reference=given).reference)
+        found = load_given(folder, views_of(capture, roles), poses.Params(reference=given).reference)
         load_depth(found[0].depth)
     assert time.monotonic() - began < LONGEST
 
@@ -832,7 +832,7 @@ def test_paintings(captures, tmp_path, broken):
     (folder / "painted").mkdir()
     both(picture("painted/v01.png", NOISE), broken("painted/v01.png"))(folder)
     with pytest.raises(BadInput, match="v01"):
-        capture, roles = read_scene(Params(), folder)
+        capture, roles = read_scene(poses.Params(), folder)
         found = load_given(folder, views_of(capture, roles), None)
         load_image(found[0].path if found else GivenReference("v01", folder / "painted/v01.png").path)
 

@@ -163,7 +163,13 @@ def test_evaluate_counts_the_unseen_apart_and_shows_no_black(tmp_path):
     save_image(poses / "images" / "t0.png", small_scene.photo(aside))
     for name in ("on", "off"):
         (tmp_path / name).mkdir()
-        evaluate.run(evaluate.Params(beyond=name == "on"), tmp_path / name, poses=poses, fit=fit)
+        evaluate.run(
+            evaluate.Params(beyond=name == "on"),
+            tmp_path / name,
+            poses=poses,
+            raw_masks=poses.with_name("raw_masks"),
+            fit=fit,
+        )
     on, off = (load_json(tmp_path / name / "metrics.json") for name in ("on", "off"))
     assert on["mean"]["unseen_share"] == off["mean"]["unseen_share"] > 0.1
     assert on["mean"]["psnr_outside_seen"] > off["mean"]["psnr_outside_seen"] - 0.05

@@ -124,7 +124,7 @@ def test_clicks_in_one_view_give_the_masks_of_all(scene, tmp_path):
     _, placed, fit = scene
     middle = np.argwhere(truth("a2")).mean(0)[::-1] + 0.5
     params = masks.Params(clicks={"a2": [[*middle, "+"]]})
-    masks.run(params, tmp_path, poses=placed, fit=fit)
+    masks.run(params, tmp_path, poses=placed, raw_masks=placed.with_name("raw_masks"), fit=fit)
     for name, found in load_mask_sets(tmp_path, small.CAMERAS).items():
         if name in small.TRAIN:
             assert small.iou(found.raw, truth(name)) > 0.9 and small.iou(found.consistent, truth(name)) > 0.85
@@ -135,7 +135,13 @@ def test_clicks_in_one_view_give_the_masks_of_all(scene, tmp_path):
 def test_clicks_on_nothing_are_refused(scene, tmp_path):
     _, placed, fit = scene
     with pytest.raises(ValueError, match="click in the middle of the object"):
-        masks.run(masks.Params(clicks={"a2": [[3, 3, "-"]]}), tmp_path, poses=placed, fit=fit)
+        masks.run(
+            masks.Params(clicks={"a2": [[3, 3, "-"]]}),
+            tmp_path,
+            poses=placed,
+            raw_masks=placed.with_name("raw_masks"),
+            fit=fit,
+        )
 
 
 def test_a_mask_in_one_view_stays_as_it_was_given(scene):

@@ -439,7 +439,7 @@ def folders(tmp_path):
     cameras = {name: camera(name, shift) for name, shift in (("a", 0.0), ("b", 0.1), ("t", 0.05))}
     here = Similarity(1.0, np.zeros(3))
     scene = Scene(cameras, ("a", "b"), ("t",), frozenset(), np.zeros((4, 3)), np.zeros((4, 3), np.uint8), here)
-    names = ("scene", "poses", "fit", "masks", "initialize", "reference", "personalize", "distill")
+    names = ("scene", "poses", "raw_masks", "fit", "masks", "initialize", "reference", "personalize", "distill")
     paths = {name: tmp_path / name for name in names}
     for path in paths.values():
         path.mkdir()
@@ -475,7 +475,7 @@ def test_stages_chain_through_files_with_the_scenes_own_reference(folders):
     assert (load_mask(folders["reference"] / "masks" / "a.png") == hole().numpy()).all()
 
     learning = personalize.Params(prior=folders["prior"], steps=2, optimizer={"batch": 2}, samples={"size": 8})
-    personalize.run(learning, folders["personalize"], **pick(folders, "poses", "reference"))
+    personalize.run(learning, folders["personalize"], **pick(folders, "poses", "raw_masks", "reference"))
     assert (folders["personalize"] / "pytorch_lora_weights.safetensors").exists()
 
     needs = pick(folders, "poses", "fit", "masks", "reference", "personalize", "initialize")

@@ -51,15 +51,15 @@ def write_stages(home):
         np.zeros((1, 3), np.uint8),
         SIMILARITY,
     )
-    made = {name: home / name for name in ("poses", "fit", "masks", "reference", "initialize", "distill")}
+    made = {name: home / name for name in ("poses", "raw_masks", "fit", "masks", "reference", "initialize", "distill")}
     rng = np.random.default_rng(0)
     save_scene(made["poses"], scene)
     for name in names:
         save_image(made["poses"] / "images" / f"{name}.png", rng.random((HEIGHT, WIDTH, 3)))
     mask, empty = np.zeros((HEIGHT, WIDTH), bool), np.zeros((HEIGHT, WIDTH), bool)
     mask[10:30, 5:35] = True
-    save_mask(made["poses"] / "test_masks" / "view0.png", mask)
-    save_mask(made["poses"] / "test_masks" / "view1.png", empty)
+    save_mask(made["raw_masks"] / "test_masks" / "view0.png", mask)
+    save_mask(made["raw_masks"] / "test_masks" / "view1.png", empty)
     other = np.zeros_like(mask)
     other[4:24, 20:48] = True
     save_mask_sets(made["masks"], {name: MaskSet(empty, other, empty, empty) for name in names})
@@ -138,7 +138,7 @@ def test_scores_are_those_of_the_saved_pictures(done):
     boxes = {"view0": metrics.Box(2, 8, 38, 32), "view1": None, "view2": metrics.Box(17, 2, 48, 26)}
     train = [cameras[name] for name in load_scene(done / "poses").train]
     fit = load_ply(done / "fit" / "gaussians.ply")
-    hidden = {camera.name: evaluate.mask_of(camera, done / "poses", done / "masks") for camera in train}
+    hidden = {camera.name: evaluate.mask_of(camera, done / "raw_masks", done / "masks") for camera in train}
     seen_by = sight.seen_views(fit, train, hidden)
     for kind, renders in (("mean", "renders"), ("initialize", "renders_initialize")):
         scored = [
@@ -146,7 +146,7 @@ def test_scores_are_those_of_the_saved_pictures(done):
                 load_image(out / renders / f"{name}.png"),
                 load_image(done / "poses" / "images" / f"{name}.png"),
                 box,
-                mask=widened(evaluate.mask_of(cameras[name], done / "poses", done / "masks"), 0.01),
+                mask=widened(evaluate.mask_of(cameras[name], done / "raw_masks", done / "masks"), 0.01),
                 unseen=sight.unseen(fit, cameras[name], seen_by),
             )
             for name, box in boxes.items()
@@ -197,9 +197,9 @@ def test_without_distill_the_initialization_is_the_result(tmp_path, folders):
 
 
 def test_nothing_removed_scores_the_fit_on_the_full_image(tmp_path, folders):
-    for path in (folders["poses"] / "test_masks").iterdir():
+    for path in (folders["raw_masks"] / "test_masks").iterdir():
         path.unlink()
-    summary = run(tmp_path / "out", {"poses": folders["poses"], "fit": folders["fit"]})
+    summary = run(tmp_path / "out", {stage: folders[stage] for stage in ("poses", "raw_masks", "fit")})
     assert summary["result"] == "fit" and summary["mean"]["psnr_box"] is None
     assert summary["mean"]["psnr_full"] > 0 and set(summary["initialize"].values()) == {None}
 
@@ -235,8 +235,8 @@ def test_a_test_view_without_picture_is_rendered_and_one_of_another_size_refused
 
 
 def test_a_held_out_view_that_shows_the_object_is_scored_outside_its_mask_only(tmp_path, monkeypatch, folders):
-    shutil.copytree(folders["poses"] / "test_masks", folders["poses"] / "masks")
-    (folders["poses"] / "masks" / "view1.png").unlink()
+    shutil.copytree(folders["raw_masks"] / "test_masks", folders["raw_masks"] / "masks")
+    (folders["raw_masks"] / "masks" / "view1.png").unlink()
     monkeypatch.setattr(rows, "OUTSIDE_MARGIN", 0.05)
     summary = run(tmp_path / "out", folders)
     assert summary["views"]["psnr_outside"] == 3 and summary["views"]["psnr_full"] == 2  # view0 shows the object

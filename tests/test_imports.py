@@ -161,7 +161,8 @@ def test_parameters_are_few():
         return sum(leaves(k) if isinstance(k, type) and issubclass(k, BaseModel) else 1 for k in kinds)
 
     stages = [path.stem for path in sources("stages") if path.parent.name == "stages" and path.stem != "__init__"]
-    assert len(stages) == 9
+    assert len(stages) == 10
+    stages.remove("raw_masks")  # it has keys of scene.yaml that `poses` has
     assert sum(leaves(importlib.import_module(f"reffusion.params.{stage}").Params) for stage in stages) <= 165
 
 

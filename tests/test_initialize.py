@@ -34,7 +34,7 @@ def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene")
     poses, fit, _ = small.write(folder, NEAR)
     (folder / "masks").mkdir()
-    masks.run(masks.Params(), folder / "masks", poses=poses, fit=fit)
+    masks.run(masks.Params(), folder / "masks", poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fit)
     return {"poses": poses, "fit": fit, "masks": folder / "masks"}
 
 

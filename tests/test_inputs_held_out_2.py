@@ -30,6 +30,7 @@ from small_capture import (
     WIDTH,
     Truth,
     prepare,
+    preview,
     some_truth,
     write_masks,
     write_pictures,
@@ -37,8 +38,6 @@ from small_capture import (
 from test_sfm import draw_corner, noise, walk
 
 from reffusion.io.images import save_image
-from stages import poses
-from stages.plan.poses import preview
 
 # ---------------------------------------------------------------------------------------------- F: masks of any kind
 
@@ -117,8 +116,9 @@ def test_G_reference_and_its_depth_among_photographs_of_input(tmp_path):
     Image.fromarray(np.full((HEIGHT, WIDTH), 4000, np.uint16)).save(folder / "input/clean plate depth.png")
     write_masks(folder / "masks", names)
     reference = {"view": "IMG_2", "image": "input/clean plate.jpg", "depth": "input/clean plate depth.png"}
-    notes = preview(poses.Params(reference=reference), folder)
-    assert_sentence(notes, "6 training", "6 masks")
+    notes = preview(folder, reference=reference)
+    assert_sentence(notes, "6 training")
+    assert_sentence(notes, "6 masks")
     assert_sentence(notes, "6 photos bring no poses")
 
 

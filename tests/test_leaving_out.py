@@ -27,13 +27,13 @@ import sys
 from pathlib import Path
 from stages import evaluate, initialize, masks
 home = Path(sys.argv[1])
-given = {"poses": home / "poses", "fit": home / "fit"}
+given, raw_masks = {"poses": home / "poses", "fit": home / "fit"}, home / "raw_masks"
 for name in ("masks", "initialize", "evaluate"):
     (home / name).mkdir()
-masks.run(masks.Params(negligible=0.2), home / "masks", **given)
+masks.run(masks.Params(negligible=0.2), home / "masks", **given, raw_masks=raw_masks)
 given["masks"] = home / "masks"
 initialize.run(initialize.Params(), home / "initialize", **given, reference=None)
-evaluate.run(evaluate.Params(), home / "evaluate", **given, initialize=home / "initialize")
+evaluate.run(evaluate.Params(), home / "evaluate", **given, raw_masks=raw_masks, initialize=home / "initialize")
 print(sorted({name.split(".")[0] for name in sys.modules} & set(sys.argv[2].split())))
 """
 
@@ -70,7 +70,7 @@ def test_few_unseen_pixels_are_negligible_and_it_can_be_forced(tmp_path):
     def classified(**params):
         out = tmp_path / "-".join(map(str, params.values()))
         out.mkdir()
-        masks.run(masks.Params(**params), out, poses=poses, fit=fitted)
+        masks.run(masks.Params(**params), out, poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fitted)
         return load_mask_sets(out, small.TRAIN).values(), load_json(out / "facts.json")
 
     sets, facts = classified(negligible=0.0)

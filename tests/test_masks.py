@@ -22,7 +22,7 @@ def classify(tmp_path, square_at, params=None, **scene):
     poses, fit, labels = small.write(tmp_path, square_at, **scene)
     out = tmp_path / "masks"
     out.mkdir()
-    run(params or Params(), out, poses=poses, fit=fit)
+    run(params or Params(), out, poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fit)
     found = load_labels(out / "labels.npy")
     return load_mask_sets(out, small.CAMERAS), load_json(out / "facts.json"), found, labels
 
@@ -163,9 +163,9 @@ def test_empty_and_full_masks_are_handled(tmp_path, value):
 def test_a_region_alone_marks_and_fills(tmp_path):
     poses, fit, labels = small.write(tmp_path, NEAR, masks={})
     with pytest.raises(ValueError, match="neither masks nor a region"):
-        run(Params(), tmp_path, poses=poses, fit=fit)
-    save_json(poses / "region.json", {"center": [0, 0, NEAR], "size": [0.5, 0.5, 0.1]})
-    run(Params(), tmp_path, poses=poses, fit=fit)
+        run(Params(), tmp_path, poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fit)
+    save_json(tmp_path / "raw_masks/region.json", {"center": [0, 0, NEAR], "size": [0.5, 0.5, 0.1]})
+    run(Params(), tmp_path, poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fit)
     sets = load_mask_sets(tmp_path, small.CAMERAS)
     assert (load_labels(tmp_path / "labels.npy") == labels).all()
     rows, columns = np.nonzero(sets["a2"].invent)
@@ -176,8 +176,10 @@ def test_a_region_alone_marks_and_fills(tmp_path):
 @pytest.mark.parametrize("invent", ["auto", "consistent"])
 def test_a_region_to_be_filled_removes_nothing_and_is_a_part_of_m(tmp_path, invent):
     poses, fit, _ = small.write(tmp_path, NEAR, masks={})
-    save_json(poses / "region.json", {"center": [0, 0, NEAR], "size": [0.5] * 3, "round": True, "holds": False})
-    run(Params(invent=invent), tmp_path, poses=poses, fit=fit)
+    save_json(
+        tmp_path / "raw_masks/region.json", {"center": [0, 0, NEAR], "size": [0.5] * 3, "round": True, "holds": False}
+    )
+    run(Params(invent=invent), tmp_path, poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fit)
     sets = load_mask_sets(tmp_path, small.CAMERAS)
     assert not load_labels(tmp_path / "labels.npy").any()
     assert not any(each.consistent.any() for each in sets.values())
@@ -190,8 +192,8 @@ def test_masks_say_what_is_to_be_filled(tmp_path):
     wanted = np.zeros((small.HEIGHT, small.WIDTH), bool)
     wanted[10:30, 5:40] = True
     for name in small.TRAIN:
-        save_mask(poses / "fill" / f"{name}.png", wanted)
-    run(Params(), tmp_path, poses=poses, fit=fit)
+        save_mask(tmp_path / "raw_masks/fill" / f"{name}.png", wanted)
+    run(Params(), tmp_path, poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fit)
     sets = load_mask_sets(tmp_path, small.CAMERAS)
     assert not load_labels(tmp_path / "labels.npy").any()
     assert all((sets[name].invent == wanted).all() and not sets[name].consistent.any() for name in small.TRAIN)
@@ -253,16 +255,16 @@ def test_any_subset_of_the_objects_goes_and_the_others_stay(tmp_path):
     """Two squares side by side with masks of their own, and one set of Gaussians."""
     poses, fit, labels = small.write(tmp_path, NEAR)
     first = labels & (load_ply(fit / "gaussians.ply").means[:, 0] < 0)
-    for path in sorted((poses / "masks").glob("*.png")):
+    for path in sorted((tmp_path / "raw_masks/masks").glob("*.png")):
         mask, half = load_mask(path), split_at(path.stem)
         for name, part in (("left", half), ("right", ~half)):
-            save_mask(poses / "masks" / name / path.name, mask & part)
+            save_mask(tmp_path / "raw_masks/masks" / name / path.name, mask & part)
         path.unlink()
     found = {}
     for remove in (None, ["left"], ["right"], ["left", "right"]):
         out = tmp_path / f"masks-{remove}"
         out.mkdir()
-        run(Params(remove=remove), out, poses=poses, fit=fit)
+        run(Params(remove=remove), out, poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fit)
         found[str(remove)] = load_labels(out / "labels.npy"), load_json(out / "facts.json")["kept"]
     everything, left, right, both = found.values()
     assert torch.equal(everything[0], both[0]) and everything[1] == both[1] == []

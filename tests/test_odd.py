@@ -9,7 +9,7 @@ import pytest
 import small_scene
 
 from reffusion.capture.checks import odd
-from reffusion.capture.checks.odd import oddities
+from reffusion.capture.checks.odd import odd_exposures, odd_masks
 from reffusion.geometry import pixel_rays
 from reffusion.io.arrays import save_json
 from reffusion.io.images import image_size
@@ -24,11 +24,11 @@ def brought(tmp_path_factory):
     folder = tmp_path_factory.mktemp("odd")
     poses, _, _ = small_scene.write(folder, 1.5)
     scene = load_scene(poses)
-    return scene, load_raw_masks(poses, scene.train), load_views(poses, scene.cameras)
+    return scene, load_raw_masks(folder / "raw_masks", scene.train), load_views(poses, scene.cameras)
 
 
 def said(scene, masks, pictures) -> str:
-    return "; ".join(oddities(scene, masks, pictures.__getitem__))
+    return "; ".join([*odd_masks(scene, masks), *odd_exposures(scene, pictures.__getitem__)])
 
 
 def test_nothing_is_odd_about_a_good_capture(brought):
@@ -85,10 +85,10 @@ def test_exposure_that_jumps(brought):
 def test_the_sheet_shows_every_mask_over_its_photograph(tmp_path, brought):
     _, masks, _ = brought
     poses, _, _ = small_scene.write(tmp_path / "wall", 1.5)
-    save_json(poses / "warnings.json", ["the mask of a3 is odd"])
+    save_json(tmp_path / "wall/raw_masks/warnings.json", ["the mask of a3 is odd"])
     path, lines = check.make(tmp_path / "wall")
     assert lines == ["the mask of a3 is odd"] and image_size(path)[0] > 3 * check.WIDTH
-    shown = check.tinted(poses, "a3")
+    shown = check.tinted(poses, tmp_path / "wall/raw_masks", "a3")
     assert shown.shape[:2] == (180, 240)
     assert (np.abs(shown.astype(int) - check.TINT).sum(-1) < 300).mean() > 0.5 * masks["a3"].mean()
 
@@ -102,6 +102,6 @@ def test_check_says_how_structure_from_motion_went(tmp_path, monkeypatch, capsys
     assert lines[0] == "structure from motion: 3 of 4 photographs" and "nothing odd" in lines[1]
 
 
-def test_the_sheet_needs_the_stage_poses(tmp_path):
-    with pytest.raises(ValueError, match=r"run `make scene=x poses` first"):
+def test_the_sheet_needs_the_stage_raw_masks(tmp_path):
+    with pytest.raises(ValueError, match=r"run `make scene=x raw_masks` first"):
         check.make(tmp_path / "x")

@@ -30,7 +30,7 @@ def ready(tmp_path_factory):
     higher = torch.zeros(len(gaussians), 3, 3)
     save_ply(fitted / "gaussians.ply", replace(gaussians, sh=torch.cat([gaussians.sh, higher], 1)))
     (home / "masks").mkdir()
-    masks.run(masks.Params(), home / "masks", poses=poses, fit=fitted)
+    masks.run(masks.Params(), home / "masks", poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fitted)
     hole = load_mask_sets(home / "masks", ["a2"])["a2"].invent
     save_references(home / "reference", [Reference(small.CAMERAS["a2"], small.photo(small.CAMERAS["a2"]), hole)])
     return SimpleNamespace(home=home, poses=poses, fit=fitted)
@@ -61,7 +61,13 @@ def test_the_stand_in_refuses_what_cuda_refuses():
 
 @pytest.mark.parametrize("vote", ["weight", "count"])
 def test_masks_on_a_card(ready, tmp_path, vote):
-    run = lambda device, out: masks.run(masks.Params(device=device, vote=vote), out, poses=ready.poses, fit=ready.fit)
+    run = lambda device, out: masks.run(
+        masks.Params(device=device, vote=vote),
+        out,
+        poses=ready.poses,
+        raw_masks=ready.poses.with_name("raw_masks"),
+        fit=ready.fit,
+    )
     cpu, cuda = both(tmp_path, run)
     assert torch.equal(load_labels(cpu / "labels.npy"), load_labels(cuda / "labels.npy"))
     before, after = (load_mask_sets(folder, small.TRAIN) for folder in (cpu, cuda))

@@ -28,12 +28,12 @@ from runner.resolve import Request, resolve
 
 ROOT = Path(__file__).resolve().parent.parent
 STAGES = {
-    "masks": ("poses", "fit"),
+    "masks": ("poses", "raw_masks", "fit"),
     "reference": ("scene", "poses", "fit", "masks"),
-    "personalize": ("poses", "reference"),
+    "personalize": ("poses", "raw_masks", "reference"),
     "initialize": ("poses", "fit", "masks", "reference"),
     "distill": ("poses", "fit", "masks", "reference", "personalize", "initialize"),
-    "evaluate": ("poses", "fit", "masks", "reference", "personalize", "initialize", "distill"),
+    "evaluate": ("poses", "raw_masks", "fit", "masks", "reference", "personalize", "initialize", "distill"),
 }
 # All that differs from the profile: sizes and numbers of steps; where to compute, and where the weights lie.
 SIZES = {
@@ -99,7 +99,7 @@ def parameters(weights: Path) -> dict[str, Settings]:
 def made(tmp_path_factory):
     """Every stage's folder."""
     home = tmp_path_factory.mktemp("paper")
-    paths = {name: home / name for name in ("scene", "poses", "fit", *STAGES)}
+    paths = {name: home / name for name in ("scene", "poses", "raw_masks", "fit", *STAGES)}
     for name, shape in (("sd2", full_size.SD2), ("sdxl", full_size.SDXL)):
         prior = full_size.build(full_size.shrunk(shape), torch.float32)
         pipeline(replace(prior, zero_empty=True)).save_pretrained(home / name)

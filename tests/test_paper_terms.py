@@ -94,7 +94,13 @@ def test_a_clean_view_can_be_a_reference(tmp_path):
     small.write_photos(paths["scene"], poses, small.CAMERAS)
     for name in ("masks", "reference", "initialize"):
         paths[name].mkdir()
-    masks.run(masks.Params(invent="consistent"), paths["masks"], poses=poses, fit=fitted)
+    masks.run(
+        masks.Params(invent="consistent"),
+        paths["masks"],
+        poses=poses,
+        raw_masks=poses.with_name("raw_masks"),
+        fit=fitted,
+    )
     given = {"view": "a2", "image": "images/a2.png"}
     asked = reference.Params(reference=given)
     reference.run(asked, paths["reference"], **{k: paths[k] for k in ("scene", "poses", "fit", "masks")})

@@ -201,7 +201,7 @@ def test_what_was_deleted_stands_for_votes(tmp_path):
     folder, fit, labels = small.write(tmp_path, NEAR, masks={})
     save_labels(folder / "deleted.npy", labels)
     (out := tmp_path / "masks").mkdir()
-    masks.run(masks.Params(), out, poses=folder, fit=fit)
+    masks.run(masks.Params(), out, poses=folder, raw_masks=folder.with_name("raw_masks"), fit=fit)
     assert (load_labels(out / "labels.npy") | ~labels).all()
     found = load_mask_sets(out, small.CAMERAS)
     for name in small.TRAIN:
@@ -218,7 +218,7 @@ def test_gaussians_in_another_frame_than_the_cameras_are_refused(tmp_path, moved
         save_ply(path / "gaussians.ply", shifted)
     save_labels(folder / "deleted.npy", labels)
     with pytest.raises(ValueError, match=r"`gaussians` of scene\.yaml: .* in another frame"):
-        masks.run(masks.Params(), tmp_path, poses=folder, fit=fit)
+        masks.run(masks.Params(), tmp_path, poses=folder, raw_masks=folder.with_name("raw_masks"), fit=fit)
 
 
 # ---------------------------------------------------------------------------------------------- what is given back

@@ -87,6 +87,7 @@ def placed(folder: Path, **params) -> tuple[Path, list[str]]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         poses.run(Params(**params), out, scene=folder)
+    out.with_name("raw_masks").mkdir(exist_ok=True)
     said = out / "warnings.json"
     return out, json.loads(said.read_text()) if said.exists() else []
 

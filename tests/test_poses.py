@@ -25,6 +25,7 @@ from small_capture import (
     prepare,
     reprojection_error,
     run,
+    run_stages,
     some_truth,
     write_masks,
     write_model,
@@ -45,8 +46,9 @@ from reffusion.io.images import image_size
 from reffusion.io.ply import load_ply, save_ply, save_points
 from reffusion.io.scene import load_fill, load_raw_masks, load_scene, load_test_masks, load_views, objects_of
 from reffusion.types import Gaussians
-from stages import fit, poses
+from stages import fit, poses, raw_masks
 from stages.plan import poses as plan
+from stages.plan import raw_masks as raw_masks_plan
 
 CAPTURES = Path(__file__).parents[2] / "shared" / "data"
 
@@ -166,8 +168,8 @@ def test_masks_of_what_is_to_be_filled(tmp_path):
     asked = {"fill": "new", "train": ["v00", "v01", "v02", "v03"]}
     scene, out = run(folder, **asked)
     assert sorted(load_fill(out)) == list(scene.train) and not load_raw_masks(out, scene.train)
-    read = plan.scene_files(poses.Params(**asked), folder, sorted(folder.rglob("*.*")))
-    assert folder / "new/v02.png" in read
+    params, files = raw_masks.Params(**asked), sorted(folder.rglob("*.*"))
+    assert folder / "new/v02.png" in raw_masks_plan.scene_files(params, folder, files)
     (folder / "new/v02.png").unlink()
     with pytest.raises(BadInput, match="new: no mask for 1 of 4 training views, 'v02' for one"):
         plan.preview(poses.Params(**asked), folder)
@@ -421,7 +423,7 @@ def test_a_sphere_on_an_optical_axis_is_filled_or_masks_what_lies_beyond(tmp_pat
 def test_preview_is_light_and_says_what_will_happen(tmp_path):
     write_spin_nerf(tmp_path / "s", full=False)
     notes = plan.preview(poses.Params(), tmp_path / "s")
-    assert notes[0] == "4 training and 2 test views, 4 masks"
+    assert notes[0] == "4 training and 2 test views"
     assert notes[1] == f"SfM left out: {Path('sparse/0/images.bin')} brings poses"
     assert notes[2].startswith("undistortion: SIMPLE_RADIAL k1=0.05 moves the border by up to ")
     prepare(tmp_path / "t", "transforms", some_truth())
@@ -430,7 +432,8 @@ def test_preview_is_light_and_says_what_will_happen(tmp_path):
     write_masks(tmp_path / "p" / "masks", ["a", "b", "c"])
     assert "SfM: 3 photos bring no poses" in plan.preview(poses.Params(), tmp_path / "p")
     code = (
-        "import sys, pathlib, stages.plan.poses as p; p.preview(p.Params(), pathlib.Path(sys.argv[1])); "
+        "import sys, pathlib, stages.plan.poses as p, stages.plan.raw_masks as m; scene = pathlib.Path(sys.argv[1]); "
+        "p.preview(p.Params(), scene); m.preview(m.Params(), scene=scene); "
         "sys.exit(bool({'torch', 'cv2', 'scipy'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", code, str(tmp_path / "s")]).returncode == 0
@@ -447,7 +450,7 @@ def capture(name: str) -> Path:
 
 def real(tmp_path: Path, name: str, **params):
     (tmp_path / "out").mkdir(parents=True)
-    poses.run(poses.Params(**params), tmp_path / "out", scene=capture(name))
+    run_stages(capture(name), tmp_path / "out", **params)
     return load_scene(tmp_path / "out"), tmp_path / "out"
 
 
@@ -501,7 +504,7 @@ def test_fox(tmp_path):
     assert (camera.width, camera.height) == (135, 240)
     assert 100 < len(scene.points) <= 10_000, "it brings none, these are of flow"
     notes = plan.preview(poses.Params(masks="none", test="every 8"), capture("fox"))
-    assert "43 training and 7 test views, 0 masks" in notes and any("OPENCV k1=0.05784" in n for n in notes)
+    assert "43 training and 7 test views" in notes and any("OPENCV k1=0.05784" in n for n in notes)
 
 
 def test_statue_has_its_cameras_adjusted(tmp_path, monkeypatch):

@@ -415,7 +415,7 @@ def test_a_new_reference_reruns_nothing_before_its_stage(tmp_path):
         return {stage: each.word for stage, each in plan(job, job.pipeline.closure("reference")).items()}
 
     def only_the_reference_changed() -> bool:
-        return words() == {"poses": "cached", "fit": "cached", "masks": "cached", "reference": "run"}
+        return words() == dict.fromkeys(("poses", "raw_masks", "fit", "masks"), "cached") | {"reference": "run"}
 
     run_scene(request, "reference")
     home = tmp_path / "runs" / "wall"
@@ -443,13 +443,42 @@ def test_a_new_reference_reruns_nothing_before_its_stage(tmp_path):
     assert not home.exists() and (folder / "painted" / f"{view}.png").is_file()
 
 
+def test_saved_masks_rerun_neither_poses_nor_the_fit(tmp_path):
+    folder = capture(tmp_path / "wall")
+    masks = {path: path.read_bytes() for path in (folder / "masks").iterdir()}
+    request = Request(ROOT, tmp_path / "runs", str(folder), profile="laptop", set=SMALL)
+
+    def words() -> dict[str, str]:
+        job = prepare_job(request)
+        return {stage: each.word for stage, each in plan(job, job.pipeline.closure("masks")).items()}
+
+    before = dict.fromkeys(("poses", "fit"), "cached")
+    (folder / "scene.yaml").write_text("masks: none\n")
+    shutil.rmtree(folder / "masks")
+    run_scene(request, "masks")
+    assert words() == before | {"raw_masks": "cached", "masks": "skip"}
+    (folder / "masks").mkdir()
+    (folder / "scene.yaml").unlink()
+    for path, content in masks.items():
+        path.write_bytes(content)
+    assert words() == before | {"raw_masks": "run", "masks": "undecided"}
+    run_scene(request, "masks")
+    last = max(masks)
+    save_mask(last, np.roll(load_image(last)[..., 0] > 0, 2, 0))
+    assert words() == before | {"raw_masks": "run", "masks": "undecided"}
+    last.unlink()  # a view without a mask is a training view all the same
+    assert words() == before | {"raw_masks": "run", "masks": "undecided"}
+    (folder / "scene.yaml").write_text("test: [a0]\n")
+    assert words()["poses"] == "run"
+
+
 def test_a_photograph_that_is_also_a_reference_still_counts_for_poses(tmp_path):
     folder = prepare(tmp_path / "s", "transforms", some_truth())
     write_pictures(folder, ["ref"])
     (folder / "scene.yaml").write_text("")
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     read = plan_poses.scene_files(poses.Params(), folder, files)
-    assert folder / "images/v00.png" in read and folder / "masks/v00.png" in read and folder / "transforms.json" in read
+    assert folder / "images/v00.png" in read and folder / "transforms.json" in read
     assert folder / "ref.png" not in read and folder / "scene.yaml" not in read
     of_reference = plan_reference.scene_files(reference.Params(**named("v00", "images/v00.png")), folder, files)
     assert of_reference == [folder / "images/v00.png"]

@@ -46,7 +46,7 @@ def ready(tmp_path_factory):
     folders = {"poses": poses, "fit": fitted, "masks": home / "masks", "reference": home / "reference"}
     for name in ("masks", "initialize"):
         (home / name).mkdir()
-    masks.run(masks.Params(), home / "masks", poses=poses, fit=fitted)
+    masks.run(masks.Params(), home / "masks", poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fitted)
     view = small.CAMERAS["a2"]
     save_references(
         folders["reference"],
@@ -71,6 +71,7 @@ def run(stage: str, ready, out: Path, **changed) -> Path:
             personalize.Params(**{**PERSONALIZE, "prior": ready.prior, **changed}),
             out,
             poses=ready.poses,
+            raw_masks=ready.home / "raw_masks",
             reference=ready.reference,
         )
     else:

@@ -232,7 +232,7 @@ def scene(tmp_path_factory):
     poses, fitted, _ = small.write(folder, NEAR)
     found = {"poses": poses, "fit": fitted, "masks": folder / "masks"}
     found["masks"].mkdir()
-    masks.run(masks.Params(), found["masks"], poses=poses, fit=fitted)
+    masks.run(masks.Params(), found["masks"], poses=poses, raw_masks=poses.with_name("raw_masks"), fit=fitted)
     return found
 
 
@@ -341,7 +341,13 @@ def test_the_chain_of_lifted_pictures(scene, painted, tmp_path, monkeypatch):
     out = tmp_path / "evaluate"
     out.mkdir()
     evaluate.run(
-        evaluate.Params(), out, **scene, initialize=chain["initialize"], distill=tmp_path / "mse", lift=painted
+        evaluate.Params(),
+        out,
+        **scene,
+        raw_masks=scene["poses"].with_name("raw_masks"),
+        initialize=chain["initialize"],
+        distill=tmp_path / "mse",
+        lift=painted,
     )
     summary = load_json(out / "metrics.json")
     assert summary["inpainter"].startswith("OpenCV") and summary["perceptual"] is None
@@ -352,8 +358,10 @@ def test_the_chain_of_lifted_pictures(scene, painted, tmp_path, monkeypatch):
 def test_rendered_views_inpainted_in_2d(scene, tmp_path):
     (tmp_path / "fit").mkdir()
     (tmp_path / "inpainted").mkdir()
-    evaluate.run(evaluate.Params(), tmp_path / "fit", **scene)
-    evaluate.run(evaluate.Params(inpaint=True), tmp_path / "inpainted", **scene)
+    evaluate.run(evaluate.Params(), tmp_path / "fit", **scene, raw_masks=scene["poses"].with_name("raw_masks"))
+    evaluate.run(
+        evaluate.Params(inpaint=True), tmp_path / "inpainted", **scene, raw_masks=scene["poses"].with_name("raw_masks")
+    )
     before, after = (load_json(tmp_path / n / "metrics.json") for n in ("fit", "inpainted"))
     assert before["inpainter"] is None and after["inpainter"].startswith("OpenCV") and after["result"] == "fit"
     assert after["mean"]["psnr_box"] > before["mean"]["psnr_box"] + 5, "the red square is still there"
@@ -372,13 +380,13 @@ def test_the_masked_fit_never_sees_a_masked_pixel(scene, tmp_path):
     found = []
     for seed in (0, 1):
         poses = small.write(tmp_path / f"scene{seed}", NEAR)[0]
-        for name, mask in load_raw_masks(poses, small.TRAIN).items():
+        for name, mask in load_raw_masks(poses.with_name("raw_masks"), small.TRAIN).items():
             noise = np.random.default_rng(seed).integers(0, 256, (*mask.shape, 3), np.uint8)
             picture = np.where(mask[..., None], noise, small.photo(small.CAMERAS[name]))
             save_image(poses / "images" / f"{name}.png", picture)
         out = tmp_path / f"fit{seed}"
         out.mkdir()
-        fit.run(params, out, poses=poses)
+        fit.run(params, out, poses=poses, raw_masks=poses.with_name("raw_masks"))
         found.append((out / "gaussians.ply").read_bytes())
     assert found[0] == found[1]
     means = load_ply(out / "gaussians.ply").means
@@ -388,7 +396,7 @@ def test_the_masked_fit_never_sees_a_masked_pixel(scene, tmp_path):
 def test_a_masked_fit_needs_masks_and_fits_a_scene_that_brings_gaussians(scene, tmp_path):
     poses = small.write(tmp_path, NEAR, masks={})[0]
     with pytest.raises(ValueError, match=r"fit.pixels is 'unmasked', but the scene has no masks"):
-        fit.run(fit.Params(iterations=1, pixels="unmasked"), tmp_path, poses=poses)
+        fit.run(fit.Params(iterations=1, pixels="unmasked"), tmp_path, poses=poses, raw_masks=tmp_path / "raw_masks")
     save_ply(poses / "gaussians.ply", small.gaussians(NEAR)[0])
     assert plan_fit.preview(fit.Params(), poses=poses)
     assert not plan_fit.preview(fit.Params(pixels="unmasked"), poses=poses)
@@ -396,7 +404,8 @@ def test_a_masked_fit_needs_masks_and_fits_a_scene_that_brings_gaussians(scene, 
 
 def test_the_box_is_the_test_masks_whatever_was_left_out(scene, tmp_path):
     view, given = small.CAMERAS["a1"], load_mask(scene["masks"] / "consistent" / "a1.png")
-    raw = load_raw_masks(scene["poses"], ["a1"])["a1"]
-    assert (evaluate.mask_of(view, scene["poses"], scene["masks"]) == given).all()
-    assert (evaluate.mask_of(view, scene["poses"], None) == raw).all()
-    assert not evaluate.mask_of(small.CAMERAS["t0"], scene["poses"], None).any()
+    raw_masks = scene["poses"].with_name("raw_masks")
+    raw = load_raw_masks(raw_masks, ["a1"])["a1"]
+    assert (evaluate.mask_of(view, raw_masks, scene["masks"]) == given).all()
+    assert (evaluate.mask_of(view, raw_masks, None) == raw).all()
+    assert not evaluate.mask_of(small.CAMERAS["t0"], raw_masks, None).any()

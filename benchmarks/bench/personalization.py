@@ -49,7 +49,7 @@ def diagram(run: Path, out: Path) -> Diagram:
     if not (run / "reference" / "receipt.json").exists():
         raise ValueError(f"{run}/reference is missing: run `make scene={run.name} reference` first")
     usual = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"]["personalize"]
-    given = {name: run / name for name in ("poses", "reference")}
+    given = {name: run / name for name in ("poses", "raw_masks", "reference")}
     choices = [("steps", {"steps": n}) for n in STEPS]
     choices += [("rank, 200 steps", {"steps": 200, "lora": {"rank": n, "alpha": n}}) for n in RANKS]
     rates = [{"lr_unet": r, "lr_text": r / 5} for r in RATES]

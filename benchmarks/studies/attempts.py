@@ -78,7 +78,7 @@ def test_views(run: Path) -> list[tuple]:
     for name in scene.test:
         camera = scene.cameras[name]
         truth = evaluate.truth_of(camera, run / "poses")
-        box = metrics.mask_box(evaluate.mask_of(camera, run / "poses", run / "masks"))
+        box = metrics.mask_box(evaluate.mask_of(camera, run / "raw_masks", run / "masks"))
         if truth is not None and box is not None:
             found.append((camera, truth, box))
     if not found:

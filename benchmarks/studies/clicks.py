@@ -54,9 +54,9 @@ def clicked(image: np.ndarray, true: np.ndarray, most: int, relief: np.ndarray) 
 def measured(run: Path, most: int, sheet: Path | None) -> str:
     """A line of figures; ValueError where the run has no masks."""
     scene = load_scene(run / "poses")
-    true = load_raw_masks(run / "poses", scene.train)
+    true = load_raw_masks(run / "raw_masks", scene.train)
     if not true:
-        raise ValueError(f"{run / 'poses/masks'}: no masks to compare with")
+        raise ValueError(f"{run / 'raw_masks/masks'}: no masks to compare with")
     names = sorted(true)
     view, images = names[len(names) // 2], load_views(run / "poses", names)
     gaussians = load_ply(run / "fit/gaussians.ply")

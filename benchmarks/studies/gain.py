@@ -43,7 +43,7 @@ def measured(run: Path) -> dict:
         raise ValueError(f"{run}: no test view has ground truth and a mask")
     energies: dict[str, list[tuple[float, float]]] = {"truth": [], **{way: [] for way in WAYS}}
     for name in scene.test:
-        mask = evaluate.mask_of(scene.cameras[name], stage_folder(run, "poses"), stage_folder(run, "masks"))
+        mask = evaluate.mask_of(scene.cameras[name], stage_folder(run, "raw_masks"), stage_folder(run, "masks"))
         left, top, right, bottom = metrics.mask_box(mask)
         box = np.zeros_like(mask)
         box[top:bottom, left:right] = True
@@ -91,7 +91,7 @@ def sheet(run: Path, path: Path) -> None:
         pictures = [load_image(run / "evaluate" / folder / f"{name}.png") for folder in folders]
         pictures.append(evaluate.truth_of(camera, stage_folder(run, "poses")))
         left, top, right, bottom = metrics.mask_box(
-            evaluate.mask_of(camera, stage_folder(run, "poses"), stage_folder(run, "masks")), 0.3
+            evaluate.mask_of(camera, stage_folder(run, "raw_masks"), stage_folder(run, "masks")), 0.3
         )
         rows.append([enlarged(picture[top:bottom, left:right], ENLARGE) for picture in pictures])
     height, width = (max(cell.shape[axis] for row in rows for cell in row) for axis in (0, 1))

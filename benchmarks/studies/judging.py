@@ -50,7 +50,7 @@ class Run:
     def mask(self, name: str) -> np.ndarray:
         """bool [H, W]: where the object is: the test mask of a test view, else the consistent mask."""
         masks = self.folder / "masks"
-        return evaluate.mask_of(self.scene.cameras[name], self.folder / "poses", masks if masks.exists() else None)
+        return evaluate.mask_of(self.scene.cameras[name], self.folder / "raw_masks", masks if masks.exists() else None)
 
     def gaussians(self) -> Gaussians:
         """The result."""

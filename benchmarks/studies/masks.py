@@ -57,10 +57,9 @@ def perturbed(mask: np.ndarray, random: np.random.Generator) -> np.ndarray:
     return away <= distance if way == "dilate" else away > distance
 
 
-def with_masks(poses: Path, given: dict[str, np.ndarray], folder: Path) -> Path:
-    """A copy of the `poses` artifact that has these masks and no others."""
+def save_raw_masks(given: dict[str, np.ndarray], folder: Path) -> Path:
+    """The folder, as the stage `raw_masks` leaves it with these masks and no others."""
     shutil.rmtree(folder, ignore_errors=True)
-    shutil.copytree(poses, folder, ignore=shutil.ignore_patterns("masks"))
     for name, mask in given.items():
         save_mask(folder / "masks" / f"{name}.png", mask)
     return folder
@@ -91,7 +90,7 @@ def scores(made: Path, scene: Scene, truth: dict[str, dict[str, np.ndarray]]) ->
 def measure(scene_folder: Path, run: Path, out: Path, seed: int) -> dict[str, dict[str, dict[str, float]]]:
     """Kind of input -> kind of mask -> mean and worst IoU; the masks made are kept in `out`."""
     scene = load_scene(run / "poses")
-    exact = load_raw_masks(run / "poses", scene.train)
+    exact = load_raw_masks(run / "raw_masks", scene.train)
     cameras = [scene.cameras[name] for name in scene.train]
     truth = {"consistent": exact, "undecided": true_never_seen(scene_folder, cameras)}
     random = np.random.default_rng(seeding.seed_for(seed, "perturbed masks"))
@@ -103,7 +102,8 @@ def measure(scene_folder: Path, run: Path, out: Path, seed: int) -> dict[str, di
         made = out / kind
         shutil.rmtree(made, ignore_errors=True)
         made.mkdir(parents=True)
-        masks_stage.run(params, made, poses=with_masks(run / "poses", given, out / f"poses-{kind}"), fit=run / "fit")
+        raw_masks = save_raw_masks(given, out / f"raw_masks-{kind}")
+        masks_stage.run(params, made, poses=run / "poses", raw_masks=raw_masks, fit=run / "fit")
         results[kind] = scores(made, scene, truth)
     results["perturbed"]["input"] = {"together": iou(list(noisy.values()), [exact[n] for n in noisy])}
     return results

@@ -173,7 +173,7 @@ def renders(parts: tuple[Path, ...], placed: Scene, similarity: Similarity) -> d
 def box_psnr(pictures: dict[str, np.ndarray], run: Path, placed: Scene) -> float:
     values = []
     for name, picture in pictures.items():
-        box = metrics.mask_box(load_mask(run / "poses" / "test_masks" / f"{name}.png"))
+        box = metrics.mask_box(load_mask(run / "raw_masks" / "test_masks" / f"{name}.png"))
         values.append(metrics.psnr(box.crop(picture), box.crop(load_image(run / "poses" / "images" / f"{name}.png"))))
     return float(np.mean(values))
 

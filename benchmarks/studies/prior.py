@@ -108,7 +108,7 @@ def scene_cases(run: Path, size: int, pictures: dict[str, np.ndarray] | None = N
     found = {}
     for name in scene.test:
         truth = evaluate.truth_of(scene.cameras[name], run / "poses")
-        hole = evaluate.mask_of(scene.cameras[name], run / "poses", run / "masks")
+        hole = evaluate.mask_of(scene.cameras[name], run / "raw_masks", run / "masks")
         if truth is not None and hole.any():
             found[name] = Case(truth if pictures is None else pictures[name], hole, name)
     if not found:

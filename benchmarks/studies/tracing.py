@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 STAGES = {
     "fit": (fit, "iterations", ("poses",), (2, FIRST_MOMENT)),
-    "personalize": (personalize, "steps", ("poses", "reference"), (1, 1)),
+    "personalize": (personalize, "steps", ("poses", "raw_masks", "reference"), (1, 1)),
     "distill": (distill, "iterations", ("poses", "fit", "masks", "reference", "personalize", "initialize"), (4, 1)),
 }
 ALLOWED = 0.03

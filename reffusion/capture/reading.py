@@ -1,4 +1,4 @@
-"""A scene folder read as the parameters of `poses` say."""
+"""A scene folder read as the keys of scene.yaml say."""
 
 from __future__ import annotations
 
@@ -11,21 +11,28 @@ from reffusion.capture.layouts.cameras import has_pictures
 from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.layouts.mask_files import objects_of_masks
 from reffusion.capture.lens import without_distortion
-from reffusion.capture.load import load_capture
+from reffusion.capture.load import LONGEST, load_capture
 from reffusion.capture.names import list_pictures
 from reffusion.capture.roles import Roles, load_roles
 from reffusion.capture.views import known
 from reffusion.io.files import BadInput, there
 from reffusion.io.splats import load_splats, summarize
-from reffusion.params.poses import Params
+from reffusion.params.capture import SceneKeys
 
 
-def read_scene(params: Params, scene: Path) -> tuple[Capture, Roles]:
-    """The capture and its views' roles; BadInput naming the file and the remedy where one is wrong."""
+def read_scene(params: SceneKeys, scene: Path, longest: int = LONGEST) -> tuple[Capture, Roles]:
+    """The capture and its views' roles.
+
+    Args:
+        longest: larger image side in px that is asked for, see `load_capture`; no role depends on it.
+
+    Raises:
+        BadInput: naming the file and the remedy where one is wrong.
+    """
     references = frozenset(
         scene / name for each in listed(params.reference) for name in (each.image, each.depth) if name is not None
     )
-    capture = load_capture(scene, params.layout, params.images, params.longest, references)
+    capture = load_capture(scene, params.layout, params.images, longest, references)
     roles = load_roles(
         scene,
         capture,
@@ -50,7 +57,7 @@ def read_scene(params: Params, scene: Path) -> tuple[Capture, Roles]:
     return capture, roles
 
 
-def _exclude(params: Params, capture: Capture, roles: Roles) -> tuple[Capture, Roles]:
+def _exclude(params: SceneKeys, capture: Capture, roles: Roles) -> tuple[Capture, Roles]:
     """The capture and its roles without the views that the scene excludes."""
     excluded, kept = ({known(n, capture.pictures, key) for n in getattr(params, key)} for key in ("exclude", "keep"))
     if both := sorted(excluded & kept):
@@ -62,7 +69,7 @@ def _exclude(params: Params, capture: Capture, roles: Roles) -> tuple[Capture, R
     return replace(capture, pictures=pictures), roles.among(set(pictures))
 
 
-def check_brought(params: Params, scene: Path) -> list[str]:
+def check_brought(params: SceneKeys, scene: Path) -> list[str]:
     """What reading the Gaussians that the scene brings will change in them; BadInput where they cannot be used: both as
     far as their headers tell."""
     counts, notes = {}, []
@@ -90,7 +97,7 @@ def check_brought(params: Params, scene: Path) -> list[str]:
     return notes
 
 
-def unphotographed(params: Params, scene: Path) -> bool:
+def unphotographed(params: SceneKeys, scene: Path) -> bool:
     """Are there no photographs, and a cleaned scene whose renders can stand for them? BadInput for a key that is about
     photographs."""
     named = [each.image for each in listed(params.reference)]

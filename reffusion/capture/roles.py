@@ -13,7 +13,7 @@ from reffusion.capture.names import list_pictures
 from reffusion.capture.views import Views, check_proportions, known
 from reffusion.io.files import BadInput
 from reffusion.io.images import WHITE, MaskValues, image_size
-from reffusion.params.poses import Masks
+from reffusion.params.capture import Masks
 
 LEAST_TRAINING_VIEWS = 3  # but for a scene with views that are cameras only
 OTHERS = "others"

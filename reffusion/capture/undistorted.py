@@ -33,34 +33,42 @@ def lens_of(name: str, capture: Capture, longest: int) -> tuple[Lens, Lens]:
     return lens, undoing(lens)[0]
 
 
-def save_undistorted(out: Path, name: str, capture: Capture, roles: Roles, longest: int) -> tuple[Lens, Lens]:
-    """Write the view's image and masks, all in the same pinhole.
-
-    Writes images/, masks/, test_masks/, fill/<view>.png; the last three where the view has one, of objects that are
-    told apart masks/<object>/<view>.png.
+def save_undistorted(out: Path, name: str, capture: Capture, longest: int) -> tuple[Lens, Lens]:
+    """Write the view's picture as a pinhole shows it, images/<view>.png.
 
     Returns:
         the photograph's lens at this size, and the pinhole.
 
     Raises:
-        BadInput: naming the file, where one is unreadable, or its lens cannot be undone.
+        BadInput: naming the file, where it is unreadable, or its lens cannot be undone.
     """
     image = load_at(capture.pictures[name], longest, capture.upright)
-    size = image.shape[1], image.shape[0]
-    lens = capture.poses.lenses[name].resized(*size)
+    lens = capture.poses.lenses[name].resized(image.shape[1], image.shape[0])
     try:
         pinhole, where = undoing(lens)
     except ValueError as error:
         raise BadInput(f"{capture.brought_by or capture.pictures[name]}: view '{name}': {error}") from error
     save_image(out / "images" / f"{name}.png", image if where is None else undistort_image(image, where))
+    return lens, pinhole
+
+
+def save_undistorted_masks(out: Path, name: str, roles: Roles, lens: Lens) -> None:
+    """Write the view's masks as its undistorted picture lies: masks/, test_masks/ and fill/<view>.png, those that the
+    view has; of several objects masks/<object>/<view>.png.
+
+    Args:
+        lens: of the view's photograph, see `reffusion.capture.lenses`.
+
+    Raises:
+        BadInput: naming the file, where it is unreadable.
+    """
     masks = {f"masks/{thing}": files for thing, files in roles.masks.items()}
     own = {path for files in masks.values() for path in files.values()}
     for folder, files in (*masks.items(), ("test_masks", roles.test_masks), ("fill", roles.fill)):
         if name in files:
             values = roles.values if files[name] in own else WHITE
-            mask = load_mask(files[name], (size[1], size[0]), values)
+            mask, where = load_mask(files[name], (lens.height, lens.width), values), undoing(lens)[1]
             save_mask(out / folder / f"{name}.png", mask if where is None else undistort_mask(mask, where))
-    return lens, pinhole
 
 
 def check_masks(masks: Mapping[str, Path], values: MaskValues = WHITE) -> None:

@@ -1,7 +1,7 @@
 """The artifacts of the stages: scenes, views, masks and references.
 
-Layout of the folder `poses` leaves behind: images/<view>.png, masks/<view>.png, test_masks/<view>.png,
-sparse/0/*.bin, transform.json, views.json, lenses.json.
+`poses` writes images/<view>.png, sparse/0/*.bin, transform.json, views.json and lenses.json; `raw_masks` writes
+masks/<view>.png (with several objects masks/<object>/<view>.png), test_masks/<view>.png and fill/<view>.png.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from reffusion.types import MaskSet, Reference, Scene
 
+WARNINGS = "warnings.json"  # in either folder: sentences about what is odd
 PIXEL_CLASSES = ("raw", "consistent", "undecided", "invent")
 
 
@@ -82,39 +83,45 @@ def has_photograph(poses_dir: Path, name: str) -> bool:
     return (Path(poses_dir) / "images" / f"{name}.png").exists()
 
 
-def objects_of(poses_dir: Path) -> list[str]:
+def load_warnings(folder: Path) -> list[str]:
+    """What is odd, as `poses` or `raw_masks` wrote it, a sentence each."""
+    path = Path(folder) / WARNINGS
+    return load_json(path) if path.is_file() else []
+
+
+def objects_of(raw_masks_dir: Path) -> list[str]:
     """The objects that masks tell apart, sorted."""
-    return sorted(path.name for path in (Path(poses_dir) / "masks").glob("[!.]*") if path.is_dir())
+    return sorted(path.name for path in (Path(raw_masks_dir) / "masks").glob("[!.]*") if path.is_dir())
 
 
-def raw_mask_files(poses_dir: Path, name: str, objects: Sequence[str] | None = None) -> list[Path]:
+def raw_mask_files(raw_masks_dir: Path, name: str, objects: Sequence[str] | None = None) -> list[Path]:
     """The view's masks: one, or where objects are told apart one for each of `objects` (None: all) that has one."""
-    folder = Path(poses_dir) / "masks"
-    told = objects_of(poses_dir) if objects is None else objects
+    folder = Path(raw_masks_dir) / "masks"
+    told = objects_of(raw_masks_dir) if objects is None else objects
     return [path for path in (folder / thing / f"{name}.png" for thing in told or [""]) if path.is_file()]
 
 
 def load_raw_masks(
-    poses_dir: Path, names: Iterable[str], objects: Sequence[str] | None = None
+    raw_masks_dir: Path, names: Iterable[str], objects: Sequence[str] | None = None
 ) -> dict[str, np.ndarray]:
     """View name -> bool [H, W], True = the object; only the views that have a mask.
 
     Where objects are told apart, the union of those in `objects` (None: all), of views with a mask of each.
     """
-    objects = objects_of(poses_dir) if objects is None else objects
-    files = {name: raw_mask_files(poses_dir, name, objects) for name in names}
+    objects = objects_of(raw_masks_dir) if objects is None else objects
+    files = {name: raw_mask_files(raw_masks_dir, name, objects) for name in names}
     found = {name: paths for name, paths in files.items() if len(paths) == max(len(objects), 1)}
     return {name: np.logical_or.reduce([load_mask(path) for path in paths]) for name, paths in found.items()}
 
 
-def load_test_masks(poses_dir: Path) -> dict[str, np.ndarray]:
+def load_test_masks(raw_masks_dir: Path) -> dict[str, np.ndarray]:
     """Test view name -> bool [H, W], True = where the object would be seen; empty where the scene has none."""
-    return {path.stem: load_mask(path) for path in sorted((Path(poses_dir) / "test_masks").glob("*.png"))}
+    return {path.stem: load_mask(path) for path in sorted((Path(raw_masks_dir) / "test_masks").glob("*.png"))}
 
 
-def load_fill(poses_dir: Path) -> dict[str, np.ndarray]:
+def load_fill(raw_masks_dir: Path) -> dict[str, np.ndarray]:
     """Training view name -> bool [H, W], what is to be filled there; empty where the scene brings no such masks."""
-    return {path.stem: load_mask(path) for path in sorted((Path(poses_dir) / "fill").glob("*.png"))}
+    return {path.stem: load_mask(path) for path in sorted((Path(raw_masks_dir) / "fill").glob("*.png"))}
 
 
 def save_mask_sets(masks_dir: Path, sets: Mapping[str, MaskSet]) -> None:
@@ -132,10 +139,10 @@ def load_mask_sets(masks_dir: Path, names: Iterable[str]) -> dict[str, MaskSet]:
     return {name: MaskSet(*(load(kind, name) for kind in PIXEL_CLASSES)) for name in names}
 
 
-def shows_object(poses_dir: Path, masks_dir: Path | None, name: str) -> bool:
+def shows_object(raw_masks_dir: Path, masks_dir: Path | None, name: str) -> bool:
     """Has the view a raw mask: one that was given, or one made from clicks?"""
-    if raw_mask_files(poses_dir, name) or masks_dir is None:
-        return bool(raw_mask_files(poses_dir, name))
+    if raw_mask_files(raw_masks_dir, name) or masks_dir is None:
+        return bool(raw_mask_files(raw_masks_dir, name))
     made = Path(masks_dir) / "raw" / f"{name}.png"
     return made.is_file() and bool(load_mask(made).any())
 

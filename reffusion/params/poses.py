@@ -2,91 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from pydantic import Field
 
-from pydantic import Field, model_validator
-
-from reffusion.params.base import UNKEYED, Settings
-from reffusion.params.clicks import Clicked
-from reffusion.params.reference import Given
-
-Side = Annotated[float, Field(gt=0)]
+from reffusion.params.capture import SceneKeys
 
 
-class Region(Settings):
-    """A place in the scene's own frame and units: a box along its axes, or a sphere."""
-
-    center: tuple[float, float, float] | None = Field(None, description="its middle")
-    view: str | None = Field(None, description="instead of center: a view on whose optical axis the middle lies")
-    distance: Side | None = Field(None, description="with view: how far from its camera")
-    size: tuple[Side, Side, Side] | None = Field(None, description="side lengths of a box")
-    radius: Side | None = Field(None, description="instead of size: of a sphere")
-    outside: bool = Field(False, description="all that lies beyond the sphere is masked in every view")
-
-    @model_validator(mode="after")
-    def _whole(self) -> Self:
-        if (self.size is None) == (self.radius is None):
-            raise ValueError("give either the size of a box, or the radius of a sphere")
-        if (self.center is None) == (self.view is None) or (self.view is None) != (self.distance is None):
-            raise ValueError("give either its center, or a view and a distance along that view's optical axis")
-        if self.outside and self.radius is None:
-            raise ValueError("outside needs a sphere: give its radius")
-        return self
-
-
-class Masks(Settings):
-    """Where masks lie, and which numbers in them are the object."""
-
-    folder: str | None = Field(None, description="relative to the scene; None: the usual ones")
-    id: int | list[int] | None = Field(
-        None, description="of maps of object numbers, and of palettes: the numbers that are the object"
-    )
-
-    @property
-    def numbers(self) -> tuple[int, ...]:
-        return () if self.id is None else (self.id,) if isinstance(self.id, int) else tuple(self.id)
-
-
-class Params(Settings):
-    layout: Literal["llff", "colmap", "transforms", "photos"] | None = Field(None, description="None: recognised")
-    images: str | None = Field(None, description="folder of pictures, relative to the scene; None: the usual ones")
-    masks: str | Masks | None = Field(
-        None, description='folder of masks, or {folder, id}; "none": the scene has none; None: the usual ones'
-    )
-    test_masks: str | None = Field(None, description="folder of masks of test views, by name or in their order")
-    train: list[str] | str | None = Field(None, description='view names, or "every N"; None: all that are not test')
-    test: list[str] | str | None = Field(None, description='view names, or "every N"; None: those of the test masks')
-    clean: list[str] = Field([], description="training views in which the object is absent")
-    cameras_only: list[str] | str | None = Field(
-        None, description='views whose pixels are not used: names, "every N", or "others" than train and test'
-    )
-    exclude: list[str] = Field([], description="views that are no part of the scene")
-    keep: list[str] = Field([], description="views that stay, even where their photographs contradict their poses")
-    gaussians: str | None = Field(None, description="splats the scene brings in its own frame: .ply, .spz or .splat")
-    cleaned: str | None = Field(None, description="the same file after someone deleted splats: these are the object")
-    region: Region | None = Field(None, description="box or sphere that holds the object, or is to be filled")
-    fill: str | None = Field(None, description="instead of a region: folder of masks, of what is to be filled")
-    clicks: Clicked | None = Field(
-        None, description="read by the stage `masks`; here only checked", json_schema_extra=UNKEYED
-    )
-    remove: list[str] | None = Field(
-        None, description="read by the stage `masks`; here only checked", json_schema_extra=UNKEYED
-    )
-    reference: Given | list[Given] | None = Field(
-        None,
-        description="read by the stage `reference`; here only checked against the views",
-        json_schema_extra=UNKEYED,
-    )
+class Params(SceneKeys):
     longest: int = Field(1600, ge=16, description="larger image side in px; smaller pictures stay as they are")
     # PAPER leaves open: pictures that are blurred or were enlarged. It takes 1600 px; half of them may show as much.
     detail: float = Field(0.0, ge=0, description="pictures of less are halved, see reffusion.capture.support; 0: never")
     refine: bool = Field(False, description="adjust cameras, the principal point of each view too, that flow belies")
-
-    @property
-    def has_masks(self) -> bool:
-        """Does the scene not say that it has no masks?"""
-        return (self.mask_folder or "").lower() != "none"
-
-    @property
-    def mask_folder(self) -> str | None:
-        return self.masks.folder if isinstance(self.masks, Masks) else self.masks

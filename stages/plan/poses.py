@@ -10,54 +10,53 @@ from reffusion.capture.layouts import cameras
 from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.reading import check_brought, read_scene, unphotographed
 from reffusion.capture.roles import views_of
-from reffusion.io.images import load_mask
 from reffusion.params.clicks import CLICKS
 from reffusion.params.poses import Params
 
-LOOKED_INTO = 3  # masks of each object whose pixels are read: maps of object numbers are refused before any work
-# pictures count where they are photographs or masks; depth maps belong to references
+# pictures count where they are photographs; depth maps belong to references
 NOT_READ = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".npy", ".exr")
 
 
 def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
-    """Of the scene's files those that this stage reads, and what it reads elsewhere: the photographs and masks, and
-    all that is neither a picture nor a depth map. So a new reference, wherever it lies, reruns nothing here."""
+    """Of the scene's files those that this stage reads, and what it reads elsewhere: the photographs, and all that is
+    neither a picture nor a depth map. So new masks and references, wherever they lie, rerun nothing here."""
     others = [path for path in files if path.parent != scene or path.name not in ("scene.yaml", CLICKS)]
     brought = {scene / name for name in (params.gaussians, params.cleaned) if name is not None}
     try:
         if unphotographed(params, scene):
             return sorted({path for path in others if path.suffix.lower() not in NOT_READ} | brought)
-        capture, roles = read_scene(params, scene)
+        capture, roles = read_scene(params, scene, params.longest)
     except ValueError:  # `preview` refuses it
         return others
-    masks = {path for files in roles.masks.values() for path in files.values()}
     shown = {path for name, path in capture.pictures.items() if name not in roles.blank}
-    read = {*shown, *masks, *roles.test_masks.values(), *roles.fill.values()}
-    read |= brought | set(capture.depth_maps)
+    read = shown | brought | set(capture.depth_maps)
     kept = [path for path in others if path.suffix.lower() not in NOT_READ or path.name == "poses_bounds.npy"]
     return sorted(read | {path for path in kept if path.parent != scene / PAINTED})
 
 
+def scene_facts(params: Params, scene: Path) -> dict[str, object]:
+    """What each view is for, which may follow from the names of masks."""
+    if unphotographed(params, scene):
+        return {}
+    roles = read_scene(params, scene, params.longest)[1]
+    return {"views": [roles.train, roles.test, sorted(roles.clean), roles.blank]}
+
+
 def preview(params: Params, scene: Path) -> list[str]:
-    """What the stage will do, from headers and the pixels of a few masks. ValueError where it would refuse, or where a
-    reference that the scene brings, read by a later stage, belongs to none of its views."""
+    """What the stage will do, from headers. ValueError where it would refuse, or where a reference that the scene
+    brings, read by a later stage, belongs to none of its views."""
     if unphotographed(params, scene):
         brought = check_brought(params, scene)
         found = cameras.read(scene)
         who = f"{len(found[0].lenses)} cameras of {found[1].relative_to(scene)}" if found else "cameras around the hole"
         return [f"no photographs: {who} look at renders of {params.gaussians} instead", *brought]
-    capture, roles = read_scene(params, scene)
+    capture, roles = read_scene(params, scene, params.longest)
     given = load_given(scene, views_of(capture, roles), params.reference)
-    for files in roles.masks.values():
-        for path in [*files.values()][:LOOKED_INTO]:
-            load_mask(path, values=roles.values)
-    masks = sum(len(files) for files in roles.masks.values())
-    apart = f" of {', '.join(roles.masks)}" if len(roles.masks) > 1 else ""
-    notes = [f"{len(roles.train)} training and {len(roles.test)} test views, {masks} masks{apart}"]
+    notes = [f"{len(roles.train)} training and {len(roles.test)} test views"]
     notes += [f"{len(roles.blank)} views are cameras only"] if roles.blank else []
     notes += _of_poses(capture, scene)
     notes += [f"the scene brings a reference of {words(given)}"] if given else []
-    return [*notes, *capture.warnings, *roles.warnings, *check_brought(params, scene)]
+    return [*notes, *capture.warnings, *check_brought(params, scene)]
 
 
 def _of_poses(capture: Capture, scene: Path) -> list[str]:

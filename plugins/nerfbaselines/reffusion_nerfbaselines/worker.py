@@ -34,12 +34,12 @@ def dataset(path: np.ndarray, split: np.ndarray, cache: np.ndarray) -> dict[str,
     poses, part, out = Path(str(path)), str(split), Path(str(cache))
     if not (poses / "views.json").is_file():
         poses = _undistorted(poses, out / "poses")
-    scene = load_scene(poses)
+    scene, raw_masks = load_scene(poses), poses.with_name("raw_masks")
     cameras = [scene.cameras[name] for name in (scene.train if part == "train" else scene.test)]
-    raw = load_raw_masks(poses, scene.train) if part == "train" else {}
+    raw = load_raw_masks(raw_masks, scene.train) if part == "train" else {}
     masks, to_world = [], []
     for camera in cameras:
-        file = poses / "test_masks" / f"{camera.name}.png"
+        file = raw_masks / "test_masks" / f"{camera.name}.png"
         shown = raw.get(camera.name, np.zeros((camera.height, camera.width), bool))
         shown = load_mask(file) if part == "test" and file.is_file() else shown
         masks.append(out / part / f"{camera.name}.png")
@@ -67,13 +67,18 @@ def _bounds(camera: Camera, points: np.ndarray) -> np.ndarray:
 
 
 def _undistorted(scene: Path, out: Path) -> Path:
-    """What `poses` makes of a scene at the size of its pictures, its cameras as given; once for each scene."""
+    """What `poses` makes of a scene at the size of its pictures, its cameras as given; once for each scene. Its masks
+    lie beside, in raw_masks/."""
     if not (out / "made").is_file():
-        shutil.rmtree(out, ignore_errors=True)
-        out.mkdir(parents=True)
         sys.path.insert(0, str(root()))
+        raw_masks = out.with_name("raw_masks")
+        for folder in (out, raw_masks):
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir(parents=True)
         stage, params = (importlib.import_module(name) for name in ("stages.poses", "reffusion.params.poses"))
         stage.run(params.Params(detail=0, refine=False), out, scene=scene)
+        stage, params = (importlib.import_module(name) for name in ("stages.raw_masks", "reffusion.params.raw_masks"))
+        stage.run(params.Params(), raw_masks, scene=scene, poses=out)
         (out / "made").touch()
     return out
 

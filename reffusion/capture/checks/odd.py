@@ -25,16 +25,43 @@ POINTS = 5000  # at most, at which photographs are compared
 LEAST_SEEN = 50  # points in a view for anything to be said of it
 
 
-def oddities(scene: Scene, masks: Mapping[str, np.ndarray], image_of: Callable[[str], np.ndarray]) -> list[str]:
-    """A sentence for each thing that is odd.
+def odd_exposures(scene: Scene, image_of: Callable[[str], np.ndarray]) -> list[str]:
+    """A sentence for each photograph much brighter or darker than the others.
 
     Args:
         scene: undistorted, in the normalised frame; its points are sparse ones or those of flow, none that were drawn.
-        masks: view name -> bool [H, W], True = the object.
         image_of: view name -> uint8 [H, W, 3].
     """
     cameras = [scene.cameras[name] for name in (*scene.train, *scene.test) if name not in scene.suspects]
-    return [*_covering(masks), *_disagreeing(scene, masks), *_exposed(cameras, scene.points, image_of)]
+    points = scene.points[:: max(1, -(-len(scene.points) // POINTS))]
+    if len(points) < LEAST_SEEN or len(cameras) < 3:
+        return []
+    seen = np.stack([_brightness(camera, points, image_of(camera.name)) for camera in cameras])  # [V, P]
+    known = ~np.isnan(seen)
+    total, count = np.where(known, seen, 0).sum(0), known.sum(0)
+    ratios = {}
+    for camera, own, here in zip(cameras, seen, known & (count > 1), strict=True):
+        if here.sum() >= LEAST_SEEN:
+            others = (total - own)[here] / (count[here] - 1)
+            ratios[camera.name] = float(np.median((own[here] + 4) / (others + 4)))
+    jumps = {name: ratio for name, ratio in ratios.items() if not 1 / BRIGHTER < ratio < BRIGHTER}
+    if not jumps:
+        return []
+    worst = max(jumps, key=lambda name: abs(np.log(jumps[name])))
+    who = f"{len(jumps)} of {len(ratios)} photographs are" if len(jumps) > 1 else "a photograph is"
+    return [
+        f"{who} exposed otherwise than the rest ({_listed(sorted(jumps))}; {worst} is {jumps[worst]:.2g} times as "
+        "bright): take them with a fixed exposure, or have each one's fitted (fit.exposure)"
+    ]
+
+
+def odd_masks(scene: Scene, masks: Mapping[str, np.ndarray]) -> list[str]:
+    """A sentence for masks that cover most of their pictures, and for those that contradict the others in 3D.
+
+    Args:
+        masks: view name -> bool [H, W], True = the object.
+    """
+    return [*_covering(masks), *_disagreeing(scene, masks)]
 
 
 def _covering(masks: Mapping[str, np.ndarray]) -> list[str]:
@@ -99,30 +126,6 @@ def _along_rays(camera: Camera, mask: np.ndarray, points: np.ndarray) -> np.ndar
 
 
 # ---------------------------------------------------------------------------------------------- photographs
-
-
-def _exposed(cameras: list[Camera], points: np.ndarray, image_of: Callable[[str], np.ndarray]) -> list[str]:
-    """Photographs of another exposure than the others, by what they show at the points."""
-    points = points[:: max(1, -(-len(points) // POINTS))]
-    if len(points) < LEAST_SEEN or len(cameras) < 3:
-        return []
-    seen = np.stack([_brightness(camera, points, image_of(camera.name)) for camera in cameras])  # [V, P]
-    known = ~np.isnan(seen)
-    total, count = np.where(known, seen, 0).sum(0), known.sum(0)
-    ratios = {}
-    for camera, own, here in zip(cameras, seen, known & (count > 1), strict=True):
-        if here.sum() >= LEAST_SEEN:
-            others = (total - own)[here] / (count[here] - 1)
-            ratios[camera.name] = float(np.median((own[here] + 4) / (others + 4)))
-    jumps = {name: ratio for name, ratio in ratios.items() if not 1 / BRIGHTER < ratio < BRIGHTER}
-    if not jumps:
-        return []
-    worst = max(jumps, key=lambda name: abs(np.log(jumps[name])))
-    who = f"{len(jumps)} of {len(ratios)} photographs are" if len(jumps) > 1 else "a photograph is"
-    return [
-        f"{who} exposed otherwise than the rest ({_listed(sorted(jumps))}; {worst} is {jumps[worst]:.2g} times as "
-        "bright): take them with a fixed exposure, or have each one's fitted (fit.exposure)"
-    ]
 
 
 def _brightness(camera: Camera, points: np.ndarray, image: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.names import is_mask_of_another, pair_masks, strip_ending
 from reffusion.io.files import BadInput
 from reffusion.io.images import ENDINGS, WHITE, MaskValues
-from reffusion.params.poses import Masks
+from reffusion.params.capture import Masks
 
 NONE = "none"
 USUAL = ("masks", "mask", "label")  # of the scene's folder, after `label` inside the folder of pictures
@@ -33,7 +33,7 @@ def find_masks(folder: Path, capture: Capture, asked: str | Masks | None, option
     """The masks of a scene, each checked to have its picture.
 
     Args:
-        asked: the parameter `masks` (`reffusion.params.poses`).
+        asked: the parameter `masks` (`reffusion.params.capture`).
         optional: the scene may lack masks.
 
     Raises:

@@ -1,0 +1,48 @@
+"""What `raw_masks` says before it runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from reffusion.capture.reading import read_scene, unphotographed
+from reffusion.capture.roles import Roles
+from reffusion.capture.undistorted import check_masks
+from reffusion.params.raw_masks import Params
+
+
+def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
+    """The mask files that this stage reads."""
+    try:
+        roles = None if unphotographed(params, scene) else read_scene(params, scene)[1]
+    except ValueError:  # `preview` refuses it
+        return files
+    return sorted({path for views in _files(roles).values() for path in views.values()}) if roles else []
+
+
+def scene_facts(params: Params, scene: Path) -> dict[str, object]:
+    """Which file is which view's mask, and the region."""
+    region = {"region": params.region.model_dump() | {"holds": params.has_masks}} if params.region else {}
+    if unphotographed(params, scene):
+        return region
+    roles = read_scene(params, scene)[1]
+    named = {kind: {name: str(path) for name, path in views.items()} for kind, views in _files(roles).items()}
+    return {"masks": [named, roles.values.ids], **region}
+
+
+def preview(params: Params, *, scene: Path, poses: Path | None = None) -> list[str]:
+    """What the stage will do. ValueError where a mask is unreadable, or all are empty or full."""
+    if unphotographed(params, scene):
+        return []
+    _, roles = read_scene(params, scene)
+    for files in roles.masks.values():
+        check_masks(files, roles.values)
+    check_masks(roles.fill)
+    count = sum(len(files) for files in roles.masks.values())
+    apart = f" of {', '.join(roles.masks)}" if len(roles.masks) > 1 else ""
+    return [f"{count} masks{apart}", *roles.warnings]
+
+
+def _files(roles: Roles) -> dict[str, dict[str, Path]]:
+    """Kind, or kind and object, -> view -> file."""
+    masks = {f"masks/{thing}": files for thing, files in roles.masks.items()}
+    return {**masks, "test_masks": roles.test_masks, "fill": roles.fill}

@@ -1,0 +1,61 @@
+"""raw_masks: the masks that a scene brings, as its undistorted views lie; the region to change.
+
+They are no part of `poses`, so new masks move no camera and run no structure from motion again.
+"""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+from reffusion import trace
+from reffusion.capture.checks.odd import odd_masks
+from reffusion.capture.lenses import load_lenses
+from reffusion.capture.reading import read_scene, unphotographed
+from reffusion.capture.undistorted import save_undistorted_masks
+from reffusion.capture.views import check_outliers, known
+from reffusion.io.arrays import save_json
+from reffusion.io.images import save_mask
+from reffusion.io.scene import WARNINGS, load_raw_masks, load_scene
+from reffusion.masks import regions
+from reffusion.params.raw_masks import Params
+from reffusion.types import Scene
+
+
+def run(params: Params, out: Path, *, scene: Path, poses: Path) -> None:
+    """Write masks/ (with masks of several objects, masks/<object>/), test_masks/ and fill/, <view>.png each;
+    region.json where the scene names a region; warnings.json where masks are odd."""
+    placed, lenses = load_scene(poses), load_lenses(poses)[0]
+    notes: tuple[str, ...] = ()
+    if not unphotographed(params, scene):
+        _, roles = read_scene(params, scene)
+        names = sorted(lenses)
+        for k in trace.progress(len(names), "masks"):
+            save_undistorted_masks(out, names[k], roles, lenses[names[k]])
+        notes = roles.warnings
+    if params.region is not None:
+        _save_region(params, out, placed)
+    notes = (*notes, *odd_masks(placed, load_raw_masks(out, placed.train)))
+    for note in notes:
+        warnings.warn(note, stacklevel=1)
+    if notes:
+        save_json(out / WARNINGS, list(notes))
+
+
+def _save_region(params: Params, out: Path, scene: Scene) -> None:
+    """Write the region as region.json, or masks of what lies outside it."""
+    region, scale = params.region, scene.similarity.scale
+    if region.view is not None:
+        check_outliers("region", [region.view], scene.outliers)
+        center = regions.on_axis(scene.cameras[known(region.view, scene.cameras, "region")], region.distance * scale)
+    else:
+        center = scene.similarity.apply(region.center)
+    if region.outside:
+        given = load_raw_masks(out, scene.train)
+        for name in scene.train:
+            mask = regions.beyond(center, region.radius * scale, scene.cameras[name])
+            save_mask(out / "masks" / f"{name}.png", mask | given.get(name, mask))
+        return
+    size = [side * scale for side in region.size or [2 * region.radius] * 3]
+    facts = {"center": center.tolist(), "size": size, "round": region.size is None}
+    save_json(out / "region.json", {**facts, "holds": params.has_masks})
