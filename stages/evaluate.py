@@ -81,7 +81,7 @@ def run(
     needs |= {"personalize": personalize, "lift": lift, "initialize": initialize, "distill": distill}
     scene = load_scene(poses)
     loaded = {net: lpips.load(net, params.lpips_weights) for net in ("vgg", "alex")}
-    models = {net: model for net, (model, _) in (loaded | {"st": lpips.load_st()}).items() if model}
+    models = {net: model for net, (model, _) in loaded.items() if model}
     names, kind = views_of(scene)
     work, counts = prepared(params, scene, out, needs, tested=kind == "test")
     scored, before = [], None

@@ -1,18 +1,14 @@
 """Metrics against their definitions, written out again here, and at the edges: one pixel, constant, identical."""
 
-import hashlib
 import math
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from reffusion.score import lpips, metrics
 from reffusion.score.metrics import Box, mask_box
-from reffusion.weights import local
-from reffusion.weights.published import LPIPS_PACKAGES
 
 
 def pair(height, width, seed=0, noise=0.1):
@@ -205,208 +201,18 @@ def test_bytes_and_floats_score_alike():
         assert metric(image, truth) == pytest.approx(metric(image / 255, truth / 255), rel=1e-6)
 
 
-# --- LPIPS
-
-
-def random_states(net, seed=0):
-    """A backbone with torchvision's keys and linear weights with the published ones', random."""
-    generator = torch.Generator().manual_seed(seed)
-    shapes = {
-        "alex": {0: (64, 3, 11), 3: (192, 64, 5), 6: (384, 192, 3), 8: (256, 384, 3), 10: (256, 256, 3)},
-        "vgg": dict(
-            zip(
-                (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28),
-                [
-                    *[(64, 3, 3), (64, 64, 3), (128, 64, 3), (128, 128, 3), (256, 128, 3)],
-                    *[(256, 256, 3), (256, 256, 3), (512, 256, 3)],
-                    *[(512, 512, 3)] * 5,
-                ],
-                strict=True,
-            )
-        ),
-    }[net]
-    backbone = {"classifier.1.weight": torch.zeros(2, 2)}
-    for index, (out, into, kernel) in shapes.items():
-        spread = (2 / (into * kernel**2)) ** 0.5
-        backbone[f"features.{index}.weight"] = spread * torch.randn(out, into, kernel, kernel, generator=generator)
-        backbone[f"features.{index}.bias"] = 0.1 * torch.randn(out, generator=generator)
-    widths = {"alex": (64, 192, 384, 256, 256), "vgg": (64, 128, 256, 512, 512)}[net]
-    linear = {f"lin{i}.model.1.weight": torch.rand(1, c, 1, 1, generator=generator) for i, c in enumerate(widths)}
-    return backbone, linear
-
-
-def thinned(x):
-    """[1, C, H, W] filtered by [1 2 1] / 4 along both axes, mirrored 2 cells beyond the border, every second cell."""
-    wide = np.pad(x[0].numpy(), ((0, 0), (2, 2), (2, 2)), mode="reflect")
-    rows = (wide[:, :-2] + 2 * wide[:, 1:-1] + wide[:, 2:])[:, ::2] / 4
-    return torch.from_numpy((rows[..., :-2] + 2 * rows[..., 1:-1] + rows[..., 2:])[..., ::2] / 4)[None]
-
-
-def lpips_by_definition(net, backbone, linear, images):
-    """The formula, layer by layer with functional calls, in float64; images [H, W, 3] in [0, 1]."""
-    F = torch.nn.functional
-    blurred = net == "st"
-    steps = {
-        "alex": [(0, 4, 2), "tap", 3, (3, 1, 2), "tap", 3, (6, 1, 1), "tap", (8, 1, 1), "tap", (10, 1, 1), "tap"],
-        "vgg": [
-            *[(0, 1, 1), (2, 1, 1), "tap", 2, (5, 1, 1), (7, 1, 1), "tap", 2],
-            *[(10, 1, 1), (12, 1, 1), (14, 1, 1), "tap", 2, (17, 1, 1), (19, 1, 1), (21, 1, 1), "tap", 2],
-            *[(24, 1, 1), (26, 1, 1), (28, 1, 1), "tap"],
-        ],
-    }["vgg" if blurred else net]
-    taps = []
-    for image in images:
-        x = torch.from_numpy(image).double()
-        x = (2 * x - 1 - torch.tensor([-0.030, -0.088, -0.188])) / torch.tensor([0.458, 0.448, 0.450])
-        x, found = x.permute(2, 0, 1)[None], []
-        for step in steps:
-            if step == "tap":
-                found.append(x[0] / torch.linalg.vector_norm(x[0], dim=0))
-            elif isinstance(step, int):
-                x = F.max_pool2d(x, step, 1 if blurred else 2)
-                x = thinned(x) if blurred else x
-            else:
-                index, stride, padding = step
-                weight, bias = (backbone[f"features.{index}.{key}"].double() for key in ("weight", "bias"))
-                x = F.relu(F.conv2d(x, weight, bias, stride, padding))
-        taps.append(found)
-    total = 0.0
-    for i, (a, b) in enumerate(zip(*taps, strict=True)):
-        weight = linear[f"lin{i}.model.1.weight"].double().flatten()
-        total += torch.einsum("c,chw->hw", weight, (a - b) ** 2).mean().item()
-    return total
-
-
-@pytest.mark.parametrize("net", ["alex", "vgg"])
-def test_lpips_equals_its_formula_with_random_weights(net):
-    states = random_states(net)
-    model = lpips.from_states(net, *states)
-    image, truth = pair(45, 38)
-    value = metrics.lpips(image, truth, model)
-    assert value == pytest.approx(lpips_by_definition(net, *states, (image, truth)), rel=1e-4)
-    assert value > 0 and metrics.lpips(truth, truth, model) == 0.0
-    constant = np.full((40, 40, 3), 0.5)
-    assert metrics.lpips(constant, constant, model) == 0.0
-
-
-@pytest.mark.parametrize("net", ["alex", "vgg"])
-def test_lpips_takes_the_smallest_size_and_refuses_smaller(net):
-    model = lpips.from_states(net, *random_states(net))
-    size = lpips.SMALLEST[net]
-    image, truth = pair(size, size)
-    assert np.isfinite(metrics.lpips(image, truth, model))
-    with pytest.raises(ValueError, match=rf"at least {size} px a side; the image is {size}x{size - 1} px"):
-        metrics.lpips(image[1:], truth[1:], model)
-
-
-def test_lpips_weights_of_another_shape_are_refused_by_name():
-    backbone, linear = random_states("alex")
-    with pytest.raises(ValueError, match=r"no `features.3.bias`"):
-        lpips.from_states("alex", {k: v for k, v in backbone.items() if k != "features.3.bias"}, linear)
-    with pytest.raises(ValueError, match=r"lin1.model.1.weight` has shape \(1, 128, 1, 1\)"):
-        lpips.from_states("alex", backbone, random_states("vgg")[1])
-
-
-@pytest.fixture
-def no_caches(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
-    monkeypatch.setattr(local, "LPIPS_PACKAGES", {})
-    monkeypatch.setattr(lpips, "ST_FILE", ("no_such_package", lpips.ST_FILE[1]))
-    return tmp_path
-
-
-def test_lpips_without_weights_says_why(no_caches):
-    model, reason = lpips.load("vgg")
-    assert model is None and "no backbone" in reason and "vgg16-*.pth" in reason
-    model, reason = lpips.load("alex", no_caches / "given")
-    assert model is None and "given" in reason
-
-
-def test_lpips_weights_are_found_in_the_caches_and_checked(no_caches):
-    backbone, linear = random_states("alex")
-    hub, own = no_caches / "torch" / "hub" / "checkpoints", no_caches / "cache" / "reffusion" / "lpips"
-    hub.mkdir(parents=True)
-    own.mkdir(parents=True)
-    torch.save(backbone, hub / "raw.pth")
-    digest = hashlib.sha256((hub / "raw.pth").read_bytes()).hexdigest()
-    path = (hub / "raw.pth").rename(hub / f"alexnet-owt-{digest[:8]}.pth")
-    assert "no linear weights" in lpips.load("alex")[1]
-    torch.save(linear, own / "alex.pth")
-    model, reason = lpips.load("alex")
-    image, truth = pair(40, 40)
-    assert reason is None
-    assert metrics.lpips(image, truth, model) == metrics.lpips(
-        image, truth, lpips.from_states("alex", backbone, linear)
-    )
-    assert model.files[path.name] == digest[:16]
-
-    path.write_bytes(path.read_bytes()[:-1] + b"x")
-    with pytest.raises(ValueError, match="not the file its name says"):
-        lpips.load("alex")
-    path.unlink()
-    torch.save({"features.0.weight": torch.zeros(1)}, hub / "alexnet-own.pth")
-    with pytest.raises(ValueError, match=r"alexnet-own.pth.*cannot be used"):
-        lpips.load("alex")
-
-
-@pytest.mark.parametrize("package, below", LPIPS_PACKAGES.items())
-def test_lpips_takes_the_linear_weights_of_an_installed_package(no_caches, monkeypatch, package, below):
-    """Beside torchvision's backbone in torch hub's cache; the package itself is not imported."""
-    backbone, linear = random_states("vgg")
-    hub, inside = no_caches / "torch/hub/checkpoints", no_caches / "site" / package / below
-    for folder in (hub, inside):
-        folder.mkdir(parents=True)
-    monkeypatch.setattr(local, "LPIPS_PACKAGES", {package: below})
-    (no_caches / "site" / package / "__init__.py").write_text("raise ImportError('torchvision is missing')")
-    torch.save(backbone, hub / "vgg16-own.pth")
-    assert "install lpips or torchmetrics" in lpips.load("vgg")[1]
-    torch.save(linear, inside / "vgg.pth")
-    monkeypatch.syspath_prepend(str(no_caches / "site"))
-    model, reason = lpips.load("vgg")
-    assert reason is None and set(model.files) == {"vgg16-own.pth", "vgg.pth"}
-
-
-def test_st_lpips_from_its_package_equals_its_formula(no_caches, monkeypatch):
-    """Random weights of its own keys; in float64, maxima of 2 px a step apart, then every second of [1 2 1] / 4."""
-    assert lpips.load_st() == (None, "no weights for ST-LPIPS: `pip install no_such_package` brings them")
-    backbone, linear = random_states("vgg")
-    blurs = {0: 0, 2: 0, 5: 1, 7: 1, 10: 2, 12: 2, 14: 2, 17: 3, 19: 3, 21: 3, 24: 4, 26: 4, 28: 4}  # before a layer
-    state = dict(linear)
-    for index, before in blurs.items():
-        for kind in ("weight", "bias"):
-            state[f"net.slice{before + 1}.{index + before}.{kind}"] = backbone[f"features.{index}.{kind}"]
-    file = no_caches / "site/a_package" / lpips.ST_FILE[1]
-    file.parent.mkdir(parents=True)
-    torch.save(state, file)
-    monkeypatch.setattr(lpips, "ST_FILE", ("a_package", lpips.ST_FILE[1]))
-    monkeypatch.syspath_prepend(str(no_caches / "site"))
-    model, reason = lpips.load_st()
-    image, truth = pair(45, 38)
-    assert reason is None and metrics.lpips(truth, truth, model) == 0
-    assert metrics.lpips(image, truth, model) == pytest.approx(
-        lpips_by_definition("st", backbone, linear, (image, truth)), rel=1e-4
-    )
-    row = metrics.score(image, truth, {"st": model})
-    assert row["stlpips"] > 0 and "lpips_vgg" not in row
-    assert (
-        np.isfinite(metrics.lpips(*pair(18, 18), model))
-        and metrics.score(*pair(17, 17), {"st": model})["stlpips"] is None
-    )
-
-
 # --- a view's row
 
 
 def test_score_view_leaves_out_what_is_too_small():
     image, truth = pair(40, 50)
-    models = {"vgg": lpips.from_states("vgg", *random_states("vgg"))}
-    row = metrics.score_view(image, truth, Box(3, 4, 13, 34), models)  # 10 px wide
+    targets = metrics.lpips_targets(truth[4:34, 3:13], {"vgg": lpips.Lpips("vgg")})
+    row = metrics.score_view(image, truth, Box(3, 4, 13, 34), targets)  # 10 px wide
     assert tuple(row) == metrics.COLUMNS
     assert row["psnr_box"] == metrics.psnr(image[4:34, 3:13], truth[4:34, 3:13])
     assert row["ssim_box"] is None and row["lpips_vgg_box"] is None and row["lpips_alex_box"] is None
     assert row["ssim_full"] == metrics.ssim(image, truth)
-    row = metrics.score_view(image, truth, None, models)
+    row = metrics.score_view(image, truth, None)
     assert row["psnr_box"] is None and row["flip_box"] is None and row["psnr_full"] is not None
 
 

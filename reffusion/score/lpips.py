@@ -1,10 +1,7 @@
 """LPIPS (Zhang et al., 2018), version 0.1, from weights that lie on this machine; nothing is downloaded or made up.
 
-Two files a network: the backbone as torchvision saves it (keys `features.N.weight`), and the published linear
-weights (keys `lin0.model.1.weight`). Where either is absent the metric is unavailable, with a reason.
-
-ST-LPIPS (Ghildyal and Liu, 2022) is the same formula on a VGG of its own, whose maxima are blurred before they are
-thinned out. Its weights, the backbone's too, come with the package stlpips_pytorch, which is read and not imported.
+The weights of a network are one file `<net>.safetensors` (`reffusion.weights.lpips_package`), or two: the backbone as
+torchvision saves it, and the published linear weights. Without them the metric is unavailable, with a reason.
 """
 
 from __future__ import annotations
@@ -15,20 +12,17 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
-from reffusion.weights.local import at_home, inside_package, lpips_folders
-from reffusion.weights.published import LPIPS_PACKAGES
+from reffusion.weights.local import at_home, lpips_files, lpips_folders
+from reffusion.weights.lpips_package import digest
+from reffusion.weights.published import LPIPS
 
-Net = Literal["alex", "vgg", "st"]
+Net = Literal["vgg", "alex"]
 
-BACKBONE_FILES = {"alex": "alexnet-*.pth", "vgg": "vgg16-*.pth"}  # torchvision's names; a hash follows the dash
-LINEAR_FILES = {"alex": "alex.pth", "vgg": "vgg.pth"}
-NAMES = {"vgg": "lpips_vgg", "alex": "lpips_alex", "st": "stlpips"}  # of the scores
-# px a side: anything smaller leaves the deepest layer without a single cell, or nothing to mirror at a border
-SMALLEST = {"alex": 31, "vgg": 16, "st": 18}
-ST_FILE = ("stlpips_pytorch", "weights/vST0.0/vgg_shift_tolerant.pth")  # package, file inside
+NAMES = {"vgg": "lpips_vgg", "alex": "lpips_alex"}  # of the scores
+# px a side: anything smaller leaves the deepest layer without a single cell
+SMALLEST = {"alex": 31, "vgg": 16}
 
 # Layers of torchvision's `features`: (channels, kernel, stride, padding) a convolution with its ReLU, "pool" a maximum.
 _ALEX = [(64, 11, 4, 2), "pool", (192, 5, 1, 2), "pool", (384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1)]
@@ -43,34 +37,22 @@ _VGG = [
     "pool",
     *[(512, 3, 1, 1)] * 3,
 ]
-_LAYERS: dict[str, list[Any]] = {"alex": _ALEX, "vgg": _VGG, "st": _VGG}
-_POOL = {"alex": (3, 2), "vgg": (2, 2), "st": (2, 1)}  # side and step of a maximum
+_LAYERS: dict[str, list[Any]] = {"alex": _ALEX, "vgg": _VGG}
+_POOL = {"alex": (3, 2), "vgg": (2, 2)}  # side and step of a maximum
 # Indices in `features` of the ReLUs compared.
-TAPS = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29), "st": (3, 9, 17, 25, 33)}
-WIDTHS = {"alex": (64, 192, 384, 256, 256), "vgg": (64, 128, 256, 512, 512), "st": (64, 128, 256, 512, 512)}
-
-
-class Blur(nn.Module):
-    """Every second cell of [B, C, H, W] after a binomial filter of 3 x 3, the border mirrored 2 cells far."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        side = torch.tensor([1.0, 2.0, 1.0]) / 4
-        self.register_buffer("filter", side.outer(side)[None, None], persistent=False)
-
-    def forward(self, x: Tensor) -> Tensor:
-        kernel = self.filter.expand(x.shape[1], 1, 3, 3)
-        return F.conv2d(F.pad(x, (2, 2, 2, 2), mode="reflect"), kernel, stride=2, groups=x.shape[1])
+TAPS = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}
+WIDTHS = {"alex": (64, 192, 384, 256, 256), "vgg": (64, 128, 256, 512, 512)}
+EPSILON = 1e-10  # of the published code, added to the length of a cell's features
 
 
 class Lpips(nn.Module):
     """The distance of one network. Build it with `from_states` or `load`.
 
     Attributes:
-        net: "alex", "vgg" (16 layers) or "st".
-        features: the backbone under torchvision's indices, of "st" under its own.
+        net: "alex" or "vgg" (16 layers).
+        features: the backbone under torchvision's indices.
         linear: five non-negative weights, [C_l] each.
-        files: what was read: file name -> first 16 digits of its SHA-256 (empty when built from states).
+        files: what was read: file name -> digest (empty when built from states).
     """
 
     def __init__(self, net: Net):
@@ -79,7 +61,7 @@ class Lpips(nn.Module):
         layers, channels = [], 3
         for layer in _LAYERS[net]:
             if layer == "pool":
-                layers += [nn.MaxPool2d(*_POOL[net]), *([Blur()] if net == "st" else [])]
+                layers.append(nn.MaxPool2d(*_POOL[net]))
             else:
                 width, kernel, stride, padding = layer
                 layers += [nn.Conv2d(channels, width, kernel, stride, padding), nn.ReLU()]
@@ -97,23 +79,31 @@ class Lpips(nn.Module):
 
         Raises ValueError when the shapes differ or an image is smaller than `SMALLEST[net]` a side.
         """
-        if first.shape != second.shape or first.dim() != 4 or first.shape[1] != 3:
+        if first.shape != second.shape:
             raise ValueError(f"LPIPS compares two [B, 3, H, W]; got {tuple(first.shape)} and {tuple(second.shape)}")
-        height, width = first.shape[2:]
+        return self.distance(first, self.activations(second))
+
+    def distance(self, images: Tensor, target: list[Tensor]) -> Tensor:
+        """The same, [B], of images [B, 3, H, W] from one whose `activations` are known."""
+        pairs = zip(self.activations(images), target, self.linear, strict=True)
+        return sum(((a - b).square() * w.float().view(1, -1, 1, 1)).sum(1).mean((1, 2)) for a, b, w in pairs)
+
+    def activations(self, images: Tensor) -> list[Tensor]:
+        """The five tapped layers, float32, each cell's channels at unit length."""
+        if images.dim() != 4 or images.shape[1] != 3:
+            raise ValueError(f"LPIPS compares two [B, 3, H, W]; got {tuple(images.shape)}")
+        height, width = images.shape[2:]
         if min(height, width) < SMALLEST[self.net]:
             raise ValueError(
                 f"LPIPS ({self.net}) needs at least {SMALLEST[self.net]} px a side; the image is {width}x{height} px"
             )
-        pairs = zip(self.activations(first), self.activations(second), self.linear, strict=True)
-        return sum(((a - b).square() * weight.view(1, -1, 1, 1)).sum(1).mean((1, 2)) for a, b, weight in pairs)
-
-    def activations(self, images: Tensor) -> list[Tensor]:
-        """The five tapped layers, each cell's channels at unit length."""
         x, tapped = (images - self.shift) / self.scale, []
         for index, layer in enumerate(self.features):
             x = layer(x)
             if index in TAPS[self.net]:
-                tapped.append(x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10))
+                # In half precision squares overflow and EPSILON is 0. The length's gradient is 0 where all are 0.
+                wide = x.float()
+                tapped.append(wide / (torch.linalg.vector_norm(wide, dim=1, keepdim=True) + EPSILON))
         return tapped
 
 
@@ -143,45 +133,42 @@ def from_states(net: Net, backbone: dict[str, Tensor], linear: dict[str, Tensor]
 def load(net: Net, folder: str | Path | None = None) -> tuple[Lpips | None, str | None]:
     """(metric, None), or (None, why it is unavailable).
 
-    Raises ValueError for a file that is there but broken: wrong keys or shapes, or other content than the hash
-    in its name says. A damaged file is an error to mend, not an unavailable metric.
+    Raises ValueError for a file that is there but broken: wrong keys or shapes, or other content than published. A
+    damaged file is an error to mend, not an unavailable metric.
     """
-    places = lpips_folders(folder)
-    found = {}
-    for role, pattern in [("backbone", BACKBONE_FILES[net]), ("linear weights", LINEAR_FILES[net])]:
-        paths = [path for place in places for path in sorted(place.glob(pattern))]
-        if not paths:
-            looked = ", ".join(at_home(place) for place in places)
-            brings = f"install {' or '.join(LPIPS_PACKAGES)}, " if pattern == LINEAR_FILES[net] else ""
-            cures = f"run `make weights`, {brings}or put {pattern} into one of {looked}"
-            return None, f"no {role} for LPIPS ({net}): {cures}"
-        found[role] = paths[0]
-    hashes = {path: _sha256(path) for path in found.values()}
-    stated = found["backbone"].stem.rpartition("-")[2]
-    if re.fullmatch("[0-9a-f]{8}", stated) and not hashes[found["backbone"]].startswith(stated):
-        raise ValueError(f"{found['backbone']} is not the file its name says (hash {stated}): download it again")
+    files = lpips_files(net, folder)
+    if not files:
+        looked = ", ".join(at_home(place) for place in lpips_folders(folder))
+        return None, f"no weights of LPIPS ({net}): run `make weights`, or put {net}.safetensors into one of {looked}"
     try:
-        states = [torch.load(path, map_location="cpu", weights_only=True) for path in found.values()]
-        model = from_states(net, *states)
+        if len(files) == 1:
+            return _load_whole(net, files[0]), None
+        for path in files:
+            _check_name(path)
+        model = from_states(net, *(torch.load(path, map_location="cpu", weights_only=True) for path in files))
     except Exception as error:
-        raise ValueError(f"LPIPS weights {', '.join(map(str, found.values()))} cannot be used: {error}") from error
-    model.files = {path.name: digest[:16] for path, digest in hashes.items()}
+        raise ValueError(f"LPIPS weights {', '.join(map(str, files))} cannot be used: {error}") from error
+    model.files = {path.name: _sha256(path)[:16] for path in files}
     return model, None
 
 
-def load_st() -> tuple[Lpips | None, str | None]:
-    """ST-LPIPS: (metric, None), or (None, why it is unavailable). Raises ValueError for a file that is broken."""
-    package, below = ST_FILE
-    path = inside_package(package, below)
-    if path is None:
-        return None, f"no weights for ST-LPIPS: `pip install {package}` brings them"
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-        model = from_states("st", {re.sub(r"^net\.slice\d\.", "features.", key): v for key, v in state.items()}, state)
-    except Exception as error:
-        raise ValueError(f"ST-LPIPS weights {path} cannot be used: {error}") from error
-    model.files = {path.name: _sha256(path)[:16]}
-    return model, None
+def _load_whole(net: Net, path: Path) -> Lpips:
+    from safetensors.torch import load_file
+
+    state = load_file(path)
+    found = digest({name: value.numpy() for name, value in state.items()})
+    if found != LPIPS.nets[net].digest:
+        raise ValueError("it is damaged: remove it, and run `make weights`")
+    model = from_states(net, state, state)
+    model.files = {path.name: found}
+    return model
+
+
+def _check_name(path: Path) -> None:
+    """ValueError where the name ends in a hash, as torchvision's do, and the file has another."""
+    stated = path.stem.rpartition("-")[2]
+    if re.fullmatch("[0-9a-f]{8}", stated) and not _sha256(path).startswith(stated):
+        raise ValueError(f"{path.name} is not the file its name says: download it again")
 
 
 def _sha256(path: Path) -> str:

@@ -7,6 +7,7 @@ outside it enters, and nothing is resized. Every function raises ValueError on u
 from __future__ import annotations
 
 import csv
+from dataclasses import dataclass
 from importlib.metadata import version
 from io import StringIO
 from math import ceil, floor, inf, log10
@@ -58,8 +59,6 @@ PROTOCOL = {
     "flip": f"LDR-FLIP, mean of the error map, {PIXELS_PER_DEGREE:.0f} pixels per degree",
     "lpips": "version 0.1, backbones alex and vgg16, input in [-1, 1] at native resolution; "
     f"no value under {SMALLEST['alex']} (alex) or {SMALLEST['vgg']} (vgg) px a side",
-    "stlpips": "ST-LPIPS, another score than LPIPS: shift-tolerant VGG of the package stlpips_pytorch, input in "
-    f"[-1, 1] at native resolution; no value under {SMALLEST['st']} px a side",
     "mean": "over the views that have the value; `views` says how many those are",
 }
 
@@ -136,22 +135,43 @@ def flip_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return difference(*_pair(image, truth))
 
 
-def lpips(image: np.ndarray, truth: np.ndarray, model: Lpips) -> float:
-    """LPIPS with a model of `reffusion.score.lpips`. Raises ValueError under `SMALLEST` px a side."""
-    tensors = (torch.from_numpy(2.0 * x - 1.0).permute(2, 0, 1)[None].float() for x in _pair(image, truth))
-    return float(model(*tensors))
+@dataclass(frozen=True)
+class LpipsTarget:
+    """A truth as an LPIPS network sees it, computed once for all images that are compared with it."""
+
+    model: Lpips
+    activations: list[torch.Tensor]
+
+    @torch.no_grad()
+    def distance(self, image: np.ndarray) -> float:
+        """LPIPS of an image of the truth's size. Raises ValueError for an image that is none."""
+        return float(self.model.distance(_signed(image), self.activations))
 
 
-def score(image: np.ndarray, truth: np.ndarray, models: dict[str, Lpips] | None = None) -> dict[str, float | None]:
-    """{"psnr", "ssim", "flip", and `NAMES` of each model}; None where the image is too small for a metric."""
+@torch.no_grad()
+def lpips_targets(truth: np.ndarray, models: dict[str, Lpips]) -> dict[str, LpipsTarget | None]:
+    """Network -> target; None where the truth is too small for it."""
+    fits = {net: min(truth.shape[:2]) >= SMALLEST[net] for net in models}
+    return {n: LpipsTarget(m, m.activations(_signed(truth))) if fits[n] else None for n, m in models.items()}
+
+
+def _signed(image: np.ndarray) -> torch.Tensor:
+    """[1, 3, H, W] float32 in [-1, 1]."""
+    return torch.from_numpy(2.0 * _unit(image) - 1.0).permute(2, 0, 1)[None].float()
+
+
+def score(
+    image: np.ndarray, truth: np.ndarray, targets: dict[str, LpipsTarget | None] | None = None
+) -> dict[str, float | None]:
+    """{"psnr", "ssim", "flip", and `NAMES` of each LPIPS target}; None where the image is too small for a metric."""
     side = min(image.shape[:2])
     values = {
         "psnr": psnr(image, truth),
         "ssim": ssim(image, truth) if side >= SSIM_WINDOW else None,
         "flip": flip(image, truth),
     }
-    for net, model in (models or {}).items():
-        values[NAMES[net]] = lpips(image, truth, model) if side >= SMALLEST[net] else None
+    for net, target in (targets or {}).items():
+        values[NAMES[net]] = target and target.distance(image)
     return values
 
 
@@ -159,7 +179,7 @@ def score_view(
     image: np.ndarray,
     truth: np.ndarray,
     box: Box | None,
-    models: dict[str, Lpips] | None = None,
+    targets: dict[str, LpipsTarget | None] | None = None,
     mask: np.ndarray | None = None,
     shows_object: bool = False,
     unseen: np.ndarray | None = None,
@@ -168,6 +188,7 @@ def score_view(
     no pixel is masked), and `score` on the full image without LPIPS.
 
     Args:
+        targets: `lpips_targets` of the truth in the box.
         shows_object: the truth has the object in it, so that only what lies outside its mask is true.
         unseen: bool [H, W], pixels that no training view saw; None where that is not known: then what is said of them
             has no value.
@@ -177,7 +198,7 @@ def score_view(
     if unseen is not None:
         values |= outside_seen(image, truth, mask, unseen)
     if not shows_object:
-        inside = score(box.crop(image), box.crop(truth), models) if box is not None else {}
+        inside = score(box.crop(image), box.crop(truth), targets) if box is not None else {}
         values |= {f"{name}_box": value for name, value in inside.items()}
         values |= {f"{name}_full": value for name, value in score(image, truth).items()}
     return {column: values.get(column) for column in COLUMNS}

@@ -37,7 +37,9 @@ def row_of(shown: Shown, initial: np.ndarray | None, truth: Truth, models: dict[
     row |= dict(zip(("left", "top", "right", "bottom"), box or (None,) * 4, strict=True))
     if truth.picture is not None:
         margin = widened(shown.mask, OUTSIDE_MARGIN)
-        given = truth.picture, box, models, margin, truth.shows_object, truth.unseen
+        scored = box is not None and not truth.shows_object
+        targets = metrics.lpips_targets(box.crop(truth.picture), models) if scored else {}
+        given = truth.picture, box, targets, margin, truth.shows_object, truth.unseen
         row |= metrics.score_view(shown.picture, *given)
         if initial is not None:
             scores = metrics.score_view(initial, *given)

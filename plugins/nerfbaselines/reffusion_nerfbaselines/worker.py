@@ -117,7 +117,8 @@ def score(image: np.ndarray, truth: np.ndarray, mask: np.ndarray, weights: np.nd
     """Metrics in the mask's box and 10 %; empty where the mask is. LPIPS where its weights are in the folder, or on the
     machine."""
     box = metrics.mask_box(mask.astype(bool))
-    values = metrics.score(box.crop(image), box.crop(truth), _models(str(weights))) if box else {}
+    targets = metrics.lpips_targets(box.crop(truth), _models(str(weights))) if box else {}
+    values = metrics.score(box.crop(image), box.crop(truth), targets) if box else {}
     return {name: np.float64(value) for name, value in values.items() if value is not None}
 
 
