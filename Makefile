@@ -104,7 +104,7 @@ $(VENV)/.ready-cluster: $(VENV)/.ready
 
 # Once, and a failure too: `make weights` tries again.
 $(VENV)/.lpips: | $(VENV)/.ready
-	@$(PY) -m reffusion.weights.lpips_package
+	@$(PY) -m reffusion.weights
 	@touch $@
 
 $(VENV)/.ready-dev: $(VENV)/.ready

@@ -18,7 +18,8 @@ from runner.many import Outcome, Run, do_all
 from runner.pipeline import Pipeline, find_scene, load_pipeline, scene_name, unknown
 from runner.resolve import Request, resolve_all
 
-FULL = "full"  # what the scene's own run, without a variant, is called beside them
+FULL = "full"  # the whole method: a variant of this name, else the scene's own run
+OWN = "default"  # the scene's own run, where FULL is a variant
 TOGETHER = "compare"  # the folder in runs/ of a comparison over a folder of scenes
 RECORD = "compare.json"
 RUNS = "compare-runs"  # .csv and .md: a row a run, written anew after each
@@ -36,7 +37,7 @@ class By:
 
 
 def compare(request: Request, only: str = "", seeds: int = 1, data: Path | None = None, by: By | None = None) -> int:
-    """Bring the full method and the variants up to date, and write compare.json to runs/<scene>/, of a folder of
+    """Bring the full method and the variants up to date, in the profile of pipeline.yaml's `comparisons`, and write compare.json to runs/<scene>/, of a folder of
     scenes to runs/compare/; how many failed.
 
     What is cached is not run again, so the same command goes on after a kill; after each run all that is done is a
@@ -47,9 +48,12 @@ def compare(request: Request, only: str = "", seeds: int = 1, data: Path | None 
     if request.variant:
         raise Refused(f"variant={request.variant}: compare runs all variants; variants={request.variant} picks some")
     pipeline, by = load_pipeline(request.root), by or By(Local())
-    methods = [FULL, *_chosen(only, pipeline)]
-    names = _scenes(request, seeds, data)
-    asks = lambda scene, method: replace(request, scene=scene, variant=None if method == FULL else method)
+    names, own = _scenes(request, seeds, data), OWN if FULL in pipeline.variants else FULL
+    methods = [FULL, *_chosen(only, pipeline, own)]
+
+    def asks(scene: str, method: str) -> Request:
+        return replace(request, scene=scene, variant=None if method == own else method, compared=method != own)
+
     requests = {(scene, method): asks(scene, method) for scene in names for method in methods}
     hashes = Hashes(request.runs / HASHES)
     _refuse_wrong(list(names), requests, hashes)
@@ -70,7 +74,7 @@ def compare(request: Request, only: str = "", seeds: int = 1, data: Path | None 
     write_json(home / RECORD, record)
     todo = []
     for number, ((scene, method), asked) in enumerate(requests.items(), 1):
-        place = request.runs / (names[scene] if method == FULL else f"{names[scene]}@{method}")
+        place = request.runs / (names[scene] if method == own else f"{names[scene]}@{method}")
         announced = f"\ncompare: {method} on {names[scene]}, {number} of {len(runs)}"
         todo.append(Run(place.name, names[scene], place, asked, announced))
     do_all(todo, by.engine, by.cores, hashes, list(pipeline.stages), ended)
@@ -95,13 +99,13 @@ def _refuse_wrong(scenes: list[str], requests: dict[tuple[str, str], Request], h
     raise refusals[0]
 
 
-def _chosen(only: str, pipeline: Pipeline) -> list[str]:
-    if FULL in pipeline.variants:
-        raise Refused(f"pipeline.yaml: a variant is called {FULL!r}, which is what compare calls the whole method")
+def _chosen(only: str, pipeline: Pipeline, own: str) -> list[str]:
+    """The methods beside FULL: those that `only` names, else the scene's own run and all variants."""
+    known = [name for name in dict.fromkeys((own, *pipeline.variants)) if name != FULL]
     asked = [name for name in re.split(r"[,\s]+", only) if name and name != FULL]
-    for name in (name for name in asked if name not in pipeline.variants):
-        raise Refused(f"variants: {unknown('variant', name, pipeline.variants)}")
-    return list(dict.fromkeys(asked)) if only else list(pipeline.variants)
+    for name in (name for name in asked if name not in known):
+        raise Refused(f"variants: {unknown('variant', name, known)}")
+    return list(dict.fromkeys(asked)) if only else known
 
 
 def _scenes(request: Request, seeds: int, data: Path | None) -> dict[str, str]:

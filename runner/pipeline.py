@@ -100,13 +100,15 @@ class Memory(Strict):
 
 
 class Pipeline(Strict):
-    """The stages in order; parameters by profile and by variant; the keys of scene.yaml and the stage they go to; the
-    parts of a time budget that stages get; what memory they take, where no earlier run tells."""
+    """The stages in order; parameters by profile and by variant; the keys of scene.yaml and the stages they go to; the
+    profile in which a profile's methods are compared, where it is another; the parts of a time budget that stages get;
+    what memory they take, where no earlier run tells."""
 
     stages: dict[str, Stage]
     scene_keys: dict[str, tuple[str, ...]]
     profiles: dict[str, Overrides]
     variants: dict[str, Overrides] = {}
+    comparisons: dict[str, str] = {}
     budget: dict[str, Annotated[float, Field(gt=0)]] = {}
     memory: dict[str, Memory] = {}
 
@@ -132,6 +134,8 @@ class Pipeline(Strict):
             for stage in layer:
                 if stage not in self.stages:
                     raise ValueError(f"{label} names {unknown('stage', stage, self.stages)}")
+        for name in (name for pair in self.comparisons.items() for name in pair if name not in self.profiles):
+            raise ValueError(f"comparisons names {unknown('profile', name, self.profiles)}")
         if sum(self.budget.values()) > 1:
             raise ValueError(f"budget: the parts add up to {sum(self.budget.values()):g}, which is more than 1")
         return self

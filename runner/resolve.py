@@ -47,6 +47,7 @@ class Request:
     budget: str | None = None
     keep: bool = False
     cuda: bool | None = None  # is there a card where stages run? None: where this runs; see `has_cuda`
+    compared: bool = False  # in the profile of pipeline.yaml's `comparisons`
 
 
 @dataclass(frozen=True)
@@ -127,6 +128,8 @@ def _draft(request: Request, hashes: Hashes, scene: bool) -> Job:
         raise Refused(f"{root / 'pipeline.yaml'}: {unknown('variant', variant, pipeline.variants)}")
     home = base.with_name(f"{base.name}@{variant}") if variant else base
     profile, why = choose_profile(request.profile, found, [home / "profile", base / "profile"], pipeline, request.cuda)
+    if request.compared and profile in pipeline.comparisons:
+        profile, why = pipeline.comparisons[profile], f"methods of the profile {profile} are compared in it"
     layer = (pipeline, found, profile, variant, parse_set(request.set, pipeline))
     layers = layered(*layer, {})
     if request.budget or found.budget is not None:

@@ -80,12 +80,13 @@ def run(
     needs = {"poses": poses, "raw_masks": raw_masks, "fit": fit, "masks": masks, "reference": reference}
     needs |= {"personalize": personalize, "lift": lift, "initialize": initialize, "distill": distill}
     scene = load_scene(poses)
-    loaded = {net: lpips.load(net, params.lpips_weights) for net in ("vgg", "alex")}
+    loaded = {net: lpips.load(net) for net in ("vgg", "alex")}
     models = {net: model for net, (model, _) in loaded.items() if model}
     names, kind = views_of(scene)
+    longest = reduced_size(params, raw_masks)
     work, counts = prepared(params, scene, out, needs, tested=kind == "test")
     scored, before = [], None
-    looked = lambda name: looked_at(work, scene.cameras[name], models)
+    looked = lambda name: looked_at(work, scene.cameras[name], models, longest)
     at_once = MOST_AT_ONCE if params.device == "cpu" else 1
     with closing(side_by_side(looked, names, at_once)) as views:
         for _ in trace.progress(len(names), "evaluate"):
@@ -95,10 +96,11 @@ def run(
             before = shown
             scored.append(row)
 
-    (out / "per_view.csv").write_text(metrics.table(scored))
+    (out / "per_view.csv").write_text(rows.table(scored))
     save_ply(out / "scene.ply", work.gaussians[work.result], similarity=scene.similarity)
     summary = {
-        **metrics.summary(scored),
+        **rows.summary(scored),
+        "reduced": rows.reduced_of(scored, longest),
         "rendered": f"{len(names)} {kind} views",
         "result": work.result,
         "suspects": [name for name in names if name in scene.suspects] or None,  # their photographs contradict poses
@@ -133,12 +135,12 @@ def prepared(
     return Work(out, poses, raw_masks, masks, gaussians, result, painter, tested, unseen, exposures), counts
 
 
-def looked_at(work: Work, camera: Camera, models: dict) -> tuple[Shown, dict[str, Any]]:
+def looked_at(work: Work, camera: Camera, models: dict, longest: int) -> tuple[Shown, dict[str, Any]]:
     """The view as the result shows it, saved with all that goes with it; and its row of scores."""
     truth = truth_for(work, camera)
     shown, pictures = rendered(work, camera, exposure_of(work, camera, truth.picture))
     save_side_by_side(work.out, pictures["fit"], truth.picture, shown)
-    return shown, rows.row_of(shown, pictures.get("initialize"), truth, models)
+    return shown, rows.row_of(shown, pictures.get("initialize"), truth, models, longest)
 
 
 @torch.no_grad()
@@ -182,6 +184,14 @@ def save_side_by_side(out: Path, fit: np.ndarray, truth: np.ndarray | None, show
     panels = [p for p in (fit, truth, shown.picture) if p is not None]
     picture = metrics.side_by_side(panels, metrics.mask_box(shown.mask))
     save_image(out / "side_by_side" / f"{shown.camera.name}.png", picture)
+
+
+def reduced_size(params: Params, raw_masks: Path) -> int:
+    """Larger side in px at which boxes are scored beside their own size; 0: at none."""
+    if params.longest is not None:
+        return params.longest
+    facts = raw_masks / "facts.json"
+    return load_json(facts)["test_masks_longest"] if facts.exists() else 0
 
 
 def views_of(scene: Scene) -> tuple[tuple[str, ...], str]:
@@ -257,8 +267,6 @@ def mask_of(camera: Camera, raw_masks: Path, masks: Path | None) -> np.ndarray:
 
 def used(painter: str | None, distill: Path | None) -> dict[str, str | None]:
     """{"inpainter", "perceptual"}: what painted in 2D and what compared patches, None where nothing did."""
-    from reffusion.io.arrays import load_json
-
     facts = distill / "facts.json" if distill else None
     said = load_json(facts) if facts and facts.exists() else {}
     return {"inpainter": painter or said.get("inpainter"), "perceptual": said.get("perceptual")}

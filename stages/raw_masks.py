@@ -15,16 +15,19 @@ from reffusion.capture.reading import read_scene, unphotographed
 from reffusion.capture.undistorted import save_undistorted_masks
 from reffusion.capture.views import check_outliers, known
 from reffusion.io.arrays import save_json
-from reffusion.io.images import save_mask
+from reffusion.io.images import image_size, save_mask
 from reffusion.io.scene import WARNINGS, load_raw_masks, load_scene
 from reffusion.masks import regions
 from reffusion.params.raw_masks import Params
 from reffusion.types import Scene
 
+FACTS = "facts.json"
+
 
 def run(params: Params, out: Path, *, scene: Path, poses: Path) -> None:
     """Write masks/ (with masks of several objects, masks/<object>/), test_masks/ and fill/, <view>.png each;
-    region.json where the scene names a region; warnings.json where masks are odd."""
+    region.json where the scene names a region; facts.json, the size of the test masks' files; warnings.json where
+    masks are odd."""
     placed, lenses = load_scene(poses), load_lenses(poses)[0]
     notes: tuple[str, ...] = ()
     if not unphotographed(params, scene):
@@ -33,6 +36,8 @@ def run(params: Params, out: Path, *, scene: Path, poses: Path) -> None:
         for k in trace.progress(len(names), "masks"):
             save_undistorted_masks(out, names[k], roles, lenses[names[k]])
         notes = roles.warnings
+        if roles.test_masks:
+            save_json(out / FACTS, {"test_masks_longest": max(max(image_size(p)) for p in roles.test_masks.values())})
     if params.region is not None:
         _save_region(params, out, placed)
     notes = (*notes, *odd_masks(placed, load_raw_masks(out, placed.train)))

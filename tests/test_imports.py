@@ -36,6 +36,7 @@ OWN_FILES = (
     "reffusion/score/lpips.py",
     "reffusion/weights/local.py",
     "reffusion/weights/download.py",
+    "reffusion/weights/lpips_package.py",
     "reffusion/capture/sfm.py",
     COMPILER,
 )  # weights, databases, pipes, kernels

@@ -279,7 +279,7 @@ def test_a_pickle_that_is_no_array_runs_nothing(tmp_path, index, monkeypatch):
 def test_without_a_network_one_line_says_so(no_caches, index):
     environment = {**os.environ, "PIP_FIND_LINKS": ""}
     began = time.monotonic()
-    command = [sys.executable, "-m", "reffusion.weights.lpips_package"]
+    command = [sys.executable, "-m", "reffusion.weights"]
     done = subprocess.run(command, capture_output=True, text=True, env=environment)
     assert done.returncode == 0 and time.monotonic() - began < 20
     assert done.stderr.startswith("warning: scores are without LPIPS: ") and done.stderr.count("\n") == 1

@@ -99,7 +99,7 @@ def test_the_stand_in_for_lpips_is_named_as_such_and_measures_structure(tmp_path
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     name, distance = perceptual.load()
-    assert name.startswith("multi-scale D-SSIM (no backbone for LPIPS (vgg)")
+    assert name.startswith("multi-scale D-SSIM (no weights of LPIPS (vgg)")
     target = torch.rand(32, 32, 3, generator=generator(0))
     assert float(distance(target, target)) == pytest.approx(0, abs=1e-5)
     brighter, other = target * 0.8 + 0.2, torch.rand(32, 32, 3, generator=generator(1))

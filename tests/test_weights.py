@@ -183,11 +183,14 @@ def test_what_a_stage_needs(caches):
     shutil.rmtree(folder / "unet")
     broken = local.of_model(str(folder), "float32")
     assert "lacks unet" in broken.problem and not broken.fetched
-    names = {need.name: need for need in local.of_lpips(None)}
-    assert all(need.problem and need.optional for need in names.values()) and len(names) == 4
-    (caches / "cache" / "reffusion" / "lpips").mkdir(parents=True)
-    (caches / "cache" / "reffusion" / "lpips" / "alex.pth").write_bytes(b"x")
-    assert {n.name for n in local.of_lpips(None) if not n.problem} == {"alex.pth"}
+    assert "no weights of alex and vgg" in local.of_lpips().problem and local.of_lpips().optional
+    own = caches / "cache" / "reffusion" / "lpips"
+    own.mkdir(parents=True)
+    for name in ("alex.safetensors", "vgg.pth"):  # whole, and half of a pair
+        (own / name).write_bytes(b"x")
+    assert "no weights of vgg on" in local.of_lpips().problem
+    (own / "vgg16-own.pth").write_bytes(b"x")
+    assert local.of_lpips().problem is None
 
 
 # ------------------------------------------------------------------------------------------------------------- fetching

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from reffusion.params.base import WEIGHTS, Device, Settings
+from reffusion.params.base import Device, Settings
 from reffusion.params.lift import lama_field
 
 
 class Params(Settings):
-    lpips_weights: str | None = Field(
+    # PAPER leaves open: at which size it scores. SPIn-NeRF's masks are of 1008 px, and LPIPS depends on the size.
+    longest: int | None = Field(
         None,
-        description="folder with LPIPS weights, looked into before ~/.cache/reffusion/lpips and torch hub's cache",
-        json_schema_extra=WEIGHTS,
+        ge=0,
+        description="the box is also scored with pictures reduced to this larger side, px; None: that of the test "
+        "masks' files; 0: not",
     )
     inpaint: bool = Field(False, description="a baseline: each rendered view is inpainted in 2D inside its mask")
     lama: str | None = lama_field()

@@ -6,12 +6,9 @@ outside it enters, and nothing is resized. Every function raises ValueError on u
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
-from importlib.metadata import version
-from io import StringIO
 from math import ceil, floor, inf, log10
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -23,15 +20,12 @@ from reffusion.score.lpips import NAMES, SMALLEST, Lpips
 SSIM_WINDOW = 11  # px
 SSIM_SIGMA = 1.5  # px
 SSIM_CONSTANTS = 0.01**2, 0.03**2  # of the paper, at data range 1
-LIBRARIES = ("torch", "numpy", "opencv-contrib-python-headless")
 BOX_DILATION = 0.1  # each side of the mask's box moves outwards by this share of the box's extent
 PSNR_CAP = 100.0  # dB, what an identical image counts in a mean
 
+BOX_COLUMNS = (*(f"{name}_box" for name in NAMES.values()), "psnr_box", "ssim_box", "flip_box")
 COLUMNS = (
-    "psnr_box",
-    "ssim_box",
-    "flip_box",
-    *(f"{name}_box" for name in NAMES.values()),
+    *BOX_COLUMNS,
     "psnr_outside",
     "ssim_outside",
     "flip_outside",
@@ -250,36 +244,6 @@ def mean(values: list[float | None]) -> float | None:
     """
     present = [min(value, PSNR_CAP) for value in values if value is not None]
     return float(np.mean(present)) if present else None
-
-
-def summary(rows: list[dict[str, Any]]) -> dict[str, dict[str, float | int | None]]:
-    """{"mean", "initialize", "views"}, each with `COLUMNS`: the means of the columns, of the columns that start with
-    `initialize_`, and how many views have a value."""
-    values = {
-        prefix + name: [row.get(prefix + name) for row in rows] for prefix in ("", "initialize_") for name in COLUMNS
-    }
-    return {
-        "mean": {name: mean(values[name]) for name in COLUMNS},
-        "initialize": {name: mean(values[f"initialize_{name}"]) for name in COLUMNS},
-        "views": {name: sum(value is not None for value in values[name]) for name in COLUMNS},
-    }
-
-
-def table(rows: list[dict[str, Any]]) -> str:
-    """CSV, a line a view; a value that does not exist is empty, an identical image's PSNR is inf."""
-    text = StringIO()
-    columns = dict.fromkeys(column for row in rows for column in row)
-    writer = csv.DictWriter(text, list(columns), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
-
-
-def versions() -> dict[str, str]:
-    """The libraries that the numbers depend on."""
-    import reffusion
-
-    return {"reffusion": reffusion.__version__} | {name: version(name) for name in LIBRARIES}
 
 
 def side_by_side(panels: list[np.ndarray], box: Box | None) -> np.ndarray:

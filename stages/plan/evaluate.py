@@ -9,7 +9,7 @@ from reffusion.weights import local
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
     """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
-    return local.of_lpips(params.lpips_weights)
+    return [local.of_lpips()]
 
 
 def lacks(params: Params) -> list[str]:

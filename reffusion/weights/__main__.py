@@ -1,0 +1,23 @@
+"""`python -m reffusion.weights`: fetch the weights of LPIPS where they are missing, as `make` does once."""
+
+from __future__ import annotations
+
+import sys
+
+from reffusion.weights.local import of_lpips
+
+
+def main() -> None:
+    """Fetch; a line about it, and no error where that fails."""
+    need = of_lpips()
+    if need.problem is None:
+        return
+    print(f"fetching the weights of LPIPS, a score ({need.bytes / 1e6:.0f} MB, once)", flush=True)
+    try:
+        need.fetch()
+    except ValueError as error:
+        print(f"warning: scores are without LPIPS: {error}; `make weights` tries again", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()
