@@ -29,12 +29,11 @@ from report.results import (
 
 TITLES = {
     "method": "method",
+    "lpips_vgg_box": "LPIPS (vgg) ↓",
+    "lpips_alex_box": "LPIPS (alex) ↓",
     "psnr_box": "PSNR, dB ↑",
     "ssim_box": "SSIM ↑",
     "flip_box": "FLIP ↓",
-    "lpips_vgg_box": "LPIPS (vgg) ↓",
-    "lpips_alex_box": "LPIPS (alex) ↓",
-    "stlpips_box": "ST-LPIPS ↓",
     "psnr_outside": "outside: PSNR ↑",
     "ssim_outside": "outside: SSIM ↑",
     "flip_outside": "outside: FLIP ↓",
@@ -44,19 +43,15 @@ TITLES = {
     "peak_memory_mb": "peak MB",
     "gaussians": "Gaussians",
 }
-DIGITS = {"psnr_box": 2, "ssim_box": 4, "flip_box": 4, "lpips_vgg_box": 4, "lpips_alex_box": 4, "stlpips_box": 4}
+DIGITS = {"lpips_vgg_box": 4, "lpips_alex_box": 4, "psnr_box": 2, "ssim_box": 4, "flip_box": 4}
 DIGITS |= {"consistency": 5}
 DIGITS |= {"psnr_outside": 2, "ssim_outside": 4, "flip_outside": 4}
-ERRORS = {"flip_box": "FLIP in the box", "ssim_box": "1 − SSIM in the box", "lpips_vgg_box": "LPIPS (vgg) in the box"}
-SHORT = {"psnr_box": "PSNR, dB", "ssim_box": "SSIM", "flip_box": "FLIP", "lpips_vgg_box": "LPIPS (vgg)"}
-SHORT |= {"lpips_alex_box": "LPIPS (alex)", "stlpips_box": "ST-LPIPS"}
+ERRORS = {"lpips_vgg_box": "LPIPS (vgg) in the box", "flip_box": "FLIP in the box", "ssim_box": "1 − SSIM in the box"}
+SHORT = {"lpips_vgg_box": "LPIPS (vgg)", "lpips_alex_box": "LPIPS (alex)"}
+SHORT |= {"psnr_box": "PSNR, dB", "ssim_box": "SSIM", "flip_box": "FLIP"}
 SHORT |= {"psnr_outside": "PSNR outside, dB", "ssim_outside": "SSIM outside", "flip_outside": "FLIP outside"}
-WHERE_THERE = (
-    "consistency",
-    "lpips_alex_box",
-    "stlpips_box",
-    *OUTSIDE,
-)  # columns that are left out where no method has a value
+# columns that are left out where no method has a value
+WHERE_THERE = ("consistency", "lpips_vgg_box", "lpips_alex_box", *OUTSIDE)
 WAYS = {"inpainter": "2D inpainter", "perceptual": "perceptual distance"}  # keys of the files, in words
 
 
@@ -124,13 +119,15 @@ def cells(table: list[dict[str, Any]]) -> tuple[list[str], list[list[str]], list
     best = {}
     most = max(row["scenes"] for row in table)
     for name, better in SCORES.items():  # not in consistency, which blur has too; nor a mean over fewer scenes
-        values = [row[name] for row in table if row[name] is not None and row["scenes"] == most]
+        values = [round(row[name], DIGITS[name]) for row in table if row[name] is not None and row["scenes"] == most]
         best[name] = (max if better == "more" else min)(values, default=None) if len(values) > 1 else None
     texts, bold = [], []
     for row in table:
-        state = "" if row["state"] == "done" else f" ({row['state']})"
+        state = f" ({row['state']})" if row["state"] != "done" else f" = {row['same_as']}" if row["same_as"] else ""
         texts.append([row["method"] + state if n == "method" else _cell(row, n) for n in names])
-        bold.append([best.get(n) is not None and row[n] == best[n] for n in names])
+        bold.append(
+            [best.get(n) is not None and row[n] is not None and round(row[n], DIGITS[n]) == best[n] for n in names]
+        )
     return [TITLES[name] for name in names], texts, bold
 
 
@@ -142,7 +139,8 @@ def _cell(row: dict[str, Any], name: str) -> str:
 def difference_cells(table: list[dict[str, Any]]) -> tuple[list[str], list[list[str]]] | None:
     """Method minus full: the mean, half its interval over views, and over scenes where there are several."""
     found = [metric for metric in SCORES if any(row[f"{metric}_minus_full"] is not None for row in table)]
-    lines = [[row["method"], *(_signed(row, metric) for metric in found)] for row in table if row["method"] != FULL]
+    others = [row for row in table if row["method"] != FULL and not row["same_as"]]
+    lines = [[row["method"], *(_signed(row, metric) for metric in found)] for row in others]
     return (["method", *(SHORT[metric] for metric in found)], lines) if found else None
 
 
@@ -185,8 +183,10 @@ def summary(comparison: Comparison, table: list[dict[str, Any]]) -> str:
     for metric, better in (BETTER if boxed else OUTSIDE).items():
         there = [row for row in table if row[metric] is not None]
         if len(there) > 1:
-            best = (max if better == "more" else min)(there, key=lambda row: row[metric])
-            parts.append(f"best in {SHORT[metric].removesuffix(', dB')}: {best['method']}")
+            shown = [round(row[metric], DIGITS[metric]) for row in there]
+            best = (max if better == "more" else min)(shown)
+            tied = [row["method"] for row, value in zip(there, shown, strict=True) if value == best]
+            parts.append(f"best in {SHORT[metric].removesuffix(', dB')}: {' and '.join(tied)}")
     return "; ".join(parts) + "."
 
 
@@ -211,6 +211,7 @@ def notes(comparison: Comparison) -> list[str]:
     if any(row["consistency"] is not None for row in rows(comparison)):
         words = "mean absolute difference inside the mask to the next view, by rendered depth; blur is consistent too."
         said.append(f"consistency: {words}")
+    said += [f"{method} is the very same job as {other} here." for method, other in comparison.same_as.items()]
     said += dict.fromkeys(words for run in done for words in ways(run))
     for run in done:
         resumed = [stage for stage, receipt in run.receipts.items() if receipt.get("resumed")]

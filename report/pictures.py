@@ -30,7 +30,7 @@ def sheets(comparison: Comparison, out: Path, count: int = 3) -> dict[str, Path]
 
 
 def _sheets_of(comparison: Comparison, scene: str, out: Path, prefix: str, count: int) -> dict[str, Path]:
-    runs = [run for m in comparison.methods if (run := comparison.runs[m, scene]).state == "done" and run.views]
+    runs = [run for m in comparison.distinct if (run := comparison.runs[m, scene]).state == "done" and run.views]
     if not runs:
         return {}
     first = next((run for run in runs if run.method == FULL), runs[0])

@@ -15,14 +15,21 @@ from report.paired import Difference, half_width, paired
 
 FULL = "full"
 TOGETHER = "compare"  # the folder in runs/ of a comparison over a folder of scenes
-BETTER = {"psnr_box": "more", "ssim_box": "more", "flip_box": "less", "lpips_vgg_box": "less", "lpips_alex_box": "less"}
-BETTER |= {"stlpips_box": "less"}
+MAIN = "lpips_vgg_box"  # by which methods are ordered
+BETTER = {"lpips_vgg_box": "less", "lpips_alex_box": "less", "psnr_box": "more", "ssim_box": "more", "flip_box": "less"}
 OUTSIDE = {"psnr_outside": "more", "ssim_outside": "more", "flip_outside": "less"}  # of the masks
 SCORES = BETTER | OUTSIDE
 PSNR_CAP = 100.0  # dB, what an identical view counts: as in metrics.json
 MEASURED = ("consistency", "seconds", "own_seconds", "peak_memory_mb", "gaussians", "scenes")
 AGAINST = ("minus_full", "interval_views", "interval_scenes")  # see report.paired.Difference; halves of intervals
-COLUMNS = ("method", "state", *SCORES, *MEASURED, *(f"{metric}_{what}" for metric in SCORES for what in AGAINST))
+COLUMNS = (
+    "method",
+    "state",
+    "same_as",
+    *SCORES,
+    *MEASURED,
+    *(f"{metric}_{what}" for metric in SCORES for what in AGAINST),
+)
 COLUMNS += tuple(f"{metric}_interval" for metric in SCORES)  # half the 95% interval of the mean over scenes
 
 
@@ -51,14 +58,26 @@ class Run:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All methods on all scenes. `runs[method, scene]`; the first method is the full one; `data`: the folder that the
-    scenes are from, where they are all of a folder."""
+    """All methods on all scenes.
+
+    Attributes:
+        data: the folder that the scenes are from, where they are all of a folder.
+        methods: the first is the full one.
+        runs: (method, scene) -> run.
+        same_as: method -> an earlier one that is the very same job in every scene.
+    """
 
     home: Path
     data: Path | None
     scenes: tuple[str, ...]
     methods: tuple[str, ...]
     runs: dict[tuple[str, str], Run]
+    same_as: dict[str, str]
+
+    @property
+    def distinct(self) -> list[str]:
+        """The methods that are no other method's job."""
+        return [method for method in self.methods if method not in self.same_as]
 
     @property
     def name(self) -> str:
@@ -79,7 +98,19 @@ def load(home: Path) -> Comparison:
     record = load_json(path)
     runs = {(run["method"], run["scene"]): load_run(run, home.parent) for run in record["runs"]}
     data = Path(record["data"]) if "data" in record else None
-    return Comparison(home, data, tuple(record["scenes"]), tuple(record["methods"]), runs)
+    scenes, methods = tuple(record["scenes"]), tuple(record["methods"])
+    return Comparison(home, data, scenes, methods, runs, _same_jobs(methods, scenes, runs))
+
+
+def _same_jobs(methods: tuple[str, ...], scenes: tuple[str, ...], runs: dict[tuple[str, str], Run]) -> dict[str, str]:
+    """Method -> an earlier one of which the last stage had the same inputs in every scene."""
+    first: dict[tuple[str, ...], str] = {}
+    found = {}
+    for method in methods:
+        keys = tuple(runs[method, scene].receipts.get("evaluate", {}).get("key", "") for scene in scenes)
+        if all(keys) and first.setdefault(keys, method) != method:
+            found[method] = first[keys]
+    return found
 
 
 def load_run(record: dict[str, Any], runs: Path) -> Run:
@@ -128,8 +159,10 @@ def _number(column: str, text: str | None) -> float | None:
 
 
 def rows(comparison: Comparison) -> list[dict[str, Any]]:
-    """A dict of `COLUMNS` for each method: means over its finished scenes; None where there is no value."""
+    """A dict of `COLUMNS` for each method: means over its finished scenes; None where there is no value, and of a
+    method that is another's job. The best in `MAIN` first; methods without it as they were named."""
     table = [_row(comparison, method) for method in comparison.methods]
+    table.sort(key=lambda row: (row["same_as"] is not None, row[MAIN] is None, row[MAIN] or 0.0))
     for metric in SCORES:
         found = differences(comparison, metric)
         for row in table:
@@ -145,6 +178,9 @@ def _row(comparison: Comparison, method: str) -> dict[str, Any]:
     row: dict[str, Any] = dict.fromkeys(COLUMNS)
     row |= {"method": method, "scenes": len(done)}
     row["state"] = states[0] if len(set(states)) == 1 else f"{len(done)} of {len(states)} done"
+    row["same_as"] = comparison.same_as.get(method)
+    if row["same_as"]:
+        return row
     for name in SCORES:
         values = [run.metrics.get("mean", {}).get(name) for run in done]
         row |= {name: mean(values), f"{name}_interval": interval(values)}
@@ -203,8 +239,8 @@ def load_csv(path: Path) -> list[dict[str, Any]]:
 
 
 def _value(name: str, text: str) -> Any:
-    if name in ("method", "state"):
-        return text
+    if name in ("method", "state", "same_as"):
+        return text or None
     whole = name in ("peak_memory_mb", "gaussians", "scenes")
     return None if text == "" else int(text) if whole else float(text)
 
@@ -215,7 +251,7 @@ def _value(name: str, text: str) -> Any:
 def differences(comparison: Comparison, metric: str) -> dict[str, Difference]:
     """Method -> its difference to the full one in a score, over the views that both have."""
     found = {}
-    for method in comparison.methods:
+    for method in comparison.distinct:
         if method == FULL:
             continue
         scenes = []

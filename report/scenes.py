@@ -12,7 +12,7 @@ from report.loading import Job
 
 COLUMNS = ("stage", "quantity", "scenes", "quartile_1", "median", "quartile_3")
 WHOLE = "whole job"
-SCORES = ("psnr_box", "ssim_box", "flip_box", "lpips_vgg_box")
+SCORES = ("lpips_vgg_box", "psnr_box", "ssim_box", "flip_box")
 
 
 def make(jobs: list[Job], out: Path) -> Path:

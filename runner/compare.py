@@ -37,8 +37,8 @@ class By:
 
 
 def compare(request: Request, only: str = "", seeds: int = 1, data: Path | None = None, by: By | None = None) -> int:
-    """Bring the full method and the variants up to date, in the profile of pipeline.yaml's `comparisons`, and write compare.json to runs/<scene>/, of a folder of
-    scenes to runs/compare/; how many failed.
+    """Bring the full method and the variants up to date, in the profile of pipeline.yaml's `comparisons`, and write
+    compare.json to runs/<scene>/, of a folder of scenes to runs/compare/; how many failed.
 
     What is cached is not run again, so the same command goes on after a kill; after each run all that is done is a
     table, compare-runs.csv and .md. A variant that fails stops no other.

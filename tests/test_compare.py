@@ -182,10 +182,48 @@ def test_every_variant_once_and_what_is_equal_is_shared(compared):
 
 def test_a_failed_variant_shows_and_stops_no_other(compared, pages):
     table = by_method(compared / "runs/toy")
-    assert [row["state"] for row in table.values()] == ["done", "done", "done", "failed", "done"]
+    assert [name for name, row in table.items() if row["state"] == "failed"] == ["bad"]
     assert table["bad"]["psnr_box"] is None and table["bad"]["seconds"] is None and table["none"]["psnr_box"] == 22.5
     assert "| bad (failed) |" in pages["md"].read_text()
     assert all("a gain below 0 | cannot be" in pages[kind].read_text() for kind in ("md", "html"))
+
+
+def test_the_same_job_is_no_row_of_figures(compared, pages):
+    twin = by_method(compared / "runs/toy")["twin"]
+    assert twin["same_as"] == "better" and twin["psnr_box"] is None and twin["seconds"] is None
+    text = pages["md"].read_text()
+    assert "| twin = better |" in text and "twin is the very same job as better here." in text
+    assert "best in SSIM: better;" in text
+
+
+def test_methods_are_compared_in_a_profile_of_their_own(tmp_path):
+    """The scene's own run is a method beside the others."""
+    root = written(tmp_path)
+    pipeline = FILES["pipeline.yaml"].replace(
+        "profiles: {laptop: {}}", "profiles: {laptop: {}, terms: {distill: {gain: 2}}}"
+    )
+    pipeline = pipeline.replace("variants:\n", "comparisons: {laptop: terms}\nvariants:\n  full: {}\n")
+    write(root, {"pipeline.yaml": pipeline})
+    assert compare(request(root), only="better default") == 0
+    table = by_method(root / "runs/toy")
+    assert list(table) == ["full", "better", "default"]
+    assert [table[name]["gaussians"] for name in table] == [102, 103, 101]
+    assert (root / "runs/toy/profile").read_text() == "laptop\n"
+    assert (root / "runs/toy@full/profile").read_text() == "terms\n"
+    write(root, {"pipeline.yaml": pipeline.replace("{laptop: terms}", "{laptop: nothing}")})
+    with pytest.raises(Refused, match="comparisons names unknown profile 'nothing'"):
+        compare(request(root))
+
+
+def test_the_best_in_lpips_comes_first_and_ties_are_ties(home):
+    for method, value in (("toy", 0.2), ("toy@better", 0.1), ("toy@none", 0.10001)):
+        path = home.parent / method / "evaluate/metrics.json"
+        metrics = json.loads(path.read_text())
+        metrics["mean"]["lpips_vgg_box"] = value
+        path.write_text(json.dumps(metrics))
+    assert list(by_method(home)) == ["better", "none", "full", "bad", "twin"]
+    text = page.make(home)["md"].read_text()
+    assert "best in LPIPS (vgg): better and none;" in text and text.count("**0.1000**") == 2
 
 
 def test_a_folder_of_scenes_killed_and_started_again_nothing_runs_twice(tmp_path):
