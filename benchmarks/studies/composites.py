@@ -59,21 +59,27 @@ def made(place: Place, captures: Path, options: drawing.Options, out: Path) -> t
     return scene, untouched
 
 
-def job(scene: Path, runs: Path, profile: str) -> Path:
+def job(scene: Path, runs: Path, profile: str, variant: str = "") -> Path:
     """The whole job on a scene by the runner, which finds what is done; its folder. ValueError where it fails."""
     command = ["run", "all", "--scene", str(scene), "--runs", str(runs), "--profile", profile]
+    command += ["--variant", variant] if variant else []
     if subprocess.run([sys.executable, "-m", "runner", *command], cwd=ROOT).returncode:
         raise ValueError(f"{scene.name}: the job failed; see above")
-    return runs / scene.name
+    return runs / (f"{scene.name}@{variant}" if variant else scene.name)
 
 
-def measured(place: Place, captures: Path, options: drawing.Options, out: Path, profile: str) -> dict:
+def measured(
+    place: Place, captures: Path, options: drawing.Options, out: Path, profile: str, variants: list[str]
+) -> dict:
     """The place's row of the table; its sheet is saved, and its errors against seconds."""
     scene, untouched = made(place, captures, options, out)
     run, ceiling = (judging.Run.at(job(folder, out / "runs", profile)) for folder in (scene, untouched))
+    others = {name: judging.Run.of_variant(run, job(scene, out / "runs", profile, name)) for name in variants}
     save_image(out / f"{scene.name}.png", judging.sheet(run, ceiling))
+    for name, other in others.items():
+        save_image(out / f"{scene.name}@{name}.png", judging.sheet(other, ceiling))
     draw(load_job(run.folder), out / f"{scene.name}-seconds.png", ceiling.metrics["mean"]["psnr_box"])
-    return {"place": scene.name, **judging.scores(run, ceiling)}
+    return {"place": scene.name, **judging.scores(run, ceiling, others)}
 
 
 def chosen(names: str, report: bool) -> tuple[Place, ...]:
@@ -97,7 +103,8 @@ def benchmark(given: argparse.Namespace) -> int:
         if given.make:
             print("made", *made(place, given.captures, options, out))
             continue
-        rows.append(measured(place, given.captures, options, out, given.profile))
+        variants = [name for name in given.variants.split(",") if name]
+        rows.append(measured(place, given.captures, options, out, given.profile, variants))
         (out / "composites.json").write_text(json.dumps(rows, indent=1))
         (out / "composites.md").write_text(judging.table(rows))
     if rows:
@@ -116,6 +123,7 @@ def main() -> int:
     parser.add_argument("--rough", type=int, default=0, help="px by which training masks are wrong")
     parser.add_argument("--seed", type=int, default=0, help="of the object's colours and the masks' faults")
     parser.add_argument("--profile", default="laptop", help="of pipeline.yaml")
+    parser.add_argument("--variants", default="", help="of pipeline.yaml, with commas between: scored beside it")
     parser.add_argument("--make", action="store_true", help="make the scenes only, to look at")
     given = parser.parse_args()
     if not given.captures.is_dir():

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,7 +16,7 @@ from reffusion.io.images import load_image
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_scene
 from reffusion.paint import paint2d
-from reffusion.score import metrics
+from reffusion.score import lpips, metrics
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Scene
 from stages import evaluate
@@ -23,7 +25,7 @@ THIN = 0.9  # alpha under which a pixel is uncovered
 BLACK, LIT = 0.06, 0.15  # brightest channel: of what looks uncovered, where the truth has more than that
 AROUND = 0.6  # of the box's extent that a sheet shows to each side
 ROW = 200  # px, height of a sheet's rows
-COLUMNS = ("psnr", "ssim", "flip")
+COLUMNS = {"lpips_vgg": 3, "psnr": 2, "ssim": 3, "flip": 3}  # and their digits
 WAYS = ("result", "initialize", "ceiling", "telea")
 
 
@@ -34,10 +36,20 @@ class Run:
     folder: Path
     scene: Scene
     metrics: dict
+    base: Path | None = None
 
     @classmethod
     def at(cls, folder: Path) -> Run:
         return cls(folder, load_scene(folder / "poses"), load_json(folder / "evaluate/metrics.json"))
+
+    @classmethod
+    def of_variant(cls, base: Run, folder: Path) -> Run:
+        """A variant's, which shares with `base` the stages that it has no folder of."""
+        return cls(folder, base.scene, load_json(folder / "evaluate/metrics.json"), base.folder)
+
+    def stage(self, name: str) -> Path:
+        own = self.folder / name
+        return own if own.exists() or self.base is None else self.base / name
 
     def picture(self, name: str, kind: str = "renders") -> np.ndarray:
         """uint8 [H, W, 3], a test view as evaluate drew it."""
@@ -45,22 +57,22 @@ class Run:
 
     def truth(self, name: str) -> np.ndarray:
         """uint8 [H, W, 3], a test view's photograph."""
-        return load_image(self.folder / f"poses/images/{name}.png")
+        return load_image(self.stage("poses") / f"images/{name}.png")
 
     def mask(self, name: str) -> np.ndarray:
         """bool [H, W]: where the object is: the test mask of a test view, else the consistent mask."""
-        masks = self.folder / "masks"
-        return evaluate.mask_of(self.scene.cameras[name], self.folder / "raw_masks", masks if masks.exists() else None)
+        masks = self.stage("masks")
+        return evaluate.mask_of(self.scene.cameras[name], self.stage("raw_masks"), masks if masks.exists() else None)
 
     def gaussians(self) -> Gaussians:
         """The result."""
-        return load_ply(self.folder / self.metrics["result"] / "gaussians.ply")
+        return load_ply(self.stage(self.metrics["result"]) / "gaussians.ply")
 
 
-def scores(run: Run, ceiling: Run) -> dict[str, dict[str, float | None] | float | None]:
+def scores(run: Run, ceiling: Run, variants: Mapping[str, Run]) -> dict[str, Any]:
     """A place's row: for each of WAYS its means of COLUMNS over the test views' boxes (+ 10 %); "sharpness" of result
-    and ceiling; "uncovered", worst view, of "train" and "test"; "seconds" of the job."""
-    row: dict = {
+    and ceiling; "uncovered", worst view, of "train" and "test"; "seconds" of the job; "variants", COLUMNS of each."""
+    row: dict[str, Any] = {
         "result": _means(run.metrics["mean"]),
         "initialize": _means(run.metrics["initialize"]),
         "ceiling": _means(ceiling.metrics["mean"]),
@@ -71,6 +83,7 @@ def scores(run: Run, ceiling: Run) -> dict[str, dict[str, float | None] | float 
             "test": _worst(run, {name: run.truth(name) for name in run.scene.test}),
         },
         "seconds": sum(run.metrics["seconds"].values()),
+        "variants": {name: _means(each.metrics["mean"]) for name, each in variants.items()},
     }
     return row
 
@@ -81,14 +94,16 @@ def _means(of: dict[str, float | None]) -> dict[str, float | None]:
 
 def _telea(run: Run) -> dict[str, float | None]:
     """Telea's filling of the test masks in our own renders: our surroundings, but inside them no method at all."""
-    rows = []
+    rows, (vgg, _) = [], lpips.load("vgg")
+    models = {"vgg": vgg} if vgg else {}
     for name in run.scene.test:
         mask = run.mask(name)
         box = metrics.mask_box(mask)
         if box is not None:
             painted = paint2d.telea(run.picture(name), mask)
-            rows.append(metrics.score(box.crop(painted), box.crop(run.truth(name))))
-    return {column: metrics.mean([row[column] for row in rows]) for column in COLUMNS}
+            truth = box.crop(run.truth(name))
+            rows.append(metrics.score(box.crop(painted), truth, metrics.lpips_targets(truth, models)))
+    return {column: metrics.mean([row.get(column) for row in rows]) for column in COLUMNS}
 
 
 def _sharpness(run: Run) -> float | None:
@@ -155,15 +170,26 @@ def _row(panels: list[np.ndarray]) -> np.ndarray:
 
 
 def table(rows: list[dict]) -> str:
-    """Markdown: a row a place; scores are PSNR / SSIM / FLIP, shares in percent."""
+    """Markdown: a row a place; scores are LPIPS (vgg) / PSNR / SSIM / FLIP, shares in percent; of each variant its
+    scores, and the ratio of our LPIPS to its."""
+    variants = list(rows[0]["variants"]) if rows else []
     heads = [*WAYS, "sharpness", "its ceiling", "uncovered, train %", "test %", "seconds"]
+    heads += [head for name in variants for head in (name, f"LPIPS, ours / {name}")]
     lines = ["| place | " + " | ".join(heads) + " |", "|---" * (len(heads) + 1) + "|"]
     for row in rows:
-        cells = [" / ".join(_number(row[way][c], 2 if c == "psnr" else 3) for c in COLUMNS) for way in WAYS]
+        cells = [_scores(row[way]) for way in WAYS]
         cells += [_number(row["sharpness"][way], 2) for way in ("result", "ceiling")]
         cells += [_number(row["uncovered"][split], 2, 100) for split in ("train", "test")]
-        lines.append(f"| {row['place']} | " + " | ".join([*cells, _number(row["seconds"], 0)]) + " |")
+        cells.append(_number(row["seconds"], 0))
+        for each in row["variants"].values():
+            ours, theirs = row["result"]["lpips_vgg"], each["lpips_vgg"]
+            cells += [_scores(each), _number(ours / theirs if ours and theirs else None, 2)]
+        lines.append(f"| {row['place']} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
+
+
+def _scores(of: dict[str, float | None]) -> str:
+    return " / ".join(_number(of[column], digits) for column, digits in COLUMNS.items())
 
 
 def _number(value: float | None, digits: int, factor: float = 1.0) -> str:
