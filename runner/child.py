@@ -1,8 +1,9 @@
 """The process in which stages are imported: `describe` reads their parameters, `fetch` gets the weights they name,
 `run` does a stage's work, `frames` takes pictures from a video.
 
-What can be told of a stage before it runs (Params, needed_weights, lacks, cost, preview, scene_files, scene_facts) lies
-in stages/plan/<stage>.py where there is such a file, which imports nothing heavy, else in stages/<stage>.py itself.
+What can be told of a stage before it runs (Params, needed_weights, lacks, lacking, cost, preview, scene_files,
+scene_facts) lies in stages/plan/<stage>.py where there is such a file, which imports nothing heavy, else in
+stages/<stage>.py itself.
 """
 
 import ast
@@ -75,6 +76,8 @@ def _describe(asked: dict[str, Any]) -> dict[str, Any]:
         "weights": [name for name, extra in marks.items() if extra.get("weights")],
         "unkeyed": [name for name, extra in marks.items() if extra.get("keyed") is False],
     }
+    if hasattr(planned, "lacking"):
+        answer["lacking"] = planned.lacking(resolved)
     if brings is not None and hasattr(planned, "needed_weights"):
         answer["needed"] = [asdict(need) for need in planned.needed_weights(resolved, frozenset(brings))]
     if brings is not None and hasattr(planned, "lacks") and answer["params"].get("device") == "cuda":

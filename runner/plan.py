@@ -66,7 +66,8 @@ def decide(job: Job, stage: str, earlier: dict[str, Decision]) -> Decision:
         found = path and read_receipt(path)
         if not path or not found:
             return Decision("run", "no artifact yet")
-        as_then = Inputs(job.params[stage], found["needs"], found["weights"], code, job.stages[stage].unkeyed)
+        own = job.stages[stage]
+        as_then = Inputs(own.params, found["needs"], found["weights"], code, own.unkeyed, own.lacking)
         if known := ([] if job.trust else changes(found, as_then)) or _harm(job, wear(path, job.hashes)):
             return Decision("run", listed(known), path)
         return Decision("stale", f"waits for {', '.join(moving)}; kept if the new content is the same", path)
@@ -147,7 +148,7 @@ def _inputs(job: Job, stage: str, needs: dict[str, Path | None], code: dict[str,
                 raise Refused(f"{stage}: {path} is named in scene.yaml, and holds the scene itself; name one beside it")
             hashes[str(path)] = job.hashes.folder(path) if path.is_dir() else job.hashes.file(path)
     weights = {param: job.hashes.weights(folder) if folder else name for param, name, folder in _weights(job, stage)}
-    return Inputs(own.params, hashes, weights, code, own.unkeyed)
+    return Inputs(own.params, hashes, weights, code, own.unkeyed, own.lacking)
 
 
 def _compare(job: Job, stage: str, inputs: Inputs) -> Decision:

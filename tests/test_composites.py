@@ -191,4 +191,8 @@ def test_the_table_has_a_row_a_place():
     row = {"place": "here", **dict.fromkeys(judging.WAYS, scores), "seconds": 61.6, "variants": {"lift": other}}
     row |= {"sharpness": {"result": 0.8, "ceiling": None}, "uncovered": {"train": 0.001, "test": 0.0125}}
     assert "| here | 0.300 / 21.23 / 0.600 / - |" in judging.table([row])
-    assert judging.table([row]).splitlines()[-1].endswith("| 0.80 | - | 0.10 | 1.25 | 62 | 0.400 / 21.23 / 0.600 / - | 0.75 |")
+    assert (
+        judging.table([row])
+        .splitlines()[-1]
+        .endswith("| 0.80 | - | 0.10 | 1.25 | 62 | 0.400 / 21.23 / 0.600 / - | 0.75 |")
+    )

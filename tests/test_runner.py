@@ -287,6 +287,44 @@ def preview(""",
     assert words(root)["poses"] == "run need scene changed"
 
 
+def test_a_stage_depends_on_facts_that_it_takes_from_other_files(root, capsys):
+    edit(
+        root / "stages/poses.py",
+        "def preview(",
+        """def scene_files(params, scene, files):
+    return [path for path in files if path.parent.name != "drafts"]
+
+def scene_facts(params, scene):
+    return {"drafts": sorted(path.name for path in scene.glob("drafts/*"))}
+
+def preview(""",
+    )
+    ran(capsys, root)
+    write(root, {"data/toy/drafts/idea.txt": "?"})
+    assert words(root)["poses"] == "run need scene: drafts changed"
+    ran(capsys, root)
+    write(root, {"data/toy/drafts/idea.txt": "!"})
+    assert set(words(root).values()) == {"cached"}
+
+
+def test_what_a_stage_did_without_makes_it_anew_once_it_is_there(root, capsys):
+    """And where it is gone again, on another machine, what was made with it stays."""
+    edit(
+        root / "stages/evaluate.py",
+        "def run(",
+        """def lacking(params):
+    return [] if Path(__file__).with_name("metric.txt").exists() else ["the metric"]
+
+def run(""",
+    )
+    assert ran(capsys, root) == ["evaluate"] and set(words(root).values()) == {"cached"}
+    write(root, {"stages/metric.txt": ""})
+    assert words(root)["evaluate"] == "run the metric is on this machine now"
+    assert ran(capsys, root) == ["evaluate"]
+    (root / "stages/metric.txt").unlink()
+    assert set(words(root).values()) == {"cached"}
+
+
 def test_a_stage_that_reads_the_scene_refuses_before_its_other_needs_are_made(fresh):
     edit(fresh / "pipeline.yaml", "masks:\n    needs: [poses, fit]", "masks:\n    needs: [scene, poses, fit]")
     edit(

@@ -79,17 +79,22 @@ def one_pixel_box() -> float:
     return float(not inside) + float(not math.isfinite(scored["psnr_box"])) + float(scored["ssim_box"] is not None)
 
 
-def constant_lpips() -> float:
-    """LPIPS of constant images with random weights: 0 of equal ones, finite otherwise, and a finite gradient."""
+def lpips_of(first: float, second: float, kind: torch.dtype) -> float:
+    """LPIPS of constant images with random weights, of both networks: how many of these do not hold: 0 of equal ones,
+    positive and finite of others, and a finite gradient, 0 at equal ones."""
     torch.manual_seed(0)
-    model = Lpips("alex")
-    for weight in model.linear:
-        weight.data.fill_(1.0)
-    black, grey = torch.full((1, 3, 32, 32), -1.0), torch.zeros(1, 3, 32, 32, requires_grad=True)
-    same, apart = model(black, black), model(black, grey)
-    apart.sum().backward()
-    good = same.item() == 0, math.isfinite(apart.item()), torch.isfinite(grey.grad).all().item()
-    return float(3 - sum(good))
+    wrong = 0
+    for net in ("alex", "vgg"):
+        model = Lpips(net)
+        for weight in model.linear:
+            weight.data.fill_(1.0)
+        model, image = model.to(kind), torch.full((1, 3, 32, 32), first, dtype=kind, requires_grad=True)
+        value = model(image, torch.full((1, 3, 32, 32), second, dtype=kind))
+        value.sum().backward()
+        largest_slope = image.grad.abs().max().item()
+        wrong += (value.item() == 0) != (first == second) or not math.isfinite(value.item())
+        wrong += not math.isfinite(largest_slope) or (first == second and largest_slope > 0)
+    return float(wrong)
 
 
 def loss_of_constant_images() -> float:
@@ -180,7 +185,11 @@ CASES = (
     Case("FLIP of constant images", "how far outside [0, 0] and [0.9, 1]", 16 * EPS32, constant_flip),
     Case("metrics of 1-px images", WRONG, EXACT, one_pixel),
     Case("box of a 1-px mask", WRONG, EXACT, one_pixel_box),
-    Case("LPIPS of constant images", WRONG, EXACT, constant_lpips),
+    Case("LPIPS of black and grey", WRONG, EXACT, lambda: lpips_of(-1.0, 0.0, torch.float32)),
+    Case("LPIPS of equal images", WRONG, EXACT, lambda: lpips_of(0.3, 0.3, torch.float32)),
+    Case("LPIPS of black images", WRONG, EXACT, lambda: lpips_of(-1.0, -1.0, torch.float32)),
+    Case("LPIPS in half precision", WRONG, EXACT,
+         lambda: lpips_of(-1.0, 0.0, torch.float16) + lpips_of(-1.0, -1.0, torch.float16)),
     # E[x^2] - E[x]^2 of numbers of order one rounds by some 2^-24, against C2 = 9e-4.
     Case("reconstruction loss of identical constant images", "largest value or gradient", 4 * EPS32 / 9e-4,
          loss_of_constant_images),

@@ -12,6 +12,11 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
     return [local.of_lpips()]
 
 
+def lacking(params: Params) -> list[str]:
+    """What scores are missing here; where it comes later, they are made anew."""
+    return ["LPIPS"] if local.of_lpips().problem else []
+
+
 def lacks(params: Params) -> list[str]:
     """What this machine has not, and the stage needs on CUDA."""
     return machine.lacks(machine.machine())
