@@ -1,9 +1,9 @@
 """The process in which stages are imported: `describe` reads their parameters, `fetch` gets the weights they name,
 `run` does a stage's work, `frames` takes pictures from a video.
 
-What can be told of a stage before it runs (Params, needed_weights, lacks, lacking, cost, preview, scene_files,
-scene_facts) lies in stages/plan/<stage>.py where there is such a file, which imports nothing heavy, else in
-stages/<stage>.py itself.
+What can be told of a stage before it runs (Params, needed_weights, lacks, lacking, offered_weights, cost, preview,
+scene_files, scene_facts, machine_facts) lies in stages/plan/<stage>.py where there is such a file, which imports
+nothing heavy, else in stages/<stage>.py itself.
 """
 
 import ast
@@ -76,6 +76,10 @@ def _describe(asked: dict[str, Any]) -> dict[str, Any]:
         "weights": [name for name, extra in marks.items() if extra.get("weights")],
         "unkeyed": [name for name, extra in marks.items() if extra.get("keyed") is False],
     }
+    if hasattr(planned, "machine_facts"):
+        answer["machine"] = planned.machine_facts(resolved)
+    if brings is not None and hasattr(planned, "offered_weights"):
+        answer["offered"] = [asdict(need) for need in planned.offered_weights(resolved)]
     if hasattr(planned, "lacking"):
         answer["lacking"] = planned.lacking(resolved)
     if brings is not None and hasattr(planned, "needed_weights"):
@@ -156,7 +160,9 @@ def fetch() -> int:
     for stage, asked in json.load(sys.stdin).items():
         planned = _module(_described_in(stage))
         if hasattr(planned, "needed_weights"):
-            needs = planned.needed_weights(planned.Params(**asked["params"]), frozenset(asked["brings"]))
+            params = planned.Params(**asked["params"])
+            needs = planned.needed_weights(params, frozenset(asked["brings"]))
+            needs += planned.offered_weights(params) if hasattr(planned, "offered_weights") else []
             wanted |= {need.name: need for need in needs if need.problem and need.fetched}
     failed = 0
     for need in wanted.values():

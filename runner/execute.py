@@ -209,8 +209,13 @@ def weights(request: Request, offline: bool) -> int:
     """Show the weights of all stages, of a scene where one is named, and fetch what is missing unless `offline`; how
     many that a stage cannot do without are missing in the end."""
     job = resolve(request, scene=bool(request.scene))
-    answers = zip(job.stages, ask(job.root, list(map(job.question, job.stages))), strict=True)
+    answers = list(zip(job.stages, ask(job.root, list(map(job.question, job.stages))), strict=True))
     all_needs = [(stage, need) for stage, answer in answers for need in answer.get("needed", ())]
+    all_needs += [
+        (f"{stage}, if asked for", need | {"optional": True})
+        for stage, answer in answers
+        for need in answer.get("offered", ())
+    ]
     needs = {need["name"]: need for _, need in all_needs}
     users = {name: ", ".join(stage for stage, need in all_needs if need["name"] == name) for name in needs}
     missing = [need for need in needs.values() if need["problem"]]

@@ -139,6 +139,7 @@ def _inputs(job: Job, stage: str, needs: dict[str, Path | None], code: dict[str,
     own = job.stages[stage]
     hashes = {need: path and job.hashes.folder(path) for need, path in needs.items()}
     hashes |= {f"{SCENE}: {name}": digest(json.dumps(fact)) for name, fact in own.facts.items()}
+    hashes |= {f"machine: {name}": fact for name, fact in own.machine.items()}
     if own.reads is not None:
         hashes[SCENE] = job.hashes.files(job.folder, map(Path, own.reads))
     elif SCENE in job.pipeline.stages[stage].takes:

@@ -17,7 +17,7 @@ from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_raw_masks, load_scene, shows_object
 from reffusion.kernels.compiled import side_by_side
 from reffusion.masks.witness import OPAQUE
-from reffusion.paint import paint2d
+from reffusion.paint import feedforward
 from reffusion.paint.margin import widened
 from reffusion.paint.paint2d import Painter
 from reffusion.params.evaluate import Params
@@ -130,7 +130,7 @@ def prepared(
         # What was made up in views without pixels is as good as seen.
         views = (*scene.train, *scene.blank) if needs["reference"] else scene.train
         gaussians |= finished([scene.cameras[name] for name in views], gaussians, result)
-    painter = paint2d.load(params.lama, params.device) if params.inpaint else None
+    painter = feedforward.load_named(params.inpainter, params.device) if params.inpaint else None
     exposures = exposure.of_views(needs["fit"], list(scene.cameras.values()))
     return Work(out, poses, raw_masks, masks, gaussians, result, painter, tested, unseen, exposures), counts
 

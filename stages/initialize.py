@@ -22,12 +22,14 @@ from reffusion.io.images import save_exr, save_image, save_mask
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_mask_sets, load_object, load_references, load_scene
 from reffusion.masks import regions, undecided, voting
-from reffusion.paint import margin, paint2d
+from reffusion.paint import feedforward, margin, paint2d
 from reffusion.params.initialize import Params
 from reffusion.prior import inpaint
 from reffusion.splat import rasterizer
 from reffusion.texture import surfaces
 from reffusion.types import Reference
+from reffusion.weights import painters
+from reffusion.weights.published import PAINTERS
 
 WARN_FROM = 0.01  # share of C that shows nothing, from which a view is named
 LEAK = 1.0  # weight in undecided over other pixels from which Gaussians are haze
@@ -221,22 +223,25 @@ def true_pictures(reference: Path, references: list, around) -> list:
 
 
 def completed_further(params: Params, out: Path, gaussians, new, around, true):
-    """Views put together from patches of the photographs and of the `true` pictures, the one with most that nothing
-    covers first; the Gaussians with what they show, the labels, and the views."""
+    """Views put together from patches of the photographs and of the `true` pictures, or painted, the one with most that
+    nothing covers first; the Gaussians with what they show, the labels, and the views."""
     further: list[Reference] = []
     images = coverage.mirrored(around)
     found = coverage.open_pixels(gaussians, new, around, around.cameras, images)
     haze = coverage.haze(gaussians, new, around, found, LEAK)
     gaussians, new = gaussians.map(lambda p: p[~haze]), new[~haze]
     looked = replace(around.looked(), completed=coverage.completed(true, gaussians, around))
-    cameras = coverage.beside_photographs(around)
+    cameras, kind = coverage.beside_photographs(around), painters.chosen(params.inpainter)
+    painter = feedforward.load(kind, "", params.device) if kind in PAINTERS else None
     while len(further) < params.further and (camera := coverage.barest(cameras, around, found)):
         mask, hidden = found[camera.name], around.hidden[camera.name]
         # Just outside C a photograph may still show the object's rim, which would be repeated.
         rimmed = margin.widened(hidden, surfaces.RIM)
         base = inpaint.background(gaussians, camera, around.photos[camera.name], rimmed)
         hole = surfaces.with_rim(mask, hidden)
-        if coverage.narrow(mask):  # in a gap there is no room for texture, only for what is beside it
+        if painter is not None:
+            picture = painter.paint(base, hole)
+        elif coverage.narrow(mask):  # in a gap there is no room for texture, only for what is beside it
             picture = paint2d.telea(base, hole)
         else:
             picture = surfaces.completions(base, hole, camera, hidden, looked, [SEED])[0].image

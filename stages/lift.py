@@ -15,7 +15,7 @@ from reffusion.io.arrays import load_json, load_labels, save_json
 from reffusion.io.images import load_image, replace_image
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets, load_scene, save_references
-from reffusion.paint import paint2d
+from reffusion.paint import feedforward
 from reffusion.params.base import REFINED_FROM
 from reffusion.params.lift import Params
 from reffusion.prior import inpaint
@@ -52,8 +52,8 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path) -> No
 
 def painter_of(params: Params) -> tuple[str, Callable[[np.ndarray, np.ndarray, str], np.ndarray]]:
     """The inpainter's name, and (image [H, W, 3] uint8, hole [H, W] bool, name of the view) -> uint8 [H, W, 3]."""
-    if params.inpainter == "deterministic":
-        painter = paint2d.load(params.lama, params.device)
+    if params.inpainter != "diffusion":
+        painter = feedforward.load_named(params.inpainter, params.device)
         return painter.name, lambda image, hole, _: painter.paint(image, hole)
     prior = load_prior(params.prior, device=params.device, dtype=DTYPE)
 

@@ -21,6 +21,7 @@ from reffusion.io.ply import load_ply
 from reffusion.io.scene import has_photograph, load_mask_sets, load_object, load_scene, load_views, save_references
 from reffusion.masks import taint
 from reffusion.paint import agreement, feedforward, painting
+from reffusion.paint.paint2d import Painter
 from reffusion.params.base import REFINED_FROM
 from reffusion.params.reference import Params
 from reffusion.prior import inpaint, memory
@@ -29,6 +30,7 @@ from reffusion.references import color, registration
 from reffusion.references.registration import Registration
 from reffusion.texture import surfaces
 from reffusion.types import Camera, MaskSet, Reference, Scene
+from reffusion.weights import painters
 from reffusion.weights.published import PAINTERS
 
 TO_PAINT, VIEWS_TO_PAINT = "to_paint", 4
@@ -195,11 +197,14 @@ def inpainted(params: Params, out: Path, scene: Scene, poses: Path, fit: Path, m
     remaining = load_ply(fit / "gaussians.ply").map(lambda p: p[keep])
     photo = exposure.load_views(poses, fit, [name])[name]
     base = inpaint.background(remaining, camera, photo, pixels.consistent)
-    if params.inpainter == "exemplar":
+    inpainter = painters.chosen(params.inpainter)
+    if inpainter == "exemplar":
         around = surfaces_around(scene, poses, fit, masks)
         return Reference(camera, from_photographs(params, out, base, pixels, camera, around), pixels.invent)
-    if params.inpainter in PAINTERS:
-        return Reference(camera, from_network(params, out, name, base, pixels), pixels.invent)
+    if inpainter in PAINTERS:
+        source = "" if params.inpainter == painters.AUTO else params.prior
+        painter = feedforward.load(inpainter, source, params.device)
+        return Reference(camera, from_network(painter, out, name, base, pixels), pixels.invent)
     return Reference(camera, from_prior(params, out, name, base, pixels.invent), pixels.invent)
 
 
@@ -227,9 +232,8 @@ def from_photographs(
     return found[chosen].image
 
 
-def from_network(params: Params, out: Path, name: str, base: np.ndarray, pixels: MaskSet) -> np.ndarray:
+def from_network(painter: Painter, out: Path, name: str, base: np.ndarray, pixels: MaskSet) -> np.ndarray:
     """The picture [H, W, 3] uint8 with I painted in one pass by LaMa or MI-GAN; also written as the one candidate."""
-    painter = feedforward.load(params.inpainter, params.prior, params.device)
     image = painter.paint(base, surfaces.to_paint(pixels.consistent, pixels.invent))
     save_image(out / "candidates.png", image)
     save_json(out / "candidates.json", {"view": name, "painter": painter.name, "chosen": 0})

@@ -22,6 +22,7 @@ from reffusion.paint.onnx_model import Network
 from reffusion.params.reference import Params
 from reffusion.texture import surfaces
 from reffusion.weights import painters
+from reffusion.weights.published import PAINTERS
 from runner.keys import Hashes
 from runner.plan import plan
 from runner.resolve import Request
@@ -202,11 +203,55 @@ def needs(**params):
     return plan_reference.needed_weights(Params(**params), frozenset())
 
 
-def test_the_file_is_found_or_the_plan_says_where_people_get_it(tmp_path):
-    (need,) = needs(inpainter="lama")  # the diffusion prior's name is no file
-    assert need.name == "LaMa" and not need.fetched and "reference.prior: LaMa: sd2-community/" in need.problem
-    assert "is not on this machine; get" in need.problem
-    assert "lama_fp32.onnx (208 MB" in need.problem and "name the file or its folder" in need.problem
+@pytest.fixture
+def own_cache(tmp_path, monkeypatch):
+    """A cache of weights with nothing in it; its folder of models by owner/name."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("HF_HOME", str(tmp_path / "hub"))
+    monkeypatch.delenv("HF_HUB_CACHE", raising=False)
+    return tmp_path / "cache" / "reffusion"
+
+
+def publish(own_cache, kind):
+    """The stand-in where `make weights` leaves the published file."""
+    folder = own_cache / PAINTERS[kind].repo
+    folder.mkdir(parents=True)
+    return model(folder / PAINTERS[kind].file, kind)
+
+
+def test_auto_takes_the_best_that_is_here(own_cache):
+    assert painters.chosen("auto") == "exemplar" and painters.facts("auto") == {"inpainter": "exemplar"}
+    publish(own_cache, "migan")
+    assert painters.chosen("auto") == "migan" and painters.chosen("exemplar") == "exemplar"
+    before = painters.facts("auto")
+    file = publish(own_cache, "lama")
+    assert painters.chosen("auto") == "lama" and painters.facts("auto") != before
+    assert feedforward.load("lama").name == "LaMa (lama_fp32.onnx)" and painters.file_of("lama") == file
+    assert painters.facts("exemplar") == painters.facts("diffusion") == {}, "the default depends on no cache"
+    assert not needs(inpainter="auto")
+
+
+def test_the_key_of_scene_yaml_reaches_references_and_further_views(own_cache, tmp_path):
+    scene = capture(tmp_path / "wall")
+    (scene / "scene.yaml").write_text("inpainter: auto\n")
+
+    def machine():
+        job = prepare_job(Request(ROOT, tmp_path / "runs", str(scene), profile="laptop"))
+        assert {job.params[stage]["inpainter"] for stage in ("reference", "initialize")} == {"auto"}
+        return [job.stages[stage].machine for stage in ("reference", "initialize")]
+
+    assert machine() == [{"inpainter": "exemplar"}] * 2
+    publish(own_cache, "lama")
+    first, second = machine()
+    assert first == second and first["inpainter"].startswith("lama ")
+
+
+def test_the_file_is_found_or_the_plan_says_where_people_get_it(own_cache, tmp_path):
+    (need,) = needs(inpainter="lama")  # the diffusion prior is none of its files: the published one is meant
+    assert (need.name, need.file, need.fetched) == ("Carve/LaMa-ONNX", "lama_fp32.onnx", True)
+    assert "Carve/LaMa-ONNX is not on this machine" in need.problem and "make weights" in need.problem
+    (need,) = needs(inpainter="lama", prior=str(tmp_path / "nowhere.onnx"))
+    assert not need.fetched and "is not on this machine; get lama_fp32.onnx (208 MB" in need.problem
     (need,) = needs(inpainter="migan", prior=str(script(tmp_path / "big.pt")))
     assert "is no .onnx file; get migan_pipeline_v2.onnx" in need.problem
     (need,) = needs(inpainter="lama", prior=str(tmp_path))
@@ -221,7 +266,7 @@ def test_the_file_is_found_or_the_plan_says_where_people_get_it(tmp_path):
     assert not plan_reference.needed_weights(params, frozenset({"painted"}))
 
 
-def test_a_job_is_told_before_any_work_and_keyed_by_the_files_content(tmp_path):
+def test_a_job_is_told_before_any_work_and_keyed_by_the_files_content(own_cache, tmp_path):
     scene, file = capture(tmp_path / "wall"), tmp_path / "big.pt"
 
     def planned(prior):
@@ -233,7 +278,7 @@ def test_a_job_is_told_before_any_work_and_keyed_by_the_files_content(tmp_path):
     word, reason = planned(file)
     assert word == "missing" and f"reference.prior: no weights at {file}; name a folder, a file" in reason
     word, reason = planned("priors/tiny")
-    assert word == "missing" and "reference.prior: LaMa: priors/tiny holds no .pt or .onnx file; get" in reason
+    assert word == "missing" and "Carve/LaMa-ONNX is not on this machine" in reason and "(208 MB)" in reason
     script(file)
     assert planned(file)[0] == "undecided", "it waits for masks"
     hashes = Hashes(tmp_path / "hashes.json")

@@ -37,6 +37,7 @@ OWN_FILES = (
     "reffusion/weights/local.py",
     "reffusion/weights/download.py",
     "reffusion/weights/lpips_package.py",
+    "reffusion/weights/painters.py",
     "reffusion/capture/sfm.py",
     COMPILER,
 )  # weights, databases, pipes, kernels

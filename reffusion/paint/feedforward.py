@@ -20,9 +20,9 @@ from reffusion.weights.published import PAINTERS
 DTYPES = {"lama": "float32", "migan": "uint8"}
 
 
-def load(inpainter: str, source: str | Path, device: str = "cpu") -> Painter:
-    """The inpainter "lama" or "migan" from a file, or the folder of one: TorchScript (.pt, LaMa's only) on `device`,
-    ONNX (.onnx) on the CPU.
+def load(inpainter: str, source: str | Path = "", device: str = "cpu") -> Painter:
+    """The inpainter "lama" or "migan" from a file, or the folder of one, by default the published one: TorchScript
+    (.pt, LaMa's only) on `device`, ONNX (.onnx) on the CPU.
 
     Raises:
         ValueError: no such file or several, no onnxruntime, or a file of something else.
@@ -32,6 +32,11 @@ def load(inpainter: str, source: str | Path, device: str = "cpu") -> Painter:
         return paint2d.load(file, device)
     network = onnx_model.load(file, DTYPES[inpainter])
     return Painter(f"{PAINTERS[inpainter].name} ({file.name})", lambda image, hole: painted(network, image, hole))
+
+
+def load_named(inpainter: str, device: str = "cpu") -> Painter:
+    """ "fsr", or the published "lama" or "migan"."""
+    return paint2d.classical() if inpainter == "fsr" else load(inpainter, "", device)
 
 
 def painted(network: Network, image: np.ndarray, hole: np.ndarray) -> np.ndarray:

@@ -33,25 +33,19 @@ class Painter:
     paint: Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
-def load(folder: str | Path | None = None, device: str = "cpu") -> Painter:
-    """LaMa where `folder` names its TorchScript file or the folder that holds it; without one OpenCV's FSR, and Telea's
-    method where this OpenCV has no FSR, or one that does not work.
+def classical() -> Painter:
+    """OpenCV's FSR, and Telea's method where this OpenCV has no FSR, or one that does not work."""
+    return Painter(f"OpenCV FSR fast, {FSR_SIDE} px", fsr) if _fsr_works() else _TELEA
 
-    Raises:
-        ValueError: the folder holds no or several `.pt` files, or the file is no TorchScript module.
-    """
-    if folder is None:
-        return Painter(f"OpenCV FSR fast, {FSR_SIDE} px", fsr) if _fsr_works() else _TELEA
-    path = Path(folder).expanduser()
-    files = [path] if path.is_file() else sorted(path.glob("*.pt"))
-    if len(files) != 1:
-        raise ValueError(f"LaMa: {path} holds {len(files)} .pt files; name the folder of one, e.g. of big-lama.pt")
+
+def load(file: Path, device: str = "cpu") -> Painter:
+    """LaMa as a TorchScript file. ValueError where the file is no TorchScript module."""
     try:
-        module = torch.jit.load(files[0], map_location=device).eval()
+        module = torch.jit.load(file, map_location=device).eval()
     except (RuntimeError, ValueError) as error:
         reason = str(error).strip().splitlines()[0]
-        raise ValueError(f"LaMa: {files[0]} is no TorchScript module ({reason}); big-lama.pt is one") from error
-    return Painter(f"LaMa ({files[0].name})", lambda image, hole: lama(module, image, hole, device))
+        raise ValueError(f"LaMa: {file} is no TorchScript module ({reason}); big-lama.pt is one") from error
+    return Painter(f"LaMa ({file.name})", lambda image, hole: lama(module, image, hole, device))
 
 
 @torch.no_grad()

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from reffusion.params.base import Device, Settings
-from reffusion.params.lift import lama_field
+from reffusion.params.lift import inpainter_field
 
 
 class Params(Settings):
@@ -17,6 +19,6 @@ class Params(Settings):
         "masks' files; 0: not",
     )
     inpaint: bool = Field(False, description="a baseline: each rendered view is inpainted in 2D inside its mask")
-    lama: str | None = lama_field()
+    inpainter: Literal["fsr", "lama", "migan"] = inpainter_field()
     beyond: bool = Field(True, description="what no training view saw is closed by a soft backdrop, scene.ply's too")
     device: Device = Field("cpu", description="where the views are rendered")

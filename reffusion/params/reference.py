@@ -21,10 +21,11 @@ class Given(Settings):
 
 class Params(Settings):
     reference: Given | list[Given] | None = Field(None, description="completed views that the scene brings")
-    inpainter: Literal["diffusion", "exemplar", "lama", "migan"] = Field(
+    inpainter: Literal["diffusion", "exemplar", "lama", "migan", "auto"] = Field(
         "diffusion",
         description="the prior; patches of the photographs, along surfaces: sharp, with nothing new; LaMa or MI-GAN: "
-        "`prior` then names their file (.pt or .onnx) or its folder",
+        "what `make weights` fetched, or the file (.pt or .onnx) or folder that `prior` names; auto: the first of "
+        "LaMa, MI-GAN that is here, else patches",
     )
     prior: str = prior_field()
     prompt: str = Field("", description="what the invented region shows, for a prior that reads")

@@ -18,12 +18,13 @@ from reffusion.weights.published import NETWORKS, PUBLISHED
 _ELSEWHERE = "run `make weights` on a machine with a network and copy its cache, or name a folder of weights"
 
 
-def model(name: str, half: bool) -> Path:
+def model(name: str, half: bool, only: str | None = None) -> Path:
     """A hub model into the hub's own cache; its folder there.
 
     Args:
         name: owner/name.
         half: take the half-precision files where the model has them.
+        only: this file of it, and nothing else.
     Raises:
         ValueError: offline, no network, no such model, not open to all, no .safetensors weights, or a damaged file.
     """
@@ -36,9 +37,11 @@ def model(name: str, half: bool) -> Path:
         raise ValueError(f"{name} is not here and HF_HUB_OFFLINE is set: unset it, or {_ELSEWHERE}")
     try:
         facts = HfApi().model_info(name, files_metadata=True)
-        chosen = chosen_files([entry.rfilename for entry in facts.siblings], half)
+        names = [entry.rfilename for entry in facts.siblings]
+        chosen = [each for each in names if each == only] if only else chosen_files(names, half)
         if not chosen:
-            raise ValueError(f"{name} has no .safetensors weights, and others are not read; {instead}")
+            what = f"file {only}" if only else ".safetensors weights, and others are not read"
+            raise ValueError(f"{name} has no {what}; {instead}")
         folder = Path(snapshot_download(name, revision=facts.sha, allow_patterns=chosen))
         _mark_main(folder)
     except hub.GatedRepoError:

@@ -35,6 +35,7 @@ class Need:
         fetched: `make weights` can fetch them; False for a folder.
         optional: the stage works without them, and says what it leaves out.
         half: half precision is enough.
+        file: the only file of the hub's model that is wanted; None: all that diffusers or transformers reads.
         url, sha256: of a plain file; the latter may be its beginning.
         looked: the folders in which a plain file is looked for.
     """
@@ -45,6 +46,7 @@ class Need:
     fetched: bool = True
     optional: bool = False
     half: bool = False
+    file: str | None = None
     url: str | None = None
     sha256: str = ""
     looked: tuple[str, ...] = ()
@@ -58,7 +60,7 @@ class Need:
         elif self.url:
             download.file(self.url, lpips_cache() / self.name, self.sha256, self.bytes)
         else:
-            download.model(self.name, self.half)
+            download.model(self.name, self.half, self.file)
 
 
 def of_model(source: str | Path, dtype: str) -> Need:

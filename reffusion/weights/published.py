@@ -90,29 +90,40 @@ LPIPS_PACKAGES = {"lpips": "weights/v0.1", "torchmetrics": "functional/image/lpi
 
 @dataclass(frozen=True)
 class PublishedPainter:
-    """A feed-forward inpainter, one file.
+    """A feed-forward inpainter, one file of a model of the hub.
 
     Attributes:
         name: for tables and messages.
         endings: of the files that are read.
-        where: which file, its size and licence, and who publishes it. Taken from public sources, not tried.
+        repo, file: where `make weights` gets it. The hub tells its sha256, by which it is checked.
+        bytes: about, as its page says.
+        where: which files can be taken, their sizes and licences, and who publishes them. From public sources.
     """
 
     name: str
     endings: tuple[str, ...]
+    repo: str
+    file: str
+    bytes: int
     where: str
 
 
-PAINTERS = {
+PAINTERS = {  # the better first
     "lama": PublishedPainter(
         "LaMa",
         (".pt", ".onnx"),
+        "Carve/LaMa-ONNX",
+        "lama_fp32.onnx",
+        208_000_000,
         "lama_fp32.onnx (208 MB, Apache-2.0) from https://huggingface.co/Carve/LaMa-ONNX or big-lama.pt (206 MB) from "
         "https://github.com/enesmsahin/simple-lama-inpainting/releases",
     ),
     "migan": PublishedPainter(
         "MI-GAN",
         (".onnx",),
+        "andraniksargsyan/migan",
+        "migan_pipeline_v2.onnx",
+        28_000_000,
         "migan_pipeline_v2.onnx (28 MB, MIT) from https://huggingface.co/andraniksargsyan/migan",
     ),
 }

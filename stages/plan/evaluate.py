@@ -4,12 +4,19 @@ from __future__ import annotations
 
 from reffusion.io import machine
 from reffusion.params.evaluate import Params
-from reffusion.weights import local
+from reffusion.weights import local, painters
+from reffusion.weights.published import PAINTERS
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
     """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
-    return [local.of_lpips()]
+    painted = params.inpaint and params.inpainter in PAINTERS
+    return [local.of_lpips(), *([painters.of_painter(params.inpainter, param="evaluate.inpainter")] if painted else [])]
+
+
+def machine_facts(params: Params) -> dict[str, str]:
+    """What the result depends on beside the parameters: the content of the inpainter's file."""
+    return painters.facts(params.inpainter) if params.inpaint else {}
 
 
 def lacking(params: Params) -> list[str]:

@@ -4,12 +4,20 @@ from __future__ import annotations
 
 from reffusion.io import machine
 from reffusion.params.lift import Params
-from reffusion.weights import local
+from reffusion.weights import local, painters
+from reffusion.weights.published import PAINTERS
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
     """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
-    return [local.of_model(params.prior, "float32")] if params.inpainter == "diffusion" else []
+    if params.inpainter == "diffusion":
+        return [local.of_model(params.prior, "float32")]
+    return [painters.of_painter(params.inpainter, param="lift.inpainter")] if params.inpainter in PAINTERS else []
+
+
+def machine_facts(params: Params) -> dict[str, str]:
+    """What the result depends on beside the parameters: the content of the inpainter's file."""
+    return painters.facts(params.inpainter)
 
 
 def lacks(params: Params) -> list[str]:

@@ -16,12 +16,22 @@ from reffusion.weights.published import PAINTERS
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
     """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml, and its folders."""
-    given = params.reference is not None or PAINTED in brings or params.inpainter == "exemplar"
-    if given:
+    given = params.reference is not None or PAINTED in brings
+    if given or params.inpainter in (painters.EXEMPLAR, painters.AUTO):
         return []
     if params.inpainter in PAINTERS:
         return [painters.of_painter(params.inpainter, params.prior, "reference.prior")]
     return [local.of_model(params.prior, params.dtype)]
+
+
+def offered_weights(params: Params) -> list[local.Need]:
+    """What `inpainter: auto` would take."""
+    return [painters.of_painter(kind) for kind in PAINTERS]
+
+
+def machine_facts(params: Params) -> dict[str, str]:
+    """What the result depends on beside the parameters: which inpainter, and the content of its file."""
+    return painters.facts(params.inpainter, "" if params.inpainter == painters.AUTO else params.prior)
 
 
 def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
@@ -40,8 +50,8 @@ def preview(params: Params, *, scene: Path, poses: Path | None = None, **_: Path
         return []
     unread = f"; the prompt '{params.prompt}' is not read, reference.inpainter=diffusion would" if params.prompt else ""
     how = "puts the reference together from patches of the photographs"
-    if params.inpainter in PAINTERS:
-        how = f"completes the reference by {PAINTERS[params.inpainter].name}, one picture"
+    if (inpainter := painters.chosen(params.inpainter)) in PAINTERS:
+        how = f"completes the reference by {PAINTERS[inpainter].name}, one picture"
     return [f"{how}: no diffusion here{unread}"]
 
 
