@@ -4,16 +4,19 @@ import hashlib
 import http.server
 import json
 import os
+import re
 import shutil
+import signal
 import socket
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save, save_file
 
 from reffusion.prior.model import load_prior
 from reffusion.weights import download, local, published
@@ -217,74 +220,12 @@ def test_one_set_of_weights_a_part_is_chosen():
     assert download.chosen_files(["config.json", "pytorch_model.bin"], True) == []
 
 
-class Files(http.server.BaseHTTPRequestHandler):
-    """Plain files with ranges. `content`: path -> bytes; `sent`: bytes of each answer; set by the fixture."""
-
-    def do_GET(self):
-        body = self.content.get(self.path)
-        if body is None:
-            self.send_error(404)
-            return
-        first = int(self.headers.get("Range", "bytes=0-").removeprefix("bytes=").rstrip("-"))
-        if first >= len(body):
-            self.send_error(416)
-            return
-        self.send_response(206 if first else 200)
-        self.send_header("Content-Length", str(len(body) - first))
-        self.end_headers()
-        self.sent.append(len(body) - first)  # before the client has it all, and goes on
-        self.wfile.write(body[first:])
-
-    def log_message(self, *_):
-        pass
-
-
-@pytest.fixture
-def served():
-    """(address, the handler's class) of a local server."""
-    handler = type("Handler", (Files,), {"content": {}, "sent": []})
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    yield f"http://127.0.0.1:{server.server_port}", handler
-    server.shutdown()
-    server.server_close()
-
-
-def test_a_plain_file_is_fetched_gone_on_with_and_checked(tmp_path, served, monkeypatch):
-    monkeypatch.delenv("HF_HUB_OFFLINE", raising=False)
-    address, handler = served
-    body = os.urandom(300_000)
-    digest = hashlib.sha256(body).hexdigest()
-    handler.content["/net.pth"] = body
-    target = tmp_path / "deep" / "net.pth"
-    target.parent.mkdir()
-    target.with_name("net.pth.part").write_bytes(body[:100_000])
-    download.file(f"{address}/net.pth", target, digest[:8], len(body))
-    assert target.read_bytes() == body and handler.sent == [200_000]
-    assert not target.with_name("net.pth.part").exists()
-
-    target.unlink()
-    target.with_name("net.pth.part").write_bytes(body)  # whole, but stopped before it was renamed
-    download.file(f"{address}/net.pth", target, digest, len(body))
-    assert target.read_bytes() == body and handler.sent == [200_000]
-
-    target.unlink()
-    target.with_name("net.pth.part").write_bytes(b"other" * 10)
-    with pytest.raises(ValueError, match="arrived damaged"):
-        download.file(f"{address}/net.pth", target, digest, len(body))
-    assert not any(target.parent.iterdir())
-    with pytest.raises(ValueError, match=r"404.*moved\? Put the file at"):
-        download.file(f"{address}/gone.pth", target, digest, None)
-    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    with pytest.raises(ValueError, match="HF_HUB_OFFLINE is set"):
-        download.file(f"{address}/net.pth", target, digest, None)
-    monkeypatch.delenv("HF_HUB_OFFLINE")
-    with pytest.raises(ValueError, match="does not answer"):
-        download.file("http://127.0.0.1:9/net.pth", target, digest, None)
-
-
 class Hub(http.server.BaseHTTPRequestHandler):
-    """As much of a hub as fetching asks for: one model, one that is gated, none else."""
+    """As much of a hub as fetching asks for: models, one that is gated, none else.
+
+    `models`: name -> file -> bytes. `spoilt`: files that arrive with a byte flipped. `stalls`: files of which half is
+    sent, and then nothing. `ranges`: first bytes asked for, where not 0. Set by `hub`.
+    """
 
     STATE = "a" * 40
 
@@ -300,32 +241,60 @@ class Hub(http.server.BaseHTTPRequestHandler):
         path = self.path.partition("?")[0]
         if "acme/gated" in path:
             return self._answer(403, X_Error_Code="GatedRepo", X_Error_Message="Access is restricted")
-        if "acme/paint" not in path:
+        model = next((name for name in self.models if name in path), None)
+        if model is None:
             return self._answer(404, X_Error_Code="RepoNotFound", X_Error_Message="Repository Not Found")
-        files = {
-            p.relative_to(TINY).as_posix(): p for p in sorted(TINY.rglob("*")) if p.suffix in (".json", ".safetensors")
-        }
+        files = self.models[model]
+        digest = lambda body: hashlib.sha256(body).hexdigest()
         described = [
-            {"rfilename": n, "path": n, "type": "file", "size": p.stat().st_size, "oid": "0" * 40, "blobId": "0" * 40}
-            | ({"lfs": {"sha256": hashlib.sha256(p.read_bytes()).hexdigest(), "size": p.stat().st_size,
-                        "oid": hashlib.sha256(p.read_bytes()).hexdigest(), "pointerSize": 1}}
-               if p.suffix == ".safetensors" else {})
-            for n, p in files.items()
+            {"rfilename": n, "path": n, "type": "file", "size": len(body), "oid": "0" * 40, "blobId": "0" * 40}
+            | ({"lfs": {"sha256": digest(body), "size": len(body), "oid": digest(body), "pointerSize": 1}}
+               if n.endswith((".safetensors", ".onnx")) else {})
+            for n, body in files.items()
         ]  # fmt: skip
         if "/tree/" in path:
             return self._answer(200, json.dumps(described).encode(), Content_Type="application/json")
         if path.startswith("/api/"):
-            facts = {"id": "acme/paint", "sha": self.STATE, "siblings": described, "private": False, "tags": []}
+            facts = {"id": model, "sha": self.STATE, "siblings": described, "private": False, "tags": []}
             return self._answer(200, json.dumps(facts).encode(), Content_Type="application/json")
         name = path.partition("/resolve/")[2].partition("/")[2]
-        body = files[name].read_bytes()
-        tag = f'"{hashlib.sha256(body).hexdigest()}"'
-        return self._answer(200, body, ETag=tag, X_Repo_Commit=self.STATE, X_Linked_Etag=tag)
+        body = files[name]
+        told = {"ETag": f'"{digest(body)}"', "X_Repo_Commit": self.STATE, "X_Linked_Etag": f'"{digest(body)}"'}
+        if name in self.spoilt:
+            body = body[:-1] + bytes([body[-1] ^ 1])
+        first = int(self.headers.get("Range", "bytes=0-").removeprefix("bytes=").split("-")[0])
+        if first and self.command == "GET":
+            self.ranges.append(first)
+            told["Content_Range"] = f"bytes {first}-{len(body) - 1}/{len(body)}"
+        if name in self.stalls and self.command == "GET":
+            self.send_response(200)
+            for header, value in {"Content-Length": str(len(body)), **told}.items():
+                self.send_header(header.replace("_", "-"), value)
+            self.end_headers()
+            self.wfile.write(body[: len(body) // 2])
+            self.wfile.flush()
+            return self.stalled.wait(60)
+        return self._answer(206 if first else 200, body[first:], **told)
 
     do_HEAD = do_GET
 
     def log_message(self, *_):
         pass
+
+
+@pytest.fixture
+def hub():
+    """(address, the handler's class) of a local hub."""
+    tiny = {p.relative_to(TINY).as_posix(): p.read_bytes() for p in sorted(TINY.rglob("*"))
+            if p.suffix in (".json", ".safetensors")}  # fmt: skip
+    fields = {"models": {"acme/paint": tiny}, "spoilt": set(), "stalls": set(), "ranges": []}
+    handler = type("Handler", (Hub,), {**fields, "stalled": threading.Event()})
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_port}", handler
+    handler.stalled.set()
+    server.shutdown()
+    server.server_close()
 
 
 FETCH = """
@@ -349,17 +318,8 @@ def fetched(*names, **environment) -> list[str]:
     return done.stdout.strip().splitlines()
 
 
-def test_a_model_is_fetched_from_the_hub_and_its_refusals_are_told_apart(tmp_path, monkeypatch):
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Hub)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    try:
-        said = fetched(
-            "acme/paint", "acme/gated", "acme/gone", published.SD2,
-            HF_ENDPOINT=f"http://127.0.0.1:{server.server_port}", HF_HOME=str(tmp_path),
-        )  # fmt: skip
-    finally:
-        server.shutdown()
-        server.server_close()
+def test_a_model_is_fetched_from_the_hub_and_its_refusals_are_told_apart(tmp_path, monkeypatch, hub):
+    said = fetched("acme/paint", "acme/gated", "acme/gone", published.SD2, HF_ENDPOINT=hub[0], HF_HOME=str(tmp_path))
     folder, gated, gone, moved = said
     monkeypatch.delenv("HF_HUB_CACHE", raising=False)
     monkeypatch.setenv("HF_HOME", str(tmp_path))
@@ -368,6 +328,58 @@ def test_a_model_is_fetched_from_the_hub_and_its_refusals_are_told_apart(tmp_pat
     assert "acme/gated is gated: accept its terms" in gated and "hf auth login" in gated
     assert "acme/gone: the hub has no such model" in gone
     assert "the hub has no such model" in moved and "stable-diffusion-v1-5/stable-diffusion-inpainting" in moved
+
+
+def test_weights_of_the_laptop_are_fetched_killed_resumed_and_checked(tmp_path, hub):
+    """LaMa, MI-GAN, Depth Anything: what `make weights` lists, from a local hub."""
+    address, handler = hub
+    small = {
+        "config.json": b"{}",
+        "preprocessor_config.json": b"{}",
+        "model.safetensors": save({"x": torch.rand(1000)}),
+    }
+    painters = {
+        each.repo: {each.file: os.urandom(25_000_000), "README.md": b"x"} for each in published.PAINTERS.values()
+    }
+    handler.models |= {published.DEPTH_ANYTHING: small, **painters}
+    lama, migan = published.PAINTERS.values()
+    home = tmp_path / "cache" / "reffusion" / "lpips"
+    home.mkdir(parents=True)
+    for name in ("alex", "vgg"):  # from another server: tests/test_lpips.py
+        (home / f"{name}.safetensors").touch()
+    variables = {k: v for k, v in os.environ.items() if not k.startswith("HF_")}
+    variables |= {"HF_ENDPOINT": address, "HF_HOME": str(tmp_path / "hub"), "XDG_CACHE_HOME": str(tmp_path / "cache"),
+                  "HF_HUB_DISABLE_XET": "1", "HF_HUB_DOWNLOAD_TIMEOUT": "60"}  # fmt: skip
+    command = [sys.executable, "-m", "runner", "weights", "--profile", "laptop", "--runs", str(tmp_path / "runs")]
+    begin = lambda: subprocess.Popen(command, cwd=ROOT, env=variables, text=True, stdout=subprocess.PIPE,
+                                     stderr=subprocess.PIPE, start_new_session=True)  # fmt: skip
+    half = lambda: max((p.stat().st_size for p in (tmp_path / "hub").rglob("*.part")), default=0)
+
+    handler.stalls.add(lama.file)
+    process = begin()
+    deadline = time.monotonic() + 60
+    while half() < 10_000_000:
+        assert time.monotonic() < deadline and process.poll() is None
+        time.sleep(0.1)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
+    handler.stalls.clear()
+    handler.spoilt.add(migan.file)
+    process = begin()
+    out, said = process.communicate(timeout=120)
+    assert process.returncode == 1 and f"{migan.file} arrived damaged" in said, said
+    assert re.search(r"to fetch +208 MB +Carve/LaMa-ONNX", out) and out.index("to fetch: about 3") < out.index(
+        "fetched"
+    )
+    assert handler.ranges and min(handler.ranges) >= 10_000_000, "it went on where it was killed"
+    handler.spoilt.clear()
+    process = begin()
+    out, said = process.communicate(timeout=120)
+    assert process.returncode == 0, said
+    for repo, files in handler.models.items():
+        for name in files if repo != "acme/paint" else ():
+            found = list((tmp_path / "hub").glob(f"hub/models--{repo.replace('/', '--')}/snapshots/*/{name}"))
+            assert [path.read_bytes() for path in found] == ([files[name]] if name != "README.md" else [])
 
 
 def test_no_network_and_the_offline_switch_are_told(tmp_path):

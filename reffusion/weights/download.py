@@ -1,4 +1,7 @@
-"""Fetching weights: models of the hub, and plain files. The only importer of huggingface_hub.
+"""Fetching models of the hub. The only importer of huggingface_hub.
+
+Its library begins a file anew where a process was killed. So large files are fetched here, into its cache, where it
+finds them.
 
 Called by `make weights` alone. Half-fetched files are gone on with; what has arrived is checked by its sha256.
 """
@@ -7,11 +10,9 @@ from __future__ import annotations
 
 import hashlib
 import os
-import urllib.error
 import urllib.request
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from reffusion.weights.published import NETWORKS, PUBLISHED
 
@@ -28,8 +29,9 @@ def model(name: str, half: bool, only: str | None = None) -> Path:
     Raises:
         ValueError: offline, no network, no such model, not open to all, no .safetensors weights, or a damaged file.
     """
-    from huggingface_hub import HfApi, constants, snapshot_download
+    from huggingface_hub import HfApi, constants, hf_hub_url, snapshot_download
     from huggingface_hub import errors as hub
+    from huggingface_hub.file_download import repo_folder_name
 
     known = PUBLISHED.get(name)
     instead = f"take {known.instead}" if known else "take another model"
@@ -42,6 +44,11 @@ def model(name: str, half: bool, only: str | None = None) -> Path:
         if not chosen:
             what = f"file {only}" if only else ".safetensors weights, and others are not read"
             raise ValueError(f"{name} has no {what}; {instead}")
+        blobs = Path(constants.HF_HUB_CACHE, repo_folder_name(repo_id=name, repo_type="model"), "blobs")
+        for entry in facts.siblings:
+            if entry.lfs and entry.rfilename in chosen:
+                url = hf_hub_url(name, entry.rfilename, revision=facts.sha)
+                _fetch(url, blobs / entry.lfs.sha256, entry.lfs.sha256, entry.lfs.size, entry.rfilename)
         folder = Path(snapshot_download(name, revision=facts.sha, allow_patterns=chosen))
         _mark_main(folder)
     except hub.GatedRepoError:
@@ -56,9 +63,6 @@ def model(name: str, half: bool, only: str | None = None) -> Path:
         raise
     except Exception as error:  # the hub's library passes on what its HTTP library raises
         raise ValueError(f"{name}: the hub does not answer ({_line(error)}); {_ELSEWHERE}") from None
-    for entry in facts.siblings:
-        if entry.lfs and entry.rfilename in chosen:
-            _check(folder / entry.rfilename, entry.lfs.sha256)
     return folder
 
 
@@ -88,54 +92,38 @@ def _mark_main(folder: Path) -> None:
     (refs / "main").write_text(folder.name)
 
 
-def file(url: str, target: Path, sha256: str, size: int | None) -> None:
-    """A plain file to `target`; what an earlier try left in `target`.part is gone on with.
+def _fetch(url: str, target: Path, sha256: str, size: int, name: str) -> None:
+    """A file to `target`, unless it is there; what an earlier try left in `target`.part is gone on with.
 
-    Args:
-        sha256: of the whole file, or how it begins.
-        size: bytes, for the progress bar.
     Raises:
-        ValueError: offline, no network, moved, or other content than expected (which is then removed).
+        ValueError: other content than expected, which is then removed.
+        OSError: no answer, or it breaks off.
     """
+    from huggingface_hub.utils import build_hf_headers
     from tqdm import tqdm
 
-    if os.environ.get("HF_HUB_OFFLINE", "").upper() in ("1", "ON", "YES", "TRUE"):
-        raise ValueError(f"{target.name} is not here and HF_HUB_OFFLINE is set: unset it, or put the file there")
+    if target.exists():
+        return
     partial = target.with_name(target.name + ".part")
     partial.parent.mkdir(parents=True, exist_ok=True)
     done = partial.stat().st_size if partial.exists() else 0
-    try:
-        with _opened(url, done) as answer:
-            if answer.status != 206:  # the whole file: the server does not go on
-                done = 0
-            with (
-                open(partial, "ab" if done else "wb") as out,
-                tqdm(total=size, initial=done, unit="B", unit_scale=True, desc=target.name) as bar,
-            ):
+    if done < size:
+        request = urllib.request.Request(url, headers={"Range": f"bytes={done}-"} if done else {})
+        for header, value in build_hf_headers().items():
+            request.add_unredirected_header(header, value)  # a token is for the hub, not for where it sends us
+        with urllib.request.urlopen(request, timeout=60) as answer:
+            done = done if answer.status == 206 else 0  # 200: the whole file
+            bar = tqdm(total=size, initial=done, unit="B", unit_scale=True, desc=name)
+            with open(partial, "ab" if done else "wb") as out, bar:
                 while block := answer.read(1 << 20):
                     out.write(block)
                     bar.update(len(block))
-    except urllib.error.HTTPError as error:
-        if error.code != 416:  # 416: nothing is left to fetch
-            raise ValueError(f"{url}: {error.code} {error.reason}: moved? Put the file at {target}") from None
-    except OSError as error:
-        raise ValueError(f"{url} does not answer ({_line(error)}); put the file at {target}, or try again") from None
-    _check(partial, sha256)
-    os.replace(partial, target)
-
-
-def _opened(url: str, done: int) -> Any:
-    headers = {"User-Agent": "reffusion", **({"Range": f"bytes={done}-"} if done else {})}
-    return urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=60)
-
-
-def _check(path: Path, sha256: str) -> None:
-    with open(path, "rb") as content:
+    with open(partial, "rb") as content:
         found = hashlib.file_digest(content, "sha256").hexdigest()
-    if not found.startswith(sha256):
-        path.resolve().unlink()
-        path.unlink(missing_ok=True)
-        raise ValueError(f"{path.name} arrived damaged (sha256 {found[:8]}, not {sha256[:8]}); fetch it again")
+    if found != sha256:
+        partial.unlink()
+        raise ValueError(f"{name} arrived damaged (sha256 {found[:8]}, not {sha256[:8]}); fetch it again")
+    os.replace(partial, target)
 
 
 def _line(error: BaseException) -> str:

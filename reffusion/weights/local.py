@@ -36,8 +36,7 @@ class Need:
         optional: the stage works without them, and says what it leaves out.
         half: half precision is enough.
         file: the only file of the hub's model that is wanted; None: all that diffusers or transformers reads.
-        url, sha256: of a plain file; the latter may be its beginning.
-        looked: the folders in which a plain file is looked for.
+        looked: the folders in which a file is looked for.
     """
 
     name: str
@@ -47,8 +46,6 @@ class Need:
     optional: bool = False
     half: bool = False
     file: str | None = None
-    url: str | None = None
-    sha256: str = ""
     looked: tuple[str, ...] = ()
 
     def fetch(self) -> None:
@@ -57,8 +54,6 @@ class Need:
 
         if self.name == LPIPS_NAME:
             lpips_package.fetch(lpips_cache())
-        elif self.url:
-            download.file(self.url, lpips_cache() / self.name, self.sha256, self.bytes)
         else:
             download.model(self.name, self.half, self.file)
 
