@@ -1,0 +1,89 @@
+"""Does the misfit choose the right candidate? References from patches of photographs, against the truth of their view.
+
+`python -m benchmarks.studies.candidates --runs runs/composites/runs` after `benchmarks.studies.composites --alone`: for
+each place with a run and an untouched one, and each seed, the candidates of the stage `reference` are scored in the box
+of their hole. Prints a table: of each score the mean candidate, the one that the lowest misfit takes, and the best one.
+Writes candidates.json and sheets (truth, candidates; the taken one first) to --out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from reffusion.io.arrays import load_json, save_json
+from reffusion.io.images import load_image, save_image
+from reffusion.io.scene import load_mask_sets
+from reffusion.params.reference import Params
+from reffusion.score import lpips, metrics
+from stages import reference
+
+SCORES = {"lpips_vgg": min, "lpips_alex": min, "psnr": max, "ssim": max, "flip": min}  # and which is the best
+
+
+def measured(run: Path, untouched: Path, out: Path, seed: int, models: dict[str, lpips.Lpips]) -> dict | None:
+    """{"view", "taken", SCORES of every candidate} of a place; None where nothing had to be invented."""
+    if not (run / "reference/candidates.json").is_file() or not load_json(run / "masks/facts.json")["invent_pixels"]:
+        return None
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    given = load_json(run / "reference/receipt.json")["params"] | {"seed": seed, "reference": None}
+    needs = {name: run / name for name in ("poses", "fit", "masks")}
+    reference.run(Params(**given), out, scene=out, **needs)
+    facts = load_json(out / "candidates.json")
+    view, taken = facts["view"], facts["chosen"]
+    pixels = load_mask_sets(run / "masks", [view])[view]
+    truth, sheet = load_image(untouched / f"poses/images/{view}.png"), load_image(out / "candidates.png")
+    candidates = np.split(sheet, sheet.shape[1] // truth.shape[1], 1)
+    box = metrics.mask_box(pixels.invent)
+    true = box.crop(truth)
+    targets = metrics.lpips_targets(true, models)
+    scores = [metrics.score(box.crop(each), true, targets) for each in candidates]
+    order = [taken, *(k for k in range(len(candidates)) if k != taken)]
+    save_image(out / "sheet.png", np.concatenate([true, *(box.crop(candidates[k]) for k in order)], 1))
+    return {"view": view, "taken": taken, **{name: [each[name] for each in scores] for name in SCORES}}
+
+
+def table(rows: list[dict]) -> str:
+    """Markdown: a row a score; how often the taken one is the best, beside the share that chance would give."""
+    lines = ["| score | mean candidate | taken | best | taken is best | by chance |", "|---" * 6 + "|"]
+    for name, best in SCORES.items():
+        there = [row for row in rows if None not in row[name]]
+        values = [(np.mean(row[name]), row[name][row["taken"]], best(row[name])) for row in there]
+        means = [f"{value:.4f}" for value in np.mean(values, 0)]
+        hit = np.mean([taken == best for _, taken, best in values])
+        chance = np.mean([1 / len(row[name]) for row in there])
+        lines.append(f"| {name} | {' | '.join(means)} | {hit:.2f} | {chance:.2f} |")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=Path, default=Path("runs/composites/runs"))
+    parser.add_argument("--out", type=Path, default=Path("runs/candidates"))
+    parser.add_argument("--seeds", type=int, default=3)
+    given = parser.parse_args()
+    models = {net: model for net in ("vgg", "alex") if (model := lpips.load(net)[0])}
+    rows = []
+    for untouched in sorted(given.runs.glob("*-untouched")):
+        run = given.runs / f"{untouched.name.removesuffix('-untouched')}-alone"
+        for seed in range(given.seeds):
+            out = given.out / f"{run.name}-{seed}"
+            row = measured(run, untouched, out, 10 * seed, models) if run.is_dir() else None
+            if row:
+                rows.append({"place": run.name, "seed": seed, **row})
+                print(run.name, seed, row["taken"], [round(value, 4) for value in row["lpips_vgg"]], flush=True)
+    if not rows:
+        print(f"error: no finished places with an untouched run in {given.runs}", file=sys.stderr)
+        return 1
+    save_json(given.out / "candidates.json", rows)
+    print(table(rows))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
