@@ -54,7 +54,8 @@ def compare(request: Request, only: str = "", seeds: int = 1, data: Path | None 
     def asks(scene: str, method: str) -> Request:
         return replace(request, scene=scene, variant=None if method == own else method, compared=method != own)
 
-    requests = {(scene, method): asks(scene, method) for scene in names for method in methods}
+    in_turn = sorted(methods, key=lambda method: method != own)  # the scene's own run first: variants share its stages
+    requests = {(scene, method): asks(scene, method) for scene in names for method in in_turn}
     hashes = Hashes(request.runs / HASHES)
     _refuse_wrong(list(names), requests, hashes)
     runs = [{"scene": names[scene], "method": method, "state": WAITING} for scene, method in requests]

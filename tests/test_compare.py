@@ -209,6 +209,7 @@ def test_methods_are_compared_in_a_profile_of_their_own(tmp_path):
     assert list(table) == ["full", "better", "default"]
     assert [table[name]["gaussians"] for name in table] == [102, 103, 101]
     assert (root / "runs/toy/profile").read_text() == "laptop\n"
+    assert not (root / "runs/toy@full/poses").exists(), "shared with the scene's own run"
     assert (root / "runs/toy@full/profile").read_text() == "terms\n"
     write(root, {"pipeline.yaml": pipeline.replace("{laptop: terms}", "{laptop: nothing}")})
     with pytest.raises(Refused, match="comparisons names unknown profile 'nothing'"):
