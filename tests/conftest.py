@@ -1,9 +1,14 @@
 """What several tests are given."""
 
+import os
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
+
+# No result of a test depends on which weights lie in the cache of whoever runs it.
+os.environ["XDG_CACHE_HOME"] = str(Path(tempfile.gettempdir()) / f"reffusion-tests-{os.getuid()}")
 
 DATA = Path(__file__).parents[1] / "data"
 

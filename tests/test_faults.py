@@ -356,8 +356,7 @@ def stub(tmp_path) -> Path:
     for name in ("reffusion", "python"):
         (tmp_path / "bin" / name).write_text('#!/bin/sh\nfor each in "$@"; do printf "%s|" "$each"; done; echo\n')
         (tmp_path / "bin" / name).chmod(0o755)
-    (tmp_path / ".ready").touch()
-    for name in (".ready-dev", ".ready-view"):
+    for name in (".ready", ".ready-dev", ".ready-view", ".lpips"):
         (tmp_path / name).touch()
     return tmp_path
 
