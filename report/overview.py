@@ -16,7 +16,7 @@ Table = tuple[list[str], list[list[str]]]
 def by_scene(comparison: Comparison, metric: str, digits: int) -> Table | None:
     """Header and rows: a method in each scene, then the mean of those that are done. None where none has a value."""
     lines, found = [], False
-    for method in comparison.distinct:
+    for method in comparison.distinct_methods:
         runs = [comparison.runs[method, scene] for scene in comparison.scenes]
         values = [run.metrics.get("mean", {}).get(metric) if run.state == "done" else None for run in runs]
         found |= any(value is not None for value in values)

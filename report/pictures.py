@@ -30,7 +30,9 @@ def sheets(comparison: Comparison, out: Path, count: int = 3) -> dict[str, Path]
 
 
 def _sheets_of(comparison: Comparison, scene: str, out: Path, prefix: str, count: int) -> dict[str, Path]:
-    runs = [run for m in comparison.distinct if (run := comparison.runs[m, scene]).state == "done" and run.views]
+    runs = [
+        run for m in comparison.distinct_methods if (run := comparison.runs[m, scene]).state == "done" and run.views
+    ]
     if not runs:
         return {}
     first = next((run for run in runs if run.method == FULL), runs[0])
@@ -50,7 +52,7 @@ def _cells(runs: list[Run], first: Run, view: str) -> list[tuple[str, np.ndarray
     cells = []
     if photo.exists() and views.exists():
         raw_masks, masks = (first.folders.get(stage) for stage in ("raw_masks", "masks"))
-        with_object = view not in load_json(views)["test"] or shows_object(raw_masks or poses, masks, view)
+        with_object = view not in load_json(views)["test"] or (raw_masks and shows_object(raw_masks, masks, view))
         cells.append(("ground truth" if not with_object else "photograph, with the object", load_image(photo)))
     for run in runs:
         path = run.folders["evaluate"] / "renders" / f"{view}.png"

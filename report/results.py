@@ -75,7 +75,7 @@ class Comparison:
     same_as: dict[str, str]
 
     @property
-    def distinct(self) -> list[str]:
+    def distinct_methods(self) -> list[str]:
         """The methods that are no other method's job."""
         return [method for method in self.methods if method not in self.same_as]
 
@@ -99,10 +99,12 @@ def load(home: Path) -> Comparison:
     runs = {(run["method"], run["scene"]): load_run(run, home.parent) for run in record["runs"]}
     data = Path(record["data"]) if "data" in record else None
     scenes, methods = tuple(record["scenes"]), tuple(record["methods"])
-    return Comparison(home, data, scenes, methods, runs, _same_jobs(methods, scenes, runs))
+    return Comparison(home, data, scenes, methods, runs, _find_same_jobs(methods, scenes, runs))
 
 
-def _same_jobs(methods: tuple[str, ...], scenes: tuple[str, ...], runs: dict[tuple[str, str], Run]) -> dict[str, str]:
+def _find_same_jobs(
+    methods: tuple[str, ...], scenes: tuple[str, ...], runs: dict[tuple[str, str], Run]
+) -> dict[str, str]:
     """Method -> an earlier one of which the last stage had the same inputs in every scene."""
     first: dict[tuple[str, ...], str] = {}
     found = {}
@@ -251,7 +253,7 @@ def _value(name: str, text: str) -> Any:
 def differences(comparison: Comparison, metric: str) -> dict[str, Difference]:
     """Method -> its difference to the full one in a score, over the views that both have."""
     found = {}
-    for method in comparison.distinct:
+    for method in comparison.distinct_methods:
         if method == FULL:
             continue
         scenes = []

@@ -57,7 +57,7 @@ def make(home: Path, methods: list[str], seed: int = 0, frames: int = FRAMES) ->
         ValueError: nothing was compared, a method is not among those, or no pair of clips can be made.
     """
     comparison = load(home)
-    others = [method for method in comparison.distinct if method != FULL]
+    others = [method for method in comparison.distinct_methods if method != FULL]
     if unknown := [method for method in methods if method not in others]:
         raise ValueError(f"variants: {unknown[0]} was not compared; there are {', '.join(others)}")
     out, draws = home / "study", generator(seed, "study")

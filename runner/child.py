@@ -1,7 +1,7 @@
 """The process in which stages are imported: `describe` reads their parameters, `fetch` gets the weights they name,
 `run` does a stage's work, `frames` takes pictures from a video.
 
-What can be told of a stage before it runs (Params, needed_weights, lacks, lacking, offered_weights, cost, preview,
+What can be told of a stage before it runs (Params, needed_weights, lacks, unavailable, optional_weights, cost, preview,
 scene_files, scene_facts, machine_facts) lies in stages/plan/<stage>.py where there is such a file, which imports
 nothing heavy, else in stages/<stage>.py itself.
 """
@@ -78,10 +78,10 @@ def _describe(asked: dict[str, Any]) -> dict[str, Any]:
     }
     if hasattr(planned, "machine_facts"):
         answer["machine"] = planned.machine_facts(resolved)
-    if brings is not None and hasattr(planned, "offered_weights"):
-        answer["offered"] = [asdict(need) for need in planned.offered_weights(resolved)]
-    if hasattr(planned, "lacking"):
-        answer["lacking"] = planned.lacking(resolved)
+    if brings is not None and hasattr(planned, "optional_weights"):
+        answer["optional"] = [asdict(need) for need in planned.optional_weights(resolved)]
+    if hasattr(planned, "unavailable"):
+        answer["unavailable"] = planned.unavailable(resolved)
     if brings is not None and hasattr(planned, "needed_weights"):
         answer["needed"] = [asdict(need) for need in planned.needed_weights(resolved, frozenset(brings))]
     if brings is not None and hasattr(planned, "lacks") and answer["params"].get("device") == "cuda":
@@ -162,7 +162,7 @@ def fetch() -> int:
         if hasattr(planned, "needed_weights"):
             params = planned.Params(**asked["params"])
             needs = planned.needed_weights(params, frozenset(asked["brings"]))
-            needs += planned.offered_weights(params) if hasattr(planned, "offered_weights") else []
+            needs += planned.optional_weights(params) if hasattr(planned, "optional_weights") else []
             wanted |= {need.name: need for need in needs if need.problem and need.fetched}
     failed = 0
     for need in wanted.values():

@@ -35,7 +35,7 @@ from runner.files import (
 from runner.keys import Hashes, Inputs
 from runner.lost import take_over
 from runner.pipeline import SCENE
-from runner.plan import Decision, amount, decide, expected_seconds, partial_folder, plan, read_needs, table
+from runner.plan import Decision, amount, decide, expected_seconds, needs_in_use, partial_folder, plan, table
 from runner.resolve import Job, Request, ask, child, resolve
 
 PACKAGES = ("reffusion", "numpy", "torch", "numba", "diffusers", "transformers", "peft", "pycolmap", "gsplat")
@@ -103,7 +103,7 @@ def _done_by(
     """The result the stage's process told. Raises Failed with its error, KeyboardInterrupt where it was interrupted."""
     log = job.home / f"{stage}.log"
     needs = dict.fromkeys(job.pipeline.stages[stage].takes)
-    needs |= {need: job.folder if need == SCENE else earlier[need].path for need in read_needs(job, stage)}
+    needs |= {need: job.folder if need == SCENE else earlier[need].path for need in needs_in_use(job, stage)}
     line = {"stage": stage, "params": job.params[stage], "out": partial, "log": log, "needs": needs}
     task = Task(job.root, json.loads(json.dumps(line, default=str)), work.output)
     wanted = Needs(work.cores, int(job.params[stage].get("device") == "cuda"), memory_of(job, stage, needs))
@@ -214,7 +214,7 @@ def weights(request: Request, offline: bool) -> int:
     all_needs += [
         (f"{stage}, if asked for", need | {"optional": True})
         for stage, answer in answers
-        for need in answer.get("offered", ())
+        for need in answer.get("optional", ())
     ]
     needs = {need["name"]: need for _, need in all_needs}
     users = {name: ", ".join(stage for stage, need in all_needs if need["name"] == name) for name in needs}

@@ -202,7 +202,7 @@ class Inputs:
     weights: dict[str, str]  # parameter -> hash of the folder or file it names, or the name itself where none is here
     code: dict[str, str]  # file -> fingerprint
     unkeyed: tuple[str, ...] = ()  # parameters that nothing in the artifact depends on
-    lacking: tuple[str, ...] = ()  # what the stage did without; where it is there, the artifact is made anew
+    unavailable: tuple[str, ...] = ()  # what the stage did without; where it is there, the artifact is made anew
 
     @property
     def key(self) -> str:
@@ -235,7 +235,7 @@ def changes(old: dict[str, Any], new: Inputs) -> list[str]:
             said.append(f"param {name} {_short(before[name])} -> {_short(after[name])}")
     for kind, then, now in (("need", old["needs"], new.needs), ("weights", old["weights"], new.weights)):
         said += [f"{kind} {name} changed" for name in sorted({*then, *now}) if then.get(name) != now.get(name)]
-    said += [f"{name} is on this machine now" for name in old.get("lacking", ()) if name not in new.lacking]
+    said += [f"{name} is on this machine now" for name in old.get("unavailable", ()) if name not in new.unavailable]
     return said + code_changes(old, new)
 
 

@@ -72,9 +72,9 @@ def layered(
         (f"pipeline.yaml: profile {profile}", pipeline.profiles[profile]),
         ("budget", shares),
         (str(scene.path), brought),
-        (f"{scene.path}: stages", spread(pipeline, scene.stages)),
-        (f"pipeline.yaml: variant {variant}", spread(pipeline, pipeline.variants.get(variant or "", {}))),
-        ("set", spread(pipeline, asked)),
+        (f"{scene.path}: stages", share_scene_keys(pipeline, scene.stages)),
+        (f"pipeline.yaml: variant {variant}", share_scene_keys(pipeline, pipeline.variants.get(variant or "", {}))),
+        ("set", share_scene_keys(pipeline, asked)),
     )
     values: Overrides = {name: {} for name in pipeline.stages}
     for _, layer in each:
@@ -83,7 +83,7 @@ def layered(
     return Layers(values, each)
 
 
-def spread(pipeline: Pipeline, overrides: Overrides) -> Overrides:
+def share_scene_keys(pipeline: Pipeline, overrides: Overrides) -> Overrides:
     """`overrides` with a key of scene.yaml set for every stage that reads it, where it is set for one of them."""
     found = {stage: dict(params) for stage, params in overrides.items()}
     for stage, params in overrides.items():

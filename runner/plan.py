@@ -48,7 +48,7 @@ def decide(job: Job, stage: str, earlier: dict[str, Decision]) -> Decision:
             return Decision("skip", _because(condition, earlier), settled=True)
         if holds is None:
             unknown_yet.append(f"left out if {condition.because.split(':')[0]}: known after {condition.names[0]}")
-    needs = {need: earlier[need] for need in read_needs(job, stage) if need != SCENE}
+    needs = {need: earlier[need] for need in needs_in_use(job, stage) if need != SCENE}
     for need in (need for need in spec.needs if need != SCENE):
         if needs[need].word == "skip":
             return Decision("skip", f"needs {need}, which is left out", settled=True)
@@ -67,14 +67,14 @@ def decide(job: Job, stage: str, earlier: dict[str, Decision]) -> Decision:
         if not path or not found:
             return Decision("run", "no artifact yet")
         own = job.stages[stage]
-        as_then = Inputs(own.params, found["needs"], found["weights"], code, own.unkeyed, own.lacking)
+        as_then = Inputs(own.params, found["needs"], found["weights"], code, own.unkeyed, own.unavailable)
         if known := ([] if job.trust else changes(found, as_then)) or _harm(job, wear(path, job.hashes)):
             return Decision("run", listed(known), path)
         return Decision("stale", f"waits for {', '.join(moving)}; kept if the new content is the same", path)
     return _compare(job, stage, _inputs(job, stage, {need: d.path for need, d in needs.items()}, code))
 
 
-def read_needs(job: Job, stage: str) -> list[str]:
+def needs_in_use(job: Job, stage: str) -> list[str]:
     """The needs of a stage, without one that its parameters leave unread."""
     spec = job.pipeline.stages[stage]
     unread = spec.unread and _is(job, spec.unread.param, spec.unread.equals) and spec.unread.need
@@ -149,7 +149,7 @@ def _inputs(job: Job, stage: str, needs: dict[str, Path | None], code: dict[str,
                 raise Refused(f"{stage}: {path} is named in scene.yaml, and holds the scene itself; name one beside it")
             hashes[str(path)] = job.hashes.folder(path) if path.is_dir() else job.hashes.file(path)
     weights = {param: job.hashes.weights(folder) if folder else name for param, name, folder in _weights(job, stage)}
-    return Inputs(own.params, hashes, weights, code, own.unkeyed, own.lacking)
+    return Inputs(own.params, hashes, weights, code, own.unkeyed, own.unavailable)
 
 
 def _compare(job: Job, stage: str, inputs: Inputs) -> Decision:
@@ -230,7 +230,7 @@ def _question(job: Job, stage: str, decisions: dict[str, Decision]) -> dict[str,
 
 
 def _answered(job: Job, question: dict[str, Any], decision: Decision, answer: dict[str, Any]) -> Decision:
-    """The decision with what the stage says of itself; `missing` where it refuses, or something is lacking."""
+    """The decision with what the stage says of itself; `missing` where it refuses, or something is unavailable."""
     needed, notes = (tuple(answer.get(name, ())) for name in ("needed", "notes"))
     if decision.word not in TO_DO:
         return replace(decision, needed=needed)

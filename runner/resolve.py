@@ -60,7 +60,7 @@ class Described:
     reads: tuple[str, ...] | None = None  # the files of the scene that it reads; None for all of them
     facts: dict[str, Any] = field(default_factory=dict)  # what it takes from other files, such as their names
     machine: dict[str, str] = field(default_factory=dict)  # what it depends on of this machine
-    lacking: tuple[str, ...] = ()  # what it can do without, and this machine has not
+    unavailable: tuple[str, ...] = ()  # what it can do without, and this machine has not
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def resolve_all(requests: list[Request], hashes: Hashes, scene: bool = True) -> 
     new = {name: question for each in asked for name, question in each.items() if name not in hashes.known}
     answers = dict(zip(new, ask(requests[0].root, list(new.values())), strict=True))
     lasting = lambda name, said: (
-        name.startswith(LASTING) and "params" in said and not (said.get("lacking") or said.get("machine"))
+        name.startswith(LASTING) and "params" in said and not (said.get("unavailable") or said.get("machine"))
     )
     inside = lambda question, said: not any(elsewhere(said.get("reads") or (), Path(question.get("scene", "."))))
     hashes.known |= {n: said for n, said in answers.items() if lasting(n, said) and inside(new[n], said)}

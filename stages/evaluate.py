@@ -83,10 +83,10 @@ def run(
     loaded = {net: lpips.load(net) for net in ("vgg", "alex")}
     models = {net: model for net, (model, _) in loaded.items() if model}
     names, kind = views_of(scene)
-    longest = reduced_size(params, raw_masks)
+    longest = reduced_side(params, raw_masks)
     work, counts = prepared(params, scene, out, needs, tested=kind == "test")
     scored, before = [], None
-    looked = lambda name: looked_at(work, scene.cameras[name], models, longest)
+    looked = lambda name: evaluate_view(work, scene.cameras[name], models, longest)
     at_once = MOST_AT_ONCE if params.device == "cpu" else 1
     with closing(side_by_side(looked, names, at_once)) as views:
         for _ in trace.progress(len(names), "evaluate"):
@@ -100,7 +100,7 @@ def run(
     save_ply(out / "scene.ply", work.gaussians[work.result], similarity=scene.similarity)
     summary = {
         **rows.summary(scored),
-        "reduced": rows.reduced_of(scored, longest),
+        "reduced": rows.summarize_reduced(scored, longest),
         "rendered": f"{len(names)} {kind} views",
         "result": work.result,
         "suspects": [name for name in names if name in scene.suspects] or None,  # their photographs contradict poses
@@ -130,12 +130,12 @@ def prepared(
         # What was made up in views without pixels is as good as seen.
         views = (*scene.train, *scene.blank) if needs["reference"] else scene.train
         gaussians |= finished([scene.cameras[name] for name in views], gaussians, result)
-    painter = feedforward.load_named(params.inpainter, params.device) if params.inpaint else None
+    painter = feedforward.load_by_name(params.inpainter, params.device) if params.inpaint else None
     exposures = exposure.of_views(needs["fit"], list(scene.cameras.values()))
     return Work(out, poses, raw_masks, masks, gaussians, result, painter, tested, unseen, exposures), counts
 
 
-def looked_at(work: Work, camera: Camera, models: dict, longest: int) -> tuple[Shown, dict[str, Any]]:
+def evaluate_view(work: Work, camera: Camera, models: dict, longest: int) -> tuple[Shown, dict[str, Any]]:
     """The view as the result shows it, saved with all that goes with it; and its row of scores."""
     truth = truth_for(work, camera)
     shown, pictures = rendered(work, camera, exposure_of(work, camera, truth.picture))
@@ -186,7 +186,7 @@ def save_side_by_side(out: Path, fit: np.ndarray, truth: np.ndarray | None, show
     save_image(out / "side_by_side" / f"{shown.camera.name}.png", picture)
 
 
-def reduced_size(params: Params, raw_masks: Path) -> int:
+def reduced_side(params: Params, raw_masks: Path) -> int:
     """Larger side in px at which boxes are scored beside their own size; 0: at none."""
     if params.longest is not None:
         return params.longest

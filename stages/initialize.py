@@ -231,7 +231,7 @@ def completed_further(params: Params, out: Path, gaussians, new, around, true):
     haze = coverage.haze(gaussians, new, around, found, LEAK)
     gaussians, new = gaussians.map(lambda p: p[~haze]), new[~haze]
     looked = replace(around.looked(), completed=coverage.completed(true, gaussians, around))
-    cameras, kind = coverage.beside_photographs(around), painters.chosen(params.inpainter)
+    cameras, kind = coverage.beside_photographs(around), painters.resolve_inpainter(params.inpainter)
     painter = feedforward.load(kind, "", params.device) if kind in PAINTERS else None
     while len(further) < params.further and (camera := coverage.barest(cameras, around, found)):
         mask, hidden = found[camera.name], around.hidden[camera.name]

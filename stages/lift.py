@@ -53,7 +53,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path) -> No
 def painter_of(params: Params) -> tuple[str, Callable[[np.ndarray, np.ndarray, str], np.ndarray]]:
     """The inpainter's name, and (image [H, W, 3] uint8, hole [H, W] bool, name of the view) -> uint8 [H, W, 3]."""
     if params.inpainter != "diffusion":
-        painter = feedforward.load_named(params.inpainter, params.device)
+        painter = feedforward.load_by_name(params.inpainter, params.device)
         return painter.name, lambda image, hole, _: painter.paint(image, hole)
     prior = load_prior(params.prior, device=params.device, dtype=DTYPE)
 

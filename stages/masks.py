@@ -47,7 +47,7 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
     check_brought(poses, fit, gaussians, train)
     region = load_region(raw_masks)
     deleted = deleted_from(poses, params.device)  # stands for votes
-    raw = {} if deleted is not None else brought_masks(params, scene, gaussians, poses, raw_masks)
+    raw = {} if deleted is not None else collect_raw_masks(params, scene, gaussians, poses, raw_masks)
     empty = {name: np.zeros((camera.height, camera.width), bool) for name, camera in scene.cameras.items()}
     ballots = {name: raw[name] for name in scene.train if name in raw} | {name: empty[name] for name in scene.clean}
     fill = Filled(region, load_fill(raw_masks)) if params.invent != "undecided" else Filled(None, {})
@@ -108,7 +108,7 @@ def load_region(raw_masks: Path) -> Region | None:
     return Region(**load_json(path)) if path.exists() else None
 
 
-def brought_masks(
+def collect_raw_masks(
     params: Params, scene: Scene, gaussians: Gaussians, poses: Path, raw_masks: Path
 ) -> dict[str, np.ndarray]:
     """View -> bool [H, W], the raw masks: those that the scene brings, and what clicks make of them."""

@@ -188,7 +188,7 @@ def _adjust_cameras(params: Params, scene: Scene, out: Path) -> Scene:
 
 
 def _oddities(scene: Scene, out: Path) -> list[str]:
-    return odd.odd_exposures(scene, lambda name: load_views(out, [name])[name])
+    return odd.find_odd_exposures(scene, lambda name: load_views(out, [name])[name])
 
 
 def _save_warnings(out: Path, said: list[str]) -> None:

@@ -9,7 +9,7 @@ import warnings
 from pathlib import Path
 
 from reffusion import trace
-from reffusion.capture.checks.odd import odd_masks
+from reffusion.capture.checks.odd import find_odd_masks
 from reffusion.capture.lenses import load_lenses
 from reffusion.capture.reading import read_scene, unphotographed
 from reffusion.capture.undistorted import save_undistorted_masks
@@ -40,7 +40,7 @@ def run(params: Params, out: Path, *, scene: Path, poses: Path) -> None:
             save_json(out / FACTS, {"test_masks_longest": max(max(image_size(p)) for p in roles.test_masks.values())})
     if params.region is not None:
         _save_region(params, out, placed)
-    notes = (*notes, *odd_masks(placed, load_raw_masks(out, placed.train)))
+    notes = (*notes, *find_odd_masks(placed, load_raw_masks(out, placed.train)))
     for note in notes:
         warnings.warn(note, stacklevel=1)
     if notes:

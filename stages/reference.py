@@ -197,7 +197,7 @@ def inpainted(params: Params, out: Path, scene: Scene, poses: Path, fit: Path, m
     remaining = load_ply(fit / "gaussians.ply").map(lambda p: p[keep])
     photo = exposure.load_views(poses, fit, [name])[name]
     base = inpaint.background(remaining, camera, photo, pixels.consistent)
-    inpainter = painters.chosen(params.inpainter)
+    inpainter = painters.resolve_inpainter(params.inpainter)
     if inpainter == "exemplar":
         around = surfaces_around(scene, poses, fit, masks)
         return Reference(camera, from_photographs(params, out, base, pixels, camera, around), pixels.invent)

@@ -391,8 +391,9 @@ def test_without_ground_truth_held_out_views_are_compared_outside_their_masks(ho
     runs = results.load(home)
     title = lambda: pictures._cells([runs.runs["full", "toy"]], runs.runs["full", "toy"], "a")[0][0]
     assert title() == "ground truth"
-    (home / "poses/masks").mkdir()
-    (home / "poses/masks/a.png").touch()  # as `poses` leaves it of a test view that shows the object
+    (home / "raw_masks/masks").mkdir(parents=True)
+    (home / "raw_masks/masks/a.png").touch()  # of a test view that shows the object
+    runs.runs["full", "toy"].folders["raw_masks"] = home / "raw_masks"
     assert title() == "photograph, with the object"
     assert (home / "compare/differences.png").exists()
 

@@ -220,14 +220,18 @@ def publish(own_cache, kind):
 
 
 def test_auto_takes_the_best_that_is_here(own_cache):
-    assert painters.chosen("auto") == "exemplar" and painters.facts("auto") == {"inpainter": "exemplar"}
+    assert painters.resolve_inpainter("auto") == "exemplar" and painters.inpainter_facts("auto") == {
+        "inpainter": "exemplar"
+    }
     publish(own_cache, "migan")
-    assert painters.chosen("auto") == "migan" and painters.chosen("exemplar") == "exemplar"
-    before = painters.facts("auto")
+    assert painters.resolve_inpainter("auto") == "migan" and painters.resolve_inpainter("exemplar") == "exemplar"
+    before = painters.inpainter_facts("auto")
     file = publish(own_cache, "lama")
-    assert painters.chosen("auto") == "lama" and painters.facts("auto") != before
+    assert painters.resolve_inpainter("auto") == "lama" and painters.inpainter_facts("auto") != before
     assert feedforward.load("lama").name == "LaMa (lama_fp32.onnx)" and painters.file_of("lama") == file
-    assert painters.facts("exemplar") == painters.facts("diffusion") == {}, "the default depends on no cache"
+    assert painters.inpainter_facts("exemplar") == painters.inpainter_facts("diffusion") == {}, (
+        "the default depends on no cache"
+    )
     assert not needs(inpainter="auto")
 
 

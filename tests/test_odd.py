@@ -9,7 +9,7 @@ import pytest
 import small_scene
 
 from reffusion.capture.checks import odd
-from reffusion.capture.checks.odd import odd_exposures, odd_masks
+from reffusion.capture.checks.odd import find_odd_exposures, find_odd_masks
 from reffusion.geometry import pixel_rays
 from reffusion.io.arrays import save_json
 from reffusion.io.images import image_size
@@ -28,7 +28,7 @@ def brought(tmp_path_factory):
 
 
 def said(scene, masks, pictures) -> str:
-    return "; ".join([*odd_masks(scene, masks), *odd_exposures(scene, pictures.__getitem__)])
+    return "; ".join([*find_odd_masks(scene, masks), *find_odd_exposures(scene, pictures.__getitem__)])
 
 
 def test_nothing_is_odd_about_a_good_capture(brought):

@@ -39,7 +39,7 @@ def hole():
 
 def painters(folder):
     torch.jit.script(Mean()).save(folder / "any-name.pt")
-    return [paint2d.load(folder / "any-name.pt"), paint2d.classical(), paint2d.Painter("telea", paint2d.telea)]
+    return [paint2d.load(folder / "any-name.pt"), paint2d.load_classical(), paint2d.Painter("telea", paint2d.telea)]
 
 
 def test_only_the_hole_changes_and_its_content_does_not_count(tmp_path):
@@ -59,7 +59,7 @@ def test_a_mask_is_widened_by_a_share_of_the_width():
 
 
 def test_a_smooth_picture_is_continued():
-    for painter in (paint2d.classical(), paint2d.Painter("telea", paint2d.telea)):
+    for painter in (paint2d.load_classical(), paint2d.Painter("telea", paint2d.telea)):
         error = np.abs(painter.paint(picture(), hole()).astype(int) - picture())[hole()]
         assert error.mean() < 12, painter.name
 

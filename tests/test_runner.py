@@ -312,7 +312,7 @@ def test_what_a_stage_did_without_makes_it_anew_once_it_is_there(root, capsys):
     edit(
         root / "stages/evaluate.py",
         "def run(",
-        """def lacking(params):
+        """def unavailable(params):
     return [] if Path(__file__).with_name("metric.txt").exists() else ["the metric"]
 
 def run(""",

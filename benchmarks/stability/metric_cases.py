@@ -79,7 +79,7 @@ def one_pixel_box() -> float:
     return float(not inside) + float(not math.isfinite(scored["psnr_box"])) + float(scored["ssim_box"] is not None)
 
 
-def lpips_of(first: float, second: float, kind: torch.dtype) -> float:
+def count_lpips_faults(first: float, second: float, kind: torch.dtype) -> float:
     """LPIPS of constant images with random weights, of both networks: how many of these do not hold: 0 of equal ones,
     positive and finite of others, and a finite gradient, 0 at equal ones."""
     torch.manual_seed(0)
@@ -185,11 +185,11 @@ CASES = (
     Case("FLIP of constant images", "how far outside [0, 0] and [0.9, 1]", 16 * EPS32, constant_flip),
     Case("metrics of 1-px images", WRONG, EXACT, one_pixel),
     Case("box of a 1-px mask", WRONG, EXACT, one_pixel_box),
-    Case("LPIPS of black and grey", WRONG, EXACT, lambda: lpips_of(-1.0, 0.0, torch.float32)),
-    Case("LPIPS of equal images", WRONG, EXACT, lambda: lpips_of(0.3, 0.3, torch.float32)),
-    Case("LPIPS of black images", WRONG, EXACT, lambda: lpips_of(-1.0, -1.0, torch.float32)),
+    Case("LPIPS of black and grey", WRONG, EXACT, lambda: count_lpips_faults(-1.0, 0.0, torch.float32)),
+    Case("LPIPS of equal images", WRONG, EXACT, lambda: count_lpips_faults(0.3, 0.3, torch.float32)),
+    Case("LPIPS of black images", WRONG, EXACT, lambda: count_lpips_faults(-1.0, -1.0, torch.float32)),
     Case("LPIPS in half precision", WRONG, EXACT,
-         lambda: lpips_of(-1.0, 0.0, torch.float16) + lpips_of(-1.0, -1.0, torch.float16)),
+         lambda: count_lpips_faults(-1.0, 0.0, torch.float16) + count_lpips_faults(-1.0, -1.0, torch.float16)),
     # E[x^2] - E[x]^2 of numbers of order one rounds by some 2^-24, against C2 = 9e-4.
     Case("reconstruction loss of identical constant images", "largest value or gradient", 4 * EPS32 / 9e-4,
          loss_of_constant_images),

@@ -25,7 +25,7 @@ from stages import reference
 SCORES = {"lpips_vgg": min, "lpips_alex": min, "psnr": max, "ssim": max, "flip": min}  # and which is the best
 
 
-def measured(run: Path, untouched: Path, out: Path, seed: int, models: dict[str, lpips.Lpips]) -> dict | None:
+def score_candidates(run: Path, untouched: Path, out: Path, seed: int, models: dict[str, lpips.Lpips]) -> dict | None:
     """{"view", "taken", SCORES of every candidate} of a place; None where nothing had to be invented."""
     if not (run / "reference/candidates.json").is_file() or not load_json(run / "masks/facts.json")["invent_pixels"]:
         return None
@@ -73,7 +73,7 @@ def main() -> int:
         run = given.runs / f"{untouched.name.removesuffix('-untouched')}-alone"
         for seed in range(given.seeds):
             out = given.out / f"{run.name}-{seed}"
-            row = measured(run, untouched, out, 10 * seed, models) if run.is_dir() else None
+            row = score_candidates(run, untouched, out, 10 * seed, models) if run.is_dir() else None
             if row:
                 rows.append({"place": run.name, "seed": seed, **row})
                 print(run.name, seed, row["taken"], [round(value, 4) for value in row["lpips_vgg"]], flush=True)

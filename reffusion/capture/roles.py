@@ -46,6 +46,12 @@ class Roles:
     fill: dict[str, Path] = field(default_factory=dict)
     keep: frozenset[str] = frozenset()
 
+    @property
+    def mask_files(self) -> dict[str, dict[str, Path]]:
+        """Folder of the stage `raw_masks` -> view -> file: "masks/" or "masks/<object>", "test_masks", "fill"."""
+        masks = {f"masks/{thing}": files for thing, files in self.masks.items()}
+        return {**masks, "test_masks": self.test_masks, "fill": self.fill}
+
     def among(self, names: set[str]) -> Roles:
         """Without the views that are not in `names` (those that structure from motion could not place).
 

@@ -62,9 +62,8 @@ def save_undistorted_masks(out: Path, name: str, roles: Roles, lens: Lens) -> No
     Raises:
         BadInput: naming the file, where it is unreadable.
     """
-    masks = {f"masks/{thing}": files for thing, files in roles.masks.items()}
-    own = {path for files in masks.values() for path in files.values()}
-    for folder, files in (*masks.items(), ("test_masks", roles.test_masks), ("fill", roles.fill)):
+    own = {path for files in roles.masks.values() for path in files.values()}
+    for folder, files in roles.mask_files.items():
         if name in files:
             values = roles.values if files[name] in own else WHITE
             mask, where = load_mask(files[name], (lens.height, lens.width), values), undoing(lens)[1]

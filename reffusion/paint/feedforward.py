@@ -34,9 +34,9 @@ def load(inpainter: str, source: str | Path = "", device: str = "cpu") -> Painte
     return Painter(f"{PAINTERS[inpainter].name} ({file.name})", lambda image, hole: painted(network, image, hole))
 
 
-def load_named(inpainter: str, device: str = "cpu") -> Painter:
+def load_by_name(inpainter: str, device: str = "cpu") -> Painter:
     """ "fsr", or the published "lama" or "migan"."""
-    return paint2d.classical() if inpainter == "fsr" else load(inpainter, "", device)
+    return paint2d.load_classical() if inpainter == "fsr" else load(inpainter, "", device)
 
 
 def painted(network: Network, image: np.ndarray, hole: np.ndarray) -> np.ndarray:

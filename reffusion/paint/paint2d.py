@@ -33,7 +33,7 @@ class Painter:
     paint: Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
-def classical() -> Painter:
+def load_classical() -> Painter:
     """OpenCV's FSR, and Telea's method where this OpenCV has no FSR, or one that does not work."""
     return Painter(f"OpenCV FSR fast, {FSR_SIDE} px", fsr) if _fsr_works() else _TELEA
 

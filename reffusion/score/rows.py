@@ -57,11 +57,11 @@ def row_of(
             row |= {f"initialize_{column}": value for column, value in scores.items()}
         if 0 < longest < max(camera.width, camera.height) and not truth.shows_object:
             pictures = {"": shown.picture} | ({"initialize_": initial} if initial is not None else {})
-            row |= _reduced_scores(pictures, truth.picture, shown.mask, models, longest)
+            row |= _score_reduced(pictures, truth.picture, shown.mask, models, longest)
     return row
 
 
-def _reduced_scores(
+def _score_reduced(
     pictures: dict[str, np.ndarray], truth: np.ndarray, mask: np.ndarray, models: dict[str, Lpips], longest: int
 ) -> dict[str, Any]:
     """`REDUCED` of each picture, its key before it, and the size of all."""
@@ -79,7 +79,7 @@ def _reduced_scores(
     return found
 
 
-def reduced_of(rows: list[dict[str, Any]], longest: int) -> dict[str, Any] | None:
+def summarize_reduced(rows: list[dict[str, Any]], longest: int) -> dict[str, Any] | None:
     """{"mean", "initialize", "views"} of `metrics.BOX_COLUMNS` at the reduced size, and {"protocol"}; None without."""
     sizes = sorted({f"{row['reduced_width']}x{row['reduced_height']}" for row in rows if "reduced_width" in row})
     if not sizes:

@@ -15,7 +15,7 @@ from reffusion.weights.published import PAINTERS, PUBLISHED
 AUTO, EXEMPLAR = "auto", "exemplar"
 
 
-def chosen(inpainter: str) -> str:
+def resolve_inpainter(inpainter: str) -> str:
     """The inpainter; for "auto" the best feed-forward one whose published file is on this machine and can be run, else
     "exemplar"."""
     if inpainter != AUTO:
@@ -28,7 +28,7 @@ def published_file(inpainter: str) -> Path | None:
     """The file that `make weights` fetches, or another of its kind in that place; None where it is not here."""
     folder = locate(PAINTERS[inpainter].repo)
     try:
-        return file_in(inpainter, folder) if folder else None
+        return find_file(inpainter, folder) if folder else None
     except ValueError:
         return None
 
@@ -44,13 +44,13 @@ def file_of(inpainter: str, source: str | Path = "") -> Path:
         ValueError: there is none or there are several, of a kind that this inpainter has.
     """
     if not _is_none(source):
-        return file_in(inpainter, Path(source).expanduser())
+        return find_file(inpainter, Path(source).expanduser())
     if file := published_file(inpainter):
         return file
     raise ValueError(f"{PAINTERS[inpainter].name}: {absent(PAINTERS[inpainter].repo)}")
 
 
-def file_in(inpainter: str, path: Path) -> Path:
+def find_file(inpainter: str, path: Path) -> Path:
     """`path`, or the only file of the inpainter's kind in it. ValueError as of `file_of`."""
     known = PAINTERS[inpainter]
     kinds = " or ".join(known.endings)
@@ -84,9 +84,9 @@ def of_painter(inpainter: str, source: str | Path = "", param: str = "inpainter"
     return Need(str(file), problem, file.stat().st_size, fetched=False)
 
 
-def facts(inpainter: str, source: str | Path = "") -> dict[str, str]:
+def inpainter_facts(inpainter: str, source: str | Path = "") -> dict[str, str]:
     """What its result depends on: which inpainter, and its file's content; nothing for one without a file."""
-    kind = chosen(inpainter)
+    kind = resolve_inpainter(inpainter)
     if kind not in PAINTERS:
         return {"inpainter": kind} if inpainter == AUTO else {}
     try:

@@ -16,10 +16,10 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
 
 def machine_facts(params: Params) -> dict[str, str]:
     """What the result depends on beside the parameters: the content of the inpainter's file."""
-    return painters.facts(params.inpainter) if params.inpaint else {}
+    return painters.inpainter_facts(params.inpainter) if params.inpaint else {}
 
 
-def lacking(params: Params) -> list[str]:
+def unavailable(params: Params) -> list[str]:
     """What scores are missing here; where it comes later, they are made anew."""
     return ["LPIPS"] if local.of_lpips().problem else []
 

@@ -19,21 +19,21 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
     return found + ([painters.of_painter(params.inpainter, param="initialize.inpainter")] if painted else [])
 
 
-def offered_weights(params: Params) -> list[local.Need]:
+def optional_weights(params: Params) -> list[local.Need]:
     """What the stage could work with instead."""
     return [] if params.depth.model else [local.of_model(DEPTH_ANYTHING, "float32")]
 
 
 def machine_facts(params: Params) -> dict[str, str]:
     """What the result depends on beside the parameters: which inpainter, and the content of its file."""
-    return painters.facts(params.inpainter) if params.further else {}
+    return painters.inpainter_facts(params.inpainter) if params.further else {}
 
 
 def preview(params: Params, **_: Path | None) -> list[str]:
     """What the stage will do, as far as that is known before it looks."""
     if not (params.further and params.start == "reference"):
         return []
-    kind = painters.chosen(params.inpainter)
+    kind = painters.resolve_inpainter(params.inpainter)
     how = f"by {PAINTERS[kind].name}" if kind in PAINTERS else "from patches of the photographs"
     return [f"completes up to {params.further} further views {how}: what no reference shows"]
 

@@ -17,7 +17,7 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
 
 def machine_facts(params: Params) -> dict[str, str]:
     """What the result depends on beside the parameters: the content of the inpainter's file."""
-    return painters.facts(params.inpainter)
+    return painters.inpainter_facts(params.inpainter)
 
 
 def lacks(params: Params) -> list[str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from reffusion.capture.reading import read_scene, unphotographed
-from reffusion.capture.roles import Roles
 from reffusion.capture.undistorted import check_masks
 from reffusion.params.raw_masks import Params
 
@@ -16,7 +15,7 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
         roles = None if unphotographed(params, scene) else read_scene(params, scene)[1]
     except ValueError:  # `preview` refuses it
         return files
-    return sorted({path for views in _files(roles).values() for path in views.values()}) if roles else []
+    return sorted({path for views in roles.mask_files.values() for path in views.values()}) if roles else []
 
 
 def scene_facts(params: Params, scene: Path) -> dict[str, object]:
@@ -25,7 +24,7 @@ def scene_facts(params: Params, scene: Path) -> dict[str, object]:
     if unphotographed(params, scene):
         return region
     roles = read_scene(params, scene)[1]
-    named = {kind: {name: str(path) for name, path in views.items()} for kind, views in _files(roles).items()}
+    named = {kind: {name: str(path) for name, path in views.items()} for kind, views in roles.mask_files.items()}
     return {"masks": [named, roles.values.ids], **region}
 
 
@@ -40,9 +39,3 @@ def preview(params: Params, *, scene: Path, poses: Path | None = None) -> list[s
     count = sum(len(files) for files in roles.masks.values())
     apart = f" of {', '.join(roles.masks)}" if len(roles.masks) > 1 else ""
     return [f"{count} masks{apart}", *roles.warnings]
-
-
-def _files(roles: Roles) -> dict[str, dict[str, Path]]:
-    """Kind, or kind and object, -> view -> file."""
-    masks = {f"masks/{thing}": files for thing, files in roles.masks.items()}
-    return {**masks, "test_masks": roles.test_masks, "fill": roles.fill}

@@ -24,14 +24,14 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
     return [local.of_model(params.prior, params.dtype)]
 
 
-def offered_weights(params: Params) -> list[local.Need]:
+def optional_weights(params: Params) -> list[local.Need]:
     """What `inpainter: auto` would take."""
     return [painters.of_painter(kind) for kind in PAINTERS]
 
 
 def machine_facts(params: Params) -> dict[str, str]:
     """What the result depends on beside the parameters: which inpainter, and the content of its file."""
-    return painters.facts(params.inpainter, "" if params.inpainter == painters.AUTO else params.prior)
+    return painters.inpainter_facts(params.inpainter, "" if params.inpainter == painters.AUTO else params.prior)
 
 
 def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
@@ -50,7 +50,7 @@ def preview(params: Params, *, scene: Path, poses: Path | None = None, **_: Path
         return []
     unread = f"; the prompt '{params.prompt}' is not read, reference.inpainter=diffusion would" if params.prompt else ""
     how = "puts the reference together from patches of the photographs"
-    if (inpainter := painters.chosen(params.inpainter)) in PAINTERS:
+    if (inpainter := painters.resolve_inpainter(params.inpainter)) in PAINTERS:
         how = f"completes the reference by {PAINTERS[inpainter].name}, one picture"
     return [f"{how}: no diffusion here{unread}"]
 

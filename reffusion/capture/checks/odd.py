@@ -25,7 +25,7 @@ POINTS = 5000  # at most, at which photographs are compared
 LEAST_SEEN = 50  # points in a view for anything to be said of it
 
 
-def odd_exposures(scene: Scene, image_of: Callable[[str], np.ndarray]) -> list[str]:
+def find_odd_exposures(scene: Scene, image_of: Callable[[str], np.ndarray]) -> list[str]:
     """A sentence for each photograph much brighter or darker than the others.
 
     Args:
@@ -55,7 +55,7 @@ def odd_exposures(scene: Scene, image_of: Callable[[str], np.ndarray]) -> list[s
     ]
 
 
-def odd_masks(scene: Scene, masks: Mapping[str, np.ndarray]) -> list[str]:
+def find_odd_masks(scene: Scene, masks: Mapping[str, np.ndarray]) -> list[str]:
     """A sentence for masks that cover most of their pictures, and for those that contradict the others in 3D.
 
     Args:
