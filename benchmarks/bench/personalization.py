@@ -9,7 +9,7 @@ import yaml
 from benchmarks.bench.points import Diagram, Point
 
 ROOT = Path(__file__).resolve().parents[2]
-# LOG.md, "Prior, personalization, SDS", of 2026-11-21: demo, whole view at 64 px painted from pure noise, CPU seconds of
+# LOG.md, "Prior, personalization, SDS", of 2026-11-21: demo, a whole view of 64 px painted from noise, CPU seconds of
 # one thread and PSNR (dB) in the reference's hole. Base: 15.4 dB.
 RECORDED = {
     ("rank 16, rectangles, 16 x 32 px", "120 steps"): (136.0, 16.8),
