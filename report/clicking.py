@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from reffusion.capture.clicked import as_photographed, photographed, straightened
+from reffusion.capture.click_coordinates import as_photographed, photographed, straightened
 from reffusion.capture.lenses import load_lenses, photograph_sizes
-from reffusion.capture.reading import read_scene
-from reffusion.clicks import everywhere
+from reffusion.capture.scene_folder import read_scene
+from reffusion.clicks import all_views
 from reffusion.clicks.marks import Clicks
 from reffusion.clicks.network import SOURCE, Looked, Segmenter, load_segmenter, look, network_mask
-from reffusion.clicks.picture import corrected, view_mask
+from reffusion.clicks.single_view import corrected, view_mask
 from reffusion.command import root
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.files import BadInput
@@ -221,9 +221,9 @@ class Session:
             return self._by_network(name, clicks)
         if self.gaussians is not None:
             if name not in self.reliefs:
-                self.reliefs[name] = everywhere.relief(self.gaussians, self.scene.cameras[name])
+                self.reliefs[name] = all_views.relief(self.gaussians, self.scene.cameras[name])
             relief = self.reliefs[name]
-        alone = not self.capture.given and everywhere.in_order(self._all_clicks())[0] == name
+        alone = not self.capture.given and all_views.in_order(self._all_clicks())[0] == name
         if alone or name not in self.masks:
             return view_mask(image, clicks, relief)
         return corrected(image, self.masks[name], clicks, relief)
@@ -249,7 +249,7 @@ class Session:
         given = given | {name: self._by_network(name, clicks.pop(name)) for name in asked}
         shown = {name: self.scene.cameras[name] for name in {*self.views, *given}}
         ask = (self.gaussians, self.near, shown, self.images.__getitem__, clicks, given)
-        return lambda: everywhere.solved(*ask).labels
+        return lambda: all_views.solved(*ask).labels
 
     def _take(self, labels: Tensor | None, made: int) -> None:
         """Show the labels that follow from so many changes of clicks: those views first that were clicked on."""
@@ -265,7 +265,7 @@ class Session:
 
     def _refine(self, name: str) -> None:
         camera, image, on = self.scene.cameras[name], self.images[name], self._clicks_on(name)
-        self._show(name, everywhere.shown(self.gaussians, self.labels, camera, image, on))
+        self._show(name, all_views.shown(self.gaussians, self.labels, camera, image, on))
         self.todo = [each for each in self.todo if each != name]
 
     def _follow(self) -> None:
@@ -293,7 +293,7 @@ class Session:
     def _load(self) -> None:
         if self.fitted():
             gaussians = load_ply(self.capture.fit / "gaussians.ply")
-            near = everywhere.neighbours(gaussians)
+            near = all_views.neighbours(gaussians)
             with self.turn:
                 self.gaussians, self.near = gaussians, near
                 self.made += bool(self.clicks)

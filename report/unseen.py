@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from reffusion.background import training_coverage
 from reffusion.io.images import load_mask, resize_nearest
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_raw_masks
-from reffusion.score import sight
 from reffusion.types import Camera, Gaussians, Scene
 from report.sheet import stage_folder
 
@@ -19,7 +19,7 @@ EVERY, LINE = 14, 2  # px between the lines of the hatching, and their width
 WORDS = "hatched: no photograph shows it"
 
 
-def photographed(home: Path, scene: Scene) -> list[sight.SeenView]:
+def photographed(home: Path, scene: Scene) -> list[training_coverage.SeenView]:
     """What the training views saw, by the fit of them; empty where there is none."""
     fit = stage_folder(home, "fit") / "gaussians.ply"
     if not fit.exists():
@@ -28,17 +28,19 @@ def photographed(home: Path, scene: Scene) -> list[sight.SeenView]:
     train = [name for name in scene.train if name not in scene.clean]
     masks = load_raw_masks(stage_folder(home, "raw_masks"), train)
     masks |= {name: load_mask(path) for name in train if (path := consistent / f"{name}.png").exists()}
-    return sight.seen_views(load_ply(fit), [scene.cameras[name] for name in scene.train], masks)
+    return training_coverage.seen_views(load_ply(fit), [scene.cameras[name] for name in scene.train], masks)
 
 
-def noted(picture: np.ndarray, gaussians: Gaussians, camera: Camera, seen_by: list[sight.SeenView]) -> np.ndarray:
+def noted(
+    picture: np.ndarray, gaussians: Gaussians, camera: Camera, seen_by: list[training_coverage.SeenView]
+) -> np.ndarray:
     """uint8 [H, W, 3] with what none of the training views saw hatched, and words for it; as it is where that is next
     to nothing.
 
     Args:
         camera: of any size; a small one answers sooner.
     """
-    found = resize_nearest(sight.unseen(gaussians, camera, seen_by), picture.shape[:2])
+    found = resize_nearest(training_coverage.unseen(gaussians, camera, seen_by), picture.shape[:2])
     if found.mean() < LEAST:
         return picture
     rows, columns = np.indices(found.shape)

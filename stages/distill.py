@@ -13,7 +13,7 @@ from torch import Tensor
 
 from reffusion import trace
 from reffusion.depth import monocular
-from reffusion.depth.behind import Completion
+from reffusion.depth.background_depth import Completion
 from reffusion.distill import depth_term, perceptual
 from reffusion.distill.confinement import TrainView
 from reffusion.distill.optimization import distill

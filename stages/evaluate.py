@@ -10,19 +10,20 @@ import numpy as np
 import torch
 
 from reffusion import trace
+from reffusion.background import backdrop, training_coverage
+from reffusion.background.visibility import OPAQUE
 from reffusion.fit import exposure
+from reffusion.inpaint import feedforward
+from reffusion.inpaint.classical import Painter
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.images import load_image, load_mask, save_image
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_raw_masks, load_scene, shows_object
 from reffusion.kernels.compiled import side_by_side
-from reffusion.masks.witness import OPAQUE
-from reffusion.paint import feedforward
-from reffusion.paint.margin import widened
-from reffusion.paint.paint2d import Painter
+from reffusion.metrics import consistency, image_metrics, lpips, rows
+from reffusion.metrics.consistency import Shown
+from reffusion.morphology import widened
 from reffusion.params.evaluate import Params
-from reffusion.score import beyond, consistency, lpips, metrics, rows, sight
-from reffusion.score.consistency import Shown
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Scene
 
@@ -182,7 +183,7 @@ def truth_for(work: Work, camera: Camera) -> rows.Truth:
 
 def save_side_by_side(out: Path, fit: np.ndarray, truth: np.ndarray | None, shown: Shown) -> None:
     panels = [p for p in (fit, truth, shown.picture) if p is not None]
-    picture = metrics.side_by_side(panels, metrics.mask_box(shown.mask))
+    picture = image_metrics.side_by_side(panels, image_metrics.mask_box(shown.mask))
     save_image(out / "side_by_side" / f"{shown.camera.name}.png", picture)
 
 
@@ -204,8 +205,8 @@ def views_of(scene: Scene) -> tuple[tuple[str, ...], str]:
 
 def unseen_in(scene: Scene, captured: Gaussians, raw_masks: Path, masks: Path | None) -> dict[str, np.ndarray]:
     """Test view -> bool [H, W], pixels that show what no training view saw."""
-    seen_by = sight.seen_views(*captured_by(scene, captured, raw_masks, masks))
-    return {name: sight.unseen(captured, scene.cameras[name], seen_by) for name in scene.test}
+    seen_by = training_coverage.seen_views(*captured_by(scene, captured, raw_masks, masks))
+    return {name: training_coverage.unseen(captured, scene.cameras[name], seen_by) for name in scene.test}
 
 
 def reaches_beyond(unseen: dict[str, np.ndarray], hidden: dict[str, np.ndarray]) -> bool:
@@ -218,7 +219,7 @@ def reaches_beyond(unseen: dict[str, np.ndarray], hidden: dict[str, np.ndarray])
 def finished(cameras: list[Camera], gaussians: dict[str, Gaussians], result: str) -> dict[str, Gaussians]:
     """Stage -> its Gaussians completed by what lies beyond the capture: of the result, and of the initialization."""
     stages = list(dict.fromkeys(stage for stage in (result, "initialize") if stage in gaussians))
-    return dict(zip(stages, beyond.completed([gaussians[stage] for stage in stages], cameras), strict=True))
+    return dict(zip(stages, backdrop.completed([gaussians[stage] for stage in stages], cameras), strict=True))
 
 
 def captured_by(

@@ -11,18 +11,18 @@ from types import MappingProxyType
 import numpy as np
 
 from reffusion import seeding, trace
-from reffusion.capture import stereo, support
-from reffusion.fit import few
+from reffusion.capture import image_detail, stereo
+from reffusion.fit import few_views
 from reffusion.fit.exposure import UNEVEN
 from reffusion.fit.gains import gains, uneven
 from reffusion.fit.reconstruction import fit
 from reffusion.fit.start import initial_gaussians
 from reffusion.fit.step import GENTLE
+from reffusion.inpaint import classical
 from reffusion.io.images import to_uint8
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_raw_masks, load_scene, load_views
 from reffusion.masks import voting
-from reffusion.paint import paint2d
 from reffusion.params.fit import Params
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Scene
@@ -39,13 +39,13 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path | None = None
     cameras = [scene.cameras[name] for name in scene.train if name not in held_out]
     images = load_views(poses, scene.train)
     hidden = hidden_pixels(raw_masks, scene) if params.pixels == "unmasked" else {}
-    images |= {name: paint2d.telea(images[name], mask) for name, mask in hidden.items()}  # flow looks at them too
+    images |= {name: classical.telea(images[name], mask) for name, mask in hidden.items()}  # flow looks at them too
     exposed = exposures(params, scene, cameras, images)
     even = images if exposed is None else evened(images, cameras, exposed)
     params, first = capped(params, cameras), on_surfaces(params, scene, cameras, even, hidden)
     rates = None
     if first is not None:
-        params, rates = few.gently(params), GENTLE
+        params, rates = few_views.gently(params), GENTLE
     elif (out / trace.CHECKPOINT).exists():  # of what it starts from only the degree and the device still matter
         first = start(params, scene.points, scene.point_colors)
     else:
@@ -76,7 +76,7 @@ def supported(params: Params, scene: Scene) -> Params:
     most = params.sh.degree
     if params.few_views == "as_many":
         return params
-    degree, views = support.harmonics(scene.points, [scene.cameras[name] for name in scene.train], most)
+    degree, views = image_detail.harmonics(scene.points, [scene.cameras[name] for name in scene.train], most)
     if degree == most:
         return params
     print(f"spherical harmonics of degree {degree}: a typical point is in {views} views", flush=True)
@@ -106,9 +106,9 @@ def evened(images: Mapping[str, np.ndarray], cameras: list[Camera], exposed: np.
 def on_surfaces(params: Params, scene: Scene, cameras: list[Camera], images, hidden) -> Gaussians | None:
     """The Gaussians to start from where there are few views; None where there are enough, or too few points that they
     show."""
-    if params.few_views != "surfaces" or len(cameras) > few.MOST:
+    if params.few_views != "surfaces" or len(cameras) > few_views.MOST:
         return None
-    found = few.surfaces(cameras, images, scene.points, scene.point_colors, hidden, params)
+    found = few_views.surfaces(cameras, images, scene.points, scene.point_colors, hidden, params)
     if found is not None:
         print(f"few photographs: {len(found)} Gaussians on surfaces between {len(scene.points)} points", flush=True)
     return found

@@ -9,24 +9,24 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from reffusion import seeding, trace
-from reffusion.depth import behind, billboard, monocular
-from reffusion.depth.behind import Completion
+from reffusion import morphology, seeding, trace
+from reffusion.background import unobserved
+from reffusion.depth import background_depth, billboard, monocular
+from reffusion.depth.background_depth import Completion
 from reffusion.fit import exposure
 from reffusion.gaussians.sheets import Sheets
-from reffusion.initialize import coverage, filling, scatter, shadows, sharing
-from reffusion.initialize.gain import Gain, estimated
-from reffusion.initialize.settle import Known, settle
+from reffusion.initialize import coverage, random_init, relighting, sharing, unprojection
+from reffusion.initialize.refit import Known, settle
+from reffusion.initialize.sds_gain import Gain, estimated
+from reffusion.inpaint import classical, exemplar, feedforward
 from reffusion.io.arrays import load_json, load_labels, save_json, save_labels
 from reffusion.io.images import save_exr, save_image, save_mask
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_mask_sets, load_object, load_references, load_scene
-from reffusion.masks import regions, undecided, voting
-from reffusion.paint import feedforward, margin, paint2d
+from reffusion.masks import regions, voting
 from reffusion.params.initialize import Params
 from reffusion.prior import inpaint
 from reffusion.splat import rasterizer
-from reffusion.texture import surfaces
 from reffusion.types import Reference
 from reffusion.weights import painters
 from reffusion.weights.published import PAINTERS
@@ -72,7 +72,7 @@ def run(
         sets = narrowed(out, gaussians, new, sets, around.cameras)
     true = true_pictures(reference, references, around) if references and params.start == "reference" else []
     if true and params.settle:
-        true, around, marks = shadows.without_shadows(true, gaussians, around)
+        true, around, marks = relighting.without_shadows(true, gaussians, around)
         for name, mask in marks.items():
             save_mask(out / "tainted" / f"{name}.png", mask)
     further = []
@@ -90,7 +90,7 @@ def run(
         gaussians = settled(params, out, gaussians, exact, true, shown, drawn_there)
     save_ply(out / "gaussians.ply", gaussians)
     save_labels(out / "labels.npy", new.cpu())
-    uncovered = {each.name: filling.uncovered(gaussians, each, sets[each.name].consistent) for each in train}
+    uncovered = {each.name: unprojection.uncovered(gaussians, each, sets[each.name].consistent) for each in train}
     facts = {"new_gaussians": int(new.sum()), "removed_gaussians": int(labels.sum()), "haze": int(haze.sum())}
     facts |= {"completed": [each.camera.name for each in true], "uncovered": uncovered}
     shares = {each.camera.name: float(each.mask.sum() / sets[each.camera.name].consistent.sum()) for each in further}
@@ -119,27 +119,27 @@ def surroundings(params: Params, scene, gaussians, thing, sets, poses: Path, fit
     for name in scene.blank:  # the Gaussians' own picture; what no photograph shows of it is hidden
         everything = np.ones_like(hidden[name])
         photos[name] = inpaint.background(gaussians, scene.cameras[name], np.zeros((1, 1, 3), np.uint8), everything)
-    found = surfaces.looked_around(gaussians, thing, train, hidden, photos, scene.points, SEED)
+    found = exemplar.looked_around(gaussians, thing, train, hidden, photos, scene.points, SEED)
     consistent = {name: each.consistent for name, each in sets.items()}
     unknown = {name: each.undecided for name, each in sets.items()}
     place = (found.planes, scene.points, found.centre, found.radius, found.mirrors)
-    return filling.Surroundings(train, consistent, photos, found.views, *place, unknown, frozenset(scene.blank))
+    return unprojection.Surroundings(train, consistent, photos, found.views, *place, unknown, frozenset(scene.blank))
 
 
 def at_random(params: Params, removed, remaining, scene, sets, masks: Path):
     """Gaussians at random in the region of the hole: that of the removed ones, or the box that the scene names."""
     region, train = load_json(masks / "facts.json").get("region"), [scene.cameras[name] for name in scene.train]
     if region:
-        box = scatter.box_around(region["center"], region["size"])
+        box = random_init.box_around(region["center"], region["size"])
     elif len(removed):
-        box = scatter.box_of(removed.means.double().cpu().numpy())
+        box = random_init.box_of(removed.means.double().cpu().numpy())
     else:
         raise ValueError("initialize.start is 'random', but no Gaussian was removed: nothing says where the hole is")
     invents = {camera.name: sets[camera.name].invent for camera in train if sets[camera.name].invent.any()}
-    count = max(len(removed), scatter.FEWEST)
-    points = scatter.points_in(box, count, train, invents, seeding.generator(SEED, "initialize", "random"))
+    count = max(len(removed), random_init.FEWEST)
+    points = random_init.points_in(box, count, train, invents, seeding.generator(SEED, "initialize", "random"))
     draw = seeding.generator(SEED, "initialize", "random colours")
-    added = scatter.gaussians_at(points, remaining.sh.shape[1], remaining.antialiased, draw)
+    added = random_init.gaussians_at(points, remaining.sh.shape[1], remaining.antialiased, draw)
     return added.map(lambda p: p.to(params.device))
 
 
@@ -161,18 +161,20 @@ def filled(params: Params, out: Path, gaussians, new, reference, around, network
     camera, hidden = reference.camera, around.hidden[reference.camera.name]
     stays = reference.mask & ~hidden  # what is put in there has a shine of its own; and a sliver tells nothing of it
     sheets = Sheets(gloss=params.gloss and not farthest and not stays.any())
-    hole = filling.to_fill(gaussians, new, reference, hidden, COVERED)
+    hole = unprojection.to_fill(gaussians, new, reference, hidden, COVERED)
     if farthest and around.mirrors:
         hole |= reference.mask  # also where something lies there, but behind a mirror image
     remaining = gaussians.map(lambda p: p[~new])
     # A gap that is left open at last is too narrow for the comparison to tell of its rim.
     swept = params.depth.sweep and not (farthest and coverage.narrow(hole))
     near, told = around.compared(camera, hole) if swept else (around, None)
-    onward = undecided.behind(remaining, camera, hidden, near.views, near.planes, near.mirrors)
+    onward = unobserved.behind(remaining, camera, hidden, near.views, near.planes, near.mirrors)
     past = (lambda depth: near.looked_past(camera, depth)) if params.depth.sweep else None
-    hints = behind.Hints(onward.continued, onward.planes, onward.witnessed, near.photographed(camera), told, past)
+    hints = background_depth.Hints(
+        onward.continued, onward.planes, onward.witnessed, near.photographed(camera), told, past
+    )
     estimate = estimate_of(network, reference)
-    depth, made_up, said = filling.depth_behind(
+    depth, made_up, said = unprojection.depth_behind(
         remaining, reference, hole, hidden, around.points, HOW, estimate, log, hints, farthest
     )
     drawn_over = over = np.zeros_like(hole)
@@ -190,15 +192,15 @@ def filled(params: Params, out: Path, gaussians, new, reference, around, network
         over = drawn_over & ~coverage.beside_edges(depth, behind_it)
     print(f"depth of reference {camera.name}: {said}")
     save_exr(out / "depth" / f"{camera.name}.exr", depth.astype("float32"))
-    pixels = behind.grown(hole & ~drawn_over & ~leaves, OVERLAP) & ~leaves | over
-    gaussians, new = filling.placed(gaussians, new, reference, depth, pixels, around, sheets)
+    pixels = background_depth.grown(hole & ~drawn_over & ~leaves, OVERLAP) & ~leaves | over
+    gaussians, new = unprojection.placed(gaussians, new, reference, depth, pixels, around, sheets)
     if farthest or not params.tidy:  # what is open still is asked for view by view, or left
         return gaussians, new
     views = [(each, around.hidden[each.name]) for each in around.cameras]
-    gap = filling.seen_through(gaussians, camera, made_up, hidden & ~pixels, views, SEEN_THROUGH)
+    gap = unprojection.seen_through(gaussians, camera, made_up, hidden & ~pixels, views, SEEN_THROUGH)
     if not gap.any():
         return gaussians, new
-    return filling.placed(gaussians, new, reference, made_up, gap, around, sheets)
+    return unprojection.placed(gaussians, new, reference, made_up, gap, around, sheets)
 
 
 def narrowed(out: Path, gaussians, new, sets, cameras):
@@ -236,15 +238,15 @@ def completed_further(params: Params, out: Path, gaussians, new, around, true):
     while len(further) < params.further and (camera := coverage.barest(cameras, around, found)):
         mask, hidden = found[camera.name], around.hidden[camera.name]
         # Just outside C a photograph may still show the object's rim, which would be repeated.
-        rimmed = margin.widened(hidden, surfaces.RIM)
+        rimmed = morphology.widened(hidden, exemplar.RIM)
         base = inpaint.background(gaussians, camera, around.photos[camera.name], rimmed)
-        hole = surfaces.with_rim(mask, hidden)
+        hole = exemplar.with_rim(mask, hidden)
         if painter is not None:
             picture = painter.paint(base, hole)
         elif coverage.narrow(mask):  # in a gap there is no room for texture, only for what is beside it
-            picture = paint2d.telea(base, hole)
+            picture = classical.telea(base, hole)
         else:
-            picture = surfaces.completions(base, hole, camera, hidden, looked, [SEED])[0].image
+            picture = exemplar.completions(base, hole, camera, hidden, looked, [SEED])[0].image
         reference = Reference(camera, picture, mask)
         print(f"further view {camera.name}: {mask.sum() / hidden.sum():.1%} of the mask is covered by nothing")
         try:
@@ -263,7 +265,7 @@ def completed_further(params: Params, out: Path, gaussians, new, around, true):
 
 
 def settled(params: Params, out: Path, gaussians, exact, references, around, drawn_there):
-    """The Gaussians after `params.settle` steps of reconstruction; see `reffusion.initialize.settle`.
+    """The Gaussians after `params.settle` steps of reconstruction; see `reffusion.initialize.refit`.
 
     `exact`: [N] bool, whose depth references brought. `drawn_there`: view name -> bool [H, W], where something is to be
     drawn that no photograph shows.

@@ -11,11 +11,11 @@ import torch
 
 from reffusion import seeding, trace
 from reffusion.fit import exposure
+from reffusion.inpaint import feedforward
 from reffusion.io.arrays import load_json, load_labels, save_json
 from reffusion.io.images import load_image, replace_image
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets, load_scene, save_references
-from reffusion.paint import feedforward
 from reffusion.params.base import REFINED_FROM
 from reffusion.params.lift import Params
 from reffusion.prior import inpaint

@@ -13,25 +13,25 @@ import torch
 from torch import Tensor
 
 from reffusion import trace
-from reffusion.capture.clicked import to_views
+from reffusion.background import training_coverage, unobserved, visibility
+from reffusion.background.continuation import planes_around
+from reffusion.background.mirrors import Mirror
+from reffusion.background.plane import Plane
+from reffusion.background.symmetry import mirrors_around
+from reffusion.background.visibility import Witness
+from reffusion.capture.click_coordinates import to_views
 from reffusion.capture.views import check_outliers
-from reffusion.clicks import everywhere
+from reffusion.clicks import all_views
 from reffusion.clicks.marks import Clicks
 from reffusion.fit import exposure
 from reffusion.io.arrays import load_json, load_labels, save_json, save_labels
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_fill, load_raw_masks, load_scene, load_views, objects_of, save_mask_sets
 from reffusion.kernels.compiled import side_by_side
-from reffusion.masks import brought, regions, undecided, voting, witness
-from reffusion.masks.continuation import planes_around
-from reffusion.masks.mirrors import Mirror
-from reffusion.masks.plane import Plane
+from reffusion.masks import frame_check, regions, voting
 from reffusion.masks.regions import Filled, Region
-from reffusion.masks.symmetry import mirrors_around
 from reffusion.masks.voting import Votes, extent
-from reffusion.masks.witness import Witness
 from reffusion.params.masks import Params
-from reffusion.score import sight
 from reffusion.types import Camera, Gaussians, MaskSet, Scene
 
 BURIED = 0.1  # blending weight in all views up to which a Gaussian votes by where it stands
@@ -70,11 +70,11 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
         gaussians, train, {n: consistent[n] for n in scene.train if n not in scene.clean}, share=params.hull
     )
     hidden = {name: empty[name] if name in scene.clean else consistent[name] for name in scene.cameras}
-    views = witness.witnesses(gaussians, train, hidden)
+    views = visibility.witnesses(gaussians, train, hidden)
     planes = continuations(gaussians, labels, views, scene.points)
     photos = exposure.load_views(poses, fit, scene.train) if planes or params.debris else {}
     if params.debris and (raw or deleted is not None):
-        debris = witness.debris(gaussians, labels, views, hidden, photos)
+        debris = visibility.debris(gaussians, labels, views, hidden, photos)
         save_labels(out / "debris.npy", debris.cpu())
         labels |= debris
     remaining = gaussians.map(lambda p: p[~labels])
@@ -82,8 +82,8 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
     sets = classified(params, scene, remaining, raw, consistent, views, planes, mirrors, fill)
     sets |= of_blank_views(params, scene, gaussians, hidden, sets)
     distilled = (*scene.train, *scene.blank)
-    undecided = share_undecided(sets, distilled)
-    if params.invent != "consistent" and not fill and undecided <= params.negligible:
+    unobserved_share = share_undecided(sets, distilled)
+    if params.invent != "consistent" and not fill and unobserved_share <= params.negligible:
         sets = {name: replace(each, invent=empty[name]) for name, each in sets.items()}
     save_labels(out / "labels.npy", labels.cpu())
     save_mask_sets(out, sets)
@@ -95,7 +95,7 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, fit: Path) -
         "voting_views": len(ballots),
         "invent_pixels": pixels_of("invent", sets, distilled),
         "consistent_pixels": pixels_of("consistent", sets, distilled),
-        "undecided_share": undecided,
+        "undecided_share": unobserved_share,
         "invent_views": [name for name in distilled if invents[name].any()],
         "best_reference": voting.best_view(invents, scene.train),
         "region": region and {"center": list(region.center), "size": list(region.size)},
@@ -132,14 +132,14 @@ def clicked(
     clicks = {name: Clicks(*points) for name, points in to_views(poses, params.clicks).items()}
     image_of = lambda name: load_views(poses, [name])[name]
     show_it = {name: scene.cameras[name] for name in scene.train if name in given or name not in scene.clean}
-    found = everywhere.solved(gaussians, everywhere.neighbours(gaussians), show_it, image_of, clicks, given)
+    found = all_views.solved(gaussians, all_views.neighbours(gaussians), show_it, image_of, clicks, given)
     if not found.labels.any():
         raise ValueError("scene.yaml: clicks: the views show nothing there; click in the middle of the object")
     names, masks = [name for name in (*scene.train, *scene.test) if name not in {*given, *scene.clean}], dict(given)
     for k in trace.progress(len(names), "masks from clicks"):
         name, camera, image = names[k], scene.cameras[names[k]], image_of(names[k])
-        mask = everywhere.shown(gaussians, found.labels, camera, image, clicks.get(name))
-        if name in scene.train or everywhere.there(gaussians, camera, image, mask):
+        mask = all_views.shown(gaussians, found.labels, camera, image, clicks.get(name))
+        if name in scene.train or all_views.there(gaussians, camera, image, mask):
             masks[name] = mask
     return masks
 
@@ -156,7 +156,7 @@ def check_brought(poses: Path, fit: Path, gaussians: Gaussians, train: list[Came
         return
     some = train[:: max(1, len(train) // LOOKED_AT)]
     photos = {camera.name: exposure.load_views(poses, fit, [camera.name])[camera.name] for camera in some}
-    if wrong := brought.misplaced(gaussians, some, photos):
+    if wrong := frame_check.misplaced(gaussians, some, photos):
         raise ValueError(f"{poses / 'gaussians.ply'}: `gaussians` of scene.yaml: {wrong}")
 
 
@@ -194,7 +194,7 @@ def classified(
 
     def masks_of(name: str) -> MaskSet:
         camera = scene.cameras[name]
-        found = undecided.behind(remaining, camera, consistent[name], views, planes, mirrors)
+        found = unobserved.behind(remaining, camera, consistent[name], views, planes, mirrors)
         unknown = tidied(params, found.undecided) & consistent[name] & (name not in scene.clean)
         invent = consistent[name] & (name not in scene.clean) if params.invent == "consistent" else unknown
         invent = invent | fill.shown(camera, found.depth)
@@ -210,8 +210,10 @@ def of_blank_views(
     """The masks of views without pixels: what they show and no photograph does is unknown, and to be made up."""
     if not scene.blank:
         return {}
-    seen_by = sight.seen_views(gaussians, [scene.cameras[name] for name in scene.train], hidden)
-    found = {name: tidied(params, sight.unseen(gaussians, scene.cameras[name], seen_by)) for name in scene.blank}
+    seen_by = training_coverage.seen_views(gaussians, [scene.cameras[name] for name in scene.train], hidden)
+    found = {
+        name: tidied(params, training_coverage.unseen(gaussians, scene.cameras[name], seen_by)) for name in scene.blank
+    }
     union = lambda name, mask: MaskSet(
         sets[name].raw, sets[name].consistent | mask, sets[name].undecided | mask, sets[name].invent | mask
     )

@@ -10,18 +10,17 @@ import numpy as np
 import torch
 
 from reffusion import seeding, trace
-from reffusion.capture import frame, sfm, stereo, support
-from reffusion.capture.checks import odd
+from reffusion.capture import frame, image_detail, sfm, stereo
+from reffusion.capture.checks import sanity
 from reffusion.capture.checks.pose_check import check_poses, judge
-from reffusion.capture.given import listed
 from reffusion.capture.layouts import cameras, ring
 from reffusion.capture.layouts.capture import Capture
 from reffusion.capture.lens import undoing
 from reffusion.capture.lenses import save_lenses
-from reffusion.capture.reading import check_brought, read_scene, unphotographed
 from reffusion.capture.refine import refined
 from reffusion.capture.roles import Roles
-from reffusion.capture.undistorted import fitting_size, lens_of, load_at, save_undistorted
+from reffusion.capture.scene_folder import check_brought, read_scene, unphotographed
+from reffusion.capture.undistort import fitting_size, lens_of, load_at, save_undistorted
 from reffusion.capture.views import check_outliers
 from reffusion.gaussians import matching
 from reffusion.io.arrays import save_json, save_labels
@@ -31,6 +30,7 @@ from reffusion.io.ply import properties_of, save_ply
 from reffusion.io.scene import WARNINGS, load_views, save_scene
 from reffusion.io.splats import Splats, load_splats
 from reffusion.params.poses import Params
+from reffusion.params.reference import reference_list
 from reffusion.splat.conventions import SH0
 from reffusion.types import Scene
 
@@ -171,7 +171,7 @@ def _drop_outliers(params: Params, roles: Roles, scene: Scene, out: Path) -> tup
     shown = [camera for name, camera in tied.cameras.items() if name not in tied.blank]
     check = check_poses(shown, tied.points, lambda name: load_views(out, [name])[name])
     verdict = judge(check, tied, roles.keep, params.exclude)
-    check_outliers("reference", [each.view for each in listed(params.reference)], verdict.outliers)
+    check_outliers("reference", [each.view for each in reference_list(params.reference)], verdict.outliers)
     check_outliers("clicks", params.clicks or (), verdict.outliers)
     if params.region is not None and params.region.view is not None:
         check_outliers("region", [params.region.view], verdict.outliers)
@@ -188,7 +188,7 @@ def _adjust_cameras(params: Params, scene: Scene, out: Path) -> Scene:
 
 
 def _oddities(scene: Scene, out: Path) -> list[str]:
-    return odd.find_odd_exposures(scene, lambda name: load_views(out, [name])[name])
+    return sanity.find_odd_exposures(scene, lambda name: load_views(out, [name])[name])
 
 
 def _save_warnings(out: Path, said: list[str]) -> None:
@@ -205,7 +205,7 @@ def _supported_size(params: Params, capture: Capture, roles: Roles) -> int:
         return params.longest
     chosen = roles.train[:: max(1, len(roles.train) // 8)]
     images = [load_at(capture.pictures[name], params.longest, capture.upright) for name in chosen]
-    if not support.enlarged(images, params.detail):
+    if not image_detail.enlarged(images, params.detail):
         return params.longest
     side = max(max(image.shape[:2]) for image in images)
     print(f"pictures of {side} px show no more than {side // 2} px would: taken at that size", flush=True)

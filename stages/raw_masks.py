@@ -9,10 +9,10 @@ import warnings
 from pathlib import Path
 
 from reffusion import trace
-from reffusion.capture.checks.odd import find_odd_masks
+from reffusion.capture.checks.sanity import find_odd_masks
 from reffusion.capture.lenses import load_lenses
-from reffusion.capture.reading import read_scene, unphotographed
-from reffusion.capture.undistorted import save_undistorted_masks
+from reffusion.capture.scene_folder import read_scene, unphotographed
+from reffusion.capture.undistort import save_undistorted_masks
 from reffusion.capture.views import check_outliers, known
 from reffusion.io.arrays import save_json
 from reffusion.io.images import image_size, save_mask

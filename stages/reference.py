@@ -9,26 +9,25 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from reffusion.capture.given import GivenReference, load_given
 from reffusion.capture.lenses import load_lenses
-from reffusion.capture.straight import load_straight, load_straight_depth
 from reffusion.capture.views import placed_views
 from reffusion.fit import exposure
+from reffusion.inpaint import exemplar, feedforward
+from reffusion.inpaint.classical import Painter
 from reffusion.io.arrays import load_json, load_labels, save_json, save_text
 from reffusion.io.files import BadInput
 from reffusion.io.images import save_image, save_mask
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import has_photograph, load_mask_sets, load_object, load_scene, load_views, save_references
-from reffusion.masks import taint
-from reffusion.paint import agreement, feedforward, painting
-from reffusion.paint.paint2d import Painter
+from reffusion.masks import shadows
 from reffusion.params.base import REFINED_FROM
 from reffusion.params.reference import Params
 from reffusion.prior import inpaint, memory
 from reffusion.prior.model import load_prior
-from reffusion.references import color, registration
+from reffusion.references import agreement, color, registration, view_ranking
+from reffusion.references.files import GivenReference, load_given
 from reffusion.references.registration import Registration
-from reffusion.texture import surfaces
+from reffusion.references.undistort import load_straight, load_straight_depth
 from reffusion.types import Camera, MaskSet, Reference, Scene
 from reffusion.weights import painters
 from reffusion.weights.published import PAINTERS
@@ -82,7 +81,7 @@ def refuse_contradictions(references: list[Reference], scene: Scene, fit: Path, 
     keep = ~load_labels(masks / "labels.npy")
     remaining = load_ply(fit / "gaussians.ply").map(lambda p: p[keep])
     hidden = {camera.name: sets[camera.name].consistent for camera in cameras}
-    holes = painting.holes(remaining, cameras, hidden, {each.camera.name: each.mask for each in references})
+    holes = view_ranking.holes(remaining, cameras, hidden, {each.camera.name: each.mask for each in references})
     holes = agreement.as_drawn(holes, references, remaining, hidden)
     for first, second, unlike in agreement.contradicting(references, holes):
         raise ValueError(
@@ -118,12 +117,12 @@ def fitted(
         image, inside = load_straight(given, lens, upright, found.moved)
         image = color.recolor(image, found.gain, found.offset)
         margin, blend = (share * camera.width for share in (MARGIN, BLEND))
-        usual = taint.redrawn_difference(image, photo, inside & ~hidden)
-        hole = hidden | taint.tainted(image, photo, hidden) & inside
+        usual = shadows.redrawn_difference(image, photo, inside & ~hidden)
+        hole = hidden | shadows.tainted(image, photo, hidden) & inside
         image = color.paste(image, photo, hole, inside, margin, blend)
     if sets.invent.any() and (share := inside[sets.invent].mean()) < WHOLE:
         raise ValueError(f"{given.path}: shows only {share:.0%} of the hole in '{given.view}'; crop less")
-    drawn = sets.consistent | taint.changed(image, photo, sets.invent, usual)
+    drawn = sets.consistent | shadows.changed(image, photo, sets.invent, usual)
     image = image if given.painted else exposure.normalised(image, fit, given.view)
     depth = load_straight_depth(given, lens, upright, found.moved)
     if depth is not None:  # where it is in the scene's own unit, it is in this frame's now
@@ -173,15 +172,15 @@ def lay_out(folder: Path, painted: list[str], scene: Scene, poses: Path, fit: Pa
     keep = ~load_labels(masks / "labels.npy")
     remaining = load_ply(fit / "gaussians.ply").map(lambda p: p[keep])
     hidden, invent = ({n: getattr(each, kind) for n, each in sets.items()} for kind in ("consistent", "invent"))
-    holes = painting.holes(remaining, [scene.cameras[name] for name in scene.train], hidden, invent)
-    views = painting.ranked(holes, painted, VIEWS_TO_PAINT)
+    holes = view_ranking.holes(remaining, [scene.cameras[name] for name in scene.train], hidden, invent)
+    views = view_ranking.ranked(holes, painted, VIEWS_TO_PAINT)
     for name in (each.view for each in views):
         photo = exposure.load_views(poses, fit, [name])[name]
         known = inpaint.background(remaining, scene.cameras[name], photo, hidden[name])
-        save_image(folder / f"{name}.png", painting.to_paint(known, invent[name]))
+        save_image(folder / f"{name}.png", view_ranking.to_paint(known, invent[name]))
         save_mask(folder / f"{name}_mask.png", invent[name])
     if views:
-        save_text(folder / "ranked.txt", painting.words(views, painted))
+        save_text(folder / "ranked.txt", view_ranking.words(views, painted))
         names = ", ".join(f"{each.view} ({each.share:.0%})" for each in views)
         print(f"to be painted by hand, and what each covers more: {names}; see {TO_PAINT}/ranked.txt", flush=True)
 
@@ -208,23 +207,23 @@ def inpainted(params: Params, out: Path, scene: Scene, poses: Path, fit: Path, m
     return Reference(camera, from_prior(params, out, name, base, pixels.invent), pixels.invent)
 
 
-def surfaces_around(scene: Scene, poses: Path, fit: Path, masks: Path) -> surfaces.Around:
+def surfaces_around(scene: Scene, poses: Path, fit: Path, masks: Path) -> exemplar.Around:
     """What the photographs show around the object."""
     sets, train = load_mask_sets(masks, scene.train), [scene.cameras[name] for name in scene.train]
     hidden = {name: each.consistent & (name not in scene.clean) for name, each in sets.items()}
     photos = exposure.load_views(poses, fit, scene.train)
     gaussians, thing = load_ply(fit / "gaussians.ply"), load_object(masks)
-    return surfaces.looked_around(gaussians, thing, train, hidden, photos, scene.points)
+    return exemplar.looked_around(gaussians, thing, train, hidden, photos, scene.points)
 
 
 def from_photographs(
-    params: Params, out: Path, base: np.ndarray, pixels: MaskSet, camera: Camera, around: surfaces.Around
+    params: Params, out: Path, base: np.ndarray, pixels: MaskSet, camera: Camera, around: exemplar.Around
 ) -> np.ndarray:
     """The picture [H, W, 3] uint8 with I put together from patches of the photographs; also writes the sheet of
     candidates."""
-    hole = surfaces.to_paint(pixels.consistent, pixels.invent)
+    hole = exemplar.to_paint(pixels.consistent, pixels.invent)
     seeds = [params.seed + index for index in range(params.candidates)]
-    found = surfaces.completions(base, hole, camera, pixels.consistent, around, seeds)
+    found = exemplar.completions(base, hole, camera, pixels.consistent, around, seeds)
     misfits = [each.misfit for each in found]
     chosen = int(np.argmin(misfits)) if params.choose is None else params.choose
     save_image(out / "candidates.png", np.concatenate([each.image for each in found], 1))
@@ -234,7 +233,7 @@ def from_photographs(
 
 def from_network(painter: Painter, out: Path, name: str, base: np.ndarray, pixels: MaskSet) -> np.ndarray:
     """The picture [H, W, 3] uint8 with I painted in one pass by LaMa or MI-GAN; also written as the one candidate."""
-    image = painter.paint(base, surfaces.to_paint(pixels.consistent, pixels.invent))
+    image = painter.paint(base, exemplar.to_paint(pixels.consistent, pixels.invent))
     save_image(out / "candidates.png", image)
     save_json(out / "candidates.json", {"view": name, "painter": painter.name, "chosen": 0})
     return image

@@ -18,7 +18,7 @@ import torch
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_leaves, tree_map
 
-from reffusion.fit import feed
+from reffusion.fit import view_loader
 from reffusion.gaussians import adam, ssim
 from reffusion.splat import cpu, cuda
 from reffusion.types import Rendering
@@ -126,5 +126,5 @@ def card() -> Iterator[None]:
         patched.setattr(cuda, "accumulate", accumulate)
         patched.setattr(ssim, "triton_works", lambda: False)
         patched.setattr(adam, "triton_works", lambda: False)
-        patched.setattr(feed, "ThreadPoolExecutor", partial(ThreadPoolExecutor, initializer=Card().__enter__))
+        patched.setattr(view_loader, "ThreadPoolExecutor", partial(ThreadPoolExecutor, initializer=Card().__enter__))
         yield

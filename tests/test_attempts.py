@@ -11,7 +11,7 @@ from benchmarks.studies import attempts as benchmark
 from reffusion.io.images import save_image, save_mask
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets, save_references
-from reffusion.score import metrics
+from reffusion.metrics import image_metrics
 from reffusion.splat import rasterizer
 from reffusion.types import Reference
 from stages import distill, initialize, masks
@@ -70,7 +70,7 @@ def test_scores_are_those_of_the_box(run):
     camera, truth, box = benchmark.test_views(run)[0]
     with torch.no_grad():
         picture = (rasterizer.render(gaussians, camera).color.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
-    expected = metrics.score_view(picture, truth, box, {}, np.zeros(truth.shape[:2], bool), False)
+    expected = image_metrics.score_view(picture, truth, box, {}, np.zeros(truth.shape[:2], bool), False)
     found = benchmark.scored(gaussians, [(camera, truth, box)])
     assert found == pytest.approx({name: expected[name] for name in benchmark.SCORES})
 

@@ -21,13 +21,14 @@ import pytest
 from PIL import Image
 from small_capture import HEIGHT, WIDTH, prepare, some_truth, write_masks, write_pictures
 
-from reffusion.capture.given import load_depth, load_given
-from reffusion.capture.reading import read_scene
 from reffusion.capture.roles import views_of
-from reffusion.capture.straight import GivenReference
+from reffusion.capture.scene_folder import read_scene
+from reffusion.io.depth_maps import load_depth
 from reffusion.io.files import BadInput
 from reffusion.io.images import load_image, save_exr, save_image
 from reffusion.io.ply import save_ply
+from reffusion.references.files import load_given
+from reffusion.references.undistort import GivenReference
 from reffusion.types import Gaussians
 from runner import Refused, child
 from runner.layers import layered, parse_set, seconds_of

@@ -5,11 +5,12 @@ import pytest
 import small_scene
 import torch
 
+from reffusion.background import backdrop, training_coverage
 from reffusion.io.arrays import load_json
 from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_scene, save_scene
-from reffusion.score import beyond, metrics, sight
+from reffusion.metrics import image_metrics
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
@@ -46,7 +47,7 @@ def with_more(gaussians: Gaussians, mean, sizes, color) -> Gaussians:
 
 def test_beyond_the_capture_the_picture_goes_on_softly_and_seen_pixels_stay():
     scene = wall()
-    done = beyond.completed([scene], TRAIN)[0]
+    done = backdrop.completed([scene], TRAIN)[0]
     for camera in TRAIN:
         assert np.abs(picture(done, camera) - picture(scene, camera)).max() < 0.02
     away = turned(75)
@@ -64,7 +65,7 @@ def test_beyond_the_capture_the_picture_goes_on_softly_and_seen_pixels_stay():
 def test_each_direction_takes_the_colours_that_lie_there():
     left, right = (0.9, 0.1, 0.1), (0.1, 0.1, 0.9)
     color = lambda x, y: np.where(x[..., None] < 0, left, right)
-    done = beyond.completed([small_scene.plane(small_scene.WALL, 2.0, 1.4, color)], TRAIN)[0]
+    done = backdrop.completed([small_scene.plane(small_scene.WALL, 2.0, 1.4, color)], TRAIN)[0]
     to_the_left, to_the_right = (picture(done, turned(angle)).mean((0, 1)) for angle in (-80, 80))
     assert to_the_left[0] > 2 * to_the_left[2] and to_the_right[2] > 2 * to_the_right[0]
 
@@ -73,37 +74,37 @@ def test_needles_beyond_the_capture_go():
     needle = with_more(wall(), [5.0, 0.0, 2.0], [0.8, 0.01, 0.01], [0.0, 1.0, 0.0])
     away = turned(65)
     assert (picture(needle, away)[..., 1] - picture(wall(), away)[..., 1]).max() > 0.5
-    with_it, without = (picture(beyond.completed([scene], TRAIN)[0], away) for scene in (needle, wall()))
+    with_it, without = (picture(backdrop.completed([scene], TRAIN)[0], away) for scene in (needle, wall()))
     assert np.abs(with_it - without).max() < 0.05
 
 
 def test_what_one_training_view_shows_stays():
     spot = with_more(wall(), [0.9, 0.0, 1.9], [0.02, 0.02, 0.02], [0.0, 1.0, 0.0])
     assert any(np.abs(picture(spot, camera) - picture(wall(), camera)).max() > 0.3 for camera in TRAIN)
-    done = beyond.completed([spot], TRAIN)[0]
+    done = backdrop.completed([spot], TRAIN)[0]
     assert (done.means == spot.means[-1]).all(1).any()
 
 
 def test_a_scene_without_training_views_or_gaussians_is_left_alone():
     scene = wall()
-    assert beyond.completed([scene], [])[0] is scene
+    assert backdrop.completed([scene], [])[0] is scene
     nothing = scene.map(lambda p: p[:0])
-    assert len(beyond.completed([nothing], TRAIN)[0]) == 0
+    assert len(backdrop.completed([nothing], TRAIN)[0]) == 0
     behind = Camera("b", 8, 8, 8.0, 8.0, 4.0, 4.0, np.diag([-1.0, 1.0, -1.0, 1.0]))
-    assert len(beyond.completed([scene], [behind])[0]) == len(scene)  # it sees none: nothing to continue
+    assert len(backdrop.completed([scene], [behind])[0]) == len(scene)  # it sees none: nothing to continue
 
 
 # --- what was seen
 
 
-def seen_by(scene: Gaussians, masks=None) -> list[sight.SeenView]:
-    return sight.seen_views(scene, TRAIN, masks or {})
+def seen_by(scene: Gaussians, masks=None) -> list[training_coverage.SeenView]:
+    return training_coverage.seen_views(scene, TRAIN, masks or {})
 
 
 def test_a_view_that_everything_saw_has_nothing_unseen():
     scene = wall()
     for name in small_scene.TEST:
-        assert not sight.unseen(scene, small_scene.CAMERAS[name], seen_by(scene))[2:-2, 2:-2].any()
+        assert not training_coverage.unseen(scene, small_scene.CAMERAS[name], seen_by(scene))[2:-2, 2:-2].any()
 
 
 def test_unseen_is_what_lies_outside_all_frames():
@@ -111,7 +112,7 @@ def test_unseen_is_what_lies_outside_all_frames():
     aside = small_scene.camera("aside", 1.0)
     x = small_scene.wall_points(aside)[..., 0]
     edge = TRAIN[-1].center[0] + small_scene.WALL * small_scene.WIDTH / 2 / small_scene.FOCAL
-    found = sight.unseen(scene, aside, seen_by(scene))
+    found = training_coverage.unseen(scene, aside, seen_by(scene))
     assert small_scene.iou(found, x > edge) > 0.95
     assert 0.3 < found.mean() < 0.9
 
@@ -127,9 +128,9 @@ def test_unseen_is_what_all_training_views_hide_behind_something_or_under_masks(
     framed = np.any([((uv >= 0) & (uv < (c.width, c.height))).all(-1) & ~small_scene.behind_square(points, c, at)
                      for c in TRAIN for uv in [small_scene.geometry.project(points, c)[0]]], 0)  # fmt: skip
     here = ~small_scene.behind_square(points, aside, at)  # the square itself was seen
-    assert small_scene.iou(sight.unseen(both, aside, seen_by(both)) & here, ~framed & here) > 0.85
+    assert small_scene.iou(training_coverage.unseen(both, aside, seen_by(both)) & here, ~framed & here) > 0.85
     hidden = {c.name: np.ones((c.height, c.width), bool) for c in TRAIN}
-    assert sight.unseen(scene, TRAIN[0], seen_by(scene, hidden)).all()
+    assert training_coverage.unseen(scene, TRAIN[0], seen_by(scene, hidden)).all()
 
 
 # --- what is counted
@@ -142,13 +143,13 @@ def test_scores_of_seen_pixels_only():
     unseen[:, 30:], mask[:, :10] = True, True
     image[:, 30:] = 0.0
     image[:, 10:30] = np.clip(truth[:, 10:30] + 0.01, 0, 1)
-    row = metrics.score_view(image, truth, None, mask=mask, unseen=unseen)
+    row = image_metrics.score_view(image, truth, None, mask=mask, unseen=unseen)
     assert row["unseen_share"] == pytest.approx(1 / 3)
-    assert row["psnr_outside_seen"] == pytest.approx(metrics.psnr(image[:, 10:30], truth[:, 10:30]))
+    assert row["psnr_outside_seen"] == pytest.approx(image_metrics.psnr(image[:, 10:30], truth[:, 10:30]))
     assert row["psnr_outside"] < row["psnr_outside_seen"] - 20
-    row = metrics.score_view(image, truth, None, mask=mask)
+    row = image_metrics.score_view(image, truth, None, mask=mask)
     assert row["psnr_outside_seen"] is None and row["unseen_share"] is None
-    row = metrics.score_view(image, truth, None, mask=mask, unseen=np.zeros_like(mask))
+    row = image_metrics.score_view(image, truth, None, mask=mask, unseen=np.zeros_like(mask))
     assert row["psnr_outside_seen"] == row["psnr_outside"] and row["unseen_share"] == 0
 
 

@@ -28,7 +28,7 @@ from small_capture import (
 )
 
 from reffusion.capture.lens import sampling_map, without_distortion
-from reffusion.capture.reading import read_scene
+from reffusion.capture.scene_folder import read_scene
 from reffusion.io import colmap
 from reffusion.io.arrays import load_json
 from reffusion.io.files import BadInput

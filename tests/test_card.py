@@ -18,7 +18,7 @@ if DEVICE == "cpu" and os.environ.get("TRITON_INTERPRET") != "1":
     pytest.skip("needs a CUDA GPU, or Triton's interpreter", allow_module_level=True)
 pytest.importorskip("triton")
 
-from reffusion.gaussians import card  # noqa: E402  (imports Triton)
+from reffusion.gaussians import cuda_kernels  # noqa: E402
 
 
 @pytest.mark.parametrize("size", [(4, 4, 1), (23, 31, 3), (61, 1030, 3)])
@@ -34,14 +34,14 @@ def test_ssim_and_its_gradient(size, masked):
     exact = dssim_torch(leaf, target, weights)
     (slope,) = torch.autograd.grad(exact, leaf)
     there = [None if each is None else each.float().to(DEVICE) for each in (image, target, weights)]
-    value, gradient = card.dssim_and_gradient(*there, window(), (C1, C2))
+    value, gradient = cuda_kernels.dssim_and_gradient(*there, window(), (C1, C2))
     assert abs(float(value) - float(exact.detach())) < 1e-6
     assert (gradient.cpu().double() - slope).norm() < 1e-5 * slope.norm()
 
 
 def test_adam(monkeypatch):
     count, found = 700, []
-    for update in (adam.adam, card.adam):
+    for update in (adam.adam, cuda_kernels.adam):
         monkeypatch.setattr(adam, "fastest", lambda device, update=update: update)
         draw = generator(0, "adam")
         normal = lambda *shape, draw=draw: torch.randn(*shape, generator=draw).to(DEVICE)

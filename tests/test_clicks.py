@@ -11,11 +11,11 @@ import small_scene as small
 import torch
 from browser import visiting
 
-from reffusion.capture.clicked import as_photographed, photographed, straightened
-from reffusion.clicks import everywhere
+from reffusion.capture.click_coordinates import as_photographed, photographed, straightened
+from reffusion.clicks import all_views
 from reffusion.clicks.marks import Clicks
-from reffusion.clicks.picture import corrected, view_mask
-from reffusion.cuts import least_cut
+from reffusion.clicks.single_view import corrected, view_mask
+from reffusion.graph_cut import least_cut
 from reffusion.io.files import BadInput
 from reffusion.io.images import load_image, load_mask, save_image, save_mask, to_uint8
 from reffusion.io.scene import load_mask_sets
@@ -148,10 +148,10 @@ def test_a_mask_in_one_view_stays_as_it_was_given(scene):
     _, placed, _ = scene
     everything, _ = small.gaussians(NEAR)
     image_of = lambda name: load_image(placed / "images" / f"{name}.png")
-    near = everywhere.neighbours(everything)
-    found = everywhere.solved(everything, near, small.CAMERAS, image_of, {}, {"a1": truth("a1")})
+    near = all_views.neighbours(everything)
+    found = all_views.solved(everything, near, small.CAMERAS, image_of, {}, {"a1": truth("a1")})
     assert (found.masks["a1"] == truth("a1")).all()
-    shown = everywhere.shown(everything, found.labels, small.CAMERAS["a4"], image_of("a4"))
+    shown = all_views.shown(everything, found.labels, small.CAMERAS["a4"], image_of("a4"))
     assert small.iou(shown, truth("a4")) > 0.9
 
 
@@ -183,8 +183,8 @@ def test_sides_that_no_click_shows_are_found_by_the_other_photographs():
     with torch.no_grad():
         images = {n: to_uint8(rasterizer.render(scene, c).color.clamp(0, 1).numpy()) for n, c in cameras.items()}
     box = torch.arange(count) >= len(parts[0][0])
-    near, mask = everywhere.neighbours(scene), voting.label_view(scene, box, cameras["middle"]) > 0.5
-    found = everywhere.labelled(scene, near, cameras, {"middle": mask}, images.__getitem__)
+    near, mask = all_views.neighbours(scene), voting.label_view(scene, box, cameras["middle"]) > 0.5
+    found = all_views.labelled(scene, near, cameras, {"middle": mask}, images.__getitem__)
     assert (found & box).sum() > 0.95 * box.sum() and (found & ~box).sum() < 0.01 * box.sum()
 
 

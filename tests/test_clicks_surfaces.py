@@ -6,7 +6,7 @@ import numpy as np
 import small_scene as small
 
 from reffusion.clicks.marks import Clicks
-from reffusion.clicks.picture import view_mask
+from reffusion.clicks.single_view import view_mask
 
 
 def chequered_on_gravel():

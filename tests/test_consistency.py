@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from reffusion.score import consistency
-from reffusion.score.consistency import Shown
+from reffusion.metrics import consistency
+from reffusion.metrics.consistency import Shown
 from reffusion.types import Camera
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from reffusion import geometry
-from reffusion.masks.continuation import planes_around
-from reffusion.masks.corners import third_faces
-from reffusion.masks.witness import Witness, surface_range
+from reffusion.background.continuation import planes_around
+from reffusion.background.corners import third_faces
+from reffusion.background.visibility import Witness, surface_range
 from reffusion.types import Camera
 
 NO_POINTS = np.zeros((0, 3))

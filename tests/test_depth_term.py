@@ -8,9 +8,9 @@ import torch
 from small_params import altered
 
 from reffusion import trace
-from reffusion.depth import behind, estimates
+from reffusion.depth import background_depth, estimates
 from reffusion.depth.alignment import align
-from reffusion.depth.behind import Completion
+from reffusion.depth.background_depth import Completion
 from reffusion.distill import depth_term
 from reffusion.distill import optimization as D
 from reffusion.distill.confinement import TrainView
@@ -66,7 +66,7 @@ def term(gaussians, masked, estimator, prior=None, text=None, view=None, **more)
 def shown(moved=1.0, how=HOW):
     """What the view shows of the wall's depth."""
     with torch.no_grad():
-        return behind.seen(render(wall(moved)[0], VIEW), VIEW, HOLE, HOLE, how)
+        return background_depth.seen(render(wall(moved)[0], VIEW), VIEW, HOLE, HOLE, how)
 
 
 def giving(estimate):
@@ -273,7 +273,7 @@ def test_the_picture_is_painted_only_where_planes_do_not_explain(prior, text):
 
     view = replace(shown(), depth=1 / WALL)
     for share, times in ((0.7, 0), (2.0, 1)):
-        found, _ = behind.continued(view, guide, NO_POINTS, replace(HOW, planar_share=share))
+        found, _ = background_depth.continued(view, guide, NO_POINTS, replace(HOW, planar_share=share))
         np.testing.assert_allclose(found[HOLE], WALL[HOLE], rtol=1e-3)
         assert len(asked) == times
     smooth = depth_term.by_continuation(NO_POINTS, replace(HOW, planar_share=2.0))

@@ -10,12 +10,13 @@ import pytest
 import torch
 
 from reffusion import seeding
+from reffusion.background import backdrop, training_coverage
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.images import load_image, save_image, save_mask
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_scene, save_mask_sets, save_scene
-from reffusion.paint.margin import widened
-from reffusion.score import beyond, metrics, rows, sight
+from reffusion.metrics import image_metrics, rows
+from reffusion.morphology import widened
 from reffusion.splat.rasterizer import render
 from reffusion.types import Camera, Gaussians, MaskSet, Scene, Similarity
 from report import sheet
@@ -135,24 +136,24 @@ def test_scores_are_those_of_the_saved_pictures(done):
     out = done / "evaluate"
     summary = load_json(out / "metrics.json")
     cameras = load_scene(done / "poses").cameras
-    boxes = {"view0": metrics.Box(2, 8, 38, 32), "view1": None, "view2": metrics.Box(17, 2, 48, 26)}
+    boxes = {"view0": image_metrics.Box(2, 8, 38, 32), "view1": None, "view2": image_metrics.Box(17, 2, 48, 26)}
     train = [cameras[name] for name in load_scene(done / "poses").train]
     fit = load_ply(done / "fit" / "gaussians.ply")
     hidden = {camera.name: evaluate.mask_of(camera, done / "raw_masks", done / "masks") for camera in train}
-    seen_by = sight.seen_views(fit, train, hidden)
+    seen_by = training_coverage.seen_views(fit, train, hidden)
     for kind, renders in (("mean", "renders"), ("initialize", "renders_initialize")):
         scored = [
-            metrics.score_view(
+            image_metrics.score_view(
                 load_image(out / renders / f"{name}.png"),
                 load_image(done / "poses" / "images" / f"{name}.png"),
                 box,
                 mask=widened(evaluate.mask_of(cameras[name], done / "raw_masks", done / "masks"), 0.01),
-                unseen=sight.unseen(fit, cameras[name], seen_by),
+                unseen=training_coverage.unseen(fit, cameras[name], seen_by),
             )
             for name, box in boxes.items()
         ]
-        for column in metrics.COLUMNS:
-            assert summary[kind][column] == metrics.mean([row[column] for row in scored]), (kind, column)
+        for column in image_metrics.COLUMNS:
+            assert summary[kind][column] == image_metrics.mean([row[column] for row in scored]), (kind, column)
     assert summary["mean"]["psnr_box"] != summary["initialize"]["psnr_box"]
     assert summary["views"]["psnr_box"] == 2 and summary["views"]["psnr_full"] == 3
     assert summary["mean"]["lpips_vgg_box"] is None and "make weights" in summary["lpips_unavailable"]
@@ -171,7 +172,7 @@ def test_scores_are_those_of_the_saved_pictures(done):
 def test_the_scene_is_exported_in_its_own_frame(done):
     exported, result = load_ply(done / "evaluate" / "scene.ply"), load_ply(done / "distill" / "gaussians.ply")
     scene = load_scene(done / "poses")
-    (result,) = beyond.completed([result], [scene.cameras[name] for name in scene.train])
+    (result,) = backdrop.completed([result], [scene.cameras[name] for name in scene.train])
     back = SIMILARITY.apply(exported.means.double().numpy())
     # 500 km away a float of the scene's own frame is worth 0.03 units, 6e-4 of the normalised frame.
     assert np.abs(back - result.means.double().numpy()).max() < 1e-3
@@ -184,7 +185,7 @@ def test_an_identical_view_is_infinite_in_the_table_and_capped_in_the_mean(done,
         picture = load_image(done / "evaluate" / "renders" / f"{view}.png")
         save_image(folders["poses"] / "images" / f"{view}.png", picture)
     summary = run(tmp_path / "again", folders)
-    assert summary["mean"]["psnr_full"] == summary["mean"]["psnr_box"] == metrics.PSNR_CAP
+    assert summary["mean"]["psnr_full"] == summary["mean"]["psnr_box"] == image_metrics.PSNR_CAP
     assert summary["mean"]["flip_full"] == 0.0 and summary["mean"]["ssim_box"] == pytest.approx(1.0)
     assert "inf" in (tmp_path / "again" / "per_view.csv").read_text()
 
@@ -246,7 +247,7 @@ def test_a_held_out_view_that_shows_the_object_is_scored_outside_its_mask_only(t
     mask = np.zeros((HEIGHT, WIDTH), bool)
     mask[8:32, 3:37] = True  # 2 px wider, a disk at its corners
     picture, truth = (load_image(p / "view0.png") for p in (tmp_path / "out/renders", folders["poses"] / "images"))
-    nearly = metrics.outside(picture, truth, mask)
+    nearly = image_metrics.outside(picture, truth, mask)
     assert float(row["psnr_outside"]) == pytest.approx(nearly["psnr_outside"], abs=0.05)
     assert summary["protocol"]["outside_margin"] == 0.05
 

@@ -15,12 +15,11 @@ import torch
 from test_paint2d import Mean
 from test_references import ROOT, capture, wall  # noqa: F401 (a fixture)
 
+from reffusion.inpaint import exemplar, feedforward
+from reffusion.inpaint.onnx_model import Network
 from reffusion.io.images import load_image
 from reffusion.io.scene import load_mask_sets, load_references, load_scene
-from reffusion.paint import feedforward
-from reffusion.paint.onnx_model import Network
 from reffusion.params.reference import Params
-from reffusion.texture import surfaces
 from reffusion.weights import painters
 from reffusion.weights.published import PAINTERS
 from runner.keys import Hashes
@@ -299,7 +298,7 @@ def test_the_stage_paints_the_hole_in_one_pass(wall, tmp_path, kind):  # noqa: F
     reference.run(Params(inpainter=kind, prior=str(file)), out, **wall)
     (found,) = load_references(out, load_scene(wall["poses"]))
     pixels = load_mask_sets(wall["masks"], ["a2"])["a2"]
-    inner = surfaces.to_paint(pixels.consistent, pixels.invent)
+    inner = exemplar.to_paint(pixels.consistent, pixels.invent)
     assert found.camera.name == "a2" and np.array_equal(found.mask, pixels.invent)
     assert np.ptp(found.image[inner].astype(int), axis=0).max() <= 1, "the stand-in's mean"
     outside = ~inner & ~pixels.consistent

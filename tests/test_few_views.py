@@ -8,10 +8,10 @@ import torch
 from small_scene import camera
 
 from reffusion import geometry
-from reffusion.depth import between, patchmatch
-from reffusion.depth.agreed import agreed
-from reffusion.depth.between import SparsePoints, known
-from reffusion.fit import few
+from reffusion.depth import patchmatch, sparse_to_dense
+from reffusion.depth.multiview_depth import agreed
+from reffusion.depth.sparse_to_dense import SparsePoints, known
+from reffusion.fit import few_views
 from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import save_scene
@@ -25,7 +25,7 @@ NONE: dict[str, np.ndarray] = {}
 
 
 def depth_between(points, view, picture):
-    return between.depth_between(known(points, view, picture), view, picture)
+    return sparse_to_dense.depth_between(known(points, view, picture), view, picture)
 
 
 def shown(view):
@@ -76,9 +76,9 @@ def test_too_few_points_tell_nothing():
     view = camera("a", 0.0)
     assert depth_between(SparsePoints.of(positions[:20], colors[:20]), view, shown(view)[1]) is None
     params = Params(sh={"degree": 0})
-    assert few.surfaces([view], {"a": shown(view)[1]}, positions[:10], colors[:10], NONE, params) is None
+    assert few_views.surfaces([view], {"a": shown(view)[1]}, positions[:10], colors[:10], NONE, params) is None
     behind = positions * (1, 1, -1)
-    assert few.surfaces([view], {"a": shown(view)[1]}, behind, colors, NONE, params) is None
+    assert few_views.surfaces([view], {"a": shown(view)[1]}, behind, colors, NONE, params) is None
 
 
 def rough(points):
@@ -167,12 +167,12 @@ def test_a_further_view_adds_what_those_before_do_not_show():
     views = [camera("a", 0.0), camera("b", 0.1)]
     images = {view.name: shown(view)[1] for view in views}
     params = Params(sh={"degree": 0})
-    one, both = (few.surfaces(views[:k], images, *sparse(), NONE, params) for k in (1, 2))
+    one, both = (few_views.surfaces(views[:k], images, *sparse(), NONE, params) for k in (1, 2))
     pixels = views[0].width * views[0].height
     assert 1.9 * pixels < len(one) < 2 * pixels, "but for what is beside the square"
     assert len(one) < len(both) < 2.4 * pixels
     hidden = {"a": np.ones((views[0].height, views[0].width), bool)}
-    assert len(few.surfaces(views[:1], images, *sparse(), hidden, params)) == 0
+    assert len(few_views.surfaces(views[:1], images, *sparse(), hidden, params)) == 0
 
 
 def written(folder, train):

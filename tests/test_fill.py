@@ -6,7 +6,7 @@ import torch
 from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import spsolve
 
-from reffusion.prior.fill import extended
+from reffusion.prior.harmonic_fill import extended
 
 
 def disc(height, width, radius):

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from reffusion import seeding, trace
-from reffusion.fit import exposure, feed, step
+from reffusion.fit import exposure, step, view_loader
 from reffusion.fit import reconstruction as fitting
 from reffusion.fit.reconstruction import KNOWN_PLACE, fit
 from reffusion.fit.start import initial_gaussians
@@ -362,9 +362,9 @@ def test_a_dense_start_looks_at_half_the_size_first():
     image, counts = np.arange(84, dtype=np.uint8).reshape(4, 7, 3), np.ones((4, 7), np.float32)
     counts[0, 0] = 0
     given = [camera], {"v": image}, {"v": counts}, range(3), 0
-    sizes = [(c.width, c.height, tuple(t.shape), tuple(w.shape)) for c, t, w in feed.samples(*given, coarse=2)]
+    sizes = [(c.width, c.height, tuple(t.shape), tuple(w.shape)) for c, t, w in view_loader.samples(*given, coarse=2)]
     assert sizes == [(4, 2, (2, 4, 3), (2, 4))] * 2 + [(7, 4, (4, 7, 3), (4, 7))]
-    small, _, weights = feed.halved(camera, image, counts)
+    small, _, weights = view_loader.halved(camera, image, counts)
     assert weights[0, 0] == 0 and weights[1, 2] == 1 and small.cy == 1.0
     assert (
         step.coarse_steps(Params(iterations=10)) == 0 < step.coarse_steps(Params(iterations=10, init=Init(flow_cell=3)))
@@ -376,9 +376,9 @@ def test_sparse_steps_look_at_every_pixel_in_four_turns(monkeypatch):
     image, counts = np.zeros((5, 7, 3), np.uint8), np.arange(35, dtype=np.float32).reshape(5, 7)
     image[..., 0] = counts
     given = [camera], {"v": image}, {"v": counts}, range(5), 0
-    assert all(look[0] == camera for look in feed.samples(*given, sparse=range(4)))  # too small to do without
-    monkeypatch.setattr(feed, "SPARED", 35)
-    looks = list(feed.samples(*given, sparse=range(4)))
+    assert all(look[0] == camera for look in view_loader.samples(*given, sparse=range(4)))  # too small to do without
+    monkeypatch.setattr(view_loader, "SPARED", 35)
+    looks = list(view_loader.samples(*given, sparse=range(4)))
     assert sorted(np.concatenate([weights.flatten() for _, _, weights in looks[:4]])) == list(range(35))
     for seen, target, weights in looks[:4]:
         assert target.shape[:2] == weights.shape == (seen.height, seen.width) and seen.every == 2

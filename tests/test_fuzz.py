@@ -24,11 +24,11 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from reffusion.capture.given import load_depth
 from reffusion.capture.load import load_capture
 from reffusion.io.arrays import load_array, load_json
 from reffusion.io.colmap import ModelCamera, ModelImage, load_cameras, load_images, load_model_points, save_model
 from reffusion.io.compressed import save_spz
+from reffusion.io.depth_maps import load_depth
 from reffusion.io.files import BadInput
 from reffusion.io.images import image_size, load_exr, load_image, load_mask, save_exr
 from reffusion.io.ply import check_gaussians, load_ply, load_points, save_ply, save_points

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import ast
 import graphlib
-import importlib
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from pydantic import BaseModel
 
 ROOT = Path(__file__).resolve().parent.parent
 OWN = {"reffusion", "stages", "runner", "report"}
@@ -22,7 +20,7 @@ DOORS = {
     "peft": ("reffusion/prior/lora.py",),
     "transformers": ("reffusion/prior/model.py", "reffusion/depth/monocular.py", "reffusion/clicks/network.py"),
     "huggingface_hub": ("reffusion/weights/download.py",),
-    "onnxruntime": ("reffusion/paint/onnx_model.py",),
+    "onnxruntime": ("reffusion/inpaint/onnx_model.py",),
     "gsply": ("reffusion/io/compressed.py",),
     "ray": ("runner/on_ray.py",),
     "submitit": ("runner/on_slurm.py",),
@@ -33,7 +31,7 @@ COMPILER = "reffusion/kernels/compiled.py"
 OWN_FILES = (
     "reffusion/prior/model.py",
     "reffusion/prior/lora.py",
-    "reffusion/score/lpips.py",
+    "reffusion/metrics/lpips.py",
     "reffusion/weights/local.py",
     "reffusion/weights/download.py",
     "reffusion/weights/lpips_package.py",
@@ -135,37 +133,10 @@ def test_no_module_imports_itself_by_a_detour():
     tuple(graphlib.TopologicalSorter(rooms).static_order())
 
 
-def test_a_folder_is_seen_at_a_glance():
-    """Faces are empty, so that what a stage depends on is what it imports; at most 16 modules lie side by side."""
+def test_package_faces_are_empty():
+    """What a stage depends on is what it imports."""
     for folder in {path.parent for path in sources("reffusion")}:
-        modules = [path for path in folder.glob("*.py") if path.stem != "__init__"]
-        assert len(modules) <= 16, f"{folder}: {len(modules)} modules"
         assert folder.name == "reffusion" or not (folder / "__init__.py").read_text().strip(), folder
-
-
-KERNELS = ("reffusion/kernels/", "reffusion/splat/", "reffusion/gaussians/adam.py", "reffusion/gaussians/ssim.py")
-
-
-@pytest.mark.parametrize("path", sources("reffusion", "stages", "runner", "report"), ids=named)
-def test_files_and_functions_are_short(path):
-    """But compiled kernels."""
-    if named(path).startswith(KERNELS):
-        return
-    text = path.read_text(encoding="utf-8")
-    assert len(text.splitlines()) <= 300
-    functions = [n for n in ast.walk(ast.parse(text)) if isinstance(n, ast.FunctionDef)]
-    assert not [f.name for f in functions if f.end_lineno - f.lineno >= 60]
-
-
-def test_parameters_are_few():
-    def leaves(model: type[BaseModel]) -> int:
-        kinds = [field.annotation for field in model.model_fields.values()]
-        return sum(leaves(k) if isinstance(k, type) and issubclass(k, BaseModel) else 1 for k in kinds)
-
-    stages = [path.stem for path in sources("stages") if path.parent.name == "stages" and path.stem != "__init__"]
-    assert len(stages) == 10
-    stages.remove("raw_masks")  # it has keys of scene.yaml that `poses` has
-    assert sum(leaves(importlib.import_module(f"reffusion.params.{stage}").Params) for stage in stages) <= 165
 
 
 @pytest.mark.parametrize("path", sources("reffusion"), ids=named)
@@ -184,7 +155,11 @@ def test_the_command_starts_at_once():
 def test_report_reads_through_io(path):
     own = {name for name in imports(path) if name.split(".")[0] in OWN - {"report"}}
     draws = ("flight", "turntable", "view", "drawn", "layers", "unseen", "study")
-    drawing = ("reffusion.splat.rasterizer", "reffusion.types", "reffusion.score.sight") if path.stem in draws else ()
+    drawing = (
+        ("reffusion.splat.rasterizer", "reffusion.types", "reffusion.background.training_coverage")
+        if path.stem in draws
+        else ()
+    )
     clicked = ("reffusion.clicks", "reffusion.capture", "reffusion.params", "reffusion.command")
     making = clicked if path.stem == "clicking" else ()  # masks
     chance = ("reffusion.seeding",) if path.stem in ("study", "votes") else ()  # the order of pairs, intervals

@@ -8,14 +8,14 @@ import small_scene as small
 import torch
 
 from reffusion import geometry
-from reffusion.depth import behind
-from reffusion.depth.behind import Completion
+from reffusion.depth import background_depth
+from reffusion.depth.background_depth import Completion
 from reffusion.gaussians.optimize import reconstruction_loss
 from reffusion.gaussians.sheets import Sheets
 from reffusion.gaussians.surfels import surface_gaussians, surface_normals
 from reffusion.initialize import coverage
-from reffusion.initialize import filling as rules
-from reffusion.initialize.settle import Known, around, turns_of
+from reffusion.initialize import unprojection as rules
+from reffusion.initialize.refit import Known, around, turns_of
 from reffusion.io.arrays import load_json, load_labels, save_labels
 from reffusion.io.images import load_exr
 from reffusion.io.ply import load_ply
@@ -53,8 +53,8 @@ def test_the_hidden_wall_is_rebuilt_where_it_was(scene, tmp_path, monkeypatch, h
     haze = load_json(tmp_path / "facts.json")["haze"]
     assert len(gaussians) == len(new) and int((~new).sum()) == len(before) - int(removed.sum()) - haze
     sheet = small.WALL / small.FOCAL * SHEETS.sunk  # the second one lies so far behind the wall
-    behind = gaussians.means[new][:, 2] - small.WALL
-    assert (torch.minimum(behind.abs(), (behind - sheet).abs()) < 0.03).all() and (behind.abs() < 0.03).any()
+    distance = gaussians.means[new][:, 2] - small.WALL
+    assert (torch.minimum(distance.abs(), (distance - sheet).abs()) < 0.03).all() and (distance.abs() < 0.03).any()
     depth = load_exr(tmp_path / "depth" / "a2.exr")
     assert np.abs(depth - small.WALL).max() < 0.04
     for name in small.TEST:
@@ -216,7 +216,7 @@ def test_sparse_points_count_where_they_are_visible():
     points = np.array([[0, 0, 2.0], [0, 0, 3.0], [0.9, 0, 2.0], [5, 0, 2.0], [0, 0, -2.0]])
     wall, left = np.full((small.HEIGHT, small.WIDTH), 0.5), np.zeros((small.HEIGHT, small.WIDTH), bool)
     left[:, :60] = True
-    pixels, values = behind.visible_points(points, view, left, wall)
+    pixels, values = background_depth.visible_points(points, view, left, wall)
     np.testing.assert_allclose(pixels, [[small.WIDTH / 2, small.HEIGHT / 2]])
     assert values.tolist() == [0.5]
 

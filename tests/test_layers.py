@@ -4,10 +4,10 @@ import itertools
 
 import numpy as np
 
-from reffusion.cuts import least_labels
-from reffusion.depth.behind import Completion, Hints, Seen, continued, grown
+from reffusion.background.continuation import _surrounded
+from reffusion.depth.background_depth import Completion, Hints, Seen, continued, grown
 from reffusion.depth.layers import pieces, shared_out
-from reffusion.masks.continuation import _surrounded
+from reffusion.graph_cut import least_labels
 from reffusion.types import Camera
 
 

@@ -12,7 +12,7 @@ import pytest
 import small_scene as small
 import yaml
 
-from reffusion.capture import support
+from reffusion.capture import image_detail
 from reffusion.io.arrays import load_json
 from reffusion.io.scene import load_mask_sets, load_scene
 from stages import fit, masks
@@ -91,20 +91,20 @@ def test_enlarged_pictures_are_told_from_sharp_ones(filter_):
     sharp = [np.clip(128 + 45 * field / field.std(), 0, 255).astype(np.uint8) for field in fields]
     sharp = [np.repeat(picture[..., None], 3, -1) for picture in sharp]
     twice = [cv2.resize(picture, None, fx=2, fy=2, interpolation=filter_) for picture in sharp]
-    assert not support.enlarged(sharp, 0.1)
-    assert support.enlarged(twice, 0.1)
-    assert not support.enlarged(twice, 0.0)  # never
-    assert not support.enlarged([np.full((64, 64, 3), 7, np.uint8)], 0.1)  # plain: nothing says that it was
+    assert not image_detail.enlarged(sharp, 0.1)
+    assert image_detail.enlarged(twice, 0.1)
+    assert not image_detail.enlarged(twice, 0.0)  # never
+    assert not image_detail.enlarged([np.full((64, 64, 3), 7, np.uint8)], 0.1)  # plain: nothing says that it was
 
 
 def test_no_more_harmonics_than_views():
     cameras = [small.camera(f"c{k}", 0.01 * k) for k in range(20)]
     point, behind = np.array([[0.0, 0.0, small.WALL]]), np.array([[0.0, 0.0, -small.WALL]])
     for count, degree in ((1, 0), (3, 0), (4, 1), (8, 1), (9, 2), (16, 3), (20, 3)):
-        assert support.harmonics(point, cameras[:count], 3) == (degree, count)
-    assert support.harmonics(point, cameras, 1)[0] == 1
-    assert support.harmonics(behind, cameras, 3) == (0, 0)
-    assert support.harmonics(np.zeros((0, 3)), cameras[:9], 3) == (2, 9)
+        assert image_detail.harmonics(point, cameras[:count], 3) == (degree, count)
+    assert image_detail.harmonics(point, cameras, 1)[0] == 1
+    assert image_detail.harmonics(behind, cameras, 3) == (0, 0)
+    assert image_detail.harmonics(np.zeros((0, 3)), cameras[:9], 3) == (2, 9)
 
 
 def test_fit_takes_the_degree_that_the_views_support(tmp_path):

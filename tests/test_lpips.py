@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from reffusion.score import lpips, metrics
+from reffusion.metrics import image_metrics, lpips
 from reffusion.weights import local, lpips_package
 from reffusion.weights.published import LPIPS, LPIPS_PACKAGES, LpipsNet
 
@@ -56,7 +56,7 @@ def random_states(net, seed=0):
 
 def distance(image, truth, model) -> float:
     signed = torch.from_numpy(2 * truth - 1).permute(2, 0, 1)[None].float()
-    return metrics.LpipsTarget(model, model.activations(signed)).distance(image)
+    return image_metrics.LpipsTarget(model, model.activations(signed)).distance(image)
 
 
 def lpips_by_definition(net, backbone, linear, images):

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from reffusion.score import lpips, metrics
-from reffusion.score.metrics import Box, mask_box
+from reffusion.metrics import image_metrics, lpips
+from reffusion.metrics.image_metrics import Box, mask_box
 
 
 def pair(height, width, seed=0, noise=0.1):
@@ -60,15 +60,17 @@ def test_box_holds_the_mask_and_lies_in_the_image(seed, dilation):
 
 def test_psnr_of_a_known_error():
     truth = np.full((5, 7, 3), 0.5)
-    assert metrics.psnr(truth + 0.1, truth) == pytest.approx(20.0)
-    assert metrics.psnr(np.full((1, 1, 3), 1, np.uint8), np.zeros((1, 1, 3), np.uint8)) == pytest.approx(48.1308, 1e-5)
-    assert metrics.psnr(truth, truth) == math.inf
+    assert image_metrics.psnr(truth + 0.1, truth) == pytest.approx(20.0)
+    assert image_metrics.psnr(np.full((1, 1, 3), 1, np.uint8), np.zeros((1, 1, 3), np.uint8)) == pytest.approx(
+        48.1308, 1e-5
+    )
+    assert image_metrics.psnr(truth, truth) == math.inf
 
 
 def test_a_mean_counts_an_identical_view_as_the_cap_and_skips_what_is_missing():
-    assert metrics.mean([math.inf, 20.0, None]) == 60.0
-    assert metrics.mean([0.25, 0.75]) == 0.5
-    assert metrics.mean([None, None]) is None and metrics.mean([]) is None
+    assert image_metrics.mean([math.inf, 20.0, None]) == 60.0
+    assert image_metrics.mean([0.25, 0.75]) == 0.5
+    assert image_metrics.mean([None, None]) is None and image_metrics.mean([]) is None
 
 
 # --- SSIM
@@ -93,17 +95,17 @@ def ssim_by_definition(x, y):
 
 def test_ssim_equals_its_definition_over_the_valid_region():
     image, truth = pair(17, 14)
-    assert metrics.ssim(image, truth) == pytest.approx(ssim_by_definition(image, truth), abs=1e-10)
+    assert image_metrics.ssim(image, truth) == pytest.approx(ssim_by_definition(image, truth), abs=1e-10)
 
 
 def test_ssim_edges():
     image, truth = pair(11, 11)
-    assert metrics.ssim(image, truth) == pytest.approx(ssim_by_definition(image, truth), abs=1e-10)
-    assert metrics.ssim(truth, truth) == pytest.approx(1.0)
+    assert image_metrics.ssim(image, truth) == pytest.approx(ssim_by_definition(image, truth), abs=1e-10)
+    assert image_metrics.ssim(truth, truth) == pytest.approx(1.0)
     black, white = np.zeros((12, 12, 3)), np.ones((12, 12, 3))
-    assert metrics.ssim(black, white) == pytest.approx(1e-4 / (1 + 1e-4))
+    assert image_metrics.ssim(black, white) == pytest.approx(1e-4 / (1 + 1e-4))
     with pytest.raises(ValueError, match="11 px"):
-        metrics.ssim(image[:10], truth[:10])
+        image_metrics.ssim(image[:10], truth[:10])
 
 
 # --- outside
@@ -113,21 +115,21 @@ def test_outside_a_mask_only_what_lies_outside_counts():
     image, truth = pair(40, 50)
     mask = np.zeros((40, 50), bool)
     mask[10:25, 15:35] = True
-    found = metrics.outside(image, truth, mask)
+    found = image_metrics.outside(image, truth, mask)
     assert found["psnr_outside"] == pytest.approx(-10 * np.log10(((image - truth)[~mask] ** 2).mean()))
     other = np.where(mask[..., None], np.random.default_rng(1).random((40, 50, 3)), image)
-    assert metrics.outside(other, truth, mask) == found
+    assert image_metrics.outside(other, truth, mask) == found
     right = np.where(mask[..., None], image, truth)
-    clean = metrics.outside(right, truth, mask)
+    clean = image_metrics.outside(right, truth, mask)
     assert clean["psnr_outside"] == math.inf and clean["ssim_outside"] == pytest.approx(1) and not clean["flip_outside"]
 
 
 def test_outside_nothing_is_the_whole_picture_and_outside_all_is_nothing():
     image, truth = pair(20, 30)
-    found, whole = metrics.outside(image, truth, np.zeros((20, 30), bool)), metrics.score(image, truth)
+    found, whole = image_metrics.outside(image, truth, np.zeros((20, 30), bool)), image_metrics.score(image, truth)
     assert found == {f"{name}_outside": pytest.approx(value) for name, value in whole.items()}
-    assert set(metrics.outside(image, truth, np.ones((20, 30), bool)).values()) == {None}
-    small = metrics.outside(image[:10], truth[:10], np.zeros((10, 30), bool))
+    assert set(image_metrics.outside(image, truth, np.ones((20, 30), bool)).values()) == {None}
+    small = image_metrics.outside(image[:10], truth[:10], np.zeros((10, 30), bool))
     assert small["ssim_outside"] is None and small["flip_outside"] > 0
 
 
@@ -135,9 +137,9 @@ def test_where_the_truth_shows_the_object_only_the_outside_is_scored():
     image, truth = pair(40, 50)
     mask = np.zeros((40, 50), bool)
     mask[10:25, 15:35] = True
-    found = metrics.score_view(image, truth, mask_box(mask), mask=mask, shows_object=True)
+    found = image_metrics.score_view(image, truth, mask_box(mask), mask=mask, shows_object=True)
     there = {name for name, value in found.items() if value is not None}
-    assert there == {"psnr_outside", "ssim_outside", "flip_outside"} and tuple(found) == metrics.COLUMNS
+    assert there == {"psnr_outside", "ssim_outside", "flip_outside"} and tuple(found) == image_metrics.COLUMNS
 
 
 # --- FLIP
@@ -146,10 +148,10 @@ def test_where_the_truth_shows_the_object_only_the_outside_is_scored():
 def test_flip_is_zero_for_identical_one_for_the_worst_and_grows_between():
     image, truth = pair(32, 32, noise=0.02)
     worse, _ = pair(32, 32, noise=0.3)
-    assert metrics.flip(truth, truth) == 0.0
-    assert 0 < metrics.flip(image, truth) < metrics.flip(worse, truth) < 1
+    assert image_metrics.flip(truth, truth) == 0.0
+    assert 0 < image_metrics.flip(image, truth) < image_metrics.flip(worse, truth) < 1
     black, white = np.zeros((40, 40, 3)), np.ones((40, 40, 3))
-    assert 0.9 < metrics.flip(white, black) <= 1.0
+    assert 0.9 < image_metrics.flip(white, black) <= 1.0
 
 
 def test_flip_is_that_of_its_authors():
@@ -160,26 +162,26 @@ def test_flip_is_that_of_its_authors():
     rough, smooth = draw.random((67, 121, 3)), np.linspace(0, 1, 90 * 80 * 3).reshape(90, 80, 3)
     for truth, image in [(rough, draw.random(rough.shape)), (smooth, smooth[::-1]), (smooth, 0.9 * smooth + 0.05)]:
         pair = (np.ascontiguousarray(x, np.float32) for x in (truth, image))
-        settings = {"ppd": metrics.PIXELS_PER_DEGREE}
+        settings = {"ppd": image_metrics.PIXELS_PER_DEGREE}
         theirs = flip_evaluator.evaluate(*pair, "LDR", applyMagma=False, computeMeanError=False, parameters=settings)
-        ours = metrics.flip_map(image, truth)
+        ours = image_metrics.flip_map(image, truth)
         assert np.abs(ours - theirs[0].reshape(ours.shape)).max() < 1e-4 and ours.dtype == np.float32
         assert abs(ours.mean() - theirs[0].mean()) < 2e-6
 
 
 def test_flip_of_one_pixel_and_of_a_view_into_a_larger_array():
     black, white = np.zeros((1, 1, 3), np.uint8), np.full((1, 1, 3), 255, np.uint8)
-    assert metrics.flip(black, black) == 0.0 < metrics.flip(white, black)
+    assert image_metrics.flip(black, black) == 0.0 < image_metrics.flip(white, black)
     image, truth = pair(40, 40)
     window = Box(5, 7, 30, 22)
     copies = window.crop(image).copy(), window.crop(truth).copy()
-    assert metrics.flip(window.crop(image), window.crop(truth)) == metrics.flip(*copies)
+    assert image_metrics.flip(window.crop(image), window.crop(truth)) == image_metrics.flip(*copies)
 
 
 # --- what every metric refuses
 
 
-@pytest.mark.parametrize("metric", [metrics.psnr, metrics.ssim, metrics.flip])
+@pytest.mark.parametrize("metric", [image_metrics.psnr, image_metrics.ssim, image_metrics.flip])
 def test_bad_images_are_refused(metric):
     image, truth = pair(16, 16)
     for wrong, message in [
@@ -197,7 +199,7 @@ def test_bad_images_are_refused(metric):
 
 def test_bytes_and_floats_score_alike():
     image, truth = ((255 * x).round().astype(np.uint8) for x in pair(20, 20))
-    for metric in (metrics.psnr, metrics.ssim, metrics.flip):
+    for metric in (image_metrics.psnr, image_metrics.ssim, image_metrics.flip):
         assert metric(image, truth) == pytest.approx(metric(image / 255, truth / 255), rel=1e-6)
 
 
@@ -206,21 +208,21 @@ def test_bytes_and_floats_score_alike():
 
 def test_score_view_leaves_out_what_is_too_small():
     image, truth = pair(40, 50)
-    targets = metrics.lpips_targets(truth[4:34, 3:13], {"vgg": lpips.Lpips("vgg")})
-    row = metrics.score_view(image, truth, Box(3, 4, 13, 34), targets)  # 10 px wide
-    assert tuple(row) == metrics.COLUMNS
-    assert row["psnr_box"] == metrics.psnr(image[4:34, 3:13], truth[4:34, 3:13])
+    targets = image_metrics.lpips_targets(truth[4:34, 3:13], {"vgg": lpips.Lpips("vgg")})
+    row = image_metrics.score_view(image, truth, Box(3, 4, 13, 34), targets)  # 10 px wide
+    assert tuple(row) == image_metrics.COLUMNS
+    assert row["psnr_box"] == image_metrics.psnr(image[4:34, 3:13], truth[4:34, 3:13])
     assert row["ssim_box"] is None and row["lpips_vgg_box"] is None and row["lpips_alex_box"] is None
-    assert row["ssim_full"] == metrics.ssim(image, truth)
-    row = metrics.score_view(image, truth, None)
+    assert row["ssim_full"] == image_metrics.ssim(image, truth)
+    row = image_metrics.score_view(image, truth, None)
     assert row["psnr_box"] is None and row["flip_box"] is None and row["psnr_full"] is not None
 
 
 def test_side_by_side_draws_the_box_and_leaves_the_pictures_alone():
     first, second = (np.full((6, 8, 3), v, np.uint8) for v in (10, 200))
-    strip = metrics.side_by_side([first, second], Box(2, 1, 6, 5))
+    strip = image_metrics.side_by_side([first, second], Box(2, 1, 6, 5))
     assert strip.shape == (6, 20, 3) and (strip[:, 8:12] == 255).all()
     assert (strip[1, 2] == (255, 220, 0)).all() and (strip[4, 17] == (255, 220, 0)).all()
     assert (strip[2, 3] == 10).all() and (strip[0, 0] == 10).all() and (strip[2, 15] == 200).all()
     assert (first == 10).all()
-    assert metrics.side_by_side([np.zeros((1, 1, 3), np.uint8)], Box(0, 0, 1, 1)).shape == (1, 1, 3)
+    assert image_metrics.side_by_side([np.zeros((1, 1, 3), np.uint8)], Box(0, 0, 1, 1)).shape == (1, 1, 3)

@@ -10,8 +10,8 @@ import small_scene as small
 import torch
 
 from reffusion.depth import monocular
-from reffusion.depth.behind import Completion, Seen
-from reffusion.initialize import filling
+from reffusion.depth.background_depth import Completion, Seen
+from reffusion.initialize import unprojection
 from reffusion.seeding import generator
 from reffusion.types import Reference
 
@@ -116,7 +116,7 @@ def test_the_references_depth_is_the_estimate_aligned():
     means *= 1 / (1 - 0.2 * means[:, 1:2] / small.WALL)
     height = (np.mgrid[: small.HEIGHT, : small.WIDTH][0] + 0.5 - small.HEIGHT / 2) / small.FOCAL
     true = (1 - 0.2 * height) / small.WALL
-    behind_it = lambda estimate: filling.depth_behind(
+    behind_it = lambda estimate: unprojection.depth_behind(
         replace(remaining, means=means), reference, hole, hole, np.zeros((0, 3)), Completion(), estimate
     )
     _, made_up, said = behind_it(50 * true - 3)

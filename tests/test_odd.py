@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import small_scene
 
-from reffusion.capture.checks import odd
-from reffusion.capture.checks.odd import find_odd_exposures, find_odd_masks
+from reffusion.capture.checks import sanity
+from reffusion.capture.checks.sanity import find_odd_exposures, find_odd_masks
 from reffusion.geometry import pixel_rays
 from reffusion.io.arrays import save_json
 from reffusion.io.images import image_size
@@ -71,9 +71,9 @@ def test_masks_of_a_small_object_in_a_deep_scene_agree():
     points = directions * np.geomspace(0.5, 40, 40_000)[:, None]
     colours = np.zeros((40_000, 3), np.uint8)
     scene = Scene(cameras, tuple(cameras), (), frozenset(), points, colours, Similarity(1.0, np.zeros(3)))
-    assert odd._disagreeing(scene, masks) == []
+    assert sanity._disagreeing(scene, masks) == []
     moved = masks | {"v4": np.roll(masks["v4"], 20, 0)}
-    assert odd._disagreeing(scene, moved) == ["the mask of v4 shows something else than those of the other views do"]
+    assert sanity._disagreeing(scene, moved) == ["the mask of v4 shows something else than those of the other views do"]
 
 
 def test_exposure_that_jumps(brought):

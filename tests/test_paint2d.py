@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from reffusion import morphology
 from reffusion.distill import perceptual
-from reffusion.paint import margin, paint2d
+from reffusion.inpaint import classical
 from reffusion.seeding import generator
 
 HEIGHT, WIDTH = 37, 50
@@ -39,7 +40,11 @@ def hole():
 
 def painters(folder):
     torch.jit.script(Mean()).save(folder / "any-name.pt")
-    return [paint2d.load(folder / "any-name.pt"), paint2d.load_classical(), paint2d.Painter("telea", paint2d.telea)]
+    return [
+        classical.load(folder / "any-name.pt"),
+        classical.load_classical(),
+        classical.Painter("telea", classical.telea),
+    ]
 
 
 def test_only_the_hole_changes_and_its_content_does_not_count(tmp_path):
@@ -53,13 +58,13 @@ def test_only_the_hole_changes_and_its_content_does_not_count(tmp_path):
 
 
 def test_a_mask_is_widened_by_a_share_of_the_width():
-    wide = margin.widened(hole(), 0.04)  # 2 px
+    wide = morphology.widened(hole(), 0.04)  # 2 px
     assert (wide[10:26, 25]).all() and not wide[9, 25] and not wide[26, 25] and wide[18, 13] and not wide[18, 12]
-    assert (margin.widened(hole(), 0) == hole()).all() and not margin.widened(np.zeros_like(hole()), 0.1).any()
+    assert (morphology.widened(hole(), 0) == hole()).all() and not morphology.widened(np.zeros_like(hole()), 0.1).any()
 
 
 def test_a_smooth_picture_is_continued():
-    for painter in (paint2d.load_classical(), paint2d.Painter("telea", paint2d.telea)):
+    for painter in (classical.load_classical(), classical.Painter("telea", classical.telea)):
         error = np.abs(painter.paint(picture(), hole()).astype(int) - picture())[hole()]
         assert error.mean() < 12, painter.name
 
@@ -69,7 +74,7 @@ def test_large_pictures_are_painted_small_by_fsr():
     image = np.stack([rows // 3, columns // 3, 0 * rows + 50], -1).astype(np.uint8)
     mask = np.zeros((300, 400), bool)
     mask[100:160, 150:260] = True
-    painted = paint2d.fsr(image, mask)
+    painted = classical.fsr(image, mask)
     assert (painted[~mask] == image[~mask]).all() and np.abs(painted.astype(int) - image)[mask].mean() < 10
 
 
@@ -84,10 +89,10 @@ def test_weights_that_are_none_are_refused(tmp_path):
     file = tmp_path / "a.pt"
     file.write_text("no module")
     with pytest.raises(ValueError, match=r"a.pt is no TorchScript module"):
-        paint2d.load(file)
+        classical.load(file)
     torch.jit.script(Broken()).save(file)
     with pytest.raises(ValueError, match="the module's answer"):
-        paint2d.load(file).paint(picture(), hole())
+        classical.load(file).paint(picture(), hole())
 
 
 def test_the_stand_in_for_lpips_is_named_as_such_and_measures_structure(tmp_path, monkeypatch):

@@ -219,11 +219,11 @@ def test_constants_of_the_library():
 
     from benchmarks.gpu import full_size
     from reffusion.gaussians.optimize import reconstruction_loss
+    from reffusion.metrics import image_metrics
     from reffusion.prior import crops, lora
-    from reffusion.score import metrics
 
     assert crops.PROMPTS == ("A photo of sks", "A photo of sks, cropped", "")
-    assert metrics.BOX_DILATION == 0.1
+    assert image_metrics.BOX_DILATION == 0.1
     assert 8 * full_size.SD2.unet["sample_size"] == 512
     assert set(lora.TEXT_ATTENTION) == {"q_proj", "k_proj", "v_proj", "out_proj"}
     assert set(lora.ATTENTION) == {"to_q", "to_k", "to_v", "to_out.0"}

@@ -9,7 +9,7 @@ from small_prior import small_prior
 
 from reffusion import trace
 from reffusion.params.personalize import Params, Samples
-from reffusion.prior import crops, denoising, diffusion, held_out, lora
+from reffusion.prior import crops, denoising, diffusion, lora, validation
 from reffusion.prior import personalize as P
 from reffusion.prior.windows import two_scale_masks
 from reffusion.seeding import generator
@@ -151,7 +151,7 @@ def test_photographs_are_measured_by_and_not_learnt_from(tiny, tmp_path):
     thing = torch.zeros(70, 90, dtype=torch.bool)
     thing[:, :45] = True
     photograph = reference.image.flip(2)
-    held = held_out.held_out([reference], [(photograph, thing)], NATIVE, 0)
+    held = validation.held_out([reference], [(photograph, thing)], NATIVE, 0)
     assert len(held.pictures) == 2 and not (held.holes[1] * two_scale_masks(thing, [], NATIVE)[0]).any()
     assert held.holes[1].any() and (held.repaint[1] >= held.holes[1]).all()
 

@@ -14,7 +14,6 @@ import small_capture
 from scipy.spatial.transform import Rotation
 
 from reffusion.capture.checks.pose_check import check_poses
-from reffusion.capture.given import load_given
 from reffusion.capture.views import placed_views
 from reffusion.geometry import pixel_rays
 from reffusion.io.files import BadInput
@@ -22,6 +21,7 @@ from reffusion.io.images import load_image, save_image
 from reffusion.io.scene import load_scene
 from reffusion.params.poses import Params
 from reffusion.params.reference import Given
+from reffusion.references.files import load_given
 from reffusion.types import Camera
 from report import check
 from stages import poses

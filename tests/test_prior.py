@@ -10,7 +10,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from reffusion.io.lora import save_portable
-from reffusion.prior import diffusion, fill, lora
+from reffusion.prior import diffusion, harmonic_fill, lora
 from reffusion.prior.model import CONDITIONING, load_prior, make_prior
 from reffusion.seeding import generator
 
@@ -79,7 +79,7 @@ def test_conditioning_hides_what_lies_under_the_mask(tiny):
 
 def test_a_folder_says_what_the_hole_shows(tiny, tmp_path):
     images, masks = pictures(), half_masks()
-    filled = fill.extended(images, masks)
+    filled = harmonic_fill.extended(images, masks)
     assert tiny.fills
     expected = torch.cat([masks, diffusion.encode(tiny, filled)], 1)
     assert torch.equal(diffusion.conditioning(tiny, images, masks), expected)

@@ -12,7 +12,7 @@ from benchmarks.studies import holes
 from benchmarks.studies import prior as benchmark
 from priors.tiny import images
 from reffusion.io.images import load_image, save_image
-from reffusion.score import metrics
+from reffusion.metrics import image_metrics
 from report import prior as page
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -26,7 +26,7 @@ def cases():
 def test_a_perfect_picture_a_blurred_one_and_a_flat_one_are_told_apart(cases):
     for case in cases[:6]:
         perfect = holes.hole_scores(case.truth, case.truth, case.hole)
-        assert perfect == {"psnr": metrics.PSNR_CAP, "ssim": 1, "flip": 0, "energy": 1}
+        assert perfect == {"psnr": image_metrics.PSNR_CAP, "ssim": 1, "flip": 0, "energy": 1}
         soft, softer = (holes.hole_scores(cv2.GaussianBlur(case.truth, (0, 0), s), case.truth, case.hole)
                         for s in (1, 4))  # fmt: skip
         for better, worse in ((perfect, soft), (soft, softer)):
@@ -37,10 +37,12 @@ def test_a_perfect_picture_a_blurred_one_and_a_flat_one_are_told_apart(cases):
 def test_only_the_hole_counts(cases):
     case = cases[0]
     spoilt = np.where(case.hole[..., None], case.truth, 255 - case.truth)
-    assert holes.hole_scores(spoilt, case.truth, case.hole)["psnr"] == metrics.PSNR_CAP
+    assert holes.hole_scores(spoilt, case.truth, case.hole)["psnr"] == image_metrics.PSNR_CAP
     inside = case.truth.copy()
     inside[case.hole] = np.clip(inside[case.hole].astype(int) + 10, 0, 255)
-    whole = metrics.psnr(inside, case.truth) + 10 * np.log10(case.hole.mean())  # all of its error lies in the hole
+    whole = image_metrics.psnr(inside, case.truth) + 10 * np.log10(
+        case.hole.mean()
+    )  # all of its error lies in the hole
     assert holes.hole_scores(inside, case.truth, case.hole)["psnr"] == pytest.approx(whole)
     with pytest.raises(ValueError, match="hole is empty"):
         holes.hole_scores(case.truth, case.truth, case.hole & False)

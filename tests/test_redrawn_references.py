@@ -11,14 +11,14 @@ import small_scene as small
 from small_references import completed, named, pattern, psnr, write_wall
 
 from benchmarks.studies import redrawn
-from reffusion.capture.given import load_given
 from reffusion.capture.views import placed_views
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.files import BadInput
 from reffusion.io.images import save_image
-from reffusion.masks import taint
+from reffusion.masks import shadows
 from reffusion.params.reference import Given
 from reffusion.references import color, registration
+from reffusion.references.files import load_given
 
 CAPTURES = Path(__file__).resolve().parents[2] / "shared" / "data"
 SIZE = (480, 360)
@@ -56,10 +56,10 @@ def test_a_redrawn_picture_of_the_view_is_accepted(variant):
     image = color.recolor(registration.warp(picture, moved)[0], found.gain, found.offset)
     low = lambda picture: cv2.GaussianBlur(picture, (0, 0), 3)
     assert psnr(low(image), low(truth), hole) > 35, "the colours and the place of what fills the hole"
-    assert (taint.tainted(image, photo, hole) & ~hole).mean() < 0.03, "redrawn texture is no shadow"
+    assert (shadows.tainted(image, photo, hole) & ~hole).mean() < 0.03, "redrawn texture is no shadow"
     away = cv2.dilate(hole.astype(np.uint8), np.ones((17, 17))) == 0
-    usual = taint.redrawn_difference(image, photo, away)
-    assert taint.changed(image, photo, away, usual).mean() < 0.02, "and nothing that was drawn"
+    usual = shadows.redrawn_difference(image, photo, away)
+    assert shadows.changed(image, photo, away, usual).mean() < 0.02, "and nothing that was drawn"
 
 
 @pytest.mark.parametrize("parallax", [2.0, 5.0])

@@ -18,15 +18,15 @@ from small_references import SIZE, completed, from_another_tool, named, pattern,
 
 from reffusion import geometry
 from reffusion.capture import lens
-from reffusion.capture.given import GivenReference, load_depth
 from reffusion.capture.lenses import save_lenses
-from reffusion.capture.straight import load_straight, load_straight_depth
 from reffusion.depth import alignment
 from reffusion.io.arrays import save_json
+from reffusion.io.depth_maps import load_depth
 from reffusion.io.images import load_image, load_mask, save_exr, save_image, save_mask
 from reffusion.io.scene import load_references, load_scene
-from reffusion.paint import agreement, painting
-from reffusion.references import color, registration
+from reffusion.references import agreement, color, registration, view_ranking
+from reffusion.references.files import GivenReference
+from reffusion.references.undistort import load_straight, load_straight_depth
 from reffusion.types import Reference
 from runner.execute import run_scene
 from runner.keys import Hashes, code_of
@@ -279,7 +279,7 @@ def test_the_stage_reads_nothing_of_the_capture(tmp_path):
     """So mending a reader of captures reruns `poses` at most."""
     code = code_of(ROOT, "reference", Hashes(tmp_path / "hashes.json"))
     readers = ("reffusion/capture/layouts/", "reffusion/capture/load.py", "reffusion/capture/roles.py")
-    assert "reffusion/capture/given.py" in code and not [path for path in code if path.startswith(readers)]
+    assert "reffusion/references/files.py" in code and not [path for path in code if path.startswith(readers)]
     assert any(path.startswith(readers) for path in code_of(ROOT, "poses", Hashes(tmp_path / "hashes.json")))
 
 
@@ -354,7 +354,8 @@ def test_what_is_to_be_painted_is_laid_out_and_a_painting_comes_back(wall, tmp_p
     shown, mask = load_image(laid_out / f"{view}.png"), load_mask(laid_out / f"{view}_mask.png")
     photo, hidden = small.photo(small.CAMERAS[view]), small.true_mask(small.CAMERAS[view], 1.6)
     assert (
-        np.array_equal(mask, small.true_never_seen(small.CAMERAS[view], 1.6)) and (shown[mask] == painting.GREY).all()
+        np.array_equal(mask, small.true_never_seen(small.CAMERAS[view], 1.6))
+        and (shown[mask] == view_ranking.GREY).all()
     )
     assert np.array_equal(shown[~hidden], photo[~hidden]) and psnr(shown, photo, hidden & ~mask) > 20
 
@@ -369,17 +370,17 @@ def test_what_is_to_be_painted_is_laid_out_and_a_painting_comes_back(wall, tmp_p
 def test_views_are_ranked_by_what_they_cover_beyond_those_before():
     """Three cameras at a wall: two see the same piece of it, the third another, of which its border cuts off a part."""
 
-    def hole(name: str, x: float, columns: slice) -> painting.Hole:
+    def hole(name: str, x: float, columns: slice) -> view_ranking.Hole:
         camera = small.camera(name, x)
         pixels = np.zeros((small.HEIGHT, small.WIDTH), bool)
         pixels[20:40, columns] = True
-        return painting.Hole(camera, pixels, np.full(pixels.shape, small.WALL))
+        return view_ranking.Hole(camera, pixels, np.full(pixels.shape, small.WALL))
 
     holes = {"a": hole("a", 0.0, slice(10, 40)), "b": hole("b", 0.0, slice(12, 36)), "c": hole("c", 2.0, slice(10, 25))}
-    found = painting.ranked(holes, [], 3)
+    found = view_ranking.ranked(holes, [], 3)
     assert [each.view for each in found] == ["a", "c"]
     assert [each.share for each in found] == pytest.approx([54 / 69, 15 / 69])
-    assert [each.view for each in painting.ranked(holes, ["b"], 3)] == ["b", "c", "a"]
+    assert [each.view for each in view_ranking.ranked(holes, ["b"], 3)] == ["b", "c", "a"]
 
 
 # ------------------------------------------------------------------------------------------ what reruns, and what stays
@@ -496,7 +497,7 @@ def test_references_that_contradict_each_other_are_told_from_those_that_agree():
     for view in views:
         points = geometry.unproject(depth, view)
         painted[view.name] = np.round(255 * small.texture(points[..., 0], points[..., 1])).astype(np.uint8)
-    holes = {view.name: painting.Hole(view, hole, depth) for view in views}
+    holes = {view.name: view_ranking.Hole(view, hole, depth) for view in views}
     alike = [Reference(view, painted[view.name], hole) for view in views]
     assert agreement.difference(*alike, *holes.values()) < agreement.UNLIKE / 4
     other = replace(alike[1], image=np.where(hole[..., None], 255 - alike[1].image, alike[1].image))
@@ -521,7 +522,7 @@ def test_what_references_draw_before_a_scene_is_compared_at_its_own_depth():
         references.append(Reference(view, np.round(255 * image).astype(np.uint8), drawn, 3 * depth))
     cameras, nothing = [each.camera for each in references], np.zeros((small.HEIGHT, small.WIDTH), bool)
     hidden = {camera.name: nothing for camera in cameras}
-    holes = painting.holes(scene, cameras, hidden, {each.camera.name: each.mask for each in references})
+    holes = view_ranking.holes(scene, cameras, hidden, {each.camera.name: each.mask for each in references})
     measured = agreement.as_drawn(holes, references, scene, hidden)
     assert set(measured) == {"a", "b"} and not agreement.contradicting(references, measured)
     assert agreement.contradicting(references, holes)  # at the wall's depth the stripes would not meet

@@ -8,7 +8,7 @@ import torch
 from small_params import altered
 from small_scene import CAMERAS, TRAIN, gaussians, true_mask
 
-from reffusion.initialize.gain import GUESSED, TAUGHT, VIEWS, WORSE, estimated
+from reffusion.initialize.sds_gain import GUESSED, TAUGHT, VIEWS, WORSE, estimated
 from reffusion.io.arrays import save_json
 from reffusion.params.distill import Params
 from reffusion.splat import rasterizer

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from reffusion import geometry
-from reffusion.texture.offsets import frequent
-from reffusion.texture.shifts import shifted
-from reffusion.texture.shown import alone
-from reffusion.texture.slopes import slopes
+from reffusion.inpaint.normals import slopes
+from reffusion.inpaint.shift_map.offsets import frequent
+from reffusion.inpaint.shift_map.photo_shifts import shifted
+from reffusion.inpaint.source_image import alone
 from reffusion.types import Camera
 
 HEIGHT, WIDTH = 120, 200

@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from reffusion import geometry
-from reffusion.initialize import gloss, sweep
-from reffusion.masks import continuation
-from reffusion.masks.plane import CELLS, Plane, without_pits
-from reffusion.masks.witness import Witness, surface_range, widened
+from reffusion.background import continuation
+from reffusion.background.plane import CELLS, Plane, without_pits
+from reffusion.background.visibility import Witness, surface_range, widened
+from reffusion.initialize import sweep, view_dependent_color
 from reffusion.splat.conventions import SH0
 from reffusion.splat.reference import colors, harmonics
 from reffusion.types import Camera, Gaussians
@@ -116,8 +116,8 @@ def test_what_is_new_shines_as_the_surface_around_it(views):
     photos = {view.name: photograph(view, shines=True) for view in CAMERAS}
     fresh = new_gaussians(1)
     every = torch.ones(len(fresh), dtype=torch.bool)
-    around = gloss.change_around(photos["v0"], ground(CAMERAS[0])[0], HOLE, CAMERAS[0], views, photos)
-    lit = gloss.lent(fresh, every, CAMERAS[0], around, views)
+    around = view_dependent_color.change_around(photos["v0"], ground(CAMERAS[0])[0], HOLE, CAMERAS[0], views, photos)
+    lit = view_dependent_color.lent(fresh, every, CAMERAS[0], around, views)
     torch.testing.assert_close(colors(lit, CAMERAS[0], 1), colors(fresh, CAMERAS[0], 1), atol=1e-4, rtol=0)
     for view in CAMERAS[1:]:
         means = lit.means.double().numpy()
@@ -130,8 +130,8 @@ def test_what_is_new_shines_as_the_surface_around_it(views):
 def test_a_matte_surface_stays_matte(views):
     photos = {view.name: photograph(view) for view in CAMERAS}
     fresh = new_gaussians(1)
-    around = gloss.change_around(photos["v0"], ground(CAMERAS[0])[0], HOLE, CAMERAS[0], views, photos)
-    lit = gloss.lent(fresh, torch.ones(len(fresh), dtype=torch.bool), CAMERAS[0], around, views)
+    around = view_dependent_color.change_around(photos["v0"], ground(CAMERAS[0])[0], HOLE, CAMERAS[0], views, photos)
+    lit = view_dependent_color.lent(fresh, torch.ones(len(fresh), dtype=torch.bool), CAMERAS[0], around, views)
     torch.testing.assert_close(lit.sh, fresh.sh, atol=0.01, rtol=0)
 
 
@@ -139,20 +139,22 @@ def test_a_shadow_that_a_reference_does_not_show_is_no_shine(views):
     light = {view.name: photograph(view) for view in CAMERAS}
     photos = {name: (photo * 0.6).astype(np.uint8) for name, photo in light.items()}
     fresh = new_gaussians(1)
-    around = gloss.change_around(light["v0"], ground(CAMERAS[0])[0], HOLE, CAMERAS[0], views, photos)
-    lit = gloss.lent(fresh, torch.ones(len(fresh), dtype=torch.bool), CAMERAS[0], around, views)
+    around = view_dependent_color.change_around(light["v0"], ground(CAMERAS[0])[0], HOLE, CAMERAS[0], views, photos)
+    lit = view_dependent_color.lent(fresh, torch.ones(len(fresh), dtype=torch.bool), CAMERAS[0], around, views)
     torch.testing.assert_close(lit.sh, fresh.sh, atol=0.01, rtol=0)
 
 
 def test_nothing_is_lent_where_nothing_is_known_or_harmonics_are_flat(views):
     photos = {view.name: photograph(view, shines=True) for view in CAMERAS}
     flat, fresh = new_gaussians(0), new_gaussians(1)
-    around = gloss.change_around(photos["v0"], ground(CAMERAS[0])[0], HOLE, CAMERAS[0], views, photos)
+    around = view_dependent_color.change_around(photos["v0"], ground(CAMERAS[0])[0], HOLE, CAMERAS[0], views, photos)
     every = torch.ones(len(fresh), dtype=torch.bool)
-    assert gloss.lent(flat, every, CAMERAS[0], around, views) is flat
-    assert gloss.lent(fresh, ~every, CAMERAS[0], around, views) is fresh
-    blind = gloss.change_around(photos["v0"], np.zeros_like(HOLE, float), HOLE, CAMERAS[0], views, photos)
-    assert gloss.lent(fresh, every, CAMERAS[0], blind, views) is fresh
+    assert view_dependent_color.lent(flat, every, CAMERAS[0], around, views) is flat
+    assert view_dependent_color.lent(fresh, ~every, CAMERAS[0], around, views) is fresh
+    blind = view_dependent_color.change_around(
+        photos["v0"], np.zeros_like(HOLE, float), HOLE, CAMERAS[0], views, photos
+    )
+    assert view_dependent_color.lent(fresh, every, CAMERAS[0], blind, views) is fresh
 
 
 def test_harmonics_are_orthonormal():

@@ -7,11 +7,11 @@ import small_scene
 import torch
 
 from reffusion import geometry
-from reffusion.masks.continuation import planes_around
-from reffusion.masks.mirrors import Mirror, imaged
-from reffusion.masks.symmetry import mirrors_around
-from reffusion.masks.undecided import behind
-from reffusion.masks.witness import Witness
+from reffusion.background.continuation import planes_around
+from reffusion.background.mirrors import Mirror, imaged
+from reffusion.background.symmetry import mirrors_around
+from reffusion.background.unobserved import behind
+from reffusion.background.visibility import Witness
 from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians

@@ -8,17 +8,19 @@ import numpy as np
 import pytest
 
 from reffusion import geometry
-from reffusion.masks.mirrors import imaged
-from reffusion.masks.plane import CELLS, Plane
-from reffusion.masks.witness import Witness, surface_range
-from reffusion.paint.paint2d import telea
-from reffusion.texture import along, completion, regular, search, surfaces
-from reffusion.texture.blending import blended
-from reffusion.texture.completion import complete
-from reffusion.texture.matches import NONE, PATCH, Compared
-from reffusion.texture.montage import montage
-from reffusion.texture.regular import FEWEST, Seen, repeats
-from reffusion.texture.shown import alone
+from reffusion.background.mirrors import imaged
+from reffusion.background.plane import CELLS, Plane
+from reffusion.background.visibility import Witness, surface_range
+from reffusion.inpaint import exemplar, plane_frames
+from reffusion.inpaint.classical import telea
+from reffusion.inpaint.patchmatch import completion, search
+from reffusion.inpaint.patchmatch.completion import complete
+from reffusion.inpaint.patchmatch.matches import NONE, PATCH, Compared
+from reffusion.inpaint.poisson import blended
+from reffusion.inpaint.shift_map import plane_symmetry
+from reffusion.inpaint.shift_map.plane_montage import montage
+from reffusion.inpaint.shift_map.plane_symmetry import FEWEST, Seen, repeats
+from reffusion.inpaint.source_image import alone
 from reffusion.types import Camera
 
 SIDE = 128
@@ -128,20 +130,20 @@ def hidden() -> np.ndarray:
     return (rows - 70) ** 2 + (columns - 62) ** 2 < 24**2
 
 
-def floor() -> surfaces.Around:
+def floor() -> exemplar.Around:
     views = []
     for view in CAMERAS:
         depth = FLOOR.depth(view)
         depth = np.where(np.isfinite(depth) & (depth < 5), depth, 0).astype(np.float32)
         views.append(Witness.of(view, depth, surface_range(depth), hidden()))
-    return surfaces.Around(views, [FLOOR], {view.name: planks(view) for view in CAMERAS}, np.zeros(3), 1.0)
+    return exemplar.Around(views, [FLOOR], {view.name: planks(view) for view in CAMERAS}, np.zeros(3), 1.0)
 
 
 def test_planks_run_on_in_their_own_perspective():
     image = np.where(hidden()[..., None], np.uint8(RED), planks(CAMERAS[0]))
 
     def off(around):
-        found = surfaces.completions(image, hidden(), CAMERAS[0], hidden(), around, range(3))
+        found = exemplar.completions(image, hidden(), CAMERAS[0], hidden(), around, range(3))
         return np.mean([np.abs(each.image.astype(int) - planks(CAMERAS[0]))[hidden()].mean() for each in found])
 
     plain = np.abs(telea(image, hidden()).astype(int) - planks(CAMERAS[0]))[hidden()].mean()
@@ -151,7 +153,7 @@ def test_planks_run_on_in_their_own_perspective():
 
 def seen_plane(picture: np.ndarray, view: Camera) -> Seen:
     """The floor within 1.2 of its middle, as a picture shows it."""
-    places = along.places_of(np.ones((SIDE, SIDE), np.int64), view, [FLOOR])
+    places = plane_frames.places_of(np.ones((SIDE, SIDE), np.int64), view, [FLOOR])
     rows, columns = np.nonzero((np.linalg.norm(places, axis=-1) < 1.2) & np.isfinite(FLOOR.depth(view)))
     return Seen(np.stack([columns, rows], 1), places[rows, columns], picture)
 
@@ -187,9 +189,9 @@ def test_planks_that_meet_in_a_point_are_turned_about_it():
 def test_the_centre_is_found_from_afar_though_a_part_of_the_top_is_seen():
     whole = seen_plane(tabletop(CAMERAS[0]), CAMERAS[0])
     right = whole.places[:, 0] > -0.1
-    seen, cell = Seen(whole.pixels[right], whole.places[right], whole.image), 2.4 / regular.SIDE
+    seen, cell = Seen(whole.pixels[right], whole.places[right], whole.image), 2.4 / plane_symmetry.SIDE
     for away in ((6, -5), (-4, 6)):
-        centre, flat = regular._put_right(seen, np.array([0.1, 0.4]) + cell * np.array(away), cell)
+        centre, flat = plane_symmetry._put_right(seen, np.array([0.1, 0.4]) + cell * np.array(away), cell)
         assert flat is not None and np.linalg.norm(centre - (0.1, 0.4)) < 2 * cell, away
 
 
@@ -207,7 +209,7 @@ def test_joints_and_round_borders_go_on_where_a_floor_repeats_itself(shown):
     around = replace(floor(), photos={view.name: shown(view) for view in CAMERAS})
     truth = shown(CAMERAS[0]).astype(int)
     image = np.where(hidden()[..., None], np.uint8(RED), shown(CAMERAS[0]))
-    target, sources, smooth, how = surfaces._told(
+    target, sources, smooth, how = exemplar._told(
         image, hidden(), CAMERAS[0], hidden(), around, imaged([], CAMERAS[0], hidden(), [])
     )
     picture, filled = montage(target, hidden(), sources, 1, how[1])
@@ -221,7 +223,7 @@ def test_joints_and_round_borders_go_on_where_a_floor_repeats_itself(shown):
 
 def test_a_hole_without_anything_to_move_into_it_is_left():
     image = np.where(hidden()[..., None], np.uint8(RED), planks(CAMERAS[0]))
-    target, sources, _, how = surfaces._told(
+    target, sources, _, how = exemplar._told(
         image, hidden(), CAMERAS[0], hidden(), floor(), imaged([], CAMERAS[0], hidden(), [])
     )
     picture, filled = montage(
@@ -232,7 +234,7 @@ def test_a_hole_without_anything_to_move_into_it_is_left():
 
 def test_frames_are_the_derivative_of_a_planes_coordinates():
     view, h = CAMERAS[1], 1e-4
-    frames = along.frames_of(np.ones((SIDE, SIDE), np.int64), view, [FLOOR])
+    frames = plane_frames.frames_of(np.ones((SIDE, SIDE), np.int64), view, [FLOOR])
     for row, column in ((80, 30), (100, 90)):
         for axis, (dx, dy) in enumerate(((h, 0), (0, h))):
             coordinates = []
@@ -246,24 +248,24 @@ def test_frames_are_the_derivative_of_a_planes_coordinates():
 
 def test_a_floor_is_smooth_and_grass_is_not():
     around = floor()
-    assert surfaces._roughness(FLOOR, around) < 1e-6
+    assert exemplar._roughness(FLOOR, around) < 1e-6
     rng = np.random.default_rng(0)
     uneven = lambda view: replace(view, depth=view.depth * (1 + 0.03 * rng.standard_normal(view.depth.shape)))
     grass = replace(around, views=[uneven(view) for view in around.views])
-    assert surfaces._roughness(FLOOR, grass) > surfaces.SMOOTH
+    assert exemplar._roughness(FLOOR, grass) > exemplar.SMOOTH
 
 
 def test_the_misfit_is_the_mean_square_by_weight():
     """Against NumPy, in float64, for a patch that is turned and carried along the floor."""
     around = floor()
-    own, other = (surfaces._source(view, around.photos[view.camera.name], around) for view in around.views[:2])
+    own, other = (exemplar._source(view, around.photos[view.camera.name], around) for view in around.views[:2])
     seen = [(completion._values(each.image, each.masked), each.masked) for each in (own, other)]
     marked = [completion._marked(values, each, [1], 1) for (values, _), each in zip(seen, (own, other), strict=True)]
     pictures = completion._pictures(marked, [masked for _, masked in seen], [own, other], 1)
     mask = np.zeros((SIDE, SIDE), bool)
     mask[70, 62] = True
     target = replace(own, surface=np.ones((SIDE, SIDE), np.int64))
-    target = replace(target, to_plane=along.frames_of(target.surface, CAMERAS[0], [FLOOR]))
+    target = replace(target, to_plane=plane_frames.frames_of(target.surface, CAMERAS[0], [FLOOR]))
     pixels = completion._pixels(target, mask, 1, [1], pictures)
     now, weight = marked[0], np.random.default_rng(0).random((SIDE, SIDE)).astype(np.float32)
     row, column, angle = 100.0, 40.0, 0.2
@@ -304,7 +306,7 @@ def test_what_is_painted_reaches_over_the_rim_and_narrow_rests():
     mask, unknown = np.zeros((100, 200), bool), np.zeros((100, 200), bool)
     mask[20:80, 40:160] = True
     unknown[20:80, 40:80] = unknown[20:80, 84:100] = True  # a rest of 4 px is left between, and 60 px beside
-    hole = surfaces.to_paint(mask, unknown)
+    hole = exemplar.to_paint(mask, unknown)
     assert hole[50, 82] and hole[50, 39] and not hole[50, 120] and not hole[50, 37] and not hole[10].any()
 
 
@@ -314,8 +316,8 @@ def test_a_nearer_surface_ends_at_the_prolongation_of_its_border():
     depth[60:] = 1.0
     hidden = np.zeros((120, 160), bool)
     hidden[30:90, 60:100] = True
-    found, layer = surfaces._drawn(depth, ~hidden, hidden)
+    found, layer = exemplar._drawn(depth, ~hidden, hidden)
     assert np.allclose(found[30:60, 60:100], 4, rtol=0.01) and np.allclose(found[61:90, 60:100], 1, rtol=0.01)
     assert (layer[61:90, 60:100] == 1).all() and (layer[30:60, 60:100] == 0).all() and layer[0, 0] == -1
-    alone, layer = surfaces._drawn(np.full((120, 160), 2.0), ~hidden, hidden)
+    alone, layer = exemplar._drawn(np.full((120, 160), 2.0), ~hidden, hidden)
     assert np.allclose(alone, 2, rtol=0.01) and layer.max() == 0

@@ -16,7 +16,7 @@ from small_prior import save_small_prior
 from benchmarks.bench import gate
 from benchmarks.bench.points import Diagram, Point, recommendation
 from reffusion import trace
-from reffusion.depth.behind import Completion
+from reffusion.depth.background_depth import Completion
 from reffusion.distill import optimization as distilling
 from reffusion.fit import reconstruction as fitting
 from reffusion.io.ply import load_ply

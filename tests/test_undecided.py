@@ -9,12 +9,21 @@ import small_scene
 import torch
 
 from reffusion import geometry
+from reffusion.background.continuation import planes_around
+from reffusion.background.plane import CELLS, Plane
+from reffusion.background.unobserved import _grows_out_of, behind
+from reffusion.background.visibility import (
+    FREE,
+    SURFACE,
+    Witness,
+    seen_by,
+    surface_range,
+    unlike,
+    votes,
+    without_slivers,
+)
 from reffusion.gaussians.surfels import surface_gaussians
-from reffusion.masks import taint
-from reffusion.masks.continuation import planes_around
-from reffusion.masks.plane import CELLS, Plane
-from reffusion.masks.undecided import _grows_out_of, behind
-from reffusion.masks.witness import FREE, SURFACE, Witness, seen_by, surface_range, unlike, votes, without_slivers
+from reffusion.masks import shadows
 from reffusion.types import Camera, Gaussians
 
 NO_POINTS = np.zeros((0, 3))
@@ -231,16 +240,16 @@ def test_a_shadow_beside_the_mask_is_found_and_carried_into_other_views(views):
     truth = np.clip(np.full((SIZE, SIZE, 3), 140) + grain, 0, 255).astype(np.uint8)
     photo = np.where(shadow[..., None], (truth * 0.6).astype(np.uint8), truth)
     photo[5:25, 5:25] = 40  # something else that differs, far from the mask
-    found = taint.tainted(truth, photo, hidden)
+    found = shadows.tainted(truth, photo, hidden)
     assert (found & shadow).sum() > 0.9 * (shadow & ~view.hidden).sum() and not found[5:25, 5:25].any()
-    assert not taint.tainted(truth, truth, hidden).any()
+    assert not shadows.tainted(truth, truth, hidden).any()
     there = geometry.unproject(drawn(other.camera)[0], other.camera)
     same = drawn(other.camera)[2] & (np.hypot(there[..., 0] - 0.5, there[..., 1] - 0.5) < 0.25) & ~other.hidden
-    carried, light = taint.carried(found, taint.light(truth, photo), depth, view.camera, [other])["a1"]
+    carried, light = shadows.carried(found, shadows.light(truth, photo), depth, view.camera, [other])["a1"]
     assert carried[same].mean() > 0.9 and not carried[~drawn(other.camera)[2]].mean() > 0.02
     lit = np.clip(np.full((SIZE, SIZE, 3), 140) + np.random.default_rng(1).integers(-12, 13, (SIZE, SIZE, 1)), 0, 255)
     core = drawn(other.camera)[2] & (np.hypot(there[..., 0] - 0.5, there[..., 1] - 0.5) < 0.2) & ~other.hidden
-    again = taint.relit((lit * 0.6).astype(np.uint8), light)
+    again = shadows.relit((lit * 0.6).astype(np.uint8), light)
     assert np.abs(again[core].astype(float) - lit[core]).mean() < 4 and np.abs(lit[core] * 0.4).mean() > 50
     outside = ~cv2.dilate(carried.astype(np.uint8), np.ones((9, 9))).astype(bool)
     assert (again[outside] == (lit * 0.6).astype(np.uint8)[outside]).all(), "where nothing is known it stays as it is"

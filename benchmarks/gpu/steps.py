@@ -14,7 +14,7 @@ from benchmarks.gpu import full_size
 from benchmarks.gpu.bench import PAPER, Bench, Sizes
 from reffusion import trace
 from reffusion.depth import monocular
-from reffusion.depth.behind import Completion, Seen
+from reffusion.depth.background_depth import Completion, Seen
 from reffusion.distill.adversary import Adversary
 from reffusion.distill.confinement import adversarial_term, reconstruction_term, reference_term
 from reffusion.distill.depth_term import Estimator, by_network, depth_term

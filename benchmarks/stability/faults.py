@@ -66,7 +66,7 @@ FAULTS = (
           lambda right: lambda x, y, w: Alignment((w @ (x * y)) / (w @ x**2), 0.0, 0.0), "alignment, four pixels"),
     Fault("no consensus before the reweighting", "reffusion.depth.alignment", "_consensus",
           lambda right: lambda x, y, w, draws: None, "alignment, 90% outliers"),
-    Fault("an unsafe logarithm in PSNR", "reffusion.score.metrics", "psnr",
+    Fault("an unsafe logarithm in PSNR", "reffusion.metrics.image_metrics", "psnr",
           then(lambda decibels: -10 * log10(10 ** (-decibels / 10))), "metrics of identical images"),
     Fault("an unsafe logarithm in the critic's loss", "reffusion.distill.discriminator", "critic_loss",
           lambda right: log_of_sigmoid, "discriminator logits +-1e4, critic"),

@@ -9,11 +9,12 @@ import torch
 
 from benchmarks.stability.cases import EPS32, EPS64, EXACT, UNCLEAR, Case, largest, unclear
 from benchmarks.stability.splatting import camera, cloud
+from reffusion.background import continuation, unobserved, visibility
 from reffusion.gaussians.optimize import reconstruction_loss
 from reffusion.gaussians.ssim import C1
-from reffusion.masks import continuation, undecided, voting, witness
-from reffusion.score import metrics
-from reffusion.score.lpips import Lpips
+from reffusion.masks import voting
+from reffusion.metrics import image_metrics
+from reffusion.metrics.lpips import Lpips
 
 VIEWS = [camera(12, 10), camera(12, 10, 1.2), camera(12, 10, 1.5)]
 NAMED = [type(view)(f"v{k}", *list(vars(view).values())[1:8]) for k, view in enumerate(VIEWS)]
@@ -33,16 +34,16 @@ def flat(value: float, height: int = 24, width: int = 32) -> np.ndarray:
 
 def identical() -> float:
     """PSNR infinite, SSIM 1, FLIP 0, and 100 dB in a mean: how many of the four are not."""
-    found = metrics.score(picture(), picture())
+    found = image_metrics.score(picture(), picture())
     good = found["psnr"] == math.inf, abs(found["ssim"] - 1) < 1e-12, found["flip"] == 0
-    return float(4 - sum(good) - (metrics.mean([found["psnr"]]) == metrics.PSNR_CAP))
+    return float(4 - sum(good) - (image_metrics.mean([found["psnr"]]) == image_metrics.PSNR_CAP))
 
 
 def constant_ssim() -> float:
     """Of two constant images SSIM is its luminance term, (2ab + C1) / (a^2 + b^2 + C1); difference."""
     apart = 0.0
     for a, b in ((0.0, 1.0), (0.25, 0.75), (0.0, 0.0), (1.0, 1.0)):
-        apart = largest(apart, abs(metrics.ssim(flat(a), flat(b)) - (2 * a * b + C1) / (a * a + b * b + C1)))
+        apart = largest(apart, abs(image_metrics.ssim(flat(a), flat(b)) - (2 * a * b + C1) / (a * a + b * b + C1)))
     return apart
 
 
@@ -50,21 +51,21 @@ def constant_psnr() -> float:
     """-20 log10 of the difference, also where that is a grey level of 2^-24; relative error."""
     apart = 0.0
     for step in (1.0, 0.5, 2.0**-8, 2.0**-24):
-        missed = abs(metrics.psnr(flat(0.0), flat(step)) + 20 * math.log10(step))
+        missed = abs(image_metrics.psnr(flat(0.0), flat(step)) + 20 * math.log10(step))
         apart = largest(apart, missed / max(1, -math.log2(step)))
     return apart
 
 
 def constant_flip() -> float:
     """Of a constant image with itself 0, of black and white within [0.9, 1]: by how much that is missed."""
-    zero, most = metrics.flip(flat(0.3), flat(0.3)), metrics.flip(flat(0.0), flat(1.0))
+    zero, most = image_metrics.flip(flat(0.3), flat(0.3)), image_metrics.flip(flat(0.0), flat(1.0))
     return largest(zero, 0.9 - most, most - 1.0)
 
 
 def one_pixel() -> float:
     """PSNR and FLIP of 1 x 1 px are finite numbers, SSIM has none: how many of the three are wrong."""
     black, grey = flat(0.0, 1, 1), flat(0.5, 1, 1)
-    found = metrics.score(black, grey)
+    found = image_metrics.score(black, grey)
     good = abs(found["psnr"] + 20 * math.log10(0.5)) < 1e-9, 0 < found["flip"] <= 1, found["ssim"] is None
     return float(3 - sum(good))
 
@@ -73,8 +74,8 @@ def one_pixel_box() -> float:
     """A mask of one pixel in a corner has a box within the image, and a score."""
     mask = np.zeros((24, 32), bool)
     mask[-1, -1] = True
-    box = metrics.mask_box(mask)
-    scored = metrics.score_view(picture(), 255 - picture(), box)
+    box = image_metrics.mask_box(mask)
+    scored = image_metrics.score_view(picture(), 255 - picture(), box)
     inside = 0 <= box.left < box.right <= 32 and 0 <= box.top < box.bottom <= 24
     return float(not inside) + float(not math.isfinite(scored["psnr_box"])) + float(scored["ssim_box"] is not None)
 
@@ -154,10 +155,10 @@ def nothing_remains() -> float:
     """Every Gaussian is the object: nobody saw anything, so all is undecided and nothing goes on; how many pixels and
     votes say otherwise."""
     nobody = cloud().map(lambda p: p[:0])
-    views = witness.witnesses(nobody, NAMED, {view.name: FULL for view in NAMED})
+    views = visibility.witnesses(nobody, NAMED, {view.name: FULL for view in NAMED})
     planes = continuation.planes_around(np.zeros(3), 1.0, views, np.zeros((0, 3)))
-    found = undecided.behind(nobody, NAMED[0], FULL, views, planes)
-    said = witness.votes(np.zeros((1, 3)), views)
+    found = unobserved.behind(nobody, NAMED[0], FULL, views, planes)
+    said = visibility.votes(np.zeros((1, 3)), views)
     return float((~found.undecided).sum() + np.isfinite(found.continued).sum() + said.seen.sum() + said.free.sum())
 
 
@@ -170,8 +171,8 @@ def tidied() -> float:
 def views_of_masks() -> float:
     """The view to complete: none of empty masks, one of full ones; boxes likewise; how many are wrong."""
     names = [view.name for view in NAMED]
-    none = voting.best_view(dict.fromkeys(names, EMPTY), names), metrics.mask_box(EMPTY)
-    some = voting.best_view(dict.fromkeys(names, FULL), names), metrics.mask_box(FULL)
+    none = voting.best_view(dict.fromkeys(names, EMPTY), names), image_metrics.mask_box(EMPTY)
+    some = voting.best_view(dict.fromkeys(names, FULL), names), image_metrics.mask_box(FULL)
     return float(sum(x is not None for x in none) + sum(x is None for x in some) + (some[1] != (0, 0, 12, 10)))
 
 

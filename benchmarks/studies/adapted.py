@@ -21,11 +21,11 @@ from reffusion.io.arrays import load_labels
 from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets, load_references, load_scene
-from reffusion.paint import painting
 from reffusion.params.base import Sampler
 from reffusion.prior import diffusion, inpaint
 from reffusion.prior.crops import PROMPTS
 from reffusion.prior.model import Prior
+from reffusion.references import view_ranking
 from report.sheet import enlarged, evenly, framed
 
 VIEWS = 5
@@ -85,7 +85,7 @@ def drawn(models: dict[str, Prior], run: Path, count: int, steps: int, out: Path
     """Write the pictures and sheet.png; the views on it."""
     views, rows = given_views(run, count), []
     for name, (picture, hole) in views.items():
-        row = {"to paint": painting.to_paint(picture, hole)}
+        row = {"to paint": view_ranking.to_paint(picture, hole)}
         for column, (when, prompt) in COLUMNS.items():
             row[column] = painted(models[when], picture, hole, prompt, steps)
         for column, made in row.items():

@@ -25,7 +25,7 @@ from reffusion.distill.steps import job_of, step_of
 from reffusion.gaussians.optimize import GaussianOptimizer
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.scene import load_scene
-from reffusion.score import metrics
+from reffusion.metrics import image_metrics
 from reffusion.splat import rasterizer
 from report import charts
 from stages import distill as stage
@@ -78,7 +78,7 @@ def test_views(run: Path) -> list[tuple]:
     for name in scene.test:
         camera = scene.cameras[name]
         truth = evaluate.truth_of(camera, run / "poses")
-        box = metrics.mask_box(evaluate.mask_of(camera, run / "raw_masks", run / "masks"))
+        box = image_metrics.mask_box(evaluate.mask_of(camera, run / "raw_masks", run / "masks"))
         if truth is not None and box is not None:
             found.append((camera, truth, box))
     if not found:
@@ -92,7 +92,7 @@ def scored(gaussians, views: list[tuple]) -> dict[str, float]:
     rows = []
     for camera, truth, box in views:
         picture = (rasterizer.render(gaussians, camera).color.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
-        rows.append(metrics.score(box.crop(picture), box.crop(truth)))
+        rows.append(image_metrics.score(box.crop(picture), box.crop(truth)))
     return {name: float(np.mean([row[name.removesuffix("_box")] for row in rows])) for name in SCORES}
 
 

@@ -18,8 +18,8 @@ import numpy as np
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.images import load_image, save_image
 from reffusion.io.scene import load_mask_sets
+from reffusion.metrics import image_metrics, lpips
 from reffusion.params.reference import Params
-from reffusion.score import lpips, metrics
 from stages import reference
 
 SCORES = {"lpips_vgg": min, "lpips_alex": min, "psnr": max, "ssim": max, "flip": min}  # and which is the best
@@ -39,10 +39,10 @@ def score_candidates(run: Path, untouched: Path, out: Path, seed: int, models: d
     pixels = load_mask_sets(run / "masks", [view])[view]
     truth, sheet = load_image(untouched / f"poses/images/{view}.png"), load_image(out / "candidates.png")
     candidates = np.split(sheet, sheet.shape[1] // truth.shape[1], 1)
-    box = metrics.mask_box(pixels.invent)
+    box = image_metrics.mask_box(pixels.invent)
     true = box.crop(truth)
-    targets = metrics.lpips_targets(true, models)
-    scores = [metrics.score(box.crop(each), true, targets) for each in candidates]
+    targets = image_metrics.lpips_targets(true, models)
+    scores = [image_metrics.score(box.crop(each), true, targets) for each in candidates]
     order = [taken, *(k for k in range(len(candidates)) if k != taken)]
     save_image(out / "sheet.png", np.concatenate([true, *(box.crop(candidates[k]) for k in order)], 1))
     return {"view": view, "taken": taken, **{name: [each[name] for each in scores] for name in SCORES}}

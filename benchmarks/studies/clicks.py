@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from reffusion.clicks import everywhere
+from reffusion.clicks import all_views
 from reffusion.clicks.marks import Clicks
-from reffusion.clicks.picture import view_mask
+from reffusion.clicks.single_view import view_mask
 from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_raw_masks, load_scene, load_views
@@ -60,11 +60,11 @@ def measured(run: Path, most: int, sheet: Path | None) -> str:
     names = sorted(true)
     view, images = names[len(names) // 2], load_views(run / "poses", names)
     gaussians = load_ply(run / "fit/gaussians.ply")
-    clicks = clicked(images[view], true[view], most, everywhere.relief(gaussians, scene.cameras[view]))
+    clicks = clicked(images[view], true[view], most, all_views.relief(gaussians, scene.cameras[view]))
     began, cameras = time.monotonic(), {name: scene.cameras[name] for name in names}
-    near = everywhere.neighbours(gaussians)
-    solved = everywhere.solved(gaussians, near, cameras, images.__getitem__, {view: clicks}, {})
-    shown = lambda name: everywhere.shown(gaussians, solved.labels, cameras[name], images[name])
+    near = all_views.neighbours(gaussians)
+    solved = all_views.solved(gaussians, near, cameras, images.__getitem__, {view: clicks}, {})
+    shown = lambda name: all_views.shown(gaussians, solved.labels, cameras[name], images[name])
     found = {name: shown(name) for name in names}
     seconds = time.monotonic() - began
     shares = {name: iou(found[name], true[name]) for name in names}

@@ -18,7 +18,7 @@ from benchmarks.studies.holes import gradient_energy
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.images import load_image, save_image
 from reffusion.io.scene import load_scene
-from reffusion.score import metrics
+from reffusion.metrics import image_metrics
 from report.sheet import enlarged, evenly, framed, stage_folder
 from stages import evaluate
 
@@ -44,7 +44,7 @@ def measured(run: Path) -> dict:
     energies: dict[str, list[tuple[float, float]]] = {"truth": [], **{way: [] for way in WAYS}}
     for name in scene.test:
         mask = evaluate.mask_of(scene.cameras[name], stage_folder(run, "raw_masks"), stage_folder(run, "masks"))
-        left, top, right, bottom = metrics.mask_box(mask)
+        left, top, right, bottom = image_metrics.mask_box(mask)
         box = np.zeros_like(mask)
         box[top:bottom, left:right] = True
         pictures = {"truth": evaluate.truth_of(scene.cameras[name], stage_folder(run, "poses"))}
@@ -90,7 +90,7 @@ def sheet(run: Path, path: Path) -> None:
         folders = ("renders_fit", *WAYS.values())
         pictures = [load_image(run / "evaluate" / folder / f"{name}.png") for folder in folders]
         pictures.append(evaluate.truth_of(camera, stage_folder(run, "poses")))
-        left, top, right, bottom = metrics.mask_box(
+        left, top, right, bottom = image_metrics.mask_box(
             evaluate.mask_of(camera, stage_folder(run, "raw_masks"), stage_folder(run, "masks")), 0.3
         )
         rows.append([enlarged(picture[top:bottom, left:right], ENLARGE) for picture in pictures])

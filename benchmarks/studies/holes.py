@@ -16,9 +16,9 @@ from torch import Tensor
 from priors.tiny import images
 from reffusion import seeding
 from reffusion.io.images import save_image
+from reffusion.metrics import image_metrics
 from reffusion.prior import diffusion
 from reffusion.prior.model import Prior
-from reffusion.score import metrics
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -66,7 +66,7 @@ def hole_scores(picture: np.ndarray, truth: np.ndarray, hole: np.ndarray) -> dic
     picture = np.where(hole[..., None], picture, truth)
     error = float(np.mean((picture[hole] / 255.0 - truth[hole] / 255.0) ** 2))
     return {
-        "psnr": min(-10 * np.log10(error), metrics.PSNR_CAP) if error > 0 else metrics.PSNR_CAP,
+        "psnr": min(-10 * np.log10(error), image_metrics.PSNR_CAP) if error > 0 else image_metrics.PSNR_CAP,
         "ssim": float(ssim_map(picture, truth)[hole].mean()),
         "flip": float(flip_map(picture, truth)[hole].mean()),
         "energy": gradient_energy(picture, hole) / max(gradient_energy(truth, hole), 1e-9),
@@ -81,7 +81,7 @@ def ssim_map(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:
         picture / 255.0,
         truth / 255.0,
         gaussian_weights=True,
-        sigma=metrics.SSIM_SIGMA,
+        sigma=image_metrics.SSIM_SIGMA,
         use_sample_covariance=False,
         data_range=1.0,
         channel_axis=2,
@@ -92,7 +92,7 @@ def ssim_map(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 def flip_map(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """[H, W] LDR-FLIP, with the viewing distance of `metrics.flip`."""
-    return metrics.flip_map(picture, truth)
+    return image_metrics.flip_map(picture, truth)
 
 
 def gradient_energy(picture: np.ndarray, hole: np.ndarray) -> float:

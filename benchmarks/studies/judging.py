@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 
 from benchmarks.studies.holes import gradient_energy
+from reffusion.inpaint import classical
 from reffusion.io.arrays import load_json
 from reffusion.io.images import load_image
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_scene
-from reffusion.paint import paint2d
-from reffusion.score import lpips, metrics
+from reffusion.metrics import image_metrics, lpips
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Scene
 from stages import evaluate
@@ -98,24 +98,24 @@ def _telea(run: Run) -> dict[str, float | None]:
     models = {"vgg": vgg} if vgg else {}
     for name in run.scene.test:
         mask = run.mask(name)
-        box = metrics.mask_box(mask)
+        box = image_metrics.mask_box(mask)
         if box is not None:
-            painted = paint2d.telea(run.picture(name), mask)
+            painted = classical.telea(run.picture(name), mask)
             truth = box.crop(run.truth(name))
-            rows.append(metrics.score(box.crop(painted), truth, metrics.lpips_targets(truth, models)))
-    return {column: metrics.mean([row.get(column) for row in rows]) for column in COLUMNS}
+            rows.append(image_metrics.score(box.crop(painted), truth, image_metrics.lpips_targets(truth, models)))
+    return {column: image_metrics.mean([row.get(column) for row in rows]) for column in COLUMNS}
 
 
 def _sharpness(run: Run) -> float | None:
     """Mean over the test views of the gradients' energy in the box over that of the truth; 1 is as sharp."""
     shares = []
     for name in run.scene.test:
-        box = metrics.mask_box(run.mask(name))
+        box = image_metrics.mask_box(run.mask(name))
         if box is not None:
             ours, true = box.crop(run.picture(name)), box.crop(run.truth(name))
             whole = np.ones(true.shape[:2], bool)
             shares.append(gradient_energy(ours, whole) / max(gradient_energy(true, whole), 1e-9))
-    return metrics.mean(shares)
+    return image_metrics.mean(shares)
 
 
 def _untouched(run: Run, ceiling: Run, name: str) -> np.ndarray | None:
@@ -152,7 +152,7 @@ def sheet(run: Run, ceiling: Run) -> np.ndarray:
     ceiling, and the absolute difference between ours and the truth."""
     rows = []
     for name in run.scene.test:
-        box, same = (metrics.mask_box(of.mask(name), AROUND) for of in (run, ceiling))
+        box, same = (image_metrics.mask_box(of.mask(name), AROUND) for of in (run, ceiling))
         if box is None or same is None:
             continue
         truth, ours = box.crop(run.truth(name)), box.crop(run.picture(name))

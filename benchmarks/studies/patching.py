@@ -29,7 +29,7 @@ from reffusion.io.images import load_image, load_mask, save_image, to_uint8
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.ply_table import load_header, load_vertices, save_vertices
 from reffusion.io.scene import load_object, load_scene
-from reffusion.score import metrics
+from reffusion.metrics import image_metrics
 from reffusion.splat import rasterizer
 from reffusion.types import Scene, Similarity
 from report import patch_files
@@ -173,8 +173,10 @@ def renders(parts: tuple[Path, ...], placed: Scene, similarity: Similarity) -> d
 def box_psnr(pictures: dict[str, np.ndarray], run: Path, placed: Scene) -> float:
     values = []
     for name, picture in pictures.items():
-        box = metrics.mask_box(load_mask(run / "raw_masks" / "test_masks" / f"{name}.png"))
-        values.append(metrics.psnr(box.crop(picture), box.crop(load_image(run / "poses" / "images" / f"{name}.png"))))
+        box = image_metrics.mask_box(load_mask(run / "raw_masks" / "test_masks" / f"{name}.png"))
+        values.append(
+            image_metrics.psnr(box.crop(picture), box.crop(load_image(run / "poses" / "images" / f"{name}.png")))
+        )
     return float(np.mean(values))
 
 

@@ -15,7 +15,7 @@ from PIL import Image
 
 from reffusion.capture.layouts.capture import Poses
 from reffusion.capture.lens import from_colmap
-from reffusion.capture.undistorted import load_at
+from reffusion.capture.undistort import load_at
 from reffusion.io.files import BadInput
 from reffusion.io.images import image_size, opened, save_image
 from reffusion.types import Camera

@@ -6,7 +6,7 @@ import numpy as np
 
 from reffusion import geometry
 from reffusion.depth import alignment, bilateral
-from reffusion.depth.behind import Completion, Seen, continued
+from reffusion.depth.background_depth import Completion, Seen, continued
 from reffusion.depth.solverlog import SILENT, SolverLog
 
 

@@ -8,8 +8,8 @@ import numpy as np
 from scipy import ndimage, sparse
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from reffusion.cuts import HARD, least_labels
 from reffusion.depth.completion import unit_range
+from reffusion.graph_cut import HARD, least_labels
 
 STEP = 0.025  # relative disparity between neighbours from which they belong to two surfaces
 LEAST = 0.03  # of the known pixels around a hole: smaller pieces are no surface of their own

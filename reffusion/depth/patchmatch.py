@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from reffusion import geometry
-from reffusion.depth.between import UNIT
+from reffusion.depth.sparse_to_dense import UNIT
 from reffusion.kernels.compiled import kernel, parallel_for
 from reffusion.kernels.vectors import take_ticket
 from reffusion.types import Camera

@@ -22,11 +22,11 @@ from reffusion.distill.adversary import Adversary
 from reffusion.distill.discriminator import gathered
 from reffusion.distill.sds import draw_timesteps, sds_gradient, sds_loss
 from reffusion.gaussians.optimize import confine, reconstruction_loss
+from reffusion.metrics.image_metrics import Box, mask_box
 from reffusion.params.distill import Sds
 from reffusion.prior import diffusion
 from reffusion.prior.model import Prior
 from reffusion.prior.windows import enlarged, two_scale_masks, two_scales, window_around, windows_around
-from reffusion.score.metrics import Box, mask_box
 from reffusion.splat.rasterizer import render
 from reffusion.types import PARAMETERS, Camera, Gaussians, Rendering
 

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reffusion.depth import behind, estimates
-from reffusion.depth.behind import Completion, Seen
+from reffusion.depth import background_depth, estimates
+from reffusion.depth.background_depth import Completion, Seen
 from reffusion.distill.confinement import TrainView
 from reffusion.gaussians.optimize import confine
 from reffusion.geometry import Degenerate
@@ -49,7 +49,7 @@ def by_continuation(points: np.ndarray, how: Completion) -> Estimator:
     Args:
         points: [P, 3] sparse points of the scene.
     """
-    return Estimator(how, lambda view, picture: behind.continued(view, picture, points, how)[0])
+    return Estimator(how, lambda view, picture: background_depth.continued(view, picture, points, how)[0])
 
 
 def by_network(network: Callable[[Tensor], Tensor], how: Completion) -> Estimator:
@@ -98,7 +98,7 @@ def depth_term(
     camera, hole, hidden = _within(longest, view)
     reached = confine(replace(gaussians, sh=gaussians.sh.detach()), masked)
     rendering = render(reached, camera)
-    seen = behind.seen(rendering, camera, hole.cpu().numpy(), hidden.cpu().numpy(), estimator.how)
+    seen = background_depth.seen(rendering, camera, hole.cpu().numpy(), hidden.cpu().numpy(), estimator.how)
     alpha = rendering.alpha.detach().cpu().numpy()
 
     def picture() -> np.ndarray:

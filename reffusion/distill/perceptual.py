@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from reffusion.gaussians.ssim import dssim
-from reffusion.score import lpips
+from reffusion.metrics import lpips
 
 Distance = Callable[[Tensor, Tensor], Tensor]  # (render, target), [H, W, 3] in [0, 1] each -> scalar
 

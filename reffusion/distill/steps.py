@@ -20,9 +20,9 @@ from reffusion.distill.confinement import (
     reference_term,
     sds_term,
 )
-from reffusion.distill.crew import Crew
 from reffusion.distill.depth_term import Estimator, depth_term
 from reffusion.distill.lift import lift_term
+from reffusion.distill.overlap_worker import Crew
 from reffusion.distill.perceptual import Distance
 from reffusion.gaussians.optimize import GaussianOptimizer
 from reffusion.geometry import Degenerate, angle_between_views

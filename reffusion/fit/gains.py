@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import cv2
 import numpy as np
 
-from reffusion.capture.support import sample_visible
+from reffusion.capture.image_detail import sample_visible
 from reffusion.types import Camera
 
 POINTS = 5000  # at most, at which photographs are compared

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from reffusion import trace
 from reffusion.fit.exposure import Exposures
-from reffusion.fit.feed import check_sizes, sample, samples
 from reffusion.fit.step import adapt, average, coarse_steps, degree_at, rates_of, sparse_steps, squared_error, step
+from reffusion.fit.view_loader import check_sizes, sample, samples
 from reffusion.gaussians.optimize import GaussianOptimizer, Rates
 from reffusion.params.fit import Params
 from reffusion.splat.rasterizer import render

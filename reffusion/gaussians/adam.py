@@ -46,9 +46,9 @@ def fastest(device: torch.device) -> Callable[..., None]:
     if device.type == "cpu":
         return adam_cpu
     if device.type == "cuda" and triton_works():
-        from reffusion.gaussians import card
+        from reffusion.gaussians import cuda_kernels
 
-        return card.adam
+        return cuda_kernels.adam
     return adam
 
 

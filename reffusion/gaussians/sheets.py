@@ -31,7 +31,8 @@ class Sheets:
         under_spread, under_opacity: the second's. Wider Gaussians than the first's leave no gaps between them, which a
             nearer view would show as a grid; what that blurs the colours of the first make up for.
         color_steps: corrections of the colours, see `filling.match_colors`.
-        gloss: whether they change with the direction as what is around them does, see `reffusion.initialize.gloss`.
+        gloss: whether they change with the direction as what is around them does, see
+            `reffusion.initialize.view_dependent_color`.
     """
 
     spread: float = 0.3

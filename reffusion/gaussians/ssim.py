@@ -51,9 +51,9 @@ def dssim(image: Tensor, target: Tensor, weights: Tensor | None = None) -> Tenso
     if image.device.type == "cpu" and image.dtype == torch.float32:
         return _FastDssim.apply(image, target.detach(), weights)
     if image.is_cuda and image.dtype == torch.float32 and triton_works():
-        from reffusion.gaussians import card
+        from reffusion.gaussians import cuda_kernels
 
-        return card.Dssim.apply(image, target.detach(), weights, window(), (C1, C2))
+        return cuda_kernels.Dssim.apply(image, target.detach(), weights, window(), (C1, C2))
     return dssim_torch(image, target.detach(), weights)
 
 
@@ -62,9 +62,9 @@ def triton_works() -> bool:
     """Are there a card and Triton, which comes with torch's CUDA builds, for `gaussians.card`?"""
     if not torch.cuda.is_available() or find_spec("triton") is None:
         return False
-    from reffusion.gaussians import card
+    from reffusion.gaussians import cuda_kernels
 
-    return card.works()
+    return cuda_kernels.works()
 
 
 def dssim_torch(image: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:

@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reffusion.initialize.filling import Surroundings
+from reffusion.background.mirrors import imaged
+from reffusion.background.visibility import OPAQUE, Witness
+from reffusion.initialize.unprojection import Surroundings
 from reffusion.masks import voting
-from reffusion.masks.mirrors import imaged
-from reffusion.masks.witness import OPAQUE, Witness
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Reference, Rendering
 

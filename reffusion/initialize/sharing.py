@@ -12,10 +12,10 @@ import torch
 from scipy import ndimage
 
 from reffusion import geometry
-from reffusion.depth import alignment, behind
-from reffusion.depth.behind import Completion, Hints
+from reffusion.depth import alignment, background_depth
+from reffusion.depth.background_depth import Completion, Hints
 from reffusion.gaussians.surfels import surface_normals
-from reffusion.initialize.filling import Surroundings
+from reffusion.initialize.unprojection import Surroundings
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Reference
 
@@ -97,7 +97,7 @@ def aligned(remaining: Gaussians, reference: Reference, around: Surroundings, ho
     """[H, W] the depth that a reference brings, in the scene's unit; 0 where it says nothing."""
     camera, drawn = reference.camera, rasterizer.render(remaining, reference.camera, sh_degree=0)
     hints = Hints(outer=around.photographed(camera))
-    view = behind.seen(drawn, camera, reference.mask, around.hidden[camera.name], how, hints)
+    view = background_depth.seen(drawn, camera, reference.mask, around.hidden[camera.name], how, hints)
     depth, _ = alignment.align_either(reference.depth, view.depth, view.known)
     return np.where(np.isfinite(depth), depth, 0.0)
 

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import ndimage
 
 from reffusion import geometry
-from reffusion.masks.witness import Witness, pixels
+from reffusion.background.visibility import Witness, pixels
 from reffusion.types import Camera
 
 NEIGHBOURS = 6

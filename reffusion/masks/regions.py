@@ -9,7 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from reffusion import geometry
-from reffusion.masks.witness import widened
+from reffusion.background.visibility import widened
 from reffusion.types import Camera, Gaussians
 
 SHOWN = 0.1  # blending weight of new Gaussians from which a pixel shows them

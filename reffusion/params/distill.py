@@ -24,7 +24,7 @@ class Sds(Settings):
     """Multi-scale score distillation (section 4.2)."""
 
     weight: float = Field(1e-3, ge=0, description="lambda of the SDS term; 0 leaves it out")
-    # The paper always distils. What it could gain at most is told by `initialize`: reffusion.initialize.gain.
+    # The paper always distils. What it could gain at most is told by `initialize`: reffusion.initialize.sds_gain.
     run: Literal["auto", "always", "never"] = Field(
         "always", description="auto: where the initialization is not yet better than what the embedded prior paints"
     )

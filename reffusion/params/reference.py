@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 from pydantic import Field
@@ -17,6 +18,11 @@ class Given(Settings):
     depth: str | None = Field(None, description="its depth or disparity, any scale: 16-bit .png, .npy or .exr")
     undistorted: bool = Field(False, description="painted over `poses`' own undistorted image, not over the photo")
     trust: bool = Field(False, description="take it though it does not seem to show its view")
+
+
+def reference_list(given: Given | Sequence[Given] | None) -> list[Given]:
+    """The values of the key `reference` as a list."""
+    return [] if given is None else [given] if isinstance(given, Given) else list(given)
 
 
 class Params(Settings):

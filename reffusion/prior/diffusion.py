@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 from torch.utils.checkpoint import checkpoint
 
-from reffusion.prior import fill
+from reffusion.prior import harmonic_fill
 from reffusion.prior.model import Prior
 
 
@@ -78,7 +78,7 @@ def conditioning(prior: Prior, images: Tensor, masks: Tensor) -> Tensor:
     filled from its surroundings, by `prior.fills`.
     """
     hidden = (masks > 0.5).to(images.dtype)
-    latents = encode(prior, fill.extended(images, hidden) if prior.fills else images * (1 - hidden))
+    latents = encode(prior, harmonic_fill.extended(images, hidden) if prior.fills else images * (1 - hidden))
     small = interpolate(hidden, size=latents.shape[-2:], mode="nearest") if prior.factor > 1 else hidden
     return torch.cat([small.float(), latents], 1)
 

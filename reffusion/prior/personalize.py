@@ -14,9 +14,9 @@ from reffusion.params.personalize import Params
 from reffusion.prior import diffusion, lora
 from reffusion.prior.crops import PROMPTS, Batch, Picture, draw_samples
 from reffusion.prior.denoising import denoising_error, latent_shape, spread_timesteps
-from reffusion.prior.held_out import held_out, measured
 from reffusion.prior.model import Prior
 from reffusion.prior.threads import Threads
+from reffusion.prior.validation import held_out, measured
 from reffusion.seeding import generator as seeded
 
 # PAPER leaves open: both; RealFill's.

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from reffusion.capture import lens
-from reffusion.capture.given import PAINTED, load_given, words
 from reffusion.capture.layouts import cameras
 from reffusion.capture.layouts.capture import Capture
-from reffusion.capture.reading import check_brought, read_scene, unphotographed
 from reffusion.capture.roles import views_of
+from reffusion.capture.scene_folder import check_brought, read_scene, unphotographed
 from reffusion.params.clicks import CLICKS
 from reffusion.params.poses import Params
+from reffusion.references.files import PAINTED, load_given, words
 
 # pictures count where they are photographs; depth maps belong to references
 NOT_READ = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".npy", ".exr")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from reffusion.capture.reading import read_scene, unphotographed
-from reffusion.capture.undistorted import check_masks
+from reffusion.capture.scene_folder import read_scene, unphotographed
+from reffusion.capture.undistort import check_masks
 from reffusion.params.raw_masks import Params
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from reffusion.capture.given import PAINTED, listed, load_given, paintings_in, words
 from reffusion.capture.views import placed_views
 from reffusion.cost import estimate
 from reffusion.io import machine
-from reffusion.params.reference import Params
+from reffusion.params.reference import Params, reference_list
+from reffusion.references.files import PAINTED, load_given, paintings_in, words
 from reffusion.weights import local, painters
 from reffusion.weights.published import PAINTERS
 
@@ -36,14 +36,14 @@ def machine_facts(params: Params) -> dict[str, str]:
 
 def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
     """Of the scene's files those that this stage reads, and what it reads elsewhere."""
-    named = {scene / name for each in listed(params.reference) for name in (each.image, each.depth) if name}
+    named = {scene / name for each in reference_list(params.reference) for name in (each.image, each.depth) if name}
     return sorted({path for path in named if path.is_file()} | {p for p in files if p.parent == scene / PAINTED})
 
 
 def preview(params: Params, *, scene: Path, poses: Path | None = None, **_: Path | None) -> list[str]:
     """What the stage will do. ValueError where it would refuse a reference for its name, its file or its view, as far
     as that can be told: against the views that `poses` placed (before it has run, `poses` checks the capture's)."""
-    if listed(params.reference) or paintings_in(scene):
+    if reference_list(params.reference) or paintings_in(scene):
         views = words(load_given(scene, placed_views(poses), params.reference)) if poses else ""
         return [f"takes over the scene's reference{views and ' ' + views}: no diffusion here"]
     if params.inpainter == "diffusion":

@@ -21,7 +21,7 @@ from reffusion.io.arrays import load_json
 from reffusion.io.images import load_mask, save_mask
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_raw_masks, load_scene
-from reffusion.score import lpips, metrics
+from reffusion.metrics import image_metrics, lpips
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Similarity
 
@@ -116,9 +116,9 @@ def _models(folder: str) -> dict[str, Any]:
 def score(image: np.ndarray, truth: np.ndarray, mask: np.ndarray, weights: np.ndarray) -> dict[str, Any]:
     """Metrics in the mask's box and 10 %; empty where the mask is. LPIPS where its weights are in the folder, or on the
     machine."""
-    box = metrics.mask_box(mask.astype(bool))
-    targets = metrics.lpips_targets(box.crop(truth), _models(str(weights))) if box else {}
-    values = metrics.score(box.crop(image), box.crop(truth), targets) if box else {}
+    box = image_metrics.mask_box(mask.astype(bool))
+    targets = image_metrics.lpips_targets(box.crop(truth), _models(str(weights))) if box else {}
+    values = image_metrics.score(box.crop(image), box.crop(truth), targets) if box else {}
     return {name: np.float64(value) for name, value in values.items() if value is not None}
 
 

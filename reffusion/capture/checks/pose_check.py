@@ -19,8 +19,8 @@ from functools import cached_property
 import cv2
 import numpy as np
 
+from reffusion.capture.image_detail import sample_visible
 from reffusion.capture.roles import LEAST_TRAINING_VIEWS
-from reffusion.capture.support import sample_visible
 from reffusion.geometry import project
 from reffusion.types import Camera, Scene
 

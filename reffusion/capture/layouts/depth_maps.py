@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from reffusion.capture.given import load_depth
 from reffusion.capture.layouts.capture import NO_POINTS, Brought
 from reffusion.capture.lens import Lens, to_directions
+from reffusion.io.depth_maps import load_depth
 from reffusion.io.images import load_thumbnail
 
 FRAMES = 16  # depth maps that are read, spread evenly

@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 from reffusion import trace
-from reffusion.capture.undistorted import fitting_size
+from reffusion.capture.undistort import fitting_size
 from reffusion.io.arrays import save_json
 from reffusion.io.files import BadInput, reading
 from reffusion.io.images import resized

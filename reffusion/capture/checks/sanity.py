@@ -1,0 +1,139 @@
+"""What is odd about a capture, in plain words: input that can be read, and is more likely a mistake than meant.
+
+PAPER leaves open: it takes masks, poses and photographs as given. The thresholds are loose: what is said here should be
+worth a look, and nothing is refused for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+
+import cv2
+import numpy as np
+
+from reffusion.capture.image_detail import sample_visible
+from reffusion.geometry import pixel_rays, project, sample_nearest
+from reffusion.types import Camera, Scene
+
+LARGE = 0.5  # of a picture: a mask that covers more is more often inverted than meant
+LOOKED_AT = 24  # masks, spread evenly, that each is compared with in 3D
+RAYS, DEPTHS = 64, 128  # pixels of a mask, and places along the ray of each: a small object is thin to a deep scene
+AGREE = 0.75  # of the other masks that must hold a place for it to be the object
+SUPPORTED = 0.3  # of a mask's pixels, under which it shows something else than the others
+BRIGHTER = 1.5  # times as bright as the others
+POINTS = 5000  # at most, at which photographs are compared
+LEAST_SEEN = 50  # points in a view for anything to be said of it
+
+
+def find_odd_exposures(scene: Scene, image_of: Callable[[str], np.ndarray]) -> list[str]:
+    """A sentence for each photograph much brighter or darker than the others.
+
+    Args:
+        scene: undistorted, in the normalised frame; its points are sparse ones or those of flow, none that were drawn.
+        image_of: view name -> uint8 [H, W, 3].
+    """
+    cameras = [scene.cameras[name] for name in (*scene.train, *scene.test) if name not in scene.suspects]
+    points = scene.points[:: max(1, -(-len(scene.points) // POINTS))]
+    if len(points) < LEAST_SEEN or len(cameras) < 3:
+        return []
+    seen = np.stack([_brightness(camera, points, image_of(camera.name)) for camera in cameras])  # [V, P]
+    known = ~np.isnan(seen)
+    total, count = np.where(known, seen, 0).sum(0), known.sum(0)
+    ratios = {}
+    for camera, own, here in zip(cameras, seen, known & (count > 1), strict=True):
+        if here.sum() >= LEAST_SEEN:
+            others = (total - own)[here] / (count[here] - 1)
+            ratios[camera.name] = float(np.median((own[here] + 4) / (others + 4)))
+    jumps = {name: ratio for name, ratio in ratios.items() if not 1 / BRIGHTER < ratio < BRIGHTER}
+    if not jumps:
+        return []
+    worst = max(jumps, key=lambda name: abs(np.log(jumps[name])))
+    who = f"{len(jumps)} of {len(ratios)} photographs are" if len(jumps) > 1 else "a photograph is"
+    return [
+        f"{who} exposed otherwise than the rest ({_listed(sorted(jumps))}; {worst} is {jumps[worst]:.2g} times as "
+        "bright): take them with a fixed exposure, or have each one's fitted (fit.exposure)"
+    ]
+
+
+def find_odd_masks(scene: Scene, masks: Mapping[str, np.ndarray]) -> list[str]:
+    """A sentence for masks that cover most of their pictures, and for those that contradict the others in 3D.
+
+    Args:
+        masks: view name -> bool [H, W], True = the object.
+    """
+    return [*_covering(masks), *_disagreeing(scene, masks)]
+
+
+def _covering(masks: Mapping[str, np.ndarray]) -> list[str]:
+    """Masks that cover most of their pictures and of their borders: a thing seen from near leaves much of these."""
+    shares = {name: float(mask.mean()) for name, mask in masks.items()}
+    border = lambda mask: np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]]).mean()
+    large = sorted(name for name, share in shares.items() if share > LARGE and border(masks[name]) > LARGE)
+    if not large:
+        return []
+    middle = float(np.median(list(shares.values())))
+    who = f"the masks of {_listed(large)} cover" if len(large) > 1 else f"the mask of {large[0]} covers"
+    if middle > LARGE:
+        who = f"the masks cover {middle:.0%} of the pictures (median);"
+    else:
+        who += f" more than {LARGE:.0%} of the picture, the others' median is {middle:.0%};"
+    return [f"{who} inverted? The object is 255 (or 1), all else 0"]
+
+
+# ---------------------------------------------------------------------------------------------- masks in 3D
+
+
+def _disagreeing(scene: Scene, masks: Mapping[str, np.ndarray]) -> list[str]:
+    """Masks that show something else than the others: along none of their pixels' rays lies a place that is inside the
+    other masks too."""
+    names = [name for name in scene.train if name in masks and name not in scene.clean]
+    marked = [name for name in names if masks[name].any()]
+    if len(marked) < 3:
+        return []
+    cameras = [scene.cameras[name] for name in names[:: -(-len(names) // LOOKED_AT)]]
+    share = {}
+    for name in marked:
+        places = _along_rays(scene.cameras[name], masks[name], scene.points)
+        inside, framed = np.zeros(places.shape[:2]), np.zeros(places.shape[:2])
+        for camera in cameras:
+            if camera.name != name:
+                hit, within = sample_nearest(masks[camera.name], project(places, camera)[0])
+                inside += hit & within
+                framed += within
+        held = ((inside >= AGREE * framed) & (framed >= 2)).any(1)
+        told = (framed >= 2).any(1)
+        if told.sum() >= RAYS // 4:
+            share[name] = float(held[told].mean())
+    alone = sorted(name for name, each in share.items() if each < SUPPORTED)
+    if len(alone) > len(share) / 2:
+        return [
+            f"{len(alone)} of {len(share)} masks do not agree in 3D; do all mark the same object, and are the poses "
+            "right?"
+        ]
+    return [f"the mask of {name} shows something else than those of the other views do" for name in alone]
+
+
+def _along_rays(camera: Camera, mask: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """[R, D, 3]: places behind pixels of the mask, evenly in disparity from the nearest to the farthest point shown."""
+    rows, columns = np.nonzero(mask)
+    chosen = np.unique(np.linspace(0, len(rows) - 1, RAYS).astype(int))
+    at, depth = project(points, camera)
+    depth = depth[sample_nearest(np.ones(mask.shape, bool), at)[1] & (depth > 1e-3)]
+    near, far = np.percentile(depth, (1, 99)) if len(depth) else (1 / 3, 4.0)
+    rays = pixel_rays(camera)[rows[chosen], columns[chosen]]
+    local = rays[:, None] / np.linspace(1 / (0.7 * near), 1 / (1.5 * far), DEPTHS)[:, None]
+    return (local - camera.world_to_camera[:3, 3]) @ camera.world_to_camera[:3, :3]
+
+
+# ---------------------------------------------------------------------------------------------- photographs
+
+
+def _brightness(camera: Camera, points: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """[P] the photograph's brightness where its pose puts the points; NaN where it does not show them."""
+    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    return sample_visible(camera, points, cv2.blur(gray, (max(3, camera.width // 40),) * 2)[..., None])[:, 0]
+
+
+def _listed(names: Iterable[str], most: int = 4) -> str:
+    names = list(names)
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -1,0 +1,132 @@
+"""A scene folder read as the keys of scene.yaml say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from reffusion.capture.click_coordinates import check_clicks
+from reffusion.capture.layouts.cameras import has_pictures
+from reffusion.capture.layouts.capture import Capture
+from reffusion.capture.layouts.mask_files import objects_of_masks
+from reffusion.capture.lens import without_distortion
+from reffusion.capture.load import LONGEST, load_capture
+from reffusion.capture.names import list_pictures
+from reffusion.capture.roles import Roles, load_roles
+from reffusion.capture.views import known
+from reffusion.io.files import BadInput, there
+from reffusion.io.splats import load_splats, summarize
+from reffusion.params.capture import SceneKeys
+from reffusion.params.reference import reference_list
+
+
+def read_scene(params: SceneKeys, scene: Path, longest: int = LONGEST) -> tuple[Capture, Roles]:
+    """The capture and its views' roles.
+
+    Args:
+        longest: larger image side in px that is asked for, see `load_capture`; no role depends on it.
+
+    Raises:
+        BadInput: naming the file and the remedy where one is wrong.
+    """
+    given = reference_list(params.reference)
+    references = frozenset(scene / name for each in given for name in (each.image, each.depth) if name is not None)
+    capture = load_capture(scene, params.layout, params.images, longest, references)
+    roles = load_roles(
+        scene,
+        capture,
+        masks=params.masks,
+        test_masks=params.test_masks,
+        train=params.train,
+        test=params.test,
+        clean=params.clean,
+        region=not (params.region is params.fill is params.cleaned is params.clicks is None),
+        cameras_only=params.cameras_only,
+        remove=params.remove,
+    )
+    capture, roles = _exclude(params, capture, roles)
+    if params.fill is not None:
+        roles = replace(roles, fill=_to_fill(scene / params.fill, capture, roles))
+    if params.region is not None and params.region.view is not None:
+        known(params.region.view, {*roles.train, *roles.test}, "region")
+    if params.clicks:
+        check_clicks(params.clicks, capture, roles)
+    check_brought(params, scene)
+    _check_lenses(capture)
+    return capture, roles
+
+
+def _exclude(params: SceneKeys, capture: Capture, roles: Roles) -> tuple[Capture, Roles]:
+    """The capture and its roles without the views that the scene excludes."""
+    excluded, kept = ({known(n, capture.pictures, key) for n in getattr(params, key)} for key in ("exclude", "keep"))
+    if both := sorted(excluded & kept):
+        raise BadInput(f"scene.yaml: {', '.join(both)} in both exclude and keep; name a view in one of them")
+    roles = replace(roles, keep=frozenset(kept))
+    if not excluded:
+        return capture, roles
+    pictures = {name: path for name, path in capture.pictures.items() if name not in excluded}
+    return replace(capture, pictures=pictures), roles.among(set(pictures))
+
+
+def check_brought(params: SceneKeys, scene: Path) -> list[str]:
+    """What reading the Gaussians that the scene brings will change in them; BadInput where they cannot be used: both as
+    far as their headers tell."""
+    counts, notes = {}, []
+    for key, name in (("gaussians", params.gaussians), ("cleaned", params.cleaned)):
+        if name is not None:
+            if not there(scene / name):
+                raise BadInput(f"{scene / name}: no such file; correct `{key}` in scene.yaml")
+            summary = summarize(scene / name)
+            counts[key], notes = summary.count, [*notes, *(f"{name}: {note}" for note in summary.notes)]
+            if not counts[key]:
+                why = ": everything was deleted; delete the object only" if key == "cleaned" else ""
+                raise BadInput(f"{scene / name}: it holds no Gaussians{why}")
+    if params.cleaned is None:
+        return notes
+    if params.gaussians is None:
+        raise BadInput("scene.yaml: cleaned: name the scene before anything was deleted too, as `gaussians`")
+    files = [scene / name for name in (params.gaussians, params.cleaned)]
+    if counts["cleaned"] >= counts["gaussians"]:  # rows that cannot be drawn count in neither
+        counts["gaussians"], counts["cleaned"] = (len(load_splats(path).rows) for path in files)
+    if counts["cleaned"] >= counts["gaussians"]:
+        raise BadInput(
+            f"{files[1]}: {counts['cleaned']} splats, and {files[0]} has {counts['gaussians']}: nothing was deleted; "
+            "delete the object in an editor, and save what is left"
+        )
+    return notes
+
+
+def unphotographed(params: SceneKeys, scene: Path) -> bool:
+    """Are there no photographs, and a cleaned scene whose renders can stand for them? BadInput for a key that is about
+    photographs."""
+    named = [each.image for each in reference_list(params.reference)]
+    if params.cleaned is None or params.images is not None or has_pictures(scene, frozenset(named)):
+        return False
+    about_views = ("train", "test", "clean", "cameras_only", "exclude", "keep")
+    for key in (*about_views, "test_masks", "fill", "remove", "region", "masks"):
+        if getattr(params, key) and (key != "masks" or params.has_masks):
+            raise BadInput(f"scene.yaml: {key}: the scene has no photographs; add them, or remove the key")
+    return True
+
+
+def _to_fill(folder: Path, capture: Capture, roles: Roles) -> dict[str, Path]:
+    """Training view -> mask of what is to be filled; BadInput where one has none."""
+    found = objects_of_masks(folder, list_pictures(folder, nested=True), capture)
+    files = {name: path for views in found.values() for name, path in views.items()}
+    if lacking := [name for name in roles.train if name not in {*files, *roles.clean}]:
+        raise BadInput(
+            f"{folder}: no mask for {len(lacking)} of {len(roles.train)} training views, '{lacking[0]}' for one; each "
+            "needs one of what is to be filled, an empty one where it does not show that place"
+        )
+    return {name: files[name] for name in roles.train if name in files}
+
+
+def _check_lenses(capture: Capture) -> None:
+    """BadInput for a lens whose distortion cannot be undone."""
+    lenses = capture.poses.lenses.items() if capture.poses else ()
+    of = {lens: name for name, lens in lenses if replace(lens.pinhole, model=lens.model) != lens}
+    for lens, name in of.items():
+        try:
+            without_distortion(lens)
+        except BadInput as error:
+            raise BadInput(f"{capture.brought_by}: view '{name}': {error}") from None

@@ -1,0 +1,48 @@
+"""Depth maps in files that other tools write: 16-bit pictures, .npy, .exr."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from reffusion.io.arrays import load_array
+from reffusion.io.files import BadInput
+from reffusion.io.images import load_exr, opened
+
+
+def load_depth(path: Path) -> np.ndarray:
+    """float32 [h, w], a map of depth or disparity in any unit; NaN where it says nothing (not finite; 0 in a picture).
+
+    Raises:
+        BadInput: naming the file, where it is unreadable, not of one channel, 8-bit, empty or constant.
+    """
+    path = Path(path)
+    values = _values(path)
+    if values.ndim == 3 and values.shape[2] == 1:
+        values = values[..., 0]
+    if values.ndim != 2 or not values.size or not np.issubdtype(values.dtype, np.number) or np.iscomplexobj(values):
+        raise BadInput(f"{path}: {values.dtype} {list(values.shape)}; a depth map is one number for each pixel")
+    empty = (values == 0) if np.issubdtype(values.dtype, np.integer) else np.zeros(values.shape, bool)
+    with np.errstate(over="ignore"):
+        values = values.astype(np.float32)
+    values[empty | ~np.isfinite(values)] = np.nan
+    if np.isnan(values).mean() > 0.99:
+        raise BadInput(
+            f"{path}: hardly a pixel is known (0 or not finite); depth is needed of what is drawn, and around"
+        )
+    if np.nanmin(values) == np.nanmax(values):
+        raise BadInput(f"{path}: all its values are {np.nanmin(values):g}; that is no depth map")
+    return values
+
+
+def _values(path: Path) -> np.ndarray:
+    if path.suffix.lower() == ".exr":
+        return load_exr(path)
+    if path.suffix.lower() == ".npy":
+        return load_array(path, "a readable depth map")
+    with opened(path, "a readable depth map") as image:
+        mode, values = image.mode, np.array(image)
+    if mode[0] not in "IF":
+        raise BadInput(f"{path}: {mode} pixels of 8 bits are too coarse for depth; write 16-bit grey, .npy or .exr")
+    return values

@@ -1,0 +1,279 @@
+"""PSNR, SSIM, FLIP and LPIPS on the mask's box, outside the mask and on the full image.
+
+Images are [H, W, 3] sRGB, uint8 or float in [0, 1]. A box is cut out first and scored as an image of its own: nothing
+outside it enters, and nothing is resized. Every function raises ValueError on unequal or empty images.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import ceil, floor, inf, log10
+from typing import NamedTuple, TypeVar
+
+import cv2
+import numpy as np
+import torch
+
+from reffusion.metrics.flip import PIXELS_PER_DEGREE, difference
+from reffusion.metrics.lpips import NAMES, SMALLEST, Lpips
+
+SSIM_WINDOW = 11  # px
+SSIM_SIGMA = 1.5  # px
+SSIM_CONSTANTS = 0.01**2, 0.03**2  # of the paper, at data range 1
+BOX_DILATION = 0.1  # each side of the mask's box moves outwards by this share of the box's extent
+PSNR_CAP = 100.0  # dB, what an identical image counts in a mean
+
+BOX_COLUMNS = (*(f"{name}_box" for name in NAMES.values()), "psnr_box", "ssim_box", "flip_box")
+COLUMNS = (
+    *BOX_COLUMNS,
+    "psnr_outside",
+    "ssim_outside",
+    "flip_outside",
+    "psnr_outside_seen",
+    "unseen_share",
+    "psnr_full",
+    "ssim_full",
+    "flip_full",
+)
+
+PROTOCOL = {
+    "images": "8-bit sRGB as saved in renders/, against the ground truth at the same size; nothing is resized",
+    "box": "bounding box of the view's test mask (its consistent mask where the scene gives none), moved outwards by "
+    "10% of its width and height on each side, rounded outwards, clipped to the image; cut out before scoring",
+    "empty_box": "a view with an empty mask has no box: it is left out of the box means",
+    "outside": "the pixels outside the view's mask, which is first grown by the share `outside_margin` of the image's "
+    "width; inside it both pictures show the photograph, so that nothing painted there enters through a window or a "
+    "filter; no value where the mask covers all",
+    "held_out": "a test view whose photograph shows the object (its mask lies among the training masks) has no truth "
+    "inside its mask: it is scored outside only",
+    "psnr": f"dB, peak 1, mean squared error over pixels and channels; a view above {PSNR_CAP:.0f} dB "
+    f"(identical: infinite) counts {PSNR_CAP:.0f} dB in a mean",
+    "ssim": f"Gaussian window {SSIM_WINDOW} px, sigma {SSIM_SIGMA} px, population covariance, data range 1, mean over "
+    "the pixels whose window lies inside the image (valid region) and over RGB; no value under 11 px a side",
+    "flip": f"LDR-FLIP, mean of the error map, {PIXELS_PER_DEGREE:.0f} pixels per degree",
+    "lpips": "version 0.1, backbones alex and vgg16, input in [-1, 1] at native resolution; "
+    f"no value under {SMALLEST['alex']} (alex) or {SMALLEST['vgg']} (vgg) px a side",
+    "mean": "over the views that have the value; `views` says how many those are",
+}
+
+
+Pixels = TypeVar("Pixels", np.ndarray, torch.Tensor)
+
+
+class Box(NamedTuple):
+    """Pixel columns left..right-1 and rows top..bottom-1."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    def crop(self, array: Pixels) -> Pixels:
+        """[H, W, ...] -> the part inside."""
+        return array[self.top : self.bottom, self.left : self.right]
+
+
+def mask_box(mask: np.ndarray, dilation: float = BOX_DILATION) -> Box | None:
+    """The bounding box of a bool mask [H, W], each side moved outwards by `dilation` of the box's extent.
+
+    Rounded outwards and clipped to the image. None for an empty mask.
+    """
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    if len(rows) == 0:
+        return None
+    height, width = mask.shape
+    top, bottom = _dilated(int(rows[0]), int(rows[-1]) + 1, dilation, height)
+    left, right = _dilated(int(columns[0]), int(columns[-1]) + 1, dilation, width)
+    return Box(left, top, right, bottom)
+
+
+def _dilated(low: int, high: int, dilation: float, size: int) -> tuple[int, int]:
+    margin = round(dilation * (high - low), 9)  # 0.1 * 30 is a hair above 3: rounding outwards must not make it 4
+    return max(0, floor(low - margin)), min(size, ceil(high + margin))
+
+
+def psnr(image: np.ndarray, truth: np.ndarray) -> float:
+    """Peak signal-to-noise ratio in dB, inf for identical images."""
+    image, truth = _pair(image, truth)
+    error = float(np.mean((image - truth) ** 2))
+    return -10.0 * log10(error) if error > 0 else inf
+
+
+def ssim(image: np.ndarray, truth: np.ndarray) -> float:
+    """Structural similarity (Wang et al., 2004) as `PROTOCOL["ssim"]` says. Raises ValueError under 11 px a side."""
+    return float(ssim_map(image, truth).mean())
+
+
+def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """[H - 10, W - 10, 3]: SSIM of the windows that lie inside the image. Raises ValueError under 11 px a side."""
+    image, truth = _pair(image, truth)
+    if min(image.shape[:2]) < SSIM_WINDOW:
+        raise ValueError(f"SSIM needs {SSIM_WINDOW} px a side; the image is {image.shape[1]}x{image.shape[0]} px")
+    edge, window = SSIM_WINDOW // 2, cv2.getGaussianKernel(SSIM_WINDOW, SSIM_SIGMA, cv2.CV_64F)
+    inside = lambda x: cv2.sepFilter2D(x, cv2.CV_64F, window, window)[edge:-edge, edge:-edge]
+    ours, true = inside(image), inside(truth)
+    product, square_ours, square_true = ours * true, ours**2, true**2
+    covariance, variances = inside(image * truth) - product, inside(image**2 + truth**2) - square_ours - square_true
+    first, second = SSIM_CONSTANTS
+    similar = (2 * product + first) * (2 * covariance + second)
+    return similar / ((square_ours + square_true + first) * (variances + second))
+
+
+def flip(image: np.ndarray, truth: np.ndarray) -> float:
+    """Mean LDR-FLIP (Andersson et al., 2020) in [0, 1], 0 for identical images."""
+    return float(flip_map(image, truth).mean(dtype=np.float64))
+
+
+def flip_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """[H, W] float32 in [0, 1]: LDR-FLIP at each pixel."""
+    return difference(*_pair(image, truth))
+
+
+@dataclass(frozen=True)
+class LpipsTarget:
+    """A truth as an LPIPS network sees it, computed once for all images that are compared with it."""
+
+    model: Lpips
+    activations: list[torch.Tensor]
+
+    @torch.no_grad()
+    def distance(self, image: np.ndarray) -> float:
+        """LPIPS of an image of the truth's size. Raises ValueError for an image that is none."""
+        return float(self.model.distance(_signed(image), self.activations))
+
+
+@torch.no_grad()
+def lpips_targets(truth: np.ndarray, models: dict[str, Lpips]) -> dict[str, LpipsTarget | None]:
+    """Network -> target; None where the truth is too small for it."""
+    fits = {net: min(truth.shape[:2]) >= SMALLEST[net] for net in models}
+    return {n: LpipsTarget(m, m.activations(_signed(truth))) if fits[n] else None for n, m in models.items()}
+
+
+def _signed(image: np.ndarray) -> torch.Tensor:
+    """[1, 3, H, W] float32 in [-1, 1]."""
+    return torch.from_numpy(2.0 * _unit(image) - 1.0).permute(2, 0, 1)[None].float()
+
+
+def score(
+    image: np.ndarray, truth: np.ndarray, targets: dict[str, LpipsTarget | None] | None = None
+) -> dict[str, float | None]:
+    """{"psnr", "ssim", "flip", and `NAMES` of each LPIPS target}; None where the image is too small for a metric."""
+    side = min(image.shape[:2])
+    values = {
+        "psnr": psnr(image, truth),
+        "ssim": ssim(image, truth) if side >= SSIM_WINDOW else None,
+        "flip": flip(image, truth),
+    }
+    for net, target in (targets or {}).items():
+        values[NAMES[net]] = target and target.distance(image)
+    return values
+
+
+def score_view(
+    image: np.ndarray,
+    truth: np.ndarray,
+    box: Box | None,
+    targets: dict[str, LpipsTarget | None] | None = None,
+    mask: np.ndarray | None = None,
+    shows_object: bool = False,
+    unseen: np.ndarray | None = None,
+) -> dict[str, float | None]:
+    """A value for each of `COLUMNS`: `score` on the box (None without one), `outside` of the mask (bool [H, W]; None:
+    no pixel is masked), and `score` on the full image without LPIPS.
+
+    Args:
+        targets: `lpips_targets` of the truth in the box.
+        shows_object: the truth has the object in it, so that only what lies outside its mask is true.
+        unseen: bool [H, W], pixels that no training view saw; None where that is not known: then what is said of them
+            has no value.
+    """
+    mask = np.zeros(truth.shape[:2], bool) if mask is None else mask
+    values = outside(image, truth, mask)
+    if unseen is not None:
+        values |= outside_seen(image, truth, mask, unseen)
+    if not shows_object:
+        inside = score(box.crop(image), box.crop(truth), targets) if box is not None else {}
+        values |= {f"{name}_box": value for name, value in inside.items()}
+        values |= {f"{name}_full": value for name, value in score(image, truth).items()}
+    return {column: values.get(column) for column in COLUMNS}
+
+
+def outside(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> dict[str, float | None]:
+    """{"psnr", "ssim", "flip"}_outside: over the pixels where the bool mask [H, W] is False; None where there are none.
+
+    SSIM, and FLIP's filters, look at surroundings: inside the mask the truth stands in both pictures, so that nothing
+    painted there counts, and no difference at its border is one of the object's.
+    """
+    kept = ~mask
+    if not kept.any():
+        return dict.fromkeys(("psnr_outside", "ssim_outside", "flip_outside"))
+    image, truth = _pair(image, truth)
+    shown, edge = np.where(kept[..., None], image, truth), SSIM_WINDOW // 2
+    windows = kept[edge:-edge, edge:-edge]  # empty where the image is smaller than a window
+    return {
+        "psnr_outside": _psnr_at(image, truth, kept),
+        "ssim_outside": float(ssim_map(shown, truth)[windows].mean()) if windows.any() else None,
+        "flip_outside": float(flip_map(shown, truth)[kept].mean(dtype=np.float64)),
+    }
+
+
+def outside_seen(image: np.ndarray, truth: np.ndarray, mask: np.ndarray, unseen: np.ndarray) -> dict[str, float | None]:
+    """{"psnr_outside_seen", "unseen_share"}: PSNR over the pixels outside the bool mask [H, W] that some training view
+    saw, and the share of those outside it that none saw; None where there are no such pixels."""
+    kept = ~mask
+    return {
+        "psnr_outside_seen": _psnr_at(image, truth, kept & ~unseen),
+        "unseen_share": float(unseen[kept].mean()) if kept.any() else None,
+    }
+
+
+def _psnr_at(image: np.ndarray, truth: np.ndarray, pixels: np.ndarray) -> float | None:
+    """PSNR over the chosen pixels, bool [H, W]; None where there are none."""
+    if not pixels.any():
+        return None
+    image, truth = _pair(image, truth)
+    error = float(np.mean((image - truth)[pixels] ** 2))
+    return -10.0 * log10(error) if error > 0 else inf
+
+
+def mean(values: list[float | None]) -> float | None:
+    """Mean of what is there, each counting at most `PSNR_CAP`; None of nothing.
+
+    The cap only ever reaches PSNR: it keeps one identical view from making a mean infinite, and unlike leaving that
+    view out it never makes a better result score worse.
+    """
+    present = [min(value, PSNR_CAP) for value in values if value is not None]
+    return float(np.mean(present)) if present else None
+
+
+def side_by_side(panels: list[np.ndarray], box: Box | None) -> np.ndarray:
+    """uint8 [H, W', 3]: the panels from left to right, 4 px of white between them, each with the box in yellow."""
+    gap = np.full((panels[0].shape[0], 4, 3), 255, np.uint8)
+    strip = []
+    for panel in panels:
+        panel = panel.copy()
+        if box is not None:
+            inside = box.crop(panel)
+            for edge in (inside[0], inside[-1], inside[:, 0], inside[:, -1]):
+                edge[:] = (255, 220, 0)
+        strip += [panel, gap]
+    return np.concatenate(strip[:-1], axis=1)
+
+
+def _pair(image: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Both as float64 in [0, 1]."""
+    if image.shape != truth.shape or image.ndim != 3 or image.shape[2] != 3:
+        raise ValueError(f"a metric compares two [H, W, 3] of one size; got {image.shape} and {truth.shape}")
+    if image.size == 0:
+        raise ValueError("a metric needs at least one pixel")
+    return _unit(image), _unit(truth)
+
+
+def _unit(image: np.ndarray) -> np.ndarray:
+    if image.dtype == np.uint8:
+        return image / 255.0
+    if not np.issubdtype(image.dtype, np.floating):
+        raise ValueError(f"an image is uint8 or float in [0, 1], not {image.dtype}")
+    if not (image.min() >= 0.0 and image.max() <= 1.0):  # also refuses NaN
+        raise ValueError(f"a float image lies in [0, 1]; this one spans {image.min():.3g} to {image.max():.3g}")
+    return image.astype(np.float64)
