@@ -1,4 +1,4 @@
-"""Planes that stand around a hole, and where each goes on into space that no photograph shows."""
+"""Find the planes around a hole, and where each continues into space that no photograph shows."""
 
 from __future__ import annotations
 
@@ -9,267 +9,278 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-from reffusion import geometry, seeding
-from reffusion.background.borders import RIM, between
-from reffusion.background.corners import reached, third_faces
+from reffusion import geometry, morphology, seeding
+from reffusion.background.borders import RIM, extend_borders
+from reffusion.background.corners import find_third_faces, visible_past
 from reffusion.background.plane import CELLS, Plane
-from reffusion.background.plane_fit import TURNED, best_plane, surface_samples, told
-from reffusion.background.visibility import SURFACE, Witness, seen_by, votes
+from reffusion.background.plane_fit import MAX_TURN, ransac_plane, refine_by_points, sample_surfaces
+from reffusion.background.visibility import SURFACE, DepthView, count_views, is_seen
 from reffusion.gaussians.surfels import surface_normals
-from reffusion.morphology import hull
 from reffusion.types import Camera
 
-REACH = 2.5  # radii of the object around its middle within which surfaces are looked for
-TOLERANCE = 0.08  # of the object's radius: distance within which a sample belongs to a plane
-SPREAD = 0.25  # of the object's radius: how far from their middle points must lie to all sides to tell where a plane is
-LEAST_SHARE = 0.1  # of the samples that a plane must explain
-MOST = 5  # planes
-LARGE = 0.05  # of the largest patch of seen cells: smaller ones are no part of the plane
-WITHIN = (0.05, 0.03, 0.015, 0.015)  # relative depth within which a view's pixels belong to a plane, step by step
-ENOUGH = 200  # pixels that must
-FAR = 0.08  # relative depth: a plane that would move farther anywhere in the hole stays where it is
-STAYS = 0.05  # weight of the plane as it was, within the hole, against what is around
-ACROSS = 0.9  # cosine of the angle between two planes under which they cross
-RATHER = 1.0  # cosine to a plane over that to another, from which a surface faces rather as the one does
-EVENED = 0.01  # of the image's width: the scale on which a surface's direction is taken
-WIDER = 2.0  # times as wide a map on which what the plane surrounds is told
-POLISHED = 0.03  # of the cells seen of a plane: smaller ones that it surrounds are unevenness
-SPECK = 0.01  # of the cells seen of a plane: smaller patches that views look through are none
-SURROUNDS = (
-    0.8  # share of the border of what views look through that must be seen to be of the plane: a recess has less
-)
-TOUCHING = 0.25  # share of an unknown patch's border that must be seen for the plane to go on into it
+REACH = 2.5  # radii of the object: surfaces this close to its middle are considered
+INLIER = 0.08  # of the object's radius: distance within which a sample belongs to a plane
+MIN_SPREAD = 0.25  # of the object's radius: least standard deviation, in every direction, of points that refine a plane
+MIN_SHARE = 0.1  # of all samples that a plane must explain
+MAX_PLANES = 5
+MIN_PATCH = 0.05  # of the largest patch of seen cells: smaller patches do not belong to the plane
+ALIGN_INLIER = (0.05, 0.03, 0.015, 0.015)  # relative depth within which a view's pixels belong to a plane, step by step
+ALIGN_PIXELS = 200  # pixels that must belong to it
+ALIGN_LIMIT = 0.08  # relative depth: a plane that would move further anywhere in the hole stays where it is
+ALIGN_PRIOR = 0.05  # weight of the plane's old position inside the hole, against the pixels around it
+CROSSING = 0.9  # cosine of the angle between two planes below which they cross
+NORMAL_RATIO = 1.0  # cosine to one plane over that to another, from which a surface belongs to the first
+NORMAL_SMOOTHING = 0.01  # of the image's width: scale at which a surface's normal is measured
+WIDER_MAP = 2.0  # factor by which the map is wider on which enclosed patches are detected
+MIN_REFLECTION = 0.03  # of the seen cells: smaller enclosed patches are unevenness, not mirrors
+MIN_HOLE = 0.01  # of the seen cells: smaller patches that views see through are depth errors
+ENCLOSED = 0.8  # share of a free patch's border that must be seen for it to be enclosed: a recess has less
+TOUCHING = 0.25  # share of an unobserved patch's border that must be seen for the plane to continue into it
 
 
-def planes_around(
-    centre: np.ndarray, radius: float, views: Sequence[Witness], points: np.ndarray, seed: int = 0
+def find_planes(
+    center: np.ndarray, radius: float, views: Sequence[DepthView], points: np.ndarray, seed: int = 0
 ) -> list[Plane]:
-    """The planes around what is removed, those with the most samples first.
+    """The planes around the removed object, those with most samples first.
 
-    Found in the world, from the surfaces that several views show around their masks: one view's depth alone is rough,
-    and a plane seen at a slant by one is seen well by another. Where a plane lies sparse points tell, if enough lie
-    sharply on it (`sampled.told`).
+    Planes are fitted in the world to the surfaces that several views show around their masks: the depth of one view is
+    rough, and a plane that is oblique in one view is frontal in another. Sparse points refine a plane's position where
+    enough of them lie sharply on it (`plane_fit.refine_by_points`).
 
     Args:
-        centre: [3], the middle of what is removed. radius: of most of it.
-        points: [P, 3], the scene's sparse points; P = 0 allowed.
+        center: [3], the middle of the removed object. radius: the radius of most of it.
+        points: [P, 3], the scene's sparse points; P = 0 is allowed.
+        seed: of the RANSAC draws.
     """
-    samples = surface_samples(centre, REACH * radius, views, seed)
-    points = points[np.linalg.norm(points - centre, axis=1) < REACH * radius]
-    near, free = TOLERANCE * radius, np.ones(len(samples), bool)
-    away = float(np.median([np.linalg.norm(view.camera.center - centre) for view in views])) if views else 0.0
+    samples = sample_surfaces(center, REACH * radius, views, seed)
+    points = points[np.linalg.norm(points - center, axis=1) < REACH * radius]
+    inlier, unexplained = INLIER * radius, np.ones(len(samples), bool)
+    distance = float(np.median([np.linalg.norm(view.camera.center - center) for view in views])) if views else 0.0
     found: list[tuple[np.ndarray, float]] = []
-    draws = np.random.default_rng(seeding.seed_for(seed, "planes around"))
-    while free.sum() >= max(50, LEAST_SHARE * len(samples)) and len(found) < MOST:
-        normal, height, support = best_plane(samples[free], near, draws)
-        if support < LEAST_SHARE * len(samples):
+    generator = np.random.default_rng(seeding.seed_for(seed, "planes around"))
+    while unexplained.sum() >= max(50, MIN_SHARE * len(samples)) and len(found) < MAX_PLANES:
+        normal, offset, support = ransac_plane(samples[unexplained], inlier, generator)
+        if support < MIN_SHARE * len(samples):
             break
-        by_points = told(normal, height, points, near, SPREAD * radius)
-        turned, moved = by_points or (normal, height)
-        if by_points or not _drawn_again(normal, height, found, centre, SURFACE * away):
-            found.append((turned, moved))
-        # Each has its own points, and its own samples, which lie about the plane as it is drawn.
-        points = points[np.abs(points @ turned - moved) >= 1.5 * near]
-        free &= np.abs(samples @ normal - height) >= 1.5 * near
-    thirds = third_faces(samples, free, found, centre, radius, near)
-    third = [False] * len(found) + [True] * len(thirds)
+        refined = refine_by_points(normal, offset, points, inlier, MIN_SPREAD * radius)
+        new_normal, new_offset = refined or (normal, offset)
+        if refined or not _is_duplicate(normal, offset, found, center, SURFACE * distance):
+            found.append((new_normal, new_offset))
+        # The points of a plane lie about its refined position, its samples about the rendered one.
+        points = points[np.abs(points @ new_normal - new_offset) >= 1.5 * inlier]
+        unexplained &= np.abs(samples @ normal - offset) >= 1.5 * inlier
+    thirds = find_third_faces(samples, unexplained, found, center, radius, inlier)
+    is_third = [False] * len(found) + [True] * len(thirds)
     found += thirds
-    band = max(1.5 * near, SURFACE * away)
-    mapped = [_mapped(*plane, centre, REACH * radius, views, so) for plane, so in zip(found, third, strict=True)]
-    planes = [plane for plane, _ in mapped]
+    band = max(1.5 * inlier, SURFACE * distance)
+    maps = [_map_plane(*plane, center, REACH * radius, views, third) for plane, third in zip(found, is_third, strict=True)]
+    planes = [plane for plane, _ in maps]
     grounds = [_crossing(plane, planes[:k]) for k, plane in enumerate(planes)]
-    # What may be the one or the other is the better supported one's, unless it faces as this one does.
-    faced = _faced(planes, grounds, views)
-    whole: list[Plane] = []
-    for (plane, hidden), below, so, narrow in zip(mapped, grounds, faced, third, strict=True):
-        own = replace(plane, seen=plane.seen & so)
-        if narrow:
-            hidden &= reached(own, whole, views)
-        whole.append(_continued(own, hidden, below, _crossing(own, planes), band, narrow))
-    return whole
+    # Cells near a crossing could belong to either plane. They belong to the one with more samples, unless most views
+    # show a surface there that faces as the other plane does.
+    facing = _cells_facing(planes, grounds, views)
+    complete: list[Plane] = []
+    for (plane, occluded), own_grounds, own_cells, third in zip(maps, grounds, facing, is_third, strict=True):
+        own = replace(plane, seen=plane.seen & own_cells)
+        if third:
+            occluded &= visible_past(own, complete, views)
+        complete.append(_continue_plane(own, occluded, own_grounds, _crossing(own, planes), band, third))
+    return complete
 
 
-def _drawn_again(
-    normal: np.ndarray, height: float, found: Sequence[tuple[np.ndarray, float]], centre: np.ndarray, within: float
+def _is_duplicate(
+    normal: np.ndarray, offset: float, planes: Sequence[tuple[np.ndarray, float]], center: np.ndarray, distance: float
 ) -> bool:
-    """Whether a plane that no sparse points tell is a found one, drawn a little before or behind it: `within` the
-    distance that views tell apart."""
-    for other, there in found:
-        beneath = centre - (centre @ other - there) * other
-        if abs(normal @ other) > TURNED and abs(normal @ beneath - height) < within:
+    """Whether a plane without sparse points repeats one of `planes`, parallel to it within the `distance` that views can
+    tell apart."""
+    for other, other_offset in planes:
+        foot = center - (center @ other - other_offset) * other
+        if abs(normal @ other) > MAX_TURN and abs(normal @ foot - offset) < distance:
             return True
     return False
 
 
 def _crossing(plane: Plane, others: Sequence[Plane]) -> list[Plane]:
-    return [other for other in others if abs(other.normal @ plane.normal) < ACROSS]
+    return [other for other in others if abs(other.normal @ plane.normal) < CROSSING]
 
 
-def aligned(plane: Plane, depth: np.ndarray, camera: Camera, hole: np.ndarray) -> Plane:
-    """The plane moved onto what one view knows of it around a hole; as it is where that is little.
+def align_plane(plane: Plane, depth: np.ndarray, camera: Camera, hole: np.ndarray) -> Plane:
+    """The plane moved onto the depth that one view knows around a hole; unchanged where too few pixels tell.
 
     Args:
-        depth: [H, W], known well where above 0. hole: bool [H, W], where the plane may have to go on: there it stays
-            where it is as far as what is around does not say more.
+        depth: [H, W], accurate where above 0.
+        hole: bool [H, W], where the plane may continue. There its old position is a weak prior.
     """
-    at = plane.depth(camera)
-    known = (depth > 0) & np.isfinite(at)
-    rows, columns = np.nonzero(known | (hole & np.isfinite(at)))
+    plane_depth = plane.depth(camera)
+    known = (depth > 0) & np.isfinite(plane_depth)
+    rows, columns = np.nonzero(known | (hole & np.isfinite(plane_depth)))
     x, y = (columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy
-    design, prior = np.stack([x, y, np.ones_like(x)], 1), 1 / at[rows, columns]
-    told, values = known[rows, columns], np.where(known, 1 / np.maximum(depth, 1e-12), 0)[rows, columns]
-    found = np.linalg.lstsq(design, prior, rcond=None)[0] if len(rows) >= 3 else np.zeros(3)
-    for within in WITHIN:
-        off = np.abs(values / np.maximum(design @ found, 1e-12) - 1)
-        mine = told & (off < within)
-        if mine.sum() < ENOUGH:
+    design, prior = np.stack([x, y, np.ones_like(x)], 1), 1 / plane_depth[rows, columns]
+    is_known, values = known[rows, columns], np.where(known, 1 / np.maximum(depth, 1e-12), 0)[rows, columns]
+    solution = np.linalg.lstsq(design, prior, rcond=None)[0] if len(rows) >= 3 else np.zeros(3)
+    for tolerance in ALIGN_INLIER:
+        residual = np.abs(values / np.maximum(design @ solution, 1e-12) - 1)
+        inlier = is_known & (residual < tolerance)
+        if inlier.sum() < ALIGN_PIXELS:
             return plane
-        weight = np.where(mine, 1 / mine.sum(), np.where(told, 0.0, STAYS / max((~told).sum(), 1))) / prior**2
+        outside = np.where(is_known, 0.0, ALIGN_PRIOR / max((~is_known).sum(), 1))
+        weight = np.where(inlier, 1 / inlier.sum(), outside) / prior**2
         scaled = design * np.sqrt(weight)[:, None]
-        found = np.linalg.lstsq(scaled, np.where(mine, values, prior) * np.sqrt(weight), rcond=None)[0]
-    normal = found @ camera.world_to_camera[:3, :3]
+        solution = np.linalg.lstsq(scaled, np.where(inlier, values, prior) * np.sqrt(weight), rcond=None)[0]
+    normal = solution @ camera.world_to_camera[:3, :3]
     length = np.linalg.norm(normal)
-    normal, height = normal / length, (1 + normal @ camera.center) / length
-    moved = replace(plane, normal=normal, height=float(height))
-    there = hole & np.isfinite(at)
-    far = np.abs(moved.depth(camera)[there] / at[there] - 1).max() if there.any() else 0.0
-    return moved if far < FAR else plane
+    normal, offset = normal / length, (1 + normal @ camera.center) / length
+    aligned = replace(plane, normal=normal, offset=float(offset))
+    inside = hole & np.isfinite(plane_depth)
+    shift = np.abs(aligned.depth(camera)[inside] / plane_depth[inside] - 1).max() if inside.any() else 0.0
+    return aligned if shift < ALIGN_LIMIT else plane
 
 
-def _hull(plane: Plane, seen: np.ndarray, grounds: Sequence[Plane]) -> np.ndarray:
-    """bool [CELLS, CELLS], the convex hull of the large patches of seen cells: a surface ends where the prolongations
-    of its visible borders do. What stands on one of the grounds, planes that it crosses, goes on down to it."""
-    patches, count = ndimage.label(_solid(seen))
+def _continued_hull(plane: Plane, seen: np.ndarray, grounds: Sequence[Plane]) -> np.ndarray:
+    """bool [CELLS, CELLS]: the convex hull of the large patches of seen cells, since a surface ends where its visible
+    borders, extended, do. What stands on one of the `grounds`, planes that it crosses, reaches down to it."""
+    patches, count = ndimage.label(_without_rims(seen))
     areas = np.bincount(patches.ravel(), minlength=count + 1)
     areas[0] = 0
-    large = (areas >= LARGE * max(areas.max(), 1))[patches]
-    standing = plane.cells[large]
+    large = (areas >= MIN_PATCH * max(areas.max(), 1))[patches]
+    standing = plane.cell_centers[large]
     for other in grounds:
         down = other.normal - (other.normal @ plane.normal) * plane.normal
-        feet = standing + ((other.height - standing @ other.normal) / (down @ down))[:, None] * down
-        large[tuple(plane.cell_of(feet).clip(0, CELLS - 1).T)] = True
-    return hull(large)
+        feet = standing + ((other.offset - standing @ other.normal) / (down @ down))[:, None] * down
+        large[tuple(plane.cell_index(feet).clip(0, CELLS - 1).T)] = True
+    return morphology.convex_hull(large)
 
 
-def _solid(seen: np.ndarray) -> np.ndarray:
-    """bool [CELLS, CELLS]: seen cells without thin rims."""
-    return cv2.morphologyEx(seen.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2 * RIM + 1,) * 2, np.uint8)) > 0
+def _without_rims(seen: np.ndarray) -> np.ndarray:
+    """bool [CELLS, CELLS]: seen cells without thin strips."""
+    return cv2.morphologyEx(seen.astype(np.uint8), cv2.MORPH_OPEN, morphology.square(RIM)) > 0
 
 
-def _mapped(
-    normal: np.ndarray, height: float, centre: np.ndarray, reach: float, views: Sequence[Witness], third: bool
+def _map_plane(
+    normal: np.ndarray, offset: float, center: np.ndarray, reach: float, views: Sequence[DepthView], third: bool
 ) -> tuple[Plane, np.ndarray]:
-    """The plane with a map of where views show it and where they look through it; and bool [CELLS, CELLS], where
-    the object hides it from some."""
+    """The plane with its map of seen, free and reflective cells; and bool [CELLS, CELLS], cells that the object occludes
+    in some view."""
     first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    along = np.stack([first / np.linalg.norm(first), np.cross(normal, first / np.linalg.norm(first))])
-    origin, pitch = centre - (centre @ normal - height) * normal, 2 * reach / CELLS
-    nowhere = np.zeros((CELLS, CELLS), bool)
-    plane = Plane(normal, height, origin, along, pitch, nowhere, nowhere, nowhere, nowhere, nowhere)
-    # On the object's side: a table's underside, seen from below, is not the top under the object. An object before a
-    # wall's edge stands to both sides of the third face: on that from where more of it is seen.
-    facing = normal if centre @ normal > height else -normal
+    axes = np.stack([first / np.linalg.norm(first), np.cross(normal, first / np.linalg.norm(first))])
+    origin, cell_size = center - (center @ normal - offset) * normal, 2 * reach / CELLS
+    empty = np.zeros((CELLS, CELLS), bool)
+    plane = Plane(normal, offset, origin, axes, cell_size, empty, empty, empty, empty, empty)
+    # The plane is looked at from the object's side: the underside of a table, seen from below, is not the top under the
+    # object. Where no camera is on that side (a table's top beside something lower), from the other side.
+    facing = normal if center @ normal > offset else -normal
     if not any(view.camera.center @ facing > plane.origin @ facing for view in views):
-        facing = -facing  # a table's top is seen from above only, also where what stands before it is lower
-    seen, free, hidden = _looked_at(plane, facing, views)
-    if third and (other := _looked_at(plane, -facing, views))[0].sum() > seen.sum():
-        facing, (seen, free, hidden) = -facing, other
-    wider = replace(plane, pitch=WIDER * pitch)
-    pit = wider.in_cells(_surrounded(*_looked_at(wider, facing, views)[:2]), plane.cells.reshape(-1, 3))
-    pit = free & ndimage.binary_dilation(pit.reshape(free.shape), iterations=2)
-    return replace(plane, seen=seen, free=free & ~_specks(free, SPECK * seen.sum()), pit=pit), hidden
+        facing = -facing
+    seen, free, occluded = _cell_visibility(plane, facing, views)
+    # An object in front of a wall's edge is on both sides of a third face: the side from which more is seen counts.
+    if third and (other := _cell_visibility(plane, -facing, views))[0].sum() > seen.sum():
+        facing, (seen, free, occluded) = -facing, other
+    wide = replace(plane, cell_size=WIDER_MAP * cell_size)
+    enclosed = wide.contains(
+        _enclosed_patches(*_cell_visibility(wide, facing, views)[:2]), plane.cell_centers.reshape(-1, 3)
+    )
+    reflective = free & ndimage.binary_dilation(enclosed.reshape(free.shape), iterations=2)
+    free = free & ~_small_holes(free, MIN_HOLE * seen.sum())
+    return replace(plane, seen=seen, free=free, reflective=reflective), occluded
 
 
-def _specks(free: np.ndarray, small: float) -> np.ndarray:
-    """bool [CELLS, CELLS]: patches of fewer than `small` free cells. Beside the object's edge a view's depth errs."""
-    patches, count = ndimage.label(np.pad(free, 1, constant_values=True))  # beyond the map a patch may go on
+def _small_holes(free: np.ndarray, min_cells: float) -> np.ndarray:
+    """bool [CELLS, CELLS]: patches of fewer than `min_cells` free cells. Depth errs beside the object's edge."""
+    patches, count = ndimage.label(np.pad(free, 1, constant_values=True))  # a patch may continue beyond the map
     areas = np.bincount(patches.ravel(), minlength=count + 1)
-    return free & (areas < small)[patches][1:-1, 1:-1]
+    return free & (areas < min_cells)[patches][1:-1, 1:-1]
 
 
-def _looked_at(plane: Plane, facing: np.ndarray, views: Sequence[Witness]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """bool [CELLS, CELLS] each: where views show the plane, from the side that `facing` [3] points to, where they look
-    through it, and where the object hides it from some."""
-    said = votes(plane.cells.reshape(-1, 3), views, np.broadcast_to(facing, (CELLS * CELLS, 3)))
-    seen, free = (said.seen >= 1) & (said.seen >= said.free), said.empty
-    return tuple(each.reshape(CELLS, CELLS) for each in (seen, free, said.hidden > 0))
+def _cell_visibility(
+    plane: Plane, facing: np.ndarray, views: Sequence[DepthView]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """bool [CELLS, CELLS] each: cells where views on the side of `facing`, [3], show the plane, where views see through
+    it, and where the object occludes it in some view."""
+    normals = np.broadcast_to(facing, (CELLS * CELLS, 3))
+    visibility = count_views(plane.cell_centers.reshape(-1, 3), views, normals)
+    seen = (visibility.seen >= 1) & (visibility.seen >= visibility.free)
+    return tuple(each.reshape(CELLS, CELLS) for each in (seen, visibility.is_empty, visibility.masked > 0))
 
 
-def _surrounded(seen: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """bool [CELLS, CELLS]: the large patches of free cells that seen ones surround."""
+def _enclosed_patches(seen: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """bool [CELLS, CELLS]: the large patches of free cells that seen cells surround."""
     patches, count = ndimage.label(np.pad(free, 1, constant_values=True))
     found = np.zeros(patches.shape, bool)
-    around = np.pad(seen, 1)
+    padded = np.pad(seen, 1)
     for patch in set(range(1, count + 1)) - {patches[0, 0]}:
         inside = patches == patch
         border = ndimage.binary_dilation(inside) & ~inside
-        large = inside.sum() > POLISHED * seen.sum()
-        found |= inside & (large and around[border].mean() > SURROUNDS)
+        large = inside.sum() > MIN_REFLECTION * seen.sum()
+        found |= inside & (large and padded[border].mean() > ENCLOSED)
     return found[1:-1, 1:-1]
 
 
-def _continued(
-    plane: Plane, hidden: np.ndarray, grounds: Sequence[Plane], others: Sequence[Plane], band: float, narrow: bool
+def _continue_plane(
+    plane: Plane, occluded: np.ndarray, grounds: Sequence[Plane], others: Sequence[Plane], band: float, third: bool
 ) -> Plane:
-    """The plane with where it goes on: a patch of it that nobody saw, because the object was in the way, and that
-    touches what was seen of it, belongs to it up to its border; where views look through it, it is not.
+    """The plane with the cells into which it continues.
+
+    It continues into an unobserved patch that the object occludes and that touches seen cells, up to its extended
+    border; not where views see through it.
 
     Args:
-        hidden: bool [CELLS, CELLS], where the object hides it.
+        occluded: bool [CELLS, CELLS], cells that the object occludes.
         others: planes that cross it. grounds: those of them with more samples.
-        band: distance from these up to which a view that seems to show the one may show the other.
-        narrow: of a patch's border only what is known of tells whether it touches what was seen: most of the rest is
-            within walls.
+        band: distance to `others` within which a view that seems to show this plane may show the other.
+        third: only known cells of a patch's border decide whether it touches: most of the rest is inside walls.
     """
-    # Neither a thin rim nor a crossing tells where the plane goes on to.
-    seen, free = plane.seen | plane.pit, plane.free & ~plane.pit
+    # Neither thin rims nor crossings tell where the plane continues.
+    seen, free = plane.seen | plane.reflective, plane.free & ~plane.reflective
     own = seen.copy()
-    for other in others if not narrow else ():
-        own &= np.abs(plane.cells @ other.normal - other.height) >= band
-    unknown = ~seen & ~free & hidden
+    for other in others if not third else ():
+        own &= np.abs(plane.cell_centers @ other.normal - other.offset) >= band
+    unknown = ~seen & ~free & occluded
     patches, count = ndimage.label(unknown)
-    goes_on, ends = np.zeros((2, *hidden.shape), bool)
+    continued, beyond_border = np.zeros((2, *occluded.shape), bool)
     for patch in range(1, count + 1):
         inside = patches == patch
         border = ndimage.binary_dilation(inside, iterations=2) & ~inside
-        told = border & (seen | free) if narrow else border
-        if inside.sum() >= 4 and seen[told].sum() > TOUCHING * told.sum():
-            beyond = between(inside, _solid(own), free) < 0.5
-            goes_on |= inside & ~beyond
-            ends |= inside & beyond
-    goes_on &= _hull(plane, own if grounds else seen, grounds)
-    within = goes_on | (ndimage.binary_fill_holes(seen | goes_on) & ~seen & ~ends & hidden)
-    return replace(plane, goes_on=goes_on, within=within)
+        decisive = border & (seen | free) if third else border
+        if inside.sum() >= 4 and seen[decisive].sum() > TOUCHING * decisive.sum():
+            beyond = extend_borders(inside, _without_rims(own), free) < 0.5
+            continued |= inside & ~beyond
+            beyond_border |= inside & beyond
+    continued &= _continued_hull(plane, own if grounds else seen, grounds)
+    enclosed = ndimage.binary_fill_holes(seen | continued) & ~seen & ~beyond_border & occluded
+    return replace(plane, continued=continued, enclosed=continued | enclosed)
 
 
-def _faced(planes: Sequence[Plane], grounds: Sequence[Sequence[Plane]], views: Sequence[Witness]) -> list[np.ndarray]:
-    """For each plane bool [CELLS, CELLS]: of the views that show a surface at a cell, most show one that faces rather
-    as the plane does than as one of its grounds, which cross it; everywhere where it has none.
+def _cells_facing(
+    planes: Sequence[Plane], grounds: Sequence[Sequence[Plane]], views: Sequence[DepthView]
+) -> list[np.ndarray]:
+    """For each plane bool [CELLS, CELLS]: cells where most views that show a surface show one whose normal is closer to
+    the plane's than to that of its grounds, which cross it; all cells where it has none.
 
-    A view's normals take more room than all else that is known of it, so they are there for one at a time.
+    The normals of one view take more memory than everything else of it, so they exist for one view at a time.
     """
-    cells = [plane.cells.reshape(-1, 3) for plane in planes]
-    likewise, shown = ([np.zeros(len(points), np.int64) for points in cells] for _ in range(2))
+    cells = [plane.cell_centers.reshape(-1, 3) for plane in planes]
+    agreeing, visible = ([np.zeros(len(points), np.int64) for points in cells] for _ in range(2))
     for view in views if any(grounds) else ():
-        facing = _facing(view)
-        for k, (plane, below) in enumerate(zip(planes, grounds, strict=True)):
-            if not below:
+        normals = _smooth_normals(view)
+        for k, (plane, own_grounds) in enumerate(zip(planes, grounds, strict=True)):
+            if not own_grounds:
                 continue
-            on = seen_by(view, cells[k])
-            there, _ = geometry.sample_nearest(facing, geometry.project(cells[k], view.camera)[0])
-            other = np.max([np.abs(there @ each.normal) for each in below], 0)
-            shown[k] += on
-            likewise[k] += on & (np.abs(there @ plane.normal) > RATHER * other)
+            seen = is_seen(view, cells[k])
+            normal, _ = geometry.sample_nearest(normals, geometry.project(cells[k], view.camera)[0])
+            other = np.max([np.abs(normal @ each.normal) for each in own_grounds], 0)
+            visible[k] += seen
+            agreeing[k] += seen & (np.abs(normal @ plane.normal) > NORMAL_RATIO * other)
     return [
-        (2 * likewise[k] > shown[k]).reshape(plane.seen.shape) if grounds[k] else np.ones_like(plane.seen)
+        (2 * agreeing[k] > visible[k]).reshape(plane.seen.shape) if grounds[k] else np.ones_like(plane.seen)
         for k, plane in enumerate(planes)
     ]
 
 
-def _facing(view: Witness) -> np.ndarray:
-    """[H, W, 3] unit normals of what a view shows, evened out over rough ground."""
-    sigma = EVENED * view.depth.shape[1]
-    told = (view.depth > 0) & ~view.hidden
-    known = ndimage.gaussian_filter(told.astype(np.float64), sigma)
-    even = ndimage.gaussian_filter(np.where(told, geometry.reciprocal(view.depth.astype(np.float64)), 0), sigma)
-    return surface_normals(geometry.reciprocal(even / np.maximum(known, 1e-9)), view.camera)
+def _smooth_normals(view: DepthView) -> np.ndarray:
+    """[H, W, 3] unit normals of a view's surface, smoothed over rough ground."""
+    sigma = NORMAL_SMOOTHING * view.depth.shape[1]
+    known = (view.depth > 0) & ~view.masked
+    weight = ndimage.gaussian_filter(known.astype(np.float64), sigma)
+    disparity = np.where(known, geometry.reciprocal(view.depth.astype(np.float64)), 0)
+    smooth = ndimage.gaussian_filter(disparity, sigma)
+    return surface_normals(geometry.reciprocal(smooth / np.maximum(weight, 1e-9)), view.camera)

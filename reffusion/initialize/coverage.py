@@ -1,4 +1,5 @@
-"""What is still to be drawn: of a reference over what stays; of other views what no reference shows, and which next."""
+"""What is still to be drawn: pixels of C that nothing covers, the next view to complete, and a reference's pixels that
+lie over what remains."""
 
 from __future__ import annotations
 
@@ -10,119 +11,143 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reffusion.background.mirrors import imaged
-from reffusion.background.visibility import OPAQUE, Witness
-from reffusion.initialize.unprojection import Surroundings
+from reffusion import morphology
+from reffusion.background.mirrors import render_mirrors
+from reffusion.background.model import Background
+from reffusion.background.visibility import OPAQUE, DepthView
 from reffusion.masks import voting
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Reference, Rendering
 
-EDGE = 0.03  # relative depth: of a step between two things, and within which two surfaces are the same
-NARROW = 0.02  # of the image's width: a gap up to so wide shows no texture
-BESIDE = 45.0  # degrees between the axis of a camera without a photograph and that of the nearest with one
-ENOUGH = 0.001  # share of a view's C under which what is open is left to its neighbours
+EDGE = 0.03  # relative depth of a step between two things; closer surfaces are the same
+NARROW = 0.02  # of the image's width: a gap up to this wide shows no texture
+MAX_ANGLE = 45.0  # degrees between the axis of a camera without a photograph and the nearest one with a photograph
+MIN_SHARE = 0.001  # of a view's C: fewer uncovered pixels are left to its neighbours
+ISLAND, GAP = 0.01, 0.02  # of the image's width: smaller islands of uncovered pixels are dropped, smaller holes filled
 
 
-def mirrored(around: Surroundings) -> dict[str, np.ndarray]:
-    """View name -> [H, W], the depth of the mirror images that are supposed to be in C, infinite elsewhere; none where
-    nothing is mirrored."""
-    image = lambda camera: imaged(around.mirrors, camera, around.hidden[camera.name], around.views).supposed
-    return {camera.name: image(camera) for camera in around.cameras} if around.mirrors else {}
+def expected_mirror_depth(background: Background) -> dict[str, np.ndarray]:
+    """View name -> [H, W], depth of the plausible mirror images in C, inf elsewhere; empty where there is no mirror."""
+    if not background.mirrors:
+        return {}
+    render = lambda camera: render_mirrors(
+        background.mirrors, camera, background.masks[camera.name], background.views
+    ).plausible_depth
+    return {camera.name: render(camera) for camera in background.cameras}
 
 
 @torch.no_grad()
-def open_pixels(
+def find_uncovered(
     gaussians: Gaussians,
-    new: Tensor,
-    around: Surroundings,
+    is_new: Tensor,
+    background: Background,
     cameras: Sequence[Camera],
-    mirrored: Mapping[str, np.ndarray],
+    mirror_depth: Mapping[str, np.ndarray],
 ) -> dict[str, np.ndarray]:
-    """View name -> bool [H, W], pixels of C that nothing covers, or that show something else than a mirror image which
-    is supposed to be there.
+    """View name -> bool [H, W], pixels of C that nothing covers, or that show something else than the plausible mirror
+    image there.
 
-    Only these are made up: without a true picture a made-up surface is worse than what stands there, undecided or not.
+    Only these are completed: without a true picture an invented surface is worse than what is there, unobserved or not.
     """
     found = {}
     for camera in cameras:
-        hidden = around.hidden[camera.name]
-        drawn = rasterizer.render(gaussians, camera, features=new[:, None].to(gaussians.means.dtype), sh_degree=0)
-        bare = drawn.alpha.cpu().numpy() <= OPAQUE
-        if camera.name in mirrored:
-            bare |= _else_than(mirrored[camera.name], drawn, around.undecided[camera.name])
-        speck, gap = 0.01 * camera.width, 0.02 * camera.width
-        found[camera.name] = voting.tidy(hidden & bare, speck, gap) & hidden
+        mask = background.masks[camera.name]
+        rendering = rasterizer.render(
+            gaussians, camera, features=is_new[:, None].to(gaussians.means.dtype), sh_degree=0
+        )
+        uncovered = rendering.alpha.cpu().numpy() <= OPAQUE
+        if camera.name in mirror_depth:
+            uncovered |= _contradicts(mirror_depth[camera.name], rendering, background.unobserved[camera.name])
+        island, gap = ISLAND * camera.width, GAP * camera.width
+        found[camera.name] = morphology.remove_small_parts(mask & uncovered, island, gap) & mask
     return found
 
 
-def _else_than(image: np.ndarray, drawn: Rendering, undecided: np.ndarray) -> np.ndarray:
-    """bool [H, W]: before the image stands what no photograph shows, and no reference put there, or nothing does."""
-    depth, new = (each.cpu().numpy() for each in (drawn.depth, drawn.features[..., 0] > 0.5))
-    before = (depth < (1 - EDGE) * image) & ~new & undecided
-    return np.isfinite(image) & (before | (image < (1 - EDGE) * depth))
+def _contradicts(image_depth: np.ndarray, rendering: Rendering, unobserved: np.ndarray) -> np.ndarray:
+    """bool [H, W]: pixels at which something unobserved, that no reference drew, occludes the mirror image, or nothing is
+    as near as the image."""
+    depth, is_new = (each.cpu().numpy() for each in (rendering.depth, rendering.features[..., 0] > 0.5))
+    in_front = (depth < (1 - EDGE) * image_depth) & ~is_new & unobserved
+    return np.isfinite(image_depth) & (in_front | (image_depth < (1 - EDGE) * depth))
 
 
-def haze(
-    gaussians: Gaussians, new: Tensor, around: Surroundings, found: Mapping[str, np.ndarray], leak: float
+def find_floaters(
+    gaussians: Gaussians, is_new: Tensor, background: Background, uncovered: Mapping[str, np.ndarray], tau: float
 ) -> Tensor:
-    """bool [N]: old Gaussians that show mostly where nothing else covers C."""
-    return voting.leaking(gaussians, around.cameras, found, leak) & ~new
+    """bool [N]: old Gaussians that are visible mostly where nothing else covers C."""
+    return voting.find_floaters(gaussians, background.cameras, uncovered, tau) & ~is_new
 
 
 @torch.no_grad()
-def completed(
-    references: Sequence[Reference], gaussians: Gaussians, around: Surroundings
-) -> list[tuple[Witness, np.ndarray]]:
-    """The completed views as witnesses of what they show in C, where Gaussians lie by now, and their pictures."""
-    of, found = {view.camera.name: view for view in around.views}, []
+def completed_views(
+    references: Sequence[Reference], gaussians: Gaussians, background: Background
+) -> list[tuple[DepthView, np.ndarray]]:
+    """The references as depth views of the completed scene, unmasked where they are completed, and their pictures."""
+    views, found = {view.camera.name: view for view in background.views}, []
     for each in references:
-        drawn = rasterizer.render(gaussians, each.camera, sh_degree=0)
-        depth = torch.where(drawn.alpha > OPAQUE, drawn.depth, 0.0).cpu().numpy()
-        view = of[each.camera.name]
-        found.append((replace(view, depth=depth, hidden=view.hidden & ~each.mask), each.image))
+        rendering = rasterizer.render(gaussians, each.camera, sh_degree=0)
+        depth = torch.where(rendering.alpha > OPAQUE, rendering.depth, 0.0).cpu().numpy()
+        view = views[each.camera.name]
+        found.append((replace(view, depth=depth, masked=view.masked & ~each.mask), each.image))
     return found
 
 
-def beside_photographs(around: Surroundings) -> list[Camera]:
-    """The cameras from where views are completed: not those without a photograph that look from another side than all
-    photographs. What is made up there knows nothing of what stands there, and may hide what photographs show."""
+def cameras_near_photographs(background: Background) -> list[Camera]:
+    """The cameras whose views may be completed: those with a photograph, and those that look in about the same direction
+    as one. An invention seen from elsewhere knows nothing of what is there, and may hide what photographs show."""
     axis = lambda camera: camera.world_to_camera[2, :3]
-    taken = np.stack([axis(camera) for camera in around.cameras if camera.name not in around.blank])
-    near = lambda camera: float((taken @ axis(camera)).max()) > np.cos(np.radians(BESIDE))
-    return [camera for camera in around.cameras if camera.name not in around.blank or near(camera)]
+    photographed = [camera for camera in background.cameras if camera.name not in background.without_photo]
+    axes = np.stack([axis(camera) for camera in photographed])
+    is_near = lambda camera: float((axes @ axis(camera)).max()) > np.cos(np.radians(MAX_ANGLE))
+    return [
+        camera for camera in background.cameras if camera.name not in background.without_photo or is_near(camera)
+    ]
 
 
-def barest(cameras: Sequence[Camera], around: Surroundings, found: Mapping[str, np.ndarray]) -> Camera | None:
-    """The camera of whose view most is open; None where in each it is too little to count."""
-    bare = [c for c in cameras if found[c.name].sum() > ENOUGH * max(around.hidden[c.name].sum(), 1)]
-    return max(bare, key=lambda camera: int(found[camera.name].sum()), default=None)
+def least_covered_view(
+    cameras: Sequence[Camera], background: Background, uncovered: Mapping[str, np.ndarray]
+) -> Camera | None:
+    """The camera of the view with most uncovered pixels; None where every view has too few to count."""
+    candidates = [
+        camera
+        for camera in cameras
+        if uncovered[camera.name].sum() > MIN_SHARE * max(background.masks[camera.name].sum(), 1)
+    ]
+    return max(candidates, key=lambda camera: int(uncovered[camera.name].sum()), default=None)
 
 
-def narrow(mask: np.ndarray) -> bool:
-    """Whether what is open, bool [H, W], is nowhere wider than a gap."""
-    inside = cv2.distanceTransform(np.pad(mask.astype(np.uint8), 1), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return 2 * float(inside.max()) <= NARROW * mask.shape[1]
+def is_narrow(mask: np.ndarray) -> bool:
+    """Whether the mask, bool [H, W], is nowhere wider than a gap without texture."""
+    distance = cv2.distanceTransform(np.pad(mask.astype(np.uint8), 1), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return 2 * float(distance.max()) <= NARROW * mask.shape[1]
 
 
 @torch.no_grad()
-def before(gaussians: Gaussians, depth: np.ndarray, reference: Reference, hidden: np.ndarray) -> np.ndarray:
-    """bool [H, W]: what a reference draws over what stays, before all that the Gaussians show: the back of a thing of
-    which earlier ones drew the front, seen from within.
+def uncovered_share(gaussians: Gaussians, camera: Camera, mask: np.ndarray, min_alpha: float = 0.9) -> float:
+    """Share in [0, 1] of C, bool [H, W], whose alpha is below `min_alpha`."""
+    alpha = rasterizer.render(gaussians, camera, sh_degree=0).alpha.cpu().numpy()
+    return float((alpha[mask] < min_alpha).mean()) if mask.any() else 0.0
+
+
+@torch.no_grad()
+def pixels_in_front(gaussians: Gaussians, depth: np.ndarray, reference: Reference, mask: np.ndarray) -> np.ndarray:
+    """bool [H, W]: what a reference draws outside C in front of all Gaussians: the back of a thing whose front earlier
+    references drew, seen from inside.
 
     Args:
-        depth: [H, W] of the reference's surface. hidden: bool [H, W], C.
+        depth: [H, W] of the reference's surface. mask: bool [H, W], C.
     """
-    drawn = rasterizer.render(gaussians, reference.camera, sh_degree=0)
-    shown = torch.where(drawn.alpha > 0.5, drawn.depth, torch.inf).double().cpu().numpy()
-    return reference.mask & ~hidden & (depth < (1 - EDGE) * shown)
+    rendering = rasterizer.render(gaussians, reference.camera, sh_degree=0)
+    visible = torch.where(rendering.alpha > 0.5, rendering.depth, torch.inf).double().cpu().numpy()
+    return reference.mask & ~mask & (depth < (1 - EDGE) * visible)
 
 
-def beside_edges(depth: np.ndarray, stays: np.ndarray) -> np.ndarray:
-    """bool [H, W]: pixels just beyond the edge of something nearer, on what stays there: stained by its colour,
-    and photographs show them clean.
+def beside_depth_edges(depth: np.ndarray, remaining_depth: np.ndarray) -> np.ndarray:
+    """bool [H, W]: pixels just beyond the edge of something nearer that show what remains there. The nearer thing's
+    colour bleeds into them, and photographs show them clean.
 
     Args:
-        depth, stays: [H, W] of the completed view, and of the scene as it is.
+        depth, remaining_depth: [H, W] of the completed view, and of the scene that remains.
     """
     nearest = cv2.erode(depth, np.ones((3, 3)))
-    return (depth > (1 + EDGE) * nearest) & (np.abs(depth - stays) < EDGE * stays)
+    return (depth > (1 + EDGE) * nearest) & (np.abs(depth - remaining_depth) < EDGE * remaining_depth)

@@ -1,4 +1,4 @@
-"""Shadows of the object, that references no longer show: photographs in the light that is left without it."""
+"""Relight photographs that show the object's shadow, which references no longer show."""
 
 from __future__ import annotations
 
@@ -7,40 +7,47 @@ from dataclasses import replace
 
 import numpy as np
 
+from reffusion.background.model import Background
 from reffusion.background.visibility import with_photographed_depth
-from reffusion.initialize.unprojection import Surroundings
 from reffusion.masks import shadows
 from reffusion.prior import inpaint
 from reffusion.splat import rasterizer
 from reffusion.types import Gaussians, Reference
 
 
-def without_shadows(
-    true: Sequence[Reference], gaussians: Gaussians, around: Surroundings
-) -> tuple[list[Reference], Surroundings, dict[str, np.ndarray]]:
-    """The references, standing also for what the object had tainted; the surroundings with photographs in their light,
-    which say nothing where it is not known; and view name -> bool [H, W], what was tainted, empty where nothing was."""
-    marks = {camera.name: np.zeros((camera.height, camera.width), bool) for camera in around.cameras}
-    silent, photos = dict(marks), dict(around.photos)
-    pictures = []
-    for each in true:
+def remove_shadows(
+    references: Sequence[Reference], gaussians: Gaussians, background: Background
+) -> tuple[list[Reference], Background, dict[str, np.ndarray]]:
+    """Detect the object's shadow by each reference, and relight the photographs.
+
+    Returns:
+        The references, whose masks contain the shadow; the background with photographs in the references' light, and
+        views that do not count where the light is unknown; and view name -> bool [H, W], the shadow, empty where no
+        reference shows one.
+    """
+    found = {camera.name: np.zeros((camera.height, camera.width), bool) for camera in background.cameras}
+    unknown, photos = dict(found), dict(background.photos)
+    extended = []
+    for each in references:
         name = each.camera.name
-        hidden = around.hidden[name]
-        shown = inpaint.background(gaussians, each.camera, photos[name], hidden)
-        found = shadows.tainted(each.image, shown, hidden)
-        if (each.mask & ~hidden).any():  # it draws something over what stays, which is no shadow, nor is its rim
-            found &= hidden
-        pictures.append(replace(each, mask=each.mask | found))
-        if not found.any():
+        mask = background.masks[name]
+        view = inpaint.background(gaussians, each.camera, photos[name], mask)
+        shadow = shadows.detect_shadows(each.image, view, mask)
+        if (each.mask & ~mask).any():  # it draws over what remains, which is no shadow, and neither is its rim
+            shadow &= mask
+        extended.append(replace(each, mask=each.mask | shadow))
+        if not shadow.any():
             continue
-        print(f"reference {name}: beside the hole {found.sum()} px differ from what is seen, a shadow perhaps")
+        print(f"reference {name}: beside the hole {shadow.sum()} px differ from what is seen, a shadow perhaps")
         depth = rasterizer.render(gaussians, each.camera, sh_degree=0).depth.double().cpu().numpy()
-        depth = with_photographed_depth(depth, each.camera, around.views)
-        brighter = shadows.light(each.image, shown)
-        for view, (mask, light) in shadows.carried(found, brighter, depth, each.camera, around.views).items():
-            photos[view] = shadows.relit(photos[view], light)
-            marks[view], silent[view] = marks[view] | mask, silent[view] | (mask & np.isnan(light).any(-1))
-    if not any(mask.any() for mask in marks.values()):
-        return list(true), around, {}
-    views = [replace(view, hidden=view.hidden | silent[view.camera.name]) for view in around.views]
-    return pictures, replace(around, views=views, photos=photos), marks
+        depth = with_photographed_depth(depth, each.camera, background.views)
+        light = shadows.log_light(each.image, view)
+        projected = shadows.project_shadow(shadow, light, depth, each.camera, background.views)
+        for other, (pixels, own_light) in projected.items():
+            photos[other] = shadows.relight(photos[other], own_light)
+            found[other] = found[other] | pixels
+            unknown[other] = unknown[other] | (pixels & np.isnan(own_light).any(-1))
+    if not any(pixels.any() for pixels in found.values()):
+        return list(references), background, {}
+    views = [replace(view, masked=view.masked | unknown[view.camera.name]) for view in background.views]
+    return extended, replace(background, views=views, photos=photos), found

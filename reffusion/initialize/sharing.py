@@ -1,4 +1,4 @@
-"""Of several references that bring their depth: which one draws a surface that more than one of them shows."""
+"""Several references with depth maps: decide which one draws a surface that more than one of them shows."""
 
 from __future__ import annotations
 
@@ -12,39 +12,40 @@ import torch
 from scipy import ndimage
 
 from reffusion import geometry
+from reffusion.background.model import Background
 from reffusion.depth import alignment, background_depth
 from reffusion.depth.background_depth import Completion, Hints
 from reffusion.gaussians.surfels import surface_normals
-from reffusion.initialize.unprojection import Surroundings
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Reference
 
-SAME = 0.015  # relative depth within which two references show the same surface
-ALONG = 0.85  # cosine between their normals there, at least
-PAST = 0.03  # relative depth by which one looks past where another draws
-GRAZING = 0.05  # least cosine between surface and view that is told apart
-ALIKE = 12  # levels of 255 up to which two pictures show the same
-BESIDE = np.ones((3, 3), np.uint8)  # px: an edge lies where it is only to a pixel
+SAME_DEPTH = 0.015  # relative depth within which two references show the same surface
+SAME_NORMAL = 0.85  # least cosine between their normals there
+PAST = 0.03  # relative depth by which a reference sees past what another draws
+MIN_COSINE = 0.05  # between surface normal and view: a more oblique surface counts as this oblique
+UNCHANGED = 12  # of 255: largest difference between pictures that show the same
+EDGE = np.ones((3, 3), np.uint8)  # px: the position of an edge is accurate to a pixel
 
 
 @dataclass(frozen=True)
 class Share:
-    """What one of several references draws over what stays, of the pixels whose depth it brings.
+    """What one of several references draws over what remains, of the pixels whose depth it brings.
 
     Attributes:
-        draws, leaves: bool [H, W], the pixels that it draws, and those that it leaves to others, or as they are.
+        drawn: bool [H, W], the pixels that it draws.
+        ceded: bool [H, W], the pixels that it leaves to other references, or as they are.
     """
 
-    draws: np.ndarray
-    leaves: np.ndarray
+    drawn: np.ndarray
+    ceded: np.ndarray
 
 
 @dataclass(frozen=True)
-class Shown:
-    """A reference's surfaces.
+class ReferenceSurface:
+    """The surface that a reference shows.
 
     Attributes:
-        camera: its view. depth: [H, W], 0 where it brings none. pixels: bool [H, W], what it would draw.
+        camera: its view. depth: [H, W], 0 where unknown. pixels: bool [H, W], what the reference would draw.
     """
 
     camera: Camera
@@ -57,89 +58,104 @@ class Shown:
         return surface_normals(self.depth, self.camera)
 
     @cached_property
-    def widths(self) -> np.ndarray:
-        """[H, W], how wide a pixel is on the surface, where it is widest, in the frame's unit; infinite where no depth
-        is told."""
+    def footprints(self) -> np.ndarray:
+        """[H, W], the width of a pixel on the surface, in its widest direction, in world units; infinite where depth is
+        unknown."""
         rays = geometry.unproject(np.ones_like(self.depth), self.camera) - self.camera.center
-        along = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
-        cosine = np.abs((along * self.normals).sum(-1)).clip(GRAZING)
-        smooth = cv2.medianBlur((self.depth / cosine).astype(np.float32), 3)  # normals are unsure
+        direction = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+        cosine = np.abs((direction * self.normals).sum(-1)).clip(MIN_COSINE)
+        smooth = cv2.medianBlur((self.depth / cosine).astype(np.float32), 3)  # normals are noisy
         return np.where(self.depth > 0, smooth, np.inf) / np.sqrt(self.camera.fx * self.camera.fy)
 
 
-def shares(
-    remaining: Gaussians, references: Sequence[Reference], around: Surroundings, how: Completion
+def share_surfaces(
+    remaining: Gaussians, references: Sequence[Reference], background: Background, completion: Completion
 ) -> dict[str, Share]:
-    """View name -> its share, of the references that bring their depth; none where fewer than two do.
+    """View name -> its share, of the references with a depth map; empty where there are fewer than two.
 
-    Each by itself draws all that it shows, and what it shows from the side is coarse: one pixel is a long smear there,
-    and keeps out what another would show sharply.
+    Each alone would draw all that it shows. What it shows obliquely is coarse, one pixel is a long smear there, and it
+    would keep out what another reference shows sharply.
 
     Args:
-        remaining: the Gaussians left.
+        remaining: the Gaussians that remain.
         references: in the order in which they are drawn.
     """
-    bring = [each for each in references if each.depth is not None]
-    if len(bring) < 2:
+    with_depth = [each for each in references if each.depth is not None]
+    if len(with_depth) < 2:
         return {}
-    shown, told = [], []
-    for each in bring:
-        name, depth = each.camera.name, aligned(remaining, each, around, how)
-        over = each.mask & ~around.hidden[name]
-        told.append(over & (depth > 0))
-        shown.append(Shown(each.camera, depth, told[-1] & ~unchanged_rim(each.image, around.photos[name], over)))
-    shared = zip(shown, told, finest(shown), strict=True)
-    return {each.camera.name: Share(draws, pixels & ~draws) for each, pixels, draws in shared}
+    surfaces, known = [], []
+    for each in with_depth:
+        name, depth = each.camera.name, align_reference_depth(remaining, each, background, completion)
+        over = each.mask & ~background.masks[name]
+        known.append(over & (depth > 0))
+        rim = unchanged_rim(each.image, background.photos[name], over)
+        surfaces.append(ReferenceSurface(each.camera, depth, known[-1] & ~rim))
+    drawn = select_finest(surfaces)
+    return {
+        each.camera.name: Share(own, pixels & ~own) for each, pixels, own in zip(surfaces, known, drawn, strict=True)
+    }
 
 
 @torch.no_grad()
-def aligned(remaining: Gaussians, reference: Reference, around: Surroundings, how: Completion) -> np.ndarray:
-    """[H, W] the depth that a reference brings, in the scene's unit; 0 where it says nothing."""
-    camera, drawn = reference.camera, rasterizer.render(remaining, reference.camera, sh_degree=0)
-    hints = Hints(outer=around.photographed(camera))
-    view = background_depth.seen(drawn, camera, reference.mask, around.hidden[camera.name], how, hints)
+def align_reference_depth(
+    remaining: Gaussians, reference: Reference, background: Background, completion: Completion
+) -> np.ndarray:
+    """[H, W] the depth map of a reference in world units; 0 where unknown."""
+    camera, rendering = reference.camera, rasterizer.render(remaining, reference.camera, sh_degree=0)
+    hints = Hints(outer=background.photographed_depth(camera))
+    mask = background.masks[camera.name]
+    view = background_depth.seen(rendering, camera, reference.mask, mask, completion, hints)
     depth, _ = alignment.align_either(reference.depth, view.depth, view.known)
     return np.where(np.isfinite(depth), depth, 0.0)
 
 
-def finest(shown: Sequence[Shown]) -> list[np.ndarray]:
-    """bool [H, W] of each: the pixels that it draws. A surface is drawn by the one that shows it most finely, of two
-    alike by the earlier; and nothing stands where another looks past it."""
+def select_finest(surfaces: Sequence[ReferenceSurface]) -> list[np.ndarray]:
+    """bool [H, W] of each: the pixels that it draws.
+
+    A surface is drawn by the reference that shows it with the smallest footprint, by the earlier of two alike; and
+    nothing is drawn where another reference sees past it.
+    """
     found = []
-    for i, each in enumerate(shown):
-        points, mine = geometry.unproject(each.depth, each.camera)[each.pixels], each.widths[each.pixels]
-        draws = np.ones(len(points), bool)
-        for j, other in enumerate(shown):
+    for i, each in enumerate(surfaces):
+        points, own = geometry.unproject(each.depth, each.camera)[each.pixels], each.footprints[each.pixels]
+        drawn = np.ones(len(points), bool)
+        for j, other in enumerate(surfaces):
             if i != j:
-                same, past, theirs = beheld(points, each.normals[each.pixels], other)
-                draws &= ~past & ~(same & ((theirs < mine) | (theirs == mine) & (j < i)))
+                same, past, theirs = cross_visibility(points, each.normals[each.pixels], other)
+                drawn &= ~past & ~(same & ((theirs < own) | (theirs == own) & (j < i)))
         pixels = each.pixels.copy()
-        pixels[each.pixels] = draws
+        pixels[each.pixels] = drawn
         found.append(pixels)
     return found
 
 
-def beheld(points: np.ndarray, normals: np.ndarray, other: Shown) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of points [P, 3] with these normals, [P, 3]: whether another reference would draw the same surface there, bool
-    [P]; whether it looks past them, bool [P]; and how wide its pixel is there, [P].
+def cross_visibility(
+    points: np.ndarray, normals: np.ndarray, other: ReferenceSurface
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of points [P, 3] with normals [P, 3]: whether another reference would draw the same surface there, bool [P];
+    whether it sees past them, bool [P]; and its footprint there, [P].
 
-    Beyond an edge the next side of a thing is as near: it is another surface, for it faces another way. Where that is
-    not sure both draw, which does less harm than a gap.
+    Beyond an edge the next side of a thing is as near, but faces elsewhere: it is another surface. Where this is
+    uncertain both draw, which does less harm than a gap.
     """
-    near, far = cv2.erode(np.where(other.depth > 0, other.depth, np.inf), BESIDE), cv2.dilate(other.depth, BESIDE)
+    near, far = cv2.erode(np.where(other.depth > 0, other.depth, np.inf), EDGE), cv2.dilate(other.depth, EDGE)
     uv, z = geometry.project(points, other.camera)
     near, inside = geometry.sample_nearest(near, uv)
-    maps = far, other.pixels, other.widths, other.normals
-    far, drawn, theirs, facing = (geometry.sample_nearest(each, uv)[0] for each in maps)
+    maps = far, other.pixels, other.footprints, other.normals
+    far, drawn, footprint, normal = (geometry.sample_nearest(each, uv)[0] for each in maps)
     inside &= (z > 0) & (far > 0)
-    same = inside & drawn & (z > (1 - SAME) * near) & (z < (1 + SAME) * far) & ((facing * normals).sum(1) > ALONG)
-    return same, inside & (z < (1 - PAST) * near), theirs
+    same_depth = (z > (1 - SAME_DEPTH) * near) & (z < (1 + SAME_DEPTH) * far)
+    same = inside & drawn & same_depth & ((normal * normals).sum(1) > SAME_NORMAL)
+    return same, inside & (z < (1 - PAST) * near), footprint
 
 
 def unchanged_rim(image: np.ndarray, photo: np.ndarray, drawn: np.ndarray) -> np.ndarray:
-    """bool [H, W]: pixels at the border of what was drawn over a photograph, bool [H, W], that look like it, uint8
-    [H, W, 3] both: what was found to change reaches a little too far, and depth there is of something else."""
-    alike = drawn & (np.abs(image.astype(np.int16) - photo).max(-1) <= ALIKE)
+    """bool [H, W]: pixels at the border of what was drawn over a photograph, bool [H, W], that look like the photograph;
+    both pictures uint8 [H, W, 3].
+
+    Detected changes extend a little too far, and depth there belongs to something else.
+    """
+    alike = drawn & (np.abs(image.astype(np.int16) - photo).max(-1) <= UNCHANGED)
     alike = ndimage.binary_opening(alike, np.ones((2, 2)))
-    pieces, _ = ndimage.label(alike | ~drawn)
-    return alike & np.isin(pieces, np.unique(pieces[~drawn]))
+    parts, _ = ndimage.label(alike | ~drawn)
+    return alike & np.isin(parts, np.unique(parts[~drawn]))

@@ -1,218 +1,149 @@
-"""From a completed view to new Gaussians: depth behind the object, then a disk for each pixel of the reference."""
+"""Unproject a completed view: estimate the depth behind the object, and add a disk for each pixel."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import torch
 
 from reffusion import geometry, trace
-from reffusion.background import continuation
-from reffusion.background.mirrors import Mirror
-from reffusion.background.plane import Plane, without_pits
-from reffusion.background.visibility import Witness, votes, widened, with_photographed_depth
+from reffusion.background.model import Background
 from reffusion.depth import background_depth, estimates
 from reffusion.depth.background_depth import NO_HINTS, Completion, Hints
 from reffusion.depth.solverlog import SolverLog
 from reffusion.gaussians.sheets import Sheets, surface
-from reffusion.initialize import sweep, view_dependent_color
-from reffusion.inpaint.exemplar import Around
+from reffusion.initialize.draft import Draft
+from reffusion.initialize.view_dependent_color import measure_change, transfer_sh
+from reffusion.morphology import square
 from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians, Reference
 
-AROUND, BEYOND = 2, 0.1  # px around, and how far beyond the colours there, in [0, 1], a Gaussian's may lie
-SWEPT = 0.1  # of the image's width: how far around a hole depth is found by comparing photographs
+COLOR_WINDOW_PX = 2  # radius in which the picture bounds a Gaussian's colour
+COLOR_MARGIN = 0.1  # of [0, 1]: how far beyond these bounds it may lie
 
 
 @torch.no_grad()
-def depth_behind(
+def estimate_depth(
     remaining: Gaussians,
     reference: Reference,
     hole: np.ndarray,
-    hidden: np.ndarray,
+    mask: np.ndarray,
     points: np.ndarray,
-    how: Completion,
-    estimate: np.ndarray | None = None,
+    completion: Completion,
+    disparity: np.ndarray | None = None,
     log: trace.Trace | None = None,
     hints: Hints = NO_HINTS,
     farthest: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, str]:
-    """The scene without the object in one view: depth [H, W] float64, as rendered where that is known, else made up;
-    the same made up everywhere; and how in words.
+    """The depth of the scene without the object in one view.
 
-    By the reference's own depth map where it brings one; with an estimate, the paper's way (`estimates`); else
-    the surroundings are continued.
+    The reference's own depth map is used where it has one; with a depth model's answer the paper's way
+    (`depth.estimates`); otherwise the surroundings are continued into the hole.
 
     Args:
-        remaining: the Gaussians left.
-        reference: gives the view and the guide.
-        hole: bool [H, W], the pixels to be filled.
-        hidden: bool [H, W], C of that view: where the object stood.
+        remaining: the Gaussians that remain.
+        reference: its camera and picture.
+        hole: bool [H, W], the pixels to fill.
+        mask: bool [H, W], C of the view.
         points: [P, 3] sparse points of the scene.
-        how: parameters.
-        estimate: [H, W] a depth model's answer to the reference, disparity up to scale and offset; None: there is none.
-        log: gets a series for each solver (docs/traces.md).
-        hints: what else is known of its depth. farthest: see `behind.continued`.
+        completion: settings.
+        disparity: [H, W], a depth model's answer to the reference, up to scale and offset; None without a model.
+        log: receives a series for each solver (docs/traces.md).
+        hints: what else is known of the depth. farthest: see `background_depth.continued`.
+
+    Returns:
+        Depth [H, W] float64, as rendered where that is known, else estimated; the estimate at all pixels; and the way it
+        was found, in words.
 
     Raises:
         ValueError: naming the view, where too little is known around the hole, or the estimate does not fit.
     """
-    drawn = rasterizer.render(remaining, reference.camera, sh_degree=0)
-    view = background_depth.seen(drawn, reference.camera, hole, hidden, how, hints)
-    solvers = SolverLog(log, reference.camera.name, *background_depth.points_around(view, points, how))
+    rendering = rasterizer.render(remaining, reference.camera, sh_degree=0)
+    view = background_depth.seen(rendering, reference.camera, hole, mask, completion, hints)
+    solvers = SolverLog(log, reference.camera.name, *background_depth.points_around(view, points, completion))
     try:
         if reference.depth is not None:
-            solved, said = estimates.brought(view, reference.image, reference.depth, points, how, solvers)
-        elif estimate is None:
-            solved, said = background_depth.continued(view, reference.image, points, how, solvers, farthest)
+            solved, words = estimates.brought(view, reference.image, reference.depth, points, completion, solvers)
+        elif disparity is None:
+            solved, words = background_depth.continued(view, reference.image, points, completion, solvers, farthest)
         else:
-            solved, said = estimates.estimated(view, reference.image, estimate, how, solvers)
-        # Beyond infinity there is nothing: the farthest depth that can be told stands in.
-        made_up = 1.0 / np.maximum(solved, view.least_disparity)
+            solved, words = estimates.estimated(view, reference.image, disparity, completion, solvers)
+        # Nothing is beyond infinity: the farthest depth that can be told stands in for it.
+        estimate = 1.0 / np.maximum(solved, view.least_disparity)
     except ValueError as error:
         raise ValueError(f"reference {reference.camera.name}: {error}") from error
-    return np.where(view.known, view.depth, made_up), made_up, said
+    return np.where(view.known, view.depth, estimate), estimate, words
 
 
 @torch.no_grad()
-def to_fill(
-    gaussians: Gaussians, new: torch.Tensor, reference: Reference, hidden: np.ndarray, covered: float
-) -> np.ndarray:
-    """bool [H, W]: what the reference has to fill: of its mask, what no earlier reference filled; of C (`hidden`, bool
-    [H, W]) also what the Gaussians cover by less than `covered`, e.g. where haze was taken away.
+def find_hole(draft: Draft, reference: Reference, mask: np.ndarray, min_alpha: float) -> np.ndarray:
+    """bool [H, W]: the pixels that a reference has to fill.
+
+    These are the pixels of its mask that no earlier reference filled, and pixels of C, `mask`, that the Gaussians cover by
+    less than `min_alpha`, e.g. where floaters were dropped.
     """
-    drawn = rasterizer.render(gaussians, reference.camera, features=new[:, None].to(gaussians.means.dtype), sh_degree=0)
-    thin, filled = drawn.alpha.cpu().numpy() < covered, drawn.features[..., 0].cpu().numpy() > 0.5
-    return (reference.mask & ~filled) | (hidden & thin)
+    features = draft.is_new[:, None].to(draft.gaussians.means.dtype)
+    rendering = rasterizer.render(draft.gaussians, reference.camera, features=features, sh_degree=0)
+    thin, filled = rendering.alpha.cpu().numpy() < min_alpha, rendering.features[..., 0].cpu().numpy() > 0.5
+    return (reference.mask & ~filled) | (mask & thin)
 
 
 @torch.no_grad()
-def seen_through(
+def find_gaps(
     gaussians: Gaussians,
-    reference: Camera,
+    camera: Camera,
     depth: np.ndarray,
     pixels: np.ndarray,
     views: Sequence[tuple[Camera, np.ndarray]],
-    covered: float,
+    min_alpha: float,
 ) -> np.ndarray:
-    """bool [H, W]: those of `pixels` whose surface another view sees through, into nothing.
+    """bool [H, W]: those of `pixels`, bool [H, W], whose surface another view sees through into nothing.
 
-    Beside the hole, behind the object, stand Gaussians that few views ever looked at from about one side: from there
-    they cover the ground, from the other side they do not, and leave a black gap between it and the new surface.
+    Beside the hole, behind the object, lie Gaussians that few views looked at from about one side. From there they cover
+    the ground; from the other side they leave a black gap between the ground and the new surface.
 
     Args:
-        reference: the view; depth: [H, W] of its surface; pixels: bool [H, W].
-        views: other cameras, and C in them, bool; only there a gap is looked for.
-        covered: alpha under which there is nothing.
+        camera: the view. depth: [H, W] of its surface.
+        views: other cameras, and C in them, bool; gaps are looked for in C only.
+        min_alpha: alpha below which there is nothing.
     """
     rows, columns = np.nonzero(pixels)
-    points, gap = geometry.unproject(depth, reference)[rows, columns], np.zeros(len(rows), bool)
-    for camera, hidden in views:
-        alpha = rasterizer.render(gaussians, camera, sh_degree=0).alpha.cpu().numpy()
-        uv, z = geometry.project(points, camera)
-        empty, inside = geometry.sample_nearest(hidden & (alpha < covered), uv)
-        gap |= empty & inside & (z > 0)
+    points, is_gap = geometry.unproject(depth, camera)[rows, columns], np.zeros(len(rows), bool)
+    for other, mask in views:
+        alpha = rasterizer.render(gaussians, other, sh_degree=0).alpha.cpu().numpy()
+        uv, z = geometry.project(points, other)
+        empty, inside = geometry.sample_nearest(mask & (alpha < min_alpha), uv)
+        is_gap |= empty & inside & (z > 0)
     found = np.zeros_like(pixels)
-    found[rows[gap], columns[gap]] = True
+    found[rows[is_gap], columns[is_gap]] = True
     return found
 
 
-@dataclass(frozen=True)
-class Surroundings:
-    """What is known around the object.
-
-    Attributes:
-        cameras: the training views.
-        hidden: view name -> bool [H, W], C. photos: view name -> uint8 [H, W, 3], exposed as the Gaussians are.
-        views: the training views as witnesses. planes: those that go on into what nobody saw.
-        points: [P, 3] sparse points of the scene.
-        centre: [3], the object's middle. radius: of most of it; infinite where there is none.
-        mirrors: of things around the object. undecided: view name -> bool [H, W], what of C no photograph shows.
-        blank: names of the cameras without a photograph.
-    """
-
-    cameras: Sequence[Camera]
-    hidden: Mapping[str, np.ndarray]
-    photos: Mapping[str, np.ndarray]
-    views: Sequence[Witness]
-    planes: Sequence[Plane]
-    points: np.ndarray
-    centre: np.ndarray
-    radius: float
-    mirrors: Sequence[Mirror]
-    undecided: Mapping[str, np.ndarray]
-    blank: frozenset[str]
-
-    def looked(self) -> Around:
-        """What of this pictures are completed by."""
-        return Around(self.views, self.planes, self.photos, self.centre, self.radius, mirrors=self.mirrors)
-
-    def photographed(self, camera: Camera) -> np.ndarray:
-        """[H, W] depth that a training view shows beside its mask, of a mirror its plane's; 0 elsewhere."""
-        nothing = np.zeros((camera.height, camera.width))
-        shown = with_photographed_depth(nothing, camera, self.views)
-        return without_pits(shown, camera, self.planes)
-
-    def looked_past(self, camera: Camera, depth: np.ndarray) -> np.ndarray:
-        """bool [H, W], where other views look past a surface at this depth of a view, and few show it."""
-        return votes(geometry.unproject(depth, camera).reshape(-1, 3), self.views).empty.reshape(depth.shape)
-
-    def compared(self, camera: Camera, hole: np.ndarray) -> tuple[Surroundings, np.ndarray]:
-        """The same, but around a hole of a training view depth and planes are where the photographs agree best; and
-        bool [H, W], where they tell."""
-        depth = self.photographed(camera)
-        ring = widened(hole | self.hidden[camera.name], SWEPT) & ~hole & (depth > 0)
-        swept = sweep.swept(self.photos[camera.name], depth, ring, camera, self.views, self.photos)
-        told = swept > 0
-        better = lambda view: replace(view, depth=np.where(told, swept, view.depth).astype(view.depth.dtype))
-        views = [better(view) if view.camera.name == camera.name else view for view in self.views]
-        planes = [continuation.aligned(plane, swept, camera, hole) for plane in self.planes]
-        return replace(self, views=views, planes=planes), told
-
-
-@torch.no_grad()
-def uncovered(gaussians: Gaussians, camera: Camera, hidden: np.ndarray, covered: float = 0.9) -> float:
-    """Share in [0, 1] of C (`hidden`, bool [H, W]) whose alpha is below `covered`."""
-    alpha = rasterizer.render(gaussians, camera, sh_degree=0).alpha.cpu().numpy()
-    return float((alpha[hidden] < covered).mean()) if hidden.any() else 0.0
-
-
-def placed(
-    gaussians: Gaussians,
-    new: torch.Tensor,
+def add_surface(
+    draft: Draft,
     reference: Reference,
     depth: np.ndarray,
     pixels: np.ndarray,
-    around: Surroundings,
-    how: Sheets,
-) -> tuple[Gaussians, torch.Tensor]:
-    """The Gaussians with a surface that shows these pixels of the reference, bool [H, W], and the labels of the new."""
-    added = surface(reference.image, depth, pixels, reference.camera, gaussians.sh.shape[1], how)
-    added = added.map(lambda p: p.to(gaussians.means))
-    together = gaussians.zipped(added, lambda a, b: torch.cat([a, b]))
-    fresh = torch.arange(len(together), device=new.device) >= len(gaussians)
-    if how.gloss:
-        camera, known = reference.camera, around.photographed(reference.camera)
-        hole = pixels | around.hidden[camera.name]
-        change = view_dependent_color.change_around(reference.image, known, hole, camera, around.views, around.photos)
-        together = view_dependent_color.lent(together, fresh, camera, change, around.views)
-    together = match_colors(together, fresh, reference.image, pixels, reference.camera, how.color_steps)
-    return together, torch.cat([new, fresh[len(new) :]])
-
-
-def _range_around(gaussians: Gaussians, image: np.ndarray, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
-    """[N, 3] twice: between which constant colours may lie, that of the picture around each Gaussian and a bit more."""
-    window = np.ones((2 * AROUND + 1,) * 2, np.uint8)
-    uv, _ = geometry.project(gaussians.means.double().cpu().numpy(), camera)
-    bounds = []
-    for of, beyond in ((cv2.erode, -BEYOND), (cv2.dilate, BEYOND)):
-        told, _ = geometry.sample_nearest(of(image, window), uv)
-        bounds.append(torch.from_numpy((told / 255 + beyond).clip(0, 1) - 0.5).to(gaussians.sh) / SH0)
-    return bounds[0], bounds[1]
+    background: Background,
+    sheets: Sheets,
+) -> Draft:
+    """The draft with a surface at `depth`, [H, W], that shows these pixels of the reference, bool [H, W]."""
+    camera = reference.camera
+    added = surface(reference.image, depth, pixels, camera, draft.gaussians.sh.shape[1], sheets)
+    old_count, draft = len(draft.gaussians), draft.add(added.map(lambda p: p.to(draft.gaussians.means)))
+    gaussians = draft.gaussians
+    is_added = torch.arange(len(gaussians), device=draft.is_new.device) >= old_count
+    if sheets.gloss:
+        known = background.photographed_depth(camera)
+        hole = pixels | background.masks[camera.name]
+        change = measure_change(reference.image, known, hole, camera, background.views, background.photos)
+        gaussians = transfer_sh(gaussians, is_added, camera, change, background.views)
+    gaussians = match_colors(gaussians, is_added, reference.image, pixels, camera, sheets.color_steps)
+    return Draft(gaussians, draft.is_new)
 
 
 @torch.no_grad()
@@ -221,22 +152,32 @@ def match_colors(
 ) -> Gaussians:
     """The labelled Gaussians' constant colours, corrected until the view shows `image` on `pixels`.
 
-    Each step gives a Gaussian the mean residual of the pixels it is blended into, by weight: this undoes the blur that
-    the footprints lay over the picture. One that is hidden by others cannot show the picture whatever its colour: what
-    is around in the picture bounds it, or it would stand out as a speck from elsewhere.
+    Each step adds to a Gaussian the mean residual of the pixels it is blended into, by weight, which undoes the blur of
+    the footprints. An occluded Gaussian cannot show the picture whatever its colour; its colour is bounded by the
+    picture around it, or it would stand out as a speck in other views.
 
     Args:
         image: [H, W, 3] uint8; pixels: bool [H, W]; labels: bool [N]; steps: corrections.
     """
     target = torch.from_numpy(image).to(gaussians.means) / 255
     chosen = torch.from_numpy(pixels)[..., None].to(gaussians.means)
-    low, high = _range_around(gaussians, image, camera)
+    low, high = _color_bounds(gaussians, image, camera)
     for _ in range(steps):
         residual = (target - rasterizer.render(gaussians, camera).color) * chosen
         gathered = rasterizer.accumulate(gaussians, camera, torch.cat([residual, chosen], -1))
-        seen = labels & (gathered[:, 3] > 1e-3)
+        visible = labels & (gathered[:, 3] > 1e-3)
         sh = gaussians.sh.clone()
-        sh[seen, 0] += gathered[seen, :3] / gathered[seen, 3:] / SH0
-        sh[seen, 0] = sh[seen, 0].clamp(low[seen], high[seen])
+        sh[visible, 0] += gathered[visible, :3] / gathered[visible, 3:] / SH0
+        sh[visible, 0] = sh[visible, 0].clamp(low[visible], high[visible])
         gaussians = replace(gaussians, sh=sh)
     return gaussians
+
+
+def _color_bounds(gaussians: Gaussians, image: np.ndarray, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
+    """[N, 3] twice: bounds of the constant coefficients, from the picture's colours around each Gaussian."""
+    uv, _ = geometry.project(gaussians.means.double().cpu().numpy(), camera)
+    bounds = []
+    for extreme, margin in ((cv2.erode, -COLOR_MARGIN), (cv2.dilate, COLOR_MARGIN)):
+        color, _ = geometry.sample_nearest(extreme(image, square(COLOR_WINDOW_PX)), uv)
+        bounds.append(torch.from_numpy((color / 255 + margin).clip(0, 1) - 0.5).to(gaussians.sh) / SH0)
+    return bounds[0], bounds[1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -61,3 +62,16 @@ def load_labels(path: Path) -> Tensor:
     if array.dtype != np.bool_ or array.ndim != 1:
         raise BadInput(f"{path}: labels must be bool [N], got {array.dtype} {list(array.shape)}")
     return torch.from_numpy(array)
+
+
+def save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write named arrays as a compressed `.npz`, creating the folder; equal arrays give equal bytes."""
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "wb") as file:
+        np.savez_compressed(file, **arrays)
+
+
+def load_arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays that `save_arrays` wrote."""
+    with reading(path, "a readable archive of arrays"), np.load(path, allow_pickle=False) as archive:
+        return {name: archive[name] for name in archive.files}

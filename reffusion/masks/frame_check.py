@@ -1,4 +1,4 @@
-"""Gaussians from elsewhere: are they in the frame of the cameras?"""
+"""Check that Gaussians from elsewhere lie in the frame of the scene's cameras."""
 
 from __future__ import annotations
 
@@ -11,42 +11,45 @@ import torch
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
-WIDTH = 160  # px, at which they are compared
-COARSE = 0.06  # of the width: what changes more slowly, like sky over ground, is alike in any two pictures
-ALIKE = 0.3  # correlation of the rest under which it is another place; it is above 0.8 where it is the same
-SHOWN = 0.2  # of a view's pixels that must show something
+WIDTH_PX = 160  # at which renders and photographs are compared
+LOW_PASS = 0.06  # of the width: coarser structure, such as sky above ground, agrees in any two pictures
+MIN_CORRELATION = 0.3  # of the rest; above 0.8 where the frame is right
+MIN_COVERAGE = 0.2  # share of a view's pixels that must show something
 
 
 @torch.no_grad()
-def misplaced(gaussians: Gaussians, cameras: Sequence[Camera], photos: Mapping[str, np.ndarray]) -> str | None:
-    """What is wrong, in words; None where most of the cameras see what their photographs show.
+def explain_misplacement(
+    gaussians: Gaussians, cameras: Sequence[Camera], photos: Mapping[str, np.ndarray]
+) -> str | None:
+    """A sentence about what is wrong; None where most cameras see what their photographs show.
 
     Args:
         photos: view name -> uint8 [H, W, 3].
     """
-    shown, alike = [], []
+    coverage, correlation = [], []
     for camera in cameras:
-        small = camera.resized(WIDTH, max(1, round(WIDTH * camera.height / camera.width)))
-        drawn = rasterizer.render(gaussians, small)
+        small = camera.resized(WIDTH_PX, max(1, round(WIDTH_PX * camera.height / camera.width)))
+        rendering = rasterizer.render(gaussians, small)
         photo = cv2.resize(photos[camera.name], (small.width, small.height), interpolation=cv2.INTER_AREA)
-        shown.append(float((drawn.alpha > 0.5).float().mean()))
-        alike.append(_correlation(_detail(drawn.color.cpu().numpy()), _detail(photo / np.float32(255))))
-    if np.median(shown) < SHOWN:
-        return f"the cameras see hardly anything of them ({np.median(shown):.0%} of a view): they are in another frame"
-    if np.median(alike) < ALIKE:
+        coverage.append(float((rendering.alpha > 0.5).float().mean()))
+        correlation.append(_correlate(_detail(rendering.color.cpu().numpy()), _detail(photo / np.float32(255))))
+    if np.median(coverage) < MIN_COVERAGE:
+        share = np.median(coverage)
+        return f"the cameras see hardly anything of them ({share:.0%} of a view): they are in another frame"
+    if np.median(correlation) < MIN_CORRELATION:
         return (
-            f"their renders and the photographs are unlike (correlation {np.median(alike):.2f}): they are in another "
-            "frame than the cameras; give the cameras that they were fitted with"
+            f"their renders and the photographs are unlike (correlation {np.median(correlation):.2f}): they are in "
+            "another frame than the cameras; give the cameras that they were fitted with"
         )
     return None
 
 
 def _detail(image: np.ndarray) -> np.ndarray:
-    """[h, w], brightness without what changes slowly."""
-    grey = image.astype(np.float32).mean(-1)
-    return grey - cv2.GaussianBlur(grey, (0, 0), COARSE * grey.shape[1])
+    """[h, w], brightness without coarse structure."""
+    gray = image.astype(np.float32).mean(-1)
+    return gray - cv2.GaussianBlur(gray, (0, 0), LOW_PASS * gray.shape[1])
 
 
-def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+def _correlate(a: np.ndarray, b: np.ndarray) -> float:
     scale = float(np.sqrt((a**2).sum() * (b**2).sum()))
     return float((a * b).sum()) / scale if scale > 0 else 1.0

@@ -1,4 +1,4 @@
-"""2D masks -> votes -> labelled Gaussians -> consistent masks -> the view to complete (paper, mask consolidation)."""
+"""Mask consolidation (paper): 2D masks vote for Gaussians, and labelled Gaussians are rendered to consistent masks."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Literal
 
 import numpy as np
 import torch
-from scipy import ndimage
 from torch import Tensor
 
 from reffusion import geometry
@@ -33,11 +32,11 @@ class Votes:
 def cast_votes(
     gaussians: Gaussians, cameras: Sequence[Camera], masks: Mapping[str, np.ndarray], *, mode: VoteMode = "weight"
 ) -> Votes:
-    """The votes of every view that has a mask; the others do not vote.
+    """Sum the votes of all views that have a mask.
 
-    PAPER leaves open: whether a contribution counts as one or by its blending weight. `weight` is the default: behind
-    the object a Gaussian is still blended, faintly, into many masked pixels, and by `count` these outvote the pixels
-    in which it is plainly seen, so that background is removed which photographs show.
+    PAPER leaves open: whether a contribution counts as one or by its blending weight. `weight` is the default: a
+    Gaussian behind the object is blended faintly into many masked pixels, and by `count` these outvote the pixels that
+    show it plainly, so that visible background is removed.
 
     Args:
         gaussians: N of them.
@@ -71,28 +70,28 @@ def label_gaussians(votes: Votes, tau: float = 1.0) -> Tensor:
     return votes.masked > tau * votes.unmasked
 
 
-def leaking(
-    remaining: Gaussians, cameras: Sequence[Camera], undecided: Mapping[str, np.ndarray], tau: float = 1.0
+def find_floaters(
+    remaining: Gaussians, cameras: Sequence[Camera], unobserved: Mapping[str, np.ndarray], tau: float = 1.0
 ) -> Tensor:
-    """bool [M]: haze, the Gaussians that with the object gone show mostly in undecided pixels.
+    """bool [M]: floaters, the Gaussians that contribute mostly to unobserved pixels once the object is removed.
 
-    The fit had no say in what they show there: footprints that reached far into or behind the object while it hid
-    them. The same ratio that labels the object decides, counted without the object.
+    The fit was not supervised there: their footprints reached far into or behind the object while it hid them. The
+    ratio is the one that labels the object, counted without the object.
 
     Args:
-        remaining: M Gaussians, the masked ones gone.
-        undecided: view name -> bool [H, W].
-        tau: ratio of contributions in undecided pixels to those in all others.
+        remaining: M Gaussians, without those to remove.
+        unobserved: view name -> bool [H, W].
+        tau: ratio of contributions to unobserved pixels over those to all others, above which it is a floater.
     """
-    return label_gaussians(cast_votes(remaining, cameras, undecided, mode="weight"), tau)
+    return label_gaussians(cast_votes(remaining, cameras, unobserved, mode="weight"), tau)
 
 
 def hidden_inside(
     gaussians: Gaussians, cameras: Sequence[Camera], masks: Mapping[str, np.ndarray], share: float = 0.5
 ) -> Tensor:
-    """bool [N]: the centre falls into the mask in more than `share` of the voting views that have it in their frame.
+    """bool [N]: the centre lies inside the mask in more than `share` of the voting views whose frame contains it.
 
-    The vote for Gaussians no view sees: those buried in the object would come to light with its removal.
+    This is the vote for Gaussians that no view sees: those inside the object would come to light when it is removed.
     """
     means = gaussians.means.detach().cpu().double().numpy()
     return torch.as_tensor(points_inside(means, cameras, masks, share), device=gaussians.means.device)
@@ -101,7 +100,7 @@ def hidden_inside(
 def points_inside(
     points: np.ndarray, cameras: Sequence[Camera], masks: Mapping[str, np.ndarray], share: float = 0.5
 ) -> np.ndarray:
-    """bool [P]: points [P, 3] inside the mask of more than `share` of the views with a mask that frame them."""
+    """bool [P]: points [P, 3] that lie inside the mask in more than `share` of the masked views that frame them."""
     inside, framed = np.zeros(len(points)), np.zeros(len(points))
     for camera in cameras:
         if camera.name in masks:
@@ -112,46 +111,22 @@ def points_inside(
 
 
 @torch.no_grad()
-def label_view(gaussians: Gaussians, labels: Tensor, camera: Camera) -> np.ndarray:
-    """What one view shows of the labels, [H, W] in [0, 1).
+def render_labels(gaussians: Gaussians, labels: Tensor, camera: Camera) -> np.ndarray:
+    """The labels rendered into one view, [H, W] in [0, 1).
 
-    C is where it exceeds tau'. PAPER leaves open: whether it is divided by alpha first. Not here: where alpha is small
-    nothing hides the background, whatever the label of the haze.
+    C is where they exceed tau'. PAPER leaves open: whether they are divided by alpha first. Here they are not: where
+    alpha is small nothing hides the background, whatever the labels of faint Gaussians.
     """
-    drawn = rasterizer.render(gaussians, camera, features=labels[:, None].to(gaussians.means.dtype), sh_degree=0)
-    return drawn.features[..., 0].cpu().numpy()
-
-
-def extent(means: Tensor) -> tuple[np.ndarray, float]:
-    """Middle [3] and radius, float64, of what most of the points [N, 3] stand on, N at least 1.
-
-    From medians: a tenth of the labels may be wrong, and lie as far away as the sky.
-    """
-    points = means.detach().double().cpu().numpy()
-    centre = np.median(points, 0)
-    return centre, 1.5 * float(np.median(np.linalg.norm(points - centre, axis=1)))
-
-
-def tidy(mask: np.ndarray, speck: float, gap: float) -> np.ndarray:
-    """`mask` without islands of less than `speck` and holes of less than `gap`, both diameters in pixels."""
-    kept = mask & ~_small_parts(mask, speck)
-    return kept | _small_parts(~kept, gap)
-
-
-def _small_parts(mask: np.ndarray, diameter: float) -> np.ndarray:
-    parts, count = ndimage.label(mask)
-    area = np.bincount(parts.ravel(), minlength=count + 1)
-    small = area < np.pi / 4 * diameter**2
-    small[0] = False
-    return small[parts]
+    rendering = rasterizer.render(gaussians, camera, features=labels[:, None].to(gaussians.means.dtype), sh_degree=0)
+    return rendering.features[..., 0].cpu().numpy()
 
 
 def best_view(invent: Mapping[str, np.ndarray], names: Sequence[str]) -> str | None:
-    """The view to complete: of those whose invent mask keeps clear of the border (if any does), the largest mask.
+    """The view to complete: the one with the largest invent mask, of those whose mask does not touch the border if there
+    are any; None where no view has anything to invent.
 
-    PAPER leaves open: which view is the reference. The largest, because what another view shows of the hole beyond
-    it would be left empty; clear of the border, because a mask cut off by it hides a part of the hole.
-    None where no view has anything to invent.
+    PAPER leaves open: which view is the reference. The largest mask, because parts of the hole that it does not show
+    would stay empty; away from the border, because a border that cuts the mask hides a part of the hole.
     """
     sizes = {name: int(invent[name].sum()) for name in names if invent[name].any()}
     whole = {name: size for name, size in sizes.items() if not _touches_border(invent[name])}

@@ -1,0 +1,86 @@
+"""Complete extra views beside the references: next-best-view selection over the pixels that nothing covers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from reffusion import morphology
+from reffusion.background.model import Background
+from reffusion.initialize import coverage
+from reffusion.initialize.draft import Draft
+from reffusion.initialize.fill import fill_reference
+from reffusion.inpaint import classical, exemplar
+from reffusion.inpaint.classical import Painter
+from reffusion.params.initialize import Params
+from reffusion.prior import inpaint
+from reffusion.types import Reference
+
+FLOATER_RATIO = 1.0  # weight in uncovered over other pixels from which Gaussians are floaters
+STUCK = 0.9  # share of its uncovered pixels that may remain after a view is completed, before it is given up
+SEED = 0  # of the patch search
+
+
+def complete_extra_views(
+    params: Params, draft: Draft, background: Background, references: Sequence[Reference], painter: Painter | None
+) -> tuple[Draft, list[Reference], dict[str, np.ndarray]]:
+    """Complete the view with most uncovered pixels, add it to the draft, and repeat, up to `params.extra_views` times.
+
+    Args:
+        references: completed views, of which textures may be taken too.
+        painter: a feed-forward inpainter; None for patches of the photographs and the references.
+
+    Returns:
+        The draft, the extra views, and view name -> the depth [H, W] at which each was added.
+    """
+    extra: list[Reference] = []
+    depths: dict[str, np.ndarray] = {}
+    mirror_depth = coverage.expected_mirror_depth(background)
+    find = lambda draft, cameras: coverage.find_uncovered(
+        draft.gaussians, draft.is_new, background, cameras, mirror_depth
+    )
+    uncovered = find(draft, background.cameras)
+    draft = draft.drop(
+        coverage.find_floaters(draft.gaussians, draft.is_new, background, uncovered, FLOATER_RATIO)
+    )
+    completed = coverage.completed_views(references, draft.gaussians, background)
+    sources = replace(background, completed=completed)
+    cameras = coverage.cameras_near_photographs(background)
+    while len(extra) < params.extra_views:
+        camera = coverage.least_covered_view(cameras, background, uncovered)
+        if camera is None:
+            break
+        hole, mask = uncovered[camera.name], background.masks[camera.name]
+        picture = _complete_view(draft, camera, hole, sources, painter)
+        reference = Reference(camera, picture, hole)
+        print(f"further view {camera.name}: {hole.sum() / mask.sum():.1%} of the mask is covered by nothing")
+        try:
+            filled = fill_reference(params, draft, reference, background, farthest=True)
+        except ValueError as error:  # a sliver at the border of a view: others may show it better
+            print(f"left as it is: {error}")
+            uncovered[camera.name] = np.zeros_like(hole)
+            continue
+        draft, depths[camera.name] = filled.draft, filled.depth
+        extra.append(reference)
+        uncovered |= find(draft, [each for each in cameras if uncovered[each.name].any()])
+        if uncovered[camera.name].sum() > STUCK * hole.sum():  # another try would cover as little
+            uncovered[camera.name] = np.zeros_like(hole)
+    return draft, extra, depths
+
+
+def _complete_view(
+    draft: Draft, camera, hole: np.ndarray, sources: Background, painter: Painter | None
+) -> np.ndarray:
+    """uint8 [H, W, 3]: the view with its uncovered pixels, bool [H, W], completed."""
+    mask = sources.masks[camera.name]
+    # Just outside C a photograph may still show the object's rim, which would be repeated.
+    photo = sources.photos[camera.name]
+    base = inpaint.background(draft.gaussians, camera, photo, morphology.dilate(mask, exemplar.RIM))
+    region = exemplar.with_rim(hole, mask)
+    if painter is not None:
+        return painter.paint(base, region)
+    if coverage.is_narrow(hole):  # a gap has no room for texture, only for what is beside it
+        return classical.telea(base, region)
+    return exemplar.completions(base, region, camera, mask, sources, [SEED])[0].image
