@@ -190,13 +190,13 @@ class MaskSet:
     Attributes:
         raw: the given 2D mask (all False where none was given).
         consistent: C, rendered back from the labelled Gaussians; it must not supervise.
-        undecided: U, inside C: no other photograph shows what is to be seen there.
+        unobserved: U, inside C: no other photograph shows what is to be seen there.
         invent: I, the pixels to be made up: U, and the region the scene asks to fill.
     """
 
     raw: np.ndarray
     consistent: np.ndarray
-    undecided: np.ndarray
+    unobserved: np.ndarray
     invent: np.ndarray
 
 

@@ -109,5 +109,3 @@ class Workspace:
             without_photo=frozenset(scene.blank),
         )
         return surfaces_from_arrays(background, load_arrays(self.masks / SURFACES), self.device)
-
-

@@ -107,12 +107,15 @@ def _origin(facts: dict, folder: Path, name: str) -> str:
 def further(job: Job) -> list[str]:
     """The views that were completed beside the references, and why."""
     folder = job.folders.get("initialize", Path())
-    shares = _facts(folder).get("further", {}) if "initialize" in job.folders else {}
+    shares = _facts(folder).get("extra_views", {}) if "initialize" in job.folders else {}
     if not shares:
         return []
     said = "No reference shows what was open there: these views were put together from patches of the photographs."
     cells = [
-        (inside.photograph(load_image(folder / "further" / f"{view}.png"), DEPTH), f"{view}: {share:.1%} of its mask")
+        (
+            inside.photograph(load_image(folder / "extra_views" / f"{view}.png"), DEPTH),
+            f"{view}: {share:.1%} of its mask",
+        )
         for view, share in shares.items()
     ]
     return [page.heading("Further views", 3), page.paragraph(said), inside.grid(cells)]

@@ -78,11 +78,11 @@ def without_sds(params: Params, initialize: Path) -> tuple[Params, str]:
     """The parameters, of SDS the weight 0 where it is not to run, and in words whether it runs."""
     if params.sds.weight == 0 or params.sds.run == "always":
         return params, "runs" if params.sds.weight else "weight 0"
-    never = {"sds_says": "distill.sds.run is never"}
+    never = {"sds_reason": "distill.sds.run is never"}
     told = load_json(initialize / "facts.json") if params.sds.run == "auto" else never
     if told.get("sds_may_gain"):
-        return params, f"runs: {told['sds_says']}"
-    said = f"left out: {told['sds_says']}"
+        return params, f"runs: {told['sds_reason']}"
+    said = f"left out: {told['sds_reason']}"
     print(f"SDS {said}", flush=True)
     return params.model_copy(update={"sds": params.sds.model_copy(update={"weight": 0.0})}), said
 
@@ -125,7 +125,7 @@ def train_views(
     place = lambda array: torch.from_numpy(array).to(params.device)
     painted = load_views(lift, [n for n in scene.train if (lift / "images" / f"{n}.png").exists()]) if lift else {}
     known = lambda folder: {path.stem: path for path in (initialize / folder).glob("*.png")} if initialize else {}
-    shadowed = known("tainted")
+    shadowed = known("shadows")
     sets |= {name: replace(sets[name], invent=load_mask(path)) for name, path in known("invent").items()}
     views = []
     for name in (*scene.train, *scene.blank):

@@ -22,7 +22,7 @@ from reffusion.io.scene import load_raw_masks, load_scene, shows_object
 from reffusion.kernels.compiled import side_by_side
 from reffusion.metrics import consistency, image_metrics, lpips, rows
 from reffusion.metrics.consistency import Shown
-from reffusion.morphology import widened
+from reffusion.morphology import dilate
 from reffusion.params.evaluate import Params
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Scene
@@ -152,7 +152,7 @@ def exposure_of(work: Work, camera: Camera, photo: np.ndarray | None) -> np.ndar
         return told
     drawn = rasterizer.render(work.gaussians["fit"], camera)
     color, there = exposure.exposed(drawn.color, told).cpu().numpy(), drawn.alpha.cpu().numpy() > OPAQUE
-    outside = ~widened(mask_of(camera, work.raw_masks, work.masks), rows.OUTSIDE_MARGIN)
+    outside = ~dilate(mask_of(camera, work.raw_masks, work.masks), rows.OUTSIDE_MARGIN)
     return exposure.matched(told, color, photo, outside & there)
 
 

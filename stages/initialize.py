@@ -115,9 +115,7 @@ def load_completed(params: Params, space: Workspace, reference: Path | None, lif
     return load_references(folder, space.scene) if folder else []
 
 
-def trusted_references(
-    reference: Path, references: list[Reference], background: Background
-) -> list[Reference]:
+def trusted_references(reference: Path, references: list[Reference], background: Background) -> list[Reference]:
     """The references with the pixels of which they know more than the Gaussians do: all of C where the scene brings the
     picture, what was invented where it was completed here."""
     facts = reference / "facts.json"

@@ -52,13 +52,15 @@ def _save_region(params: Params, out: Path, scene: Scene) -> None:
     region, scale = params.region, scene.similarity.scale
     if region.view is not None:
         check_outliers("region", [region.view], scene.outliers)
-        center = regions.on_axis(scene.cameras[known(region.view, scene.cameras, "region")], region.distance * scale)
+        center = regions.point_on_axis(
+            scene.cameras[known(region.view, scene.cameras, "region")], region.distance * scale
+        )
     else:
         center = scene.similarity.apply(region.center)
     if region.outside:
         given = load_raw_masks(out, scene.train)
         for name in scene.train:
-            mask = regions.beyond(center, region.radius * scale, scene.cameras[name])
+            mask = regions.outside_sphere(center, region.radius * scale, scene.cameras[name])
             save_mask(out / "masks" / f"{name}.png", mask | given.get(name, mask))
         return
     size = [side * scale for side in region.size or [2 * region.radius] * 3]

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from reffusion import geometry
-from reffusion.background.continuation import planes_around
-from reffusion.background.corners import third_faces
-from reffusion.background.visibility import Witness, surface_range
+from reffusion.background.continuation import find_planes
+from reffusion.background.corners import find_third_faces
+from reffusion.background.visibility import DepthView, depth_range
 from reffusion.types import Camera
 
 NO_POINTS = np.zeros((0, 3))
@@ -43,13 +43,13 @@ def witness(view, step=0.0):
         depth = np.min([np.where(each > 0, each, np.inf) for each in (floor, front, behind, side)], axis=0)
         bounds = np.stack([(LOW - view.center) / rays, (HIGH - view.center) / rays])
     enter, leave = bounds.min(0).max(-1), bounds.max(0).min(-1)
-    return Witness.of(view, depth, surface_range(depth.astype(np.float32)), (enter < leave) & (leave > 0))
+    return DepthView.of(view, depth, depth_range(depth.astype(np.float32)), (enter < leave) & (leave > 0))
 
 
 @pytest.fixture(scope="module")
 def planes():
     views = [witness(camera(turn)) for turn in np.linspace(0.1, 0.6, 12)]
-    return planes_around((LOW + HIGH) / 2, 0.3, views, NO_POINTS)
+    return find_planes((LOW + HIGH) / 2, 0.3, views, NO_POINTS)
 
 
 def test_the_side_of_a_wall_goes_on_behind_a_thing_down_to_the_floor_and_not_into_the_wall(planes):
@@ -68,11 +68,11 @@ def test_leaves_have_no_third_face():
     leaves = draws.uniform(-1, 1, (4000, 3))
     face = np.stack([draws.normal(0.1, 0.004, 200), *draws.uniform(-0.5, 0.5, (2, 200))], 1)
     free = np.ones(4200, bool)
-    asked = lambda samples: third_faces(samples, free[: len(samples)], found, np.zeros(3), 0.5, 0.02)
+    asked = lambda samples: find_third_faces(samples, free[: len(samples)], found, np.zeros(3), 0.5, 0.02)
     assert asked(leaves) == []
     ((normal, height),) = asked(np.concatenate([leaves[:1500], face]))
     assert height * normal[0] == pytest.approx(0.1, abs=0.005)
-    assert third_faces(face, free[:200], found[:1], np.zeros(3), 0.5, 0.02) == [], "one plane has no corner"
+    assert find_third_faces(face, free[:200], found[:1], np.zeros(3), 0.5, 0.02) == [], "one plane has no corner"
 
 
 def test_sparse_points_tell_where_planes_lie_that_are_drawn_too_near():
@@ -81,23 +81,23 @@ def test_sparse_points_tell_where_planes_lie_that_are_drawn_too_near():
         true = witness(camera(turn))
         rows = np.linspace(0, 0.02, SIZE)[:, None]  # haze: the farther up, so farther off, the nearer it is drawn
         depth = true.depth * (1 - rows[::-1])
-        views.append(Witness.of(true.camera, depth, surface_range(depth.astype(np.float32)), true.hidden))
+        views.append(DepthView.of(true.camera, depth, depth_range(depth.astype(np.float32)), true.hidden))
     draws, count = np.random.default_rng(0), 150
     floor = np.stack([*draws.uniform(-0.5, 0.5, (2, count)), np.zeros(count)], 1)
     front = np.stack([draws.uniform(0, 0.5, count), np.zeros(count), draws.uniform(0, 0.6, count)], 1)
     points = np.concatenate([floor, front]) + draws.normal(0, 1e-3, (2 * count, 3))
     points = np.concatenate([points, draws.uniform(-0.6, 0.6, (100, 3))])
-    told, untold = (planes_around((LOW + HIGH) / 2, 0.3, views, each) for each in (points, NO_POINTS))
+    told, untold = (find_planes((LOW + HIGH) / 2, 0.3, views, each) for each in (points, NO_POINTS))
     for axis in (2, 1):
         off = lambda plane, axis=axis: np.degrees(np.arccos(abs(plane.normal[axis])))
         of_points, of_views = (min(planes, key=off) for planes in (told, untold))
         assert off(of_points) < 0.2 and abs(of_points.height) < 2e-3
         assert off(of_views) > 2 * off(of_points)
     line = np.stack([np.linspace(-0.5, 0.5, 200), np.zeros(200), np.zeros(200)], 1)  # tells no direction across
-    few = planes_around((LOW + HIGH) / 2, 0.3, views, line)
+    few = find_planes((LOW + HIGH) / 2, 0.3, views, line)
     assert all(np.allclose(a.normal, b.normal) for a, b in zip(few, untold, strict=True))
     grass = np.stack([*draws.uniform(-0.5, 0.5, (2, 600)), draws.uniform(-0.05, 0.05, 600)], 1)  # lies sharply nowhere
-    rough = planes_around((LOW + HIGH) / 2, 0.3, views, grass)
+    rough = find_planes((LOW + HIGH) / 2, 0.3, views, grass)
     assert all(np.allclose(a.normal, b.normal) for a, b in zip(rough, untold, strict=True))
 
 
@@ -109,7 +109,7 @@ def test_a_floor_that_is_drawn_twice_is_one_unless_points_tell_a_step():
     boards = floor[:, :1] % 0.3 < 0.15
     heights = lambda points: sorted(
         abs(plane.height)
-        for plane in planes_around(np.array([0.0, -0.3, 0.1]), 0.15, views, points)
+        for plane in find_planes(np.array([0.0, -0.3, 0.1]), 0.15, views, points)
         if abs(plane.normal[2]) > 0.99
     )
     assert heights(floor) == pytest.approx([0], abs=2e-3)

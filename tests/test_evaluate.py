@@ -16,7 +16,7 @@ from reffusion.io.images import load_image, save_image, save_mask
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_scene, save_mask_sets, save_scene
 from reffusion.metrics import image_metrics, rows
-from reffusion.morphology import widened
+from reffusion.morphology import dilate
 from reffusion.splat.rasterizer import render
 from reffusion.types import Camera, Gaussians, MaskSet, Scene, Similarity
 from report import sheet
@@ -147,7 +147,7 @@ def test_scores_are_those_of_the_saved_pictures(done):
                 load_image(out / renders / f"{name}.png"),
                 load_image(done / "poses" / "images" / f"{name}.png"),
                 box,
-                mask=widened(evaluate.mask_of(cameras[name], done / "raw_masks", done / "masks"), 0.01),
+                mask=dilate(evaluate.mask_of(cameras[name], done / "raw_masks", done / "masks"), 0.01),
                 unseen=training_coverage.unseen(fit, cameras[name], seen_by),
             )
             for name, box in boxes.items()

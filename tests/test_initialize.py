@@ -15,7 +15,7 @@ from reffusion.gaussians.sheets import Sheets
 from reffusion.gaussians.surfels import surface_gaussians, surface_normals
 from reffusion.initialize import coverage
 from reffusion.initialize import unprojection as rules
-from reffusion.initialize.refit import Known, around, turns_of
+from reffusion.initialize.refit import Supervision, crop_to_mask, repetitions
 from reffusion.io.arrays import load_json, load_labels, save_labels
 from reffusion.io.images import load_exr
 from reffusion.io.ply import load_ply
@@ -50,7 +50,7 @@ def test_the_hidden_wall_is_rebuilt_where_it_was(scene, tmp_path, monkeypatch, h
     initialize.run(initialize.Params(), tmp_path, **scene, reference=references(scene, tmp_path / "r", "a2"))
     gaussians, new = load_ply(tmp_path / "gaussians.ply"), load_labels(tmp_path / "labels.npy")
     before, removed = load_ply(scene["fit"] / "gaussians.ply"), load_labels(scene["masks"] / "labels.npy")
-    haze = load_json(tmp_path / "facts.json")["haze"]
+    haze = load_json(tmp_path / "facts.json")["floaters"]
     assert len(gaussians) == len(new) and int((~new).sum()) == len(before) - int(removed.sum()) - haze
     sheet = small.WALL / small.FOCAL * SHEETS.sunk  # the second one lies so far behind the wall
     distance = gaussians.means[new][:, 2] - small.WALL
@@ -70,7 +70,7 @@ def test_without_references_it_only_removes(scene, tmp_path):
     initialize.run(initialize.Params(), tmp_path, **scene, reference=None)
     labels = load_labels(scene["masks"] / "labels.npy")
     before, after = load_ply(scene["fit"] / "gaussians.ply"), load_ply(tmp_path / "gaussians.ply")
-    haze = load_json(tmp_path / "facts.json")["haze"]
+    haze = load_json(tmp_path / "facts.json")["floaters"]
     assert len(after) == len(before) - int(labels.sum()) - haze and haze < 0.01 * len(before)
     assert not load_labels(tmp_path / "labels.npy").any()
 
@@ -165,10 +165,12 @@ def test_no_view_is_completed_from_behind_where_nobody_photographed():
     turns = {"photographed": 0, "beside": 40, "before the other": 205, "behind": 110, "the other": 180}
     cameras = [small.looking(name, angle, 0.5, 2.0, at, 32, 40.0) for name, angle in turns.items()]
     blank = frozenset({"beside", "before the other", "behind"})
-    around = rules.Surroundings(cameras, {}, {}, [], [], np.zeros((0, 3)), at, 1.0, [], {}, blank)
-    assert [camera.name for camera in coverage.beside_photographs(around)] == [n for n in turns if n != "behind"]
-    everywhere = replace(around, blank=frozenset())
-    assert coverage.beside_photographs(everywhere) == cameras, "with photographs all views are"
+    crop_to_mask = rules.Surroundings(cameras, {}, {}, [], [], np.zeros((0, 3)), at, 1.0, [], {}, blank)
+    assert [camera.name for camera in coverage.cameras_near_photographs(crop_to_mask)] == [
+        n for n in turns if n != "behind"
+    ]
+    everywhere = replace(crop_to_mask, blank=frozenset())
+    assert coverage.cameras_near_photographs(everywhere) == cameras, "with photographs all views are"
 
 
 def test_what_is_painted_on_the_new_surface_stays_in_place_from_the_other_side():
@@ -177,10 +179,13 @@ def test_what_is_painted_on_the_new_surface_stays_in_place_from_the_other_side()
     depth, picture = floor(view)
     reference = Reference(view, (picture * 255).round().astype(np.uint8), np.ones(depth.shape, bool))
     nothing = surface_gaussians(picture, depth, np.zeros(depth.shape, bool), view, sh_count=1)
-    around, errors = rules.Surroundings([], {}, {}, [], [], np.zeros((0, 3)), np.zeros(3), 1.0, [], {}, frozenset()), []
+    crop_to_mask, errors = (
+        rules.Surroundings([], {}, {}, [], [], np.zeros((0, 3)), np.zeros(3), 1.0, [], {}, frozenset()),
+        [],
+    )
     for how in (replace(SHEETS, opacity=0.95, sunk=0.0, spread=0.4), SHEETS):
-        drawn, _ = rules.placed(
-            nothing, torch.zeros(0, dtype=torch.bool), reference, depth, reference.mask, around, how
+        drawn, _ = rules.add_surface(
+            nothing, torch.zeros(0, dtype=torch.bool), reference, depth, reference.mask, crop_to_mask, how
         )
         inner = (slice(14, 26), slice(14, 34))
         here, there = (rasterizer.render(drawn, v).color.numpy() - floor(v)[1] for v in (view, opposite))
@@ -206,8 +211,8 @@ def test_what_haze_left_open_is_filled_too(scene, tmp_path):
     gaussians, labels = load_ply(scene["fit"] / "gaussians.ply"), load_labels(scene["masks"] / "labels.npy")
     remaining = gaussians.map(lambda p: p[~labels])
     reference = Reference(view, small.photo(view), np.zeros_like(sets.invent))
-    asked = rules.to_fill(remaining, torch.zeros(len(remaining), dtype=torch.bool), reference, sets.consistent, 0.9)
-    assert (asked & sets.undecided).sum() > 0.9 * small.true_never_seen(view, NEAR).sum()
+    asked = rules.find_hole(remaining, torch.zeros(len(remaining), dtype=torch.bool), reference, sets.consistent, 0.9)
+    assert (asked & sets.unobserved).sum() > 0.9 * small.true_never_seen(view, NEAR).sum()
     assert not (asked & ~sets.consistent).any()
 
 
@@ -256,7 +261,10 @@ def test_settling_moves_the_gaussians_and_leaves_no_checkpoint(scene, tmp_path):
         out.mkdir()
         given = references(scene, out / "r", "a2")
         initialize.run(
-            initialize.Params(settle=steps, gloss=True, depth={"sweep": True}, further=2), out, **scene, reference=given
+            initialize.Params(refit_steps=steps, view_dependent_color=True, depth={"sweep": True}, extra_views=2),
+            out,
+            **scene,
+            reference=given,
         )
         found[name] = load_ply(out / "gaussians.ply")
         visible = [path.name for path in out.rglob("*") if ".settle" not in path.parts]
@@ -279,19 +287,19 @@ def test_a_few_pixels_of_a_further_view_do_not_cost_the_reference_its_turns():
         np.zeros((view.height, view.width), bool),
     )
     large[10:40, 10:40], few[0, :3] = True, True
-    shown = lambda *masks: Known([view] * 40, {}, {}, [Reference(view, picture, mask) for mask in masks])
-    assert turns_of(shown(large)) == [20]
-    assert turns_of(shown(large, few, few, few)) == [20, 1, 1, 1]
-    assert turns_of(shown(large, large)) == [10, 10]
-    assert turns_of(shown()) == []
+    shown = lambda *masks: Supervision([view] * 40, {}, {}, [Reference(view, picture, mask) for mask in masks])
+    assert repetitions(shown(large)) == [20]
+    assert repetitions(shown(large, few, few, few)) == [20, 1, 1, 1]
+    assert repetitions(shown(large, large)) == [10, 10]
+    assert repetitions(shown()) == []
 
 
 def test_a_gap_is_narrow_and_a_hole_is_not():
     gap, hole = np.zeros((100, 200), bool), np.zeros((100, 200), bool)
     gap[10:90, 50:54], hole[40:50, 50:60] = True, True
-    assert coverage.narrow(gap) and not coverage.narrow(hole) and not coverage.narrow(gap | hole)
+    assert coverage.is_narrow(gap) and not coverage.is_narrow(hole) and not coverage.is_narrow(gap | hole)
     gap[:, 54:58] = True
-    assert not coverage.narrow(gap)
+    assert not coverage.is_narrow(gap)
 
 
 def test_a_completed_view_pulls_by_its_window_as_by_the_whole():
@@ -300,7 +308,7 @@ def test_a_completed_view_pulls_by_its_window_as_by_the_whole():
     noise, mask = np.random.default_rng(0), np.zeros((small.HEIGHT, small.WIDTH), bool)
     mask[10:20, 12:30] = True
     picture = noise.integers(0, 256, (*mask.shape, 3), dtype=np.uint8)
-    window, part, counts = around(Reference(view, picture, mask))
+    window, part, counts = crop_to_mask(Reference(view, picture, mask))
     assert window.width * window.height < 0.6 * mask.size
     found = []
     for camera, image, weights in ((view, picture, mask.astype(np.float32)), (window, part, counts)):
@@ -319,19 +327,19 @@ def test_the_back_of_a_thing_is_drawn_though_its_front_shows_from_behind():
     drawn, hidden = small.true_mask(view, near), np.zeros((small.HEIGHT, small.WIDTH), bool)
     reference = Reference(view, np.zeros((*drawn.shape, 3), np.uint8), drawn)
     depth = np.where(drawn, near, small.WALL)
-    assert (coverage.before(wall, depth, reference, hidden) == drawn).all()
+    assert (coverage.pixels_in_front(wall, depth, reference, hidden) == drawn).all()
     front = small.plane(near, small.HALF, small.HALF, small.texture)
     both = wall.zipped(front, lambda a, b: torch.cat([a, b]))
-    assert coverage.before(both, depth, reference, hidden).sum() < 0.2 * drawn.sum()  # the square's soft rim
-    assert not coverage.before(wall, depth, reference, drawn).any()
+    assert coverage.pixels_in_front(both, depth, reference, hidden).sum() < 0.2 * drawn.sum()  # the square's soft rim
+    assert not coverage.pixels_in_front(wall, depth, reference, drawn).any()
 
 
 def test_pixels_stained_by_an_edge_lie_beside_it_on_what_stays():
     depth, stays = np.full((9, 9), 2.0), np.full((9, 9), 2.0)
     depth[3:6, 3:6] = 1.0
-    found = coverage.beside_edges(depth, stays)
+    found = coverage.beside_depth_edges(depth, stays)
     ring = np.zeros((9, 9), bool)
     ring[2:7, 2:7] = True
     ring[3:6, 3:6] = False
     assert (found == ring).all()
-    assert not coverage.beside_edges(depth, stays + 1).any()  # not on what stays: a part of the thing
+    assert not coverage.beside_depth_edges(depth, stays + 1).any()  # not on what stays: a part of the thing

@@ -285,7 +285,7 @@ def test_mask_sets_and_references(tmp_path):
     save_mask_sets(tmp_path, sets)
     again = load_mask_sets(tmp_path, scene.cameras)
     for name, mask_set in sets.items():
-        for kind in ("raw", "consistent", "undecided", "invent"):
+        for kind in ("raw", "consistent", "unobserved", "invent"):
             assert np.array_equal(getattr(again[name], kind), getattr(mask_set, kind))
     image = generator.integers(0, 256, (8, 12, 3)).astype(np.uint8)
     save_references(tmp_path / "reference", [Reference(scene.cameras["b"], image, draw())])

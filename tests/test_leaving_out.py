@@ -58,7 +58,7 @@ def test_the_pipeline_leaves_diffusion_out_where_nothing_is_to_be_invented():
 def test_personalization_is_left_out_where_sds_cannot_gain_and_the_profile_asks():
     pipeline = yaml.safe_load((ROOT / "pipeline.yaml").read_text())
     (asked,) = (c for c in pipeline["stages"]["personalize"]["left_out"] if c.get("fact") == "initialize.sds_may_gain")
-    assert asked["equals"] is False and "{sds_says}" in asked["because"]
+    assert asked["equals"] is False and "{sds_reason}" in asked["because"]
     assert asked["only"] == {"distill.sds.run": "auto", "distill.depth.weight": 0}  # the depth term asks the prior too
     runs = {name: profile["distill"].get("sds", {}).get("run") for name, profile in pipeline["profiles"].items()}
     assert runs == {"paper": None, "best": None, "laptop": "auto", "laptop-terms": "always", "paper-terms": None}
@@ -74,10 +74,10 @@ def test_few_unseen_pixels_are_negligible_and_it_can_be_forced(tmp_path):
         return load_mask_sets(out, small.TRAIN).values(), load_json(out / "facts.json")
 
     sets, facts = classified(negligible=0.0)
-    assert 0 < facts["undecided_share"] < 0.1 and facts["invent_pixels"] > 0
+    assert 0 < facts["unobserved_share"] < 0.1 and facts["invent_pixels"] > 0
     sets, few = classified(negligible=0.1)
-    assert few["invent_pixels"] == 0 and few["undecided_share"] == facts["undecided_share"]
-    assert not any(each.invent.any() for each in sets) and any(each.undecided.any() for each in sets)
+    assert few["invent_pixels"] == 0 and few["unobserved_share"] == facts["unobserved_share"]
+    assert not any(each.invent.any() for each in sets) and any(each.unobserved.any() for each in sets)
     sets, _ = classified(invent="consistent")
     assert all((each.invent == each.consistent).all() and each.invent.any() for each in sets)
 

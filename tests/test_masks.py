@@ -98,9 +98,9 @@ def test_consistent_and_undecided_masks_match_the_truth(tmp_path):
     assert (found == labels).float().mean() > 0.99
     for name, view in small.CAMERAS.items():
         assert small.iou(sets[name].consistent, small.true_mask(view, NEAR)) > 0.9
-        assert small.iou(sets[name].undecided, small.true_never_seen(view, NEAR)) > 0.75
-        assert not (sets[name].undecided & ~sets[name].consistent).any()
-        assert (sets[name].invent == sets[name].undecided).all()
+        assert small.iou(sets[name].unobserved, small.true_never_seen(view, NEAR)) > 0.75
+        assert not (sets[name].unobserved & ~sets[name].consistent).any()
+        assert (sets[name].invent == sets[name].unobserved).all()
     assert facts["best_reference"] in small.TRAIN and facts["invent_views"] == list(small.TRAIN)
     assert facts["masked_gaussians"] == int(found.sum())
     assert facts["invent_pixels"] == sum(int(sets[name].invent.sum()) for name in small.TRAIN)
@@ -110,7 +110,7 @@ def test_what_other_views_saw_is_not_invented(tmp_path):
     sets, facts, _, _ = classify(tmp_path, FAR)
     assert all(small.iou(sets[n].consistent, small.true_mask(v, FAR)) > 0.9 for n, v in small.CAMERAS.items())
     # Some is: a band of half a footprint, whose Gaussians the masks' rim outvotes.
-    assert facts["undecided_share"] < 0.1
+    assert facts["unobserved_share"] < 0.1
 
 
 def test_a_missing_and_a_contradicting_mask_are_outvoted(tmp_path):
@@ -146,7 +146,7 @@ def test_a_clean_view_shows_what_the_object_hid(tmp_path):
     given = {name: small.true_mask(small.CAMERAS[name], NEAR) for name in small.TRAIN if name != "a2"}
     sets, facts, _, _ = classify(tmp_path, NEAR, masks=given, clean=("a2",))
     assert facts["voting_views"] == 5
-    assert not sets["a2"].undecided.any()
+    assert not sets["a2"].unobserved.any()
     hidden = classify(tmp_path / "b", NEAR)[1] if (tmp_path / "b").mkdir() is None else None
     assert facts["invent_pixels"] <= hidden["invent_pixels"]
 
@@ -204,7 +204,7 @@ def test_of_a_region_what_was_drawn_is_repainted_and_its_rim():
     invent, consistent, shown = np.zeros((60, 100), bool), np.zeros((60, 100), bool), np.zeros((60, 100))
     invent[10:50, 10:90], consistent[10:50, 10:20], shown[20:40, 40:60] = True, True, 0.9
     shown[30, 50], shown[15, 80] = 0.0, 0.01  # a pinhole, haze
-    found = regions.where_drawn(invent, consistent, shown)
+    found = regions.restrict_to_new(invent, consistent, shown)
     rows, columns = np.nonzero(found & ~consistent)
     assert found[20:40, 40:60].all() and (found & consistent == invent & consistent).all()
     assert rows.min() == 20 and rows.max() == 39 and columns.min() == 40 and columns.max() == 59
@@ -224,13 +224,13 @@ def test_what_lies_beyond_a_sphere_on_the_optical_axis():
     """A sphere of radius r at distance d shows as a disc of tan(asin(r / d)), and the rest of the view is beyond it."""
     view = small.camera("v", 0.0)
     ahead, radius = view.center + 1.0 * view.world_to_camera[2, :3], 0.25
-    np.testing.assert_allclose(regions.on_axis(view, 1.0), ahead)
-    beyond = regions.beyond(ahead, radius, view)
+    np.testing.assert_allclose(regions.point_on_axis(view, 1.0), ahead)
+    beyond = regions.outside_sphere(ahead, radius, view)
     rays = geometry.pixel_rays(view)
     disc = np.hypot(rays[..., 0], rays[..., 1]) < np.tan(np.arcsin(radius))
     assert disc.any() and not disc.all() and (beyond == ~disc).all()
-    assert regions.beyond(view.center - (ahead - view.center), radius, view).all(), "it is behind the camera"
-    assert not regions.beyond(view.center, radius, view).any(), "the camera is in it"
+    assert regions.outside_sphere(view.center - (ahead - view.center), radius, view).all(), "it is behind the camera"
+    assert not regions.outside_sphere(view.center, radius, view).any(), "the camera is in it"
 
 
 def test_the_best_view_has_the_largest_mask_clear_of_the_border():
@@ -248,7 +248,7 @@ def test_haze_shows_mostly_where_nobody_saw():
     aside = blob.map(lambda p: p.clone())
     aside.means[0, 0] = 0.4
     both = blob.zipped(aside, lambda a, b: torch.cat([a, b]))
-    assert voting.leaking(both, [view], {"v": inside}).tolist() == [True, False]
+    assert voting.find_floaters(both, [view], {"v": inside}).tolist() == [True, False]
 
 
 def test_any_subset_of_the_objects_goes_and_the_others_stay(tmp_path):

@@ -116,7 +116,7 @@ def test_the_references_depth_is_the_estimate_aligned():
     means *= 1 / (1 - 0.2 * means[:, 1:2] / small.WALL)
     height = (np.mgrid[: small.HEIGHT, : small.WIDTH][0] + 0.5 - small.HEIGHT / 2) / small.FOCAL
     true = (1 - 0.2 * height) / small.WALL
-    behind_it = lambda estimate: unprojection.depth_behind(
+    behind_it = lambda estimate: unprojection.estimate_depth(
         replace(remaining, means=means), reference, hole, hole, np.zeros((0, 3)), Completion(), estimate
     )
     _, made_up, said = behind_it(50 * true - 3)

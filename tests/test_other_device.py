@@ -72,7 +72,7 @@ def test_masks_on_a_card(ready, tmp_path, vote):
     assert torch.equal(load_labels(cpu / "labels.npy"), load_labels(cuda / "labels.npy"))
     before, after = (load_mask_sets(folder, small.TRAIN) for folder in (cpu, cuda))
     for name in small.TRAIN:
-        for kind in ("consistent", "undecided", "invent"):
+        for kind in ("consistent", "unobserved", "invent"):
             differs = getattr(before[name], kind) != getattr(after[name], kind)
             assert differs.mean() <= (0.01 if there_is_one() else 0), (name, kind)  # a card rounds otherwise
 
@@ -81,13 +81,13 @@ def test_a_box_on_a_card():
     gaussians, _ = small.gaussians(NEAR)
     box = regions.Region((0, 0, NEAR), (0.5, 0.5, 0.1))
     with card():
-        there = regions.inside(gaussians.map(lambda p: p.to("cuda")), box)
-        assert there.is_cuda and there.any() and torch.equal(there.cpu(), regions.inside(gaussians, box))
+        there = regions.inside_region(gaussians.map(lambda p: p.to("cuda")), box)
+        assert there.is_cuda and there.any() and torch.equal(there.cpu(), regions.inside_region(gaussians, box))
 
 
 @pytest.mark.parametrize(
     "changed",
-    [{"gloss": True, "settle": 2, "further": 1}, {"start": "random"}, {"start": "nothing"}],
+    [{"view_dependent_color": True, "refit_steps": 2, "extra_views": 1}, {"start": "random"}, {"start": "nothing"}],
     ids=["reference", "random", "nothing"],
 )
 def test_initialize_on_a_card(ready, tmp_path, changed):

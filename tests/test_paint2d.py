@@ -58,9 +58,9 @@ def test_only_the_hole_changes_and_its_content_does_not_count(tmp_path):
 
 
 def test_a_mask_is_widened_by_a_share_of_the_width():
-    wide = morphology.widened(hole(), 0.04)  # 2 px
+    wide = morphology.dilate(hole(), 0.04)  # 2 px
     assert (wide[10:26, 25]).all() and not wide[9, 25] and not wide[26, 25] and wide[18, 13] and not wide[18, 12]
-    assert (morphology.widened(hole(), 0) == hole()).all() and not morphology.widened(np.zeros_like(hole()), 0.1).any()
+    assert (morphology.dilate(hole(), 0) == hole()).all() and not morphology.dilate(np.zeros_like(hole()), 0.1).any()
 
 
 def test_a_smooth_picture_is_continued():

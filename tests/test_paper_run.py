@@ -145,8 +145,8 @@ def test_every_term_works_and_masked_gaussians_multiply(made):
     assert not [name for name in last if name.startswith("depth_skipped")]
     assert last["masked_gaussians"] > first["masked_gaussians"]
     assert last["gaussians"] - last["masked_gaussians"] == first["gaussians"] - first["masked_gaussians"]
-    assert load_json(made["initialize"] / "facts.json")["haze"] == 0
-    assert not (made["initialize"] / "further").exists() and not (made["initialize"] / "tainted").exists()
+    assert load_json(made["initialize"] / "facts.json")["floaters"] == 0
+    assert not (made["initialize"] / "extra_views").exists() and not (made["initialize"] / "shadows").exists()
 
 
 def test_the_scores_are_those_of_a_scene_with_noise_in_its_hole(made):

@@ -83,7 +83,7 @@ def test_settling_leaves_what_is_to_be_drawn_alone(tmp_path, monkeypatch):
     hidden, drawn = np.eye(4, dtype=bool), np.eye(4, dtype=bool)[::-1]
     view = type("View", (), {"camera": camera(), "hidden": hidden})
     around = type("Around", (), {"cameras": [camera()], "photos": {}, "views": [view]})
-    initialize.settled(initialize.Params(settle=1), tmp_path, None, None, [], around, {"a": drawn})
+    initialize.settled(initialize.Params(refit_steps=1), tmp_path, None, None, [], around, {"a": drawn})
     assert (said["a"] == hidden | drawn).all()
 
 

@@ -234,7 +234,7 @@ def test_the_command_fills_a_hole_and_goes_on(tmp_path):
         "--runs",
         tmp_path / "runs",
     ]
-    words += ["--profile", "laptop", "--set", "poses.longest=96 initialize.settle=20 distill.iterations=4"]
+    words += ["--profile", "laptop", "--set", "poses.longest=96 initialize.refit_steps=20 distill.iterations=4"]
     first = command(*words)
     assert first.returncode == 0, first.stdout + first.stderr
     assert f"{tmp_path / 'out.ply'}: the whole scene" in first.stdout and "painted" in first.stdout

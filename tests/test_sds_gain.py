@@ -8,7 +8,7 @@ import torch
 from small_params import altered
 from small_scene import CAMERAS, TRAIN, gaussians, true_mask
 
-from reffusion.initialize.sds_gain import GUESSED, TAUGHT, VIEWS, WORSE, estimated
+from reffusion.initialize.sds_gain import GUESSED, TAUGHT, VIEWS, WORSE, predict_gain
 from reffusion.io.arrays import save_json
 from reffusion.params.distill import Params
 from reffusion.splat import rasterizer
@@ -33,14 +33,14 @@ def given():
 
 def test_renders_that_show_the_photographs_cannot_gain(given):
     wall, sets, photos = given
-    found = estimated(wall, TRAINED, sets, photos)
+    found = predict_gain(wall, TRAINED, sets, photos)
     assert not found.may and found.beside > 45 and f"{found.beside - WORSE:.1f} dB" in found.says
 
 
 def test_what_no_reference_covers_may_gain_however_good_the_rest(given):
     wall, sets, photos = given
-    assert not estimated(wall, TRAINED, sets, photos, guessed=GUESSED).may
-    found = estimated(wall, TRAINED, sets, photos, guessed=0.19)
+    assert not predict_gain(wall, TRAINED, sets, photos, guessed=GUESSED).may
+    found = predict_gain(wall, TRAINED, sets, photos, guessed=0.19)
     assert found.may and "19%" in found.says and found.beside > 45
 
 
@@ -49,16 +49,16 @@ def test_what_is_wrong_in_the_hole_or_far_from_it_does_not_count_and_beside_it_d
     rows = np.arange(photos["a0"].shape[0])[:, None]
     in_hole = {name: np.where(sets[name].consistent[..., None], 0, image) for name, image in photos.items()}
     far = {name: np.where((rows < 8)[..., None], 0, image).astype(np.uint8) for name, image in photos.items()}
-    assert not estimated(wall, TRAINED, sets, in_hole).may and not estimated(wall, TRAINED, sets, far).may
+    assert not predict_gain(wall, TRAINED, sets, in_hole).may and not predict_gain(wall, TRAINED, sets, far).may
     brighter = {name: np.where(image > 215, 255, image + 40).astype(np.uint8) for name, image in photos.items()}
-    found = estimated(wall, TRAINED, sets, brighter)
+    found = predict_gain(wall, TRAINED, sets, brighter)
     assert found.may and found.beside - WORSE < TAUGHT
 
 
 def test_beside_what_is_put_in_where_nothing_was_removed(given):
     wall, sets, photos = given
     put_in = {name: replace(each, consistent=np.zeros_like(each.invent)) for name, each in sets.items()}
-    assert estimated(wall, TRAINED, put_in, photos) == estimated(wall, TRAINED, sets, photos)
+    assert predict_gain(wall, TRAINED, put_in, photos) == predict_gain(wall, TRAINED, sets, photos)
 
 
 def test_a_few_views_are_looked_at_and_without_any_it_may_gain(given):
@@ -72,16 +72,16 @@ def test_a_few_views_are_looked_at_and_without_any_it_may_gain(given):
             looked.append(name)
             return photos[repeated[name]]
 
-    estimated(wall, many, {n: sets[o] for n, o in repeated.items()}, Photos(repeated))
+    predict_gain(wall, many, {n: sets[o] for n, o in repeated.items()}, Photos(repeated))
     assert len(looked) == VIEWS and looked[0] == "v0" and looked[-1] == many[-1].name
-    assert estimated(wall, TRAINED, sets, {}).may and estimated(wall, TRAINED, sets, {}).beside is None
+    assert predict_gain(wall, TRAINED, sets, {}).may and predict_gain(wall, TRAINED, sets, {}).beside is None
 
 
 @pytest.mark.parametrize(
     ("run", "may", "weight"), [("always", False, 1), ("never", True, 0), ("auto", True, 1), ("auto", False, 0)]
 )
 def test_distillation_reads_what_the_initialization_says(tmp_path, run, may, weight):
-    save_json(tmp_path / "facts.json", {"sds_may_gain": may, "sds_says": "too good at 40.0 dB"})
+    save_json(tmp_path / "facts.json", {"sds_may_gain": may, "sds_reason": "too good at 40.0 dB"})
     asked = altered(Params(), sds={"run": run, "weight": 1})
     params, said = distill.without_sds(asked, tmp_path)
     assert params == altered(asked, sds={"weight": weight})

@@ -5,7 +5,7 @@ import pytest
 import small_scene as small
 
 from reffusion import geometry
-from reffusion.initialize.sharing import Shown, finest, unchanged_rim
+from reffusion.initialize.sharing import ReferenceSurface, select_finest, unchanged_rim
 
 SIZE = 64
 
@@ -27,7 +27,7 @@ def floor(camera, z=0.0):
 
 def shown(camera, depth, pixels=None):
     told = depth > 0
-    return Shown(camera, depth, told if pixels is None else told & pixels)
+    return ReferenceSurface(camera, depth, told if pixels is None else told & pixels)
 
 
 def near_middle(camera, depth, radius):
@@ -38,21 +38,21 @@ def near_middle(camera, depth, radius):
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
 def test_a_surface_is_drawn_by_the_view_that_shows_it_most_finely(order):
     views = [shown(camera, floor(camera), near_middle(camera, floor(camera), 0.5)) for camera in (FRONT, SIDE)]
-    drawn = dict(zip(order, finest([views[k] for k in order]), strict=True))
+    drawn = dict(zip(order, select_finest([views[k] for k in order]), strict=True))
     assert (drawn[0] == views[0].pixels).mean() > 0.98
     assert drawn[1].sum() < 0.1 * views[1].pixels.sum()  # a border, to a pixel
 
 
 def test_of_two_alike_the_earlier_draws():
     same = shown(FRONT, floor(FRONT))
-    first, second = finest([same, same])
+    first, second = select_finest([same, same])
     assert np.array_equal(first, same.pixels) and not second.any()
 
 
 def test_what_only_one_shows_stays_its_own():
     wide = shown(SIDE, floor(SIDE), near_middle(SIDE, floor(SIDE), 0.5))
     narrow = shown(FRONT, floor(FRONT), near_middle(FRONT, floor(FRONT), 0.2))
-    _, left = finest([narrow, wide])
+    _, left = select_finest([narrow, wide])
     away = near_middle(SIDE, floor(SIDE), 0.25)
     assert np.array_equal(left & ~away, wide.pixels & ~away)
     assert left[near_middle(SIDE, floor(SIDE), 0.15)].mean() < 0.05
@@ -63,16 +63,16 @@ def test_nothing_stands_where_another_looks_past_it():
     sheet = floor(SIDE, z=0.2)
     hanging = near_middle(SIDE, sheet, 0.4)
     depth = np.where(hanging, sheet, floor(SIDE))
-    drawn, _ = finest([shown(SIDE, depth, hanging), shown(FRONT, floor(FRONT), np.zeros((SIZE, SIZE), bool))])
+    drawn, _ = select_finest([shown(SIDE, depth, hanging), shown(FRONT, floor(FRONT), np.zeros((SIZE, SIZE), bool))])
     assert not drawn[hanging].any()
 
 
 def test_without_depth_nothing_is_said():
     empty = np.zeros((SIZE, SIZE))
     whole = shown(SIDE, floor(SIDE))
-    drawn, nothing = finest([whole, Shown(FRONT, empty, np.zeros((SIZE, SIZE), bool))])
+    drawn, nothing = select_finest([whole, ReferenceSurface(FRONT, empty, np.zeros((SIZE, SIZE), bool))])
     assert np.array_equal(drawn, whole.pixels) and not nothing.any()
-    assert np.isinf(Shown(FRONT, empty, whole.pixels).widths).all()
+    assert np.isinf(ReferenceSurface(FRONT, empty, whole.pixels).widths).all()
 
 
 def test_a_pixel_is_as_wide_as_its_slant_makes_it():

@@ -6,8 +6,8 @@ import torch
 
 from reffusion import geometry
 from reffusion.background import continuation
-from reffusion.background.plane import CELLS, Plane, without_pits
-from reffusion.background.visibility import Witness, surface_range, widened
+from reffusion.background.plane import CELLS, Plane, remove_reflected_depth
+from reffusion.background.visibility import DepthView, depth_range, widened
 from reffusion.initialize import sweep, view_dependent_color
 from reffusion.splat.conventions import SH0
 from reffusion.splat.reference import colors, harmonics
@@ -59,9 +59,9 @@ WAVES = [(np.array([np.cos(a), np.sin(a)]) * f, a * 7) for f in (9.0, 17.0, 31.0
 
 
 @pytest.fixture(scope="module")
-def views() -> list[Witness]:
+def views() -> list[DepthView]:
     depths = [ground(view)[0].astype(np.float32) for view in CAMERAS]
-    return [Witness.of(view, depth, surface_range(depth), HOLE) for view, depth in zip(CAMERAS, depths, strict=True)]
+    return [DepthView.of(view, depth, depth_range(depth), HOLE) for view, depth in zip(CAMERAS, depths, strict=True)]
 
 
 def rough(depth: np.ndarray) -> np.ndarray:
@@ -72,13 +72,13 @@ def rough(depth: np.ndarray) -> np.ndarray:
 def test_photographs_tell_the_depth_that_splats_show_too_near(views):
     view, photos = CAMERAS[0], {each.name: photograph(each) for each in CAMERAS}
     true, ring = ground(view)[0], widened(HOLE, 0.1) & ~HOLE
-    found = sweep.swept(photos["v0"], rough(true), ring, view, views, photos)
+    found = sweep.sweep_depth(photos["v0"], rough(true), ring, view, views, photos)
     told = found > 0
     assert told[ring].mean() > 0.7 and not told[~ring].any()
     assert abs(np.median(found[told] / true[told]) - 1) < 0.003
     plain = {name: np.full_like(photo, 128) for name, photo in photos.items()}
-    assert not sweep.swept(plain["v0"], rough(true), ring, view, views, plain).any()
-    assert not sweep.swept(photos["v0"], rough(true), ring, view, views[:1], photos).any()
+    assert not sweep.sweep_depth(plain["v0"], rough(true), ring, view, views, plain).any()
+    assert not sweep.sweep_depth(photos["v0"], rough(true), ring, view, views[:1], photos).any()
 
 
 def plane(height: float, tilt: float) -> Plane:
@@ -92,12 +92,12 @@ def test_a_plane_moves_onto_what_is_known_around_the_hole():
     noise = 1 + 0.004 * np.random.default_rng(1).standard_normal(true.shape)
     far = np.random.default_rng(2).random(true.shape) < 0.2  # something else shows there
     depth = np.where(ring, np.where(far, 1.5, noise) * true, 0.0)
-    moved = continuation.aligned(plane(0.08, 0.02), depth, CAMERAS[0], HOLE)
+    moved = continuation.align_plane(plane(0.08, 0.02), depth, CAMERAS[0], HOLE)
     assert np.abs(moved.depth(CAMERAS[0])[HOLE] / true[HOLE] - 1).max() < 0.003
     off = plane(0.08, 0.02)
-    assert continuation.aligned(off, np.zeros_like(depth), CAMERAS[0], HOLE) is off
+    assert continuation.align_plane(off, np.zeros_like(depth), CAMERAS[0], HOLE) is off
     one_sided = np.where(np.arange(SIZE)[:, None] < 64, depth, 0.0) * np.where(np.arange(SIZE) < 64, 1.03, 1.0)
-    still = continuation.aligned(plane(0.0, 0.0), one_sided, CAMERAS[0], HOLE)
+    still = continuation.align_plane(plane(0.0, 0.0), one_sided, CAMERAS[0], HOLE)
     assert np.abs(still.depth(CAMERAS[0])[HOLE] / true[HOLE] - 1).max() < continuation.FAR
 
 
@@ -116,8 +116,8 @@ def test_what_is_new_shines_as_the_surface_around_it(views):
     photos = {view.name: photograph(view, shines=True) for view in CAMERAS}
     fresh = new_gaussians(1)
     every = torch.ones(len(fresh), dtype=torch.bool)
-    around = view_dependent_color.change_around(photos["v0"], ground(CAMERAS[0])[0], HOLE, CAMERAS[0], views, photos)
-    lit = view_dependent_color.lent(fresh, every, CAMERAS[0], around, views)
+    around = view_dependent_color.measure_change(photos["v0"], ground(CAMERAS[0])[0], HOLE, CAMERAS[0], views, photos)
+    lit = view_dependent_color.transfer_sh(fresh, every, CAMERAS[0], around, views)
     torch.testing.assert_close(colors(lit, CAMERAS[0], 1), colors(fresh, CAMERAS[0], 1), atol=1e-4, rtol=0)
     for view in CAMERAS[1:]:
         means = lit.means.double().numpy()
@@ -130,8 +130,8 @@ def test_what_is_new_shines_as_the_surface_around_it(views):
 def test_a_matte_surface_stays_matte(views):
     photos = {view.name: photograph(view) for view in CAMERAS}
     fresh = new_gaussians(1)
-    around = view_dependent_color.change_around(photos["v0"], ground(CAMERAS[0])[0], HOLE, CAMERAS[0], views, photos)
-    lit = view_dependent_color.lent(fresh, torch.ones(len(fresh), dtype=torch.bool), CAMERAS[0], around, views)
+    around = view_dependent_color.measure_change(photos["v0"], ground(CAMERAS[0])[0], HOLE, CAMERAS[0], views, photos)
+    lit = view_dependent_color.transfer_sh(fresh, torch.ones(len(fresh), dtype=torch.bool), CAMERAS[0], around, views)
     torch.testing.assert_close(lit.sh, fresh.sh, atol=0.01, rtol=0)
 
 
@@ -139,22 +139,22 @@ def test_a_shadow_that_a_reference_does_not_show_is_no_shine(views):
     light = {view.name: photograph(view) for view in CAMERAS}
     photos = {name: (photo * 0.6).astype(np.uint8) for name, photo in light.items()}
     fresh = new_gaussians(1)
-    around = view_dependent_color.change_around(light["v0"], ground(CAMERAS[0])[0], HOLE, CAMERAS[0], views, photos)
-    lit = view_dependent_color.lent(fresh, torch.ones(len(fresh), dtype=torch.bool), CAMERAS[0], around, views)
+    around = view_dependent_color.measure_change(light["v0"], ground(CAMERAS[0])[0], HOLE, CAMERAS[0], views, photos)
+    lit = view_dependent_color.transfer_sh(fresh, torch.ones(len(fresh), dtype=torch.bool), CAMERAS[0], around, views)
     torch.testing.assert_close(lit.sh, fresh.sh, atol=0.01, rtol=0)
 
 
 def test_nothing_is_lent_where_nothing_is_known_or_harmonics_are_flat(views):
     photos = {view.name: photograph(view, shines=True) for view in CAMERAS}
     flat, fresh = new_gaussians(0), new_gaussians(1)
-    around = view_dependent_color.change_around(photos["v0"], ground(CAMERAS[0])[0], HOLE, CAMERAS[0], views, photos)
+    around = view_dependent_color.measure_change(photos["v0"], ground(CAMERAS[0])[0], HOLE, CAMERAS[0], views, photos)
     every = torch.ones(len(fresh), dtype=torch.bool)
-    assert view_dependent_color.lent(flat, every, CAMERAS[0], around, views) is flat
-    assert view_dependent_color.lent(fresh, ~every, CAMERAS[0], around, views) is fresh
-    blind = view_dependent_color.change_around(
+    assert view_dependent_color.transfer_sh(flat, every, CAMERAS[0], around, views) is flat
+    assert view_dependent_color.transfer_sh(fresh, ~every, CAMERAS[0], around, views) is fresh
+    blind = view_dependent_color.measure_change(
         photos["v0"], np.zeros_like(HOLE, float), HOLE, CAMERAS[0], views, photos
     )
-    assert view_dependent_color.lent(fresh, every, CAMERAS[0], blind, views) is fresh
+    assert view_dependent_color.transfer_sh(fresh, every, CAMERAS[0], blind, views) is fresh
 
 
 def test_harmonics_are_orthonormal():
@@ -186,5 +186,5 @@ def test_a_mirror_has_the_depth_of_its_plane():
     mirrored = wall.on(plate, wall.depth(view), view, np.ones((64, 64), bool))
     depth = np.where(mirrored, 3.5, 2.0)
     depth[:, :30] = 1.5  # something stands before the left of it
-    found = without_pits(depth, view, [wall])
+    found = remove_reflected_depth(depth, view, [wall])
     assert 100 < mirrored.sum() < 2000 and (found == np.minimum(depth, 2.0)).all()

@@ -7,11 +7,11 @@ import small_scene
 import torch
 
 from reffusion import geometry
-from reffusion.background.continuation import planes_around
-from reffusion.background.mirrors import Mirror, imaged
-from reffusion.background.symmetry import mirrors_around
-from reffusion.background.unobserved import behind
-from reffusion.background.visibility import Witness
+from reffusion.background.continuation import find_planes
+from reffusion.background.mirrors import Mirror, render_mirrors
+from reffusion.background.symmetry import find_mirrors
+from reffusion.background.unobserved import find_unobserved
+from reffusion.background.visibility import DepthView
 from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
 from reffusion.types import Camera, Gaussians
@@ -60,11 +60,11 @@ def drawn(view: Camera, cut: bool = False) -> tuple[np.ndarray, np.ndarray, np.n
     return depth, (enter < leave) & (leave > 0) & (enter < depth), vase < ground
 
 
-def witness(view: Camera, cut: bool = False) -> Witness:
+def witness(view: Camera, cut: bool = False) -> DepthView:
     depth, hidden, _ = drawn(view, cut)
     kernel = np.ones((3, 3))
     wide = cv2.dilate(hidden.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    return Witness.of(view, depth, (cv2.erode(depth, kernel), cv2.dilate(depth, kernel)), wide)
+    return DepthView.of(view, depth, (cv2.erode(depth, kernel), cv2.dilate(depth, kernel)), wide)
 
 
 def colour(points: np.ndarray, halved: bool) -> np.ndarray:
@@ -104,8 +104,8 @@ def sideways(mirrors: list[Mirror]) -> list[Mirror]:
 @pytest.fixture(scope="module")
 def whole():
     views, photos, gaussians = scene()
-    planes = planes_around(CENTRE, RADIUS, views, NO_POINTS)
-    return views, gaussians, planes, mirrors_around(gaussians, CENTRE, RADIUS, views, planes, photos)
+    planes = find_planes(CENTRE, RADIUS, views, NO_POINTS)
+    return views, gaussians, planes, find_mirrors(gaussians, CENTRE, RADIUS, views, planes, photos)
 
 
 def test_a_vase_is_its_own_mirror_image(whole):
@@ -119,7 +119,7 @@ def test_the_half_that_the_box_hides_stands_where_it_is(whole):
     views, _, _, mirrors = whole
     for view in views[::3]:
         true, hidden, vase = drawn(view.camera)
-        found = imaged(mirrors, view.camera, hidden, views).supposed
+        found = render_mirrors(mirrors, view.camera, hidden, views).supposed
         behind_box = cv2.erode((hidden & vase).astype(np.uint8), np.ones((7, 7))) > 0
         if behind_box.sum() < 100:
             continue
@@ -134,26 +134,26 @@ def test_its_pixels_are_undecided_and_have_its_depth(whole):
     views, gaussians, planes, mirrors = whole
     view = views[5]
     true, hidden, vase = drawn(view.camera)
-    supposed = np.isfinite(imaged(mirrors, view.camera, hidden, views).supposed) & vase
+    supposed = np.isfinite(render_mirrors(mirrors, view.camera, hidden, views).supposed) & vase
     inside = cv2.erode(supposed.astype(np.uint8), np.ones((9, 9))) > 0
-    found = behind(gaussians, view.camera, hidden, views, planes, mirrors)
+    found = find_unobserved(gaussians, view.camera, hidden, views, planes, mirrors)
     inside &= found.depth > 1.05 * true  # the ground behind it is seen by others, but not from here
-    assert inside.sum() > 200 and found.undecided[inside].mean() > 0.9
-    assert np.median(np.abs(found.continued / true - 1)[inside & found.undecided]) < 0.01
+    assert inside.sum() > 200 and found.unobserved[inside].mean() > 0.9
+    assert np.median(np.abs(found.continued / true - 1)[inside & found.unobserved]) < 0.01
 
 
 @pytest.mark.parametrize("how", [{"cut": True}, {"halved": True}])
 def test_what_is_unlike_on_its_other_side_has_no_mirror(how):
     views, photos, gaussians = scene(**how)
-    planes = planes_around(CENTRE, RADIUS, views, NO_POINTS)
-    assert not sideways(mirrors_around(gaussians, CENTRE, RADIUS, views, planes, photos))
+    planes = find_planes(CENTRE, RADIUS, views, NO_POINTS)
+    assert not sideways(find_mirrors(gaussians, CENTRE, RADIUS, views, planes, photos))
 
 
 def test_nothing_stands_there_and_nothing_is_asked():
     views, photos, gaussians = scene()
-    assert mirrors_around(gaussians, CENTRE, RADIUS, views, [], photos) == []
-    planes = planes_around(CENTRE, RADIUS, views, NO_POINTS)
-    assert mirrors_around(gaussians, CENTRE, np.inf, views, planes, photos) == []
+    assert find_mirrors(gaussians, CENTRE, RADIUS, views, [], photos) == []
+    planes = find_planes(CENTRE, RADIUS, views, NO_POINTS)
+    assert find_mirrors(gaussians, CENTRE, np.inf, views, planes, photos) == []
 
 
 def test_a_camera_behind_the_mirror_shows_the_image_with_its_sides_swapped():

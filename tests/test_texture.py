@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from reffusion import geometry
-from reffusion.background.mirrors import imaged
+from reffusion.background.mirrors import render_mirrors
 from reffusion.background.plane import CELLS, Plane
-from reffusion.background.visibility import Witness, surface_range
+from reffusion.background.visibility import DepthView, depth_range
 from reffusion.inpaint import exemplar, plane_frames
 from reffusion.inpaint.classical import telea
 from reffusion.inpaint.patchmatch import completion, search
@@ -135,7 +135,7 @@ def floor() -> exemplar.Around:
     for view in CAMERAS:
         depth = FLOOR.depth(view)
         depth = np.where(np.isfinite(depth) & (depth < 5), depth, 0).astype(np.float32)
-        views.append(Witness.of(view, depth, surface_range(depth), hidden()))
+        views.append(DepthView.of(view, depth, depth_range(depth), hidden()))
     return exemplar.Around(views, [FLOOR], {view.name: planks(view) for view in CAMERAS}, np.zeros(3), 1.0)
 
 
@@ -210,7 +210,7 @@ def test_joints_and_round_borders_go_on_where_a_floor_repeats_itself(shown):
     truth = shown(CAMERAS[0]).astype(int)
     image = np.where(hidden()[..., None], np.uint8(RED), shown(CAMERAS[0]))
     target, sources, smooth, how = exemplar._told(
-        image, hidden(), CAMERAS[0], hidden(), around, imaged([], CAMERAS[0], hidden(), [])
+        image, hidden(), CAMERAS[0], hidden(), around, render_mirrors([], CAMERAS[0], hidden(), [])
     )
     picture, filled = montage(target, hidden(), sources, 1, how[1])
     assert filled[hidden()].mean() > 0.9 and not filled[~hidden()].any() and (picture[~filled] == image[~filled]).all()
@@ -224,7 +224,7 @@ def test_joints_and_round_borders_go_on_where_a_floor_repeats_itself(shown):
 def test_a_hole_without_anything_to_move_into_it_is_left():
     image = np.where(hidden()[..., None], np.uint8(RED), planks(CAMERAS[0]))
     target, sources, _, how = exemplar._told(
-        image, hidden(), CAMERAS[0], hidden(), floor(), imaged([], CAMERAS[0], hidden(), [])
+        image, hidden(), CAMERAS[0], hidden(), floor(), render_mirrors([], CAMERAS[0], hidden(), [])
     )
     picture, filled = montage(
         target, hidden(), [replace(s, usable=np.zeros_like(hidden())) for s in sources], 1, how[1]

@@ -9,17 +9,17 @@ import small_scene
 import torch
 
 from reffusion import geometry
-from reffusion.background.continuation import planes_around
+from reffusion.background.continuation import find_planes
 from reffusion.background.plane import CELLS, Plane
-from reffusion.background.unobserved import _grows_out_of, behind
+from reffusion.background.unobserved import _grows_out_of, find_unobserved
 from reffusion.background.visibility import (
     FREE,
     SURFACE,
-    Witness,
-    seen_by,
-    surface_range,
+    DepthView,
+    count_views,
+    depth_range,
+    is_seen,
     unlike,
-    votes,
     without_slivers,
 )
 from reffusion.gaussians.surfels import surface_gaussians
@@ -53,11 +53,11 @@ def drawn(view: Camera, notched: bool = False) -> tuple[np.ndarray, np.ndarray, 
     return depth, (enter < leave) & (leave > 0) & (enter < depth), on_table & (table < floor)
 
 
-def witness(view: Camera, notched: bool = False) -> Witness:
+def witness(view: Camera, notched: bool = False) -> DepthView:
     depth, hidden, _ = drawn(view, notched)
     kernel = np.ones((3, 3))
     wide = cv2.dilate(hidden.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    return Witness.of(view, depth, (cv2.erode(depth, kernel), cv2.dilate(depth, kernel)), wide)
+    return DepthView.of(view, depth, (cv2.erode(depth, kernel), cv2.dilate(depth, kernel)), wide)
 
 
 @pytest.fixture(scope="module")
@@ -68,24 +68,24 @@ def views():
 
 def test_a_point_is_seen_on_its_surface_only(views):
     points = np.array([[0.7, 0.7, 0.0], [0.7, 0.7, 0.4], [0.7, 0.7, -0.5], [0.0, 0.0, 0.25], [0.0, 0.0, 0.0]])
-    said = votes(points, views)
+    said = count_views(points, views)
     assert said.seen[0] >= 6 and said.free[0] == 0, "the table's top"
     assert said.free[1] >= 6 and said.seen[1] == 0, "the air above it"
     assert said.seen[2] == 0 and said.free[2] >= 2, "under the table low views look through"
     assert said.seen[3] == said.free[3] == 0 and said.hidden[3] == len(views), "within the box nobody knows"
-    above = votes(points, views, np.tile([0.0, 0.0, 1.0], (5, 1)))
+    above = count_views(points, views, np.tile([0.0, 0.0, 1.0], (5, 1)))
     assert above.seen[4] == 0 and above.free[4] == 0, "nor, from above, what it stands on"
 
 
 def test_a_surface_does_not_face_views_from_its_other_side(views):
     point = np.array([[0.7, 0.7, 0.0]])
-    up, down = (votes(point, views, np.array([[0.0, 0.0, z]])).seen[0] for z in (1.0, -1.0))
-    assert up + down == votes(point, views).seen[0]
+    up, down = (count_views(point, views, np.array([[0.0, 0.0, z]])).seen[0] for z in (1.0, -1.0))
+    assert up + down == count_views(point, views).seen[0]
     assert up >= 6 and down >= 1, "the thin top is seen from both"
 
 
 def test_the_table_goes_on_under_the_box_and_ends_at_its_edge(views):
-    planes = planes_around(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, NO_POINTS)
+    planes = find_planes(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, NO_POINTS)
     table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.height))
     assert abs(table.normal[2]) > 0.999 and abs(table.height) < 0.01
     view = camera("new", 15.0, 1.6)
@@ -102,7 +102,7 @@ def test_the_table_goes_on_under_the_box_and_ends_at_its_edge(views):
 
 def test_a_table_is_seen_from_above_though_what_stands_beside_it_is_lower(views):
     above = [view for view in views if view.camera.name.startswith("a")]
-    planes = planes_around(np.array([0.0, 0.0, -0.2]), 0.45, above, NO_POINTS)
+    planes = find_planes(np.array([0.0, 0.0, -0.2]), 0.45, above, NO_POINTS)
     table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.height))
     assert table.in_cells(table.seen, np.array([[0.7, 0.7, 0.0]]))[0]
 
@@ -117,7 +117,7 @@ def test_a_speck_that_views_look_through_is_no_hole(wide, through):
         place = view.camera.center - rays * (view.camera.center[2] / rays[..., 2])[..., None]
         spot = (np.abs(place[..., :2] - [BOX + wide, 0]) < wide / 2).all(-1)
         views.append(replace(view, depth=np.where(spot, 2 * view.depth, view.depth)))
-    planes = planes_around(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, NO_POINTS)
+    planes = find_planes(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, NO_POINTS)
     table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.height))
     middle = np.array([[BOX + wide, 0.0, 0.0]])
     assert table.in_cells(table.free, middle)[0] == through
@@ -127,7 +127,7 @@ def test_borders_that_are_visible_go_on_under_the_box():
     """The box hides the inner corner of an L-shaped table: what is beyond the line between its visible edges is free,
     though the convex hull of the table has it."""
     views = [witness(camera(f"a{k}", 30 * k, 1.6), notched=True) for k in range(12)]
-    planes = planes_around(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, NO_POINTS)
+    planes = find_planes(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, NO_POINTS)
     table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.height))
     steps = (np.arange(len(table.goes_on)) + 0.5 - len(table.goes_on) / 2) * table.pitch
     points = table.origin + steps[:, None, None] * table.along[0] + steps[None, :, None] * table.along[1]
@@ -137,7 +137,7 @@ def test_borders_that_are_visible_go_on_under_the_box():
     assert table.within[under & (across > 1.3 * BOX)].mean() < 0.05
 
 
-def beside_a_plinth(view: Camera) -> Witness:
+def beside_a_plinth(view: Camera) -> DepthView:
     """Rough ground with a plinth's face upright behind the box, that ends where the box begins."""
     rays = geometry.pixel_rays(view) @ view.world_to_camera[:3, :3]
     ground, face = -view.center[2] / rays[..., 2], (0.5 - view.center[1]) / rays[..., 1]
@@ -149,13 +149,13 @@ def beside_a_plinth(view: Camera) -> Witness:
     enter, leave = bounds.min(0).max(-1), bounds.max(0).min(-1)
     wide = cv2.dilate(((enter < leave) & (leave > 0)).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     near, far = 0.94 * cv2.erode(depth, np.ones((3, 3))), 1.06 * cv2.dilate(depth, np.ones((3, 3)))
-    return Witness.of(view, depth, (near, far), wide)
+    return DepthView.of(view, depth, (near, far), wide)
 
 
 def test_a_wall_does_not_go_on_along_the_ground_where_it_was_never_seen():
     """Near their crossing, and beneath it, rough ground looks like the wall's: on both sides of the box."""
     views = [beside_a_plinth(camera(f"a{k}", 200 + 12 * k, 1.4)) for k in range(12)]
-    planes = planes_around(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, NO_POINTS)
+    planes = find_planes(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, NO_POINTS)
     face = max(planes, key=lambda plane: abs(plane.normal[1]))
     assert abs(face.normal[1]) > 0.99
     right = face.cells[..., 0] > -0.8 * BOX
@@ -178,16 +178,16 @@ def test_what_lies_beneath_the_table_in_all_views_but_one_is_not_what_is_behind_
     def shows_it(view):
         rays = geometry.pixel_rays(view.camera) @ view.camera.world_to_camera[:3, :3]
         depth = (-0.2 - view.camera.center[2]) / np.minimum(rays[..., 2], -1e-3)
-        return Witness.of(view.camera, depth, (depth, depth), view.hidden)
+        return DepthView.of(view.camera, depth, (depth, depth), view.hidden)
 
     above = views[:12]
-    others = votes(geometry.unproject(beneath, camera)[hidden], above[4:]).behind
+    others = count_views(geometry.unproject(beneath, camera)[hidden], above[4:]).behind
     asked = np.zeros_like(hidden)
     asked[hidden] = others > 3
-    one = behind(left, camera, hidden, [shows_it(above[3]), *above[4:]], [])
-    all_of_them = behind(left, camera, hidden, [*map(shows_it, above)], [])
+    one = find_unobserved(left, camera, hidden, [shows_it(above[3]), *above[4:]], [])
+    all_of_them = find_unobserved(left, camera, hidden, [*map(shows_it, above)], [])
     assert asked.sum() > 100
-    assert one.undecided[asked].mean() > 0.75 and all_of_them.undecided[asked].mean() < 0.1
+    assert one.unobserved[asked].mean() > 0.75 and all_of_them.unobserved[asked].mean() < 0.1
 
 
 def test_what_stands_before_a_plane_does_not_speak_against_it():
@@ -216,9 +216,9 @@ def test_slivers_go_and_patches_stay():
 def test_a_vase_that_hides_its_far_side_does_not_speak_against_it(views):
     """Half of the views look at the box's side from behind: something stands before it there."""
     exact = lambda depth: (depth, (depth, depth))
-    whole = [Witness.of(v.camera, *exact(drawn_with_the_box(v.camera)), np.zeros_like(v.hidden)) for v in views[:12]]
+    whole = [DepthView.of(v.camera, *exact(drawn_with_the_box(v.camera)), np.zeros_like(v.hidden)) for v in views[:12]]
     point, side = np.array([[BOX, 0.0, 0.25]]), np.array([[1.0, 0.0, 0.0]])
-    plain, faced = votes(point, whole), votes(point, whole, side)
+    plain, faced = count_views(point, whole), count_views(point, whole, side)
     assert plain.behind[0] >= 4 and faced.behind[0] == 0 and faced.seen[0] >= 3
 
 
@@ -240,16 +240,16 @@ def test_a_shadow_beside_the_mask_is_found_and_carried_into_other_views(views):
     truth = np.clip(np.full((SIZE, SIZE, 3), 140) + grain, 0, 255).astype(np.uint8)
     photo = np.where(shadow[..., None], (truth * 0.6).astype(np.uint8), truth)
     photo[5:25, 5:25] = 40  # something else that differs, far from the mask
-    found = shadows.tainted(truth, photo, hidden)
+    found = shadows.detect_shadows(truth, photo, hidden)
     assert (found & shadow).sum() > 0.9 * (shadow & ~view.hidden).sum() and not found[5:25, 5:25].any()
-    assert not shadows.tainted(truth, truth, hidden).any()
+    assert not shadows.detect_shadows(truth, truth, hidden).any()
     there = geometry.unproject(drawn(other.camera)[0], other.camera)
     same = drawn(other.camera)[2] & (np.hypot(there[..., 0] - 0.5, there[..., 1] - 0.5) < 0.25) & ~other.hidden
-    carried, light = shadows.carried(found, shadows.light(truth, photo), depth, view.camera, [other])["a1"]
+    carried, light = shadows.project_shadow(found, shadows.log_light(truth, photo), depth, view.camera, [other])["a1"]
     assert carried[same].mean() > 0.9 and not carried[~drawn(other.camera)[2]].mean() > 0.02
     lit = np.clip(np.full((SIZE, SIZE, 3), 140) + np.random.default_rng(1).integers(-12, 13, (SIZE, SIZE, 1)), 0, 255)
     core = drawn(other.camera)[2] & (np.hypot(there[..., 0] - 0.5, there[..., 1] - 0.5) < 0.2) & ~other.hidden
-    again = shadows.relit((lit * 0.6).astype(np.uint8), light)
+    again = shadows.relight((lit * 0.6).astype(np.uint8), light)
     assert np.abs(again[core].astype(float) - lit[core]).mean() < 4 and np.abs(lit[core] * 0.4).mean() > 50
     outside = ~cv2.dilate(carried.astype(np.uint8), np.ones((9, 9))).astype(bool)
     assert (again[outside] == (lit * 0.6).astype(np.uint8)[outside]).all(), "where nothing is known it stays as it is"
@@ -260,14 +260,14 @@ def test_what_has_other_colours_than_gravel_is_debris():
     view = camera("v", 0, 2.0)
     depth, _, _ = drawn(view)
     rough = (depth * (1 + 0.1 * np.random.default_rng(0).random(depth.shape))).astype(np.float32)
-    witness = Witness.of(view, rough, surface_range(rough), np.zeros_like(rough, bool))
+    witness = DepthView.of(view, rough, depth_range(rough), np.zeros_like(rough, bool))
     photo = np.random.default_rng(1).integers(90, 160, (*rough.shape, 3)).astype(np.uint8)
     place = geometry.unproject(rough.astype(float), view)[80:84, 80]
     sh = torch.zeros(4, 1, 3)
     sh[2:, 0] = torch.tensor([-1.2, 0.6, 0.6])  # teal; the others are grey
     parts = torch.tensor(place).float(), torch.zeros(4, 4), torch.full((4, 3), -4.0), torch.zeros(4), sh
     assert unlike(Gaussians(*parts), [witness], {"v": photo}).tolist() == [0, 0, 1, 1]
-    smooth = Witness.of(view, depth, surface_range(np.full_like(depth, depth[80, 80])), witness.hidden)
+    smooth = DepthView.of(view, depth, depth_range(np.full_like(depth, depth[80, 80])), witness.hidden)
     assert not unlike(Gaussians(*parts), [smooth], {"v": photo}).any()
 
 
@@ -278,7 +278,7 @@ def test_views_say_of_points_what_the_formulas_say(views):
     points[:1000, 2], points[1000:1500, 2], points[-2], points[-1] = TOP, FLOOR, (9, 0, 0.5), np.nan
     normals = noise.normal(size=points.shape)
     for sides in (None, normals):
-        said, expected = votes(points, views, sides), np.zeros((4, len(points)), int)
+        said, expected = count_views(points, views, sides), np.zeros((4, len(points)), int)
         for view in views:
             uv, z = geometry.project(points, view.camera)
             maps = (view.hidden, view.nearest, view.farthest)
@@ -289,6 +289,6 @@ def test_views_say_of_points_what_the_formulas_say(views):
             behind_it = z > farthest * (1 + SURFACE)
             free = nearest > z * (1 + FREE)
             expected += [shown & on & faced, shown & free, shown & behind_it & faced, inside & hidden & (z > 0)]
-            assert (seen_by(view, points) == (shown & on)).all()
+            assert (is_seen(view, points) == (shown & on)).all()
         for name, count in zip(("seen", "free", "behind", "hidden"), expected, strict=True):
             assert (getattr(said, name) == count).all() and count.any(), name

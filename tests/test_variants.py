@@ -305,16 +305,16 @@ def test_random_gaussians_fill_the_region_of_the_hole_by_their_seed(scene, tmp_p
 
 
 def test_scattered_points_lie_where_the_holes_are():
-    box = random_init.box_of(np.random.default_rng(0).uniform(-1, 1, (4000, 3)))
+    box = random_init.bounding_box(np.random.default_rng(0).uniform(-1, 1, (4000, 3)))
     assert np.allclose(box, [[-1.15] * 3, [1.15] * 3], atol=0.05)
-    assert np.allclose(random_init.box_around((0, 1, 2), (2, 2, 4)), [[-1, 0, 0], [1, 2, 4]])
+    assert np.allclose(random_init.box_at((0, 1, 2), (2, 2, 4)), [[-1, 0, 0], [1, 2, 4]])
     view, half = small.CAMERAS["a2"], np.zeros((small.HEIGHT, small.WIDTH), bool)
     half[:, : small.WIDTH // 2] = True
-    holes, box = ([view], {"a2": half}), random_init.box_around((0, 0, 2), (0.5, 0.5, 0.5))
-    points = random_init.points_in(box, 300, *holes, torch.Generator())
+    holes, box = ([view], {"a2": half}), random_init.box_at((0, 0, 2), (0.5, 0.5, 0.5))
+    points = random_init.sample_points(box, 300, *holes, torch.Generator())
     assert points.shape == (300, 3) and (points[:, 0] < 0).all()
     with pytest.raises(ValueError, match="do not meet"):
-        random_init.points_in(random_init.box_around((9, 9, 2), (0.1, 0.1, 0.1)), 9, *holes, torch.Generator())
+        random_init.sample_points(random_init.box_at((9, 9, 2), (0.1, 0.1, 0.1)), 9, *holes, torch.Generator())
 
 
 def test_the_chain_of_lifted_pictures(scene, painted, tmp_path, monkeypatch):

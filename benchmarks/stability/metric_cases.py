@@ -155,11 +155,11 @@ def nothing_remains() -> float:
     """Every Gaussian is the object: nobody saw anything, so all is undecided and nothing goes on; how many pixels and
     votes say otherwise."""
     nobody = cloud().map(lambda p: p[:0])
-    views = visibility.witnesses(nobody, NAMED, {view.name: FULL for view in NAMED})
-    planes = continuation.planes_around(np.zeros(3), 1.0, views, np.zeros((0, 3)))
-    found = unobserved.behind(nobody, NAMED[0], FULL, views, planes)
-    said = visibility.votes(np.zeros((1, 3)), views)
-    return float((~found.undecided).sum() + np.isfinite(found.continued).sum() + said.seen.sum() + said.free.sum())
+    views = visibility.render_depth_views(nobody, NAMED, {view.name: FULL for view in NAMED})
+    planes = continuation.find_planes(np.zeros(3), 1.0, views, np.zeros((0, 3)))
+    found = unobserved.find_unobserved(nobody, NAMED[0], FULL, views, planes)
+    said = visibility.count_views(np.zeros((1, 3)), views)
+    return float((~found.unobserved).sum() + np.isfinite(found.continued).sum() + said.seen.sum() + said.free.sum())
 
 
 def tidied() -> float:

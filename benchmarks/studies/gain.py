@@ -76,8 +76,8 @@ def table(runs: dict[str, dict], shares: dict[str, dict[str, float]]) -> str:
 
 def never_seen(run: Path, scene: Path | None) -> dict[str, float]:
     """By `masks`, over the training views; by the generator's rays, over training and test views."""
-    share = {"by masks": round(load_json(stage_folder(run, "masks") / "facts.json")["undecided_share"], 3)}
-    facts = load_json(scene / "truth/facts.json")["undecided_share"] if scene else {}
+    share = {"by masks": round(load_json(stage_folder(run, "masks") / "facts.json")["unobserved_share"], 3)}
+    facts = load_json(scene / "truth/facts.json")["unobserved_share"] if scene else {}
     return share | {f"by rays, {kind} views": round(value, 3) for kind, value in facts.items() if value is not None}
 
 

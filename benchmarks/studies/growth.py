@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[2]
 STAGES = ("poses", "raw_masks", "fit", "masks", "reference", "initialize", "personalize", "distill", "evaluate")
 VIEWS, PIXELS = (30, 60, 120, 300), (0.3, 0.6, 1.2, 2.0)  # megapixels
 WIDE, HIGH = 4, 3
-TENTH = "fit.iterations=190 personalize.steps=15 distill.iterations=15 initialize.settle=30 poses.longest=4000 "
+TENTH = "fit.iterations=190 personalize.steps=15 distill.iterations=15 initialize.refit_steps=30 poses.longest=4000 "
 TENTH += "distill.sds.run=always"
 SAMPLES, TEST = 1, 4  # rays a side of a pixel, so that large scenes are made in minutes; test views
 MAKE = """

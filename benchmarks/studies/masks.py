@@ -26,7 +26,7 @@ from reffusion.io.scene import load_mask_sets, load_raw_masks, load_scene
 from reffusion.types import Camera, Scene
 from stages import masks as masks_stage
 
-ASKED = {"exact": {"consistent": 0.95, "undecided": 0.9}, "perturbed": {"consistent": 0.90, "undecided": 0.85}}
+ASKED = {"exact": {"consistent": 0.95, "unobserved": 0.9}, "perturbed": {"consistent": 0.90, "unobserved": 0.85}}
 BORDER = 2  # px
 LARGEST, MISSING = 0.02, 0.1  # of the image's width; share of the views
 
@@ -92,7 +92,7 @@ def measure(scene_folder: Path, run: Path, out: Path, seed: int) -> dict[str, di
     scene = load_scene(run / "poses")
     exact = load_raw_masks(run / "raw_masks", scene.train)
     cameras = [scene.cameras[name] for name in scene.train]
-    truth = {"consistent": exact, "undecided": true_never_seen(scene_folder, cameras)}
+    truth = {"consistent": exact, "unobserved": true_never_seen(scene_folder, cameras)}
     random = np.random.default_rng(seeding.seed_for(seed, "perturbed masks"))
     kept = random.permutation(len(scene.train))[round(MISSING * len(scene.train)) :]
     noisy = {scene.train[k]: perturbed(exact[scene.train[k]], random) for k in sorted(kept)}

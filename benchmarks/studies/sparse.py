@@ -33,7 +33,7 @@ BOTH, PLAIN, TAUGHT = "both", "plain 3DGS", "personalization"
 POINTS = "fit.few_views=fewer_harmonics"  # a fit starts from points
 WAYS = {
     TAUGHT: (
-        f"--set={POINTS} fit.iterations=1 initialize.settle=0 distill.reconstruction.every=0 "
+        f"--set={POINTS} fit.iterations=1 initialize.refit_steps=0 distill.reconstruction.every=0 "
         "distill.reference.weight=0",
     ),
     BOTH: (),

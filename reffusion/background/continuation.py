@@ -73,7 +73,9 @@ def find_planes(
     is_third = [False] * len(found) + [True] * len(thirds)
     found += thirds
     band = max(1.5 * inlier, SURFACE * distance)
-    maps = [_map_plane(*plane, center, REACH * radius, views, third) for plane, third in zip(found, is_third, strict=True)]
+    maps = [
+        _map_plane(*plane, center, REACH * radius, views, third) for plane, third in zip(found, is_third, strict=True)
+    ]
     planes = [plane for plane, _ in maps]
     grounds = [_crossing(plane, planes[:k]) for k, plane in enumerate(planes)]
     # Cells near a crossing could belong to either plane. They belong to the one with more samples, unless most views
@@ -91,8 +93,8 @@ def find_planes(
 def _is_duplicate(
     normal: np.ndarray, offset: float, planes: Sequence[tuple[np.ndarray, float]], center: np.ndarray, distance: float
 ) -> bool:
-    """Whether a plane without sparse points repeats one of `planes`, parallel to it within the `distance` that views can
-    tell apart."""
+    """Whether a plane without sparse points repeats one of `planes`, parallel to it within the `distance` that views
+    can tell apart."""
     for other, other_offset in planes:
         foot = center - (center @ other - other_offset) * other
         if abs(normal @ other) > MAX_TURN and abs(normal @ foot - offset) < distance:
@@ -159,8 +161,8 @@ def _without_rims(seen: np.ndarray) -> np.ndarray:
 def _map_plane(
     normal: np.ndarray, offset: float, center: np.ndarray, reach: float, views: Sequence[DepthView], third: bool
 ) -> tuple[Plane, np.ndarray]:
-    """The plane with its map of seen, free and reflective cells; and bool [CELLS, CELLS], cells that the object occludes
-    in some view."""
+    """The plane with its map of seen, free and reflective cells; and bool [CELLS, CELLS], cells that the object
+    occludes in some view."""
     first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
     axes = np.stack([first / np.linalg.norm(first), np.cross(normal, first / np.linalg.norm(first))])
     origin, cell_size = center - (center @ normal - offset) * normal, 2 * reach / CELLS

@@ -11,7 +11,7 @@ import torch
 
 from reffusion import morphology
 from reffusion.background.visibility import DepthView, count_views, smooth_surface
-from reffusion.references.view_ranking import drawn_across
+from reffusion.depth.inpaint_depth import inpaint_depth
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
@@ -83,7 +83,7 @@ class Mirror:
         observed[rows, columns] = count_views(points, views, normals).is_observed
         observed &= depth < DEEPER * _fill_pits(depth, WINDOW)
         whole = morphology.close_mask(observed, WINDOW)
-        depth = np.where(whole & ~observed, drawn_across(depth, observed), depth) if observed.any() else depth
+        depth = np.where(whole & ~observed, inpaint_depth(depth, observed), depth) if observed.any() else depth
         flip = lambda values: np.ascontiguousarray(values[:, ::-1])
         image_depth = flip(np.where(depth > 0, depth, np.inf))
         plausible = np.where(flip(whole & possible), image_depth, np.inf)

@@ -17,7 +17,18 @@ from reffusion.background.symmetry import find_mirrors
 from reffusion.background.visibility import DepthView, count_views, with_photographed_depth
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
-_PLANE_ARRAYS = ("normal", "offset", "origin", "axes", "cell_size", "continued", "enclosed", "free", "seen", "reflective")
+_PLANE_ARRAYS = (
+    "normal",
+    "offset",
+    "origin",
+    "axes",
+    "cell_size",
+    "continued",
+    "enclosed",
+    "free",
+    "seen",
+    "reflective",
+)
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,8 @@ class Plane:
         origin: [3], the point on the plane at the middle of the map. axes: [2, 3], unit axes of the map.
         cell_size: side of a cell, in world units.
         continued: bool [CELLS, CELLS], unobserved cells into which the plane continues.
-        enclosed: bool [CELLS, CELLS], `continued`, and what it encloses together with `seen`: reflections make a polished
-            part look like a pit.
+        enclosed: bool [CELLS, CELLS], `continued`, and what it encloses together with `seen`: reflections make a
+            polished part look like a pit.
         free: bool [CELLS, CELLS], views see through the plane there: it does not exist there.
         seen: bool [CELLS, CELLS], views show the plane there.
         reflective: bool [CELLS, CELLS], `free` cells that the plane surrounds: a mirror in it, or a window.

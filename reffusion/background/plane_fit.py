@@ -15,8 +15,9 @@ VIEWS = 12  # views that are sampled
 SAMPLES = 1500  # samples of each view
 TRIALS = 300  # RANSAC trials for each plane
 # Sparse points refine a plane in steps, each with a smaller inlier distance, as fractions of that of the samples.
-# MIN_INLIERS points must lie within the last distance, and they must be at least MIN_SHARPNESS of those within the whole
-# distance (a quarter of them would where there is no plane). MAX_TURN is the cosine of the largest turn they may cause.
+# MIN_INLIERS points must lie within the last distance, and they must be at least MIN_SHARPNESS of those within the
+# whole distance (a quarter of them would where there is no plane). MAX_TURN is the cosine of the largest turn they may
+# cause.
 INLIER_STEPS, MIN_INLIERS, MIN_SHARPNESS, MAX_TURN = (1.0, 0.5, 0.25), 50, 0.5, 0.98
 
 
@@ -74,9 +75,7 @@ def refine_by_points(
     return (new_normal, new_offset) if spread > min_spread else None
 
 
-def _refit(
-    normal: np.ndarray, offset: float, points: np.ndarray, inlier_distance: float
-) -> tuple[np.ndarray, float]:
+def _refit(normal: np.ndarray, offset: float, points: np.ndarray, inlier_distance: float) -> tuple[np.ndarray, float]:
     """Normal and offset of the plane, refitted five times by least squares to its inliers."""
     for _ in range(5):
         inliers = points[np.abs(points @ normal - offset) < inlier_distance]

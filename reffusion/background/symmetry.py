@@ -63,9 +63,9 @@ def find_mirrors(
     up = ground.normal if center @ ground.normal > ground.offset else -ground.normal
     found: list[Mirror] = []
     for points in _find_things(center, radius, up, views, planes):
-        distance = cKDTree(points).query(
-            gaussians.means.double().cpu().numpy(), distance_upper_bound=CLEARANCE * cell
-        )[0]
+        distance = cKDTree(points).query(gaussians.means.double().cpu().numpy(), distance_upper_bound=CLEARANCE * cell)[
+            0
+        ]
         own = torch.from_numpy(np.isfinite(distance)).to(gaussians.means.device)
         mirrors = _select_mirrors(points, up, cell, views, photos)
         thing = _with_mean_colors(gaussians.map(lambda p, own=own: p[own]), views) if mirrors else None
@@ -100,7 +100,9 @@ def _find_things(
     )
     middles = np.stack([np.bincount(of_point, points[:, k]) / count for k in range(3)], 1)
     visibility = count_views(middles, views)
-    solid = visibility.is_observed & (count >= MIN_POINTS) & (visibility.seen >= 2) & (visibility.seen > visibility.free)
+    solid = (
+        visibility.is_observed & (count >= MIN_POINTS) & (visibility.seen >= 2) & (visibility.seen > visibility.free)
+    )
     filled = np.zeros(index.max(0) + 1, bool)
     filled.ravel()[number[solid]] = True
     thing = ndimage.label(filled, np.ones((3, 3, 3)))[0].ravel()[number[solid]]

@@ -65,8 +65,8 @@ def find_unobserved(
 ) -> Uncovered:
     """Split the pixels of C into observed and unobserved ones.
 
-    The remaining Gaussians are rendered, each pixel is unprojected, and the views count that see this point unmasked, at
-    the same depth and from the same side. A pixel is observed if at least a quarter of the views that could see the
+    The remaining Gaussians are rendered, each pixel is unprojected, and the views count that see this point unmasked,
+    at the same depth and from the same side. A pixel is observed if at least a quarter of the views that could see the
     point do (`Visibility.is_observed`), and if no plane or mirror image continues in front of it. The quarter excludes
     Gaussians that most views place below a surface; these are fitting artifacts.
 

@@ -1,4 +1,5 @@
-"""What the training views know of points in space: on a visible surface, in free space, occluded, or behind the mask."""
+"""What the training views know of points in space: on a visible surface, in free space, occluded, or behind the
+mask."""
 
 from __future__ import annotations
 
@@ -141,8 +142,8 @@ def count_views(points: np.ndarray, views: Sequence[DepthView], normals: np.ndar
 
     Args:
         normals: [P, 3], normals of the surface on which the points lie, towards the side in question. Views from the
-            other side do not count: the underside of a table is no evidence of its top, and a vase that occludes its own
-            far side is no evidence against it.
+            other side do not count: the underside of a table is no evidence of its top, and a vase that occludes its
+            own far side is no evidence against it.
     """
     counts = np.zeros((4, len(points)), np.int64)
     for view in views:

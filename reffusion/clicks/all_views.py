@@ -99,7 +99,7 @@ def solved(
         labels = labelled(gaussians, near, cameras, masks, image_of)
     for name in in_order(clicks):
         if labels.any():
-            before = voting.label_view(gaussians, labels, cameras[name]) > SHOWN
+            before = voting.render_labels(gaussians, labels, cameras[name]) > SHOWN
             masks[name] = corrected(image_of(name), before, clicks[name], relief(gaussians, cameras[name]))
         else:
             masks[name] = view_mask(image_of(name), clicks[name], relief(gaussians, cameras[name]))
@@ -156,7 +156,7 @@ def shown(
     gaussians: Gaussians, labels: Tensor, camera: Camera, image: np.ndarray, clicks: Clicks | None = None
 ) -> np.ndarray:
     """bool [H, W]: where a view shows the labelled Gaussians, up to its photograph's own edges."""
-    mask = voting.label_view(gaussians, labels, camera) > SHOWN
+    mask = voting.render_labels(gaussians, labels, camera) > SHOWN
     nothing = Clicks(np.zeros((0, 2)), np.zeros(0, bool))
     return refined(image, mask, marked(clicks or nothing, mask.shape))
 

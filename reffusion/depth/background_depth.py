@@ -70,7 +70,7 @@ class Hints:
     """What else is known of a view's depth; None where it was not asked.
 
     Attributes:
-        continued: [H, W] depth of planes that go on in the hole, inf where none does (`undecided.Behind`).
+        continued: [H, W] depth of planes that go on in the hole, inf where none does (`unobserved.Uncovered`).
         planes: depth [H, W] of each of these planes, everywhere. witnessed: bool [H, W], pixels of the hole whose
             rendered depth other views show.
         outer: [H, W] depth that is better known than the rendering's, above 0 where there is one.

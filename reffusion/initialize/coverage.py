@@ -30,9 +30,9 @@ def expected_mirror_depth(background: Background) -> dict[str, np.ndarray]:
     """View name -> [H, W], depth of the plausible mirror images in C, inf elsewhere; empty where there is no mirror."""
     if not background.mirrors:
         return {}
-    render = lambda camera: render_mirrors(
-        background.mirrors, camera, background.masks[camera.name], background.views
-    ).plausible_depth
+    render = lambda camera: (
+        render_mirrors(background.mirrors, camera, background.masks[camera.name], background.views).plausible_depth
+    )
     return {camera.name: render(camera) for camera in background.cameras}
 
 
@@ -64,8 +64,8 @@ def find_uncovered(
 
 
 def _contradicts(image_depth: np.ndarray, rendering: Rendering, unobserved: np.ndarray) -> np.ndarray:
-    """bool [H, W]: pixels at which something unobserved, that no reference drew, occludes the mirror image, or nothing is
-    as near as the image."""
+    """bool [H, W]: pixels at which something unobserved, that no reference drew, occludes the mirror image, or nothing
+    is as near as the image."""
     depth, is_new = (each.cpu().numpy() for each in (rendering.depth, rendering.features[..., 0] > 0.5))
     in_front = (depth < (1 - EDGE) * image_depth) & ~is_new & unobserved
     return np.isfinite(image_depth) & (in_front | (image_depth < (1 - EDGE) * depth))
@@ -93,15 +93,15 @@ def completed_views(
 
 
 def cameras_near_photographs(background: Background) -> list[Camera]:
-    """The cameras whose views may be completed: those with a photograph, and those that look in about the same direction
-    as one. An invention seen from elsewhere knows nothing of what is there, and may hide what photographs show."""
+    """The cameras whose views may be completed: those with a photograph, and those that look about the same way.
+
+    An invention seen from elsewhere knows nothing of what is there, and may hide what photographs show.
+    """
     axis = lambda camera: camera.world_to_camera[2, :3]
     photographed = [camera for camera in background.cameras if camera.name not in background.without_photo]
     axes = np.stack([axis(camera) for camera in photographed])
     is_near = lambda camera: float((axes @ axis(camera)).max()) > np.cos(np.radians(MAX_ANGLE))
-    return [
-        camera for camera in background.cameras if camera.name not in background.without_photo or is_near(camera)
-    ]
+    return [camera for camera in background.cameras if camera.name not in background.without_photo or is_near(camera)]
 
 
 def least_covered_view(

@@ -42,9 +42,7 @@ def complete_extra_views(
         draft.gaussians, draft.is_new, background, cameras, mirror_depth
     )
     uncovered = find(draft, background.cameras)
-    draft = draft.drop(
-        coverage.find_floaters(draft.gaussians, draft.is_new, background, uncovered, FLOATER_RATIO)
-    )
+    draft = draft.drop(coverage.find_floaters(draft.gaussians, draft.is_new, background, uncovered, FLOATER_RATIO))
     completed = coverage.completed_views(references, draft.gaussians, background)
     sources = replace(background, completed=completed)
     cameras = coverage.cameras_near_photographs(background)
@@ -55,7 +53,7 @@ def complete_extra_views(
         hole, mask = uncovered[camera.name], background.masks[camera.name]
         picture = _complete_view(draft, camera, hole, sources, painter)
         reference = Reference(camera, picture, hole)
-        print(f"further view {camera.name}: {hole.sum() / mask.sum():.1%} of the mask is covered by nothing")
+        print(f"extra view {camera.name}: {hole.sum() / mask.sum():.1%} of the mask is covered by nothing")
         try:
             filled = fill_reference(params, draft, reference, background, farthest=True)
         except ValueError as error:  # a sliver at the border of a view: others may show it better
@@ -70,9 +68,7 @@ def complete_extra_views(
     return draft, extra, depths
 
 
-def _complete_view(
-    draft: Draft, camera, hole: np.ndarray, sources: Background, painter: Painter | None
-) -> np.ndarray:
+def _complete_view(draft: Draft, camera, hole: np.ndarray, sources: Background, painter: Painter | None) -> np.ndarray:
     """uint8 [H, W, 3]: the view with its uncovered pixels, bool [H, W], completed."""
     mask = sources.masks[camera.name]
     # Just outside C a photograph may still show the object's rim, which would be repeated.

@@ -117,9 +117,7 @@ def fill_reference(
             words += f"; a billboard, good within {billboard.GOOD_WITHIN} degrees, stands where the scene goes on"
         else:
             back = (
-                share.drawn
-                if share
-                else coverage.pixels_in_front(draft.gaussians, estimate, reference, mask) & ~hole
+                share.drawn if share else coverage.pixels_in_front(draft.gaussians, estimate, reference, mask) & ~hole
             )
             inserted, depth = inserted & ~ceded | back, np.where(back, estimate, depth)
         drawn_over = inserted & ~coverage.beside_depth_edges(depth, behind)

@@ -85,8 +85,8 @@ def crop_to_mask(reference: Reference) -> tuple[Camera, np.ndarray, np.ndarray]:
 
 
 def repetitions(supervision: Supervision) -> list[int]:
-    """How often each completed view occurs for one occurrence of each photograph, in proportion to its completed pixels:
-    an extra view of a few pixels must not take steps from the reference."""
+    """How often each completed view occurs for one occurrence of each photograph, in proportion to its completed
+    pixels: an extra view of a few pixels must not take steps from the reference."""
     sizes = [int(reference.mask.sum()) for reference in supervision.references]
     total = REFERENCE_SHARE / (1 - REFERENCE_SHARE) * len(supervision.cameras)
     return [max(1, round(total * size / max(sum(sizes), 1))) for size in sizes]

@@ -1,9 +1,9 @@
 """Predict whether score distillation can improve an initialization, from how well it shows the photographs.
 
-The embedded prior, adapted to the reference, improves pictures of up to `PRIOR_PSNR`, at its own size of `SIDE_PX` for a
-whole view, and degrades better ones (docs/distillation.md). The truth inside the hole is unknown. Beside the hole there
-are photographs, and renders inside the hole are about `HOLE_LOSS` worse. This says nothing of pixels that no reference
-shows and that patches of photographs filled.
+The embedded prior, adapted to the reference, improves pictures of up to `PRIOR_PSNR`, at its own size of `SIDE_PX` for
+a whole view, and degrades better ones (docs/distillation.md). The truth inside the hole is unknown. Beside the hole
+there are photographs, and renders inside the hole are about `HOLE_LOSS` worse. This says nothing of pixels that no
+reference shows and that patches of photographs filled.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ GUESSED_SHARE = 0.05  # of a view's mask: it was 0.19 where SDS gained (`demo-co
 
 
 class GainPrediction(NamedTuple):
-    """Whether SDS may gain, the reason in words, and the PSNR in dB beside the hole (None where nothing was compared)."""
+    """Whether SDS may gain, the reason in words, and the PSNR in dB beside the hole (None where nothing was
+    compared)."""
 
     may_gain: bool
     reason: str

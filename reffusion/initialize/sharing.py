@@ -150,8 +150,8 @@ def cross_visibility(
 
 
 def unchanged_rim(image: np.ndarray, photo: np.ndarray, drawn: np.ndarray) -> np.ndarray:
-    """bool [H, W]: pixels at the border of what was drawn over a photograph, bool [H, W], that look like the photograph;
-    both pictures uint8 [H, W, 3].
+    """bool [H, W]: pixels at the border of what was drawn over a photograph, bool [H, W], that look like the
+    photograph; both pictures uint8 [H, W, 3].
 
     Detected changes extend a little too far, and depth there belongs to something else.
     """

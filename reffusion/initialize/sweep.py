@@ -1,7 +1,7 @@
 """Plane sweep: find the depth of one photograph around a hole by comparing it with its neighbours.
 
-The expected depth of splats is rough, and biased towards the camera wherever haze hangs before a surface. A surface that
-continues into a hole must be accurate to a thousandth of its depth, or it breaks at the hole's border.
+The expected depth of splats is rough, and biased towards the camera wherever haze hangs before a surface. A surface
+that continues into a hole must be accurate to a thousandth of its depth, or it breaks at the hole's border.
 """
 
 from __future__ import annotations
@@ -94,7 +94,9 @@ def _smooth_depth(depth: np.ndarray, known: np.ndarray, side: int) -> np.ndarray
 def _select_neighbors(camera: Camera, point: np.ndarray, views: Sequence[DepthView]) -> list[DepthView]:
     """The views that look at a point from another direction, but not too different a one; the nearest first."""
     direction = lambda center: (center - point) / max(np.linalg.norm(center - point), 1e-12)
-    angles = [np.degrees(np.arccos(np.clip(direction(v.camera.center) @ direction(camera.center), -1, 1))) for v in views]
+    angles = [
+        np.degrees(np.arccos(np.clip(direction(v.camera.center) @ direction(camera.center), -1, 1))) for v in views
+    ]
     chosen = sorted(
         (angle, k)
         for k, angle in enumerate(angles)

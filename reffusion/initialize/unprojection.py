@@ -56,8 +56,8 @@ def estimate_depth(
         hints: what else is known of the depth. farthest: see `background_depth.continued`.
 
     Returns:
-        Depth [H, W] float64, as rendered where that is known, else estimated; the estimate at all pixels; and the way it
-        was found, in words.
+        Depth [H, W] float64, as rendered where that is known, else estimated; the estimate at all pixels; and the way
+        it was found, in words.
 
     Raises:
         ValueError: naming the view, where too little is known around the hole, or the estimate does not fit.
@@ -83,8 +83,8 @@ def estimate_depth(
 def find_hole(draft: Draft, reference: Reference, mask: np.ndarray, min_alpha: float) -> np.ndarray:
     """bool [H, W]: the pixels that a reference has to fill.
 
-    These are the pixels of its mask that no earlier reference filled, and pixels of C, `mask`, that the Gaussians cover by
-    less than `min_alpha`, e.g. where floaters were dropped.
+    These are the pixels of its mask that no earlier reference filled, and pixels of C, `mask`, that the Gaussians
+    cover by less than `min_alpha`, e.g. where floaters were dropped.
     """
     features = draft.is_new[:, None].to(draft.gaussians.means.dtype)
     rendering = rasterizer.render(draft.gaussians, reference.camera, features=features, sh_degree=0)
@@ -103,8 +103,8 @@ def find_gaps(
 ) -> np.ndarray:
     """bool [H, W]: those of `pixels`, bool [H, W], whose surface another view sees through into nothing.
 
-    Beside the hole, behind the object, lie Gaussians that few views looked at from about one side. From there they cover
-    the ground; from the other side they leave a black gap between the ground and the new surface.
+    Beside the hole, behind the object, lie Gaussians that few views looked at from about one side. From there they
+    cover the ground; from the other side they leave a black gap between the ground and the new surface.
 
     Args:
         camera: the view. depth: [H, W] of its surface.

@@ -1,7 +1,8 @@
 """View-dependent colour of new Gaussians: it follows the surface around them, from photograph to photograph.
 
 One picture shows a surface from one side. A wet table, or a leaf in the sun, is brighter from another side, and new
-Gaussians of constant colour would stand out as a patch. The photographs show the surface around the hole from all sides.
+Gaussians of constant colour would stand out as a patch. The photographs show the surface around the hole from all
+sides.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from reffusion.types import Camera, Gaussians
 RING = 0.1  # of the image's width: how far around the hole the surface is sampled
 MARGIN = 0.006  # of the image's width: distance from the object's blurred rim
 BLUR = 0.015  # of the image's width: standard deviation at which brightness is compared
-COLOR_BLUR = 0.03  # of the image's width: for the similarity of materials; with the same blur dark spots seem to brighten
+COLOR_BLUR = 0.03  # of the image's width: at which materials are compared; at `BLUR` dark spots would seem to brighten
 MAX_SAMPLES = 3000  # points that are kept
 NEIGHBORS = 200  # samples that each new Gaussian takes its colour change from
 BATCH = 20_000  # new Gaussians at a time: their neighbours in all views take a GB at 200 views
@@ -68,7 +69,8 @@ def measure_change(
         hole: bool [H, W]. camera: the completed view, one of those with a photograph.
         views: V of them. photos: their pictures, uint8, in one exposure.
     """
-    # Outside the hole photographs are compared: a reference may show in the light what they show in the object's shadow.
+    # Outside the hole photographs are compared: a reference may show in the light what they show in the object's
+    # shadow.
     picture = np.where(hole[..., None], picture, photos[camera.name])
     ring = morphology.dilate(hole, RING) & ~morphology.dilate(hole, MARGIN) & (depth > 0)
     rows, columns = np.nonzero(ring)
@@ -100,7 +102,8 @@ def transfer_sh(
     """The new Gaussians, bool [N], with spherical harmonics that change as the surface around them does.
 
     Each takes the mean change of its neighbours in every view, weighted by distance and similarity of colour; the
-    harmonics are a least squares fit to these. Towards `camera`, in which the Gaussians were made, they keep their colour.
+    harmonics are a least squares fit to these. Towards `camera`, in which the Gaussians were made, they keep their
+    colour.
     """
     indices = torch.nonzero(is_new)[:, 0]
     if gaussians.sh_degree == 0 or not len(indices) or len(change.points) < NEIGHBORS:

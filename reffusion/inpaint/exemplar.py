@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
-from torch import Tensor
 
 from reffusion import geometry
-from reffusion.background.continuation import planes_around
-from reffusion.background.mirrors import Drawn, Mirror, imaged
-from reffusion.background.plane import Plane, without_pits
-from reffusion.background.symmetry import mirrors_around
-from reffusion.background.visibility import Witness, pixels, witnesses
+from reffusion.background.mirrors import MirrorImage, render_mirrors
+from reffusion.background.model import Background
+from reffusion.background.plane import Plane, remove_reflected_depth
+from reffusion.background.visibility import DepthView
+from reffusion.depth.inpaint_depth import inpaint_depth
 from reffusion.depth.layers import pieces, standing
 from reffusion.inpaint.normals import slopes
 from reffusion.inpaint.patchmatch.completion import Completed, complete
@@ -26,10 +25,8 @@ from reffusion.inpaint.shift_map.photo_shifts import shifted
 from reffusion.inpaint.shift_map.plane_montage import montage
 from reffusion.inpaint.shift_map.plane_symmetry import FEWEST, Repeats, Seen, repeats
 from reffusion.inpaint.source_image import Shown
-from reffusion.masks.voting import extent
-from reffusion.morphology import hull, widened
-from reffusion.references.view_ranking import drawn_across
-from reffusion.types import Camera, Gaussians
+from reffusion.morphology import convex_hull, dilate, to_pixels
+from reffusion.types import Camera
 
 OTHERS = 3  # photographs beside the view's own that patches are taken from
 RING = 0.12  # of the image's width: how far around the object surfaces are told apart
@@ -45,58 +42,11 @@ SOME = 200  # pixels of a view that tell
 GOES_ON = 0.02  # share of the hole below which what stands before the rest is of no account: it ends beside it
 
 
-@dataclass(frozen=True)
-class Around:
-    """What the photographs show around the object.
-
-    Attributes:
-        views: the training views as witnesses. planes: those around the object.
-        photos: view name -> uint8 [H, W, 3], exposed alike.
-        centre: [3], the object's middle. radius: of most of it; infinite where there is none.
-        completed: views completed before, without the object, and their pictures, uint8 [H, W, 3].
-        mirrors: of things around the object.
-    """
-
-    views: Sequence[Witness]
-    planes: Sequence[Plane]
-    photos: Mapping[str, np.ndarray]
-    centre: np.ndarray
-    radius: float
-    completed: Sequence[tuple[Witness, np.ndarray]] = ()
-    mirrors: Sequence[Mirror] = ()
-
-
-def looked_around(
-    gaussians: Gaussians,
-    thing: Tensor,
-    cameras: Sequence[Camera],
-    hidden: Mapping[str, np.ndarray],
-    photos: Mapping[str, np.ndarray],
-    points: np.ndarray,
-    seed: int = 0,
-) -> Around:
-    """What the training views, `cameras`, show around the object.
-
-    Args:
-        gaussians: N of them, the object included. thing: [N] bool, the object's.
-        hidden: view name -> bool [H, W], where the photograph shows the object. photos: see `Around`.
-        points: [P, 3], the scene's sparse points.
-        seed: of the draws that find planes.
-    """
-    views = witnesses(gaussians, cameras, hidden)
-    if not thing.any():
-        return Around(views, [], photos, np.zeros(3), np.inf)
-    centre, radius = extent(gaussians.means[thing])
-    planes = planes_around(centre, radius, views, points, seed)
-    mirrors = mirrors_around(gaussians.map(lambda p: p[~thing]), centre, radius, views, planes, photos)
-    return Around(views, planes, photos, centre, radius, mirrors=mirrors)
-
-
 def to_paint(hidden: np.ndarray, unknown: np.ndarray) -> np.ndarray:
     """bool [H, W]: what of a view is painted anew for the pixels that are `unknown`: also what of C (`hidden`) is left
     between them in narrow pieces, and the rim."""
     decided = hidden & ~unknown
-    reach = pixels(NARROW, hidden.shape[1])
+    reach = to_pixels(NARROW, hidden.shape[1])
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     wide = np.pad((~hidden | decided).astype(np.uint8), reach, constant_values=1)
     broad = cv2.morphologyEx(wide, cv2.MORPH_OPEN, disk)[reach:-reach, reach:-reach] > 0
@@ -106,11 +56,11 @@ def to_paint(hidden: np.ndarray, unknown: np.ndarray) -> np.ndarray:
 def with_rim(hole: np.ndarray, hidden: np.ndarray) -> np.ndarray:
     """The hole, bool [H, W], and the rim of C (`hidden`) beside it, inside and out: what is left there of the object's
     blurred edge would be continued."""
-    return hole | widened(hidden, RIM) & widened(hole, RIM)
+    return hole | dilate(hidden, RIM) & dilate(hole, RIM)
 
 
 def completions(
-    image: np.ndarray, hole: np.ndarray, camera: Camera, hidden: np.ndarray, around: Around, seeds: Sequence[int]
+    image: np.ndarray, hole: np.ndarray, camera: Camera, hidden: np.ndarray, around: Background, seeds: Sequence[int]
 ) -> list[Completed]:
     """A training view's picture, uint8 [H, W, 3], with its hole filled from patches of its own photograph, of others
     and of views completed before, once for each seed.
@@ -118,10 +68,10 @@ def completions(
     Args:
         hole: bool [H, W]. hidden: bool [H, W], C: where the photograph shows the object.
     """
-    mirrored = imaged(around.mirrors, camera, hidden, around.views)
+    mirrored = render_mirrors(around.mirrors, camera, hidden, around.views)
     target, sources, smooth, how = _told(image, hole, camera, hidden, around, mirrored)
     depth = target.size * camera.fx
-    shown = hole & mirrored.told & (mirrored.supposed < (1 + ON) * depth)
+    shown = hole & mirrored.is_observed & (mirrored.plausible_depth < (1 + ON) * depth)
     if shown.any():
         beside = ~target.masked & _near(depth, mirrored.depth)
         target = _painted(target, laid_over(target.image, mirrored.picture, shown, beside), shown)
@@ -155,7 +105,7 @@ def _painted(target: Shown, image: np.ndarray, filled: np.ndarray) -> Shown:
 
 
 def _told(
-    image: np.ndarray, hole: np.ndarray, camera: Camera, hidden: np.ndarray, around: Around, mirrored: Drawn
+    image: np.ndarray, hole: np.ndarray, camera: Camera, hidden: np.ndarray, around: Background, mirrored: MirrorImage
 ) -> tuple[Shown, list[Shown], list[int], dict[int, Repeats]]:
     """The view, the pictures that it is filled from, the view's own photograph first, the planes along which patches
     are carried, and how those that repeat themselves do; see `completions`."""
@@ -190,7 +140,7 @@ def _how_it_repeats(plane: int, sources: Sequence[Shown]) -> Repeats | None:
 
 
 def _behind(
-    own: Witness, hidden: np.ndarray, asked: np.ndarray, planes: Sequence[Plane], mirrored: Drawn
+    own: DepthView, hidden: np.ndarray, asked: np.ndarray, planes: Sequence[Plane], mirrored: MirrorImage
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What a view shows without the object: planes' numbers, int [H, W], depth, [H, W] float64, and what stands before
     the rest, int [H, W], see `_drawn`.
@@ -198,24 +148,24 @@ def _behind(
     Where it is `asked` for, bool [H, W], C and its rim, the nearest plane that is seen there by others or goes on
     there; where there is none, see `_drawn`.
     """
-    shown = without_pits(own.depth, own.camera, planes)
+    shown = remove_reflected_depth(own.depth, own.camera, planes)
     known = (shown > 0) & ~hidden
     depth, layer = _drawn(shown, known, hidden)
     surface, nearest = np.where(hidden, 0, labelled(shown, own.camera, planes)), np.full(hidden.shape, np.inf)
     for k, plane in enumerate(planes, start=1):
         at = plane.depth(own.camera)
-        whole = plane.seen | plane.within | plane.goes_on | plane.pit
+        whole = plane.seen | plane.enclosed | plane.continued | plane.reflective
         before = hidden | (at < (1 + ON) * shown)
-        there = plane.on(whole, at, own.camera, asked & before) & (at < nearest)
+        there = plane.pixels_on(whole, at, own.camera, asked & before) & (at < nearest)
         surface[there], nearest[there] = k, at[there]
     for k in range(1, len(planes) + 1):
         beside = (surface == k) & ~hidden & (layer >= 0)
         layer[hidden & (surface == k)] = np.bincount(layer[beside]).argmax() if beside.any() else 0
-    image = mirrored.supposed < (1 + ON) * nearest  # a plane may cut through a round thing
+    image = mirrored.plausible_depth < (1 + ON) * nearest  # a plane may cut through a round thing
     if image.any():
         of = known & (layer >= 0) & _near(shown, mirrored.depth)
         layer[image] = np.bincount(layer[of]).argmax() if of.any() else 0
-        surface[image], nearest[image] = 0, mirrored.supposed[image]
+        surface[image], nearest[image] = 0, mirrored.plausible_depth[image]
     return surface, np.where(np.isfinite(nearest), nearest, depth), layer
 
 
@@ -228,16 +178,16 @@ def _drawn(depth: np.ndarray, known: np.ndarray, hidden: np.ndarray) -> tuple[np
     """
     if not known.any():
         return np.ones(depth.shape), np.zeros(depth.shape, np.int64)
-    across = drawn_across(depth, known)
+    across = inpaint_depth(depth, known)
     found = np.where(across > 0, across, np.median(depth[known]))
-    ring = known & widened(hidden, RING)
+    ring = known & dilate(hidden, RING)
     disparity = geometry.reciprocal(depth)
     piece, before = pieces(disparity, ring, hole=hidden), standing(disparity, ring, hidden)
     layer = np.where(ring, before, np.where(hidden, 0, -1))
     away = lambda k: -float(np.median(depth[piece == k]))
     for nearer, k in enumerate(sorted(range(1, piece.max() + 1), key=away)):
-        own = drawn_across(depth, piece == k)
-        there = hidden & (own > 0) & (hull(piece == k) if nearer else True)
+        own = inpaint_depth(depth, piece == k)
+        there = hidden & (own > 0) & (convex_hull(piece == k) if nearer else True)
         found[there], layer[there] = own[there], np.bincount(before[piece == k]).argmax()
     return found, layer
 
@@ -250,7 +200,7 @@ class _Nearest:
         told = (layer >= 0) & (np.indices(layer.shape).sum(0) % 2 == 0)
         self._tree, self._layer = cKDTree(points[told]), layer[told]
 
-    def of(self, view: Witness) -> np.ndarray:
+    def of(self, view: DepthView) -> np.ndarray:
         """int [H, W]: what the nearest point is of; 0 where the view shows nothing."""
         found = np.zeros(view.depth.shape, np.int64)
         shown = view.depth > 0
@@ -259,23 +209,23 @@ class _Nearest:
 
 
 def _source(
-    view: Witness, picture: np.ndarray, around: Around, nearest: _Nearest | None = None, mirrors: bool = False
+    view: DepthView, picture: np.ndarray, around: Background, nearest: _Nearest | None = None, mirrors: bool = False
 ) -> Shown:
     """A view's picture as a source of patches: what it shows near the object, beside its mask; without its `mirrors`,
     which show something else from elsewhere. `nearest`: of what stands before the rest."""
-    depth = without_pits(view.depth, view.camera, around.planes)
+    depth = remove_reflected_depth(view.depth, view.camera, around.planes)
     points = geometry.unproject(depth, view.camera)
-    near = np.linalg.norm(points - around.centre, axis=-1) < NEARBY * around.radius
+    near = np.linalg.norm(points - around.center, axis=-1) < NEARBY * around.radius
     usable = near & (depth > 0) & (mirrors | (depth == view.depth))
     surface = labelled(depth, view.camera, around.planes)
     size = np.where(depth > 0, depth, 1.0) / view.camera.fx
     frames, places = (of(surface, view.camera, around.planes) for of in (frames_of, places_of))
     layer = np.zeros_like(surface) if nearest is None else nearest.of(view)
-    lies = slopes(depth, (depth > 0) & ~view.hidden, view.camera)
-    return Shown(picture, widened(view.hidden, BESIDE), usable, surface, frames, size, places, layer, lies)
+    lies = slopes(depth, (depth > 0) & ~view.masked, view.camera)
+    return Shown(picture, dilate(view.masked, BESIDE), usable, surface, frames, size, places, layer, lies)
 
 
-def _others(own: Witness, views: Sequence[Witness]) -> list[Witness]:
+def _others(own: DepthView, views: Sequence[DepthView]) -> list[DepthView]:
     """From near to far, so that what is oblique in one is not in another."""
     away = lambda view: float(np.linalg.norm(view.camera.center - own.camera.center))
     rest = sorted((view for view in views if view is not own), key=away)
@@ -283,14 +233,14 @@ def _others(own: Witness, views: Sequence[Witness]) -> list[Witness]:
     return [rest[k] for k in sorted(chosen)]
 
 
-def _roughness(plane: Plane, around: Around) -> float:
+def _roughness(plane: Plane, around: Background) -> float:
     """Median distance of what is seen of a plane from it, relative to depth."""
     found = []
     for view in around.views[:: max(1, len(around.views) // 6)]:
         off = np.abs(view.depth / plane.depth(view.camera) - 1)
         points = geometry.unproject(view.depth, view.camera)
-        near = np.linalg.norm(points - around.centre, axis=-1) < REACH * around.radius
-        mine = near & (view.depth > 0) & ~view.hidden & (off < LOOSE)
+        near = np.linalg.norm(points - around.center, axis=-1) < REACH * around.radius
+        mine = near & (view.depth > 0) & ~view.masked & (off < LOOSE)
         if mine.sum() >= SOME:
             found.append(float(np.median(off[mine])))
     return float(np.median(found)) if found else np.inf

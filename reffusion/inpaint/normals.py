@@ -7,7 +7,7 @@ import numpy as np
 from scipy import ndimage
 
 from reffusion import geometry
-from reffusion.background.visibility import pixels
+from reffusion.morphology import to_pixels
 from reffusion.types import Camera
 
 ARM = 0.01  # of the image's width: between points of half this distance and more a slope is measured
@@ -18,7 +18,7 @@ TOLD = 0.3  # share of a window that must be known
 def slopes(depth: np.ndarray, known: np.ndarray, camera: Camera) -> np.ndarray:
     """[H, W, 3] float32: the mean normal around each pixel, towards the camera, in the world; short where normals
     differ, as in leaves. That of the nearest known pixel where it is not `known`, bool [H, W]."""
-    step = pixels(ARM, depth.shape[1]) + 1
+    step = to_pixels(ARM, depth.shape[1]) + 1
     window = (2 * step - 1,) * 2
     points = geometry.unproject(cv2.medianBlur(depth.astype(np.float32), 5), camera)
     share = cv2.blur(known.astype(np.float64), window)
@@ -37,5 +37,5 @@ def slopes(depth: np.ndarray, known: np.ndarray, camera: Camera) -> np.ndarray:
     rays = geometry.pixel_rays(camera) @ camera.world_to_camera[:3, :3]
     normal *= -np.sign((normal * rays).sum(-1, keepdims=True))
     nearest = ndimage.distance_transform_edt(~told, return_distances=False, return_indices=True)
-    around = (2 * pixels(EVEN, depth.shape[1]) + 1,) * 2
+    around = (2 * to_pixels(EVEN, depth.shape[1]) + 1,) * 2
     return cv2.blur(normal[tuple(nearest)].astype(np.float32), around)

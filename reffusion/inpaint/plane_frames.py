@@ -31,10 +31,10 @@ def frames_of(surface: np.ndarray, camera: Camera, planes: Sequence[Plane]) -> n
     for k, plane in enumerate(planes, start=1):
         mine = surface == k
         slope = rays[mine] @ plane.normal
-        distance = (plane.height - camera.center @ plane.normal) / slope
+        distance = (plane.offset - camera.center @ plane.normal) / slope
         for axis, step in enumerate(steps):
             moved = step - rays[mine] * (step @ plane.normal / slope)[:, None]
-            frames[mine, :, axis] = distance[:, None] * moved @ plane.along.T
+            frames[mine, :, axis] = distance[:, None] * moved @ plane.axes.T
     return frames
 
 
@@ -44,8 +44,8 @@ def places_of(surface: np.ndarray, camera: Camera, planes: Sequence[Plane]) -> n
     rays = geometry.pixel_rays(camera) @ camera.world_to_camera[:3, :3]
     for k, plane in enumerate(planes, start=1):
         mine = surface == k
-        distance = (plane.height - camera.center @ plane.normal) / (rays[mine] @ plane.normal)
-        places[mine] = (camera.center + rays[mine] * distance[:, None] - plane.origin) @ plane.along.T
+        distance = (plane.offset - camera.center @ plane.normal) / (rays[mine] @ plane.normal)
+        places[mine] = (camera.center + rays[mine] * distance[:, None] - plane.origin) @ plane.axes.T
     return places
 
 

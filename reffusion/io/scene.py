@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from reffusion.types import MaskSet, Reference, Scene
 
 WARNINGS = "warnings.json"  # in either folder: sentences about what is odd
-PIXEL_CLASSES = ("raw", "consistent", "undecided", "invent")
+PIXEL_CLASSES = ("raw", "consistent", "unobserved", "invent")
 
 
 def save_scene(poses_dir: Path, scene: Scene) -> None:
@@ -125,7 +125,7 @@ def load_fill(raw_masks_dir: Path) -> dict[str, np.ndarray]:
 
 
 def save_mask_sets(masks_dir: Path, sets: Mapping[str, MaskSet]) -> None:
-    """Write raw/, consistent/, undecided/ and invent/<view>.png."""
+    """Write raw/, consistent/, unobserved/ and invent/<view>.png."""
     for name, mask_set in sets.items():
         for kind in PIXEL_CLASSES:
             save_mask(Path(masks_dir) / kind / f"{name}.png", getattr(mask_set, kind))

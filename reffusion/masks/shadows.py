@@ -27,8 +27,8 @@ ISLAND, NOTCH = 0.015, 0.01  # of the image's width: smaller islands are dropped
 
 
 def redrawn_difference(reference: np.ndarray, photo: np.ndarray, known: np.ndarray) -> float:
-    """The difference, in levels of 255, between a picture and its photograph where both show the same: the texture of an
-    autoencoder.
+    """The difference, in levels of 255, between a picture and its photograph where both show the same: the texture of
+    an autoencoder.
 
     Args:
         known: bool [H, W], pixels without the object.
@@ -89,8 +89,8 @@ def log_light(reference: np.ndarray, view: np.ndarray) -> np.ndarray:
 def project_shadow(
     shadow: np.ndarray, light: np.ndarray, depth: np.ndarray, camera: Camera, views: Sequence[DepthView]
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """View name -> the shadow as the view shows it, bool [H, W], and its log light [H, W, 3]; NaN elsewhere and where it
-    is unknown.
+    """View name -> the shadow as the view shows it, bool [H, W], and its log light [H, W, 3]; NaN elsewhere and where
+    it is unknown.
 
     Args:
         shadow: bool [H, W]; light: [H, W, 3], `log_light`; depth: [H, W], above 0 where known; camera: their view.

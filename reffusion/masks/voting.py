@@ -122,8 +122,8 @@ def render_labels(gaussians: Gaussians, labels: Tensor, camera: Camera) -> np.nd
 
 
 def best_view(invent: Mapping[str, np.ndarray], names: Sequence[str]) -> str | None:
-    """The view to complete: the one with the largest invent mask, of those whose mask does not touch the border if there
-    are any; None where no view has anything to invent.
+    """The view to complete: the one with the largest invent mask, of those whose mask does not touch the border if
+    there are any; None where no view has anything to invent.
 
     PAPER leaves open: which view is the reference. The largest mask, because parts of the hole that it does not show
     would stay empty; away from the border, because a border that cuts the mask hides a part of the hole.

@@ -14,7 +14,7 @@ from reffusion.io.images import resize_nearest, resized
 from reffusion.metrics import consistency, image_metrics
 from reffusion.metrics.consistency import Shown
 from reffusion.metrics.lpips import Lpips
-from reffusion.morphology import widened
+from reffusion.morphology import dilate
 
 LIBRARIES = ("torch", "numpy", "opencv-contrib-python-headless")
 OUTSIDE_MARGIN = 0.01  # how much wider than the mask is left out of the scores outside it, / image width
@@ -48,7 +48,7 @@ def row_of(
     row = {"view": camera.name, "width": camera.width, "height": camera.height} | dict.fromkeys(CONSISTENCY)
     row |= dict(zip(("left", "top", "right", "bottom"), box or (None,) * 4, strict=True))
     if truth.picture is not None:
-        margin = widened(shown.mask, OUTSIDE_MARGIN)
+        margin = dilate(shown.mask, OUTSIDE_MARGIN)
         scored = box is not None and not truth.shows_object
         targets = image_metrics.lpips_targets(box.crop(truth.picture), models) if scored else {}
         given = truth.picture, box, targets, margin, truth.shows_object, truth.unseen

@@ -30,12 +30,16 @@ class Params(Settings):
         "nothing, there is a second",
     )
     # PAPER leaves open: the new Gaussians' view-dependent colour. The reference shows one side only.
-    gloss: bool = Field(False, description="they change with the direction as the surfaces around them do")
+    view_dependent_color: bool = Field(
+        False, description="they change with the direction as the surfaces around them do"
+    )
     # PAPER leaves open: what the reference's camera does not see of the hole.
-    further: int = Field(0, ge=0, description="most views completed beside the references, until nothing is uncovered")
+    extra_views: int = Field(
+        0, ge=0, description="most views completed beside the references, until nothing is uncovered"
+    )
     inpainter: Literal["exemplar", "diffusion", "lama", "migan", "auto"] = Field(
         "exemplar",
         description="what completes them, as `reference.inpainter`; diffusion: patches of the photographs too",
     )
-    settle: int = Field(0, ge=0, description="steps of reconstruction after filling; 0: none")
+    refit_steps: int = Field(0, ge=0, description="steps of reconstruction after filling; 0: none")
     device: Device = Field("cpu", description="where Gaussians are drawn and the depth model is asked")

@@ -30,8 +30,8 @@ class Params(Settings):
     )
     debris: bool = Field(True, description="masked too: what the removal brings to light and no photograph supports")
     # PAPER leaves open: it always invents. So few pixels are rims of masks and crannies, not worth a diffusion model.
-    negligible: float = Field(0.005, ge=0, lt=1, description="share of C up to which undecided pixels are left alone")
-    invent: Literal["auto", "undecided", "consistent"] = Field(
-        "auto", description="what is made up; auto = undecided pixels, and what the scene says is to be filled"
+    negligible: float = Field(0.005, ge=0, lt=1, description="share of C up to which unobserved pixels are left alone")
+    invent: Literal["auto", "unobserved", "consistent"] = Field(
+        "auto", description="what is made up; auto = unobserved pixels, and what the scene says is to be filled"
     )
     device: Device = Field("cpu", description="where Gaussians are drawn and votes are counted")

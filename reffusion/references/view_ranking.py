@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from reffusion import geometry
+from reffusion.depth.inpaint_depth import inpaint_depth
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
 
@@ -73,18 +74,8 @@ def holes(
         known = (drawn.alpha.cpu().numpy() > 0.5) & ~covered
         pixels = shrunk(invent[camera.name], 0.5) & covered
         if pixels.any() and known.any():
-            found[camera.name] = Hole(small, pixels, drawn_across(drawn.depth.cpu().numpy(), known))
+            found[camera.name] = Hole(small, pixels, inpaint_depth(drawn.depth.cpu().numpy(), known))
     return found
-
-
-def drawn_across(depth: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Depth [h, w] whose unknown pixels continue the known disparity, from all sides, by distance."""
-    disparity = np.where(known, 1 / np.where(known, depth, 1.0), 0.0)
-    top = max(float(disparity.max()), 1e-12)
-    levels = np.round(disparity / top * 65535).astype(np.uint16)
-    filled = cv2.inpaint(levels, (~known).astype(np.uint8), 3, cv2.INPAINT_TELEA) / 65535 * top
-    filled = np.where(known, disparity, filled)
-    return np.divide(1.0, filled, out=np.zeros_like(filled), where=filled > 1e-3 * top)
 
 
 def ranked(holes: Mapping[str, Hole], chosen: Sequence[str], most: int) -> list[Ranked]:

@@ -15,7 +15,7 @@ __all__ = ["Params", "lacks", "needed_weights", "preview"]
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
     """What must be on this machine, and what of it is not; `brings`: the keys of scene.yaml."""
     found = [local.of_model(params.depth.model, "float32")] if params.depth.model else []
-    painted = params.further and params.inpainter in PAINTERS
+    painted = params.extra_views and params.inpainter in PAINTERS
     return found + ([painters.of_painter(params.inpainter, param="initialize.inpainter")] if painted else [])
 
 
@@ -26,16 +26,16 @@ def optional_weights(params: Params) -> list[local.Need]:
 
 def machine_facts(params: Params) -> dict[str, str]:
     """What the result depends on beside the parameters: which inpainter, and the content of its file."""
-    return painters.inpainter_facts(params.inpainter) if params.further else {}
+    return painters.inpainter_facts(params.inpainter) if params.extra_views else {}
 
 
 def preview(params: Params, **_: Path | None) -> list[str]:
     """What the stage will do, as far as that is known before it looks."""
-    if not (params.further and params.start == "reference"):
+    if not (params.extra_views and params.start == "reference"):
         return []
     kind = painters.resolve_inpainter(params.inpainter)
     how = f"by {PAINTERS[kind].name}" if kind in PAINTERS else "from patches of the photographs"
-    return [f"completes up to {params.further} further views {how}: what no reference shows"]
+    return [f"completes up to {params.extra_views} extra views {how}: what no reference shows"]
 
 
 def lacks(params: Params) -> list[str]:
