@@ -43,7 +43,7 @@ def witness(view, step=0.0):
         depth = np.min([np.where(each > 0, each, np.inf) for each in (floor, front, behind, side)], axis=0)
         bounds = np.stack([(LOW - view.center) / rays, (HIGH - view.center) / rays])
     enter, leave = bounds.min(0).max(-1), bounds.max(0).min(-1)
-    return DepthView.of(view, depth, depth_range(depth.astype(np.float32)), (enter < leave) & (leave > 0))
+    return DepthView.from_range(view, depth, depth_range(depth.astype(np.float32)), (enter < leave) & (leave > 0))
 
 
 @pytest.fixture(scope="module")
@@ -54,11 +54,11 @@ def planes():
 
 def test_the_side_of_a_wall_goes_on_behind_a_thing_down_to_the_floor_and_not_into_the_wall(planes):
     sides = [plane for plane in planes if abs(plane.normal[0]) > 0.99]
-    assert len(sides) == 1 and abs(sides[0].height) < 0.01
-    _, y, z = np.moveaxis(sides[0].cells, -1, 0)
-    known = sides[0].goes_on | sides[0].seen
+    assert len(sides) == 1 and abs(sides[0].offset) < 0.01
+    _, y, z = np.moveaxis(sides[0].cell_centers, -1, 0)
+    known = sides[0].continued | sides[0].seen
     assert known[(y > 0.03) & (y < DEEP - 0.03) & (z > 0.03) & (z < 0.6)].mean() > 0.95
-    assert sides[0].goes_on.sum() > 100
+    assert sides[0].continued.sum() > 100
     assert not known[(y < -0.05) | (y > DEEP + 0.05) | (z < -0.05)].any()
 
 
@@ -81,7 +81,7 @@ def test_sparse_points_tell_where_planes_lie_that_are_drawn_too_near():
         true = witness(camera(turn))
         rows = np.linspace(0, 0.02, SIZE)[:, None]  # haze: the farther up, so farther off, the nearer it is drawn
         depth = true.depth * (1 - rows[::-1])
-        views.append(DepthView.of(true.camera, depth, depth_range(depth.astype(np.float32)), true.hidden))
+        views.append(DepthView.from_range(true.camera, depth, depth_range(depth.astype(np.float32)), true.masked))
     draws, count = np.random.default_rng(0), 150
     floor = np.stack([*draws.uniform(-0.5, 0.5, (2, count)), np.zeros(count)], 1)
     front = np.stack([draws.uniform(0, 0.5, count), np.zeros(count), draws.uniform(0, 0.6, count)], 1)
@@ -91,7 +91,7 @@ def test_sparse_points_tell_where_planes_lie_that_are_drawn_too_near():
     for axis in (2, 1):
         off = lambda plane, axis=axis: np.degrees(np.arccos(abs(plane.normal[axis])))
         of_points, of_views = (min(planes, key=off) for planes in (told, untold))
-        assert off(of_points) < 0.2 and abs(of_points.height) < 2e-3
+        assert off(of_points) < 0.2 and abs(of_points.offset) < 2e-3
         assert off(of_views) > 2 * off(of_points)
     line = np.stack([np.linspace(-0.5, 0.5, 200), np.zeros(200), np.zeros(200)], 1)  # tells no direction across
     few = find_planes((LOW + HIGH) / 2, 0.3, views, line)
@@ -108,7 +108,7 @@ def test_a_floor_that_is_drawn_twice_is_one_unless_points_tell_a_step():
     floor = np.stack([*draws.uniform(-0.5, 0.3, (2, count)), draws.normal(0, 5e-4, count)], 1)
     boards = floor[:, :1] % 0.3 < 0.15
     heights = lambda points: sorted(
-        abs(plane.height)
+        abs(plane.offset)
         for plane in find_planes(np.array([0.0, -0.3, 0.1]), 0.15, views, points)
         if abs(plane.normal[2]) > 0.99
     )

@@ -8,6 +8,7 @@ import small_scene as small
 import torch
 
 from reffusion import geometry
+from reffusion.background.model import Background
 from reffusion.depth import background_depth
 from reffusion.depth.background_depth import Completion
 from reffusion.gaussians.optimize import reconstruction_loss
@@ -15,6 +16,7 @@ from reffusion.gaussians.sheets import Sheets
 from reffusion.gaussians.surfels import surface_gaussians, surface_normals
 from reffusion.initialize import coverage
 from reffusion.initialize import unprojection as rules
+from reffusion.initialize.draft import Draft
 from reffusion.initialize.refit import Supervision, crop_to_mask, repetitions
 from reffusion.io.arrays import load_json, load_labels, save_labels
 from reffusion.io.images import load_exr
@@ -165,11 +167,12 @@ def test_no_view_is_completed_from_behind_where_nobody_photographed():
     turns = {"photographed": 0, "beside": 40, "before the other": 205, "behind": 110, "the other": 180}
     cameras = [small.looking(name, angle, 0.5, 2.0, at, 32, 40.0) for name, angle in turns.items()]
     blank = frozenset({"beside", "before the other", "behind"})
-    crop_to_mask = rules.Surroundings(cameras, {}, {}, [], [], np.zeros((0, 3)), at, 1.0, [], {}, blank)
-    assert [camera.name for camera in coverage.cameras_near_photographs(crop_to_mask)] == [
+    views = [type("View", (), {"camera": camera}) for camera in cameras]
+    background = Background(views, {}, without_photo=blank)
+    assert [camera.name for camera in coverage.cameras_near_photographs(background)] == [
         n for n in turns if n != "behind"
     ]
-    everywhere = replace(crop_to_mask, blank=frozenset())
+    everywhere = replace(background, without_photo=frozenset())
     assert coverage.cameras_near_photographs(everywhere) == cameras, "with photographs all views are"
 
 
@@ -179,14 +182,10 @@ def test_what_is_painted_on_the_new_surface_stays_in_place_from_the_other_side()
     depth, picture = floor(view)
     reference = Reference(view, (picture * 255).round().astype(np.uint8), np.ones(depth.shape, bool))
     nothing = surface_gaussians(picture, depth, np.zeros(depth.shape, bool), view, sh_count=1)
-    crop_to_mask, errors = (
-        rules.Surroundings([], {}, {}, [], [], np.zeros((0, 3)), np.zeros(3), 1.0, [], {}, frozenset()),
-        [],
-    )
+    errors = []
     for how in (replace(SHEETS, opacity=0.95, sunk=0.0, spread=0.4), SHEETS):
-        drawn, _ = rules.add_surface(
-            nothing, torch.zeros(0, dtype=torch.bool), reference, depth, reference.mask, crop_to_mask, how
-        )
+        background = Background([], {})
+        drawn = rules.add_surface(Draft.start(nothing), reference, depth, reference.mask, background, how).gaussians
         inner = (slice(14, 26), slice(14, 34))
         here, there = (rasterizer.render(drawn, v).color.numpy() - floor(v)[1] for v in (view, opposite))
         assert np.abs(here[inner]).mean() < 0.02
@@ -211,7 +210,7 @@ def test_what_haze_left_open_is_filled_too(scene, tmp_path):
     gaussians, labels = load_ply(scene["fit"] / "gaussians.ply"), load_labels(scene["masks"] / "labels.npy")
     remaining = gaussians.map(lambda p: p[~labels])
     reference = Reference(view, small.photo(view), np.zeros_like(sets.invent))
-    asked = rules.find_hole(remaining, torch.zeros(len(remaining), dtype=torch.bool), reference, sets.consistent, 0.9)
+    asked = rules.find_hole(Draft.start(remaining), reference, sets.consistent, 0.9)
     assert (asked & sets.unobserved).sum() > 0.9 * small.true_never_seen(view, NEAR).sum()
     assert not (asked & ~sets.consistent).any()
 

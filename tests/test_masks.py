@@ -5,7 +5,7 @@ import pytest
 import small_scene as small
 import torch
 
-from reffusion import geometry
+from reffusion import geometry, morphology
 from reffusion.io.arrays import load_json, load_labels, save_json
 from reffusion.io.images import load_mask, save_mask
 from reffusion.io.ply import load_ply
@@ -87,10 +87,10 @@ def test_tidy_removes_specks_and_closes_gaps():
     whole = mask.copy()
     mask[10, 10] = False
     mask[35, 35] = True
-    assert (voting.tidy(mask, 3, 3) == whole).all()
-    assert (voting.tidy(mask, 0, 0) == mask).all()
+    assert (morphology.remove_small_parts(mask, 3, 3) == whole).all()
+    assert (morphology.remove_small_parts(mask, 0, 0) == mask).all()
     mask[12:20, 12:20] = False
-    assert not voting.tidy(mask, 3, 3)[15, 15]
+    assert not morphology.remove_small_parts(mask, 3, 3)[15, 15]
 
 
 def test_consistent_and_undecided_masks_match_the_truth(tmp_path):

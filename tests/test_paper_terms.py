@@ -79,7 +79,7 @@ def test_a_view_without_invented_pixels_is_distilled_where_c_is_repainted(views_
 
 def test_settling_leaves_what_is_to_be_drawn_alone(tmp_path, monkeypatch):
     said = {}
-    monkeypatch.setattr(initialize, "settle", lambda scene, exact, known, *_: said.update(known.hidden) or scene)
+    monkeypatch.setattr(initialize, "refit", lambda scene, exact, known, *_: said.update(known.hidden) or scene)
     hidden, drawn = np.eye(4, dtype=bool), np.eye(4, dtype=bool)[::-1]
     view = type("View", (), {"camera": camera(), "hidden": hidden})
     around = type("Around", (), {"cameras": [camera()], "photos": {}, "views": [view]})

@@ -8,7 +8,7 @@ import torch
 from small_params import altered
 from small_scene import CAMERAS, TRAIN, gaussians, true_mask
 
-from reffusion.initialize.sds_gain import GUESSED, TAUGHT, VIEWS, WORSE, predict_gain
+from reffusion.initialize.sds_gain import GUESSED_SHARE, HOLE_LOSS, MAX_VIEWS, PRIOR_PSNR, predict_gain
 from reffusion.io.arrays import save_json
 from reffusion.params.distill import Params
 from reffusion.splat import rasterizer
@@ -34,14 +34,14 @@ def given():
 def test_renders_that_show_the_photographs_cannot_gain(given):
     wall, sets, photos = given
     found = predict_gain(wall, TRAINED, sets, photos)
-    assert not found.may and found.beside > 45 and f"{found.beside - WORSE:.1f} dB" in found.says
+    assert not found.may_gain and found.psnr_beside > 45 and f"{found.psnr_beside - HOLE_LOSS:.1f} dB" in found.reason
 
 
 def test_what_no_reference_covers_may_gain_however_good_the_rest(given):
     wall, sets, photos = given
-    assert not predict_gain(wall, TRAINED, sets, photos, guessed=GUESSED).may
-    found = predict_gain(wall, TRAINED, sets, photos, guessed=0.19)
-    assert found.may and "19%" in found.says and found.beside > 45
+    assert not predict_gain(wall, TRAINED, sets, photos, guessed_share=GUESSED_SHARE).may_gain
+    found = predict_gain(wall, TRAINED, sets, photos, guessed_share=0.19)
+    assert found.may_gain and "19%" in found.reason and found.psnr_beside > 45
 
 
 def test_what_is_wrong_in_the_hole_or_far_from_it_does_not_count_and_beside_it_does(given):
@@ -49,10 +49,12 @@ def test_what_is_wrong_in_the_hole_or_far_from_it_does_not_count_and_beside_it_d
     rows = np.arange(photos["a0"].shape[0])[:, None]
     in_hole = {name: np.where(sets[name].consistent[..., None], 0, image) for name, image in photos.items()}
     far = {name: np.where((rows < 8)[..., None], 0, image).astype(np.uint8) for name, image in photos.items()}
-    assert not predict_gain(wall, TRAINED, sets, in_hole).may and not predict_gain(wall, TRAINED, sets, far).may
+    assert (
+        not predict_gain(wall, TRAINED, sets, in_hole).may_gain and not predict_gain(wall, TRAINED, sets, far).may_gain
+    )
     brighter = {name: np.where(image > 215, 255, image + 40).astype(np.uint8) for name, image in photos.items()}
     found = predict_gain(wall, TRAINED, sets, brighter)
-    assert found.may and found.beside - WORSE < TAUGHT
+    assert found.may_gain and found.psnr_beside - HOLE_LOSS < PRIOR_PSNR
 
 
 def test_beside_what_is_put_in_where_nothing_was_removed(given):
@@ -63,7 +65,7 @@ def test_beside_what_is_put_in_where_nothing_was_removed(given):
 
 def test_a_few_views_are_looked_at_and_without_any_it_may_gain(given):
     wall, sets, photos = given
-    many = [replace(TRAINED[k % 5], name=f"v{k}") for k in range(3 * VIEWS)]
+    many = [replace(TRAINED[k % 5], name=f"v{k}") for k in range(3 * MAX_VIEWS)]
     repeated = {camera.name: TRAIN[k % 5] for k, camera in enumerate(many)}
     looked = []
 
@@ -73,8 +75,8 @@ def test_a_few_views_are_looked_at_and_without_any_it_may_gain(given):
             return photos[repeated[name]]
 
     predict_gain(wall, many, {n: sets[o] for n, o in repeated.items()}, Photos(repeated))
-    assert len(looked) == VIEWS and looked[0] == "v0" and looked[-1] == many[-1].name
-    assert predict_gain(wall, TRAINED, sets, {}).may and predict_gain(wall, TRAINED, sets, {}).beside is None
+    assert len(looked) == MAX_VIEWS and looked[0] == "v0" and looked[-1] == many[-1].name
+    assert predict_gain(wall, TRAINED, sets, {}).may_gain and predict_gain(wall, TRAINED, sets, {}).psnr_beside is None
 
 
 @pytest.mark.parametrize(

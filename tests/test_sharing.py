@@ -72,14 +72,14 @@ def test_without_depth_nothing_is_said():
     whole = shown(SIDE, floor(SIDE))
     drawn, nothing = select_finest([whole, ReferenceSurface(FRONT, empty, np.zeros((SIZE, SIZE), bool))])
     assert np.array_equal(drawn, whole.pixels) and not nothing.any()
-    assert np.isinf(ReferenceSurface(FRONT, empty, whole.pixels).widths).all()
+    assert np.isinf(ReferenceSurface(FRONT, empty, whole.pixels).footprints).all()
 
 
 def test_a_pixel_is_as_wide_as_its_slant_makes_it():
     depth = floor(SIDE)
     row = SIZE * 3 // 4
     below, above = geometry.unproject(depth, SIDE)[[row, row + 1], SIZE // 2]
-    assert shown(SIDE, depth).widths[row, SIZE // 2] == pytest.approx(np.linalg.norm(below - above), rel=0.1)
+    assert shown(SIDE, depth).footprints[row, SIZE // 2] == pytest.approx(np.linalg.norm(below - above), rel=0.1)
 
 
 def test_a_rim_that_looks_like_the_photograph_is_left():

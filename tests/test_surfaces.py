@@ -7,8 +7,9 @@ import torch
 from reffusion import geometry
 from reffusion.background import continuation
 from reffusion.background.plane import CELLS, Plane, remove_reflected_depth
-from reffusion.background.visibility import DepthView, depth_range, widened
+from reffusion.background.visibility import DepthView, depth_range
 from reffusion.initialize import sweep, view_dependent_color
+from reffusion.morphology import dilate
 from reffusion.splat.conventions import SH0
 from reffusion.splat.reference import colors, harmonics
 from reffusion.types import Camera, Gaussians
@@ -61,7 +62,9 @@ WAVES = [(np.array([np.cos(a), np.sin(a)]) * f, a * 7) for f in (9.0, 17.0, 31.0
 @pytest.fixture(scope="module")
 def views() -> list[DepthView]:
     depths = [ground(view)[0].astype(np.float32) for view in CAMERAS]
-    return [DepthView.of(view, depth, depth_range(depth), HOLE) for view, depth in zip(CAMERAS, depths, strict=True)]
+    return [
+        DepthView.from_range(view, depth, depth_range(depth), HOLE) for view, depth in zip(CAMERAS, depths, strict=True)
+    ]
 
 
 def rough(depth: np.ndarray) -> np.ndarray:
@@ -71,7 +74,7 @@ def rough(depth: np.ndarray) -> np.ndarray:
 
 def test_photographs_tell_the_depth_that_splats_show_too_near(views):
     view, photos = CAMERAS[0], {each.name: photograph(each) for each in CAMERAS}
-    true, ring = ground(view)[0], widened(HOLE, 0.1) & ~HOLE
+    true, ring = ground(view)[0], dilate(HOLE, 0.1) & ~HOLE
     found = sweep.sweep_depth(photos["v0"], rough(true), ring, view, views, photos)
     told = found > 0
     assert told[ring].mean() > 0.7 and not told[~ring].any()
@@ -88,7 +91,7 @@ def plane(height: float, tilt: float) -> Plane:
 
 
 def test_a_plane_moves_onto_what_is_known_around_the_hole():
-    true, ring = ground(CAMERAS[0])[0], widened(HOLE, 0.1) & ~HOLE
+    true, ring = ground(CAMERAS[0])[0], dilate(HOLE, 0.1) & ~HOLE
     noise = 1 + 0.004 * np.random.default_rng(1).standard_normal(true.shape)
     far = np.random.default_rng(2).random(true.shape) < 0.2  # something else shows there
     depth = np.where(ring, np.where(far, 1.5, noise) * true, 0.0)
@@ -98,7 +101,7 @@ def test_a_plane_moves_onto_what_is_known_around_the_hole():
     assert continuation.align_plane(off, np.zeros_like(depth), CAMERAS[0], HOLE) is off
     one_sided = np.where(np.arange(SIZE)[:, None] < 64, depth, 0.0) * np.where(np.arange(SIZE) < 64, 1.03, 1.0)
     still = continuation.align_plane(plane(0.0, 0.0), one_sided, CAMERAS[0], HOLE)
-    assert np.abs(still.depth(CAMERAS[0])[HOLE] / true[HOLE] - 1).max() < continuation.FAR
+    assert np.abs(still.depth(CAMERAS[0])[HOLE] / true[HOLE] - 1).max() < continuation.ALIGN_LIMIT
 
 
 def new_gaussians(sh_degree: int) -> Gaussians:
@@ -170,9 +173,9 @@ def test_what_a_plane_surrounds_is_told_from_what_lies_beyond_it():
     seen = (away > 20) & (away < 60)
     free = (away < 20) | (away > 60)
     free[95, 120], seen[95, 120] = True, False
-    assert (continuation._surrounded(seen, free) == (away < 20)).all(), "a plate in a table, no speck, nor the garden"
+    assert (continuation._enclosed_patches(seen, free) == (away < 20)).all(), "a plate in a table, no speck, nor the garden"
     open_to_a_side = seen & ~((np.abs(rows) < 6) & (columns > 0))
-    assert not continuation._surrounded(open_to_a_side, free | ~open_to_a_side).any()
+    assert not continuation._enclosed_patches(open_to_a_side, free | ~open_to_a_side).any()
 
 
 def test_a_mirror_has_the_depth_of_its_plane():
@@ -183,7 +186,7 @@ def test_a_mirror_has_the_depth_of_its_plane():
     wall = Plane(
         np.array([0.0, 0, 1]), 2.0, np.array([0.0, 0, 2]), np.eye(3)[:2], 0.02, nowhere, nowhere, plate, whole, plate
     )
-    mirrored = wall.on(plate, wall.depth(view), view, np.ones((64, 64), bool))
+    mirrored = wall.pixels_on(plate, wall.depth(view), view, np.ones((64, 64), bool))
     depth = np.where(mirrored, 3.5, 2.0)
     depth[:, :30] = 1.5  # something stands before the left of it
     found = remove_reflected_depth(depth, view, [wall])

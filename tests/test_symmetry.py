@@ -64,7 +64,7 @@ def witness(view: Camera, cut: bool = False) -> DepthView:
     depth, hidden, _ = drawn(view, cut)
     kernel = np.ones((3, 3))
     wide = cv2.dilate(hidden.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    return DepthView.of(view, depth, (cv2.erode(depth, kernel), cv2.dilate(depth, kernel)), wide)
+    return DepthView.from_range(view, depth, (cv2.erode(depth, kernel), cv2.dilate(depth, kernel)), wide)
 
 
 def colour(points: np.ndarray, halved: bool) -> np.ndarray:
@@ -81,7 +81,7 @@ def scene(cut: bool = False, halved: bool = False):
     for view in views:
         points = geometry.unproject(view.depth, view.camera)
         photos[view.camera.name] = (255 * colour(points, halved)).astype(np.uint8)
-        seen.append(points[::2, ::2][(~view.hidden & (view.depth < 6))[::2, ::2]])
+        seen.append(points[::2, ::2][(~view.masked & (view.depth < 6))[::2, ::2]])
     points = np.concatenate(seen)
     points = points[np.unique(np.floor(points / 0.02), axis=0, return_index=True)[1]]
     count = len(points)
@@ -112,14 +112,14 @@ def test_a_vase_is_its_own_mirror_image(whole):
     _, _, _, mirrors = whole
     found = sideways(mirrors)
     assert len(found) == 1 and len(mirrors) <= 2  # its back is like its front, too
-    assert abs(found[0].normal[0]) > 0.995 and abs(found[0].height) < 0.02
+    assert abs(found[0].normal[0]) > 0.995 and abs(found[0].offset) < 0.02
 
 
 def test_the_half_that_the_box_hides_stands_where_it_is(whole):
     views, _, _, mirrors = whole
     for view in views[::3]:
         true, hidden, vase = drawn(view.camera)
-        found = render_mirrors(mirrors, view.camera, hidden, views).supposed
+        found = render_mirrors(mirrors, view.camera, hidden, views).plausible_depth
         behind_box = cv2.erode((hidden & vase).astype(np.uint8), np.ones((7, 7))) > 0
         if behind_box.sum() < 100:
             continue
@@ -134,12 +134,12 @@ def test_its_pixels_are_undecided_and_have_its_depth(whole):
     views, gaussians, planes, mirrors = whole
     view = views[5]
     true, hidden, vase = drawn(view.camera)
-    supposed = np.isfinite(render_mirrors(mirrors, view.camera, hidden, views).supposed) & vase
+    supposed = np.isfinite(render_mirrors(mirrors, view.camera, hidden, views).plausible_depth) & vase
     inside = cv2.erode(supposed.astype(np.uint8), np.ones((9, 9))) > 0
     found = find_unobserved(gaussians, view.camera, hidden, views, planes, mirrors)
     inside &= found.depth > 1.05 * true  # the ground behind it is seen by others, but not from here
     assert inside.sum() > 200 and found.unobserved[inside].mean() > 0.9
-    assert np.median(np.abs(found.continued / true - 1)[inside & found.unobserved]) < 0.01
+    assert np.median(np.abs(found.continued_depth / true - 1)[inside & found.unobserved]) < 0.01
 
 
 @pytest.mark.parametrize("how", [{"cut": True}, {"halved": True}])
@@ -163,8 +163,8 @@ def test_a_camera_behind_the_mirror_shows_the_image_with_its_sides_swapped():
     balls = Gaussians(means, torch.eye(4)[:1].repeat(60, 1), torch.full((60, 3), -3.0), torch.full((60,), 2.0), colors)
     normal = np.array([0.6, 0.64, 0.48])
     mirror = Mirror(balls, normal, 0.13)
-    image = torch.tensor(mirror.image_of(means.double().numpy()), dtype=torch.float32)
+    image = torch.tensor(mirror.reflect(means.double().numpy()), dtype=torch.float32)
     direct = rasterizer.render(balls.map(lambda p: image if p is means else p), view)
-    across = rasterizer.render(balls, mirror.behind(view))
+    across = rasterizer.render(balls, mirror.reflect_camera(view))
     assert torch.allclose(direct.color, across.color.flip(1), atol=2e-4)
-    assert np.allclose(mirror.image_of(mirror.image_of(means.numpy())), means, atol=1e-6)
+    assert np.allclose(mirror.reflect(mirror.reflect(means.numpy())), means, atol=1e-6)

@@ -9,6 +9,7 @@ import torch
 
 from benchmarks.stability.cases import EPS32, EPS64, EXACT, UNCLEAR, Case, largest, unclear
 from benchmarks.stability.splatting import camera, cloud
+from reffusion import morphology
 from reffusion.background import continuation, unobserved, visibility
 from reffusion.gaussians.optimize import reconstruction_loss
 from reffusion.gaussians.ssim import C1
@@ -159,12 +160,14 @@ def nothing_remains() -> float:
     planes = continuation.find_planes(np.zeros(3), 1.0, views, np.zeros((0, 3)))
     found = unobserved.find_unobserved(nobody, NAMED[0], FULL, views, planes)
     said = visibility.count_views(np.zeros((1, 3)), views)
-    return float((~found.unobserved).sum() + np.isfinite(found.continued).sum() + said.seen.sum() + said.free.sum())
+    return float(
+        (~found.unobserved).sum() + np.isfinite(found.continued_depth).sum() + said.seen.sum() + said.free.sum()
+    )
 
 
 def tidied() -> float:
     """Empty and full masks stay what they are, whatever counts as a speck or a gap."""
-    changed = [(voting.tidy(mask, 5.0, 5.0) != mask).sum() for mask in (EMPTY, FULL)]
+    changed = [(morphology.remove_small_parts(mask, 5.0, 5.0) != mask).sum() for mask in (EMPTY, FULL)]
     return float(sum(changed))
 
 

@@ -11,7 +11,7 @@ import torch
 from reffusion import geometry
 from reffusion.background.continuation import find_planes
 from reffusion.background.plane import CELLS, Plane
-from reffusion.background.unobserved import _grows_out_of, find_unobserved
+from reffusion.background.unobserved import _continues_surroundings, find_unobserved
 from reffusion.background.visibility import (
     FREE,
     SURFACE,
@@ -19,11 +19,11 @@ from reffusion.background.visibility import (
     count_views,
     depth_range,
     is_seen,
-    unlike,
-    without_slivers,
 )
 from reffusion.gaussians.surfels import surface_gaussians
 from reffusion.masks import shadows
+from reffusion.masks.debris import count_color_mismatches
+from reffusion.morphology import remove_slivers
 from reffusion.types import Camera, Gaussians
 
 NO_POINTS = np.zeros((0, 3))
@@ -57,7 +57,7 @@ def witness(view: Camera, notched: bool = False) -> DepthView:
     depth, hidden, _ = drawn(view, notched)
     kernel = np.ones((3, 3))
     wide = cv2.dilate(hidden.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    return DepthView.of(view, depth, (cv2.erode(depth, kernel), cv2.dilate(depth, kernel)), wide)
+    return DepthView.from_range(view, depth, (cv2.erode(depth, kernel), cv2.dilate(depth, kernel)), wide)
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +72,7 @@ def test_a_point_is_seen_on_its_surface_only(views):
     assert said.seen[0] >= 6 and said.free[0] == 0, "the table's top"
     assert said.free[1] >= 6 and said.seen[1] == 0, "the air above it"
     assert said.seen[2] == 0 and said.free[2] >= 2, "under the table low views look through"
-    assert said.seen[3] == said.free[3] == 0 and said.hidden[3] == len(views), "within the box nobody knows"
+    assert said.seen[3] == said.free[3] == 0 and said.masked[3] == len(views), "within the box nobody knows"
     above = count_views(points, views, np.tile([0.0, 0.0, 1.0], (5, 1)))
     assert above.seen[4] == 0 and above.free[4] == 0, "nor, from above, what it stands on"
 
@@ -86,12 +86,12 @@ def test_a_surface_does_not_face_views_from_its_other_side(views):
 
 def test_the_table_goes_on_under_the_box_and_ends_at_its_edge(views):
     planes = find_planes(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, NO_POINTS)
-    table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.height))
-    assert abs(table.normal[2]) > 0.999 and abs(table.height) < 0.01
+    table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.offset))
+    assert abs(table.normal[2]) > 0.999 and abs(table.offset) < 0.01
     view = camera("new", 15.0, 1.6)
     depth, _, on_table = drawn(view)
     at = table.depth(view)
-    goes_on = table.on(table.goes_on, at, view, np.ones_like(on_table))
+    goes_on = table.pixels_on(table.continued, at, view, np.ones_like(on_table))
     place = geometry.unproject(np.where(np.isfinite(at), at, 1.0), view)
     footprint = on_table & (np.abs(place[..., :2]) < BOX - 0.05).all(-1)
     beyond = ~(np.abs(place[..., :2]) < EDGE + 0.05).all(-1)
@@ -103,8 +103,8 @@ def test_the_table_goes_on_under_the_box_and_ends_at_its_edge(views):
 def test_a_table_is_seen_from_above_though_what_stands_beside_it_is_lower(views):
     above = [view for view in views if view.camera.name.startswith("a")]
     planes = find_planes(np.array([0.0, 0.0, -0.2]), 0.45, above, NO_POINTS)
-    table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.height))
-    assert table.in_cells(table.seen, np.array([[0.7, 0.7, 0.0]]))[0]
+    table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.offset))
+    assert table.contains(table.seen, np.array([[0.7, 0.7, 0.0]]))[0]
 
 
 @pytest.mark.parametrize(("wide", "through"), [(0.15, False), (0.4, True)])
@@ -118,9 +118,9 @@ def test_a_speck_that_views_look_through_is_no_hole(wide, through):
         spot = (np.abs(place[..., :2] - [BOX + wide, 0]) < wide / 2).all(-1)
         views.append(replace(view, depth=np.where(spot, 2 * view.depth, view.depth)))
     planes = find_planes(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, NO_POINTS)
-    table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.height))
+    table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.offset))
     middle = np.array([[BOX + wide, 0.0, 0.0]])
-    assert table.in_cells(table.free, middle)[0] == through
+    assert table.contains(table.free, middle)[0] == through
 
 
 def test_borders_that_are_visible_go_on_under_the_box():
@@ -128,13 +128,13 @@ def test_borders_that_are_visible_go_on_under_the_box():
     though the convex hull of the table has it."""
     views = [witness(camera(f"a{k}", 30 * k, 1.6), notched=True) for k in range(12)]
     planes = find_planes(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, NO_POINTS)
-    table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.height))
-    steps = (np.arange(len(table.goes_on)) + 0.5 - len(table.goes_on) / 2) * table.pitch
-    points = table.origin + steps[:, None, None] * table.along[0] + steps[None, :, None] * table.along[1]
+    table = max(planes, key=lambda plane: abs(plane.normal[2]) - abs(plane.offset))
+    steps = (np.arange(len(table.continued)) + 0.5 - len(table.continued) / 2) * table.cell_size
+    points = table.origin + steps[:, None, None] * table.axes[0] + steps[None, :, None] * table.axes[1]
     across, under = points[..., :2].sum(-1), (np.abs(points[..., :2]) < 0.9 * BOX).all(-1)
-    assert table.goes_on[under & (across < 0.7 * BOX)].mean() > 0.95
-    assert table.goes_on[under & (across > 1.3 * BOX)].mean() < 0.05
-    assert table.within[under & (across > 1.3 * BOX)].mean() < 0.05
+    assert table.continued[under & (across < 0.7 * BOX)].mean() > 0.95
+    assert table.continued[under & (across > 1.3 * BOX)].mean() < 0.05
+    assert table.enclosed[under & (across > 1.3 * BOX)].mean() < 0.05
 
 
 def beside_a_plinth(view: Camera) -> DepthView:
@@ -149,7 +149,7 @@ def beside_a_plinth(view: Camera) -> DepthView:
     enter, leave = bounds.min(0).max(-1), bounds.max(0).min(-1)
     wide = cv2.dilate(((enter < leave) & (leave > 0)).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     near, far = 0.94 * cv2.erode(depth, np.ones((3, 3))), 1.06 * cv2.dilate(depth, np.ones((3, 3)))
-    return DepthView.of(view, depth, (near, far), wide)
+    return DepthView.from_range(view, depth, (near, far), wide)
 
 
 def test_a_wall_does_not_go_on_along_the_ground_where_it_was_never_seen():
@@ -158,12 +158,12 @@ def test_a_wall_does_not_go_on_along_the_ground_where_it_was_never_seen():
     planes = find_planes(np.array([0.0, 0.0, HIGH / 2]), 0.45, views, NO_POINTS)
     face = max(planes, key=lambda plane: abs(plane.normal[1]))
     assert abs(face.normal[1]) > 0.99
-    right = face.cells[..., 0] > -0.8 * BOX
-    assert not (face.goes_on & right).any()
+    right = face.cell_centers[..., 0] > -0.8 * BOX
+    assert not (face.continued & right).any()
     assert (face.seen & ~right).sum() > 5 * (face.seen & right).sum()
     ground = max(planes, key=lambda plane: abs(plane.normal[2]))
-    under = (np.abs(ground.cells[..., :2]) < 0.8 * BOX).all(-1)
-    assert ground.goes_on[under].mean() > 0.95
+    under = (np.abs(ground.cell_centers[..., :2]) < 0.8 * BOX).all(-1)
+    assert ground.continued[under].mean() > 0.95
 
 
 def test_what_lies_beneath_the_table_in_all_views_but_one_is_not_what_is_behind_the_box(views):
@@ -178,10 +178,10 @@ def test_what_lies_beneath_the_table_in_all_views_but_one_is_not_what_is_behind_
     def shows_it(view):
         rays = geometry.pixel_rays(view.camera) @ view.camera.world_to_camera[:3, :3]
         depth = (-0.2 - view.camera.center[2]) / np.minimum(rays[..., 2], -1e-3)
-        return DepthView.of(view.camera, depth, (depth, depth), view.hidden)
+        return DepthView.from_range(view.camera, depth, (depth, depth), view.masked)
 
     above = views[:12]
-    others = count_views(geometry.unproject(beneath, camera)[hidden], above[4:]).behind
+    others = count_views(geometry.unproject(beneath, camera)[hidden], above[4:]).occluded
     asked = np.zeros_like(hidden)
     asked[hidden] = others > 3
     one = find_unobserved(left, camera, hidden, [shows_it(above[3]), *above[4:]], [])
@@ -200,7 +200,7 @@ def test_what_stands_before_a_plane_does_not_speak_against_it():
     patch = np.zeros((SIZE, SIZE), bool)
     patch[60:100, 60:100] = True
     half, full = np.arange(SIZE) < 78, np.ones(SIZE, bool)
-    agrees = lambda rate, where: _grows_out_of(patch, wall, at, view, np.where(where, rate * at, at), ~patch)
+    agrees = lambda rate, where: _continues_surroundings(patch, wall, at, view, np.where(where, rate * at, at), ~patch)
     assert agrees(0.7, half) and not agrees(1.4, half)
     assert not agrees(0.7, full)  # nothing of it is seen there
 
@@ -209,17 +209,20 @@ def test_slivers_go_and_patches_stay():
     mask = np.zeros((100, 200), bool)
     mask[20:22, 10:190] = True
     mask[50:80, 50:90] = True
-    found = without_slivers(mask, 0.01)
+    found = remove_slivers(mask, 0.01)
     assert not found[:40].any() and found[52:78, 52:88].all() and not (found & ~mask).any()
 
 
 def test_a_vase_that_hides_its_far_side_does_not_speak_against_it(views):
     """Half of the views look at the box's side from behind: something stands before it there."""
     exact = lambda depth: (depth, (depth, depth))
-    whole = [DepthView.of(v.camera, *exact(drawn_with_the_box(v.camera)), np.zeros_like(v.hidden)) for v in views[:12]]
+    whole = [
+        DepthView.from_range(v.camera, *exact(drawn_with_the_box(v.camera)), np.zeros_like(v.masked))
+        for v in views[:12]
+    ]
     point, side = np.array([[BOX, 0.0, 0.25]]), np.array([[1.0, 0.0, 0.0]])
     plain, faced = count_views(point, whole), count_views(point, whole, side)
-    assert plain.behind[0] >= 4 and faced.behind[0] == 0 and faced.seen[0] >= 3
+    assert plain.occluded[0] >= 4 and faced.occluded[0] == 0 and faced.seen[0] >= 3
 
 
 def drawn_with_the_box(view: Camera) -> np.ndarray:
@@ -241,14 +244,14 @@ def test_a_shadow_beside_the_mask_is_found_and_carried_into_other_views(views):
     photo = np.where(shadow[..., None], (truth * 0.6).astype(np.uint8), truth)
     photo[5:25, 5:25] = 40  # something else that differs, far from the mask
     found = shadows.detect_shadows(truth, photo, hidden)
-    assert (found & shadow).sum() > 0.9 * (shadow & ~view.hidden).sum() and not found[5:25, 5:25].any()
+    assert (found & shadow).sum() > 0.9 * (shadow & ~view.masked).sum() and not found[5:25, 5:25].any()
     assert not shadows.detect_shadows(truth, truth, hidden).any()
     there = geometry.unproject(drawn(other.camera)[0], other.camera)
-    same = drawn(other.camera)[2] & (np.hypot(there[..., 0] - 0.5, there[..., 1] - 0.5) < 0.25) & ~other.hidden
+    same = drawn(other.camera)[2] & (np.hypot(there[..., 0] - 0.5, there[..., 1] - 0.5) < 0.25) & ~other.masked
     carried, light = shadows.project_shadow(found, shadows.log_light(truth, photo), depth, view.camera, [other])["a1"]
     assert carried[same].mean() > 0.9 and not carried[~drawn(other.camera)[2]].mean() > 0.02
     lit = np.clip(np.full((SIZE, SIZE, 3), 140) + np.random.default_rng(1).integers(-12, 13, (SIZE, SIZE, 1)), 0, 255)
-    core = drawn(other.camera)[2] & (np.hypot(there[..., 0] - 0.5, there[..., 1] - 0.5) < 0.2) & ~other.hidden
+    core = drawn(other.camera)[2] & (np.hypot(there[..., 0] - 0.5, there[..., 1] - 0.5) < 0.2) & ~other.masked
     again = shadows.relight((lit * 0.6).astype(np.uint8), light)
     assert np.abs(again[core].astype(float) - lit[core]).mean() < 4 and np.abs(lit[core] * 0.4).mean() > 50
     outside = ~cv2.dilate(carried.astype(np.uint8), np.ones((9, 9))).astype(bool)
@@ -260,15 +263,15 @@ def test_what_has_other_colours_than_gravel_is_debris():
     view = camera("v", 0, 2.0)
     depth, _, _ = drawn(view)
     rough = (depth * (1 + 0.1 * np.random.default_rng(0).random(depth.shape))).astype(np.float32)
-    witness = DepthView.of(view, rough, depth_range(rough), np.zeros_like(rough, bool))
+    witness = DepthView.from_range(view, rough, depth_range(rough), np.zeros_like(rough, bool))
     photo = np.random.default_rng(1).integers(90, 160, (*rough.shape, 3)).astype(np.uint8)
     place = geometry.unproject(rough.astype(float), view)[80:84, 80]
     sh = torch.zeros(4, 1, 3)
     sh[2:, 0] = torch.tensor([-1.2, 0.6, 0.6])  # teal; the others are grey
     parts = torch.tensor(place).float(), torch.zeros(4, 4), torch.full((4, 3), -4.0), torch.zeros(4), sh
-    assert unlike(Gaussians(*parts), [witness], {"v": photo}).tolist() == [0, 0, 1, 1]
-    smooth = DepthView.of(view, depth, depth_range(np.full_like(depth, depth[80, 80])), witness.hidden)
-    assert not unlike(Gaussians(*parts), [smooth], {"v": photo}).any()
+    assert count_color_mismatches(Gaussians(*parts), [witness], {"v": photo}).tolist() == [0, 0, 1, 1]
+    smooth = DepthView.from_range(view, depth, depth_range(np.full_like(depth, depth[80, 80])), witness.masked)
+    assert not count_color_mismatches(Gaussians(*parts), [smooth], {"v": photo}).any()
 
 
 def test_views_say_of_points_what_the_formulas_say(views):
@@ -281,7 +284,7 @@ def test_views_say_of_points_what_the_formulas_say(views):
         said, expected = count_views(points, views, sides), np.zeros((4, len(points)), int)
         for view in views:
             uv, z = geometry.project(points, view.camera)
-            maps = (view.hidden, view.nearest, view.farthest)
+            maps = (view.masked, view.nearest, view.farthest)
             (hidden, inside), (nearest, _), (farthest, _) = (geometry.sample_nearest(each, uv) for each in maps)
             faced = True if sides is None else ((view.camera.center - points) * sides).sum(-1) > 0
             shown = inside & ~hidden & (z > 0) & (nearest > 0)
@@ -290,5 +293,5 @@ def test_views_say_of_points_what_the_formulas_say(views):
             free = nearest > z * (1 + FREE)
             expected += [shown & on & faced, shown & free, shown & behind_it & faced, inside & hidden & (z > 0)]
             assert (is_seen(view, points) == (shown & on)).all()
-        for name, count in zip(("seen", "free", "behind", "hidden"), expected, strict=True):
+        for name, count in zip(("seen", "free", "occluded", "masked"), expected, strict=True):
             assert (getattr(said, name) == count).all() and count.any(), name
