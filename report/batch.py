@@ -19,7 +19,7 @@ from report import page
 from report.compare import DIGITS, SHORT
 
 WIDTH = 240  # px of a picture
-MOST = 200  # pictures on the page; with more it would be of tens of MB
+MAX_PICTURES = 200  # pictures on the page; with more it would be of tens of MB
 
 
 def make(record: Path) -> Path:
@@ -37,7 +37,7 @@ def make(record: Path) -> Path:
     count = f"{states.count('done')} of {len(runs)} scenes done, {states.count('failed')} failed"
     parts = [page.heading(f"Batch of {Path(said['data']).name}", 1), page.paragraph(count)]
     header = ["scene", *(SHORT[name] for name in names), "seconds", ""]
-    lines = [_line(run, names, record.parent, number < MOST) for number, run in enumerate(runs)]
+    lines = [_line(run, names, record.parent, number < MAX_PICTURES) for number, run in enumerate(runs)]
     head = "".join(f"<th>{escape(word)}</th>" for word in header)
     parts.append(f'<div class="wide"><table><tr>{head}</tr>{"".join(lines)}</table></div>')
     parts.append(
@@ -55,8 +55,8 @@ def _line(run: dict[str, Any], names: list[str], runs: Path, drawn: bool) -> str
         name = f'<a href="{escape(home)}/report.html">{name}</a>'
     if run["state"] == "done":
         mean = run.get("mean", {})
-        cells = [page.number(mean.get(each), DIGITS.get(each, 4)) for each in names]
-        middle = "".join(f"<td>{cell}</td>" for cell in [*cells, page.number(run.get("seconds"))])
+        cells = [page.format_number(mean.get(each), DIGITS.get(each, 4)) for each in names]
+        middle = "".join(f"<td>{cell}</td>" for cell in [*cells, page.format_number(run.get("seconds"))])
     else:
         said = f"failed: {run['error']}" if run["state"] == "failed" else run["state"]
         middle = f'<td class="text" colspan="{len(names) + 1}">{escape(said)}</td>'

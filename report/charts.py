@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from reffusion.io.images import save_image
-from report.paired import Difference, pareto
+from report.paired_statistics import Difference, pareto_front
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 # Okabe and Ito's colours, told apart by every kind of eye.
 BLUE, ORANGE, GREEN, GREY, INK = "#0072B2", "#D55E00", "#009E73", "#8a8a8a", "#222222"
 WIDTH, DPI = 9.6, 200  # inches, as wide as a page
-AIR = 12  # pixels between a label and what stands beside it
-PLACES = [(6, 0), (-6, 0), (5, 7), (-5, 7), (5, -7), (-5, -7), (0, 10), (0, -10),
+LABEL_GAP = 12  # pixels between a label and what stands beside it
+LABEL_OFFSETS = [(6, 0), (-6, 0), (5, 7), (-5, 7), (5, -7), (-5, -7), (0, 10), (0, -10),
           (14, 14), (-14, 14), (14, -14), (-14, -14), (0, 22), (0, -22), (26, 24), (-26, 24), (26, -24), (-26, -24),
           (0, 34), (0, -34), (40, 34), (-40, 34), (40, -34), (-40, -34)]  # fmt: skip
 
 
-def figure(height: float, rows: int = 1, columns: int = 1, **options) -> tuple[Figure, np.ndarray]:
+def new_figure(height: float, rows: int = 1, columns: int = 1, **options) -> tuple[Figure, np.ndarray]:
     """A figure of the page's width and its axes [rows, columns], in the common style."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -42,24 +42,24 @@ def figure(height: float, rows: int = 1, columns: int = 1, **options) -> tuple[F
     return made, grid
 
 
-def save(drawn: Figure, path: Path) -> None:
+def save_chart(drawn: Figure, path: Path) -> None:
     drawn.canvas.draw()
     save_image(path, np.asarray(drawn.canvas.buffer_rgba())[..., :3].copy())
 
 
-def write(axes: Axes, text: str, at, offset=(0, 0), colour: str = INK, ha: str = "left", va: str = "center") -> None:
+def annotate(axes: Axes, text: str, at, offset=(0, 0), colour: str = INK, ha: str = "left", va: str = "center") -> None:
     """Words beside a point of a chart; `offset` in points."""
     look = {"fontsize": 9, "color": colour, "ha": ha, "va": va}
     axes.annotate(text, at, offset, textcoords="offset points", **look)
 
 
-def spans(values: Sequence[float], factor: float = 12) -> bool:
+def needs_log_axis(values: Sequence[float], factor: float = 12) -> bool:
     """Do positive values cover so much that a logarithmic axis serves them better?"""
     there = [value for value in values if value > 0]
     return len(there) > 1 and max(there) > factor * min(there)
 
 
-def plain_ticks(axes: Axes, which: str = "x") -> None:
+def use_plain_log_ticks(axes: Axes, which: str = "x") -> None:
     """A logarithmic axis with 10, 20, 50, 100 instead of powers."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
@@ -73,20 +73,22 @@ def plain_ticks(axes: Axes, which: str = "x") -> None:
 # ------------------------------------------------------------------------------------------- error against run time
 
 
-def tradeoff(names: Sequence[str], seconds: Sequence[float], errors: dict[str, Sequence[float]], path: Path) -> None:
+def draw_tradeoff(
+    names: Sequence[str], seconds: Sequence[float], errors: dict[str, Sequence[float]], path: Path
+) -> None:
     """All methods, a panel for each error (title -> a value a method, less is better), the Pareto front marked."""
-    made, grid = figure(0.5 + 3.6 * len(errors), len(errors), sharex=True)
+    made, grid = new_figure(0.5 + 3.6 * len(errors), len(errors), sharex=True)
     for axes, (title, values) in zip(grid[:, 0], errors.items(), strict=True):
-        front = pareto(seconds, values)
+        front = pareto_front(seconds, values)
         order = np.argsort(np.asarray(seconds)[front], kind="stable")
         steps = np.column_stack([seconds, values])[front][order]
         axes.step(steps[:, 0], steps[:, 1], where="post", color=BLUE, linewidth=1.2, alpha=0.6)
         axes.plot(*np.column_stack([seconds, values])[~front].T, "o", color=GREY, markersize=6, markerfacecolor="white")
         axes.plot(*steps.T, "o", color=BLUE, markersize=7)
         axes.set_ylabel(title, fontsize=10)
-        if spans(seconds):
+        if needs_log_axis(seconds):
             axes.set_xscale("log")
-            plain_ticks(axes)
+            use_plain_log_ticks(axes)
         else:
             low, high = min(seconds), max(seconds)
             axes.set_xlim(0 if low < 0.3 * high else low - 0.15 * (high - low), high + 0.15 * (high - low) or None)
@@ -97,11 +99,11 @@ def tradeoff(names: Sequence[str], seconds: Sequence[float], errors: dict[str, S
     made.canvas.draw()  # the layout is final: labels can be placed
     made.set_layout_engine("none")
     for axes, values in zip(grid[:, 0], errors.values(), strict=True):
-        label(axes, np.column_stack([seconds, values]), names, pareto(seconds, values))
-    save(made, path)
+        label_points(axes, np.column_stack([seconds, values]), names, pareto_front(seconds, values))
+    save_chart(made, path)
 
 
-def label(axes: Axes, points: np.ndarray, names: Sequence[str], strong: np.ndarray) -> None:
+def label_points(axes: Axes, points: np.ndarray, names: Sequence[str], strong: np.ndarray) -> None:
     """Write each name [n] beside its point [n, 2], where it covers no other point or name; a thin line if far off."""
     renderer = axes.figure.canvas.get_renderer()
     unit = axes.figure.dpi / 72
@@ -118,15 +120,15 @@ def label(axes: Axes, points: np.ndarray, names: Sequence[str], strong: np.ndarr
             weight="bold" if names[index] == "full" else "normal",
         )  # fmt: skip
         wide, high = text.get_window_extent(renderer).size
-        boxes = [_box(pixels[index], place, wide, high, unit) for place in PLACES]
+        boxes = [_box(pixels[index], place, wide, high, unit) for place in LABEL_OFFSETS]
         others = [box for number, box in enumerate(taken) if number != index]
-        costs = [_cost(box, place, others, inside) for box, place in zip(boxes, PLACES, strict=True)]
+        costs = [_cost(box, place, others, inside) for box, place in zip(boxes, LABEL_OFFSETS, strict=True)]
         best = int(np.argmin(costs))
         taken.append(boxes[best])
         corner = (boxes[best][:2] - pixels[index]) / unit
         text.set_position(tuple(corner))
-        if np.hypot(*PLACES[best]) > 12:
-            end = np.array(PLACES[best]) * 0.85
+        if np.hypot(*LABEL_OFFSETS[best]) > 12:
+            end = np.array(LABEL_OFFSETS[best]) * 0.85
             line = {"arrowstyle": "-", "color": "#bbb", "linewidth": 0.7, "shrinkA": 0, "shrinkB": 4}
             axes.annotate("", points[index], tuple(end), textcoords="offset points", arrowprops=line)
 
@@ -140,7 +142,7 @@ def _box(point: np.ndarray, place: tuple[float, float], wide: float, high: float
 
 def _cost(box: np.ndarray, place: tuple[float, float], taken: list[np.ndarray], inside) -> float:
     """Pixels covered twice, those outside most; among free places the nearest."""
-    box = box + np.array([-AIR, 0, AIR, 0])
+    box = box + np.array([-LABEL_GAP, 0, LABEL_GAP, 0])
     covered = sum(
         max(0, min(box[2], other[2]) - max(box[0], other[0])) * max(0, min(box[3], other[3]) - max(box[1], other[1]))
         for other in taken
@@ -152,13 +154,15 @@ def _cost(box: np.ndarray, place: tuple[float, float], taken: list[np.ndarray], 
 # --------------------------------------------------------------------------------------- differences to the full one
 
 
-def forest(differences: dict[str, dict[str, Difference]], titles: dict[str, str], more: set[str], path: Path) -> None:
+def draw_forest(
+    differences: dict[str, dict[str, Difference]], titles: dict[str, str], more: set[str], path: Path
+) -> None:
     """A panel for each metric: method minus full, with its intervals; what lies to the left is worse in all panels.
 
     `more`: the metrics of which more is better. Orange and blue: the interval over views leaves zero out.
     """
     names = list(dict.fromkeys(name for by_method in differences.values() for name in by_method))
-    made, grid = figure(0.9 + 0.3 * len(names), 1, len(differences), sharey=True)
+    made, grid = new_figure(0.9 + 0.3 * len(names), 1, len(differences), sharey=True)
     for axes, (metric, by_method) in zip(grid[0], differences.items(), strict=True):
         axes.axvline(0, color=INK, linewidth=1)
         axes.grid(axis="y", visible=False)
@@ -174,7 +178,7 @@ def forest(differences: dict[str, dict[str, Difference]], titles: dict[str, str]
     grid[0, 0].set_ylim(len(names) - 0.4, -0.6)
     grid[0, 0].set_title("← worse than full", fontsize=9, color=ORANGE, loc="left")
     grid[0, -1].set_title("better than full →", fontsize=9, color=BLUE, loc="right")
-    save(made, path)
+    save_chart(made, path)
 
 
 def _interval(axes: Axes, difference: Difference, row: int, sign: int, far: float) -> None:

@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw, ImageFont
 from reffusion.io.arrays import load_json
 from reffusion.io.images import load_image, load_mask, resize_nearest, resized, save_image
 from reffusion.io.scene import has_photograph, load_warnings
-from report import command, sheet
+from report import cli, sheet
 
 WIDTH, HEIGHT, GAP = 240, 180, 4  # px of the room for a picture, and between them
 COLUMNS = 6
@@ -35,18 +35,18 @@ def make(home: Path) -> tuple[Path, list[str]]:
     named = [name for name in sorted(there) if has_photograph(poses, name)]
     if not named:
         raise ValueError(f"{poses}: the scene has no photographs to look at")
-    cells = [(name, tinted(poses, raw_masks, name), kind_of(name, views)) for name in named]
-    save_image(home / "check.png", arranged(cells))
+    cells = [(name, overlay_masks(poses, raw_masks, name), view_role(name, views)) for name in named]
+    save_image(home / "check.png", contact_sheet(cells))
     return home / "check.png", [*load_warnings(poses), *load_warnings(raw_masks)]
 
 
-def kind_of(name: str, views: dict[str, list[str]]) -> str:
+def view_role(name: str, views: dict[str, list[str]]) -> str:
     if name in views.get("outliers", ()):
         return "left out"
     return "clean" if name in views["clean"] else "test" if name in views["test"] else "training"
 
 
-def tinted(poses: Path, raw_masks: Path, name: str) -> np.ndarray:
+def overlay_masks(poses: Path, raw_masks: Path, name: str) -> np.ndarray:
     """uint8 [h, w, 3], at most `WIDTH` x `HEIGHT`: the photograph, its mask over it."""
     image = load_image(poses / "images" / f"{name}.png")
     factor = min(WIDTH / image.shape[1], HEIGHT / image.shape[0])
@@ -59,7 +59,7 @@ def tinted(poses: Path, raw_masks: Path, name: str) -> np.ndarray:
     return small
 
 
-def arranged(cells: list[tuple[str, np.ndarray, str]]) -> np.ndarray:
+def contact_sheet(cells: list[tuple[str, np.ndarray, str]]) -> np.ndarray:
     """uint8 [H, W, 3]: the pictures in rows on white, under each its view's name and what it is for."""
     font, line = ImageFont.load_default(13), 20
     columns = min(COLUMNS, len(cells))
@@ -74,7 +74,7 @@ def arranged(cells: list[tuple[str, np.ndarray, str]]) -> np.ndarray:
 
 
 def main() -> None:
-    home = command.home(command.parser("check", __doc__).parse_args())
+    home = cli.run_folder(cli.scene_parser("check", __doc__).parse_args())
     try:
         path, said = make(home)
     except ValueError as error:

@@ -10,7 +10,7 @@ from reffusion.io.compressed import save_compressed
 from reffusion.io.lora import save_portable
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import has_photograph, load_scene
-from report import command
+from report import cli
 from report.sheet import stage_folder
 
 PLY, COMPRESSED, WITH_OBJECT = "scene.ply", "scene.compressed.ply", "with_object.ply"
@@ -34,7 +34,7 @@ def make(home: Path) -> list[str]:
     save_compressed(out / COMPRESSED, gaussians, scene.similarity)
     shutil.copyfile(finished, out / PLY)
     said = [f"{out / PLY}: {len(gaussians)} Gaussians of degree {gaussians.sh_degree}, in the scene's own frame"]
-    said[0] += unlike_3dgs(finished, gaussians.antialiased)
+    said[0] += viewer_caveats(finished, gaussians.antialiased)
     smaller = finished.stat().st_size / (out / COMPRESSED).stat().st_size
     said.append(f"{out / COMPRESSED}: the same, quantised, {smaller:.1f} times smaller, in PlayCanvas's format")
     save_cameras(out / CAMERAS, scene, IMAGES)
@@ -59,7 +59,7 @@ def make(home: Path) -> list[str]:
     return said
 
 
-def unlike_3dgs(path: Path, antialiased: bool) -> str:
+def viewer_caveats(path: Path, antialiased: bool) -> str:
     """What of the file not every viewer shows as we do."""
     with open(path, "rb") as file:
         exact = b"property double x" in file.read(HEADER)
@@ -69,9 +69,9 @@ def unlike_3dgs(path: Path, antialiased: bool) -> str:
 
 
 def main() -> None:
-    arguments = command.parser("export", __doc__).parse_args()
+    arguments = cli.scene_parser("export", __doc__).parse_args()
     try:
-        print("\n".join(make(command.home(arguments))))
+        print("\n".join(make(cli.run_folder(arguments))))
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
 

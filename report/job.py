@@ -13,8 +13,18 @@ from tempfile import TemporaryDirectory
 
 from reffusion.io.arrays import load_json
 from reffusion.io.scene import load_warnings
-from report import before, command, covered, curves, drawn, inside, page, scenes, settings
-from report.loading import Job, load_job
+from report import (
+    before_after,
+    cli,
+    coverage,
+    inline_images,
+    job_parameters,
+    job_pictures,
+    page,
+    scenes_page,
+    trace_charts,
+)
+from report.job_data import Job, load_job
 
 WORDS = {
     "skip": "left\u00a0out", "provided": "brought", "cached": "done", "run": "to\u00a0run", "stale": "to\u00a0run",
@@ -45,18 +55,35 @@ def make(home: Path) -> Path:
     job = load_job(home)
     title = f"{home.name}: what was done"
     seconds = sum(receipt["seconds"] for receipt in job.receipts.values())
-    done = f"{page.duration(seconds)} in {len(job.receipts)} stages"
-    parts = [page.heading(title, 1), page.paragraph(f"{done}. {outcome(job)}"), *unfinished(job), *said(job)]
-    parts += before.section(job) + drawn.masks(job) + drawn.references(job) + drawn.depths(job) + covered.section(job)
+    done = f"{page.format_duration(seconds)} in {len(job.receipts)} stages"
+    parts = [
+        page.heading(title, 1),
+        page.paragraph(f"{done}. {summarize_result(job)}"),
+        *unfinished_note(job),
+        *capture_notes(job),
+    ]
+    parts += (
+        before_after.before_after_section(job)
+        + job_pictures.masks_section(job)
+        + job_pictures.references_section(job)
+        + job_pictures.depth_section(job)
+        + coverage.coverage_section(job)
+    )
     with TemporaryDirectory() as charts:
-        parts += whole(job, Path(charts)) + stages(job, Path(charts))
-    parts += left_out(job) + settings.section(job) + receipts(job) + settings.command(job) + artifacts(job)
+        parts += whole_job_section(job, Path(charts)) + stage_sections(job, Path(charts))
+    parts += (
+        skipped_section(job)
+        + job_parameters.parameters_section(job)
+        + receipts_section(job)
+        + job_parameters.reproduce_section(job)
+        + files_section(job)
+    )
     path = home / "report.html"
-    path.write_text(page.document(title, parts, STYLE + before.STYLE, before.SCRIPT), encoding="utf-8")
+    path.write_text(page.document(title, parts, STYLE + before_after.STYLE, before_after.SCRIPT), encoding="utf-8")
     return path
 
 
-def outcome(job: Job) -> str:
+def summarize_result(job: Job) -> str:
     """The result in a sentence."""
     mean, counts = job.metrics.get("mean", {}), job.metrics.get("gaussians", {})
     if not job.metrics:
@@ -73,7 +100,7 @@ def outcome(job: Job) -> str:
 # --------------------------------------------------------------------------------------------------------- sections
 
 
-def unfinished(job: Job) -> list[str]:
+def unfinished_note(job: Job) -> list[str]:
     """The stages that are still to run."""
     due = [stage for stage, told in job.plan.items() if told["word"] not in ("cached", "skip", "provided")]
     if not job.plan:
@@ -81,7 +108,7 @@ def unfinished(job: Job) -> list[str]:
     return [page.paragraph(f"Still to run, or to run again: {', '.join(due)}.")] if due else []
 
 
-def said(job: Job) -> list[str]:
+def capture_notes(job: Job) -> list[str]:
     """Which frames of a video were taken, how structure from motion went, and what was odd about the photographs."""
     record = job.home.with_name(job.home.name.split("@")[0]) / "frames" / "frames.json"
     lines = [load_json(record)["said"]] if record.is_file() else []
@@ -93,67 +120,73 @@ def said(job: Job) -> list[str]:
     return [page.bullets(lines)] if lines else []
 
 
-def whole(job: Job, out: Path) -> list[str]:
+def whole_job_section(job: Job, out: Path) -> list[str]:
     """The whole job against the clock, and the scores of initialization and result."""
-    draw(job, out / "job.png")
-    parts = [page.heading("The whole job"), inside.chart(out / "job.png", "PSNR and stages against seconds")]
+    draw_job(job, out / "job.png")
+    parts = [
+        page.heading("The whole job"),
+        inline_images.chart_element(out / "job.png", "PSNR and stages against seconds"),
+    ]
     if any(stage in job.traces for stage in ("fit", "distill")):
         words = (
             "Curves: each stage's own error, on training views or references. Test views are only scored at the end."
         )
         parts.append(page.paragraph(words, quiet=True))
-    return parts + scores(job)
+    return parts + score_table(job)
 
 
-def draw(job: Job, path: Path, ceiling: float | None = None) -> None:
+def draw_job(job: Job, path: Path, ceiling: float | None = None) -> None:
     """PSNR and stages against seconds; `ceiling`: see `curves.job_chart`."""
     seconds = {stage: receipt["seconds"] for stage, receipt in job.receipts.items()}
     lines = {stage: series.get("", []) for stage, series in job.traces.items()}
     result = job.metrics.get("result", "")
     box = {"initialize": job.metrics.get("initialize", {}).get("psnr_box")}
     box |= {result: job.metrics.get("mean", {}).get("psnr_box")}
-    curves.job_chart(seconds, {stage: own for stage, own in lines.items() if own}, box, path, ceiling)
+    trace_charts.draw_job_chart(seconds, {stage: own for stage, own in lines.items() if own}, box, path, ceiling)
 
 
-def scores(job: Job) -> list[str]:
+def score_table(job: Job) -> list[str]:
     """The mean metrics, those of the initialization beside them."""
-    after, before = job.metrics.get("mean", {}), job.metrics.get("initialize", {})
+    after, initial = job.metrics.get("mean", {}), job.metrics.get("initialize", {})
     names = [name for name, value in after.items() if value is not None]
     if not names:
         return []
     lines = [
-        [title, *(page.number(values.get(n), 2 if "psnr" in n else 4) for n in names)]
-        for title, values in (("initialization", before), ("result", after))
+        [title, *(page.format_number(values.get(n), 2 if "psnr" in n else 4) for n in names)]
+        for title, values in (("initialization", initial), ("result", after))
         if any(values.get(name) is not None for name in names)
     ]
     return [page.table(["mean over test views", *names], lines)]
 
 
-def stages(job: Job, out: Path) -> list[str]:
+def stage_sections(job: Job, out: Path) -> list[str]:
     """A chart for each stage with a trace."""
     parts = []
     for stage, series in job.traces.items():
         path = out / f"{stage}.png"
-        if names := curves.stage_chart(stage, series, path):
-            parts += [page.heading(f"{stage}: error against seconds"), inside.chart(path, ", ".join(names))]
+        if names := trace_charts.draw_stage_chart(stage, series, path):
+            parts += [
+                page.heading(f"{stage}: error against seconds"),
+                inline_images.chart_element(path, ", ".join(names)),
+            ]
     parts += [page.paragraph(f"Not drawn: {why}", quiet=True) for why in job.unread]
     return parts
 
 
-def left_out(job: Job) -> list[str]:
+def skipped_section(job: Job) -> list[str]:
     """The runner's words for stages that are not simply done."""
     if not job.plan:
         return []
     rows = [
-        [stage, WORDS.get(said["word"], said["word"]), "; ".join([said["reason"], *said["notes"]])]
-        for stage, said in job.plan.items()
-        if said["word"] != "cached" or said["reason"]
+        [stage, WORDS.get(entry["word"], entry["word"]), "; ".join([entry["reason"], *entry["notes"]])]
+        for stage, entry in job.plan.items()
+        if entry["word"] != "cached" or entry["reason"]
     ]
     parts = [page.heading("What was left out or taken over, and why")]
     return parts + ([page.table(["stage", "", "because"], rows, text=(1, 2))] if rows else [page.paragraph("Nothing.")])
 
 
-def receipts(job: Job) -> list[str]:
+def receipts_section(job: Job) -> list[str]:
     """Seconds, memory and where it ran; versions once."""
     total = sum(receipt["seconds"] for receipt in job.receipts.values())
     rows = []
@@ -164,12 +197,16 @@ def receipts(job: Job) -> list[str]:
         rows.append([stage, f"{r['seconds']:.1f}", share, f"{r['peak_memory_mb']:,}", *place, resumed])
     header = ["stage", "seconds", "share", "peak MB", "device", "machine", "profile", "made", ""]
     versions = {name: v for r in job.receipts.values() for name, v in r.get("versions", {}).items()}
-    said = ", ".join(f"{name} {version}" for name, version in versions.items())
+    with_versions = ", ".join(f"{name} {version}" for name, version in versions.items())
     table = page.table(header, rows, text=(4, 5, 6, 7, 8))
-    return [page.heading("Receipts"), table, page.paragraph(f"With {said}.", quiet=True) if said else ""]
+    return [
+        page.heading("Receipts"),
+        table,
+        page.paragraph(f"With {with_versions}.", quiet=True) if with_versions else "",
+    ]
 
 
-def artifacts(job: Job) -> list[str]:
+def files_section(job: Job) -> list[str]:
     there = {"turntable.webm: a way around the capture": "turntable.webm"}
     there = there if (job.home / "turntable.webm").is_file() else {}
     for name, words in RESULTS.items():
@@ -191,13 +228,13 @@ def main() -> None:
     suffix = f"@{arguments.variant}" if arguments.variant else ""
     try:
         if arguments.scene:
-            print(make(command.home(arguments)))
+            print(make(cli.run_folder(arguments)))
             return
         folders = sorted(path for path in arguments.data.iterdir() if path.is_dir()) if arguments.data.is_dir() else []
         homes = [home for path in folders if (home := arguments.runs / (path.name + suffix)).is_dir()]
         if not homes:
             raise ValueError(f"data={arguments.data}: none of its scenes has a folder in {arguments.runs}")
-        print(scenes.make([load_job(home) for home in homes], arguments.runs / f"report{suffix}"))
+        print(scenes_page.make([load_job(home) for home in homes], arguments.runs / f"report{suffix}"))
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
 

@@ -18,13 +18,13 @@ from urllib.parse import unquote, urlsplit
 import numpy as np
 from PIL import Image
 
-from report import command
-from report.clicking import Session, capture_of, segmenter_here
+from report import cli
+from report.mask_session import Session, load_capture, load_local_segmenter
 
 PORT = 8090
 PAGE = Path(__file__).with_name("mask.html")
 THUMBNAIL = 160  # px, larger side
-MOST = 2_000_000  # bytes of a request
+MAX_REQUEST_BYTES = 2_000_000  # bytes of a request
 TINT = (255, 0, 160)
 # The page is one file, and asks nobody but this server.
 POLICY = "default-src 'none'; img-src 'self' data:; connect-src 'self'; "
@@ -77,7 +77,7 @@ class Handler(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         length = int(self.headers.get("Content-Length") or 0)
-        if not self._from_here() or length > MOST:
+        if not self._from_here() or length > MAX_REQUEST_BYTES:
             self._say(HTTPStatus.FORBIDDEN, {"error": "this page is for this machine only"})
             return
         try:
@@ -136,7 +136,7 @@ def _tinted(mask: np.ndarray) -> bytes:
     return file.getvalue()
 
 
-def run(stage: str, arguments) -> list[str]:
+def stage_command(stage: str, arguments) -> list[str]:
     """The command that runs a stage of a scene that may have no masks yet."""
     given = {"--profile": arguments.profile, "--budget": arguments.budget}
     said = [word for name, value in given.items() if value for word in (name, value)]
@@ -145,17 +145,17 @@ def run(stage: str, arguments) -> list[str]:
 
 
 def main() -> None:
-    parser = command.parser("mask", __doc__)
+    parser = cli.scene_parser("mask", __doc__)
     parser.add_argument("--port", type=int, default=PORT, help="the next free one is taken where it is not free")
-    parser.add_argument("--profile", help="as of `run`; these four are for the stages `poses` and `fit`")
-    parser.add_argument("--budget", help="as of `run`")
-    parser.add_argument("--set", default="", help="as of `run`")
+    parser.add_argument("--profile", help="as of `stage_command`; these four are for the stages `poses` and `fit`")
+    parser.add_argument("--budget", help="as of `stage_command`")
+    parser.add_argument("--set", default="", help="as of `stage_command`")
     arguments = parser.parse_args()
-    if status := subprocess.run(run("poses", arguments)).returncode:
+    if status := subprocess.run(stage_command("poses", arguments)).returncode:
         raise SystemExit(status)
     try:
-        capture, segmenter = capture_of(command.home(arguments)), segmenter_here()
-        fit = subprocess.Popen(run("fit", arguments))
+        capture, segmenter = load_capture(cli.run_folder(arguments)), load_local_segmenter()
+        fit = subprocess.Popen(stage_command("fit", arguments))
         session = Session(capture, lambda: fit.poll() == 0, segmenter)
         server = Server(session, arguments.port, fit)
     except ValueError as error:

@@ -83,18 +83,18 @@ def links(targets: dict[str, str]) -> str:
     return "<ul>" + "".join(lines) + "</ul>"
 
 
-def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """The same table for a text file."""
     lines = [header, ["---"] * len(header), *rows]
     return "".join("| " + " | ".join(cell.replace("|", "/") for cell in line) + " |\n" for line in lines)
 
 
-def number(value: float | None, digits: int = 0) -> str:
+def format_number(value: float | None, digits: int = 0) -> str:
     """With commas between thousands; a dash where there is none."""
     return "–" if value is None else f"{value:,.{digits}f}"
 
 
-def duration(seconds: float | None) -> str:
+def format_duration(seconds: float | None) -> str:
     """As people say it: 48 s, 5 min 20 s, 1 h 5 min."""
     if seconds is None:
         return "–"

@@ -8,8 +8,8 @@ from pathlib import Path
 from reffusion.io.arrays import load_labels
 from reffusion.io.ply import properties_of, save_ply
 from reffusion.io.scene import load_scene
-from report import command, patch_files
-from report.patch_result import check, load_result
+from report import cli, patch_files
+from report.patch_result import load_result, require_deleted
 
 WHOLE, NEW = "patched.ply", "new.ply"
 
@@ -39,7 +39,7 @@ def make(home: Path) -> str:
 
 
 def main() -> None:
-    parser = command.parser("patch", __doc__, needs_scene=False)
+    parser = cli.scene_parser("patch", __doc__, needs_scene=False)
     parser.add_argument("--only-check", action="store_true", help="does the scene say what was deleted?")
     files = "two files of splats, before and after the object was deleted (.ply, compressed .ply, .spz, .splat)"
     parser.add_argument("files", type=Path, nargs="*", metavar="BEFORE AFTER", help=f"instead of --scene: {files}")
@@ -55,9 +55,9 @@ def main() -> None:
         elif arguments.scene is None:
             raise ValueError("name a scene (--scene), or two files: reffusion patch before.ply after.ply --out out.ply")
         elif arguments.only_check:
-            check(command.home(arguments))
+            require_deleted(cli.run_folder(arguments))
         else:
-            print(make(command.home(arguments)))
+            print(make(cli.run_folder(arguments)))
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
 

@@ -22,10 +22,10 @@ from reffusion.io.splats import summarize
 from report.patch_result import load_result
 
 BEFORE, AFTER, PATCHES = "before", "after", "patches"
-OWN = (BEFORE, AFTER, "painted", "scene.yaml")  # names in the folder that no link to a camera replaces
+RESERVED_NAMES = (BEFORE, AFTER, "painted", "scene.yaml")  # names in the folder that no link to a camera replaces
 
 
-def check(arguments: argparse.Namespace) -> None:
+def check_arguments(arguments: argparse.Namespace) -> None:
     """ValueError where the files cannot be used, as far as their headers tell, or the result could not be written."""
     if len(arguments.files) != 2:
         raise BadInput(f"{arguments.files[0]}: name two files, the scene before and after the object was deleted")
@@ -40,7 +40,7 @@ def check(arguments: argparse.Namespace) -> None:
         raise BadInput(f"{arguments.cameras}: no such folder; --cameras names one with transforms.json or sparse/0")
 
 
-def prepare(arguments: argparse.Namespace) -> Path:
+def write_scene_folder(arguments: argparse.Namespace) -> Path:
     """The scene's folder, written anew but for what a person painted."""
     files = [file.expanduser().resolve() for file in arguments.files]
     folder, names = find_folder(arguments.runs, *files), {}
@@ -51,7 +51,7 @@ def prepare(arguments: argparse.Namespace) -> Path:
         if path.is_symlink():
             path.unlink()
     for path in sorted(arguments.cameras.expanduser().resolve().iterdir()) if arguments.cameras else ():
-        if path.name not in OWN and not path.name.startswith("."):
+        if path.name not in RESERVED_NAMES and not path.name.startswith("."):
             _link(folder / path.name, path)
     said = f"gaussians: {json.dumps(names[BEFORE])}\ncleaned: {json.dumps(names[AFTER])}\nmasks: none\n"
     scene = folder / "scene.yaml"
@@ -81,9 +81,9 @@ def make(arguments: argparse.Namespace) -> str:
     Raises:
         ValueError: the files cannot be used; SystemExit: a stage was refused, failed or was interrupted.
     """
-    check(arguments)
-    folder = prepare(arguments)
-    run_all(folder, arguments)
+    check_arguments(arguments)
+    folder = write_scene_folder(arguments)
+    run_stages(folder, arguments)
     home = arguments.runs / folder.name
     result = load_result(home)
     similarity = load_scene(result.poses).similarity
@@ -95,7 +95,7 @@ def make(arguments: argparse.Namespace) -> str:
     )
 
 
-def run_all(folder: Path, arguments: argparse.Namespace) -> None:
+def run_stages(folder: Path, arguments: argparse.Namespace) -> None:
     """All stages; SystemExit with the runner's code where it ends without a result, its line being on the screen."""
     given = {"--profile": arguments.profile, "--budget": arguments.budget, "--set": arguments.set}
     said = [word for name, value in given.items() if value for word in (name, value)]

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Result:
+class PatchResult:
     """A filled scene.
 
     Attributes:
@@ -31,16 +31,18 @@ class Result:
     poses: Path
 
 
-def load_result(home: Path) -> Result:
+def load_result(home: Path) -> PatchResult:
     """Of runs/<scene> or runs/<scene>@<variant>. ValueError where nothing was deleted, or `evaluate` has not run."""
-    check(home)
+    require_deleted(home)
     poses, finished = stage_folder(home, "poses"), home / "evaluate" / "scene.ply"
     if not finished.exists():
         raise ValueError(f"{finished} is missing; `make scene={home.name.split('@')[0]} patch` makes it")
-    return Result(load_ply(finished, load_scene(poses).similarity), load_labels(last_of(home) / "labels.npy"), poses)
+    return PatchResult(
+        load_ply(finished, load_scene(poses).similarity), load_labels(result_stage_folder(home) / "labels.npy"), poses
+    )
 
 
-def check(home: Path) -> None:
+def require_deleted(home: Path) -> None:
     """ValueError where the scene does not say what was deleted, as far as its stage `poses` knows."""
     if not (stage_folder(home, "poses") / "deleted.npy").is_file():
         raise ValueError(
@@ -49,7 +51,7 @@ def check(home: Path) -> None:
         )
 
 
-def last_of(home: Path) -> Path:
+def result_stage_folder(home: Path) -> Path:
     """The folder of the stage whose Gaussians are the result."""
     used = load_receipts({"evaluate": home / "evaluate"})["evaluate"]["needs"]
     return stage_folder(home, next(stage for stage in ("distill", "initialize") if used.get(stage)))

@@ -11,24 +11,34 @@ from typing import Any
 import numpy as np
 
 from reffusion.io.arrays import load_json
-from report.paired import Difference, half_width, paired
+from report.paired_statistics import Difference, confidence_half_width, paired_difference
 
 FULL = "full"
-TOGETHER = "compare"  # the folder in runs/ of a comparison over a folder of scenes
+FOLDER_COMPARISON = "compare"  # the folder in runs/ of a comparison over a folder of scenes
 MAIN = "lpips_vgg_box"  # by which methods are ordered
-BETTER = {"lpips_vgg_box": "less", "lpips_alex_box": "less", "psnr_box": "more", "ssim_box": "more", "flip_box": "less"}
-OUTSIDE = {"psnr_outside": "more", "ssim_outside": "more", "flip_outside": "less"}  # of the masks
-SCORES = BETTER | OUTSIDE
+BOX_SCORES = {
+    "lpips_vgg_box": "less",
+    "lpips_alex_box": "less",
+    "psnr_box": "more",
+    "ssim_box": "more",
+    "flip_box": "less",
+}
+OUTSIDE_SCORES = {"psnr_outside": "more", "ssim_outside": "more", "flip_outside": "less"}  # of the masks
+SCORES = BOX_SCORES | OUTSIDE_SCORES
 PSNR_CAP = 100.0  # dB, what an identical view counts: as in metrics.json
 MEASURED = ("consistency", "seconds", "own_seconds", "peak_memory_mb", "gaussians", "scenes")
-AGAINST = ("minus_full", "interval_views", "interval_scenes")  # see report.paired.Difference; halves of intervals
+DIFFERENCE_COLUMNS = (
+    "minus_full",
+    "interval_views",
+    "interval_scenes",
+)  # see report.paired_statistics.Difference; halves of intervals
 COLUMNS = (
     "method",
     "state",
     "same_as",
     *SCORES,
     *MEASURED,
-    *(f"{metric}_{what}" for metric in SCORES for what in AGAINST),
+    *(f"{metric}_{what}" for metric in SCORES for what in DIFFERENCE_COLUMNS),
 )
 COLUMNS += tuple(f"{metric}_interval" for metric in SCORES)  # half the 95% interval of the mean over scenes
 
@@ -88,12 +98,12 @@ class Comparison:
         return [run for scene in self.scenes if (run := self.runs[method, scene]).state == "done"]
 
 
-def load(home: Path) -> Comparison:
+def load_comparison(home: Path) -> Comparison:
     """Read compare.json of runs/<scene>, or of runs/compare for a folder of scenes, and what it names. Raises
     ValueError where nothing was compared yet."""
     path = home / "compare.json"
     if not path.exists():
-        what = "data=FOLDER" if home.name == TOGETHER else f"scene={home.name}"
+        what = "data=FOLDER" if home.name == FOLDER_COMPARISON else f"scene={home.name}"
         raise ValueError(f"{path}: no such file; run `make {what} compare` first")
     record = load_json(path)
     runs = {(run["method"], run["scene"]): load_run(run, home.parent) for run in record["runs"]}
@@ -160,17 +170,17 @@ def _number(column: str, text: str | None) -> float | None:
 # ------------------------------------------------------------------------------------------------------- the table
 
 
-def rows(comparison: Comparison) -> list[dict[str, Any]]:
+def summarize_methods(comparison: Comparison) -> list[dict[str, Any]]:
     """A dict of `COLUMNS` for each method: means over its finished scenes; None where there is no value, and of a
     method that is another's job. The best in `MAIN` first; methods without it as they were named."""
     table = [_row(comparison, method) for method in comparison.methods]
     table.sort(key=lambda row: (row["same_as"] is not None, row[MAIN] is None, row[MAIN] or 0.0))
     for metric in SCORES:
-        found = differences(comparison, metric)
+        found = differences_to_full(comparison, metric)
         for row in table:
             if difference := found.get(row["method"]):
                 values = (difference.mean, difference.views, difference.scenes)
-                row |= {f"{metric}_{what}": value for what, value in zip(AGAINST, values, strict=True)}
+                row |= {f"{metric}_{what}": value for what, value in zip(DIFFERENCE_COLUMNS, values, strict=True)}
     return table
 
 
@@ -185,29 +195,29 @@ def _row(comparison: Comparison, method: str) -> dict[str, Any]:
         return row
     for name in SCORES:
         values = [run.metrics.get("mean", {}).get(name) for run in done]
-        row |= {name: mean(values), f"{name}_interval": interval(values)}
-    row["consistency"] = mean([consistency(run) for run in done])
-    row["seconds"] = mean([seconds(run) for run in done])
-    row["own_seconds"] = mean([own_seconds(run, comparison.runs[FULL, run.scene]) for run in done])
+        row |= {name: finite_mean(values), f"{name}_interval": mean_interval(values)}
+    row["consistency"] = finite_mean([view_consistency(run) for run in done])
+    row["seconds"] = finite_mean([total_seconds(run) for run in done])
+    row["own_seconds"] = finite_mean([own_seconds(run, comparison.runs[FULL, run.scene]) for run in done])
     peaks = [receipt["peak_memory_mb"] for run in done for receipt in run.receipts.values()]
     row["peak_memory_mb"] = max(peaks, default=None)
-    counts = mean([run.metrics.get("gaussians", {}).get(run.metrics.get("result")) for run in done])
+    counts = finite_mean([run.metrics.get("gaussians", {}).get(run.metrics.get("result")) for run in done])
     row["gaussians"] = None if counts is None else round(counts)
     return row
 
 
-def mean(values: list[float | None]) -> float | None:
+def finite_mean(values: list[float | None]) -> float | None:
     """Of those that are there and finite; None where there are none."""
     there = [value for value in values if value is not None and math.isfinite(value)]
     return sum(there) / len(there) if there else None
 
 
-def interval(values: list[float | None]) -> float | None:
+def mean_interval(values: list[float | None]) -> float | None:
     """Half the 95% interval of the mean of those that are there and finite; None under two."""
-    return half_width(np.array([value for value in values if value is not None and math.isfinite(value)]))
+    return confidence_half_width(np.array([value for value in values if value is not None and math.isfinite(value)]))
 
 
-def seconds(run: Run) -> float:
+def total_seconds(run: Run) -> float:
     """Of the whole job, its evaluation included."""
     return round(sum(receipt["seconds"] for receipt in run.receipts.values()), 2)
 
@@ -220,7 +230,7 @@ def own_seconds(run: Run, full: Run) -> float | None:
     return round(sum(own), 2)
 
 
-def consistency(run: Run) -> float | None:
+def view_consistency(run: Run) -> float | None:
     """The mean over pairs of neighbouring views, where metrics.json has it."""
     value = (run.metrics.get("consistency") or {}).get("consistency")
     return None if value is None else float(value)
@@ -250,7 +260,7 @@ def _value(name: str, text: str) -> Any:
 # ------------------------------------------------------------------------------------------------ against the full one
 
 
-def differences(comparison: Comparison, metric: str) -> dict[str, Difference]:
+def differences_to_full(comparison: Comparison, metric: str) -> dict[str, Difference]:
     """Method -> its difference to the full one in a score, over the views that both have."""
     found = {}
     for method in comparison.distinct_methods:
@@ -261,6 +271,6 @@ def differences(comparison: Comparison, metric: str) -> dict[str, Difference]:
             full = comparison.runs[FULL, run.scene]
             both = [v for v in run.views if metric in run.views[v] and metric in full.views.get(v, {})]
             scenes.append(np.array([run.views[v][metric] - full.views[v][metric] for v in both]))
-        if difference := paired(scenes):
+        if difference := paired_difference(scenes):
             found[method] = difference
     return found

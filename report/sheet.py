@@ -37,20 +37,20 @@ def make(scene_dir: Path, out: Path, *, views: list[str] | int = 3, scale: int |
     there = sorted(path.stem for path in (evaluate / "renders").glob("*.png"))
     if not there:
         raise ValueError(f"{evaluate / 'renders'}: no pictures; run `make scene={scene_dir.name} evaluate` first")
-    names = evenly(there, views) if isinstance(views, int) else views
+    names = pick_evenly(there, views) if isinstance(views, int) else views
     if unknown := [name for name in names if name not in there]:
         raise ValueError(f"{evaluate / 'renders'} has no {', '.join(unknown)}; it has {there[0]} ... {there[-1]}")
     test = load_json(poses / "views.json")["test"]
-    rows = [pictures_of(evaluate, poses if name in test else None, name) for name in names]
+    rows = [load_view_pictures(evaluate, poses if name in test else None, name) for name in names]
     columns = [key for key in TITLES if any(key in row for row in rows)]
     width = max(picture.shape[1] for row in rows for picture in row.values())
     scale = scale or max(1, round(480 / width))
-    cells = [[enlarged(row.get(key), scale) for key in columns] for row in rows]
-    save_image(out, framed(cells, [TITLES[key] for key in columns], names))
+    cells = [[enlarge(row.get(key), scale) for key in columns] for row in rows]
+    save_image(out, compose_sheet(cells, [TITLES[key] for key in columns], names))
     return out
 
 
-def evenly(names: list[str], count: int) -> list[str]:
+def pick_evenly(names: list[str], count: int) -> list[str]:
     """`count` of them, spread evenly, the first and last a little inside."""
     places = (np.arange(min(count, len(names))) + 0.5) * len(names) / min(count, len(names))
     return [names[int(place)] for place in places]
@@ -62,7 +62,7 @@ def stage_folder(scene_dir: Path, stage: str) -> Path:
     return own if own.exists() else scene_dir.with_name(scene_dir.name.split("@")[0]) / stage
 
 
-def pictures_of(evaluate: Path, poses: Path | None, name: str) -> dict[str, np.ndarray]:
+def load_view_pictures(evaluate: Path, poses: Path | None, name: str) -> dict[str, np.ndarray]:
     """Column -> uint8 [H, W, 3], of what is there. No `poses` for a training photo: it shows the object."""
     paths = {key: evaluate / key / f"{name}.png" for key in TITLES}
     if poses:
@@ -70,12 +70,12 @@ def pictures_of(evaluate: Path, poses: Path | None, name: str) -> dict[str, np.n
     return {key: load_image(path) for key, path in paths.items() if path.exists()}
 
 
-def enlarged(picture: np.ndarray | None, scale: int) -> np.ndarray | None:
+def enlarge(picture: np.ndarray | None, scale: int) -> np.ndarray | None:
     """Each pixel repeated `scale` times, so that nothing is blurred."""
     return None if picture is None else picture.repeat(scale, 0).repeat(scale, 1)
 
 
-def framed(cells: list[list[np.ndarray | None]], titles: list[str], names: list[str]) -> np.ndarray:
+def compose_sheet(cells: list[list[np.ndarray | None]], titles: list[str], names: list[str]) -> np.ndarray:
     """uint8 [H, W, 3]: the cells on white, titles above, the view's name on its first picture."""
     heights = [max(cell.shape[0] for cell in row if cell is not None) for row in cells]
     width = max(cell.shape[1] for row in cells for cell in row if cell is not None)

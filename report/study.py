@@ -22,17 +22,17 @@ from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_scene
 from reffusion.seeding import generator
 from reffusion.splat import rasterizer
-from report import flight
-from report.results import FULL, TOGETHER, Comparison, Run, load
-from report.sheet import GAP, evenly
-from report.turntable import RATE, save_film
+from report import camera_path
+from report.results import FOLDER_COMPARISON, FULL, Comparison, Run, load_comparison
+from report.sheet import GAP, pick_evenly
+from report.turntable import RATE, save_video
 
 PAGE = Path(__file__).with_name("study.html")
 FRAMES = 96  # of a clip: four seconds, shown again and again
-SLOW = 4  # frames a second where a clip goes through the test views
+VIEWS_RATE = 4  # frames a second where a clip goes through the test views
 STILLS = 3  # views side by side, where there is no video
-CHECKS = 2  # attention checks at least; one for every ten pairs
-SPOILT = 24  # px of the blocks of a spoilt clip
+MIN_CHECKS = 2  # attention checks at least; one for every ten pairs
+BLOCK_SIZE = 24  # px of the blocks of a spoilt clip
 KEY = "study-key.json"  # beside the folder of the study, never in it: who made which clip
 
 
@@ -56,7 +56,7 @@ def make(home: Path, methods: list[str], seed: int = 0, frames: int = FRAMES) ->
     Raises:
         ValueError: nothing was compared, a method is not among those, or no pair of clips can be made.
     """
-    comparison = load(home)
+    comparison = load_comparison(home)
     others = [method for method in comparison.distinct_methods if method != FULL]
     if unknown := [method for method in methods if method not in others]:
         raise ValueError(f"variants: {unknown[0]} was not compared; there are {', '.join(others)}")
@@ -75,7 +75,7 @@ def make(home: Path, methods: list[str], seed: int = 0, frames: int = FRAMES) ->
             trial = {"id": _name(draws), "clips": [names[FULL], names[theirs.run.method]], "reference": reference}
             trials.append(trial)
             key["pairs"][trial["id"]] = {"scene": scene, "method": theirs.run.method, "full": names[FULL]}
-            if len(key["checks"]) < max(CHECKS, len(trials) / 10):
+            if len(key["checks"]) < max(MIN_CHECKS, len(trials) / 10):
                 spoilt = _save([_spoilt(each, draws) for each in ours.frames], ours.rate, out / "clips", _name(draws))
                 check = {"id": _name(draws), "clips": [names[FULL], spoilt], "reference": reference}
                 trials.append(check)
@@ -117,24 +117,26 @@ def _flown(run: Run, frames: int) -> Clip | None:
         return None
     scene = load_scene(poses)
     gaussians = load_ply(evaluate / "scene.ply", scene.similarity)
-    cameras = flight.around([scene.cameras[name] for name in scene.train], scene.points, frames)
+    cameras = camera_path.ellipse_path([scene.cameras[name] for name in scene.train], scene.points, frames)
     return Clip(run, [to_uint8(rasterizer.render(gaussians, each).color.numpy()) for each in cameras], RATE)
 
 
 def _views(run: Run) -> Clip | None:
     paths = sorted((run.folders["evaluate"] / "renders").glob("*.png")) if "evaluate" in run.folders else []
-    return Clip(run, [load_image(path) for path in paths], SLOW) if paths else None
+    return Clip(run, [load_image(path) for path in paths], VIEWS_RATE) if paths else None
 
 
 def _save(frames: list[np.ndarray], rate: int, folder: Path, name: str) -> str:
     """A .webm, or views side by side where no encoder is there; its address as the page has it."""
     try:
-        save_film(folder / f"{name}.webm", frames, rate)
+        save_video(folder / f"{name}.webm", frames, rate)
     except ValueError:
         (folder / f"{name}.webm").unlink(missing_ok=True)
         gap = np.full((frames[0].shape[0], GAP, 3), 255, np.uint8)
         shown = [
-            part for place in evenly([str(n) for n in range(len(frames))], STILLS) for part in (frames[int(place)], gap)
+            part
+            for place in pick_evenly([str(n) for n in range(len(frames))], STILLS)
+            for part in (frames[int(place)], gap)
         ]
         save_image(folder / f"{name}.png", np.concatenate(shown[:-1], 1))
         return f"clips/{name}.png"
@@ -144,7 +146,7 @@ def _save(frames: list[np.ndarray], rate: int, folder: Path, name: str) -> str:
 def _spoilt(picture: np.ndarray, draws: torch.Generator) -> np.ndarray:
     """The picture in coarse blocks, a third of them of any colour: worse to anybody who looks."""
     high, wide = picture.shape[:2]
-    rows, columns = (max(2, round(side / SPOILT)) for side in (high, wide))
+    rows, columns = (max(2, round(side / BLOCK_SIZE)) for side in (high, wide))
     small = cv2.resize(picture, (columns, rows), interpolation=cv2.INTER_AREA)
     noise = torch.randint(256, (rows, columns, 3), generator=draws).numpy().astype(np.uint8)
     chosen = torch.rand(rows, columns, generator=draws).numpy() < 1 / 3
@@ -174,7 +176,7 @@ def main() -> None:
         parser.error("--scene or --data: of which comparison?")
     methods = [name for name in given.variants.split(",") if name]
     try:
-        print(make(given.runs / (given.scene.name if given.scene else TOGETHER), methods, given.seed))
+        print(make(given.runs / (given.scene.name if given.scene else FOLDER_COMPARISON), methods, given.seed))
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
 

@@ -12,7 +12,7 @@ from reffusion.io.images import to_uint8
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_scene
 from reffusion.splat import rasterizer
-from report import command, flight
+from report import camera_path, cli
 
 FRAMES, RATE = 144, 24  # six seconds
 # In a .webm: what browsers play and OpenCV's wheels write, with a complaint about the tag that means nothing.
@@ -34,12 +34,12 @@ def make(home: Path, frames: int = FRAMES) -> Path:
     scene = load_scene(home.with_name(home.name.split("@")[0]) / "poses")
     gaussians = load_ply(finished, scene.similarity)
     train = [scene.cameras[name] for name in scene.train]
-    path, cameras = home / "turntable.webm", flight.around(train, scene.points, frames)
-    save_film(path, (to_uint8(rasterizer.render(gaussians, camera).color.numpy()) for camera in cameras))
+    path, cameras = home / "turntable.webm", camera_path.ellipse_path(train, scene.points, frames)
+    save_video(path, (to_uint8(rasterizer.render(gaussians, camera).color.numpy()) for camera in cameras))
     return path
 
 
-def save_film(path: Path, pictures: Iterable[np.ndarray], rate: int = RATE) -> None:
+def save_video(path: Path, pictures: Iterable[np.ndarray], rate: int = RATE) -> None:
     """Pictures uint8 [H, W, 3], at least one, as a .webm. Raises ValueError where this OpenCV writes none."""
     film = None
     for picture in pictures:
@@ -56,9 +56,9 @@ def save_film(path: Path, pictures: Iterable[np.ndarray], rate: int = RATE) -> N
 
 
 def main() -> None:
-    arguments = command.parser("turntable", __doc__).parse_args()
+    arguments = cli.scene_parser("turntable", __doc__).parse_args()
     try:
-        print(make(command.home(arguments)))
+        print(make(cli.run_folder(arguments)))
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
 

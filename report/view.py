@@ -16,19 +16,22 @@ from reffusion.io.images import load_image, to_uint8
 from reffusion.io.scene import has_photograph, load_scene, load_views
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Scene
-from report import command, flight, unseen
-from report.layers import how, load_layers
+from report import camera_path, cli, unseen_overlay
+from report.gaussian_layers import finish_command, load_layers
 from report.sheet import stage_folder
 
 PORT = 8080
 MOVING, STILL = 180, 480  # px, height of a picture while the camera moves, and once it rests
-PYRAMID = 0.04  # size of a drawn camera, of the scene's extent 1
+FRUSTUM_SCALE = 0.04  # size of a drawn camera, of the scene's extent 1
 # Of cameras: width in px of the picture inside, colour, and thickness of the lines.
-LOOKS = {"cameras": (160, (20, 20, 20), PYRAMID / 40), "references": (480, (230, 120, 0), PYRAMID / 15)}
-TURN = threading.Lock()  # the rasterizer's threads serve one picture at a time
+FRUSTUM_STYLES = {
+    "cameras": (160, (20, 20, 20), FRUSTUM_SCALE / 40),
+    "references": (480, (230, 120, 0), FRUSTUM_SCALE / 15),
+}
+RENDER_LOCK = threading.Lock()  # the rasterizer's threads serve one picture at a time
 
 
-def camera_of(place: Any, height: int) -> Camera:
+def visitor_camera(place: Any, height: int) -> Camera:
     """The pinhole view of a visitor's camera: `position` [3], `wxyz` [4] of camera to world, vertical `fov` in radians,
     `aspect` width / height."""
     from scipy.spatial.transform import Rotation
@@ -40,33 +43,33 @@ def camera_of(place: Any, height: int) -> Camera:
     return Camera("visitor", width, height, focal, focal, width / 2, height / 2, pose)
 
 
-def picture(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+def render_picture(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     """uint8 [H, W, 3]."""
-    with TURN:
+    with RENDER_LOCK:
         return to_uint8(rasterizer.render(gaussians, camera).color.numpy())
 
 
-def home_of(home: Path) -> Path:
+def scene_home(home: Path) -> Path:
     """The scene's own run, where `poses` lies, of one of its variants."""
     return home.with_name(home.name.split("@")[0])
 
 
-def go_to(place: Any, camera: Camera, target: np.ndarray) -> None:
+def move_to_view(place: Any, camera: Camera, target: np.ndarray) -> None:
     """Set a visitor's camera, or everyone's first one, to where a view was photographed.
 
     What it looks at, and turns around, is as far away as `target` [3].
     """
     place.position = camera.center
     place.look_at = camera.center + camera.world_to_camera[2, :3] * np.linalg.norm(target - camera.center)
-    place.fov = field_of_view(camera)
+    place.fov = vertical_fov(camera)
 
 
-def field_of_view(camera: Camera) -> float:
+def vertical_fov(camera: Camera) -> float:
     """Vertical, in radians; of a principal point beside the centre, that of the lens with it in the centre."""
     return float(2 * np.arctan(camera.height / (2 * camera.fy)))
 
 
-class Window:
+class Viewer:
     """The server, what it shows, and a thread for each visitor that draws the latest camera asked for.
 
     Raises:
@@ -78,12 +81,12 @@ class Window:
             import viser
         except ImportError:
             raise ValueError("the viewer needs viser: `make scene=X view`, or `pip install viser`") from None
-        poses = home_of(home) / "poses"
+        poses = scene_home(home) / "poses"
         if not poses.is_dir():
-            raise ValueError(f"{poses} is missing; {how(home)} makes it")
+            raise ValueError(f"{poses} is missing; {finish_command(home)} makes it")
         scene = load_scene(poses)
         self.layers = load_layers(home, scene.similarity)
-        self.seen_by = unseen.photographed(home, scene)
+        self.seen_by = unseen_overlay.load_seen_views(home, scene)
         self.shown, self.noted = next(reversed(self.layers.states.values()))[0], True
         self.asked: dict[int, threading.Event] = {}
         self.open = True
@@ -121,12 +124,12 @@ class Window:
     def _cameras(self, home: Path, scene: Scene) -> None:
         """Every training view as a pyramid with its photograph, and the references with theirs; a click on one takes
         the visitor there."""
-        train, poses = [scene.cameras[name] for name in scene.train], home_of(home) / "poses"
+        train, poses = [scene.cameras[name] for name in scene.train], scene_home(home) / "poses"
         photographed = load_views(poses, [name for name in scene.train if has_photograph(poses, name)])
         photos = {name: photographed.get(name) for name in scene.train}
-        target = flight.focus(train, scene.points)
+        target = camera_path.focus_point(train, scene.points)
         self.server.scene.set_up_direction(-np.mean([camera.world_to_camera[1, :3] for camera in train], 0))
-        go_to(self.server.initial_camera, train[len(train) // 2], target)
+        move_to_view(self.server.initial_camera, train[len(train) // 2], target)
         folder = stage_folder(home, "reference") / "references"
         given = {path.stem: load_image(path) for path in sorted(folder.glob("*.png")) if path.stem in scene.cameras}
         for kind, pictures in (("cameras", photos), ("references", given)):
@@ -136,15 +139,15 @@ class Window:
 
     def _pyramid(self, kind: str, camera: Camera, image: np.ndarray | None, target: np.ndarray) -> Any:
         """A camera with its picture, where it has one; not visible yet."""
-        width, color, thickness = LOOKS[kind]
+        width, color, thickness = FRUSTUM_STYLES[kind]
         step = max(1, camera.width // width)
         small = image[::step, ::step] if image is not None else None
         place = {"wxyz": _quaternion(camera.world_to_camera[:3, :3].T), "position": camera.center}
-        lens = {"fov": field_of_view(camera), "aspect": camera.width / camera.height}
-        look = {"scale": PYRAMID, "thickness": thickness, "color": color}
+        lens = {"fov": vertical_fov(camera), "aspect": camera.width / camera.height}
+        look = {"scale": FRUSTUM_SCALE, "thickness": thickness, "color": color}
         add = self.server.scene.add_camera_frustum
         made = add(f"/{kind}/{camera.name}", **lens, **place, **look, image=small, visible=False)
-        made.on_click(lambda event: go_to(event.client.camera, camera, target))
+        made.on_click(lambda event: move_to_view(event.client.camera, camera, target))
         return made
 
     def _visit(self, client: Any) -> None:
@@ -164,7 +167,7 @@ class Window:
             asked.wait(1.0)
             for height in (MOVING, STILL) if asked.is_set() else ():
                 asked.clear()
-                drawn = self._drawn(camera_of(client.camera, height), client.camera)
+                drawn = self._drawn(visitor_camera(client.camera, height), client.camera)
                 client.scene.set_background_image(drawn, format="jpeg", jpeg_quality=90)
                 if asked.is_set():
                     break
@@ -173,10 +176,10 @@ class Window:
     def _drawn(self, camera: Camera, place: Any) -> np.ndarray:
         """uint8 [H, W, 3]; once the camera rests, with a note of what was never seen."""
         shown = self.shown
-        drawn = picture(shown, camera)
+        drawn = render_picture(shown, camera)
         if camera.height == STILL and self.noted:
-            with TURN:
-                drawn = unseen.noted(drawn, shown, camera_of(place, MOVING), self.seen_by)
+            with RENDER_LOCK:
+                drawn = unseen_overlay.hatch_unseen(drawn, shown, visitor_camera(place, MOVING), self.seen_by)
         return drawn
 
     def close(self) -> None:
@@ -197,11 +200,11 @@ def _quaternion(rotation: np.ndarray) -> np.ndarray:
 
 
 def main() -> None:
-    parser = command.parser("view", __doc__)
+    parser = cli.scene_parser("view", __doc__)
     parser.add_argument("--port", type=int, default=PORT, help="the next free one is taken where it is not free")
     arguments = parser.parse_args()
     try:
-        window = Window(command.home(arguments), arguments.port)
+        window = Viewer(cli.run_folder(arguments), arguments.port)
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
     print(f"http://127.0.0.1:{window.server.get_port()}  (Ctrl-C ends)", flush=True)

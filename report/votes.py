@@ -36,7 +36,7 @@ class Preference:
     participants: int
 
 
-def counted(answers: list[dict[str, Any]], key: dict[str, Any]) -> tuple[list[Preference], list[str]]:
+def count_votes(answers: list[dict[str, Any]], key: dict[str, Any]) -> tuple[list[Preference], list[str]]:
     """Preferences, and those who are left out for failing an attention check, in words.
 
     Args:
@@ -79,7 +79,7 @@ def _preference(
     if not counts:
         return None
     wins, totals = np.array(counts, float).T
-    low, high = interval(wins, totals, seed_for(0, "votes", method, question))
+    low, high = share_interval(wins, totals, seed_for(0, "votes", method, question))
     share = float(wins.sum() / totals.sum())
     return Preference(method, question, share, low, high, int(totals.sum()), len(counts))
 
@@ -90,7 +90,7 @@ def _pair(key: dict[str, Any], trial: str) -> dict[str, str]:
     return key["pairs"][trial]
 
 
-def interval(wins: np.ndarray, totals: np.ndarray, seed: int) -> tuple[float, float]:
+def share_interval(wins: np.ndarray, totals: np.ndarray, seed: int) -> tuple[float, float]:
     """Of the share of all votes won: a bootstrap over participants, for one's votes are not independent; where all
     agree, which a bootstrap takes for certain, or there is but one, Wilson's for one vote a participant. [n], [n] ->
     parts of 1."""
@@ -113,7 +113,7 @@ def interval(wins: np.ndarray, totals: np.ndarray, seed: int) -> tuple[float, fl
     return float(found.low), float(found.high)
 
 
-def table(found: list[Preference]) -> str:
+def preference_table(found: list[Preference]) -> str:
     """Markdown."""
     header = ["preferred to", "question", "share", "95 % interval", "votes", "participants"]
     percent = lambda part: f"{100 * part:.1f} %"
@@ -128,7 +128,7 @@ def table(found: list[Preference]) -> str:
         ]
         for each in found
     ]
-    return page.markdown(header, rows)
+    return page.markdown_table(header, rows)
 
 
 def main() -> None:
@@ -137,10 +137,10 @@ def main() -> None:
     parser.add_argument("--key", type=Path, required=True, help="runs/X/study-key.json")
     given = parser.parse_args()
     try:
-        found, left_out = counted([_read(path) for path in given.answers], load_json(given.key))
+        found, left_out = count_votes([_read(path) for path in given.answers], load_json(given.key))
     except (ValueError, OSError) as error:
         raise SystemExit(f"error: {error}") from None
-    print(table(found), end="")
+    print(preference_table(found), end="")
     for words in left_out:
         print(f"left out: {words}")
 

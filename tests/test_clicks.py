@@ -24,8 +24,8 @@ from reffusion.params.poses import Params as Poses
 from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
 from reffusion.types import Gaussians
-from report.clicking import Capture, Session
 from report.mask import Server
+from report.mask_session import Capture, Session
 from stages import masks, poses
 
 NEAR = 1.7

@@ -11,7 +11,7 @@ import torch
 
 from reffusion.clicks.marks import Clicks
 from reffusion.clicks.network import load_segmenter, look, make_segmenter, network_mask
-from report.clicking import Capture, Session
+from report.mask_session import Capture, Session
 
 SIDE, WIDE = 64, 16
 

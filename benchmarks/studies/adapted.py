@@ -26,7 +26,7 @@ from reffusion.prior import diffusion, inpaint
 from reffusion.prior.crops import PROMPTS
 from reffusion.prior.model import Prior
 from reffusion.references import view_ranking
-from report.sheet import enlarged, evenly, framed
+from report.sheet import compose_sheet, enlarge, pick_evenly
 
 VIEWS = 5
 SEED = 0
@@ -56,7 +56,7 @@ def given_views(run: Path, count: int) -> dict[str, tuple[np.ndarray, np.ndarray
         raise ValueError(f"{run / 'masks'}: nothing is to be invented but in the reference")
     keep = ~load_labels(run / "masks" / "labels.npy")
     remaining = load_ply(run / "fit" / "gaussians.ply").map(lambda p: p[keep])
-    chosen = evenly(names, count)
+    chosen = pick_evenly(names, count)
     photos = exposure.load_views(run / "poses", run / "fit", chosen)
     known = lambda n: inpaint.background(remaining, scene.cameras[n], photos[n], sets[n].consistent)
     return {name: (known(name), sets[name].invent) for name in chosen}
@@ -91,9 +91,9 @@ def drawn(models: dict[str, Prior], run: Path, count: int, steps: int, out: Path
         for column, made in row.items():
             save_image(out / name / f"{column.replace(', ', '-').replace(' ', '-')}.png", made)
         scale = max(1, round(WIDTH / picture.shape[1]))
-        rows.append([enlarged(made, scale) for made in row.values()])
+        rows.append([enlarge(made, scale) for made in row.values()])
         print(f"{name}: painted by {len(COLUMNS)}", flush=True)
-    save_image(out / "sheet.png", framed(rows, ["to paint", *COLUMNS], list(views)))
+    save_image(out / "sheet.png", compose_sheet(rows, ["to paint", *COLUMNS], list(views)))
     return list(views)
 
 

@@ -122,7 +122,7 @@ def curve(overrides: dict, run: Path, start: Path, views: list[tuple]) -> list[d
 
 def draw(curves: dict[str, list[dict]], path: Path, title: str) -> None:
     """PSNR and FLIP against seconds, a line an attempt."""
-    figure, grid = charts.figure(4.6, 1, 2)
+    figure, grid = charts.new_figure(4.6, 1, 2)
     for axes, (name, label) in zip(grid[0], (("psnr_box", "PSNR, dB ↑"), ("flip_box", "FLIP ↓")), strict=True):
         for index, (attempt, lines) in enumerate(curves.items()):
             style = "--" if "no SDS" in attempt else ":" if attempt.startswith("free") else "-"
@@ -134,7 +134,7 @@ def draw(curves: dict[str, list[dict]], path: Path, title: str) -> None:
     named = grid[0, 0].get_legend_handles_labels()
     figure.legend(*named, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
     figure.suptitle(title, fontsize=9)
-    charts.save(figure, path)
+    charts.save_chart(figure, path)
 
 
 def main() -> None:

@@ -19,8 +19,8 @@ from pathlib import Path
 from benchmarks.studies import drawing, judging, placing
 from benchmarks.studies.placing import Place
 from reffusion.io.images import save_image
-from report.job import draw
-from report.loading import load_job
+from report.job import draw_job
+from report.job_data import load_job
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -78,7 +78,7 @@ def measured(
     save_image(out / f"{scene.name}.png", judging.sheet(run, ceiling))
     for name, other in others.items():
         save_image(out / f"{scene.name}@{name}.png", judging.sheet(other, ceiling))
-    draw(load_job(run.folder), out / f"{scene.name}-seconds.png", ceiling.metrics["mean"]["psnr_box"])
+    draw_job(load_job(run.folder), out / f"{scene.name}-seconds.png", ceiling.metrics["mean"]["psnr_box"])
     return {"place": scene.name, **judging.scores(run, ceiling, others)}
 
 

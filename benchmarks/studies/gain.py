@@ -19,7 +19,7 @@ from reffusion.io.arrays import load_json, save_json
 from reffusion.io.images import load_image, save_image
 from reffusion.io.scene import load_scene
 from reffusion.metrics import image_metrics
-from report.sheet import enlarged, evenly, framed, stage_folder
+from report.sheet import compose_sheet, enlarge, pick_evenly, stage_folder
 from stages import evaluate
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -84,7 +84,7 @@ def never_seen(run: Path, scene: Path | None) -> dict[str, float]:
 def sheet(run: Path, path: Path) -> None:
     """`VIEWS` test views as rows: the fit with the object, initialization, result, truth; cut to the mask's box."""
     scene = load_scene(stage_folder(run, "poses"))
-    names, rows = evenly(list(scene.test), VIEWS), []
+    names, rows = pick_evenly(list(scene.test), VIEWS), []
     for name in names:
         camera = scene.cameras[name]
         folders = ("renders_fit", *WAYS.values())
@@ -93,10 +93,10 @@ def sheet(run: Path, path: Path) -> None:
         left, top, right, bottom = image_metrics.mask_box(
             evaluate.mask_of(camera, stage_folder(run, "raw_masks"), stage_folder(run, "masks")), 0.3
         )
-        rows.append([enlarged(picture[top:bottom, left:right], ENLARGE) for picture in pictures])
+        rows.append([enlarge(picture[top:bottom, left:right], ENLARGE) for picture in pictures])
     height, width = (max(cell.shape[axis] for row in rows for cell in row) for axis in (0, 1))
     room = [[np.pad(c, ((0, height - c.shape[0]), (0, width - c.shape[1]), (0, 0))) for c in row] for row in rows]
-    save_image(path, framed(room, ["fit", *WAYS, "truth"], names))
+    save_image(path, compose_sheet(room, ["fit", *WAYS, "truth"], names))
 
 
 def main() -> None:

@@ -78,15 +78,15 @@ def exponent(sizes: Sequence[float], values: Sequence[float]) -> float:
 
 def draw(found: dict[str, dict[str, dict[str, list[float]]]], path: Path) -> None:
     """For views and for pixels a panel of CPU seconds and one of memory, a line for each stage."""
-    made, grid = charts.figure(5.6, 2, 2)
+    made, grid = charts.new_figure(5.6, 2, 2)
     for row, (of, stages) in zip(grid, found.items(), strict=True):
         for axes, what in zip(row, ("cpu", "mb"), strict=True):
             for stage, told in stages.items():
                 axes.plot(told["size"], told[what], "o-", label=f"{stage} {exponent(told['size'], told[what]):.2f}")
             axes.set(xscale="log", yscale="log", xlabel=of, ylabel={"cpu": "CPU seconds", "mb": "memory (MB)"}[what])
-            charts.plain_ticks(axes)
+            charts.use_plain_log_ticks(axes)
             axes.legend(frameon=False, fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
-    charts.save(made, path)
+    charts.save_chart(made, path)
 
 
 def main() -> None:

@@ -73,17 +73,17 @@ def scored(scene: Path, way: str, runs: Path) -> dict[str, float]:
 
 def draw(found: dict[str, dict[str, list[dict[str, float]]]], path: Path) -> None:
     """way -> number of views -> a score for each scene; a panel for each score."""
-    made, grid = charts.figure(3.2, 1, len(SCORES))
+    made, grid = charts.new_figure(3.2, 1, len(SCORES))
     for axes, (score, title) in zip(grid[0], SCORES.items(), strict=True):
         for way, counts in found.items():
             means = [np.mean([each[score] for each in scenes]) for scenes in counts.values()]
             axes.plot([int(count) for count in counts], means, "o-", color=COLOURS[way], label=way)
         axes.set(xscale="log", xlabel="views with pixels", ylabel=title)
-        charts.plain_ticks(axes)
+        charts.use_plain_log_ticks(axes)
         counts = sorted({int(count) for each in found.values() for count in each})
         axes.set_xticks(counts, [str(count) for count in counts])
     grid[0, 0].legend(frameon=False, fontsize=9)
-    charts.save(made, path)
+    charts.save_chart(made, path)
 
 
 def main() -> None:

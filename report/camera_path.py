@@ -8,10 +8,10 @@ import numpy as np
 
 from reffusion.types import Camera
 
-PULL = 1e-2  # how much a camera pulls the focus to the points, next to how much its axis pulls it sideways
+POINT_WEIGHT = 1e-2  # how much a camera pulls the focus to the points, next to how much its axis pulls it sideways
 
 
-def around(cameras: Sequence[Camera], points: np.ndarray, frames: int) -> list[Camera]:
+def ellipse_path(cameras: Sequence[Camera], points: np.ndarray, frames: int) -> list[Camera]:
     """An ellipse in the plane in which the cameras stand most, of their extent, always looking at their focus.
 
     Cameras on a circle give that circle back; cameras side by side a small loop before the scene.
@@ -27,7 +27,7 @@ def around(cameras: Sequence[Camera], points: np.ndarray, frames: int) -> list[C
     if not cameras or frames < 1:
         raise ValueError(f"a flight needs a camera and a frame, not {len(cameras)} and {frames}")
     centers = np.stack([camera.center for camera in cameras])
-    middle, target = centers.mean(0), focus(cameras, points)
+    middle, target = centers.mean(0), focus_point(cameras, points)
     _, sizes, axes = np.linalg.svd(centers - middle, full_matrices=False)
     radii = np.sqrt(2 / len(centers)) * sizes  # a circle has root mean square radius / sqrt 2 along each axis
     down = np.mean([camera.world_to_camera[1, :3] for camera in cameras], 0)
@@ -35,26 +35,26 @@ def around(cameras: Sequence[Camera], points: np.ndarray, frames: int) -> list[C
     for k in range(frames):
         turn = 2 * np.pi * k / frames
         offset = sum(f(turn) * radius * axis for f, radius, axis in zip((np.cos, np.sin), radii, axes, strict=False))
-        pose = looking(middle + offset, target, down)
+        pose = look_at(middle + offset, target, down)
         made.append(
             Camera(f"flight{k:04d}", lens.width, lens.height, lens.fx, lens.fy, lens.width / 2, lens.height / 2, pose)
         )
     return made
 
 
-def focus(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
+def focus_point(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
     """[3], nearest to all optical axes in the least squares, drawn a little to the median of the points."""
     matrix, right = np.zeros((3, 3)), np.zeros(3)
     anchor = np.median(points, 0) if len(points) else np.mean([c.center + c.world_to_camera[2, :3] for c in cameras], 0)
     for camera in cameras:
         axis = camera.world_to_camera[2, :3]
         across = np.eye(3) - np.outer(axis, axis)
-        matrix += across + PULL * np.eye(3)
-        right += across @ camera.center + PULL * anchor
+        matrix += across + POINT_WEIGHT * np.eye(3)
+        right += across @ camera.center + POINT_WEIGHT * anchor
     return np.linalg.solve(matrix, right)
 
 
-def looking(center: np.ndarray, target: np.ndarray, down: np.ndarray) -> np.ndarray:
+def look_at(center: np.ndarray, target: np.ndarray, down: np.ndarray) -> np.ndarray:
     """[4, 4] world to camera, from `center` towards `target`, image rows along `down` as far as that can be."""
     forward = target - center
     length = np.linalg.norm(forward)

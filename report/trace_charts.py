@@ -9,27 +9,38 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from reffusion.io.traces import MAIN, QUANTITIES
-from report.charts import BLUE, GREEN, GREY, INK, ORANGE, figure, plain_ticks, save, spans, write
-from report.page import duration
+from report.charts import (
+    BLUE,
+    GREEN,
+    GREY,
+    INK,
+    ORANGE,
+    annotate,
+    needs_log_axis,
+    new_figure,
+    save_chart,
+    use_plain_log_ticks,
+)
+from report.page import format_duration
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Lines = list[dict[str, Any]]  # of one series of a trace
-PANELS = 4  # errors of a stage at most
-LEFT_OUT = ("sds_gradient_mean", "sds_gradient_max", "gaussians", "masked_gaussians")  # no errors
+MAX_PANELS = 4  # errors of a stage at most
+NO_ERRORS = ("sds_gradient_mean", "sds_gradient_max", "gaussians", "masked_gaussians")  # no errors
 
 
-def quantities(stage: str, lines: Lines) -> list[str]:
+def pick_errors(stage: str, lines: Lines) -> list[str]:
     """The errors in these lines, the stage's main one first; of a stage that has no main one, all numbers."""
     there = {name for line in lines for name, value in line.items() if isinstance(value, int | float)}
     main = [name for name in MAIN.get(stage, ()) if name in there][:1]
     others = [name for name, quantity in QUANTITIES.items() if name in there and quantity.better and name not in main]
     strange = sorted(there - {"seconds", "iteration", "reason", *QUANTITIES}) if not (main or others) else []
-    return [name for name in (*main, *others, *strange) if name not in LEFT_OUT][:PANELS]
+    return [name for name in (*main, *others, *strange) if name not in NO_ERRORS][:MAX_PANELS]
 
 
-def title(name: str) -> str:
+def axis_title(name: str) -> str:
     """What an axis says: the quantity, its unit where it has one, and which way is better."""
     if name not in QUANTITIES:
         return name
@@ -38,37 +49,37 @@ def title(name: str) -> str:
     return quantity.label[0].upper() + quantity.label[1:] + unit + {"more": " ↑", "less": " ↓", "": ""}[quantity.better]
 
 
-def best(name: str, values: Sequence[float]) -> int:
+def best_index(name: str, values: Sequence[float]) -> int:
     """The index of the best of them."""
     more = name in QUANTITIES and QUANTITIES[name].better == "more"
     return int((np.argmax if more else np.argmin)(values))
 
 
-def stage_chart(stage: str, series: dict[str, Lines], path: Path) -> list[str]:
+def draw_stage_chart(stage: str, series: dict[str, Lines], path: Path) -> list[str]:
     """Error against seconds of work, a panel a quantity; gives back the quantities drawn, or nothing."""
-    names = quantities(stage, [line for lines in series.values() for line in lines])
+    names = pick_errors(stage, [line for lines in series.values() for line in lines])
     if not names:
         return []
-    made, grid = figure(3.0, 1, len(names))
+    made, grid = new_figure(3.0, 1, len(names))
     for axes, name in zip(grid[0], names, strict=True):
-        drawn = {key: column(lines, name) for key, lines in series.items()}
-        drawn = {key: from_edge(points) for key, points in drawn.items() if len(points)}
+        drawn = {key: quantity_curve(lines, name) for key, lines in series.items()}
+        drawn = {key: clamp_first_seconds(points) for key, points in drawn.items() if len(points)}
         alone = len(drawn) == 1
         for key, points in drawn.items():
             words = f" {key}" if 1 < len(drawn) <= 4 else ""
             _curve(axes, name, points, BLUE if alone else GREY, words, main=alone and name == names[0])
         values = np.concatenate([points[:, 1] for points in drawn.values()])
-        if spans(values, 10) and values.min() > 0:
+        if needs_log_axis(values, 10) and values.min() > 0:
             axes.set_yscale("log")
-            plain_ticks(axes, "y")
-        time_axis(axes, np.concatenate([points[:, 0] for points in drawn.values()]))
-        axes.set_title(title(name), fontsize=10, loc="left")
+            use_plain_log_ticks(axes, "y")
+        set_time_axis(axes, np.concatenate([points[:, 0] for points in drawn.values()]))
+        axes.set_title(axis_title(name), fontsize=10, loc="left")
         axes.set_xlabel("seconds of work", fontsize=10)
-    save(made, path)
+    save_chart(made, path)
     return names
 
 
-def column(lines: Lines, name: str) -> np.ndarray:
+def quantity_curve(lines: Lines, name: str) -> np.ndarray:
     """[moments, 2]: seconds and the quantity, of the lines that have it."""
     return np.array([(line["seconds"], line[name]) for line in lines if name in line], np.float64).reshape(-1, 2)
 
@@ -76,24 +87,24 @@ def column(lines: Lines, name: str) -> np.ndarray:
 def _curve(axes: Axes, name: str, points: np.ndarray, colour: str, words: str, main: bool) -> None:
     """A line with its last value beside it; of the main quantity the best moment too, where that is another one."""
     axes.plot(*points.T, color=colour, linewidth=1.8, marker="o", markersize=3)
-    last, top = points[-1], points[best(name, points[:, 1])]
-    write(axes, f"{last[1]:.3g}{words}", last, (6, 0), colour if main or not words else INK)
+    last, top = points[-1], points[best_index(name, points[:, 1])]
+    annotate(axes, f"{last[1]:.3g}{words}", last, (6, 0), colour if main or not words else INK)
     if main and top[1] != last[1]:
         axes.plot(*top, "o", markersize=8, markerfacecolor="none", color=ORANGE)
-        write(axes, f"best {top[1]:.3g}", top, (-7, 0), ORANGE, ha="right")
+        annotate(axes, f"best {top[1]:.3g}", top, (-7, 0), ORANGE, ha="right")
 
 
-def from_edge(points: np.ndarray) -> np.ndarray:
+def clamp_first_seconds(points: np.ndarray) -> np.ndarray:
     """The curve [moments, 2] with what happened in the first instants moved to a 300th of the whole time."""
     return np.column_stack([np.maximum(points[:, 0], points[:, 0].max() / 300), points[:, 1]])
 
 
-def time_axis(axes: Axes, seconds: np.ndarray) -> None:
+def set_time_axis(axes: Axes, seconds: np.ndarray) -> None:
     """Logarithmic where the moments span much, for they are log-spaced; room on the right for a number."""
-    if spans(seconds, 10):
+    if needs_log_axis(seconds, 10):
         axes.set_xscale("log")
         axes.set_xlim(seconds[seconds > 0].min() / 1.1, seconds.max() * 1.9)
-        plain_ticks(axes)
+        use_plain_log_ticks(axes)
     else:
         axes.margins(x=0.15)
 
@@ -101,7 +112,7 @@ def time_axis(axes: Axes, seconds: np.ndarray) -> None:
 # -------------------------------------------------------------------------------------------------------- one job
 
 
-def job_chart(
+def draw_job_chart(
     seconds: dict[str, float],
     traces: dict[str, Lines],
     box: dict[str, float | None],
@@ -119,22 +130,22 @@ def job_chart(
     begins = dict(zip(seconds, np.cumsum([0.0, *seconds.values()]), strict=False))
     curves = {}
     for stage, lines in traces.items():
-        names = [n for n in quantities(stage, lines)[:1] if n in QUANTITIES and QUANTITIES[n].unit == "dB"]
+        names = [n for n in pick_errors(stage, lines)[:1] if n in QUANTITIES and QUANTITIES[n].unit == "dB"]
         if names and stage in begins:
-            curves[stage] = (names[0], column(lines, names[0]) + np.array([begins[stage], 0]))
+            curves[stage] = (names[0], quantity_curve(lines, names[0]) + np.array([begins[stage], 0]))
     ends = {stage: (begins[stage] + seconds[stage], v) for stage, v in box.items() if v is not None and stage in begins}
     rows = 2 if curves or ends else 1
     bars = 0.6 + 0.26 * len(seconds)
     ratios = [3.4, bars][-rows:]
-    made, grid = figure(sum(ratios), rows, 1, sharex=True, height_ratios=ratios)
+    made, grid = new_figure(sum(ratios), rows, 1, sharex=True, height_ratios=ratios)
     if rows == 2:
         _errors(grid[0, 0], curves, ends, sum(seconds.values()))
         if ceiling is not None:
             grid[0, 0].axhline(ceiling, color="#bbbbbb", linewidth=1.2, linestyle="--", zorder=0)
             words = f"box, a fit to photographs without the object: {ceiling:.2f}"
-            write(grid[0, 0], words, (0, ceiling), (4, 6))
+            annotate(grid[0, 0], words, (0, ceiling), (4, 6))
     _bars(grid[-1, 0], seconds, begins)
-    save(made, path)
+    save_chart(made, path)
     return begins
 
 
@@ -145,11 +156,11 @@ def _errors(
         axes.plot(*points.T, color=colour, linewidth=1.8)
         words = f"{stage}: {QUANTITIES[name].label}, {points[-1, 1]:.1f}"
         late = points[-1, 0] > total / 2  # then there is no room to its right
-        write(axes, words, points[-1], *(((-8, 4), colour, "right") if late else ((6, 0), colour)))
+        annotate(axes, words, points[-1], *(((-8, 4), colour, "right") if late else ((6, 0), colour)))
     for row, (stage, at) in enumerate(ends.items()):  # below one another: they may stand side by side
         axes.plot(*at, "D", color=INK, markersize=6)
         words = f"box of the test views\nafter {stage}: {at[1]:.2f}"
-        write(axes, words, at, (0, -10 - 26 * row), ha="right", va="top")
+        annotate(axes, words, at, (0, -10 - 26 * row), ha="right", va="top")
     finals = [points[-1, 1] for _, points in curves.values()] + [value for _, value in ends.values()]
     highest = max([*finals, *(points[:, 1].max() for _, points in curves.values())])
     axes.set_ylim(min(finals) - 10, highest + 2)  # how a fit begins, at 10 dB, matters to no one
@@ -160,7 +171,7 @@ def _bars(axes: Axes, seconds: dict[str, float], begins: dict[str, float]) -> No
     total = sum(seconds.values())
     for row, (stage, value) in enumerate(seconds.items()):
         axes.barh(row, max(value, total / 500), left=begins[stage], color=GREY, height=0.62)
-        write(axes, duration(value), (begins[stage] + value, row), (5, 0))
+        annotate(axes, format_duration(value), (begins[stage] + value, row), (5, 0))
     axes.set_yticks(range(len(seconds)), list(seconds))
     axes.set_ylim(len(seconds) - 0.4, -0.6)
     axes.set_xlim(0, total * 1.1)
@@ -171,7 +182,7 @@ def _bars(axes: Axes, seconds: dict[str, float], begins: dict[str, float]) -> No
 # ----------------------------------------------------------------------------------------------------- many scenes
 
 
-def band(curves: Sequence[np.ndarray], count: int = 200) -> tuple[np.ndarray, np.ndarray]:
+def quartile_band(curves: Sequence[np.ndarray], count: int = 200) -> tuple[np.ndarray, np.ndarray]:
     """Seconds [M] from when all have begun to when the last has ended, and the quartiles [3, M] of the curves there.
 
     Between two moments a curve is a straight line over the logarithm of time; after its last it keeps its value.
@@ -184,18 +195,18 @@ def band(curves: Sequence[np.ndarray], count: int = 200) -> tuple[np.ndarray, np
     return moments, np.percentile(values, [25, 50, 75], axis=0)
 
 
-def scenes_chart(curves: dict[str, tuple[str, list[np.ndarray]]], path: Path) -> None:
+def draw_scenes_chart(curves: dict[str, tuple[str, list[np.ndarray]]], path: Path) -> None:
     """A panel a stage: its main error in every scene, the median and the quartiles."""
-    made, grid = figure(3.3, 1, len(curves))
+    made, grid = new_figure(3.3, 1, len(curves))
     for axes, (stage, (name, raw)) in zip(grid[0], curves.items(), strict=True):
-        lines = [from_edge(points) for points in raw]
+        lines = [clamp_first_seconds(points) for points in raw]
         for points in lines:
             axes.plot(*points.T, color="#bbbbbb", linewidth=0.8)
-        moments, quartiles = band(lines)
+        moments, quartiles = quartile_band(lines)
         axes.fill_between(moments, quartiles[0], quartiles[2], color=BLUE, alpha=0.2, linewidth=0)
         axes.plot(moments, quartiles[1], color=BLUE, linewidth=2)
-        time_axis(axes, np.concatenate([points[:, 0] for points in lines]))
-        write(axes, f"{quartiles[1, -1]:.3g}", (moments[-1], quartiles[1, -1]), (5, 0), BLUE)
-        axes.set_title(f"{stage}, {len(lines)} scenes\n{title(name)}", fontsize=9, loc="left")
+        set_time_axis(axes, np.concatenate([points[:, 0] for points in lines]))
+        annotate(axes, f"{quartiles[1, -1]:.3g}", (moments[-1], quartiles[1, -1]), (5, 0), BLUE)
+        axes.set_title(f"{stage}, {len(lines)} scenes\n{axis_title(name)}", fontsize=9, loc="left")
         axes.set_xlabel("seconds of work", fontsize=10)
-    save(made, path)
+    save_chart(made, path)

@@ -28,16 +28,16 @@ class Difference:
     scenes: float | None
 
 
-def paired(differences: Sequence[np.ndarray]) -> Difference | None:
+def paired_difference(differences: Sequence[np.ndarray]) -> Difference | None:
     """`differences`: one array [views] a scene, method minus the other, same views. None where there is no pair."""
     scenes = [np.asarray(d, np.float64) for d in differences if len(d)]
     if not scenes:
         return None
     pairs, means = np.concatenate(scenes), np.array([d.mean() for d in scenes])
-    return Difference(float(pairs.mean()), len(pairs), half_width(pairs), half_width(means))
+    return Difference(float(pairs.mean()), len(pairs), confidence_half_width(pairs), confidence_half_width(means))
 
 
-def half_width(values: np.ndarray) -> float | None:
+def confidence_half_width(values: np.ndarray) -> float | None:
     """Of Student's interval of the mean of [n] independent values; None under two."""
     if len(values) < 2:
         return None
@@ -46,7 +46,7 @@ def half_width(values: np.ndarray) -> float | None:
     return float(t.ppf((1 + LEVEL) / 2, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values)))
 
 
-def pareto(seconds: Sequence[float], errors: Sequence[float]) -> np.ndarray:
+def pareto_front(seconds: Sequence[float], errors: Sequence[float]) -> np.ndarray:
     """bool [n]: no other point is as fast and as good, and better in one of the two. Equal points stay together."""
     front = np.zeros(len(seconds), bool)
     best = np.inf  # the least error among all faster points

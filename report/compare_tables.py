@@ -6,25 +6,25 @@ import csv
 from pathlib import Path
 
 from report import page
-from report.results import BETTER, Comparison, Run, mean
+from report.results import BOX_SCORES, Comparison, Run, finite_mean
 
 PUBLISHED = "published.csv"  # in the folder of the scenes
 COLUMNS = ("method", "metric", "value", "protocol")
 Table = tuple[list[str], list[list[str]]]
 
 
-def by_scene(comparison: Comparison, metric: str, digits: int) -> Table | None:
+def scene_table(comparison: Comparison, metric: str, digits: int) -> Table | None:
     """Header and rows: a method in each scene, then the mean of those that are done. None where none has a value."""
     lines, found = [], False
     for method in comparison.distinct_methods:
         runs = [comparison.runs[method, scene] for scene in comparison.scenes]
         values = [run.metrics.get("mean", {}).get(metric) if run.state == "done" else None for run in runs]
         found |= any(value is not None for value in values)
-        lines.append([method, *(page.number(value, digits) for value in [*values, mean(values)])])
+        lines.append([method, *(page.format_number(value, digits) for value in [*values, finite_mean(values)])])
     return (["method", *comparison.scenes, "mean"], lines) if found else None
 
 
-def protocol(done: list[Run]) -> list[str]:
+def describe_protocol(done: list[Run]) -> list[str]:
     """What was rendered in which scenes, and at what size; one phrase, none where that is not known."""
     said: dict[str, dict[str, None]] = {}
     for run in done:
@@ -35,7 +35,7 @@ def protocol(done: list[Run]) -> list[str]:
     return ["; ".join(groups)] if groups else []
 
 
-def published(data: Path | None) -> list[dict[str, str]]:
+def load_published(data: Path | None) -> list[dict[str, str]]:
     """The rows of FOLDER/published.csv, none where there is none.
 
     Raises:
@@ -49,8 +49,8 @@ def published(data: Path | None) -> list[dict[str, str]]:
     for number, row in enumerate(rows, 2):
         if set(row) != set(COLUMNS):
             raise ValueError(f"{path}: its columns are {', '.join(map(str, row))}; expected {', '.join(COLUMNS)}")
-        if row["metric"] not in BETTER:
-            raise ValueError(f"{path}: line {number}: metric {row['metric']!r} is none of {', '.join(BETTER)}")
+        if row["metric"] not in BOX_SCORES:
+            raise ValueError(f"{path}: line {number}: metric {row['metric']!r} is none of {', '.join(BOX_SCORES)}")
         try:
             float(row["value"])
         except (TypeError, ValueError):
@@ -58,7 +58,7 @@ def published(data: Path | None) -> list[dict[str, str]]:
     return rows
 
 
-def beside(
+def published_table(
     rows: list[dict[str, str]], table: list[dict], short: dict[str, str], digits: dict[str, int], here: str
 ) -> Table:
     """The published rows, each metric followed by our own in it, with intervals over scenes; `here`: our protocol."""
@@ -70,11 +70,13 @@ def beside(
             if row["metric"] == metric
         ]
         ours = [row for row in table if row[metric] is not None]
-        lines += [[row["method"], "here", short[metric], spread(row, metric, digits[metric]), here] for row in ours]
+        lines += [
+            [row["method"], "here", short[metric], format_spread(row, metric, digits[metric]), here] for row in ours
+        ]
     return ["method", "from", "metric", "mean over scenes", "protocol"], lines
 
 
-def spread(row: dict, metric: str, digits: int) -> str:
+def format_spread(row: dict, metric: str, digits: int) -> str:
     """The mean, and half its interval over scenes where there are several."""
     half = row[f"{metric}_interval"]
-    return page.number(row[metric], digits) + ("" if half is None else f" ± {half:.{digits}f}")
+    return page.format_number(row[metric], digits) + ("" if half is None else f" ± {half:.{digits}f}")

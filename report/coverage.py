@@ -8,23 +8,23 @@ from pathlib import Path
 from reffusion.io.arrays import load_json
 from reffusion.io.images import load_mask
 from report import page
-from report.loading import Job
+from report.job_data import Job
 from report.results import load_views
 
 HEADER = ("view", "mask, of the picture", "made up, of the mask", "uncovered, of the mask")
-OPEN = 0.01  # share of a mask from which a view counts as uncovered: `initialize` names these too
+MIN_UNCOVERED = 0.01  # share of a mask from which a view counts as uncovered: `initialize` names these too
 
 
-def section(job: Job) -> list[str]:
+def coverage_section(job: Job) -> list[str]:
     """A sentence, and a table with a bar for each share."""
     top = page.heading("What was covered")
-    shares = of_views(job)
+    shares = view_shares(job)
     if not shares:
         return [top, page.paragraph("Not known yet: the stage masks has not run.")]
     covered = any(open_ is not None for _, _, open_ in shares.values())
     said = f"Of what is removed, {_mean([made for _, made, _ in shares.values()]):.0%} is made up in the mean of views"
     if covered:
-        bare = [name for name, (_, _, open_) in shares.items() if (open_ or 0) > OPEN]
+        bare = [name for name, (_, _, open_) in shares.items() if (open_ or 0) > MIN_UNCOVERED]
         said += f"; places that nothing covers: in {len(bare)} views" + (f", {', '.join(bare[:8])}" if bare else "")
     else:
         said += "; what is left uncovered is known after the stage initialize"
@@ -34,7 +34,7 @@ def section(job: Job) -> list[str]:
     return parts + _unseen(job)
 
 
-def of_views(job: Job) -> dict[str, tuple[float, float, float | None]]:
+def view_shares(job: Job) -> dict[str, tuple[float, float, float | None]]:
     """Training view that shows the object -> shares: of the mask in the picture, made up and uncovered in the mask."""
     masks, folder = job.folders.get("masks", Path()), job.folders.get("initialize", Path())
     facts = folder / "facts.json"
@@ -70,7 +70,7 @@ def _bar(share: float | None) -> str:
 def _unseen(job: Job) -> list[str]:
     """Test views with pixels that no training view saw."""
     rows = load_views(job.folders["evaluate"] / "per_view.csv") if "evaluate" in job.folders else {}
-    shares = {name: row["unseen_share"] for name, row in rows.items() if row.get("unseen_share", 0) > OPEN}
+    shares = {name: row["unseen_share"] for name, row in rows.items() if row.get("unseen_share", 0) > MIN_UNCOVERED}
     if not shares:
         return []
     said = ", ".join(f"{name} {share:.0%}" for name, share in sorted(shares.items(), key=lambda s: -s[1])[:12])

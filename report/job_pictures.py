@@ -13,51 +13,58 @@ from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_scene
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians
-from report import before, inside, page
-from report.check import kind_of, tinted
-from report.loading import Job
-from report.sheet import evenly
+from report import before_after, inline_images, page
+from report.check import overlay_masks, view_role
+from report.job_data import Job
+from report.sheet import pick_evenly
 
-MOST_MASKS, MASKS, MASK = 60, 12, 240  # views; those that are seen at once; px a side
-REFERENCE, DEPTH = 640, 480  # px a side
-DEPTHS = 4  # views
+MAX_MASK_VIEWS, FIRST_MASK_VIEWS, MASK_SIDE = 60, 12, 240  # views; those that are seen at once; px a side
+REFERENCE_SIDE, DEPTH_SIDE = 640, 480  # px a side
+DEPTH_VIEWS = 4  # views
 REMOVED, INVENTED = (255, 210, 0), (0, 230, 230)  # outlines over photographs
-OPAQUE = 0.5  # alpha under which there is no depth
+MIN_ALPHA = 0.5  # alpha under which there is no depth
 RESULTS = ("distill", "initialize", "fit")  # the last of what is there
 
 
-def masks(job: Job) -> list[str]:
+def masks_section(job: Job) -> list[str]:
     """Masks over photographs: the given ones tinted, what the stage masks made of them outlined."""
     poses, given = (job.folders.get(stage, Path()) for stage in ("poses", "raw_masks"))
     top = page.heading("Masks")
     if not (poses / "views.json").is_file() or not any((given / "masks").rglob("*.png")):
         return [top, page.paragraph("None: nothing is marked in the photographs.")]
     views = load_json(poses / "views.json")
-    shown = evenly(sorted(views["train"]), MOST_MASKS)
-    cell = lambda name: (inside.photograph(outlined(job, poses, name), MASK), f"{name}, {kind_of(name, views)}")
-    first = evenly(shown, MASKS)
+    shown = pick_evenly(sorted(views["train"]), MAX_MASK_VIEWS)
+    cell = lambda name: (
+        inline_images.photo_address(draw_mask_classes(job, poses, name), MASK_SIDE),
+        f"{name}, {view_role(name, views)}",
+    )
+    first = pick_evenly(shown, FIRST_MASK_VIEWS)
     rest = [name for name in shown if name not in first]
-    more = f"<details><summary>{len(rest)} more</summary>{inside.grid(list(map(cell, rest)))}</details>" if rest else ""
+    more = (
+        f"<details><summary>{len(rest)} more</summary>{inline_images.picture_grid(list(map(cell, rest)))}</details>"
+        if rest
+        else ""
+    )
     words = "Magenta: the mask as given. "
     if "masks" in job.folders:
         words += "Yellow line: what all views agreed to remove. Cyan line: what no photograph shows and was made up. "
     else:
         words += "What all views agree on comes with the stage masks. "
     words += f"{len(shown)} of {len(views['train'])} training views."
-    return [top, page.paragraph(words, quiet=True), inside.grid(list(map(cell, first))), more]
+    return [top, page.paragraph(words, quiet=True), inline_images.picture_grid(list(map(cell, first))), more]
 
 
-def outlined(job: Job, poses: Path, name: str) -> np.ndarray:
+def draw_mask_classes(job: Job, poses: Path, name: str) -> np.ndarray:
     """uint8 [h, w, 3]: the photograph, small, its mask over it, and the outlines of its pixel classes."""
-    small = np.ascontiguousarray(tinted(poses, job.folders.get("raw_masks", Path()), name))
+    small = np.ascontiguousarray(overlay_masks(poses, job.folders.get("raw_masks", Path()), name))
     for kind, colour in (("consistent", REMOVED), ("invent", INVENTED)):
         path = job.folders.get("masks", Path()) / kind / f"{name}.png"
         if "masks" in job.folders and path.is_file():
-            lines(small, load_mask(path), colour)
+            draw_outline(small, load_mask(path), colour)
     return small
 
 
-def lines(picture: np.ndarray, mask: np.ndarray, colour: tuple[int, int, int]) -> None:
+def draw_outline(picture: np.ndarray, mask: np.ndarray, colour: tuple[int, int, int]) -> None:
     """Draw a mask's outline into a picture, uint8 [H, W, 3], of any size."""
     scale = picture.shape[1] / mask.shape[1]
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
@@ -65,7 +72,7 @@ def lines(picture: np.ndarray, mask: np.ndarray, colour: tuple[int, int, int]) -
     cv2.polylines(picture, moved, True, colour, 1 if picture.shape[1] < 400 else 2)
 
 
-def references(job: Job) -> list[str]:
+def references_section(job: Job) -> list[str]:
     """Each reference beside its photograph, the hole outlined, and how it fits or was made."""
     folder, poses = job.folders.get("reference", Path()), job.folders.get("poses", Path())
     top = page.heading("References")
@@ -75,16 +82,26 @@ def references(job: Job) -> list[str]:
     parts = [top]
     for path in sorted((folder / "references").glob("*.png")):
         name, picture = path.stem, load_image(path)
-        lines(picture, load_mask(folder / "masks" / path.name), INVENTED)
-        cells = [(inside.photograph(picture, REFERENCE), f"{name}, the hole outlined: {_origin(facts, folder, name)}")]
+        draw_outline(picture, load_mask(folder / "masks" / path.name), INVENTED)
+        cells = [
+            (
+                inline_images.photo_address(picture, REFERENCE_SIDE),
+                f"{name}, the hole outlined: {_origin(facts, folder, name)}",
+            )
+        ]
         photo = poses / "images" / path.name
         if photo.is_file():
-            cells.insert(0, (inside.photograph(load_image(photo), REFERENCE), f"{name}, photograph"))
+            cells.insert(0, (inline_images.photo_address(load_image(photo), REFERENCE_SIDE), f"{name}, photograph"))
         depth = job.folders.get("initialize", Path()) / "depth" / f"{name}.exr"
         if "initialize" in job.folders and depth.is_file():
-            cells.append((inside.photograph(coloured([load_exr(depth)])[0], REFERENCE), "its depth behind the object"))
-        parts.append(inside.grid(cells))
-    return [*parts, *further(job)]
+            cells.append(
+                (
+                    inline_images.photo_address(color_disparity([load_exr(depth)])[0], REFERENCE_SIDE),
+                    "its depth behind the object",
+                )
+            )
+        parts.append(inline_images.picture_grid(cells))
+    return [*parts, *extra_views_section(job)]
 
 
 def _facts(folder: Path) -> dict:
@@ -104,7 +121,7 @@ def _origin(facts: dict, folder: Path, name: str) -> str:
     return f"{way}, the best of {len(scores)} tries" if len(scores) > 1 else way
 
 
-def further(job: Job) -> list[str]:
+def extra_views_section(job: Job) -> list[str]:
     """The views that were completed beside the references, and why."""
     folder = job.folders.get("initialize", Path())
     shares = _facts(folder).get("further", {}) if "initialize" in job.folders else {}
@@ -112,38 +129,41 @@ def further(job: Job) -> list[str]:
         return []
     said = "No reference shows what was open there: these views were put together from patches of the photographs."
     cells = [
-        (inside.photograph(load_image(folder / "further" / f"{view}.png"), DEPTH), f"{view}: {share:.1%} of its mask")
+        (
+            inline_images.photo_address(load_image(folder / "further" / f"{view}.png"), DEPTH_SIDE),
+            f"{view}: {share:.1%} of its mask",
+        )
         for view, share in shares.items()
     ]
-    return [page.heading("Further views", 3), page.paragraph(said), inside.grid(cells)]
+    return [page.heading("Further views", 3), page.paragraph(said), inline_images.picture_grid(cells)]
 
 
-def depths(job: Job) -> list[str]:
+def depth_section(job: Job) -> list[str]:
     """Depth of a few views before and after, in the same colours."""
     there = [s for s in RESULTS if s in job.folders and (job.folders[s] / "gaussians.ply").is_file()]
     top = page.heading("Depth, before and after")
     if not there or "fit" not in there or "poses" not in job.folders:
         return [top, page.paragraph("None yet: the stage fit has not run.")]
     scene = load_scene(job.folders["poses"])
-    names = evenly(before.rendered(job) or list(scene.train), DEPTHS)
+    names = pick_evenly(before_after.rendered_views(job) or list(scene.train), DEPTH_VIEWS)
     states = {"with the object": "fit"} | ({f"after {there[0]}": there[0]} if len(there) > 1 else {})
     loaded = {words: load_ply(job.folders[stage] / "gaussians.ply") for words, stage in states.items()}
     cells = []
     for name in names:
-        drawn = coloured([depth_of(gaussians, scene.cameras[name]) for gaussians in loaded.values()])
+        drawn = color_disparity([render_depth(gaussians, scene.cameras[name]) for gaussians in loaded.values()])
         for words, picture in zip(loaded, drawn, strict=True):
-            cells.append((inside.photograph(picture, DEPTH), f"{name}, {words}"))
+            cells.append((inline_images.photo_address(picture, DEPTH_SIDE), f"{name}, {words}"))
     said = "Bright is near; pairs share a scale; grey where nothing is."
-    return [top, page.paragraph(said, quiet=True), inside.grid(cells)]
+    return [top, page.paragraph(said, quiet=True), inline_images.picture_grid(cells)]
 
 
-def depth_of(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+def render_depth(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     """[H, W] camera z, 0 where nothing is."""
     drawn = rasterizer.render(gaussians, camera, sh_degree=0)
-    return np.where(drawn.alpha.numpy() > OPAQUE, drawn.depth.numpy(), 0.0)
+    return np.where(drawn.alpha.numpy() > MIN_ALPHA, drawn.depth.numpy(), 0.0)
 
 
-def coloured(depths: list[np.ndarray]) -> list[np.ndarray]:
+def color_disparity(depths: list[np.ndarray]) -> list[np.ndarray]:
     """uint8 [H, W, 3] each: disparity, on the scale of the first."""
     from matplotlib import colormaps
 

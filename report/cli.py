@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 
-def parser(name: str, description: str, needs_scene: bool = True) -> argparse.ArgumentParser:
+def scene_parser(name: str, description: str, needs_scene: bool = True) -> argparse.ArgumentParser:
     found = argparse.ArgumentParser(prog=f"reffusion {name}", description=description.split("\n")[0])
     found.add_argument("--scene", type=Path, required=needs_scene, help="its name, or the path of its folder")
     found.add_argument("--variant", default="", help="of the scene")
@@ -14,7 +14,7 @@ def parser(name: str, description: str, needs_scene: bool = True) -> argparse.Ar
     return found
 
 
-def home(arguments: argparse.Namespace) -> Path:
+def run_folder(arguments: argparse.Namespace) -> Path:
     """runs/<scene>, or runs/<scene>@<variant>."""
     scene = arguments.scene.expanduser().resolve()
     name = scene.stem if scene.is_file() else scene.name

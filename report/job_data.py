@@ -8,10 +8,10 @@ from typing import Any
 
 from reffusion.io.arrays import load_json
 from reffusion.io.traces import load_trace
-from report import curves, sheet
+from report import sheet, trace_charts
 from report.results import load_receipts
 
-ORDER = (
+STAGES = (
     "poses", "raw_masks", "fit", "masks", "reference", "lift", "initialize", "personalize", "distill", "evaluate",
 )  # fmt: skip
 
@@ -36,7 +36,7 @@ class Job:
     unset: dict[str, dict[str, Any]]
     folders: dict[str, Path]
     receipts: dict[str, dict[str, Any]]
-    traces: dict[str, dict[str, curves.Lines]]
+    traces: dict[str, dict[str, trace_charts.Lines]]
     unread: tuple[str, ...]
     metrics: dict[str, Any]
 
@@ -44,7 +44,7 @@ class Job:
 def load_job(home: Path) -> Job:
     """Raises ValueError where no stage has been done."""
     plan = load_plan(home)
-    names = list(plan or ORDER)
+    names = list(plan or STAGES)
     places = {s: home.parent / plan[s]["folder"] if plan and plan[s]["folder"] else None for s in plan}
     found = {stage: places.get(stage) or sheet.stage_folder(home, stage) for stage in names}
     left_out = {stage for stage, said in plan.items() if said["word"] == "skip"}

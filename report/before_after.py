@@ -8,12 +8,12 @@ from pathlib import Path
 from reffusion.io.arrays import load_json
 from reffusion.io.images import image_size, load_image
 from reffusion.io.scene import raw_mask_files
-from report import inside, page
-from report.loading import Job
+from report import inline_images, page
+from report.job_data import Job
 from report.results import load_views
 
 MEGABYTES = 3.0  # that all pictures may take, about
-LEAST, MOST = 320, 960  # px a side
+MIN_SIDE, MAX_SIDE = 320, 960  # px a side
 TITLES = {
     "photograph": "photograph",
     "renders_fit": "with the object, as fitted",
@@ -83,15 +83,15 @@ addEventListener('beforeprint', () => document.querySelectorAll('details').forEa
 """
 
 
-def section(job: Job) -> list[str]:
+def before_after_section(job: Job) -> list[str]:
     """The heading and the slider; or what is missing for one."""
-    views = {name: found for name in rendered(job) if (found := files_of(job, name))}
+    views = {name: found for name in rendered_views(job) if (found := find_pictures(job, name))}
     top = page.heading("Before and after")
     if not views:
         return [top, page.paragraph("None yet: the stage evaluate renders the views.")]
     width, height = image_size(next(iter(next(iter(views.values())).values())))
     count = sum(len(found) for found in views.values())
-    longest = inside.affordable(count, MEGABYTES, LEAST, MOST, width / height)
+    longest = inline_images.affordable_side(count, MEGABYTES, MIN_SIDE, MAX_SIDE, width / height)
     kinds = [kind for kind in TITLES if any(kind in found for found in views.values())]
     rows = load_views(job.folders["evaluate"] / "per_view.csv")
     pairs = [
@@ -106,13 +106,13 @@ def section(job: Job) -> list[str]:
     return [top, page.paragraph(words, quiet=True), f'<div class="compare">{choice}', *pairs, "</div>"]
 
 
-def rendered(job: Job) -> list[str]:
+def rendered_views(job: Job) -> list[str]:
     """The views that the stage evaluate rendered, sorted."""
     folder = job.folders.get("evaluate", Path()) / "renders"
     return sorted(path.stem for path in folder.glob("*.png")) if "evaluate" in job.folders else []
 
 
-def files_of(job: Job, name: str) -> dict[str, Path]:
+def find_pictures(job: Job, name: str) -> dict[str, Path]:
     """Kind of picture (`TITLES`) -> file, of what there is of a view."""
     evaluate = job.folders["evaluate"]
     poses, raw_masks = (job.folders.get(stage, Path()) for stage in ("poses", "raw_masks"))
@@ -144,7 +144,7 @@ def _pair(name: str, found: dict[str, Path], row: dict[str, float], longest: int
     sides = {_left(kinds): "left", kinds[-1]: "right"}
     for kind, path in found.items():
         side = f' class="{sides[kind]}"' if kind in sides else ""
-        source = inside.photograph(load_image(path), longest)
+        source = inline_images.photo_address(load_image(path), longest)
         images.append(f'<img{side} data-kind="{kind}" src="{source}" alt="{TITLES[kind]}">')
     scores = [f"{row['psnr_box']:.2f} dB in the box"] if "psnr_box" in row else []
     scores += [f"FLIP {row['flip_box']:.3f}"] if "flip_box" in row else []

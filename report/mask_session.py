@@ -46,7 +46,7 @@ class Capture:
     given: dict[str, np.ndarray]
 
 
-def capture_of(home: Path) -> Capture:
+def load_capture(home: Path) -> Capture:
     """Of runs/<scene>, after its stage `raw_masks`.
 
     Raises:
@@ -66,19 +66,19 @@ def capture_of(home: Path) -> Capture:
         raise BadInput(f"{folder}: its masks hold object numbers, or are inverted; remove them: clicks make white ones")
     files = roles.masks.get("", {})
     written = _saved(folder)["written"]
-    theirs = [name for name, path in files.items() if written.get(_named(path, folder)) != digest(path)]
+    theirs = [name for name, path in files.items() if written.get(_named(path, folder)) != file_digest(path)]
     place = next((path.parent for path in files.values()), folder / (params.mask_folder or "masks"))
     return Capture(folder, place, poses, sheet.stage_folder(home, "fit"), load_raw_masks(raw_masks, theirs))
 
 
-def segmenter_here() -> Segmenter | None:
+def load_local_segmenter() -> Segmenter | None:
     """The segmentation network whose weights are on this machine. ValueError where they are not whole."""
     if (found := load_segmenter()) is not None:
         print(f"clicks are answered by {SOURCE}", flush=True)
     return found
 
 
-def digest(path: Path) -> str:
+def file_digest(path: Path) -> str:
     """Of a file's content."""
     return hashlib.blake2b(path.read_bytes(), digest_size=10).hexdigest()
 
@@ -161,12 +161,12 @@ class Session:
             masks = {name: mask for name, mask in self.masks.items() if name not in self.capture.given}
             folder, written = self.capture.folder, dict(_saved(self.capture.folder)["written"])
             paths = {name: self.capture.masks / f"{name}.png" for name in masks}
-            foreign = [p for p in paths.values() if p.exists() and written.get(_named(p, folder)) != digest(p)]
+            foreign = [p for p in paths.values() if p.exists() and written.get(_named(p, folder)) != file_digest(p)]
             if foreign:
                 raise ValueError(f"{foreign[0]}: not written by this page, and not overwritten; move it away")
             for name, path in paths.items():
                 replace_image(path, to_uint8(as_photographed(masks[name], self.lenses[name], self.sizes[name]) * 1.0))
-                written[_named(path, folder)] = digest(path)
+                written[_named(path, folder)] = file_digest(path)
             save_json(folder / CLICKS, {"clicks": self._photographed(), "written": written})
             self.unsaved = False
             return {"written": len(masks), "kept": len(self.capture.given)}
