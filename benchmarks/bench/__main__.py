@@ -65,7 +65,7 @@ def main() -> int:
         draw(diagram, given.out / f"{name}.png")
         print(recommendation(diagram), flush=True)
     unit = min(unit, gate.machine_unit())  # the quieter moment
-    measured = gate.table(diagrams, unit)
+    measured = gate.baseline_table(diagrams, unit)
     (given.out / "precision.json").write_text(json.dumps(measured, indent=1) + "\n")
     print(f"pictures and precision.json in {given.out}/; machine unit {1e3 * unit:.1f} ms")
     if given.write_baselines:
@@ -75,7 +75,7 @@ def main() -> int:
     worse = gate.regressions(diagrams, unit, baselines) if baselines else []
     for _ in range(RETRIES if worse else 0):  # a busy machine's times: only what is slow every time is slow
         named = {line.split(":")[0] for line in worse}
-        diagrams = [gate.quicker(d, every[d.name]()) if d.name in named else d for d in diagrams]
+        diagrams = [gate.take_faster(d, every[d.name]()) if d.name in named else d for d in diagrams]
         worse = gate.regressions(diagrams, unit, baselines)
     for line in worse:
         print(f"regression: {line}", file=sys.stderr)

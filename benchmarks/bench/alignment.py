@@ -14,7 +14,7 @@ NOISE = 0.01  # of the inliers, relative to the map's spread
 SEEDS = 5
 
 
-def maps(share: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def make_maps(share: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(estimate, target, truth), [SIZE] each: truth is affine in the estimate; a share of the target is displaced by up
     to its whole range, upwards, as things in front of a wall displace its disparity."""
     random = np.random.default_rng(seeding.seed_for(seed, "alignment", share))
@@ -32,7 +32,7 @@ def diagram() -> Diagram:
         for share in SHARES:
             errors = []
             for seed in range(SEEDS):
-                estimate, target, truth = maps(share, seed)
+                estimate, target, truth = make_maps(share, seed)
                 fitted = align(estimate, target, robust=robust).apply(estimate)
                 errors.append(np.sqrt(np.mean((fitted - truth) ** 2)) / truth.std())
             seconds = cpu_seconds(lambda r=robust, e=estimate, t=target: align(e, t, robust=r))

@@ -30,7 +30,7 @@ def machine_unit() -> float:
     return cpu_seconds(work, repeats=7)
 
 
-def table(diagrams: list[Diagram], unit: float) -> dict[str, Any]:
+def baseline_table(diagrams: list[Diagram], unit: float) -> dict[str, Any]:
     """What goes into a baseline: name -> {"curve, setting": [error, seconds]}."""
     points = {d.name: {f"{p.curve}, {p.setting}": [p.error, p.seconds] for p in d.points} for d in diagrams}
     return {"machine_unit": unit, "diagrams": points}
@@ -61,7 +61,7 @@ def regressions(diagrams: list[Diagram], unit: float, baselines: dict[str, Any])
     return found
 
 
-def quicker(diagram: Diagram, again: Diagram) -> Diagram:
+def take_faster(diagram: Diagram, again: Diagram) -> Diagram:
     """The diagram with the shorter of two measured times at each point; errors of the first."""
     seconds = {(p.curve, p.setting): p.seconds for p in again.points}
     points = [replace(p, seconds=min(p.seconds, seconds[p.curve, p.setting])) for p in diagram.points]

@@ -79,7 +79,7 @@ class Scaling(NamedTuple):
         return f"{self.median:8.2f} {self.upper:4.2f} {self.ceiling:8.2f}"
 
 
-def scene(count: int, camera: Camera, seed: int = 0) -> Gaussians:
+def make_scene(count: int, camera: Camera, seed: int = 0) -> Gaussians:
     """Gaussians all over a view's frustum, of sizes that give every pixel about LAYERS of them; SH degree 3."""
     generator = torch.Generator().manual_seed(seed)
     uniform = lambda *shape: torch.rand(*shape, generator=generator)
@@ -103,7 +103,7 @@ def prepare(size: str) -> Case:
         raise ValueError(f"size {size!r}: write it like {SIZES[0]}")
     count, width, height = map(int, match.groups())
     camera = Camera("bench", width, height, 1.1 * width, 1.1 * width, width / 2, height / 2, np.eye(4))
-    gaussians = scene(count, camera)
+    gaussians = make_scene(count, camera)
     pairs = rasterizer.accumulate(gaussians, camera, torch.ones(height, width, 1), count=True).sum().item()
     return Case(gaussians, camera, round(pairs), visited_lanes(gaussians, camera), [], [])
 
@@ -120,7 +120,7 @@ def visited_lanes(gaussians: Gaussians, camera: Camera) -> int:
     return 8 * int((rows[starts + used] - rows[starts]).sum())
 
 
-def step(case: Case, clock) -> tuple[float, float]:
+def time_step(case: Case, clock) -> tuple[float, float]:
     """Milliseconds of one forward and one backward pass."""
     leaves = case.gaussians.map(lambda tensor: tensor.detach().requires_grad_())
     start = clock()
@@ -154,12 +154,13 @@ def fma_peak(rounds: int = 3_000_000, tries: int = 10) -> float:
     return 2 * 10 * v.LANES * rounds / min(seconds) / 1e9
 
 
-def first_image() -> tuple[float, float]:
+def time_first_image() -> tuple[float, float]:
     """CPU seconds from starting Python to the first small image, kernels and bytecode in the cache; and of that, what
     starting Python and importing torch alone take."""
     image = (
         "import benchmarks.bench.large as b; import numpy as np; "
-        "view = b.Camera('v', 64, 48, 70.0, 70.0, 32.0, 24.0, np.eye(4)); b.splat.render(b.scene(100, view), view)"
+        "view = b.Camera('v', 64, 48, 70.0, 70.0, 32.0, 24.0, np.eye(4)); "
+        "b.rasterizer.render(b.make_scene(100, view), view)"
     )
     cached = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
 
@@ -173,7 +174,7 @@ def first_image() -> tuple[float, float]:
     return min(seconds(image) for _ in range(3)), min(seconds("import torch") for _ in range(3))
 
 
-def scaling(case: Case, threads: int, repeats: int) -> Scaling:
+def measure_scaling(case: Case, threads: int, repeats: int) -> Scaling:
     """Wall time of one thread over that of several, by pairs of steps taken one after the other."""
     steps, ceilings = [], []
     with ThreadPoolExecutor(threads) as pool:
@@ -188,8 +189,8 @@ def scaling(case: Case, threads: int, repeats: int) -> Scaling:
 def _best_step(case: Case, threads: int, tries: int = 2) -> float:
     """Milliseconds of wall time."""
     torch.set_num_threads(threads)
-    step(case, time.perf_counter)  # torch makes its threads anew
-    return min(sum(step(case, time.perf_counter)) for _ in range(tries))
+    time_step(case, time.perf_counter)  # torch makes its threads anew
+    return min(sum(time_step(case, time.perf_counter)) for _ in range(tries))
 
 
 def _ceiling(pool: ThreadPoolExecutor, threads: int, rounds: int = 20_000_000) -> float:
@@ -201,7 +202,7 @@ def _ceiling(pool: ThreadPoolExecutor, threads: int, rounds: int = 20_000_000) -
     return threads * (middle - start) / (time.perf_counter() - middle)
 
 
-def report(case: Case, peak: float, speedup: Scaling | None) -> str:
+def format_row(case: Case, peak: float, speedup: Scaling | None) -> str:
     """One row of the table."""
     fwd, bwd = float(np.median(case.forward)), float(np.median(case.backward))
     size = f"{len(case.gaussians)}@{case.camera.width}x{case.camera.height}"
@@ -226,22 +227,22 @@ def main() -> None:
     except ValueError as error:
         sys.exit(f"error: {error}")
     for case in cases:
-        step(case, time.thread_time)  # compiles, touches memory
+        time_step(case, time.thread_time)  # compiles, touches memory
     peak = fma_peak()
     for _ in range(options.repeats):
         for case in cases:
-            step(case, time.thread_time)  # caches and memory as in a fit, where one step follows another
-            for series, ms in zip((case.forward, case.backward), step(case, time.thread_time), strict=True):
+            time_step(case, time.thread_time)  # caches and memory as in a fit, where one step follows another
+            for series, ms in zip((case.forward, case.backward), time_step(case, time.thread_time), strict=True):
                 series.append(ms)
     peak = max(peak, fma_peak())
     print(f"FMA peak of one core {peak:.0f} GF/s; {v.LANES} lanes to a vector; ", end="")
-    first, torch_alone = first_image()
+    first, torch_alone = time_first_image()
     print(f"from import to first image {first:.2f} s of CPU, {torch_alone:.2f} of them torch's import")
     print(f"{'size':>16} {'pairs':>7} {'lanes':>7} {'fwd':>8} {'bwd':>8} {'step/aim':>9} {'scaled':>7} ", end="")
     print(f"{'Glane/s':>14} {'FMA share':>15} {'threads':>13} {'ceiling':>8}")
     for case in cases:
-        speedup = scaling(case, options.threads, options.repeats) if options.threads > 1 else None
-        print(report(case, peak, speedup), flush=True)
+        speedup = measure_scaling(case, options.threads, options.repeats) if options.threads > 1 else None
+        print(format_row(case, peak, speedup), flush=True)
 
 
 if __name__ == "__main__":

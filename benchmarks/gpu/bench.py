@@ -38,7 +38,7 @@ class Sizes:
 
 
 PAPER = Sizes(1280, 500_000, 16, 400, 12, 3, Adversarial(), full_size.SD2)  # 1600 x 1280 px
-TOY = Sizes(40, 300, 2, 4, 3, 1, Adversarial(patches=8, size=8, width=8), full_size.shrunk(full_size.SD2), (100, 70))
+TOY = Sizes(40, 300, 2, 4, 3, 1, Adversarial(patches=8, size=8, width=8), full_size.shrink(full_size.SD2), (100, 70))
 
 
 @dataclass
@@ -63,7 +63,7 @@ class Bench:
             if shape == full_size.SD2 and local.locate(published.SD2) is not None:
                 self._prior = half, load_prior(published.SD2, self.device, dtype), published.SD2
             else:
-                self._prior = half, full_size.build(shape, dtype, self.device), "random"
+                self._prior = half, full_size.build_prior(shape, dtype, self.device), "random"
         return self._prior[1], self._prior[2]
 
     def forget_prior(self) -> None:

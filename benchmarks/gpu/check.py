@@ -35,16 +35,16 @@ from reffusion.params.distill import Params as Distill
 from reffusion.params.fit import Params as Fit
 from reffusion.params.personalize import Params as Personalize
 
-LIMIT = 480.0  # seconds, gsplat's compilation left out
+SECONDS_LIMIT = 480.0  # seconds, gsplat's compilation left out
 # The critic's step is the one that is most likely to run out of memory: after all that must not be lost with it.
 PARTS: dict[str, Callable[[Bench], dict[str, Any]]] = {
-    "splatting": exact.splatting,
-    "splatting, antialiased": lambda bench: exact.splatting(bench, antialiased=True),
-    "splatting, a crop": lambda bench: exact.splatting(bench, crop=True),
-    "SSIM": exact.similarity,
+    "splatting": exact.check_splatting,
+    "splatting, antialiased": lambda bench: exact.check_splatting(bench, antialiased=True),
+    "splatting, a crop": lambda bench: exact.check_splatting(bench, crop=True),
+    "SSIM": exact.check_similarity,
     "reconstruction": steps.reconstruction,
     "reference": steps.reference,
-    "fit": steps.fitted_scene,
+    "fit": steps.fit_scene,
     "personalization": steps.personalization,
     "SDS": steps.distillation,
     "depth": steps.depth,
@@ -56,20 +56,20 @@ def check(device: str, out: Path) -> dict[str, Any]:
     """All of it; what fails says why and does not stop the rest. On the CPU small."""
     out.mkdir(parents=True, exist_ok=True)
     bench = Bench(PAPER if device == "cuda" else TOY, device, out)
-    report: dict[str, Any] = {"machine": machine(device), "parts": {}}
+    report: dict[str, Any] = {"machine": describe_machine(device), "parts": {}}
     began = time.perf_counter()
     for name, part in PARTS.items():
-        report["parts"][name] = result_of(part, bench, time.perf_counter() - began)
-        report["projected_hours"] = projected(report["parts"])
+        report["parts"][name] = run_part(part, bench, time.perf_counter() - began)
+        report["projected_hours"] = project_hours(report["parts"])
         report["seconds"] = time.perf_counter() - began
-        write(out / "gpu_check.json", json.dumps(report, indent=1) + "\n")
-        write(out / "gpu_check.md", table(report))
+        write_atomically(out / "gpu_check.json", json.dumps(report, indent=1) + "\n")
+        write_atomically(out / "gpu_check.md", table(report))
     return report
 
 
-def result_of(part: Callable[[Bench], dict[str, Any]], bench: Bench, seconds: float) -> dict[str, Any]:
-    if seconds > LIMIT:
-        return {"skipped": f"{LIMIT:.0f} s are over"}
+def run_part(part: Callable[[Bench], dict[str, Any]], bench: Bench, seconds: float) -> dict[str, Any]:
+    if seconds > SECONDS_LIMIT:
+        return {"skipped": f"{SECONDS_LIMIT:.0f} s are over"}
     try:
         return part(bench)
     except Exception as error:
@@ -82,14 +82,14 @@ def result_of(part: Callable[[Bench], dict[str, Any]], bench: Bench, seconds: fl
             torch.cuda.reset_peak_memory_stats()
 
 
-def write(path: Path, text: str) -> None:
+def write_atomically(path: Path, text: str) -> None:
     """At once or not at all."""
     partial = path.with_suffix(path.suffix + ".writing")
     partial.write_text(text)
     os.replace(partial, path)
 
 
-def projected(parts: dict[str, dict[str, Any]]) -> dict[str, float]:
+def project_hours(parts: dict[str, dict[str, Any]]) -> dict[str, float]:
     """Hours that the paper's steps take at these seconds a step; of stages all of whose terms were measured."""
     seconds = {name: part["seconds"] for name, part in parts.items() if "seconds" in part}
     hours, distill = {}, Distill()
@@ -104,7 +104,7 @@ def projected(parts: dict[str, dict[str, Any]]) -> dict[str, float]:
     return hours
 
 
-def machine(device: str) -> dict[str, Any]:
+def describe_machine(device: str) -> dict[str, Any]:
     """What the figures hold for. Loads gsplat's extension, builds it where `make gpu` has not: outside all parts."""
     said: dict[str, Any] = {"device": device, "torch": torch.__version__}
     if device == "cpu":

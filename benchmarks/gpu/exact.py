@@ -24,7 +24,9 @@ FLIPPED = 1e-4  # share of the pixels that may differ by more
 COUNTED = 1e-3  # and what they may change of the numbers of blended pixels
 
 
-def drawn(bench: Bench, scene: Gaussians, camera: Camera, impl: str, dtype: torch.dtype) -> dict[str, Tensor]:
+def render_with_gradients(
+    bench: Bench, scene: Gaussians, camera: Camera, impl: str, dtype: torch.dtype
+) -> dict[str, Tensor]:
     """What one implementation makes of a scene: pictures, sums of weights, the gradients of a sum over all of it."""
     device = "cpu" if impl == "reference" else bench.device
     place = lambda tensor: tensor.detach().to(device, dtype).clone().requires_grad_()
@@ -47,7 +49,7 @@ def drawn(bench: Bench, scene: Gaussians, camera: Camera, impl: str, dtype: torc
     return {name: tensor.cpu().double() for name, tensor in found.items()}
 
 
-def compared(found: dict[str, Tensor], truth: dict[str, Tensor]) -> dict[str, Any]:
+def compare_blocks(found: dict[str, Tensor], truth: dict[str, Tensor]) -> dict[str, Any]:
     """Relative errors: of pictures that which only `FLIPPED` of the numbers exceed, over the largest; else by norm."""
     errors, limits = {}, {}
     for name, true in truth.items():
@@ -62,18 +64,18 @@ def compared(found: dict[str, Tensor], truth: dict[str, Tensor]) -> dict[str, An
     return {"errors": errors, "ok": not beyond} | ({"beyond": ", ".join(beyond)} if beyond else {})
 
 
-def splatting(bench: Bench, antialiased: bool = False, crop: bool = False) -> dict[str, Any]:
+def check_splatting(bench: Bench, antialiased: bool = False, crop: bool = False) -> dict[str, Any]:
     count, width = bench.sizes.oracle
     height = width * 4 // 5
     camera = Camera("oracle", width, height, width, width, width / 2, height / 2, np.eye(4))
     camera = camera.cropped(width // 3, height // 4, width // 3, height // 3) if crop else camera
     scene = replace(full_size.gaussians(count, "cpu").map(Tensor.detach), antialiased=antialiased)
     impl = "cuda" if bench.device == "cuda" else "cpu"
-    found = drawn(bench, scene, camera, impl, torch.float32)
-    return compared(found, drawn(bench, scene, camera, "reference", torch.float64))
+    found = render_with_gradients(bench, scene, camera, impl, torch.float32)
+    return compare_blocks(found, render_with_gradients(bench, scene, camera, "reference", torch.float64))
 
 
-def similarity(bench: Bench) -> dict[str, Any]:
+def check_similarity(bench: Bench) -> dict[str, Any]:
     """D-SSIM and its gradient in float32 on the device against float64: TF32 would be off by a tenth."""
     draw, size = generator(0, "ssim"), bench.sizes.oracle[1]
     image, other = (torch.rand(size, size, 3, generator=draw, dtype=torch.float64) for _ in range(2))
@@ -86,4 +88,4 @@ def similarity(bench: Bench) -> dict[str, Any]:
         (slope,) = torch.autograd.grad(value, leaf)
         return {"value": value.detach().cpu().double(), "gradient": slope.cpu().double()}
 
-    return compared(told(dssim, torch.float32, bench.device), told(dssim_torch, torch.float64, "cpu"))
+    return compare_blocks(told(dssim, torch.float32, bench.device), told(dssim_torch, torch.float64, "cpu"))

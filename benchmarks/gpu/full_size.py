@@ -101,7 +101,7 @@ SDXL = Shape(
 )
 
 
-def shrunk(shape: Shape) -> Shape:
+def shrink(shape: Shape) -> Shape:
     """The same kinds of layers with few channels, 32 px: a forward pass in milliseconds."""
     second = len(shape.texts) == 2
     depth = len(shape.unet["block_out_channels"])
@@ -136,20 +136,20 @@ def networks(shape: Shape, dtype: torch.dtype) -> dict[str, torch.nn.Module]:
     return made | {"vae": AutoencoderKL(**shape.vae)}
 
 
-def count(shape: Shape) -> int:
+def count_parameters(shape: Shape) -> int:
     """Parameters of all parts, without making one."""
     with torch.device("meta"):
         return sum(p.numel() for part in networks(shape, torch.float32).values() for p in part.parameters())
 
 
-def living(shape: Shape, dtype: torch.dtype) -> dict[str, float]:
+def peak_memory(shape: Shape, dtype: torch.dtype) -> dict[str, float]:
     """GB of weights and, for one sample, of the most tensors that live at once: counted, nothing is computed.
 
     On torch's device without memory; attention is taken apart there, so that a GPU's kernels need less.
     """
     with torch.device("meta"):
         made = networks(shape, dtype)
-    prior = assembled(shape, made, "meta")
+    prior = assemble_prior(shape, made, "meta")
     picture = reference(prior.native_size)
     steps = {"inpainting": memory.answering, "SDS": memory.encoding}
     said = {"weights": prior.bytes}
@@ -163,15 +163,15 @@ def living(shape: Shape, dtype: torch.dtype) -> dict[str, float]:
     return {name: round(count / 1e9, 6) for name, count in said.items()}
 
 
-def build(shape: Shape, dtype: torch.dtype, device: str = "cpu", seed: int = 0) -> Prior:
+def build_prior(shape: Shape, dtype: torch.dtype, device: str = "cpu", seed: int = 0) -> Prior:
     """A prior of random weights, made on the device: the same there for equal seeds."""
     with torch.random.fork_rng(), torch.device(device):
         torch.manual_seed(seed)
         made = networks(shape, dtype)
-    return assembled(shape, made, device)
+    return assemble_prior(shape, made, device)
 
 
-def assembled(shape: Shape, made: dict[str, torch.nn.Module], device: str) -> Prior:
+def assemble_prior(shape: Shape, made: dict[str, torch.nn.Module], device: str) -> Prior:
     """The networks with a tokenizer (the embedded prior's: words do not matter here) and SD2's schedule."""
     from diffusers import DDIMScheduler
     from transformers import CLIPTokenizer
@@ -266,7 +266,7 @@ def sds_step(
 # ---------------------------------------------------------------------------------------------------------------- main
 
 
-def timed(report: dict[str, Any], name: str, work: Any) -> Any:
+def record_time(report: dict[str, Any], name: str, work: Any) -> Any:
     """The result of `work`, its seconds and the process's peak memory so far noted in the report."""
     began, cpu = time.perf_counter(), time.process_time()
     result = work()
@@ -281,29 +281,35 @@ def timed(report: dict[str, Any], name: str, work: Any) -> Any:
 def run(shape: Shape, dtype: torch.dtype, options: argparse.Namespace) -> dict[str, Any]:
     """Both steps and the round trip of the LoRA; everything measured."""
     options.out.mkdir(parents=True, exist_ok=True)
-    report: dict[str, Any] = {"parameters": count(shape), "dtype": str(dtype), "size": shape.unet["sample_size"] * 8}
+    report: dict[str, Any] = {
+        "parameters": count_parameters(shape),
+        "dtype": str(dtype),
+        "size": shape.unet["sample_size"] * 8,
+    }
 
     def made() -> Prior:
-        prior = build(shape, dtype)
+        prior = build_prior(shape, dtype)
         return recomputing(prior) if options.checkpointing else prior
 
-    prior = timed(report, "build", made)
+    prior = record_time(report, "build", made)
     report["size"] = size = prior.native_size
     picture = reference(size)
-    timed(report, "personalization step", lambda: personalization_step(prior, picture, options.batch, options.out))
-    before = timed(report, "epsilon of the trained", lambda: epsilon(prior))
+    record_time(
+        report, "personalization step", lambda: personalization_step(prior, picture, options.batch, options.out)
+    )
+    before = record_time(report, "epsilon of the trained", lambda: epsilon(prior))
     del prior
     gc.collect()
-    prior = lora.merged(timed(report, "build again", made), options.out)
-    after = timed(report, "epsilon of the loaded", lambda: epsilon(prior))
+    prior = lora.merged(record_time(report, "build again", made), options.out)
+    after = record_time(report, "epsilon of the loaded", lambda: epsilon(prior))
     report["epsilon difference"] = float((after - before).abs().max())
     report["epsilon size"] = float(before.abs().max())
     with torch.no_grad():
-        text = timed(report, "embed prompts", lambda: diffusion.embed_text(prior, list(crops.PROMPTS)))
+        text = record_time(report, "embed prompts", lambda: diffusion.embed_text(prior, list(crops.PROMPTS)))
     prior = without_text(prior)
     gc.collect()
     sds, scene = Sds(patches=options.patches), gaussians(options.gaussians, "cpu")
-    timed(report, "SDS step", lambda: sds_step(prior, text, train_view(size, "cpu"), scene, sds))
+    record_time(report, "SDS step", lambda: sds_step(prior, text, train_view(size, "cpu"), scene, sds))
     return report
 
 
@@ -320,14 +326,14 @@ def main() -> None:
     parser.add_argument("--count", action="store_true", help="only count the memory that one sample takes")
     parser.add_argument("--out", type=Path, default=Path("runs/full-size"))
     options = parser.parse_args()
-    shape = shrunk(SD2) if options.toy else SD2
+    shape = shrink(SD2) if options.toy else SD2
     if options.size:
         factor = 2 ** (len(shape.vae["block_out_channels"]) - 1)
         shape = Shape(shape.unet | {"sample_size": options.size // factor}, shape.vae, shape.texts)
     if options.count:
-        print(json.dumps(living(shape, getattr(torch, options.dtype)), indent=1))
+        print(json.dumps(peak_memory(shape, getattr(torch, options.dtype)), indent=1))
         return
-    need = 1.2 * count(shape) * (4 if options.dtype == "float32" else 2) / 1e9
+    need = 1.2 * count_parameters(shape) * (4 if options.dtype == "float32" else 2) / 1e9
     if need > options.memory_gb:
         parser.error(f"the weights alone take {need:.0f} GB, more than --memory-gb {options.memory_gb:g}")
     with memory.blamed("--size", options.size):

@@ -17,14 +17,14 @@ from reffusion.io.machine import Machine, lacks, machine
 COMPILER_GB = 1.0  # what a compiler takes: gsplat's largest file 0.85
 
 
-def refused(here: Machine, before: bool) -> list[str]:
+def refusal_reasons(here: Machine, before: bool) -> list[str]:
     """What is in the way, a line each."""
     if here.driver is None and here.card is None:
         return ["there is no NVIDIA driver on this machine: nothing to do; profile=laptop needs no card"]
     return lacks(here, splats=not before)
 
 
-def jobs(cores: int, free_gb: float) -> int:
+def compiler_jobs(cores: int, free_gb: float) -> int:
     """How many compilers may run at once."""
     return max(1, min(8, cores, int(free_gb / COMPILER_GB)))
 
@@ -33,12 +33,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--before", action="store_true", help="ask for driver and torch only, load nothing")
     before = parser.parse_args().before
-    if found := refused(machine(), before):
+    if found := refusal_reasons(machine(), before):
         print(f"error: {'; '.join(found)}", file=sys.stderr)
         return 2
     if before:
         return 0
-    os.environ.setdefault("MAX_JOBS", str(jobs(os.cpu_count() or 1, psutil.virtual_memory().available / 1e9)))
+    os.environ.setdefault("MAX_JOBS", str(compiler_jobs(os.cpu_count() or 1, psutil.virtual_memory().available / 1e9)))
     began = time.monotonic()
     import torch
 

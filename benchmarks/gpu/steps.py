@@ -31,7 +31,7 @@ from reffusion.types import PARAMETERS, Camera, Gaussians
 from reffusion.weights import local, published
 
 
-def term(scene: Gaussians, loss: Tensor) -> None:
+def backpropagate(scene: Gaussians, loss: Tensor) -> None:
     """The way back, and nothing kept of it."""
     loss.backward()
     for name in PARAMETERS:
@@ -40,13 +40,13 @@ def term(scene: Gaussians, loss: Tensor) -> None:
 
 def reconstruction(bench: Bench) -> dict[str, Any]:
     (scene, masked), view = bench.scene(), full_size.train_view(bench.sizes.rows, bench.device)
-    return bench.measured(lambda: term(scene, reconstruction_term(scene, masked, view)[0]))
+    return bench.measured(lambda: backpropagate(scene, reconstruction_term(scene, masked, view)[0]))
 
 
 def reference(bench: Bench) -> dict[str, Any]:
     (scene, masked), view = bench.scene(), full_size.train_view(bench.sizes.rows, bench.device)
     return bench.measured(
-        lambda: term(scene, reference_term(scene, masked, view.camera, view.picture, view.repaint)[0])
+        lambda: backpropagate(scene, reference_term(scene, masked, view.camera, view.picture, view.repaint)[0])
     )
 
 
@@ -62,7 +62,7 @@ def personalization(bench: Bench) -> dict[str, Any]:
     return said | {"batch": bench.sizes.batch, "rows": prior.rows_graded, "lora_text": moved, "weights": source}
 
 
-def prompted(bench: Bench) -> tuple[Prior, Tensor, str]:
+def prior_and_prompts(bench: Bench) -> tuple[Prior, Tensor, str]:
     """The prior without its text encoder, the embedded prompts, and where the weights are from."""
     prior, source = bench.prior("float16")
     with torch.no_grad():
@@ -70,7 +70,7 @@ def prompted(bench: Bench) -> tuple[Prior, Tensor, str]:
 
 
 def distillation(bench: Bench) -> dict[str, Any]:
-    prior, text, source = prompted(bench)
+    prior, text, source = prior_and_prompts(bench)
     (scene, _), view = bench.scene(), full_size.train_view(bench.sizes.rows, bench.device)
 
     def step() -> dict[str, float]:
@@ -83,14 +83,14 @@ def distillation(bench: Bench) -> dict[str, Any]:
 
 
 def depth(bench: Bench) -> dict[str, Any]:
-    prior, text, source = prompted(bench)
+    prior, text, source = prior_and_prompts(bench)
     (scene, masked), view = bench.scene(), full_size.train_view(bench.sizes.rows, bench.device)
     estimator, whose = depth_estimator(bench.sizes, bench.device)
 
     def step() -> dict[str, float]:
         draw = generator(0, "depth")
         loss, _ = depth_term(scene, masked, view, prior, text, Depth(), Sds().guidance, draw, estimator)
-        term(scene, loss)
+        backpropagate(scene, loss)
         return {"loss": float(loss.detach())}
 
     return bench.measured(step) | {"weights": f"{source}, {whose}"}
@@ -104,7 +104,7 @@ def adversarial(bench: Bench) -> dict[str, Any]:
     def step() -> dict[str, float]:
         draw = generator(0, "patches")
         loss, _, said = adversarial_term(scene, masked, view, view.picture, view.repaint, critic, draw)
-        term(scene, loss)
+        backpropagate(scene, loss)
         return said
 
     return bench.measured(step)
@@ -141,7 +141,7 @@ def depth_estimator(sizes: Sizes, device: str) -> tuple[Estimator, str]:
     return Estimator(tries[0].how, disparity), source
 
 
-def fitted_scene(bench: Bench) -> dict[str, Any]:
+def fit_scene(bench: Bench) -> dict[str, Any]:
     """A cloud of coloured Gaussians photographed by the splatting itself, fitted from blurred and shifted ones."""
     sizes, device, out = bench.sizes, bench.device, bench.out
     truth = full_size.gaussians(sizes.gaussians, device, degree=1).map(Tensor.detach)

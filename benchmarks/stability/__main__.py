@@ -15,7 +15,7 @@ import torch
 from benchmarks.stability import Row, all_cases, run
 
 
-def line(row: Row) -> str:
+def format_row(row: Row) -> str:
     measured = "failed" if row.measured is None else f"{row.measured:.3g}"
     return f"{'ok ' if row.ok else 'BAD'} {row.case:<58} {measured:>10} <= {row.bound:<9.3g} {row.quantity}"
 
@@ -32,7 +32,7 @@ def main() -> int:
     rows = []
     for case in cases:
         rows.append(run(case))
-        print(line(rows[-1]), flush=True)
+        print(format_row(rows[-1]), flush=True)
     given.out.parent.mkdir(parents=True, exist_ok=True)
     given.out.write_text(json.dumps([row._asdict() for row in rows], indent=1) + "\n")
     bad = [row.case for row in rows if not row.ok]

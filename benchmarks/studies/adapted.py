@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.studies import device
+from benchmarks.studies import scene_priors
 from reffusion import seeding
 from reffusion.fit import exposure
 from reffusion.io.arrays import load_labels
@@ -38,7 +38,7 @@ COLUMNS = {  # column -> the prior, and its prompt
 }
 
 
-def given_views(run: Path, count: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def load_holes(run: Path, count: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """View -> (uint8 [H, W, 3], as far as it is known without the object; hole, bool [H, W]): up to `count` training
     views with something to invent, the reference's own left out.
 
@@ -63,7 +63,7 @@ def given_views(run: Path, count: int) -> dict[str, tuple[np.ndarray, np.ndarray
 
 
 @torch.no_grad()
-def painted(prior: Prior, picture: np.ndarray, hole: np.ndarray, prompt: str, steps: int) -> np.ndarray:
+def paint_hole(prior: Prior, picture: np.ndarray, hole: np.ndarray, prompt: str, steps: int) -> np.ndarray:
     """uint8 [H, W, 3]: the hole painted from the noise of `SEED`."""
     inside = torch.from_numpy(hole)
     made = inpaint.repaint(
@@ -81,13 +81,13 @@ def painted(prior: Prior, picture: np.ndarray, hole: np.ndarray, prompt: str, st
     return inpaint.as_picture(made)
 
 
-def drawn(models: dict[str, Prior], run: Path, count: int, steps: int, out: Path) -> list[str]:
+def save_sheet(models: dict[str, Prior], run: Path, count: int, steps: int, out: Path) -> list[str]:
     """Write the pictures and sheet.png; the views on it."""
-    views, rows = given_views(run, count), []
+    views, rows = load_holes(run, count), []
     for name, (picture, hole) in views.items():
         row = {"to paint": view_ranking.to_paint(picture, hole)}
         for column, (when, prompt) in COLUMNS.items():
-            row[column] = painted(models[when], picture, hole, prompt, steps)
+            row[column] = paint_hole(models[when], picture, hole, prompt, steps)
         for column, made in row.items():
             save_image(out / name / f"{column.replace(', ', '-').replace(' ', '-')}.png", made)
         scale = max(1, round(WIDTH / picture.shape[1]))
@@ -98,16 +98,18 @@ def drawn(models: dict[str, Prior], run: Path, count: int, steps: int, out: Path
 
 
 def main() -> None:
-    parser = device.arguments(__doc__, "the stages up to personalize", "adapted")
+    parser = scene_priors.study_parser(__doc__, "the stages up to personalize", "adapted")
     parser.add_argument("--views", type=int, default=VIEWS)
     parser.add_argument("--steps", type=int, default=Sampler().steps, help="sampler steps from pure noise")
     given = parser.parse_args()
-    models, base = device.before_and_after(given)
+    models, base = scene_priors.load_priors(given)
     out = given.out or given.run / "adapted"
-    views = drawn(models, given.run, given.views, given.steps, out)
-    device.save(given, out, "adapted.json", {"prior": base, "seed": SEED, "steps": given.steps, "views": views})
+    views = save_sheet(models, given.run, given.views, given.steps, out)
+    scene_priors.save_results(
+        given, out, "adapted.json", {"prior": base, "seed": SEED, "steps": given.steps, "views": views}
+    )
     print(out / "sheet.png")
 
 
 if __name__ == "__main__":
-    device.run(main)
+    scene_priors.run_study(main)

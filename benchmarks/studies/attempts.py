@@ -33,7 +33,7 @@ from stages import evaluate
 
 ROOT = Path(__file__).resolve().parents[2]
 
-MOMENTS = (0, 5, 10, 20, 40, 70, 100)  # steps done
+MEASURED_STEPS = (0, 5, 10, 20, 40, 70, 100)  # steps done
 VIEWS = 10  # test views, evenly over all
 SCORES = ("psnr_box", "ssim_box", "flip_box")
 NEEDS = ("poses", "fit", "masks", "reference", "initialize")
@@ -59,7 +59,7 @@ ATTEMPTS: dict[str, dict] = {
 }
 
 
-def profile(overrides: dict) -> stage.Params:
+def profile_params(overrides: dict) -> stage.Params:
     """The laptop profile's parameters of `distill`, changed."""
     values = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"]["distill"]
     for name, value in overrides.items():
@@ -68,7 +68,7 @@ def profile(overrides: dict) -> stage.Params:
     return stage.Params(**values)
 
 
-def test_views(run: Path) -> list[tuple]:
+def load_test_views(run: Path) -> list[tuple]:
     """(camera, truth uint8 [H, W, 3], box) of `VIEWS` test views.
 
     Raises:
@@ -87,7 +87,7 @@ def test_views(run: Path) -> list[tuple]:
 
 
 @torch.no_grad()
-def scored(gaussians, views: list[tuple]) -> dict[str, float]:
+def score_views(gaussians, views: list[tuple]) -> dict[str, float]:
     """Means of `SCORES` of 8-bit renders, as `evaluate` gives them."""
     rows = []
     for camera, truth, box in views:
@@ -96,9 +96,9 @@ def scored(gaussians, views: list[tuple]) -> dict[str, float]:
     return {name: float(np.mean([row[name.removesuffix("_box")] for row in rows])) for name in SCORES}
 
 
-def curve(overrides: dict, run: Path, start: Path, views: list[tuple]) -> list[dict[str, float]]:
+def run_attempt(overrides: dict, run: Path, start: Path, views: list[tuple]) -> list[dict[str, float]]:
     """Lines {"seconds", "iteration", the scores} of one attempt."""
-    params = profile(overrides)
+    params = profile_params(overrides)
     scene = load_scene(run / "poses")
     initial, masked, holes = stage.start(params, scene, run / "reference", start)
     adapted = run / "personalize" if overrides.get(BASE, True) else None
@@ -110,11 +110,11 @@ def curve(overrides: dict, run: Path, start: Path, views: list[tuple]) -> list[d
     optimizer.forget_gradients()
     with tempfile.TemporaryDirectory() as folder:
         log = trace.Trace(Path(folder))
-        for step in range(max(MOMENTS) + 1):
-            if step in MOMENTS:
+        for step in range(max(MEASURED_STEPS) + 1):
+            if step in MEASURED_STEPS:
                 with log.paused():
-                    log.log(step, **scored(optimizer.gaussians, views))
-            if step < max(MOMENTS):
+                    log.log(step, **score_views(optimizer.gaussians, views))
+            if step < max(MEASURED_STEPS):
                 step_of(optimizer, step, job)
                 average(optimizer, params, step + 1)
         return trace.read_trace(log.path)
@@ -150,11 +150,11 @@ def main() -> None:
         if not (given.run / need).is_dir():
             raise ValueError(f"{given.run / need} is missing: run `make scene={given.run.name} all` first")
     given.out.mkdir(parents=True, exist_ok=True)
-    file, views = given.out / "attempts.json", test_views(given.run)
+    file, views = given.out / "attempts.json", load_test_views(given.run)
     curves = load_json(file) if file.exists() else {}
     for name in given.only or ATTEMPTS:
         if name not in curves:
-            curves[name] = curve(ATTEMPTS[name], given.run, given.start or given.run / "initialize", views)
+            curves[name] = run_attempt(ATTEMPTS[name], given.run, given.start or given.run / "initialize", views)
             save_json(file, curves)
         last = curves[name][-1]
         print(f"{name:44}", {s: round(last[s], 4) for s in SCORES}, f"{last['seconds']:.0f} s", flush=True)

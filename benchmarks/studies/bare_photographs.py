@@ -62,7 +62,7 @@ def pose_errors(found: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray]
     return 100 * np.linalg.norm(aligned - b, axis=1) / extent, np.degrees(rotations.magnitude())
 
 
-def rows(folder: Path, images: str | None, every: int, longest: int) -> list[dict]:
+def evaluate_capture(folder: Path, images: str | None, every: int, longest: int) -> list[dict]:
     """The capture's lines of the table: poses as solved and, where flow changes them, as adjusted."""
     capture = load_capture(folder, images=images)
     names = sorted(capture.pictures)[::every]
@@ -95,7 +95,7 @@ def rows(folder: Path, images: str | None, every: int, longest: int) -> list[dic
     return result
 
 
-def line(row: dict) -> str:
+def format_row(row: dict) -> str:
     """A row of the table in Markdown."""
     cells = (f"{value:.2f}" if isinstance(value, float) else str(value) for value in row.values())
     return f"| {' | '.join(cells)} |"
@@ -113,9 +113,9 @@ def main() -> None:
     print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}")
     table = []
     for folder in given.captures:
-        for row in rows(folder, given.images, given.every, given.longest):
+        for row in evaluate_capture(folder, given.images, given.every, given.longest):
             table.append(row)
-            print(line(row), flush=True)
+            print(format_row(row), flush=True)
     (given.out / "bare_photographs.json").write_text(json.dumps(table, indent=1))
 
 

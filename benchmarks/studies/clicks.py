@@ -22,7 +22,7 @@ from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_raw_masks, load_scene, load_views
 
-RIGHT = 0.94  # IoU from which a person would not correct
+GOOD_IOU = 0.94  # IoU from which a person would not correct
 TINT = (255, 0, 160)
 
 
@@ -39,10 +39,10 @@ def next_click(found: np.ndarray, true: np.ndarray) -> tuple[float, float, bool]
     return column + 0.5, row + 0.5, missing
 
 
-def clicked(image: np.ndarray, true: np.ndarray, most: int, relief: np.ndarray) -> Clicks:
+def simulate_clicks(image: np.ndarray, true: np.ndarray, most: int, relief: np.ndarray) -> Clicks:
     """The clicks that a person would make on a view, with what comes of each printed; relief: `view_mask` has it."""
     chosen, found = [], np.zeros_like(true)
-    while len(chosen) < most and iou(found, true) < RIGHT:
+    while len(chosen) < most and iou(found, true) < GOOD_IOU:
         chosen.append(next_click(found, true))
         clicks = Clicks(np.array([each[:2] for each in chosen]), np.array([each[2] for each in chosen]))
         began = time.monotonic()
@@ -51,7 +51,7 @@ def clicked(image: np.ndarray, true: np.ndarray, most: int, relief: np.ndarray) 
     return clicks
 
 
-def measured(run: Path, most: int, sheet: Path | None) -> str:
+def evaluate_run(run: Path, most: int, sheet: Path | None) -> str:
     """A line of figures; ValueError where the run has no masks."""
     scene = load_scene(run / "poses")
     true = load_raw_masks(run / "raw_masks", scene.train)
@@ -60,7 +60,7 @@ def measured(run: Path, most: int, sheet: Path | None) -> str:
     names = sorted(true)
     view, images = names[len(names) // 2], load_views(run / "poses", names)
     gaussians = load_ply(run / "fit/gaussians.ply")
-    clicks = clicked(images[view], true[view], most, all_views.relief(gaussians, scene.cameras[view]))
+    clicks = simulate_clicks(images[view], true[view], most, all_views.relief(gaussians, scene.cameras[view]))
     began, cameras = time.monotonic(), {name: scene.cameras[name] for name in names}
     near = all_views.neighbours(gaussians)
     solved = all_views.solved(gaussians, near, cameras, images.__getitem__, {view: clicks}, {})
@@ -71,12 +71,12 @@ def measured(run: Path, most: int, sheet: Path | None) -> str:
     worst = min(shares, key=shares.__getitem__)
     if sheet:
         some = [*names[:: max(1, len(names) // 3)][:3], worst]
-        save_image(sheet, np.hstack([tinted(images[name], found[name]) for name in some]))
+        save_image(sheet, np.hstack([overlay_mask(images[name], found[name]) for name in some]))
     mean = float(np.mean(list(shares.values())))
     return f"{run.name}: {len(clicks)} clicks, mean {mean:.3f}, worst {shares[worst]:.3f} ({worst}), {seconds:.1f} s"
 
 
-def tinted(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
+def overlay_mask(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """uint8 [H, W, 3], the mask over its picture."""
     return np.where(mask[..., None], 0.5 * image + 0.5 * np.array(TINT), image).round().astype(np.uint8)
 
@@ -88,7 +88,7 @@ def main() -> None:
     parser.add_argument("--sheets", type=Path, help="folder for pictures")
     given = parser.parse_args()
     for run in given.runs:
-        print(measured(run, given.clicks, given.sheets / f"{run.name}.png" if given.sheets else None), flush=True)
+        print(evaluate_run(run, given.clicks, given.sheets / f"{run.name}.png" if given.sheets else None), flush=True)
 
 
 if __name__ == "__main__":

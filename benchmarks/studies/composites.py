@@ -16,20 +16,20 @@ import subprocess
 import sys
 from pathlib import Path
 
-from benchmarks.studies import drawing, judging, placing
-from benchmarks.studies.placing import Place
+from benchmarks.studies import compositing, placement, scoring
+from benchmarks.studies.placement import Place
 from reffusion.io.images import save_image
 from report.job import draw_job
 from report.job_data import load_job
 
 ROOT = Path(__file__).resolve().parents[2]
 
-CHOOSE = (
+TUNING_PLACES = (
     Place("table", "garden", "frame_00097", (180, 270), 0.16, 50, 34, 8),
     Place("bear-rock", "bear", "frame_00041", (255, 395), 0.13, 100, 40, 5),
     Place("dino-ground", "dinosaur", "frame_00056", (250, 430), 0.14, 45, test=4, near=40, shape="ellipsoid"),
 )
-REPORT = (
+REPORT_PLACES = (
     Place("table-rim", "garden", "frame_00151", (377, 343), 0.12, 60, 34, 5),
     Place("table-vase", "garden", "frame_00120", (234, 285), 0.12, 50, 34, 8),
     Place("vase-front", "garden", "frame_00128", (290, 285), 0.12, 50, 34, 6),
@@ -40,7 +40,7 @@ REPORT = (
 )
 
 
-def made(place: Place, captures: Path, options: drawing.Options, out: Path) -> tuple[Path, Path]:
+def make_scenes(place: Place, captures: Path, options: compositing.Options, out: Path) -> tuple[Path, Path]:
     """(the place's scene, the same without the object) under out/scenes; made anew only where what they are made of
     has changed."""
     scenes = out / "scenes"
@@ -50,16 +50,16 @@ def made(place: Place, captures: Path, options: drawing.Options, out: Path) -> t
         told = json.dumps([repr(part) for part in of])
         if (folder / "made.json").exists() and (folder / "made.json").read_text() == told:
             continue
-        capture = capture or placing.load(captures / place.capture)
+        capture = capture or placement.load_photographs(captures / place.capture)
         if folder == scene:
-            drawing.write(place, capture, options, folder)
+            compositing.write_scene(place, capture, options, folder)
         else:
-            drawing.write_untouched(place, capture, scene, folder)
+            compositing.write_untouched(place, capture, scene, folder)
         (folder / "made.json").write_text(told)
     return scene, untouched
 
 
-def job(scene: Path, runs: Path, profile: str, variant: str = "") -> Path:
+def run_job(scene: Path, runs: Path, profile: str, variant: str = "") -> Path:
     """The whole job on a scene by the runner, which finds what is done; its folder. ValueError where it fails."""
     command = ["run", "all", "--scene", str(scene), "--runs", str(runs), "--profile", profile]
     command += ["--variant", variant] if variant else []
@@ -68,47 +68,47 @@ def job(scene: Path, runs: Path, profile: str, variant: str = "") -> Path:
     return runs / (f"{scene.name}@{variant}" if variant else scene.name)
 
 
-def measured(
-    place: Place, captures: Path, options: drawing.Options, out: Path, profile: str, variants: list[str]
+def evaluate_place(
+    place: Place, captures: Path, options: compositing.Options, out: Path, profile: str, variants: list[str]
 ) -> dict:
     """The place's row of the table; its sheet is saved, and its errors against seconds."""
-    scene, untouched = made(place, captures, options, out)
-    run, ceiling = (judging.Run.at(job(folder, out / "runs", profile)) for folder in (scene, untouched))
-    others = {name: judging.Run.of_variant(run, job(scene, out / "runs", profile, name)) for name in variants}
-    save_image(out / f"{scene.name}.png", judging.sheet(run, ceiling))
+    scene, untouched = make_scenes(place, captures, options, out)
+    run, ceiling = (scoring.Run.at(run_job(folder, out / "runs", profile)) for folder in (scene, untouched))
+    others = {name: scoring.Run.of_variant(run, run_job(scene, out / "runs", profile, name)) for name in variants}
+    save_image(out / f"{scene.name}.png", scoring.comparison_sheet(run, ceiling))
     for name, other in others.items():
-        save_image(out / f"{scene.name}@{name}.png", judging.sheet(other, ceiling))
+        save_image(out / f"{scene.name}@{name}.png", scoring.comparison_sheet(other, ceiling))
     draw_job(load_job(run.folder), out / f"{scene.name}-seconds.png", ceiling.metrics["mean"]["psnr_box"])
-    return {"place": scene.name, **judging.scores(run, ceiling, others)}
+    return {"place": scene.name, **scoring.score_place(run, ceiling, others)}
 
 
-def chosen(names: str, report: bool) -> tuple[Place, ...]:
+def select_places(names: str, report: bool) -> tuple[Place, ...]:
     """The places of a set, or those named, of either set. ValueError for one that is not known."""
     if not names:
-        return REPORT if report else CHOOSE
-    known = {place.name: place for place in (*CHOOSE, *REPORT)}
+        return REPORT_PLACES if report else TUNING_PLACES
+    known = {place.name: place for place in (*TUNING_PLACES, *REPORT_PLACES)}
     wrong = [name for name in names.split(",") if name not in known]
     if wrong:
         raise ValueError(f"no place is called {', '.join(wrong)}; there are {', '.join(known)}")
     return tuple(known[name] for name in names.split(","))
 
 
-def benchmark(given: argparse.Namespace) -> int:
-    options = drawing.Options(not given.alone, given.shadow, given.rough, given.seed)
+def run_benchmark(given: argparse.Namespace) -> int:
+    options = compositing.Options(not given.alone, given.shadow, given.rough, given.seed)
     out, rows = given.out.resolve(), []
-    for place in chosen(given.places, given.report):
+    for place in select_places(given.places, given.report):
         if not (given.captures / place.capture).is_dir():
             print(f"{place.name} skipped: there is no capture {given.captures / place.capture}")
             continue
         if given.make:
-            print("made", *made(place, given.captures, options, out))
+            print("made", *make_scenes(place, given.captures, options, out))
             continue
         variants = [name for name in given.variants.split(",") if name]
-        rows.append(measured(place, given.captures, options, out, given.profile, variants))
+        rows.append(evaluate_place(place, given.captures, options, out, given.profile, variants))
         (out / "composites.json").write_text(json.dumps(rows, indent=1))
-        (out / "composites.md").write_text(judging.table(rows))
+        (out / "composites.md").write_text(scoring.table(rows))
     if rows:
-        print(judging.table(rows))
+        print(scoring.table(rows))
     return 0
 
 
@@ -130,7 +130,7 @@ def main() -> int:
         print(f"skipped: there are no captures at {given.captures}")
         return 0
     try:
-        return benchmark(given)
+        return run_benchmark(given)
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

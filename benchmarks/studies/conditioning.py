@@ -23,7 +23,7 @@ SPREADS = 10.0 ** np.arange(0, 12)  # offsets, in units of the data's spread
 STEPS = 400
 
 
-def aligned() -> list[tuple[float, float, float, float]]:
+def alignment_errors() -> list[tuple[float, float, float, float]]:
     """Offset in spreads, condition number of the plain equations, errors of the plain and of the library's line.
 
     Exact data; errors are the largest on the data, relative to the target's spread.
@@ -39,7 +39,7 @@ def aligned() -> list[tuple[float, float, float, float]]:
     return rows
 
 
-def scene() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def make_maps() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(misfit, confidence from 1e-2 to 1e2 and 0 in a hole, guide): edges, texture, noise."""
     random = np.random.default_rng(0)
     rows, columns = np.mgrid[:HEIGHT, :WIDTH].astype(float)
@@ -50,9 +50,9 @@ def scene() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.where(columns + 0.4 * rows < 40, 0.1, -0.2) + 0.02 * random.normal(size=hole.shape), confidence, guide
 
 
-def solver() -> dict[str, tuple[float, list[tuple[float, float]]]]:
+def solver_errors() -> dict[str, tuple[float, list[tuple[float, float]]]]:
     """Form -> (condition number, [seconds, relative L2 error after each step of conjugate gradients])."""
-    misfit, confidence, guide = scene()
+    misfit, confidence, guide = make_maps()
     system, cell = bilateral.system_of(confidence, guide)
     right = np.bincount(cell, (confidence * misfit).ravel(), minlength=system.shape[0])
     exact = spsolve(system.tocsc(), right)
@@ -68,12 +68,12 @@ def solver() -> dict[str, tuple[float, list[tuple[float, float]]]]:
     return found
 
 
-def completed() -> tuple[float, list[tuple[float, float, float]]]:
+def completion_errors() -> tuple[float, list[tuple[float, float, float]]]:
     """(condition number, [offset in spreads, error of the disparity's own system, error of the library's completion]).
 
     A plane with a hole, solved by the same factorisation; errors in the hole, relative to the plane's spread.
     """
-    _, confidence, _ = scene()
+    _, confidence, _ = make_maps()
     known = confidence > 0
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] / WIDTH
     tilted, found = columns - 0.6 * rows, []
@@ -88,9 +88,9 @@ def completed() -> tuple[float, list[tuple[float, float, float]]]:
     return completion.condition(known.astype(float), plate=plate), found
 
 
-def report(say: Callable[[str], None]) -> tuple:
+def measure(say: Callable[[str], None]) -> tuple:
     """Measure all three, saying the numbers."""
-    lines, systems, (number, maps) = aligned(), solver(), completed()
+    lines, systems, (number, maps) = alignment_errors(), solver_errors(), completion_errors()
     say("alignment: offset / spread, condition (plain), error plain, error centred and scaled (condition 1)")
     for row in lines:
         say("  {:8.0e} {:10.1e} {:10.1e} {:10.1e}".format(*row))
@@ -135,7 +135,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/conditioning.png"))
     given = parser.parse_args()
     given.out.parent.mkdir(parents=True, exist_ok=True)
-    draw(*report(print), given.out)
+    draw(*measure(print), given.out)
     print(given.out)
 
 

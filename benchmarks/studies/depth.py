@@ -30,11 +30,11 @@ DATA = Path(__file__).resolve().parents[2] / "data"
 KINDS = ("wide", "360", "seen", "behind", "table", "corner", "grass", "mini")  # else: demo; a scene's name says which
 WITHIN = (0.01, 0.02, 0.05)  # of the true depth
 EDGE, NEAR = 0.02, 4  # bend of disparity over a pixel that is a step, of itself; px
-AGREE = 0.02  # the middle error outside the masks; more is no fit's inaccuracy
+MAX_OUTSIDE_ERROR = 0.02  # the middle error outside the masks; more is no fit's inaccuracy
 CLIP, MARGIN, SIDE = 0.05, 12, 480  # of the drawn error; px around the hole; least px of a panel's width
 
 
-def kind_of(name: str) -> str:
+def scene_kind(name: str) -> str:
     """The kind of a scene that make named: `demo-table-21` is a table."""
     return next((part for part in name.split("-") if part in KINDS), "demo")
 
@@ -67,7 +67,7 @@ def near_edges(depth: np.ndarray) -> np.ndarray:
     return cv2.distanceTransform((~step).astype(np.uint8), cv2.DIST_L2, 5) <= NEAR if step.any() else step
 
 
-def errors(made: np.ndarray, true: np.ndarray) -> np.ndarray:
+def relative_errors(made: np.ndarray, true: np.ndarray) -> np.ndarray:
     """[H, W] of the true depth, positive where too far, infinite where there is none."""
     return np.where(np.isfinite(made) & (made > 0), made / true - 1, np.inf)
 
@@ -80,7 +80,7 @@ def scores(error: np.ndarray) -> dict[str, float]:
     return {"pixels": error.size, **shares, "median": float(np.median(np.abs(error))), "bias": float(np.median(error))}
 
 
-def picture(reference: Reference, true: np.ndarray, made: np.ndarray, error: np.ndarray) -> np.ndarray:
+def error_sheet(reference: Reference, true: np.ndarray, made: np.ndarray, error: np.ndarray) -> np.ndarray:
     """Reference, truth, made-up depth and error around the hole, whose border is drawn; [h, w, 3] uint8."""
     mask = reference.mask
     near, far = np.percentile(1 / true[mask], (99.5, 0.5))
@@ -117,17 +117,17 @@ def measure(scene_folder: Path, run: Path, out: Path, kind: str) -> dict[str, di
         if not file.exists():
             continue
         made, true = load_exr(file).astype(float), true_depth(seed, kind, reference.camera, scene.similarity)
-        error, edges, mask = errors(made, true), near_edges(true), reference.mask
+        error, edges, mask = relative_errors(made, true), near_edges(true), reference.mask
         sets = load_mask_sets(run / "masks", [name])[name]
         hidden = sets.raw | sets.consistent | mask
         parts = {"hole": mask, "near edges": mask & edges, "elsewhere": mask & ~edges}
         never = true_never_seen(scene_folder, [reference.camera])[name]
         parts |= {"rest of C": sets.consistent & ~mask, "never seen": never, "outside": ~hidden & ~edges}
         found[name] = {part: scores(error[pixels]) for part, pixels in parts.items()}
-        if not found[name]["outside"].get("median", 0) < AGREE:
+        if not found[name]["outside"].get("median", 0) < MAX_OUTSIDE_ERROR:
             outside = found[name]["outside"]
             raise ValueError(f"{name}: what is seen outside the masks is not at its true depth ({outside}): --kind?")
-        save_image(out / f"{name}.png", picture(reference, true, made, error))
+        save_image(out / f"{name}.png", error_sheet(reference, true, made, error))
     if not found:
         raise ValueError(f"{run / 'initialize/depth'}: no depth of a reference; run `make scene=... initialize`")
     return found
@@ -145,7 +145,7 @@ def main() -> int:
     for path in (given.scene / "truth/facts.json", run / "initialize/facts.json"):
         if not path.exists():
             raise ValueError(f"{path} is missing: make a scene of the generator's, and run `make scene=... initialize`")
-    results = measure(given.scene, run, out, given.kind or kind_of(name))
+    results = measure(given.scene, run, out, given.kind or scene_kind(name))
     (out / "depth.json").write_text(json.dumps(results, indent=1))
     for view, parts in results.items():
         for part, found in parts.items():

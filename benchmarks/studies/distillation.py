@@ -38,7 +38,7 @@ RENDERS = {"initialization": "renders_initialize", "result": "renders"}
 SCALES = {"whole": "A photo of sks", "window": "A photo of sks, cropped"}
 
 
-def pictures_of(run: Path, cases: dict[str, list[Case]], renders: dict[str, dict[str, list[Case]]]):
+def degraded_pictures(run: Path, cases: dict[str, list[Case]], renders: dict[str, dict[str, list[Case]]]):
     """Name -> scale -> [B, 3, H, W] in [-1, 1]: the mixes, then the renders where the run has them."""
     made: dict[str, dict[str, Tensor]] = {}
     for scale in SCALES:
@@ -53,7 +53,7 @@ def pictures_of(run: Path, cases: dict[str, list[Case]], renders: dict[str, dict
 
 
 @torch.no_grad()
-def gradient(prior, pictures: Tensor, holes: Tensor, timestep: int, text: Tensor) -> tuple[Tensor, Tensor]:
+def sds_gradient(prior, pictures: Tensor, holes: Tensor, timestep: int, text: Tensor) -> tuple[Tensor, Tensor]:
     """E[z - x0(z_t)] over two disjoint halves of the noises, each [B, 3, H, W] by decoding z - g and z."""
     latents, condition = diffusion.encode(prior, pictures), diffusion.conditioning(prior, pictures, holes)
     t, halves = torch.full((len(pictures),), timestep), []
@@ -67,7 +67,7 @@ def gradient(prior, pictures: Tensor, holes: Tensor, timestep: int, text: Tensor
     return halves[0], halves[1]
 
 
-def gain(halves: tuple[Tensor, Tensor], error: Tensor, holes: Tensor) -> dict[str, float]:
+def possible_gain(halves: tuple[Tensor, Tensor], error: Tensor, holes: Tensor) -> dict[str, float]:
     """The cosine of g and e in the holes, over all pictures at once, and the greatest gain in dB.
 
     |g|^2 is the product of the two halves, which the noise left in either does not enlarge.
@@ -79,12 +79,12 @@ def gain(halves: tuple[Tensor, Tensor], error: Tensor, holes: Tensor) -> dict[st
     return {"cosine": cosine, "gain": float(-10 * np.log10(1 - max(cosine, 0.0) ** 2))}
 
 
-def measured(models: dict[str, Prior], run: Path) -> list[dict]:
+def measure(models: dict[str, Prior], run: Path) -> list[dict]:
     """A row for each model, scale, picture and timestep."""
     first = next(iter(models.values()))
     cases = scene_cases(run, first.native_size)
     renders = {name: rendered_cases(run, folder, first.native_size) for name, folder in RENDERS.items()}
-    pictures, rows = pictures_of(run, cases, renders), []
+    pictures, rows = degraded_pictures(run, cases, renders), []
     for model, prior in models.items():
         for scale, prompt in SCALES.items():
             truth, hole = tensors(cases[scale])
@@ -93,9 +93,9 @@ def measured(models: dict[str, Prior], run: Path) -> list[dict]:
                 error = (by_scale[scale] - truth) * hole
                 psnr = -10 * np.log10(float(error.square().sum() / hole.sum() / 3 / 4))
                 for timestep in TIMESTEPS:
-                    halves = gradient(prior, by_scale[scale], hole, timestep, text)
+                    halves = sds_gradient(prior, by_scale[scale], hole, timestep, text)
                     row = {"model": model, "scale": scale, "picture": name, "psnr": psnr, "timestep": timestep}
-                    rows.append(row | gain(halves, error, hole))
+                    rows.append(row | possible_gain(halves, error, hole))
                 best = max(rows[-len(TIMESTEPS) :], key=lambda row: row["gain"])
                 print(f"{model:12} {scale:7} {name:16} {psnr:5.2f} dB: {best['gain']:.3f} at t={best['timestep']}")
     return rows
@@ -150,7 +150,7 @@ def main() -> None:
         "unadapted": load_prior(given.prior),
         "personalized": lora.merged(load_prior(given.prior), given.run / "personalize"),
     }
-    rows = measured(models, given.run)
+    rows = measure(models, given.run)
     save_json(given.out / "distillation.json", rows)
     draw(rows, given.out / "distillation.png")
     print(given.out / "distillation.png")

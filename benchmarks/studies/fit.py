@@ -36,13 +36,13 @@ VARIANTS = {
 }
 
 
-def parameters(profile: str, overrides: dict[str, object], every: int) -> fit.Params:
+def fit_params(profile: str, overrides: dict[str, object], every: int) -> fit.Params:
     """The profile's parameters of `fit` with these in their place; ValueError naming an unknown one."""
     given = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"][profile].get("fit", {})
     return fit.Params(**given).changed({**overrides, "holdout": every})
 
 
-def curve(poses: Path, out: Path, params: fit.Params) -> list[dict[str, float]]:
+def run_fit(poses: Path, out: Path, params: fit.Params) -> list[dict[str, float]]:
     """The trace of a fit with these parameters, kept in `out`."""
     said = out / "params.json"
     if said.exists() and json.loads(said.read_text()) != params.model_dump():
@@ -79,10 +79,10 @@ def main() -> None:
     poses, out = given.run / "poses", given.out or Path("runs/fit") / given.run.name
     if not (poses / "receipt.json").exists():
         raise ValueError(f"{poses} is missing: run `make scene={given.run.name} poses` first")
-    chosen = {name: parameters(given.profile, VARIANTS[name], given.every) for name in given.only or VARIANTS}
+    chosen = {name: fit_params(given.profile, VARIANTS[name], given.every) for name in given.only or VARIANTS}
     curves = {}
     for name, params in chosen.items():
-        curves[name] = curve(poses, out / name.replace(" ", "_").replace(",", ""), params)
+        curves[name] = run_fit(poses, out / name.replace(" ", "_").replace(",", ""), params)
         last = curves[name][-1]
         print(f"{name}: {last['psnr_held_out']:.2f} dB after {last['seconds']:.0f} s, {last['gaussians']} Gaussians")
     columns = ("seconds", "iteration", "gaussians", "psnr", "psnr_held_out")

@@ -26,8 +26,8 @@ ROOT = Path(__file__).resolve().parents[2]
 STAGES = ("poses", "raw_masks", "fit", "masks", "reference", "initialize", "personalize", "distill", "evaluate")
 VIEWS, PIXELS = (30, 60, 120, 300), (0.3, 0.6, 1.2, 2.0)  # megapixels
 WIDE, HIGH = 4, 3
-TENTH = "fit.iterations=190 personalize.steps=15 distill.iterations=15 initialize.settle=30 poses.longest=4000 "
-TENTH += "distill.sds.run=always"
+SHORT_JOB = "fit.iterations=190 personalize.steps=15 distill.iterations=15 initialize.settle=30 poses.longest=4000 "
+SHORT_JOB += "distill.sds.run=always"
 SAMPLES, TEST = 1, 4  # rays a side of a pixel, so that large scenes are made in minutes; test views
 MAKE = """
 import sys; from dataclasses import replace; from pathlib import Path
@@ -39,7 +39,7 @@ generate(Path(sys.argv[2]), 0, replace(KINDS["demo"], **dict(zip(names, size))))
 """
 
 
-def made(views: int, megapixels: float, folder: Path) -> Path:
+def make_room(views: int, megapixels: float, folder: Path) -> Path:
     """A made room of so many training views of that size, in a folder that says so."""
     unit = (megapixels * 1e6 / (WIDE * HIGH)) ** 0.5
     scene = folder / f"{views}-views-{megapixels}-mp"
@@ -50,7 +50,7 @@ def made(views: int, megapixels: float, folder: Path) -> Path:
     return scene
 
 
-def measured(scene: Path, runs: Path, profile: str, last: str) -> dict[str, dict[str, float]]:
+def run_stages(scene: Path, runs: Path, profile: str, last: str) -> dict[str, dict[str, float]]:
     """Stage -> "cpu" seconds of all its processes, "seconds" and "mb" at its peak, up to `last`. Stages that were left
     out are not there. RuntimeError where one fails."""
     told, found = runs / f"{scene.name}.json", {}
@@ -59,7 +59,7 @@ def measured(scene: Path, runs: Path, profile: str, last: str) -> dict[str, dict
     for stage in STAGES[: STAGES.index(last) + 1]:
         command = [sys.executable, "-m", "runner", "run", stage, "--scene", str(scene), "--runs", str(runs)]
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        if subprocess.run([*command, "--profile", profile, f"--set={TENTH}"], cwd=ROOT).returncode:
+        if subprocess.run([*command, "--profile", profile, f"--set={SHORT_JOB}"], cwd=ROOT).returncode:
             raise RuntimeError(f"{scene.name}: {stage} failed; see above")
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         receipt = runs / scene.name / stage / "receipt.json"
@@ -71,22 +71,24 @@ def measured(scene: Path, runs: Path, profile: str, last: str) -> dict[str, dict
     return found
 
 
-def exponent(sizes: Sequence[float], values: Sequence[float]) -> float:
+def growth_exponent(sizes: Sequence[float], values: Sequence[float]) -> float:
     """The power of the size with which the values grow."""
     return float(np.polyfit(np.log(sizes), np.log(values), 1)[0])
 
 
 def draw(found: dict[str, dict[str, dict[str, list[float]]]], path: Path) -> None:
     """For views and for pixels a panel of CPU seconds and one of memory, a line for each stage."""
-    made, grid = charts.new_figure(5.6, 2, 2)
+    figure, grid = charts.new_figure(5.6, 2, 2)
     for row, (of, stages) in zip(grid, found.items(), strict=True):
         for axes, what in zip(row, ("cpu", "mb"), strict=True):
             for stage, told in stages.items():
-                axes.plot(told["size"], told[what], "o-", label=f"{stage} {exponent(told['size'], told[what]):.2f}")
+                axes.plot(
+                    told["size"], told[what], "o-", label=f"{stage} {growth_exponent(told['size'], told[what]):.2f}"
+                )
             axes.set(xscale="log", yscale="log", xlabel=of, ylabel={"cpu": "CPU seconds", "mb": "memory (MB)"}[what])
             charts.use_plain_log_ticks(axes)
             axes.legend(frameon=False, fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
-    charts.save_chart(made, path)
+    charts.save_chart(figure, path)
 
 
 def main() -> None:
@@ -108,20 +110,20 @@ def main() -> None:
     for axis, (of, scenes) in enumerate(asked.items()):
         stages = found.setdefault(of, {})
         for size in scenes:
-            taken = measured(made(*size, out / "scenes"), out / "runs", given.profile, given.last)
+            taken = run_stages(make_room(*size, out / "scenes"), out / "runs", given.profile, given.last)
             for stage, told in taken.items():
                 row = stages.setdefault(stage, {"size": [], "cpu": [], "seconds": [], "mb": []})
                 row["size"].append(size[axis])
                 for what in ("cpu", "seconds", "mb"):
                     row[what].append(told[what])
         for stage, row in stages.items():
-            cpu, mb = (exponent(row["size"], row[what]) for what in ("cpu", "mb"))
+            cpu, mb = (growth_exponent(row["size"], row[what]) for what in ("cpu", "mb"))
             print(f"{of}, {stage}: CPU {cpu:.2f}, memory {mb:.2f}")
     save_json(out / "growth.json", found)
     draw(found, out / "growth.png")
     if given.largest:
-        scene = made(given.views[-1], given.pixels[-1], out / "scenes")
-        print(json.dumps(measured(scene, out / "runs", given.profile, given.last), indent=1))
+        scene = make_room(given.views[-1], given.pixels[-1], out / "scenes")
+        print(json.dumps(run_stages(scene, out / "runs", given.profile, given.last), indent=1))
 
 
 if __name__ == "__main__":

@@ -39,7 +39,7 @@ class Case:
     kind: str
 
 
-def held_out(count: int, seed: int = SEED) -> list[Case]:
+def held_out_cases(count: int, seed: int = SEED) -> list[Case]:
     """`count` pictures that no training has seen, each with a silhouette that covers `COVER` of it."""
     cases = []
     for index in range(count):
@@ -105,26 +105,26 @@ def gradient_energy(picture: np.ndarray, hole: np.ndarray) -> float:
     return float(total / max(count, 1))
 
 
-def means(rows: list[dict[str, float]]) -> dict[str, float]:
+def mean_scores(rows: list[dict[str, float]]) -> dict[str, float]:
     """The mean of each column, and of PSNR also its standard error."""
     values = {column: float(np.mean([row[column] for row in rows])) for column in COLUMNS}
     spread = np.std([row["psnr"] for row in rows], ddof=1) / len(rows) ** 0.5 if len(rows) > 1 else 0.0
     return values | {"psnr_error": float(spread), "pictures": len(rows)}
 
 
-def tensors(cases: list[Case]) -> tuple[Tensor, Tensor]:
+def to_tensors(cases: list[Case]) -> tuple[Tensor, Tensor]:
     """[B, 3, H, W] in [-1, 1] and [B, 1, H, W], 1 = repaint."""
     pictures = torch.from_numpy(np.stack([case.truth for case in cases])).permute(0, 3, 1, 2).float() / 127.5 - 1
     return pictures, torch.from_numpy(np.stack([case.hole for case in cases]))[:, None].float()
 
 
-def painted(
+def fill_holes(
     prior: Prior, cases: list[Case], seed: int, prompt: str = "", steps: int = SAMPLER_STEPS
 ) -> list[np.ndarray]:
     """The holes filled from pure noise in `steps` of the sampler: uint8 [H, W, 3] each."""
     done = []
     for first in range(0, len(cases), BATCH):
-        pictures, holes = tensors(cases[first : first + BATCH])
+        pictures, holes = to_tensors(cases[first : first + BATCH])
         text = diffusion.embed_text(prior, [prompt]).detach().expand(len(pictures), -1, -1)
         noise = seeding.generator(seed, "sample", first)
         filled = diffusion.sample(prior, pictures * (1 - holes), holes, text, steps, noise)

@@ -26,7 +26,7 @@ from reffusion.io.scene import load_mask_sets, load_raw_masks, load_scene
 from reffusion.types import Camera, Scene
 from stages import masks as masks_stage
 
-ASKED = {"exact": {"consistent": 0.95, "undecided": 0.9}, "perturbed": {"consistent": 0.90, "undecided": 0.85}}
+REQUIRED_IOU = {"exact": {"consistent": 0.95, "undecided": 0.9}, "perturbed": {"consistent": 0.90, "undecided": 0.85}}
 BORDER = 2  # px
 LARGEST, MISSING = 0.02, 0.1  # of the image's width; share of the views
 
@@ -44,7 +44,7 @@ def true_never_seen(scene_folder: Path, cameras: list[Camera]) -> dict[str, np.n
     return shown
 
 
-def perturbed(mask: np.ndarray, random: np.random.Generator) -> np.ndarray:
+def perturb_mask(mask: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """bool [H, W] dilated, eroded or shifted, each as likely, by a distance drawn up to LARGEST."""
     distance = random.uniform(0, LARGEST * mask.shape[1])
     way = random.choice(["dilate", "erode", "shift"])
@@ -95,7 +95,7 @@ def measure(scene_folder: Path, run: Path, out: Path, seed: int) -> dict[str, di
     truth = {"consistent": exact, "undecided": true_never_seen(scene_folder, cameras)}
     random = np.random.default_rng(seeding.seed_for(seed, "perturbed masks"))
     kept = random.permutation(len(scene.train))[round(MISSING * len(scene.train)) :]
-    noisy = {scene.train[k]: perturbed(exact[scene.train[k]], random) for k in sorted(kept)}
+    noisy = {scene.train[k]: perturb_mask(exact[scene.train[k]], random) for k in sorted(kept)}
     params = masks_stage.Params(**load_json(run / "masks/receipt.json")["params"])
     results = {}
     for kind, given in (("exact", exact), ("perturbed", noisy)):
@@ -125,7 +125,7 @@ def main() -> int:
     results = measure(given.scene, run, out, given.seed)
     (out / "masks.json").write_text(json.dumps(results, indent=1))
     missed = 0
-    for kind, asked in ASKED.items():
+    for kind, asked in REQUIRED_IOU.items():
         for mask, least in asked.items():
             found = results[kind][mask]
             missed += found["together"] < least

@@ -14,16 +14,16 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.studies import composites, drawing, judging, placing
+from benchmarks.studies import composites, compositing, placement, scoring
 from reffusion.io.arrays import save_json
 from reffusion.io.images import save_image
 
-ROOM_FOR_IT = 1.08  # radius of the region over that of the object
+REGION_FACTOR = 1.08  # radius of the region over that of the object
 COVERED = 0.995  # of what photographs show of the object: what the references show of it, at least
 GRID = 12  # points along each edge of a face, by which is told how well a picture shows the object
 
 
-def showing(capture: placing.Photographs, thing: placing.Thing, names: list[str]) -> list[str]:
+def select_references(capture: placement.Photographs, thing: placement.PlacedObject, names: list[str]) -> list[str]:
     """The photographs that show `COVERED` of what all of them show of the object: each next one is that by which its
     surface is seen most finely, each point in the picture that shows it best, beside the best of all."""
     ticks = (np.arange(GRID) + 0.5) / GRID * 2 - 1
@@ -40,7 +40,7 @@ def showing(capture: placing.Photographs, thing: placing.Thing, names: list[str]
     return [names[k] for k in chosen]
 
 
-def _fineness(capture: placing.Photographs, name: str, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+def _fineness(capture: placement.Photographs, name: str, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """[P], how finely a photograph shows points of these normals, [P, 3] both; 0 where it does not."""
     camera = capture.cameras[name]
     image, z = capture.project(camera, points)
@@ -50,42 +50,49 @@ def _fineness(capture: placing.Photographs, name: str, points: np.ndarray, norma
     return np.where(framed, np.sqrt(facing.clip(0)) / np.abs(z), 0)
 
 
-def write(start: placing.Place, goal: placing.Place, capture: placing.Photographs, out: Path) -> Path:
+def write_scenes(
+    start: placement.Place,
+    goal: placement.Place,
+    capture: placement.Photographs,
+    out: Path,
+) -> Path:
     """The scene in out/<start>-to-<goal>, and the ceiling's beside it; its folder."""
-    before, after = placing.stand(capture, start), placing.stand(capture, goal)
-    after = placing.Thing(after.foot, before.height, after.axes, before.half, before.shape)
-    views, pictured = placing.views_around(capture, goal, after), drawing.Pictured(capture)
+    before, after = placement.place_object(capture, start), placement.place_object(capture, goal)
+    after = placement.PlacedObject(after.foot, before.height, after.axes, before.half, before.shape)
+    views, pictured = placement.select_views(capture, goal, after), compositing.PixelRays(capture)
     tints = np.random.default_rng(0).uniform(0.35, 0.9, (3, 3))
     scene, ceiling = (out / f"{start.name}-to-{goal.name}{end}" for end in ("", "-untouched"))
     train = [name for name in views.all if name not in views.test]
-    asked = showing(capture, after, train)
+    asked = select_references(capture, after, train)
     for folder in (scene, ceiling):
         shutil.rmtree(folder, ignore_errors=True)
     for name in views.all:
-        camera, photo = capture.cameras[name], drawing.photograph(capture, name) / 255
-        shown, at_goal = drawing.drawn_into(photo, pictured, camera, after, tints)
+        camera, photo = capture.cameras[name], compositing.load_photograph(capture, name) / 255
+        shown, at_goal = compositing.composite_object(photo, pictured, camera, after, tints)
         save_image(ceiling / f"images/{name}.png", shown)
         if name in views.test:
             save_image(scene / f"images/{name}.png", shown)
             for folder in (scene, ceiling):
                 save_image(folder / f"test_masks/{name}.png", at_goal)
             continue
-        with_it, mask = drawing.drawn_into(photo, pictured, camera, before, tints)
+        with_it, mask = compositing.composite_object(photo, pictured, camera, before, tints)
         save_image(scene / f"images/{name}.png", with_it)
         save_image(scene / f"masks/{name}.png", mask)
         if name in asked:
             save_image(scene / f"references/{name}.png", shown)
-            depth = drawing.depth(pictured, camera, after)
+            depth = compositing.composite_depth(pictured, camera, after)
             depth[(mask > 0) & (at_goal == 0)] = np.nan  # nobody knows where it stood
             np.save(scene / f"references/{name}.npy", depth)
     for folder in (scene, ceiling):
-        drawing.write_meta(capture, views, folder)
-    tested = f"test_masks: test_masks\ntest: {drawing.listed(views.test)}\nstages: {{poses: {{refine: false}}}}\n"
+        compositing.write_cameras(capture, views, folder)
+    tested = (
+        f"test_masks: test_masks\ntest: {compositing.yaml_list(views.test)}\nstages: {{poses: {{refine: false}}}}\n"
+    )
     (ceiling / "scene.yaml").write_text(f"masks: none\n{tested}")
     given = "".join(
         f'- {{view: "{name}", image: references/{name}.png, depth: references/{name}.npy}}\n' for name in asked
     )
-    radius = ROOM_FOR_IT * float(np.linalg.norm(after.half))
+    radius = REGION_FACTOR * float(np.linalg.norm(after.half))
     region = f"region: {{center: {after.middle.tolist()}, radius: {radius}}}\n"
     (scene / "scene.yaml").write_text(f"masks: masks\n{tested}{region}reference:\n{given}")
     return scene
@@ -99,16 +106,16 @@ def main() -> None:
     parser.add_argument("--profile", default="laptop")
     parser.add_argument("--out", type=Path, default=composites.ROOT / "runs/moving")
     given = parser.parse_args()
-    (start,), (goal,) = (composites.chosen(name, False) for name in (given.start, given.goal))
+    (start,), (goal,) = (composites.select_places(name, False) for name in (given.start, given.goal))
     if start.capture != goal.capture:
         parser.error(
             f"{start.name} is a place of {start.capture}, {goal.name} of {goal.capture}; take two of one capture"
         )
-    scene = write(start, goal, placing.load(given.captures / start.capture), given.out / "scenes")
+    scene = write_scenes(start, goal, placement.load_photographs(given.captures / start.capture), given.out / "scenes")
     folders = (scene, scene.with_name(f"{scene.name}-untouched"))
-    run, ceiling = (judging.Run.at(composites.job(each, given.out / "runs", given.profile)) for each in folders)
-    save_image(given.out / f"{scene.name}.png", judging.sheet(run, ceiling))
-    scores = judging.scores(run, ceiling)
+    run, ceiling = (scoring.Run.at(composites.run_job(each, given.out / "runs", given.profile)) for each in folders)
+    save_image(given.out / f"{scene.name}.png", scoring.comparison_sheet(run, ceiling))
+    scores = scoring.score_place(run, ceiling, {})
     save_json(given.out / "moving.json", {"place": scene.name, **scores})
     print(scores)
 

@@ -52,7 +52,7 @@ def in_box(means: np.ndarray, labels: np.ndarray) -> np.ndarray:
     return ((along >= low) & (along <= high)).all(1)
 
 
-def write(run: Path, scene: Path, out: Path) -> None:
+def write_scenes(run: Path, scene: Path, out: Path) -> None:
     """The three scenes' folders in `out`."""
     placed, gaussians = load_scene(run / "poses"), load_ply(run / "fit" / "gaussians.ply")
     deleted = torch.from_numpy(in_box(gaussians.means.double().numpy(), load_object(run / "masks").numpy()))
@@ -82,7 +82,7 @@ def write(run: Path, scene: Path, out: Path) -> None:
     print(f"{int(deleted.sum())} of {len(gaussians)} splats deleted; the run itself removed {int(own.sum())}")
 
 
-def cut(run: Path, folder: Path, tool: list[str]) -> None:
+def delete_object(run: Path, folder: Path, tool: list[str]) -> None:
     """before.ply and after.ply in the scene's own frame: splat-transform deletes what a person selected with a box
     around the object, which is a column of the file that it reads. cameras/: the training views and photographs."""
     exported, placed = run / "export", load_scene(run / "poses")
@@ -110,10 +110,10 @@ def cut(run: Path, folder: Path, tool: list[str]) -> None:
     print(f"splat-transform deleted {len(table) - kept} of {len(table)} splats")
 
 
-def fill(run: Path, out: Path, runs: Path, tool: list[str], set_: str) -> None:
+def run_patch_command(run: Path, out: Path, runs: Path, tool: list[str], set_: str) -> None:
     """Run the command with the cameras, photographs and the run's reference, and on the two files alone."""
     folder = out / "command"
-    cut(run, folder, tool)
+    delete_object(run, folder, tool)
     reference = next((run / "reference" / "references").glob("*.png"))
     for kind in COMMANDS:
         words = [str(folder / "before.ply"), str(folder / "after.ply"), "--profile", "laptop", "--set", set_]
@@ -150,7 +150,7 @@ def score(run: Path, out: Path, runs: Path) -> None:
     found, rows, some = {}, [], placed.test[:: max(1, len(placed.test) // SHOWN)][:SHOWN]
     for title, parts in together.items():
         if all(path.exists() for path in parts):
-            pictures = renders(parts, placed, placed.similarity)
+            pictures = render_test_views(parts, placed, placed.similarity)
             found[title] = box_psnr(pictures, run, placed)
             rows.append(np.concatenate([pictures[name] for name in some], 1))
             print(f"{title}: {found[title]:.2f} dB", flush=True)
@@ -158,7 +158,7 @@ def score(run: Path, out: Path, runs: Path) -> None:
     save_image(out / "patching.png", np.concatenate(rows))
 
 
-def renders(parts: tuple[Path, ...], placed: Scene, similarity: Similarity) -> dict[str, np.ndarray]:
+def render_test_views(parts: tuple[Path, ...], placed: Scene, similarity: Similarity) -> dict[str, np.ndarray]:
     """Test view -> uint8 [H, W, 3], of the files' splats together."""
     first, *others = (load_ply(path, similarity) for path in parts)
     for other in others:
@@ -191,9 +191,9 @@ def main() -> None:
     parser.add_argument("what", choices=("write", "command", "score"))
     arguments = parser.parse_args()
     if arguments.what == "write":
-        write(arguments.run, arguments.scene, arguments.out)
+        write_scenes(arguments.run, arguments.scene, arguments.out)
     elif arguments.what == "command":
-        fill(arguments.run, arguments.out, arguments.runs, shlex.split(arguments.tool), arguments.set)
+        run_patch_command(arguments.run, arguments.out, arguments.runs, shlex.split(arguments.tool), arguments.set)
     else:
         score(arguments.run, arguments.out, arguments.runs)
 

@@ -29,7 +29,17 @@ import numpy as np
 import torch
 import yaml
 
-from benchmarks.studies.holes import COLUMNS, SEED, Case, held_out, hole_scores, means, painted, save_row, tensors
+from benchmarks.studies.holes import (
+    COLUMNS,
+    SEED,
+    Case,
+    fill_holes,
+    held_out_cases,
+    hole_scores,
+    mean_scores,
+    save_row,
+    to_tensors,
+)
 from reffusion import seeding, trace
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.images import load_image, save_image
@@ -53,44 +63,44 @@ LEARNS = ("poses", "reference")  # what personalization needs of a run
 # ---------------------------------------------------------------------------------------------- inpainting
 
 
-def scored(pictures: list[np.ndarray], cases: list[Case]) -> dict[str, float]:
+def score_cases(pictures: list[np.ndarray], cases: list[Case]) -> dict[str, float]:
     """Means of the scores inside the holes."""
-    return means([hole_scores(p, c.truth, c.hole) for p, c in zip(pictures, cases, strict=True)])
+    return mean_scores([hole_scores(p, c.truth, c.hole) for p, c in zip(pictures, cases, strict=True)])
 
 
-def timed(work) -> tuple:
+def time_cpu(work) -> tuple:
     """(what `work` gives, seconds of this process on all its threads): other work on the machine does not count."""
     began = time.process_time()
     return work(), time.process_time() - began
 
 
-def inpainting(priors: list[str], cases: list[Case], out: Path) -> dict:
+def measure_inpainting(priors: list[str], cases: list[Case], out: Path) -> dict:
     """Method -> kind -> means, and seconds of a picture; the first `SHOWN` cases as rows of pictures."""
     rivals = {"Telea": cv2.INPAINT_TELEA, "Navier-Stokes": cv2.INPAINT_NS}
     ways, seconds = {}, {}
     for name, flag in rivals.items():
         fill = lambda flag=flag: [cv2.inpaint(c.truth, c.hole.astype(np.uint8), TELEA_RADIUS, flag) for c in cases]
-        ways[name], seconds[name] = timed(fill)
+        ways[name], seconds[name] = time_cpu(fill)
     for name in priors:
         prior = load_prior(name)
-        ways[name], seconds[name] = timed(lambda prior=prior: painted(prior, cases, SEED))
+        ways[name], seconds[name] = time_cpu(lambda prior=prior: fill_holes(prior, cases, SEED))
     for index, case in enumerate(cases[:SHOWN]):
         save_row(out / "inpainting" / f"{index:02d}.png", case, [pictures[index] for pictures in ways.values()])
     result = {}
     for name, pictures in ways.items():
         rows = [(c.kind, hole_scores(p, c.truth, c.hole)) for p, c in zip(pictures, cases, strict=True)]
         kinds = ["all", *sorted({kind for kind, _ in rows})]
-        result[name] = {kind: means([row for own, row in rows if kind in ("all", own)]) for kind in kinds}
+        result[name] = {kind: mean_scores([row for own, row in rows if kind in ("all", own)]) for kind in kinds}
         result[name]["all"]["seconds"] = seconds[name] / len(cases)
     return {"columns": ["hole", *ways, "truth"], "scores": result}
 
 
-def by_steps(prior: Prior, cases: list[Case], steps: list[int], prompt: str = "") -> dict[str, dict]:
+def measure_steps(prior: Prior, cases: list[Case], steps: list[int], prompt: str = "") -> dict[str, dict]:
     """Number of sampler steps -> means, and CPU seconds of a picture."""
     result = {}
     for count in steps:
-        pictures, seconds = timed(lambda count=count: painted(prior, cases, SEED, prompt, count))
-        result[str(count)] = scored(pictures, cases) | {"seconds": seconds / len(cases)}
+        pictures, seconds = time_cpu(lambda count=count: fill_holes(prior, cases, SEED, prompt, count))
+        result[str(count)] = score_cases(pictures, cases) | {"seconds": seconds / len(cases)}
     return result
 
 
@@ -136,7 +146,7 @@ def _reduced(case: Case, size: int) -> Case:
     )
 
 
-def profile(prior: str, settings: dict) -> stage.Params:
+def profile_params(prior: str, settings: dict) -> stage.Params:
     """The laptop profile's parameters of `personalize` for a prior; `settings`, by dotted names, come last."""
     values = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"]["personalize"]
     for name, value in {"prior": prior, **settings}.items():
@@ -149,10 +159,10 @@ def profile(prior: str, settings: dict) -> stage.Params:
 
 
 @torch.no_grad()
-def by_timestep(prior: Prior, cases: list[Case], prompt: str) -> dict[str, list[float]]:
+def measure_timesteps(prior: Prior, cases: list[Case], prompt: str) -> dict[str, list[float]]:
     """For each of `TIMESTEPS`, means over the holes: the squared error of the clean latent predicted from the noised
     truth, and the variance of that prediction (so of z - x0, the SDS gradient) over `NOISES` draws of the noise."""
-    pictures, holes = tensors(cases)
+    pictures, holes = to_tensors(cases)
     clean, condition = diffusion.encode(prior, pictures), diffusion.conditioning(prior, pictures, holes)
     text = diffusion.embed_text(prior, [prompt]).expand(len(cases), -1, -1)
     inside = condition[:, :1].expand_as(clean) > 0.5
@@ -169,7 +179,7 @@ def by_timestep(prior: Prior, cases: list[Case], prompt: str) -> dict[str, list[
     return result
 
 
-def with_picture(reference: Path, picture: Path, folder: Path) -> Path:
+def replace_references(reference: Path, picture: Path, folder: Path) -> Path:
     """A copy of the stage's folder in which every reference shows `picture` instead, at its size; masks stay."""
     shutil.copytree(reference, folder)
     for path in (folder / "references").glob("*.png"):
@@ -178,7 +188,7 @@ def with_picture(reference: Path, picture: Path, folder: Path) -> Path:
     return folder
 
 
-def learnt(params: stage.Params, needs: dict[str, Path], folder: Path) -> tuple[Prior, list[dict]]:
+def personalize_prior(params: stage.Params, needs: dict[str, Path], folder: Path) -> tuple[Prior, list[dict]]:
     """The prior personalized in `folder`, and the trace of that; what was begun there with these parameters goes on."""
     settings, made = params.model_dump(mode="json"), folder / "settings.json"
     if not made.exists() or load_json(made) != settings:
@@ -190,27 +200,27 @@ def learnt(params: stage.Params, needs: dict[str, Path], folder: Path) -> tuple[
     return lora.merged(load_prior(params.prior), folder), trace.read_trace(folder / "trace.jsonl")
 
 
-def mislearnt(params: stage.Params, needs: dict[str, Path], wrong: Path, folder: Path) -> Prior:
+def personalize_wrongly(params: stage.Params, needs: dict[str, Path], wrong: Path, folder: Path) -> Prior:
     """The prior personalized on what is not the scene's reference: a picture, or another scene's run as it is."""
     if wrong.is_dir():
         return lora.merged(load_prior(params.prior), wrong / "personalize")
-    other = with_picture(needs["reference"], wrong, folder / "other")
-    model, _ = learnt(params, needs | {"reference": other}, folder / f"{params.seed}-wrong")
+    other = replace_references(needs["reference"], wrong, folder / "other")
+    model, _ = personalize_prior(params, needs | {"reference": other}, folder / f"{params.seed}-wrong")
     shutil.rmtree(other)
     return model
 
 
-def filled(model: Prior, cases: dict[str, list[Case]], seed: int, sampler: int) -> dict[str, list[np.ndarray]]:
+def fill_scales(model: Prior, cases: dict[str, list[Case]], seed: int, sampler: int) -> dict[str, list[np.ndarray]]:
     """Scale -> its holes filled from pure noise in `sampler` steps."""
-    return {scale: painted(model, some, SEED + seed, PROMPTS[scale], sampler) for scale, some in cases.items()}
+    return {scale: fill_holes(model, some, SEED + seed, PROMPTS[scale], sampler) for scale, some in cases.items()}
 
 
-def samples(pictures: dict[str, list[np.ndarray]], cases: dict[str, list[Case]]) -> dict[str, dict[str, float]]:
+def score_scales(pictures: dict[str, list[np.ndarray]], cases: dict[str, list[Case]]) -> dict[str, dict[str, float]]:
     """Scale -> means of the scores."""
-    return {scale: scored(pictures[scale], some) for scale, some in cases.items()}
+    return {scale: score_cases(pictures[scale], some) for scale, some in cases.items()}
 
 
-def personalization(
+def measure_personalization(
     params: stage.Params, run: Path, seeds: list[int], wrong: Path | None, steps: list[int], sampler: int, out: Path
 ) -> dict:
     """Personalize on the run's reference, once a seed, and measure before and after on views that were never seen.
@@ -228,16 +238,16 @@ def personalization(
     result["seeds"] = {}
     for seed in seeds:
         mine = params.model_copy(update={"seed": seed})
-        model, log = learnt(mine, needs, out / "personalize" / str(seed))
+        model, log = personalize_prior(mine, needs, out / "personalize" / str(seed))
         models = {"before": base, "after": model}
         if wrong:
-            models["wrong"] = mislearnt(mine, needs, wrong, out / "personalize")
-        pictures = {when: filled(model, cases, seed, sampler) for when, model in models.items()}
-        result["seeds"][str(seed)] = {when: samples(made, cases) for when, made in pictures.items()}
+            models["wrong"] = personalize_wrongly(mine, needs, wrong, out / "personalize")
+        pictures = {when: fill_scales(model, cases, seed, sampler) for when, model in models.items()}
+        result["seeds"][str(seed)] = {when: score_scales(made, cases) for when, made in pictures.items()}
         result["seeds"][str(seed)]["seconds"] = log[-1]["seconds"]
         print_seed(seed, result["seeds"][str(seed)])
         if seed == seeds[0]:
-            result |= first_seed(models, cases, pictures, log, steps, out)
+            result |= measure_first_seed(models, cases, pictures, log, steps, out)
     return result
 
 
@@ -248,7 +258,7 @@ def print_seed(seed: int, scores: dict) -> None:
             print(f"  {when}, {scale}", {column: round(row[column], 3) for column in COLUMNS}, flush=True)
 
 
-def first_seed(
+def measure_first_seed(
     models: dict[str, Prior],
     cases: dict[str, list[Case]],
     pictures: dict[str, dict[str, list[np.ndarray]]],
@@ -260,16 +270,16 @@ def first_seed(
     result: dict = {"trace": log, "timesteps": TIMESTEPS, "columns": ["hole", *models, "truth"]}
     for scale, some in cases.items():
         result[scale] = {
-            when: by_timestep(model, some, PROMPTS[scale]) | {"samples": scored(pictures[when][scale], some)}
+            when: measure_timesteps(model, some, PROMPTS[scale]) | {"samples": score_cases(pictures[when][scale], some)}
             for when, model in models.items()
         }
         for index, case in enumerate(some):
             save_row(out / scale / f"{case.kind}.png", case, [made[scale][index] for made in pictures.values()])
-    result["sampler"] = {s: by_steps(models["after"], cases[s], steps, PROMPTS[s]) for s in ("reference", "whole")}
+    result["sampler"] = {s: measure_steps(models["after"], cases[s], steps, PROMPTS[s]) for s in ("reference", "whole")}
     return result
 
 
-def setting(text: str) -> tuple[str, object]:
+def parse_setting(text: str) -> tuple[str, object]:
     """("steps", 500) of "steps=500"."""
     name, found, value = text.partition("=")
     if not found:
@@ -277,7 +287,7 @@ def setting(text: str) -> tuple[str, object]:
     return name, yaml.safe_load(value)
 
 
-def arguments() -> argparse.Namespace:
+def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--priors", nargs="+", default=["priors/tiny"], help="diffusers folders; the first is the one")
     parser.add_argument("--pictures", type=int, default=64, help="held-out pictures to fill; 0: leave them out")
@@ -286,30 +296,32 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of personalization, one after the other")
     parser.add_argument("--sampler", type=int, default=50, help="steps in which a personalized prior paints")
     parser.add_argument("--wrong-reference", type=Path, help="a picture, or runs/<another scene>, to measure beside it")
-    parser.add_argument("--set", type=setting, nargs="*", default=[], help="personalization's: steps=500 lora.rank=32")
+    parser.add_argument(
+        "--set", type=parse_setting, nargs="*", default=[], help="personalization's: steps=500 lora.rank=32"
+    )
     parser.add_argument("--out", type=Path, default=Path("runs/prior-report"))
     parser.add_argument("--threads", type=int, default=2)
     return parser.parse_args()
 
 
 def main() -> None:
-    given = arguments()
+    given = parse_arguments()
     torch.set_num_threads(given.threads)
     for folder in ("inpainting", "reference", "whole", "window"):
         shutil.rmtree(given.out / folder, ignore_errors=True)
     first = given.priors[0]
     result: dict = {"prior": first}
     if given.pictures:
-        cases = held_out(given.pictures)
-        result["inpainting"] = inpainting(given.priors, cases, given.out)
+        cases = held_out_cases(given.pictures)
+        result["inpainting"] = measure_inpainting(given.priors, cases, given.out)
         for name, kinds in result["inpainting"]["scores"].items():
             print(name, {column: round(kinds["all"][column], 3) for column in (*COLUMNS, "seconds")}, flush=True)
-        result["sampler"] = by_steps(load_prior(first), cases, given.steps)
+        result["sampler"] = measure_steps(load_prior(first), cases, given.steps)
         for count, row in result["sampler"].items():
             print(f"{count} steps", {column: round(row[column], 3) for column in (*COLUMNS, "seconds")}, flush=True)
     if given.run:
-        params = profile(first, dict(given.set))
-        result["personalization"] = personalization(
+        params = profile_params(first, dict(given.set))
+        result["personalization"] = measure_personalization(
             params, given.run, given.seeds, given.wrong_reference, given.steps, given.sampler, given.out
         )
     save_json(given.out / "prior.json", result)

@@ -120,7 +120,7 @@ class Photographs:
         return sorted(others, key=lambda name: away[name] / usual + 2 * np.arccos(cosine[name]))
 
 
-def load(folder: Path) -> Photographs:
+def load_photographs(folder: Path) -> Photographs:
     """Those of a capture that brings poses."""
     capture = load_capture(folder)
     if capture.poses is None:
@@ -230,7 +230,7 @@ def main() -> int:
     if len(folders) < 2:
         print(f"skipped: fewer than two captures in {given.captures}")
         return 0
-    captures = {folder.name: load(folder) for folder in folders}
+    captures = {folder.name: load_photographs(folder) for folder in folders}
     first = {name: capture.picture(next(iter(capture.files))) for name, capture in captures.items()}
     if given.seconds:
         print(measure_seconds(next(iter(first.values()))))

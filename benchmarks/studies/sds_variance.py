@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.studies import device
+from benchmarks.studies import scene_priors
 from reffusion import seeding
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets, load_scene
@@ -42,7 +42,7 @@ SEED = 0
 
 
 @torch.no_grad()
-def inputs(run: Path, prior: Prior) -> dict[str, tuple[Tensor, Tensor]]:
+def load_inputs(run: Path, prior: Prior) -> dict[str, tuple[Tensor, Tensor]]:
     """Scale -> (pictures [B, 3, S, S] in [-1, 1], holes [B, 1, S, S], 1 = repaint) of up to `VIEWS` training views.
 
     Raises:
@@ -70,7 +70,7 @@ def inputs(run: Path, prior: Prior) -> dict[str, tuple[Tensor, Tensor]]:
 
 
 @torch.no_grad()
-def gradients(prior: Prior, pictures: Tensor, holes: Tensor, prompt: str) -> Tensor:
+def sds_gradients(prior: Prior, pictures: Tensor, holes: Tensor, prompt: str) -> Tensor:
     """[T, K, M]: z - x0(z_t) at `TIMESTEPS`, for each of `NOISES` draws, in the M latent values of the holes."""
     latents, condition = diffusion.encode(prior, pictures), diffusion.conditioning(prior, pictures, holes)
     text = diffusion.embed_text(prior, [prompt]).expand(len(latents), -1, -1)
@@ -101,11 +101,11 @@ def variances(drawn: Tensor) -> dict:
     }
 
 
-def measured(models: dict[str, Prior], run: Path) -> dict[str, dict[str, dict]]:
+def measure(models: dict[str, Prior], run: Path) -> dict[str, dict[str, dict]]:
     """Scale -> "before" or "after" -> `variances`."""
-    given = inputs(run, next(iter(models.values())))
+    given = load_inputs(run, next(iter(models.values())))
     return {
-        scale: {when: variances(gradients(model, *given[scale], prompt)) for when, model in models.items()}
+        scale: {when: variances(sds_gradients(model, *given[scale], prompt)) for when, model in models.items()}
         for scale, prompt in zip(SCALES, PROMPTS, strict=False)
     }
 
@@ -131,14 +131,14 @@ def _pair(before: float, after: float) -> str:
 
 
 def main() -> None:
-    given = device.arguments(__doc__, "initialize and personalize", "sds-variance").parse_args()
-    models, base = device.before_and_after(given)
-    found, out = measured(models, given.run), given.out or given.run / "sds-variance"
+    given = scene_priors.study_parser(__doc__, "initialize and personalize", "sds-variance").parse_args()
+    models, base = scene_priors.load_priors(given)
+    found, out = measure(models, given.run), given.out or given.run / "sds-variance"
     out.mkdir(parents=True, exist_ok=True)
     print(table(found))
-    device.save(given, out, "sds_variance.json", {"prior": base, "timesteps": TIMESTEPS} | found)
+    scene_priors.save_results(given, out, "sds_variance.json", {"prior": base, "timesteps": TIMESTEPS} | found)
     print(out / "sds_variance.json")
 
 
 if __name__ == "__main__":
-    device.run(main)
+    scene_priors.run_study(main)

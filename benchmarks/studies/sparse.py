@@ -31,7 +31,7 @@ COUNTS = (1, 2, 4, 8)
 SCORES = {"psnr_full": "PSNR (dB)", "flip_full": "FLIP"}
 BOTH, PLAIN, TAUGHT = "both", "plain 3DGS", "personalization"
 POINTS = "fit.few_views=fewer_harmonics"  # a fit starts from points
-WAYS = {
+METHODS = {
     TAUGHT: (
         f"--set={POINTS} fit.iterations=1 initialize.settle=0 distill.reconstruction.every=0 "
         "distill.reference.weight=0",
@@ -42,7 +42,7 @@ WAYS = {
 COLOURS = {TAUGHT: charts.GREEN, BOTH: charts.BLUE, PLAIN: charts.ORANGE}
 
 
-def with_views(scene: Path, count: int, folder: Path) -> Path:
+def make_scene(scene: Path, count: int, folder: Path) -> Path:
     """The scene with pixels in so many views; its files are linked, not copied.
 
     Raises:
@@ -60,10 +60,10 @@ def with_views(scene: Path, count: int, folder: Path) -> Path:
     return made
 
 
-def scored(scene: Path, way: str, runs: Path) -> dict[str, float]:
+def run_method(scene: Path, way: str, runs: Path) -> dict[str, float]:
     """The scores of one way on a scene, by the runner. ValueError where it fails."""
     home = runs / way.replace(" ", "-")
-    command = [sys.executable, "-m", "runner", "run", "all", f"--scene={scene}", f"--runs={home}", *WAYS[way]]
+    command = [sys.executable, "-m", "runner", "run", "all", f"--scene={scene}", f"--runs={home}", *METHODS[way]]
     if subprocess.run(command, cwd=ROOT).returncode:
         raise ValueError(f"{scene.name}, {way}: failed; see above")
     (found,) = home.glob(f"{scene.name}*/evaluate/metrics.json")
@@ -90,14 +90,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=Path, nargs="+", required=True)
     parser.add_argument("--counts", type=int, nargs="+", default=COUNTS)
-    parser.add_argument("--ways", choices=WAYS, nargs="+", default=list(WAYS))
+    parser.add_argument("--ways", choices=METHODS, nargs="+", default=list(METHODS))
     parser.add_argument("--out", type=Path, default=ROOT / "runs/sparse")
     given = parser.parse_args()
     found: dict[str, dict[str, list[dict[str, float]]]] = {way: {} for way in given.ways}
     for count in given.counts:
         for way in given.ways:
-            scenes = [with_views(scene, count, given.out / "scenes") for scene in given.scenes]
-            found[way][str(count)] = [scored(scene, way, given.out) for scene in scenes]
+            scenes = [make_scene(scene, count, given.out / "scenes") for scene in given.scenes]
+            found[way][str(count)] = [run_method(scene, way, given.out) for scene in scenes]
             save_json(given.out / "sparse.json", found)
     draw(found, given.out / "sparse.png")
     for way, counts in found.items():

@@ -39,7 +39,7 @@ def cpu_seconds(stage: ModuleType, params: object, needs: dict[str, Path | None]
         return time.process_time() - began, len(trace.read_trace(Path(folder) / "trace.jsonl"))
 
 
-def pairs(name: str, run: Path, steps: int, repeats: int) -> tuple[float, float, int, float]:
+def measure_pairs(name: str, run: Path, steps: int, repeats: int) -> tuple[float, float, int, float]:
     """Of the medians: seconds without and with a trace, and the moments it has more; seconds of a step without one."""
     stage, count, needs, _ = STAGES[name]
     given = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"][name]
@@ -73,7 +73,7 @@ def main() -> int:
     print(f"{'stage':<12} {'without':>9} {'with':>9} {'moments':>8} {'a moment':>9} {'a step':>8} {'full length':>12}")
     for name in given.only or STAGES:
         steps = 8 * given.steps if name == "fit" else given.steps
-        plain, traced, moments, step = pairs(name, given.run, steps, given.repeats)
+        plain, traced, moments, step = measure_pairs(name, given.run, steps, given.repeats)
         profile = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"][name]
         full = profile[STAGES[name][1]]
         moment = (traced - plain) / moments

@@ -17,10 +17,10 @@ from reffusion.io.arrays import load_json
 from reffusion.io.ply import load_points
 
 MARGIN = 20  # px from the picture's border within which the object's axis must not come
-SLACK = 1.06  # depth over the nearest points' up to which a point is of the surface in front
-FEWEST = 8  # points that make a surface
-TURN = 25.0  # degrees that the object is turned away from the view in which it is placed
-HALF = (0.55, 0.4, 0.5)  # extents of the object, of its height
+FRONT_TOLERANCE = 1.06  # depth over the nearest points' up to which a point is of the surface in front
+MIN_POINTS = 8  # points that make a surface
+YAW = 25.0  # degrees that the object is turned away from the view in which it is placed
+HALF_EXTENTS = (0.55, 0.4, 0.5)  # extents of the object, of its height
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -84,7 +84,7 @@ class Photographs:
 
 
 @dataclass(frozen=True)
-class Thing:
+class PlacedObject:
     """The object in the capture's frame.
 
     Attributes:
@@ -119,7 +119,7 @@ class Views(NamedTuple):
         return [name for name in self.all if name not in self.test]
 
 
-def load(folder: Path) -> Photographs:
+def load_photographs(folder: Path) -> Photographs:
     """ValueError where transforms.json or the points are missing."""
     if not (folder / "transforms.json").exists():
         raise ValueError(f"{folder} holds no transforms.json: it is no nerfstudio capture")
@@ -136,13 +136,13 @@ def load(folder: Path) -> Photographs:
     return Photographs(folder, meta, intrinsics, distortion, *size, frames, cameras, load_points(cloud)[0])
 
 
-def save_meta(capture: Photographs, names: list[str], path: Path) -> None:
+def save_transforms(capture: Photographs, names: list[str], path: Path) -> None:
     """transforms.json of some views, whose pictures lie in images/<view>.png."""
     frames = [capture.frames[name] | {"file_path": f"images/{name}.png"} for name in names]
     path.write_text(json.dumps(capture.meta | {"frames": frames}, indent=1))
 
 
-def stand(capture: Photographs, place: Place) -> Thing:
+def place_object(capture: Photographs, place: Place) -> PlacedObject:
     """The object on the plane through the points around the place's pixel.
 
     Raises:
@@ -161,19 +161,19 @@ def stand(capture: Photographs, place: Place) -> Thing:
     across = np.cross(normal, ray)
     across /= np.linalg.norm(across)
     ahead = np.cross(across, normal)
-    c, s = np.cos(np.radians(TURN)), np.sin(np.radians(TURN))
+    c, s = np.cos(np.radians(YAW)), np.sin(np.radians(YAW))
     axes = np.stack([c * across + s * ahead, c * ahead - s * across, normal])
-    return Thing(foot, height, axes, np.array(HALF) * height, place.shape)
+    return PlacedObject(foot, height, axes, np.array(HALF_EXTENTS) * height, place.shape)
 
 
 def _surface(capture: Photographs, place: Place) -> np.ndarray:
     """The points [P, 3] of the surface in front around the place's pixel."""
     image, depth = capture.project(capture.cameras[place.view], capture.points)
     close = (depth > 0) & (np.linalg.norm(image - place.pixel, axis=1) < place.near)
-    if close.sum() < FEWEST:
+    if close.sum() < MIN_POINTS:
         found = f"{close.sum()} points within {place.near:g} px of its pixel"
-        raise ValueError(f"{place.name}: {found}, {FEWEST} are needed")
-    return capture.points[close & (depth < SLACK * np.percentile(depth[close], 20))]
+        raise ValueError(f"{place.name}: {found}, {MIN_POINTS} are needed")
+    return capture.points[close & (depth < FRONT_TOLERANCE * np.percentile(depth[close], 20))]
 
 
 def _plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -185,17 +185,17 @@ def _plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.median(points, 0), normal
 
 
-def azimuth(thing: Thing, base: np.ndarray, camera: np.ndarray) -> float:
+def azimuth(thing: PlacedObject, base: np.ndarray, camera: np.ndarray) -> float:
     """Degrees from camera `base` to another about the surface's normal."""
     one, other = (_along(thing, at[:3, 3] - thing.foot) for at in (base, camera))
     return float(np.degrees(np.arctan2(np.cross(one, other) @ thing.normal, one @ other)))
 
 
-def _along(thing: Thing, vector: np.ndarray) -> np.ndarray:
+def _along(thing: PlacedObject, vector: np.ndarray) -> np.ndarray:
     return vector - thing.normal * (vector @ thing.normal)
 
 
-def views_around(capture: Photographs, place: Place, thing: Thing) -> Views:
+def select_views(capture: Photographs, place: Place, thing: PlacedObject) -> Views:
     """Photographs that show the object, evenly taken, test views evenly among them.
 
     Raises:

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 
-from benchmarks.studies import placing
+from benchmarks.studies import placement
 from reffusion.io.images import load_image, save_image
 
 SAMPLES = 3  # rays a side of a pixel
@@ -49,10 +49,10 @@ class Options:
 
 
 @dataclass(frozen=True)
-class Pictured:
+class PixelRays:
     """A capture with the rays of its pixels, the lens undone: the same in every view."""
 
-    capture: placing.Photographs
+    capture: placement.Photographs
 
     def rays(self, samples: int) -> np.ndarray:
         """[H samples W samples, 3], z 1, row by row, in the camera's axes."""
@@ -76,7 +76,9 @@ class Pictured:
         return values.reshape(k.height, SAMPLES, k.width, SAMPLES, *values.shape[1:]).mean((1, 3))
 
 
-def draw(view: Pictured, camera: np.ndarray, thing: placing.Thing, tints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def render_object(
+    view: PixelRays, camera: np.ndarray, thing: placement.PlacedObject, tints: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """(RGB [H, W, 3] times coverage, coverage [H, W]) of the object, each in [0, 1]; tints: [3, 3], of its faces."""
     # In the object's own axes, divided by its half extents: a cube, or a ball of radius 1.
     ways = view.fine @ camera[:3, :3].T @ thing.axes.T / thing.half
@@ -91,24 +93,24 @@ def draw(view: Pictured, camera: np.ndarray, thing: placing.Thing, tints: np.nda
     return view.mean(color), view.mean(hit.astype(float))
 
 
-def drawn_into(
-    photo: np.ndarray, view: Pictured, camera: np.ndarray, thing: placing.Thing, tints: np.ndarray
+def composite_object(
+    photo: np.ndarray, view: PixelRays, camera: np.ndarray, thing: placement.PlacedObject, tints: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """(a photograph, [H, W, 3] in [0, 1], with the object in it, its mask [H, W] in {0, 255}), uint8 both."""
-    color, cover = draw(view, camera, thing, tints)
+    color, cover = render_object(view, camera, thing, tints)
     both = photo * (1 - cover[..., None]) + color
     return (both * 255 + 0.5).clip(0, 255).astype(np.uint8), (cover > 0).astype(np.uint8) * 255
 
 
-def depth(view: Pictured, camera: np.ndarray, thing: placing.Thing) -> np.ndarray:
+def composite_depth(view: PixelRays, camera: np.ndarray, thing: placement.PlacedObject) -> np.ndarray:
     """[H, W] camera z of the object, and elsewhere between the sparse points that the view shows; NaN beyond them."""
     ways, shape = view.coarse @ camera[:3, :3].T, (view.capture.height, view.capture.width)
     start = (camera[:3, 3] - thing.middle) @ thing.axes.T / thing.half
     far, hit, _, _ = (_cube if thing.shape == "box" else _ball)(ways @ thing.axes.T / thing.half, start, thing.half)
-    return np.where(hit, far, between_points(view, camera).ravel()).reshape(shape)
+    return np.where(hit, far, interpolate_points(view, camera).ravel()).reshape(shape)
 
 
-def between_points(view: Pictured, camera: np.ndarray) -> np.ndarray:
+def interpolate_points(view: PixelRays, camera: np.ndarray) -> np.ndarray:
     """[H, W] camera z, linear between the capture's sparse points, in CELL pixels those of the surface in front; NaN
     beyond them."""
     image, z = view.capture.project(camera, view.capture.points)
@@ -117,7 +119,7 @@ def between_points(view: Pictured, camera: np.ndarray) -> np.ndarray:
     _, cell = np.unique(image // CELL, axis=0, return_inverse=True)
     nearest = np.full(cell.max() + 1, np.inf)
     np.minimum.at(nearest, cell, z)
-    front = z < placing.SLACK * nearest[cell]
+    front = z < placement.FRONT_TOLERANCE * nearest[cell]
     columns, rows = np.meshgrid(*(np.arange(side) + 0.5 for side in size))
     return LinearNDInterpolator(image[front], z[front])(columns, rows)
 
@@ -143,7 +145,7 @@ def _ball(ways: np.ndarray, start: np.ndarray, half: np.ndarray):
     return far, (root > 0) & (far > 0), normal, np.zeros(len(ways), int)
 
 
-def light_left(view: Pictured, camera: np.ndarray, thing: placing.Thing, strength: float) -> np.ndarray:
+def shadow_factor(view: PixelRays, camera: np.ndarray, thing: placement.PlacedObject, strength: float) -> np.ndarray:
     """[H, W]: what the object's soft shadow leaves of the light on the surface; 1 without a shadow."""
     ways = view.coarse @ camera[:3, :3].T
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -155,7 +157,7 @@ def light_left(view: Pictured, camera: np.ndarray, thing: placing.Thing, strengt
     return left.reshape(view.capture.height, view.capture.width)
 
 
-def roughened(mask: np.ndarray, most: int, random: np.random.Generator) -> np.ndarray:
+def perturb_mask(mask: np.ndarray, most: int, random: np.random.Generator) -> np.ndarray:
     """A uint8 mask [H, W] grown or shrunk by up to `most` px, then shifted by up to `most` px along each axis."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * random.integers(1, most + 1) + 1,) * 2)
     mask = cv2.dilate(mask, disc) if random.random() < 0.5 else cv2.erode(mask, disc)
@@ -163,57 +165,57 @@ def roughened(mask: np.ndarray, most: int, random: np.random.Generator) -> np.nd
     return cv2.warpAffine(mask, np.float32([[1, 0, right], [0, 1, down]]), mask.shape[::-1], flags=cv2.INTER_NEAREST)
 
 
-def write(place: placing.Place, capture: placing.Photographs, options: Options, out: Path) -> None:
+def write_scene(place: placement.Place, capture: placement.Photographs, options: Options, out: Path) -> None:
     """The scene of a place in a new folder `out`: images, masks, test_masks, truth, transforms.json, scene.yaml.
 
     Raises:
         ValueError: the object cannot be placed, too few photographs show it, or one is of another size.
     """
-    thing = placing.stand(capture, place)
-    views = placing.views_around(capture, place, thing)
+    thing = placement.place_object(capture, place)
+    views = placement.select_views(capture, place, thing)
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
-    random, view = np.random.default_rng(options.seed), Pictured(capture)
+    random, view = np.random.default_rng(options.seed), PixelRays(capture)
     tints = random.uniform(0.35, 0.9, (3, 3))
     for name in views.all:
-        camera, photo = capture.cameras[name], photograph(capture, name)
-        light = light_left(view, camera, thing, options.shadow)[..., None] if options.shadow else 1.0
-        both, mask = drawn_into(photo / 255.0 * light, view, camera, thing, tints)
+        camera, photo = capture.cameras[name], load_photograph(capture, name)
+        light = shadow_factor(view, camera, thing, options.shadow)[..., None] if options.shadow else 1.0
+        both, mask = composite_object(photo / 255.0 * light, view, camera, thing, tints)
         save_image(out / f"truth/{name}.png", photo)
         if name in views.test:
             save_image(out / f"images/{name}.png", photo)
             save_image(out / f"test_masks/{name}.png", mask)
             continue
         save_image(out / f"images/{name}.png", both)
-        given = roughened(mask, options.rough, random) if options.rough else mask
+        given = perturb_mask(mask, options.rough, random) if options.rough else mask
         save_image(out / f"masks/{name}.png", given)
-    write_meta(capture, views, out)
-    lines = ["masks: masks", "test_masks: test_masks", f"test: {listed(views.test)}"]
+    write_cameras(capture, views, out)
+    lines = ["masks: masks", "test_masks: test_masks", f"test: {yaml_list(views.test)}"]
     if options.reference:
         middle = views.train[len(views.train) // 2]
         lines += ["reference:", f'  view: "{middle}"', f"  image: truth/{middle}.png"]
     (out / "scene.yaml").write_text("\n".join(lines) + "\n")
 
 
-def write_untouched(place: placing.Place, capture: placing.Photographs, scene: Path, out: Path) -> None:
+def write_untouched(place: placement.Place, capture: placement.Photographs, scene: Path, out: Path) -> None:
     """The same views without the object, nothing to remove: what a fit to them reaches is the ceiling. `scene`: the
-    place's folder as `write` made it."""
-    views = placing.views_around(capture, place, placing.stand(capture, place))
+    place's folder as `write_scene` made it."""
+    views = placement.select_views(capture, place, placement.place_object(capture, place))
     shutil.rmtree(out, ignore_errors=True)
     shutil.copytree(scene / "truth", out / "images")
     shutil.copytree(scene / "test_masks", out / "test_masks")
-    write_meta(capture, views, out)
-    (out / "scene.yaml").write_text(f"masks: none\ntest_masks: test_masks\ntest: {listed(views.test)}\n")
+    write_cameras(capture, views, out)
+    (out / "scene.yaml").write_text(f"masks: none\ntest_masks: test_masks\ntest: {yaml_list(views.test)}\n")
 
 
-def write_meta(capture: placing.Photographs, views: placing.Views, out: Path) -> None:
+def write_cameras(capture: placement.Photographs, views: placement.Views, out: Path) -> None:
     """transforms.json and the points of the capture."""
-    placing.save_meta(capture, views.all, out / "transforms.json")
+    placement.save_transforms(capture, views.all, out / "transforms.json")
     (out / capture.cloud).parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(capture.folder / capture.cloud, out / capture.cloud)
 
 
-def photograph(capture: placing.Photographs, name: str) -> np.ndarray:
+def load_photograph(capture: placement.Photographs, name: str) -> np.ndarray:
     """uint8 [H, W, 3]; ValueError where it is of another size than transforms.json says."""
     path = capture.folder / capture.frames[name]["file_path"]
     photo = load_image(path)
@@ -223,6 +225,6 @@ def photograph(capture: placing.Photographs, name: str) -> np.ndarray:
     return photo
 
 
-def listed(names: list[str]) -> str:
+def yaml_list(names: list[str]) -> str:
     """Of YAML."""
     return "[" + ", ".join(f'"{name}"' for name in names) + "]"

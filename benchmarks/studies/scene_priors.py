@@ -18,7 +18,7 @@ from reffusion.prior.model import Prior, load_prior
 DTYPES = ("float32", "float16", "bfloat16")
 
 
-def arguments(about: str, needs: str, folder: str) -> argparse.ArgumentParser:
+def study_parser(about: str, needs: str, folder: str) -> argparse.ArgumentParser:
     """What such studies are told. `about`: the help; `needs`: of the run; `folder`: where the results go in it."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--run", type=Path, required=True, help=f"runs/<scene>, with {needs}")
@@ -29,7 +29,7 @@ def arguments(about: str, needs: str, folder: str) -> argparse.ArgumentParser:
     return parser
 
 
-def run(study: Callable[[], None]) -> None:
+def run_study(study: Callable[[], None]) -> None:
     """A study as a command: what is wrong is one line."""
     try:
         study()
@@ -37,7 +37,7 @@ def run(study: Callable[[], None]) -> None:
         sys.exit(f"error: {error}")
 
 
-def before_and_after(given: argparse.Namespace) -> tuple[dict[str, Prior], str]:
+def load_priors(given: argparse.Namespace) -> tuple[dict[str, Prior], str]:
     """{"before", "after"} personalization, and the prior's name. ValueError where the run has none, or this machine no
     such device."""
     adapted: Path = given.run / "personalize"
@@ -61,7 +61,7 @@ def peak_mb(device: str) -> int:
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6)
 
 
-def save(given: argparse.Namespace, folder: Path, name: str, found: dict[str, Any]) -> None:
+def save_results(given: argparse.Namespace, folder: Path, name: str, found: dict[str, Any]) -> None:
     """The study's file, with what it ran on, which is printed too."""
     peak = peak_mb(given.device)
     save_json(folder / name, found | {"device": given.device, "dtype": given.dtype, "peak_mb": peak})

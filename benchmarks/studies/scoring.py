@@ -21,12 +21,12 @@ from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Scene
 from stages import evaluate
 
-THIN = 0.9  # alpha under which a pixel is uncovered
+MIN_ALPHA = 0.9  # alpha under which a pixel is uncovered
 BLACK, LIT = 0.06, 0.15  # brightest channel: of what looks uncovered, where the truth has more than that
-AROUND = 0.6  # of the box's extent that a sheet shows to each side
+SHEET_MARGIN = 0.6  # of the box's extent that a sheet shows to each side
 ROW = 200  # px, height of a sheet's rows
 COLUMNS = {"lpips_vgg": 3, "psnr": 2, "ssim": 3, "flip": 3}  # and their digits
-WAYS = ("result", "initialize", "ceiling", "telea")
+PICTURES = ("result", "initialize", "ceiling", "telea")
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Run:
         return load_ply(self.stage(self.metrics["result"]) / "gaussians.ply")
 
 
-def scores(run: Run, ceiling: Run, variants: Mapping[str, Run]) -> dict[str, Any]:
+def score_place(run: Run, ceiling: Run, variants: Mapping[str, Run]) -> dict[str, Any]:
     """A place's row: for each of WAYS its means of COLUMNS over the test views' boxes (+ 10 %); "sharpness" of result
     and ceiling; "uncovered", worst view, of "train" and "test"; "seconds" of the job; "variants", COLUMNS of each."""
     row: dict[str, Any] = {
@@ -126,13 +126,15 @@ def _untouched(run: Run, ceiling: Run, name: str) -> np.ndarray | None:
 
 
 def _worst(run: Run, truths: dict[str, np.ndarray | None]) -> float | None:
-    """The largest `uncovered` share of the named views."""
+    """The largest `uncovered_share` share of the named views."""
     gaussians = run.gaussians()
-    found = [uncovered(gaussians, run.scene.cameras[name], run.mask(name), truth) for name, truth in truths.items()]
+    found = [
+        uncovered_share(gaussians, run.scene.cameras[name], run.mask(name), truth) for name, truth in truths.items()
+    ]
     return max((share for share in found if share is not None), default=None)
 
 
-def uncovered(gaussians: Gaussians, camera: Camera, mask: np.ndarray, truth: np.ndarray | None) -> float | None:
+def uncovered_share(gaussians: Gaussians, camera: Camera, mask: np.ndarray, truth: np.ndarray | None) -> float | None:
     """Share of the mask's pixels, bool [H, W], that nothing covers: alpha under THIN, or near black where the truth
     (uint8 [H, W, 3]) is not. None for an empty mask."""
     import torch
@@ -141,18 +143,18 @@ def uncovered(gaussians: Gaussians, camera: Camera, mask: np.ndarray, truth: np.
         return None
     with torch.no_grad():
         drawing = rasterizer.render(gaussians, camera)
-    bare = drawing.alpha.cpu().numpy() < THIN
+    bare = drawing.alpha.cpu().numpy() < MIN_ALPHA
     if truth is not None:
         bare |= (drawing.color.cpu().numpy().max(2) < BLACK) & (truth.max(2) / 255.0 > LIT)
     return float(bare[mask].mean())
 
 
-def sheet(run: Run, ceiling: Run) -> np.ndarray:
+def comparison_sheet(run: Run, ceiling: Run) -> np.ndarray:
     """uint8 [H, W, 3], a row a test view around its box: truth, with the object (the fit's render), ours, the
     ceiling, and the absolute difference between ours and the truth."""
     rows = []
     for name in run.scene.test:
-        box, same = (image_metrics.mask_box(of.mask(name), AROUND) for of in (run, ceiling))
+        box, same = (image_metrics.mask_box(of.mask(name), SHEET_MARGIN) for of in (run, ceiling))
         if box is None or same is None:
             continue
         truth, ours = box.crop(run.truth(name)), box.crop(run.picture(name))
@@ -173,11 +175,11 @@ def table(rows: list[dict]) -> str:
     """Markdown: a row a place; scores are LPIPS (vgg) / PSNR / SSIM / FLIP, shares in percent; of each variant its
     scores, and the ratio of our LPIPS to its."""
     variants = list(rows[0]["variants"]) if rows else []
-    heads = [*WAYS, "sharpness", "its ceiling", "uncovered, train %", "test %", "seconds"]
+    heads = [*PICTURES, "sharpness", "its ceiling", "uncovered, train %", "test %", "seconds"]
     heads += [head for name in variants for head in (name, f"LPIPS, ours / {name}")]
     lines = ["| place | " + " | ".join(heads) + " |", "|---" * (len(heads) + 1) + "|"]
     for row in rows:
-        cells = [_scores(row[way]) for way in WAYS]
+        cells = [_scores(row[way]) for way in PICTURES]
         cells += [_number(row["sharpness"][way], 2) for way in ("result", "ceiling")]
         cells += [_number(row["uncovered"][split], 2, 100) for split in ("train", "test")]
         cells.append(_number(row["seconds"], 0))
