@@ -1,4 +1,4 @@
-"""What is typed at the makers of one scene's pages."""
+"""Command-line arguments shared by the commands that make a page of one scene."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from pathlib import Path
 
 
 def scene_parser(name: str, description: str, needs_scene: bool = True) -> argparse.ArgumentParser:
-    found = argparse.ArgumentParser(prog=f"reffusion {name}", description=description.split("\n")[0])
-    found.add_argument("--scene", type=Path, required=needs_scene, help="its name, or the path of its folder")
-    found.add_argument("--variant", default="", help="of the scene")
-    found.add_argument("--runs", type=Path, default=Path("runs"))
-    return found
+    """Parser with --scene, --variant and --runs; the help shows the first line of `description`."""
+    parser = argparse.ArgumentParser(prog=f"reffusion {name}", description=description.split("\n")[0])
+    parser.add_argument("--scene", type=Path, required=needs_scene, help="name of the scene, or path of its folder")
+    parser.add_argument("--variant", default="", help="variant of the scene")
+    parser.add_argument("--runs", type=Path, default=Path("runs"))
+    return parser
 
 
 def run_folder(arguments: argparse.Namespace) -> Path:

@@ -13,14 +13,16 @@ from reffusion.io.scene import shows_object
 from report.results import FULL, Comparison, Run
 from report.sheet import GAP, enlarge, pick_evenly
 
-WIDTH = 1920  # px of a sheet of crops, about
-CONTEXT = 0.15  # the crop is wider than the box by this share of it on each side
+WIDTH = 1920  # approximate width of a sheet, px
+CONTEXT = 0.15  # margin of the crop on each side, as a share of the box
 BOX = ("left", "top", "right", "bottom")
 
 
 def save_sheets(comparison: Comparison, out: Path, count: int = 3) -> dict[str, Path]:
-    """View -> a PNG with what every method made of it, and the truth; views of the only scene, spread evenly, or one
-    of each of so many scenes."""
+    """View -> PNG with the result of every method and the truth.
+
+    With one scene, `count` evenly spread views; with several, one view each of `count` scenes.
+    """
     if len(comparison.scenes) == 1:
         return _sheets_of(comparison, comparison.scenes[0], out, "", count)
     made: dict[str, Path] = {}
@@ -69,7 +71,7 @@ def _title(run: Run, view: str) -> str:
 
 
 def crop_to_box(picture: np.ndarray, row: dict[str, float]) -> np.ndarray:
-    """[H, W, 3] -> the box of a row of per_view.csv with `CONTEXT` around; the whole picture where it has no box."""
+    """[H, W, 3]: the box of a row of per_view.csv with `CONTEXT` around it; the whole picture if the row has no box."""
     if not all(side in row for side in BOX):
         return picture
     left, top, right, bottom = (int(row[side]) for side in BOX)
@@ -78,7 +80,7 @@ def crop_to_box(picture: np.ndarray, row: dict[str, float]) -> np.ndarray:
 
 
 def arrange_crops(cells: list[np.ndarray], titles: list[str]) -> np.ndarray:
-    """uint8 [H, W, 3]: pictures of one size in rows, each enlarged by a whole factor, its title (two lines) above."""
+    """uint8 [H, W, 3]: pictures of one size in rows, enlarged by a whole factor, with titles of one or two lines."""
     height, width = (max(cell.shape[axis] for cell in cells) for axis in (0, 1))
     columns = min(len(cells), 4)
     scale = max(1, round(WIDTH / columns / width))

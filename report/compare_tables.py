@@ -1,4 +1,4 @@
-"""Many scenes in one table: each method in each scene; beside them rows that others published."""
+"""Tables over several scenes: each method in each scene, and published figures beside ours."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from report import page
 from report.results import BOX_SCORES, Comparison, Run, finite_mean
 
-PUBLISHED = "published.csv"  # in the folder of the scenes
+PUBLISHED = "published.csv"  # file in the folder of the scenes
 COLUMNS = ("method", "metric", "value", "protocol")
 Table = tuple[list[str], list[list[str]]]
 
@@ -25,21 +25,21 @@ def scene_table(comparison: Comparison, metric: str, digits: int) -> Table | Non
 
 
 def describe_protocol(done: list[Run]) -> list[str]:
-    """What was rendered in which scenes, and at what size; one phrase, none where that is not known."""
-    said: dict[str, dict[str, None]] = {}
+    """Which views of what size were rendered in which scenes, as one phrase; empty if unknown."""
+    scenes_by_size: dict[str, dict[str, None]] = {}
     for run in done:
         sizes = ", ".join(run.metrics.get("protocol", {}).get("resolution", ()))
         if sizes:
-            said.setdefault(f"{run.metrics['rendered']} of {sizes} px", {})[run.scene] = None
-    groups = [f"{what} ({', '.join(scenes)})" for what, scenes in said.items()]
+            scenes_by_size.setdefault(f"{run.metrics['rendered']} of {sizes} px", {})[run.scene] = None
+    groups = [f"{what} ({', '.join(scenes)})" for what, scenes in scenes_by_size.items()]
     return ["; ".join(groups)] if groups else []
 
 
 def load_published(data: Path | None) -> list[dict[str, str]]:
-    """The rows of FOLDER/published.csv, none where there is none.
+    """The rows of FOLDER/published.csv; empty if there is no such file.
 
     Raises:
-        ValueError: it has other columns, a metric that is not compared, or a value that is no number.
+        ValueError: it has other columns, a metric that is not compared, or a value that is not a number.
     """
     path = data / PUBLISHED if data else None
     if path is None or not path.is_file():
@@ -61,7 +61,10 @@ def load_published(data: Path | None) -> list[dict[str, str]]:
 def published_table(
     rows: list[dict[str, str]], table: list[dict], short: dict[str, str], digits: dict[str, int], here: str
 ) -> Table:
-    """The published rows, each metric followed by our own in it, with intervals over scenes; `here`: our protocol."""
+    """Header and rows: per metric the published values, then ours with intervals over scenes.
+
+    `short` and `digits` give the name and the decimals of a metric; `here` is our protocol.
+    """
     lines = []
     for metric in dict.fromkeys(row["metric"] for row in rows):
         lines += [
@@ -77,6 +80,6 @@ def published_table(
 
 
 def format_spread(row: dict, metric: str, digits: int) -> str:
-    """The mean, and half its interval over scenes where there are several."""
+    """The mean and, if there are several scenes, half its interval over them."""
     half = row[f"{metric}_interval"]
     return page.format_number(row[metric], digits) + ("" if half is None else f" ± {half:.{digits}f}")

@@ -1,4 +1,4 @@
-"""What of a finished scene was kept, added and removed, from the initialization to the result."""
+"""Gaussians of a finished scene that were kept, added and removed, from the initialization to the result."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from reffusion.io.ply import load_ply
 from reffusion.types import Gaussians, Similarity
 from report.sheet import stage_folder
 
-SAME_DISTANCE = 1e-5  # of the scene's extent 1: Gaussians so near to one another are one, read from two files
+SAME_DISTANCE = 1e-5  # in units of the extent (1): nearer Gaussians of two files are the same one
 
 
 @dataclass(frozen=True)
@@ -23,22 +23,22 @@ class GaussianLayers:
     """Gaussians of a finished scene.
 
     Attributes:
-        states: title -> what was kept and what was added by then, in the order in which they came to be.
-        removed: what was there and went; empty where nothing did.
+        states: title -> (kept, added) Gaussians, from the initialization to the result.
+        removed: Gaussians that were removed; may be empty.
     """
 
     states: dict[str, tuple[Gaussians, Gaussians]]
     removed: Gaussians
 
-    def shown(self, state: str, kept: bool, added: bool, removed: bool) -> Gaussians:
-        """The asked parts of a state."""
+    def select(self, state: str, kept: bool, added: bool, removed: bool) -> Gaussians:
+        """The chosen parts of a state, as one scene."""
         parts = zip((*self.states[state], self.removed), (kept, added, removed), strict=True)
-        chosen = [part if asked else part.map(lambda p: p[:0]) for part, asked in parts]
+        chosen = [part if wanted else part.map(lambda p: p[:0]) for part, wanted in parts]
         return reduce(lambda one, other: one.zipped(other, lambda a, b: torch.cat([a, b])), chosen)
 
 
 def load_layers(home: Path, similarity: Similarity) -> GaussianLayers:
-    """Of runs/<scene> or runs/<scene>@<variant>, with the scene's similarity.
+    """Load the layers of runs/<scene> or runs/<scene>@<variant>; `similarity` is the scene's.
 
     Raises:
         ValueError: the stage `evaluate` has not run.
@@ -60,19 +60,22 @@ def load_layers(home: Path, similarity: Similarity) -> GaussianLayers:
 
 
 def list_snapshots(distill: Path) -> list[Path]:
-    """The Gaussians that were added, as they were after so many steps."""
+    """Snapshots of the added Gaussians that `distill` saved, in the order of their steps."""
     return sorted((distill / "snapshots").glob("*.ply"), key=lambda path: int(path.stem))
 
 
 def split_new(folder: Path) -> tuple[Gaussians, Gaussians]:
-    """A stage's Gaussians: those that were kept, and those that are new."""
+    """A stage's Gaussians, as (kept, new)."""
     gaussians, new = load_ply(folder / "gaussians.ply"), load_labels(folder / "labels.npy")
     return gaussians.map(lambda p: p[~new]), gaussians.map(lambda p: p[new])
 
 
 def find_added(result: Gaussians, folder: Path) -> Tensor:
-    """bool [N]: those of the finished scene that a stage labelled as new. `evaluate` leaves out and adds Gaussians, so
-    they are told by where they are; what it adds beyond the capture counts as kept."""
+    """bool [N]: Gaussians of the finished scene that a stage labelled as new.
+
+    They are matched by position, since `evaluate` removes and adds Gaussians; what it adds around the capture counts as
+    kept.
+    """
     from scipy.spatial import cKDTree
 
     _, new = split_new(folder)
@@ -83,7 +86,7 @@ def find_added(result: Gaussians, folder: Path) -> Tensor:
 
 
 def load_removed(home: Path, used: set[str], none: Gaussians) -> Gaussians:
-    """Of the fit, what the stage masks labelled."""
+    """Gaussians of the fit that the stage `masks` labelled; `none`, an empty scene, if they are unknown."""
     masks, fit = stage_folder(home, "masks") / "labels.npy", stage_folder(home, "fit") / "gaussians.ply"
     if not {"masks", "fit"} <= used or not masks.exists() or not fit.exists():
         return none

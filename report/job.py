@@ -1,4 +1,4 @@
-"""One page on what a scene's job did: errors against time, seconds, pictures, what was left out and why.
+"""Report on a scene's job: errors against time, seconds, pictures, what was left out and why.
 
 python -m report.job --scene X --runs runs          runs/X/report.html, one file
 python -m report.job --data FOLDER --runs runs      runs/report/index.html, of all scenes in the folder
@@ -51,7 +51,7 @@ RESULTS = {
 
 
 def make(home: Path) -> Path:
-    """Write runs/<scene>/report.html, which needs no other file; gives back its path."""
+    """Write runs/<scene>/report.html, which needs no other file, and return its path."""
     job = load_job(home)
     title = f"{home.name}: what was done"
     seconds = sum(receipt["seconds"] for receipt in job.receipts.values())
@@ -84,7 +84,7 @@ def make(home: Path) -> Path:
 
 
 def summarize_result(job: Job) -> str:
-    """The result in a sentence."""
+    """The result in one sentence."""
     mean, counts = job.metrics.get("mean", {}), job.metrics.get("gaussians", {})
     if not job.metrics:
         return "It is not evaluated yet."
@@ -93,35 +93,37 @@ def summarize_result(job: Job) -> str:
     if mean.get("psnr_box") is None:
         return f"{gaussians}; no ground truth, so no scores."
     suspects = ", ".join(job.metrics.get("suspects") or ())
-    but = f"; photographs of these contradict their poses: {suspects}" if suspects else ""
-    return f"{gaussians}; {mean['psnr_box']:.2f} dB and FLIP {mean['flip_box']:.3f} in the box of the test views{but}."
+    warning = f"; photographs that contradict their poses: {suspects}" if suspects else ""
+    return (
+        f"{gaussians}; {mean['psnr_box']:.2f} dB and FLIP {mean['flip_box']:.3f} in the box of the test views{warning}."
+    )
 
 
 # --------------------------------------------------------------------------------------------------------- sections
 
 
 def unfinished_note(job: Job) -> list[str]:
-    """The stages that are still to run."""
-    due = [stage for stage, told in job.plan.items() if told["word"] not in ("cached", "skip", "provided")]
+    """Paragraph with the stages that still have to run."""
+    due = [stage for stage, entry in job.plan.items() if entry["word"] not in ("cached", "skip", "provided")]
     if not job.plan:
         due = [stage for stage in ("poses", "fit", "evaluate") if stage not in job.folders]
     return [page.paragraph(f"Still to run, or to run again: {', '.join(due)}.")] if due else []
 
 
 def capture_notes(job: Job) -> list[str]:
-    """Which frames of a video were taken, how structure from motion went, and what was odd about the photographs."""
+    """Selected video frames, the outcome of structure from motion, and warnings about the photographs."""
     record = job.home.with_name(job.home.name.split("@")[0]) / "frames" / "frames.json"
     lines = [load_json(record)["said"]] if record.is_file() else []
     if "poses" in job.folders:
-        solved = job.folders["poses"] / "sfm.json"
-        lines += [load_json(solved)["summary"]] if solved.is_file() else []
+        sfm = job.folders["poses"] / "sfm.json"
+        lines += [load_json(sfm)["summary"]] if sfm.is_file() else []
     for stage in ("poses", "raw_masks"):
         lines += load_warnings(job.folders[stage]) if stage in job.folders else []
     return [page.bullets(lines)] if lines else []
 
 
 def whole_job_section(job: Job, out: Path) -> list[str]:
-    """The whole job against the clock, and the scores of initialization and result."""
+    """The whole job over time, and the scores of initialization and result."""
     draw_job(job, out / "job.png")
     parts = [
         page.heading("The whole job"),
@@ -129,14 +131,14 @@ def whole_job_section(job: Job, out: Path) -> list[str]:
     ]
     if any(stage in job.traces for stage in ("fit", "distill")):
         words = (
-            "Curves: each stage's own error, on training views or references. Test views are only scored at the end."
+            "Curves: each stage's own error, on training views or references. Test views are scored only at the end."
         )
         parts.append(page.paragraph(words, quiet=True))
     return parts + score_table(job)
 
 
 def draw_job(job: Job, path: Path, ceiling: float | None = None) -> None:
-    """PSNR and stages against seconds; `ceiling`: see `curves.job_chart`."""
+    """Chart PSNR and stages against seconds; for `ceiling` see `trace_charts.draw_job_chart`."""
     seconds = {stage: receipt["seconds"] for stage, receipt in job.receipts.items()}
     lines = {stage: series.get("", []) for stage, series in job.traces.items()}
     result = job.metrics.get("result", "")
@@ -146,7 +148,7 @@ def draw_job(job: Job, path: Path, ceiling: float | None = None) -> None:
 
 
 def score_table(job: Job) -> list[str]:
-    """The mean metrics, those of the initialization beside them."""
+    """Mean metrics of the result, and of the initialization beside them."""
     after, initial = job.metrics.get("mean", {}), job.metrics.get("initialize", {})
     names = [name for name, value in after.items() if value is not None]
     if not names:
@@ -174,7 +176,7 @@ def stage_sections(job: Job, out: Path) -> list[str]:
 
 
 def skipped_section(job: Job) -> list[str]:
-    """The runner's words for stages that are not simply done."""
+    """The runner's reasons for stages that were left out, brought by the scene, or still have to run."""
     if not job.plan:
         return []
     rows = [
@@ -187,7 +189,7 @@ def skipped_section(job: Job) -> list[str]:
 
 
 def receipts_section(job: Job) -> list[str]:
-    """Seconds, memory and where it ran; versions once."""
+    """Seconds, memory and machine of each stage; versions once."""
     total = sum(receipt["seconds"] for receipt in job.receipts.values())
     rows = []
     for stage, r in job.receipts.items():
@@ -207,22 +209,23 @@ def receipts_section(job: Job) -> list[str]:
 
 
 def files_section(job: Job) -> list[str]:
-    there = {"turntable.webm: a way around the capture": "turntable.webm"}
-    there = there if (job.home / "turntable.webm").is_file() else {}
+    """Links to the result files."""
+    targets = {"turntable.webm: video around the capture": "turntable.webm"}
+    targets = targets if (job.home / "turntable.webm").is_file() else {}
     for name, words in RESULTS.items():
         stage, rest = name.split("/")
         path = job.folders.get(stage, Path()) / rest
         if stage in job.folders and path.exists():
-            there[f"{name}: {words}"] = os.path.relpath(path, job.home)
-    return [page.heading("Files"), page.links(there)]
+            targets[f"{name}: {words}"] = os.path.relpath(path, job.home)
+    return [page.heading("Files"), page.links(targets)]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="reffusion report", description=__doc__.split("\n")[0])
     what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("--scene", type=Path, help="its name, or the path of its folder")
+    what.add_argument("--scene", type=Path, help="name of the scene, or path of its folder")
     what.add_argument("--data", type=Path, help="a folder of scenes")
-    parser.add_argument("--variant", default="", help="of the scene")
+    parser.add_argument("--variant", default="", help="variant of the scene")
     parser.add_argument("--runs", type=Path, default=Path("runs"))
     arguments = parser.parse_args()
     suffix = f"@{arguments.variant}" if arguments.variant else ""

@@ -1,4 +1,4 @@
-"""With what a job was done: parameters other than their defaults, and the command that does it again."""
+"""Parameters of a job that differ from their defaults, and the command that repeats the job."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from report.job_data import Job
 
 
 def flatten_parameters(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted names and values of nested groups."""
+    """Yield dotted names and values of nested groups."""
     for name, value in values.items():
         if isinstance(value, dict):
             yield from flatten_parameters(value, f"{prefix}{name}.")
@@ -23,7 +23,7 @@ def flatten_parameters(values: dict[str, Any], prefix: str = "") -> Iterator[tup
 
 
 def default_parameters(stage: str) -> dict[str, Any]:
-    """Dotted name -> value; empty for a stage that this code does not know."""
+    """Dotted name -> default value; empty for a stage that this code does not know."""
     try:
         found = import_module(f"reffusion.params.{stage}").Params()
     except ModuleNotFoundError:
@@ -32,19 +32,18 @@ def default_parameters(stage: str) -> dict[str, Any]:
 
 
 def command_line_parameters(job: Job) -> dict[str, Any]:
-    """stage.parameter -> value, of what was done otherwise than the profile and scene.yaml say: by `set=` or
-    `budget=`. Empty where the plan was not recorded."""
-    said = {stage: dict(flatten_parameters(values)) for stage, values in job.unset.items()}
+    """stage.parameter -> value, for parameters set by `set=` or `budget=`; empty if no plan was recorded."""
+    unset = {stage: dict(flatten_parameters(values)) for stage, values in job.unset.items()}
     return {
         f"{stage}.{name}": value
         for stage, receipt in job.receipts.items()
         for name, value in flatten_parameters(receipt.get("params", {}))
-        if stage in said and said[stage].get(name, value) != value
+        if stage in unset and unset[stage].get(name, value) != value
     }
 
 
 def parameters_section(job: Job) -> list[str]:
-    """A table of what differs from the defaults, those set by hand first."""
+    """Table of parameters that differ from the defaults, those set on the command line first."""
     typed, own, rows = command_line_parameters(job), [], []
     for stage, receipt in job.receipts.items():
         usual = default_parameters(stage)
@@ -69,7 +68,7 @@ def _short(value: Any) -> str:
 
 
 def reproduce_section(job: Job) -> list[str]:
-    """What to type to do it again."""
+    """The command that repeats the job."""
     name, _, variant = job.home.name.partition("@")
     source = job.home.with_name(name) / "source"
     scene = load_scene_argument(source, name)
@@ -83,9 +82,9 @@ def reproduce_section(job: Job) -> list[str]:
 
 
 def load_scene_argument(path: Path, name: str) -> str:
-    """What the scene was called on the command line: its name below data/, else its path, of a video the file's."""
-    said = path.read_text(encoding="utf-8").strip() if path.is_file() else name
+    """The scene's name on the command line: its name below data/, else its path, or the path of a video."""
+    source = path.read_text(encoding="utf-8").strip() if path.is_file() else name
     record = path.parent / "frames" / "frames.json"
-    if record.is_file() and Path(said).name == "frames":
+    if record.is_file() and Path(source).name == "frames":
         return json.loads(record.read_text(encoding="utf-8"))["video"]
-    return name if said == f"data/{name}" else said
+    return name if source == f"data/{name}" else source

@@ -1,4 +1,4 @@
-"""What a job was given and made of it, as pictures: masks, references, views completed beside them, depth."""
+"""Picture sections of a job's page: masks, references, extra completed views, depth."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from report.check import overlay_masks, view_role
 from report.job_data import Job
 from report.sheet import pick_evenly
 
-MAX_MASK_VIEWS, FIRST_MASK_VIEWS, MASK_SIDE = 60, 12, 240  # views; those that are seen at once; px a side
-REFERENCE_SIDE, DEPTH_SIDE = 640, 480  # px a side
-DEPTH_VIEWS = 4  # views
-REMOVED, INVENTED = (255, 210, 0), (0, 230, 230)  # outlines over photographs
-MIN_ALPHA = 0.5  # alpha under which there is no depth
-RESULTS = ("distill", "initialize", "fit")  # the last of what is there
+MAX_MASK_VIEWS, FIRST_MASK_VIEWS, MASK_SIDE = 60, 12, 240  # most views, views visible at once, longer side in px
+REFERENCE_SIDE, DEPTH_SIDE = 640, 480  # longer side, px
+DEPTH_VIEWS = 4  # number of views
+REMOVED, INVENTED = (255, 210, 0), (0, 230, 230)  # outline colours
+MIN_ALPHA = 0.5  # below this alpha there is no depth
+RESULTS = ("distill", "initialize", "fit")  # stages with Gaussians, latest first
 
 
 def masks_section(job: Job) -> list[str]:
-    """Masks over photographs: the given ones tinted, what the stage masks made of them outlined."""
+    """Masks over photographs: input masks tinted, the classes from the stage `masks` outlined."""
     poses, given = (job.folders.get(stage, Path()) for stage in ("poses", "raw_masks"))
     top = page.heading("Masks")
     if not (poses / "views.json").is_file() or not any((given / "masks").rglob("*.png")):
-        return [top, page.paragraph("None: nothing is marked in the photographs.")]
+        return [top, page.paragraph("None: no photograph has a mask.")]
     views = load_json(poses / "views.json")
     shown = pick_evenly(sorted(views["train"]), MAX_MASK_VIEWS)
     cell = lambda name: (
@@ -45,17 +45,17 @@ def masks_section(job: Job) -> list[str]:
         if rest
         else ""
     )
-    words = "Magenta: the mask as given. "
+    words = "Magenta: the input mask. "
     if "masks" in job.folders:
-        words += "Yellow line: what all views agreed to remove. Cyan line: what no photograph shows and was made up. "
+        words += "Yellow line: the removed region, consistent over all views. Cyan line: what no photograph shows. "
     else:
-        words += "What all views agree on comes with the stage masks. "
+        words += "Consistent masks come with the stage `masks`. "
     words += f"{len(shown)} of {len(views['train'])} training views."
     return [top, page.paragraph(words, quiet=True), inline_images.picture_grid(list(map(cell, first))), more]
 
 
 def draw_mask_classes(job: Job, poses: Path, name: str) -> np.ndarray:
-    """uint8 [h, w, 3]: the photograph, small, its mask over it, and the outlines of its pixel classes."""
+    """uint8 [h, w, 3]: the reduced photograph with its mask tinted and its pixel classes outlined."""
     small = np.ascontiguousarray(overlay_masks(poses, job.folders.get("raw_masks", Path()), name))
     for kind, colour in (("consistent", REMOVED), ("invent", INVENTED)):
         path = job.folders.get("masks", Path()) / kind / f"{name}.png"
@@ -65,7 +65,7 @@ def draw_mask_classes(job: Job, poses: Path, name: str) -> np.ndarray:
 
 
 def draw_outline(picture: np.ndarray, mask: np.ndarray, colour: tuple[int, int, int]) -> None:
-    """Draw a mask's outline into a picture, uint8 [H, W, 3], of any size."""
+    """Draw the outline of a mask of any size into a picture, uint8 [H, W, 3], in place."""
     scale = picture.shape[1] / mask.shape[1]
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     moved = [((contour + 0.5) * scale - 0.5).round().astype(np.int32) for contour in contours]
@@ -73,11 +73,11 @@ def draw_outline(picture: np.ndarray, mask: np.ndarray, colour: tuple[int, int, 
 
 
 def references_section(job: Job) -> list[str]:
-    """Each reference beside its photograph, the hole outlined, and how it fits or was made."""
+    """Each reference beside its photograph, the hole outlined, with its origin and fit."""
     folder, poses = job.folders.get("reference", Path()), job.folders.get("poses", Path())
     top = page.heading("References")
     if "reference" not in job.folders:
-        return [top, page.paragraph("None: the stage reference has not run, or was left out.")]
+        return [top, page.paragraph("None: the stage `reference` has not run, or was left out.")]
     facts = _facts(folder)
     parts = [top]
     for path in sorted((folder / "references").glob("*.png")):
@@ -109,25 +109,25 @@ def _facts(folder: Path) -> dict:
 
 
 def _origin(facts: dict, folder: Path, name: str) -> str:
-    """Where a reference comes from, and how well it fits."""
+    """Where a reference comes from and how well it fits."""
     if name in facts.get("given", ()):
         return f"given; {facts.get('fits', {}).get(name, 'how well it fits was not recorded')}"
     path = folder / "candidates.json"
     said = load_json(path) if path.is_file() else {}
     if "painter" in said:
         return f"painted by {said['painter']}"
-    way = "put together from patches of the photographs" if "misfits" in said else "painted by the diffusion model"
+    way = "composed of patches of the photographs" if "misfits" in said else "painted by the diffusion model"
     scores = said.get("misfits") or said.get("seams") or []
     return f"{way}, the best of {len(scores)} tries" if len(scores) > 1 else way
 
 
 def extra_views_section(job: Job) -> list[str]:
-    """The views that were completed beside the references, and why."""
+    """Views that were completed in addition to the references, and why."""
     folder = job.folders.get("initialize", Path())
     shares = _facts(folder).get("further", {}) if "initialize" in job.folders else {}
     if not shares:
         return []
-    said = "No reference shows what was open there: these views were put together from patches of the photographs."
+    reason = "No reference shows these places, so these views were completed from patches of the photographs."
     cells = [
         (
             inline_images.photo_address(load_image(folder / "further" / f"{view}.png"), DEPTH_SIDE),
@@ -135,36 +135,36 @@ def extra_views_section(job: Job) -> list[str]:
         )
         for view, share in shares.items()
     ]
-    return [page.heading("Further views", 3), page.paragraph(said), inline_images.picture_grid(cells)]
+    return [page.heading("Extra views", 3), page.paragraph(reason), inline_images.picture_grid(cells)]
 
 
 def depth_section(job: Job) -> list[str]:
     """Depth of a few views before and after, in the same colours."""
-    there = [s for s in RESULTS if s in job.folders and (job.folders[s] / "gaussians.ply").is_file()]
+    stages = [s for s in RESULTS if s in job.folders and (job.folders[s] / "gaussians.ply").is_file()]
     top = page.heading("Depth, before and after")
-    if not there or "fit" not in there or "poses" not in job.folders:
-        return [top, page.paragraph("None yet: the stage fit has not run.")]
+    if not stages or "fit" not in stages or "poses" not in job.folders:
+        return [top, page.paragraph("None yet: the stage `fit` has not run.")]
     scene = load_scene(job.folders["poses"])
     names = pick_evenly(before_after.rendered_views(job) or list(scene.train), DEPTH_VIEWS)
-    states = {"with the object": "fit"} | ({f"after {there[0]}": there[0]} if len(there) > 1 else {})
+    states = {"with the object": "fit"} | ({f"after {stages[0]}": stages[0]} if len(stages) > 1 else {})
     loaded = {words: load_ply(job.folders[stage] / "gaussians.ply") for words, stage in states.items()}
     cells = []
     for name in names:
         drawn = color_disparity([render_depth(gaussians, scene.cameras[name]) for gaussians in loaded.values()])
         for words, picture in zip(loaded, drawn, strict=True):
             cells.append((inline_images.photo_address(picture, DEPTH_SIDE), f"{name}, {words}"))
-    said = "Bright is near; pairs share a scale; grey where nothing is."
-    return [top, page.paragraph(said, quiet=True), inline_images.picture_grid(cells)]
+    legend = "Bright is near; pairs share a scale; grey is empty."
+    return [top, page.paragraph(legend, quiet=True), inline_images.picture_grid(cells)]
 
 
 def render_depth(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """[H, W] camera z, 0 where nothing is."""
-    drawn = rasterizer.render(gaussians, camera, sh_degree=0)
-    return np.where(drawn.alpha.numpy() > MIN_ALPHA, drawn.depth.numpy(), 0.0)
+    """[H, W]: camera z, 0 where alpha is below `MIN_ALPHA`."""
+    rendering = rasterizer.render(gaussians, camera, sh_degree=0)
+    return np.where(rendering.alpha.numpy() > MIN_ALPHA, rendering.depth.numpy(), 0.0)
 
 
 def color_disparity(depths: list[np.ndarray]) -> list[np.ndarray]:
-    """uint8 [H, W, 3] each: disparity, on the scale of the first."""
+    """uint8 [H, W, 3] each: disparity in colours, on the scale of the first map."""
     from matplotlib import colormaps
 
     near = [np.where(depth > 0, 1 / np.where(depth > 0, depth, 1.0), np.nan) for depth in depths]

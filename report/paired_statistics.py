@@ -1,4 +1,4 @@
-"""Is a method better than another? Paired differences with their intervals, and who is on the Pareto front."""
+"""Paired differences between methods with confidence intervals, and the Pareto front."""
 
 from __future__ import annotations
 
@@ -7,19 +7,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-LEVEL = 0.95
+LEVEL = 0.95  # of confidence
 
 
 @dataclass(frozen=True)
 class Difference:
-    """How far one method lies from another in a metric.
+    """Difference of one method to another in a metric.
 
     Attributes:
         mean: over all pairs.
         pairs: how many.
-        views: half the width of its 95% interval, the paired t over views times scenes: holds for these scenes.
-            None under two pairs.
-        scenes: the same over the means of the scenes: for another scene of their kind. None under two scenes.
+        views: half the width of the 95% interval of the paired t over views of all scenes: holds for these scenes. None
+            for fewer than two pairs.
+        scenes: the same over the means of the scenes: holds for another scene of their kind. None for fewer than two
+            scenes.
     """
 
     mean: float
@@ -29,7 +30,10 @@ class Difference:
 
 
 def paired_difference(differences: Sequence[np.ndarray]) -> Difference | None:
-    """`differences`: one array [views] a scene, method minus the other, same views. None where there is no pair."""
+    """Difference over all pairs, or None without pairs.
+
+    `differences` holds one array [views] per scene: method minus the other, on the same views.
+    """
     scenes = [np.asarray(d, np.float64) for d in differences if len(d)]
     if not scenes:
         return None
@@ -38,7 +42,7 @@ def paired_difference(differences: Sequence[np.ndarray]) -> Difference | None:
 
 
 def confidence_half_width(values: np.ndarray) -> float | None:
-    """Of Student's interval of the mean of [n] independent values; None under two."""
+    """Half the width of Student's interval of the mean of [n] independent values; None for n < 2."""
     if len(values) < 2:
         return None
     from scipy.stats import t
@@ -47,9 +51,12 @@ def confidence_half_width(values: np.ndarray) -> float | None:
 
 
 def pareto_front(seconds: Sequence[float], errors: Sequence[float]) -> np.ndarray:
-    """bool [n]: no other point is as fast and as good, and better in one of the two. Equal points stay together."""
+    """bool [n]: points for which no other is as fast and as good, and better in one of the two.
+
+    Equal points are on the front together.
+    """
     front = np.zeros(len(seconds), bool)
-    best = np.inf  # the least error among all faster points
+    best = np.inf  # least error of all faster points
     points = np.column_stack([seconds, errors]).reshape(-1, 2)
     for moment in np.unique(points[:, 0]):
         at = np.flatnonzero(points[:, 0] == moment)

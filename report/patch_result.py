@@ -1,4 +1,4 @@
-"""The result of a scene from which something was deleted: what the stages made of it."""
+"""The result of a scene from which something was deleted."""
 
 from __future__ import annotations
 
@@ -23,7 +23,9 @@ class PatchResult:
     """A filled scene.
 
     Attributes:
-        gaussians: in the normalised frame; new: bool [N], those that fill the hole; poses: that stage's folder.
+        gaussians: in the normalised frame.
+        new: bool [N], the Gaussians that fill the hole.
+        poses: folder of the stage `poses`.
     """
 
     gaussians: Gaussians
@@ -32,7 +34,7 @@ class PatchResult:
 
 
 def load_result(home: Path) -> PatchResult:
-    """Of runs/<scene> or runs/<scene>@<variant>. ValueError where nothing was deleted, or `evaluate` has not run."""
+    """Load runs/<scene> or runs/<scene>@<variant>. ValueError if nothing was deleted, or `evaluate` has not run."""
     require_deleted(home)
     poses, finished = stage_folder(home, "poses"), home / "evaluate" / "scene.ply"
     if not finished.exists():
@@ -43,7 +45,7 @@ def load_result(home: Path) -> PatchResult:
 
 
 def require_deleted(home: Path) -> None:
-    """ValueError where the scene does not say what was deleted, as far as its stage `poses` knows."""
+    """Raise ValueError if the scene does not say what was deleted, according to its stage `poses`."""
     if not (stage_folder(home, "poses") / "deleted.npy").is_file():
         raise ValueError(
             "scene.yaml: nothing says what was deleted; `gaussians: scene.ply` names the scene before, "
@@ -52,6 +54,6 @@ def require_deleted(home: Path) -> None:
 
 
 def result_stage_folder(home: Path) -> Path:
-    """The folder of the stage whose Gaussians are the result."""
+    """Folder of the stage whose Gaussians are the result."""
     used = load_receipts({"evaluate": home / "evaluate"})["evaluate"]["needs"]
     return stage_folder(home, next(stage for stage in ("distill", "initialize") if used.get(stage)))

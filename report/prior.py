@@ -1,4 +1,4 @@
-"""What `benchmarks/studies/prior.py` measured, as a page: tables, charts and sheets of pictures.
+"""Page of the measurements of `benchmarks/studies/prior.py`: tables, charts and sheets of pictures.
 
 python -m report.prior runs/prior-report
 """
@@ -15,7 +15,7 @@ from reffusion.io.arrays import load_json
 from reffusion.io.images import load_image, save_image
 from report.sheet import compose_sheet, enlarge
 
-ENLARGE = 3  # whole factor; held-out pictures are 64 px
+ENLARGE = 3  # whole factor; held-out pictures have 64 px
 SCALES = ("reference", "whole", "window")
 SHEETS = {
     "inpainting": "Held-out pictures, filled from pure noise",
@@ -27,7 +27,7 @@ SCORES = {"psnr": "PSNR, dB", "ssim": "SSIM", "flip": "FLIP", "energy": "gradien
 
 
 def make(folder: Path) -> Path:
-    """Write prior.md, sheets and charts into the benchmark's folder; gives back the page's path.
+    """Write prior.md, sheets and charts into the benchmark's folder; return the page's path.
 
     Raises:
         ValueError: nothing was measured there yet.
@@ -56,7 +56,7 @@ def make(folder: Path) -> Path:
 
 
 def save_sheet(folder: Path, name: str, columns: list[str]) -> list[str]:
-    """Put the rows of pictures in folder/name together as folder/name.png; the page's lines for it."""
+    """Join the rows of pictures in folder/name as folder/name.png; return the page's lines for it."""
     paths = sorted((folder / name).glob("*.png"))
     rows = [np.split(load_image(path), len(columns), 1) for path in paths]
     cells = [[enlarge(picture, ENLARGE) for picture in row] for row in rows]
@@ -65,7 +65,7 @@ def save_sheet(folder: Path, name: str, columns: list[str]) -> list[str]:
 
 
 def inpainting_table(scores: dict[str, dict[str, dict[str, float]]]) -> str:
-    """Markdown: a row for each kind of picture and method."""
+    """Markdown table with a row for each kind of picture and method."""
     lines = [f"| inside the hole | pictures | {' | '.join(SCORES.values())} |", "|---" * (len(SCORES) + 2) + "|"]
     kinds = dict.fromkeys(kind for by_kind in scores.values() for kind in by_kind)
     for kind in kinds:
@@ -77,14 +77,14 @@ def inpainting_table(scores: dict[str, dict[str, dict[str, float]]]) -> str:
 
 
 def format_score(row: dict[str, float], column: str) -> str:
-    """A figure; PSNR with its standard error."""
+    """A score; PSNR with its standard error."""
     if column == "psnr":
         return f"{row['psnr']:.2f} ± {row['psnr_error']:.2f}"
     return f"{row[column]:.3f}"
 
 
 def personalization_table(personal: dict[str, Any]) -> str:
-    """Markdown: samples of unseen views, and errors over all timesteps, before and after."""
+    """Markdown table: samples of unseen views, and errors over all timesteps, before and after."""
     titles = ("clean-latent error", "variance of the SDS gradient")
     lines = [
         f"| holes, {personal['steps']} steps | {' | '.join((*titles, *SCORES.values()))} |",
@@ -99,7 +99,7 @@ def personalization_table(personal: dict[str, Any]) -> str:
 
 
 def sampler_table(by_name: dict[str, dict[str, dict[str, float]]]) -> str:
-    """Markdown: a row for each set of holes and number of sampler steps."""
+    """Markdown table with a row for each set of holes and number of sampler steps."""
     lines = [
         f"| holes, sampler steps | {' | '.join(SCORES.values())} | CPU ms each |",
         "|---" * (len(SCORES) + 2) + "|",
@@ -112,7 +112,7 @@ def sampler_table(by_name: dict[str, dict[str, dict[str, float]]]) -> str:
 
 
 def seeds_table(seeds: dict[str, dict[str, Any]]) -> str:
-    """Markdown: for each kind of holes, without and with the reference or a wrong one, mean and spread over seeds."""
+    """Markdown table: mean and range over seeds for each kind of holes, before, after, and with a wrong reference."""
     lines = [
         f"| holes, {len(seeds)} seeds: mean (lowest to highest) | {' | '.join(SCORES.values())} |",
         "|---" * (len(SCORES) + 1) + "|",
@@ -127,13 +127,13 @@ def seeds_table(seeds: dict[str, dict[str, Any]]) -> str:
 
 
 def format_range(values: list[float], digits: int) -> str:
-    """Mean, and lowest to highest where there are several."""
+    """Mean, and the range from lowest to highest if there are several values."""
     mean = f"{np.mean(values):.{digits}f}"
     return f"{mean} ({min(values):.{digits}f} to {max(values):.{digits}f})" if len(values) > 1 else mean
 
 
 def save_charts(personal: dict[str, Any], path: Path) -> None:
-    """Error against steps; error and variance against the timestep, before and after."""
+    """Chart error against steps, and error and variance against the timestep, before and after."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

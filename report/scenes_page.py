@@ -1,4 +1,4 @@
-"""Many scenes on a page: median and quartiles of errors, seconds and scores."""
+"""Statistics over many scenes on a page: median and quartiles of errors, seconds and scores."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SCORES = ("lpips_vgg_box", "psnr_box", "ssim_box", "flip_box")
 
 
 def make(jobs: list[Job], out: Path) -> Path:
-    """Write index.html, stages.png and stages.csv into `out`; gives back the page's path."""
+    """Write index.html, stages.png and stages.csv into `out`; return the page's path."""
     out.mkdir(parents=True, exist_ok=True)
     rows = summarize_stages(jobs)
     with open(out / "stages.csv", "w", newline="", encoding="utf-8") as file:
@@ -24,10 +24,10 @@ def make(jobs: list[Job], out: Path) -> Path:
         writer.writerows([COLUMNS, *rows])
     title = f"{len(jobs)} scenes"
     parts = [page.heading(title, 1), page.paragraph(", ".join(job.home.name for job in jobs))]
-    if drawn := main_error_curves(jobs):
-        trace_charts.draw_scenes_chart(drawn, out / "stages.png")
+    if curves := main_error_curves(jobs):
+        trace_charts.draw_scenes_chart(curves, out / "stages.png")
         parts += [page.heading("Error against seconds"), page.picture(out / "stages.png", "error against seconds")]
-        words = "Blue: median and quartiles of the scenes; grey: each scene. A stage that has ended keeps its error."
+        words = "Blue: median and quartiles over the scenes. Grey: each scene. A stage that has ended keeps its error."
         parts.append(page.paragraph(words, quiet=True))
     parts += [page.heading("Median, and quartiles in brackets"), *statistics_tables(rows)]
     parts += [page.heading("Scenes"), scene_table(jobs, out)]
@@ -37,7 +37,7 @@ def make(jobs: list[Job], out: Path) -> Path:
 
 
 def statistics_tables(rows: list[tuple]) -> list[str]:
-    """A row a stage with seconds, memory and error; a row of scores."""
+    """A table with seconds, memory and error of each stage, and one with the scores."""
     by_stage: dict[str, dict[str, tuple]] = {}
     for stage, quantity, *values in rows:
         by_stage.setdefault(stage, {})[quantity] = tuple(values)
@@ -59,7 +59,7 @@ def statistics_tables(rows: list[tuple]) -> list[str]:
 
 
 def format_quartiles(values: tuple, digits: int | None = None) -> str:
-    """Median and quartiles; with four significant digits where no number of decimals is given."""
+    """Median and quartiles, with `digits` decimals or else four significant digits."""
     _, low, middle, high = values
     if digits is None:
         return f"{middle:.4g} [{low:.4g}, {high:.4g}]"
@@ -67,7 +67,7 @@ def format_quartiles(values: tuple, digits: int | None = None) -> str:
 
 
 def main_error_curves(jobs: list[Job]) -> dict[str, tuple[str, list[np.ndarray]]]:
-    """Stage -> its main quantity, the one that most traces have, and a curve [moments, 2] for each scene with it."""
+    """Stage -> its main quantity (the one most traces have), and a curve [moments, 2] for each scene that has it."""
     found: dict[str, tuple[str, list[np.ndarray]]] = {}
     for stage in dict.fromkeys(stage for job in jobs for stage in job.traces):
         traces = [job.traces[stage][""] for job in jobs if job.traces.get(stage, {}).get("")]
@@ -82,13 +82,13 @@ def main_error_curves(jobs: list[Job]) -> dict[str, tuple[str, list[np.ndarray]]
 
 
 def summarize_stages(jobs: list[Job]) -> list[tuple]:
-    """Rows of `COLUMNS`: each stage's seconds, memory and last main error; the scores of the result."""
+    """Rows of `COLUMNS`: seconds, memory and last main error of each stage; scores of the result."""
     errors = main_error_curves(jobs)
     rows = []
     for stage in dict.fromkeys(stage for job in jobs for stage in job.receipts):
-        there = [job.receipts[stage] for job in jobs if stage in job.receipts]
-        rows.append((stage, "seconds", *quartiles([receipt["seconds"] for receipt in there])))
-        rows.append((stage, "peak_memory_mb", *quartiles([receipt["peak_memory_mb"] for receipt in there])))
+        receipts = [job.receipts[stage] for job in jobs if stage in job.receipts]
+        rows.append((stage, "seconds", *quartiles([receipt["seconds"] for receipt in receipts])))
+        rows.append((stage, "peak_memory_mb", *quartiles([receipt["peak_memory_mb"] for receipt in receipts])))
         if stage in errors:
             name, lines = errors[stage]
             rows.append((stage, name, *quartiles([points[-1, 1] for points in lines])))
@@ -96,17 +96,18 @@ def summarize_stages(jobs: list[Job]) -> list[tuple]:
     rows.append((WHOLE_JOB, "seconds", *quartiles(whole)))
     for name in SCORES:
         values = [job.metrics.get("mean", {}).get(name) for job in jobs]
-        if there := [value for value in values if value is not None]:
-            rows.append((WHOLE_JOB, name, *quartiles(there)))
+        if known := [value for value in values if value is not None]:
+            rows.append((WHOLE_JOB, name, *quartiles(known)))
     return rows
 
 
 def quartiles(values: list[float]) -> tuple[int, float, float, float]:
-    """How many, and the three quartiles."""
+    """Number of values and their three quartiles."""
     return (len(values), *(float(v) for v in np.percentile(values, [25, 50, 75])))
 
 
 def scene_table(jobs: list[Job], out: Path) -> str:
+    """HTML table with a row per scene: stages done, seconds and scores."""
     names = [n for n in SCORES if any(job.metrics.get("mean", {}).get(n) is not None for job in jobs)]
     rows = []
     for job in jobs:

@@ -26,22 +26,22 @@ from report.page import format_duration
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Lines = list[dict[str, Any]]  # of one series of a trace
-MAX_PANELS = 4  # errors of a stage at most
-NO_ERRORS = ("sds_gradient_mean", "sds_gradient_max", "gaussians", "masked_gaussians")  # no errors
+Lines = list[dict[str, Any]]  # the lines of one series of a trace
+MAX_PANELS = 4  # most errors drawn of one stage
+NO_ERRORS = ("sds_gradient_mean", "sds_gradient_max", "gaussians", "masked_gaussians")  # quantities that are not errors
 
 
 def pick_errors(stage: str, lines: Lines) -> list[str]:
-    """The errors in these lines, the stage's main one first; of a stage that has no main one, all numbers."""
-    there = {name for line in lines for name, value in line.items() if isinstance(value, int | float)}
-    main = [name for name in MAIN.get(stage, ()) if name in there][:1]
-    others = [name for name, quantity in QUANTITIES.items() if name in there and quantity.better and name not in main]
-    strange = sorted(there - {"seconds", "iteration", "reason", *QUANTITIES}) if not (main or others) else []
-    return [name for name in (*main, *others, *strange) if name not in NO_ERRORS][:MAX_PANELS]
+    """Errors in these lines, the stage's main one first; all numbers if the stage has no known error."""
+    present = {name for line in lines for name, value in line.items() if isinstance(value, int | float)}
+    main = [name for name in MAIN.get(stage, ()) if name in present][:1]
+    others = [name for name, quantity in QUANTITIES.items() if name in present and quantity.better and name not in main]
+    unknown = sorted(present - {"seconds", "iteration", "reason", *QUANTITIES}) if not (main or others) else []
+    return [name for name in (*main, *others, *unknown) if name not in NO_ERRORS][:MAX_PANELS]
 
 
 def axis_title(name: str) -> str:
-    """What an axis says: the quantity, its unit where it has one, and which way is better."""
+    """Title of an axis: the quantity, its unit, and an arrow towards the better side."""
     if name not in QUANTITIES:
         return name
     quantity = QUANTITIES[name]
@@ -50,13 +50,13 @@ def axis_title(name: str) -> str:
 
 
 def best_index(name: str, values: Sequence[float]) -> int:
-    """The index of the best of them."""
+    """Index of the best value."""
     more = name in QUANTITIES and QUANTITIES[name].better == "more"
     return int((np.argmax if more else np.argmin)(values))
 
 
 def draw_stage_chart(stage: str, series: dict[str, Lines], path: Path) -> list[str]:
-    """Error against seconds of work, a panel a quantity; gives back the quantities drawn, or nothing."""
+    """Chart error against seconds of work, one panel per quantity; return the quantities drawn."""
     names = pick_errors(stage, [line for lines in series.values() for line in lines])
     if not names:
         return []
@@ -80,12 +80,12 @@ def draw_stage_chart(stage: str, series: dict[str, Lines], path: Path) -> list[s
 
 
 def quantity_curve(lines: Lines, name: str) -> np.ndarray:
-    """[moments, 2]: seconds and the quantity, of the lines that have it."""
+    """[moments, 2]: seconds and the quantity, for the lines that have it."""
     return np.array([(line["seconds"], line[name]) for line in lines if name in line], np.float64).reshape(-1, 2)
 
 
 def _curve(axes: Axes, name: str, points: np.ndarray, colour: str, words: str, main: bool) -> None:
-    """A line with its last value beside it; of the main quantity the best moment too, where that is another one."""
+    """A line with its last value; for the main quantity also its best moment, if that is not the last."""
     axes.plot(*points.T, color=colour, linewidth=1.8, marker="o", markersize=3)
     last, top = points[-1], points[best_index(name, points[:, 1])]
     annotate(axes, f"{last[1]:.3g}{words}", last, (6, 0), colour if main or not words else INK)
@@ -95,12 +95,12 @@ def _curve(axes: Axes, name: str, points: np.ndarray, colour: str, words: str, m
 
 
 def clamp_first_seconds(points: np.ndarray) -> np.ndarray:
-    """The curve [moments, 2] with what happened in the first instants moved to a 300th of the whole time."""
+    """The curve [moments, 2] with times below 1/300 of the total moved there, so that a log axis can start."""
     return np.column_stack([np.maximum(points[:, 0], points[:, 0].max() / 300), points[:, 1]])
 
 
 def set_time_axis(axes: Axes, seconds: np.ndarray) -> None:
-    """Logarithmic where the moments span much, for they are log-spaced; room on the right for a number."""
+    """Use a logarithmic axis if the moments span much (they are log-spaced), with room on the right for a number."""
     if needs_log_axis(seconds, 10):
         axes.set_xscale("log")
         axes.set_xlim(seconds[seconds > 0].min() / 1.1, seconds.max() * 1.9)
@@ -119,13 +119,13 @@ def draw_job_chart(
     path: Path,
     ceiling: float | None = None,
 ) -> dict[str, float]:
-    """PSNR against seconds since the beginning, above a bar for each stage; gives back the stages' beginnings.
+    """Chart PSNR against seconds since the beginning, above a bar for each stage; return when each stage began.
 
     Args:
-        seconds: stage -> of its receipt, in order.
-        traces: stage -> its lines; drawn are those whose main quantity is in dB.
-        box: stage -> the mean PSNR in the box of the test views with what it made.
-        ceiling: the same of a fit to photographs without the object, where there is one.
+        seconds: stage -> seconds in its receipt, in order.
+        traces: stage -> its lines; drawn if the main quantity is in dB.
+        box: stage -> mean PSNR of the stage's result in the box of the test views.
+        ceiling: the same for a fit to photographs without the object, if there is one.
     """
     begins = dict(zip(seconds, np.cumsum([0.0, *seconds.values()]), strict=False))
     curves = {}
@@ -155,15 +155,15 @@ def _errors(
     for (stage, (name, points)), colour in zip(curves.items(), (BLUE, GREEN, ORANGE), strict=False):
         axes.plot(*points.T, color=colour, linewidth=1.8)
         words = f"{stage}: {QUANTITIES[name].label}, {points[-1, 1]:.1f}"
-        late = points[-1, 0] > total / 2  # then there is no room to its right
+        late = points[-1, 0] > total / 2  # no room on its right side
         annotate(axes, words, points[-1], *(((-8, 4), colour, "right") if late else ((6, 0), colour)))
-    for row, (stage, at) in enumerate(ends.items()):  # below one another: they may stand side by side
+    for row, (stage, at) in enumerate(ends.items()):  # one below the other, as they may be close in time
         axes.plot(*at, "D", color=INK, markersize=6)
         words = f"box of the test views\nafter {stage}: {at[1]:.2f}"
         annotate(axes, words, at, (0, -10 - 26 * row), ha="right", va="top")
     finals = [points[-1, 1] for _, points in curves.values()] + [value for _, value in ends.values()]
     highest = max([*finals, *(points[:, 1].max() for _, points in curves.values())])
-    axes.set_ylim(min(finals) - 10, highest + 2)  # how a fit begins, at 10 dB, matters to no one
+    axes.set_ylim(min(finals) - 10, highest + 2)  # cuts off the first steps of a fit, at 10 dB
     axes.set_ylabel("PSNR, dB ↑", fontsize=10)
 
 
@@ -183,9 +183,9 @@ def _bars(axes: Axes, seconds: dict[str, float], begins: dict[str, float]) -> No
 
 
 def quartile_band(curves: Sequence[np.ndarray], count: int = 200) -> tuple[np.ndarray, np.ndarray]:
-    """Seconds [M] from when all have begun to when the last has ended, and the quartiles [3, M] of the curves there.
+    """Quartiles of curves: seconds [M], from when all have begun to when the last has ended, and values [3, M].
 
-    Between two moments a curve is a straight line over the logarithm of time; after its last it keeps its value.
+    Curves are linear in the logarithm of time and keep their last value.
     """
     low = max(max(points[0, 0] for points in curves), 1e-3)
     high = max(max(points[-1, 0] for points in curves), low)
@@ -196,7 +196,7 @@ def quartile_band(curves: Sequence[np.ndarray], count: int = 200) -> tuple[np.nd
 
 
 def draw_scenes_chart(curves: dict[str, tuple[str, list[np.ndarray]]], path: Path) -> None:
-    """A panel a stage: its main error in every scene, the median and the quartiles."""
+    """One panel per stage: its main error in every scene, with median and quartiles."""
     made, grid = new_figure(3.3, 1, len(curves))
     for axes, (stage, (name, raw)) in zip(grid[0], curves.items(), strict=True):
         lines = [clamp_first_seconds(points) for points in raw]

@@ -1,4 +1,4 @@
-"""A flight around a finished scene as a video: `python -m report.turntable --scene demo` (`make scene=X turntable`)."""
+"""Video around a finished scene: `python -m report.turntable --scene demo` (`make scene=X turntable`)."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from reffusion.splat import rasterizer
 from report import camera_path, cli
 
 FRAMES, RATE = 144, 24  # six seconds
-# In a .webm: what browsers play and OpenCV's wheels write, with a complaint about the tag that means nothing.
+# Codec of the .webm, which browsers play and OpenCV's wheels write; OpenCV's warning about the tag is harmless.
 CODEC = "VP90"
 
 
 def make(home: Path, frames: int = FRAMES) -> Path:
-    """Write turntable.webm beside the scene's stages, with the result on a way around the capture; its path.
+    """Write turntable.webm beside the scene's stages, the result on a path around the capture, and return its path.
 
     Args:
         home: runs/<scene> or runs/<scene>@<variant>, its stage `evaluate` finished.
@@ -40,19 +40,19 @@ def make(home: Path, frames: int = FRAMES) -> Path:
 
 
 def save_video(path: Path, pictures: Iterable[np.ndarray], rate: int = RATE) -> None:
-    """Pictures uint8 [H, W, 3], at least one, as a .webm. Raises ValueError where this OpenCV writes none."""
-    film = None
+    """Save pictures, uint8 [H, W, 3], at least one, as a .webm. ValueError if this OpenCV cannot write it."""
+    writer = None
     for picture in pictures:
-        if film is None:
+        if writer is None:
             size = (picture.shape[1], picture.shape[0])
-            film = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*CODEC), rate, size)
-        if not film.isOpened():
+            writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*CODEC), rate, size)
+        if not writer.isOpened():
             raise ValueError(
-                f"{path}: this OpenCV writes no {CODEC} video; `pip install opencv-contrib-python-headless`"
+                f"{path}: this OpenCV cannot write {CODEC} video; `pip install opencv-contrib-python-headless`"
             )
-        film.write(np.ascontiguousarray(picture[..., ::-1]))
-    if film is not None:
-        film.release()
+        writer.write(np.ascontiguousarray(picture[..., ::-1]))
+    if writer is not None:
+        writer.release()
 
 
 def main() -> None:

@@ -69,7 +69,7 @@ def test_the_layers_are_those_that_the_result_was_made_from(tmp_path):
     save_ply(tmp_path / "x/distill/snapshots/100.ply", gaussians.map(lambda p: p[labels][:3]))
     found = gaussian_layers.load_layers(tmp_path / "x", SIMILARITY)
     assert list(found.states) == ["initialization", "step 20", "step 100", "result"]
-    count = lambda state, **parts: len(found.shown(state, **{"kept": False, "added": False, "removed": False} | parts))
+    count = lambda state, **parts: len(found.select(state, **{"kept": False, "added": False, "removed": False} | parts))
     for state, new in (("initialization", added), ("step 20", added), ("step 100", 3), ("result", added)):
         assert count(state, kept=True) == kept and count(state, added=True) == new
         assert count(state, removed=True) == added, "what the stage masks labelled of the fit"
@@ -135,16 +135,16 @@ def test_a_visitor_gets_a_small_picture_at_once_then_the_whole_and_another_when_
         client_id=7, camera=camera, scene=SimpleNamespace(set_background_image=lambda image, **_: drawn.append(image))
     )
     monkeypatch.setattr(window.server, "get_clients", lambda: {7: guest})
-    window._visit(guest)
+    window._serve_visitor(guest)
     wait(lambda: len(drawn) == 2)
     assert [image.shape[0] for image in drawn] == [view.MOVING, view.STILL]
-    assert np.array_equal(drawn[-1], window._drawn(view.visitor_camera(camera, view.STILL), camera))
+    assert np.array_equal(drawn[-1], window._render_for(view.visitor_camera(camera, view.STILL), camera))
     there = next(h for h in window.server.gui._gui_input_handle_from_uuid.values() if h.label == "what was kept")
     there.value = False
     wait(lambda: len(drawn) == 4)
     assert drawn[-1].mean() < drawn[1].mean(), "the wall is gone"
     monkeypatch.setattr(window.server, "get_clients", dict)
-    wait(lambda: 7 not in window.asked)
+    wait(lambda: 7 not in window.requests)
 
 
 @pytest.mark.parametrize("width", [1280, 390])
