@@ -166,7 +166,7 @@ def extra_tables(comparison: Comparison, table: list[dict[str, Any]]) -> dict[st
     """
     found: dict[str, compare_tables.Table] = {}
     if len(comparison.scenes) > 1:
-        each = {metric: compare_tables.scene_table(comparison, metric, DIGITS[metric]) for metric in BOX_SCORES}
+        each = {metric: compare_tables.scene_table(comparison, table, metric, DIGITS[metric]) for metric in BOX_SCORES}
         found |= {f"{SHORT[metric]} in each scene": found_table for metric, found_table in each.items() if found_table}
     if given := compare_tables.load_published(comparison.data):
         done = [run for method in comparison.methods for run in comparison.finished_runs(method)]
@@ -195,7 +195,7 @@ def summary(comparison: Comparison, table: list[dict[str, Any]]) -> str:
     return "; ".join(parts) + "."
 
 
-def table_notes(comparison: Comparison) -> list[str]:
+def table_notes(comparison: Comparison, table: list[dict[str, Any]]) -> list[str]:
     """What a reader of the tables needs to know, each fact once."""
     done = [run for method in comparison.methods for run in comparison.finished_runs(method)]
     lines = [
@@ -209,11 +209,11 @@ def table_notes(comparison: Comparison) -> list[str]:
         lines.append("No box metrics: the scene has no ground truth.")
     if any(run.metrics.get("mean", {}).get("psnr_outside") is not None for run in done):
         lines.append(
-            "outside: the test views' pixels outside their masks (widened by 1% of the width), which all methods should "
-            "leave as they are."
+            "outside: pixels of the test views outside their masks (widened by 1% of the width), which all methods "
+            "should leave as they are."
         )
     lines += dict.fromkeys(f"No LPIPS: {why}." for run in done if (why := run.metrics.get("lpips_unavailable")))
-    if any(row["consistency"] is not None for row in summarize_methods(comparison)):
+    if any(row["consistency"] is not None for row in table):
         words = "mean absolute difference to the next view in the mask, by rendered depth; blur is consistent too."
         lines.append(f"consistency: {words}")
     lines += [f"{method} is the very same job as {other} here." for method, other in comparison.same_as.items()]
@@ -221,7 +221,7 @@ def table_notes(comparison: Comparison) -> list[str]:
     for run in done:
         resumed = [stage for stage, receipt in run.receipts.items() if receipt.get("resumed")]
         if resumed:
-            lines.append(f"{run.method} on {run.scene}: {', '.join(resumed)} was resumed; seconds are incomplete.")
+            lines.append(f"{run.method} on {run.scene}: {', '.join(resumed)} resumed; seconds are incomplete.")
     lines += [f"{r.method} on {r.scene} failed: {r.error}" for r in comparison.runs.values() if r.state == "failed"]
     receipts = [receipt for run in done for receipt in run.receipts.values()]
     machines = dict.fromkeys(f"{r.get('device', 'cpu')} of {r.get('machine', '?')}, {r['profile']}" for r in receipts)
@@ -266,7 +266,7 @@ def markdown(comparison: Comparison, table: list[dict], drawn: dict[str, Path | 
         lines += [f"![{title}](compare/{path.name})", ""] if path else []
     for view, path in views.items():
         lines += [f"## {view}", "", f"![{view} by every method](compare/{path.name})", ""]
-    return "\n".join([*lines, "## Notes", "", *(f"- {note}" for note in table_notes(comparison)), ""])
+    return "\n".join([*lines, "## Notes", "", *(f"- {note}" for note in table_notes(comparison, table)), ""])
 
 
 def html(comparison: Comparison, table: list[dict], drawn: dict[str, Path | None], views: dict[str, Path]) -> str:
@@ -286,7 +286,7 @@ def html(comparison: Comparison, table: list[dict], drawn: dict[str, Path | None
         body += [page.heading("The same views"), page.paragraph("Crops of the box with a margin.", quiet=True)]
     for view, path in views.items():
         body += [page.heading(view, 3), page.picture(path, f"{view} by every method", embed=True)]
-    return page.document(title, [*body, page.heading("Notes"), page.bullets(table_notes(comparison))])
+    return page.document(title, [*body, page.heading("Notes"), page.bullets(table_notes(comparison, table))])
 
 
 def main() -> None:

@@ -6,22 +6,25 @@ import csv
 from pathlib import Path
 
 from report import page
-from report.results import BOX_SCORES, Comparison, Run, finite_mean
+from report.results import BOX_SCORES, Comparison, Run
 
 PUBLISHED = "published.csv"  # file in the folder of the scenes
 COLUMNS = ("method", "metric", "value", "protocol")
 Table = tuple[list[str], list[list[str]]]
 
 
-def scene_table(comparison: Comparison, metric: str, digits: int) -> Table | None:
-    """Header and rows: a method in each scene, then the mean of those that are done. None where none has a value."""
-    lines, found = [], False
-    for method in comparison.distinct_methods:
+def scene_table(comparison: Comparison, table: list[dict], metric: str, digits: int) -> Table | None:
+    """Header and rows: a method's score in each scene, then its mean as in `table`; None if there are no scores."""
+    means = {row["method"]: row[metric] for row in table}
+    methods = comparison.distinct_methods
+    if all(means[method] is None for method in methods):
+        return None
+    lines = []
+    for method in methods:
         runs = [comparison.runs[method, scene] for scene in comparison.scenes]
         values = [run.metrics.get("mean", {}).get(metric) if run.state == "done" else None for run in runs]
-        found |= any(value is not None for value in values)
-        lines.append([method, *(page.format_number(value, digits) for value in [*values, finite_mean(values)])])
-    return (["method", *comparison.scenes, "mean"], lines) if found else None
+        lines.append([method, *(page.format_number(value, digits) for value in [*values, means[method]])])
+    return ["method", *comparison.scenes, "mean"], lines
 
 
 def describe_protocol(done: list[Run]) -> list[str]:

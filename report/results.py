@@ -252,19 +252,6 @@ def save_csv(path: Path, rows: list[dict[str, Any]]) -> None:
         writer.writerows(rows)
 
 
-def load_csv(path: Path) -> list[dict[str, Any]]:
-    """What `save_csv` wrote."""
-    with open(path, newline="", encoding="utf-8") as file:
-        return [{name: _value(name, text) for name, text in row.items()} for row in csv.DictReader(file)]
-
-
-def _value(name: str, text: str) -> Any:
-    if name in ("method", "state", "same_as"):
-        return text or None
-    whole = name in ("peak_memory_mb", "gaussians", "scenes")
-    return None if text == "" else int(text) if whole else float(text)
-
-
 # ------------------------------------------------------------------------------------------------ against the full one
 
 

@@ -27,7 +27,7 @@ from report.results import FOLDER_COMPARISON, FULL, Comparison, Run, load_compar
 from report.sheet import GAP, pick_evenly
 from report.turntable import RATE, save_video
 
-PAGE = Path(__file__).with_random_name("study.html")
+PAGE = Path(__file__).with_name("study.html")
 FRAMES = 96  # of a clip: four seconds, repeated
 VIEWS_RATE = 4  # frames per second of a clip through the test views
 STILLS = 3  # views side by side, if no video can be written

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import re
@@ -337,7 +338,9 @@ def test_refused_before_any_work(tmp_path):
 def test_the_table_survives_its_csv(compared, pages):
     home = compared / "runs/toy"
     table = results.summarize_methods(results.load_comparison(home))
-    assert results.load_csv(pages["csv"]) == table
+    with open(pages["csv"], newline="") as file:
+        saved = list(csv.DictReader(file))
+    assert [{k: "" if v is None else str(v) for k, v in row.items()} for row in table] == saved
     full = table[0]
     assert full["method"] == "full" and full["psnr_box"] == 23.65 and full["lpips_vgg_box"] is None
     receipts = [json.loads(p.read_text()) for p in home.glob("*/receipt.json")]
@@ -387,7 +390,7 @@ def test_without_ground_truth_held_out_views_are_compared_outside_their_masks(ho
     assert row["psnr_outside_minus_full"] == pytest.approx(1.15) and row["psnr_outside_interval_views"] > 0
     text = made["md"].read_text()
     assert "outside: PSNR ↑" in text and "| +1.15 ± 0.21 |" in text and "best in PSNR outside: better" in text
-    assert "all methods should leave as they are" in made["html"].read_text()
+    assert "should leave as they are" in made["html"].read_text()
     runs = results.load_comparison(home)
     title = lambda: compare_pictures._cells([runs.runs["full", "toy"]], runs.runs["full", "toy"], "a")[0][0]
     assert title() == "ground truth"
