@@ -1,10 +1,11 @@
-"""The paper's Figure 2: several views of a scene painted by the adapted prior, beside the prior as it is.
+"""The paper's Figure 2: views of a scene inpainted by the personalized prior, beside the prior as it is.
 
 `python -m benchmarks.studies.adapted --run runs/demo`, or `make scene=X adapted`; needs the stages up to `personalize`.
-Training views with something to invent, spread evenly, are known without the object as far as other views tell; their
-hole is painted from pure noise, the whole view at the prior's own size as SDS sees it. Same views, same noise,
-same sampler; the prior as it is with the empty prompt, and with the adapted one's, which may mean something to it.
-Writes sheet.png, the pictures, each as <view>/<column>.png, and adapted.json to --out.
+Takes evenly spread training views with something to invent; their background comes from other views, as far as known.
+The hole is inpainted from pure noise, with the whole view at the prior's native size, as SDS sees it. Views, noise and
+sampler are the same for all columns. The prior as it is runs with the empty prompt and with the personalized prior's
+prompt, which may mean something to it.
+Writes sheet.png, each picture as <view>/<column>.png, and adapted.json to --out.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from report.sheet import compose_sheet, enlarge, pick_evenly
 
 VIEWS = 5
 SEED = 0
-WIDTH = 400  # px of a picture on the sheet, about
+WIDTH = 400  # approximate width of a picture on the sheet, px
 COLUMNS = {  # column -> the prior, and its prompt
     "as it is, no prompt": ("before", ""),
     "as it is": ("before", PROMPTS[0]),
@@ -39,11 +40,12 @@ COLUMNS = {  # column -> the prior, and its prompt
 
 
 def load_holes(run: Path, count: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """View -> (uint8 [H, W, 3], as far as it is known without the object; hole, bool [H, W]): up to `count` training
-    views with something to invent, the reference's own left out.
+    """View -> (picture, hole) of up to `count` training views with something to invent, without the reference's own.
+
+    The picture is uint8 [H, W, 3] with the background as far as known, the hole bool [H, W].
 
     Raises:
-        ValueError: naming what is missing, or where nothing is to be invented.
+        ValueError: a stage is missing, or nothing is to be invented.
     """
     for stage in ("poses", "fit", "masks", "reference"):
         if not (run / stage).is_dir():
@@ -64,7 +66,7 @@ def load_holes(run: Path, count: int) -> dict[str, tuple[np.ndarray, np.ndarray]
 
 @torch.no_grad()
 def paint_hole(prior: Prior, picture: np.ndarray, hole: np.ndarray, prompt: str, steps: int) -> np.ndarray:
-    """uint8 [H, W, 3]: the hole painted from the noise of `SEED`."""
+    """uint8 [H, W, 3]: the hole inpainted from the noise of `SEED`."""
     inside = torch.from_numpy(hole)
     made = inpaint.repaint(
         prior,
@@ -82,7 +84,7 @@ def paint_hole(prior: Prior, picture: np.ndarray, hole: np.ndarray, prompt: str,
 
 
 def save_sheet(models: dict[str, Prior], run: Path, count: int, steps: int, out: Path) -> list[str]:
-    """Write the pictures and sheet.png; the views on it."""
+    """Write the pictures and sheet.png; return the views on it."""
     views, rows = load_holes(run, count), []
     for name, (picture, hole) in views.items():
         row = {"to paint": view_ranking.to_paint(picture, hole)}

@@ -1,11 +1,11 @@
-"""Ways of distilling, error against seconds: `python -m benchmarks.studies.attempts --run runs/demo`.
+"""Settings of distillation, error against seconds: `python -m benchmarks.studies.attempts --run runs/demo`.
 
-From one initialization, each setting of `ATTEMPTS` runs for the laptop profile's number of steps; at some of them the
-Gaussians are rendered from test views, with the clock stopped, and scored in the mask's box. The initialization is the
-run's own; --start takes another folder with gaussians.ply and labels.npy, such as runs/demo@lift_mse/initialize, whose
-pictures are worse: what a prior is worth depends on what there is left to teach.
-Test views measure here; nothing chooses a setting by them. Writes attempts.json and attempts.png to --out; settings
-that are in the file already are not run again.
+From one initialization, each setting in `ATTEMPTS` runs for the laptop profile's number of steps. At some of them test
+views are rendered, with the clock stopped, and scored in the mask's box. The initialization is the run's own; --start
+takes another folder with gaussians.ply and labels.npy, such as runs/demo@lift_mse/initialize, whose pictures are worse:
+the value of a prior depends on what is left to improve.
+Test views only measure; no setting is chosen by them. Writes attempts.json and attempts.png to --out; settings that
+are already in the file are not run again.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from stages import evaluate
 
 ROOT = Path(__file__).resolve().parents[2]
 
-MEASURED_STEPS = (0, 5, 10, 20, 40, 70, 100)  # steps done
-VIEWS = 10  # test views, evenly over all
+MEASURED_STEPS = (0, 5, 10, 20, 40, 70, 100)  # steps after which scores are measured
+VIEWS = 10  # test views, evenly spread
 SCORES = ("psnr_box", "ssim_box", "flip_box")
 NEEDS = ("poses", "fit", "masks", "reference", "initialize")
-BASE = "personalize"  # a key that is none of distill's: False takes the prior as it is
-FREE = {"lr": {"epsilon": 1e-15, "masked": 1.0, "opacities": 1.0}}  # 3DGS's full steps for masked Gaussians
-# What differs from the laptop profile.
+BASE = "personalize"  # not a parameter of `distill`: False takes the prior without personalization
+FREE = {"lr": {"epsilon": 1e-15, "masked": 1.0, "opacities": 1.0}}  # 3DGS's full step sizes for masked Gaussians
+# Differences from the laptop profile.
 ATTEMPTS: dict[str, dict] = {
     "the profile": {},
     "no SDS": {"sds": {"weight": 0}},
@@ -60,7 +60,7 @@ ATTEMPTS: dict[str, dict] = {
 
 
 def profile_params(overrides: dict) -> stage.Params:
-    """The laptop profile's parameters of `distill`, changed."""
+    """The laptop profile's parameters of `distill` with overrides."""
     values = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"]["distill"]
     for name, value in overrides.items():
         if name != BASE:
@@ -72,7 +72,7 @@ def load_test_views(run: Path) -> list[tuple]:
     """(camera, truth uint8 [H, W, 3], box) of `VIEWS` test views.
 
     Raises:
-        ValueError: none has a truth and a mask.
+        ValueError: no test view has ground truth and a mask.
     """
     scene, found = load_scene(run / "poses"), []
     for name in scene.test:
@@ -88,7 +88,7 @@ def load_test_views(run: Path) -> list[tuple]:
 
 @torch.no_grad()
 def score_views(gaussians, views: list[tuple]) -> dict[str, float]:
-    """Means of `SCORES` of 8-bit renders, as `evaluate` gives them."""
+    """Means of `SCORES` over 8-bit renders, as `evaluate` computes them."""
     rows = []
     for camera, truth, box in views:
         picture = (rasterizer.render(gaussians, camera).color.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
@@ -97,7 +97,7 @@ def score_views(gaussians, views: list[tuple]) -> dict[str, float]:
 
 
 def run_attempt(overrides: dict, run: Path, start: Path, views: list[tuple]) -> list[dict[str, float]]:
-    """Lines {"seconds", "iteration", the scores} of one attempt."""
+    """Lines {"seconds", "iteration", scores} of one setting."""
     params = profile_params(overrides)
     scene = load_scene(run / "poses")
     initial, masked, holes = stage.start(params, scene, run / "reference", start)
@@ -106,7 +106,9 @@ def run_attempt(overrides: dict, run: Path, start: Path, views: list[tuple]) -> 
     seen = stage.train_views(params, scene, run / "poses", run / "fit", run / "masks")
     job = job_of(seen, holes, prior, text, params, initial, masked)
     optimizer = GaussianOptimizer(initial, masked, None, masked_factors(params.lr), epsilon=params.lr.epsilon)
-    rasterizer.render(optimizer.gaussians, holes[0][0]).color.sum().backward()  # compiles, before the clock starts
+    rasterizer.render(
+        optimizer.gaussians, holes[0][0]
+    ).color.sum().backward()  # compiles the kernels before the clock starts
     optimizer.forget_gradients()
     with tempfile.TemporaryDirectory() as folder:
         log = trace.Trace(Path(folder))
@@ -121,7 +123,7 @@ def run_attempt(overrides: dict, run: Path, start: Path, views: list[tuple]) -> 
 
 
 def draw(curves: dict[str, list[dict]], path: Path, title: str) -> None:
-    """PSNR and FLIP against seconds, a line an attempt."""
+    """Chart PSNR and FLIP against seconds, one line per setting."""
     figure, grid = charts.new_figure(4.6, 1, 2)
     for axes, (name, label) in zip(grid[0], (("psnr_box", "PSNR, dB ↑"), ("flip_box", "FLIP ↓")), strict=True):
         for index, (attempt, lines) in enumerate(curves.items()):

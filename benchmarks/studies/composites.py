@@ -1,11 +1,11 @@
-"""The benchmark on real captures: `python -m benchmarks.studies.composites --places dino-ground`.
+"""Benchmark on real captures with synthetic objects: `python -m benchmarks.studies.composites --places dino-ground`.
 
-An object that is not there is drawn into the training photographs of a nerfstudio capture; the untouched photographs
-are the exact truth of what it hides. For each place: the scene, the job on it (given the true reference, unless
---alone), and a fit to the untouched photographs of the same views, scored in the same boxes: the ceiling.
-Writes to --out composites.md, composites.json and for each place a sheet of all test views (truth, with the object,
-ours, ceiling, difference) and a chart of errors against seconds. Settings are chosen on the places that run without
---report; those with it are for reporting.
+An object is drawn into the training photographs of a nerfstudio capture; the untouched photographs are the exact truth
+behind it. For each place: the scene, the job on it (with the true reference, unless --alone), and as the ceiling a fit
+to the untouched photographs of the same views, scored in the same boxes.
+Writes to --out composites.md, composites.json and per place a sheet of all test views (truth, with the object, ours,
+ceiling, difference) and a chart of errors against seconds. Settings are chosen only on the places that run without
+--report; the others serve for reporting.
 """
 
 from __future__ import annotations
@@ -41,26 +41,25 @@ REPORT_PLACES = (
 
 
 def make_scenes(place: Place, captures: Path, options: compositing.Options, out: Path) -> tuple[Path, Path]:
-    """(the place's scene, the same without the object) under out/scenes; made anew only where what they are made of
-    has changed."""
+    """(the place's scene, the same without the object) under out/scenes; made again only if their inputs changed."""
     scenes = out / "scenes"
     scene, untouched = scenes / (place.name + options.suffix), scenes / f"{place.name}-untouched"
     capture = None
     for folder, of in ((scene, [place, options]), (untouched, [place])):
-        told = json.dumps([repr(part) for part in of])
-        if (folder / "made.json").exists() and (folder / "made.json").read_text() == told:
+        inputs = json.dumps([repr(part) for part in of])
+        if (folder / "made.json").exists() and (folder / "made.json").read_text() == inputs:
             continue
         capture = capture or placement.load_photographs(captures / place.capture)
         if folder == scene:
             compositing.write_scene(place, capture, options, folder)
         else:
             compositing.write_untouched(place, capture, scene, folder)
-        (folder / "made.json").write_text(told)
+        (folder / "made.json").write_text(inputs)
     return scene, untouched
 
 
 def run_job(scene: Path, runs: Path, profile: str, variant: str = "") -> Path:
-    """The whole job on a scene by the runner, which finds what is done; its folder. ValueError where it fails."""
+    """Run the whole job on a scene, skipping finished stages, and return its folder. ValueError if it fails."""
     command = ["run", "all", "--scene", str(scene), "--runs", str(runs), "--profile", profile]
     command += ["--variant", variant] if variant else []
     if subprocess.run([sys.executable, "-m", "runner", *command], cwd=ROOT).returncode:
@@ -71,10 +70,10 @@ def run_job(scene: Path, runs: Path, profile: str, variant: str = "") -> Path:
 def evaluate_place(
     place: Place, captures: Path, options: compositing.Options, out: Path, profile: str, variants: list[str]
 ) -> dict:
-    """The place's row of the table; its sheet is saved, and its errors against seconds."""
+    """The place's row of the table; saves its sheet and its chart of errors against seconds."""
     scene, untouched = make_scenes(place, captures, options, out)
-    run, ceiling = (scoring.Run.at(run_job(folder, out / "runs", profile)) for folder in (scene, untouched))
-    others = {name: scoring.Run.of_variant(run, run_job(scene, out / "runs", profile, name)) for name in variants}
+    run, ceiling = (scoring.Run.load(run_job(folder, out / "runs", profile)) for folder in (scene, untouched))
+    others = {name: scoring.Run.load_variant(run, run_job(scene, out / "runs", profile, name)) for name in variants}
     save_image(out / f"{scene.name}.png", scoring.comparison_sheet(run, ceiling))
     for name, other in others.items():
         save_image(out / f"{scene.name}@{name}.png", scoring.comparison_sheet(other, ceiling))
@@ -115,16 +114,18 @@ def run_benchmark(given: argparse.Namespace) -> int:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--captures", type=Path, default=Path("../shared/data"), help="folder of nerfstudio captures")
-    parser.add_argument("--places", default="", help="these only, with commas between")
-    parser.add_argument("--report", action="store_true", help="the places that no setting is chosen on")
+    parser.add_argument("--places", default="", help="only these, separated by commas")
+    parser.add_argument("--report", action="store_true", help="the places on which no setting was chosen")
     parser.add_argument("--out", type=Path, default=Path("runs/composites"))
-    parser.add_argument("--alone", action="store_true", help="hand over no reference")
-    parser.add_argument("--shadow", type=float, default=0.0, help="strength, 0 to 1, of a shadow that is in no mask")
-    parser.add_argument("--rough", type=int, default=0, help="px by which training masks are wrong")
+    parser.add_argument("--alone", action="store_true", help="give no reference")
+    parser.add_argument("--shadow", type=float, default=0.0, help="strength, 0 to 1, of a shadow that no mask contains")
+    parser.add_argument("--rough", type=int, default=0, help="largest error of training masks, px")
     parser.add_argument("--seed", type=int, default=0, help="of the object's colours and the masks' faults")
     parser.add_argument("--profile", default="laptop", help="of pipeline.yaml")
-    parser.add_argument("--variants", default="", help="of pipeline.yaml, with commas between: scored beside it")
-    parser.add_argument("--make", action="store_true", help="make the scenes only, to look at")
+    parser.add_argument(
+        "--variants", default="", help="variants of pipeline.yaml, separated by commas, to score as well"
+    )
+    parser.add_argument("--make", action="store_true", help="only make the scenes")
     given = parser.parse_args()
     if not given.captures.is_dir():
         print(f"skipped: there are no captures at {given.captures}")

@@ -1,9 +1,8 @@
 """PSNR of held-out views against seconds of fitting: `python -m benchmarks.studies.fit --run runs/demo`.
 
-Fits the scene of a finished `poses` stage with the laptop profile's parameters and with variants of them, every 8th
-training view held out and only measured, the clock stopped meanwhile; making the points to start from counts. Writes
-fit.png (the curves), fit.csv and fit.md (where they end). Variants that `--out` holds already are not run again; an
-interrupted one goes on.
+Fits the scene of a finished `poses` stage with the laptop profile's parameters and variants of them. Every 8th training
+view is held out and only measured, with the clock stopped; making the initial points counts. Writes fit.png (curves),
+fit.csv and fit.md (final values). Variants that --out already holds are not run again; an interrupted one continues.
 """
 
 from __future__ import annotations
@@ -37,18 +36,18 @@ VARIANTS = {
 
 
 def fit_params(profile: str, overrides: dict[str, object], every: int) -> fit.Params:
-    """The profile's parameters of `fit` with these in their place; ValueError naming an unknown one."""
+    """The profile's parameters of `fit` with overrides. ValueError names an unknown one."""
     given = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"][profile].get("fit", {})
     return fit.Params(**given).changed({**overrides, "holdout": every})
 
 
 def run_fit(poses: Path, out: Path, params: fit.Params) -> list[dict[str, float]]:
-    """The trace of a fit with these parameters, kept in `out`."""
-    said = out / "params.json"
-    if said.exists() and json.loads(said.read_text()) != params.model_dump():
+    """Trace of a fit with these parameters, kept in `out`."""
+    saved = out / "params.json"
+    if saved.exists() and json.loads(saved.read_text()) != params.model_dump():
         raise ValueError(f"{out} holds a fit with other parameters; remove it, or name another --out")
     out.mkdir(parents=True, exist_ok=True)
-    said.write_text(json.dumps(params.model_dump()))
+    saved.write_text(json.dumps(params.model_dump()))
     if not (out / "gaussians.ply").exists():
         fit.run(params, out, poses=poses)
     return trace.read_trace(out / "trace.jsonl")
@@ -73,7 +72,7 @@ def main() -> None:
     parser.add_argument("--run", type=Path, required=True, help="runs/<scene>, its stage `poses` finished")
     parser.add_argument("--out", type=Path, help="default: runs/fit/<scene>")
     parser.add_argument("--profile", default="laptop")
-    parser.add_argument("--every", type=int, default=8, help="every so manieth training view is held out")
+    parser.add_argument("--every", type=int, default=8, help="hold out every n-th training view")
     parser.add_argument("--only", nargs="+", choices=list(VARIANTS), help="these variants")
     given = parser.parse_args()
     poses, out = given.run / "poses", given.out or Path("runs/fit") / given.run.name

@@ -1,9 +1,9 @@
-"""What distillation gains: `python -m benchmarks.studies.gain runs/demo-wide runs/demo-wide@no_sds`.
+"""Gain of distillation over initialization: `python -m benchmarks.studies.gain runs/demo-wide runs/demo-wide@no_sds`.
 
-For each run, over its test views: the scores in the mask's box that evaluate gave to result and initialization, and the
-gradient energy of both in that box and inside the mask itself, in units of the truth's. Under 1 is too smooth, over 1
-is grain or doubled edges. Shares of the masks that no training view saw are `masks`' own, and, with --scene, the
-generator's by casting rays. Pictures of some views go to --out: photo with the object, initialization, result, truth.
+For each run, over its test views: evaluate's box scores of result and initialization, and the gradient energy of both
+in the box and in the mask, in units of the truth's. Energy below 1 is too smooth; above 1 is grain or doubled edges.
+The shares of the masks that no training view saw come from `masks` and, with --scene, from the generator's rays.
+Writes pictures of some views to --out: photograph with the object, initialization, result, truth.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 RENDERS = {"initialization": "renders_initialize", "result": "renders"}
 SCORES = {"psnr_box": 2, "ssim_box": 4, "flip_box": 4}  # column of metrics.json, digits
-VIEWS = 4  # on the sheet
+VIEWS = 4  # number of views on the sheet
 ENLARGE = 2  # whole factor
 
 
@@ -60,7 +60,7 @@ def evaluate_run(run: Path) -> dict:
 
 
 def table(runs: dict[str, dict], shares: dict[str, dict[str, float]]) -> str:
-    """Markdown: the initialization once for each run whose result differs from it."""
+    """Markdown table; the initialization appears once per run whose initialization is its own."""
     lines = ["| | PSNR box, dB | SSIM | FLIP | energy, box | energy, mask |", "|---" * 6 + "|"]
     for name, ways in runs.items():
         for way, row in ways.items():
@@ -75,14 +75,17 @@ def table(runs: dict[str, dict], shares: dict[str, dict[str, float]]) -> str:
 
 
 def unseen_shares(run: Path, scene: Path | None) -> dict[str, float]:
-    """By `masks`, over the training views; by the generator's rays, over training and test views."""
+    """Shares of the masks that no training view saw.
+
+    By `masks` over the training views and, with `scene`, by the generator's rays over training and test views.
+    """
     share = {"by masks": round(load_json(stage_folder(run, "masks") / "facts.json")["undecided_share"], 3)}
     facts = load_json(scene / "truth/facts.json")["undecided_share"] if scene else {}
     return share | {f"by rays, {kind} views": round(value, 3) for kind, value in facts.items() if value is not None}
 
 
 def save_sheet(run: Path, path: Path) -> None:
-    """`VIEWS` test views as rows: the fit with the object, initialization, result, truth; cut to the mask's box."""
+    """Save `VIEWS` test views as rows: fit with the object, initialization, result, truth, around the mask's box."""
     scene = load_scene(stage_folder(run, "poses"))
     names, rows = pick_evenly(list(scene.test), VIEWS), []
     for name in names:

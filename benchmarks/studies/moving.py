@@ -1,8 +1,9 @@
-"""An object removed from one place of a real capture and put in at another: `python -m benchmarks.studies.moving`.
+"""An object of a real capture moved to another place: `python -m benchmarks.studies.moving`.
 
-The training photographs show the object where it stood, with masks; as many pictures of it at the other place as show
-all of it are the references, each with its depth, around it between the sparse points. The same object drawn there into
-all photographs is the truth, and a fit to them the ceiling. Cameras stay as given, for by these the object was drawn.
+The training photographs show the object at its first place, with masks. The references are as many pictures of it at
+the second place as are needed to show all of it, each with depth: the object's own, elsewhere interpolated between
+sparse points. The object drawn there into all photographs is the truth, and a fit to these is the ceiling. Cameras stay
+as given, since the object was drawn with them.
 Writes moving.json and a sheet of all test views (truth, as photographed, ours, ceiling, difference) to --out.
 """
 
@@ -18,17 +19,22 @@ from benchmarks.studies import composites, compositing, placement, scoring
 from reffusion.io.arrays import save_json
 from reffusion.io.images import save_image
 
-REGION_FACTOR = 1.08  # radius of the region over that of the object
-COVERED = 0.995  # of what photographs show of the object: what the references show of it, at least
-GRID = 12  # points along each edge of a face, by which is told how well a picture shows the object
+REGION_FACTOR = 1.08  # radius of the region, over that of the object
+COVERED = 0.995  # least part of the object's visible surface that the references must show
+GRID = 12  # points along each edge of a face, by which the visibility of the object is measured
 
 
 def select_references(capture: placement.Photographs, thing: placement.PlacedObject, names: list[str]) -> list[str]:
-    """The photographs that show `COVERED` of what all of them show of the object: each next one is that by which its
-    surface is seen most finely, each point in the picture that shows it best, beside the best of all."""
+    """Photographs that together show `COVERED` of the object's visible surface, selected greedily.
+
+    Each next one adds most to the resolution at which the surface is seen, every point taken in its best picture,
+    relative to the best of all photographs.
+    """
     ticks = (np.arange(GRID) + 0.5) / GRID * 2 - 1
     sides = np.stack(np.meshgrid(ticks, ticks), -1).reshape(-1, 2)
-    faces = [(axis, end) for axis in range(3) for end in (-1, 1) if (axis, end) != (2, -1)]  # it stands on that one
+    faces = [
+        (axis, end) for axis in range(3) for end in (-1, 1) if (axis, end) != (2, -1)
+    ]  # without the face it stands on
     at = np.concatenate([np.insert(sides, axis, end, 1) for axis, end in faces])
     normals = np.repeat(np.array([end * thing.axes[axis] for axis, end in faces]), len(sides), 0)
     points = thing.middle + (at * thing.half) @ thing.axes
@@ -41,7 +47,7 @@ def select_references(capture: placement.Photographs, thing: placement.PlacedObj
 
 
 def _fineness(capture: placement.Photographs, name: str, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """[P], how finely a photograph shows points of these normals, [P, 3] both; 0 where it does not."""
+    """[P]: how finely a photograph shows points with normals, [P, 3] both; 0 for points that it does not show."""
     camera = capture.cameras[name]
     image, z = capture.project(camera, points)
     framed = ((image >= 0) & (image < (capture.width, capture.height))).all(1) & (z > 0)
@@ -56,14 +62,14 @@ def write_scenes(
     capture: placement.Photographs,
     out: Path,
 ) -> Path:
-    """The scene in out/<start>-to-<goal>, and the ceiling's beside it; its folder."""
+    """Write the scene to out/<start>-to-<goal> and the ceiling's beside it; return the scene's folder."""
     before, after = placement.place_object(capture, start), placement.place_object(capture, goal)
     after = placement.PlacedObject(after.foot, before.height, after.axes, before.half, before.shape)
     views, pictured = placement.select_views(capture, goal, after), compositing.PixelRays(capture)
     tints = np.random.default_rng(0).uniform(0.35, 0.9, (3, 3))
     scene, ceiling = (out / f"{start.name}-to-{goal.name}{end}" for end in ("", "-untouched"))
     train = [name for name in views.all if name not in views.test]
-    asked = select_references(capture, after, train)
+    references = select_references(capture, after, train)
     for folder in (scene, ceiling):
         shutil.rmtree(folder, ignore_errors=True)
     for name in views.all:
@@ -78,10 +84,10 @@ def write_scenes(
         with_it, mask = compositing.composite_object(photo, pictured, camera, before, tints)
         save_image(scene / f"images/{name}.png", with_it)
         save_image(scene / f"masks/{name}.png", mask)
-        if name in asked:
+        if name in references:
             save_image(scene / f"references/{name}.png", shown)
             depth = compositing.composite_depth(pictured, camera, after)
-            depth[(mask > 0) & (at_goal == 0)] = np.nan  # nobody knows where it stood
+            depth[(mask > 0) & (at_goal == 0)] = np.nan  # unknown behind the object's first place
             np.save(scene / f"references/{name}.npy", depth)
     for folder in (scene, ceiling):
         compositing.write_cameras(capture, views, folder)
@@ -90,7 +96,7 @@ def write_scenes(
     )
     (ceiling / "scene.yaml").write_text(f"masks: none\n{tested}")
     given = "".join(
-        f'- {{view: "{name}", image: references/{name}.png, depth: references/{name}.npy}}\n' for name in asked
+        f'- {{view: "{name}", image: references/{name}.png, depth: references/{name}.npy}}\n' for name in references
     )
     radius = REGION_FACTOR * float(np.linalg.norm(after.half))
     region = f"region: {{center: {after.middle.tolist()}, radius: {radius}}}\n"
@@ -113,7 +119,7 @@ def main() -> None:
         )
     scene = write_scenes(start, goal, placement.load_photographs(given.captures / start.capture), given.out / "scenes")
     folders = (scene, scene.with_name(f"{scene.name}-untouched"))
-    run, ceiling = (scoring.Run.at(composites.run_job(each, given.out / "runs", given.profile)) for each in folders)
+    run, ceiling = (scoring.Run.load(composites.run_job(each, given.out / "runs", given.profile)) for each in folders)
     save_image(given.out / f"{scene.name}.png", scoring.comparison_sheet(run, ceiling))
     scores = scoring.score_place(run, ceiling, {})
     save_json(given.out / "moving.json", {"place": scene.name, **scores})
