@@ -180,8 +180,8 @@ def test_without_captures_it_is_skipped(tmp_path, monkeypatch, capsys):
 
 
 def test_the_sets_share_no_place_and_unknown_ones_are_named():
-    names = [place.name for place in (*composites.TUNING_PLACES, *composites.REPORT_PLACES)]
-    assert len(set(names)) == len(names) == 10
+    names = [place.name for place in (*composites.TUNING_PLACES, *composites.REPORT_PLACES, *composites.NAMED_PLACES)]
+    assert len(set(names)) == len(names) == 24
     assert composites.select_places("bear-rim,table", report=False) == (
         composites.REPORT_PLACES[4],
         composites.TUNING_PLACES[0],
