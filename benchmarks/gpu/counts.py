@@ -1,7 +1,7 @@
-"""What the parts of a step compute and move at full size, counted without computing: the table of the cost model.
+"""Operations and bytes of the parts of a step at full size, counted without computing: the table of the cost model.
 
-Floating-point operations of products and convolutions, and the bytes that all operations read and write (an attention's
-matrices left out: a GPU's kernels do not write them), on torch's device without memory.
+Counts floating-point operations of matrix products and convolutions, and the bytes that all operations read and write
+(without attention matrices, which GPU kernels do not write), on torch's meta device.
 
     python -m benchmarks.gpu.counts > reffusion/cost/counts.py
 """
@@ -25,12 +25,12 @@ from reffusion.gaussians.ssim import dssim_torch
 from reffusion.prior import denoising, diffusion
 from reffusion.prior.model import Prior
 
-HEIGHT, WIDTH, GAUSSIANS = 300, 400, 1000  # of what is counted by pixel, and by Gaussian
+HEIGHT, WIDTH, GAUSSIANS = 300, 400, 1000  # of what is counted per pixel and per Gaussian
 PATCHES, SIDE = 64, 64  # the paper's
 
 
 class _TrafficCounter(TorchDispatchMode):
-    """Counts the bytes of what each operation is given and makes; views move nothing."""
+    """Counts the bytes of each operation's inputs and outputs; views move nothing."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -49,7 +49,7 @@ class _TrafficCounter(TorchDispatchMode):
 
 
 def _attention(tensor: Tensor) -> bool:
-    """A matrix of who looks at whom, a row for each pixel of a latent."""
+    """True for an attention matrix, with a row for each pixel of a latent."""
     return tensor.ndim >= 3 and min(tensor.shape[-2:]) >= 1024
 
 
@@ -61,8 +61,10 @@ def count_work(work: Callable[[], object]) -> dict[str, float]:
 
 
 def count_prior(shape: full_size.Shape, name: str) -> dict[str, dict[str, float]]:
-    """One sample of the prior's native size: the UNet's answer, encoding, encoding and the way back, decoding, and a
-    personalization sample forward and backward."""
+    """Counts of one sample at the prior's native size.
+
+    The UNet, encoding, encoding with its backward pass, decoding, and a personalization sample forward and backward.
+    """
     with torch.device("meta"):
         made = full_size.networks(shape, torch.float16)
     prior = full_size.assemble_prior(shape, made, "meta")
@@ -74,7 +76,7 @@ def count_prior(shape: full_size.Shape, name: str) -> dict[str, dict[str, float]
         "encode": count_work(_without(diffusion.encode, prior, image)),
     }
     found["decode"] = count_work(_without(diffusion.decode, prior, latents))
-    if prior.text_encoder_2 is None:  # SDXL paints references only
+    if prior.text_encoder_2 is None:  # SDXL only inpaints references
         graded = image.clone().requires_grad_()
         found["encode and back"] = count_work(lambda: diffusion.encode(prior, graded).sum().backward())
         full_size.trainer(prior, 1)
@@ -99,7 +101,7 @@ def run_unet(prior: Prior, latents: Tensor) -> None:
 
 
 def count_critic_step(width: int) -> dict[str, float]:
-    """What `Adversary.learn` and `.loss` do: the critic's step with R1, then its word on the fake patches."""
+    """Counts of `Adversary.learn` and `.loss`: the critic's step with R1, then its answer to the fake patches."""
     critic = Critic(SIDE, width, torch.Generator()).to("meta")
     real = torch.zeros(PATCHES, 3, SIDE, SIDE, device="meta")
     leaf = torch.zeros(PATCHES, 3, SIDE, SIDE, device="meta", requires_grad=True)
@@ -115,7 +117,7 @@ def count_critic_step(width: int) -> dict[str, float]:
 
 
 def count_depth_network(height: int = 518, width: int = 686) -> dict[str, float]:
-    """Depth Anything V2 Small on a view of 4:3."""
+    """Counts of Depth Anything V2 Small on a 4:3 view."""
     from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
 
     backbone = Dinov2Config(
@@ -132,7 +134,10 @@ def count_depth_network(height: int = 518, width: int = 686) -> dict[str, float]
 
 
 def count_pixel_loss() -> dict[str, float]:
-    """Reconstruction loss there and back, a pixel of three channels; gsplat reads and writes as much again."""
+    """Counts of the reconstruction loss and its backward pass per million pixels of three channels.
+
+    gsplat reads and writes as much again.
+    """
     image = torch.zeros(HEIGHT, WIDTH, 3, requires_grad=True)
 
     def work() -> None:
@@ -143,7 +148,7 @@ def count_pixel_loss() -> dict[str, float]:
 
 
 def count_adam() -> dict[str, float]:
-    """One step of Adam for each Gaussian of degree 3, all of them visible."""
+    """Counts of one Adam step per million Gaussians of degree 3, all visible."""
     scene = full_size.gaussians(GAUSSIANS, "cpu")
     optimizer = optimize.GaussianOptimizer(scene)
     rates = optimizer.rates.at(0.0, optimizer.gaussians)
@@ -157,7 +162,7 @@ def count_adam() -> dict[str, float]:
 
 
 def _scaled(found: dict[str, float], count: int) -> dict[str, float]:
-    """Per a million."""
+    """Values per million."""
     return {name: round(value * 1e6 / count, 5) for name, value in found.items()}
 
 

@@ -44,7 +44,7 @@ REPORT_PLACES = (
 NAMED_PLACES = (
     Place("paving", "garden", "frame_00001", (130, 440), 0.13, 60, 34, 6, near=30),
     Place("lawn", "dinosaur", "frame_00096", (400, 400), 0.13, 50, 36, 5, near=40, shape="ellipsoid"),
-    # Of photographs at half the size, with the points of our own stage `poses`. The object is drawn over the fox's head.
+    # Photographs at half size, points of our own stage `poses`. The object is drawn over the fox's head.
     Place("fox-wall", "fox", "0001", (300, 830), 0.13, 62, 40, 6, near=70),
     # LOG.md records photograph, pixel, size and shape of the following ones. Arc, numbers of views and `near` are new:
     # they give the recorded numbers of photographs (10 to 30) to within 5.

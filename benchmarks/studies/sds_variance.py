@@ -1,17 +1,17 @@
-"""The variance of a scene's SDS gradient over noise and timesteps, before and after personalization.
+"""Variance of a scene's SDS gradient over noise and timesteps, before and after personalization.
 
-`python -m benchmarks.studies.sds_variance`, or `make scene=X sds-variance`: on any scene, with ground truth or
-without, once `initialize` and `personalize` are done. Training views with something to invent are rendered from the
-initialization and given to the prior as distillation gives them: whole, and in a window around the hole. The gradient
-is g = z - x0(z_t), that of `weighting: x0`; any other weighting multiplies it by a function of t alone. In the hole's
-latents, means over them and over the views:
+`python -m benchmarks.studies.sds_variance`, or `make scene=X sds-variance`: for any scene, with or without ground
+truth, after `initialize` and `personalize`. Training views with something to invent are rendered from the
+initialization and given to the prior as in distillation: whole, and in a window around the hole. The gradient is
+g = z - x0(z_t), that of `weighting: x0`; any other weighting multiplies it by a function of t alone. In the latents of
+the hole, averaged over them and over the views:
 
   noise       variance of g over draws of the noise, at each timestep
-  pull        square of the mean over these draws, what remains of it in the long run (their own noise is taken off)
-  over noise, over timesteps, together: the mean of `noise` over the timesteps, the variance of that mean gradient from
-              one timestep to another, and their sum: the variance of what one step of distillation draws
+  pull        squared mean over these draws, the part that remains in the long run (corrected for the draws' own noise)
+  over noise, over timesteps, together: mean of `noise` over the timesteps, variance of the mean gradient over the
+              timesteps, and their sum: the variance of what one step of distillation draws
 
-Every draw is seeded, and the same before and after, on any device. Prints tables and the memory it took, and writes
+Every draw is seeded and the same before and after, on any device. Prints tables and the memory used, and writes
 sds_variance.json to --out.
 """
 
@@ -46,7 +46,7 @@ def load_inputs(run: Path, prior: Prior) -> dict[str, tuple[Tensor, Tensor]]:
     """Scale -> (pictures [B, 3, S, S] in [-1, 1], holes [B, 1, S, S], 1 = repaint) of up to `VIEWS` training views.
 
     Raises:
-        ValueError: naming what is missing, or where nothing is to be invented.
+        ValueError: a stage is missing, or nothing is to be invented.
     """
     for stage in ("poses", "masks", "initialize"):
         if not (run / stage).is_dir():
@@ -86,10 +86,10 @@ def sds_gradients(prior: Prior, pictures: Tensor, holes: Tensor, prompt: str) ->
 
 
 def variances(drawn: Tensor) -> dict:
-    """See the module's first lines. Args: drawn: [T, K, M], T and K at least 2."""
+    """Variances of gradients [T, K, M], T and K at least 2; see the module docstring."""
     noise = drawn.var(1)  # [T, M], unbiased
     mean = drawn.mean(1)
-    left = noise / drawn.shape[1]  # what of the noise remains in the mean of K draws
+    left = noise / drawn.shape[1]  # part of the noise that remains in the mean of K draws
     over_noise = noise.mean()
     over_timesteps = (mean.var(0) - left.mean(0)).mean().clamp(min=0)
     return {
@@ -111,7 +111,7 @@ def measure(models: dict[str, Prior], run: Path) -> dict[str, dict[str, dict]]:
 
 
 def table(found: dict[str, dict[str, dict]]) -> str:
-    """Markdown: for each scale a row a timestep, then the three sums; variance before and after, and their ratio."""
+    """Markdown: per scale a row for each timestep, then the three sums; variance before and after, and their ratio."""
     lines = []
     for scale, by_time in found.items():
         before, after = by_time["before"], by_time["after"]

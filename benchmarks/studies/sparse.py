@@ -1,14 +1,14 @@
 """Scores against the number of photographs: `make scene=demo-sparse sparse`.
 
-A made scene brings its views in the order in which they are given pixels, the first of which its scene.yaml names; here
-1, 2, 4 and 8 of them, every other training view a camera only. Three ways for each number:
+A made scene lists its views in the order in which they become photographs; its scene.yaml names the first. Here 1, 2, 4
+and 8 of them are photographs, and every other training view is a camera only. Three methods for each number:
 
-  personalization   the photographs teach the prior, and nothing else: Gaussians start at the sparse points
-  both              they also are reconstructed: the method as it is
-  plain 3DGS        a fit to them from points, and no more: the variant `remove_only`
+  personalization   the photographs only personalize the prior; Gaussians start at the sparse points
+  both              they are also reconstructed: the method as it is
+  plain 3DGS        only a fit to them, from points: the variant `remove_only`
 
-Whole test views are scored. Writes sparse.json and sparse.png to --out; jobs that are done are not run again. Several
-scenes, of several seeds: a curve is their mean.
+Whole test views are scored. Writes sparse.json and sparse.png to --out; finished jobs are not run again. With several
+scenes, of several seeds, a curve is their mean.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ ROOT = Path(__file__).resolve().parents[2]
 COUNTS = (1, 2, 4, 8)
 SCORES = {"psnr_full": "PSNR (dB)", "flip_full": "FLIP"}
 BOTH, PLAIN, TAUGHT = "both", "plain 3DGS", "personalization"
-POINTS = "fit.few_views=fewer_harmonics"  # a fit starts from points
+POINTS = "fit.few_views=fewer_harmonics"  # a fit starts from sparse points
 METHODS = {
     TAUGHT: (
         f"--set={POINTS} fit.iterations=1 initialize.settle=0 distill.reconstruction.every=0 "
@@ -43,10 +43,10 @@ COLOURS = {TAUGHT: charts.GREEN, BOTH: charts.BLUE, PLAIN: charts.ORANGE}
 
 
 def make_scene(scene: Path, count: int, folder: Path) -> Path:
-    """The scene with pixels in so many views; its files are linked, not copied.
+    """The scene with that many photographs; its files are hard links.
 
     Raises:
-        ValueError: it does not say in which order its views are given pixels.
+        ValueError: the scene does not say in which order its views become photographs.
     """
     order = load_json(scene / "truth/facts.json").get("shown", [])
     if len(order) < count:
@@ -54,14 +54,14 @@ def make_scene(scene: Path, count: int, folder: Path) -> Path:
     made = folder / f"{scene.name}-{count}-views"
     if not made.exists():
         shutil.copytree(scene, made, copy_function=os.link, ignore=shutil.ignore_patterns("scene.yaml", ".generated"))
-    said, shown = yaml.safe_load((scene / "scene.yaml").read_text()), order[:count]
+    settings, shown = yaml.safe_load((scene / "scene.yaml").read_text()), order[:count]
     given = [{"view": name, "image": f"images_4/{name}.png"} for name in shown]
-    save_text(made / "scene.yaml", yaml.safe_dump(said | {"train": shown, "clean": shown, "reference": given}))
+    save_text(made / "scene.yaml", yaml.safe_dump(settings | {"train": shown, "clean": shown, "reference": given}))
     return made
 
 
 def run_method(scene: Path, way: str, runs: Path) -> dict[str, float]:
-    """The scores of one way on a scene, by the runner. ValueError where it fails."""
+    """Run one method on a scene and return its scores. ValueError if it fails."""
     home = runs / way.replace(" ", "-")
     command = [sys.executable, "-m", "runner", "run", "all", f"--scene={scene}", f"--runs={home}", *METHODS[way]]
     if subprocess.run(command, cwd=ROOT).returncode:
@@ -72,7 +72,7 @@ def run_method(scene: Path, way: str, runs: Path) -> dict[str, float]:
 
 
 def draw(found: dict[str, dict[str, list[dict[str, float]]]], path: Path) -> None:
-    """way -> number of views -> a score for each scene; a panel for each score."""
+    """Draw a panel per score. `found`: method -> number of views -> scores of each scene."""
     made, grid = charts.new_figure(3.2, 1, len(SCORES))
     for axes, (score, title) in zip(grid[0], SCORES.items(), strict=True):
         for way, counts in found.items():
