@@ -57,7 +57,7 @@ class Bench:
     _prior: tuple[str, Prior, str] | None = field(default=None, repr=False)
 
     def prior(self, half: str) -> tuple[Prior, str]:
-        """(prior, source): in that precision on a GPU, else float32; published weights if they are here, else random ones."""
+        """(prior, source): in that precision on a GPU, else float32; published weights if present, else random ones."""
         if self._prior is None or self._prior[0] != half:
             self._prior = None
             gc.collect()
@@ -78,7 +78,7 @@ class Bench:
         return made, masked.to(self.device)
 
     def measure(self, work: Callable[[], dict[str, float] | None]) -> dict[str, Any]:
-        """Median seconds after a warm-up, peak memory of the GPU (or of live tensors), and the values that `work` returns."""
+        """Median seconds after a warm-up, peak memory of the GPU (or of live tensors), and the values of `work`."""
         values, seconds = work() or {}, []
         for _ in range(self.sizes.repeats):
             self._wait()

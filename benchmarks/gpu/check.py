@@ -106,7 +106,10 @@ def project_hours(parts: dict[str, dict[str, Any]]) -> dict[str, float]:
 
 
 def describe_machine(device: str) -> dict[str, Any]:
-    """The machine that the figures hold for. Loads gsplat's extension, and builds it if `make gpu` has not, outside all parts."""
+    """The machine that the figures hold for.
+
+    Loads gsplat's extension before all parts, and builds it if `make gpu` has not.
+    """
     facts: dict[str, Any] = {"device": device, "torch": torch.__version__}
     if device == "cpu":
         return facts

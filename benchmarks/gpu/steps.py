@@ -74,10 +74,10 @@ def distillation(bench: Bench) -> dict[str, Any]:
     (scene, _), view = bench.scene(), full_size.train_view(bench.sizes.rows, bench.device)
 
     def step() -> dict[str, float]:
-        said = full_size.sds_step(prior, text, view, scene, Sds())
+        values = full_size.sds_step(prior, text, view, scene, Sds())
         for name in PARAMETERS:
             getattr(scene, name).grad = None
-        return said
+        return values
 
     return bench.measure(step) | {"weights": source}
 
@@ -103,15 +103,15 @@ def adversarial(bench: Bench) -> dict[str, Any]:
 
     def step() -> dict[str, float]:
         draw = generator(0, "patches")
-        loss, _, said = adversarial_term(scene, masked, view, view.picture, view.repaint, critic, draw)
+        loss, _, values = adversarial_term(scene, masked, view, view.picture, view.repaint, critic, draw)
         backpropagate(scene, loss)
-        return said
+        return values
 
     return bench.measure(step)
 
 
 def depth_estimator(sizes: Sizes, device: str) -> tuple[Estimator, str]:
-    """Depth Anything V2 Small, published or with random weights; of the two signs the one that fits the scene is taken."""
+    """Depth Anything V2 Small, published or with random weights; the sign that fits the scene is taken."""
     from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
 
     if sizes == PAPER and local.locate(published.DEPTH_ANYTHING) is not None:

@@ -1,4 +1,4 @@
-"""Run every case: a table on the screen, and a file. Ends with 1 when a case is out of bound.
+"""Run every case, print a table and write a file. Exits with 1 if a case is out of bound.
 
 python -m benchmarks.stability [--out runs/stability.json] [--only WORDS]
 """
@@ -23,7 +23,7 @@ def format_row(row: Row) -> str:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs/stability.json"))
-    parser.add_argument("--only", default="", help="cases whose name contains this")
+    parser.add_argument("--only", default="", help="only cases whose name contains this")
     given = parser.parse_args()
     cases = [case for case in all_cases() if given.only in case.name]
     if not cases:
