@@ -35,7 +35,7 @@ def robust_error(outliers: float) -> float:
 
 
 def robust_difference() -> float:
-    """Without outliers: difference of the robust line from plain L2, in L2's standard errors at the end of the range."""
+    """Without outliers: difference of the robust line from plain L2, in L2's standard errors at the range's end."""
     x, y, _ = make_samples(0.0)
     apart = alignment.align(x, y, robust=True).apply(x) - alignment.align(x, y).apply(x)
     return float(np.abs(apart).max() / (NOISE * 2.0 / np.sqrt(len(x))))

@@ -25,7 +25,7 @@ from reffusion.depth.alignment import Alignment
 
 
 class Fault(NamedTuple):
-    """A fault: its name, module and name of what is replaced, correct function (or constant) -> faulty one, the case."""
+    """A fault: its name, module and name of the replaced object, correct -> faulty object, and the catching case."""
 
     name: str
     module: str

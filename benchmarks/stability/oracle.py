@@ -102,8 +102,8 @@ gradients are standard normal) and rounded about ten times on its way, keeps a r
 def errors(gaussians: Gaussians, camera: Camera, relative: float, seed: int = 0) -> dict[str, float]:
     """Name of an image or parameter block -> relative L2 error |kernel - oracle| / (|oracle| + floor / relative).
 
-    A value of at most `relative` means an error within relative * |oracle| + floor. A quaternion's gradient is multiplied
-    by its length, which makes it one of a rotation: otherwise the shortest quaternion would dominate.
+    A value of at most `relative` means an error within relative * |oracle| + floor. A quaternion's gradient is
+    multiplied by its length, which makes it one of a rotation: otherwise the shortest quaternion would dominate.
     """
     # Depth is in units of the farthest one, so that the terms of all sums are of order one, as `FLOOR` assumes.
     far = max(1.0, rasterizer.render(gaussians, camera, impl="cpu").depth.max().item())
