@@ -28,18 +28,18 @@ RESULTS = ("distill", "initialize", "fit")  # stages with Gaussians, latest firs
 
 def masks_section(job: Job) -> list[str]:
     """Masks over photographs: input masks tinted, the classes from the stage `masks` outlined."""
-    poses, given = (job.folders.get(stage, Path()) for stage in ("poses", "raw_masks"))
+    poses, raw_masks = (job.folders.get(stage, Path()) for stage in ("poses", "raw_masks"))
     top = page.heading("Masks")
-    if not (poses / "views.json").is_file() or not any((given / "masks").rglob("*.png")):
+    if not (poses / "views.json").is_file() or not any((raw_masks / "masks").rglob("*.png")):
         return [top, page.paragraph("None: no photograph has a mask.")]
     views = load_json(poses / "views.json")
-    shown = pick_evenly(sorted(views["train"]), MAX_MASK_VIEWS)
+    names = pick_evenly(sorted(views["train"]), MAX_MASK_VIEWS)
     cell = lambda name: (
         inline_images.photo_address(draw_mask_classes(job, poses, name), MASK_SIDE),
         f"{name}, {view_role(name, views)}",
     )
-    first = pick_evenly(shown, FIRST_MASK_VIEWS)
-    rest = [name for name in shown if name not in first]
+    first = pick_evenly(names, FIRST_MASK_VIEWS)
+    rest = [name for name in names if name not in first]
     more = (
         f"<details><summary>{len(rest)} more</summary>{inline_images.picture_grid(list(map(cell, rest)))}</details>"
         if rest
@@ -50,7 +50,7 @@ def masks_section(job: Job) -> list[str]:
         words += "Yellow line: the removed region, consistent over all views. Cyan line: what no photograph shows. "
     else:
         words += "Consistent masks come with the stage `masks`. "
-    words += f"{len(shown)} of {len(views['train'])} training views."
+    words += f"{len(names)} of {len(views['train'])} training views."
     return [top, page.paragraph(words, quiet=True), inline_images.picture_grid(list(map(cell, first))), more]
 
 
@@ -113,11 +113,11 @@ def _origin(facts: dict, folder: Path, name: str) -> str:
     if name in facts.get("given", ()):
         return f"given; {facts.get('fits', {}).get(name, 'how well it fits was not recorded')}"
     path = folder / "candidates.json"
-    said = load_json(path) if path.is_file() else {}
-    if "painter" in said:
-        return f"painted by {said['painter']}"
-    way = "composed of patches of the photographs" if "misfits" in said else "painted by the diffusion model"
-    scores = said.get("misfits") or said.get("seams") or []
+    record = load_json(path) if path.is_file() else {}
+    if "painter" in record:
+        return f"painted by {record['painter']}"
+    way = "composed of patches of the photographs" if "misfits" in record else "painted by the diffusion model"
+    scores = record.get("misfits") or record.get("seams") or []
     return f"{way}, the best of {len(scores)} tries" if len(scores) > 1 else way
 
 
@@ -150,8 +150,8 @@ def depth_section(job: Job) -> list[str]:
     loaded = {words: load_ply(job.folders[stage] / "gaussians.ply") for words, stage in states.items()}
     cells = []
     for name in names:
-        drawn = color_disparity([render_depth(gaussians, scene.cameras[name]) for gaussians in loaded.values()])
-        for words, picture in zip(loaded, drawn, strict=True):
+        pictures = color_disparity([render_depth(gaussians, scene.cameras[name]) for gaussians in loaded.values()])
+        for words, picture in zip(loaded, pictures, strict=True):
             cells.append((inline_images.photo_address(picture, DEPTH_SIDE), f"{name}, {words}"))
     legend = "Bright is near; pairs share a scale; grey is empty."
     return [top, page.paragraph(legend, quiet=True), inline_images.picture_grid(cells)]

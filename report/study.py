@@ -145,12 +145,12 @@ def _save_clip(frames: list[np.ndarray], rate: int, folder: Path, name: str) -> 
     except ValueError:
         (folder / f"{name}.webm").unlink(missing_ok=True)
         gap = np.full((frames[0].shape[0], GAP, 3), 255, np.uint8)
-        shown = [
+        stills = [
             part
             for place in pick_evenly([str(n) for n in range(len(frames))], STILLS)
             for part in (frames[int(place)], gap)
         ]
-        save_image(folder / f"{name}.png", np.concatenate(shown[:-1], 1))
+        save_image(folder / f"{name}.png", np.concatenate(stills[:-1], 1))
         return f"clips/{name}.png"
     return f"clips/{name}.webm"
 

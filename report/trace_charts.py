@@ -62,17 +62,17 @@ def draw_stage_chart(stage: str, series: dict[str, Lines], path: Path) -> list[s
         return []
     made, grid = new_figure(3.0, 1, len(names))
     for axes, name in zip(grid[0], names, strict=True):
-        drawn = {key: quantity_curve(lines, name) for key, lines in series.items()}
-        drawn = {key: clamp_first_seconds(points) for key, points in drawn.items() if len(points)}
-        alone = len(drawn) == 1
-        for key, points in drawn.items():
-            words = f" {key}" if 1 < len(drawn) <= 4 else ""
+        curves = {key: quantity_curve(lines, name) for key, lines in series.items()}
+        curves = {key: clamp_first_seconds(points) for key, points in curves.items() if len(points)}
+        alone = len(curves) == 1
+        for key, points in curves.items():
+            words = f" {key}" if 1 < len(curves) <= 4 else ""
             _curve(axes, name, points, BLUE if alone else GREY, words, main=alone and name == names[0])
-        values = np.concatenate([points[:, 1] for points in drawn.values()])
+        values = np.concatenate([points[:, 1] for points in curves.values()])
         if needs_log_axis(values, 10) and values.min() > 0:
             axes.set_yscale("log")
             use_plain_log_ticks(axes, "y")
-        set_time_axis(axes, np.concatenate([points[:, 0] for points in drawn.values()]))
+        set_time_axis(axes, np.concatenate([points[:, 0] for points in curves.values()]))
         axes.set_title(axis_title(name), fontsize=10, loc="left")
         axes.set_xlabel("seconds of work", fontsize=10)
     save_chart(made, path)

@@ -132,8 +132,10 @@ class Viewer:
         self.server.scene.set_up_direction(-np.mean([camera.world_to_camera[1, :3] for camera in train], 0))
         move_to_view(self.server.initial_camera, train[len(train) // 2], target)
         folder = stage_folder(home, "reference") / "references"
-        given = {path.stem: load_image(path) for path in sorted(folder.glob("*.png")) if path.stem in scene.cameras}
-        for kind, pictures in (("cameras", photos), ("references", given)):
+        references = {
+            path.stem: load_image(path) for path in sorted(folder.glob("*.png")) if path.stem in scene.cameras
+        }
+        for kind, pictures in (("cameras", photos), ("references", references)):
             checkbox = self.server.gui.add_checkbox(kind, False, visible=bool(pictures))
             frusta = [self._add_frustum(kind, scene.cameras[name], p, target) for name, p in pictures.items()]
             checkbox.on_update(lambda _, frusta=frusta, box=checkbox: _set_visible(frusta, box.value))
