@@ -232,7 +232,10 @@ class Session:
         return corrected(image, self.masks[name], clicks, relief)
 
     def _uses_network(self, clicks: Clicks) -> bool:
-        """True if the network answers these clicks: it cannot remove parts of a mask that came from other views."""
+        """True if the network answers these clicks.
+
+        Negative clicks alone correct a mask that follows from other views, of which the network knows nothing.
+        """
         return self.segmenter is not None and bool(clicks.positive.any())
 
     def _network_mask(self, name: str, clicks: Clicks) -> np.ndarray:

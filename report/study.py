@@ -186,15 +186,10 @@ def main() -> None:
     arguments = parser.parse_args()
     if not arguments.scene and not arguments.data:
         parser.error("--scene or --data: of which comparison?")
-    methods = [name for name in arguments.variants.split(",") if name]
+    methods = [method for method in arguments.variants.split(",") if method]
+    name = arguments.scene.name if arguments.scene else FOLDER_COMPARISON
     try:
-        print(
-            make(
-                arguments.runs / (arguments.scene.name if arguments.scene else FOLDER_COMPARISON),
-                methods,
-                arguments.seed,
-            )
-        )
+        print(make(arguments.runs / name, methods, arguments.seed))
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
 
