@@ -21,7 +21,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.studies.prior import Case, scene_cases, tensors
+from benchmarks.studies.holes import Case, to_tensors
+from benchmarks.studies.prior import scene_cases
 from reffusion import seeding
 from reffusion.io.arrays import save_json
 from reffusion.io.images import load_image
@@ -42,13 +43,13 @@ def degraded_pictures(run: Path, cases: dict[str, list[Case]], renders: dict[str
     """Name -> scale -> [B, 3, H, W] in [-1, 1]: the mixes, then the run's renders."""
     made: dict[str, dict[str, Tensor]] = {}
     for scale in SCALES:
-        truth, hole = tensors(cases[scale])
+        truth, hole = to_tensors(cases[scale])
         filled = [cv2.inpaint(c.truth, c.hole.astype(np.uint8), 5, cv2.INPAINT_TELEA) for c in cases[scale]]
-        telea = tensors([replace(c, truth=f) for c, f in zip(cases[scale], filled, strict=True)])[0]
+        telea = to_tensors([replace(c, truth=f) for c, f in zip(cases[scale], filled, strict=True)])[0]
         for mix in MIXES:
             made.setdefault(f"{mix:g} Telea", {})[scale] = truth + mix * hole * (telea - truth)
         for name, crops in renders.items():
-            made.setdefault(name, {})[scale] = truth + hole * (tensors(crops[scale])[0] - truth)
+            made.setdefault(name, {})[scale] = truth + hole * (to_tensors(crops[scale])[0] - truth)
     return made
 
 
@@ -87,7 +88,7 @@ def measure(models: dict[str, Prior], run: Path) -> list[dict]:
     pictures, rows = degraded_pictures(run, cases, renders), []
     for model, prior in models.items():
         for scale, prompt in SCALES.items():
-            truth, hole = tensors(cases[scale])
+            truth, hole = to_tensors(cases[scale])
             text = diffusion.embed_text(prior, [prompt]).detach().expand(len(truth), -1, -1)
             for name, by_scale in pictures.items():
                 error = (by_scale[scale] - truth) * hole
