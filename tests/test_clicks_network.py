@@ -91,4 +91,4 @@ def test_the_page_asks_the_network_and_takes_back_without_it(folder, tmp_path):
     expected = network_mask(segmenter, look(segmenter, session.images[name]), Clicks(np.array([at]), np.array([True])))
     assert (session.masks[name] == expected).all()
     session.click(session.views[1], [(*at, False)])
-    assert set(session.looked) == {name}
+    assert set(session.embeddings) == {name}
