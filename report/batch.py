@@ -1,4 +1,4 @@
-"""A batch as a page: runs/results.html, a row a scene with its scores or the reason why it failed, and a picture.
+"""Page of a batch: runs/results.html, one row per scene with its scores or the reason of its failure, and a picture.
 
 python -m report.batch --runs runs (`make data=FOLDER batch` draws it)
 """
@@ -18,54 +18,54 @@ from reffusion.io.images import load_image
 from report import page
 from report.compare import DIGITS, SHORT
 
-WIDTH = 240  # px of a picture
-MOST = 200  # pictures on the page; with more it would be of tens of MB
+WIDTH = 240  # width of a picture, px
+MAX_PICTURES = 200  # more pictures would make a page of tens of MB
 
 
 def make(record: Path) -> Path:
-    """Write the page beside runs/results.json; its path.
+    """Write the page beside runs/results.json and return its path.
 
     Raises:
         ValueError: no batch has been run.
     """
     if not record.is_file():
         raise ValueError(f"{record} is missing; `make data=FOLDER batch` writes it")
-    said = load_json(record)
-    runs = said["runs"]
+    results = load_json(record)
+    runs = results["runs"]
     names = [name for name in SHORT if any(run.get("mean", {}).get(name) is not None for run in runs)]
     states = [run["state"] for run in runs]
     count = f"{states.count('done')} of {len(runs)} scenes done, {states.count('failed')} failed"
-    parts = [page.heading(f"Batch of {Path(said['data']).name}", 1), page.paragraph(count)]
+    parts = [page.heading(f"Batch of {Path(results['data']).name}", 1), page.paragraph(count)]
     header = ["scene", *(SHORT[name] for name in names), "seconds", ""]
-    lines = [_line(run, names, record.parent, number < MOST) for number, run in enumerate(runs)]
+    lines = [_line(run, names, record.parent, number < MAX_PICTURES) for number, run in enumerate(runs)]
     head = "".join(f"<th>{escape(word)}</th>" for word in header)
     parts.append(f'<div class="wide"><table><tr>{head}</tr>{"".join(lines)}</table></div>')
     parts.append(
-        page.paragraph("Scores in the box around the mask, means over test views. Seconds of this call.", True)
+        page.paragraph("Scores: means over the test views, in the box around the mask. Seconds: of this call.", True)
     )
     path = record.with_suffix(".html")
     path.write_text(page.document("Batch", parts), encoding="utf-8")
     return path
 
 
-def _line(run: dict[str, Any], names: list[str], runs: Path, drawn: bool) -> str:
-    """A row of the table; a failed run has its reason instead of scores, or beside the older result's picture."""
+def _line(run: dict[str, Any], names: list[str], runs: Path, with_picture: bool) -> str:
+    """A row of the table. A failed run shows its reason instead of scores, and no picture."""
     name, home = escape(run["scene"]), run.get("home", run["scene"])
     if (runs / home / "report.html").is_file():
         name = f'<a href="{escape(home)}/report.html">{name}</a>'
     if run["state"] == "done":
         mean = run.get("mean", {})
-        cells = [page.number(mean.get(each), DIGITS.get(each, 4)) for each in names]
-        middle = "".join(f"<td>{cell}</td>" for cell in [*cells, page.number(run.get("seconds"))])
+        cells = [page.format_number(mean.get(each), DIGITS.get(each, 4)) for each in names]
+        middle = "".join(f"<td>{cell}</td>" for cell in [*cells, page.format_number(run.get("seconds"))])
     else:
-        said = f"failed: {run['error']}" if run["state"] == "failed" else run["state"]
-        middle = f'<td class="text" colspan="{len(names) + 1}">{escape(said)}</td>'
-    shown = _picture(runs / home, run["scene"]) if drawn and run["state"] == "done" else ""
-    return f"<tr><td>{name}</td>{middle}<td>{shown}</td></tr>\n"
+        reason = f"failed: {run['error']}" if run["state"] == "failed" else run["state"]
+        middle = f'<td class="text" colspan="{len(names) + 1}">{escape(reason)}</td>'
+    image = _picture(runs / home, run["scene"]) if with_picture and run["state"] == "done" else ""
+    return f"<tr><td>{name}</td>{middle}<td>{image}</td></tr>\n"
 
 
 def _picture(home: Path, scene: str) -> str:
-    """The first view that was rendered, small."""
+    """The first rendered view, reduced to `WIDTH`, as an `img` element; empty if there is none."""
     first = next(iter(sorted((home / "evaluate" / "renders").glob("*.png"))), None)
     if first is None:
         return ""

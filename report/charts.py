@@ -1,4 +1,4 @@
-"""The look of all charts, and those of a comparison: error against run time, differences to the full method."""
+"""Common style of all charts, and the charts of a comparison: error against run time, differences to `full`."""
 
 from __future__ import annotations
 
@@ -10,57 +10,58 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from reffusion.io.images import save_image
-from report.paired import Difference, pareto
+from report.paired_statistics import Difference, pareto_front
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's colours, told apart by every kind of eye.
+# Okabe and Ito's palette, which colour-blind readers can tell apart.
 BLUE, ORANGE, GREEN, GREY, INK = "#0072B2", "#D55E00", "#009E73", "#8a8a8a", "#222222"
-WIDTH, DPI = 9.6, 200  # inches, as wide as a page
-AIR = 12  # pixels between a label and what stands beside it
-PLACES = [(6, 0), (-6, 0), (5, 7), (-5, 7), (5, -7), (-5, -7), (0, 10), (0, -10),
+WIDTH, DPI = 9.6, 200  # inches (page width) and dots per inch
+LABEL_GAP = 12  # least distance of a label to its neighbours, px
+LABEL_OFFSETS = [(6, 0), (-6, 0), (5, 7), (-5, 7), (5, -7), (-5, -7), (0, 10), (0, -10),
           (14, 14), (-14, 14), (14, -14), (-14, -14), (0, 22), (0, -22), (26, 24), (-26, 24), (26, -24), (-26, -24),
           (0, 34), (0, -34), (40, 34), (-40, 34), (40, -34), (-40, -34)]  # fmt: skip
 
 
-def figure(height: float, rows: int = 1, columns: int = 1, **options) -> tuple[Figure, np.ndarray]:
-    """A figure of the page's width and its axes [rows, columns], in the common style."""
+def new_figure(height: float, rows: int = 1, columns: int = 1, **options) -> tuple[Figure, np.ndarray]:
+    """A figure of page width and its axes [rows, columns], in the common style."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    made = Figure((WIDTH, height), dpi=DPI, layout="constrained")
-    FigureCanvasAgg(made)
-    grid = made.subplots(rows, columns, squeeze=False, **options)
+    chart = Figure((WIDTH, height), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(chart)
+    grid = chart.subplots(rows, columns, squeeze=False, **options)
     for axes in grid.flat:
         axes.spines[["top", "right"]].set_visible(False)
         axes.spines[["left", "bottom"]].set_color("#999")
         axes.tick_params(colors=INK, labelsize=9, color="#999")
         axes.grid(color="#eee", linewidth=0.8)
         axes.set_axisbelow(True)
-    return made, grid
+    return chart, grid
 
 
-def save(drawn: Figure, path: Path) -> None:
-    drawn.canvas.draw()
-    save_image(path, np.asarray(drawn.canvas.buffer_rgba())[..., :3].copy())
+def save_chart(chart: Figure, path: Path) -> None:
+    """Draw a figure and save it as a PNG."""
+    chart.canvas.draw()
+    save_image(path, np.asarray(chart.canvas.buffer_rgba())[..., :3].copy())
 
 
-def write(axes: Axes, text: str, at, offset=(0, 0), colour: str = INK, ha: str = "left", va: str = "center") -> None:
-    """Words beside a point of a chart; `offset` in points."""
+def annotate(axes: Axes, text: str, at, offset=(0, 0), colour: str = INK, ha: str = "left", va: str = "center") -> None:
+    """Write text beside a point of a chart; `offset` is in points."""
     look = {"fontsize": 9, "color": colour, "ha": ha, "va": va}
     axes.annotate(text, at, offset, textcoords="offset points", **look)
 
 
-def spans(values: Sequence[float], factor: float = 12) -> bool:
-    """Do positive values cover so much that a logarithmic axis serves them better?"""
-    there = [value for value in values if value > 0]
-    return len(there) > 1 and max(there) > factor * min(there)
+def needs_log_axis(values: Sequence[float], factor: float = 12) -> bool:
+    """True if the positive values span more than `factor`, so that a logarithmic axis serves them better."""
+    positive = [value for value in values if value > 0]
+    return len(positive) > 1 and max(positive) > factor * min(positive)
 
 
-def plain_ticks(axes: Axes, which: str = "x") -> None:
-    """A logarithmic axis with 10, 20, 50, 100 instead of powers."""
+def use_plain_log_ticks(axes: Axes, which: str = "x") -> None:
+    """Label a logarithmic axis with 10, 20, 50, 100 instead of powers of ten."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axis = axes.xaxis if which == "x" else axes.yaxis
@@ -73,36 +74,41 @@ def plain_ticks(axes: Axes, which: str = "x") -> None:
 # ------------------------------------------------------------------------------------------- error against run time
 
 
-def tradeoff(names: Sequence[str], seconds: Sequence[float], errors: dict[str, Sequence[float]], path: Path) -> None:
-    """All methods, a panel for each error (title -> a value a method, less is better), the Pareto front marked."""
-    made, grid = figure(0.5 + 3.6 * len(errors), len(errors), sharex=True)
+def draw_tradeoff(
+    names: Sequence[str], seconds: Sequence[float], errors: dict[str, Sequence[float]], path: Path
+) -> None:
+    """Chart all methods, one panel per error (title -> one value per method, less is better), with the Pareto front."""
+    chart, grid = new_figure(0.5 + 3.6 * len(errors), len(errors), sharex=True)
     for axes, (title, values) in zip(grid[:, 0], errors.items(), strict=True):
-        front = pareto(seconds, values)
+        front = pareto_front(seconds, values)
         order = np.argsort(np.asarray(seconds)[front], kind="stable")
         steps = np.column_stack([seconds, values])[front][order]
         axes.step(steps[:, 0], steps[:, 1], where="post", color=BLUE, linewidth=1.2, alpha=0.6)
         axes.plot(*np.column_stack([seconds, values])[~front].T, "o", color=GREY, markersize=6, markerfacecolor="white")
         axes.plot(*steps.T, "o", color=BLUE, markersize=7)
         axes.set_ylabel(title, fontsize=10)
-        if spans(seconds):
+        if needs_log_axis(seconds):
             axes.set_xscale("log")
-            plain_ticks(axes)
+            use_plain_log_ticks(axes)
         else:
             low, high = min(seconds), max(seconds)
             axes.set_xlim(0 if low < 0.3 * high else low - 0.15 * (high - low), high + 0.15 * (high - low) or None)
         axes.set_ylim(0, max(values) * 1.12 or 1)
     grid[-1, 0].set_xlabel("seconds of the whole job, evaluation included", fontsize=10)
-    note = "filled, on the line: the Pareto front (no other method is as fast and as good)"
+    note = "filled, on the line: Pareto front (no other method is both as fast and as good)"
     grid[0, 0].set_title(note, fontsize=9, color=BLUE, loc="left")
-    made.canvas.draw()  # the layout is final: labels can be placed
-    made.set_layout_engine("none")
+    chart.canvas.draw()  # fixes the layout, so that labels can be placed
+    chart.set_layout_engine("none")
     for axes, values in zip(grid[:, 0], errors.values(), strict=True):
-        label(axes, np.column_stack([seconds, values]), names, pareto(seconds, values))
-    save(made, path)
+        label_points(axes, np.column_stack([seconds, values]), names, pareto_front(seconds, values))
+    save_chart(chart, path)
 
 
-def label(axes: Axes, points: np.ndarray, names: Sequence[str], strong: np.ndarray) -> None:
-    """Write each name [n] beside its point [n, 2], where it covers no other point or name; a thin line if far off."""
+def label_points(axes: Axes, points: np.ndarray, names: Sequence[str], strong: np.ndarray) -> None:
+    """Write each name [n] beside its point [n, 2] where it covers no other point or name, with a thin line if far away.
+
+    `strong` marks the points on the Pareto front, bool [n].
+    """
     renderer = axes.figure.canvas.get_renderer()
     unit = axes.figure.dpi / 72
     pixels = axes.transData.transform(points)
@@ -118,29 +124,29 @@ def label(axes: Axes, points: np.ndarray, names: Sequence[str], strong: np.ndarr
             weight="bold" if names[index] == "full" else "normal",
         )  # fmt: skip
         wide, high = text.get_window_extent(renderer).size
-        boxes = [_box(pixels[index], place, wide, high, unit) for place in PLACES]
+        boxes = [_box(pixels[index], place, wide, high, unit) for place in LABEL_OFFSETS]
         others = [box for number, box in enumerate(taken) if number != index]
-        costs = [_cost(box, place, others, inside) for box, place in zip(boxes, PLACES, strict=True)]
+        costs = [_cost(box, place, others, inside) for box, place in zip(boxes, LABEL_OFFSETS, strict=True)]
         best = int(np.argmin(costs))
         taken.append(boxes[best])
         corner = (boxes[best][:2] - pixels[index]) / unit
         text.set_position(tuple(corner))
-        if np.hypot(*PLACES[best]) > 12:
-            end = np.array(PLACES[best]) * 0.85
+        if np.hypot(*LABEL_OFFSETS[best]) > 12:
+            end = np.array(LABEL_OFFSETS[best]) * 0.85
             line = {"arrowstyle": "-", "color": "#bbb", "linewidth": 0.7, "shrinkA": 0, "shrinkB": 4}
             axes.annotate("", points[index], tuple(end), textcoords="offset points", arrowprops=line)
 
 
 def _box(point: np.ndarray, place: tuple[float, float], wide: float, high: float, unit: float) -> np.ndarray:
-    """[left, bottom, right, top] in pixels of a text of that size at an offset in points."""
+    """[left, bottom, right, top] in px of a text of the given size, placed at an offset in points."""
     x, y = point + np.array(place) * unit
     left = x - wide / 2 if place[0] == 0 else x if place[0] > 0 else x - wide
     return np.array([left, y - high / 2, left + wide, y + high / 2])
 
 
 def _cost(box: np.ndarray, place: tuple[float, float], taken: list[np.ndarray], inside) -> float:
-    """Pixels covered twice, those outside most; among free places the nearest."""
-    box = box + np.array([-AIR, 0, AIR, 0])
+    """Overlap with other boxes in px^2, plus penalties for leaving the axes (largest) and for distance to the point."""
+    box = box + np.array([-LABEL_GAP, 0, LABEL_GAP, 0])
     covered = sum(
         max(0, min(box[2], other[2]) - max(box[0], other[0])) * max(0, min(box[3], other[3]) - max(box[1], other[1]))
         for other in taken
@@ -152,13 +158,15 @@ def _cost(box: np.ndarray, place: tuple[float, float], taken: list[np.ndarray], 
 # --------------------------------------------------------------------------------------- differences to the full one
 
 
-def forest(differences: dict[str, dict[str, Difference]], titles: dict[str, str], more: set[str], path: Path) -> None:
-    """A panel for each metric: method minus full, with its intervals; what lies to the left is worse in all panels.
+def draw_forest(
+    differences: dict[str, dict[str, Difference]], titles: dict[str, str], more: set[str], path: Path
+) -> None:
+    """One panel per metric with the difference of each method to `full` and its intervals; left is always worse.
 
-    `more`: the metrics of which more is better. Orange and blue: the interval over views leaves zero out.
+    `more` names the metrics of which more is better. Coloured: the interval over views excludes zero.
     """
     names = list(dict.fromkeys(name for by_method in differences.values() for name in by_method))
-    made, grid = figure(0.9 + 0.3 * len(names), 1, len(differences), sharey=True)
+    chart, grid = new_figure(0.9 + 0.3 * len(names), 1, len(differences), sharey=True)
     for axes, (metric, by_method) in zip(grid[0], differences.items(), strict=True):
         axes.axvline(0, color=INK, linewidth=1)
         axes.grid(axis="y", visible=False)
@@ -174,11 +182,11 @@ def forest(differences: dict[str, dict[str, Difference]], titles: dict[str, str]
     grid[0, 0].set_ylim(len(names) - 0.4, -0.6)
     grid[0, 0].set_title("← worse than full", fontsize=9, color=ORANGE, loc="left")
     grid[0, -1].set_title("better than full →", fontsize=9, color=BLUE, loc="right")
-    save(made, path)
+    save_chart(chart, path)
 
 
 def _interval(axes: Axes, difference: Difference, row: int, sign: int, far: float) -> None:
-    """One row of a panel; what lies further off than `far` is an arrow with its number."""
+    """One row of a panel. Differences beyond `far` become an arrow with the number."""
     mean, views = difference.mean, difference.views or 0
     colour = GREY if abs(mean) <= views else BLUE if sign * mean > 0 else ORANGE
     if abs(mean) > far:
@@ -195,7 +203,7 @@ def _interval(axes: Axes, difference: Difference, row: int, sign: int, far: floa
 
 
 def _far(differences: Sequence[Difference]) -> float:
-    """How far a panel reaches, so that some methods that fail do not press all others together."""
+    """Reach of a panel: three times the median difference, so that a few failing methods do not squeeze the others."""
     sizes = np.abs([difference.mean for difference in differences])
     usual = 3 * float(np.median(sizes))
     return usual if sizes.max() > usual > 0 else np.inf

@@ -1,7 +1,6 @@
-"""A look at what a scene brings: `python -m report.check --scene demo` (`make scene=X check`), after its stage
-`raw_masks`.
+"""Overview of a scene's input, after its stage `raw_masks`: `python -m report.check --scene X` (`make scene=X check`).
 
-Writes runs/<scene>/check.png, every mask over its photograph, and prints what is odd.
+Writes runs/<scene>/check.png, each mask over its photograph, and prints warnings about photographs, masks and poses.
 """
 
 from __future__ import annotations
@@ -14,40 +13,41 @@ from PIL import Image, ImageDraw, ImageFont
 from reffusion.io.arrays import load_json
 from reffusion.io.images import load_image, load_mask, resize_nearest, resized, save_image
 from reffusion.io.scene import has_photograph, load_warnings
-from report import command, sheet
+from report import cli, sheet
 
-WIDTH, HEIGHT, GAP = 240, 180, 4  # px of the room for a picture, and between them
+WIDTH, HEIGHT, GAP = 240, 180, 4  # largest width and height of a picture, and the gap between pictures, px
 COLUMNS = 6
-TINT = (255, 0, 160)  # of masks; test masks in the complement
+TINT = (255, 0, 160)  # colour of masks; test masks take the complement
 
 
 def make(home: Path) -> tuple[Path, list[str]]:
-    """Write check.png of runs/<scene>; its path, and what is odd, a sentence each.
+    """Write runs/<scene>/check.png; return its path and the warnings, one sentence each.
 
     Raises:
         ValueError: the stage `raw_masks` has not run.
     """
     poses, raw_masks = (sheet.stage_folder(home, stage) for stage in ("poses", "raw_masks"))
     if not (poses / "views.json").is_file() or not raw_masks.is_dir():
-        raise ValueError(f"{raw_masks}: not there; run `make scene={home.name.split('@')[0]} raw_masks` first")
+        raise ValueError(f"{raw_masks} is missing; run `make scene={home.name.split('@')[0]} raw_masks` first")
     views = load_json(poses / "views.json")
-    there = {*views["train"], *views["test"], *views.get("outliers", ())}
-    named = [name for name in sorted(there) if has_photograph(poses, name)]
-    if not named:
+    known = {*views["train"], *views["test"], *views.get("outliers", ())}
+    names = [name for name in sorted(known) if has_photograph(poses, name)]
+    if not names:
         raise ValueError(f"{poses}: the scene has no photographs to look at")
-    cells = [(name, tinted(poses, raw_masks, name), kind_of(name, views)) for name in named]
-    save_image(home / "check.png", arranged(cells))
+    cells = [(name, overlay_masks(poses, raw_masks, name), view_role(name, views)) for name in names]
+    save_image(home / "check.png", contact_sheet(cells))
     return home / "check.png", [*load_warnings(poses), *load_warnings(raw_masks)]
 
 
-def kind_of(name: str, views: dict[str, list[str]]) -> str:
+def view_role(name: str, views: dict[str, list[str]]) -> str:
+    """Role of a view: "left out", "clean", "test" or "training"."""
     if name in views.get("outliers", ()):
         return "left out"
     return "clean" if name in views["clean"] else "test" if name in views["test"] else "training"
 
 
-def tinted(poses: Path, raw_masks: Path, name: str) -> np.ndarray:
-    """uint8 [h, w, 3], at most `WIDTH` x `HEIGHT`: the photograph, its mask over it."""
+def overlay_masks(poses: Path, raw_masks: Path, name: str) -> np.ndarray:
+    """uint8 [h, w, 3], at most `WIDTH` x `HEIGHT`: the photograph with its masks tinted."""
     image = load_image(poses / "images" / f"{name}.png")
     factor = min(WIDTH / image.shape[1], HEIGHT / image.shape[0])
     size = max(1, round(image.shape[1] * factor)), max(1, round(image.shape[0] * factor))
@@ -59,8 +59,8 @@ def tinted(poses: Path, raw_masks: Path, name: str) -> np.ndarray:
     return small
 
 
-def arranged(cells: list[tuple[str, np.ndarray, str]]) -> np.ndarray:
-    """uint8 [H, W, 3]: the pictures in rows on white, under each its view's name and what it is for."""
+def contact_sheet(cells: list[tuple[str, np.ndarray, str]]) -> np.ndarray:
+    """uint8 [H, W, 3]: the pictures in rows on white, each with its view's name and role below."""
     font, line = ImageFont.load_default(13), 20
     columns = min(COLUMNS, len(cells))
     rows = -(-len(cells) // columns)
@@ -74,16 +74,16 @@ def arranged(cells: list[tuple[str, np.ndarray, str]]) -> np.ndarray:
 
 
 def main() -> None:
-    home = command.home(command.parser("check", __doc__).parse_args())
+    home = cli.run_folder(cli.scene_parser("check", __doc__).parse_args())
     try:
-        path, said = make(home)
+        path, warnings = make(home)
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
-    if (solved := sheet.stage_folder(home, "poses") / "sfm.json").is_file():
-        print(load_json(solved)["summary"])
-    for line in said:
+    if (sfm := sheet.stage_folder(home, "poses") / "sfm.json").is_file():
+        print(load_json(sfm)["summary"])
+    for line in warnings:
         print(f"odd: {line}")
-    print(f"{len(said) or 'nothing'} odd; every mask over its photograph: {path}")
+    print(f"{len(warnings) or 'nothing'} odd; every mask over its photograph: {path}")
 
 
 if __name__ == "__main__":

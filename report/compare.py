@@ -1,4 +1,4 @@
-"""What `make scene=X compare` ran, as tables and pictures: runs/X/compare.md, .csv and .html; of a whole folder
+"""Tables and pictures of what `make scene=X compare` ran: runs/X/compare.md, .csv and .html; of a folder of scenes
 runs/compare/compare.md, .csv and .html.
 
 python -m report.compare --scene X --runs runs
@@ -11,20 +11,20 @@ from pathlib import Path
 from typing import Any
 
 from reffusion.io.arrays import load_json
-from report import charts, overview, page, pictures
+from report import charts, compare_pictures, compare_tables, page
 from report.results import (
-    AGAINST,
-    BETTER,
+    BOX_SCORES,
+    DIFFERENCE_COLUMNS,
+    FOLDER_COMPARISON,
     FULL,
-    OUTSIDE,
+    OUTSIDE_SCORES,
     SCORES,
-    TOGETHER,
     Comparison,
     Run,
-    differences,
-    load,
-    rows,
+    differences_to_full,
+    load_comparison,
     save_csv,
+    summarize_methods,
 )
 
 TITLES = {
@@ -50,75 +50,80 @@ ERRORS = {"lpips_vgg_box": "LPIPS (vgg) in the box", "flip_box": "FLIP in the bo
 SHORT = {"lpips_vgg_box": "LPIPS (vgg)", "lpips_alex_box": "LPIPS (alex)"}
 SHORT |= {"psnr_box": "PSNR, dB", "ssim_box": "SSIM", "flip_box": "FLIP"}
 SHORT |= {"psnr_outside": "PSNR outside, dB", "ssim_outside": "SSIM outside", "flip_outside": "FLIP outside"}
-# columns that are left out where no method has a value
-WHERE_THERE = ("consistency", "lpips_vgg_box", "lpips_alex_box", *OUTSIDE)
-WAYS = {"inpainter": "2D inpainter", "perceptual": "perceptual distance"}  # keys of the files, in words
+# Columns that are omitted if no method has a value.
+OPTIONAL_COLUMNS = ("consistency", "lpips_vgg_box", "lpips_alex_box", *OUTSIDE_SCORES)
+FACTS = {"inpainter": "2D inpainter", "perceptual": "perceptual distance"}  # keys of metrics.json and facts.json
 
 
 def make(home: Path) -> dict[str, Path]:
-    """Write the table and the pages of runs/<scene>; gives back {"csv", "md", "html"}.
+    """Write the tables and the pages of runs/<scene>; return their paths as {"csv", "md", "html"}.
 
     Pictures go to runs/<scene>/compare/ and into the HTML page, which needs no other file.
 
     Raises:
         ValueError: nothing was compared yet.
     """
-    comparison = load(home)
+    comparison = load_comparison(home)
     out = home / "compare"
     out.mkdir(exist_ok=True)
-    for chart in ("tradeoff", "differences"):  # there may be nothing to draw any more
+    for chart in ("tradeoff", "differences"):  # left by an earlier call; there may be nothing to draw now
         (out / f"{chart}.png").unlink(missing_ok=True)
-    table = rows(comparison)
+    table = summarize_methods(comparison)
     paths = {kind: home / f"compare.{kind}" for kind in ("csv", "md", "html")}
     save_csv(paths["csv"], table)
-    drawn = {
-        "Error against run time": tradeoff(table, out / "tradeoff.png"),
-        "Difference to the full method": forest(comparison, out / "differences.png"),
+    charts_drawn = {
+        "Error against run time": save_tradeoff(table, out / "tradeoff.png"),
+        "Difference to the full method": save_forest(comparison, out / "differences.png"),
     }
-    views = pictures.sheets(comparison, out)
-    paths["md"].write_text(markdown(comparison, table, drawn, views), encoding="utf-8")
-    paths["html"].write_text(html(comparison, table, drawn, views), encoding="utf-8")
+    views = compare_pictures.save_sheets(comparison, out)
+    paths["md"].write_text(markdown(comparison, table, charts_drawn, views), encoding="utf-8")
+    paths["html"].write_text(html(comparison, table, charts_drawn, views), encoding="utf-8")
     return paths
 
 
 # -------------------------------------------------------------------------------------------------------- figures
 
 
-def tradeoff(table: list[dict[str, Any]], path: Path) -> Path | None:
-    """Error against seconds of what is done: the box errors there are; the inconsistency where there is no truth."""
+def save_tradeoff(table: list[dict[str, Any]], path: Path) -> Path | None:
+    """Chart error against seconds of the finished methods: box errors, or without ground truth the inconsistency."""
     errors = {}
     for name, title in {**ERRORS, "consistency": "inconsistency between views"}.items():
-        there = [row for row in table if row[name] is not None]
-        if there and not (name == "consistency" and errors):
-            errors[title] = {row["method"]: 1 - row[name] if name == "ssim_box" else row[name] for row in there}
+        rows = [row for row in table if row[name] is not None]
+        if rows and not (name == "consistency" and errors):
+            errors[title] = {row["method"]: 1 - row[name] if name == "ssim_box" else row[name] for row in rows}
     common = [row for row in table if errors and all(row["method"] in values for values in errors.values())]
     if not common:
         return None
     names, seconds = [row["method"] for row in common], [row["seconds"] for row in common]
-    charts.tradeoff(names, seconds, {title: [values[n] for n in names] for title, values in errors.items()}, path)
+    charts.draw_tradeoff(names, seconds, {title: [values[n] for n in names] for title, values in errors.items()}, path)
     return path
 
 
-def forest(comparison: Comparison, path: Path) -> Path | None:
-    """Method minus full in the box; outside the masks where no truth shows what is inside."""
-    found = {metric: by_method for metric in BETTER if (by_method := differences(comparison, metric))}
-    found = found or {metric: by_method for metric in OUTSIDE if (by_method := differences(comparison, metric))}
+def save_forest(comparison: Comparison, path: Path) -> Path | None:
+    """Chart method minus full: in the box, or outside the masks if there is no ground truth inside."""
+    found = {metric: by_method for metric in BOX_SCORES if (by_method := differences_to_full(comparison, metric))}
+    found = found or {
+        metric: by_method for metric in OUTSIDE_SCORES if (by_method := differences_to_full(comparison, metric))
+    }
     if not found:
         return None
     more = {metric for metric, better in SCORES.items() if better == "more"}
-    charts.forest(found, {metric: f"{SHORT[metric]}, minus full" for metric in found}, more, path)
+    charts.draw_forest(found, {metric: f"{SHORT[metric]}, minus full" for metric in found}, more, path)
     return path
 
 
 # --------------------------------------------------------------------------------------------------------- tables
 
 
-def cells(table: list[dict[str, Any]]) -> tuple[list[str], list[list[str]], list[list[bool]]]:
-    """Header, texts and which are best in their column; a dash where there is no value."""
-    names = [name for name in TITLES if name not in WHERE_THERE or any(row[name] is not None for row in table)]
+def method_table(table: list[dict[str, Any]]) -> tuple[list[str], list[list[str]], list[list[bool]]]:
+    """Header, cells, and which cells are the best in their column, [rows][columns]; a dash marks a missing value."""
+    names = [name for name in TITLES if name not in OPTIONAL_COLUMNS or any(row[name] is not None for row in table)]
     best = {}
     most = max(row["scenes"] for row in table)
-    for name, better in SCORES.items():  # not in consistency, which blur has too; nor a mean over fewer scenes
+    for (
+        name,
+        better,
+    ) in SCORES.items():  # `consistency` has no best (blur is consistent), nor has a mean over fewer scenes
         values = [round(row[name], DIGITS[name]) for row in table if row[name] is not None and row["scenes"] == most]
         best[name] = (max if better == "more" else min)(values, default=None) if len(values) > 1 else None
     texts, bold = [], []
@@ -133,11 +138,11 @@ def cells(table: list[dict[str, Any]]) -> tuple[list[str], list[list[str]], list
 
 def _cell(row: dict[str, Any], name: str) -> str:
     digits = DIGITS.get(name, 0)
-    return overview.spread(row, name, digits) if name in SCORES else page.number(row[name], digits)
+    return compare_tables.format_spread(row, name, digits) if name in SCORES else page.format_number(row[name], digits)
 
 
-def difference_cells(table: list[dict[str, Any]]) -> tuple[list[str], list[list[str]]] | None:
-    """Method minus full: the mean, half its interval over views, and over scenes where there are several."""
+def difference_table(table: list[dict[str, Any]]) -> tuple[list[str], list[list[str]]] | None:
+    """Method minus full: the mean, half its interval over views, and over scenes if there are several."""
     found = [metric for metric in SCORES if any(row[f"{metric}_minus_full"] is not None for row in table)]
     others = [row for row in table if row["method"] != FULL and not row["same_as"]]
     lines = [[row["method"], *(_signed(row, metric) for metric in found)] for row in others]
@@ -145,7 +150,7 @@ def difference_cells(table: list[dict[str, Any]]) -> tuple[list[str], list[list[
 
 
 def _signed(row: dict[str, Any], metric: str) -> str:
-    mean, views, scenes = (row[f"{metric}_{what}"] for what in AGAINST)
+    mean, views, scenes = (row[f"{metric}_{what}"] for what in DIFFERENCE_COLUMNS)
     if mean is None:
         return "–"
     text = f"{mean:+.{DIGITS[metric]}f}".replace("-", "−")
@@ -153,20 +158,20 @@ def _signed(row: dict[str, Any], metric: str) -> str:
     return text if scenes is None else f"{text} (± {scenes:.{DIGITS[metric]}f})"
 
 
-def further_tables(comparison: Comparison, table: list[dict[str, Any]]) -> dict[str, overview.Table]:
-    """Title -> header and rows: every scene, where there are several, and what others published.
+def extra_tables(comparison: Comparison, table: list[dict[str, Any]]) -> dict[str, compare_tables.Table]:
+    """Title -> header and rows: each scene, if there are several, and published figures.
 
     Raises:
-        ValueError: FOLDER/published.csv is not as it must be.
+        ValueError: FOLDER/published.csv is malformed.
     """
-    found: dict[str, overview.Table] = {}
+    found: dict[str, compare_tables.Table] = {}
     if len(comparison.scenes) > 1:
-        each = {metric: overview.by_scene(comparison, metric, DIGITS[metric]) for metric in BETTER}
-        found |= {f"{SHORT[metric]} in each scene": cells for metric, cells in each.items() if cells}
-    if given := overview.published(comparison.data):
-        done = [run for method in comparison.methods for run in comparison.of(method)]
-        here = " ".join(overview.protocol(done))
-        found["Published, and here"] = overview.beside(given, table, SHORT, DIGITS, here)
+        each = {metric: compare_tables.scene_table(comparison, table, metric, DIGITS[metric]) for metric in BOX_SCORES}
+        found |= {f"{SHORT[metric]} in each scene": found_table for metric, found_table in each.items() if found_table}
+    if given := compare_tables.load_published(comparison.data):
+        done = [run for method in comparison.methods for run in comparison.finished_runs(method)]
+        here = " ".join(compare_tables.describe_protocol(done))
+        found["Published, and here"] = compare_tables.published_table(given, table, SHORT, DIGITS, here)
     return found
 
 
@@ -174,118 +179,125 @@ def further_tables(comparison: Comparison, table: list[dict[str, Any]]) -> dict[
 
 
 def summary(comparison: Comparison, table: list[dict[str, Any]]) -> str:
-    """What was compared, and what is the best in each metric."""
+    """Sentence with what was compared and the best method in each metric."""
     done = sum(run.state == "done" for run in comparison.runs.values())
     place = f"{len(comparison.scenes)} scenes ({', '.join(comparison.scenes)})"
     parts = [f"{len(table)} methods on {place if len(comparison.scenes) > 1 else comparison.scenes[0]}"]
     parts[0] += "" if done == len(comparison.runs) else f", {done} of {len(comparison.runs)} runs done"
     boxed = any(row["psnr_box"] is not None for row in table)
-    for metric, better in (BETTER if boxed else OUTSIDE).items():
-        there = [row for row in table if row[metric] is not None]
-        if len(there) > 1:
-            shown = [round(row[metric], DIGITS[metric]) for row in there]
-            best = (max if better == "more" else min)(shown)
-            tied = [row["method"] for row, value in zip(there, shown, strict=True) if value == best]
+    for metric, better in (BOX_SCORES if boxed else OUTSIDE_SCORES).items():
+        rows = [row for row in table if row[metric] is not None]
+        if len(rows) > 1:
+            rounded = [round(row[metric], DIGITS[metric]) for row in rows]
+            best = (max if better == "more" else min)(rounded)
+            tied = [row["method"] for row, value in zip(rows, rounded, strict=True) if value == best]
             parts.append(f"best in {SHORT[metric].removesuffix(', dB')}: {' and '.join(tied)}")
     return "; ".join(parts) + "."
 
 
-def notes(comparison: Comparison) -> list[str]:
-    """What a reader of the table must know, each thing once."""
-    done = [run for method in comparison.methods for run in comparison.of(method)]
-    said = [
+def table_notes(comparison: Comparison, table: list[dict[str, Any]]) -> list[str]:
+    """What a reader of the tables needs to know, each fact once."""
+    done = [run for method in comparison.methods for run in comparison.finished_runs(method)]
+    lines = [
         "Box: the bounding box of the view's mask, 10% wider on each side. Means over the test views"
         + (" and the scenes; ± half the 95% interval over the scenes." if len(comparison.scenes) > 1 else "."),
-        *(f"Scored: {words}." for words in overview.protocol(done)),
-        "seconds: all stages of the method, evaluation included, from their receipts; own seconds: of the stages that "
-        "it does not share with the full method. Peak memory: of its hungriest stage.",
+        *(f"Scored: {words}." for words in compare_tables.describe_protocol(done)),
+        "seconds: all stages of the method, evaluation included, from their receipts. own seconds: the stages that it "
+        "does not share with the full method. peak MB: the stage that takes most memory.",
     ]
     if not any(run.metrics.get("mean", {}).get("psnr_box") is not None for run in done):
-        said.append("No box metrics: the scene has no ground truth.")
+        lines.append("No box metrics: the scene has no ground truth.")
     if any(run.metrics.get("mean", {}).get("psnr_outside") is not None for run in done):
-        said.append(
-            "outside: the test views' pixels outside their masks (1% of the width wider), which all methods should "
-            "leave as they are."
+        lines.append(
+            "outside: pixels of the test views outside their masks (widened by 1% of the width), which all methods "
+            "should leave as they are."
         )
-    said += dict.fromkeys(f"No LPIPS: {why}." for run in done if (why := run.metrics.get("lpips_unavailable")))
-    if any(row["consistency"] is not None for row in rows(comparison)):
-        words = "mean absolute difference inside the mask to the next view, by rendered depth; blur is consistent too."
-        said.append(f"consistency: {words}")
-    said += [f"{method} is the very same job as {other} here." for method, other in comparison.same_as.items()]
-    said += dict.fromkeys(words for run in done for words in ways(run))
+    lines += dict.fromkeys(f"No LPIPS: {why}." for run in done if (why := run.metrics.get("lpips_unavailable")))
+    if any(row["consistency"] is not None for row in table):
+        words = "mean absolute difference to the next view in the mask, by rendered depth; blur is consistent too."
+        lines.append(f"consistency: {words}")
+    lines += [f"{method} is the very same job as {other} here." for method, other in comparison.same_as.items()]
+    lines += dict.fromkeys(words for run in done for words in method_facts(run))
     for run in done:
         resumed = [stage for stage, receipt in run.receipts.items() if receipt.get("resumed")]
         if resumed:
-            said.append(f"{run.method} on {run.scene}: {', '.join(resumed)} was resumed: more seconds than counted.")
-    said += [f"{r.method} on {r.scene} failed: {r.error}" for r in comparison.runs.values() if r.state == "failed"]
+            lines.append(f"{run.method} on {run.scene}: {', '.join(resumed)} resumed; seconds are incomplete.")
+    lines += [f"{r.method} on {r.scene} failed: {r.error}" for r in comparison.runs.values() if r.state == "failed"]
     receipts = [receipt for run in done for receipt in run.receipts.values()]
     machines = dict.fromkeys(f"{r.get('device', 'cpu')} of {r.get('machine', '?')}, {r['profile']}" for r in receipts)
-    return [*said, f"Ran on: {'; '.join(machines)}."] if machines else said
+    return [*lines, f"Ran on: {'; '.join(machines)}."] if machines else lines
 
 
-def ways(run: Run) -> list[str]:
-    """Which inpainter and which distance a method used, as metrics.json or the facts.json of its stages say."""
+def method_facts(run: Run) -> list[str]:
+    """Inpainter and perceptual distance of a run in words, from metrics.json or facts.json of its stages."""
     paths = [folder / "facts.json" for folder in run.folders.values()]
-    said = [run.metrics, *(load_json(path) for path in paths if path.is_file())]
-    found = {words: facts[key] for facts in said for key, words in WAYS.items() if facts.get(key)}
+    records = [run.metrics, *(load_json(path) for path in paths if path.is_file())]
+    found = {words: facts[key] for facts in records for key, words in FACTS.items() if facts.get(key)}
     return [f"{run.method}: " + ", ".join(f"{words} {name}" for words, name in found.items()) + "."] if found else []
 
 
-def intervals(comparison: Comparison) -> str:
+def explain_intervals(comparison: Comparison) -> str:
+    """Sentence on the intervals of the difference table and of the forest chart."""
     text = "Method minus full, ± half the 95% interval of the paired t over pairs of equal views"
     if len(comparison.scenes) == 1:
-        return f"{text} (the line through a dot). That speaks of this scene, not of others."
+        return f"{text} (the line through a dot). It holds for this scene, not for others."
     return (
-        f"{text} of all {len(comparison.scenes)} scenes (thick lines), which speaks of these scenes; in brackets over "
-        "the scenes' means (thin lines), which speaks of another scene of their kind."
+        f"{text} of all {len(comparison.scenes)} scenes (thick lines), which holds for these scenes; in brackets over "
+        "the scenes' means (thin lines), which holds for another scene of their kind."
     )
 
 
 def markdown(comparison: Comparison, table: list[dict], drawn: dict[str, Path | None], views: dict[str, Path]) -> str:
-    header, texts, bold = cells(table)
+    header, texts, bold = method_table(table)
     strong = [[f"**{c}**" if b else c for c, b in zip(*line, strict=True)] for line in zip(texts, bold, strict=True)]
     lines = [f"# {comparison.name}: methods compared", "", summary(comparison, table), ""]
-    lines += [page.markdown(header, strong)]
-    for title, further in further_tables(comparison, table).items():
-        lines += [f"## {title}", "", page.markdown(*further)]
-    if found := difference_cells(table):
-        lines += ["## Difference to the full method", "", intervals(comparison), "", page.markdown(*found)]
+    lines += [page.markdown_table(header, strong)]
+    for title, further in extra_tables(comparison, table).items():
+        lines += [f"## {title}", "", page.markdown_table(*further)]
+    if found := difference_table(table):
+        lines += [
+            "## Difference to the full method",
+            "",
+            explain_intervals(comparison),
+            "",
+            page.markdown_table(*found),
+        ]
     for title, path in drawn.items():
         lines += [f"![{title}](compare/{path.name})", ""] if path else []
     for view, path in views.items():
         lines += [f"## {view}", "", f"![{view} by every method](compare/{path.name})", ""]
-    return "\n".join([*lines, "## Notes", "", *(f"- {note}" for note in notes(comparison)), ""])
+    return "\n".join([*lines, "## Notes", "", *(f"- {note}" for note in table_notes(comparison, table)), ""])
 
 
 def html(comparison: Comparison, table: list[dict], drawn: dict[str, Path | None], views: dict[str, Path]) -> str:
-    header, texts, bold = cells(table)
+    header, texts, bold = method_table(table)
     title = f"{comparison.name}: methods compared"
     full = next((number for number, row in enumerate(table) if row["method"] == FULL), None)
     body = [page.heading(title, 1), page.paragraph(summary(comparison, table))]
     body += [page.table(header, texts, bold=bold, marked=full)]
-    for heading, further in further_tables(comparison, table).items():
+    for heading, further in extra_tables(comparison, table).items():
         body += [page.heading(heading), page.table(*further)]
     for heading, path in drawn.items():
         body += [page.heading(heading), page.picture(path, heading, embed=True)] if path else []
-    if found := difference_cells(table):
-        dots = " Orange and blue dots: the interval over views leaves zero out; an arrow: further off than shown."
-        body += [page.paragraph(intervals(comparison) + dots, quiet=True), page.table(*found)]
+    if found := difference_table(table):
+        dots = " Orange and blue dots: the interval over views excludes zero. An arrow: beyond the axis."
+        body += [page.paragraph(explain_intervals(comparison) + dots, quiet=True), page.table(*found)]
     if views:
-        body += [page.heading("The same views"), page.paragraph("The box and a margin around it.", quiet=True)]
+        body += [page.heading("The same views"), page.paragraph("Crops of the box with a margin.", quiet=True)]
     for view, path in views.items():
         body += [page.heading(view, 3), page.picture(path, f"{view} by every method", embed=True)]
-    return page.document(title, [*body, page.heading("Notes"), page.bullets(notes(comparison))])
+    return page.document(title, [*body, page.heading("Notes"), page.bullets(table_notes(comparison, table))])
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="reffusion compare-page", description=__doc__.split("\n")[0])
     what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("--scene", type=Path, help="its name, or the path of its folder")
+    what.add_argument("--scene", type=Path, help="name of the scene, or path of its folder")
     what.add_argument("--data", type=Path, help="the folder whose scenes were compared last")
     parser.add_argument("--runs", type=Path, default=Path("runs"))
     arguments = parser.parse_args()
     try:
-        name = arguments.scene.expanduser().resolve().name if arguments.scene else TOGETHER
+        name = arguments.scene.expanduser().resolve().name if arguments.scene else FOLDER_COMPARISON
         made = make(arguments.runs / name)
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None

@@ -10,17 +10,17 @@ from reffusion.io.compressed import save_compressed
 from reffusion.io.lora import save_portable
 from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import has_photograph, load_scene
-from report import command
+from report import cli
 from report.sheet import stage_folder
 
 PLY, COMPRESSED, WITH_OBJECT = "scene.ply", "scene.compressed.ply", "with_object.ply"
 CAMERAS, IMAGES, LORA = "cameras", "images", "lora"
-HEADER = 1000  # bytes of it that tell the type of x
+HEADER = 1000  # bytes of the header that contain the type of x
 LORA_FILE = "pytorch_lora_weights.safetensors"
 
 
 def make(home: Path) -> list[str]:
-    """Write runs/<scene>/export/; what is there, a line each.
+    """Write runs/<scene>/export/; return one line for each file or folder.
 
     Raises:
         ValueError: the stage `evaluate` has not run, or gsply is not installed.
@@ -33,45 +33,49 @@ def make(home: Path) -> list[str]:
     gaussians = load_ply(finished, scene.similarity)
     save_compressed(out / COMPRESSED, gaussians, scene.similarity)
     shutil.copyfile(finished, out / PLY)
-    said = [f"{out / PLY}: {len(gaussians)} Gaussians of degree {gaussians.sh_degree}, in the scene's own frame"]
-    said[0] += unlike_3dgs(finished, gaussians.antialiased)
+    lines = [f"{out / PLY}: {len(gaussians)} Gaussians of degree {gaussians.sh_degree}, in the scene's own frame"]
+    lines[0] += viewer_caveats(finished, gaussians.antialiased)
     smaller = finished.stat().st_size / (out / COMPRESSED).stat().st_size
-    said.append(f"{out / COMPRESSED}: the same, quantised, {smaller:.1f} times smaller, in PlayCanvas's format")
+    lines.append(f"{out / COMPRESSED}: the same, quantised, {smaller:.1f} times smaller, in PlayCanvas's format")
     save_cameras(out / CAMERAS, scene, IMAGES)
     pictured = [name for name in scene.cameras if has_photograph(poses, name)]
     for name in pictured:
         (out / CAMERAS / IMAGES).mkdir(exist_ok=True)
         shutil.copyfile(poses / "images" / f"{name}.png", out / CAMERAS / IMAGES / f"{name}.png")
     pictures = f"{len(pictured)} undistorted photographs" if pictured else "no photographs"
-    said.append(f"{out / CAMERAS}: {len(scene.cameras)} pinholes, a COLMAP model and transforms.json; {pictures}")
+    lines.append(f"{out / CAMERAS}: {len(scene.cameras)} pinholes, a COLMAP model and transforms.json; {pictures}")
     fitted = stage_folder(home, "fit") / "gaussians.ply"
     if fitted.exists():
         save_ply(out / WITH_OBJECT, load_ply(fitted), scene.similarity)
         command_line = f"reffusion patch {out / WITH_OBJECT} AFTER.ply --cameras {out / CAMERAS} --out patched.ply"
-        said.append(
+        lines.append(
             f"{out / WITH_OBJECT}: the scene with the object, to be edited: delete something in an editor, save the "
             f"rest as AFTER.ply, and `{command_line}` fills the hole"
         )
     adapted = stage_folder(home, "personalize") / LORA_FILE
     if adapted.exists():
         save_portable(adapted, out / LORA / LORA_FILE)
-        said.append(f"{out / LORA / LORA_FILE}: the prior's LoRA, as diffusers' load_lora_weights reads it")
-    return said
+        lines.append(f"{out / LORA / LORA_FILE}: the prior's LoRA, as diffusers' load_lora_weights reads it")
+    return lines
 
 
-def unlike_3dgs(path: Path, antialiased: bool) -> str:
-    """What of the file not every viewer shows as we do."""
+def viewer_caveats(path: Path, antialiased: bool) -> str:
+    """Properties of the file that some viewers do not support, as text to append."""
     with open(path, "rb") as file:
         exact = b"property double x" in file.read(HEADER)
-    doubles = "; positions are doubles, as floats would move them: many editors read floats only" if exact else ""
-    smoothed = "; made for Mip-Splatting's filter: viewers without it show it a little bolder" if antialiased else ""
+    doubles = (
+        "; positions are doubles, since floats would move them, but many editors read floats only" if exact else ""
+    )
+    smoothed = (
+        "; made for Mip-Splatting's filter, without which viewers show it slightly thicker" if antialiased else ""
+    )
     return doubles + smoothed
 
 
 def main() -> None:
-    arguments = command.parser("export", __doc__).parse_args()
+    arguments = cli.scene_parser("export", __doc__).parse_args()
     try:
-        print("\n".join(make(command.home(arguments))))
+        print("\n".join(make(cli.run_folder(arguments))))
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
 

@@ -1,4 +1,4 @@
-"""One page on what a scene's job did: errors against time, seconds, pictures, what was left out and why.
+"""Report on a scene's job: errors against time, seconds, pictures, what was left out and why.
 
 python -m report.job --scene X --runs runs          runs/X/report.html, one file
 python -m report.job --data FOLDER --runs runs      runs/report/index.html, of all scenes in the folder
@@ -13,8 +13,18 @@ from tempfile import TemporaryDirectory
 
 from reffusion.io.arrays import load_json
 from reffusion.io.scene import load_warnings
-from report import before, command, covered, curves, drawn, inside, page, scenes, settings
-from report.loading import Job, load_job
+from report import (
+    before_after,
+    cli,
+    coverage,
+    inline_images,
+    job_parameters,
+    job_pictures,
+    page,
+    scenes_page,
+    trace_charts,
+)
+from report.job_data import Job, load_job
 
 WORDS = {
     "skip": "left\u00a0out", "provided": "brought", "cached": "done", "run": "to\u00a0run", "stale": "to\u00a0run",
@@ -41,23 +51,40 @@ RESULTS = {
 
 
 def make(home: Path) -> Path:
-    """Write runs/<scene>/report.html, which needs no other file; gives back its path."""
+    """Write runs/<scene>/report.html, which needs no other file, and return its path."""
     job = load_job(home)
     title = f"{home.name}: what was done"
     seconds = sum(receipt["seconds"] for receipt in job.receipts.values())
-    done = f"{page.duration(seconds)} in {len(job.receipts)} stages"
-    parts = [page.heading(title, 1), page.paragraph(f"{done}. {outcome(job)}"), *unfinished(job), *said(job)]
-    parts += before.section(job) + drawn.masks(job) + drawn.references(job) + drawn.depths(job) + covered.section(job)
+    done = f"{page.format_duration(seconds)} in {len(job.receipts)} stages"
+    parts = [
+        page.heading(title, 1),
+        page.paragraph(f"{done}. {summarize_result(job)}"),
+        *unfinished_note(job),
+        *capture_notes(job),
+    ]
+    parts += (
+        before_after.before_after_section(job)
+        + job_pictures.masks_section(job)
+        + job_pictures.references_section(job)
+        + job_pictures.depth_section(job)
+        + coverage.coverage_section(job)
+    )
     with TemporaryDirectory() as charts:
-        parts += whole(job, Path(charts)) + stages(job, Path(charts))
-    parts += left_out(job) + settings.section(job) + receipts(job) + settings.command(job) + artifacts(job)
+        parts += whole_job_section(job, Path(charts)) + stage_sections(job, Path(charts))
+    parts += (
+        skipped_section(job)
+        + job_parameters.parameters_section(job)
+        + receipts_section(job)
+        + job_parameters.reproduce_section(job)
+        + files_section(job)
+    )
     path = home / "report.html"
-    path.write_text(page.document(title, parts, STYLE + before.STYLE, before.SCRIPT), encoding="utf-8")
+    path.write_text(page.document(title, parts, STYLE + before_after.STYLE, before_after.SCRIPT), encoding="utf-8")
     return path
 
 
-def outcome(job: Job) -> str:
-    """The result in a sentence."""
+def summarize_result(job: Job) -> str:
+    """The result in one sentence."""
     mean, counts = job.metrics.get("mean", {}), job.metrics.get("gaussians", {})
     if not job.metrics:
         return "It is not evaluated yet."
@@ -66,95 +93,103 @@ def outcome(job: Job) -> str:
     if mean.get("psnr_box") is None:
         return f"{gaussians}; no ground truth, so no scores."
     suspects = ", ".join(job.metrics.get("suspects") or ())
-    but = f"; photographs of these contradict their poses: {suspects}" if suspects else ""
-    return f"{gaussians}; {mean['psnr_box']:.2f} dB and FLIP {mean['flip_box']:.3f} in the box of the test views{but}."
+    warning = f"; photographs that contradict their poses: {suspects}" if suspects else ""
+    return (
+        f"{gaussians}; {mean['psnr_box']:.2f} dB and FLIP {mean['flip_box']:.3f} in the box of the test views{warning}."
+    )
 
 
 # --------------------------------------------------------------------------------------------------------- sections
 
 
-def unfinished(job: Job) -> list[str]:
-    """The stages that are still to run."""
-    due = [stage for stage, told in job.plan.items() if told["word"] not in ("cached", "skip", "provided")]
+def unfinished_note(job: Job) -> list[str]:
+    """Paragraph with the stages that still have to run."""
+    due = [stage for stage, entry in job.plan.items() if entry["word"] not in ("cached", "skip", "provided")]
     if not job.plan:
         due = [stage for stage in ("poses", "fit", "evaluate") if stage not in job.folders]
     return [page.paragraph(f"Still to run, or to run again: {', '.join(due)}.")] if due else []
 
 
-def said(job: Job) -> list[str]:
-    """Which frames of a video were taken, how structure from motion went, and what was odd about the photographs."""
+def capture_notes(job: Job) -> list[str]:
+    """Selected video frames, the outcome of structure from motion, and warnings about the photographs."""
     record = job.home.with_name(job.home.name.split("@")[0]) / "frames" / "frames.json"
     lines = [load_json(record)["said"]] if record.is_file() else []
     if "poses" in job.folders:
-        solved = job.folders["poses"] / "sfm.json"
-        lines += [load_json(solved)["summary"]] if solved.is_file() else []
+        sfm = job.folders["poses"] / "sfm.json"
+        lines += [load_json(sfm)["summary"]] if sfm.is_file() else []
     for stage in ("poses", "raw_masks"):
         lines += load_warnings(job.folders[stage]) if stage in job.folders else []
     return [page.bullets(lines)] if lines else []
 
 
-def whole(job: Job, out: Path) -> list[str]:
-    """The whole job against the clock, and the scores of initialization and result."""
-    draw(job, out / "job.png")
-    parts = [page.heading("The whole job"), inside.chart(out / "job.png", "PSNR and stages against seconds")]
+def whole_job_section(job: Job, out: Path) -> list[str]:
+    """The whole job over time, and the scores of initialization and result."""
+    draw_job(job, out / "job.png")
+    parts = [
+        page.heading("The whole job"),
+        inline_images.chart_element(out / "job.png", "PSNR and stages against seconds"),
+    ]
     if any(stage in job.traces for stage in ("fit", "distill")):
         words = (
-            "Curves: each stage's own error, on training views or references. Test views are only scored at the end."
+            "Curves: each stage's own error, on training views or references. Test views are scored only at the end."
         )
         parts.append(page.paragraph(words, quiet=True))
-    return parts + scores(job)
+    return parts + score_table(job)
 
 
-def draw(job: Job, path: Path, ceiling: float | None = None) -> None:
-    """PSNR and stages against seconds; `ceiling`: see `curves.job_chart`."""
+def draw_job(job: Job, path: Path, ceiling: float | None = None) -> None:
+    """Chart PSNR and stages against seconds; for `ceiling` see `trace_charts.draw_job_chart`."""
     seconds = {stage: receipt["seconds"] for stage, receipt in job.receipts.items()}
     lines = {stage: series.get("", []) for stage, series in job.traces.items()}
     result = job.metrics.get("result", "")
     box = {"initialize": job.metrics.get("initialize", {}).get("psnr_box")}
     box |= {result: job.metrics.get("mean", {}).get("psnr_box")}
-    curves.job_chart(seconds, {stage: own for stage, own in lines.items() if own}, box, path, ceiling)
+    trace_charts.draw_job_chart(seconds, {stage: own for stage, own in lines.items() if own}, box, path, ceiling)
 
 
-def scores(job: Job) -> list[str]:
-    """The mean metrics, those of the initialization beside them."""
-    after, before = job.metrics.get("mean", {}), job.metrics.get("initialize", {})
+def score_table(job: Job) -> list[str]:
+    """Mean metrics of the result, and of the initialization beside them."""
+    after, initial = job.metrics.get("mean", {}), job.metrics.get("initialize", {})
     names = [name for name, value in after.items() if value is not None]
     if not names:
         return []
     lines = [
-        [title, *(page.number(values.get(n), 2 if "psnr" in n else 4) for n in names)]
-        for title, values in (("initialization", before), ("result", after))
+        [title, *(page.format_number(values.get(n), 2 if "psnr" in n else 4) for n in names)]
+        for title, values in (("initialization", initial), ("result", after))
         if any(values.get(name) is not None for name in names)
     ]
     return [page.table(["mean over test views", *names], lines)]
 
 
-def stages(job: Job, out: Path) -> list[str]:
+def stage_sections(job: Job, out: Path) -> list[str]:
     """A chart for each stage with a trace."""
     parts = []
     for stage, series in job.traces.items():
         path = out / f"{stage}.png"
-        if names := curves.stage_chart(stage, series, path):
-            parts += [page.heading(f"{stage}: error against seconds"), inside.chart(path, ", ".join(names))]
+        if names := trace_charts.draw_stage_chart(stage, series, path):
+            parts += [
+                page.heading(f"{stage}: error against seconds"),
+                inline_images.chart_element(path, ", ".join(names)),
+            ]
     parts += [page.paragraph(f"Not drawn: {why}", quiet=True) for why in job.unread]
     return parts
 
 
-def left_out(job: Job) -> list[str]:
-    """The runner's words for stages that are not simply done."""
+def skipped_section(job: Job) -> list[str]:
+    """The runner's reasons for stages that were left out, brought by the scene, or still have to run."""
     if not job.plan:
         return []
     rows = [
-        [stage, WORDS.get(said["word"], said["word"]), "; ".join([said["reason"], *said["notes"]])]
-        for stage, said in job.plan.items()
-        if said["word"] != "cached" or said["reason"]
+        [stage, WORDS.get(entry["word"], entry["word"]), "; ".join([entry["reason"], *entry["notes"]])]
+        for stage, entry in job.plan.items()
+        if entry["word"] != "cached" or entry["reason"]
     ]
     parts = [page.heading("What was left out or taken over, and why")]
     return parts + ([page.table(["stage", "", "because"], rows, text=(1, 2))] if rows else [page.paragraph("Nothing.")])
 
 
-def receipts(job: Job) -> list[str]:
-    """Seconds, memory and where it ran; versions once."""
+def receipts_section(job: Job) -> list[str]:
+    """Seconds, memory and machine of each stage; versions once."""
     total = sum(receipt["seconds"] for receipt in job.receipts.values())
     rows = []
     for stage, r in job.receipts.items():
@@ -164,40 +199,45 @@ def receipts(job: Job) -> list[str]:
         rows.append([stage, f"{r['seconds']:.1f}", share, f"{r['peak_memory_mb']:,}", *place, resumed])
     header = ["stage", "seconds", "share", "peak MB", "device", "machine", "profile", "made", ""]
     versions = {name: v for r in job.receipts.values() for name, v in r.get("versions", {}).items()}
-    said = ", ".join(f"{name} {version}" for name, version in versions.items())
+    with_versions = ", ".join(f"{name} {version}" for name, version in versions.items())
     table = page.table(header, rows, text=(4, 5, 6, 7, 8))
-    return [page.heading("Receipts"), table, page.paragraph(f"With {said}.", quiet=True) if said else ""]
+    return [
+        page.heading("Receipts"),
+        table,
+        page.paragraph(f"With {with_versions}.", quiet=True) if with_versions else "",
+    ]
 
 
-def artifacts(job: Job) -> list[str]:
-    there = {"turntable.webm: a way around the capture": "turntable.webm"}
-    there = there if (job.home / "turntable.webm").is_file() else {}
+def files_section(job: Job) -> list[str]:
+    """Links to the result files."""
+    targets = {"turntable.webm: video around the capture": "turntable.webm"}
+    targets = targets if (job.home / "turntable.webm").is_file() else {}
     for name, words in RESULTS.items():
         stage, rest = name.split("/")
         path = job.folders.get(stage, Path()) / rest
         if stage in job.folders and path.exists():
-            there[f"{name}: {words}"] = os.path.relpath(path, job.home)
-    return [page.heading("Files"), page.links(there)]
+            targets[f"{name}: {words}"] = os.path.relpath(path, job.home)
+    return [page.heading("Files"), page.links(targets)]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="reffusion report", description=__doc__.split("\n")[0])
     what = parser.add_mutually_exclusive_group(required=True)
-    what.add_argument("--scene", type=Path, help="its name, or the path of its folder")
+    what.add_argument("--scene", type=Path, help="name of the scene, or path of its folder")
     what.add_argument("--data", type=Path, help="a folder of scenes")
-    parser.add_argument("--variant", default="", help="of the scene")
+    parser.add_argument("--variant", default="", help="variant of the scene")
     parser.add_argument("--runs", type=Path, default=Path("runs"))
     arguments = parser.parse_args()
     suffix = f"@{arguments.variant}" if arguments.variant else ""
     try:
         if arguments.scene:
-            print(make(command.home(arguments)))
+            print(make(cli.run_folder(arguments)))
             return
         folders = sorted(path for path in arguments.data.iterdir() if path.is_dir()) if arguments.data.is_dir() else []
         homes = [home for path in folders if (home := arguments.runs / (path.name + suffix)).is_dir()]
         if not homes:
             raise ValueError(f"data={arguments.data}: none of its scenes has a folder in {arguments.runs}")
-        print(scenes.make([load_job(home) for home in homes], arguments.runs / f"report{suffix}"))
+        print(scenes_page.make([load_job(home) for home in homes], arguments.runs / f"report{suffix}"))
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
 

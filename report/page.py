@@ -26,7 +26,7 @@ pre { white-space: pre-wrap; overflow-wrap: anywhere; font-size: .85rem; backgro
 
 
 def document(title: str, body: Sequence[str], style: str = "", script: str = "") -> str:
-    """A whole page; `title` is plain text, the parts of `body` are HTML; `style` and `script` go into it."""
+    """A whole page. `title` is plain text, the parts of `body` are HTML, `style` and `script` add to the page's own."""
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
     head += f"<title>{escape(title)}</title><style>{STYLE}{style}</style>"
     top = f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>'
@@ -54,7 +54,10 @@ def table(
     text: Sequence[int] = (),
     marked: int | None = None,
 ) -> str:
-    """`bold`: cells to stand out, [rows][columns]; `text`: columns of words, set to the left; `marked`: a row."""
+    """HTML table.
+
+    `bold` [rows][columns] marks cells, `text` the columns of words (set to the left), `marked` one row.
+    """
     left = lambda column: ' class="text"' if column in text else ""
     lines = ["<tr>" + "".join(f"<th{left(n)}>{escape(cell)}</th>" for n, cell in enumerate(header)) + "</tr>"]
     for number, row in enumerate(rows):
@@ -67,35 +70,35 @@ def table(
 
 
 def picture(path: Path, alt: str, embed: bool = False) -> str:
-    """A PNG, by its name beside the page, or inside the page."""
+    """Element of a PNG, by its name beside the page or embedded in the page."""
     source = f"data:image/png;base64,{base64.b64encode(path.read_bytes()).decode()}" if embed else escape(path.name)
     return f'<img src="{source}" alt="{escape(alt)}">'
 
 
 def code(line: str) -> str:
-    """A command, to be copied."""
+    """A command to copy."""
     return f"<pre><code>{escape(line)}</code></pre>"
 
 
 def links(targets: dict[str, str]) -> str:
-    """A list of {words: relative address}."""
+    """List of links, {text: relative address}."""
     lines = [f'<li><a href="{escape(to)}">{escape(name)}</a></li>' for name, to in targets.items()]
     return "<ul>" + "".join(lines) + "</ul>"
 
 
-def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """The same table for a text file."""
+def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """The table in Markdown."""
     lines = [header, ["---"] * len(header), *rows]
     return "".join("| " + " | ".join(cell.replace("|", "/") for cell in line) + " |\n" for line in lines)
 
 
-def number(value: float | None, digits: int = 0) -> str:
-    """With commas between thousands; a dash where there is none."""
+def format_number(value: float | None, digits: int = 0) -> str:
+    """Number with commas between thousands; a dash for None."""
     return "–" if value is None else f"{value:,.{digits}f}"
 
 
-def duration(seconds: float | None) -> str:
-    """As people say it: 48 s, 5 min 20 s, 1 h 5 min."""
+def format_duration(seconds: float | None) -> str:
+    """Duration as people write it: 48 s, 5 min 20 s, 1 h 5 min."""
     if seconds is None:
         return "–"
     if seconds < 100:

@@ -1,5 +1,5 @@
-"""A patched hole as files for an editor: `python -m report.patch --scene X` (`make scene=X patch`), or of two files
-alone: `reffusion patch before.ply after.ply --out patched.ply`."""
+"""A patched hole as files for an editor: `python -m report.patch --scene X` (`make scene=X patch`), or without a scene
+`reffusion patch before.ply after.ply --out patched.ply`."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ from pathlib import Path
 from reffusion.io.arrays import load_labels
 from reffusion.io.ply import properties_of, save_ply
 from reffusion.io.scene import load_scene
-from report import command, patch_files
-from report.patch_result import check, load_result
+from report import cli, patch_files
+from report.patch_result import load_result, require_deleted
 
 WHOLE, NEW = "patched.ply", "new.ply"
 
 
 def make(home: Path) -> str:
-    """Write patch/patched.ply, the whole scene, and patch/new.ply, what was put in: both in the scene's own frame,
-    their properties in the order of the file that the scene brought. What to say of them.
+    """Write patch/patched.ply (the whole scene) and patch/new.ply (the new Gaussians); return what to print.
+
+    Both files are in the scene's own frame, with properties in the order of the file that the scene brought.
 
     Args:
         home: runs/<scene> or runs/<scene>@<variant>, its stage `evaluate` finished.
@@ -24,30 +25,32 @@ def make(home: Path) -> str:
     Raises:
         ValueError: nothing was deleted, or that stage has not run.
     """
-    found = load_result(home)
-    similarity, properties = load_scene(found.poses).similarity, properties_of(found.poses / "gaussians.ply")
-    result, new, out = found.gaussians, found.new, home / "patch"
+    patch = load_result(home)
+    similarity, properties = load_scene(patch.poses).similarity, properties_of(patch.poses / "gaussians.ply")
+    result, new, out = patch.gaussians, patch.new, home / "patch"
     save_ply(out / WHOLE, result, similarity, properties)
     save_ply(out / NEW, result.map(lambda parameter: parameter[new]), similarity, properties)
-    kept, stayed = int((~load_labels(found.poses / "deleted.npy")).sum()), len(result) - int(new.sum())
+    kept, stayed = int((~load_labels(patch.poses / "deleted.npy")).sum()), len(result) - int(new.sum())
     more = kept - stayed
-    left = f"; {more} more than were deleted are gone: haze, and what the object hid" if more > 0 else ""
+    left = f"; {more} more than you deleted are gone: haze and floaters behind the object" if more > 0 else ""
     return (
         f"{out / WHOLE}: the whole scene, {len(result)} splats{left}\n"
-        f"{out / NEW}: the {int(new.sum())} new ones alone, which the whole holds too"
+        f"{out / NEW}: the {int(new.sum())} new ones alone, which the whole scene contains too"
     )
 
 
 def main() -> None:
-    parser = command.parser("patch", __doc__, needs_scene=False)
-    parser.add_argument("--only-check", action="store_true", help="does the scene say what was deleted?")
+    parser = cli.scene_parser("patch", __doc__, needs_scene=False)
+    parser.add_argument("--only-check", action="store_true", help="only check that the scene says what was deleted")
     files = "two files of splats, before and after the object was deleted (.ply, compressed .ply, .spz, .splat)"
     parser.add_argument("files", type=Path, nargs="*", metavar="BEFORE AFTER", help=f"instead of --scene: {files}")
-    parser.add_argument("--out", type=Path, help="of two files: the filled scene, in the format of its ending")
-    parser.add_argument("--cameras", type=Path, help="of two files: a folder with cameras, as `export` writes it")
-    parser.add_argument("--profile", help="of two files: as of `run`, these three")
-    parser.add_argument("--budget", help="as of `run`")
-    parser.add_argument("--set", default="", help="as of `run`")
+    parser.add_argument(
+        "--out", type=Path, help="for two files: where to write the filled scene; the ending selects the format"
+    )
+    parser.add_argument("--cameras", type=Path, help="for two files: a folder with cameras, as `export` writes it")
+    parser.add_argument("--profile", help="for two files, as for `run` (these three options)")
+    parser.add_argument("--budget", help="as for `run`")
+    parser.add_argument("--set", default="", help="as for `run`")
     arguments = parser.parse_args()
     try:
         if arguments.files:
@@ -55,9 +58,9 @@ def main() -> None:
         elif arguments.scene is None:
             raise ValueError("name a scene (--scene), or two files: reffusion patch before.ply after.ply --out out.ply")
         elif arguments.only_check:
-            check(command.home(arguments))
+            require_deleted(cli.run_folder(arguments))
         else:
-            print(make(command.home(arguments)))
+            print(make(cli.run_folder(arguments)))
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
 

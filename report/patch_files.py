@@ -1,7 +1,7 @@
-"""`reffusion patch before.ply after.ply --out patched.ply`: a hole is filled without a folder or a scene.yaml.
+"""Fill a hole from two splat files, without a scene folder: `reffusion patch before.ply after.ply --out patched.ply`.
 
-The two files, and cameras where they come along, are linked into runs/patches/<name>/, which is a scene's folder as any
-other: there a person paints a reference, and the same command goes on from what runs/<name>/ holds.
+The files, and cameras if given, are linked into runs/patches/<name>/, an ordinary scene folder. A reference can be
+painted there; the same command then continues from what runs/<name>/ holds.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from reffusion.io.splats import summarize
 from report.patch_result import load_result
 
 BEFORE, AFTER, PATCHES = "before", "after", "patches"
-OWN = (BEFORE, AFTER, "painted", "scene.yaml")  # names in the folder that no link to a camera replaces
+RESERVED_NAMES = (BEFORE, AFTER, "painted", "scene.yaml")  # names in the folder that no linked camera file replaces
 
 
-def check(arguments: argparse.Namespace) -> None:
-    """ValueError where the files cannot be used, as far as their headers tell, or the result could not be written."""
+def check_arguments(arguments: argparse.Namespace) -> None:
+    """Raise ValueError if the files' headers show that they cannot be used, or the result could not be written."""
     if len(arguments.files) != 2:
         raise BadInput(f"{arguments.files[0]}: name two files, the scene before and after the object was deleted")
     if arguments.scene or arguments.variant:
@@ -40,8 +40,8 @@ def check(arguments: argparse.Namespace) -> None:
         raise BadInput(f"{arguments.cameras}: no such folder; --cameras names one with transforms.json or sparse/0")
 
 
-def prepare(arguments: argparse.Namespace) -> Path:
-    """The scene's folder, written anew but for what a person painted."""
+def write_scene_folder(arguments: argparse.Namespace) -> Path:
+    """Write the scene's folder anew, except what was painted there, and return it."""
     files = [file.expanduser().resolve() for file in arguments.files]
     folder, names = find_folder(arguments.runs, *files), {}
     for key, file in zip((BEFORE, AFTER), files, strict=True):
@@ -51,17 +51,17 @@ def prepare(arguments: argparse.Namespace) -> Path:
         if path.is_symlink():
             path.unlink()
     for path in sorted(arguments.cameras.expanduser().resolve().iterdir()) if arguments.cameras else ():
-        if path.name not in OWN and not path.name.startswith("."):
+        if path.name not in RESERVED_NAMES and not path.name.startswith("."):
             _link(folder / path.name, path)
-    said = f"gaussians: {json.dumps(names[BEFORE])}\ncleaned: {json.dumps(names[AFTER])}\nmasks: none\n"
+    text = f"gaussians: {json.dumps(names[BEFORE])}\ncleaned: {json.dumps(names[AFTER])}\nmasks: none\n"
     scene = folder / "scene.yaml"
-    if not scene.is_file() or scene.read_text(encoding="utf-8") != said:
-        save_text(scene, said)
+    if not scene.is_file() or scene.read_text(encoding="utf-8") != text:
+        save_text(scene, text)
     return folder
 
 
 def find_folder(runs: Path, before: Path, after: Path) -> Path:
-    """The scene's folder of two files: the same for as long as they lie where they are."""
+    """The scene folder of two files; it depends on their paths only."""
     files = [file.expanduser().resolve() for file in (before, after)]
     identity = hashlib.blake2b("\n".join(map(str, files)).encode(), digest_size=3).hexdigest()
     stem = re.sub(r"[^\w.,+'() -]", "_", files[0].name.split(".")[0]) or "scene"
@@ -76,34 +76,35 @@ def _link(place: Path, file: Path) -> None:
 
 
 def make(arguments: argparse.Namespace) -> str:
-    """Fill the hole and write `out`; what to say of it.
+    """Fill the hole, write `out`, and return what to print.
 
     Raises:
-        ValueError: the files cannot be used; SystemExit: a stage was refused, failed or was interrupted.
+        ValueError: the files cannot be used.
+        SystemExit: a stage was refused, failed or was interrupted.
     """
-    check(arguments)
-    folder = prepare(arguments)
-    run_all(folder, arguments)
+    check_arguments(arguments)
+    folder = write_scene_folder(arguments)
+    run_stages(folder, arguments)
     home = arguments.runs / folder.name
     result = load_result(home)
     similarity = load_scene(result.poses).similarity
     save_splats(arguments.out, result.gaussians, similarity, properties_of(arguments.files[0]))
     return (
         f"{arguments.out}: the whole scene, {len(result.gaussians)} splats, {int(result.new.sum())} of them new\n"
-        f"another filling: paint one of {home / 'to_paint'}, save it as {folder / 'painted'}/<view>.png, and give the "
-        "same command again"
+        f"for another filling, paint one of {home / 'to_paint'}, save it as {folder / 'painted'}/<view>.png, and "
+        "repeat the command"
     )
 
 
-def run_all(folder: Path, arguments: argparse.Namespace) -> None:
-    """All stages; SystemExit with the runner's code where it ends without a result, its line being on the screen."""
-    given = {"--profile": arguments.profile, "--budget": arguments.budget, "--set": arguments.set}
-    said = [word for name, value in given.items() if value for word in (name, value)]
-    words = ["run", "all", "--scene", str(folder), "--runs", str(arguments.runs.resolve()), *said]
+def run_stages(folder: Path, arguments: argparse.Namespace) -> None:
+    """Run all stages. SystemExit with the runner's code if it fails; the runner has printed the reason."""
+    options = {"--profile": arguments.profile, "--budget": arguments.budget, "--set": arguments.set}
+    typed = [word for name, value in options.items() if value for word in (name, value)]
+    words = ["run", "all", "--scene", str(folder), "--runs", str(arguments.runs.resolve()), *typed]
     process = subprocess.Popen([sys.executable, "-m", "reffusion.command", *words])
     try:
         status = process.wait()
-    except KeyboardInterrupt:  # which the runner has got, too: it says that the same command goes on
+    except KeyboardInterrupt:  # the runner gets it too and prints how to continue
         status = process.wait()
     if status:
         raise SystemExit(status)

@@ -1,4 +1,4 @@
-"""The result of a scene from which something was deleted: what the stages made of it."""
+"""The result of a scene from which something was deleted."""
 
 from __future__ import annotations
 
@@ -19,11 +19,13 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Result:
+class PatchResult:
     """A filled scene.
 
     Attributes:
-        gaussians: in the normalised frame; new: bool [N], those that fill the hole; poses: that stage's folder.
+        gaussians: in the normalised frame.
+        new: bool [N], the Gaussians that fill the hole.
+        poses: folder of the stage `poses`.
     """
 
     gaussians: Gaussians
@@ -31,17 +33,19 @@ class Result:
     poses: Path
 
 
-def load_result(home: Path) -> Result:
-    """Of runs/<scene> or runs/<scene>@<variant>. ValueError where nothing was deleted, or `evaluate` has not run."""
-    check(home)
+def load_result(home: Path) -> PatchResult:
+    """Load runs/<scene> or runs/<scene>@<variant>. ValueError if nothing was deleted, or `evaluate` has not run."""
+    require_deleted(home)
     poses, finished = stage_folder(home, "poses"), home / "evaluate" / "scene.ply"
     if not finished.exists():
         raise ValueError(f"{finished} is missing; `make scene={home.name.split('@')[0]} patch` makes it")
-    return Result(load_ply(finished, load_scene(poses).similarity), load_labels(last_of(home) / "labels.npy"), poses)
+    return PatchResult(
+        load_ply(finished, load_scene(poses).similarity), load_labels(result_stage_folder(home) / "labels.npy"), poses
+    )
 
 
-def check(home: Path) -> None:
-    """ValueError where the scene does not say what was deleted, as far as its stage `poses` knows."""
+def require_deleted(home: Path) -> None:
+    """Raise ValueError if the scene does not say what was deleted, according to its stage `poses`."""
     if not (stage_folder(home, "poses") / "deleted.npy").is_file():
         raise ValueError(
             "scene.yaml: nothing says what was deleted; `gaussians: scene.ply` names the scene before, "
@@ -49,7 +53,7 @@ def check(home: Path) -> None:
         )
 
 
-def last_of(home: Path) -> Path:
-    """The folder of the stage whose Gaussians are the result."""
+def result_stage_folder(home: Path) -> Path:
+    """Folder of the stage whose Gaussians are the result."""
     used = load_receipts({"evaluate": home / "evaluate"})["evaluate"]["needs"]
     return stage_folder(home, next(stage for stage in ("distill", "initialize") if used.get(stage)))

@@ -1,4 +1,4 @@
-"""What `benchmarks/studies/prior.py` measured, as a page: tables, charts and sheets of pictures.
+"""Page of the measurements of `benchmarks/studies/prior.py`: tables, charts and sheets of pictures.
 
 python -m report.prior runs/prior-report
 """
@@ -13,9 +13,9 @@ import numpy as np
 
 from reffusion.io.arrays import load_json
 from reffusion.io.images import load_image, save_image
-from report.sheet import enlarged, framed
+from report.sheet import compose_sheet, enlarge
 
-ENLARGE = 3  # whole factor; held-out pictures are 64 px
+ENLARGE = 3  # whole factor; held-out pictures have 64 px
 SCALES = ("reference", "whole", "window")
 SHEETS = {
     "inpainting": "Held-out pictures, filled from pure noise",
@@ -27,7 +27,7 @@ SCORES = {"psnr": "PSNR, dB", "ssim": "SSIM", "flip": "FLIP", "energy": "gradien
 
 
 def make(folder: Path) -> Path:
-    """Write prior.md, sheets and charts into the benchmark's folder; gives back the page's path.
+    """Write prior.md, sheets and charts into the benchmark's folder; return the page's path.
 
     Raises:
         ValueError: nothing was measured there yet.
@@ -38,53 +38,53 @@ def make(folder: Path) -> Path:
     lines = [f"# {measured['prior']}, measured", ""]
     if "inpainting" in measured:
         lines += [inpainting_table(measured["inpainting"]["scores"])]
-        lines += sheet(folder, "inpainting", measured["inpainting"]["columns"])
+        lines += save_sheet(folder, "inpainting", measured["inpainting"]["columns"])
     if measured.get("sampler"):
         lines += ["## Numbers of sampler steps", "", sampler_table({"held out": measured["sampler"]})]
     if "personalization" in measured:
         personal = measured["personalization"]
-        charts(personal, folder / "charts.png")
+        save_charts(personal, folder / "charts.png")
         lines += ["## Personalization", "", personalization_table(personal), "![](charts.png)", ""]
         lines += ["Every seed's samples:", "", seeds_table(personal["seeds"])]
         if personal["sampler"]["reference"]:
             lines += ["Personalized, with other numbers of sampler steps:", "", sampler_table(personal["sampler"])]
         for scale in SCALES:
-            lines += sheet(folder, scale, personal["columns"])
+            lines += save_sheet(folder, scale, personal["columns"])
     page = folder / "prior.md"
     page.write_text("\n".join(lines), encoding="utf-8")
     return page
 
 
-def sheet(folder: Path, name: str, columns: list[str]) -> list[str]:
-    """Put the rows of pictures in folder/name together as folder/name.png; the page's lines for it."""
+def save_sheet(folder: Path, name: str, columns: list[str]) -> list[str]:
+    """Join the rows of pictures in folder/name as folder/name.png; return the page's lines for it."""
     paths = sorted((folder / name).glob("*.png"))
     rows = [np.split(load_image(path), len(columns), 1) for path in paths]
-    cells = [[enlarged(picture, ENLARGE) for picture in row] for row in rows]
-    save_image(folder / f"{name}.png", framed(cells, columns, [path.stem for path in paths]))
+    cells = [[enlarge(picture, ENLARGE) for picture in row] for row in rows]
+    save_image(folder / f"{name}.png", compose_sheet(cells, columns, [path.stem for path in paths]))
     return [f"## {SHEETS[name]}", "", f"![]({name}.png)", ""]
 
 
 def inpainting_table(scores: dict[str, dict[str, dict[str, float]]]) -> str:
-    """Markdown: a row for each kind of picture and method."""
+    """Markdown table with a row for each kind of picture and method."""
     lines = [f"| inside the hole | pictures | {' | '.join(SCORES.values())} |", "|---" * (len(SCORES) + 2) + "|"]
     kinds = dict.fromkeys(kind for by_kind in scores.values() for kind in by_kind)
     for kind in kinds:
         for name, by_kind in scores.items():
             row = by_kind[kind]
-            cells = " | ".join(cell(row, column) for column in SCORES)
+            cells = " | ".join(format_score(row, column) for column in SCORES)
             lines.append(f"| {kind}: {name} | {row['pictures']} | {cells} |")
     return "\n".join(lines) + "\n"
 
 
-def cell(row: dict[str, float], column: str) -> str:
-    """A figure; PSNR with its standard error."""
+def format_score(row: dict[str, float], column: str) -> str:
+    """A score; PSNR with its standard error."""
     if column == "psnr":
         return f"{row['psnr']:.2f} ± {row['psnr_error']:.2f}"
     return f"{row[column]:.3f}"
 
 
 def personalization_table(personal: dict[str, Any]) -> str:
-    """Markdown: samples of unseen views, and errors over all timesteps, before and after."""
+    """Markdown table: samples of unseen views, and errors over all timesteps, before and after."""
     titles = ("clean-latent error", "variance of the SDS gradient")
     lines = [
         f"| holes, {personal['steps']} steps | {' | '.join((*titles, *SCORES.values()))} |",
@@ -93,26 +93,26 @@ def personalization_table(personal: dict[str, Any]) -> str:
     for scale in SCALES:
         for when, row in personal[scale].items():
             figures = [f"{np.mean(row[key]):.4f}" for key in ("error", "variance")]
-            cells = [*figures, *(cell(row["samples"], column) for column in SCORES)]
+            cells = [*figures, *(format_score(row["samples"], column) for column in SCORES)]
             lines.append(f"| {scale}, {when} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
 def sampler_table(by_name: dict[str, dict[str, dict[str, float]]]) -> str:
-    """Markdown: a row for each set of holes and number of sampler steps."""
+    """Markdown table with a row for each set of holes and number of sampler steps."""
     lines = [
         f"| holes, sampler steps | {' | '.join(SCORES.values())} | CPU ms each |",
         "|---" * (len(SCORES) + 2) + "|",
     ]
     for name, by_count in by_name.items():
         for count, row in by_count.items():
-            cells = " | ".join(cell(row, column) for column in SCORES)
+            cells = " | ".join(format_score(row, column) for column in SCORES)
             lines.append(f"| {name}, {count} | {cells} | {1000 * row['seconds']:.0f} |")
     return "\n".join(lines) + "\n"
 
 
 def seeds_table(seeds: dict[str, dict[str, Any]]) -> str:
-    """Markdown: for each kind of holes, without and with the reference or a wrong one, mean and spread over seeds."""
+    """Markdown table: mean and range over seeds for each kind of holes, before, after, and with a wrong reference."""
     lines = [
         f"| holes, {len(seeds)} seeds: mean (lowest to highest) | {' | '.join(SCORES.values())} |",
         "|---" * (len(SCORES) + 1) + "|",
@@ -121,19 +121,19 @@ def seeds_table(seeds: dict[str, dict[str, Any]]) -> str:
     for scale in SCALES:
         for when in whens:
             rows = [scores[when][scale] for scores in seeds.values()]
-            cells = (spread([row[column] for row in rows], 2 if column == "psnr" else 3) for column in SCORES)
+            cells = (format_range([row[column] for row in rows], 2 if column == "psnr" else 3) for column in SCORES)
             lines.append(f"| {scale}, {when} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
-def spread(values: list[float], digits: int) -> str:
-    """Mean, and lowest to highest where there are several."""
+def format_range(values: list[float], digits: int) -> str:
+    """Mean, and the range from lowest to highest if there are several values."""
     mean = f"{np.mean(values):.{digits}f}"
     return f"{mean} ({min(values):.{digits}f} to {max(values):.{digits}f})" if len(values) > 1 else mean
 
 
-def charts(personal: dict[str, Any], path: Path) -> None:
-    """Error against steps; error and variance against the timestep, before and after."""
+def save_charts(personal: dict[str, Any], path: Path) -> None:
+    """Chart error against steps, and error and variance against the timestep, before and after."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

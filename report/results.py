@@ -1,4 +1,4 @@
-"""What the runs of a comparison measured: compare.json, and the artifacts it names."""
+"""Results of a comparison: compare.json, the artifacts that it names, and the table of all methods."""
 
 from __future__ import annotations
 
@@ -11,26 +11,36 @@ from typing import Any
 import numpy as np
 
 from reffusion.io.arrays import load_json
-from report.paired import Difference, half_width, paired
+from report.paired_statistics import Difference, confidence_half_width, paired_difference
 
 FULL = "full"
-TOGETHER = "compare"  # the folder in runs/ of a comparison over a folder of scenes
-MAIN = "lpips_vgg_box"  # by which methods are ordered
-BETTER = {"lpips_vgg_box": "less", "lpips_alex_box": "less", "psnr_box": "more", "ssim_box": "more", "flip_box": "less"}
-OUTSIDE = {"psnr_outside": "more", "ssim_outside": "more", "flip_outside": "less"}  # of the masks
-SCORES = BETTER | OUTSIDE
-PSNR_CAP = 100.0  # dB, what an identical view counts: as in metrics.json
+FOLDER_COMPARISON = "compare"  # folder in runs/ of a comparison over a folder of scenes
+MAIN = "lpips_vgg_box"  # the score that orders the methods
+BOX_SCORES = {
+    "lpips_vgg_box": "less",
+    "lpips_alex_box": "less",
+    "psnr_box": "more",
+    "ssim_box": "more",
+    "flip_box": "less",
+}
+OUTSIDE_SCORES = {"psnr_outside": "more", "ssim_outside": "more", "flip_outside": "less"}  # outside the masks
+SCORES = BOX_SCORES | OUTSIDE_SCORES
+PSNR_CAP = 100.0  # dB, for a view that equals the truth; as in metrics.json
 MEASURED = ("consistency", "seconds", "own_seconds", "peak_memory_mb", "gaussians", "scenes")
-AGAINST = ("minus_full", "interval_views", "interval_scenes")  # see report.paired.Difference; halves of intervals
+DIFFERENCE_COLUMNS = (  # half intervals; see report.paired_statistics.Difference
+    "minus_full",
+    "interval_views",
+    "interval_scenes",
+)  # see report.paired_statistics.Difference; halves of intervals
 COLUMNS = (
     "method",
     "state",
     "same_as",
     *SCORES,
     *MEASURED,
-    *(f"{metric}_{what}" for metric in SCORES for what in AGAINST),
+    *(f"{metric}_{what}" for metric in SCORES for what in DIFFERENCE_COLUMNS),
 )
-COLUMNS += tuple(f"{metric}_interval" for metric in SCORES)  # half the 95% interval of the mean over scenes
+COLUMNS += tuple(f"{metric}_interval" for metric in SCORES)  # half the 95 % interval of the mean over scenes
 
 
 @dataclass(frozen=True)
@@ -38,11 +48,11 @@ class Run:
     """One method on one scene.
 
     Attributes:
-        state: done, failed or not run yet.
-        error: of a failed one, in a line.
-        folders: stage -> its artifact, of the stages that were not left out.
+        state: "done", "failed" or "not run yet".
+        error: reason of the failure, in one line.
+        folders: stage -> its artifact, for stages that were not left out.
         receipts: stage -> its receipt.json.
-        metrics: metrics.json; empty where there is none.
+        metrics: metrics.json, or empty.
         views: view -> the numbers of its row in per_view.csv.
     """
 
@@ -61,10 +71,11 @@ class Comparison:
     """All methods on all scenes.
 
     Attributes:
-        data: the folder that the scenes are from, where they are all of a folder.
+        home: runs/<scene>, or runs/compare.
+        data: the folder of the scenes, if a whole folder was compared.
         methods: the first is the full one.
         runs: (method, scene) -> run.
-        same_as: method -> an earlier one that is the very same job in every scene.
+        same_as: method -> an earlier method that is the very same job in every scene.
     """
 
     home: Path
@@ -76,24 +87,27 @@ class Comparison:
 
     @property
     def distinct_methods(self) -> list[str]:
-        """The methods that are no other method's job."""
+        """The methods that are not the same job as an earlier one."""
         return [method for method in self.methods if method not in self.same_as]
 
     @property
     def name(self) -> str:
         return f"{self.data.name}, {len(self.scenes)} scenes" if self.data else self.home.name
 
-    def of(self, method: str) -> list[Run]:
+    def finished_runs(self, method: str) -> list[Run]:
         """The method's finished runs."""
         return [run for scene in self.scenes if (run := self.runs[method, scene]).state == "done"]
 
 
-def load(home: Path) -> Comparison:
-    """Read compare.json of runs/<scene>, or of runs/compare for a folder of scenes, and what it names. Raises
-    ValueError where nothing was compared yet."""
+def load_comparison(home: Path) -> Comparison:
+    """Read compare.json of runs/<scene>, or of runs/compare for a folder of scenes, and what it names.
+
+    Raises:
+        ValueError: nothing was compared yet.
+    """
     path = home / "compare.json"
     if not path.exists():
-        what = "data=FOLDER" if home.name == TOGETHER else f"scene={home.name}"
+        what = "data=FOLDER" if home.name == FOLDER_COMPARISON else f"scene={home.name}"
         raise ValueError(f"{path}: no such file; run `make {what} compare` first")
     record = load_json(path)
     runs = {(run["method"], run["scene"]): load_run(run, home.parent) for run in record["runs"]}
@@ -105,7 +119,7 @@ def load(home: Path) -> Comparison:
 def _find_same_jobs(
     methods: tuple[str, ...], scenes: tuple[str, ...], runs: dict[tuple[str, str], Run]
 ) -> dict[str, str]:
-    """Method -> an earlier one of which the last stage had the same inputs in every scene."""
+    """Method -> an earlier one whose last stage had the same inputs in every scene."""
     first: dict[tuple[str, ...], str] = {}
     found = {}
     for method in methods:
@@ -116,6 +130,7 @@ def _find_same_jobs(
 
 
 def load_run(record: dict[str, Any], runs: Path) -> Run:
+    """Load one entry of compare.json; `runs` is the folder that its paths are relative to."""
     folders = {stage: runs / folder for stage, folder in record.get("stages", {}).items() if folder}
     evaluate = folders.get("evaluate", Path())
     metrics = evaluate / "metrics.json"
@@ -132,13 +147,13 @@ def load_run(record: dict[str, Any], runs: Path) -> Run:
 
 
 def load_receipts(folders: dict[str, Path]) -> dict[str, dict[str, Any]]:
-    """Stage -> receipt. A stage that the scene's own file stands for has another's folder, which counts once."""
+    """Stage -> receipt. A stage that scene.yaml replaces has another stage's folder, which counts only once."""
     paths = {stage: folder / "receipt.json" for stage, folder in folders.items() if folder.name == stage}
     return {stage: load_json(path) for stage, path in paths.items() if path.is_file()}
 
 
 def load_views(path: Path) -> dict[str, dict[str, float]]:
-    """View -> its numbers; empty cells are left out, an identical picture's PSNR is `PSNR_CAP`."""
+    """View -> its numbers, without empty cells; the PSNR of a view that equals the truth is `PSNR_CAP`."""
     if not path.is_file():
         return {}
     with open(path, newline="", encoding="utf-8") as file:
@@ -160,22 +175,25 @@ def _number(column: str, text: str | None) -> float | None:
 # ------------------------------------------------------------------------------------------------------- the table
 
 
-def rows(comparison: Comparison) -> list[dict[str, Any]]:
-    """A dict of `COLUMNS` for each method: means over its finished scenes; None where there is no value, and of a
-    method that is another's job. The best in `MAIN` first; methods without it as they were named."""
+def summarize_methods(comparison: Comparison) -> list[dict[str, Any]]:
+    """One dict of `COLUMNS` per method: means over its finished scenes.
+
+    None marks missing values, and all values of a method that is the same job as another. The best in `MAIN` comes
+    first; methods without it keep their order.
+    """
     table = [_row(comparison, method) for method in comparison.methods]
     table.sort(key=lambda row: (row["same_as"] is not None, row[MAIN] is None, row[MAIN] or 0.0))
     for metric in SCORES:
-        found = differences(comparison, metric)
+        found = differences_to_full(comparison, metric)
         for row in table:
             if difference := found.get(row["method"]):
                 values = (difference.mean, difference.views, difference.scenes)
-                row |= {f"{metric}_{what}": value for what, value in zip(AGAINST, values, strict=True)}
+                row |= {f"{metric}_{what}": value for what, value in zip(DIFFERENCE_COLUMNS, values, strict=True)}
     return table
 
 
 def _row(comparison: Comparison, method: str) -> dict[str, Any]:
-    done = comparison.of(method)
+    done = comparison.finished_runs(method)
     states = [comparison.runs[method, scene].state for scene in comparison.scenes]
     row: dict[str, Any] = dict.fromkeys(COLUMNS)
     row |= {"method": method, "scenes": len(done)}
@@ -185,82 +203,69 @@ def _row(comparison: Comparison, method: str) -> dict[str, Any]:
         return row
     for name in SCORES:
         values = [run.metrics.get("mean", {}).get(name) for run in done]
-        row |= {name: mean(values), f"{name}_interval": interval(values)}
-    row["consistency"] = mean([consistency(run) for run in done])
-    row["seconds"] = mean([seconds(run) for run in done])
-    row["own_seconds"] = mean([own_seconds(run, comparison.runs[FULL, run.scene]) for run in done])
+        row |= {name: finite_mean(values), f"{name}_interval": mean_interval(values)}
+    row["consistency"] = finite_mean([view_consistency(run) for run in done])
+    row["seconds"] = finite_mean([total_seconds(run) for run in done])
+    row["own_seconds"] = finite_mean([own_seconds(run, comparison.runs[FULL, run.scene]) for run in done])
     peaks = [receipt["peak_memory_mb"] for run in done for receipt in run.receipts.values()]
     row["peak_memory_mb"] = max(peaks, default=None)
-    counts = mean([run.metrics.get("gaussians", {}).get(run.metrics.get("result")) for run in done])
+    counts = finite_mean([run.metrics.get("gaussians", {}).get(run.metrics.get("result")) for run in done])
     row["gaussians"] = None if counts is None else round(counts)
     return row
 
 
-def mean(values: list[float | None]) -> float | None:
-    """Of those that are there and finite; None where there are none."""
-    there = [value for value in values if value is not None and math.isfinite(value)]
-    return sum(there) / len(there) if there else None
+def finite_mean(values: list[float | None]) -> float | None:
+    """Mean of the values that are finite numbers; None if there are none."""
+    finite = [value for value in values if value is not None and math.isfinite(value)]
+    return sum(finite) / len(finite) if finite else None
 
 
-def interval(values: list[float | None]) -> float | None:
-    """Half the 95% interval of the mean of those that are there and finite; None under two."""
-    return half_width(np.array([value for value in values if value is not None and math.isfinite(value)]))
+def mean_interval(values: list[float | None]) -> float | None:
+    """Half the 95 % interval of the mean of the values that are finite numbers; None for fewer than two."""
+    return confidence_half_width(np.array([value for value in values if value is not None and math.isfinite(value)]))
 
 
-def seconds(run: Run) -> float:
-    """Of the whole job, its evaluation included."""
+def total_seconds(run: Run) -> float:
+    """Seconds of the whole job, evaluation included."""
     return round(sum(receipt["seconds"] for receipt in run.receipts.values()), 2)
 
 
 def own_seconds(run: Run, full: Run) -> float | None:
-    """Of the stages that it does not share with the full method; 0 for that one itself."""
+    """Seconds of the stages that a run does not share with the full method; 0 for the full method itself."""
     if full.state != "done":
         return None
     own = [receipt["seconds"] for s, receipt in run.receipts.items() if run.folders[s] != full.folders.get(s)]
     return round(sum(own), 2)
 
 
-def consistency(run: Run) -> float | None:
-    """The mean over pairs of neighbouring views, where metrics.json has it."""
+def view_consistency(run: Run) -> float | None:
+    """Mean over pairs of neighbouring views, if metrics.json has it."""
     value = (run.metrics.get("consistency") or {}).get("consistency")
     return None if value is None else float(value)
 
 
 def save_csv(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Every digit; an empty cell where there is no value."""
+    """Write the table with all digits; missing values are empty cells."""
     with open(path, "w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(COLUMNS), lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
 
 
-def load_csv(path: Path) -> list[dict[str, Any]]:
-    """What `save_csv` wrote."""
-    with open(path, newline="", encoding="utf-8") as file:
-        return [{name: _value(name, text) for name, text in row.items()} for row in csv.DictReader(file)]
-
-
-def _value(name: str, text: str) -> Any:
-    if name in ("method", "state", "same_as"):
-        return text or None
-    whole = name in ("peak_memory_mb", "gaussians", "scenes")
-    return None if text == "" else int(text) if whole else float(text)
-
-
 # ------------------------------------------------------------------------------------------------ against the full one
 
 
-def differences(comparison: Comparison, metric: str) -> dict[str, Difference]:
-    """Method -> its difference to the full one in a score, over the views that both have."""
+def differences_to_full(comparison: Comparison, metric: str) -> dict[str, Difference]:
+    """Method -> its difference to the full method in a score, over the views that both have."""
     found = {}
     for method in comparison.distinct_methods:
         if method == FULL:
             continue
         scenes = []
-        for run in comparison.of(method):
+        for run in comparison.finished_runs(method):
             full = comparison.runs[FULL, run.scene]
             both = [v for v in run.views if metric in run.views[v] and metric in full.views.get(v, {})]
             scenes.append(np.array([run.views[v][metric] - full.views[v][metric] for v in both]))
-        if difference := paired(scenes):
+        if difference := paired_difference(scenes):
             found[method] = difference
     return found

@@ -1,4 +1,4 @@
-"""A contact sheet of a finished scene: a row a view; with the object, ground truth, initialization, result.
+"""Contact sheet of a finished scene, a row per view: with the object, ground truth, initialization, result.
 
 python -m report.sheet runs/demo --views 3 --out docs/images/demo.png
 """
@@ -14,7 +14,7 @@ from PIL import Image, ImageDraw, ImageFont
 from reffusion.io.arrays import load_json
 from reffusion.io.images import load_image, save_image
 
-GAP = 6  # px between pictures
+GAP = 6  # between pictures, px
 TITLES = {
     "renders_fit": "with the object",
     "truth": "ground truth",
@@ -24,59 +24,62 @@ TITLES = {
 
 
 def make(scene_dir: Path, out: Path, *, views: list[str] | int = 3, scale: int | None = None) -> Path:
-    """Write the sheet of runs/<scene> to `out` and give back its path.
+    """Write the sheet of runs/<scene> to `out` and return its path.
 
     Args:
-        views: names, or how many to take, spread evenly.
-        scale: whole factor by which pixels are repeated; None enlarges to about 480 px of width.
+        views: names, or how many evenly spread views to take.
+        scale: whole factor by which pixels are repeated; None enlarges to a width of about 480 px.
 
     Raises:
-        ValueError: where the scene is not evaluated yet, or a named view is not among its renders.
+        ValueError: the scene is not evaluated yet, or a named view is not among its renders.
     """
     evaluate, poses = (stage_folder(scene_dir, stage) for stage in ("evaluate", "poses"))
-    there = sorted(path.stem for path in (evaluate / "renders").glob("*.png"))
-    if not there:
+    rendered = sorted(path.stem for path in (evaluate / "renders").glob("*.png"))
+    if not rendered:
         raise ValueError(f"{evaluate / 'renders'}: no pictures; run `make scene={scene_dir.name} evaluate` first")
-    names = evenly(there, views) if isinstance(views, int) else views
-    if unknown := [name for name in names if name not in there]:
-        raise ValueError(f"{evaluate / 'renders'} has no {', '.join(unknown)}; it has {there[0]} ... {there[-1]}")
+    names = pick_evenly(rendered, views) if isinstance(views, int) else views
+    if unknown := [name for name in names if name not in rendered]:
+        raise ValueError(f"{evaluate / 'renders'} has no {', '.join(unknown)}; it has {rendered[0]} ... {rendered[-1]}")
     test = load_json(poses / "views.json")["test"]
-    rows = [pictures_of(evaluate, poses if name in test else None, name) for name in names]
+    rows = [load_view_pictures(evaluate, poses if name in test else None, name) for name in names]
     columns = [key for key in TITLES if any(key in row for row in rows)]
     width = max(picture.shape[1] for row in rows for picture in row.values())
     scale = scale or max(1, round(480 / width))
-    cells = [[enlarged(row.get(key), scale) for key in columns] for row in rows]
-    save_image(out, framed(cells, [TITLES[key] for key in columns], names))
+    cells = [[enlarge(row.get(key), scale) for key in columns] for row in rows]
+    save_image(out, compose_sheet(cells, [TITLES[key] for key in columns], names))
     return out
 
 
-def evenly(names: list[str], count: int) -> list[str]:
-    """`count` of them, spread evenly, the first and last a little inside."""
+def pick_evenly(names: list[str], count: int) -> list[str]:
+    """`count` evenly spread names; the first and the last are slightly inside."""
     places = (np.arange(min(count, len(names))) + 0.5) * len(names) / min(count, len(names))
     return [names[int(place)] for place in places]
 
 
 def stage_folder(scene_dir: Path, stage: str) -> Path:
-    """runs/<scene>/<stage>; of a variant, runs/<scene>@<variant>, the scene's own where the variant shares it."""
+    """runs/<scene>/<stage>; for a variant its own stage, or the scene's own one if the variant shares it."""
     own = scene_dir / stage
     return own if own.exists() else scene_dir.with_name(scene_dir.name.split("@")[0]) / stage
 
 
-def pictures_of(evaluate: Path, poses: Path | None, name: str) -> dict[str, np.ndarray]:
-    """Column -> uint8 [H, W, 3], of what is there. No `poses` for a training photo: it shows the object."""
+def load_view_pictures(evaluate: Path, poses: Path | None, name: str) -> dict[str, np.ndarray]:
+    """Column -> uint8 [H, W, 3], for pictures that exist.
+
+    `poses` is None for a training view, whose photograph shows the object and is no ground truth.
+    """
     paths = {key: evaluate / key / f"{name}.png" for key in TITLES}
     if poses:
         paths["truth"] = poses / "images" / f"{name}.png"
     return {key: load_image(path) for key, path in paths.items() if path.exists()}
 
 
-def enlarged(picture: np.ndarray | None, scale: int) -> np.ndarray | None:
-    """Each pixel repeated `scale` times, so that nothing is blurred."""
+def enlarge(picture: np.ndarray | None, scale: int) -> np.ndarray | None:
+    """Repeat each pixel `scale` times in both directions, which blurs nothing."""
     return None if picture is None else picture.repeat(scale, 0).repeat(scale, 1)
 
 
-def framed(cells: list[list[np.ndarray | None]], titles: list[str], names: list[str]) -> np.ndarray:
-    """uint8 [H, W, 3]: the cells on white, titles above, the view's name on its first picture."""
+def compose_sheet(cells: list[list[np.ndarray | None]], titles: list[str], names: list[str]) -> np.ndarray:
+    """uint8 [H, W, 3]: the cells on white, column titles above, each view's name on its first picture."""
     heights = [max(cell.shape[0] for cell in row if cell is not None) for row in cells]
     width = max(cell.shape[1] for row in cells for cell in row if cell is not None)
     size = max(12, width // 20)
@@ -101,7 +104,7 @@ def framed(cells: list[list[np.ndarray | None]], titles: list[str], names: list[
 def main() -> None:
     parser = argparse.ArgumentParser(prog="reffusion sheet", description=__doc__.split("\n")[0])
     parser.add_argument("scene", type=Path, help="runs/<scene>")
-    parser.add_argument("--views", nargs="+", default=["3"], help="how many views, or their names")
+    parser.add_argument("--views", nargs="+", default=["3"], help="number of views, or their names")
     parser.add_argument("--scale", type=int, help="whole factor of enlargement (default: to about 480 px)")
     parser.add_argument("--out", type=Path, help="default: runs/<scene>/sheet.png")
     arguments = parser.parse_args()

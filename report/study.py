@@ -1,4 +1,4 @@
-"""A preference study (the paper's Table 2) as a static page: the method's clip beside another's, in random order.
+"""Preference study (the paper's Table 2) as a static page: the method's clip beside another's, in random order.
 
 python -m report.study --scene X --runs runs (`make scene=X study`, `make data=FOLDER study`), after `compare`
 """
@@ -22,23 +22,23 @@ from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_scene
 from reffusion.seeding import generator
 from reffusion.splat import rasterizer
-from report import flight
-from report.results import FULL, TOGETHER, Comparison, Run, load
-from report.sheet import GAP, evenly
-from report.turntable import RATE, save_film
+from report import camera_path
+from report.results import FOLDER_COMPARISON, FULL, Comparison, Run, load_comparison
+from report.sheet import GAP, pick_evenly
+from report.turntable import RATE, save_video
 
 PAGE = Path(__file__).with_name("study.html")
-FRAMES = 96  # of a clip: four seconds, shown again and again
-SLOW = 4  # frames a second where a clip goes through the test views
-STILLS = 3  # views side by side, where there is no video
-CHECKS = 2  # attention checks at least; one for every ten pairs
-SPOILT = 24  # px of the blocks of a spoilt clip
-KEY = "study-key.json"  # beside the folder of the study, never in it: who made which clip
+FRAMES = 96  # of a clip: four seconds, repeated
+VIEWS_RATE = 4  # frames per second of a clip through the test views
+STILLS = 3  # views side by side, if no video can be written
+MIN_CHECKS = 2  # least number of attention checks; one for every ten pairs
+BLOCK_SIZE = 24  # blocks of a corrupted clip, px
+KEY = "study-key.json"  # tells who made which clip; beside the study's folder, never in it
 
 
 @dataclass(frozen=True)
 class Clip:
-    """One run's pictures. `frames`: uint8 [H, W, 3], `rate` a second."""
+    """One run's pictures: uint8 [H, W, 3] each, at `rate` frames per second."""
 
     run: Run
     frames: list[np.ndarray]
@@ -46,17 +46,20 @@ class Clip:
 
 
 def make(home: Path, methods: list[str], seed: int = 0, frames: int = FRAMES) -> Path:
-    """Write runs/<scene>/study/ or runs/compare/study/, which may be put on any server or opened as a file, and
-    study-key.json beside it; the page's path.
+    """Write runs/<scene>/study/ or runs/compare/study/, and study-key.json beside it; return the page's path.
+
+    The folder can be served statically or opened as files.
 
     Args:
-        home: of a comparison. methods: those to be put beside the full one; none: all that are done.
-        seed: of the clips' names, and with each participant's name of the order. frames: of a clip.
+        home: of a comparison.
+        methods: to compare with the full method; empty for all that are done.
+        seed: of the clips' names and, with each participant's name, of the order.
+        frames: length of a clip.
 
     Raises:
-        ValueError: nothing was compared, a method is not among those, or no pair of clips can be made.
+        ValueError: nothing was compared, an unknown method is named, or no pair of clips can be made.
     """
-    comparison = load(home)
+    comparison = load_comparison(home)
     others = [method for method in comparison.distinct_methods if method != FULL]
     if unknown := [method for method in methods if method not in others]:
         raise ValueError(f"variants: {unknown[0]} was not compared; there are {', '.join(others)}")
@@ -65,24 +68,30 @@ def make(home: Path, methods: list[str], seed: int = 0, frames: int = FRAMES) ->
     trials: list[dict[str, Any]] = []
     key: dict[str, Any] = {"seed": seed, "clips": {}, "pairs": {}, "checks": {}}
     for scene, pairs in _pairs(comparison, methods or others, frames):
-        reference = _reference(comparison.runs[FULL, scene], out, _name(draws))
+        reference = _save_reference(comparison.runs[FULL, scene], out, _random_name(draws))
         names: dict[str, str] = {}
         for ours, theirs in pairs:
             for clip in (ours, theirs):
                 if clip.run.method not in names:
-                    names[clip.run.method] = _save(clip.frames, clip.rate, out / "clips", _name(draws))
+                    names[clip.run.method] = _save_clip(clip.frames, clip.rate, out / "clips", _random_name(draws))
                     key["clips"][names[clip.run.method]] = {"scene": scene, "method": clip.run.method}
-            trial = {"id": _name(draws), "clips": [names[FULL], names[theirs.run.method]], "reference": reference}
+            trial = {
+                "id": _random_name(draws),
+                "clips": [names[FULL], names[theirs.run.method]],
+                "reference": reference,
+            }
             trials.append(trial)
             key["pairs"][trial["id"]] = {"scene": scene, "method": theirs.run.method, "full": names[FULL]}
-            if len(key["checks"]) < max(CHECKS, len(trials) / 10):
-                spoilt = _save([_spoilt(each, draws) for each in ours.frames], ours.rate, out / "clips", _name(draws))
-                check = {"id": _name(draws), "clips": [names[FULL], spoilt], "reference": reference}
+            if len(key["checks"]) < max(MIN_CHECKS, len(trials) / 10):
+                corrupted = _save_clip(
+                    [_corrupt(each, draws) for each in ours.frames], ours.rate, out / "clips", _random_name(draws)
+                )
+                check = {"id": _random_name(draws), "clips": [names[FULL], corrupted], "reference": reference}
                 trials.append(check)
                 key["checks"][check["id"]] = {"right": names[FULL]}
     if not key["pairs"]:
         raise ValueError(f"{home}: no pair of finished runs; `make ... compare` runs them")
-    record = {"study": _name(draws), "seed": seed, "trials": sorted(trials, key=lambda trial: trial["id"])}
+    record = {"study": _random_name(draws), "seed": seed, "trials": sorted(trials, key=lambda trial: trial["id"])}
     key["study"] = record["study"]
     page = PAGE.read_text(encoding="utf-8").replace('"STUDY"', json.dumps(record).replace("</", "<\\/"))
     (out / "index.html").write_text(page, encoding="utf-8")
@@ -90,61 +99,66 @@ def make(home: Path, methods: list[str], seed: int = 0, frames: int = FRAMES) ->
     return out / "index.html"
 
 
-def _name(draws: torch.Generator) -> str:
-    """Ten digits that tell nothing."""
+def _random_name(draws: torch.Generator) -> str:
+    """Random name of ten hexadecimal digits."""
     return f"{int(torch.randint(16**10, (1,), generator=draws)):010x}"
 
 
 def _pairs(comparison: Comparison, methods: list[str], frames: int) -> Iterator[tuple[str, list[tuple[Clip, Clip]]]]:
-    """Each scene with the method's clip and another's, along one way where both results can be rendered, else through
-    the test views."""
+    """Yield each scene with pairs of clips, of the full method and another one.
+
+    Both follow one camera path if both results can be rendered, else the test views.
+    """
     for scene in comparison.scenes:
         runs = [comparison.runs[method, scene] for method in (FULL, *methods)]
         ours, *others = [run for run in runs if run.state == "done"] if runs[0].state == "done" else [runs[0]]
-        flown, found = _flown(ours, frames), []
+        path_clip, found = _render_path(ours, frames), []
         for run in others:
-            theirs = _flown(run, frames) if flown else None
-            pair = (flown, theirs) if theirs else (_views(ours), _views(run))
+            theirs = _render_path(run, frames) if path_clip else None
+            pair = (path_clip, theirs) if theirs else (_load_test_views(ours), _load_test_views(run))
             if all(pair):
                 found.append(pair)
         yield scene, found
 
 
-def _flown(run: Run, frames: int) -> Clip | None:
-    """On a way around the capture; None where the result is no scene, but pictures."""
+def _render_path(run: Run, frames: int) -> Clip | None:
+    """Clip along a path around the capture; None if the result is not a scene but pictures."""
     evaluate, poses = run.folders.get("evaluate"), run.folders.get("poses")
     if not evaluate or not poses or not (evaluate / "scene.ply").exists() or "inpainter" in run.metrics:
         return None
     scene = load_scene(poses)
     gaussians = load_ply(evaluate / "scene.ply", scene.similarity)
-    cameras = flight.around([scene.cameras[name] for name in scene.train], scene.points, frames)
+    cameras = camera_path.ellipse_path([scene.cameras[name] for name in scene.train], scene.points, frames)
     return Clip(run, [to_uint8(rasterizer.render(gaussians, each).color.numpy()) for each in cameras], RATE)
 
 
-def _views(run: Run) -> Clip | None:
+def _load_test_views(run: Run) -> Clip | None:
+    """Clip through the rendered test views; None if there are none."""
     paths = sorted((run.folders["evaluate"] / "renders").glob("*.png")) if "evaluate" in run.folders else []
-    return Clip(run, [load_image(path) for path in paths], SLOW) if paths else None
+    return Clip(run, [load_image(path) for path in paths], VIEWS_RATE) if paths else None
 
 
-def _save(frames: list[np.ndarray], rate: int, folder: Path, name: str) -> str:
-    """A .webm, or views side by side where no encoder is there; its address as the page has it."""
+def _save_clip(frames: list[np.ndarray], rate: int, folder: Path, name: str) -> str:
+    """Save a .webm, or views side by side if no encoder is available; return its address on the page."""
     try:
-        save_film(folder / f"{name}.webm", frames, rate)
+        save_video(folder / f"{name}.webm", frames, rate)
     except ValueError:
         (folder / f"{name}.webm").unlink(missing_ok=True)
         gap = np.full((frames[0].shape[0], GAP, 3), 255, np.uint8)
-        shown = [
-            part for place in evenly([str(n) for n in range(len(frames))], STILLS) for part in (frames[int(place)], gap)
+        stills = [
+            part
+            for place in pick_evenly([str(n) for n in range(len(frames))], STILLS)
+            for part in (frames[int(place)], gap)
         ]
-        save_image(folder / f"{name}.png", np.concatenate(shown[:-1], 1))
+        save_image(folder / f"{name}.png", np.concatenate(stills[:-1], 1))
         return f"clips/{name}.png"
     return f"clips/{name}.webm"
 
 
-def _spoilt(picture: np.ndarray, draws: torch.Generator) -> np.ndarray:
-    """The picture in coarse blocks, a third of them of any colour: worse to anybody who looks."""
+def _corrupt(picture: np.ndarray, draws: torch.Generator) -> np.ndarray:
+    """The picture in coarse blocks, a third of them in random colours: clearly worse, for attention checks."""
     high, wide = picture.shape[:2]
-    rows, columns = (max(2, round(side / SPOILT)) for side in (high, wide))
+    rows, columns = (max(2, round(side / BLOCK_SIZE)) for side in (high, wide))
     small = cv2.resize(picture, (columns, rows), interpolation=cv2.INTER_AREA)
     noise = torch.randint(256, (rows, columns, 3), generator=draws).numpy().astype(np.uint8)
     chosen = torch.rand(rows, columns, generator=draws).numpy() < 1 / 3
@@ -152,8 +166,8 @@ def _spoilt(picture: np.ndarray, draws: torch.Generator) -> np.ndarray:
     return cv2.resize(small, (wide, high), interpolation=cv2.INTER_NEAREST)
 
 
-def _reference(run: Run, out: Path, name: str) -> str | None:
-    """The completed view that the method was given, where it had one; its address as the page has it."""
+def _save_reference(run: Run, out: Path, name: str) -> str | None:
+    """Save the first reference of a run for the page; return its address, or None without a reference."""
     folder = run.folders.get("reference")
     first = next(iter(sorted((folder / "references").glob("*.png"))), None) if folder else None
     if first is None:
@@ -164,17 +178,18 @@ def _reference(run: Run, out: Path, name: str) -> str | None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="reffusion study", description=__doc__.split("\n")[0])
-    parser.add_argument("--scene", type=Path, help="its name, or the path of its folder")
+    parser.add_argument("--scene", type=Path, help="name of the scene, or path of its folder")
     parser.add_argument("--data", type=Path, help="a folder of scenes instead")
     parser.add_argument("--runs", type=Path, default=Path("runs"))
-    parser.add_argument("--variants", default="", help="these only, with commas between")
+    parser.add_argument("--variants", default="", help="only these, separated by commas")
     parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
-    if not given.scene and not given.data:
+    arguments = parser.parse_args()
+    if not arguments.scene and not arguments.data:
         parser.error("--scene or --data: of which comparison?")
-    methods = [name for name in given.variants.split(",") if name]
+    methods = [method for method in arguments.variants.split(",") if method]
+    name = arguments.scene.name if arguments.scene else FOLDER_COMPARISON
     try:
-        print(make(given.runs / (given.scene.name if given.scene else TOGETHER), methods, given.seed))
+        print(make(arguments.runs / name, methods, arguments.seed))
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
 

@@ -1,4 +1,4 @@
-"""A flight around a finished scene as a video: `python -m report.turntable --scene demo` (`make scene=X turntable`)."""
+"""Video around a finished scene: `python -m report.turntable --scene demo` (`make scene=X turntable`)."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from reffusion.io.images import to_uint8
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_scene
 from reffusion.splat import rasterizer
-from report import command, flight
+from report import camera_path, cli
 
 FRAMES, RATE = 144, 24  # six seconds
-# In a .webm: what browsers play and OpenCV's wheels write, with a complaint about the tag that means nothing.
+# Codec of the .webm, which browsers play and OpenCV's wheels write; OpenCV's warning about the tag is harmless.
 CODEC = "VP90"
 
 
 def make(home: Path, frames: int = FRAMES) -> Path:
-    """Write turntable.webm beside the scene's stages, with the result on a way around the capture; its path.
+    """Write turntable.webm beside the scene's stages, the result on a path around the capture, and return its path.
 
     Args:
         home: runs/<scene> or runs/<scene>@<variant>, its stage `evaluate` finished.
@@ -34,31 +34,31 @@ def make(home: Path, frames: int = FRAMES) -> Path:
     scene = load_scene(home.with_name(home.name.split("@")[0]) / "poses")
     gaussians = load_ply(finished, scene.similarity)
     train = [scene.cameras[name] for name in scene.train]
-    path, cameras = home / "turntable.webm", flight.around(train, scene.points, frames)
-    save_film(path, (to_uint8(rasterizer.render(gaussians, camera).color.numpy()) for camera in cameras))
+    path, cameras = home / "turntable.webm", camera_path.ellipse_path(train, scene.points, frames)
+    save_video(path, (to_uint8(rasterizer.render(gaussians, camera).color.numpy()) for camera in cameras))
     return path
 
 
-def save_film(path: Path, pictures: Iterable[np.ndarray], rate: int = RATE) -> None:
-    """Pictures uint8 [H, W, 3], at least one, as a .webm. Raises ValueError where this OpenCV writes none."""
-    film = None
+def save_video(path: Path, pictures: Iterable[np.ndarray], rate: int = RATE) -> None:
+    """Save pictures, uint8 [H, W, 3], at least one, as a .webm. ValueError if this OpenCV cannot write it."""
+    writer = None
     for picture in pictures:
-        if film is None:
+        if writer is None:
             size = (picture.shape[1], picture.shape[0])
-            film = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*CODEC), rate, size)
-        if not film.isOpened():
+            writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*CODEC), rate, size)
+        if not writer.isOpened():
             raise ValueError(
-                f"{path}: this OpenCV writes no {CODEC} video; `pip install opencv-contrib-python-headless`"
+                f"{path}: this OpenCV cannot write {CODEC} video; `pip install opencv-contrib-python-headless`"
             )
-        film.write(np.ascontiguousarray(picture[..., ::-1]))
-    if film is not None:
-        film.release()
+        writer.write(np.ascontiguousarray(picture[..., ::-1]))
+    if writer is not None:
+        writer.release()
 
 
 def main() -> None:
-    arguments = command.parser("turntable", __doc__).parse_args()
+    arguments = cli.scene_parser("turntable", __doc__).parse_args()
     try:
-        print(make(command.home(arguments)))
+        print(make(cli.run_folder(arguments)))
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
 

@@ -1,7 +1,7 @@
-"""A finished scene in a browser, to walk through: `python -m report.view --scene demo` (`make scene=X view`).
+"""Viewer of a finished scene in a browser: `python -m report.view --scene demo` (`make scene=X view`).
 
-This machine draws what each visitor's camera sees, with the rasterizer of all other stages: small while it moves, then
-in full. So what one sees is what `evaluate` scores, and the browser needs no graphics card.
+This machine renders each visitor's camera with the rasterizer of all stages, small while the camera moves, then in
+full. So the picture is what `evaluate` scores, and the browser needs no GPU.
 """
 
 from __future__ import annotations
@@ -16,21 +16,26 @@ from reffusion.io.images import load_image, to_uint8
 from reffusion.io.scene import has_photograph, load_scene, load_views
 from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Scene
-from report import command, flight, unseen
-from report.layers import how, load_layers
+from report import camera_path, cli, unseen_overlay
+from report.gaussian_layers import finish_command, load_layers
 from report.sheet import stage_folder
 
 PORT = 8080
-MOVING, STILL = 180, 480  # px, height of a picture while the camera moves, and once it rests
-PYRAMID = 0.04  # size of a drawn camera, of the scene's extent 1
-# Of cameras: width in px of the picture inside, colour, and thickness of the lines.
-LOOKS = {"cameras": (160, (20, 20, 20), PYRAMID / 40), "references": (480, (230, 120, 0), PYRAMID / 15)}
-TURN = threading.Lock()  # the rasterizer's threads serve one picture at a time
+MOVING, STILL = 180, 480  # picture heights in px while the camera moves, and at rest
+FRUSTUM_SCALE = 0.04  # size of a drawn camera, in units of the extent (1)
+# Width in px of the picture in the frustum, colour, and thickness of the lines.
+FRUSTUM_STYLES = {
+    "cameras": (160, (20, 20, 20), FRUSTUM_SCALE / 40),
+    "references": (480, (230, 120, 0), FRUSTUM_SCALE / 15),
+}
+RENDER_LOCK = threading.Lock()  # the rasterizer's threads serve one picture at a time
 
 
-def camera_of(place: Any, height: int) -> Camera:
-    """The pinhole view of a visitor's camera: `position` [3], `wxyz` [4] of camera to world, vertical `fov` in radians,
-    `aspect` width / height."""
+def visitor_camera(place: Any, height: int) -> Camera:
+    """Pinhole camera of a visitor, with an image of `height` px.
+
+    `place` has `position` [3], `wxyz` [4] (camera to world), vertical `fov` in radians, and `aspect`, width / height.
+    """
     from scipy.spatial.transform import Rotation
 
     pose, focal = np.eye(4), height / (2 * np.tan(place.fov / 2))
@@ -40,34 +45,34 @@ def camera_of(place: Any, height: int) -> Camera:
     return Camera("visitor", width, height, focal, focal, width / 2, height / 2, pose)
 
 
-def picture(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """uint8 [H, W, 3]."""
-    with TURN:
+def render_picture(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+    """uint8 [H, W, 3]: the Gaussians from a camera."""
+    with RENDER_LOCK:
         return to_uint8(rasterizer.render(gaussians, camera).color.numpy())
 
 
-def home_of(home: Path) -> Path:
-    """The scene's own run, where `poses` lies, of one of its variants."""
+def scene_home(home: Path) -> Path:
+    """Folder of the scene's own run, which holds `poses`, for any of its variants."""
     return home.with_name(home.name.split("@")[0])
 
 
-def go_to(place: Any, camera: Camera, target: np.ndarray) -> None:
-    """Set a visitor's camera, or everyone's first one, to where a view was photographed.
+def move_to_view(place: Any, camera: Camera, target: np.ndarray) -> None:
+    """Move a visitor's camera, or the initial one, to the position of a photograph.
 
-    What it looks at, and turns around, is as far away as `target` [3].
+    The centre of rotation is on the optical axis, as far away as `target` [3].
     """
     place.position = camera.center
     place.look_at = camera.center + camera.world_to_camera[2, :3] * np.linalg.norm(target - camera.center)
-    place.fov = field_of_view(camera)
+    place.fov = vertical_fov(camera)
 
 
-def field_of_view(camera: Camera) -> float:
-    """Vertical, in radians; of a principal point beside the centre, that of the lens with it in the centre."""
+def vertical_fov(camera: Camera) -> float:
+    """Vertical field of view in radians, with the principal point taken as the image centre."""
     return float(2 * np.arctan(camera.height / (2 * camera.fy)))
 
 
-class Window:
-    """The server, what it shows, and a thread for each visitor that draws the latest camera asked for.
+class Viewer:
+    """The server, the Gaussians it shows, and a thread per visitor that renders the latest requested camera.
 
     Raises:
         ValueError: viser is not installed, or the scene is not finished.
@@ -78,23 +83,23 @@ class Window:
             import viser
         except ImportError:
             raise ValueError("the viewer needs viser: `make scene=X view`, or `pip install viser`") from None
-        poses = home_of(home) / "poses"
+        poses = scene_home(home) / "poses"
         if not poses.is_dir():
-            raise ValueError(f"{poses} is missing; {how(home)} makes it")
+            raise ValueError(f"{poses} is missing; {finish_command(home)} makes it")
         scene = load_scene(poses)
         self.layers = load_layers(home, scene.similarity)
-        self.seen_by = unseen.photographed(home, scene)
-        self.shown, self.noted = next(reversed(self.layers.states.values()))[0], True
-        self.asked: dict[int, threading.Event] = {}
+        self.seen_by = unseen_overlay.load_seen_views(home, scene)
+        self.gaussians, self.marks_unseen = next(reversed(self.layers.states.values()))[0], True
+        self.requests: dict[int, threading.Event] = {}
         self.open = True
         self.server = viser.ViserServer(host="127.0.0.1", port=port, label=home.name, verbose=False)
-        self._choices()
-        self._cameras(home, scene)
-        self.server.on_client_connect(self._visit)
-        self.server.on_client_disconnect(lambda client: self._ask(client.client_id))
+        self._add_controls()
+        self._add_cameras(home, scene)
+        self.server.on_client_connect(self._serve_visitor)
+        self.server.on_client_disconnect(lambda client: self._request_picture(client.client_id))
 
-    def _choices(self) -> None:
-        """What is shown: of which state, and which of its parts."""
+    def _add_controls(self) -> None:
+        """Controls for the state and its parts."""
         gui, titles = self.server.gui, list(self.layers.states)
         last = len(titles) - 1
         marks = tuple((k, title if k in (0, last) else "") for k, title in enumerate(titles))
@@ -103,88 +108,89 @@ class Window:
         state = gui.add_markdown("")
         kept, added = (gui.add_checkbox(f"what was {kind}", True) for kind in ("kept", "added"))
         removed = gui.add_checkbox("what was removed", False, visible=len(self.layers.removed) > 0)
-        words = "hatch what no photograph shows, once the camera rests"
+        words = "hatch what no photograph shows, when the camera is at rest"
         note = gui.add_checkbox("never seen", True, hint=words, visible=len(self.seen_by) > 0)
 
         def changed(_: Any = None) -> None:
             title = titles[min(int(slider.value), last)]
             state.content = title if last else ""
-            self.shown = self.layers.shown(title, kept.value, added.value, removed.value)
-            self.noted = note.value and not removed.value and bool(self.seen_by)
-            for visitor in list(self.asked):
-                self._ask(visitor)
+            self.gaussians = self.layers.select(title, kept.value, added.value, removed.value)
+            self.marks_unseen = note.value and not removed.value and bool(self.seen_by)
+            for visitor in list(self.requests):
+                self._request_picture(visitor)
 
         for choice in (slider, kept, added, removed, note):
             choice.on_update(changed)
         changed()
 
-    def _cameras(self, home: Path, scene: Scene) -> None:
-        """Every training view as a pyramid with its photograph, and the references with theirs; a click on one takes
-        the visitor there."""
-        train, poses = [scene.cameras[name] for name in scene.train], home_of(home) / "poses"
+    def _add_cameras(self, home: Path, scene: Scene) -> None:
+        """Frusta of the training views with photographs and of the references; a click moves the visitor there."""
+        train, poses = [scene.cameras[name] for name in scene.train], scene_home(home) / "poses"
         photographed = load_views(poses, [name for name in scene.train if has_photograph(poses, name)])
         photos = {name: photographed.get(name) for name in scene.train}
-        target = flight.focus(train, scene.points)
+        target = camera_path.focus_point(train, scene.points)
         self.server.scene.set_up_direction(-np.mean([camera.world_to_camera[1, :3] for camera in train], 0))
-        go_to(self.server.initial_camera, train[len(train) // 2], target)
+        move_to_view(self.server.initial_camera, train[len(train) // 2], target)
         folder = stage_folder(home, "reference") / "references"
-        given = {path.stem: load_image(path) for path in sorted(folder.glob("*.png")) if path.stem in scene.cameras}
-        for kind, pictures in (("cameras", photos), ("references", given)):
-            shown = self.server.gui.add_checkbox(kind, False, visible=bool(pictures))
-            drawn = [self._pyramid(kind, scene.cameras[name], p, target) for name, p in pictures.items()]
-            shown.on_update(lambda _, drawn=drawn, shown=shown: _show(drawn, shown.value))
+        references = {
+            path.stem: load_image(path) for path in sorted(folder.glob("*.png")) if path.stem in scene.cameras
+        }
+        for kind, pictures in (("cameras", photos), ("references", references)):
+            checkbox = self.server.gui.add_checkbox(kind, False, visible=bool(pictures))
+            frusta = [self._add_frustum(kind, scene.cameras[name], p, target) for name, p in pictures.items()]
+            checkbox.on_update(lambda _, frusta=frusta, box=checkbox: _set_visible(frusta, box.value))
 
-    def _pyramid(self, kind: str, camera: Camera, image: np.ndarray | None, target: np.ndarray) -> Any:
-        """A camera with its picture, where it has one; not visible yet."""
-        width, color, thickness = LOOKS[kind]
+    def _add_frustum(self, kind: str, camera: Camera, image: np.ndarray | None, target: np.ndarray) -> Any:
+        """A camera frustum with its picture, if it has one; initially hidden."""
+        width, color, thickness = FRUSTUM_STYLES[kind]
         step = max(1, camera.width // width)
         small = image[::step, ::step] if image is not None else None
         place = {"wxyz": _quaternion(camera.world_to_camera[:3, :3].T), "position": camera.center}
-        lens = {"fov": field_of_view(camera), "aspect": camera.width / camera.height}
-        look = {"scale": PYRAMID, "thickness": thickness, "color": color}
+        lens = {"fov": vertical_fov(camera), "aspect": camera.width / camera.height}
+        look = {"scale": FRUSTUM_SCALE, "thickness": thickness, "color": color}
         add = self.server.scene.add_camera_frustum
         made = add(f"/{kind}/{camera.name}", **lens, **place, **look, image=small, visible=False)
-        made.on_click(lambda event: go_to(event.client.camera, camera, target))
+        made.on_click(lambda event: move_to_view(event.client.camera, camera, target))
         return made
 
-    def _visit(self, client: Any) -> None:
-        self.asked[client.client_id] = threading.Event()
-        threading.Thread(target=self._draw, args=(client,), daemon=True).start()
-        client.camera.on_update(lambda _: self._ask(client.client_id))
-        self._ask(client.client_id)
+    def _serve_visitor(self, client: Any) -> None:
+        self.requests[client.client_id] = threading.Event()
+        threading.Thread(target=self._render_loop, args=(client,), daemon=True).start()
+        client.camera.on_update(lambda _: self._request_picture(client.client_id))
+        self._request_picture(client.client_id)
 
-    def _ask(self, visitor: int) -> None:
-        if visitor in self.asked:
-            self.asked[visitor].set()
+    def _request_picture(self, visitor: int) -> None:
+        if visitor in self.requests:
+            self.requests[visitor].set()
 
-    def _draw(self, client: Any) -> None:
-        """Draw for one visitor until he leaves: at once in little, and in full when nothing else is asked meanwhile."""
-        asked = self.asked[client.client_id]
+    def _render_loop(self, client: Any) -> None:
+        """Render for one visitor until they leave: small at once, in full when no other request has come meanwhile."""
+        request = self.requests[client.client_id]
         while self.open and client.client_id in self.server.get_clients():
-            asked.wait(1.0)
-            for height in (MOVING, STILL) if asked.is_set() else ():
-                asked.clear()
-                drawn = self._drawn(camera_of(client.camera, height), client.camera)
-                client.scene.set_background_image(drawn, format="jpeg", jpeg_quality=90)
-                if asked.is_set():
+            request.wait(1.0)
+            for height in (MOVING, STILL) if request.is_set() else ():
+                request.clear()
+                picture = self._render_for(visitor_camera(client.camera, height), client.camera)
+                client.scene.set_background_image(picture, format="jpeg", jpeg_quality=90)
+                if request.is_set():
                     break
-        self.asked.pop(client.client_id, None)
+        self.requests.pop(client.client_id, None)
 
-    def _drawn(self, camera: Camera, place: Any) -> np.ndarray:
-        """uint8 [H, W, 3]; once the camera rests, with a note of what was never seen."""
-        shown = self.shown
-        drawn = picture(shown, camera)
-        if camera.height == STILL and self.noted:
-            with TURN:
-                drawn = unseen.noted(drawn, shown, camera_of(place, MOVING), self.seen_by)
-        return drawn
+    def _render_for(self, camera: Camera, place: Any) -> np.ndarray:
+        """uint8 [H, W, 3]; at rest with unseen parts hatched."""
+        gaussians = self.gaussians
+        picture = render_picture(gaussians, camera)
+        if camera.height == STILL and self.marks_unseen:
+            with RENDER_LOCK:
+                picture = unseen_overlay.hatch_unseen(picture, gaussians, visitor_camera(place, MOVING), self.seen_by)
+        return picture
 
     def close(self) -> None:
         self.open = False
         self.server.stop()
 
 
-def _show(things: list[Any], visible: bool) -> None:
+def _set_visible(things: list[Any], visible: bool) -> None:
     for thing in things:
         thing.visible = visible
 
@@ -197,11 +203,11 @@ def _quaternion(rotation: np.ndarray) -> np.ndarray:
 
 
 def main() -> None:
-    parser = command.parser("view", __doc__)
-    parser.add_argument("--port", type=int, default=PORT, help="the next free one is taken where it is not free")
+    parser = cli.scene_parser("view", __doc__)
+    parser.add_argument("--port", type=int, default=PORT, help="if it is in use, the next free one is taken")
     arguments = parser.parse_args()
     try:
-        window = Window(command.home(arguments), arguments.port)
+        window = Viewer(cli.run_folder(arguments), arguments.port)
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
     print(f"http://127.0.0.1:{window.server.get_port()}  (Ctrl-C ends)", flush=True)

@@ -1,4 +1,4 @@
-"""What a preference study says: how often the method was preferred to each other, with intervals over participants.
+"""Result of a preference study: how often the method was preferred to each other, with intervals over participants.
 
 python -m report.votes ANSWERS.json ... --key runs/X/study-key.json (`reffusion study-votes`)
 """
@@ -24,8 +24,10 @@ RESAMPLES = 5000
 
 @dataclass(frozen=True)
 class Preference:
-    """How often the method was preferred to `method`; parts of 1. low, high: the 95 % interval; `votes` of
-    `participants`."""
+    """How often the full method was preferred to `method`.
+
+    `share` with its 95 % interval `low` to `high` are parts of 1, from `votes` of `participants`.
+    """
 
     method: str
     question: str
@@ -36,42 +38,43 @@ class Preference:
     participants: int
 
 
-def counted(answers: list[dict[str, Any]], key: dict[str, Any]) -> tuple[list[Preference], list[str]]:
-    """Preferences, and those who are left out for failing an attention check, in words.
+def count_votes(answers: list[dict[str, Any]], key: dict[str, Any]) -> tuple[list[Preference], list[str]]:
+    """Preferences, and sentences that name the participants who were excluded by the attention checks.
 
     Args:
-        answers: what the page saved, one for each participant. key: study-key.json.
+        answers: what the page saved, one entry per participant.
+        key: study-key.json.
 
     Raises:
-        ValueError: answers of another study, of one participant twice, or to what is no question of it.
+        ValueError: answers of another study, of one participant twice, or to an unknown pair.
     """
-    taken, left_out, names = [], [], set()
-    for said in answers:
-        name = said["participant"]
-        if said["study"] != key["study"]:
+    accepted, left_out, names = [], [], set()
+    for entry in answers:
+        name = entry["participant"]
+        if entry["study"] != key["study"]:
             raise ValueError(f"{name}: answers to another study than this key's")
         if name in names:
             raise ValueError(f"{name}: two files of one participant; keep one")
         names.add(name)
-        checks = [answer for answer in said["answers"] if answer["trial"] in key["checks"]]
+        checks = [answer for answer in entry["answers"] if answer["trial"] in key["checks"]]
         right = [answer["overall"] == key["checks"][answer["trial"]]["right"] for answer in checks]
         if len(right) < len(key["checks"]):
             left_out.append(f"{name}: not to its end")
         elif not all(right):
             left_out.append(f"{name}: {right.count(False)} of {len(right)} attention checks failed")
         else:
-            taken.append([answer for answer in said["answers"] if answer["trial"] not in key["checks"]])
+            accepted.append([answer for answer in entry["answers"] if answer["trial"] not in key["checks"]])
     methods = list(dict.fromkeys(pair["method"] for pair in key["pairs"].values()))
-    found = [_preference(taken, key, method, question) for method in methods for question in QUESTIONS]
+    found = [_preference(accepted, key, method, question) for method in methods for question in QUESTIONS]
     return [each for each in found if each], left_out
 
 
 def _preference(
-    taken: list[list[dict[str, Any]]], key: dict[str, Any], method: str, question: str
+    accepted: list[list[dict[str, Any]]], key: dict[str, Any], method: str, question: str
 ) -> Preference | None:
-    """One row; None where nobody was asked."""
+    """One row; None if nobody was asked."""
     counts = []
-    for each in taken:
+    for each in accepted:
         pairs = [(answer, _pair(key, answer["trial"])) for answer in each if question in answer]
         won = [answer[question] == pair["full"] for answer, pair in pairs if pair["method"] == method]
         if won:
@@ -79,7 +82,7 @@ def _preference(
     if not counts:
         return None
     wins, totals = np.array(counts, float).T
-    low, high = interval(wins, totals, seed_for(0, "votes", method, question))
+    low, high = share_interval(wins, totals, seed_for(0, "votes", method, question))
     share = float(wins.sum() / totals.sum())
     return Preference(method, question, share, low, high, int(totals.sum()), len(counts))
 
@@ -90,10 +93,12 @@ def _pair(key: dict[str, Any], trial: str) -> dict[str, str]:
     return key["pairs"][trial]
 
 
-def interval(wins: np.ndarray, totals: np.ndarray, seed: int) -> tuple[float, float]:
-    """Of the share of all votes won: a bootstrap over participants, for one's votes are not independent; where all
-    agree, which a bootstrap takes for certain, or there is but one, Wilson's for one vote a participant. [n], [n] ->
-    parts of 1."""
+def share_interval(wins: np.ndarray, totals: np.ndarray, seed: int) -> tuple[float, float]:
+    """95 % interval of the share of all votes won, in parts of 1, from wins [n] and totals [n] per participant.
+
+    A bootstrap over participants, as one person's votes are not independent. If all agree, which a bootstrap would take
+    for certain, or there is only one participant, Wilson's interval for one vote per participant.
+    """
     people, share = len(wins), wins.sum() / totals.sum()
     agreed = (wins.min() == 0 and wins.max() == 0) or bool((wins == totals).all())
     if people < 2 or agreed:
@@ -113,8 +118,8 @@ def interval(wins: np.ndarray, totals: np.ndarray, seed: int) -> tuple[float, fl
     return float(found.low), float(found.high)
 
 
-def table(found: list[Preference]) -> str:
-    """Markdown."""
+def preference_table(found: list[Preference]) -> str:
+    """Markdown table."""
     header = ["preferred to", "question", "share", "95 % interval", "votes", "participants"]
     percent = lambda part: f"{100 * part:.1f} %"
     rows = [
@@ -128,28 +133,28 @@ def table(found: list[Preference]) -> str:
         ]
         for each in found
     ]
-    return page.markdown(header, rows)
+    return page.markdown_table(header, rows)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="reffusion study-votes", description=__doc__.split("\n")[0])
-    parser.add_argument("answers", type=Path, nargs="+", help="files that the page saved")
+    parser.add_argument("answers", type=Path, nargs="+", help="files saved by the page")
     parser.add_argument("--key", type=Path, required=True, help="runs/X/study-key.json")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     try:
-        found, left_out = counted([_read(path) for path in given.answers], load_json(given.key))
+        found, left_out = count_votes([_read(path) for path in arguments.answers], load_json(arguments.key))
     except (ValueError, OSError) as error:
         raise SystemExit(f"error: {error}") from None
-    print(table(found), end="")
+    print(preference_table(found), end="")
     for words in left_out:
         print(f"left out: {words}")
 
 
 def _read(path: Path) -> dict[str, Any]:
-    said = load_json(path)
-    if not isinstance(said, dict) or not {"study", "participant", "answers"} <= set(said):
+    content = load_json(path)
+    if not isinstance(content, dict) or not {"study", "participant", "answers"} <= set(content):
         raise ValueError(f"{path}: not a file of answers that the study's page saved")
-    return said
+    return content
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ import pytest
 from small_prior import small_prior
 from test_sds_variance import small_run
 
-from benchmarks.studies import adapted, device
+from benchmarks.studies import adapted, scene_priors
 from reffusion.io.arrays import save_labels
 from reffusion.io.images import load_image, save_image
 from reffusion.io.ply import load_ply, save_ply
@@ -33,7 +33,7 @@ def learnt_run(home):
 
 def test_same_views_same_noise_and_holes_alone_are_painted(tmp_path):
     prior, run = small_prior(), learnt_run(tmp_path / "run")
-    views = adapted.drawn({"before": prior, "after": prior}, run, 3, 2, tmp_path / "out")
+    views = adapted.save_sheet({"before": prior, "after": prior}, run, 3, 2, tmp_path / "out")
     assert views == ["b"]  # the reference's own view is what was learnt, the third is clean
     pictures = {path.stem: load_image(path) for path in (tmp_path / "out/b").glob("*.png")}
     assert sorted(pictures) == ["adapted", "as-it-is", "as-it-is-no-prompt", "to-paint"]
@@ -45,16 +45,16 @@ def test_same_views_same_noise_and_holes_alone_are_painted(tmp_path):
 
 def test_what_is_missing_is_named(tmp_path):
     with pytest.raises(ValueError, match="make scene=nowhere personalize"):
-        adapted.given_views(tmp_path / "nowhere", 3)
+        adapted.load_holes(tmp_path / "nowhere", 3)
 
 
 def test_a_device_that_is_not_there_is_refused(tmp_path, monkeypatch):
     import torch
 
     (tmp_path / "run/personalize").mkdir(parents=True)
-    parser = device.arguments("", "all stages", "adapted")
+    parser = scene_priors.study_parser("", "all stages", "adapted")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     for typed, message in ((["--device", "cuda"], "no CUDA device"), (["--dtype", "float16"], "for device=cuda")):
         with pytest.raises(ValueError, match=message):
-            device.before_and_after(parser.parse_args(["--run", str(tmp_path / "run"), *typed]))
-    assert device.peak_mb("cpu") > 10
+            scene_priors.load_priors(parser.parse_args(["--run", str(tmp_path / "run"), *typed]))
+    assert scene_priors.peak_mb("cpu") > 10

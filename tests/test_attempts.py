@@ -44,38 +44,38 @@ def run(tmp_path_factory):
 @pytest.mark.parametrize("name", benchmark.ATTEMPTS)
 def test_every_attempt_is_a_setting_of_the_stage(name):
     changed = {key: value for key, value in benchmark.ATTEMPTS[name].items() if key != benchmark.BASE}
-    params = benchmark.profile(benchmark.ATTEMPTS[name])
+    params = benchmark.profile_params(benchmark.ATTEMPTS[name])
     found = params.model_dump()
     for key, value in changed.items():
         inside = value if isinstance(value, dict) else {key: value}
         assert inside.items() <= (found[key] if isinstance(value, dict) else found).items()
     if changed:
-        assert params != benchmark.profile({})
+        assert params != benchmark.profile_params({})
 
 
 def test_a_curve_begins_at_the_initialization_and_ends_where_the_stage_ends(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(benchmark, "MOMENTS", (0, 4))
-    views = benchmark.test_views(run)
-    lines = benchmark.curve(NO_PRIOR, run, run / "initialize", views)
+    monkeypatch.setattr(benchmark, "MEASURED_STEPS", (0, 4))
+    views = benchmark.load_test_views(run)
+    lines = benchmark.run_attempt(NO_PRIOR, run, run / "initialize", views)
     assert [line["iteration"] for line in lines] == [0, 4]
     needs = {name: run / name for name in benchmark.NEEDS}
-    distill.run(benchmark.profile(NO_PRIOR), tmp_path, personalize=None, **needs)
+    distill.run(benchmark.profile_params(NO_PRIOR), tmp_path, personalize=None, **needs)
     for folder, line in ((run / "initialize", lines[0]), (tmp_path, lines[1])):
-        expected = benchmark.scored(load_ply(folder / "gaussians.ply"), views)
+        expected = benchmark.score_views(load_ply(folder / "gaussians.ply"), views)
         assert {name: line[name] for name in benchmark.SCORES} == pytest.approx(expected, rel=1e-4)
 
 
 def test_scores_are_those_of_the_box(run):
     gaussians = load_ply(run / "initialize" / "gaussians.ply")
-    camera, truth, box = benchmark.test_views(run)[0]
+    camera, truth, box = benchmark.load_test_views(run)[0]
     with torch.no_grad():
         picture = (rasterizer.render(gaussians, camera).color.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
     expected = image_metrics.score_view(picture, truth, box, {}, np.zeros(truth.shape[:2], bool), False)
-    found = benchmark.scored(gaussians, [(camera, truth, box)])
+    found = benchmark.score_views(gaussians, [(camera, truth, box)])
     assert found == pytest.approx({name: expected[name] for name in benchmark.SCORES})
 
 
 def test_a_scene_without_ground_truth_is_refused(run, tmp_path):
     poses, _, _ = small.write(tmp_path, NEAR)
     with pytest.raises(ValueError, match="take another scene"):
-        benchmark.test_views(poses.parent)
+        benchmark.load_test_views(poses.parent)

@@ -24,8 +24,8 @@ from reffusion.params.poses import Params as Poses
 from reffusion.splat import rasterizer
 from reffusion.splat.conventions import SH0
 from reffusion.types import Gaussians
-from report.clicking import Capture, Session
 from report.mask import Server
+from report.mask_session import Capture, Session
 from stages import masks, poses
 
 NEAR = 1.7
@@ -269,7 +269,7 @@ def test_clicks_in_a_browser_make_masks_that_are_saved(page, tmp_path, width):
         tab.keyboard.press("ArrowRight")
         assert tab.evaluate("view") != name
         tab.locator("#save").click()
-        tab.wait_for_function("document.getElementById('said').textContent.includes('saved')")
+        tab.wait_for_function("document.getElementById('status').textContent.includes('saved')")
         assert tab.evaluate("document.documentElement.scrollWidth") <= width
     for each in small.TRAIN:
         assert small.iou(load_mask(tmp_path / "masks" / f"{each}.png"), truth(each)) > 0.85

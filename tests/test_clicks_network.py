@@ -11,7 +11,7 @@ import torch
 
 from reffusion.clicks.marks import Clicks
 from reffusion.clicks.network import load_segmenter, look, make_segmenter, network_mask
-from report.clicking import Capture, Session
+from report.mask_session import Capture, Session
 
 SIDE, WIDE = 64, 16
 
@@ -91,4 +91,4 @@ def test_the_page_asks_the_network_and_takes_back_without_it(folder, tmp_path):
     expected = network_mask(segmenter, look(segmenter, session.images[name]), Clicks(np.array([at]), np.array([True])))
     assert (session.masks[name] == expected).all()
     session.click(session.views[1], [(*at, False)])
-    assert set(session.looked) == {name}
+    assert set(session.embeddings) == {name}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import re
@@ -17,8 +18,8 @@ import pytest
 from browser import visiting
 
 from report import compare as page
-from report import curves, job, loading, pictures, results, scenes
-from report.paired import half_width, paired, pareto
+from report import compare_pictures, job, job_data, results, scenes_page, trace_charts
+from report.paired_statistics import confidence_half_width, paired_difference, pareto_front
 from runner import Refused
 from runner.compare import compare
 from runner.resolve import Request
@@ -146,7 +147,7 @@ def ran(root: Path) -> list[str]:
 
 
 def by_method(home: Path) -> dict[str, dict]:
-    return {row["method"]: row for row in results.rows(results.load(home))}
+    return {row["method"]: row for row in results.summarize_methods(results.load_comparison(home))}
 
 
 @pytest.fixture(scope="module")
@@ -336,8 +337,10 @@ def test_refused_before_any_work(tmp_path):
 
 def test_the_table_survives_its_csv(compared, pages):
     home = compared / "runs/toy"
-    table = results.rows(results.load(home))
-    assert results.load_csv(pages["csv"]) == table
+    table = results.summarize_methods(results.load_comparison(home))
+    with open(pages["csv"], newline="") as file:
+        saved = list(csv.DictReader(file))
+    assert [{k: "" if v is None else str(v) for k, v in row.items()} for row in table] == saved
     full = table[0]
     assert full["method"] == "full" and full["psnr_box"] == 23.65 and full["lpips_vgg_box"] is None
     receipts = [json.loads(p.read_text()) for p in home.glob("*/receipt.json")]
@@ -387,9 +390,9 @@ def test_without_ground_truth_held_out_views_are_compared_outside_their_masks(ho
     assert row["psnr_outside_minus_full"] == pytest.approx(1.15) and row["psnr_outside_interval_views"] > 0
     text = made["md"].read_text()
     assert "outside: PSNR ↑" in text and "| +1.15 ± 0.21 |" in text and "best in PSNR outside: better" in text
-    assert "all methods should leave as they are" in made["html"].read_text()
-    runs = results.load(home)
-    title = lambda: pictures._cells([runs.runs["full", "toy"]], runs.runs["full", "toy"], "a")[0][0]
+    assert "should leave as they are" in made["html"].read_text()
+    runs = results.load_comparison(home)
+    title = lambda: compare_pictures._cells([runs.runs["full", "toy"]], runs.runs["full", "toy"], "a")[0][0]
     assert title() == "ground truth"
     (home / "raw_masks/masks").mkdir(parents=True)
     (home / "raw_masks/masks/a.png").touch()  # of a test view that shows the object
@@ -430,13 +433,17 @@ def test_several_scenes(home):
 def test_the_interval_is_students():
     """Quantiles from the printed table of Student's t: 2.776445 with 4 degrees of freedom, 12.706205 with 1."""
     values = np.array([1.0, 2, 3, 4, 5])
-    assert half_width(values) == pytest.approx(2.776445 * np.sqrt(2.5) / np.sqrt(5), rel=1e-6)
-    assert half_width(values[:1]) is None and half_width(np.full(7, 0.3)) == pytest.approx(0, abs=1e-12)
-    found = paired([values, values[:3] - 2])
+    assert confidence_half_width(values) == pytest.approx(2.776445 * np.sqrt(2.5) / np.sqrt(5), rel=1e-6)
+    assert confidence_half_width(values[:1]) is None and confidence_half_width(np.full(7, 0.3)) == pytest.approx(
+        0, abs=1e-12
+    )
+    found = paired_difference([values, values[:3] - 2])
     assert found.pairs == 8 and found.mean == pytest.approx(15 / 8)
     assert found.scenes == pytest.approx(12.706205 * np.std([3, 0], ddof=1) / np.sqrt(2), rel=1e-6)
-    assert paired([]) is None and paired([np.zeros(0)]) is None
-    assert paired([values]).scenes is None and paired([values]).views == half_width(values)
+    assert paired_difference([]) is None and paired_difference([np.zeros(0)]) is None
+    assert paired_difference([values]).scenes is None and paired_difference([values]).views == confidence_half_width(
+        values
+    )
 
 
 def test_pareto_front_against_all_pairs():
@@ -444,14 +451,14 @@ def test_pareto_front_against_all_pairs():
     for count in range(1, 40):
         points = random.integers(0, 12, (count, 2)).astype(float)  # with many ties
         beaten = [any((q <= p).all() and (q < p).any() for q in points) for p in points]
-        assert (pareto(*points.T) == ~np.array(beaten)).all()
-    assert not len(pareto([], []))
+        assert (pareto_front(*points.T) == ~np.array(beaten)).all()
+    assert not len(pareto_front([], []))
 
 
 def test_the_median_of_curves():
     steps = np.array([1.0, 10, 100])
     lines = [np.column_stack([steps[:n], np.full(n, value)]) for n, value in ((3, 1.0), (2, 2.0), (3, 4.0), (3, 9.0))]
-    moments, quartiles = curves.band(lines)
+    moments, quartiles = trace_charts.quartile_band(lines)
     assert moments[0] == pytest.approx(1) and moments[-1] == pytest.approx(100)  # the one that ended keeps its value
     assert np.allclose(quartiles.T, np.percentile([1, 2, 4, 9], [25, 50, 75]))
 
@@ -510,8 +517,8 @@ def test_report_with_pieces_missing(home):
 
 
 def test_report_of_many_scenes(home):
-    jobs = [loading.load_job(path) for path in (home, home.with_name("toy@better"), home.with_name("toy@twin"))]
-    path = scenes.make(jobs, home.parent / "report")
+    jobs = [job_data.load_job(path) for path in (home, home.with_name("toy@better"), home.with_name("toy@twin"))]
+    path = scenes_page.make(jobs, home.parent / "report")
     rows = [line.split(",") for line in (path.parent / "stages.csv").read_text().splitlines()]
     found = {(stage, quantity): [float(value) for value in values] for stage, quantity, *values in rows[1:]}
     assert found["distill", "reference_psnr"] == [3, 26, 29, 29]

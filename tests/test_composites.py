@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from benchmarks.studies import composites, drawing, judging, placing
+from benchmarks.studies import composites, compositing, placement, scoring
 from reffusion.capture import lens
 from reffusion.io.images import load_image, load_mask, save_image
 from reffusion.io.ply import save_points
@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 WIDTH, HEIGHT = 96, 72
 LENS = {"fl_x": 80.0, "fl_y": 82.0, "cx": 47.0, "cy": 36.5, "k1": 0.05, "k2": -0.03, "p1": 0.002, "p2": -0.001}
-PLACE = placing.Place("here", "small", "v03", (48.0, 40.0), 0.25, 60.0, train=5, test=2, near=14.0)
+PLACE = placement.Place("here", "small", "v03", (48.0, 40.0), 0.25, 60.0, train=5, test=2, near=14.0)
 
 
 def camera_at(angle: float) -> np.ndarray:
@@ -42,7 +42,7 @@ def captures(tmp_path_factory) -> Path:
     folder, random = tmp_path_factory.mktemp("captures"), np.random.default_rng(0)
     frames = []
     for k, angle in enumerate(np.radians(np.linspace(-40, 40, 8))):
-        matrix = camera_at(angle) @ placing.OPENGL
+        matrix = camera_at(angle) @ placement.OPENGL
         frames.append({"file_path": f"images/v{k:02d}.png", "transform_matrix": matrix.tolist()})
         photo = random.integers(60, 200, (HEIGHT, WIDTH, 3), np.uint8)
         save_image(folder / f"small/images/v{k:02d}.png", photo)
@@ -55,7 +55,9 @@ def captures(tmp_path_factory) -> Path:
 
 
 def scene_of(captures: Path, out: Path, place=PLACE, **options) -> Path:
-    drawing.write(place, placing.load(captures / place.capture), drawing.Options(**options), out)
+    compositing.write_scene(
+        place, placement.load_photographs(captures / place.capture), compositing.Options(**options), out
+    )
     return out
 
 
@@ -63,7 +65,7 @@ def masks(scene: Path, folder: str = "masks") -> dict[str, np.ndarray]:
     return {path.stem: load_mask(path) for path in sorted((scene / folder).glob("*.png"))}
 
 
-def through_lens(capture: placing.Photographs, name: str, points: np.ndarray) -> np.ndarray:
+def through_lens(capture: placement.Photographs, name: str, points: np.ndarray) -> np.ndarray:
     """Image points [P, 2] by the project's own lens."""
     of = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
     bent = lens.from_colmap("OPENCV", WIDTH, HEIGHT, tuple(LENS[key] for key in of))
@@ -73,9 +75,9 @@ def through_lens(capture: placing.Photographs, name: str, points: np.ndarray) ->
 
 
 def test_the_object_stands_on_the_ground_where_it_was_pointed_at(captures):
-    capture = placing.load(captures / "small")
+    capture = placement.load_photographs(captures / "small")
     assert sorted(capture.cameras) == [f"v{k:02d}" for k in range(8)]
-    thing = placing.stand(capture, PLACE)
+    thing = placement.place_object(capture, PLACE)
     np.testing.assert_allclose(thing.normal, [0, 1, 0], atol=1e-9)
     assert abs(thing.foot[1]) < 1e-9
     image, depth = capture.project(capture.cameras["v03"], thing.foot[None])
@@ -87,8 +89,8 @@ def test_the_object_stands_on_the_ground_where_it_was_pointed_at(captures):
 @pytest.mark.parametrize("shape", ["box", "ellipsoid"])
 def test_masks_are_the_projected_object(captures, tmp_path, shape):
     """The hull of the object's projected surface covers the mask, and the mask covers it, but for a pixel."""
-    place, capture = replace(PLACE, shape=shape), placing.load(captures / "small")
-    thing, scene = placing.stand(capture, place), scene_of(captures, tmp_path / "scene", place)
+    place, capture = replace(PLACE, shape=shape), placement.load_photographs(captures / "small")
+    thing, scene = placement.place_object(capture, place), scene_of(captures, tmp_path / "scene", place)
     unit = np.random.default_rng(1).normal(size=(4000, 3))
     unit /= np.linalg.norm(unit, axis=1, keepdims=True) if shape == "ellipsoid" else np.abs(unit).max(1, keepdims=True)
     surface = thing.middle + (unit * thing.half) @ thing.axes
@@ -146,28 +148,28 @@ def test_rough_masks_are_wrong_by_no_more_than_they_may(captures, tmp_path):
 
 
 def test_the_untouched_scene_has_the_same_views_and_nothing_to_remove(captures, tmp_path):
-    options = drawing.Options()
-    scene, untouched = composites.made(PLACE, captures, options, tmp_path)
+    options = compositing.Options()
+    scene, untouched = composites.make_scenes(PLACE, captures, options, tmp_path)
     told = (untouched / "scene.yaml").stat().st_mtime_ns
     assert yaml.safe_load((untouched / "scene.yaml").read_text())["masks"] == "none"
     assert (untouched / "transforms.json").read_text() == (scene / "transforms.json").read_text()
     for name in masks(scene):
         same = load_image(untouched / f"images/{name}.png"), load_image(scene / f"truth/{name}.png")
         assert np.array_equal(*same)
-    composites.made(PLACE, captures, options, tmp_path)
+    composites.make_scenes(PLACE, captures, options, tmp_path)
     assert (untouched / "scene.yaml").stat().st_mtime_ns == told
-    alone, _ = composites.made(PLACE, captures, replace(options, reference=False), tmp_path)
+    alone, _ = composites.make_scenes(PLACE, captures, replace(options, reference=False), tmp_path)
     assert alone != scene and "reference" not in yaml.safe_load((alone / "scene.yaml").read_text())
 
 
 def test_a_place_without_a_surface_is_an_error(captures):
-    capture = placing.load(captures / "small")
+    capture = placement.load_photographs(captures / "small")
     with pytest.raises(ValueError, match="points within"):
-        placing.stand(capture, replace(PLACE, near=0.1))
+        placement.place_object(capture, replace(PLACE, near=0.1))
     with pytest.raises(ValueError, match="no photograph"):
-        placing.stand(capture, replace(PLACE, view="lost"))
+        placement.place_object(capture, replace(PLACE, view="lost"))
     with pytest.raises(ValueError, match="no transforms"):
-        placing.load(captures)
+        placement.load_photographs(captures)
 
 
 def test_without_captures_it_is_skipped(tmp_path, monkeypatch, capsys):
@@ -178,21 +180,24 @@ def test_without_captures_it_is_skipped(tmp_path, monkeypatch, capsys):
 
 
 def test_the_sets_share_no_place_and_unknown_ones_are_named():
-    names = [place.name for place in (*composites.CHOOSE, *composites.REPORT)]
-    assert len(set(names)) == len(names) == 10
-    assert composites.chosen("bear-rim,table", report=False) == (composites.REPORT[4], composites.CHOOSE[0])
+    names = [place.name for place in (*composites.TUNING_PLACES, *composites.REPORT_PLACES, *composites.NAMED_PLACES)]
+    assert len(set(names)) == len(names) == 24
+    assert composites.select_places("bear-rim,table", report=False) == (
+        composites.REPORT_PLACES[4],
+        composites.TUNING_PLACES[0],
+    )
     with pytest.raises(ValueError, match="no place is called moon"):
-        composites.chosen("moon", report=False)
+        composites.select_places("moon", report=False)
 
 
 def test_the_table_has_a_row_a_place():
     scores = {"lpips_vgg": 0.3, "psnr": 21.234, "ssim": 0.6, "flip": None}
     other = scores | {"lpips_vgg": 0.4}
-    row = {"place": "here", **dict.fromkeys(judging.WAYS, scores), "seconds": 61.6, "variants": {"lift": other}}
+    row = {"place": "here", **dict.fromkeys(scoring.PICTURES, scores), "seconds": 61.6, "variants": {"lift": other}}
     row |= {"sharpness": {"result": 0.8, "ceiling": None}, "uncovered": {"train": 0.001, "test": 0.0125}}
-    assert "| here | 0.300 / 21.23 / 0.600 / - |" in judging.table([row])
+    assert "| here | 0.300 / 21.23 / 0.600 / - |" in scoring.table([row])
     assert (
-        judging.table([row])
+        scoring.table([row])
         .splitlines()[-1]
         .endswith("| 0.80 | - | 0.10 | 1.25 | 62 | 0.400 / 21.23 / 0.600 / - | 0.75 |")
     )

@@ -60,8 +60,8 @@ def test_another_prior_was_not_counted():
 @pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="slow: a minute")
 def test_the_table_is_what_is_counted_today():
     """The parts that are our own; `python -m benchmarks.gpu.counts` makes it anew."""
-    found = {"critic 256": counts.critic_step(256), "loss, a million pixels": counts.loss_of_a_pixel()}
-    found["Adam, a million Gaussians"] = counts.adam_of_a_gaussian()
+    found = {"critic 256": counts.count_critic_step(256), "loss, a million pixels": counts.count_pixel_loss()}
+    found["Adam, a million Gaussians"] = counts.count_adam()
     for name, each in found.items():
         assert each["tflop"] == pytest.approx(COUNTS[name]["tflop"], rel=0.02), name
         assert each["gb"] == pytest.approx(COUNTS[name]["gb"], rel=0.05), name

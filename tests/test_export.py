@@ -153,5 +153,5 @@ def test_export_writes_all_and_says_what_is_there(tmp_path):
 def test_far_away_positions_stay_exact_and_are_said(tmp_path):
     far = Similarity(0.5, np.array([4e6, 5e5, 0.0]))
     save_ply(tmp_path / "scene.ply", some_gaussians(20, 0), far)
-    assert "many editors read floats only" in export.unlike_3dgs(tmp_path / "scene.ply", False)
-    assert export.unlike_3dgs(tmp_path / "scene.ply", False).count(";") == 1
+    assert "many editors read floats only" in export.viewer_caveats(tmp_path / "scene.ply", False)
+    assert export.viewer_caveats(tmp_path / "scene.ply", False).count(";") == 1

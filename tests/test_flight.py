@@ -10,32 +10,32 @@ from reffusion import geometry
 from reffusion.io.ply import save_ply
 from reffusion.io.scene import save_scene
 from reffusion.types import Camera, Scene, Similarity
-from report import flight, turntable
+from report import camera_path, turntable
 
 
 def ring(count: int, radius: float, height: float = 0.3) -> list[Camera]:
     """Cameras on a circle about the y axis, rows downwards along +y, all looking at the origin."""
     turns = 2 * np.pi * np.arange(count) / count
     centers = np.stack([radius * np.cos(turns), np.full(count, -height), radius * np.sin(turns)], 1)
-    poses = [flight.looking(center, np.zeros(3), np.array([0.0, 1.0, 0.0])) for center in centers]
+    poses = [camera_path.look_at(center, np.zeros(3), np.array([0.0, 1.0, 0.0])) for center in centers]
     return [Camera(str(k), 64, 48, 60.0, 60.0, 31.0, 25.0, pose) for k, pose in enumerate(poses)]
 
 
 def test_a_ring_of_cameras_gives_the_ring_back():
-    made = flight.around(ring(9, 2.0), np.random.default_rng(0).normal(0, 0.1, (50, 3)), 12)
+    made = camera_path.ellipse_path(ring(9, 2.0), np.random.default_rng(0).normal(0, 0.1, (50, 3)), 12)
     centers = np.stack([camera.center for camera in made])
     assert np.allclose(np.hypot(centers[:, 0], centers[:, 2]), 2.0) and np.allclose(centers[:, 1], -0.3)
     steps = np.linalg.norm(np.diff(centers, axis=0, append=centers[:1]), axis=1)
     assert np.allclose(steps, steps[0]), "closed, and even"
-    assert np.allclose(flight.focus(ring(9, 2.0), np.zeros((0, 3))), 0, atol=0.02)
+    assert np.allclose(camera_path.focus_point(ring(9, 2.0), np.zeros((0, 3))), 0, atol=0.02)
 
 
 def test_every_camera_looks_at_the_focus_upright():
     cameras = list(small_scene.CAMERAS.values())
     points = np.array([[0.0, 0.0, 2.0]])
-    target = flight.focus(cameras, points)
+    target = camera_path.focus_point(cameras, points)
     assert target[2] == pytest.approx(2.0, abs=0.05), "parallel axes: the points say how far"
-    for camera in flight.around(cameras, points, 8):
+    for camera in camera_path.ellipse_path(cameras, points, 8):
         rotation = camera.world_to_camera[:3, :3]
         assert np.allclose(rotation @ rotation.T, np.eye(3)) and np.linalg.det(rotation) > 0
         pixels, depth = geometry.project(target[None], camera)
@@ -44,12 +44,12 @@ def test_every_camera_looks_at_the_focus_upright():
 
 
 def test_odd_captures_have_a_way_too():
-    above = [flight.looking(np.array([0.0, -2.0, 0.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]))]
+    above = [camera_path.look_at(np.array([0.0, -2.0, 0.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]))]
     one = [Camera("v", 8, 6, 9.0, 9.0, 4.0, 3.0, above[0])]
-    for camera in flight.around(one, np.zeros((0, 3)), 3):
+    for camera in camera_path.ellipse_path(one, np.zeros((0, 3)), 3):
         assert np.isfinite(camera.world_to_camera).all() and np.allclose(camera.center, (0, -2, 0))
     with pytest.raises(ValueError, match="needs a camera"):
-        flight.around([], np.zeros((0, 3)), 3)
+        camera_path.ellipse_path([], np.zeros((0, 3)), 3)
 
 
 def test_the_video_shows_the_result_of_a_variant_in_the_scenes_poses(tmp_path):
@@ -67,6 +67,6 @@ def test_the_video_shows_the_result_of_a_variant_in_the_scenes_poses(tmp_path):
     while (read := film.read())[0]:
         frames.append(read[1])
     assert len(frames) == 6 and frames[0].shape == (small_scene.HEIGHT, small_scene.WIDTH, 3)
-    first = flight.around(list(train.values()), points, 6)[0]
+    first = camera_path.ellipse_path(list(train.values()), points, 6)[0]
     drawn = turntable.rasterizer.render(wall, first).color
     assert (torch.from_numpy(frames[0][..., ::-1].copy()) / 255 - drawn).abs().mean() < 0.03, "but for compression"

@@ -24,7 +24,7 @@ def test_a_variants_initialization_is_written_once():
 
 def test_a_run_that_was_not_evaluated_is_refused_with_the_command(tmp_path):
     with pytest.raises(ValueError, match="make scene=demo all"):
-        gain.measured(tmp_path / "demo")
+        gain.evaluate_run(tmp_path / "demo")
 
 
 def test_energy_counts_steps_whose_ends_both_lie_in_the_mask():

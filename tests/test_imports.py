@@ -154,14 +154,14 @@ def test_the_command_starts_at_once():
 @pytest.mark.parametrize("path", sources("report"), ids=named)
 def test_report_reads_through_io(path):
     own = {name for name in imports(path) if name.split(".")[0] in OWN - {"report"}}
-    draws = ("flight", "turntable", "view", "drawn", "layers", "unseen", "study")
+    draws = ("camera_path", "turntable", "view", "job_pictures", "gaussian_layers", "unseen_overlay", "study")
     drawing = (
         ("reffusion.splat.rasterizer", "reffusion.types", "reffusion.background.training_coverage")
         if path.stem in draws
         else ()
     )
     clicked = ("reffusion.clicks", "reffusion.capture", "reffusion.params", "reffusion.command")
-    making = clicked if path.stem == "clicking" else ()  # masks
+    making = clicked if path.stem == "mask_session" else ()  # masks
     chance = ("reffusion.seeding",) if path.stem in ("study", "votes") else ()  # the order of pairs, intervals
     assert all(name.startswith(("reffusion.io", *chance, *drawing, *making)) for name in own), own
 

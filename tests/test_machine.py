@@ -121,4 +121,4 @@ def test_make_gpu_ends_with_one_line_where_there_is_no_card(monkeypatch, capsys)
 
 
 def test_compilers_fit_into_memory():
-    assert [ready.jobs(16, gb) for gb in (0.5, 3.2, 64)] == [1, 3, 8] and ready.jobs(2, 64) == 2
+    assert [ready.compiler_jobs(16, gb) for gb in (0.5, 3.2, 64)] == [1, 3, 8] and ready.compiler_jobs(2, 64) == 2

@@ -101,7 +101,7 @@ def made(tmp_path_factory):
     home = tmp_path_factory.mktemp("paper")
     paths = {name: home / name for name in ("scene", "poses", "raw_masks", "fit", *STAGES)}
     for name, shape in (("sd2", full_size.SD2), ("sdxl", full_size.SDXL)):
-        prior = full_size.build(full_size.shrunk(shape), torch.float32)
+        prior = full_size.build_prior(full_size.shrink(shape), torch.float32)
         pipeline(replace(prior, zero_empty=True)).save_pretrained(home / name)
     network_of_the_tilt().save_pretrained(home / "depth")
     small.write(home, 1.5)

@@ -248,7 +248,7 @@ def test_the_patch_is_given_back_as_the_editor_wrote_the_scene(tmp_path):
         np.testing.assert_array_equal(alone[name], whole[name][3900:])
     (home / "poses" / "deleted.npy").unlink()
     with pytest.raises(ValueError, match="nothing says what was deleted"):
-        patch.check(home)
+        patch.require_deleted(home)
 
 
 def test_exported_cameras_are_a_capture_without_photographs(tmp_path):

@@ -89,8 +89,8 @@ def test_the_folder_is_a_scene_and_keeps_what_a_person_painted(tmp_path):
     _, deleted = edited(made)
     without_pictures(made)
     asked = arguments(made / "scene.ply", made / "cleaned.ply", tmp_path / "out.ply")
-    patch_files.check(asked)
-    folder = patch_files.prepare(asked)
+    patch_files.check_arguments(asked)
+    folder = patch_files.write_scene_folder(asked)
     assert folder == patch_files.find_folder(asked.runs, *asked.files) and folder.name.startswith("scene-patch-")
     said = (folder / "scene.yaml").read_text()
     assert said == 'gaussians: "before/scene.ply"\ncleaned: "after/cleaned.ply"\nmasks: none\n'
@@ -101,7 +101,7 @@ def test_the_folder_is_a_scene_and_keeps_what_a_person_painted(tmp_path):
     (made / "cameras").mkdir()
     (made / "transforms.json").rename(made / "cameras" / "transforms.json")
     time = (folder / "scene.yaml").stat().st_mtime_ns
-    again = patch_files.prepare(arguments(*asked.files, asked.out, cameras=made / "cameras"))
+    again = patch_files.write_scene_folder(arguments(*asked.files, asked.out, cameras=made / "cameras"))
     assert again == folder and (folder / "painted" / "around_00.png").read_text() == "mine"
     assert (folder / "scene.yaml").stat().st_mtime_ns == time
     assert "no photographs: 6 cameras of transforms.json" in planned.preview(params, folder)[0]
@@ -110,7 +110,7 @@ def test_the_folder_is_a_scene_and_keeps_what_a_person_painted(tmp_path):
         poses.run(params, out, scene=folder)
     np.testing.assert_array_equal(load_labels(out / "deleted.npy").numpy(), deleted)
     assert len(load_scene(out).train) == 6
-    patch_files.prepare(asked)
+    patch_files.write_scene_folder(asked)
     assert not (folder / "transforms.json").exists()
 
 

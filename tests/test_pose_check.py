@@ -151,7 +151,7 @@ def test_a_photograph_that_contradicts_its_pose_is_left_out(tmp_path):
     ]
     _, lines = check.make(out.parent)
     assert lines == said
-    assert check.kind_of(BAD, json.loads((out / "views.json").read_text())) == "left out"
+    assert check.view_role(BAD, json.loads((out / "views.json").read_text())) == "left out"
 
 
 def test_what_the_other_photographs_show_stays_as_it_was(tmp_path):

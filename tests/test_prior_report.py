@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 @pytest.fixture(scope="module")
 def cases():
-    return holes.held_out(16)
+    return holes.held_out_cases(16)
 
 
 def test_a_perfect_picture_a_blurred_one_and_a_flat_one_are_told_apart(cases):
@@ -49,7 +49,7 @@ def test_only_the_hole_counts(cases):
 
 
 def test_the_held_out_set_is_fixed_and_shares_no_picture_with_training(cases):
-    again = holes.held_out(3)
+    again = holes.held_out_cases(3)
     assert all(np.array_equal(a.truth, b.truth) and np.array_equal(a.hole, b.hole) for a, b in zip(again, cases))  # noqa: B905
     kinds = [case.kind for case in cases]
     assert 0 < kinds.count("photograph") < len(kinds)
@@ -71,19 +71,19 @@ def test_a_wrong_reference_has_another_picture_and_the_same_holes(tmp_path):
     for folder, value in (("references", 90), ("masks", 255)):
         save_image(tmp_path / "given" / folder / "a.png", np.full((6, 8, 3), value, np.uint8))
     save_image(tmp_path / "other.png", np.full((30, 40, 3), 200, np.uint8))
-    made = benchmark.with_picture(tmp_path / "given", tmp_path / "other.png", tmp_path / "made")
+    made = benchmark.replace_references(tmp_path / "given", tmp_path / "other.png", tmp_path / "made")
     assert load_image(made / "references/a.png").shape == (6, 8, 3)
     assert (load_image(made / "references/a.png") == 200).all()
     assert (made / "masks/a.png").read_bytes() == (tmp_path / "given/masks/a.png").read_bytes()
 
 
 def test_settings_are_checked_and_come_last():
-    assert benchmark.setting("betas=[0.8, 0.99]") == ("betas", [0.8, 0.99])
-    assert benchmark.profile("a/prior", {"steps": 7}).steps == 7
+    assert benchmark.parse_setting("betas=[0.8, 0.99]") == ("betas", [0.8, 0.99])
+    assert benchmark.profile_params("a/prior", {"steps": 7}).steps == 7
     with pytest.raises(ValueError, match="steeps"):
-        benchmark.profile("a/prior", {"steeps": 7})
+        benchmark.profile_params("a/prior", {"steeps": 7})
     with pytest.raises(argparse.ArgumentTypeError, match="NAME=VALUE"):
-        benchmark.setting("steps")
+        benchmark.parse_setting("steps")
 
 
 def measured(folder: Path) -> None:

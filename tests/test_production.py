@@ -28,13 +28,13 @@ ROOT = Path(__file__).resolve().parent.parent
 def sdxl(tmp_path_factory):
     """An SDXL-shaped prior as `load_prior` gives it, from a folder that diffusers wrote."""
     folder = tmp_path_factory.mktemp("sdxl")
-    pipeline(replace(F.build(F.shrunk(F.SDXL), torch.float32), zero_empty=True)).save_pretrained(folder)
+    pipeline(replace(F.build_prior(F.shrink(F.SDXL), torch.float32), zero_empty=True)).save_pretrained(folder)
     return load_prior(folder)
 
 
 @pytest.fixture
 def sd2():
-    return F.build(F.shrunk(F.SD2), torch.float32)
+    return F.build_prior(F.shrink(F.SD2), torch.float32)
 
 
 def draw(*shape, seed=0):
@@ -99,7 +99,7 @@ def test_a_batch_in_parts_gives_the_same_values_and_gradients(sd2):
 def test_a_training_step_in_parts_is_the_same_step():
     after = []
     for rows in (0, 2):
-        prior = F.build(F.shrunk(F.SD2), torch.float32)
+        prior = F.build_prior(F.shrink(F.SD2), torch.float32)
         trained, optimizer, training = F.trainer(prior, 5)
         for part in (prior.unet, prior.text_encoder):  # dropout's draws depend on the parts
             for layer in part.modules():
@@ -114,7 +114,7 @@ def test_a_training_step_in_parts_is_the_same_step():
 
 
 def test_half_precision_stays_near_and_leaves_the_vae_alone(sd2):
-    half = F.build(F.shrunk(F.SD2), torch.bfloat16)
+    half = F.build_prior(F.shrink(F.SD2), torch.bfloat16)
     for name in ("unet", "text_encoder"):
         getattr(half, name).load_state_dict(getattr(sd2, name).state_dict())
     half.vae.load_state_dict(sd2.vae.state_dict())
@@ -134,7 +134,7 @@ def test_half_precision_stays_near_and_leaves_the_vae_alone(sd2):
 
 @pytest.mark.parametrize("dropout", [0.0, 0.1])
 def test_a_small_lora_is_not_lost_in_half_precision(sd2, dropout):
-    half = F.build(F.shrunk(F.SD2), torch.bfloat16)
+    half = F.build_prior(F.shrink(F.SD2), torch.bfloat16)
     half.unet.load_state_dict(sd2.unet.state_dict())
     sd2.unet.load_state_dict(half.unet.state_dict())  # the same rounded weights in float32
     noisy, condition, at, text = draw(1, 4, 16, 16), draw(1, 5, 16, 16), torch.tensor([500]), draw(1, 24, 64)
@@ -162,7 +162,7 @@ def test_a_lora_loads_into_diffusers_own_pipeline_of_sd2(sd2, tmp_path):
         parameter.data += 0.1 * torch.randn(parameter.shape, generator=noise)
     trained, words = F.epsilon(sd2), diffusion.embed_text(sd2, [crops.PROMPTS[0]])
     lora.save(sd2, tmp_path)
-    fresh = F.build(F.shrunk(F.SD2), torch.float32)
+    fresh = F.build_prior(F.shrink(F.SD2), torch.float32)
     pipe = pipeline(fresh)
     pipe.load_lora_weights(tmp_path)
     lora.set_dropout(fresh, False)  # new layers begin in training mode
@@ -176,15 +176,15 @@ def test_the_order_of_weights_in_memory_changes_nothing(sd2, tmp_path):
     before = F.epsilon(sd2)
     sd2.unet.to(memory_format=torch.channels_last)
     assert (F.epsilon(sd2) - before).abs().max() < 1e-5
-    F.personalization_step(F.build(F.shrunk(F.SD2), torch.float32), F.reference(32), 1, tmp_path)
-    fresh = F.build(F.shrunk(F.SD2), torch.float32)
+    F.personalization_step(F.build_prior(F.shrink(F.SD2), torch.float32), F.reference(32), 1, tmp_path)
+    fresh = F.build_prior(F.shrink(F.SD2), torch.float32)
     fresh.unet.to(memory_format=torch.channels_last)
-    plain = lora.merged(F.build(F.shrunk(F.SD2), torch.float32), tmp_path)
+    plain = lora.merged(F.build_prior(F.shrink(F.SD2), torch.float32), tmp_path)
     assert (F.epsilon(lora.merged(fresh, tmp_path)) - F.epsilon(plain)).abs().max() < 1e-5
 
 
 def test_the_text_encoder_is_let_go():
-    prior = F.build(F.shrunk(F.SD2), torch.float32)
+    prior = F.build_prior(F.shrink(F.SD2), torch.float32)
     whole, encoder = prior.bytes, weakref.ref(prior.text_encoder)
     text = diffusion.embed_text(prior, list(crops.PROMPTS)).detach()
     prior = without_text(prior)
@@ -246,14 +246,14 @@ def test_running_out_of_memory_names_the_param():
 
 
 def test_published_sizes_are_those_of_the_published_configurations():
-    assert F.count(F.SD2) == published.PUBLISHED[published.SD2].parameters
-    assert F.count(F.SDXL) == published.PUBLISHED[published.SDXL].parameters
+    assert F.count_parameters(F.SD2) == published.PUBLISHED[published.SD2].parameters
+    assert F.count_parameters(F.SDXL) == published.PUBLISHED[published.SDXL].parameters
 
 
 def test_memory_is_counted_without_computing():
-    shape = F.shrunk(F.SD2)
-    counted = F.living(shape, torch.float32)
-    made = F.build(shape, torch.float32)
+    shape = F.shrink(F.SD2)
+    counted = F.peak_memory(shape, torch.float32)
+    made = F.build_prior(shape, torch.float32)
     assert counted["weights"] == pytest.approx(made.bytes / 1e9, abs=1e-6)
     real = memory.peak_bytes(lambda: memory.encoding(made), "cpu") / 1e9
     assert real <= counted["SDS"] < 2 * real  # attention is taken apart there
@@ -278,9 +278,9 @@ def test_gpu_check_keeps_what_it_has(tmp_path, monkeypatch):
     def full(*given):
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate\n 20.00 GiB")
 
-    written, write = [], gpu_check.write
+    written, write = [], gpu_check.write_atomically
     monkeypatch.setattr(gpu_steps, "adversarial_term", full)
-    monkeypatch.setattr(gpu_check, "write", lambda path, text: written.append(text) or write(path, text))
+    monkeypatch.setattr(gpu_check, "write_atomically", lambda path, text: written.append(text) or write(path, text))
     report = gpu_check.check("cpu", tmp_path)
     parts = report["parts"]
     assert parts["adversarial"] == {
@@ -301,11 +301,11 @@ def test_gpu_check_keeps_what_it_has(tmp_path, monkeypatch):
 def test_gpu_check_finds_small_errors():
     truth = {"color": torch.rand(50, 40, 3), "gradient of means": torch.randn(90, 3)}
     flipped = {name: tensor.clone() for name, tensor in truth.items()}
-    assert gpu_exact.compared(flipped, truth)["ok"]
+    assert gpu_exact.compare_blocks(flipped, truth)["ok"]
     wrong = flipped | {"color": truth["color"] * (1 + 3e-5)}
-    assert gpu_exact.compared(wrong, truth)["beyond"] == "color"
+    assert gpu_exact.compare_blocks(wrong, truth)["beyond"] == "color"
     wrong = flipped | {"gradient of means": truth["gradient of means"] * 1.001}
-    assert gpu_exact.compared(wrong, truth)["beyond"] == "gradient of means"
+    assert gpu_exact.compare_blocks(wrong, truth)["beyond"] == "gradient of means"
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")

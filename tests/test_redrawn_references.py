@@ -187,7 +187,9 @@ def test_real_photographs(name):
     """Every tenth view: its redrawn picture is accepted; its nearest views' photographs and another scene's are not."""
     if not (CAPTURES / name).is_dir() or not (CAPTURES / "bear").is_dir():
         pytest.skip("no ../shared/data")
-    capture, foreign = (redrawn.load(CAPTURES / each) for each in (name, "bear" if name != "bear" else "garden"))
+    capture, foreign = (
+        redrawn.load_photographs(CAPTURES / each) for each in (name, "bear" if name != "bear" else "garden")
+    )
     photo_of_another = foreign.picture(next(iter(foreign.files)))
     for view in list(capture.files)[5::40]:
         photo, nearest = capture.picture(view), capture.nearest(view)[:2]

@@ -54,17 +54,17 @@ def small_run(home, invent):
 def test_on_a_scene_without_ground_truth(tmp_path):
     prior, hole = small_prior(), np.zeros((36, 48), bool)
     hole[10:24, 12:30] = True
-    found = benchmark.measured({"before": prior, "after": prior}, small_run(tmp_path / "run", hole))
+    found = benchmark.measure({"before": prior, "after": prior}, small_run(tmp_path / "run", hole))
     assert set(found) == {"whole", "window"}
     for by_time in found.values():
         assert by_time["before"] == by_time["after"] and by_time["before"]["over_noise"] > 0
-    assert benchmark.inputs(tmp_path / "run", prior)["whole"][0].shape[0] == 2  # the clean view is not distilled
+    assert benchmark.load_inputs(tmp_path / "run", prior)["whole"][0].shape[0] == 2  # the clean view is not distilled
     text = benchmark.table(found)
     assert text.count("| 1.00 |") == 2 * (len(benchmark.TIMESTEPS) + 3)
 
 
 def test_what_is_missing_is_named(tmp_path):
     with pytest.raises(ValueError, match="make scene=nowhere initialize"):
-        benchmark.inputs(tmp_path / "nowhere", small_prior())
+        benchmark.load_inputs(tmp_path / "nowhere", small_prior())
     with pytest.raises(ValueError, match="nothing is to be invented"):
-        benchmark.inputs(small_run(tmp_path / "run", np.zeros((36, 48), bool)), small_prior())
+        benchmark.load_inputs(small_run(tmp_path / "run", np.zeros((36, 48), bool)), small_prior())

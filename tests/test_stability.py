@@ -10,7 +10,7 @@ import torch
 from benchmarks.stability import __main__ as command
 from benchmarks.stability import all_cases, random_scenes, run
 from benchmarks.stability.cases import Case
-from benchmarks.stability.faults import FAULTS, caught
+from benchmarks.stability.faults import FAULTS, is_caught
 
 CASES = {case.name: case for case in all_cases()}
 LONG = [case.name for case in random_scenes.CASES]  # a tenth of them here, all in `make stability`
@@ -60,7 +60,7 @@ def test_names_are_unique_and_enough():
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
 def test_fault_is_caught_and_gone_again(fault):
-    assert caught(fault)
+    assert is_caught(fault)
     assert run(CASES[fault.caught_by]).ok
 
 

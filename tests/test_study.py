@@ -14,7 +14,7 @@ from browser import visiting
 from reffusion.io.images import save_image
 from reffusion.io.ply import save_ply
 from report import study, turntable, votes
-from report.results import TOGETHER
+from report.results import FOLDER_COMPARISON
 
 METHODS = ("full", "no_sds", "inpaint_2d")
 
@@ -41,10 +41,16 @@ def home(tmp_path):
                 save_image(reference / "references/a2.png", small.photo(small.CAMERAS["a2"]))
                 stages["reference"] = str(reference.relative_to(tmp_path))
             runs.append({"scene": scene, "method": method, "state": "done", "stages": stages})
-    record = {"scene": TOGETHER, "scenes": ["x", "y"], "methods": list(METHODS), "runs": runs, "data": str(tmp_path)}
-    (tmp_path / TOGETHER).mkdir()
-    (tmp_path / TOGETHER / "compare.json").write_text(json.dumps(record))
-    return tmp_path / TOGETHER
+    record = {
+        "scene": FOLDER_COMPARISON,
+        "scenes": ["x", "y"],
+        "methods": list(METHODS),
+        "runs": runs,
+        "data": str(tmp_path),
+    }
+    (tmp_path / FOLDER_COMPARISON).mkdir()
+    (tmp_path / FOLDER_COMPARISON / "compare.json").write_text(json.dumps(record))
+    return tmp_path / FOLDER_COMPARISON
 
 
 def test_the_pages_of_a_study(home):
@@ -122,7 +128,7 @@ def test_a_whole_session(home, tmp_path, width):
         saved.value.save_as(tmp_path / "answers.json")
         other = browser.evaluate("ordered('Grace').map(each => each.trial.id + each.turned)")
         assert other != browser.evaluate("ordered('Ada L.').map(each => each.trial.id + each.turned)")
-    found, left_out = votes.counted([json.loads((tmp_path / "answers.json").read_text())], key)
+    found, left_out = votes.count_votes([json.loads((tmp_path / "answers.json").read_text())], key)
     assert left_out == []
     shares = {(each.method, each.question): (each.share, each.votes) for each in found}
     assert shares == {(m, q): (float(q == "overall"), 2) for m in METHODS[1:] for q in votes.QUESTIONS}
@@ -150,29 +156,29 @@ def made_up(participants: int, truth: float, seed: int, spread: float = 0.15) ->
 
 def test_a_known_preference_is_given_back_within_the_interval():
     answers, key = made_up(40, 0.7, 1)
-    (found,), left_out = votes.counted(answers, key)
+    (found,), left_out = votes.count_votes(answers, key)
     assert found.low < 0.7 < found.high and found.high - found.low < 0.2
     assert (found.votes, found.participants) == (36 * 12, 36) and len(left_out) == 4
     assert left_out[0] == "9: 1 of 1 attention checks failed"
-    assert "| other | looks better overall | " in votes.table([found])
+    assert "| other | looks better overall | " in votes.preference_table([found])
 
 
 def test_the_interval_holds_the_truth_as_often_as_it_says(monkeypatch):
     monkeypatch.setattr(votes, "RESAMPLES", 600)
     held = 0
     for seed in range(150):
-        (found,), _ = votes.counted(*made_up(30, 0.65, seed))
+        (found,), _ = votes.count_votes(*made_up(30, 0.65, seed))
         held += found.low <= 0.65 <= found.high
     assert 0.88 <= held / 150 <= 0.99
 
 
 def test_all_agree_and_what_is_refused():
     answers, key = made_up(10, 1.0, 0, 0.0)
-    (found,), _ = votes.counted(answers, key)
+    (found,), _ = votes.count_votes(answers, key)
     assert found.share == 1 and 0.6 < found.low < 0.8 and found.high == 1  # nine people
     with pytest.raises(ValueError, match="two files of one participant"):
-        votes.counted(answers + answers[:1], key)
+        votes.count_votes(answers + answers[:1], key)
     with pytest.raises(ValueError, match="another study"):
-        votes.counted(answers, key | {"study": "t"})
+        votes.count_votes(answers, key | {"study": "t"})
     answers[0]["answers"] = answers[0]["answers"][1:]
-    assert votes.counted(answers, key)[1][0] == "0: not to its end"
+    assert votes.count_votes(answers, key)[1][0] == "0: not to its end"

@@ -173,7 +173,9 @@ def test_what_a_plane_surrounds_is_told_from_what_lies_beyond_it():
     seen = (away > 20) & (away < 60)
     free = (away < 20) | (away > 60)
     free[95, 120], seen[95, 120] = True, False
-    assert (continuation._enclosed_patches(seen, free) == (away < 20)).all(), "a plate in a table, no speck, nor the garden"
+    assert (continuation._enclosed_patches(seen, free) == (away < 20)).all(), (
+        "a plate in a table, no speck, nor the garden"
+    )
     open_to_a_side = seen & ~((np.abs(rows) < 6) & (columns > 0))
     assert not continuation._enclosed_patches(open_to_a_side, free | ~open_to_a_side).any()
 

@@ -50,9 +50,9 @@ def test_a_slanted_plane_has_no_edges_and_a_step_has():
 
 def test_scores_count_what_has_no_depth_as_wrong():
     true = np.full((1, 4), 2.0)
-    found = study.scores(study.errors(np.array([[2.0, 2.03, 2.09, 0.0]]), true))
+    found = study.scores(study.relative_errors(np.array([[2.0, 2.03, 2.09, 0.0]]), true))
     assert [found[f"within {n}%"] for n in (1, 2, 5)] == [0.25, 0.5, 0.75]
 
 
 def test_the_name_of_a_scene_tells_its_kind():
-    assert [study.kind_of(name) for name in ("demo", "demo-7", "demo-table-21")] == ["demo", "demo", "table"]
+    assert [study.scene_kind(name) for name in ("demo", "demo-7", "demo-table-21")] == ["demo", "demo", "table"]

@@ -17,7 +17,7 @@ from reffusion.io.ply import save_ply
 from reffusion.io.scene import load_scene, save_scene
 from reffusion.splat import rasterizer
 from reffusion.types import Scene, Similarity
-from report import layers, unseen, view
+from report import gaussian_layers, unseen_overlay, view
 
 SIMILARITY = Similarity(2.0, np.array([0.1, 0.2, 0.3]))
 NEEDS = {"poses": "a", "fit": "b", "masks": "c", "initialize": "d", "distill": "e", "lift": None}
@@ -48,18 +48,18 @@ def visitor(camera):
     """A visitor's camera as viser describes it."""
     rotation = camera.world_to_camera[:3, :3]
     place = {"wxyz": view._quaternion(rotation.T), "position": camera.center}
-    return SimpleNamespace(**place, fov=view.field_of_view(camera), aspect=camera.width / camera.height)
+    return SimpleNamespace(**place, fov=view.vertical_fov(camera), aspect=camera.width / camera.height)
 
 
 def test_a_visitor_who_stands_at_a_view_sees_that_view():
     gaussians, _ = small_scene.gaussians(1.0)
     for camera in small_scene.CAMERAS.values():
         centred = camera.cropped(0, 0, round(2 * camera.cx), round(2 * camera.cy))
-        seen = view.camera_of(visitor(centred), centred.height)
+        seen = view.visitor_camera(visitor(centred), centred.height)
         assert (seen.width, seen.height) == (centred.width, centred.height)
         assert np.allclose(seen.world_to_camera, centred.world_to_camera)
         expected = (rasterizer.render(gaussians, centred).color.clamp(0, 1) * 255).round().byte().numpy()
-        assert np.abs(view.picture(gaussians, seen).astype(int) - expected).max() <= 1
+        assert np.abs(view.render_picture(gaussians, seen).astype(int) - expected).max() <= 1
 
 
 def test_the_layers_are_those_that_the_result_was_made_from(tmp_path):
@@ -67,19 +67,19 @@ def test_the_layers_are_those_that_the_result_was_made_from(tmp_path):
     added, kept = int(labels.sum()), int((~labels).sum())
     save_ply(tmp_path / "x/distill/snapshots/20.ply", gaussians.map(lambda p: p[labels]))
     save_ply(tmp_path / "x/distill/snapshots/100.ply", gaussians.map(lambda p: p[labels][:3]))
-    found = layers.load_layers(tmp_path / "x", SIMILARITY)
+    found = gaussian_layers.load_layers(tmp_path / "x", SIMILARITY)
     assert list(found.states) == ["initialization", "step 20", "step 100", "result"]
-    count = lambda state, **parts: len(found.shown(state, **{"kept": False, "added": False, "removed": False} | parts))
+    count = lambda state, **parts: len(found.select(state, **{"kept": False, "added": False, "removed": False} | parts))
     for state, new in (("initialization", added), ("step 20", added), ("step 100", 3), ("result", added)):
         assert count(state, kept=True) == kept and count(state, added=True) == new
         assert count(state, removed=True) == added, "what the stage masks labelled of the fit"
         assert count(state, kept=True, added=True, removed=True) == kept + new + added and count(state) == 0
     assert torch.equal(found.states["result"][1].opacity_logits, gaussians.opacity_logits[labels])
     finished(tmp_path / "x@remove", NEEDS | {"initialize": None, "distill": None})
-    alone = layers.load_layers(tmp_path / "x@remove", SIMILARITY)
+    alone = gaussian_layers.load_layers(tmp_path / "x@remove", SIMILARITY)
     assert list(alone.states) == ["result"] and len(alone.states["result"][1]) == 0 and len(alone.removed) == added
     with pytest.raises(ValueError, match="make scene=x variant=no_sds all"):
-        layers.load_layers(tmp_path / "x@no_sds", SIMILARITY)
+        gaussian_layers.load_layers(tmp_path / "x@no_sds", SIMILARITY)
 
 
 def test_what_evaluate_adds_beyond_the_capture_counts_as_kept(tmp_path):
@@ -88,7 +88,7 @@ def test_what_evaluate_adds_beyond_the_capture_counts_as_kept(tmp_path):
     backdrop = gaussians.map(lambda p: p[:5] + 3)
     fewer = gaussians.map(lambda p: p[1:]).zipped(backdrop, lambda a, b: torch.cat([a, b]))
     save_ply(tmp_path / "x/evaluate/scene.ply", fewer, similarity=SIMILARITY)
-    kept, added = layers.load_layers(tmp_path / "x", SIMILARITY).states["result"]
+    kept, added = gaussian_layers.load_layers(tmp_path / "x", SIMILARITY).states["result"]
     assert len(kept) + len(added) == len(fewer) and len(added) == int(labels[1:].sum())
 
 
@@ -98,24 +98,24 @@ def test_what_no_photograph_shows_is_hatched(tmp_path):
     shape = next(iter(scene.cameras.values()))
     for name in scene.train:  # all of them hide what lies on the left
         save_mask(tmp_path / f"x/masks/consistent/{name}.png", np.indices((shape.height, shape.width))[1] < 12)
-    seen_by = unseen.photographed(tmp_path / "x", scene)
+    seen_by = unseen_overlay.load_seen_views(tmp_path / "x", scene)
     camera = scene.cameras[scene.train[0]]
-    drawn = view.picture(gaussians, camera)
-    noted = unseen.noted(drawn, gaussians, camera, seen_by)
+    drawn = view.render_picture(gaussians, camera)
+    noted = unseen_overlay.hatch_unseen(drawn, gaussians, camera, seen_by)
     changed = (noted != drawn).any(-1)
     assert changed[camera.height // 2 :, :8].mean() > 0.15 and not changed[camera.height // 2 :, -20:].any()
-    assert unseen.photographed(tmp_path / "y", scene) == []
+    assert unseen_overlay.load_seen_views(tmp_path / "y", scene) == []
 
 
 def test_nothing_is_served_of_a_scene_that_is_not_there(tmp_path):
     with pytest.raises(ValueError, match="make scene=y all"):
-        view.Window(tmp_path / "y")
+        view.Viewer(tmp_path / "y")
 
 
 @pytest.fixture
 def window(tmp_path):
     finished(tmp_path / "x", NEEDS)
-    opened = view.Window(tmp_path / "x", port=8300)
+    opened = view.Viewer(tmp_path / "x", port=8300)
     yield opened
     opened.close()
 
@@ -135,16 +135,16 @@ def test_a_visitor_gets_a_small_picture_at_once_then_the_whole_and_another_when_
         client_id=7, camera=camera, scene=SimpleNamespace(set_background_image=lambda image, **_: drawn.append(image))
     )
     monkeypatch.setattr(window.server, "get_clients", lambda: {7: guest})
-    window._visit(guest)
+    window._serve_visitor(guest)
     wait(lambda: len(drawn) == 2)
     assert [image.shape[0] for image in drawn] == [view.MOVING, view.STILL]
-    assert np.array_equal(drawn[-1], window._drawn(view.camera_of(camera, view.STILL), camera))
+    assert np.array_equal(drawn[-1], window._render_for(view.visitor_camera(camera, view.STILL), camera))
     there = next(h for h in window.server.gui._gui_input_handle_from_uuid.values() if h.label == "what was kept")
     there.value = False
     wait(lambda: len(drawn) == 4)
     assert drawn[-1].mean() < drawn[1].mean(), "the wall is gone"
     monkeypatch.setattr(window.server, "get_clients", dict)
-    wait(lambda: 7 not in window.asked)
+    wait(lambda: 7 not in window.requests)
 
 
 @pytest.mark.parametrize("width", [1280, 390])

@@ -1,9 +1,9 @@
-"""Work-precision diagrams of the kernels: measured, drawn and held to their baselines.
+"""Work-precision diagrams of the kernels, compared with their baselines.
 
-- points.py: a measured point, a diagram, the choice of a default.
+- points.py: a measured point, a diagram, the recommended setting.
 - splat.py: the rasterizer against its float64 oracle.
 - solvers.py: the bilateral solver and the completion.
 - alignment.py: plain and robust alignment.
 - personalization.py: LoRA over steps, rank and learning rate (slow).
-- draw.py: pictures. gate.py: baselines.
+- draw.py: charts. gate.py: baselines.
 """

@@ -1,16 +1,16 @@
 """Work-precision diagrams of the kernels: `python -m benchmarks.bench --out runs/bench` (`make bench`).
 
-  footprint, cutoff   the float32 rasterizer against its float64 oracle; what skipping faint contributions costs
-  bilateral           the fast bilateral solver, along its iterations, by cell size
+  footprint, cutoff   the float32 rasterizer against its float64 oracle; the cost of skipping faint contributions
+  bilateral           the fast bilateral solver along its iterations, by cell size
   completion          the thin plate, by the size of its grid
   alignment           plain and robust, over the share of outliers
-  personalization-recorded   what LOG.md has, drawn
-  tile                (--slow) the rasterizer, by height of a tile; compiles anew for each
+  personalization-recorded   the values recorded in LOG.md
+  tile                (--slow) the rasterizer, by height of a tile; each is compiled anew
   personalization     (--slow) LoRA over steps, rank and learning rate; needs runs/demo with its stage `reference`
 
-Prints which setting each diagram recommends and why; writes a PNG for each and precision.json (every point: error and
-seconds of CPU time on one thread). --gate compares with baselines.json beside this file and ends with code 1 where a
-point is worse: in error beyond rounding, in time beyond twice the baseline, both in units of the machine's speed.
+Prints the recommended setting of each diagram; writes a PNG for each and precision.json (error and CPU seconds on one
+thread of every point). --gate compares with baselines.json beside this file and exits with 1 if a point is worse: its
+error beyond rounding, or its time beyond twice the baseline in units of the machine's speed.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from benchmarks.bench.points import recommendation
 os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = "1"  # read when numpy and torch are loaded
 ROOT = Path(__file__).resolve().parents[2]
 
-RETRIES = 2  # measurements more of what the gate stopped
+RETRIES = 2  # additional measurements of diagrams that fail the gate
 BASELINES = Path(__file__).with_name("baselines.json")
 QUICK = {
     "footprint": splat.footprint_diagram,
@@ -45,17 +45,17 @@ QUICK = {
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs/bench"))
-    parser.add_argument("--slow", action="store_true", help="tiles and personalization too")
+    parser.add_argument("--slow", action="store_true", help="also measure tiles and personalization")
     parser.add_argument("--run", type=Path, default=Path("runs/demo"), help="scene of the personalization")
-    parser.add_argument("--gate", action="store_true", help="fail where a point is worse than its baseline")
-    parser.add_argument("--write-baselines", action="store_true", help="take what is measured now as baselines")
+    parser.add_argument("--gate", action="store_true", help="fail if a point is worse than its baseline")
+    parser.add_argument("--write-baselines", action="store_true", help="store the measured values as baselines")
     parser.add_argument("--baselines", type=Path, default=BASELINES)
     parser.add_argument("--only", nargs="+", choices=[*QUICK, "tile", "personalization"], help="these diagrams")
     given = parser.parse_args()
     slow = {"tile": splat.tile_diagram, "personalization": lambda: personalization.diagram(given.run, given.out)}
     every = QUICK | slow
     chosen = given.only or [*QUICK, *(slow if given.slow else ())]
-    baselines = gate.load(given.baselines) if given.gate else None  # missing: told before any work
+    baselines = gate.load(given.baselines) if given.gate else None  # a missing file is reported before any work
     torch.set_num_threads(1)
     given.out.mkdir(parents=True, exist_ok=True)
     unit, diagrams = gate.machine_unit(), []
@@ -64,8 +64,8 @@ def main() -> int:
         diagrams.append(diagram)
         draw(diagram, given.out / f"{name}.png")
         print(recommendation(diagram), flush=True)
-    unit = min(unit, gate.machine_unit())  # the quieter moment
-    measured = gate.table(diagrams, unit)
+    unit = min(unit, gate.machine_unit())  # the less disturbed measurement
+    measured = gate.baseline_table(diagrams, unit)
     (given.out / "precision.json").write_text(json.dumps(measured, indent=1) + "\n")
     print(f"pictures and precision.json in {given.out}/; machine unit {1e3 * unit:.1f} ms")
     if given.write_baselines:
@@ -73,9 +73,9 @@ def main() -> int:
         measured["diagrams"] = old | measured["diagrams"]
         given.baselines.write_text(json.dumps(measured, indent=1) + "\n")
     worse = gate.regressions(diagrams, unit, baselines) if baselines else []
-    for _ in range(RETRIES if worse else 0):  # a busy machine's times: only what is slow every time is slow
+    for _ in range(RETRIES if worse else 0):  # on a busy machine only repeated slowness counts
         named = {line.split(":")[0] for line in worse}
-        diagrams = [gate.quicker(d, every[d.name]()) if d.name in named else d for d in diagrams]
+        diagrams = [gate.take_faster(d, every[d.name]()) if d.name in named else d for d in diagrams]
         worse = gate.regressions(diagrams, unit, baselines)
     for line in worse:
         print(f"regression: {line}", file=sys.stderr)

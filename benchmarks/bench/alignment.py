@@ -1,4 +1,4 @@
-"""Alignment of a depth map, plain least squares against the robust one, over the share of outliers."""
+"""Alignment of a depth map, plain and robust least squares, over the share of outliers."""
 
 from __future__ import annotations
 
@@ -14,9 +14,12 @@ NOISE = 0.01  # of the inliers, relative to the map's spread
 SEEDS = 5
 
 
-def maps(share: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(estimate, target, truth), [SIZE] each: truth is affine in the estimate; a share of the target is displaced by up
-    to its whole range, upwards, as things in front of a wall displace its disparity."""
+def make_maps(share: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(estimate, target, truth), [SIZE] each; the truth is affine in the estimate.
+
+    A share of the target is displaced upwards by up to its whole range, as objects in front of a wall displace its
+    disparity.
+    """
     random = np.random.default_rng(seeding.seed_for(seed, "alignment", share))
     estimate = random.uniform(0.2, 1.0, SIZE)
     truth = 2.5 * estimate + 0.3
@@ -32,13 +35,13 @@ def diagram() -> Diagram:
         for share in SHARES:
             errors = []
             for seed in range(SEEDS):
-                estimate, target, truth = maps(share, seed)
+                estimate, target, truth = make_maps(share, seed)
                 fitted = align(estimate, target, robust=robust).apply(estimate)
                 errors.append(np.sqrt(np.mean((fitted - truth) ** 2)) / truth.std())
             seconds = cpu_seconds(lambda r=robust, e=estimate, t=target: align(e, t, robust=r))
-            # What is recommended is the way, at a share of outliers that masks at an object's rim bring about.
+            # The recommendation is for 10 % outliers, which masks cause along an object's border.
             points.append(Point(curve, f"{share:.0%}", share, float(np.mean(errors)), seconds, share == 0.1))
-    why = "At 10 % outliers; without any both are equally good, and plain is what the paper's L2 says."
+    why = "At 10 % outliers; without outliers both are equally good, and plain is the paper's L2."
     return Diagram(
         "alignment",
         f"Alignment of {SIZE} pixels, inliers with {NOISE:.0%} noise",

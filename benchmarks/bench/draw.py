@@ -1,4 +1,4 @@
-"""A diagram as a picture."""
+"""Charts of the work-precision diagrams."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from benchmarks.bench.points import Diagram
 
 
 def draw(diagram: Diagram, path: Path) -> None:
-    """Error against milliseconds, a line a curve, settings written beside their points, the default ringed.
+    """Chart error against milliseconds, one line per curve, settings beside their points, the default ringed.
 
-    Where the setting is a circumstance (`diagram.over`), it is the axis, and milliseconds have a picture of their own.
+    If `diagram.over` names a condition instead of "seconds", it is the x axis and milliseconds get a second chart.
     """
     from matplotlib.figure import Figure
 

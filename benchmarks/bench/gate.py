@@ -1,4 +1,4 @@
-"""Baselines of the diagrams: error is held tightly, time loosely and in units of this machine's speed."""
+"""Baselines of the diagrams: errors have a tight tolerance, times a loose one in units of the machine's speed."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import numpy as np
 
 from benchmarks.bench.points import Diagram, cpu_seconds
 
-SLOWER = 2.0  # factor on a baseline's time, in machine units: repeats on one machine differ by up to 1.6
-LEAST_SECONDS = 2e-3  # differences of less are noise
+SLOWER = 2.0  # allowed factor on a baseline's time, in machine units; repeats on one machine differ by up to 1.6
+LEAST_SECONDS = 2e-3  # smaller differences are noise
 LEAST_ERROR = 1e-9
 
 
 def machine_unit() -> float:
-    """CPU seconds of a fixed piece of work, part arithmetic, part memory: what times are divided by."""
+    """CPU seconds of a fixed piece of arithmetic and memory work, by which times are divided."""
     random = np.random.default_rng(0)
     square, long = random.standard_normal((300, 300)), random.standard_normal(300_000)
 
@@ -30,14 +30,14 @@ def machine_unit() -> float:
     return cpu_seconds(work, repeats=7)
 
 
-def table(diagrams: list[Diagram], unit: float) -> dict[str, Any]:
-    """What goes into a baseline: name -> {"curve, setting": [error, seconds]}."""
+def baseline_table(diagrams: list[Diagram], unit: float) -> dict[str, Any]:
+    """Content of a baseline file: name -> {"curve, setting": [error, seconds]}."""
     points = {d.name: {f"{p.curve}, {p.setting}": [p.error, p.seconds] for p in d.points} for d in diagrams}
     return {"machine_unit": unit, "diagrams": points}
 
 
 def regressions(diagrams: list[Diagram], unit: float, baselines: dict[str, Any]) -> list[str]:
-    """One line for each point that is worse than its baseline, or that one of the two sides lacks."""
+    """One line for each point that is worse than its baseline, or exists on one side only."""
     found, pace = [], unit / baselines["machine_unit"]
     for diagram in diagrams:
         if diagram.name not in baselines["diagrams"]:
@@ -61,14 +61,15 @@ def regressions(diagrams: list[Diagram], unit: float, baselines: dict[str, Any])
     return found
 
 
-def quicker(diagram: Diagram, again: Diagram) -> Diagram:
-    """The diagram with the shorter of two measured times at each point; errors of the first."""
+def take_faster(diagram: Diagram, again: Diagram) -> Diagram:
+    """The diagram with the shorter of two measured times at each point, and the errors of the first."""
     seconds = {(p.curve, p.setting): p.seconds for p in again.points}
     points = [replace(p, seconds=min(p.seconds, seconds[p.curve, p.setting])) for p in diagram.points]
     return replace(diagram, points=points)
 
 
 def load(path: Path) -> dict[str, Any]:
+    """Load baselines. ValueError if the file is missing."""
     try:
         return json.loads(path.read_text())
     except FileNotFoundError:

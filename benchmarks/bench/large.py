@@ -1,20 +1,19 @@
-"""CPU splatting: `python -m benchmarks.bench.large [--sizes 100000@512x384 ...] [--repeats 9] [--threads 2]`.
+"""Speed of CPU splatting: `python -m benchmarks.bench.large [--sizes 100000@512x384 ...] [--repeats 9] [--threads 2]`.
 
-A step is one rendering (colour, depth, alpha) and its backward pass. Times are medians of one thread's CPU time, all
-sizes taken in turn; thread scaling is wall clock. Columns:
+A step is one rendering (colour, depth, alpha) and its backward pass. Times are medians of one thread's CPU time, with
+all sizes measured in turn; thread scaling is wall-clock time. Columns:
 
   pairs      pixel-Gaussian pairs that blend, millions, by the oracle's rule
   lanes      pixel-Gaussian slots that the kernel visits, millions
   fwd, bwd   milliseconds
-  step/aim   step over the aim: 0.28 us a Gaussian + 4.2 ns a pair + 8 ns a pixel, stated for a core with a measured
-             peak of 214 GF/s
-  scaled     the same with the aim's times multiplied by 214 / (peak measured in this run)
-  Glane/s    visited lanes over the pass's time, forward and backward
-  FMA share  operations that any renderer must do, over the peak: 31 a pair forward, 49 backward (an fma is two;
-             what is done once per Gaussian or pixel is not counted)
-  threads    wall time of one thread over that of --threads: median and upper quartile of pairs of steps taken one
-             after the other
-  ceiling    the same of arithmetic that shares nothing, in between those steps: what the machine had to give then
+  step/aim   step over the target time: 0.28 us per Gaussian + 4.2 ns per pair + 8 ns per pixel, stated for a core with
+             a measured peak of 214 GF/s
+  scaled     the same with the target multiplied by 214 / (peak measured in this run)
+  Glane/s    visited lanes per time of the pass, forward and backward
+  FMA share  operations that any renderer needs, over the peak: 31 per pair forward, 49 backward (an FMA is two; work
+             per Gaussian or per pixel is not counted)
+  threads    wall time of one thread over that of --threads: median and upper quartile over pairs of consecutive steps
+  ceiling    the same for independent arithmetic, run between those steps: what the machine could give at the time
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-# Before torch: it tells torch's idle threads not to spin, which costs the second thread all of its gain.
+# Imported before torch: it stops torch's idle threads from spinning, which would cost the second thread all its gain.
 from reffusion.splat import rasterizer  # isort: skip
 
 import numba
@@ -44,15 +43,15 @@ from reffusion.splat.layout import ROWS
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
 SIZES = ("5000@256x192", "20000@320x240", "100000@512x384", "100000@1008x756", "500000@1008x756")
-PER_GAUSSIAN, PER_PAIR, PER_PIXEL, PEAK = 0.28e-6, 4.2e-9, 8e-9, 214.0  # the aim: seconds, and GF/s of its machine
+PER_GAUSSIAN, PER_PAIR, PER_PIXEL, PEAK = 0.28e-6, 4.2e-9, 8e-9, 214.0  # the target: seconds, and GF/s of its machine
 FORWARD_OPERATIONS = 2 + 4 + 13 + 3 + 9  # u; log2 alpha; exp2; weight and transmittance; colour, depth, alpha
 BACKWARD_OPERATIONS = 2 + 4 + 13 + 3 + 7 + 8 + 2 + 5 + 5  # the same; shade; colours; remainder; g; its moments
-LAYERS = 35  # about so many Gaussians over each pixel, the hidden ones too
+LAYERS = 35  # approximate number of Gaussians over each pixel, hidden ones included
 
 
 @dataclass
 class Case:
-    """One scene and view, and what was measured on it (milliseconds)."""
+    """One scene and view, and its measurements in milliseconds."""
 
     gaussians: Gaussians
     camera: Camera
@@ -63,13 +62,13 @@ class Case:
 
     @property
     def aim(self) -> float:
-        """Milliseconds a step."""
+        """Target time of a step in milliseconds."""
         pixels = self.camera.width * self.camera.height
         return 1e3 * (PER_GAUSSIAN * len(self.gaussians) + PER_PAIR * self.pairs + PER_PIXEL * pixels)
 
 
 class Scaling(NamedTuple):
-    """Of --threads over one: median and upper quartile of a step's, median of the machine's."""
+    """Speedup of --threads over one thread: median and upper quartile for steps, median of the machine's ceiling."""
 
     median: float
     upper: float
@@ -79,8 +78,8 @@ class Scaling(NamedTuple):
         return f"{self.median:8.2f} {self.upper:4.2f} {self.ceiling:8.2f}"
 
 
-def scene(count: int, camera: Camera, seed: int = 0) -> Gaussians:
-    """Gaussians all over a view's frustum, of sizes that give every pixel about LAYERS of them; SH degree 3."""
+def make_scene(count: int, camera: Camera, seed: int = 0) -> Gaussians:
+    """Gaussians all over a view's frustum, of SH degree 3, sized so that about LAYERS of them cover each pixel."""
     generator = torch.Generator().manual_seed(seed)
     uniform = lambda *shape: torch.rand(*shape, generator=generator)
     normal = lambda *shape: torch.randn(*shape, generator=generator)
@@ -97,19 +96,19 @@ def scene(count: int, camera: Camera, seed: int = 0) -> Gaussians:
 
 
 def prepare(size: str) -> Case:
-    """From '100000@512x384'."""
+    """Case from a size like '100000@512x384'."""
     match = re.fullmatch(r"(\d+)@(\d+)x(\d+)", size)
     if not match:
         raise ValueError(f"size {size!r}: write it like {SIZES[0]}")
     count, width, height = map(int, match.groups())
     camera = Camera("bench", width, height, 1.1 * width, 1.1 * width, width / 2, height / 2, np.eye(4))
-    gaussians = scene(count, camera)
+    gaussians = make_scene(count, camera)
     pairs = rasterizer.accumulate(gaussians, camera, torch.ones(height, width, 1), count=True).sum().item()
     return Case(gaussians, camera, round(pairs), visited_lanes(gaussians, camera), [], [])
 
 
 def visited_lanes(gaussians: Gaussians, camera: Camera) -> int:
-    """Slots of the tile lists, as far as they are used."""
+    """Slots of the tile lists that the kernel visits."""
     parameters = [getattr(gaussians, name).numpy() for name in PARAMETERS]
     view = cpu.project_and_bin(parameters, gaussians.antialiased, np.empty((0, 2), np.float32), camera, 0)
     nothing, black = np.empty((len(gaussians), 0), np.float32), np.zeros(3, np.float32)
@@ -120,7 +119,7 @@ def visited_lanes(gaussians: Gaussians, camera: Camera) -> int:
     return 8 * int((rows[starts + used] - rows[starts]).sum())
 
 
-def step(case: Case, clock) -> tuple[float, float]:
+def time_step(case: Case, clock) -> tuple[float, float]:
     """Milliseconds of one forward and one backward pass."""
     leaves = case.gaussians.map(lambda tensor: tensor.detach().requires_grad_())
     start = clock()
@@ -133,7 +132,7 @@ def step(case: Case, clock) -> tuple[float, float]:
 
 @numba.njit(nogil=True)
 def _fma_chains(rounds):
-    """Ten chains of multiply-adds that do not wait for one another."""
+    """Ten independent chains of multiply-adds."""
     x, y = v.splat(0.999), v.splat(0.001)
     a, b, c, d, e = v.ramp(), v.ramp() * 2.0, v.ramp() * 3.0, v.ramp() * 4.0, v.ramp() * 5.0
     f, g, h, i, j = v.ramp() * 6.0, v.ramp() * 7.0, v.ramp() * 8.0, v.ramp() * 9.0, v.ramp() * 10.0
@@ -154,12 +153,12 @@ def fma_peak(rounds: int = 3_000_000, tries: int = 10) -> float:
     return 2 * 10 * v.LANES * rounds / min(seconds) / 1e9
 
 
-def first_image() -> tuple[float, float]:
-    """CPU seconds from starting Python to the first small image, kernels and bytecode in the cache; and of that, what
-    starting Python and importing torch alone take."""
+def time_first_image() -> tuple[float, float]:
+    """CPU seconds from starting Python to the first small image with warm caches, and those of torch's import."""
     image = (
         "import benchmarks.bench.large as b; import numpy as np; "
-        "view = b.Camera('v', 64, 48, 70.0, 70.0, 32.0, 24.0, np.eye(4)); b.splat.render(b.scene(100, view), view)"
+        "view = b.Camera('v', 64, 48, 70.0, 70.0, 32.0, 24.0, np.eye(4)); "
+        "b.rasterizer.render(b.make_scene(100, view), view)"
     )
     cached = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
 
@@ -173,8 +172,8 @@ def first_image() -> tuple[float, float]:
     return min(seconds(image) for _ in range(3)), min(seconds("import torch") for _ in range(3))
 
 
-def scaling(case: Case, threads: int, repeats: int) -> Scaling:
-    """Wall time of one thread over that of several, by pairs of steps taken one after the other."""
+def measure_scaling(case: Case, threads: int, repeats: int) -> Scaling:
+    """Speedup in wall time of several threads over one, from pairs of consecutive steps."""
     steps, ceilings = [], []
     with ThreadPoolExecutor(threads) as pool:
         list(pool.map(time.sleep, threads * [0.01]))  # starts the threads
@@ -188,12 +187,12 @@ def scaling(case: Case, threads: int, repeats: int) -> Scaling:
 def _best_step(case: Case, threads: int, tries: int = 2) -> float:
     """Milliseconds of wall time."""
     torch.set_num_threads(threads)
-    step(case, time.perf_counter)  # torch makes its threads anew
-    return min(sum(step(case, time.perf_counter)) for _ in range(tries))
+    time_step(case, time.perf_counter)  # torch creates its threads again
+    return min(sum(time_step(case, time.perf_counter)) for _ in range(tries))
 
 
 def _ceiling(pool: ThreadPoolExecutor, threads: int, rounds: int = 20_000_000) -> float:
-    """How many times as much arithmetic so many threads do as one does."""
+    """Speedup of independent arithmetic on that many threads."""
     start = time.perf_counter()
     _fma_chains(rounds)
     middle = time.perf_counter()
@@ -201,7 +200,7 @@ def _ceiling(pool: ThreadPoolExecutor, threads: int, rounds: int = 20_000_000) -
     return threads * (middle - start) / (time.perf_counter() - middle)
 
 
-def report(case: Case, peak: float, speedup: Scaling | None) -> str:
+def format_row(case: Case, peak: float, speedup: Scaling | None) -> str:
     """One row of the table."""
     fwd, bwd = float(np.median(case.forward)), float(np.median(case.backward))
     size = f"{len(case.gaussians)}@{case.camera.width}x{case.camera.height}"
@@ -218,7 +217,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sizes", nargs="+", default=SIZES, help="Gaussians@WIDTHxHEIGHT")
     parser.add_argument("--repeats", type=int, default=9)
-    parser.add_argument("--threads", type=int, default=2, help="compared with one; 1 leaves it out")
+    parser.add_argument("--threads", type=int, default=2, help="compared with one thread; 1 skips this")
     options = parser.parse_args()
     torch.set_num_threads(1)
     try:
@@ -226,22 +225,22 @@ def main() -> None:
     except ValueError as error:
         sys.exit(f"error: {error}")
     for case in cases:
-        step(case, time.thread_time)  # compiles, touches memory
+        time_step(case, time.thread_time)  # compiles, touches memory
     peak = fma_peak()
     for _ in range(options.repeats):
         for case in cases:
-            step(case, time.thread_time)  # caches and memory as in a fit, where one step follows another
-            for series, ms in zip((case.forward, case.backward), step(case, time.thread_time), strict=True):
+            time_step(case, time.thread_time)  # warms the caches as in a fit, where one step follows another
+            for series, ms in zip((case.forward, case.backward), time_step(case, time.thread_time), strict=True):
                 series.append(ms)
     peak = max(peak, fma_peak())
     print(f"FMA peak of one core {peak:.0f} GF/s; {v.LANES} lanes to a vector; ", end="")
-    first, torch_alone = first_image()
+    first, torch_alone = time_first_image()
     print(f"from import to first image {first:.2f} s of CPU, {torch_alone:.2f} of them torch's import")
     print(f"{'size':>16} {'pairs':>7} {'lanes':>7} {'fwd':>8} {'bwd':>8} {'step/aim':>9} {'scaled':>7} ", end="")
     print(f"{'Glane/s':>14} {'FMA share':>15} {'threads':>13} {'ceiling':>8}")
     for case in cases:
-        speedup = scaling(case, options.threads, options.repeats) if options.threads > 1 else None
-        print(report(case, peak, speedup), flush=True)
+        speedup = measure_scaling(case, options.threads, options.repeats) if options.threads > 1 else None
+        print(format_row(case, peak, speedup), flush=True)
 
 
 if __name__ == "__main__":

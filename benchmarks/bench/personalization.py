@@ -1,4 +1,4 @@
-"""Personalization over steps, rank and learning rate: as recorded in LOG.md, and, slowly, anew."""
+"""Personalization over steps, rank and learning rate: as recorded in LOG.md and, slowly, measured again."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import yaml
 from benchmarks.bench.points import Diagram, Point
 
 ROOT = Path(__file__).resolve().parents[2]
-# LOG.md, "Prior, personalization, SDS", of 2026-11-21: demo, a whole view of 64 px painted from noise, CPU seconds of
-# one thread and PSNR (dB) in the reference's hole. Base: 15.4 dB.
+# LOG.md, "Prior, personalization, SDS", 2026-11-21: demo, a whole view of 64 px painted from noise; CPU seconds of one
+# thread and PSNR (dB) in the reference's hole. The prior without personalization: 15.4 dB.
 RECORDED = {
     ("rank 16, rectangles, 16 x 32 px", "120 steps"): (136.0, 16.8),
     ("rank 16, rectangles, 16 x 32 px", "400 steps"): (395.0, 17.8),
@@ -33,12 +33,12 @@ def recorded_diagram() -> Diagram:
         "RMS error in the reference's hole, painted from noise",
         ("rank 64, whole views, the hole masked", "500 steps of 48 px"),
         points,
-        why="The laptop profile takes 120 such steps since 2026-11-26, before that 150.",
+        why="The laptop profile takes 120 such steps since 2026-11-26; before, 150.",
     )
 
 
 def diagram(run: Path, out: Path) -> Diagram:
-    """Anew, with the laptop profile's other parameters: steps at its rank and rate, ranks and rates at 200 steps.
+    """Measure again with the laptop profile's other parameters: steps, and ranks and rates at 200 steps.
 
     Raises:
         ValueError: the run has no stage `reference`.
@@ -60,7 +60,7 @@ def diagram(run: Path, out: Path) -> Diagram:
         single = {"steps": changed["steps"]} | changed.get("lora", {}) | changed.get("optimizer", {})
         name = ", ".join(f"{key} {value:g}" for key, value in single.items() if key not in ("alpha", "lr_text"))
         folder = out / "personalization" / name.replace(", ", "_").replace(" ", "")
-        if not (folder / "pytorch_lora_weights.safetensors").exists():  # an interrupted one goes on
+        if not (folder / "pytorch_lora_weights.safetensors").exists():  # an interrupted one continues
             folder.mkdir(parents=True, exist_ok=True)
             personalize.run(personalize.Params(**{**usual, **changed, **grouped}), folder, **given)
         last = trace.read_trace(folder / "trace.jsonl")[-1]

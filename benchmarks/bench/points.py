@@ -1,4 +1,4 @@
-"""A measured point, a diagram of them, and which setting a diagram recommends."""
+"""A measured point, a diagram of points, and the setting that a diagram recommends."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-NEAR_BEST = 1.1  # a setting whose error is within this factor of the best is as good
+NEAR_BEST = 1.1  # a setting is as good as the best if its error is within this factor
 
 
 @dataclass(frozen=True)
@@ -15,10 +15,10 @@ class Point:
 
     Attributes:
         curve, setting: names; together unique within a diagram.
-        x: the setting as a number, where it is one.
+        x: the setting as a number, if it is one.
         error: in the diagram's unit; less is better.
         seconds: CPU time of one call.
-        stands: may be recommended; False for what has no choice in it, e.g. an earlier iterate.
+        stands: whether it can be recommended; False for points that are no choice, such as an earlier iterate.
     """
 
     curve: str
@@ -34,13 +34,13 @@ class Diagram:
     """Error against work.
 
     Attributes:
-        name: short; of the file too.
-        title, error: for people: what is varied, and what the error is, with its unit.
-        default: (curve, setting) that the project uses; None where nothing can be chosen.
+        name: short, also of the file.
+        title, error: what is varied, and what the error is, with its unit.
+        default: (curve, setting) that the project uses; None if there is no choice.
         points: measured.
-        tolerance: factor on a baseline's error that is still no regression.
-        over: the axis: "seconds", or the name of the setting where it is no knob but a circumstance.
-        why: what the recommendation leaves out of account, if anything.
+        tolerance: factor on a baseline's error that is not yet a regression.
+        over: the x axis: "seconds", or the name of the setting if it is a condition and not a choice.
+        why: reasons for the default that errors and times do not show.
     """
 
     name: str
@@ -61,7 +61,7 @@ class Diagram:
 
 
 def recommendation(diagram: Diagram) -> str:
-    """The cheapest setting that is as good as the best, and what the default loses or wins against it."""
+    """The cheapest setting that is as good as the best, and how the default compares."""
     if diagram.default is None:
         return f"{diagram.name}: nothing to choose. {diagram.why}".strip()
     choices = [point for point in diagram.points if point.stands]
@@ -81,7 +81,7 @@ def recommendation(diagram: Diagram) -> str:
 
 
 def cpu_seconds(work: Callable[[], object], repeats: int = 3) -> float:
-    """The least CPU time of a few calls: what others do on the machine counts little."""
+    """Least CPU time of a few calls, so that other processes count little."""
     least = float("inf")
     for _ in range(repeats):
         began = time.process_time()

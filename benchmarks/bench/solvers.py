@@ -1,4 +1,4 @@
-"""The bilateral solver over iterations and cell size, the completion over its grid's size, against the truth."""
+"""The bilateral solver over iterations and cell size, and the completion over its grid size, against the truth."""
 
 from __future__ import annotations
 
@@ -13,13 +13,16 @@ from reffusion.depth import bilateral, completion
 
 HEIGHT, WIDTH = 180, 240
 CELLS = (4.0, 8.0, 16.0, 32.0)  # px
-UNKNOWNS = (60_000, 5_000, 1_500, 500)
-NOISE = 0.01
+UNKNOWNS = (60_000, 5_000, 1_500, 500)  # largest numbers of unknowns
+NOISE = 0.01  # of the target, relative to the map's spread
 
 
 def picture(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(truth, target, confidence, guide, part): [H, W] disparity of three slanted planes that meet; the same, noisy;
-    0 in a round hole over their creases, else 1; a picture whose colours change where the planes do; the plane."""
+    """(truth, target, confidence, guide, part), [H, W] each, guide [H, W, 3].
+
+    truth: disparity of three slanted planes that meet; target: with noise; confidence: 0 in a round hole over the
+    creases, else 1; guide: a picture whose colours change where the planes do; part: index of the plane.
+    """
     random = np.random.default_rng(seeding.seed_for(seed, "solvers"))
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] / WIDTH
     planes = np.stack([0.5 + 0.3 * columns, 0.95 - 0.5 * columns, 0.05 + 1.1 * rows])
@@ -32,8 +35,10 @@ def picture(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarr
 
 
 def bilateral_diagram() -> Diagram:
-    """What the solver is for: an estimate that is wrong in another way on each surface, as monocular ones are, is put
-    right in the hole by its misfit around it."""
+    """The solver corrects, in the hole, an estimate with a different error on each surface, as monocular depth has.
+
+    The error is estimated from the misfit around the hole.
+    """
     truth, target, confidence, guide, part = picture()
     hole = confidence == 0
     estimate = truth + truth.std() * np.array([0.3, -0.2, 0.1])[part] * (0.5 + truth)
@@ -51,7 +56,7 @@ def bilateral_diagram() -> Diagram:
         "RMS error in the hole over the map's spread",
         ("8 px", "converged"),
         points,
-        why="Kept at its authors' 8 px: surfaces as large and plain as these favour larger cells.",
+        why="Kept at its authors' 8 px, since surfaces as large and plain as these favour larger cells.",
     )
 
 
@@ -90,5 +95,5 @@ def completion_diagram() -> Diagram:
         "RMS error in the hole over the map's spread",
         ("with the picture", "60000 unknowns"),
         points,
-        why="The limit is for pictures of a megapixel, where the direct solver's memory grows.",
+        why="The limit bounds the direct solver's memory for pictures of a megapixel.",
     )

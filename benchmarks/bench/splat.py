@@ -1,4 +1,4 @@
-"""The rasterizer in float32 against its float64 oracle: over the size of footprints, the cut-off and the tile."""
+"""The rasterizer in float32 against its float64 oracle: over footprint size, cut-off and tile height."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from reffusion.types import PARAMETERS, Camera, Gaussians
 
 ROOT = Path(__file__).resolve().parents[2]
 VIEW = Camera("bench", 96, 72, 100.0, 100.0, 48.0, 36.0, np.eye(4))
-FOOTPRINTS = (0.3, 1.0, 3.0, 10.0, 30.0)  # px, standard deviation
+FOOTPRINTS = (0.3, 1.0, 3.0, 10.0, 30.0)  # standard deviation, px
 CUTOFFS = (1 / 2048, 1 / 1024, 1 / 512, 1 / 255, 1 / 128, 1 / 64, 1 / 32)
-TILES = (16, 32, 64, 128)  # px, height
-LAYERS = 20  # opaque layers' worth of Gaussians over a pixel, about
+TILES = (16, 32, 64, 128)  # height, px
+LAYERS = 20  # approximate number of opaque layers over a pixel
 
 
 def scene(sigma: float, seed: int = 0) -> Gaussians:
-    """Gaussians all over the view's frustum, `sigma` px in standard deviation on average; float64."""
+    """Gaussians all over the view's frustum, with a mean standard deviation of `sigma` px; float64."""
     draw = torch.Generator().manual_seed(seed)
     count = int(np.clip(LAYERS * VIEW.width * VIEW.height / (2 * np.pi * max(sigma, 1.0) ** 2), 40, 1500))
     uniform = lambda *shape: torch.rand(*shape, generator=draw, dtype=torch.float64)
@@ -38,11 +38,11 @@ def scene(sigma: float, seed: int = 0) -> Gaussians:
         log_scales=torch.log(sigma * depth / VIEW.fx)[:, None] + 0.5 * normal(count, 3),
         opacity_logits=1.5 * normal(count),
         sh=torch.cat((0.5 * normal(count, 1, 3), 0.1 * normal(count, 8, 3)), 1),
-    ).map(lambda p: p.float().double())  # so that float32 holds it exactly
+    ).map(lambda p: p.float().double())  # exactly representable in float32
 
 
 def step(gaussians: Gaussians, impl: str) -> tuple[torch.Tensor, list[torch.Tensor]]:
-    """Colour, and the gradients of a fixed function of it by all parameters."""
+    """Colour, and the gradients of a fixed function of it with respect to all parameters."""
     leaves = gaussians.map(lambda p: p.detach().clone().requires_grad_())
     color = rasterizer.render(leaves, VIEW, impl=impl).color
     rows, columns = torch.meshgrid(torch.arange(VIEW.height), torch.arange(VIEW.width), indexing="ij")
@@ -56,7 +56,7 @@ def relative(value: torch.Tensor, truth: torch.Tensor) -> float:
 
 
 def errors(gaussians: Gaussians) -> tuple[float, float]:
-    """Relative errors of float32: of the image, and the worst of the gradients."""
+    """Relative errors of float32: of the image, and the largest of the gradients."""
     (drawn, slopes), (color, gradients) = step(gaussians.map(torch.Tensor.float), "cpu"), step(gaussians, "reference")
     return relative(drawn, color), max(relative(a, b) for a, b in zip(slopes, gradients, strict=True))
 
@@ -66,7 +66,7 @@ def footprint_diagram() -> Diagram:
     for sigma in FOOTPRINTS:
         single = scene(sigma).map(torch.Tensor.float)
         seconds = cpu_seconds(lambda single=single: step(single, "cpu"), repeats=5)
-        # The median: rarely a contribution of 1/255 stands on the other side of the cut-off in float32.
+        # The median, as rarely a contribution of 1/255 falls on the other side of the cut-off in float32.
         image, worst = np.median([errors(scene(sigma, seed)) for seed in range(3)], 0).tolist()
         points.append(Point("image", f"{sigma:g} px", sigma, image, seconds))
         points.append(Point("worst gradient", f"{sigma:g} px", sigma, worst, seconds))
@@ -78,12 +78,12 @@ def footprint_diagram() -> Diagram:
         points,
         tolerance=1.5,  # rounding: another vector length sums in another order
         over="footprint, px",
-        why="Asked are 2e-5 for ordinary scenes, 1e-3 for extreme ones.",
+        why="Required are 2e-5 for ordinary scenes and 1e-3 for extreme ones.",
     )
 
 
 def cutoff_diagram() -> Diagram:
-    """What skipping faint contributions costs, in the oracle: the error against skipping none, and the work left."""
+    """Cost of skipping faint contributions, in the oracle: error against skipping none, and the remaining work."""
     gaussians, original = scene(3.0), reference.MIN_ALPHA
     draw = lambda: step(gaussians, "reference")
     ones = torch.ones(VIEW.height, VIEW.width, 1, dtype=torch.float64)
@@ -96,7 +96,7 @@ def cutoff_diagram() -> Diagram:
         for cutoff in CUTOFFS:
             reference.MIN_ALPHA = cutoff
             drawn, slopes = draw()
-            per_pair = 4.2e-9  # seconds, docs/splatting.md: the oracle's own time knows no cut-off
+            per_pair = 4.2e-9  # seconds, docs/splatting.md: the oracle's own time does not depend on the cut-off
             seconds, name = per_pair * pairs(), f"1/{1 / cutoff:.0f}"
             worst = max(relative(a, b) for a, b in zip(slopes, gradients, strict=True))
             points.append(Point("image", name, cutoff, relative(drawn, color), seconds))
@@ -109,12 +109,12 @@ def cutoff_diagram() -> Diagram:
         "relative L2 error against no cut-off",
         ("image", "1/255"),
         points,
-        why="Kept at 1/255, under half a level of 8 bits: it is 3DGS's, and what scenes are exchanged with.",
+        why="Kept at 1/255, under half a level of 8 bits, as in 3DGS, with which scenes are exchanged.",
     )
 
 
 def tile_diagram() -> Diagram:
-    """Tiles of other heights, each compiled in a process of its own (about a minute each)."""
+    """Other tile heights, each compiled in its own process (about a minute each)."""
     points = []
     for height in TILES:
         with tempfile.TemporaryDirectory() as cache:
@@ -134,7 +134,7 @@ def tile_diagram() -> Diagram:
 
 
 def measured() -> dict[str, tuple[float, float]]:
-    """Curve -> (error of the worst gradient, seconds), with the constants as they are now."""
+    """Curve -> (error of the worst gradient, seconds), with the present constants."""
     torch.set_num_threads(1)
     found = {}
     for sigma in (1.0, 3.0, 10.0):
@@ -148,6 +148,6 @@ if __name__ == "__main__":
     from reffusion.kernels import compiled
     from reffusion.splat import layout
 
-    layout.TILE_HEIGHT = int(sys.argv[1])  # before the kernels, which take it as a constant, are imported
-    compiled._cache_folder = lambda: Path(sys.argv[2]) / "kernels"  # the usual folder knows the sources only
+    layout.TILE_HEIGHT = int(sys.argv[1])  # before the import of the kernels, which take it as a constant
+    compiled._cache_folder = lambda: Path(sys.argv[2]) / "kernels"  # the usual folder depends on the sources only
     print(json.dumps(measured()))

@@ -1,4 +1,4 @@
-"""Where the parts of gpu-check work: sizes, scene, prior, and the clock."""
+"""Shared by the parts of gpu-check: sizes, scene, prior, and the clock."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from reffusion.weights import local, published
 
 @dataclass(frozen=True)
 class Sizes:
-    """Of what is measured: rows of a view (a quarter wider), Gaussians, samples, steps and views of the fit."""
+    """Sizes of what is measured: rows of a view (a quarter wider), Gaussians, samples, steps and views of the fit."""
 
     rows: int
     gaussians: int
@@ -34,19 +34,21 @@ class Sizes:
     repeats: int
     critic: Adversarial
     shape: full_size.Shape
-    oracle: tuple[int, int] = (400, 200)  # Gaussians and width of what is compared with the oracle
+    oracle: tuple[int, int] = (400, 200)  # Gaussians and image width of the comparison with the oracle
 
 
 PAPER = Sizes(1280, 500_000, 16, 400, 12, 3, Adversarial(), full_size.SD2)  # 1600 x 1280 px
-TOY = Sizes(40, 300, 2, 4, 3, 1, Adversarial(patches=8, size=8, width=8), full_size.shrunk(full_size.SD2), (100, 70))
+TOY = Sizes(40, 300, 2, 4, 3, 1, Adversarial(patches=8, size=8, width=8), full_size.shrink(full_size.SD2), (100, 70))
 
 
 @dataclass
 class Bench:
-    """Where the parts work, and the prior that the last of them left: two in a row may need the same.
+    """Device and sizes of the parts, and the last prior, which the next part may need again.
 
     Attributes:
-        device: "cuda" or "cpu". out: a folder for what a part writes.
+        sizes: of what is measured.
+        device: "cuda" or "cpu".
+        out: folder for files of a part.
     """
 
     sizes: Sizes
@@ -55,7 +57,7 @@ class Bench:
     _prior: tuple[str, Prior, str] | None = field(default=None, repr=False)
 
     def prior(self, half: str) -> tuple[Prior, str]:
-        """Of that precision on a GPU, else float32; the published weights where they are here, else random ones."""
+        """(prior, source): in that precision on a GPU, else float32; published weights if present, else random ones."""
         if self._prior is None or self._prior[0] != half:
             self._prior = None
             gc.collect()
@@ -63,7 +65,7 @@ class Bench:
             if shape == full_size.SD2 and local.locate(published.SD2) is not None:
                 self._prior = half, load_prior(published.SD2, self.device, dtype), published.SD2
             else:
-                self._prior = half, full_size.build(shape, dtype, self.device), "random"
+                self._prior = half, full_size.build_prior(shape, dtype, self.device), "random"
         return self._prior[1], self._prior[2]
 
     def forget_prior(self) -> None:
@@ -75,9 +77,9 @@ class Bench:
         masked = torch.rand(len(made), generator=generator(0, "labels")) < 0.1
         return made, masked.to(self.device)
 
-    def measured(self, work: Callable[[], dict[str, float] | None]) -> dict[str, Any]:
-        """Seconds (median, after a run to warm up), peak of the GPU (or of living tensors), what `work` says."""
-        said, seconds = work() or {}, []
+    def measure(self, work: Callable[[], dict[str, float] | None]) -> dict[str, Any]:
+        """Median seconds after a warm-up, peak memory of the GPU (or of live tensors), and the values of `work`."""
+        values, seconds = work() or {}, []
         for _ in range(self.sizes.repeats):
             self._wait()
             began = time.perf_counter()
@@ -89,7 +91,7 @@ class Bench:
         if self.device == "cuda":
             found["peak_gb"] += torch.cuda.memory_allocated() / 1e9
             found["reserved_gb"] = torch.cuda.max_memory_reserved() / 1e9
-        return found | said
+        return found | values
 
     def _wait(self) -> None:
         if self.device == "cuda":

@@ -1,12 +1,12 @@
-"""Does the production path work on this GPU, how fast, in how much memory? A JSON file and a table, within 8 minutes.
+"""Check of the production path on this GPU: does it work, how fast, in how much memory? Takes up to 8 minutes.
 
 - gsplat against the float64 oracle: colour, depth, alpha, features, weights and their gradients; antialiased, and in a
   crop; SSIM's gradient.
-- One step of each loss at the paper's sizes with the full-size SD2-inpainting: its weights where they are on this
-  machine, else random ones of the same shapes. Seconds a step (the median of three), memory taken and reserved.
-- A fit at 1600 px: images a second, and that it gets better; the hours that the paper's steps would take.
+- One step of each loss at the paper's sizes with the full-size SD2-inpainting, with its weights if they are on this
+  machine, else random ones of the same shapes: seconds per step (median of three), memory allocated and reserved.
+- A fit at 1600 px: images per second, and that it improves; the hours that the paper's steps would take.
 
-A part that fails says why in a line, and the others go on; the file is written after each.
+A part that fails reports why in a line, and the others continue. A JSON file and a table are written after each part.
 
     python -m benchmarks.gpu.check --out runs/gpu-check      (--device cpu: the same parts, small, on the CPU)
 """
@@ -35,16 +35,16 @@ from reffusion.params.distill import Params as Distill
 from reffusion.params.fit import Params as Fit
 from reffusion.params.personalize import Params as Personalize
 
-LIMIT = 480.0  # seconds, gsplat's compilation left out
-# The critic's step is the one that is most likely to run out of memory: after all that must not be lost with it.
+SECONDS_LIMIT = 480.0  # without gsplat's compilation
+# The critic's step comes last, since it is the most likely to run out of memory.
 PARTS: dict[str, Callable[[Bench], dict[str, Any]]] = {
-    "splatting": exact.splatting,
-    "splatting, antialiased": lambda bench: exact.splatting(bench, antialiased=True),
-    "splatting, a crop": lambda bench: exact.splatting(bench, crop=True),
-    "SSIM": exact.similarity,
+    "splatting": exact.check_splatting,
+    "splatting, antialiased": lambda bench: exact.check_splatting(bench, antialiased=True),
+    "splatting, a crop": lambda bench: exact.check_splatting(bench, crop=True),
+    "SSIM": exact.check_similarity,
     "reconstruction": steps.reconstruction,
     "reference": steps.reference,
-    "fit": steps.fitted_scene,
+    "fit": steps.fit_scene,
     "personalization": steps.personalization,
     "SDS": steps.distillation,
     "depth": steps.depth,
@@ -53,23 +53,24 @@ PARTS: dict[str, Callable[[Bench], dict[str, Any]]] = {
 
 
 def check(device: str, out: Path) -> dict[str, Any]:
-    """All of it; what fails says why and does not stop the rest. On the CPU small."""
+    """Run all parts and write the report; a failing part does not stop the others. On the CPU sizes are small."""
     out.mkdir(parents=True, exist_ok=True)
     bench = Bench(PAPER if device == "cuda" else TOY, device, out)
-    report: dict[str, Any] = {"machine": machine(device), "parts": {}}
+    report: dict[str, Any] = {"machine": describe_machine(device), "parts": {}}
     began = time.perf_counter()
     for name, part in PARTS.items():
-        report["parts"][name] = result_of(part, bench, time.perf_counter() - began)
-        report["projected_hours"] = projected(report["parts"])
+        report["parts"][name] = run_part(part, bench, time.perf_counter() - began)
+        report["projected_hours"] = project_hours(report["parts"])
         report["seconds"] = time.perf_counter() - began
-        write(out / "gpu_check.json", json.dumps(report, indent=1) + "\n")
-        write(out / "gpu_check.md", table(report))
+        write_atomically(out / "gpu_check.json", json.dumps(report, indent=1) + "\n")
+        write_atomically(out / "gpu_check.md", table(report))
     return report
 
 
-def result_of(part: Callable[[Bench], dict[str, Any]], bench: Bench, seconds: float) -> dict[str, Any]:
-    if seconds > LIMIT:
-        return {"skipped": f"{LIMIT:.0f} s are over"}
+def run_part(part: Callable[[Bench], dict[str, Any]], bench: Bench, seconds: float) -> dict[str, Any]:
+    """Result of a part, or the reason why it was skipped or failed."""
+    if seconds > SECONDS_LIMIT:
+        return {"skipped": f"{SECONDS_LIMIT:.0f} s are over"}
     try:
         return part(bench)
     except Exception as error:
@@ -82,15 +83,15 @@ def result_of(part: Callable[[Bench], dict[str, Any]], bench: Bench, seconds: fl
             torch.cuda.reset_peak_memory_stats()
 
 
-def write(path: Path, text: str) -> None:
-    """At once or not at all."""
+def write_atomically(path: Path, text: str) -> None:
+    """Write a file completely or not at all."""
     partial = path.with_suffix(path.suffix + ".writing")
     partial.write_text(text)
     os.replace(partial, path)
 
 
-def projected(parts: dict[str, dict[str, Any]]) -> dict[str, float]:
-    """Hours that the paper's steps take at these seconds a step; of stages all of whose terms were measured."""
+def project_hours(parts: dict[str, dict[str, Any]]) -> dict[str, float]:
+    """Hours of the paper's steps at the measured seconds per step, for stages of which all terms were measured."""
     seconds = {name: part["seconds"] for name, part in parts.items() if "seconds" in part}
     hours, distill = {}, Distill()
     if "images_per_second" in parts.get("fit", {}):
@@ -104,18 +105,21 @@ def projected(parts: dict[str, dict[str, Any]]) -> dict[str, float]:
     return hours
 
 
-def machine(device: str) -> dict[str, Any]:
-    """What the figures hold for. Loads gsplat's extension, builds it where `make gpu` has not: outside all parts."""
-    said: dict[str, Any] = {"device": device, "torch": torch.__version__}
+def describe_machine(device: str) -> dict[str, Any]:
+    """The machine that the figures hold for.
+
+    Loads gsplat's extension before all parts, and builds it if `make gpu` has not.
+    """
+    facts: dict[str, Any] = {"device": device, "torch": torch.__version__}
     if device == "cpu":
-        return said
+        return facts
     began = time.perf_counter()
     from gsplat.cuda import _backend
 
-    facts, tf32 = torch.cuda.get_device_properties(0), (torch.backends.cuda.matmul, torch.backends.cudnn)
-    return said | {
-        "device": facts.name,
-        "memory_gb": round(facts.total_memory / 1e9, 1),
+    properties, tf32 = torch.cuda.get_device_properties(0), (torch.backends.cuda.matmul, torch.backends.cudnn)
+    return facts | {
+        "device": properties.name,
+        "memory_gb": round(properties.total_memory / 1e9, 1),
         "cuda": torch.version.cuda,
         "driver": facts_of_machine().driver,
         "gsplat": importlib.metadata.version("gsplat"),
@@ -128,12 +132,12 @@ def machine(device: str) -> dict[str, Any]:
 
 
 def table(report: dict[str, Any]) -> str:
-    """The report for people, in Markdown: a row for each part."""
+    """The report as Markdown, a row per part."""
     rows = ["| what | seconds | peak GB | more |", "| --- | --- | --- | --- |"]
     for name, part in report["parts"].items():
         more = {key: value for key, value in part.items() if key not in ("seconds", "peak_gb")}
-        said = ", ".join(f"{key} {_short(value)}" for key, value in more.items())
-        rows.append(f"| {name} | {_short(part.get('seconds'))} | {_short(part.get('peak_gb'))} | {said} |")
+        details = ", ".join(f"{key} {_short(value)}" for key, value in more.items())
+        rows.append(f"| {name} | {_short(part.get('seconds'))} | {_short(part.get('peak_gb'))} | {details} |")
     facts = ", ".join(f"{key} {value}" for key, value in report["machine"].items())
     hours = _short(report["projected_hours"]) or "not all measured"
     last = f"Hours at the paper's steps: {hours}."

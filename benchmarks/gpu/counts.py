@@ -1,7 +1,7 @@
-"""What the parts of a step compute and move at full size, counted without computing: the table of the cost model.
+"""Operations and bytes of the parts of a step at full size, counted without computing: the table of the cost model.
 
-Floating-point operations of products and convolutions, and the bytes that all operations read and write (an attention's
-matrices left out: a GPU's kernels do not write them), on torch's device without memory.
+Counts floating-point operations of matrix products and convolutions, and the bytes that all operations read and write
+(without attention matrices, which GPU kernels do not write), on torch's meta device.
 
     python -m benchmarks.gpu.counts > reffusion/cost/counts.py
 """
@@ -25,12 +25,12 @@ from reffusion.gaussians.ssim import dssim_torch
 from reffusion.prior import denoising, diffusion
 from reffusion.prior.model import Prior
 
-HEIGHT, WIDTH, GAUSSIANS = 300, 400, 1000  # of what is counted by pixel, and by Gaussian
+HEIGHT, WIDTH, GAUSSIANS = 300, 400, 1000  # of what is counted per pixel and per Gaussian
 PATCHES, SIDE = 64, 64  # the paper's
 
 
-class _Moved(TorchDispatchMode):
-    """Counts the bytes of what each operation is given and makes; views move nothing."""
+class _TrafficCounter(TorchDispatchMode):
+    """Counts the bytes of each operation's inputs and outputs; views move nothing."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -49,37 +49,39 @@ class _Moved(TorchDispatchMode):
 
 
 def _attention(tensor: Tensor) -> bool:
-    """A matrix of who looks at whom, a row for each pixel of a latent."""
+    """True for an attention matrix, with a row for each pixel of a latent."""
     return tensor.ndim >= 3 and min(tensor.shape[-2:]) >= 1024
 
 
-def counted(work: Callable[[], object]) -> dict[str, float]:
+def count_work(work: Callable[[], object]) -> dict[str, float]:
     """TFLOP and GB (1e9 bytes) of one call."""
-    with FlopCounterMode(display=False) as flops, _Moved() as moved:
+    with FlopCounterMode(display=False) as flops, _TrafficCounter() as moved:
         work()
     return {"tflop": round(flops.get_total_flops() / 1e12, 5), "gb": round(moved.bytes / 1e9, 5)}
 
 
-def of_prior(shape: full_size.Shape, name: str) -> dict[str, dict[str, float]]:
-    """One sample of the prior's native size: the UNet's answer, encoding, encoding and the way back, decoding, and a
-    personalization sample forward and backward."""
+def count_prior(shape: full_size.Shape, name: str) -> dict[str, dict[str, float]]:
+    """Counts of one sample at the prior's native size.
+
+    The UNet, encoding, encoding with its backward pass, decoding, and a personalization sample forward and backward.
+    """
     with torch.device("meta"):
         made = full_size.networks(shape, torch.float16)
-    prior = full_size.assembled(shape, made, "meta")
+    prior = full_size.assemble_prior(shape, made, "meta")
     size, side = prior.native_size, prior.native_size // prior.factor
     image = torch.zeros(1, 3, size, size, device="meta")
     latents = torch.zeros(1, 4, side, side, device="meta")
     found = {
-        "unet": counted(lambda: answered(prior, latents)),
-        "encode": counted(_without(diffusion.encode, prior, image)),
+        "unet": count_work(lambda: run_unet(prior, latents)),
+        "encode": count_work(_without(diffusion.encode, prior, image)),
     }
-    found["decode"] = counted(_without(diffusion.decode, prior, latents))
-    if prior.text_encoder_2 is None:  # SDXL paints references only
+    found["decode"] = count_work(_without(diffusion.decode, prior, latents))
+    if prior.text_encoder_2 is None:  # SDXL only inpaints references
         graded = image.clone().requires_grad_()
-        found["encode and back"] = counted(lambda: diffusion.encode(prior, graded).sum().backward())
+        found["encode and back"] = count_work(lambda: diffusion.encode(prior, graded).sum().backward())
         full_size.trainer(prior, 1)
         picture = full_size.reference(size)
-        found["personalize a sample"] = counted(lambda: denoising.one_sample(prior, [picture], 0))
+        found["personalize a sample"] = count_work(lambda: denoising.one_sample(prior, [picture], 0))
     return {f"{name} {part}": each for part, each in found.items()}
 
 
@@ -92,14 +94,14 @@ def _without(function: Callable[..., Tensor], *given: Any) -> Callable[[], Tenso
 
 
 @torch.no_grad()
-def answered(prior: Prior, latents: Tensor) -> None:
+def run_unet(prior: Prior, latents: Tensor) -> None:
     text = torch.zeros(1, 78, prior.unet.config.cross_attention_dim, device="meta")
     condition = torch.cat([latents[:, :1], latents], 1)
     diffusion.raw_prediction(prior, latents, torch.zeros(1, dtype=torch.long, device="meta"), condition, text)
 
 
-def critic_step(width: int) -> dict[str, float]:
-    """What `Adversary.learn` and `.loss` do: the critic's step with R1, then its word on the fake patches."""
+def count_critic_step(width: int) -> dict[str, float]:
+    """Counts of `Adversary.learn` and `.loss`: the critic's step with R1, then its answer to the fake patches."""
     critic = Critic(SIDE, width, torch.Generator()).to("meta")
     real = torch.zeros(PATCHES, 3, SIDE, SIDE, device="meta")
     leaf = torch.zeros(PATCHES, 3, SIDE, SIDE, device="meta", requires_grad=True)
@@ -111,11 +113,11 @@ def critic_step(width: int) -> dict[str, float]:
         critic.requires_grad_(False)
         generator_loss(critic(1 * leaf)).backward()
 
-    return counted(work)
+    return count_work(work)
 
 
-def depth_network(height: int = 518, width: int = 686) -> dict[str, float]:
-    """Depth Anything V2 Small on a view of 4:3."""
+def count_depth_network(height: int = 518, width: int = 686) -> dict[str, float]:
+    """Counts of Depth Anything V2 Small on a 4:3 view."""
     from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
 
     backbone = Dinov2Config(
@@ -128,22 +130,25 @@ def depth_network(height: int = 518, width: int = 686) -> dict[str, float]:
             fusion_hidden_size=64, head_hidden_size=32,
         ))  # fmt: skip
     picture = torch.zeros(1, 3, height, width, device="meta")
-    return counted(lambda: _without(lambda: model(pixel_values=picture).predicted_depth)())
+    return count_work(lambda: _without(lambda: model(pixel_values=picture).predicted_depth)())
 
 
-def loss_of_a_pixel() -> dict[str, float]:
-    """Reconstruction loss there and back, a pixel of three channels; gsplat reads and writes as much again."""
+def count_pixel_loss() -> dict[str, float]:
+    """Counts of the reconstruction loss and its backward pass per million pixels of three channels.
+
+    gsplat reads and writes as much again.
+    """
     image = torch.zeros(HEIGHT, WIDTH, 3, requires_grad=True)
 
     def work() -> None:
         difference = (image - torch.zeros(HEIGHT, WIDTH, 3)).abs().mean()
         (0.8 * difference + 0.2 * dssim_torch(image, torch.zeros(HEIGHT, WIDTH, 3))).backward()
 
-    return _scaled(counted(work), HEIGHT * WIDTH)
+    return _scaled(count_work(work), HEIGHT * WIDTH)
 
 
-def adam_of_a_gaussian() -> dict[str, float]:
-    """One step of Adam for each Gaussian of degree 3, all of them visible."""
+def count_adam() -> dict[str, float]:
+    """Counts of one Adam step per million Gaussians of degree 3, all visible."""
     scene = full_size.gaussians(GAUSSIANS, "cpu")
     optimizer = optimize.GaussianOptimizer(scene)
     rates = optimizer.rates.at(0.0, optimizer.gaussians)
@@ -153,19 +158,19 @@ def adam_of_a_gaussian() -> dict[str, float]:
         updates.append(adam.Update(*rows, torch.zeros_like(rows[0]), rates[name], 1.0))
     everyone, steps = torch.ones(GAUSSIANS, dtype=torch.bool), torch.ones(GAUSSIANS, dtype=torch.int32)
     given = (steps, everyone, ~everyone, *adam.unbiasing((0.9, 0.999), 1, steps.device), 0.9, 0.999, 1e-15)
-    return _scaled(counted(lambda: adam.adam(updates, *given)), GAUSSIANS)
+    return _scaled(count_work(lambda: adam.adam(updates, *given)), GAUSSIANS)
 
 
 def _scaled(found: dict[str, float], count: int) -> dict[str, float]:
-    """Per a million."""
+    """Values per million."""
     return {name: round(value * 1e6 / count, 5) for name, value in found.items()}
 
 
 def main() -> None:
-    found = of_prior(full_size.SD2, "SD2") | of_prior(full_size.SDXL, "SDXL")
-    found |= {f"critic {width}": critic_step(width) for width in (256, 512)}
-    found |= {"depth network": depth_network(), "loss, a million pixels": loss_of_a_pixel()}
-    found["Adam, a million Gaussians"] = adam_of_a_gaussian()
+    found = count_prior(full_size.SD2, "SD2") | count_prior(full_size.SDXL, "SDXL")
+    found |= {f"critic {width}": count_critic_step(width) for width in (256, 512)}
+    found |= {"depth network": count_depth_network(), "loss, a million pixels": count_pixel_loss()}
+    found["Adam, a million Gaussians"] = count_adam()
     rows = "".join(f"    {json.dumps(name)}: {json.dumps(each)},\n" for name, each in found.items())
     print('"""TFLOP and GB of the parts of a step: made by `python -m benchmarks.gpu.counts`."""')
     print(f"\nCOUNTS = {{\n{rows}}}")

@@ -1,4 +1,4 @@
-"""gsplat and SSIM on a device against float64 on the CPU: every output, and every gradient."""
+"""gsplat and SSIM on a device against float64 on the CPU: every output and every gradient."""
 
 from __future__ import annotations
 
@@ -16,16 +16,19 @@ from reffusion.seeding import generator
 from reffusion.splat import rasterizer
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
-# Errors of gsplat's formulas in float32, emulated: 4e-7 of the values, 2e-6 of the gradients. Its fast exponential may
-# err by 8 units in the last place more, 1e-6. Ten and fifty times that: an error of the method is far above.
+# Relative errors. Emulated in float32, gsplat's formulas err by 4e-7 in values and 2e-6 in gradients; its fast
+# exponential may add 8 units in the last place, 1e-6. The bounds are ten and fifty times that; errors of method are far
+# above.
 VALUES, GRADIENTS = 1e-5, 1e-4
-# A contribution that float32 puts on the other side of 1/255 changes a pixel by as much: these are not errors.
+# A contribution that falls on the other side of 1/255 in float32 changes a pixel by as much, which is no error.
 FLIPPED = 1e-4  # share of the pixels that may differ by more
-COUNTED = 1e-3  # and what they may change of the numbers of blended pixels
+COUNTED = 1e-3  # allowed relative change of the numbers of blended pixels by these
 
 
-def drawn(bench: Bench, scene: Gaussians, camera: Camera, impl: str, dtype: torch.dtype) -> dict[str, Tensor]:
-    """What one implementation makes of a scene: pictures, sums of weights, the gradients of a sum over all of it."""
+def render_with_gradients(
+    bench: Bench, scene: Gaussians, camera: Camera, impl: str, dtype: torch.dtype
+) -> dict[str, Tensor]:
+    """Images, sums of weights and counts of one implementation, and the gradients of a random sum over its images."""
     device = "cpu" if impl == "reference" else bench.device
     place = lambda tensor: tensor.detach().to(device, dtype).clone().requires_grad_()
     leaf = scene.map(place)
@@ -47,8 +50,8 @@ def drawn(bench: Bench, scene: Gaussians, camera: Camera, impl: str, dtype: torc
     return {name: tensor.cpu().double() for name, tensor in found.items()}
 
 
-def compared(found: dict[str, Tensor], truth: dict[str, Tensor]) -> dict[str, Any]:
-    """Relative errors: of pictures that which only `FLIPPED` of the numbers exceed, over the largest; else by norm."""
+def compare_blocks(found: dict[str, Tensor], truth: dict[str, Tensor]) -> dict[str, Any]:
+    """Relative errors: of images the one that only `FLIPPED` of the values exceed, over the maximum; else by norm."""
     errors, limits = {}, {}
     for name, true in truth.items():
         difference = (found[name] - true).abs()
@@ -62,22 +65,22 @@ def compared(found: dict[str, Tensor], truth: dict[str, Tensor]) -> dict[str, An
     return {"errors": errors, "ok": not beyond} | ({"beyond": ", ".join(beyond)} if beyond else {})
 
 
-def splatting(bench: Bench, antialiased: bool = False, crop: bool = False) -> dict[str, Any]:
+def check_splatting(bench: Bench, antialiased: bool = False, crop: bool = False) -> dict[str, Any]:
     count, width = bench.sizes.oracle
     height = width * 4 // 5
     camera = Camera("oracle", width, height, width, width, width / 2, height / 2, np.eye(4))
     camera = camera.cropped(width // 3, height // 4, width // 3, height // 3) if crop else camera
     scene = replace(full_size.gaussians(count, "cpu").map(Tensor.detach), antialiased=antialiased)
     impl = "cuda" if bench.device == "cuda" else "cpu"
-    found = drawn(bench, scene, camera, impl, torch.float32)
-    return compared(found, drawn(bench, scene, camera, "reference", torch.float64))
+    found = render_with_gradients(bench, scene, camera, impl, torch.float32)
+    return compare_blocks(found, render_with_gradients(bench, scene, camera, "reference", torch.float64))
 
 
-def similarity(bench: Bench) -> dict[str, Any]:
-    """D-SSIM and its gradient in float32 on the device against float64: TF32 would be off by a tenth."""
+def check_similarity(bench: Bench) -> dict[str, Any]:
+    """D-SSIM and its gradient in float32 on the device against float64; TF32 would err by a tenth."""
     draw, size = generator(0, "ssim"), bench.sizes.oracle[1]
     image, other = (torch.rand(size, size, 3, generator=draw, dtype=torch.float64) for _ in range(2))
-    image, other = 0.5 + 0.1 * image, 0.5 + 0.1 * other  # little contrast: most is lost in the subtraction
+    image, other = 0.5 + 0.1 * image, 0.5 + 0.1 * other  # low contrast loses most digits in the subtraction
     weights = torch.rand(size, size, generator=draw, dtype=torch.float64) > 0.3
 
     def told(loss, dtype: torch.dtype, device: str) -> dict[str, Tensor]:
@@ -86,4 +89,4 @@ def similarity(bench: Bench) -> dict[str, Any]:
         (slope,) = torch.autograd.grad(value, leaf)
         return {"value": value.detach().cpu().double(), "gradient": slope.cpu().double()}
 
-    return compared(told(dssim, torch.float32, bench.device), told(dssim_torch, torch.float64, "cpu"))
+    return compare_blocks(told(dssim, torch.float32, bench.device), told(dssim_torch, torch.float64, "cpu"))

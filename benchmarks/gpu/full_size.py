@@ -1,7 +1,7 @@
 """One personalization step and one SDS step of the full-size SD2-inpainting on this machine, with random weights.
 
-The configurations below are the published ones, written down as facts; the steps are the library's own. Also checked:
-the LoRA that was trained, saved and merged into a fresh model of the same weights gives the trained model's epsilon.
+The configurations below are the published ones; the steps are the library's own. It also checks that the LoRA, saved
+and merged into a fresh model of the same weights, gives the trained model's epsilon.
 
     python -m benchmarks.gpu.full_size --dtype bfloat16 --out runs/full-size      (--toy: the same at a small size)
 """
@@ -35,7 +35,7 @@ TINY = Path(__file__).resolve().parents[2] / "priors" / "tiny"
 
 @dataclass(frozen=True)
 class Shape:
-    """The configurations of a prior's parts; `texts` has one entry, of SDXL two."""
+    """Configurations of a prior's parts; `texts` has one entry, or two for SDXL."""
 
     unet: dict[str, Any]
     vae: dict[str, Any]
@@ -101,8 +101,8 @@ SDXL = Shape(
 )
 
 
-def shrunk(shape: Shape) -> Shape:
-    """The same kinds of layers with few channels, 32 px: a forward pass in milliseconds."""
+def shrink(shape: Shape) -> Shape:
+    """The same kinds of layers with few channels at 32 px, for forward passes in milliseconds."""
     second = len(shape.texts) == 2
     depth = len(shape.unet["block_out_channels"])
     unet = shape.unet | {"sample_size": 16, "block_out_channels": (32, 64, 64, 64)[:depth], "cross_attention_dim": 64}
@@ -120,7 +120,7 @@ def shrunk(shape: Shape) -> Shape:
 
 
 def networks(shape: Shape, dtype: torch.dtype) -> dict[str, torch.nn.Module]:
-    """UNet and text encoders in `dtype`, the VAE in float32; on torch's default device (`meta` only counts)."""
+    """UNet and text encoders in `dtype`, and the VAE in float32, on torch's default device (`meta` only counts)."""
     from diffusers import AutoencoderKL, UNet2DConditionModel
     from transformers import CLIPTextConfig, CLIPTextModel, CLIPTextModelWithProjection
 
@@ -136,43 +136,43 @@ def networks(shape: Shape, dtype: torch.dtype) -> dict[str, torch.nn.Module]:
     return made | {"vae": AutoencoderKL(**shape.vae)}
 
 
-def count(shape: Shape) -> int:
-    """Parameters of all parts, without making one."""
+def count_parameters(shape: Shape) -> int:
+    """Number of parameters of all parts, without allocating them."""
     with torch.device("meta"):
         return sum(p.numel() for part in networks(shape, torch.float32).values() for p in part.parameters())
 
 
-def living(shape: Shape, dtype: torch.dtype) -> dict[str, float]:
-    """GB of weights and, for one sample, of the most tensors that live at once: counted, nothing is computed.
+def peak_memory(shape: Shape, dtype: torch.dtype) -> dict[str, float]:
+    """GB of the weights and of the peak of live tensors for one sample, counted on the meta device.
 
-    On torch's device without memory; attention is taken apart there, so that a GPU's kernels need less.
+    Attention is decomposed there, so GPU kernels need less.
     """
     with torch.device("meta"):
         made = networks(shape, dtype)
-    prior = assembled(shape, made, "meta")
+    prior = assemble_prior(shape, made, "meta")
     picture = reference(prior.native_size)
     steps = {"inpainting": memory.answering, "SDS": memory.encoding}
-    said = {"weights": prior.bytes}
-    said |= {name: memory.peak_bytes(lambda s=step: s(prior), "meta") for name, step in steps.items()}
+    sizes = {"weights": prior.bytes}
+    sizes |= {name: memory.peak_bytes(lambda s=step: s(prior), "meta") for name, step in steps.items()}
     trainer(prior, 1)
     training = lambda: denoising.one_sample(prior, [picture], 0)
-    said["personalization"] = memory.peak_bytes(training, "meta")
+    sizes["personalization"] = memory.peak_bytes(training, "meta")
     recomputing(prior)
-    said["SDS, checkpointing"] = memory.peak_bytes(lambda: memory.encoding(prior), "meta")
-    said["personalization, checkpointing"] = memory.peak_bytes(training, "meta")
-    return {name: round(count / 1e9, 6) for name, count in said.items()}
+    sizes["SDS, checkpointing"] = memory.peak_bytes(lambda: memory.encoding(prior), "meta")
+    sizes["personalization, checkpointing"] = memory.peak_bytes(training, "meta")
+    return {name: round(count / 1e9, 6) for name, count in sizes.items()}
 
 
-def build(shape: Shape, dtype: torch.dtype, device: str = "cpu", seed: int = 0) -> Prior:
-    """A prior of random weights, made on the device: the same there for equal seeds."""
+def build_prior(shape: Shape, dtype: torch.dtype, device: str = "cpu", seed: int = 0) -> Prior:
+    """A prior with random weights, created on the device; equal seeds give equal weights there."""
     with torch.random.fork_rng(), torch.device(device):
         torch.manual_seed(seed)
         made = networks(shape, dtype)
-    return assembled(shape, made, device)
+    return assemble_prior(shape, made, device)
 
 
-def assembled(shape: Shape, made: dict[str, torch.nn.Module], device: str) -> Prior:
-    """The networks with a tokenizer (the embedded prior's: words do not matter here) and SD2's schedule."""
+def assemble_prior(shape: Shape, made: dict[str, torch.nn.Module], device: str) -> Prior:
+    """Prior from networks, the embedded prior's tokenizer (words do not matter here) and SD2's schedule."""
     from diffusers import DDIMScheduler
     from transformers import CLIPTokenizer
 
@@ -200,7 +200,7 @@ def reference(size: int) -> crops.Picture:
 
 
 def trainer(prior: Prior, batch: int) -> tuple[dict[str, list], torch.optim.Optimizer, Params]:
-    """The paper's LoRA on a prior: rank 8, alpha 16, dropout 0.1 on the attention layers; AdamW."""
+    """The paper's LoRA on a prior (rank 8, alpha 16, dropout 0.1, attention layers), with AdamW."""
     training = Params(optimizer=Optimizer(batch=batch))
     chosen, rates = training.lora, training.optimizer
     trained = lora.add(prior, chosen.rank, chosen.alpha, chosen.dropout, chosen.layers, training.seed)
@@ -209,7 +209,7 @@ def trainer(prior: Prior, batch: int) -> tuple[dict[str, list], torch.optim.Opti
 
 
 def personalization_step(prior: Prior, picture: crops.Picture, batch: int, folder: Path) -> dict[str, float]:
-    """One optimiser step, and the LoRA saved in `folder`."""
+    """One optimiser step; the LoRA is saved to `folder`."""
     trained, optimizer, training = trainer(prior, batch)
     loss = train_step(prior, optimizer, [picture], training, 0)
     lora.set_dropout(prior, False)
@@ -220,7 +220,7 @@ def personalization_step(prior: Prior, picture: crops.Picture, batch: int, folde
 
 @torch.no_grad()
 def epsilon(prior: Prior) -> torch.Tensor:
-    """What the prior answers to fixed noise, a fixed picture and a prompt: compared before and after saving."""
+    """The prior's answer to fixed noise, a fixed picture and a prompt, compared before and after saving."""
     side, draw = prior.native_size // prior.factor, generator(0, "epsilon")
     channels = prior.vae.config.latent_channels
     noisy, shown = (torch.randn(1, channels, side, side, generator=draw).to(prior.device) for _ in range(2))
@@ -240,7 +240,7 @@ def train_view(size: int, device: str) -> TrainView:
 
 
 def gaussians(number: int, device: str, degree: int = 3) -> Gaussians:
-    """Random ones that fill the view of `train_view`."""
+    """Random Gaussians that fill the view of `train_view`."""
     draw = generator(0, "gaussians")
     rand = lambda *shape: torch.rand(*shape, generator=draw)
     means = torch.cat([rand(number, 2) * 2.4 - 1.2, 2 + rand(number, 1)], 1)
@@ -266,8 +266,8 @@ def sds_step(
 # ---------------------------------------------------------------------------------------------------------------- main
 
 
-def timed(report: dict[str, Any], name: str, work: Any) -> Any:
-    """The result of `work`, its seconds and the process's peak memory so far noted in the report."""
+def record_time(report: dict[str, Any], name: str, work: Any) -> Any:
+    """Run `work`, record its seconds and the process's peak memory in the report, and return its result."""
     began, cpu = time.perf_counter(), time.process_time()
     result = work()
     line = {"seconds": time.perf_counter() - began, "cpu_seconds": time.process_time() - cpu}
@@ -279,55 +279,61 @@ def timed(report: dict[str, Any], name: str, work: Any) -> Any:
 
 
 def run(shape: Shape, dtype: torch.dtype, options: argparse.Namespace) -> dict[str, Any]:
-    """Both steps and the round trip of the LoRA; everything measured."""
+    """Both steps and the LoRA's round trip, with measurements."""
     options.out.mkdir(parents=True, exist_ok=True)
-    report: dict[str, Any] = {"parameters": count(shape), "dtype": str(dtype), "size": shape.unet["sample_size"] * 8}
+    report: dict[str, Any] = {
+        "parameters": count_parameters(shape),
+        "dtype": str(dtype),
+        "size": shape.unet["sample_size"] * 8,
+    }
 
     def made() -> Prior:
-        prior = build(shape, dtype)
+        prior = build_prior(shape, dtype)
         return recomputing(prior) if options.checkpointing else prior
 
-    prior = timed(report, "build", made)
+    prior = record_time(report, "build", made)
     report["size"] = size = prior.native_size
     picture = reference(size)
-    timed(report, "personalization step", lambda: personalization_step(prior, picture, options.batch, options.out))
-    before = timed(report, "epsilon of the trained", lambda: epsilon(prior))
+    record_time(
+        report, "personalization step", lambda: personalization_step(prior, picture, options.batch, options.out)
+    )
+    before = record_time(report, "epsilon of the trained", lambda: epsilon(prior))
     del prior
     gc.collect()
-    prior = lora.merged(timed(report, "build again", made), options.out)
-    after = timed(report, "epsilon of the loaded", lambda: epsilon(prior))
+    prior = lora.merged(record_time(report, "build again", made), options.out)
+    after = record_time(report, "epsilon of the loaded", lambda: epsilon(prior))
     report["epsilon difference"] = float((after - before).abs().max())
     report["epsilon size"] = float(before.abs().max())
     with torch.no_grad():
-        text = timed(report, "embed prompts", lambda: diffusion.embed_text(prior, list(crops.PROMPTS)))
+        text = record_time(report, "embed prompts", lambda: diffusion.embed_text(prior, list(crops.PROMPTS)))
     prior = without_text(prior)
     gc.collect()
     sds, scene = Sds(patches=options.patches), gaussians(options.gaussians, "cpu")
-    timed(report, "SDS step", lambda: sds_step(prior, text, train_view(size, "cpu"), scene, sds))
+    record_time(report, "SDS step", lambda: sds_step(prior, text, train_view(size, "cpu"), scene, sds))
     return report
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--dtype", choices=["float32", "bfloat16"], default="bfloat16")
-    parser.add_argument("--size", type=int, default=0, help="side in pixels that counts as native; 0: the published")
+    parser.add_argument("--size", type=int, default=0, help="native side in px; 0: the published one")
     parser.add_argument("--batch", type=int, default=1, help="samples of the personalization step")
     parser.add_argument("--patches", type=int, default=2, help="local patches of the SDS step")
     parser.add_argument("--gaussians", type=int, default=2000)
-    parser.add_argument("--memory-gb", type=float, default=20.0, help="refuse to begin where the machine has less free")
+    parser.add_argument("--memory-gb", type=float, default=20.0, help="refuse to start if the weights need more")
     parser.add_argument("--checkpointing", action="store_true")
     parser.add_argument("--toy", action="store_true", help="few channels, 32 px")
-    parser.add_argument("--count", action="store_true", help="only count the memory that one sample takes")
+    parser.add_argument("--count", action="store_true", help="only count the memory of one sample")
     parser.add_argument("--out", type=Path, default=Path("runs/full-size"))
     options = parser.parse_args()
-    shape = shrunk(SD2) if options.toy else SD2
+    shape = shrink(SD2) if options.toy else SD2
     if options.size:
         factor = 2 ** (len(shape.vae["block_out_channels"]) - 1)
         shape = Shape(shape.unet | {"sample_size": options.size // factor}, shape.vae, shape.texts)
     if options.count:
-        print(json.dumps(living(shape, getattr(torch, options.dtype)), indent=1))
+        print(json.dumps(peak_memory(shape, getattr(torch, options.dtype)), indent=1))
         return
-    need = 1.2 * count(shape) * (4 if options.dtype == "float32" else 2) / 1e9
+    need = 1.2 * count_parameters(shape) * (4 if options.dtype == "float32" else 2) / 1e9
     if need > options.memory_gb:
         parser.error(f"the weights alone take {need:.0f} GB, more than --memory-gb {options.memory_gb:g}")
     with memory.blamed("--size", options.size):

@@ -1,6 +1,6 @@
-"""Is this machine ready for jobs on CUDA? Builds gsplat's extension where it is not built, and loads it.
+"""Check that this machine is ready for CUDA jobs; builds gsplat's extension if necessary, and loads it.
 
-python -m benchmarks.gpu.ready      (--before: only whether it is worth installing gsplat)
+python -m benchmarks.gpu.ready      (--before: only check whether installing gsplat makes sense)
 """
 
 from __future__ import annotations
@@ -14,31 +14,31 @@ import psutil
 
 from reffusion.io.machine import Machine, lacks, machine
 
-COMPILER_GB = 1.0  # what a compiler takes: gsplat's largest file 0.85
+COMPILER_GB = 1.0  # memory of one compiler; gsplat's largest file takes 0.85
 
 
-def refused(here: Machine, before: bool) -> list[str]:
-    """What is in the way, a line each."""
+def refusal_reasons(here: Machine, before: bool) -> list[str]:
+    """Reasons why CUDA jobs cannot run here, one line each."""
     if here.driver is None and here.card is None:
         return ["there is no NVIDIA driver on this machine: nothing to do; profile=laptop needs no card"]
     return lacks(here, splats=not before)
 
 
-def jobs(cores: int, free_gb: float) -> int:
-    """How many compilers may run at once."""
+def compiler_jobs(cores: int, free_gb: float) -> int:
+    """Number of compilers that may run at once."""
     return max(1, min(8, cores, int(free_gb / COMPILER_GB)))
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--before", action="store_true", help="ask for driver and torch only, load nothing")
+    parser.add_argument("--before", action="store_true", help="check driver and torch only, load nothing")
     before = parser.parse_args().before
-    if found := refused(machine(), before):
+    if found := refusal_reasons(machine(), before):
         print(f"error: {'; '.join(found)}", file=sys.stderr)
         return 2
     if before:
         return 0
-    os.environ.setdefault("MAX_JOBS", str(jobs(os.cpu_count() or 1, psutil.virtual_memory().available / 1e9)))
+    os.environ.setdefault("MAX_JOBS", str(compiler_jobs(os.cpu_count() or 1, psutil.virtual_memory().available / 1e9)))
     began = time.monotonic()
     import torch
 
@@ -49,7 +49,7 @@ def main() -> int:
     from gsplat.cuda import _backend
 
     if _backend._C is None:
-        print("error: gsplat's extension was not built; its own words are above", file=sys.stderr)
+        print("error: gsplat's extension was not built; see its messages above", file=sys.stderr)
         return 2
     print(f"gsplat {gsplat.__version__} is ready on {torch.cuda.get_device_name()}: {time.monotonic() - began:.0f} s")
     return 0

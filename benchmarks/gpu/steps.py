@@ -31,8 +31,8 @@ from reffusion.types import PARAMETERS, Camera, Gaussians
 from reffusion.weights import local, published
 
 
-def term(scene: Gaussians, loss: Tensor) -> None:
-    """The way back, and nothing kept of it."""
+def backpropagate(scene: Gaussians, loss: Tensor) -> None:
+    """Backward pass of a loss into a scene; the gradients are dropped."""
     loss.backward()
     for name in PARAMETERS:
         getattr(scene, name).grad = None
@@ -40,60 +40,60 @@ def term(scene: Gaussians, loss: Tensor) -> None:
 
 def reconstruction(bench: Bench) -> dict[str, Any]:
     (scene, masked), view = bench.scene(), full_size.train_view(bench.sizes.rows, bench.device)
-    return bench.measured(lambda: term(scene, reconstruction_term(scene, masked, view)[0]))
+    return bench.measure(lambda: backpropagate(scene, reconstruction_term(scene, masked, view)[0]))
 
 
 def reference(bench: Bench) -> dict[str, Any]:
     (scene, masked), view = bench.scene(), full_size.train_view(bench.sizes.rows, bench.device)
-    return bench.measured(
-        lambda: term(scene, reference_term(scene, masked, view.camera, view.picture, view.repaint)[0])
+    return bench.measure(
+        lambda: backpropagate(scene, reference_term(scene, masked, view.camera, view.picture, view.repaint)[0])
     )
 
 
 def personalization(bench: Bench) -> dict[str, Any]:
-    """Steps of the paper's LoRA, as many samples at once as fit into 20 GB."""
+    """Steps of the paper's LoRA, with as many samples at once as fit into 20 GB."""
     prior, source = bench.prior("bfloat16")
     picture = full_size.reference(prior.native_size)
     trained, optimizer, training = full_size.trainer(prior, bench.sizes.batch)
     prior = memory.fitted(prior, 20.0, "personalize.memory_gb", lambda p: denoising.one_sample(p, [picture], 0))
-    said = bench.measured(lambda: {"loss": train_step(prior, optimizer, [picture], training, 0)})
+    values = bench.measure(lambda: {"loss": train_step(prior, optimizer, [picture], training, 0)})
     moved = sum(float(p.detach().abs().sum()) for p in trained["text"])
-    bench.forget_prior()  # it carries LoRA
-    return said | {"batch": bench.sizes.batch, "rows": prior.rows_graded, "lora_text": moved, "weights": source}
+    bench.forget_prior()  # it has LoRA layers now
+    return values | {"batch": bench.sizes.batch, "rows": prior.rows_graded, "lora_text": moved, "weights": source}
 
 
-def prompted(bench: Bench) -> tuple[Prior, Tensor, str]:
-    """The prior without its text encoder, the embedded prompts, and where the weights are from."""
+def prior_and_prompts(bench: Bench) -> tuple[Prior, Tensor, str]:
+    """The prior without its text encoder, the embedded prompts, and the source of the weights."""
     prior, source = bench.prior("float16")
     with torch.no_grad():
         return without_text(prior), diffusion.embed_text(prior, list(crops.PROMPTS)), source
 
 
 def distillation(bench: Bench) -> dict[str, Any]:
-    prior, text, source = prompted(bench)
+    prior, text, source = prior_and_prompts(bench)
     (scene, _), view = bench.scene(), full_size.train_view(bench.sizes.rows, bench.device)
 
     def step() -> dict[str, float]:
-        said = full_size.sds_step(prior, text, view, scene, Sds())
+        values = full_size.sds_step(prior, text, view, scene, Sds())
         for name in PARAMETERS:
             getattr(scene, name).grad = None
-        return said
+        return values
 
-    return bench.measured(step) | {"weights": source}
+    return bench.measure(step) | {"weights": source}
 
 
 def depth(bench: Bench) -> dict[str, Any]:
-    prior, text, source = prompted(bench)
+    prior, text, source = prior_and_prompts(bench)
     (scene, masked), view = bench.scene(), full_size.train_view(bench.sizes.rows, bench.device)
     estimator, whose = depth_estimator(bench.sizes, bench.device)
 
     def step() -> dict[str, float]:
         draw = generator(0, "depth")
         loss, _ = depth_term(scene, masked, view, prior, text, Depth(), Sds().guidance, draw, estimator)
-        term(scene, loss)
+        backpropagate(scene, loss)
         return {"loss": float(loss.detach())}
 
-    return bench.measured(step) | {"weights": f"{source}, {whose}"}
+    return bench.measure(step) | {"weights": f"{source}, {whose}"}
 
 
 def adversarial(bench: Bench) -> dict[str, Any]:
@@ -103,15 +103,15 @@ def adversarial(bench: Bench) -> dict[str, Any]:
 
     def step() -> dict[str, float]:
         draw = generator(0, "patches")
-        loss, _, said = adversarial_term(scene, masked, view, view.picture, view.repaint, critic, draw)
-        term(scene, loss)
-        return said
+        loss, _, values = adversarial_term(scene, masked, view, view.picture, view.repaint, critic, draw)
+        backpropagate(scene, loss)
+        return values
 
-    return bench.measured(step)
+    return bench.measure(step)
 
 
 def depth_estimator(sizes: Sizes, device: str) -> tuple[Estimator, str]:
-    """Depth Anything V2 Small, published or with random weights, of which the sign that fits the scene is taken."""
+    """Depth Anything V2 Small, published or with random weights; the sign that fits the scene is taken."""
     from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
 
     if sizes == PAPER and local.locate(published.DEPTH_ANYTHING) is not None:
@@ -126,7 +126,7 @@ def depth_estimator(sizes: Sizes, device: str) -> tuple[Estimator, str]:
             backbone_config=backbone, reassemble_hidden_size=384, neck_hidden_sizes=[48, 96, 192, 384],
             fusion_hidden_size=64, head_hidden_size=32, initializer_range=0.1,
         ))  # fmt: skip
-        torch.nn.init.constant_(model.head.conv3.bias, 1e4)  # whose last layer would else cut nearly all to 0
+        torch.nn.init.constant_(model.head.conv3.bias, 1e4)  # else the last ReLU would cut nearly all values to 0
         network, source = monocular.make_network(model, device), "random"
     tries = [by_network(lambda image, sign=sign: sign * monocular.disparity(network, image), Completion())
              for sign in (1, -1)]  # fmt: skip
@@ -141,8 +141,8 @@ def depth_estimator(sizes: Sizes, device: str) -> tuple[Estimator, str]:
     return Estimator(tries[0].how, disparity), source
 
 
-def fitted_scene(bench: Bench) -> dict[str, Any]:
-    """A cloud of coloured Gaussians photographed by the splatting itself, fitted from blurred and shifted ones."""
+def fit_scene(bench: Bench) -> dict[str, Any]:
+    """Fit coloured Gaussians to their own renders, starting from shifted ones with weaker colours."""
     sizes, device, out = bench.sizes, bench.device, bench.out
     truth = full_size.gaussians(sizes.gaussians, device, degree=1).map(Tensor.detach)
     cameras, images = [], {}
@@ -168,7 +168,7 @@ def fitted_scene(bench: Bench) -> dict[str, Any]:
     before = psnr(start)
     densify, sh = Densify(stop=0.0, cap_max=2 * sizes.gaussians), SphericalHarmonics(degree=1)
     settings = Params(iterations=sizes.fit_steps, sh=sh, densify=densify)
-    trace.clear_checkpoint(out)  # of a check that was stopped
+    trace.clear_checkpoint(out)  # left by an interrupted check
     began = time.perf_counter()
     after = psnr(fit(cameras, images, start, settings, folder=out))
     seconds = time.perf_counter() - began

@@ -1,4 +1,4 @@
-"""Stiff and extreme cases, each with a bound that is argued beside it (docs/stability.md)."""
+"""Stiff and extreme cases, each with a bound that is derived beside it (docs/stability.md)."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ class Row(NamedTuple):
 
 
 def all_cases() -> list[Case]:
-    """Of all subjects; names are unique."""
+    """The cases of all subjects; names are unique."""
     return [case for subject in SUBJECTS for case in import_module(f"benchmarks.stability.{subject}").CASES]
 
 
 def run(case: Case) -> Row:
-    """Measure a case; `measured` is None where it raised, or is not a finite number: neither is within any bound."""
+    """Measure a case; `measured` is None, and the case fails, if it raised or gave no finite number."""
     try:
         measured = float(case.measure())
     except Exception:

@@ -1,4 +1,4 @@
-"""Run every case: a table on the screen, and a file. Ends with 1 when a case is out of bound.
+"""Run every case, print a table and write a file. Exits with 1 if a case is out of bound.
 
 python -m benchmarks.stability [--out runs/stability.json] [--only WORDS]
 """
@@ -15,7 +15,7 @@ import torch
 from benchmarks.stability import Row, all_cases, run
 
 
-def line(row: Row) -> str:
+def format_row(row: Row) -> str:
     measured = "failed" if row.measured is None else f"{row.measured:.3g}"
     return f"{'ok ' if row.ok else 'BAD'} {row.case:<58} {measured:>10} <= {row.bound:<9.3g} {row.quantity}"
 
@@ -23,7 +23,7 @@ def line(row: Row) -> str:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs/stability.json"))
-    parser.add_argument("--only", default="", help="cases whose name contains this")
+    parser.add_argument("--only", default="", help="only cases whose name contains this")
     given = parser.parse_args()
     cases = [case for case in all_cases() if given.only in case.name]
     if not cases:
@@ -32,7 +32,7 @@ def main() -> int:
     rows = []
     for case in cases:
         rows.append(run(case))
-        print(line(rows[-1]), flush=True)
+        print(format_row(rows[-1]), flush=True)
     given.out.parent.mkdir(parents=True, exist_ok=True)
     given.out.write_text(json.dumps([row._asdict() for row in rows], indent=1) + "\n")
     bad = [row.case for row in rows if not row.ok]

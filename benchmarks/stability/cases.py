@@ -1,4 +1,4 @@
-"""What a case is, and how cases say that something was refused."""
+"""Definition of a case, and helpers shared by all cases."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Case:
-    """One stiff or extreme input, and what must hold there.
+    """One stiff or extreme input, and what must hold for it.
 
     Attributes:
         name: what is extreme.
         quantity: what is measured, with its unit.
-        bound: the largest value that is right; argued beside the case.
+        bound: the largest correct value; derived beside the case.
         measure: measures it.
     """
 
@@ -24,8 +24,8 @@ class Case:
     measure: Callable[[], float]
 
 
-def unclear(call: Callable[[], object], *words: str, error: type[Exception] = ValueError) -> float:
-    """0 where `call` raises `error` with all of these words in its message, else 1."""
+def count_unclear_refusal(call: Callable[[], object], *words: str, error: type[Exception] = ValueError) -> float:
+    """0 if `call` raises `error` with all of these words in its message, else 1."""
     try:
         call()
     except error as refusal:
@@ -33,11 +33,11 @@ def unclear(call: Callable[[], object], *words: str, error: type[Exception] = Va
     return 1.0
 
 
-def largest(*values: float) -> float:
-    """The largest, infinite where one is not a number (which `max` might pass over)."""
+def nan_safe_max(*values: float) -> float:
+    """The largest value; infinite if one is NaN, which `max` might ignore."""
     return math.inf if any(value != value for value in values) else float(max(values))
 
 
 UNCLEAR = "refusals without the cause in the message"
-EXACT = 0.0  # bound of counts, of what must agree bit for bit, and of what is refused
+EXACT = 0.0  # bound of counts, of bitwise equality, and of refusals
 EPS32, EPS64 = 2.0**-24, 2.0**-53  # relative error of one rounding

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from benchmarks.stability.cases import EPS32, EXACT, UNCLEAR, Case, largest, unclear
+from benchmarks.stability.cases import EPS32, EXACT, UNCLEAR, Case, count_unclear_refusal, nan_safe_max
 from benchmarks.stability.splatting import camera, cloud
 from reffusion import seeding
 from reffusion.distill import discriminator, sds
@@ -21,7 +21,7 @@ from reffusion.types import PARAMETERS
 TINY = Path(__file__).resolve().parents[2] / "priors" / "tiny"
 SIZE = 32  # px; the UNet takes any size that its halvings divide
 HALF = {torch.float16: 2.0**-11, torch.bfloat16: 2.0**-8}
-LAYERS = 100  # more than the UNet has one after another
+LAYERS = 100  # upper bound of the UNet's consecutive layers
 
 
 @cache
@@ -45,8 +45,8 @@ def images(label: str = "") -> Tensor:
 
 
 @torch.no_grad()
-def predicted(t: int, guidance: float | None = None, empty: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-    """z_t, and eps and z_0 that the prior finds in it; in the middle of the picture a square is repainted."""
+def predict(t: int, guidance: float | None = None, empty: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    """z_t, and the prior's eps and z_0 for it; a square in the middle of the picture is repainted."""
     mask = torch.zeros(1, 1, SIZE, SIZE)
     mask[..., 8:24, 8:24] = 1
     condition = diffusion.conditioning(model(), images(), mask)
@@ -57,41 +57,41 @@ def predicted(t: int, guidance: float | None = None, empty: Tensor | None = None
     return noisy, *diffusion.guided(model(), noisy, times, condition, prompts()[:1], empty, guidance)
 
 
-def torn(t: int, guidance: float | None = None) -> float:
-    """How far a z_0 + s eps is from z_t, relative to the largest number that takes part."""
-    noisy, eps, clean = (x.double() for x in predicted(t % model().timesteps, guidance))
+def reconstruction_error(t: int, guidance: float | None = None) -> float:
+    """Difference of a z_0 + s eps from z_t, relative to the largest number involved."""
+    noisy, eps, clean = (x.double() for x in predict(t % model().timesteps, guidance))
     a = model().alphas_cumprod[t].double()
-    largest = max(noisy.abs().max(), eps.abs().max(), (a.sqrt() * clean).abs().max())
-    return ((a.sqrt() * clean + (1 - a).sqrt() * eps - noisy).abs().max() / largest).item()
+    size = max(noisy.abs().max(), eps.abs().max(), (a.sqrt() * clean).abs().max())
+    return ((a.sqrt() * clean + (1 - a).sqrt() * eps - noisy).abs().max() / size).item()
 
 
-def no_guidance() -> float:
-    """Guidance 0 is the conditional prediction, bit for bit; largest difference."""
-    pairs = zip(predicted(500, 0.0), predicted(500), strict=True)
-    return largest(*((a - b).abs().max().item() for a, b in pairs))
+def no_guidance_error() -> float:
+    """Guidance 0 must equal the conditional prediction bit for bit; largest difference."""
+    pairs = zip(predict(500, 0.0), predict(500), strict=True)
+    return nan_safe_max(*((a - b).abs().max().item() for a, b in pairs))
 
 
-def strong_guidance() -> float:
-    """Guidance 100 against the same sum in float64 of two separate predictions, relative to eps."""
-    _, eps, _ = predicted(500)
-    other = predicted(500, 0.0)
+def strong_guidance_error() -> float:
+    """Guidance 100 against the same sum of two separate predictions in float64, relative to eps."""
+    _, eps, _ = predict(500)
+    other = predict(500, 0.0)
     with torch.no_grad():
         mask = torch.zeros(1, 1, SIZE, SIZE)
         mask[..., 8:24, 8:24] = 1
         condition = diffusion.conditioning(model(), images(), mask)
         empty, _ = diffusion.predict(model(), other[0], torch.tensor([500]), condition, prompts()[2:])
     exact = 101 * eps.double() - 100 * empty.double()
-    return ((predicted(500, 100.0)[1].double() - exact).abs().max() / eps.abs().max()).item()
+    return ((predict(500, 100.0)[1].double() - exact).abs().max() / eps.abs().max()).item()
 
 
-def guidance_to_nowhere() -> float:
-    """Guidance 100 between a prompt and itself changes nothing; largest difference relative to eps."""
-    _, eps, _ = predicted(500)
-    return ((predicted(500, 100.0, prompts()[:1])[1] - eps).abs().max() / eps.abs().max()).item()
+def equal_prompts_error() -> float:
+    """Guidance 100 between equal prompts must change nothing; largest difference relative to eps."""
+    _, eps, _ = predict(500)
+    return ((predict(500, 100.0, prompts()[:1])[1] - eps).abs().max() / eps.abs().max()).item()
 
 
-def half_precision(dtype: torch.dtype) -> float:
-    """The whole way in half precision against float32: relative L2 of eps at the first and the last timestep."""
+def half_precision_error(dtype: torch.dtype) -> float:
+    """The prior in half precision against float32: relative L2 of eps at the first and the last timestep."""
     mask, worst = torch.ones(1, 1, SIZE, SIZE), 0.0
     for t in (0, model().timesteps - 1):
         found = []
@@ -100,13 +100,15 @@ def half_precision(dtype: torch.dtype) -> float:
                 condition = diffusion.conditioning(model(kind), images(), mask)
                 noisy = normal(1, condition.shape[1] - 1, *condition.shape[-2:])
                 found.append(diffusion.predict(model(kind), noisy, torch.tensor([t]), condition, prompts()[:1])[0])
-        worst = largest(worst, ((found[1] - found[0]).norm() / found[0].norm()).item())
+        worst = nan_safe_max(worst, ((found[1] - found[0]).norm() / found[0].norm()).item())
     return worst
 
 
-def distilled(t: int, dtype: torch.dtype) -> float:
-    """Gradients of all weightings for data of unit variance, whose score is known (eps = s z_t, z_0 = a z_t), against
-    float64; L2 relative to what each is a difference of."""
+def sds_error(t: int, dtype: torch.dtype) -> float:
+    """SDS gradients of all weightings against float64, for unit-variance data of known score.
+
+    The score is eps = s z_t, z_0 = a z_t. Relative L2 error, each relative to the terms of which it is a difference.
+    """
     latents, noise = (normal(2, 4, 8, 8, label=name).to(dtype) for name in ("latents", "noise"))
     abar, times, worst = model().alphas_cumprod, torch.full((2,), t % model().timesteps), 0.0
     a, s = (x.double()[times[0]] for x in (abar.sqrt(), (1 - abar.double()).sqrt()))
@@ -116,42 +118,42 @@ def distilled(t: int, dtype: torch.dtype) -> float:
         found = sds.sds_gradient(
             latents, lambda z, _: (s.to(z) * z, a.to(z) * z), times, noise, abar, weighting=weighting
         )
-        # Each is a difference of numbers of order one (at t = 0, or at T-1): its error is measured against those.
+        # Each is a difference of numbers of order one (at t = 0, or at T-1), relative to which its error is measured.
         size = {"x0": latents.double(), "sigma2": s**2 * noise.double(), "one": noise.double()}[weighting].norm()
-        worst = largest(worst, ((found.double() - truth).norm() / size).item())
+        worst = nan_safe_max(worst, ((found.double() - truth).norm() / size).item())
     return worst
 
 
-def empty_gradient() -> float:
-    """Distillation of an empty mask."""
+def empty_mask_gradient() -> float:
+    """Largest SDS gradient under an empty mask."""
     latents, noise, abar = normal(2, 4, 8, 8), normal(2, 4, 8, 8, label="noise"), model().alphas_cumprod
     times, nothing = torch.tensor([3, 700]), torch.zeros(2, 1, 8, 8)
     found = sds.sds_gradient(latents, lambda z, _: (z, z), times, noise, abar, keep_contrast=True, mask=nothing)
     return found.abs().max().item()
 
 
-def nothing_shines_through() -> float:
-    """Under a full mask the conditioning of two pictures is the same."""
+def full_mask_leak() -> float:
+    """Difference of the conditioning of two pictures under a full mask."""
     full = torch.ones(1, 1, SIZE, SIZE)
     one, other = (diffusion.conditioning(model(), images(name), full) for name in ("a", "b"))
     return (one - other).abs().max().item()
 
 
-def nothing_hidden() -> float:
-    """With an empty mask the conditioning is the picture's latents, bit for bit."""
+def empty_mask_error() -> float:
+    """With an empty mask the conditioning must equal the picture's latents bit for bit."""
     with torch.no_grad():
         condition = diffusion.conditioning(model(), images(), torch.zeros(1, 1, SIZE, SIZE))
         apart = condition[:, 1:] - diffusion.encode(model(), images())
-    return largest(condition[:, :1].abs().max().item(), apart.abs().max().item())
+    return nan_safe_max(condition[:, :1].abs().max().item(), apart.abs().max().item())
 
 
-def window_of_nothing() -> float:
+def refuse_empty_window() -> float:
     nothing = torch.zeros(20, 30, dtype=torch.bool)
-    return unclear(lambda: windows.window_around(nothing, 8, seeding.generator(0)), "empty mask")
+    return count_unclear_refusal(lambda: windows.window_around(nothing, 8, seeding.generator(0)), "empty mask")
 
 
-def scene_gradient(low: float, high: float, guidance: float) -> float:
-    """Score distillation of a scene that is to be repainted as a whole: numbers that are not finite."""
+def count_bad_gradients(low: float, high: float, guidance: float) -> float:
+    """Non-finite gradients of SDS for a scene that is repainted as a whole."""
     view, gaussians = camera(24, 18), cloud().map(lambda p: p.clone().requires_grad_())
     everything = torch.ones(18, 24, dtype=torch.bool)
     whole = TrainView(view, torch.rand(18, 24, 3, generator=seeding.generator(0)), ~everything, everything, clean=False)
@@ -162,8 +164,8 @@ def scene_gradient(low: float, high: float, guidance: float) -> float:
     return float(sum((~torch.isfinite(getattr(gaussians, name).grad)).sum() for name in PARAMETERS))
 
 
-def one_step_painted() -> float:
-    """Painting in one step, everything masked: pixels outside [-1, 1] or no numbers."""
+def count_out_of_range() -> float:
+    """Inpainting in one step with a full mask: pixels that are outside [-1, 1] or NaN."""
     full, draws = torch.ones(1, 1, SIZE, SIZE), seeding.generator(0)
     found = diffusion.sample(model(), images(), full, prompts()[:1], 1, draws, 100.0, prompts()[2:])
     return float((~(found.abs() <= 1)).sum())
@@ -172,8 +174,8 @@ def one_step_painted() -> float:
 # ------------------------------------------------------------------------------------------ discriminator
 
 
-def sure_critic() -> float:
-    """Losses and slopes at scores of +-1e4 against their limits, max(0, x) and 0 or 1; relative error."""
+def critic_error() -> float:
+    """The critic's losses and slopes at scores of +-1e4 against their limits, max(0, x) and 0 or 1; relative error."""
     worst = 0.0
     for score in (1e4, -1e4):
         for loss, limit, slope in (
@@ -181,14 +183,14 @@ def sure_critic() -> float:
             (lambda x: discriminator.critic_loss(torch.zeros(4), x), max(0.0, score), float(score > 0)),
         ):
             scores = torch.full((4,), score, requires_grad=True)
-            value = loss(scores) - torch.tensor(2.0).log()  # what scores of zero cost
+            value = loss(scores) - torch.tensor(2.0).log()  # the loss of scores of zero
             value.backward()
-            worst = largest(worst, abs(value.item() - limit) / 1e4, (scores.grad * 4 - slope).abs().max().item())
+            worst = nan_safe_max(worst, abs(value.item() - limit) / 1e4, (scores.grad * 4 - slope).abs().max().item())
     return worst
 
 
-def sure_generator() -> float:
-    """The maker's losses at +-1e4, both forms: errors of values (relative) and slopes."""
+def generator_error() -> float:
+    """The generator's losses at +-1e4, both forms: errors of values (relative) and slopes."""
     worst = 0.0
     for form in ("non-saturating", "saturating"):
         for score in (1e4, -1e4):
@@ -197,7 +199,7 @@ def sure_generator() -> float:
             value.backward()
             limit = -max(0.0, score) if form == "saturating" else max(0.0, -score)
             slope = -float(score > 0) if form == "saturating" else -float(score < 0)
-            worst = largest(worst, abs(value.item() - limit) / 1e4, (scores.grad * 4 - slope).abs().max().item())
+            worst = nan_safe_max(worst, abs(value.item() - limit) / 1e4, (scores.grad * 4 - slope).abs().max().item())
     return worst
 
 
@@ -206,8 +208,8 @@ def critic() -> discriminator.Critic:
     return discriminator.Critic(16, 8, seeding.generator(0, "critic"))
 
 
-def flat_critic() -> float:
-    """A critic of weights zero has no slope: its penalty is 0, and so are the gradients of the penalty."""
+def flat_critic_penalty() -> float:
+    """A critic with zero weights has no slope, so its penalty and the penalty's gradients must be 0."""
     flat = discriminator.Critic(16, 8, seeding.generator(0))
     for weight in flat.parameters():
         weight.data.zero_()
@@ -215,11 +217,11 @@ def flat_critic() -> float:
     penalty = discriminator.gradient_penalty(flat(patches), patches)
     slopes = torch.autograd.grad(penalty, list(flat.parameters()), allow_unused=True)
     found = [penalty.item(), *(slope.abs().max().item() for slope in slopes if slope is not None)]
-    return largest(*found)
+    return nan_safe_max(*found)
 
 
-def equal_patches() -> float:
-    """Eight times the same patch: the deviation's root is of zero. Numbers that are not finite, of score and slopes."""
+def count_invalid_scores() -> float:
+    """Eight equal patches, whose standard deviation is the root of zero: non-finite scores and slopes."""
     patches = torch.full((8, 3, 16, 16), 0.25, requires_grad=True)
     scores = critic()(patches)
     penalty = discriminator.gradient_penalty(scores, patches)
@@ -229,32 +231,32 @@ def equal_patches() -> float:
 
 SDS = "numbers of the gradient that are not finite"
 CASES = (
-    *(Case(f"timestep {name}", "error of a z_0 + s eps = z_t, relative", 8 * EPS32, partial(torn, t))
+    *(Case(f"timestep {name}", "error of a z_0 + s eps = z_t, relative", 8 * EPS32, partial(reconstruction_error, t))
       for name, t in (("0", 0), ("T-1", -1))),
-    # Both are sums of 101 and of 100 parts that nearly cancel, each part as exact as it is without guidance.
+    # Both are sums of 101 and 100 parts that nearly cancel, each as exact as without guidance.
     Case("timestep T-1, guidance 100", "error of a z_0 + s eps = z_t, relative", 201 * 8 * EPS32,
-         partial(torn, -1, 100.0)),
+         partial(reconstruction_error, -1, 100.0)),
     *(Case(f"timestep {name}, score distillation", "relative L2 error against float64", 16 * EPS32,
-           partial(distilled, t, torch.float32)) for name, t in (("0", 0), ("T-1", -1))),
+           partial(sds_error, t, torch.float32)) for name, t in (("0", 0), ("T-1", -1))),
     *(Case(f"timestep {name}, half precision, score distillation", "relative L2 error against float64",
-           16 * HALF[torch.float16], partial(distilled, t, torch.float16)) for name, t in (("0", 0), ("T-1", -1))),
-    # One rounding a layer, none of which the next may enlarge on the whole (each layer is normalised).
+           16 * HALF[torch.float16], partial(sds_error, t, torch.float16)) for name, t in (("0", 0), ("T-1", -1))),
+    # One rounding per layer, which later layers do not enlarge overall, as each layer is normalised.
     *(Case(f"{str(dtype)[6:]}, half precision of the prior", "relative L2 difference of eps from float32",
-           LAYERS * epsilon, partial(half_precision, dtype)) for dtype, epsilon in HALF.items()),
-    Case("guidance 0", "largest difference from no guidance", EXACT, no_guidance),
-    # 101 + 100 predictions, each rounded once a layer; batches of one and of two differ so.
-    Case("guidance 100", "error relative to eps", 201 * LAYERS * EPS32, strong_guidance),
+           LAYERS * epsilon, partial(half_precision_error, dtype)) for dtype, epsilon in HALF.items()),
+    Case("guidance 0", "largest difference from no guidance", EXACT, no_guidance_error),
+    # 101 + 100 predictions, each rounded once per layer; batches of one and of two differ by that.
+    Case("guidance 100", "error relative to eps", 201 * LAYERS * EPS32, strong_guidance_error),
     Case("guidance 100, equal prompts", "difference from no guidance, relative to eps", 201 * LAYERS * EPS32,
-         guidance_to_nowhere),
-    Case("mask empty, conditioning", "difference from the picture's latents", EXACT, nothing_hidden),
-    Case("mask full, conditioning", "what of the picture is seen", EXACT, nothing_shines_through),
-    Case("mask empty, gradient", "largest number", EXACT, empty_gradient),
-    Case("mask empty, window", UNCLEAR, EXACT, window_of_nothing),
-    Case("mask full, timestep 0, guidance 100, scene", SDS, EXACT, partial(scene_gradient, 0.0, 1e-9, 100.0)),
-    Case("mask full, timestep T-1, guidance 0, scene", SDS, EXACT, partial(scene_gradient, 1 - 1e-9, 1.0, 0.0)),
-    Case("mask full, painted in one step, guidance 100", "pixels outside [-1, 1]", EXACT, one_step_painted),
-    Case("discriminator logits +-1e4, critic", "relative error of losses and slopes", 8 * EPS32, sure_critic),
-    Case("discriminator logits +-1e4, generator", "relative error of losses and slopes", 8 * EPS32, sure_generator),
-    Case("discriminator, zero gradients", "penalty and its largest gradient", EXACT, flat_critic),
-    Case("discriminator, equal patches", "numbers that are not finite", EXACT, equal_patches),
+         equal_prompts_error),
+    Case("mask empty, conditioning", "difference from the picture's latents", EXACT, empty_mask_error),
+    Case("mask full, conditioning", "what of the picture is seen", EXACT, full_mask_leak),
+    Case("mask empty, gradient", "largest number", EXACT, empty_mask_gradient),
+    Case("mask empty, window", UNCLEAR, EXACT, refuse_empty_window),
+    Case("mask full, timestep 0, guidance 100, scene", SDS, EXACT, partial(count_bad_gradients, 0.0, 1e-9, 100.0)),
+    Case("mask full, timestep T-1, guidance 0, scene", SDS, EXACT, partial(count_bad_gradients, 1 - 1e-9, 1.0, 0.0)),
+    Case("mask full, painted in one step, guidance 100", "pixels outside [-1, 1]", EXACT, count_out_of_range),
+    Case("discriminator logits +-1e4, critic", "relative error of losses and slopes", 8 * EPS32, critic_error),
+    Case("discriminator logits +-1e4, generator", "relative error of losses and slopes", 8 * EPS32, generator_error),
+    Case("discriminator, zero gradients", "penalty and its largest gradient", EXACT, flat_critic_penalty),
+    Case("discriminator, equal patches", "numbers that are not finite", EXACT, count_invalid_scores),
 )  # fmt: skip

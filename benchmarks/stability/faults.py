@@ -1,6 +1,6 @@
-"""Faults planted in the code, each with the case that must catch it: what the suite is worth.
+"""Faults planted in the code, each with the case that must catch it: a test of the suite itself.
 
-A fault is made of the right function and put in its place, wherever it was imported, while the case runs.
+A fault is derived from the correct function and replaces it wherever it was imported, while the case runs.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from reffusion.depth.alignment import Alignment
 
 
 class Fault(NamedTuple):
-    """What is wrong, module and name of what is replaced, right function (or constant) -> wrong one, who catches it."""
+    """A fault: its name, module and name of the replaced object, correct -> faulty object, and the catching case."""
 
     name: str
     module: str
@@ -34,8 +34,8 @@ class Fault(NamedTuple):
     caught_by: str
 
 
-def fold_plainly(log_scales: np.ndarray, logits: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mip-Splatting's filter as its paper prints it: exponentials that overflow, and a quotient of products."""
+def fold_filter_naively(log_scales: np.ndarray, logits: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mip-Splatting's filter as printed in its paper: exponentials that overflow, and a quotient of products."""
     with np.errstate(all="ignore"):
         squares = np.exp(2 * np.asarray(log_scales, np.float64))
         widened = squares + np.asarray(sizes, np.float64)[:, None] ** 2
@@ -43,8 +43,8 @@ def fold_plainly(log_scales: np.ndarray, logits: np.ndarray, sizes: np.ndarray) 
         return np.log(widened) / 2, np.log(opacity / (1 - opacity))
 
 
-def then(change: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Right function -> one that changes its result."""
+def change_result(change: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Correct function -> one whose result is changed."""
     return lambda right: lambda *given: change(right(*given))
 
 
@@ -54,11 +54,11 @@ def log_of_sigmoid(real: torch.Tensor, fake: torch.Tensor) -> torch.Tensor:
 
 FAULTS = (
     Fault("a sign in the gradient", "reffusion.splat.cpu", "_to_parameters",
-          then(lambda gradients: [-gradients[0], *gradients[1:]]), "scales 1 of the extent"),
+          change_result(lambda gradients: [-gradients[0], *gradients[1:]]), "scales 1 of the extent"),
     Fault("a wrong order of depths", "reffusion.splat.binning", "depth_order",
-          then(lambda order: order[::-1].copy()), "equal depths, drawn by index"),
+          change_result(lambda order: order[::-1].copy()), "equal depths, drawn by index"),
     Fault("a dropped clamp of the Jacobian", "reffusion.splat.projection", "view_numbers",
-          then(lambda numbers: np.r_[numbers[:16], -1e9, 1e9, -1e9, 1e9, numbers[20:]]),
+          change_result(lambda numbers: np.r_[numbers[:16], -1e9, 1e9, -1e9, 1e9, numbers[20:]]),
           "needles from 1e4 extents away"),
     Fault("squares that underflow", "reffusion.gaussians.densify", "unit", lambda right: partial(F.normalize, dim=1),
           "quaternions of length 1e-20, splitting"),
@@ -67,7 +67,7 @@ FAULTS = (
     Fault("no consensus before the reweighting", "reffusion.depth.alignment", "_consensus",
           lambda right: lambda x, y, w, draws: None, "alignment, 90% outliers"),
     Fault("an unsafe logarithm in PSNR", "reffusion.metrics.image_metrics", "psnr",
-          then(lambda decibels: -10 * log10(10 ** (-decibels / 10))), "metrics of identical images"),
+          change_result(lambda decibels: -10 * log10(10 ** (-decibels / 10))), "metrics of identical images"),
     Fault("an unsafe logarithm in the critic's loss", "reffusion.distill.discriminator", "critic_loss",
           lambda right: log_of_sigmoid, "discriminator logits +-1e4, critic"),
     Fault("a mean over nothing where a mask is empty", "reffusion.distill.sds", "unfaded",
@@ -94,18 +94,18 @@ FAULTS = (
               path, table.astype([(name, "f4") for name in table.dtype.names]), comments),
           "offset 1e6 of the extent, exported positions"),
     Fault("a 3D filter folded in without logarithms", "reffusion.io.splat_rows", "fold_filter",
-          lambda right: fold_plainly, "filter_3D, sizes from 0 to 1e8, scales e-40 to e40"),
+          lambda right: fold_filter_naively, "filter_3D, sizes from 0 to 1e8, scales e-40 to e40"),
     Fault("a gradient that nobody looks at", "reffusion.gaussians.optimize", "refuse_not_finite",
           lambda right: lambda gradients: None, "gradients that are not numbers"),
 )  # fmt: skip
 
 
 @contextmanager
-def planted(fault: Fault) -> Iterator[None]:
-    """The fault in the place of what is right, under every name that a loaded module has for it, while in the context.
+def plant(fault: Fault) -> Iterator[None]:
+    """Replace the correct object by the fault, under every name in every loaded module, while in the context.
 
-    A module that is first loaded in the context would keep the fault: run the case once before. A compiled kernel keeps
-    what it was compiled with: plant no fault inside one.
+    A module first loaded in the context would keep the fault, so run the case once before. A compiled kernel keeps what
+    it was compiled with, so plant no fault inside one.
     """
     right = getattr(import_module(fault.module), fault.function)
     wrong = fault.wrong(right)
@@ -117,17 +117,17 @@ def planted(fault: Fault) -> Iterator[None]:
         yield
 
 
-def caught(fault: Fault) -> bool:
-    """Whether the case is out of its bound, or raises, with the fault.
+def is_caught(fault: Fault) -> bool:
+    """True if the case is out of its bound, or raises, with the fault.
 
     Raises:
-        ValueError: it is out of bound without any fault.
-        NameError, TypeError, AttributeError: the fault is not one of numbers, but broken code.
+        ValueError: the case is out of bound without the fault.
+        NameError, TypeError, AttributeError: the fault is broken code instead of wrong numbers.
     """
     (case,) = (case for case in all_cases() if case.name == fault.caught_by)
     if not run(case).ok:
         raise ValueError(f"case {case.name!r} is out of bound without any fault")
-    with planted(fault):
+    with plant(fault):
         try:
             return not case.measure() <= case.bound
         except (NameError, TypeError, AttributeError):

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from plyfile import PlyData
 
-from benchmarks.stability.cases import EPS32, EPS64, Case, largest
+from benchmarks.stability.cases import EPS32, EPS64, Case, nan_safe_max
 from reffusion import seeding
 from reffusion.capture import frame
 from reffusion.capture.lens import Lens
@@ -25,12 +25,12 @@ from reffusion.splat.rasterizer import render
 from reffusion.types import Camera, Gaussians, Scene, Similarity
 
 WIDTH, HEIGHT, VIEWS = 24, 18, 5
-FAR = np.array([1.0, -0.6, 0.3])  # direction of the offset: the largest axis is what the cases name
-EXPORTED = 1e-5  # of the extent: what `io.save_ply` promises of positions
+OFFSET_DIRECTION = np.array([1.0, -0.6, 0.3])  # direction of the offset; the cases name its largest axis
+EXPORT_TOLERANCE = 1e-5  # in extents; accuracy of positions that `io.save_ply` promises
 
 
-def truth() -> Gaussians:
-    """What the pictures show: sixty coloured Gaussians in a box of extent 1."""
+def true_gaussians() -> Gaussians:
+    """Ground truth of the pictures: sixty coloured Gaussians in a box of extent 1."""
     random = seeding.generator(0, "stability", "truth")
     uniform = lambda *shape: torch.rand(*shape, generator=random)
     return Gaussians(
@@ -40,7 +40,7 @@ def truth() -> Gaussians:
 
 
 def poses(extent: float, offset: np.ndarray) -> dict[str, np.ndarray]:
-    """View name -> world to camera in the scene's own frame: five views of the box, from 1.6 extents away."""
+    """View name -> world-to-camera in the scene's own frame: five views of the box, from 1.6 extents away."""
     found = {}
     for k in range(VIEWS):
         turn, pose = 0.9 * (k / (VIEWS - 1) - 0.5), np.eye(4)
@@ -51,11 +51,11 @@ def poses(extent: float, offset: np.ndarray) -> dict[str, np.ndarray]:
     return found
 
 
-def normalised(extent: float, offset: float) -> Scene:
-    """The scene of this extent, `offset` extents from the origin, as the `poses` stage brings it downstream."""
-    place = extent * offset * FAR
+def normalized_scene(extent: float, offset: float) -> Scene:
+    """The scene of this extent, `offset` extents from the origin, as the stage `poses` passes it on."""
+    place = extent * offset * OFFSET_DIRECTION
     world, lens = poses(extent, place), Lens(WIDTH, HEIGHT, 26.0, 26.0, WIDTH / 2, HEIGHT / 2)
-    points = extent * truth().means.double().numpy() + place
+    points = extent * true_gaussians().means.double().numpy() + place
     matrices = np.stack(list(world.values()))
     ranges = frame.depth_ranges(matrices, [lens] * VIEWS, points, None)
     similarity = frame.normalising(matrices, ranges[:, 1])
@@ -68,77 +68,77 @@ def normalised(extent: float, offset: float) -> Scene:
 
 
 @cache
-def fitted(extent: float, offset: float, rate: float = 1.0) -> tuple[Scene, Gaussians, float]:
-    """The scene, its fit of 60 steps, and the PSNR of the fit over its views, in dB."""
-    scene = normalised(extent, offset)
+def fit_scene(extent: float, offset: float, rate: float = 1.0) -> tuple[Scene, Gaussians, float]:
+    """The scene, its fit of 60 steps, and the PSNR of the fit over its views in dB."""
+    scene = normalized_scene(extent, offset)
     cameras = list(scene.cameras.values())
-    pictures = photographs()
+    pictures = render_photographs()
     rates = Rates(means=2e-3, means_last=2e-4, log_scales=1.5e-2, sh_dc=1.5e-2)
     still = {"sh": SphericalHarmonics(degree=0), "densify": Densify(start=1.0)}
     settings = Params(iterations=60, random_background=False, **still)
     start = initial_gaussians(scene.points, scene.point_colors, 0, 1000, seeding.generator(0))
     with tempfile.TemporaryDirectory() as folder:
-        gaussians = fit(cameras, pictures, start, settings, folder=Path(folder), rates=faster(rates, rate))
+        gaussians = fit(cameras, pictures, start, settings, folder=Path(folder), rates=scale_rates(rates, rate))
     error = np.mean([(render(gaussians, c).color.clamp(0, 1).numpy() - pictures[c.name] / 255.0) ** 2 for c in cameras])
     return scene, gaussians, float(-10 * math.log10(error))
 
 
-def faster(rates: Rates, factor: float) -> Rates:
+def scale_rates(rates: Rates, factor: float) -> Rates:
     """All step sizes times `factor`."""
     return Rates(**{name: factor * value for name, value in vars(rates).items()})
 
 
 @cache
-def photographs() -> dict[str, np.ndarray]:
-    """View name -> uint8 [H, W, 3]: the truth in a frame of extent 1 at the origin; the same from every frame."""
+def render_photographs() -> dict[str, np.ndarray]:
+    """View name -> uint8 [H, W, 3]: the truth in a frame of extent 1 at the origin, the same for every frame."""
     pictures = {}
     for name, pose in poses(1.0, np.zeros(3)).items():
         view = Camera(name, WIDTH, HEIGHT, 26.0, 26.0, WIDTH / 2, HEIGHT / 2, pose)
-        pictures[name] = (255 * render(truth(), view).color.clamp(0, 1)).round().byte().numpy()
+        pictures[name] = (255 * render(true_gaussians(), view).color.clamp(0, 1)).round().byte().numpy()
     return pictures
 
 
-def psnr_apart(extent: float, offset: float) -> float:
-    """By how many dB the fit differs from that of the same scene of extent 1 at the origin."""
-    return abs(fitted(extent, offset)[2] - fitted(1.0, 0.0)[2])
+def psnr_difference(extent: float, offset: float) -> float:
+    """Difference in dB of the fit from that of the same scene with extent 1 at the origin."""
+    return abs(fit_scene(extent, offset)[2] - fit_scene(1.0, 0.0)[2])
 
 
-def cameras_apart(extent: float, offset: float) -> float:
+def camera_difference(extent: float, offset: float) -> float:
     """Largest difference of normalised poses and points from those of the scene of extent 1 at the origin."""
-    here, there = normalised(extent, offset), normalised(1.0, 0.0)
+    here, there = normalized_scene(extent, offset), normalized_scene(1.0, 0.0)
     poses_apart = [
         np.abs(here.cameras[n].world_to_camera - there.cameras[n].world_to_camera).max() for n in there.cameras
     ]
-    return float(largest(*poses_apart, np.abs(here.points - there.points).max()))
+    return float(nan_safe_max(*poses_apart, np.abs(here.points - there.points).max()))
 
 
-def exported(extent: float, offset: float) -> np.ndarray:
-    """The vertices of the fit's .ply in the scene's own frame."""
-    scene, gaussians, _ = fitted(extent, offset)
+def export_vertices(extent: float, offset: float) -> np.ndarray:
+    """Vertices of the fit's .ply in the scene's own frame."""
+    scene, gaussians, _ = fit_scene(extent, offset)
     with tempfile.TemporaryDirectory() as folder:
         save_ply(Path(folder) / "scene.ply", gaussians, similarity=scene.similarity)
         return PlyData.read(str(Path(folder) / "scene.ply"), mmap=False)["vertex"].data.copy()
 
 
-def positions_off(extent: float, offset: float) -> float:
-    """How far the exported positions are from where the fit has them, in extents."""
-    scene, gaussians, _ = fitted(extent, offset)
-    table = exported(extent, offset)
+def position_error(extent: float, offset: float) -> float:
+    """Largest error of exported positions, in extents."""
+    scene, gaussians, _ = fit_scene(extent, offset)
+    table = export_vertices(extent, offset)
     found = np.stack([table[axis] for axis in "xyz"], 1).astype(np.float64)
     return float(np.abs(found - scene.similarity.invert(gaussians.means.numpy())).max() / extent)
 
 
-def sizes_off(extent: float, offset: float) -> float:
-    """The largest error of an exported log-scale."""
-    scene, gaussians, _ = fitted(extent, offset)
-    table = exported(extent, offset)
+def scale_error(extent: float, offset: float) -> float:
+    """Largest error of an exported log-scale."""
+    scene, gaussians, _ = fit_scene(extent, offset)
+    table = export_vertices(extent, offset)
     found = np.stack([table[f"scale_{k}"] for k in range(3)], 1).astype(np.float64)
     return float(np.abs(found - (gaussians.log_scales.double().numpy() - math.log(scene.similarity.scale))).max())
 
 
-def picture_of_export(extent: float, offset: float) -> float:
-    """Largest difference of a picture of the export, brought back into the normalised frame, from the fit's."""
-    scene, gaussians, _ = fitted(extent, offset)
+def export_picture_error(extent: float, offset: float) -> float:
+    """Largest difference between renders of the fit and of its export, loaded back into the normalised frame."""
+    scene, gaussians, _ = fit_scene(extent, offset)
     with tempfile.TemporaryDirectory() as folder:
         save_ply(Path(folder) / "scene.ply", gaussians, similarity=scene.similarity)
         again = load_ply(Path(folder) / "scene.ply", similarity=scene.similarity)
@@ -146,18 +146,18 @@ def picture_of_export(extent: float, offset: float) -> float:
     return (render(again, view).color - render(gaussians, view).color).abs().max().item()
 
 
-def scene_file_off(extent: float, offset: float) -> float:
-    """Error of points that went through the saved scene and its similarity, in extents."""
-    scene = normalised(extent, offset)
+def scene_file_error(extent: float, offset: float) -> float:
+    """Error of points after saving and loading the scene with its similarity, in extents."""
+    scene = normalized_scene(extent, offset)
     with tempfile.TemporaryDirectory() as folder:
         save_scene(Path(folder), scene)
         again = load_scene(Path(folder))
-    true = extent * truth().means.double().numpy() + extent * offset * FAR
+    true = extent * true_gaussians().means.double().numpy() + extent * offset * OFFSET_DIRECTION
     return float(np.abs(again.similarity.invert(again.points) - true).max() / extent)
 
 
-def one_place() -> float:
-    """All cameras at one place without points or bounds: nothing tells the scale; 0 where that is said."""
+def refuse_one_place() -> float:
+    """All cameras at one place, without points or bounds, leave the scale open: 0 if the refusal says so."""
     lens = Lens(WIDTH, HEIGHT, 26.0, 26.0, WIDTH / 2, HEIGHT / 2)
     try:
         frame.depth_ranges(np.stack([np.eye(4)] * 3), [lens] * 3, np.zeros((0, 3)), None)
@@ -166,9 +166,9 @@ def one_place() -> float:
     return 1.0
 
 
-def smallest_similarity() -> float:
-    """A similarity there and back at an extent of 1e-3 and an offset of 1e6, relative to the extent."""
-    similarity = Similarity(1e3, 1e6 * FAR)
+def similarity_error() -> float:
+    """A similarity and its inverse at an extent of 1e-3 and an offset of 1e6: error relative to the extent."""
+    similarity = Similarity(1e3, 1e6 * OFFSET_DIRECTION)
     points = np.random.default_rng(0).uniform(-1, 1, (100, 3))
     return float(np.abs(similarity.apply(similarity.invert(points)) - points).max())
 
@@ -183,22 +183,22 @@ FRAMES = {
 # Rounding of coordinates of 1e6 extents in float64, and a handful of operations on them.
 FAR_ROUNDING = 16 * 1e6 * EPS64
 CASES = (
-    *(Case(f"{name}, fit", "difference of PSNR from extent 1 at the origin (dB)", 0.2, partial(psnr_apart, *at))
+    *(Case(f"{name}, fit", "difference of PSNR from extent 1 at the origin (dB)", 0.2, partial(psnr_difference, *at))
       for name, at in FRAMES.items()),
     *(Case(f"{name}, normalised", "largest difference of poses and points from extent 1 at the origin", FAR_ROUNDING,
-           partial(cameras_apart, *at)) for name, at in FRAMES.items()),
-    *(Case(f"{name}, exported positions", "error in the scene's own frame, in extents", EXPORTED,
-           partial(positions_off, *at)) for name, at in FRAMES.items()),
+           partial(camera_difference, *at)) for name, at in FRAMES.items()),
+    *(Case(f"{name}, exported positions", "error in the scene's own frame, in extents", EXPORT_TOLERANCE,
+           partial(position_error, *at)) for name, at in FRAMES.items()),
     # Logarithms of sizes lie in +-16 here: half a unit in the last place of float32 is 2^-24 of that.
-    *(Case(f"{name}, exported sizes", "error of a log-scale", 16 * EPS32, partial(sizes_off, *at))
+    *(Case(f"{name}, exported sizes", "error of a log-scale", 16 * EPS32, partial(scale_error, *at))
       for name, at in FRAMES.items()),
     # A position moves by up to 1e-5 extents, a footprint of 0.5 px or more by 26 * 1e-5 px; sixty may overlap.
     Case("offset 1e6 of the extent, picture of the export", "largest difference from the fit's", 60 * 26e-5,
-         partial(picture_of_export, 1.0, 1e6)),
+         partial(export_picture_error, 1.0, 1e6)),
     Case("offset 1e6 of the extent, scene file", "error of points after the way back, in extents", FAR_ROUNDING,
-         partial(scene_file_off, 1.0, 1e6)),
+         partial(scene_file_error, 1.0, 1e6)),
     # x / scale + offset and back: an offset of 1e9 extents leaves 2^-53 * 1e9 of them.
     Case("similarity, extent 1e-3 at 1e6", "error of the way there and back, in extents", 4e9 * EPS64,
-         smallest_similarity),
-    Case("all cameras at one place", "refusals without the cause in the message", 0.0, one_place),
+         similarity_error),
+    Case("all cameras at one place", "refusals without the cause in the message", 0.0, refuse_one_place),
 )  # fmt: skip

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import torch
 
-from benchmarks.stability.cases import EPS32, EPS64, EXACT, UNCLEAR, Case, largest, unclear
+from benchmarks.stability.cases import EPS32, EPS64, EXACT, UNCLEAR, Case, count_unclear_refusal, nan_safe_max
 from benchmarks.stability.splatting import camera, cloud
 from reffusion import morphology
 from reffusion.background import continuation, unobserved, visibility
@@ -44,7 +44,7 @@ def constant_ssim() -> float:
     """Of two constant images SSIM is its luminance term, (2ab + C1) / (a^2 + b^2 + C1); difference."""
     apart = 0.0
     for a, b in ((0.0, 1.0), (0.25, 0.75), (0.0, 0.0), (1.0, 1.0)):
-        apart = largest(apart, abs(image_metrics.ssim(flat(a), flat(b)) - (2 * a * b + C1) / (a * a + b * b + C1)))
+        apart = nan_safe_max(apart, abs(image_metrics.ssim(flat(a), flat(b)) - (2 * a * b + C1) / (a * a + b * b + C1)))
     return apart
 
 
@@ -53,14 +53,14 @@ def constant_psnr() -> float:
     apart = 0.0
     for step in (1.0, 0.5, 2.0**-8, 2.0**-24):
         missed = abs(image_metrics.psnr(flat(0.0), flat(step)) + 20 * math.log10(step))
-        apart = largest(apart, missed / max(1, -math.log2(step)))
+        apart = nan_safe_max(apart, missed / max(1, -math.log2(step)))
     return apart
 
 
 def constant_flip() -> float:
     """Of a constant image with itself 0, of black and white within [0.9, 1]: by how much that is missed."""
     zero, most = image_metrics.flip(flat(0.3), flat(0.3)), image_metrics.flip(flat(0.0), flat(1.0))
-    return largest(zero, 0.9 - most, most - 1.0)
+    return nan_safe_max(zero, 0.9 - most, most - 1.0)
 
 
 def one_pixel() -> float:
@@ -72,7 +72,7 @@ def one_pixel() -> float:
 
 
 def one_pixel_box() -> float:
-    """A mask of one pixel in a corner has a box within the image, and a score."""
+    """A one-pixel mask in a corner has a box inside the image, and a score."""
     mask = np.zeros((24, 32), bool)
     mask[-1, -1] = True
     box = image_metrics.mask_box(mask)
@@ -82,8 +82,11 @@ def one_pixel_box() -> float:
 
 
 def count_lpips_faults(first: float, second: float, kind: torch.dtype) -> float:
-    """LPIPS of constant images with random weights, of both networks: how many of these do not hold: 0 of equal ones,
-    positive and finite of others, and a finite gradient, 0 at equal ones."""
+    """LPIPS of constant images with random weights of both networks: number of properties that fail.
+
+    The value must be 0 for equal images, and positive and finite for others; the gradient finite, and 0 for equal
+    images.
+    """
     torch.manual_seed(0)
     wrong = 0
     for net in ("alex", "vgg"):
@@ -100,19 +103,19 @@ def count_lpips_faults(first: float, second: float, kind: torch.dtype) -> float:
 
 
 def loss_of_constant_images() -> float:
-    """The reconstruction loss of equal and of constant images, whole and masked: wrong values and gradients."""
+    """The reconstruction loss of equal constant images, whole and masked: largest value or gradient."""
     wrong = 0.0
     for value in (0.0, 0.5, 1.0):
         for weights in (None, torch.ones(9, 8), torch.zeros(9, 8)):
             image = torch.full((9, 8, 3), value, requires_grad=True)
             loss = reconstruction_loss(image, torch.full((9, 8, 3), value), weights)
             loss.backward()
-            wrong = largest(wrong, abs(loss.item()), image.grad.abs().max().item())
+            wrong = nan_safe_max(wrong, abs(loss.item()), image.grad.abs().max().item())
     return wrong
 
 
 def loss_of_one_pixel() -> float:
-    """1 x 1 px, grey against black: the closed form, 0.8 * 0.5 + 0.2 * (1 - C1 / (0.25 + C1)); difference."""
+    """1 x 1 px, grey against black: difference from the closed form 0.8 * 0.5 + 0.2 * (1 - C1 / (0.25 + C1))."""
     loss = reconstruction_loss(torch.full((1, 1, 3), 0.5), torch.zeros(1, 1, 3))
     return abs(loss.item() - (0.4 + 0.2 * (1 - C1 / (0.25 + C1))))
 
@@ -120,41 +123,40 @@ def loss_of_one_pixel() -> float:
 # -------------------------------------------------------------------------------------------------- masks
 
 
-def labelled(given: dict[str, np.ndarray]) -> float:
-    """How many of the Gaussians that a view sees are labelled as the object."""
+def count_labelled(given: dict[str, np.ndarray]) -> float:
+    """Number of visible Gaussians that are labelled as the object."""
     return float(voting.label_gaussians(voting.cast_votes(cloud(), NAMED, given)).sum())
 
 
-def seen() -> int:
+def count_seen() -> int:
     votes = voting.cast_votes(cloud(), NAMED, {view.name: FULL for view in NAMED})
     return int((votes.masked > 0).sum())
 
 
-def all_full() -> float:
-    """Full masks label whatever is seen; how many are missed, or labelled unseen."""
-    return abs(labelled({view.name: FULL for view in NAMED}) - seen())
+def full_mask_errors() -> float:
+    """Full masks must label all visible Gaussians: number missed, or labelled though unseen."""
+    return abs(count_labelled({view.name: FULL for view in NAMED}) - count_seen())
 
 
-def contradicting() -> float:
-    """One camera under two names, masked in one and not in the other: a tie, which stays unmasked (tau = 1)."""
+def tie_errors() -> float:
+    """One camera under two names, masked in one only, gives a tie, which stays unmasked (tau = 1)."""
     twice = [NAMED[0], type(NAMED[0])("other", *list(vars(NAMED[0]).values())[1:8])]
     votes = voting.cast_votes(cloud(), twice, {NAMED[0].name: FULL, "other": EMPTY})
     return float(voting.label_gaussians(votes).sum() + (votes.masked != votes.unmasked).sum())
 
 
-def in_one_view() -> float:
-    """A mask in one view of three: the others do not vote, so all that this view sees is the object."""
+def one_view_errors() -> float:
+    """A mask in one of three views: the others do not vote, so all that this view sees is the object."""
     votes = voting.cast_votes(cloud(), NAMED, {"v1": FULL})
     return float((votes.unmasked > 0).sum() + (voting.label_gaussians(votes) != (votes.masked > 0)).sum())
 
 
-def in_no_view() -> float:
-    return unclear(lambda: voting.cast_votes(cloud(), NAMED, {}), "none of the training views has a mask")
+def refuse_no_mask() -> float:
+    return count_unclear_refusal(lambda: voting.cast_votes(cloud(), NAMED, {}), "none of the training views has a mask")
 
 
-def nothing_remains() -> float:
-    """Every Gaussian is the object: nobody saw anything, so all is undecided and nothing goes on; how many pixels and
-    votes say otherwise."""
+def empty_scene_errors() -> float:
+    """If every Gaussian is the object nothing is observed: pixels and votes that say otherwise."""
     nobody = cloud().map(lambda p: p[:0])
     views = visibility.render_depth_views(nobody, NAMED, {view.name: FULL for view in NAMED})
     planes = continuation.find_planes(np.zeros(3), 1.0, views, np.zeros((0, 3)))
@@ -165,14 +167,14 @@ def nothing_remains() -> float:
     )
 
 
-def tidied() -> float:
-    """Empty and full masks stay what they are, whatever counts as a speck or a gap."""
+def tidying_errors() -> float:
+    """Empty and full masks must stay unchanged, whatever counts as a speck or a gap; changed pixels."""
     changed = [(morphology.remove_small_parts(mask, 5.0, 5.0) != mask).sum() for mask in (EMPTY, FULL)]
     return float(sum(changed))
 
 
-def views_of_masks() -> float:
-    """The view to complete: none of empty masks, one of full ones; boxes likewise; how many are wrong."""
+def view_choice_errors() -> float:
+    """Empty masks have no view to complete and no box, full masks have both; number of wrong answers."""
     names = [view.name for view in NAMED]
     none = voting.best_view(dict.fromkeys(names, EMPTY), names), image_metrics.mask_box(EMPTY)
     some = voting.best_view(dict.fromkeys(names, FULL), names), image_metrics.mask_box(FULL)
@@ -198,12 +200,12 @@ CASES = (
     Case("reconstruction loss of identical constant images", "largest value or gradient", 4 * EPS32 / 9e-4,
          loss_of_constant_images),
     Case("reconstruction loss of 1-px images", "difference from the closed form", 8 * EPS32, loss_of_one_pixel),
-    Case("masks empty", "Gaussians labelled", EXACT, lambda: labelled({view.name: EMPTY for view in NAMED})),
-    Case("masks full", "Gaussians labelled wrongly", EXACT, all_full),
-    Case("masks contradicting", "Gaussians labelled, and unequal votes", EXACT, contradicting),
-    Case("mask present in one view", "Gaussians labelled wrongly", EXACT, in_one_view),
-    Case("mask in no view", UNCLEAR, EXACT, in_no_view),
-    Case("masks full, nothing remains", "pixels and votes that say something", EXACT, nothing_remains),
-    Case("masks empty and full, tidied", "pixels changed", EXACT, tidied),
-    Case("masks empty and full, views and boxes", WRONG, EXACT, views_of_masks),
+    Case("masks empty", "Gaussians labelled", EXACT, lambda: count_labelled({view.name: EMPTY for view in NAMED})),
+    Case("masks full", "Gaussians labelled wrongly", EXACT, full_mask_errors),
+    Case("masks contradicting", "Gaussians labelled, and unequal votes", EXACT, tie_errors),
+    Case("mask present in one view", "Gaussians labelled wrongly", EXACT, one_view_errors),
+    Case("mask in no view", UNCLEAR, EXACT, refuse_no_mask),
+    Case("masks full, nothing remains", "pixels and votes that say something", EXACT, empty_scene_errors),
+    Case("masks empty and full, tidied", "pixels changed", EXACT, tidying_errors),
+    Case("masks empty and full, views and boxes", WRONG, EXACT, view_choice_errors),
 )  # fmt: skip

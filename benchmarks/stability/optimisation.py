@@ -1,4 +1,4 @@
-"""Cases of the optimisation: everything pruned, rates ten times too large, gradients of any size."""
+"""Cases of the optimisation: everything pruned, learning rates ten times too large, gradients of any size."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from benchmarks.stability import frames
-from benchmarks.stability.cases import EPS32, EXACT, Case, largest
+from benchmarks.stability.cases import EPS32, EXACT, Case, nan_safe_max
 from benchmarks.stability.splatting import camera, cloud
 from reffusion import seeding, trace
 from reffusion.distill.confinement import TrainView
@@ -32,49 +32,51 @@ STOPS = "neither recovered nor stopped by name, or wrote NaN"
 
 
 def psnr(gaussians: Gaussians) -> float:
-    """Over the views of `frames`, in dB."""
-    scene, pictures = frames.normalised(1.0, 0.0), frames.photographs()
+    """PSNR over the views of `frames`, in dB."""
+    scene, pictures = frames.normalized_scene(1.0, 0.0), frames.render_photographs()
     error = np.mean([(render(gaussians, view).color.clamp(0, 1).numpy() - pictures[name] / 255.0) ** 2
                      for name, view in scene.cameras.items()])  # fmt: skip
     return float(-10 * math.log10(error))
 
 
-def written(folder: Path) -> bool:
-    """Whether every number of the trace is finite."""
+def is_trace_finite(folder: Path) -> bool:
+    """True if every number of the trace is finite."""
     values = [v for line in trace.read_trace(folder / "trace.jsonl") for v in line.values() if not isinstance(v, str)]
     return all(math.isfinite(v) for v in values)
 
 
-def named(error: FloatingPointError, term: str) -> bool:
+def names_step_and_term(error: FloatingPointError, term: str) -> bool:
     return "step" in str(error) and term in str(error)
 
 
-def too_fast(factor: float) -> float:
-    """A fit at so many times the usual rates ends above where it began, or says in which step which term failed."""
-    scene = frames.normalised(1.0, 0.0)
+def fast_fit_fails(factor: float) -> float:
+    """0 if a fit at `factor` times the usual rates improves, or reports the step and the term that failed."""
+    scene = frames.normalized_scene(1.0, 0.0)
     start = initial_gaussians(scene.points, scene.point_colors, 0, 1000, seeding.generator(0))
     usual = Rates(means=2e-3, means_last=2e-4, log_scales=1.5e-2, sh_dc=1.5e-2)
     settings = Params(iterations=60, random_background=False).changed({"sh.degree": 0, "densify.every": 10})
-    rates = frames.faster(usual, factor)
+    rates = frames.scale_rates(usual, factor)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         try:
-            found = fit(list(scene.cameras.values()), frames.photographs(), start, settings, folder=folder, rates=rates)
+            found = fit(
+                list(scene.cameras.values()), frames.render_photographs(), start, settings, folder=folder, rates=rates
+            )
         except FloatingPointError as error:
-            return float(not (named(error, "reconstruction") and written(folder)))
+            return float(not (names_step_and_term(error, "reconstruction") and is_trace_finite(folder)))
         finite = all(torch.isfinite(getattr(found, n)).all() for n in PARAMETERS)
-        return float(not (finite and written(folder) and (psnr(found) > psnr(start) or factor > 100)))
+        return float(not (finite and is_trace_finite(folder) and (psnr(found) > psnr(start) or factor > 100)))
 
 
-def too_fast_distillation(factor: float) -> float:
-    """The same of a distillation by reconstruction and reference, half of the Gaussians masked."""
-    scene, fitted, _ = frames.fitted(1.0, 0.0)
+def fast_distillation_fails(factor: float) -> float:
+    """The same for a distillation by reconstruction and reference, with half of the Gaussians masked."""
+    scene, fitted, _ = frames.fit_scene(1.0, 0.0)
     masked = fitted.means[:, 0] > 0
     start = replace(fitted, sh=torch.where(masked[:, None, None], 0.0, fitted.sh))
-    pictures = {name: torch.from_numpy(p).float() / 255 for name, p in frames.photographs().items()}
+    pictures = {name: torch.from_numpy(p).float() / 255 for name, p in frames.render_photographs().items()}
     whole = torch.ones(frames.HEIGHT, frames.WIDTH, dtype=torch.bool)
     views = [TrainView(view, pictures[n], whole, ~whole, clean=False) for n, view in scene.cameras.items()]
-    off, rates = {"weight": 0}, frames.faster(Rates(means=2e-3), factor)
+    off, rates = {"weight": 0}, frames.scale_rates(Rates(means=2e-3), factor)
     settings = distilling.Params(
         iterations=40, sds=off, depth=off, adversarial=off, reference={"weight": 1}, lr={"epsilon": 1e-6}
     )
@@ -84,13 +86,13 @@ def too_fast_distillation(factor: float) -> float:
         try:
             found, _ = distill(start, masked, views, holes, None, None, settings, folder, rates=rates)
         except FloatingPointError as error:
-            return float(not (named(error, "re") and written(folder)))
+            return float(not (names_step_and_term(error, "re") and is_trace_finite(folder)))
         finite = all(torch.isfinite(getattr(found, n)).all() for n in PARAMETERS)
-        return float(not (finite and written(folder) and psnr(found) > psnr(start)))
+        return float(not (finite and is_trace_finite(folder) and psnr(found) > psnr(start)))
 
 
-def nobody_left() -> float:
-    """All Gaussians pruned: pictures are background, steps do nothing, files hold none; how much of it fails."""
+def empty_scene_errors() -> float:
+    """All Gaussians pruned: renders are background, steps do nothing, files are empty; number of violations."""
     optimizer, view = GaussianOptimizer(cloud()), camera()
     removed = prune(optimizer, 1.1, math.inf)
     picture = render(optimizer.gaussians, view, background=torch.full((3,), 0.25))
@@ -104,22 +106,22 @@ def nobody_left() -> float:
     return float(sum(not x for x in good))
 
 
-def fit_of_nobody() -> float:
-    """A fit whose pruning takes everything says so, with the step."""
-    scene = frames.normalised(1.0, 0.0)
+def refuse_empty_fit() -> float:
+    """0 if a fit whose pruning removes everything reports it with the step."""
+    scene = frames.normalized_scene(1.0, 0.0)
     start = initial_gaussians(scene.points, scene.point_colors, 0, 1000, seeding.generator(0))
     densify = Densify(start=0.0, stop=1.0, every=4, prune_scale3d=1e-9, grow_grad2d=1e9)
     settings = Params(iterations=8, sh=SphericalHarmonics(degree=0), densify=densify)
     with tempfile.TemporaryDirectory() as folder:
         try:
-            fit(list(scene.cameras.values()), frames.photographs(), start, settings, folder=Path(folder))
+            fit(list(scene.cameras.values()), frames.render_photographs(), start, settings, folder=Path(folder))
         except ValueError as error:
             return float(not ("step 3" in str(error) and "no Gaussian" in str(error)))
     return 1.0
 
 
-def oversized() -> float:
-    """Log-scales of 100 and more, whose exponential is infinite, are pruned as too large; how many are not."""
+def count_unpruned() -> float:
+    """Log-scales of 100 and more, whose exponential overflows, must be pruned as too large; number that is not."""
     gaussians = cloud()
     gaussians.log_scales[:4] = torch.tensor([100.0, 1e3, 1e4, 1e30])[:, None]
     optimizer = GaussianOptimizer(gaussians)
@@ -127,8 +129,8 @@ def oversized() -> float:
     return float(len(optimizer.gaussians) - 4)
 
 
-def gradients_of_any_size() -> float:
-    """Adam's first step is one step size long, whatever the gradient; by how much it is longer, relative."""
+def first_step_excess() -> float:
+    """Adam's first step has the length of the step size for any gradient; relative excess."""
     worst = 0.0
     for size in (1e-25, 1e-15, 1e-8, 1.0, 1e8, 1e18):
         optimizer = GaussianOptimizer(cloud(degree=0), rates=Rates(means=1e-3, means_last=1e-3))
@@ -136,12 +138,12 @@ def gradients_of_any_size() -> float:
         optimizer.gaussians.means.grad = torch.full_like(before, size)
         optimizer.step(0.0)
         moved = (optimizer.gaussians.means.detach() - before).abs().max().item()
-        worst = largest(worst, moved / 1e-3 - 1 if math.isfinite(moved) else math.inf)
+        worst = nan_safe_max(worst, moved / 1e-3 - 1 if math.isfinite(moved) else math.inf)
     return worst
 
 
-def broken_gradient() -> float:
-    """A gradient that is NaN or infinite: a message that names the parameter, and nothing moved."""
+def broken_gradient_errors() -> float:
+    """A NaN or infinite gradient must raise an error that names the parameter, and move nothing."""
     wrong = 0
     for value in (math.nan, math.inf):
         optimizer = GaussianOptimizer(cloud())
@@ -157,14 +159,14 @@ def broken_gradient() -> float:
 
 
 CASES = (
-    *(Case(f"learning rates {factor:g} times too large, fit", STOPS, EXACT, partial(too_fast, factor))
+    *(Case(f"learning rates {factor:g} times too large, fit", STOPS, EXACT, partial(fast_fit_fails, factor))
       for factor in (10.0, 1e6)),
-    Case("learning rates 10 times too large, distillation", STOPS, EXACT, partial(too_fast_distillation, 10.0)),
-    Case("all Gaussians pruned", "properties that do not hold", EXACT, nobody_left),
-    Case("all Gaussians pruned in a fit", "refusals without step and cause", EXACT, fit_of_nobody),
-    Case("log-scales whose exponential is infinite", "Gaussians not pruned", EXACT, oversized),
+    Case("learning rates 10 times too large, distillation", STOPS, EXACT, partial(fast_distillation_fails, 10.0)),
+    Case("all Gaussians pruned", "properties that do not hold", EXACT, empty_scene_errors),
+    Case("all Gaussians pruned in a fit", "refusals without step and cause", EXACT, refuse_empty_fit),
+    Case("log-scales whose exponential is infinite", "Gaussians not pruned", EXACT, count_unpruned),
     # A mean of order one is rounded to 2^-24, against a step of 1e-3; Adam's own arithmetic rounds some ten times.
     Case("gradients of 1e-25 to 1e18", "how much longer than a step size, relative", 2e3 * EPS32 + 16 * EPS32,
-         gradients_of_any_size),
-    Case("gradients that are not numbers", "unnamed, or something moved", EXACT, broken_gradient),
+         first_step_excess),
+    Case("gradients that are not numbers", "unnamed, or something moved", EXACT, broken_gradient_errors),
 )  # fmt: skip

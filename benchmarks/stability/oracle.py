@@ -1,8 +1,8 @@
-"""The compiled rasterizer against plain torch in float64, with the compiled one's own order and cut-offs.
+"""The compiled rasterizer against plain torch in float64, with the compiled one's order and cut-offs.
 
-A cut-off (alpha under 1/255, a finished pixel) is a jump: where float32 and float64 fall on different sides of one, a
-difference says nothing about accuracy. So the oracle is told which Gaussian the kernel blended into which pixel, and
-sorts by the depth in float32, as the kernel does. Everything else is float64.
+A cut-off (alpha under 1/255, a finished pixel) is a discontinuity: if float32 and float64 fall on different sides of
+it, their difference says nothing about accuracy. So the oracle is given which Gaussian the kernel blended into which
+pixel, and sorts by depth in float32, as the kernel does. Everything else is float64.
 """
 
 from __future__ import annotations
@@ -20,14 +20,16 @@ from reffusion.types import PARAMETERS, Camera, Gaussians
 BLOCKS = (*PARAMETERS, "features", "background", "probe")
 IMAGES = ("color", "depth", "alpha", "features")
 CHANNELS = 2
-EPSILON = 2.0**-24  # the relative error of one rounding to float32
+EPSILON = 2.0**-24  # relative error of one rounding to float32
 
 
-class Drawn(NamedTuple):
-    """What an implementation drew, and the gradients of a fixed random linear function of it.
+class Rendered(NamedTuple):
+    """Images of an implementation, and the gradients of a fixed random linear function of them.
 
     Attributes:
-        images: colour, depth, alpha, features. gradients: by `BLOCKS`. radii: [N] int32.
+        images: colour, depth, alpha, features.
+        gradients: by `BLOCKS`.
+        radii: [N] int32.
     """
 
     images: Mapping[str, Tensor]
@@ -35,10 +37,10 @@ class Drawn(NamedTuple):
     radii: Tensor
 
 
-def draw(gaussians: Gaussians, camera: Camera, impl: str, seed: int = 0, far: float = 1.0) -> Drawn:
-    """With `impl` "cpu" in float32; with "reference" in float64 with the cut-offs of "cpu".
+def render_with_gradients(gaussians: Gaussians, camera: Camera, impl: str, seed: int = 0, far: float = 1.0) -> Rendered:
+    """Render with "cpu" in float32, or with "reference" in float64 with the cut-offs of "cpu".
 
-    `far`: the unit of depth in the linear function.
+    `far` is the unit of depth in the linear function.
     """
     dtype = torch.float32 if impl == "cpu" else torch.float64
     random = torch.Generator().manual_seed(seed)
@@ -52,13 +54,13 @@ def draw(gaussians: Gaussians, camera: Camera, impl: str, seed: int = 0, far: fl
         drawn = rasterizer.render(gaussians, camera, impl="cpu", **extras)
         images, radii = {name: getattr(drawn, name) for name in IMAGES}, drawn.radii
     else:
-        images, radii = _drawn_with(blended, gaussians, camera, **extras)
+        images, radii = _render_reference(blended, gaussians, camera, **extras)
     units = {"depth": far}
     loss = sum((image * normal(*image.shape)).sum() / units.get(name, 1.0) for name, image in images.items())
     leaves = [*(getattr(gaussians, name) for name in PARAMETERS), features, background, probe]
     found = torch.autograd.grad(loss, leaves, allow_unused=True)
     gradients = {n: torch.zeros_like(x) if g is None else g for n, x, g in zip(BLOCKS, leaves, found, strict=True)}
-    return Drawn({name: image.detach() for name, image in images.items()}, gradients, radii)
+    return Rendered({name: image.detach() for name, image in images.items()}, gradients, radii)
 
 
 def blended_pixels(gaussians: Gaussians, camera: Camera) -> Tensor:
@@ -68,10 +70,10 @@ def blended_pixels(gaussians: Gaussians, camera: Camera) -> Tensor:
     return rasterizer.accumulate(gaussians, camera, each, impl="cpu", count=True).T > 0
 
 
-def _drawn_with(blended: Tensor, gaussians: Gaussians, camera: Camera, features, background, probe):
-    """The reference's pictures with given cut-offs, and its radii."""
+def _render_reference(blended: Tensor, gaussians: Gaussians, camera: Camera, features, background, probe):
+    """The reference's images with given cut-offs, and its radii."""
     projected, radii = reference.project(gaussians, camera, probe)
-    again = torch.sort(projected.depths.float(), stable=True).indices  # of equal ones, those of lower index are first
+    again = torch.sort(projected.depths.float(), stable=True).indices  # equal depths by index
     projected = reference.Projected(*(array[again] for array in projected))
     order = projected.order
     columns, rows = torch.meshgrid(torch.arange(camera.width), torch.arange(camera.height), indexing="xy")
@@ -100,17 +102,20 @@ gradients are standard normal) and rounded about ten times on its way, keeps a r
 def errors(gaussians: Gaussians, camera: Camera, relative: float, seed: int = 0) -> dict[str, float]:
     """Name of an image or parameter block -> relative L2 error |kernel - oracle| / (|oracle| + floor / relative).
 
-    So a value of at most `relative` says that the error is within relative * |oracle| + floor. A quaternion's
-    gradient counts times its length, as a rotation: otherwise the shortest one would drown all others.
+    A value of at most `relative` means an error within relative * |oracle| + floor. A quaternion's gradient is
+    multiplied by its length, which makes it one of a rotation: otherwise the shortest quaternion would dominate.
     """
-    # Depths count in units of the farthest, so that the terms of every sum are of order one, as the floor has them.
+    # Depth is in units of the farthest one, so that the terms of all sums are of order one, as `FLOOR` assumes.
     far = max(1.0, rasterizer.render(gaussians, camera, impl="cpu").depth.max().item())
-    fast, exact = (draw(gaussians, camera, impl, seed, far) for impl in ("cpu", "reference"))
+    fast, exact = (render_with_gradients(gaussians, camera, impl, seed, far) for impl in ("cpu", "reference"))
     if not torch.equal(fast.radii, exact.radii):
         return {"radii": float("inf")}
     lengths = gaussians.quaternions.double().norm(dim=1, keepdim=True)
     found = {}
-    for kind, here, there in (("values", fast.images, exact.images), ("gradients", *_turned(fast, exact, lengths))):
+    for kind, here, there in (
+        ("values", fast.images, exact.images),
+        ("gradients", *_scale_quaternions(fast, exact, lengths)),
+    ):
         for name in there:
             error = (here[name].double() - there[name]).norm().item()
             label = name if kind == "values" else f"gradient of {name}"
@@ -118,13 +123,13 @@ def errors(gaussians: Gaussians, camera: Camera, relative: float, seed: int = 0)
     return found
 
 
-def _turned(fast: Drawn, exact: Drawn, lengths: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Both gradients, those of quaternions times their lengths."""
+def _scale_quaternions(fast: Rendered, exact: Rendered, lengths: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Both gradients, with those of quaternions multiplied by their lengths."""
     turn = lambda found: {**found, "quaternions": found["quaternions"].double() * lengths}
     return turn(fast.gradients), turn(exact.gradients)
 
 
-def worst(gaussians: Gaussians, camera: Camera, relative: float) -> float:
-    """The largest of `errors`; infinite where one is not a number."""
+def worst_error(gaussians: Gaussians, camera: Camera, relative: float) -> float:
+    """The largest of `errors`; infinite if one is NaN."""
     found = errors(gaussians, camera, relative).values()
     return max(error if error == error else float("inf") for error in found)

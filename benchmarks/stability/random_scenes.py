@@ -1,7 +1,7 @@
 """Random small scenes, ordinary and extreme, on which the compiled rasterizer must agree with the oracle.
 
-A seeded generator makes them, so they are the same for every version of the code; it takes the ends of a range often.
-Each scene has up to eight Gaussians and 12 x 10 pixels, for the oracle looks at every pair.
+A seeded generator makes them, the same for every version of the code; it often takes the ends of a range. Each scene
+has up to eight Gaussians and 12 x 10 pixels, since the oracle evaluates every pair.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from benchmarks.stability.cases import Case
 from reffusion.types import Camera, Gaussians
 
 ORDINARY, EXTREME = 2e-5, 1e-3
-MOST = 8
-ENDS = 0.2  # share of numbers that are an end of their range
+MAX_GAUSSIANS = 8
+END_SHARE = 0.2  # share of numbers at an end of their range
 
 
 class Worst(NamedTuple):
-    """The largest error over random scenes, where it is, and in which scene (counted from 0)."""
+    """The largest error over random scenes, its block, the scene's number (from 0), and the number of scenes."""
 
     error: float
     where: str
@@ -34,7 +34,7 @@ class Worst(NamedTuple):
 
 
 def _between(random: np.random.Generator, low: float, high: float) -> float:
-    return float(random.choice((low, high))) if random.random() < ENDS else random.uniform(low, high)
+    return float(random.choice((low, high))) if random.random() < END_SHARE else random.uniform(low, high)
 
 
 def _integer(random: np.random.Generator, low: int, high: int) -> int:
@@ -42,8 +42,8 @@ def _integer(random: np.random.Generator, low: int, high: int) -> int:
 
 
 def ordinary(random: np.random.Generator) -> tuple[Gaussians, Camera]:
-    """Gaussians a tenth of the scene large, at most 30 times longer than thick, seen from about one extent away."""
-    count, degree = _integer(random, 1, MOST), _integer(random, 0, 3)
+    """Gaussians of a tenth of the scene, at most 30 times longer than thick, seen from about one extent away."""
+    count, degree = _integer(random, 1, MAX_GAUSSIANS), _integer(random, 0, 3)
     view = _camera(random, _between(random, 1.0, 2.0), _between(random, 0.5, 3.0))
     scales = math.log(0.1) + np.clip(0.7 * random.normal(size=(count, 3)), -1.7, 1.7)
     arrays = (
@@ -58,7 +58,7 @@ def ordinary(random: np.random.Generator) -> tuple[Gaussians, Camera]:
 
 def extreme(random: np.random.Generator) -> tuple[Gaussians, Camera]:
     """Scales of 1e-7 to 1e4 extents, anisotropy to 1e6, logits to 30, any quaternion; at, behind and in the camera."""
-    count, degree = _integer(random, 1, MOST), _integer(random, 0, 3)
+    count, degree = _integer(random, 1, MAX_GAUSSIANS), _integer(random, 0, 3)
     view = _camera(random, _between(random, 0.125, 4.0), _between(random, 0.25, 10.0))
     means, quaternions, scales, logits = [], [], [], []
     for _ in range(count):
@@ -73,7 +73,7 @@ def extreme(random: np.random.Generator) -> tuple[Gaussians, Camera]:
 
 
 def _place(random: np.random.Generator, view: Camera) -> np.ndarray:
-    """A mean [3] in the scene, about the near plane, behind the camera, in its centre, or far away."""
+    """A mean [3] in the scene, near the near plane, behind the camera, in its centre, or far away."""
     kind = random.choice(("scene", "scene", "near plane", "behind", "centre", "far"))
     if kind == "scene":
         return 0.4 * random.normal(size=3)
@@ -88,7 +88,7 @@ def _place(random: np.random.Generator, view: Camera) -> np.ndarray:
 
 
 def _camera(random: np.random.Generator, distance: float, focal: float) -> Camera:
-    """A view of the origin, up to 12 x 10 pixels; `focal`: over the image's width."""
+    """A view of the origin, up to 12 x 10 pixels; `focal` is relative to the image width."""
     width, height = _integer(random, 1, 12), _integer(random, 1, 10)
     pose = np.eye(4)
     pose[:3, :3] = Rotation.random(random_state=int(random.integers(2**31))).as_matrix()
@@ -102,7 +102,7 @@ def _gaussians(arrays, antialiased: bool) -> Gaussians:
     return Gaussians(*tensors, antialiased=antialiased)
 
 
-def worst_of(scenes: Callable, relative: float, count: int) -> Worst:
+def find_worst(scenes: Callable, relative: float, count: int) -> Worst:
     """Draw `count` scenes, the same ones each time, and compare each with the oracle."""
     found = []
     for number in range(count):
@@ -114,8 +114,8 @@ def worst_of(scenes: Callable, relative: float, count: int) -> Worst:
 
 
 def _measured(scenes: Callable, relative: float, count: int) -> float:
-    worst = worst_of(scenes, relative, count)
-    print(f"  the worst of {worst.scenes} {scenes.__name__} scenes: {worst.where}, scene {worst.scene}", flush=True)
+    worst = find_worst(scenes, relative, count)
+    print(f"  worst of {worst.scenes} {scenes.__name__} scenes: {worst.where}, scene {worst.scene}", flush=True)
     return worst.error
 
 

@@ -1,10 +1,10 @@
-"""Cases of completion (`depth`) and of the bilateral solver: almost nothing known, holes at the border, flat guides."""
+"""Cases of depth completion and the bilateral solver: little known data, holes at the border, constant guides."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.stability.cases import EPS64, EXACT, UNCLEAR, Case, largest, unclear
+from benchmarks.stability.cases import EPS64, EXACT, UNCLEAR, Case, count_unclear_refusal, nan_safe_max
 from reffusion.depth import bilateral, completion
 from reffusion.depth.planes import planar_model
 from reffusion.seeding import generator
@@ -16,11 +16,11 @@ CORNER = (ROWS > 25) & (COLUMNS > 35)
 FLAT = np.full((40, 56, 3), 128, np.uint8)
 
 
-def textured() -> np.ndarray:
+def noise_guide() -> np.ndarray:
     return np.random.default_rng(0).integers(0, 255, (40, 56, 3)).astype(np.uint8)
 
 
-def only(*pixels: tuple[int, int]) -> np.ndarray:
+def confidence_at(*pixels: tuple[int, int]) -> np.ndarray:
     confidence = np.zeros(PLANE.shape)
     for pixel in pixels:
         confidence[pixel] = 1.0
@@ -34,64 +34,68 @@ def plane_error(hole: np.ndarray, guide: np.ndarray | None = None, unit: float =
     return float(np.abs(completed / disparity - 1.0).max())
 
 
-def nothing_known_to_complete() -> float:
-    return unclear(lambda: completion.complete(PLANE, np.zeros(PLANE.shape)), "fix no plane")
+def refuse_completion_without_data() -> float:
+    return count_unclear_refusal(lambda: completion.complete(PLANE, np.zeros(PLANE.shape)), "fix no plane")
 
 
-def nothing_known_to_solve() -> float:
-    return unclear(lambda: bilateral.solve(PLANE, np.zeros(PLANE.shape), FLAT), "no pixel of positive confidence")
+def refuse_solving_without_data() -> float:
+    return count_unclear_refusal(
+        lambda: bilateral.solve(PLANE, np.zeros(PLANE.shape), FLAT), "no pixel of positive confidence"
+    )
 
 
-def one_pixel_to_complete() -> float:
-    return unclear(lambda: completion.complete(PLANE, only((3, 3))), "1 known pixels", "fix no plane")
+def refuse_completion_of_one_pixel() -> float:
+    return count_unclear_refusal(
+        lambda: completion.complete(PLANE, confidence_at((3, 3))), "1 known pixels", "fix no plane"
+    )
 
 
-def one_pixel_to_solve() -> float:
-    """One known pixel says one value, everywhere; relative error."""
-    solved = [bilateral.solve(PLANE, only((3, 3)), guide) for guide in (FLAT, textured())]
-    return float(largest(*(np.abs(s / PLANE[3, 3] - 1.0).max() for s in solved)))
+def one_pixel_error() -> float:
+    """One known pixel fixes one value everywhere; relative error."""
+    solved = [bilateral.solve(PLANE, confidence_at((3, 3)), guide) for guide in (FLAT, noise_guide())]
+    return float(nan_safe_max(*(np.abs(s / PLANE[3, 3] - 1.0).max() for s in solved)))
 
 
-def two_pixels_to_solve() -> float:
-    """Two known pixels: how far outside their values the solution gets, relative to their difference."""
-    known = only((3, 3), (30, 50))
+def two_pixels_error() -> float:
+    """Two known pixels: how far the solution leaves their range, relative to their difference."""
+    known = confidence_at((3, 3), (30, 50))
     low, high = sorted((PLANE[3, 3], PLANE[30, 50]))
-    solved = np.concatenate([bilateral.solve(PLANE, known, guide).ravel() for guide in (FLAT, textured())])
-    return float(largest(low - solved.min(), solved.max() - high) / (high - low))
+    solved = np.concatenate([bilateral.solve(PLANE, known, guide).ravel() for guide in (FLAT, noise_guide())])
+    return float(nan_safe_max(low - solved.min(), solved.max() - high) / (high - low))
 
 
-def faint_confidence() -> float:
-    """Confidence of 1e-8 everywhere: a constant stays one; relative error."""
-    solved = bilateral.solve(np.full(PLANE.shape, 3.25), np.full(PLANE.shape, 1e-8), textured())
+def faint_confidence_error() -> float:
+    """Confidence of 1e-8 everywhere must keep a constant; relative error."""
+    solved = bilateral.solve(np.full(PLANE.shape, 3.25), np.full(PLANE.shape, 1e-8), noise_guide())
     return float(np.abs(solved / 3.25 - 1.0).max())
 
 
-def unequal_confidence() -> float:
-    """Confidence from 1e-8 to 1e4: the solution outside the range of its data, relative to that range."""
+def unequal_confidence_error() -> float:
+    """Confidence from 1e-8 to 1e4: how far the solution leaves the range of its data, relative to that range."""
     random = np.random.default_rng(0)
     confidence = 10 ** random.uniform(-8, 4, PLANE.shape)
-    solved = bilateral.solve(PLANE, confidence, textured())
-    return float(largest(PLANE.min() - solved.min(), solved.max() - PLANE.max()) / np.ptp(PLANE))
+    solved = bilateral.solve(PLANE, confidence, noise_guide())
+    return float(nan_safe_max(PLANE.min() - solved.min(), solved.max() - PLANE.max()) / np.ptp(PLANE))
 
 
-def one_row() -> float:
-    """A picture one pixel high: the solver keeps a constant; relative error."""
-    solved = bilateral.solve(np.full((1, 56), 3.25), np.ones((1, 56)), textured()[:1])
+def one_row_error() -> float:
+    """An image one pixel high: the solver must keep a constant; relative error."""
+    solved = bilateral.solve(np.full((1, 56), 3.25), np.ones((1, 56)), noise_guide()[:1])
     return float(np.abs(solved / 3.25 - 1.0).max())
 
 
-def unseen_by_any() -> float:
-    """A refinement whose known pixels all agree, hole to the border: relative error of the estimate it keeps."""
+def border_hole_error() -> float:
+    """A refinement without misfit and with a hole to the border: relative error of the kept estimate."""
     refined = bilateral.refine(PLANE, np.where(CORNER, 9.0, PLANE), (~CORNER).astype(float), FLAT)
     return float(np.abs(refined / PLANE - 1.0).max())
 
 
-def hole_everywhere_but_a_rim() -> float:
-    """Only the outermost pixels of one side are known: a band, which fixes a plane only where it is two wide."""
-    return unclear(lambda: completion.complete(PLANE, COLUMNS < 1), "fix no plane")
+def refuse_one_known_line() -> float:
+    """Only one column is known; a plane needs a band two pixels wide."""
+    return count_unclear_refusal(lambda: completion.complete(PLANE, COLUMNS < 1), "fix no plane")
 
 
-def rooms_of_constant_disparity() -> float:
+def constant_plane_error() -> float:
     """Planes found among samples of one disparity: relative error."""
     rows, columns = np.nonzero(~HOLE)
     pixels = np.stack([columns, rows], 1) + 0.5
@@ -100,45 +104,48 @@ def rooms_of_constant_disparity() -> float:
 
 
 def condition_of_completion() -> float:
-    """Condition number of the completion's system, hole of 17 px: stiffness times the fourth power of what a plate
-    leaves free."""
+    """Condition number of the completion's system with a hole of 17 px.
+
+    It is the stiffness times the fourth power of the free width.
+    """
     return completion.condition((~HOLE).astype(float))
 
 
 def condition_of_solver() -> float:
-    """How many times Jacobi's preconditioning lowers the solver's condition number, as 1 / that."""
+    """Condition number with Jacobi's preconditioning, relative to the one without."""
     confidence = 10 ** np.random.default_rng(0).uniform(-2, 2, PLANE.shape)
-    plain, scaled = bilateral.condition(confidence, textured())
+    plain, scaled = bilateral.condition(confidence, noise_guide())
     return scaled / plain
 
 
-# Planes cost neither data nor bending, so only rounding is left: of the plane's fit, over some 2,000 pixels.
-FITTED = 16 * np.sqrt(PLANE.size) * EPS64
-CG = 1e-8  # relative residual at which the solver stops
+# A plane has no data misfit and no bending, so only the rounding of its fit over some 2,000 pixels is left.
+ROUNDING = 16 * np.sqrt(PLANE.size) * EPS64
+CG_TOL = 1e-8  # relative residual at which the solver stops
 
 CASES = (
-    Case("completion, zero confidence everywhere", UNCLEAR, EXACT, nothing_known_to_complete),
-    Case("solver, zero confidence everywhere", UNCLEAR, EXACT, nothing_known_to_solve),
-    Case("completion, one known pixel", UNCLEAR, EXACT, one_pixel_to_complete),
-    Case("solver, one known pixel", "relative error of the constant", 4 * EPS64, one_pixel_to_solve),
-    # The exact solution keeps to its data's range (a maximum principle); conjugate gradients stop at 1e-8 of the right
-    # hand side, which the condition number, 1e5 without data, may enlarge.
-    Case("solver, two known pixels", "how far outside their range, relative to it", 1e5 * CG, two_pixels_to_solve),
-    Case("solver, confidence 1e-8 everywhere", "relative error of a constant", 4 * EPS64, faint_confidence),
-    Case("solver, confidence 1e-8 to 1e4", "how far outside the data's range, relative to it", 1e5 * CG,
-         unequal_confidence),
-    Case("solver, image one pixel high", "relative error of a constant", 4 * EPS64, one_row),
-    Case("solver, hole touching the border", "relative error of an estimate without misfit", 4 * EPS64, unseen_by_any),
-    Case("completion, hole touching the border", "relative error of a plane", FITTED, lambda: plane_error(CORNER)),
-    Case("completion, hole over three borders", "relative error of a plane", FITTED,
+    Case("completion, zero confidence everywhere", UNCLEAR, EXACT, refuse_completion_without_data),
+    Case("solver, zero confidence everywhere", UNCLEAR, EXACT, refuse_solving_without_data),
+    Case("completion, one known pixel", UNCLEAR, EXACT, refuse_completion_of_one_pixel),
+    Case("solver, one known pixel", "relative error of the constant", 4 * EPS64, one_pixel_error),
+    # The exact solution stays in the range of its data (maximum principle); conjugate gradients stop at 1e-8 of the
+    # right-hand side, which the condition number, 1e5 without data, may enlarge.
+    Case("solver, two known pixels", "how far outside their range, relative to it", 1e5 * CG_TOL, two_pixels_error),
+    Case("solver, confidence 1e-8 everywhere", "relative error of a constant", 4 * EPS64, faint_confidence_error),
+    Case("solver, confidence 1e-8 to 1e4", "how far outside the data's range, relative to it", 1e5 * CG_TOL,
+         unequal_confidence_error),
+    Case("solver, image one pixel high", "relative error of a constant", 4 * EPS64, one_row_error),
+    Case("solver, hole touching the border", "relative error of an estimate without misfit", 4 * EPS64,
+         border_hole_error),
+    Case("completion, hole touching the border", "relative error of a plane", ROUNDING, lambda: plane_error(CORNER)),
+    Case("completion, hole over three borders", "relative error of a plane", ROUNDING,
          lambda: plane_error(COLUMNS > 8)),
-    Case("completion, one line known", UNCLEAR, EXACT, hole_everywhere_but_a_rim),
-    Case("completion, constant guide", "relative error of a plane", FITTED, lambda: plane_error(HOLE, FLAT)),
-    Case("completion, guide of noise", "relative error of a plane", FITTED, lambda: plane_error(HOLE, textured())),
-    Case("completion, disparities of 1e-8", "relative error of a plane", FITTED,
+    Case("completion, one line known", UNCLEAR, EXACT, refuse_one_known_line),
+    Case("completion, constant guide", "relative error of a plane", ROUNDING, lambda: plane_error(HOLE, FLAT)),
+    Case("completion, guide of noise", "relative error of a plane", ROUNDING, lambda: plane_error(HOLE, noise_guide())),
+    Case("completion, disparities of 1e-8", "relative error of a plane", ROUNDING,
          lambda: plane_error(HOLE, unit=1e-8)),
-    Case("completion, disparities of 1e8", "relative error of a plane", FITTED, lambda: plane_error(HOLE, unit=1e8)),
-    Case("completion, offset 1e6 of the slope", "relative error of a plane", FITTED,
+    Case("completion, disparities of 1e8", "relative error of a plane", ROUNDING, lambda: plane_error(HOLE, unit=1e8)),
+    Case("completion, offset 1e6 of the slope", "relative error of a plane", ROUNDING,
          lambda: plane_error(HOLE, offset=1e6)),
-    Case("rooms of constant disparity", "relative error", FITTED, rooms_of_constant_disparity),
+    Case("rooms of constant disparity", "relative error", ROUNDING, constant_plane_error),
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Cases of splat files: Mip-Splatting's filter folded in, values that editors clamp, quantised splats."""
+"""Cases of splat files: Mip-Splatting's folded filter, values that editors clamp, quantised splats."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.stability.cases import EPS32, EPS64, EXACT, Case, largest
+from benchmarks.stability.cases import EPS32, EPS64, EXACT, Case, nan_safe_max
 from benchmarks.stability.splatting import camera, cloud
 from reffusion.io.compressed import load_spz, save_spz
 from reffusion.io.ply import save_ply
@@ -21,14 +21,14 @@ from reffusion.io.splats import load_splats
 from reffusion.splat import rasterizer
 from reffusion.types import PARAMETERS, Gaussians
 
-# Log-scales, filters and logits: from a point to a star, from nothing to all, of like size and far apart.
+# Log-scales, filters and logits of similar and of very different size.
 LOG_SCALES = (-40.0, -20.0, -5.0, 0.0, 7.0, 40.0)
 FILTERS = (0.0, 1e-30, 1e-8, 3e-3, 1.0, 1e8)
 LOGITS = (-90.0, -20.0, -1.0, 0.0, 4.0, 30.0)
 
 
-def folded_exactly(log_scale: float, size: float, logit: float) -> tuple[float, float, float]:
-    """The log-scale, and the logarithms of the opacity and of its complement, in 80 decimal digits, all axes alike."""
+def fold_filter_exactly(log_scale: float, size: float, logit: float) -> tuple[float, float, float]:
+    """The log-scale, and the logarithms of opacity and of its complement, in 80 decimal digits, with all axes alike."""
     with localcontext() as context:
         context.prec = 80
         square, filter_ = (2 * Decimal(log_scale)).exp(), Decimal(size) ** 2
@@ -36,23 +36,25 @@ def folded_exactly(log_scale: float, size: float, logit: float) -> tuple[float, 
         return float((square + filter_).ln() / 2), float(opacity.ln()), float((1 - opacity).ln())
 
 
-def filter_off() -> float:
-    """The largest error of a folded log-scale, or of the logarithm of an opacity or of its complement, in units of
-    what a rounding of the inputs, or of a logarithm itself, makes of it."""
+def filter_error() -> float:
+    """Largest error of a folded log-scale, or of the logarithm of an opacity or of its complement.
+
+    In units of the effect of rounding an input, or the logarithm itself.
+    """
     errors = []
     for log_scale in LOG_SCALES:
         for size in FILTERS:
             for logit in LOGITS:
                 scales, logits = fold_filter(np.full((1, 3), log_scale), np.array([logit]), np.array([size]))
-                scale, opacity, clear = folded_exactly(log_scale, size, logit)
+                scale, opacity, clear = fold_filter_exactly(log_scale, size, logit)
                 logs = -np.logaddexp(0, -logits[0]), -np.logaddexp(0, logits[0])
                 errors += [abs(scales[0, 0] - scale) / (1 + abs(scale)), abs(logs[0] - opacity) / (1 + abs(opacity))]
                 errors.append(abs(logs[1] - clear) / (1 + abs(clear)))
-    return largest(*errors)
+    return nan_safe_max(*errors)
 
 
-def filter_not_finite() -> float:
-    """How many values are not finite after reading rows of every extreme, infinite logits and flat axes too."""
+def count_invalid_rows() -> float:
+    """Values that are not finite after reading rows of all extremes, with infinite logits and flat axes."""
     grid = np.array(np.meshgrid([*LOG_SCALES, -np.inf], FILTERS, [*LOGITS, np.inf, -np.inf])).reshape(3, -1)
     scales, logits = fold_filter(np.repeat(grid[0][:, None], 3, 1), grid[2], grid[1])
     count = len(logits)
@@ -68,9 +70,12 @@ def rows_of(gaussians: Gaussians) -> Rows:
     return Rows(means.astype(np.float64), *others)
 
 
-def clamped_off(gradients: bool) -> float:
-    """Largest difference of a picture, or relative one of its gradients, with an opaque splat, a transparent one and
-    flat ones from the picture of their limits; infinite where one is not finite."""
+def clamping_error(gradients: bool) -> float:
+    """Largest difference of a picture (or relative difference of its gradients) from the picture of the limits.
+
+    The scene has an opaque, a transparent and flat splats, written with infinite values. Infinite if a value is not
+    finite.
+    """
     given = cloud()
     given.opacity_logits[:2] = torch.tensor([math.inf, -math.inf])
     given.log_scales[2, 1] = given.log_scales[3, 0] = -math.inf
@@ -89,11 +94,13 @@ def clamped_off(gradients: bool) -> float:
     (picture, slopes), (other, others) = found
     if not gradients:
         return (picture - other).abs().max().item()
-    return largest(*((a - b).norm().item() / max(b.norm().item(), 1e-5) for a, b in zip(slopes, others, strict=True)))
+    return nan_safe_max(
+        *((a - b).norm().item() / max(b.norm().item(), 1e-5) for a, b in zip(slopes, others, strict=True))
+    )
 
 
-def splat_off(what: str) -> float:
-    """Largest error of what a .splat keeps, after writing and reading, in steps of its format."""
+def splat_error(what: str) -> float:
+    """Largest error of a .splat after writing and reading, in steps of its format."""
     given = cloud(500, degree=0)
     given.opacity_logits[:2] = torch.tensor([MOST_LOGIT, -MOST_LOGIT])
     given.log_scales[2] = FLAT
@@ -107,8 +114,8 @@ def splat_off(what: str) -> float:
     return float(np.abs(read.log_scales - rows.log_scales).max())
 
 
-def spz_off(extent: float) -> float:
-    """Largest error of a position after a .spz, in extents; rows that are lost count as infinite."""
+def spz_error(extent: float) -> float:
+    """Largest error of a position after a .spz, in extents; infinite if rows are lost."""
     given = cloud(500, degree=3)
     rows = rows_of(given)
     rows = Rows(rows.means * extent, *list(vars(rows).values())[1:])
@@ -121,20 +128,20 @@ def spz_off(extent: float) -> float:
 CASES = (
     # A rounding of log(size) is 2^-53 of up to 70, twice that in the exponent, thrice in the product over axes.
     Case("filter_3D, sizes from 0 to 1e8, scales e-40 to e40", "worst error of a logarithm, over 1 + its size",
-         2 * 3 * 70 * EPS64, filter_off),
+         2 * 3 * 70 * EPS64, filter_error),
     Case("filter_3D with infinite logits and flat axes", "values that are not finite, and rows lost", EXACT,
-         filter_not_finite),
+         count_invalid_rows),
     # The opacity is off by e^-20 = 2e-9, an axis by 2e-9 extents: below a rounding of float32 in what eight splats add.
     Case("infinite opacities and flat scales, picture", "largest difference from their limits", 8 * EPS32,
-         partial(clamped_off, False)),
+         partial(clamping_error, False)),
     Case("infinite opacities and flat scales, gradients", "worst relative difference of a block from the limits'",
-         1e-3, partial(clamped_off, True)),
+         1e-3, partial(clamping_error, True)),
     Case("quantised in a .splat, opacities", "worst error in steps of 1/255", 0.5 + 1e-3,
-         partial(splat_off, "opacities")),
+         partial(splat_error, "opacities")),
     # A size is a float32: its logarithm, of up to 20, is off by a rounding of the size and one of itself.
-    Case("quantised in a .splat, log-scales", "worst error", 21 * EPS32 + EPS32, partial(splat_off, "scales")),
+    Case("quantised in a .splat, log-scales", "worst error", 21 * EPS32 + EPS32, partial(splat_error, "scales")),
     # 24 bits with sign over the power of two above the extent, and one more: a step is 2^-21 of the largest coordinate,
     # which is that of 500 normal ones of 0.25; bounded by 20 fractional bits.
     *(Case(f"quantised in a .spz, extent {extent:g}", "worst error of a position in extents",
-           max(2**-21, 2**-21 / extent) + EPS32, partial(spz_off, extent)) for extent in (1e-2, 1.0, 1e4)),
+           max(2**-21, 2**-21 / extent) + EPS32, partial(spz_error, extent)) for extent in (1e-2, 1.0, 1e4)),
 )  # fmt: skip

@@ -1,10 +1,11 @@
-"""The paper's Figure 2: several views of a scene painted by the adapted prior, beside the prior as it is.
+"""The paper's Figure 2: views of a scene inpainted by the personalized prior, beside the prior as it is.
 
 `python -m benchmarks.studies.adapted --run runs/demo`, or `make scene=X adapted`; needs the stages up to `personalize`.
-Training views with something to invent, spread evenly, are known without the object as far as other views tell; their
-hole is painted from pure noise, the whole view at the prior's own size as SDS sees it. Same views, same noise,
-same sampler; the prior as it is with the empty prompt, and with the adapted one's, which may mean something to it.
-Writes sheet.png, the pictures, each as <view>/<column>.png, and adapted.json to --out.
+Takes evenly spread training views with something to invent; their background comes from other views, as far as known.
+The hole is inpainted from pure noise, with the whole view at the prior's native size, as SDS sees it. Views, noise and
+sampler are the same for all columns. The prior as it is runs with the empty prompt and with the personalized prior's
+prompt, which may mean something to it.
+Writes sheet.png, each picture as <view>/<column>.png, and adapted.json to --out.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.studies import device
+from benchmarks.studies import scene_priors
 from reffusion import seeding
 from reffusion.fit import exposure
 from reffusion.io.arrays import load_labels
@@ -26,11 +27,11 @@ from reffusion.prior import diffusion, inpaint
 from reffusion.prior.crops import PROMPTS
 from reffusion.prior.model import Prior
 from reffusion.references import view_ranking
-from report.sheet import enlarged, evenly, framed
+from report.sheet import compose_sheet, enlarge, pick_evenly
 
 VIEWS = 5
 SEED = 0
-WIDTH = 400  # px of a picture on the sheet, about
+WIDTH = 400  # approximate width of a picture on the sheet, px
 COLUMNS = {  # column -> the prior, and its prompt
     "as it is, no prompt": ("before", ""),
     "as it is": ("before", PROMPTS[0]),
@@ -38,12 +39,13 @@ COLUMNS = {  # column -> the prior, and its prompt
 }
 
 
-def given_views(run: Path, count: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """View -> (uint8 [H, W, 3], as far as it is known without the object; hole, bool [H, W]): up to `count` training
-    views with something to invent, the reference's own left out.
+def load_holes(run: Path, count: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """View -> (picture, hole) of up to `count` training views with something to invent, without the reference's own.
+
+    The picture is uint8 [H, W, 3] with the background as far as known, the hole bool [H, W].
 
     Raises:
-        ValueError: naming what is missing, or where nothing is to be invented.
+        ValueError: a stage is missing, or nothing is to be invented.
     """
     for stage in ("poses", "fit", "masks", "reference"):
         if not (run / stage).is_dir():
@@ -56,15 +58,15 @@ def given_views(run: Path, count: int) -> dict[str, tuple[np.ndarray, np.ndarray
         raise ValueError(f"{run / 'masks'}: nothing is to be invented but in the reference")
     keep = ~load_labels(run / "masks" / "labels.npy")
     remaining = load_ply(run / "fit" / "gaussians.ply").map(lambda p: p[keep])
-    chosen = evenly(names, count)
+    chosen = pick_evenly(names, count)
     photos = exposure.load_views(run / "poses", run / "fit", chosen)
     known = lambda n: inpaint.background(remaining, scene.cameras[n], photos[n], sets[n].consistent)
     return {name: (known(name), sets[name].invent) for name in chosen}
 
 
 @torch.no_grad()
-def painted(prior: Prior, picture: np.ndarray, hole: np.ndarray, prompt: str, steps: int) -> np.ndarray:
-    """uint8 [H, W, 3]: the hole painted from the noise of `SEED`."""
+def paint_hole(prior: Prior, picture: np.ndarray, hole: np.ndarray, prompt: str, steps: int) -> np.ndarray:
+    """uint8 [H, W, 3]: the hole inpainted from the noise of `SEED`."""
     inside = torch.from_numpy(hole)
     made = inpaint.repaint(
         prior,
@@ -81,33 +83,35 @@ def painted(prior: Prior, picture: np.ndarray, hole: np.ndarray, prompt: str, st
     return inpaint.as_picture(made)
 
 
-def drawn(models: dict[str, Prior], run: Path, count: int, steps: int, out: Path) -> list[str]:
-    """Write the pictures and sheet.png; the views on it."""
-    views, rows = given_views(run, count), []
+def save_sheet(models: dict[str, Prior], run: Path, count: int, steps: int, out: Path) -> list[str]:
+    """Write the pictures and sheet.png; return the views on it."""
+    views, rows = load_holes(run, count), []
     for name, (picture, hole) in views.items():
         row = {"to paint": view_ranking.to_paint(picture, hole)}
         for column, (when, prompt) in COLUMNS.items():
-            row[column] = painted(models[when], picture, hole, prompt, steps)
+            row[column] = paint_hole(models[when], picture, hole, prompt, steps)
         for column, made in row.items():
             save_image(out / name / f"{column.replace(', ', '-').replace(' ', '-')}.png", made)
         scale = max(1, round(WIDTH / picture.shape[1]))
-        rows.append([enlarged(made, scale) for made in row.values()])
+        rows.append([enlarge(made, scale) for made in row.values()])
         print(f"{name}: painted by {len(COLUMNS)}", flush=True)
-    save_image(out / "sheet.png", framed(rows, ["to paint", *COLUMNS], list(views)))
+    save_image(out / "sheet.png", compose_sheet(rows, ["to paint", *COLUMNS], list(views)))
     return list(views)
 
 
 def main() -> None:
-    parser = device.arguments(__doc__, "the stages up to personalize", "adapted")
+    parser = scene_priors.study_parser(__doc__, "the stages up to personalize", "adapted")
     parser.add_argument("--views", type=int, default=VIEWS)
     parser.add_argument("--steps", type=int, default=Sampler().steps, help="sampler steps from pure noise")
     given = parser.parse_args()
-    models, base = device.before_and_after(given)
+    models, base = scene_priors.load_priors(given)
     out = given.out or given.run / "adapted"
-    views = drawn(models, given.run, given.views, given.steps, out)
-    device.save(given, out, "adapted.json", {"prior": base, "seed": SEED, "steps": given.steps, "views": views})
+    views = save_sheet(models, given.run, given.views, given.steps, out)
+    scene_priors.save_results(
+        given, out, "adapted.json", {"prior": base, "seed": SEED, "steps": given.steps, "views": views}
+    )
     print(out / "sheet.png")
 
 
 if __name__ == "__main__":
-    device.run(main)
+    scene_priors.run_study(main)

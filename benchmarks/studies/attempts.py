@@ -1,11 +1,11 @@
-"""Ways of distilling, error against seconds: `python -m benchmarks.studies.attempts --run runs/demo`.
+"""Settings of distillation, error against seconds: `python -m benchmarks.studies.attempts --run runs/demo`.
 
-From one initialization, each setting of `ATTEMPTS` runs for the laptop profile's number of steps; at some of them the
-Gaussians are rendered from test views, with the clock stopped, and scored in the mask's box. The initialization is the
-run's own; --start takes another folder with gaussians.ply and labels.npy, such as runs/demo@lift_mse/initialize, whose
-pictures are worse: what a prior is worth depends on what there is left to teach.
-Test views measure here; nothing chooses a setting by them. Writes attempts.json and attempts.png to --out; settings
-that are in the file already are not run again.
+From one initialization, each setting in `ATTEMPTS` runs for the laptop profile's number of steps. At some of them test
+views are rendered, with the clock stopped, and scored in the mask's box. The initialization is the run's own; --start
+takes another folder with gaussians.ply and labels.npy, such as runs/demo@lift_mse/initialize, whose pictures are worse:
+the value of a prior depends on what is left to improve.
+Test views only measure; no setting is chosen by them. Writes attempts.json and attempts.png to --out; settings that
+are already in the file are not run again.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from stages import evaluate
 
 ROOT = Path(__file__).resolve().parents[2]
 
-MOMENTS = (0, 5, 10, 20, 40, 70, 100)  # steps done
-VIEWS = 10  # test views, evenly over all
+MEASURED_STEPS = (0, 5, 10, 20, 40, 70, 100)  # steps after which scores are measured
+VIEWS = 10  # test views, evenly spread
 SCORES = ("psnr_box", "ssim_box", "flip_box")
 NEEDS = ("poses", "fit", "masks", "reference", "initialize")
-BASE = "personalize"  # a key that is none of distill's: False takes the prior as it is
-FREE = {"lr": {"epsilon": 1e-15, "masked": 1.0, "opacities": 1.0}}  # 3DGS's full steps for masked Gaussians
-# What differs from the laptop profile.
+BASE = "personalize"  # not a parameter of `distill`: False takes the prior without personalization
+FREE = {"lr": {"epsilon": 1e-15, "masked": 1.0, "opacities": 1.0}}  # 3DGS's full step sizes for masked Gaussians
+# Differences from the laptop profile.
 ATTEMPTS: dict[str, dict] = {
     "the profile": {},
     "no SDS": {"sds": {"weight": 0}},
@@ -59,8 +59,8 @@ ATTEMPTS: dict[str, dict] = {
 }
 
 
-def profile(overrides: dict) -> stage.Params:
-    """The laptop profile's parameters of `distill`, changed."""
+def profile_params(overrides: dict) -> stage.Params:
+    """The laptop profile's parameters of `distill` with overrides."""
     values = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"]["distill"]
     for name, value in overrides.items():
         if name != BASE:
@@ -68,11 +68,11 @@ def profile(overrides: dict) -> stage.Params:
     return stage.Params(**values)
 
 
-def test_views(run: Path) -> list[tuple]:
+def load_test_views(run: Path) -> list[tuple]:
     """(camera, truth uint8 [H, W, 3], box) of `VIEWS` test views.
 
     Raises:
-        ValueError: none has a truth and a mask.
+        ValueError: no test view has ground truth and a mask.
     """
     scene, found = load_scene(run / "poses"), []
     for name in scene.test:
@@ -87,8 +87,8 @@ def test_views(run: Path) -> list[tuple]:
 
 
 @torch.no_grad()
-def scored(gaussians, views: list[tuple]) -> dict[str, float]:
-    """Means of `SCORES` of 8-bit renders, as `evaluate` gives them."""
+def score_views(gaussians, views: list[tuple]) -> dict[str, float]:
+    """Means of `SCORES` over 8-bit renders, as `evaluate` computes them."""
     rows = []
     for camera, truth, box in views:
         picture = (rasterizer.render(gaussians, camera).color.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
@@ -96,9 +96,9 @@ def scored(gaussians, views: list[tuple]) -> dict[str, float]:
     return {name: float(np.mean([row[name.removesuffix("_box")] for row in rows])) for name in SCORES}
 
 
-def curve(overrides: dict, run: Path, start: Path, views: list[tuple]) -> list[dict[str, float]]:
-    """Lines {"seconds", "iteration", the scores} of one attempt."""
-    params = profile(overrides)
+def run_attempt(overrides: dict, run: Path, start: Path, views: list[tuple]) -> list[dict[str, float]]:
+    """Lines {"seconds", "iteration", scores} of one setting."""
+    params = profile_params(overrides)
     scene = load_scene(run / "poses")
     initial, masked, holes = stage.start(params, scene, run / "reference", start)
     adapted = run / "personalize" if overrides.get(BASE, True) else None
@@ -106,23 +106,25 @@ def curve(overrides: dict, run: Path, start: Path, views: list[tuple]) -> list[d
     seen = stage.train_views(params, scene, run / "poses", run / "fit", run / "masks")
     job = job_of(seen, holes, prior, text, params, initial, masked)
     optimizer = GaussianOptimizer(initial, masked, None, masked_factors(params.lr), epsilon=params.lr.epsilon)
-    rasterizer.render(optimizer.gaussians, holes[0][0]).color.sum().backward()  # compiles, before the clock starts
+    rasterizer.render(
+        optimizer.gaussians, holes[0][0]
+    ).color.sum().backward()  # compiles the kernels before the clock starts
     optimizer.forget_gradients()
     with tempfile.TemporaryDirectory() as folder:
         log = trace.Trace(Path(folder))
-        for step in range(max(MOMENTS) + 1):
-            if step in MOMENTS:
+        for step in range(max(MEASURED_STEPS) + 1):
+            if step in MEASURED_STEPS:
                 with log.paused():
-                    log.log(step, **scored(optimizer.gaussians, views))
-            if step < max(MOMENTS):
+                    log.log(step, **score_views(optimizer.gaussians, views))
+            if step < max(MEASURED_STEPS):
                 step_of(optimizer, step, job)
                 average(optimizer, params, step + 1)
         return trace.read_trace(log.path)
 
 
 def draw(curves: dict[str, list[dict]], path: Path, title: str) -> None:
-    """PSNR and FLIP against seconds, a line an attempt."""
-    figure, grid = charts.figure(4.6, 1, 2)
+    """Chart PSNR and FLIP against seconds, one line per setting."""
+    figure, grid = charts.new_figure(4.6, 1, 2)
     for axes, (name, label) in zip(grid[0], (("psnr_box", "PSNR, dB ↑"), ("flip_box", "FLIP ↓")), strict=True):
         for index, (attempt, lines) in enumerate(curves.items()):
             style = "--" if "no SDS" in attempt else ":" if attempt.startswith("free") else "-"
@@ -134,7 +136,7 @@ def draw(curves: dict[str, list[dict]], path: Path, title: str) -> None:
     named = grid[0, 0].get_legend_handles_labels()
     figure.legend(*named, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
     figure.suptitle(title, fontsize=9)
-    charts.save(figure, path)
+    charts.save_chart(figure, path)
 
 
 def main() -> None:
@@ -150,11 +152,11 @@ def main() -> None:
         if not (given.run / need).is_dir():
             raise ValueError(f"{given.run / need} is missing: run `make scene={given.run.name} all` first")
     given.out.mkdir(parents=True, exist_ok=True)
-    file, views = given.out / "attempts.json", test_views(given.run)
+    file, views = given.out / "attempts.json", load_test_views(given.run)
     curves = load_json(file) if file.exists() else {}
     for name in given.only or ATTEMPTS:
         if name not in curves:
-            curves[name] = curve(ATTEMPTS[name], given.run, given.start or given.run / "initialize", views)
+            curves[name] = run_attempt(ATTEMPTS[name], given.run, given.start or given.run / "initialize", views)
             save_json(file, curves)
         last = curves[name][-1]
         print(f"{name:44}", {s: round(last[s], 4) for s in SCORES}, f"{last['seconds']:.0f} s", flush=True)

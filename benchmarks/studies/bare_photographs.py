@@ -1,10 +1,9 @@
-"""Poses found for photographs that bring none: `python -m benchmarks.studies.bare_photographs ../shared/data/fox`.
+"""Accuracy of poses found from photographs alone: `python -m benchmarks.studies.bare_photographs ../shared/data/fox`.
 
-Photographs of captures whose poses are known go through the stage `poses` without them. After the best similarity,
-centres are compared with the known ones in % of the extent (the greatest distance between two centres), rotations in
-degrees. A principal point off the middle, which structure from motion does not look for, counts as a rotation. Two
-lines a capture: before and after the adjustment to optical flow (`poses.refine`). Writes
-bare_photographs.json to --out.
+Photographs of captures with known poses go through the stage `poses` without them. After the best similarity transform,
+camera centres are compared in % of the extent (the largest distance between two centres), rotations in degrees. A
+principal point off the image centre, which structure from motion does not estimate, appears as a rotation. Two lines
+per capture: before and after the adjustment to optical flow (`poses.refine`). Writes bare_photographs.json to --out.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ COLUMNS = (
 
 
 def pose_errors(found: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of the views that both have, after the similarity that brings the centres closest.
+    """Errors of the views that both have, after the similarity transform that brings the centres closest.
 
     Args:
         found, truth: view -> world-to-camera [4, 4].
@@ -62,8 +61,8 @@ def pose_errors(found: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray]
     return 100 * np.linalg.norm(aligned - b, axis=1) / extent, np.degrees(rotations.magnitude())
 
 
-def rows(folder: Path, images: str | None, every: int, longest: int) -> list[dict]:
-    """The capture's lines of the table: poses as solved and, where flow changes them, as adjusted."""
+def evaluate_capture(folder: Path, images: str | None, every: int, longest: int) -> list[dict]:
+    """Rows of the table for a capture: poses as solved, and as adjusted to flow."""
     capture = load_capture(folder, images=images)
     names = sorted(capture.pictures)[::every]
     truth = {name: capture.poses.world_to_camera[name] for name in names}
@@ -95,8 +94,8 @@ def rows(folder: Path, images: str | None, every: int, longest: int) -> list[dic
     return result
 
 
-def line(row: dict) -> str:
-    """A row of the table in Markdown."""
+def format_row(row: dict) -> str:
+    """A row of the Markdown table."""
     cells = (f"{value:.2f}" if isinstance(value, float) else str(value) for value in row.values())
     return f"| {' | '.join(cells)} |"
 
@@ -104,7 +103,7 @@ def line(row: dict) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("captures", type=Path, nargs="+", help="folders with photographs and poses")
-    parser.add_argument("--every", type=int, default=2, help="take every so manieth photograph by name")
+    parser.add_argument("--every", type=int, default=2, help="take every n-th photograph by name")
     parser.add_argument("--images", help="folder of pictures inside the capture")
     parser.add_argument("--longest", type=int, default=640, help="px of the longer side, as poses.longest")
     parser.add_argument("--out", type=Path, default=Path("runs/bare_photographs"))
@@ -113,9 +112,9 @@ def main() -> None:
     print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}")
     table = []
     for folder in given.captures:
-        for row in rows(folder, given.images, given.every, given.longest):
+        for row in evaluate_capture(folder, given.images, given.every, given.longest):
             table.append(row)
-            print(line(row), flush=True)
+            print(format_row(row), flush=True)
     (given.out / "bare_photographs.json").write_text(json.dumps(table, indent=1))
 
 

@@ -1,9 +1,9 @@
-"""Does the misfit choose the right candidate? References from patches of photographs, against the truth of their view.
+"""Does the lowest misfit select the best candidate? Reference candidates from patches of photographs against the truth.
 
-`python -m benchmarks.studies.candidates --runs runs/composites/runs` after `benchmarks.studies.composites --alone`: for
-each place with a run and an untouched one, and each seed, the candidates of the stage `reference` are scored in the box
-of their hole. Prints a table: of each score the mean candidate, the one that the lowest misfit takes, and the best one.
-Writes candidates.json and sheets (truth, candidates; the taken one first) to --out.
+`python -m benchmarks.studies.candidates --runs runs/composites/runs`, after `benchmarks.studies.composites --alone`.
+For each place with a run and an untouched run, and each seed, the candidates of the stage `reference` are scored in the
+box of their hole. Prints for each score the mean candidate, the one with the lowest misfit, and the best one. Writes
+candidates.json and sheets (truth, selected candidate, others) to --out.
 """
 
 from __future__ import annotations
@@ -22,11 +22,17 @@ from reffusion.metrics import image_metrics, lpips
 from reffusion.params.reference import Params
 from stages import reference
 
-SCORES = {"lpips_vgg": min, "lpips_alex": min, "psnr": max, "ssim": max, "flip": min}  # and which is the best
+SCORES = {
+    "lpips_vgg": min,
+    "lpips_alex": min,
+    "psnr": max,
+    "ssim": max,
+    "flip": min,
+}  # and the function that picks the best
 
 
 def score_candidates(run: Path, untouched: Path, out: Path, seed: int, models: dict[str, lpips.Lpips]) -> dict | None:
-    """{"view", "taken", SCORES of every candidate} of a place; None where nothing had to be invented."""
+    """{"view", "taken", SCORES of every candidate} of a place; None if nothing had to be invented."""
     if not (run / "reference/candidates.json").is_file() or not load_json(run / "masks/facts.json")["invent_pixels"]:
         return None
     shutil.rmtree(out, ignore_errors=True)
@@ -49,14 +55,14 @@ def score_candidates(run: Path, untouched: Path, out: Path, seed: int, models: d
 
 
 def table(rows: list[dict]) -> str:
-    """Markdown: a row a score; how often the taken one is the best, beside the share that chance would give."""
+    """Markdown table with a row per score: how often the selected candidate is the best, beside the share by chance."""
     lines = ["| score | mean candidate | taken | best | taken is best | by chance |", "|---" * 6 + "|"]
     for name, best in SCORES.items():
-        there = [row for row in rows if None not in row[name]]
-        values = [(np.mean(row[name]), row[name][row["taken"]], best(row[name])) for row in there]
+        complete = [row for row in rows if None not in row[name]]
+        values = [(np.mean(row[name]), row[name][row["taken"]], best(row[name])) for row in complete]
         means = [f"{value:.4f}" for value in np.mean(values, 0)]
         hit = np.mean([taken == best for _, taken, best in values])
-        chance = np.mean([1 / len(row[name]) for row in there])
+        chance = np.mean([1 / len(row[name]) for row in complete])
         lines.append(f"| {name} | {' | '.join(means)} | {hit:.2f} | {chance:.2f} |")
     return "\n".join(lines) + "\n"
 

@@ -1,9 +1,9 @@
-"""Masks from few clicks in one view against true masks: `python -m benchmarks.studies.clicks --runs runs/demo`.
+"""Masks from simulated clicks against true masks: `python -m benchmarks.studies.clicks --runs runs/demo`.
 
-Of each run the stages `poses`, with true masks, and `fit` are needed. Clicks are put where a person would correct: each
-in the middle of the largest error of the middle view's mask so far, until that is right or there are --clicks. Prints
-the view's IoU after each, then mean and worst IoU over all views with masks; --sheets: the masks over three
-views and the worst.
+Each run needs the stages `poses`, with true masks, and `fit`. Each click is placed like a person's correction, in the
+middle of the largest error of the middle view's mask so far, until that mask is good or there are --clicks clicks.
+Prints that view's IoU after each click, then mean and worst IoU over all views with masks; --sheets writes the masks
+over three views and the worst one.
 """
 
 from __future__ import annotations
@@ -22,27 +22,27 @@ from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_raw_masks, load_scene, load_views
 
-RIGHT = 0.94  # IoU from which a person would not correct
+GOOD_IOU = 0.94  # from this IoU on a person would not correct
 TINT = (255, 0, 160)
 
 
 def iou(found: np.ndarray, true: np.ndarray) -> float:
-    """Of bool [H, W] masks; 1 where both are empty."""
+    """Intersection over union of bool [H, W] masks; 1 if both are empty."""
     return float((found & true).sum() / (found | true).sum()) if (found | true).any() else 1.0
 
 
 def next_click(found: np.ndarray, true: np.ndarray) -> tuple[float, float, bool]:
-    """(x, y, on the object) of the pixel that lies deepest in what is missing, or in what is too much."""
+    """(x, y, on the object) of the pixel deepest inside what is missing or superfluous."""
     depths = [ndimage.distance_transform_edt(np.pad(wrong, 1))[1:-1, 1:-1] for wrong in (found & ~true, true & ~found)]
     missing = bool(depths[1].max() >= depths[0].max())
     row, column = np.unravel_index(depths[missing].argmax(), true.shape)
     return column + 0.5, row + 0.5, missing
 
 
-def clicked(image: np.ndarray, true: np.ndarray, most: int, relief: np.ndarray) -> Clicks:
-    """The clicks that a person would make on a view, with what comes of each printed; relief: `view_mask` has it."""
+def simulate_clicks(image: np.ndarray, true: np.ndarray, most: int, relief: np.ndarray) -> Clicks:
+    """The clicks that a person would make on a view, printing the IoU after each; `relief` is that of `view_mask`."""
     chosen, found = [], np.zeros_like(true)
-    while len(chosen) < most and iou(found, true) < RIGHT:
+    while len(chosen) < most and iou(found, true) < GOOD_IOU:
         chosen.append(next_click(found, true))
         clicks = Clicks(np.array([each[:2] for each in chosen]), np.array([each[2] for each in chosen]))
         began = time.monotonic()
@@ -51,8 +51,8 @@ def clicked(image: np.ndarray, true: np.ndarray, most: int, relief: np.ndarray) 
     return clicks
 
 
-def measured(run: Path, most: int, sheet: Path | None) -> str:
-    """A line of figures; ValueError where the run has no masks."""
+def evaluate_run(run: Path, most: int, sheet: Path | None) -> str:
+    """One line of figures. ValueError if the run has no masks."""
     scene = load_scene(run / "poses")
     true = load_raw_masks(run / "raw_masks", scene.train)
     if not true:
@@ -60,7 +60,7 @@ def measured(run: Path, most: int, sheet: Path | None) -> str:
     names = sorted(true)
     view, images = names[len(names) // 2], load_views(run / "poses", names)
     gaussians = load_ply(run / "fit/gaussians.ply")
-    clicks = clicked(images[view], true[view], most, all_views.relief(gaussians, scene.cameras[view]))
+    clicks = simulate_clicks(images[view], true[view], most, all_views.relief(gaussians, scene.cameras[view]))
     began, cameras = time.monotonic(), {name: scene.cameras[name] for name in names}
     near = all_views.neighbours(gaussians)
     solved = all_views.solved(gaussians, near, cameras, images.__getitem__, {view: clicks}, {})
@@ -71,24 +71,24 @@ def measured(run: Path, most: int, sheet: Path | None) -> str:
     worst = min(shares, key=shares.__getitem__)
     if sheet:
         some = [*names[:: max(1, len(names) // 3)][:3], worst]
-        save_image(sheet, np.hstack([tinted(images[name], found[name]) for name in some]))
+        save_image(sheet, np.hstack([overlay_mask(images[name], found[name]) for name in some]))
     mean = float(np.mean(list(shares.values())))
     return f"{run.name}: {len(clicks)} clicks, mean {mean:.3f}, worst {shares[worst]:.3f} ({worst}), {seconds:.1f} s"
 
 
-def tinted(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """uint8 [H, W, 3], the mask over its picture."""
+def overlay_mask(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """uint8 [H, W, 3]: the picture with its mask tinted."""
     return np.where(mask[..., None], 0.5 * image + 0.5 * np.array(TINT), image).round().astype(np.uint8)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=Path, nargs="+", required=True)
-    parser.add_argument("--clicks", type=int, default=5, help="at most so many")
+    parser.add_argument("--clicks", type=int, default=5, help="largest number of clicks")
     parser.add_argument("--sheets", type=Path, help="folder for pictures")
     given = parser.parse_args()
     for run in given.runs:
-        print(measured(run, given.clicks, given.sheets / f"{run.name}.png" if given.sheets else None), flush=True)
+        print(evaluate_run(run, given.clicks, given.sheets / f"{run.name}.png" if given.sheets else None), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
-"""The benchmark on real captures: `python -m benchmarks.studies.composites --places dino-ground`.
+"""Benchmark on real captures with synthetic objects: `python -m benchmarks.studies.composites --places dino-ground`.
 
-An object that is not there is drawn into the training photographs of a nerfstudio capture; the untouched photographs
-are the exact truth of what it hides. For each place: the scene, the job on it (given the true reference, unless
---alone), and a fit to the untouched photographs of the same views, scored in the same boxes: the ceiling.
-Writes to --out composites.md, composites.json and for each place a sheet of all test views (truth, with the object,
-ours, ceiling, difference) and a chart of errors against seconds. Settings are chosen on the places that run without
---report; those with it are for reporting.
+An object is drawn into the training photographs of a nerfstudio capture; the untouched photographs are the exact truth
+behind it. For each place: the scene, the job on it (with the true reference, unless --alone), and as the ceiling a fit
+to the untouched photographs of the same views, scored in the same boxes.
+Writes to --out composites.md, composites.json and per place a sheet of all test views (truth, with the object, ours,
+ceiling, difference) and a chart of errors against seconds. Settings are chosen only on the places that run without
+--report; the others serve for reporting.
 """
 
 from __future__ import annotations
@@ -16,20 +16,22 @@ import subprocess
 import sys
 from pathlib import Path
 
-from benchmarks.studies import drawing, judging, placing
-from benchmarks.studies.placing import Place
+from benchmarks.studies import compositing, placement, scoring
+from benchmarks.studies.placement import Place
 from reffusion.io.images import save_image
-from report.job import draw
-from report.loading import load_job
+from report.job import draw_job
+from report.job_data import load_job
 
 ROOT = Path(__file__).resolve().parents[2]
 
-CHOOSE = (
+# Places on which settings are chosen.
+TUNING_PLACES = (
     Place("table", "garden", "frame_00097", (180, 270), 0.16, 50, 34, 8),
     Place("bear-rock", "bear", "frame_00041", (255, 395), 0.13, 100, 40, 5),
     Place("dino-ground", "dinosaur", "frame_00056", (250, 430), 0.14, 45, test=4, near=40, shape="ellipsoid"),
 )
-REPORT = (
+# Places that only report.
+REPORT_PLACES = (
     Place("table-rim", "garden", "frame_00151", (377, 343), 0.12, 60, 34, 5),
     Place("table-vase", "garden", "frame_00120", (234, 285), 0.12, 50, 34, 8),
     Place("vase-front", "garden", "frame_00128", (290, 285), 0.12, 50, 34, 6),
@@ -38,29 +40,48 @@ REPORT = (
     Place("dino-gravel", "dinosaur", "frame_00055", (343, 423), 0.12, 60, 40, 6, near=40),
     Place("dino-plinth", "dinosaur", "frame_00019", (170, 440), 0.12, 60, 40, 6, near=40, shape="ellipsoid"),
 )
+# Places that run by name only; no setting was chosen on them either.
+NAMED_PLACES = (
+    Place("paving", "garden", "frame_00001", (130, 440), 0.13, 60, 34, 6, near=30),
+    Place("lawn", "dinosaur", "frame_00096", (400, 400), 0.13, 50, 36, 5, near=40, shape="ellipsoid"),
+    # Photographs at half size, points of our own stage `poses`. The object is drawn over the fox's head.
+    Place("fox-wall", "fox", "0001", (300, 830), 0.13, 62, 40, 6, near=70),
+    # LOG.md records photograph, pixel, size and shape of the following ones. Arc, numbers of views and `near` are new:
+    # they give the recorded numbers of photographs (10 to 30) to within 5.
+    Place("table-left", "garden", "frame_00056", (120, 262), 0.12, 30, 34, 6, near=30, shape="ellipsoid"),
+    Place("t-right", "garden", "frame_00065", (420, 290), 0.10, 30, 34, 6, near=30),
+    Place("t-small", "garden", "frame_00056", (330, 310), 0.05, 30, 34, 6, near=30),
+    Place("pave2", "garden", "frame_00001", (250, 465), 0.12, 30, 34, 6, near=30, shape="ellipsoid"),
+    Place("p-large", "garden", "frame_00001", (110, 455), 0.26, 30, 34, 6, near=30),
+    Place("t-ref", "garden", "frame_00100", (300, 300), 0.14, 30, 34, 6, near=30, shape="ellipsoid"),
+    Place("rock-left", "bear", "frame_00082", (60, 470), 0.12, 30, 34, 6, near=30),
+    Place("rock-side", "bear", "frame_00091", (420, 470), 0.16, 30, 34, 6, near=30, shape="ellipsoid"),
+    Place("r-small", "bear", "frame_00001", (300, 410), 0.05, 30, 34, 6, near=30, shape="ellipsoid"),
+    Place("grass", "dinosaur", "frame_00028", (300, 430), 0.14, 30, 34, 6, near=30),
+    Place("grass2", "dinosaur", "frame_00001", (330, 400), 0.15, 30, 34, 6, near=30, shape="ellipsoid"),
+)
 
 
-def made(place: Place, captures: Path, options: drawing.Options, out: Path) -> tuple[Path, Path]:
-    """(the place's scene, the same without the object) under out/scenes; made anew only where what they are made of
-    has changed."""
+def make_scenes(place: Place, captures: Path, options: compositing.Options, out: Path) -> tuple[Path, Path]:
+    """(the place's scene, the same without the object) under out/scenes; made again only if their inputs changed."""
     scenes = out / "scenes"
     scene, untouched = scenes / (place.name + options.suffix), scenes / f"{place.name}-untouched"
     capture = None
     for folder, of in ((scene, [place, options]), (untouched, [place])):
-        told = json.dumps([repr(part) for part in of])
-        if (folder / "made.json").exists() and (folder / "made.json").read_text() == told:
+        inputs = json.dumps([repr(part) for part in of])
+        if (folder / "made.json").exists() and (folder / "made.json").read_text() == inputs:
             continue
-        capture = capture or placing.load(captures / place.capture)
+        capture = capture or placement.load_photographs(captures / place.capture)
         if folder == scene:
-            drawing.write(place, capture, options, folder)
+            compositing.write_scene(place, capture, options, folder)
         else:
-            drawing.write_untouched(place, capture, scene, folder)
-        (folder / "made.json").write_text(told)
+            compositing.write_untouched(place, capture, scene, folder)
+        (folder / "made.json").write_text(inputs)
     return scene, untouched
 
 
-def job(scene: Path, runs: Path, profile: str, variant: str = "") -> Path:
-    """The whole job on a scene by the runner, which finds what is done; its folder. ValueError where it fails."""
+def run_job(scene: Path, runs: Path, profile: str, variant: str = "") -> Path:
+    """Run the whole job on a scene, skipping finished stages, and return its folder. ValueError if it fails."""
     command = ["run", "all", "--scene", str(scene), "--runs", str(runs), "--profile", profile]
     command += ["--variant", variant] if variant else []
     if subprocess.run([sys.executable, "-m", "runner", *command], cwd=ROOT).returncode:
@@ -68,69 +89,71 @@ def job(scene: Path, runs: Path, profile: str, variant: str = "") -> Path:
     return runs / (f"{scene.name}@{variant}" if variant else scene.name)
 
 
-def measured(
-    place: Place, captures: Path, options: drawing.Options, out: Path, profile: str, variants: list[str]
+def evaluate_place(
+    place: Place, captures: Path, options: compositing.Options, out: Path, profile: str, variants: list[str]
 ) -> dict:
-    """The place's row of the table; its sheet is saved, and its errors against seconds."""
-    scene, untouched = made(place, captures, options, out)
-    run, ceiling = (judging.Run.at(job(folder, out / "runs", profile)) for folder in (scene, untouched))
-    others = {name: judging.Run.of_variant(run, job(scene, out / "runs", profile, name)) for name in variants}
-    save_image(out / f"{scene.name}.png", judging.sheet(run, ceiling))
+    """The place's row of the table; saves its sheet and its chart of errors against seconds."""
+    scene, untouched = make_scenes(place, captures, options, out)
+    run, ceiling = (scoring.Run.load(run_job(folder, out / "runs", profile)) for folder in (scene, untouched))
+    others = {name: scoring.Run.load_variant(run, run_job(scene, out / "runs", profile, name)) for name in variants}
+    save_image(out / f"{scene.name}.png", scoring.comparison_sheet(run, ceiling))
     for name, other in others.items():
-        save_image(out / f"{scene.name}@{name}.png", judging.sheet(other, ceiling))
-    draw(load_job(run.folder), out / f"{scene.name}-seconds.png", ceiling.metrics["mean"]["psnr_box"])
-    return {"place": scene.name, **judging.scores(run, ceiling, others)}
+        save_image(out / f"{scene.name}@{name}.png", scoring.comparison_sheet(other, ceiling))
+    draw_job(load_job(run.folder), out / f"{scene.name}-seconds.png", ceiling.metrics["mean"]["psnr_box"])
+    return {"place": scene.name, **scoring.score_place(run, ceiling, others)}
 
 
-def chosen(names: str, report: bool) -> tuple[Place, ...]:
-    """The places of a set, or those named, of either set. ValueError for one that is not known."""
+def select_places(names: str, report: bool) -> tuple[Place, ...]:
+    """The places of a set, or the named ones of all sets. ValueError for an unknown name."""
     if not names:
-        return REPORT if report else CHOOSE
-    known = {place.name: place for place in (*CHOOSE, *REPORT)}
+        return REPORT_PLACES if report else TUNING_PLACES
+    known = {place.name: place for place in (*TUNING_PLACES, *REPORT_PLACES, *NAMED_PLACES)}
     wrong = [name for name in names.split(",") if name not in known]
     if wrong:
         raise ValueError(f"no place is called {', '.join(wrong)}; there are {', '.join(known)}")
     return tuple(known[name] for name in names.split(","))
 
 
-def benchmark(given: argparse.Namespace) -> int:
-    options = drawing.Options(not given.alone, given.shadow, given.rough, given.seed)
+def run_benchmark(given: argparse.Namespace) -> int:
+    options = compositing.Options(not given.alone, given.shadow, given.rough, given.seed)
     out, rows = given.out.resolve(), []
-    for place in chosen(given.places, given.report):
+    for place in select_places(given.places, given.report):
         if not (given.captures / place.capture).is_dir():
             print(f"{place.name} skipped: there is no capture {given.captures / place.capture}")
             continue
         if given.make:
-            print("made", *made(place, given.captures, options, out))
+            print("made", *make_scenes(place, given.captures, options, out))
             continue
         variants = [name for name in given.variants.split(",") if name]
-        rows.append(measured(place, given.captures, options, out, given.profile, variants))
+        rows.append(evaluate_place(place, given.captures, options, out, given.profile, variants))
         (out / "composites.json").write_text(json.dumps(rows, indent=1))
-        (out / "composites.md").write_text(judging.table(rows))
+        (out / "composites.md").write_text(scoring.table(rows))
     if rows:
-        print(judging.table(rows))
+        print(scoring.table(rows))
     return 0
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--captures", type=Path, default=Path("../shared/data"), help="folder of nerfstudio captures")
-    parser.add_argument("--places", default="", help="these only, with commas between")
-    parser.add_argument("--report", action="store_true", help="the places that no setting is chosen on")
+    parser.add_argument("--places", default="", help="only these, separated by commas")
+    parser.add_argument("--report", action="store_true", help="the places on which no setting was chosen")
     parser.add_argument("--out", type=Path, default=Path("runs/composites"))
-    parser.add_argument("--alone", action="store_true", help="hand over no reference")
-    parser.add_argument("--shadow", type=float, default=0.0, help="strength, 0 to 1, of a shadow that is in no mask")
-    parser.add_argument("--rough", type=int, default=0, help="px by which training masks are wrong")
+    parser.add_argument("--alone", action="store_true", help="give no reference")
+    parser.add_argument("--shadow", type=float, default=0.0, help="strength, 0 to 1, of a shadow that no mask contains")
+    parser.add_argument("--rough", type=int, default=0, help="largest error of training masks, px")
     parser.add_argument("--seed", type=int, default=0, help="of the object's colours and the masks' faults")
     parser.add_argument("--profile", default="laptop", help="of pipeline.yaml")
-    parser.add_argument("--variants", default="", help="of pipeline.yaml, with commas between: scored beside it")
-    parser.add_argument("--make", action="store_true", help="make the scenes only, to look at")
+    parser.add_argument(
+        "--variants", default="", help="variants of pipeline.yaml, separated by commas, to score as well"
+    )
+    parser.add_argument("--make", action="store_true", help="only make the scenes")
     given = parser.parse_args()
     if not given.captures.is_dir():
         print(f"skipped: there are no captures at {given.captures}")
         return 0
     try:
-        return benchmark(given)
+        return run_benchmark(given)
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

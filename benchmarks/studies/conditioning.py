@@ -1,8 +1,8 @@
-"""What the form of a linear system buys: `python -m benchmarks.studies.conditioning`.
+"""Effect of preconditioning and scaling of linear systems: `python -m benchmarks.studies.conditioning`.
 
-Work-precision diagrams of the three systems behind depth: the alignment (plain normal equations against centred and
-scaled ones), the bilateral solver (conjugate gradients with Jacobi's preconditioning and without), and the completion
-(disparity itself against the correction to a plane). Prints the numbers, and the systems' condition numbers.
+Work-precision diagrams of the three systems of depth estimation: alignment (plain normal equations against centred and
+scaled ones), the bilateral solver (conjugate gradients with and without Jacobi preconditioning), and completion
+(disparity itself against the correction to a plane). Prints the errors and condition numbers.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ SPREADS = 10.0 ** np.arange(0, 12)  # offsets, in units of the data's spread
 STEPS = 400
 
 
-def aligned() -> list[tuple[float, float, float, float]]:
-    """Offset in spreads, condition number of the plain equations, errors of the plain and of the library's line.
+def alignment_errors() -> list[tuple[float, float, float, float]]:
+    """Rows (offset in spreads, condition number of the plain equations, error of the plain line, of the library's).
 
-    Exact data; errors are the largest on the data, relative to the target's spread.
+    The data are exact. Errors are maxima over the data, relative to the target's spread.
     """
     random, rows = np.random.default_rng(0), []
     base = random.uniform(-1.0, 1.0, 1000)
@@ -39,8 +39,8 @@ def aligned() -> list[tuple[float, float, float, float]]:
     return rows
 
 
-def scene() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(misfit, confidence from 1e-2 to 1e2 and 0 in a hole, guide): edges, texture, noise."""
+def make_maps() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(misfit, confidence, guide) with edges, texture and noise; confidence is 1e-2 to 1e2, and 0 in a hole."""
     random = np.random.default_rng(0)
     rows, columns = np.mgrid[:HEIGHT, :WIDTH].astype(float)
     bright = np.where(columns + 0.4 * rows < 40, 80, 170)[..., None] + 12 * np.sin(columns / 3)[..., None]
@@ -50,9 +50,9 @@ def scene() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.where(columns + 0.4 * rows < 40, 0.1, -0.2) + 0.02 * random.normal(size=hole.shape), confidence, guide
 
 
-def solver() -> dict[str, tuple[float, list[tuple[float, float]]]]:
+def solver_errors() -> dict[str, tuple[float, list[tuple[float, float]]]]:
     """Form -> (condition number, [seconds, relative L2 error after each step of conjugate gradients])."""
-    misfit, confidence, guide = scene()
+    misfit, confidence, guide = make_maps()
     system, cell = bilateral.system_of(confidence, guide)
     right = np.bincount(cell, (confidence * misfit).ravel(), minlength=system.shape[0])
     exact = spsolve(system.tocsc(), right)
@@ -68,16 +68,17 @@ def solver() -> dict[str, tuple[float, list[tuple[float, float]]]]:
     return found
 
 
-def completed() -> tuple[float, list[tuple[float, float, float]]]:
-    """(condition number, [offset in spreads, error of the disparity's own system, error of the library's completion]).
+def completion_errors() -> tuple[float, list[tuple[float, float, float]]]:
+    """(condition number, [offset in spreads, error of the absolute system, error of the library's completion]).
 
-    A plane with a hole, solved by the same factorisation; errors in the hole, relative to the plane's spread.
+    The data are a plane with a hole, solved with the same factorisation; errors are taken in the hole, relative to the
+    plane's spread.
     """
-    _, confidence, _ = scene()
+    _, confidence, _ = make_maps()
     known = confidence > 0
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] / WIDTH
     tilted, found = columns - 0.6 * rows, []
-    plate = completion.Plate(ring=2.0)  # so that the whole map takes part, as in the absolute form
+    plate = completion.Plate(ring=2.0)  # the whole map takes part, as in the absolute form
     factors = completion.factored(completion.system_of(known.astype(float), None, np.ones(known.shape, bool), plate))
     for offset in SPREADS:
         truth = tilted + offset * np.ptp(tilted)
@@ -88,9 +89,9 @@ def completed() -> tuple[float, list[tuple[float, float, float]]]:
     return completion.condition(known.astype(float), plate=plate), found
 
 
-def report(say: Callable[[str], None]) -> tuple:
-    """Measure all three, saying the numbers."""
-    lines, systems, (number, maps) = aligned(), solver(), completed()
+def measure(say: Callable[[str], None]) -> tuple:
+    """Measure all three systems and print the numbers."""
+    lines, systems, (number, maps) = alignment_errors(), solver_errors(), completion_errors()
     say("alignment: offset / spread, condition (plain), error plain, error centred and scaled (condition 1)")
     for row in lines:
         say("  {:8.0e} {:10.1e} {:10.1e} {:10.1e}".format(*row))
@@ -109,7 +110,7 @@ def draw(lines, systems, number, maps, path: Path) -> None:
 
     figure = Figure(figsize=(11, 3.6), layout="constrained")
     first, second, third = figure.subplots(1, 3)
-    shown = lambda values: np.maximum(values, 2.0**-53)  # an error of 0 is one of less than a rounding
+    shown = lambda values: np.maximum(values, 2.0**-53)  # an error of 0 is drawn as one rounding
     first.loglog([r[1] for r in lines], shown([r[2] for r in lines]), "o-", label="plain normal equations")
     first.loglog([r[1] for r in lines], shown([r[3] for r in lines]), "s-", label="centred and scaled")
     first.set(title="alignment", xlabel="condition number of the plain equations", ylabel="relative error")
@@ -135,7 +136,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/conditioning.png"))
     given = parser.parse_args()
     given.out.parent.mkdir(parents=True, exist_ok=True)
-    draw(*report(print), given.out)
+    draw(*measure(print), given.out)
     print(given.out)
 
 

@@ -1,10 +1,10 @@
-"""Depth made up in the hole against ray-cast truth: `python -m benchmarks.studies.depth --scene data/demo-table`.
+"""Completed depth in the hole against ray-cast truth: `python -m benchmarks.studies.depth --scene data/demo-table`.
 
-For each reference whose depth `initialize` completed, the pixels of its invent mask: the share within 1, 2 and 5 % of
-the true camera z of the room without the object, and the median error, of all of them, of those near a step of the
-true depth, and of those away from one. Writes a picture each: reference, true depth, the made up, and the error, red
-where it is too far, blue where too near. The scene must be one of the generator's: only there is the truth known. The
-depth of what is seen outside the masks is compared too, and must agree: else poses and truth are not one system.
+For each reference whose depth `initialize` completed: the share of its hole's pixels within 1, 2 and 5 % of the true
+camera z of the room without the object, and the median error; for all pixels, those near a step of the true depth, and
+those away from one. Writes a picture per reference: reference, true depth, completed depth, and the error, red where
+too far, blue where too near. The scene must be made by the generator, which alone knows the truth. Depth outside the
+masks must agree with the truth, else poses and truth differ in their frame.
 """
 
 from __future__ import annotations
@@ -27,61 +27,70 @@ from reffusion.io.scene import load_mask_sets, load_references, load_scene
 from reffusion.types import Camera, Reference, Similarity
 
 DATA = Path(__file__).resolve().parents[2] / "data"
-KINDS = ("wide", "360", "seen", "behind", "table", "corner", "grass", "mini")  # else: demo; a scene's name says which
-WITHIN = (0.01, 0.02, 0.05)  # of the true depth
-EDGE, NEAR = 0.02, 4  # bend of disparity over a pixel that is a step, of itself; px
-AGREE = 0.02  # the middle error outside the masks; more is no fit's inaccuracy
-CLIP, MARGIN, SIDE = 0.05, 12, 480  # of the drawn error; px around the hole; least px of a panel's width
+KINDS = (
+    "wide",
+    "360",
+    "seen",
+    "behind",
+    "table",
+    "corner",
+    "grass",
+    "mini",
+)  # in a scene's name; without one of these the kind is demo
+WITHIN = (0.01, 0.02, 0.05)  # relative to the true depth
+EDGE, NEAR = 0.02, 4  # change of disparity's slope over a pixel that counts as a step, relative to disparity; px
+MAX_OUTSIDE_ERROR = 0.02  # largest median error outside the masks that a fit's inaccuracy explains
+CLIP, MARGIN, SIDE = 0.05, 12, 480  # largest drawn error; margin around the hole, px; least width of a panel, px
 
 
-def kind_of(name: str) -> str:
-    """The kind of a scene that make named: `demo-table-21` is a table."""
+def scene_kind(name: str) -> str:
+    """The kind of a scene, from its name: `demo-table-21` is a table."""
     return next((part for part in name.split("-") if part in KINDS), "demo")
 
 
 def scene_pose(camera: Camera, similarity: Similarity) -> np.ndarray:
-    """[4, 4] world to camera in the scene's own frame and unit."""
+    """[4, 4] world-to-camera in the scene's own frame and unit."""
     pose = camera.world_to_camera.copy()
     pose[:3, 3] = pose[:3, 3] / similarity.scale - pose[:3, :3] @ similarity.offset
     return pose
 
 
 def true_depth(seed: int, kind: str, camera: Camera, similarity: Similarity) -> np.ndarray:
-    """[H, W] camera z in the normalised frame without the object, by the generator in a process of its own."""
+    """[H, W] camera z in the normalised frame without the object, by the generator in a separate process."""
     with tempfile.TemporaryDirectory() as folder:
         view, made = Path(folder) / "view.npz", Path(folder) / "depth.npy"
         np.savez(view, world_to_camera=scene_pose(camera, similarity), rays=pixel_rays(camera)[..., :2])
-        asked = ["--seed", str(seed), "--kind", kind, "--view", str(view), "--out", str(made)]
-        subprocess.run([sys.executable, str(DATA / "depths.py"), *asked], check=True)
+        options = ["--seed", str(seed), "--kind", kind, "--view", str(view), "--out", str(made)]
+        subprocess.run([sys.executable, str(DATA / "depths.py"), *options], check=True)
         return np.load(made) * similarity.scale
 
 
 def near_edges(depth: np.ndarray) -> np.ndarray:
-    """bool [H, W]: within NEAR px of a step. Disparity is linear over a plane however slanted it is seen."""
+    """bool [H, W]: pixels within NEAR px of a depth step. Disparity is linear over a plane at any slant."""
     padded = np.pad(1 / depth, 1, mode="edge")
     middle = padded[1:-1, 1:-1]
     across = np.abs(padded[1:-1, :-2] - 2 * middle + padded[1:-1, 2:])
     down = np.abs(padded[:-2, 1:-1] - 2 * middle + padded[2:, 1:-1])
-    across[:, [0, -1]], down[[0, -1]] = 0, 0  # at the border one neighbour is missing
+    across[:, [0, -1]], down[[0, -1]] = 0, 0  # border pixels lack a neighbour
     step = np.maximum(across, down) > EDGE * middle
     return cv2.distanceTransform((~step).astype(np.uint8), cv2.DIST_L2, 5) <= NEAR if step.any() else step
 
 
-def errors(made: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """[H, W] of the true depth, positive where too far, infinite where there is none."""
+def relative_errors(made: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """[H, W]: error relative to the true depth, positive if too far, infinite if there is no depth."""
     return np.where(np.isfinite(made) & (made > 0), made / true - 1, np.inf)
 
 
 def scores(error: np.ndarray) -> dict[str, float]:
-    """Of the pixels [P]: how many, the shares within WITHIN, the middle of the errors' sizes and of the errors."""
+    """Scores of errors [P]: count, shares within WITHIN, median absolute error, median error."""
     if not error.size:
         return {"pixels": 0}
     shares = {f"within {limit:.0%}": float((np.abs(error) <= limit).mean()) for limit in WITHIN}
     return {"pixels": error.size, **shares, "median": float(np.median(np.abs(error))), "bias": float(np.median(error))}
 
 
-def picture(reference: Reference, true: np.ndarray, made: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Reference, truth, made-up depth and error around the hole, whose border is drawn; [h, w, 3] uint8."""
+def error_sheet(reference: Reference, true: np.ndarray, made: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """[h, w, 3] uint8: reference, true depth, completed depth and error around the hole, whose border is drawn."""
     mask = reference.mask
     near, far = np.percentile(1 / true[mask], (99.5, 0.5))
     far, near = min(far, near / 1.02) / 1.02, near * 1.02
@@ -103,11 +112,13 @@ def picture(reference: Reference, true: np.ndarray, made: np.ndarray, error: np.
 
 
 def measure(scene_folder: Path, run: Path, out: Path, kind: str) -> dict[str, dict[str, dict[str, float]]]:
-    """View -> part of it -> scores; pictures are put in `out`. Parts: the hole, near and away from edges, the rest of C
-    (what other views should show), what truly no training view shows, and what this view shows, away from edges.
+    """View -> part -> scores; pictures are written to `out`.
+
+    Parts: the hole, near and away from edges; the rest of the consistent mask, which other views should show; pixels
+    that truly no training view shows; and what this view shows, away from edges.
 
     Raises:
-        ValueError: no reference's depth was completed; the truth does not fit what is seen outside the masks.
+        ValueError: no reference's depth was completed, or the truth does not agree outside the masks.
     """
     seed, scene = load_json(scene_folder / "truth/facts.json")["seed"], load_scene(run / "poses")
     found = {}
@@ -117,17 +128,17 @@ def measure(scene_folder: Path, run: Path, out: Path, kind: str) -> dict[str, di
         if not file.exists():
             continue
         made, true = load_exr(file).astype(float), true_depth(seed, kind, reference.camera, scene.similarity)
-        error, edges, mask = errors(made, true), near_edges(true), reference.mask
+        error, edges, mask = relative_errors(made, true), near_edges(true), reference.mask
         sets = load_mask_sets(run / "masks", [name])[name]
         hidden = sets.raw | sets.consistent | mask
         parts = {"hole": mask, "near edges": mask & edges, "elsewhere": mask & ~edges}
         never = true_never_seen(scene_folder, [reference.camera])[name]
         parts |= {"rest of C": sets.consistent & ~mask, "never seen": never, "outside": ~hidden & ~edges}
         found[name] = {part: scores(error[pixels]) for part, pixels in parts.items()}
-        if not found[name]["outside"].get("median", 0) < AGREE:
+        if not found[name]["outside"].get("median", 0) < MAX_OUTSIDE_ERROR:
             outside = found[name]["outside"]
-            raise ValueError(f"{name}: what is seen outside the masks is not at its true depth ({outside}): --kind?")
-        save_image(out / f"{name}.png", picture(reference, true, made, error))
+            raise ValueError(f"{name}: depth outside the masks is not the true one ({outside}); is --kind right?")
+        save_image(out / f"{name}.png", error_sheet(reference, true, made, error))
     if not found:
         raise ValueError(f"{run / 'initialize/depth'}: no depth of a reference; run `make scene=... initialize`")
     return found
@@ -138,14 +149,16 @@ def main() -> int:
     parser.add_argument("--scene", type=Path, required=True, help="a scene's folder made by data/generate.py")
     parser.add_argument("--run", type=Path, help="default: runs/<scene's name>")
     parser.add_argument("--out", type=Path, help="default: runs/depth/<scene's name>")
-    parser.add_argument("--kind", choices=("demo", *KINDS), help="of the scene; default: what its name says")
+    parser.add_argument("--kind", choices=("demo", *KINDS), help="kind of the scene; default: taken from its name")
     given = parser.parse_args()
     name = given.scene.resolve().name
     run, out = given.run or Path("runs") / name, given.out or Path("runs/depth") / name
     for path in (given.scene / "truth/facts.json", run / "initialize/facts.json"):
         if not path.exists():
-            raise ValueError(f"{path} is missing: make a scene of the generator's, and run `make scene=... initialize`")
-    results = measure(given.scene, run, out, given.kind or kind_of(name))
+            raise ValueError(
+                f"{path} is missing: make the scene with data/generate.py, and run `make scene=... initialize`"
+            )
+    results = measure(given.scene, run, out, given.kind or scene_kind(name))
     (out / "depth.json").write_text(json.dumps(results, indent=1))
     for view, parts in results.items():
         for part, found in parts.items():

@@ -1,11 +1,11 @@
-"""What distillation could gain at best: `python -m benchmarks.studies.distillation --run runs/demo`.
+"""Upper bound of the gain of one SDS step: `python -m benchmarks.studies.distillation --run runs/demo`.
 
-In holes of test views, whole and in windows, a picture x of known error e = x - truth is given to the prior, and the
-SDS gradient g = E[z - x0(z_t)] over the noise is measured, in pixels. Against e it has a cosine c; a step along the
-exact -g, of the best length, leaves |e|^2 (1 - c^2): a gain of at most -10 log10(1 - c^2) dB (nothing where c <= 0).
-The pictures: the hole filled by Telea's method, mixed with the truth in equal steps of quality; the renders of the
-run's initialization and result. So the figure says up to which quality a prior has anything to teach, before the noise
-of single draws is counted. Truth is used to measure only; nothing here chooses a setting.
+In holes of test views, whole and in windows, a picture x with known error e = x - truth is given to the prior, and the
+SDS gradient g = E[z - x0(z_t)] over the noise is measured in pixels. If c is the cosine of g and e, a step of the best
+length along -g leaves |e|^2 (1 - c^2), a gain of at most -10 log10(1 - c^2) dB (none for c <= 0).
+The pictures are the hole filled by Telea's method, mixed with the truth in steps, and the renders of the run's
+initialization and result. So the chart shows up to which quality a prior can improve a picture, before the noise of
+single draws counts. Truth only measures; no setting is chosen by it.
 Writes distillation.json and distillation.png to --out.
 """
 
@@ -21,7 +21,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.studies.prior import Case, scene_cases, tensors
+from benchmarks.studies.holes import Case, to_tensors
+from benchmarks.studies.prior import scene_cases
 from reffusion import seeding
 from reffusion.io.arrays import save_json
 from reffusion.io.images import load_image
@@ -32,29 +33,29 @@ from reffusion.prior.model import Prior, load_prior
 ROOT = Path(__file__).resolve().parents[2]
 
 TIMESTEPS = (20, 100, 300, 600, 850)
-NOISES = 4  # draws; with g's two halves from different ones, their noise does not pass for agreement
-MIXES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2)  # shares of Telea's filling in the picture
+NOISES = 4  # draws, half of them for each of two estimates of g, so that their noise is independent
+MIXES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.2)  # share of Telea's filling in the picture
 RENDERS = {"initialization": "renders_initialize", "result": "renders"}
 SCALES = {"whole": "A photo of sks", "window": "A photo of sks, cropped"}
 
 
-def pictures_of(run: Path, cases: dict[str, list[Case]], renders: dict[str, dict[str, list[Case]]]):
-    """Name -> scale -> [B, 3, H, W] in [-1, 1]: the mixes, then the renders where the run has them."""
+def degraded_pictures(run: Path, cases: dict[str, list[Case]], renders: dict[str, dict[str, list[Case]]]):
+    """Name -> scale -> [B, 3, H, W] in [-1, 1]: the mixes, then the run's renders."""
     made: dict[str, dict[str, Tensor]] = {}
     for scale in SCALES:
-        truth, hole = tensors(cases[scale])
+        truth, hole = to_tensors(cases[scale])
         filled = [cv2.inpaint(c.truth, c.hole.astype(np.uint8), 5, cv2.INPAINT_TELEA) for c in cases[scale]]
-        telea = tensors([replace(c, truth=f) for c, f in zip(cases[scale], filled, strict=True)])[0]
+        telea = to_tensors([replace(c, truth=f) for c, f in zip(cases[scale], filled, strict=True)])[0]
         for mix in MIXES:
             made.setdefault(f"{mix:g} Telea", {})[scale] = truth + mix * hole * (telea - truth)
         for name, crops in renders.items():
-            made.setdefault(name, {})[scale] = truth + hole * (tensors(crops[scale])[0] - truth)
+            made.setdefault(name, {})[scale] = truth + hole * (to_tensors(crops[scale])[0] - truth)
     return made
 
 
 @torch.no_grad()
-def gradient(prior, pictures: Tensor, holes: Tensor, timestep: int, text: Tensor) -> tuple[Tensor, Tensor]:
-    """E[z - x0(z_t)] over two disjoint halves of the noises, each [B, 3, H, W] by decoding z - g and z."""
+def sds_gradient(prior, pictures: Tensor, holes: Tensor, timestep: int, text: Tensor) -> tuple[Tensor, Tensor]:
+    """E[z - x0(z_t)] over two disjoint halves of the noises, each [B, 3, H, W], the difference of decoded latents."""
     latents, condition = diffusion.encode(prior, pictures), diffusion.conditioning(prior, pictures, holes)
     t, halves = torch.full((len(pictures),), timestep), []
     for half in range(2):
@@ -67,10 +68,10 @@ def gradient(prior, pictures: Tensor, holes: Tensor, timestep: int, text: Tensor
     return halves[0], halves[1]
 
 
-def gain(halves: tuple[Tensor, Tensor], error: Tensor, holes: Tensor) -> dict[str, float]:
-    """The cosine of g and e in the holes, over all pictures at once, and the greatest gain in dB.
+def possible_gain(halves: tuple[Tensor, Tensor], error: Tensor, holes: Tensor) -> dict[str, float]:
+    """Cosine of g and e in the holes, over all pictures together, and the largest gain in dB.
 
-    |g|^2 is the product of the two halves, which the noise left in either does not enlarge.
+    |g|^2 is the product of the two halves, which their independent noise does not enlarge.
     """
     first, second = (half * holes for half in halves)
     along = float(((first + second) / 2 * error).sum())
@@ -79,30 +80,30 @@ def gain(halves: tuple[Tensor, Tensor], error: Tensor, holes: Tensor) -> dict[st
     return {"cosine": cosine, "gain": float(-10 * np.log10(1 - max(cosine, 0.0) ** 2))}
 
 
-def measured(models: dict[str, Prior], run: Path) -> list[dict]:
+def measure(models: dict[str, Prior], run: Path) -> list[dict]:
     """A row for each model, scale, picture and timestep."""
     first = next(iter(models.values()))
     cases = scene_cases(run, first.native_size)
     renders = {name: rendered_cases(run, folder, first.native_size) for name, folder in RENDERS.items()}
-    pictures, rows = pictures_of(run, cases, renders), []
+    pictures, rows = degraded_pictures(run, cases, renders), []
     for model, prior in models.items():
         for scale, prompt in SCALES.items():
-            truth, hole = tensors(cases[scale])
+            truth, hole = to_tensors(cases[scale])
             text = diffusion.embed_text(prior, [prompt]).detach().expand(len(truth), -1, -1)
             for name, by_scale in pictures.items():
                 error = (by_scale[scale] - truth) * hole
                 psnr = -10 * np.log10(float(error.square().sum() / hole.sum() / 3 / 4))
                 for timestep in TIMESTEPS:
-                    halves = gradient(prior, by_scale[scale], hole, timestep, text)
+                    halves = sds_gradient(prior, by_scale[scale], hole, timestep, text)
                     row = {"model": model, "scale": scale, "picture": name, "psnr": psnr, "timestep": timestep}
-                    rows.append(row | gain(halves, error, hole))
+                    rows.append(row | possible_gain(halves, error, hole))
                 best = max(rows[-len(TIMESTEPS) :], key=lambda row: row["gain"])
                 print(f"{model:12} {scale:7} {name:16} {psnr:5.2f} dB: {best['gain']:.3f} at t={best['timestep']}")
     return rows
 
 
 def rendered_cases(run: Path, folder: str, size: int) -> dict[str, list[Case]]:
-    """`scene_cases` with evaluate's renders in place of the truth."""
+    """`scene_cases` with evaluate's renders instead of the truth."""
     scene = load_scene(run / "poses")
     found = run / "evaluate" / folder
     if not found.is_dir():
@@ -112,7 +113,7 @@ def rendered_cases(run: Path, folder: str, size: int) -> dict[str, list[Case]]:
 
 
 def draw(rows: list[dict], path: Path) -> None:
-    """The greatest gain over all timesteps against the quality of the picture, for each model and scale."""
+    """Chart the largest gain over all timesteps against the picture's quality, for each model and scale."""
     from matplotlib.figure import Figure
 
     figure = Figure((9, 3.8), layout="constrained")
@@ -150,7 +151,7 @@ def main() -> None:
         "unadapted": load_prior(given.prior),
         "personalized": lora.merged(load_prior(given.prior), given.run / "personalize"),
     }
-    rows = measured(models, given.run)
+    rows = measure(models, given.run)
     save_json(given.out / "distillation.json", rows)
     draw(rows, given.out / "distillation.png")
     print(given.out / "distillation.png")

@@ -1,9 +1,8 @@
 """PSNR of held-out views against seconds of fitting: `python -m benchmarks.studies.fit --run runs/demo`.
 
-Fits the scene of a finished `poses` stage with the laptop profile's parameters and with variants of them, every 8th
-training view held out and only measured, the clock stopped meanwhile; making the points to start from counts. Writes
-fit.png (the curves), fit.csv and fit.md (where they end). Variants that `--out` holds already are not run again; an
-interrupted one goes on.
+Fits the scene of a finished `poses` stage with the laptop profile's parameters and variants of them. Every 8th training
+view is held out and only measured, with the clock stopped; making the initial points counts. Writes fit.png (curves),
+fit.csv and fit.md (final values). Variants that --out already holds are not run again; an interrupted one continues.
 """
 
 from __future__ import annotations
@@ -36,19 +35,19 @@ VARIANTS = {
 }
 
 
-def parameters(profile: str, overrides: dict[str, object], every: int) -> fit.Params:
-    """The profile's parameters of `fit` with these in their place; ValueError naming an unknown one."""
+def fit_params(profile: str, overrides: dict[str, object], every: int) -> fit.Params:
+    """The profile's parameters of `fit` with overrides. ValueError names an unknown one."""
     given = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"][profile].get("fit", {})
     return fit.Params(**given).changed({**overrides, "holdout": every})
 
 
-def curve(poses: Path, out: Path, params: fit.Params) -> list[dict[str, float]]:
-    """The trace of a fit with these parameters, kept in `out`."""
-    said = out / "params.json"
-    if said.exists() and json.loads(said.read_text()) != params.model_dump():
+def run_fit(poses: Path, out: Path, params: fit.Params) -> list[dict[str, float]]:
+    """Trace of a fit with these parameters, kept in `out`."""
+    saved = out / "params.json"
+    if saved.exists() and json.loads(saved.read_text()) != params.model_dump():
         raise ValueError(f"{out} holds a fit with other parameters; remove it, or name another --out")
     out.mkdir(parents=True, exist_ok=True)
-    said.write_text(json.dumps(params.model_dump()))
+    saved.write_text(json.dumps(params.model_dump()))
     if not (out / "gaussians.ply").exists():
         fit.run(params, out, poses=poses)
     return trace.read_trace(out / "trace.jsonl")
@@ -73,16 +72,16 @@ def main() -> None:
     parser.add_argument("--run", type=Path, required=True, help="runs/<scene>, its stage `poses` finished")
     parser.add_argument("--out", type=Path, help="default: runs/fit/<scene>")
     parser.add_argument("--profile", default="laptop")
-    parser.add_argument("--every", type=int, default=8, help="every so manieth training view is held out")
+    parser.add_argument("--every", type=int, default=8, help="hold out every n-th training view")
     parser.add_argument("--only", nargs="+", choices=list(VARIANTS), help="these variants")
     given = parser.parse_args()
     poses, out = given.run / "poses", given.out or Path("runs/fit") / given.run.name
     if not (poses / "receipt.json").exists():
         raise ValueError(f"{poses} is missing: run `make scene={given.run.name} poses` first")
-    chosen = {name: parameters(given.profile, VARIANTS[name], given.every) for name in given.only or VARIANTS}
+    chosen = {name: fit_params(given.profile, VARIANTS[name], given.every) for name in given.only or VARIANTS}
     curves = {}
     for name, params in chosen.items():
-        curves[name] = curve(poses, out / name.replace(" ", "_").replace(",", ""), params)
+        curves[name] = run_fit(poses, out / name.replace(" ", "_").replace(",", ""), params)
         last = curves[name][-1]
         print(f"{name}: {last['psnr_held_out']:.2f} dB after {last['seconds']:.0f} s, {last['gaussians']} Gaussians")
     columns = ("seconds", "iteration", "gaussians", "psnr", "psnr_held_out")

@@ -1,9 +1,9 @@
-"""What distillation gains: `python -m benchmarks.studies.gain runs/demo-wide runs/demo-wide@no_sds`.
+"""Gain of distillation over initialization: `python -m benchmarks.studies.gain runs/demo-wide runs/demo-wide@no_sds`.
 
-For each run, over its test views: the scores in the mask's box that evaluate gave to result and initialization, and the
-gradient energy of both in that box and inside the mask itself, in units of the truth's. Under 1 is too smooth, over 1
-is grain or doubled edges. Shares of the masks that no training view saw are `masks`' own, and, with --scene, the
-generator's by casting rays. Pictures of some views go to --out: photo with the object, initialization, result, truth.
+For each run, over its test views: evaluate's box scores of result and initialization, and the gradient energy of both
+in the box and in the mask, in units of the truth's. Energy below 1 is too smooth; above 1 is grain or doubled edges.
+The shares of the masks that no training view saw come from `masks` and, with --scene, from the generator's rays.
+Writes pictures of some views to --out: photograph with the object, initialization, result, truth.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from reffusion.io.arrays import load_json, save_json
 from reffusion.io.images import load_image, save_image
 from reffusion.io.scene import load_scene
 from reffusion.metrics import image_metrics
-from report.sheet import enlarged, evenly, framed, stage_folder
+from report.sheet import compose_sheet, enlarge, pick_evenly, stage_folder
 from stages import evaluate
 
 ROOT = Path(__file__).resolve().parents[2]
 
-WAYS = {"initialization": "renders_initialize", "result": "renders"}
+RENDERS = {"initialization": "renders_initialize", "result": "renders"}
 SCORES = {"psnr_box": 2, "ssim_box": 4, "flip_box": 4}  # column of metrics.json, digits
-VIEWS = 4  # on the sheet
+VIEWS = 4  # number of views on the sheet
 ENLARGE = 2  # whole factor
 
 
-def measured(run: Path) -> dict:
+def evaluate_run(run: Path) -> dict:
     """{"initialization", "result"}: box scores, "energy_box" and "energy_mask" in units of the truth's.
 
     Raises:
@@ -41,14 +41,14 @@ def measured(run: Path) -> dict:
     scored, scene = load_json(run / "evaluate/metrics.json"), load_scene(stage_folder(run, "poses"))
     if not scored["views"]["psnr_box"]:
         raise ValueError(f"{run}: no test view has ground truth and a mask")
-    energies: dict[str, list[tuple[float, float]]] = {"truth": [], **{way: [] for way in WAYS}}
+    energies: dict[str, list[tuple[float, float]]] = {"truth": [], **{way: [] for way in RENDERS}}
     for name in scene.test:
         mask = evaluate.mask_of(scene.cameras[name], stage_folder(run, "raw_masks"), stage_folder(run, "masks"))
         left, top, right, bottom = image_metrics.mask_box(mask)
         box = np.zeros_like(mask)
         box[top:bottom, left:right] = True
         pictures = {"truth": evaluate.truth_of(scene.cameras[name], stage_folder(run, "poses"))}
-        pictures |= {way: load_image(run / "evaluate" / folder / f"{name}.png") for way, folder in WAYS.items()}
+        pictures |= {way: load_image(run / "evaluate" / folder / f"{name}.png") for way, folder in RENDERS.items()}
         for way, picture in pictures.items():
             energies[way].append((gradient_energy(picture, box), gradient_energy(picture, mask)))
     total = {way: np.mean(values, 0) for way, values in energies.items()}
@@ -60,7 +60,7 @@ def measured(run: Path) -> dict:
 
 
 def table(runs: dict[str, dict], shares: dict[str, dict[str, float]]) -> str:
-    """Markdown: the initialization once for each run whose result differs from it."""
+    """Markdown table; the initialization appears once per run whose initialization is its own."""
     lines = ["| | PSNR box, dB | SSIM | FLIP | energy, box | energy, mask |", "|---" * 6 + "|"]
     for name, ways in runs.items():
         for way, row in ways.items():
@@ -74,29 +74,32 @@ def table(runs: dict[str, dict], shares: dict[str, dict[str, float]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def never_seen(run: Path, scene: Path | None) -> dict[str, float]:
-    """By `masks`, over the training views; by the generator's rays, over training and test views."""
+def unseen_shares(run: Path, scene: Path | None) -> dict[str, float]:
+    """Shares of the masks that no training view saw.
+
+    By `masks` over the training views and, with `scene`, by the generator's rays over training and test views.
+    """
     share = {"by masks": round(load_json(stage_folder(run, "masks") / "facts.json")["unobserved_share"], 3)}
     facts = load_json(scene / "truth/facts.json")["unobserved_share"] if scene else {}
     return share | {f"by rays, {kind} views": round(value, 3) for kind, value in facts.items() if value is not None}
 
 
-def sheet(run: Path, path: Path) -> None:
-    """`VIEWS` test views as rows: the fit with the object, initialization, result, truth; cut to the mask's box."""
+def save_sheet(run: Path, path: Path) -> None:
+    """Save `VIEWS` test views as rows: fit with the object, initialization, result, truth, around the mask's box."""
     scene = load_scene(stage_folder(run, "poses"))
-    names, rows = evenly(list(scene.test), VIEWS), []
+    names, rows = pick_evenly(list(scene.test), VIEWS), []
     for name in names:
         camera = scene.cameras[name]
-        folders = ("renders_fit", *WAYS.values())
+        folders = ("renders_fit", *RENDERS.values())
         pictures = [load_image(run / "evaluate" / folder / f"{name}.png") for folder in folders]
         pictures.append(evaluate.truth_of(camera, stage_folder(run, "poses")))
         left, top, right, bottom = image_metrics.mask_box(
             evaluate.mask_of(camera, stage_folder(run, "raw_masks"), stage_folder(run, "masks")), 0.3
         )
-        rows.append([enlarged(picture[top:bottom, left:right], ENLARGE) for picture in pictures])
+        rows.append([enlarge(picture[top:bottom, left:right], ENLARGE) for picture in pictures])
     height, width = (max(cell.shape[axis] for row in rows for cell in row) for axis in (0, 1))
     room = [[np.pad(c, ((0, height - c.shape[0]), (0, width - c.shape[1]), (0, 0))) for c in row] for row in rows]
-    save_image(path, framed(room, ["fit", *WAYS, "truth"], names))
+    save_image(path, compose_sheet(room, ["fit", *RENDERS, "truth"], names))
 
 
 def main() -> None:
@@ -106,10 +109,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/gain"))
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
-    first, runs = given.runs[0], {run.name: measured(run) for run in given.runs}
-    text = table(runs, {first.name: never_seen(first, given.scene)})
+    first, runs = given.runs[0], {run.name: evaluate_run(run) for run in given.runs}
+    text = table(runs, {first.name: unseen_shares(first, given.scene)})
     for run in given.runs:
-        sheet(run, given.out / f"{run.name}.png")
+        save_sheet(run, given.out / f"{run.name}.png")
     save_json(given.out / "gain.json", runs)
     (given.out / "gain.md").write_text(text, encoding="utf-8")
     print(text)

@@ -1,9 +1,9 @@
-"""Seconds and memory of every stage against views and pixels: `python -m benchmarks.studies.growth` (hours).
+"""Seconds and memory of every stage against views and pixels: `python -m benchmarks.studies.growth` (takes hours).
 
-Made rooms of 30 to 300 training views of 0.3 megapixels, and of 30 views of 0.3 to 2 megapixels; and, for memory, the
-most of both. The profile's settings but a tenth of its steps, whose number depends neither on views nor on pixels, and
-no limit to the size of pictures. Writes growth.json and growth.png to --out: CPU seconds and memory of each stage, and
-its exponent: the slope of a line through them, both logarithmic. 1 is linear. Jobs that are done are not run again.
+Made rooms of 30 to 300 training views of 0.3 megapixels, and of 30 views of 0.3 to 2 megapixels; --largest adds the
+largest of both. Settings are the profile's with a tenth of its steps (their number depends neither on views nor on
+pixels) and no limit on picture size. Writes growth.json and growth.png to --out: CPU seconds and memory of each stage,
+and the exponent, the slope of a line through them in log-log axes; 1 is linear. Finished jobs are not run again.
 """
 
 from __future__ import annotations
@@ -26,9 +26,11 @@ ROOT = Path(__file__).resolve().parents[2]
 STAGES = ("poses", "raw_masks", "fit", "masks", "reference", "initialize", "personalize", "distill", "evaluate")
 VIEWS, PIXELS = (30, 60, 120, 300), (0.3, 0.6, 1.2, 2.0)  # megapixels
 WIDE, HIGH = 4, 3
-TENTH = "fit.iterations=190 personalize.steps=15 distill.iterations=15 initialize.refit_steps=30 poses.longest=4000 "
-TENTH += "distill.sds.run=always"
-SAMPLES, TEST = 1, 4  # rays a side of a pixel, so that large scenes are made in minutes; test views
+SHORT_JOB = (
+    "fit.iterations=190 personalize.steps=15 distill.iterations=15 initialize.refit_steps=30 poses.longest=4000 "
+)
+SHORT_JOB += "distill.sds.run=always"
+SAMPLES, TEST = 1, 4  # rays per side of a pixel (1 makes large scenes in minutes); test views
 MAKE = """
 import sys; from dataclasses import replace; from pathlib import Path
 sys.path.insert(0, sys.argv[1])
@@ -39,8 +41,8 @@ generate(Path(sys.argv[2]), 0, replace(KINDS["demo"], **dict(zip(names, size))))
 """
 
 
-def made(views: int, megapixels: float, folder: Path) -> Path:
-    """A made room of so many training views of that size, in a folder that says so."""
+def make_room(views: int, megapixels: float, folder: Path) -> Path:
+    """Make a room with that many training views of that size, in a folder named after both."""
     unit = (megapixels * 1e6 / (WIDE * HIGH)) ** 0.5
     scene = folder / f"{views}-views-{megapixels}-mp"
     if not (scene / "truth/facts.json").exists():
@@ -50,43 +52,48 @@ def made(views: int, megapixels: float, folder: Path) -> Path:
     return scene
 
 
-def measured(scene: Path, runs: Path, profile: str, last: str) -> dict[str, dict[str, float]]:
-    """Stage -> "cpu" seconds of all its processes, "seconds" and "mb" at its peak, up to `last`. Stages that were left
-    out are not there. RuntimeError where one fails."""
-    told, found = runs / f"{scene.name}.json", {}
-    if told.exists():
-        return load_json(told)
+def run_stages(scene: Path, runs: Path, profile: str, last: str) -> dict[str, dict[str, float]]:
+    """Stage -> "cpu" seconds of all its processes, "seconds" and peak "mb", up to `last`; stages left out are missing.
+
+    Raises:
+        RuntimeError: a stage fails.
+    """
+    record, found = runs / f"{scene.name}.json", {}
+    if record.exists():
+        return load_json(record)
     for stage in STAGES[: STAGES.index(last) + 1]:
         command = [sys.executable, "-m", "runner", "run", stage, "--scene", str(scene), "--runs", str(runs)]
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        if subprocess.run([*command, "--profile", profile, f"--set={TENTH}"], cwd=ROOT).returncode:
+        if subprocess.run([*command, "--profile", profile, f"--set={SHORT_JOB}"], cwd=ROOT).returncode:
             raise RuntimeError(f"{scene.name}: {stage} failed; see above")
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         receipt = runs / scene.name / stage / "receipt.json"
         if receipt.exists():
-            said = load_json(receipt)
+            values = load_json(receipt)
             cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-            found[stage] = {"cpu": cpu, "seconds": said["seconds"], "mb": said["peak_memory_mb"]}
-    save_json(told, found)
+            found[stage] = {"cpu": cpu, "seconds": values["seconds"], "mb": values["peak_memory_mb"]}
+    save_json(record, found)
     return found
 
 
-def exponent(sizes: Sequence[float], values: Sequence[float]) -> float:
-    """The power of the size with which the values grow."""
+def growth_exponent(sizes: Sequence[float], values: Sequence[float]) -> float:
+    """Power of the size with which the values grow."""
     return float(np.polyfit(np.log(sizes), np.log(values), 1)[0])
 
 
 def draw(found: dict[str, dict[str, dict[str, list[float]]]], path: Path) -> None:
-    """For views and for pixels a panel of CPU seconds and one of memory, a line for each stage."""
-    made, grid = charts.figure(5.6, 2, 2)
+    """For views and for pixels, a panel of CPU seconds and one of memory, one line per stage."""
+    figure, grid = charts.new_figure(5.6, 2, 2)
     for row, (of, stages) in zip(grid, found.items(), strict=True):
         for axes, what in zip(row, ("cpu", "mb"), strict=True):
             for stage, told in stages.items():
-                axes.plot(told["size"], told[what], "o-", label=f"{stage} {exponent(told['size'], told[what]):.2f}")
+                axes.plot(
+                    told["size"], told[what], "o-", label=f"{stage} {growth_exponent(told['size'], told[what]):.2f}"
+                )
             axes.set(xscale="log", yscale="log", xlabel=of, ylabel={"cpu": "CPU seconds", "mb": "memory (MB)"}[what])
-            charts.plain_ticks(axes)
+            charts.use_plain_log_ticks(axes)
             axes.legend(frameon=False, fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
-    charts.save(made, path)
+    charts.save_chart(figure, path)
 
 
 def main() -> None:
@@ -94,8 +101,8 @@ def main() -> None:
     parser.add_argument("--views", type=int, nargs="+", default=VIEWS)
     parser.add_argument("--pixels", type=float, nargs="+", default=PIXELS, help="megapixels")
     parser.add_argument("--profile", default="laptop")
-    parser.add_argument("--last", choices=STAGES, default=STAGES[-1], help="the last stage that is run")
-    parser.add_argument("--largest", action="store_true", help="the most views of the most pixels, too, by itself")
+    parser.add_argument("--last", choices=STAGES, default=STAGES[-1], help="last stage to run")
+    parser.add_argument("--largest", action="store_true", help="also run the most views with the most pixels")
     parser.add_argument("--out", type=Path, default=ROOT / "runs/growth")
     given = parser.parse_args()
     out = given.out.resolve()
@@ -108,20 +115,20 @@ def main() -> None:
     for axis, (of, scenes) in enumerate(asked.items()):
         stages = found.setdefault(of, {})
         for size in scenes:
-            taken = measured(made(*size, out / "scenes"), out / "runs", given.profile, given.last)
+            taken = run_stages(make_room(*size, out / "scenes"), out / "runs", given.profile, given.last)
             for stage, told in taken.items():
                 row = stages.setdefault(stage, {"size": [], "cpu": [], "seconds": [], "mb": []})
                 row["size"].append(size[axis])
                 for what in ("cpu", "seconds", "mb"):
                     row[what].append(told[what])
         for stage, row in stages.items():
-            cpu, mb = (exponent(row["size"], row[what]) for what in ("cpu", "mb"))
+            cpu, mb = (growth_exponent(row["size"], row[what]) for what in ("cpu", "mb"))
             print(f"{of}, {stage}: CPU {cpu:.2f}, memory {mb:.2f}")
     save_json(out / "growth.json", found)
     draw(found, out / "growth.png")
     if given.largest:
-        scene = made(given.views[-1], given.pixels[-1], out / "scenes")
-        print(json.dumps(measured(scene, out / "runs", given.profile, given.last), indent=1))
+        scene = make_room(given.views[-1], given.pixels[-1], out / "scenes")
+        print(json.dumps(run_stages(scene, out / "runs", given.profile, given.last), indent=1))
 
 
 if __name__ == "__main__":

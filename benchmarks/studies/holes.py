@@ -1,6 +1,6 @@
-"""Holes to fill, and how well one was filled: what `benchmarks/studies/prior.py` and its neighbours measure with.
+"""Holes to fill and scores of their filling, shared by `benchmarks/studies/prior.py` and related studies.
 
-Held-out pictures come from the prior's own generators under seeds that no training uses. Every draw is seeded.
+Held-out pictures come from the prior's own generators with seeds that no training uses. Every draw is seeded.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from reffusion.prior.model import Prior
 
 ROOT = Path(__file__).resolve().parents[2]
 
-SIDE = 64  # px, of the held-out pictures
-SEED = 20  # of the held-out set; training and its own validation use others
-COVER = (0.05, 0.4)  # share of a held-out picture that its hole takes
-SAMPLER_STEPS = 12  # the laptop profile's, for its reference
+SIDE = 64  # side of the held-out pictures, px
+SEED = 20  # of the held-out set; training and its validation use others
+COVER = (0.05, 0.4)  # share of a held-out picture that its hole covers
+SAMPLER_STEPS = 12  # the laptop profile's number for its reference
 BATCH = 16
 COLUMNS = ("psnr", "ssim", "flip", "energy")
 
@@ -39,7 +39,7 @@ class Case:
     kind: str
 
 
-def held_out(count: int, seed: int = SEED) -> list[Case]:
+def held_out_cases(count: int, seed: int = SEED) -> list[Case]:
     """`count` pictures that no training has seen, each with a silhouette that covers `COVER` of it."""
     cases = []
     for index in range(count):
@@ -55,10 +55,10 @@ def held_out(count: int, seed: int = SEED) -> list[Case]:
 
 
 def hole_scores(picture: np.ndarray, truth: np.ndarray, hole: np.ndarray) -> dict[str, float]:
-    """PSNR (dB), SSIM and FLIP, each its map's mean over the hole, and the gradient energy in units of the truth's.
+    """PSNR (dB), SSIM and FLIP as means of their maps over the hole, and the gradient energy in units of the truth's.
 
     Args:
-        picture, truth: uint8 [H, W, 3]; outside the hole the truth stands in for the picture.
+        picture, truth: uint8 [H, W, 3]; outside the hole the picture is replaced by the truth.
         hole: bool [H, W], not empty.
     """
     if not hole.any():
@@ -74,7 +74,7 @@ def hole_scores(picture: np.ndarray, truth: np.ndarray, hole: np.ndarray) -> dic
 
 
 def ssim_map(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """[H, W], with the window of `metrics.ssim`, mean over RGB."""
+    """[H, W]: SSIM, mean over RGB, with the window of `metrics.ssim`."""
     from skimage.metrics import structural_similarity
 
     _, values = structural_similarity(
@@ -91,12 +91,12 @@ def ssim_map(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def flip_map(picture: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """[H, W] LDR-FLIP, with the viewing distance of `metrics.flip`."""
+    """[H, W]: LDR-FLIP, with the viewing distance of `metrics.flip`."""
     return image_metrics.flip_map(picture, truth)
 
 
 def gradient_energy(picture: np.ndarray, hole: np.ndarray) -> float:
-    """Mean squared step of brightness between neighbours that both lie in the hole."""
+    """Mean squared difference of brightness between neighbouring pixels that both lie in the hole."""
     light, total, count = picture.mean(2) / 255, 0.0, 0
     for axis in (0, 1):
         both = np.logical_and(*(hole.take(range(k, hole.shape[axis] - 1 + k), axis) for k in (0, 1)))
@@ -105,26 +105,26 @@ def gradient_energy(picture: np.ndarray, hole: np.ndarray) -> float:
     return float(total / max(count, 1))
 
 
-def means(rows: list[dict[str, float]]) -> dict[str, float]:
-    """The mean of each column, and of PSNR also its standard error."""
+def mean_scores(rows: list[dict[str, float]]) -> dict[str, float]:
+    """Mean of each column, and the standard error of PSNR."""
     values = {column: float(np.mean([row[column] for row in rows])) for column in COLUMNS}
     spread = np.std([row["psnr"] for row in rows], ddof=1) / len(rows) ** 0.5 if len(rows) > 1 else 0.0
     return values | {"psnr_error": float(spread), "pictures": len(rows)}
 
 
-def tensors(cases: list[Case]) -> tuple[Tensor, Tensor]:
-    """[B, 3, H, W] in [-1, 1] and [B, 1, H, W], 1 = repaint."""
+def to_tensors(cases: list[Case]) -> tuple[Tensor, Tensor]:
+    """Pictures [B, 3, H, W] in [-1, 1] and holes [B, 1, H, W], 1 = repaint."""
     pictures = torch.from_numpy(np.stack([case.truth for case in cases])).permute(0, 3, 1, 2).float() / 127.5 - 1
     return pictures, torch.from_numpy(np.stack([case.hole for case in cases]))[:, None].float()
 
 
-def painted(
+def fill_holes(
     prior: Prior, cases: list[Case], seed: int, prompt: str = "", steps: int = SAMPLER_STEPS
 ) -> list[np.ndarray]:
-    """The holes filled from pure noise in `steps` of the sampler: uint8 [H, W, 3] each."""
+    """The holes filled from pure noise in `steps` sampler steps: uint8 [H, W, 3] each."""
     done = []
     for first in range(0, len(cases), BATCH):
-        pictures, holes = tensors(cases[first : first + BATCH])
+        pictures, holes = to_tensors(cases[first : first + BATCH])
         text = diffusion.embed_text(prior, [prompt]).detach().expand(len(pictures), -1, -1)
         noise = seeding.generator(seed, "sample", first)
         filled = diffusion.sample(prior, pictures * (1 - holes), holes, text, steps, noise)
@@ -134,7 +134,7 @@ def painted(
 
 
 def save_row(path: Path, case: Case, pictures: list[np.ndarray]) -> None:
-    """Hole, pictures and truth side by side."""
+    """Save hole, pictures and truth side by side."""
     path.parent.mkdir(parents=True, exist_ok=True)
     hollow = np.where(case.hole[..., None], np.uint8(128), case.truth)
     save_image(path, np.concatenate([hollow, *pictures, case.truth], 1))

@@ -1,10 +1,10 @@
-"""Consistent and undecided masks against ray-cast truth: `python -m benchmarks.studies.masks --scene data/demo`.
+"""Consistent and unobserved masks against ray-cast truth: `python -m benchmarks.studies.masks --scene data/demo`.
 
-Runs the `masks` stage, with the parameters of the scene's own run and on its own fit, twice: on the exact masks, and on
-masks each dilated, eroded or shifted at random by up to 2 % of the image's width, a tenth of them missing. Prints the
-intersection over union of all training views together, missing masks included, of the middle and of the worst view;
-pixels within 2 px of the true border do not count. The scene must be one of the generator's: only there is the truth
-known.
+Runs the stage `masks` with the parameters of the scene's own run and on its own fit, twice: with the exact masks, and
+with masks that are each dilated, eroded or shifted at random by up to 2 % of the image width, a tenth of them missing.
+Prints the intersection over union over all training views together (missing masks included), of the median and of the
+worst view; pixels within 2 px of the true border do not count. The scene must be made by the generator, which alone
+knows the truth.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from reffusion.io.scene import load_mask_sets, load_raw_masks, load_scene
 from reffusion.types import Camera, Scene
 from stages import masks as masks_stage
 
-ASKED = {"exact": {"consistent": 0.95, "unobserved": 0.9}, "perturbed": {"consistent": 0.90, "unobserved": 0.85}}
+REQUIRED_IOU = {"exact": {"consistent": 0.95, "unobserved": 0.9}, "perturbed": {"consistent": 0.90, "unobserved": 0.85}}
 BORDER = 2  # px
-LARGEST, MISSING = 0.02, 0.1  # of the image's width; share of the views
+LARGEST, MISSING = 0.02, 0.1  # of the image width; share of the views
 
 
 def true_never_seen(scene_folder: Path, cameras: list[Camera]) -> dict[str, np.ndarray]:
-    """View name -> bool [H, W], the generator's never-seen pixels, read through its lens as `poses` reads pictures."""
+    """View name -> bool [H, W]: the generator's never-seen pixels, undistorted as `poses` undistorts pictures."""
     truth = load_json(scene_folder / "truth/cameras.json")
     size = (truth["width"], truth["height"])
     photo = lens.Lens(*size, truth["f"], truth["f"], truth["cx"], truth["cy"], radial=(truth["k1"],))
@@ -44,21 +44,21 @@ def true_never_seen(scene_folder: Path, cameras: list[Camera]) -> dict[str, np.n
     return shown
 
 
-def perturbed(mask: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """bool [H, W] dilated, eroded or shifted, each as likely, by a distance drawn up to LARGEST."""
+def perturb_mask(mask: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """bool [H, W]: the mask dilated, eroded or shifted, with equal probability, by a random distance up to LARGEST."""
     distance = random.uniform(0, LARGEST * mask.shape[1])
     way = random.choice(["dilate", "erode", "shift"])
     if way == "shift":
         angle = random.uniform(0, 2 * np.pi)
         move = np.float32([[1, 0, distance * np.cos(angle)], [0, 1, distance * np.sin(angle)]])
         return cv2.warpAffine(mask.astype(np.float32), move, mask.shape[::-1]) > 0.5
-    # Distances to the mask's nearest pixel (or, for the erosion, to the nearest one outside it).
+    # Distance to the nearest pixel of the mask or, for an erosion, to the nearest one outside it.
     away = cv2.distanceTransform((~mask if way == "dilate" else mask).astype(np.uint8), cv2.DIST_L2, 5)
     return away <= distance if way == "dilate" else away > distance
 
 
 def save_raw_masks(given: dict[str, np.ndarray], folder: Path) -> Path:
-    """The folder, as the stage `raw_masks` leaves it with these masks and no others."""
+    """Write a folder like that of the stage `raw_masks`, with exactly these masks; return it."""
     shutil.rmtree(folder, ignore_errors=True)
     for name, mask in given.items():
         save_mask(folder / "masks" / f"{name}.png", mask)
@@ -66,7 +66,7 @@ def save_raw_masks(given: dict[str, np.ndarray], folder: Path) -> Path:
 
 
 def iou(found: list[np.ndarray], truth: list[np.ndarray]) -> float:
-    """Of all views together, without the true border's surroundings."""
+    """Intersection over union of all views together, without the surroundings of the true border."""
     square = np.ones((2 * BORDER + 1,) * 2, np.uint8)
     both = either = 0
     for made, true in zip(found, truth, strict=True):
@@ -78,24 +78,24 @@ def iou(found: list[np.ndarray], truth: list[np.ndarray]) -> float:
 
 
 def scores(made: Path, scene: Scene, truth: dict[str, dict[str, np.ndarray]]) -> dict[str, dict[str, float]]:
-    """Kind of mask -> IoU of the training views together, of the middle and of the worst."""
+    """Kind of mask -> IoU of the training views together, of the median and of the worst view."""
     sets, found = load_mask_sets(made, scene.train), {}
     for kind, true in truth.items():
-        own, asked = [getattr(sets[name], kind) for name in scene.train], [true[name] for name in scene.train]
-        each = [iou([mask], [wanted]) for mask, wanted in zip(own, asked, strict=True)]
-        found[kind] = {"together": iou(own, asked), "median": float(np.median(each)), "worst": min(each)}
+        masks, truths = [getattr(sets[name], kind) for name in scene.train], [true[name] for name in scene.train]
+        each = [iou([mask], [wanted]) for mask, wanted in zip(masks, truths, strict=True)]
+        found[kind] = {"together": iou(masks, truths), "median": float(np.median(each)), "worst": min(each)}
     return found
 
 
 def measure(scene_folder: Path, run: Path, out: Path, seed: int) -> dict[str, dict[str, dict[str, float]]]:
-    """Kind of input -> kind of mask -> mean and worst IoU; the masks made are kept in `out`."""
+    """Kind of input -> kind of mask -> IoU; the masks made are kept in `out`."""
     scene = load_scene(run / "poses")
     exact = load_raw_masks(run / "raw_masks", scene.train)
     cameras = [scene.cameras[name] for name in scene.train]
     truth = {"consistent": exact, "unobserved": true_never_seen(scene_folder, cameras)}
     random = np.random.default_rng(seeding.seed_for(seed, "perturbed masks"))
     kept = random.permutation(len(scene.train))[round(MISSING * len(scene.train)) :]
-    noisy = {scene.train[k]: perturbed(exact[scene.train[k]], random) for k in sorted(kept)}
+    noisy = {scene.train[k]: perturb_mask(exact[scene.train[k]], random) for k in sorted(kept)}
     params = masks_stage.Params(**load_json(run / "masks/receipt.json")["params"])
     results = {}
     for kind, given in (("exact", exact), ("perturbed", noisy)):
@@ -115,22 +115,22 @@ def main() -> int:
     parser.add_argument("--run", type=Path, help="default: runs/<scene's name>")
     parser.add_argument("--out", type=Path, help="default: runs/masks/<scene's name>")
     parser.add_argument("--seed", type=int, default=0, help="of the perturbations")
-    parser.add_argument("--check", action="store_true", help="exit with 1 where the aim is missed")
+    parser.add_argument("--check", action="store_true", help="exit with 1 if a required IoU is missed")
     given = parser.parse_args()
     name = given.scene.resolve().name
     run, out = given.run or Path("runs") / name, given.out or Path("runs/masks") / name
     for path in (given.scene / "truth/cameras.json", run / "masks/receipt.json"):
         if not path.exists():
-            raise ValueError(f"{path} is missing: make a scene of the generator's, and run `make scene=... masks`")
+            raise ValueError(f"{path} is missing: make the scene with data/generate.py, and run `make scene=... masks`")
     results = measure(given.scene, run, out, given.seed)
     (out / "masks.json").write_text(json.dumps(results, indent=1))
     missed = 0
-    for kind, asked in ASKED.items():
-        for mask, least in asked.items():
+    for kind, required in REQUIRED_IOU.items():
+        for mask, least in required.items():
             found = results[kind][mask]
             missed += found["together"] < least
-            numbers = f"{found['together']:.3f}, middle view {found['median']:.3f}, worst {found['worst']:.3f}"
-            print(f"{kind:9} {mask:10} IoU {numbers} (asked: {least})")
+            numbers = f"{found['together']:.3f}, median view {found['median']:.3f}, worst {found['worst']:.3f}"
+            print(f"{kind:9} {mask:10} IoU {numbers} (required: {least})")
     print(f"the perturbed masks themselves: {results['perturbed']['input']['together']:.3f}")
     return int(given.check and missed > 0)
 

@@ -1,8 +1,9 @@
-"""An object removed from one place of a real capture and put in at another: `python -m benchmarks.studies.moving`.
+"""An object of a real capture moved to another place: `python -m benchmarks.studies.moving`.
 
-The training photographs show the object where it stood, with masks; as many pictures of it at the other place as show
-all of it are the references, each with its depth, around it between the sparse points. The same object drawn there into
-all photographs is the truth, and a fit to them the ceiling. Cameras stay as given, for by these the object was drawn.
+The training photographs show the object at its first place, with masks. The references are as many pictures of it at
+the second place as are needed to show all of it, each with depth: the object's own, elsewhere interpolated between
+sparse points. The object drawn there into all photographs is the truth, and a fit to these is the ceiling. Cameras stay
+as given, since the object was drawn with them.
 Writes moving.json and a sheet of all test views (truth, as photographed, ours, ceiling, difference) to --out.
 """
 
@@ -14,21 +15,26 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.studies import composites, drawing, judging, placing
+from benchmarks.studies import composites, compositing, placement, scoring
 from reffusion.io.arrays import save_json
 from reffusion.io.images import save_image
 
-ROOM_FOR_IT = 1.08  # radius of the region over that of the object
-COVERED = 0.995  # of what photographs show of the object: what the references show of it, at least
-GRID = 12  # points along each edge of a face, by which is told how well a picture shows the object
+REGION_FACTOR = 1.08  # radius of the region, over that of the object
+COVERED = 0.995  # least part of the object's visible surface that the references must show
+GRID = 12  # points along each edge of a face, by which the visibility of the object is measured
 
 
-def showing(capture: placing.Photographs, thing: placing.Thing, names: list[str]) -> list[str]:
-    """The photographs that show `COVERED` of what all of them show of the object: each next one is that by which its
-    surface is seen most finely, each point in the picture that shows it best, beside the best of all."""
+def select_references(capture: placement.Photographs, thing: placement.PlacedObject, names: list[str]) -> list[str]:
+    """Photographs that together show `COVERED` of the object's visible surface, selected greedily.
+
+    Each next one adds most to the resolution at which the surface is seen, every point taken in its best picture,
+    relative to the best of all photographs.
+    """
     ticks = (np.arange(GRID) + 0.5) / GRID * 2 - 1
     sides = np.stack(np.meshgrid(ticks, ticks), -1).reshape(-1, 2)
-    faces = [(axis, end) for axis in range(3) for end in (-1, 1) if (axis, end) != (2, -1)]  # it stands on that one
+    faces = [
+        (axis, end) for axis in range(3) for end in (-1, 1) if (axis, end) != (2, -1)
+    ]  # without the face it stands on
     at = np.concatenate([np.insert(sides, axis, end, 1) for axis, end in faces])
     normals = np.repeat(np.array([end * thing.axes[axis] for axis, end in faces]), len(sides), 0)
     points = thing.middle + (at * thing.half) @ thing.axes
@@ -40,8 +46,8 @@ def showing(capture: placing.Photographs, thing: placing.Thing, names: list[str]
     return [names[k] for k in chosen]
 
 
-def _fineness(capture: placing.Photographs, name: str, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """[P], how finely a photograph shows points of these normals, [P, 3] both; 0 where it does not."""
+def _fineness(capture: placement.Photographs, name: str, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """[P]: how finely a photograph shows points with normals, [P, 3] both; 0 for points that it does not show."""
     camera = capture.cameras[name]
     image, z = capture.project(camera, points)
     framed = ((image >= 0) & (image < (capture.width, capture.height))).all(1) & (z > 0)
@@ -50,42 +56,49 @@ def _fineness(capture: placing.Photographs, name: str, points: np.ndarray, norma
     return np.where(framed, np.sqrt(facing.clip(0)) / np.abs(z), 0)
 
 
-def write(start: placing.Place, goal: placing.Place, capture: placing.Photographs, out: Path) -> Path:
-    """The scene in out/<start>-to-<goal>, and the ceiling's beside it; its folder."""
-    before, after = placing.stand(capture, start), placing.stand(capture, goal)
-    after = placing.Thing(after.foot, before.height, after.axes, before.half, before.shape)
-    views, pictured = placing.views_around(capture, goal, after), drawing.Pictured(capture)
+def write_scenes(
+    start: placement.Place,
+    goal: placement.Place,
+    capture: placement.Photographs,
+    out: Path,
+) -> Path:
+    """Write the scene to out/<start>-to-<goal> and the ceiling's beside it; return the scene's folder."""
+    before, after = placement.place_object(capture, start), placement.place_object(capture, goal)
+    after = placement.PlacedObject(after.foot, before.height, after.axes, before.half, before.shape)
+    views, pictured = placement.select_views(capture, goal, after), compositing.PixelRays(capture)
     tints = np.random.default_rng(0).uniform(0.35, 0.9, (3, 3))
     scene, ceiling = (out / f"{start.name}-to-{goal.name}{end}" for end in ("", "-untouched"))
     train = [name for name in views.all if name not in views.test]
-    asked = showing(capture, after, train)
+    references = select_references(capture, after, train)
     for folder in (scene, ceiling):
         shutil.rmtree(folder, ignore_errors=True)
     for name in views.all:
-        camera, photo = capture.cameras[name], drawing.photograph(capture, name) / 255
-        shown, at_goal = drawing.drawn_into(photo, pictured, camera, after, tints)
+        camera, photo = capture.cameras[name], compositing.load_photograph(capture, name) / 255
+        shown, at_goal = compositing.composite_object(photo, pictured, camera, after, tints)
         save_image(ceiling / f"images/{name}.png", shown)
         if name in views.test:
             save_image(scene / f"images/{name}.png", shown)
             for folder in (scene, ceiling):
                 save_image(folder / f"test_masks/{name}.png", at_goal)
             continue
-        with_it, mask = drawing.drawn_into(photo, pictured, camera, before, tints)
+        with_it, mask = compositing.composite_object(photo, pictured, camera, before, tints)
         save_image(scene / f"images/{name}.png", with_it)
         save_image(scene / f"masks/{name}.png", mask)
-        if name in asked:
+        if name in references:
             save_image(scene / f"references/{name}.png", shown)
-            depth = drawing.depth(pictured, camera, after)
-            depth[(mask > 0) & (at_goal == 0)] = np.nan  # nobody knows where it stood
+            depth = compositing.composite_depth(pictured, camera, after)
+            depth[(mask > 0) & (at_goal == 0)] = np.nan  # unknown behind the object's first place
             np.save(scene / f"references/{name}.npy", depth)
     for folder in (scene, ceiling):
-        drawing.write_meta(capture, views, folder)
-    tested = f"test_masks: test_masks\ntest: {drawing.listed(views.test)}\nstages: {{poses: {{refine: false}}}}\n"
+        compositing.write_cameras(capture, views, folder)
+    tested = (
+        f"test_masks: test_masks\ntest: {compositing.yaml_list(views.test)}\nstages: {{poses: {{refine: false}}}}\n"
+    )
     (ceiling / "scene.yaml").write_text(f"masks: none\n{tested}")
     given = "".join(
-        f'- {{view: "{name}", image: references/{name}.png, depth: references/{name}.npy}}\n' for name in asked
+        f'- {{view: "{name}", image: references/{name}.png, depth: references/{name}.npy}}\n' for name in references
     )
-    radius = ROOM_FOR_IT * float(np.linalg.norm(after.half))
+    radius = REGION_FACTOR * float(np.linalg.norm(after.half))
     region = f"region: {{center: {after.middle.tolist()}, radius: {radius}}}\n"
     (scene / "scene.yaml").write_text(f"masks: masks\n{tested}{region}reference:\n{given}")
     return scene
@@ -99,16 +112,16 @@ def main() -> None:
     parser.add_argument("--profile", default="laptop")
     parser.add_argument("--out", type=Path, default=composites.ROOT / "runs/moving")
     given = parser.parse_args()
-    (start,), (goal,) = (composites.chosen(name, False) for name in (given.start, given.goal))
+    (start,), (goal,) = (composites.select_places(name, False) for name in (given.start, given.goal))
     if start.capture != goal.capture:
         parser.error(
             f"{start.name} is a place of {start.capture}, {goal.name} of {goal.capture}; take two of one capture"
         )
-    scene = write(start, goal, placing.load(given.captures / start.capture), given.out / "scenes")
+    scene = write_scenes(start, goal, placement.load_photographs(given.captures / start.capture), given.out / "scenes")
     folders = (scene, scene.with_name(f"{scene.name}-untouched"))
-    run, ceiling = (judging.Run.at(composites.job(each, given.out / "runs", given.profile)) for each in folders)
-    save_image(given.out / f"{scene.name}.png", judging.sheet(run, ceiling))
-    scores = judging.scores(run, ceiling)
+    run, ceiling = (scoring.Run.load(composites.run_job(each, given.out / "runs", given.profile)) for each in folders)
+    save_image(given.out / f"{scene.name}.png", scoring.comparison_sheet(run, ceiling))
+    scores = scoring.score_place(run, ceiling, {})
     save_json(given.out / "moving.json", {"place": scene.name, **scores})
     print(scores)
 

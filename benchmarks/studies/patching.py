@@ -1,12 +1,12 @@
-"""A hole that deleting left, patched: `python -m benchmarks.studies.patching write`.
+"""A hole left by deleting splats, patched: `python -m benchmarks.studies.patching write`.
 
-The fit of a finished scene is what an artist opens; a box around the object's splats is deleted, and the rest saved as
-an editor does: in another order, quantised, without spherical harmonics. `write` makes three scenes of it in --out:
-with the photographs, with the capture's cameras alone, and with neither. `make scene=... patch` patches each; `score`
-renders the patched files from the test views, beside the run's own result: PSNR in the box, and a sheet of pictures.
+Simulates an artist: opens the fit of a finished scene, deletes a box around the object, and saves the rest as an editor
+does, in another order, quantised, without spherical harmonics. `write` makes three scenes of it in --out: with the
+photographs, with the capture's cameras only, and with neither. `make scene=... patch` patches each. `score` renders the
+patched files from the test views, beside the run's own result: PSNR in the box, and a sheet of pictures.
 
-`command` measures `reffusion patch before.ply after.ply`: what `export` wrote is cut by another tool, npm's
-splat-transform; the filled scene is opened by that tool again, and counted in `score`.
+`command` measures `reffusion patch before.ply after.ply`: splat-transform, an npm package, cuts what `export` wrote,
+opens the filled scene again, and the result is included in `score`.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ from report import patch_files
 
 KINDS = ("photographs", "cameras", "neither")
 COMMANDS = ("command, cameras", "command, two files alone")
-TRIMMED = 0.2  # percent of the object's splats on each side that are beyond the box: floaters
+TRIMMED = 0.2  # percent of the object's splats on each side that the box ignores, as floaters
 SHOWN = 4  # test views on the sheet
 
 
 def in_box(means: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """bool [N]: the splats in the smallest box around the object, which a person would turn until it fits."""
+    """bool [N]: splats in the smallest rotated box around the object, as a person would fit it."""
     thing, draws, box = means[labels], np.random.default_rng(0), Rotation.identity()
     bounds = lambda turn: np.percentile(turn.apply(thing), (TRIMMED, 100 - TRIMMED), axis=0)
     volume = lambda turn: float(np.prod(np.diff(bounds(turn), axis=0)))
@@ -52,8 +52,8 @@ def in_box(means: np.ndarray, labels: np.ndarray) -> np.ndarray:
     return ((along >= low) & (along <= high)).all(1)
 
 
-def write(run: Path, scene: Path, out: Path) -> None:
-    """The three scenes' folders in `out`."""
+def write_scenes(run: Path, scene: Path, out: Path) -> None:
+    """Write the three scenes' folders to `out`."""
     placed, gaussians = load_scene(run / "poses"), load_ply(run / "fit" / "gaussians.ply")
     deleted = torch.from_numpy(in_box(gaussians.means.double().numpy(), load_object(run / "masks").numpy()))
     left = gaussians.map(lambda p: p[~deleted])
@@ -65,26 +65,28 @@ def write(run: Path, scene: Path, out: Path) -> None:
         shutil.rmtree(folder, ignore_errors=True)
         save_ply(folder / "scene.ply", gaussians, placed.similarity)
         save_compressed(folder / "cleaned.compressed.ply", stripped, placed.similarity)
-        said = f"gaussians: scene.ply\ncleaned: cleaned.compressed.ply\nstages: {{poses: {{longest: {width}}}}}\n"
+        text = f"gaussians: scene.ply\ncleaned: cleaned.compressed.ply\nstages: {{poses: {{longest: {width}}}}}\n"
         if kind == "photographs":
             shutil.copytree(scene / "images_4", folder / "images_4")
             shutil.rmtree(folder / "images_4" / "label")
             for name in ("sparse", "poses_bounds.npy"):
                 (shutil.copytree if (scene / name).is_dir() else shutil.copy)(scene / name, folder / name)
-            said += "masks: none\n"
+            text += "masks: none\n"
         if kind == "cameras":
             shutil.copytree(scene / "sparse", folder / "sparse")
         if kind != "neither":
             shutil.copy(reference, folder / "reference.png")
-            said += f"reference: {{view: {reference.stem}, image: reference.png, undistorted: true}}\n"
-        save_text(folder / "scene.yaml", said)
+            text += f"reference: {{view: {reference.stem}, image: reference.png, undistorted: true}}\n"
+        save_text(folder / "scene.yaml", text)
     own = load_labels(run / "masks" / "labels.npy")
     print(f"{int(deleted.sum())} of {len(gaussians)} splats deleted; the run itself removed {int(own.sum())}")
 
 
-def cut(run: Path, folder: Path, tool: list[str]) -> None:
-    """before.ply and after.ply in the scene's own frame: splat-transform deletes what a person selected with a box
-    around the object, which is a column of the file that it reads. cameras/: the training views and photographs."""
+def delete_object(run: Path, folder: Path, tool: list[str]) -> None:
+    """Write before.ply, after.ply and cameras/ (training views and photographs) in the scene's own frame.
+
+    splat-transform deletes the splats in a box around the object, which are marked in a column of the file it reads.
+    """
     exported, placed = run / "export", load_scene(run / "poses")
     shutil.rmtree(folder, ignore_errors=True)
     (folder / "cameras").mkdir(parents=True)
@@ -110,10 +112,10 @@ def cut(run: Path, folder: Path, tool: list[str]) -> None:
     print(f"splat-transform deleted {len(table) - kept} of {len(table)} splats")
 
 
-def fill(run: Path, out: Path, runs: Path, tool: list[str], set_: str) -> None:
-    """Run the command with the cameras, photographs and the run's reference, and on the two files alone."""
+def run_patch_command(run: Path, out: Path, runs: Path, tool: list[str], set_: str) -> None:
+    """Run the command with cameras, photographs and the run's reference, and with the two files only."""
     folder = out / "command"
-    cut(run, folder, tool)
+    delete_object(run, folder, tool)
     reference = next((run / "reference" / "references").glob("*.png"))
     for kind in COMMANDS:
         words = [str(folder / "before.ply"), str(folder / "after.ply"), "--profile", "laptop", "--set", set_]
@@ -133,7 +135,7 @@ def fill(run: Path, out: Path, runs: Path, tool: list[str], set_: str) -> None:
 
 
 def output_file(out: Path, kind: str) -> Path:
-    """Where the command writes."""
+    """The file that the command writes."""
     return out / "command" / ("cameras.ply" if kind == COMMANDS[0] else "alone.ply")
 
 
@@ -150,7 +152,7 @@ def score(run: Path, out: Path, runs: Path) -> None:
     found, rows, some = {}, [], placed.test[:: max(1, len(placed.test) // SHOWN)][:SHOWN]
     for title, parts in together.items():
         if all(path.exists() for path in parts):
-            pictures = renders(parts, placed, placed.similarity)
+            pictures = render_test_views(parts, placed, placed.similarity)
             found[title] = box_psnr(pictures, run, placed)
             rows.append(np.concatenate([pictures[name] for name in some], 1))
             print(f"{title}: {found[title]:.2f} dB", flush=True)
@@ -158,8 +160,8 @@ def score(run: Path, out: Path, runs: Path) -> None:
     save_image(out / "patching.png", np.concatenate(rows))
 
 
-def renders(parts: tuple[Path, ...], placed: Scene, similarity: Similarity) -> dict[str, np.ndarray]:
-    """Test view -> uint8 [H, W, 3], of the files' splats together."""
+def render_test_views(parts: tuple[Path, ...], placed: Scene, similarity: Similarity) -> dict[str, np.ndarray]:
+    """Test view -> uint8 [H, W, 3], rendered from the splats of several files together."""
     first, *others = (load_ply(path, similarity) for path in parts)
     for other in others:
         most = max(first.sh.shape[1], other.sh.shape[1])
@@ -171,6 +173,7 @@ def renders(parts: tuple[Path, ...], placed: Scene, similarity: Similarity) -> d
 
 
 def box_psnr(pictures: dict[str, np.ndarray], run: Path, placed: Scene) -> float:
+    """Mean PSNR in the mask's box over the test views."""
     values = []
     for name, picture in pictures.items():
         box = image_metrics.mask_box(load_mask(run / "raw_masks" / "test_masks" / f"{name}.png"))
@@ -186,14 +189,16 @@ def main() -> None:
     parser.add_argument("--scene", type=Path, default=Path("data/demo"))
     parser.add_argument("--out", type=Path, default=Path("runs/patching"))
     parser.add_argument("--runs", type=Path, default=Path("runs"))
-    parser.add_argument("--tool", default="npx --yes @playcanvas/splat-transform", help="how splat-transform is called")
+    parser.add_argument(
+        "--tool", default="npx --yes @playcanvas/splat-transform", help="command that runs splat-transform"
+    )
     parser.add_argument("--set", default="personalize.steps=4 distill.iterations=4", help="parameters of `command`")
     parser.add_argument("what", choices=("write", "command", "score"))
     arguments = parser.parse_args()
     if arguments.what == "write":
-        write(arguments.run, arguments.scene, arguments.out)
+        write_scenes(arguments.run, arguments.scene, arguments.out)
     elif arguments.what == "command":
-        fill(arguments.run, arguments.out, arguments.runs, shlex.split(arguments.tool), arguments.set)
+        run_patch_command(arguments.run, arguments.out, arguments.runs, shlex.split(arguments.tool), arguments.set)
     else:
         score(arguments.run, arguments.out, arguments.runs)
 

@@ -1,16 +1,17 @@
-"""What a prior can do, in figures and pictures: `python -m benchmarks.studies.prior --run runs/demo`.
+"""Quality of a prior in figures and pictures: `python -m benchmarks.studies.prior --run runs/demo`.
 
   inpainting    held-out pictures of 64 px, a silhouette cut out of each, against OpenCV's Telea and Navier-Stokes:
-                PSNR, SSIM, FLIP and gradient energy inside the hole; every prior named, from the same noise
-  --steps       the first prior with other numbers of sampler steps. Few steps give nearly the mean of all fillings, the
-                best picture by PSNR and SSIM and a blurred one; many give one of them
-  personalize   the first prior on a scene's reference by the laptop profile: error against steps, then, before and
-                after, by timestep: error of the clean latent in holes of unseen views and the variance of the SDS
-                gradient over the noise; the same views, and the reference's own hole, filled from pure noise
-  --sampler     steps for that; 50, the stock pipeline's own number. More are sharper and further from the truth
-  --seeds       that as often, each with its own draws in training and in sampling
-  --wrong-reference   and once more with another reference: a picture to learn instead, at the same place, or another
-                scene's run, whose personalization is taken as it is. It must not help
+                PSNR, SSIM, FLIP and gradient energy inside the hole; all priors start from the same noise
+  --steps       the first prior with other numbers of sampler steps. Few steps give nearly the mean of all fillings,
+                which is blurred and best by PSNR and SSIM; many steps give one of the fillings
+  personalize   the first prior on a scene's reference with the laptop profile: error against steps; then, before and
+                after, by timestep: error of the clean latent in holes of unseen views, and variance of the SDS gradient
+                over the noise; the same views, and the reference's own hole, filled from pure noise
+  --sampler     steps for that filling; the default of 50 is that of the stock pipeline. More steps are sharper and
+                further from the truth
+  --seeds       repeat with these seeds, each with its own draws in training and in sampling
+  --wrong-reference   repeat with another reference, which must not help: a picture to learn instead, at the same place,
+                or another scene's run, whose personalization is taken as it is
 Writes prior.json and rows of pictures to --out; `python -m report.prior` draws them (`make prior-report` does both).
 Every draw is seeded. LPIPS is left out: its network's weights are not in the repository.
 """
@@ -29,7 +30,17 @@ import numpy as np
 import torch
 import yaml
 
-from benchmarks.studies.holes import COLUMNS, SEED, Case, held_out, hole_scores, means, painted, save_row, tensors
+from benchmarks.studies.holes import (
+    COLUMNS,
+    SEED,
+    Case,
+    fill_holes,
+    held_out_cases,
+    hole_scores,
+    mean_scores,
+    save_row,
+    to_tensors,
+)
 from reffusion import seeding, trace
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.images import load_image, save_image
@@ -42,55 +53,55 @@ from stages import personalize as stage
 
 ROOT = Path(__file__).resolve().parents[2]
 
-TELEA_RADIUS = 5  # px, of both rivals
+TELEA_RADIUS = 5  # of both OpenCV methods, px
 TIMESTEPS = (20, 100, 250, 400, 550, 700, 850, 980)
 NOISES = 4  # draws for the variance of the SDS gradient
-VIEWS = 6  # unseen views
+VIEWS = 6  # number of unseen views
 SHOWN = 12  # held-out pictures on the sheet
 PROMPTS = {"reference": "A photo of sks", "whole": "A photo of sks", "window": "A photo of sks, cropped"}
-LEARNS = ("poses", "reference")  # what personalization needs of a run
+LEARNS = ("poses", "reference")  # stages that personalization needs of a run
 
 # ---------------------------------------------------------------------------------------------- inpainting
 
 
-def scored(pictures: list[np.ndarray], cases: list[Case]) -> dict[str, float]:
+def score_cases(pictures: list[np.ndarray], cases: list[Case]) -> dict[str, float]:
     """Means of the scores inside the holes."""
-    return means([hole_scores(p, c.truth, c.hole) for p, c in zip(pictures, cases, strict=True)])
+    return mean_scores([hole_scores(p, c.truth, c.hole) for p, c in zip(pictures, cases, strict=True)])
 
 
-def timed(work) -> tuple:
-    """(what `work` gives, seconds of this process on all its threads): other work on the machine does not count."""
+def time_cpu(work) -> tuple:
+    """(result of `work`, CPU seconds of this process over all its threads); other processes do not count."""
     began = time.process_time()
     return work(), time.process_time() - began
 
 
-def inpainting(priors: list[str], cases: list[Case], out: Path) -> dict:
-    """Method -> kind -> means, and seconds of a picture; the first `SHOWN` cases as rows of pictures."""
+def measure_inpainting(priors: list[str], cases: list[Case], out: Path) -> dict:
+    """Method -> kind -> means, and seconds per picture; saves the first `SHOWN` cases as rows of pictures."""
     rivals = {"Telea": cv2.INPAINT_TELEA, "Navier-Stokes": cv2.INPAINT_NS}
     ways, seconds = {}, {}
     for name, flag in rivals.items():
         fill = lambda flag=flag: [cv2.inpaint(c.truth, c.hole.astype(np.uint8), TELEA_RADIUS, flag) for c in cases]
-        ways[name], seconds[name] = timed(fill)
+        ways[name], seconds[name] = time_cpu(fill)
     for name in priors:
         prior = load_prior(name)
-        ways[name], seconds[name] = timed(lambda prior=prior: painted(prior, cases, SEED))
+        ways[name], seconds[name] = time_cpu(lambda prior=prior: fill_holes(prior, cases, SEED))
     for index, case in enumerate(cases[:SHOWN]):
         save_row(out / "inpainting" / f"{index:02d}.png", case, [pictures[index] for pictures in ways.values()])
     result = {}
     for name, pictures in ways.items():
         rows = [(c.kind, hole_scores(p, c.truth, c.hole)) for p, c in zip(pictures, cases, strict=True)]
         kinds = ["all", *sorted({kind for kind, _ in rows})]
-        result[name] = {kind: means([row for own, row in rows if kind in ("all", own)]) for kind in kinds}
+        result[name] = {kind: mean_scores([row for own, row in rows if kind in ("all", own)]) for kind in kinds}
         result[name]["all"]["seconds"] = seconds[name] / len(cases)
     return {"columns": ["hole", *ways, "truth"], "scores": result}
 
 
-def by_steps(prior: Prior, cases: list[Case], steps: list[int], prompt: str = "") -> dict[str, dict]:
-    """Number of sampler steps -> means, and CPU seconds of a picture."""
+def measure_steps(prior: Prior, cases: list[Case], steps: list[int], prompt: str = "") -> dict[str, dict]:
+    """Number of sampler steps -> means, and CPU seconds per picture."""
     result = {}
     for count in steps:
-        pictures, seconds = timed(lambda count=count: painted(prior, cases, SEED, prompt, count))
-        result[str(count)] = scored(pictures, cases) | {"seconds": seconds / len(cases)}
+        pictures, seconds = time_cpu(lambda count=count: fill_holes(prior, cases, SEED, prompt, count))
+        result[str(count)] = score_cases(pictures, cases) | {"seconds": seconds / len(cases)}
     return result
 
 
@@ -98,11 +109,13 @@ def by_steps(prior: Prior, cases: list[Case], steps: list[int], prompt: str = ""
 
 
 def scene_cases(run: Path, size: int, pictures: dict[str, np.ndarray] | None = None) -> dict[str, list[Case]]:
-    """The first reference and its hole, `NOISES` times, and unseen views with ground truth, their test masks as holes:
-    whole, reduced to `size`, and a window of each. `pictures`, view name -> uint8 [H, W, 3], stand for the truth.
+    """The first reference and its hole, `NOISES` times, and unseen views with ground truth and their test masks.
+
+    Views come whole, reduced to `size`, and as a window of each. `pictures`, view name -> uint8 [H, W, 3], replace the
+    truth.
 
     Raises:
-        ValueError: the scene has no test view with a mask.
+        ValueError: no test view has ground truth and a mask.
     """
     scene = load_scene(run / "poses")
     found = {}
@@ -136,8 +149,8 @@ def _reduced(case: Case, size: int) -> Case:
     )
 
 
-def profile(prior: str, settings: dict) -> stage.Params:
-    """The laptop profile's parameters of `personalize` for a prior; `settings`, by dotted names, come last."""
+def profile_params(prior: str, settings: dict) -> stage.Params:
+    """The laptop profile's parameters of `personalize` for a prior; `settings`, by dotted names, override them."""
     values = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"]["personalize"]
     for name, value in {"prior": prior, **settings}.items():
         *groups, last = name.split(".")
@@ -149,10 +162,13 @@ def profile(prior: str, settings: dict) -> stage.Params:
 
 
 @torch.no_grad()
-def by_timestep(prior: Prior, cases: list[Case], prompt: str) -> dict[str, list[float]]:
-    """For each of `TIMESTEPS`, means over the holes: the squared error of the clean latent predicted from the noised
-    truth, and the variance of that prediction (so of z - x0, the SDS gradient) over `NOISES` draws of the noise."""
-    pictures, holes = tensors(cases)
+def measure_timesteps(prior: Prior, cases: list[Case], prompt: str) -> dict[str, list[float]]:
+    """Error and variance of the predicted clean latent in the holes, for each of `TIMESTEPS`.
+
+    "error" is the mean squared error of the clean latent predicted from the noised truth; "variance" that of the
+    prediction (and so of z - x0, the SDS gradient) over `NOISES` draws of the noise.
+    """
+    pictures, holes = to_tensors(cases)
     clean, condition = diffusion.encode(prior, pictures), diffusion.conditioning(prior, pictures, holes)
     text = diffusion.embed_text(prior, [prompt]).expand(len(cases), -1, -1)
     inside = condition[:, :1].expand_as(clean) > 0.5
@@ -169,8 +185,8 @@ def by_timestep(prior: Prior, cases: list[Case], prompt: str) -> dict[str, list[
     return result
 
 
-def with_picture(reference: Path, picture: Path, folder: Path) -> Path:
-    """A copy of the stage's folder in which every reference shows `picture` instead, at its size; masks stay."""
+def replace_references(reference: Path, picture: Path, folder: Path) -> Path:
+    """Copy the stage's folder with `picture`, resized, in place of every reference; masks stay."""
     shutil.copytree(reference, folder)
     for path in (folder / "references").glob("*.png"):
         height, width = load_image(path).shape[:2]
@@ -178,8 +194,8 @@ def with_picture(reference: Path, picture: Path, folder: Path) -> Path:
     return folder
 
 
-def learnt(params: stage.Params, needs: dict[str, Path], folder: Path) -> tuple[Prior, list[dict]]:
-    """The prior personalized in `folder`, and the trace of that; what was begun there with these parameters goes on."""
+def personalize_prior(params: stage.Params, needs: dict[str, Path], folder: Path) -> tuple[Prior, list[dict]]:
+    """The prior personalized in `folder`, and the trace; an earlier attempt with these parameters continues."""
     settings, made = params.model_dump(mode="json"), folder / "settings.json"
     if not made.exists() or load_json(made) != settings:
         shutil.rmtree(folder, ignore_errors=True)
@@ -190,33 +206,33 @@ def learnt(params: stage.Params, needs: dict[str, Path], folder: Path) -> tuple[
     return lora.merged(load_prior(params.prior), folder), trace.read_trace(folder / "trace.jsonl")
 
 
-def mislearnt(params: stage.Params, needs: dict[str, Path], wrong: Path, folder: Path) -> Prior:
-    """The prior personalized on what is not the scene's reference: a picture, or another scene's run as it is."""
+def personalize_wrongly(params: stage.Params, needs: dict[str, Path], wrong: Path, folder: Path) -> Prior:
+    """The prior personalized on a wrong reference: a picture, or another scene's finished run."""
     if wrong.is_dir():
         return lora.merged(load_prior(params.prior), wrong / "personalize")
-    other = with_picture(needs["reference"], wrong, folder / "other")
-    model, _ = learnt(params, needs | {"reference": other}, folder / f"{params.seed}-wrong")
+    other = replace_references(needs["reference"], wrong, folder / "other")
+    model, _ = personalize_prior(params, needs | {"reference": other}, folder / f"{params.seed}-wrong")
     shutil.rmtree(other)
     return model
 
 
-def filled(model: Prior, cases: dict[str, list[Case]], seed: int, sampler: int) -> dict[str, list[np.ndarray]]:
+def fill_scales(model: Prior, cases: dict[str, list[Case]], seed: int, sampler: int) -> dict[str, list[np.ndarray]]:
     """Scale -> its holes filled from pure noise in `sampler` steps."""
-    return {scale: painted(model, some, SEED + seed, PROMPTS[scale], sampler) for scale, some in cases.items()}
+    return {scale: fill_holes(model, some, SEED + seed, PROMPTS[scale], sampler) for scale, some in cases.items()}
 
 
-def samples(pictures: dict[str, list[np.ndarray]], cases: dict[str, list[Case]]) -> dict[str, dict[str, float]]:
+def score_scales(pictures: dict[str, list[np.ndarray]], cases: dict[str, list[Case]]) -> dict[str, dict[str, float]]:
     """Scale -> means of the scores."""
-    return {scale: scored(pictures[scale], some) for scale, some in cases.items()}
+    return {scale: score_cases(pictures[scale], some) for scale, some in cases.items()}
 
 
-def personalization(
+def measure_personalization(
     params: stage.Params, run: Path, seeds: list[int], wrong: Path | None, steps: list[int], sampler: int, out: Path
 ) -> dict:
-    """Personalize on the run's reference, once a seed, and measure before and after on views that were never seen.
+    """Personalize on the run's reference, once per seed, and measure before and after on unseen views.
 
-    Returns the first seed's measurements, and in "seeds" the samples' scores of every seed: "before", "after" and,
-    with a `wrong` reference, "wrong".
+    Returns the first seed's measurements, and in "seeds" the sample scores of every seed: "before", "after" and, with a
+    `wrong` reference, "wrong".
     """
     needs = {need: run / need for need in LEARNS}
     for folder in needs.values():
@@ -228,16 +244,16 @@ def personalization(
     result["seeds"] = {}
     for seed in seeds:
         mine = params.model_copy(update={"seed": seed})
-        model, log = learnt(mine, needs, out / "personalize" / str(seed))
+        model, log = personalize_prior(mine, needs, out / "personalize" / str(seed))
         models = {"before": base, "after": model}
         if wrong:
-            models["wrong"] = mislearnt(mine, needs, wrong, out / "personalize")
-        pictures = {when: filled(model, cases, seed, sampler) for when, model in models.items()}
-        result["seeds"][str(seed)] = {when: samples(made, cases) for when, made in pictures.items()}
+            models["wrong"] = personalize_wrongly(mine, needs, wrong, out / "personalize")
+        pictures = {when: fill_scales(model, cases, seed, sampler) for when, model in models.items()}
+        result["seeds"][str(seed)] = {when: score_scales(made, cases) for when, made in pictures.items()}
         result["seeds"][str(seed)]["seconds"] = log[-1]["seconds"]
         print_seed(seed, result["seeds"][str(seed)])
         if seed == seeds[0]:
-            result |= first_seed(models, cases, pictures, log, steps, out)
+            result |= measure_first_seed(models, cases, pictures, log, steps, out)
     return result
 
 
@@ -248,7 +264,7 @@ def print_seed(seed: int, scores: dict) -> None:
             print(f"  {when}, {scale}", {column: round(row[column], 3) for column in COLUMNS}, flush=True)
 
 
-def first_seed(
+def measure_first_seed(
     models: dict[str, Prior],
     cases: dict[str, list[Case]],
     pictures: dict[str, dict[str, list[np.ndarray]]],
@@ -256,60 +272,64 @@ def first_seed(
     steps: list[int],
     out: Path,
 ) -> dict:
-    """What is measured once: errors by timestep, the effect of the sampler's steps, rows of pictures."""
+    """Measurements made once: errors by timestep, the effect of sampler steps, rows of pictures."""
     result: dict = {"trace": log, "timesteps": TIMESTEPS, "columns": ["hole", *models, "truth"]}
     for scale, some in cases.items():
         result[scale] = {
-            when: by_timestep(model, some, PROMPTS[scale]) | {"samples": scored(pictures[when][scale], some)}
+            when: measure_timesteps(model, some, PROMPTS[scale]) | {"samples": score_cases(pictures[when][scale], some)}
             for when, model in models.items()
         }
         for index, case in enumerate(some):
             save_row(out / scale / f"{case.kind}.png", case, [made[scale][index] for made in pictures.values()])
-    result["sampler"] = {s: by_steps(models["after"], cases[s], steps, PROMPTS[s]) for s in ("reference", "whole")}
+    result["sampler"] = {s: measure_steps(models["after"], cases[s], steps, PROMPTS[s]) for s in ("reference", "whole")}
     return result
 
 
-def setting(text: str) -> tuple[str, object]:
-    """("steps", 500) of "steps=500"."""
+def parse_setting(text: str) -> tuple[str, object]:
+    """("steps", 500) from "steps=500"."""
     name, found, value = text.partition("=")
     if not found:
         raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE")
     return name, yaml.safe_load(value)
 
 
-def arguments() -> argparse.Namespace:
+def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--priors", nargs="+", default=["priors/tiny"], help="diffusers folders; the first is the one")
-    parser.add_argument("--pictures", type=int, default=64, help="held-out pictures to fill; 0: leave them out")
+    parser.add_argument(
+        "--priors", nargs="+", default=["priors/tiny"], help="diffusers folders; the first one is personalized"
+    )
+    parser.add_argument("--pictures", type=int, default=64, help="held-out pictures to fill; 0 skips this part")
     parser.add_argument("--steps", type=int, nargs="*", default=[], help="numbers of sampler steps to compare")
     parser.add_argument("--run", type=Path, help="runs/<scene>, with its reference; without it no personalization")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of personalization, one after the other")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="seeds of personalization")
     parser.add_argument("--sampler", type=int, default=50, help="steps in which a personalized prior paints")
-    parser.add_argument("--wrong-reference", type=Path, help="a picture, or runs/<another scene>, to measure beside it")
-    parser.add_argument("--set", type=setting, nargs="*", default=[], help="personalization's: steps=500 lora.rank=32")
+    parser.add_argument("--wrong-reference", type=Path, help="a picture, or runs/<another scene>, to measure as well")
+    parser.add_argument(
+        "--set", type=parse_setting, nargs="*", default=[], help="personalization's: steps=500 lora.rank=32"
+    )
     parser.add_argument("--out", type=Path, default=Path("runs/prior-report"))
     parser.add_argument("--threads", type=int, default=2)
     return parser.parse_args()
 
 
 def main() -> None:
-    given = arguments()
+    given = parse_arguments()
     torch.set_num_threads(given.threads)
     for folder in ("inpainting", "reference", "whole", "window"):
         shutil.rmtree(given.out / folder, ignore_errors=True)
     first = given.priors[0]
     result: dict = {"prior": first}
     if given.pictures:
-        cases = held_out(given.pictures)
-        result["inpainting"] = inpainting(given.priors, cases, given.out)
+        cases = held_out_cases(given.pictures)
+        result["inpainting"] = measure_inpainting(given.priors, cases, given.out)
         for name, kinds in result["inpainting"]["scores"].items():
             print(name, {column: round(kinds["all"][column], 3) for column in (*COLUMNS, "seconds")}, flush=True)
-        result["sampler"] = by_steps(load_prior(first), cases, given.steps)
+        result["sampler"] = measure_steps(load_prior(first), cases, given.steps)
         for count, row in result["sampler"].items():
             print(f"{count} steps", {column: round(row[column], 3) for column in (*COLUMNS, "seconds")}, flush=True)
     if given.run:
-        params = profile(first, dict(given.set))
-        result["personalization"] = personalization(
+        params = profile_params(first, dict(given.set))
+        result["personalization"] = measure_personalization(
             params, given.run, given.seeds, given.wrong_reference, given.steps, given.sampler, given.out
         )
     save_json(given.out / "prior.json", result)

@@ -1,8 +1,9 @@
-"""Which references are accepted: `python -m benchmarks.studies.redrawn --captures ../shared/data`.
+"""Acceptance of redrawn and of wrong references: `python -m benchmarks.studies.redrawn --captures ../shared/data`.
 
-Of each capture, for some of its views: ten pictures that an autoencoder and other tools could make of the photograph,
-which must be accepted; the photographs of the nearest views and of another capture, as they are and redrawn, which must
-be refused. Printed are shares of places in place, errors, and with --seconds the time that a registration takes.
+For some views of each capture: ten pictures that an autoencoder and other tools could make of the photograph, which
+must be accepted; photographs of the nearest views and of another capture, as they are and redrawn, which must be
+refused. Prints the shares of patches that lie in place, the wrong decisions and, with --seconds, the time of a
+registration.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ from reffusion.io.images import load_image
 from reffusion.references import registration
 
 LONGER_SIDE = 640  # px to which photographs are reduced
-NEAREST = 2  # neighbouring views that are handed in as pictures of each view
-COMPARED = 4  # neighbouring photographs that the stage `reference` compares with
-CHOSEN_ON = ("bear", "garden", "statue", "fox")  # captures on which thresholds are chosen; the others report only
+NEAREST = 2  # neighbouring views whose photographs are given as pictures of each view
+COMPARED = 4  # neighbouring photographs with which the stage `reference` compares
+CHOSEN_ON = ("bear", "garden", "statue", "fox")  # captures on which thresholds were chosen; the others only report
 
 
 def redraw(photo: np.ndarray, seed: int = 0) -> np.ndarray:
@@ -41,7 +42,7 @@ def redraw(photo: np.ndarray, seed: int = 0) -> np.ndarray:
 
 
 def resize_to_multiple(image: np.ndarray, of: int) -> np.ndarray:
-    """The picture at the nearest size of which both sides are multiples."""
+    """The picture at the nearest size whose sides are both multiples of `of`."""
     size = [max(of, round(side / of) * of) for side in image.shape[1::-1]]
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
@@ -54,7 +55,7 @@ def compress(image: np.ndarray, quality: int = 60) -> np.ndarray:
 
 
 def shift(image: np.ndarray, across: float, down: float) -> np.ndarray:
-    """The picture displaced by so many px."""
+    """The picture shifted by this many px."""
     size = (image.shape[1], image.shape[0])
     return cv2.warpAffine(image, np.array([[1.0, 0, across], [0, 1, down]]), size, borderMode=cv2.BORDER_REPLICATE)
 
@@ -78,7 +79,7 @@ def _to_picture(values: np.ndarray) -> np.ndarray:
     return np.clip(np.round(values), 0, 255).astype(np.uint8)
 
 
-# What tools do to a picture that an autoencoder has redrawn.
+# Edits by common tools after an autoencoder has redrawn a picture.
 VARIANTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "redrawn": lambda picture: picture,
     "sides multiples of 8": lambda picture: resize_to_multiple(picture, 8),
@@ -95,7 +96,7 @@ VARIANTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 @dataclass
 class Photographs:
-    """A capture's photographs, reduced, read when asked for, and the distances between its views."""
+    """A capture's reduced photographs, read on demand, and the poses of its views."""
 
     files: dict[str, Path]
     upright: bool
@@ -110,7 +111,7 @@ class Photographs:
         return self.pictures[view]
 
     def nearest(self, view: str) -> list[str]:
-        """The other views by distance: between centres, of the median one, plus twice the radians between axes."""
+        """The other views by distance: between centres, relative to the median, plus twice the radians between axes."""
         centre = {name: -pose[:3, :3].T @ pose[:3, 3] for name, pose in self.world_to_camera.items()}
         others = [name for name in self.files if name != view]
         away = {name: float(np.linalg.norm(centre[name] - centre[view])) for name in others}
@@ -120,8 +121,8 @@ class Photographs:
         return sorted(others, key=lambda name: away[name] / usual + 2 * np.arccos(cosine[name]))
 
 
-def load(folder: Path) -> Photographs:
-    """Those of a capture that brings poses."""
+def load_photographs(folder: Path) -> Photographs:
+    """Load a capture. ValueError if it has no poses."""
     capture = load_capture(folder)
     if capture.poses is None:
         raise ValueError(f"{folder} brings no poses: neighbouring views are not known")
@@ -130,13 +131,13 @@ def load(folder: Path) -> Photographs:
 
 
 def reduce(image: np.ndarray, longer: int) -> np.ndarray:
-    """The picture with its longer side so long, where it is longer."""
+    """The picture with its longer side reduced to `longer` px; smaller pictures stay."""
     size = [round(side * min(1, longer / max(image.shape[:2]))) for side in image.shape[1::-1]]
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
 def make_hole(shape: Sequence[int], seed: int) -> np.ndarray:
-    """bool [H, W], a rectangle of 15 to 35 % of each side, anywhere."""
+    """bool [H, W]: a random rectangle of 15 to 35 % of each side."""
     random, (height, width) = np.random.default_rng(seed), shape[:2]
     high, wide = (int(side * random.uniform(0.15, 0.35)) for side in (height, width))
     top, left = random.integers(0, height - high), random.integers(0, width - wide)
@@ -147,17 +148,17 @@ def make_hole(shape: Sequence[int], seed: int) -> np.ndarray:
 
 @dataclass
 class Rates:
-    """Shares of places in place, and how many pictures were judged wrongly."""
+    """Shares of patches in place, and counts of wrong decisions."""
 
     own: list[float] = field(default_factory=list)  # of accepted kinds
     other: list[float] = field(default_factory=list)  # of neighbouring views
     foreign: list[float] = field(default_factory=list)  # of another capture
     refused: int = 0
-    accepted_by_place: int = 0  # wrongly, were there no other photographs to compare with
+    accepted_by_place: int = 0  # wrongly, without comparison with other photographs
     accepted: int = 0  # wrongly
 
     def row(self, name: str) -> str:
-        """Of the table."""
+        """Row of the Markdown table."""
         own, other, foreign = (np.array(each) for each in (self.own, self.other, self.foreign))
         quantiles = lambda values, at: " / ".join(f"{100 * q:.1f}" for q in np.quantile(values, at))
         return (
@@ -174,7 +175,7 @@ HEADER = (
 
 
 def measure(capture: Photographs, foreign: np.ndarray, every: int) -> Rates:
-    """Over every so many views of a capture; `foreign`: a photograph of another one."""
+    """Rates over every n-th view of a capture; `foreign` is a photograph of another capture."""
     rates = Rates()
     for index, view in enumerate(list(capture.files)[::every]):
         photo, nearest = capture.picture(view), capture.nearest(view)
@@ -184,7 +185,7 @@ def measure(capture: Photographs, foreign: np.ndarray, every: int) -> Rates:
         for number, make in enumerate(VARIANTS.values()):
             image = fit_size(make(redrawn), photo)
             found = registration.register(image, photo, hole)
-            compare = number == index % len(VARIANTS)  # one of them with the neighbours, for time
+            compare = number == index % len(VARIANTS)  # one variant per view is compared with neighbours, to save time
             wrong = not found.fits or (compare and registration.closer_view(image, found, others))
             rates.own.append(found.in_place)
             rates.refused += bool(wrong)
@@ -201,12 +202,12 @@ def measure(capture: Photographs, foreign: np.ndarray, every: int) -> Rates:
 
 
 def fit_size(image: np.ndarray, photo: np.ndarray) -> np.ndarray:
-    """The picture at the photograph's size, as the stage reads it."""
+    """The picture resized to the photograph, as the stage does it."""
     return cv2.resize(image, (photo.shape[1], photo.shape[0]), interpolation=cv2.INTER_CUBIC)
 
 
 def measure_seconds(photo: np.ndarray) -> str:
-    """Of a registration at 640 and 1600 px, processor time."""
+    """CPU seconds of a registration at 640 and 1600 px, as text."""
     parts = []
     for longer in (640, 1600):
         scale = longer / max(photo.shape[:2])
@@ -222,15 +223,17 @@ def measure_seconds(photo: np.ndarray) -> str:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--captures", type=Path, default=Path("../shared/data"), help="folder of captures")
-    parser.add_argument("--names", default="bear,garden,statue,dinosaur,fox", help="of captures, with commas between")
-    parser.add_argument("--every", type=int, default=1, help="take one view of so many")
-    parser.add_argument("--seconds", action="store_true", help="measure the time of a registration only")
+    parser.add_argument(
+        "--names", default="bear,garden,statue,dinosaur,fox", help="names of captures, separated by commas"
+    )
+    parser.add_argument("--every", type=int, default=1, help="take every n-th view")
+    parser.add_argument("--seconds", action="store_true", help="only measure the time of a registration")
     given = parser.parse_args()
     folders = [given.captures / name for name in given.names.split(",") if (given.captures / name).is_dir()]
     if len(folders) < 2:
         print(f"skipped: fewer than two captures in {given.captures}")
         return 0
-    captures = {folder.name: load(folder) for folder in folders}
+    captures = {folder.name: load_photographs(folder) for folder in folders}
     first = {name: capture.picture(next(iter(capture.files))) for name, capture in captures.items()}
     if given.seconds:
         print(measure_seconds(next(iter(first.values()))))

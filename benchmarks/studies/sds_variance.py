@@ -1,17 +1,17 @@
-"""The variance of a scene's SDS gradient over noise and timesteps, before and after personalization.
+"""Variance of a scene's SDS gradient over noise and timesteps, before and after personalization.
 
-`python -m benchmarks.studies.sds_variance`, or `make scene=X sds-variance`: on any scene, with ground truth or
-without, once `initialize` and `personalize` are done. Training views with something to invent are rendered from the
-initialization and given to the prior as distillation gives them: whole, and in a window around the hole. The gradient
-is g = z - x0(z_t), that of `weighting: x0`; any other weighting multiplies it by a function of t alone. In the hole's
-latents, means over them and over the views:
+`python -m benchmarks.studies.sds_variance`, or `make scene=X sds-variance`: for any scene, with or without ground
+truth, after `initialize` and `personalize`. Training views with something to invent are rendered from the
+initialization and given to the prior as in distillation: whole, and in a window around the hole. The gradient is
+g = z - x0(z_t), that of `weighting: x0`; any other weighting multiplies it by a function of t alone. In the latents of
+the hole, averaged over them and over the views:
 
   noise       variance of g over draws of the noise, at each timestep
-  pull        square of the mean over these draws, what remains of it in the long run (their own noise is taken off)
-  over noise, over timesteps, together: the mean of `noise` over the timesteps, the variance of that mean gradient from
-              one timestep to another, and their sum: the variance of what one step of distillation draws
+  pull        squared mean over these draws, the part that remains in the long run (corrected for the draws' own noise)
+  over noise, over timesteps, together: mean of `noise` over the timesteps, variance of the mean gradient over the
+              timesteps, and their sum: the variance of what one step of distillation draws
 
-Every draw is seeded, and the same before and after, on any device. Prints tables and the memory it took, and writes
+Every draw is seeded and the same before and after, on any device. Prints tables and the memory used, and writes
 sds_variance.json to --out.
 """
 
@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.studies import device
+from benchmarks.studies import scene_priors
 from reffusion import seeding
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets, load_scene
@@ -42,11 +42,11 @@ SEED = 0
 
 
 @torch.no_grad()
-def inputs(run: Path, prior: Prior) -> dict[str, tuple[Tensor, Tensor]]:
+def load_inputs(run: Path, prior: Prior) -> dict[str, tuple[Tensor, Tensor]]:
     """Scale -> (pictures [B, 3, S, S] in [-1, 1], holes [B, 1, S, S], 1 = repaint) of up to `VIEWS` training views.
 
     Raises:
-        ValueError: naming what is missing, or where nothing is to be invented.
+        ValueError: a stage is missing, or nothing is to be invented.
     """
     for stage in ("poses", "masks", "initialize"):
         if not (run / stage).is_dir():
@@ -70,7 +70,7 @@ def inputs(run: Path, prior: Prior) -> dict[str, tuple[Tensor, Tensor]]:
 
 
 @torch.no_grad()
-def gradients(prior: Prior, pictures: Tensor, holes: Tensor, prompt: str) -> Tensor:
+def sds_gradients(prior: Prior, pictures: Tensor, holes: Tensor, prompt: str) -> Tensor:
     """[T, K, M]: z - x0(z_t) at `TIMESTEPS`, for each of `NOISES` draws, in the M latent values of the holes."""
     latents, condition = diffusion.encode(prior, pictures), diffusion.conditioning(prior, pictures, holes)
     text = diffusion.embed_text(prior, [prompt]).expand(len(latents), -1, -1)
@@ -86,10 +86,10 @@ def gradients(prior: Prior, pictures: Tensor, holes: Tensor, prompt: str) -> Ten
 
 
 def variances(drawn: Tensor) -> dict:
-    """See the module's first lines. Args: drawn: [T, K, M], T and K at least 2."""
+    """Variances of gradients [T, K, M], T and K at least 2; see the module docstring."""
     noise = drawn.var(1)  # [T, M], unbiased
     mean = drawn.mean(1)
-    left = noise / drawn.shape[1]  # what of the noise remains in the mean of K draws
+    left = noise / drawn.shape[1]  # part of the noise that remains in the mean of K draws
     over_noise = noise.mean()
     over_timesteps = (mean.var(0) - left.mean(0)).mean().clamp(min=0)
     return {
@@ -101,17 +101,17 @@ def variances(drawn: Tensor) -> dict:
     }
 
 
-def measured(models: dict[str, Prior], run: Path) -> dict[str, dict[str, dict]]:
+def measure(models: dict[str, Prior], run: Path) -> dict[str, dict[str, dict]]:
     """Scale -> "before" or "after" -> `variances`."""
-    given = inputs(run, next(iter(models.values())))
+    given = load_inputs(run, next(iter(models.values())))
     return {
-        scale: {when: variances(gradients(model, *given[scale], prompt)) for when, model in models.items()}
+        scale: {when: variances(sds_gradients(model, *given[scale], prompt)) for when, model in models.items()}
         for scale, prompt in zip(SCALES, PROMPTS, strict=False)
     }
 
 
 def table(found: dict[str, dict[str, dict]]) -> str:
-    """Markdown: for each scale a row a timestep, then the three sums; variance before and after, and their ratio."""
+    """Markdown: per scale a row for each timestep, then the three sums; variance before and after, and their ratio."""
     lines = []
     for scale, by_time in found.items():
         before, after = by_time["before"], by_time["after"]
@@ -131,14 +131,14 @@ def _pair(before: float, after: float) -> str:
 
 
 def main() -> None:
-    given = device.arguments(__doc__, "initialize and personalize", "sds-variance").parse_args()
-    models, base = device.before_and_after(given)
-    found, out = measured(models, given.run), given.out or given.run / "sds-variance"
+    given = scene_priors.study_parser(__doc__, "initialize and personalize", "sds-variance").parse_args()
+    models, base = scene_priors.load_priors(given)
+    found, out = measure(models, given.run), given.out or given.run / "sds-variance"
     out.mkdir(parents=True, exist_ok=True)
     print(table(found))
-    device.save(given, out, "sds_variance.json", {"prior": base, "timesteps": TIMESTEPS} | found)
+    scene_priors.save_results(given, out, "sds_variance.json", {"prior": base, "timesteps": TIMESTEPS} | found)
     print(out / "sds_variance.json")
 
 
 if __name__ == "__main__":
-    device.run(main)
+    scene_priors.run_study(main)

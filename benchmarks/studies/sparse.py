@@ -1,14 +1,14 @@
 """Scores against the number of photographs: `make scene=demo-sparse sparse`.
 
-A made scene brings its views in the order in which they are given pixels, the first of which its scene.yaml names; here
-1, 2, 4 and 8 of them, every other training view a camera only. Three ways for each number:
+A made scene lists its views in the order in which they become photographs; its scene.yaml names the first. Here 1, 2, 4
+and 8 of them are photographs, and every other training view is a camera only. Three methods for each number:
 
-  personalization   the photographs teach the prior, and nothing else: Gaussians start at the sparse points
-  both              they also are reconstructed: the method as it is
-  plain 3DGS        a fit to them from points, and no more: the variant `remove_only`
+  personalization   the photographs only personalize the prior; Gaussians start at the sparse points
+  both              they are also reconstructed: the method as it is
+  plain 3DGS        only a fit to them, from points: the variant `remove_only`
 
-Whole test views are scored. Writes sparse.json and sparse.png to --out; jobs that are done are not run again. Several
-scenes, of several seeds: a curve is their mean.
+Whole test views are scored. Writes sparse.json and sparse.png to --out; finished jobs are not run again. With several
+scenes, of several seeds, a curve is their mean.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ ROOT = Path(__file__).resolve().parents[2]
 COUNTS = (1, 2, 4, 8)
 SCORES = {"psnr_full": "PSNR (dB)", "flip_full": "FLIP"}
 BOTH, PLAIN, TAUGHT = "both", "plain 3DGS", "personalization"
-POINTS = "fit.few_views=fewer_harmonics"  # a fit starts from points
-WAYS = {
+POINTS = "fit.few_views=fewer_harmonics"  # a fit starts from sparse points
+METHODS = {
     TAUGHT: (
         f"--set={POINTS} fit.iterations=1 initialize.refit_steps=0 distill.reconstruction.every=0 "
         "distill.reference.weight=0",
@@ -42,11 +42,11 @@ WAYS = {
 COLOURS = {TAUGHT: charts.GREEN, BOTH: charts.BLUE, PLAIN: charts.ORANGE}
 
 
-def with_views(scene: Path, count: int, folder: Path) -> Path:
-    """The scene with pixels in so many views; its files are linked, not copied.
+def make_scene(scene: Path, count: int, folder: Path) -> Path:
+    """The scene with that many photographs; its files are hard links.
 
     Raises:
-        ValueError: it does not say in which order its views are given pixels.
+        ValueError: the scene does not say in which order its views become photographs.
     """
     order = load_json(scene / "truth/facts.json").get("shown", [])
     if len(order) < count:
@@ -54,16 +54,16 @@ def with_views(scene: Path, count: int, folder: Path) -> Path:
     made = folder / f"{scene.name}-{count}-views"
     if not made.exists():
         shutil.copytree(scene, made, copy_function=os.link, ignore=shutil.ignore_patterns("scene.yaml", ".generated"))
-    said, shown = yaml.safe_load((scene / "scene.yaml").read_text()), order[:count]
+    settings, shown = yaml.safe_load((scene / "scene.yaml").read_text()), order[:count]
     given = [{"view": name, "image": f"images_4/{name}.png"} for name in shown]
-    save_text(made / "scene.yaml", yaml.safe_dump(said | {"train": shown, "clean": shown, "reference": given}))
+    save_text(made / "scene.yaml", yaml.safe_dump(settings | {"train": shown, "clean": shown, "reference": given}))
     return made
 
 
-def scored(scene: Path, way: str, runs: Path) -> dict[str, float]:
-    """The scores of one way on a scene, by the runner. ValueError where it fails."""
+def run_method(scene: Path, way: str, runs: Path) -> dict[str, float]:
+    """Run one method on a scene and return its scores. ValueError if it fails."""
     home = runs / way.replace(" ", "-")
-    command = [sys.executable, "-m", "runner", "run", "all", f"--scene={scene}", f"--runs={home}", *WAYS[way]]
+    command = [sys.executable, "-m", "runner", "run", "all", f"--scene={scene}", f"--runs={home}", *METHODS[way]]
     if subprocess.run(command, cwd=ROOT).returncode:
         raise ValueError(f"{scene.name}, {way}: failed; see above")
     (found,) = home.glob(f"{scene.name}*/evaluate/metrics.json")
@@ -72,32 +72,32 @@ def scored(scene: Path, way: str, runs: Path) -> dict[str, float]:
 
 
 def draw(found: dict[str, dict[str, list[dict[str, float]]]], path: Path) -> None:
-    """way -> number of views -> a score for each scene; a panel for each score."""
-    made, grid = charts.figure(3.2, 1, len(SCORES))
+    """Draw a panel per score. `found`: method -> number of views -> scores of each scene."""
+    made, grid = charts.new_figure(3.2, 1, len(SCORES))
     for axes, (score, title) in zip(grid[0], SCORES.items(), strict=True):
         for way, counts in found.items():
             means = [np.mean([each[score] for each in scenes]) for scenes in counts.values()]
             axes.plot([int(count) for count in counts], means, "o-", color=COLOURS[way], label=way)
         axes.set(xscale="log", xlabel="views with pixels", ylabel=title)
-        charts.plain_ticks(axes)
+        charts.use_plain_log_ticks(axes)
         counts = sorted({int(count) for each in found.values() for count in each})
         axes.set_xticks(counts, [str(count) for count in counts])
     grid[0, 0].legend(frameon=False, fontsize=9)
-    charts.save(made, path)
+    charts.save_chart(made, path)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=Path, nargs="+", required=True)
     parser.add_argument("--counts", type=int, nargs="+", default=COUNTS)
-    parser.add_argument("--ways", choices=WAYS, nargs="+", default=list(WAYS))
+    parser.add_argument("--ways", choices=METHODS, nargs="+", default=list(METHODS))
     parser.add_argument("--out", type=Path, default=ROOT / "runs/sparse")
     given = parser.parse_args()
     found: dict[str, dict[str, list[dict[str, float]]]] = {way: {} for way in given.ways}
     for count in given.counts:
         for way in given.ways:
-            scenes = [with_views(scene, count, given.out / "scenes") for scene in given.scenes]
-            found[way][str(count)] = [scored(scene, way, given.out) for scene in scenes]
+            scenes = [make_scene(scene, count, given.out / "scenes") for scene in given.scenes]
+            found[way][str(count)] = [run_method(scene, way, given.out) for scene in scenes]
             save_json(given.out / "sparse.json", found)
     draw(found, given.out / "sparse.png")
     for way, counts in found.items():

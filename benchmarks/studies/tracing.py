@@ -1,9 +1,9 @@
-"""What tracing costs: `python -m benchmarks.studies.tracing --run runs/demo`.
+"""Cost of tracing: `python -m benchmarks.studies.tracing --run runs/demo`.
 
-Pairs of runs of `fit`, `personalize` and `distill` with the laptop profile, one with its trace, one that measures at
-its end only, in turn; CPU time, so that what others do on the machine counts little. Moments are log-spaced, so a short
-run pays more: the pairs take --steps steps (`fit` eight times as many, with every 8th view held out), and the last
-column is what follows for the profile's full length. Ends with code 1 where that is over 3 %.
+Runs `fit`, `personalize` and `distill` with the laptop profile in pairs, with a trace and with one measurement at the
+end only. CPU time is measured, so that other processes count little. Moments are log-spaced, so a short run pays more:
+the pairs take --steps steps (`fit` eight times as many, with every 8th view held out), and the last column extrapolates
+to the profile's full length. Exits with 1 if that is over 3 %.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ STAGES = {
     "personalize": (personalize, "steps", ("poses", "raw_masks", "reference"), (1, 1)),
     "distill": (distill, "iterations", ("poses", "fit", "masks", "reference", "personalize", "initialize"), (4, 1)),
 }
-ALLOWED = 0.03
+ALLOWED = 0.03  # largest share
 
 
 def cpu_seconds(stage: ModuleType, params: object, needs: dict[str, Path | None]) -> tuple[float, int]:
-    """CPU time of a whole run and the lines of its trace."""
+    """CPU seconds of a whole run, and the number of lines of its trace."""
     with tempfile.TemporaryDirectory() as folder:
         began = time.process_time()
         stage.run(params, Path(folder), **needs)
         return time.process_time() - began, len(trace.read_trace(Path(folder) / "trace.jsonl"))
 
 
-def pairs(name: str, run: Path, steps: int, repeats: int) -> tuple[float, float, int, float]:
-    """Of the medians: seconds without and with a trace, and the moments it has more; seconds of a step without one."""
+def measure_pairs(name: str, run: Path, steps: int, repeats: int) -> tuple[float, float, int, float]:
+    """Median seconds without and with a trace, the additional moments, and seconds per step without a trace."""
     stage, count, needs, _ = STAGES[name]
     given = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"][name]
     given |= {count: steps, "checkpoint_seconds": 1e9} | ({"holdout": 8} if name == "fit" else {})
@@ -73,7 +73,7 @@ def main() -> int:
     print(f"{'stage':<12} {'without':>9} {'with':>9} {'moments':>8} {'a moment':>9} {'a step':>8} {'full length':>12}")
     for name in given.only or STAGES:
         steps = 8 * given.steps if name == "fit" else given.steps
-        plain, traced, moments, step = pairs(name, given.run, steps, given.repeats)
+        plain, traced, moments, step = measure_pairs(name, given.run, steps, given.repeats)
         profile = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["profiles"]["laptop"][name]
         full = profile[STAGES[name][1]]
         moment = (traced - plain) / moments

@@ -1,4 +1,4 @@
-"""What of a finished scene was kept, added and removed, from the initialization to the result."""
+"""Gaussians of a finished scene that were kept, added and removed, from the initialization to the result."""
 
 from __future__ import annotations
 
@@ -15,75 +15,78 @@ from reffusion.io.ply import load_ply
 from reffusion.types import Gaussians, Similarity
 from report.sheet import stage_folder
 
-SAME = 1e-5  # of the scene's extent 1: Gaussians so near to one another are one, read from two files
+SAME_DISTANCE = 1e-5  # in units of the extent (1): nearer Gaussians of two files are the same one
 
 
 @dataclass(frozen=True)
-class Layers:
+class GaussianLayers:
     """Gaussians of a finished scene.
 
     Attributes:
-        states: title -> what was kept and what was added by then, in the order in which they came to be.
-        removed: what was there and went; empty where nothing did.
+        states: title -> (kept, added) Gaussians, from the initialization to the result.
+        removed: Gaussians that were removed; may be empty.
     """
 
     states: dict[str, tuple[Gaussians, Gaussians]]
     removed: Gaussians
 
-    def shown(self, state: str, kept: bool, added: bool, removed: bool) -> Gaussians:
-        """The asked parts of a state."""
+    def select(self, state: str, kept: bool, added: bool, removed: bool) -> Gaussians:
+        """The chosen parts of a state, as one scene."""
         parts = zip((*self.states[state], self.removed), (kept, added, removed), strict=True)
-        chosen = [part if asked else part.map(lambda p: p[:0]) for part, asked in parts]
+        chosen = [part if wanted else part.map(lambda p: p[:0]) for part, wanted in parts]
         return reduce(lambda one, other: one.zipped(other, lambda a, b: torch.cat([a, b])), chosen)
 
 
-def load_layers(home: Path, similarity: Similarity) -> Layers:
-    """Of runs/<scene> or runs/<scene>@<variant>, with the scene's similarity.
+def load_layers(home: Path, similarity: Similarity) -> GaussianLayers:
+    """Load the layers of runs/<scene> or runs/<scene>@<variant>; `similarity` is the scene's.
 
     Raises:
         ValueError: the stage `evaluate` has not run.
     """
     finished = home / "evaluate"
     if not (finished / "scene.ply").exists():
-        raise ValueError(f"{finished / 'scene.ply'} is missing; {how(home)} makes it")
+        raise ValueError(f"{finished / 'scene.ply'} is missing; {finish_command(home)} makes it")
     used = {stage for stage, key in load_json(finished / "receipt.json")["needs"].items() if key}
     result = load_ply(finished / "scene.ply", similarity)
     none, states = result.map(lambda p: p[:0]), {}
     made = [stage_folder(home, stage) for stage in ("initialize", "distill") if stage in used]
-    added = added_in(result, made[-1]) if made else torch.zeros(len(result), dtype=torch.bool)
+    added = find_added(result, made[-1]) if made else torch.zeros(len(result), dtype=torch.bool)
     kept, new = result.map(lambda p: p[~added]), result.map(lambda p: p[added])
     if "distill" in used:
-        states["initialization"] = apart(made[0]) if "initialize" in used else (kept, none)
-        states |= {f"step {path.stem}": (kept, load_ply(path)) for path in snapshots(made[-1])}
+        states["initialization"] = split_new(made[0]) if "initialize" in used else (kept, none)
+        states |= {f"step {path.stem}": (kept, load_ply(path)) for path in list_snapshots(made[-1])}
     states["result"] = kept, new
-    return Layers(states, removed_by(home, used, none))
+    return GaussianLayers(states, load_removed(home, used, none))
 
 
-def snapshots(distill: Path) -> list[Path]:
-    """The Gaussians that were added, as they were after so many steps."""
+def list_snapshots(distill: Path) -> list[Path]:
+    """Snapshots of the added Gaussians that `distill` saved, in the order of their steps."""
     return sorted((distill / "snapshots").glob("*.ply"), key=lambda path: int(path.stem))
 
 
-def apart(folder: Path) -> tuple[Gaussians, Gaussians]:
-    """A stage's Gaussians: those that were kept, and those that are new."""
+def split_new(folder: Path) -> tuple[Gaussians, Gaussians]:
+    """A stage's Gaussians, as (kept, new)."""
     gaussians, new = load_ply(folder / "gaussians.ply"), load_labels(folder / "labels.npy")
     return gaussians.map(lambda p: p[~new]), gaussians.map(lambda p: p[new])
 
 
-def added_in(result: Gaussians, folder: Path) -> Tensor:
-    """bool [N]: those of the finished scene that a stage labelled as new. `evaluate` leaves out and adds Gaussians, so
-    they are told by where they are; what it adds beyond the capture counts as kept."""
+def find_added(result: Gaussians, folder: Path) -> Tensor:
+    """bool [N]: Gaussians of the finished scene that a stage labelled as new.
+
+    They are matched by position, since `evaluate` removes and adds Gaussians; what it adds around the capture counts as
+    kept.
+    """
     from scipy.spatial import cKDTree
 
-    _, new = apart(folder)
+    _, new = split_new(folder)
     if not len(new):
         return torch.zeros(len(result), dtype=torch.bool)
-    distance, _ = cKDTree(new.means.numpy()).query(result.means.numpy(), distance_upper_bound=SAME)
+    distance, _ = cKDTree(new.means.numpy()).query(result.means.numpy(), distance_upper_bound=SAME_DISTANCE)
     return torch.from_numpy(np.isfinite(distance))
 
 
-def removed_by(home: Path, used: set[str], none: Gaussians) -> Gaussians:
-    """Of the fit, what the stage masks labelled."""
+def load_removed(home: Path, used: set[str], none: Gaussians) -> Gaussians:
+    """Gaussians of the fit that the stage `masks` labelled; `none`, an empty scene, if they are unknown."""
     masks, fit = stage_folder(home, "masks") / "labels.npy", stage_folder(home, "fit") / "gaussians.ply"
     if not {"masks", "fit"} <= used or not masks.exists() or not fit.exists():
         return none
@@ -91,7 +94,7 @@ def removed_by(home: Path, used: set[str], none: Gaussians) -> Gaussians:
     return gaussians.map(lambda p: p[labels]) if len(labels) == len(gaussians) else none
 
 
-def how(home: Path) -> str:
+def finish_command(home: Path) -> str:
     """The command that finishes a scene."""
     scene, _, variant = home.name.partition("@")
     return f"`make scene={scene}{f' variant={variant}' if variant else ''} all`"

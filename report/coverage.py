@@ -1,4 +1,4 @@
-"""How much of the object's place was known, made up, and left open, view by view."""
+"""How much of the removed region each view had to make up, and how much stayed uncovered."""
 
 from __future__ import annotations
 
@@ -8,34 +8,39 @@ from pathlib import Path
 from reffusion.io.arrays import load_json
 from reffusion.io.images import load_mask
 from report import page
-from report.loading import Job
+from report.job_data import Job
 from report.results import load_views
 
 HEADER = ("view", "mask, of the picture", "made up, of the mask", "uncovered, of the mask")
-OPEN = 0.01  # share of a mask from which a view counts as uncovered: `initialize` names these too
+MIN_UNCOVERED = 0.01  # share of a mask above which a view counts as uncovered; `initialize` names the same views
 
 
-def section(job: Job) -> list[str]:
+def coverage_section(job: Job) -> list[str]:
     """A sentence, and a table with a bar for each share."""
     top = page.heading("What was covered")
-    shares = of_views(job)
+    shares = view_shares(job)
     if not shares:
-        return [top, page.paragraph("Not known yet: the stage masks has not run.")]
+        return [top, page.paragraph("Not known yet: the stage `masks` has not run.")]
     covered = any(open_ is not None for _, _, open_ in shares.values())
-    said = f"Of what is removed, {_mean([made for _, made, _ in shares.values()]):.0%} is made up in the mean of views"
+    text = (
+        f"{_mean([made for _, made, _ in shares.values()]):.0%} of the removed region is made up, averaged over views"
+    )
     if covered:
-        bare = [name for name, (_, _, open_) in shares.items() if (open_ or 0) > OPEN]
-        said += f"; places that nothing covers: in {len(bare)} views" + (f", {', '.join(bare[:8])}" if bare else "")
+        bare = [name for name, (_, _, open_) in shares.items() if (open_ or 0) > MIN_UNCOVERED]
+        text += f"; uncovered places: in {len(bare)} views" + (f", {', '.join(bare[:8])}" if bare else "")
     else:
-        said += "; what is left uncovered is known after the stage initialize"
+        text += "; what stays uncovered is known after the stage `initialize`"
     rows = sorted(shares.items(), key=lambda each: (-(each[1][2] or 0), -each[1][1]))
     table = _table([(name, values) for name, values in rows])
-    parts = [top, page.paragraph(f"{said}."), f"<details><summary>all {len(rows)} views</summary>{table}</details>"]
+    parts = [top, page.paragraph(f"{text}."), f"<details><summary>all {len(rows)} views</summary>{table}</details>"]
     return parts + _unseen(job)
 
 
-def of_views(job: Job) -> dict[str, tuple[float, float, float | None]]:
-    """Training view that shows the object -> shares: of the mask in the picture, made up and uncovered in the mask."""
+def view_shares(job: Job) -> dict[str, tuple[float, float, float | None]]:
+    """Training view that shows the object -> shares: mask of the picture, made up of the mask, uncovered of the mask.
+
+    The uncovered share is None before the stage `initialize`.
+    """
     masks, folder = job.folders.get("masks", Path()), job.folders.get("initialize", Path())
     facts = folder / "facts.json"
     open_ = load_json(facts).get("uncovered", {}) if "initialize" in job.folders and facts.is_file() else {}
@@ -60,7 +65,7 @@ def _table(rows: list[tuple[str, tuple[float, float, float | None]]]) -> str:
 
 
 def _bar(share: float | None) -> str:
-    """A cell with its share as a number on a bar."""
+    """Table cell with a share as a number on a bar."""
     if share is None:
         return "<td>–</td>"
     part = f"{min(100 * share, 100):.1f}%"
@@ -68,11 +73,11 @@ def _bar(share: float | None) -> str:
 
 
 def _unseen(job: Job) -> list[str]:
-    """Test views with pixels that no training view saw."""
+    """Paragraph on the test views with pixels that no training view saw."""
     rows = load_views(job.folders["evaluate"] / "per_view.csv") if "evaluate" in job.folders else {}
-    shares = {name: row["unseen_share"] for name, row in rows.items() if row.get("unseen_share", 0) > OPEN}
+    shares = {name: row["unseen_share"] for name, row in rows.items() if row.get("unseen_share", 0) > MIN_UNCOVERED}
     if not shares:
         return []
-    said = ", ".join(f"{name} {share:.0%}" for name, share in sorted(shares.items(), key=lambda s: -s[1])[:12])
-    words = f"Seen by no training view, of the pixels outside the mask, in {len(shares)} of {len(rows)} test views:"
-    return [page.paragraph(f"{words} {said}.")]
+    listed = ", ".join(f"{name} {share:.0%}" for name, share in sorted(shares.items(), key=lambda s: -s[1])[:12])
+    words = f"Pixels outside the mask that no training view saw, in {len(shares)} of {len(rows)} test views:"
+    return [page.paragraph(f"{words} {listed}.")]

@@ -1,4 +1,4 @@
-"""Cameras on a closed way through a capture, for looking at a scene where nobody stood."""
+"""Closed camera paths through a capture, for views from new positions."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ import numpy as np
 
 from reffusion.types import Camera
 
-PULL = 1e-2  # how much a camera pulls the focus to the points, next to how much its axis pulls it sideways
+POINT_WEIGHT = 1e-2  # weight of the points' median in the focus, relative to that of a camera's axis
 
 
-def around(cameras: Sequence[Camera], points: np.ndarray, frames: int) -> list[Camera]:
-    """An ellipse in the plane in which the cameras stand most, of their extent, always looking at their focus.
+def ellipse_path(cameras: Sequence[Camera], points: np.ndarray, frames: int) -> list[Camera]:
+    """Cameras on an ellipse in the plane of the capture's cameras, with their extent, looking at their common focus.
 
-    Cameras on a circle give that circle back; cameras side by side a small loop before the scene.
+    Cameras on a circle give that circle; cameras side by side give a small loop in front of the scene.
 
     Args:
-        cameras: at least one; the middle one of them gives size and lens.
-        points: [P, 3] of the scene, its median stands for the depth where axes are parallel; none: the axes alone.
-        frames: cameras on the way, the last one a step before the first.
+        cameras: at least one; the middle one provides size and lens.
+        points: [P, 3] of the scene; their median fixes the depth if the axes are parallel. May be empty.
+        frames: number of cameras; the last is one step before the first.
 
     Raises:
         ValueError: no camera, or frames < 1.
     """
     if not cameras or frames < 1:
-        raise ValueError(f"a flight needs a camera and a frame, not {len(cameras)} and {frames}")
+        raise ValueError(f"a camera path needs a camera and a frame, not {len(cameras)} and {frames}")
     centers = np.stack([camera.center for camera in cameras])
-    middle, target = centers.mean(0), focus(cameras, points)
+    middle, target = centers.mean(0), focus_point(cameras, points)
     _, sizes, axes = np.linalg.svd(centers - middle, full_matrices=False)
     radii = np.sqrt(2 / len(centers)) * sizes  # a circle has root mean square radius / sqrt 2 along each axis
     down = np.mean([camera.world_to_camera[1, :3] for camera in cameras], 0)
@@ -35,32 +35,34 @@ def around(cameras: Sequence[Camera], points: np.ndarray, frames: int) -> list[C
     for k in range(frames):
         turn = 2 * np.pi * k / frames
         offset = sum(f(turn) * radius * axis for f, radius, axis in zip((np.cos, np.sin), radii, axes, strict=False))
-        pose = looking(middle + offset, target, down)
+        pose = look_at(middle + offset, target, down)
         made.append(
             Camera(f"flight{k:04d}", lens.width, lens.height, lens.fx, lens.fy, lens.width / 2, lens.height / 2, pose)
         )
     return made
 
 
-def focus(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
-    """[3], nearest to all optical axes in the least squares, drawn a little to the median of the points."""
+def focus_point(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
+    """[3], the point nearest to all optical axes in the least-squares sense, pulled slightly to the points' median."""
     matrix, right = np.zeros((3, 3)), np.zeros(3)
     anchor = np.median(points, 0) if len(points) else np.mean([c.center + c.world_to_camera[2, :3] for c in cameras], 0)
     for camera in cameras:
         axis = camera.world_to_camera[2, :3]
         across = np.eye(3) - np.outer(axis, axis)
-        matrix += across + PULL * np.eye(3)
-        right += across @ camera.center + PULL * anchor
+        matrix += across + POINT_WEIGHT * np.eye(3)
+        right += across @ camera.center + POINT_WEIGHT * anchor
     return np.linalg.solve(matrix, right)
 
 
-def looking(center: np.ndarray, target: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """[4, 4] world to camera, from `center` towards `target`, image rows along `down` as far as that can be."""
+def look_at(center: np.ndarray, target: np.ndarray, down: np.ndarray) -> np.ndarray:
+    """[4, 4] world-to-camera pose at `center` looking at `target`, with image rows along `down` as far as possible."""
     forward = target - center
     length = np.linalg.norm(forward)
     forward = forward / length if length > 0 else np.array([0.0, 0.0, 1.0])
     right = np.cross(down, forward)
-    if np.linalg.norm(right) < 1e-6 * max(np.linalg.norm(down), 1e-300):  # straight down or up: any row will do
+    if np.linalg.norm(right) < 1e-6 * max(
+        np.linalg.norm(down), 1e-300
+    ):  # looking straight down or up: any row direction works
         right = np.cross(np.eye(3)[np.argmin(np.abs(forward))], forward)
     right = right / np.linalg.norm(right)
     pose = np.eye(4)

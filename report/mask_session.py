@@ -1,4 +1,4 @@
-"""What the mask page does between its requests: clicks, the masks they make, and the files that these are saved to."""
+"""State behind the mask page: the clicks, the masks that follow from them, and the files they are saved to."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Capture:
 
     Attributes:
         folder: of the scene; masks: its folder of masks.
-        poses: the stage's artifact; fit: where that of `fit` is, or will be.
+        poses: artifact of the stage `poses`; fit: where the artifact of `fit` is, or will be.
         given: view -> bool [H, W], masks that the page did not write.
     """
 
@@ -46,134 +46,136 @@ class Capture:
     given: dict[str, np.ndarray]
 
 
-def capture_of(home: Path) -> Capture:
-    """Of runs/<scene>, after its stage `raw_masks`.
+def load_capture(home: Path) -> Capture:
+    """Load runs/<scene>, after its stage `raw_masks`.
 
     Raises:
-        ValueError: it has not run; the scene's own words leave the page no place to write to.
+        ValueError: the stage has not run, or scene.yaml leaves the page no place to write masks to.
     """
     poses, raw_masks = (sheet.stage_folder(home, stage) for stage in ("poses", "raw_masks"))
     if not (raw_masks / "receipt.json").is_file():
-        raise ValueError(f"{raw_masks}: not there; run `make scene={home.name.split('@')[0]} mask`")
+        raise ValueError(f"{raw_masks} is missing; run `make scene={home.name.split('@')[0]} mask`")
     folder = root() / (poses.parent / "source").read_text(encoding="utf-8").strip()
     params = Params(**load_json(raw_masks / "receipt.json")["params"])
     if not params.has_masks:
-        raise BadInput(f"{folder / 'scene.yaml'}: it says `masks: none`; remove that line to make masks")
+        raise BadInput(f"{folder / 'scene.yaml'}: `masks: none` is set; remove that line to make masks")
     if objects_of(raw_masks):
-        raise BadInput(f"{raw_masks / 'masks'}: the masks tell objects apart, which clicks do not")
+        raise BadInput(f"{raw_masks / 'masks'}: the masks distinguish several objects, which clicks cannot")
     roles = read_scene(params.changed({"clicks": {}}), folder)[1]
     if roles.values != WHITE:
-        raise BadInput(f"{folder}: its masks hold object numbers, or are inverted; remove them: clicks make white ones")
+        raise BadInput(f"{folder}: its masks hold object numbers or are inverted; remove them: clicks write white ones")
     files = roles.masks.get("", {})
-    written = _saved(folder)["written"]
-    theirs = [name for name, path in files.items() if written.get(_named(path, folder)) != digest(path)]
+    written = _saved_clicks(folder)["written"]
+    foreign = [name for name, path in files.items() if written.get(_relative_path(path, folder)) != file_digest(path)]
     place = next((path.parent for path in files.values()), folder / (params.mask_folder or "masks"))
-    return Capture(folder, place, poses, sheet.stage_folder(home, "fit"), load_raw_masks(raw_masks, theirs))
+    return Capture(folder, place, poses, sheet.stage_folder(home, "fit"), load_raw_masks(raw_masks, foreign))
 
 
-def segmenter_here() -> Segmenter | None:
-    """The segmentation network whose weights are on this machine. ValueError where they are not whole."""
+def load_local_segmenter() -> Segmenter | None:
+    """The segmentation network whose weights are on this machine, or None. ValueError if the weights are incomplete."""
     if (found := load_segmenter()) is not None:
-        print(f"clicks are answered by {SOURCE}", flush=True)
+        print(f"clicks are segmented by {SOURCE}", flush=True)
     return found
 
 
-def digest(path: Path) -> str:
-    """Of a file's content."""
+def file_digest(path: Path) -> str:
+    """Hash of a file's content."""
     return hashlib.blake2b(path.read_bytes(), digest_size=10).hexdigest()
 
 
-def _named(path: Path, folder: Path) -> str:
+def _relative_path(path: Path, folder: Path) -> str:
     return str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path)
 
 
-def _saved(folder: Path) -> dict:
+def _saved_clicks(folder: Path) -> dict:
     return load_json(folder / CLICKS) if (folder / CLICKS).is_file() else {"clicks": {}, "written": {}}
 
 
 class Session:
-    """The clicks on a scene; safe to call from several threads.
+    """The clicks on a scene. Safe to call from several threads.
 
-    Masks are made for a view at once, by a segmentation network where there is one. Where the fit is there, a thread of
-    its own then asks the Gaussians, and makes those of all views.
+    A click makes the mask of its view at once, by the segmentation network if there is one. Once the scene is fitted, a
+    background thread labels Gaussians from all clicks and makes the masks of all views.
     """
 
     def __init__(self, capture: Capture, fitted: Callable[[], bool], segmenter: Segmenter | None = None):
         self.capture, self.scene = capture, load_scene(capture.poses)
         self.segmenter, self.unsaved = segmenter, False
-        self.looked: dict[str, Looked] = {}  # what the network made of the views that were clicked on
-        self.fitted = fitted  # is the fit there that belongs to these poses? one of earlier poses may be, in its place
+        self.embeddings: dict[str, Looked] = {}  # view that was clicked on -> the network's features
+        self.fitted = fitted  # is the fit of these poses finished? the folder may still hold a fit of earlier poses
         self.views = [name for name in self.scene.train if name not in self.scene.clean]
         self.lenses, self.sizes = load_lenses(capture.poses)[0], photograph_sizes(capture.poses)
         self.images = load_views(capture.poses, self.views)
         self.clicks: dict[str, list[tuple[float, float, bool]]] = {}
         self.masks, self.versions = dict(capture.given), dict.fromkeys(self.views, 0)
         self.gaussians = self.near = self.labels = None
-        self.todo: list[str] = []  # views whose masks are not yet those of the latest labels
+        self.pending_views: list[str] = []  # views whose masks do not follow the latest labels yet
         self.reliefs: dict[str, np.ndarray] = {}
-        self.made, self.solved = 0, 0  # how often clicks changed, and up to which change they are in the labels
-        self.turn, self.asked = threading.RLock(), threading.Event()
-        for name, points in _saved(capture.folder)["clicks"].items():
+        self.revision, self.solved_revision = 0, 0  # of the clicks, and of the clicks that the labels include
+        self.lock, self.changed = threading.RLock(), threading.Event()
+        for name, points in _saved_clicks(capture.folder)["clicks"].items():
             if name in self.views:
                 at = straightened(np.array([p[:2] for p in points]), self.lenses[name], self.sizes[name])
                 self.clicks[name] = [(*xy, p[2] == "+") for xy, p in zip(at.tolist(), points, strict=True)]
-        threading.Thread(target=self._follow, daemon=True).start()
+        threading.Thread(target=self._update_masks, daemon=True).start()
         for name in self.clicks:
-            self._show(name, self._at_once(name))
+            self._set_mask(name, self._single_view_mask(name))
 
     def click(self, name: str, points: list[tuple[float, float, bool]]) -> None:
-        """All clicks on a view, in its undistorted pixels, in place of those before.
+        """Replace all clicks on a view; points are in its undistorted pixels.
 
         Raises:
-            ValueError: the view is unknown, has a mask of its own, or a click lies beside it.
+            ValueError: the view is unknown, has a mask of its own, or a click lies outside it.
         """
         if name not in self.images:
             raise ValueError(f"there is no view '{name}'")
         if name in self.capture.given:
-            raise ValueError(f"{name} has a mask that you brought; move it out of {self.capture.masks} to click here")
+            raise ValueError(f"{name} has a mask of your own; move it out of {self.capture.masks} to click here")
         height, width = self.images[name].shape[:2]
         if any(not (0 <= x <= width and 0 <= y <= height) for x, y, _ in points):
-            raise ValueError(f"a click lies beside {name}, which has {width}x{height} px")
-        with self.turn:
+            raise ValueError(f"a click lies outside {name}, which has {width}x{height} px")
+        with self.lock:
             self.unsaved = True
             self.clicks[name] = points
             if not points:
                 del self.clicks[name]
             if points or self.gaussians is None:
-                self._show(name, self._at_once(name))
-            self.made += 1
-            self.asked.set()
+                self._set_mask(name, self._single_view_mask(name))
+            self.revision += 1
+            self.changed.set()
 
     def save(self) -> dict[str, int]:
-        """Write masks and clicks.json; how many masks were "written", and "kept" because the page did not write them.
+        """Write masks and clicks.json; return how many masks were "written" and how many of the user's were "kept".
 
         Raises:
-            ValueError: there is no mask to write, or a file of another's is in the way.
+            ValueError: there is no mask to write, or a file that the page did not write is in the way.
         """
-        with self.turn:
+        with self.lock:
             masks = {name: mask for name, mask in self.masks.items() if name not in self.capture.given}
             if not any(mask.any() for mask in masks.values()):
                 raise ValueError("nothing to save yet: click on the object first")
-            if self.gaussians is not None and self.solved < self.made:
-                self._take(self._solver()(), self.made)
-            for name in list(self.todo):
+            if self.gaussians is not None and self.solved_revision < self.revision:
+                self._apply_labels(self._solver()(), self.revision)
+            for name in list(self.pending_views):
                 self._refine(name)
             masks = {name: mask for name, mask in self.masks.items() if name not in self.capture.given}
-            folder, written = self.capture.folder, dict(_saved(self.capture.folder)["written"])
+            folder, written = self.capture.folder, dict(_saved_clicks(self.capture.folder)["written"])
             paths = {name: self.capture.masks / f"{name}.png" for name in masks}
-            foreign = [p for p in paths.values() if p.exists() and written.get(_named(p, folder)) != digest(p)]
+            foreign = [
+                p for p in paths.values() if p.exists() and written.get(_relative_path(p, folder)) != file_digest(p)
+            ]
             if foreign:
-                raise ValueError(f"{foreign[0]}: not written by this page, and not overwritten; move it away")
+                raise ValueError(f"{foreign[0]}: not written by this page, so it is not overwritten; move it away")
             for name, path in paths.items():
                 replace_image(path, to_uint8(as_photographed(masks[name], self.lenses[name], self.sizes[name]) * 1.0))
-                written[_named(path, folder)] = digest(path)
-            save_json(folder / CLICKS, {"clicks": self._photographed(), "written": written})
+                written[_relative_path(path, folder)] = file_digest(path)
+            save_json(folder / CLICKS, {"clicks": self._photograph_clicks(), "written": written})
             self.unsaved = False
             return {"written": len(masks), "kept": len(self.capture.given)}
 
     def state(self) -> dict:
-        """What the page shows, as JSON takes it."""
-        with self.turn:
+        """What the page shows, as plain JSON values."""
+        with self.lock:
             views = [
                 {
                     "name": name,
@@ -188,37 +190,38 @@ class Session:
             return {
                 "views": views,
                 "fit": self.gaussians is not None,
-                "busy": len(self.todo) or int(self.gaussians is not None and self.solved < self.made),
+                "busy": len(self.pending_views)
+                or int(self.gaussians is not None and self.solved_revision < self.revision),
                 "unsaved": self.unsaved,
                 "folder": str(self.capture.masks),
             }
 
-    def _photographed(self) -> dict[str, list]:
-        """The clicks in pixels of the photographs."""
-        said = {}
+    def _photograph_clicks(self) -> dict[str, list]:
+        """The clicks in pixels of the distorted photographs."""
+        clicks = {}
         for name, points in self.clicks.items():
             at = photographed(np.array([p[:2] for p in points]), self.lenses[name], self.sizes[name]).round(1)
-            said[name] = [[*xy, "+" if p[2] else "-"] for xy, p in zip(at.tolist(), points, strict=True)]
-        return said
+            clicks[name] = [[*xy, "+" if p[2] else "-"] for xy, p in zip(at.tolist(), points, strict=True)]
+        return clicks
 
     def _clicks_on(self, name: str) -> Clicks | None:
         points = self.clicks.get(name)
         return points and Clicks(np.array([p[:2] for p in points], float), np.array([p[2] for p in points], bool))
 
-    def _show(self, name: str, mask: np.ndarray | None) -> None:
+    def _set_mask(self, name: str, mask: np.ndarray | None) -> None:
         if mask is None:
             self.masks.pop(name, None)
         else:
             self.masks[name] = mask
         self.versions[name] += 1
 
-    def _at_once(self, name: str) -> np.ndarray | None:
-        """A view's mask by the clicks on it, before the Gaussians are asked."""
+    def _single_view_mask(self, name: str) -> np.ndarray | None:
+        """Mask of a view from its own clicks, before the Gaussians are labelled; None without clicks."""
         clicks, image, relief = self._clicks_on(name), self.images[name], None
         if clicks is None:
             return None
-        if self._asks_network(clicks):
-            return self._by_network(name, clicks)
+        if self._uses_network(clicks):
+            return self._network_mask(name, clicks)
         if self.gaussians is not None:
             if name not in self.reliefs:
                 self.reliefs[name] = all_views.relief(self.gaussians, self.scene.cameras[name])
@@ -228,72 +231,75 @@ class Session:
             return view_mask(image, clicks, relief)
         return corrected(image, self.masks[name], clicks, relief)
 
-    def _asks_network(self, clicks: Clicks) -> bool:
-        """It knows nothing of what is taken back in one view from the mask of others."""
+    def _uses_network(self, clicks: Clicks) -> bool:
+        """True if the network answers these clicks.
+
+        Negative clicks alone correct a mask that follows from other views, of which the network knows nothing.
+        """
         return self.segmenter is not None and bool(clicks.positive.any())
 
-    def _by_network(self, name: str, clicks: Clicks) -> np.ndarray:
-        if name not in self.looked:
-            self.looked[name] = look(self.segmenter, self.images[name])
-        return network_mask(self.segmenter, self.looked[name], clicks)
+    def _network_mask(self, name: str, clicks: Clicks) -> np.ndarray:
+        if name not in self.embeddings:
+            self.embeddings[name] = look(self.segmenter, self.images[name])
+        return network_mask(self.segmenter, self.embeddings[name], clicks)
 
     def _all_clicks(self) -> dict[str, Clicks]:
         return {name: self._clicks_on(name) for name in self.clicks}
 
     def _solver(self) -> Callable[[], Tensor | None]:
-        """What finds the object by all clicks there are now, bool [N]; None where nothing says what it is."""
+        """Function that labels the object from all present clicks, bool [N]; it returns None if nothing marks it."""
         clicks, given = self._all_clicks(), self.capture.given
         if not any(each.positive.any() for each in clicks.values()) and not given:
             return lambda: None
-        asked = [name for name, on in clicks.items() if self._asks_network(on)]
-        given = given | {name: self._by_network(name, clicks.pop(name)) for name in asked}
-        shown = {name: self.scene.cameras[name] for name in {*self.views, *given}}
-        ask = (self.gaussians, self.near, shown, self.images.__getitem__, clicks, given)
-        return lambda: all_views.solved(*ask).labels
+        by_network = [name for name, on in clicks.items() if self._uses_network(on)]
+        given = given | {name: self._network_mask(name, clicks.pop(name)) for name in by_network}
+        cameras = {name: self.scene.cameras[name] for name in {*self.views, *given}}
+        problem = (self.gaussians, self.near, cameras, self.images.__getitem__, clicks, given)
+        return lambda: all_views.solved(*problem).labels
 
-    def _take(self, labels: Tensor | None, made: int) -> None:
-        """Show the labels that follow from so many changes of clicks: those views first that were clicked on."""
-        self.labels, self.solved = labels, made
+    def _apply_labels(self, labels: Tensor | None, revision: int) -> None:
+        """Show the labels that include the clicks up to `revision`; views with clicks are updated first."""
+        self.labels, self.solved_revision = labels, revision
         if labels is None:
-            self.todo = []
+            self.pending_views = []
             for name in self.views:
-                self._show(name, None)
+                self._set_mask(name, None)
             return
         for name in self.clicks:
             self._refine(name)
-        self.todo = [name for name in self.views if name not in self.clicks and name not in self.capture.given]
+        self.pending_views = [name for name in self.views if name not in self.clicks and name not in self.capture.given]
 
     def _refine(self, name: str) -> None:
         camera, image, on = self.scene.cameras[name], self.images[name], self._clicks_on(name)
-        self._show(name, all_views.shown(self.gaussians, self.labels, camera, image, on))
-        self.todo = [each for each in self.todo if each != name]
+        self._set_mask(name, all_views.shown(self.gaussians, self.labels, camera, image, on))
+        self.pending_views = [each for each in self.pending_views if each != name]
 
-    def _follow(self) -> None:
-        """Wait for the fit; then make the masks of all views, whenever clicks changed."""
+    def _update_masks(self) -> None:
+        """Background thread: wait for the fit, then remake the masks of all views whenever clicks change."""
         while True:
             if self.gaussians is None:
-                self.asked.wait(1.0)
-                self.asked.clear()
-                self._load()
-            elif self.solved < self.made:
-                with self.turn:
-                    made, solve = self.made, self._solver()
+                self.changed.wait(1.0)
+                self.changed.clear()
+                self._load_fit()
+            elif self.solved_revision < self.revision:
+                with self.lock:
+                    revision, solve = self.revision, self._solver()
                 labels = solve()
-                with self.turn:
-                    if made == self.made > self.solved:
-                        self._take(labels, made)
-            elif not self.todo:
-                self.asked.wait()
-                self.asked.clear()
+                with self.lock:
+                    if revision == self.revision > self.solved_revision:
+                        self._apply_labels(labels, revision)
+            elif not self.pending_views:
+                self.changed.wait()
+                self.changed.clear()
             else:
-                with self.turn:
-                    if self.todo and self.solved == self.made:
-                        self._refine(self.todo[0])
+                with self.lock:
+                    if self.pending_views and self.solved_revision == self.revision:
+                        self._refine(self.pending_views[0])
 
-    def _load(self) -> None:
+    def _load_fit(self) -> None:
         if self.fitted():
             gaussians = load_ply(self.capture.fit / "gaussians.ply")
             near = all_views.neighbours(gaussians)
-            with self.turn:
+            with self.lock:
                 self.gaussians, self.near = gaussians, near
-                self.made += bool(self.clicks)
+                self.revision += bool(self.clicks)

@@ -1,4 +1,4 @@
-"""A scene's prior before and after personalization, on the device that a study is told."""
+"""A scene's prior before and after personalization, and the command line of studies that compare the two."""
 
 from __future__ import annotations
 
@@ -18,28 +18,37 @@ from reffusion.prior.model import Prior, load_prior
 DTYPES = ("float32", "float16", "bfloat16")
 
 
-def arguments(about: str, needs: str, folder: str) -> argparse.ArgumentParser:
-    """What such studies are told. `about`: the help; `needs`: of the run; `folder`: where the results go in it."""
+def study_parser(about: str, needs: str, folder: str) -> argparse.ArgumentParser:
+    """Command-line parser of such a study.
+
+    Args:
+        about: the help text.
+        needs: stages that the run must have finished.
+        folder: default folder of the results inside the run.
+    """
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--run", type=Path, required=True, help=f"runs/<scene>, with {needs}")
     parser.add_argument("--out", type=Path, help=f"default: runs/<scene>/{folder}")
-    parser.add_argument("--prior", help="the one that was personalized; default: as personalize's receipt names it")
+    parser.add_argument("--prior", help="the prior that was personalized; default: the one in personalize's receipt")
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
     parser.add_argument("--dtype", choices=DTYPES, default="float32", help="of the UNet and the text encoder")
     return parser
 
 
-def run(study: Callable[[], None]) -> None:
-    """A study as a command: what is wrong is one line."""
+def run_study(study: Callable[[], None]) -> None:
+    """Run a study as a command; a ValueError becomes one line."""
     try:
         study()
     except ValueError as error:
         sys.exit(f"error: {error}")
 
 
-def before_and_after(given: argparse.Namespace) -> tuple[dict[str, Prior], str]:
-    """{"before", "after"} personalization, and the prior's name. ValueError where the run has none, or this machine no
-    such device."""
+def load_priors(given: argparse.Namespace) -> tuple[dict[str, Prior], str]:
+    """{"before", "after"} personalization, and the prior's name.
+
+    Raises:
+        ValueError: the run has no personalized prior, or the device is not available.
+    """
     adapted: Path = given.run / "personalize"
     if not adapted.is_dir():
         make = f"make scene={given.run.name} personalize set=distill.sds.run=always"
@@ -54,15 +63,14 @@ def before_and_after(given: argparse.Namespace) -> tuple[dict[str, Prior], str]:
 
 
 def peak_mb(device: str) -> int:
-    """The most memory, weights included, that this process took: of the GPU by its allocator's count, else of the
-    machine."""
+    """Peak memory of this process in MB, weights included: of the GPU by torch's count, else of the process."""
     if device == "cuda":
         return round(torch.cuda.max_memory_allocated() / 1e6)
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6)
 
 
-def save(given: argparse.Namespace, folder: Path, name: str, found: dict[str, Any]) -> None:
-    """The study's file, with what it ran on, which is printed too."""
+def save_results(given: argparse.Namespace, folder: Path, name: str, found: dict[str, Any]) -> None:
+    """Save the study's results with the device and peak memory, which are also printed."""
     peak = peak_mb(given.device)
     save_json(folder / name, found | {"device": given.device, "dtype": given.dtype, "peak_mb": peak})
     print(f"on {given.device} in {given.dtype}, both priors loaded: at most {peak:,} MB")

@@ -1,4 +1,4 @@
-"""With what a job was done: parameters other than their defaults, and the command that does it again."""
+"""Parameters of a job that differ from their defaults, and the command that repeats the job."""
 
 from __future__ import annotations
 
@@ -10,49 +10,48 @@ from pathlib import Path
 from typing import Any
 
 from report import page
-from report.loading import Job
+from report.job_data import Job
 
 
-def leaves(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted names and values of nested groups."""
+def flatten_parameters(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield dotted names and values of nested groups."""
     for name, value in values.items():
         if isinstance(value, dict):
-            yield from leaves(value, f"{prefix}{name}.")
+            yield from flatten_parameters(value, f"{prefix}{name}.")
         else:
             yield prefix + name, value
 
 
-def defaults(stage: str) -> dict[str, Any]:
-    """Dotted name -> value; empty for a stage that this code does not know."""
+def default_parameters(stage: str) -> dict[str, Any]:
+    """Dotted name -> default value; empty for a stage that this code does not know."""
     try:
         found = import_module(f"reffusion.params.{stage}").Params()
     except ModuleNotFoundError:
         return {}
-    return dict(leaves(found.model_dump(mode="json")))
+    return dict(flatten_parameters(found.model_dump(mode="json")))
 
 
-def asked(job: Job) -> dict[str, Any]:
-    """stage.parameter -> value, of what was done otherwise than the profile and scene.yaml say: by `set=` or
-    `budget=`. Empty where the plan was not recorded."""
-    said = {stage: dict(leaves(values)) for stage, values in job.unset.items()}
+def command_line_parameters(job: Job) -> dict[str, Any]:
+    """stage.parameter -> value, for parameters set by `set=` or `budget=`; empty if no plan was recorded."""
+    unset = {stage: dict(flatten_parameters(values)) for stage, values in job.unset.items()}
     return {
         f"{stage}.{name}": value
         for stage, receipt in job.receipts.items()
-        for name, value in leaves(receipt.get("params", {}))
-        if stage in said and said[stage].get(name, value) != value
+        for name, value in flatten_parameters(receipt.get("params", {}))
+        if stage in unset and unset[stage].get(name, value) != value
     }
 
 
-def section(job: Job) -> list[str]:
-    """A table of what differs from the defaults, those set by hand first."""
-    typed, own, rows = asked(job), [], []
+def parameters_section(job: Job) -> list[str]:
+    """Table of parameters that differ from the defaults, those set on the command line first."""
+    typed, own, rows = command_line_parameters(job), [], []
     for stage, receipt in job.receipts.items():
-        usual = defaults(stage)
-        for name, value in leaves(receipt.get("params", {})):
+        usual = default_parameters(stage)
+        for name, value in flatten_parameters(receipt.get("params", {})):
             if name not in usual or usual[name] != value:
                 rows.append([f"{stage}.{name}", _short(value), _short(usual.get(name))])
             if f"{stage}.{name}" in typed:
-                instead = dict(leaves(job.unset[stage])).get(name)
+                instead = dict(flatten_parameters(job.unset[stage])).get(name)
                 own.append([f"{stage}.{name}", _short(value), _short(instead), _short(usual.get(name))])
     top = page.heading("Parameters other than their defaults")
     if not rows:
@@ -68,24 +67,24 @@ def _short(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def command(job: Job) -> list[str]:
-    """What to type to do it again."""
+def reproduce_section(job: Job) -> list[str]:
+    """The command that repeats the job."""
     name, _, variant = job.home.name.partition("@")
     source = job.home.with_name(name) / "source"
-    scene = load_source(source, name)
+    scene = load_scene_argument(source, name)
     profile = next((receipt["profile"] for receipt in job.receipts.values()), "")
     words = [f"scene={shlex.quote(scene)}", f"profile={profile}", *([f"variant={variant}"] if variant else [])]
-    if typed := asked(job):
+    if typed := command_line_parameters(job):
         text = " ".join(shlex.quote(f"{key}={json.dumps(value)}") for key, value in typed.items())
         words.append(f"set={shlex.quote(text)}")
     line = " ".join(["make", *words, "all"])
     return [page.heading("To do it again"), page.code(line)]
 
 
-def load_source(path: Path, name: str) -> str:
-    """What the scene was called on the command line: its name below data/, else its path, of a video the file's."""
-    said = path.read_text(encoding="utf-8").strip() if path.is_file() else name
+def load_scene_argument(path: Path, name: str) -> str:
+    """The scene's name on the command line: its name below data/, else its path, or the path of a video."""
+    source = path.read_text(encoding="utf-8").strip() if path.is_file() else name
     record = path.parent / "frames" / "frames.json"
-    if record.is_file() and Path(said).name == "frames":
+    if record.is_file() and Path(source).name == "frames":
         return json.loads(record.read_text(encoding="utf-8"))["video"]
-    return name if said == f"data/{name}" else said
+    return name if source == f"data/{name}" else source

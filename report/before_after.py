@@ -1,4 +1,4 @@
-"""Before and after: every view by what each stage made of it, two at a time under a slider."""
+"""Before-and-after slider: two pictures of the same view, from any two stages, one over the other."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from pathlib import Path
 from reffusion.io.arrays import load_json
 from reffusion.io.images import image_size, load_image
 from reffusion.io.scene import raw_mask_files
-from report import inside, page
-from report.loading import Job
+from report import inline_images, page
+from report.job_data import Job
 from report.results import load_views
 
-MEGABYTES = 3.0  # that all pictures may take, about
-LEAST, MOST = 320, 960  # px a side
+MEGABYTES = 3.0  # approximate size of all pictures together
+MIN_SIDE, MAX_SIDE = 320, 960  # longer side of a picture, px
 TITLES = {
     "photograph": "photograph",
     "renders_fit": "with the object, as fitted",
@@ -52,10 +52,10 @@ for (const box of document.querySelectorAll('.compare')) {
   const show = () => {
     for (const pair of pairs) {
       pair.hidden = pair.dataset.view !== view.value;
-      const there = [...pair.querySelectorAll('img')];
-      const of = (kind, other) => there.find(i => i.dataset.kind === kind) || other;
-      const sides = {left: of(left.value, there[0]), right: of(right.value, there[there.length - 1])};
-      for (const image of there) {
+      const images = [...pair.querySelectorAll('img')];
+      const find = (kind, fallback) => images.find(i => i.dataset.kind === kind) || fallback;
+      const sides = {left: find(left.value, images[0]), right: find(right.value, images[images.length - 1])};
+      for (const image of images) {
         image.classList.toggle('left', image === sides.left);
         image.classList.toggle('right', image === sides.right);
       }
@@ -83,37 +83,37 @@ addEventListener('beforeprint', () => document.querySelectorAll('details').forEa
 """
 
 
-def section(job: Job) -> list[str]:
-    """The heading and the slider; or what is missing for one."""
-    views = {name: found for name in rendered(job) if (found := files_of(job, name))}
+def before_after_section(job: Job) -> list[str]:
+    """Heading and slider, or a sentence that says which stage is missing."""
+    views = {name: found for name in rendered_views(job) if (found := find_pictures(job, name))}
     top = page.heading("Before and after")
     if not views:
-        return [top, page.paragraph("None yet: the stage evaluate renders the views.")]
+        return [top, page.paragraph("None yet: the stage `evaluate` renders the views.")]
     width, height = image_size(next(iter(next(iter(views.values())).values())))
     count = sum(len(found) for found in views.values())
-    longest = inside.affordable(count, MEGABYTES, LEAST, MOST, width / height)
+    longest = inline_images.affordable_side(count, MEGABYTES, MIN_SIDE, MAX_SIDE, width / height)
     kinds = [kind for kind in TITLES if any(kind in found for found in views.values())]
     rows = load_views(job.folders["evaluate"] / "per_view.csv")
     pairs = [
         _pair(name, found, rows.get(name, {}), longest, first=k == 0) for k, (name, found) in enumerate(views.items())
     ]
     choice = '<p class="choose"><label>view ' + _select(dict.fromkeys(views)) + "</label>"
-    choice += '<span><button type="button" aria-label="view before">‹</button> '
+    choice += '<span><button type="button" aria-label="previous view">‹</button> '
     choice += '<button type="button" aria-label="next view">›</button></span>'
     choice += "<label>left " + _select({k: TITLES[k] for k in kinds}, _left(kinds)) + "</label>"
     choice += "<label>right " + _select({k: TITLES[k] for k in kinds}, kinds[-1]) + "</label></p>"
-    words = f"{job.metrics.get('rendered', f'{len(views)} views')}; drag over the picture."
+    words = f"{job.metrics.get('rendered', f'{len(views)} views')}. Drag over the picture to compare."
     return [top, page.paragraph(words, quiet=True), f'<div class="compare">{choice}', *pairs, "</div>"]
 
 
-def rendered(job: Job) -> list[str]:
-    """The views that the stage evaluate rendered, sorted."""
+def rendered_views(job: Job) -> list[str]:
+    """Sorted names of the views that the stage `evaluate` rendered."""
     folder = job.folders.get("evaluate", Path()) / "renders"
     return sorted(path.stem for path in folder.glob("*.png")) if "evaluate" in job.folders else []
 
 
-def files_of(job: Job, name: str) -> dict[str, Path]:
-    """Kind of picture (`TITLES`) -> file, of what there is of a view."""
+def find_pictures(job: Job, name: str) -> dict[str, Path]:
+    """Kind of picture (`TITLES`) -> file, for the pictures of a view that exist."""
     evaluate = job.folders["evaluate"]
     poses, raw_masks = (job.folders.get(stage, Path()) for stage in ("poses", "raw_masks"))
     found = {kind: evaluate / kind / f"{name}.png" for kind in TITLES}
@@ -125,7 +125,7 @@ def files_of(job: Job, name: str) -> dict[str, Path]:
 
 
 def _left(kinds: list[str]) -> str:
-    """What is shown first on the left: with the object in it."""
+    """The kind shown first on the left: a picture with the object, if there is one."""
     return next((kind for kind in ("photograph", "renders_fit", "truth") if kind in kinds), kinds[0])
 
 
@@ -138,13 +138,13 @@ def _select(options: dict[str, str | None], chosen: str = "") -> str:
 
 
 def _pair(name: str, found: dict[str, Path], row: dict[str, float], longest: int, first: bool) -> str:
-    """A view's pictures over one another; the first view is shown where no script runs, too."""
+    """The pictures of a view, stacked. Without JavaScript only the first view is visible."""
     kinds, images = list(found), []
     width, height = image_size(found[kinds[0]])
     sides = {_left(kinds): "left", kinds[-1]: "right"}
     for kind, path in found.items():
         side = f' class="{sides[kind]}"' if kind in sides else ""
-        source = inside.photograph(load_image(path), longest)
+        source = inline_images.photo_address(load_image(path), longest)
         images.append(f'<img{side} data-kind="{kind}" src="{source}" alt="{TITLES[kind]}">')
     scores = [f"{row['psnr_box']:.2f} dB in the box"] if "psnr_box" in row else []
     scores += [f"FLIP {row['flip_box']:.3f}"] if "flip_box" in row else []

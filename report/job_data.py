@@ -1,4 +1,4 @@
-"""What lies on the disk for a scene's job."""
+"""Files of a scene's job: its plan, artifacts, receipts, traces and scores."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from typing import Any
 
 from reffusion.io.arrays import load_json
 from reffusion.io.traces import load_trace
-from report import curves, sheet
+from report import sheet, trace_charts
 from report.results import load_receipts
 
-ORDER = (
+STAGES = (
     "poses", "raw_masks", "fit", "masks", "reference", "lift", "initialize", "personalize", "distill", "evaluate",
 )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Job:
-    """What lies on the disk for a scene.
+    """A scene's job as it lies on the disk.
 
     Attributes:
         home: runs/<scene>, or runs/<scene>@<variant>.
-        plan: stage -> word, reason, notes, as the runner wrote them to plan.json; or empty, see `load_plan`.
-        unset: stage -> all its parameters as they are without `set=` and `budget=`; or empty.
-        folders: stage -> its artifact, in order; a variant's may lie with the scene's own run.
+        plan: stage -> word, reason, notes, as the runner wrote them to plan.json; may be empty, see `load_plan`.
+        unset: stage -> all its parameters without the command line's `set=` and `budget=`; may be empty.
+        folders: stage -> its artifact, in order; a variant shares artifacts with the scene's own run.
         receipts: stage -> receipt.json.
         traces: stage -> series -> lines.
-        unread: why a trace could not be read, in words.
+        unread: reasons why traces could not be read.
         metrics: metrics.json, or empty.
     """
 
@@ -36,19 +36,19 @@ class Job:
     unset: dict[str, dict[str, Any]]
     folders: dict[str, Path]
     receipts: dict[str, dict[str, Any]]
-    traces: dict[str, dict[str, curves.Lines]]
+    traces: dict[str, dict[str, trace_charts.Lines]]
     unread: tuple[str, ...]
     metrics: dict[str, Any]
 
 
 def load_job(home: Path) -> Job:
-    """Raises ValueError where no stage has been done."""
+    """Load a job; ValueError if no stage has been done."""
     plan = load_plan(home)
-    names = list(plan or ORDER)
-    places = {s: home.parent / plan[s]["folder"] if plan and plan[s]["folder"] else None for s in plan}
-    found = {stage: places.get(stage) or sheet.stage_folder(home, stage) for stage in names}
-    left_out = {stage for stage, said in plan.items() if said["word"] == "skip"}
-    folders = {s: f for s, f in found.items() if s not in left_out and (f / "receipt.json").exists()}
+    names = list(plan or STAGES)
+    planned = {s: home.parent / plan[s]["folder"] if plan and plan[s]["folder"] else None for s in plan}
+    found = {stage: planned.get(stage) or sheet.stage_folder(home, stage) for stage in names}
+    skipped = {stage for stage, entry in plan.items() if entry["word"] == "skip"}
+    folders = {s: f for s, f in found.items() if s not in skipped and (f / "receipt.json").exists()}
     if not folders:
         raise ValueError(f"{home}: no stage has been done; run `make scene={home.name} all` first")
     traces, unread = {}, []
@@ -66,7 +66,7 @@ def load_job(home: Path) -> Job:
 
 
 def load_plan(home: Path) -> dict[str, dict[str, Any]]:
-    """plan.json's stages; empty where there is none, or a stage was done after it was written."""
+    """Stages of plan.json; empty if there is none, or a stage was done after it was written."""
     path = home / "plan.json"
     if not path.exists() or any(r.stat().st_mtime > path.stat().st_mtime for r in home.glob("*/receipt.json")):
         return {}

@@ -1,7 +1,7 @@
-"""Where an object that is not there would stand in a real capture, and which of its photographs would show it.
+"""Placement of a synthetic object in a real capture, and the photographs that show it.
 
-A capture is a nerfstudio folder: `transforms.json` and a cloud of points. Its frame is kept as it is; a camera here is
-a camera-to-world matrix [4, 4] that looks along +z, x right, y down.
+A capture is a nerfstudio folder: `transforms.json` and a point cloud. Its frame is kept; a camera here is a
+camera-to-world matrix [4, 4] that looks along +z, x right, y down.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ import numpy as np
 from reffusion.io.arrays import load_json
 from reffusion.io.ply import load_points
 
-MARGIN = 20  # px from the picture's border within which the object's axis must not come
-SLACK = 1.06  # depth over the nearest points' up to which a point is of the surface in front
-FEWEST = 8  # points that make a surface
-TURN = 25.0  # degrees that the object is turned away from the view in which it is placed
-HALF = (0.55, 0.4, 0.5)  # extents of the object, of its height
+MARGIN = 20  # least distance of the object's axis to the picture's border, px
+FRONT_TOLERANCE = 1.06  # points up to this factor of the nearest points' depth belong to the front surface
+MIN_POINTS = 8  # least number of points that define a surface
+YAW = 25.0  # degrees by which the object is turned away from the view in which it is placed
+HALF_EXTENTS = (0.55, 0.4, 0.5)  # half extents of the object, relative to its height
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -29,12 +29,13 @@ class Place:
     """Where to put an object.
 
     Attributes:
-        name: of the place; capture: its folder's name.
-        view: the photograph in which the place is pointed at; pixel: where in it, px.
-        size: the object's height over its distance from that view; shape: "box" or "ellipsoid".
-        arc: degrees about the surface's normal to either side of `view` from which photographs are taken.
-        train, test: how many photographs at most.
-        near: px around the pixel within which points make the surface.
+        name: of the place; capture: name of its folder.
+        view: photograph in which the place is marked; pixel: where in it, px.
+        size: height of the object over its distance from that view.
+        arc: photographs are taken within this many degrees about the surface's normal on either side of `view`.
+        train, test: largest numbers of photographs.
+        near: points within this many px of the pixel define the surface.
+        shape: "box" or "ellipsoid".
     """
 
     name: str
@@ -54,9 +55,9 @@ class Photographs:
     """A capture.
 
     Attributes:
-        folder: where it lies; meta: transforms.json as read, its frames left out.
+        folder: of the capture; meta: transforms.json without its frames.
         intrinsics: [3, 3]; distortion: [4], OpenCV's k1, k2, p1, p2; width, height: px.
-        frames: view -> its entry in transforms.json; cameras: view -> camera [4, 4]. Views without a file are left out.
+        frames: view -> its entry in transforms.json; cameras: view -> camera [4, 4]; views without a file are omitted.
         points: [P, 3].
     """
 
@@ -72,11 +73,11 @@ class Photographs:
 
     @property
     def cloud(self) -> str:
-        """The name of the points' file."""
+        """Name of the points' file."""
         return self.meta.get("ply_file_path", "sparse_pc.ply")
 
     def project(self, camera: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Image points [P, 2], the lens's bend left out, and depths [P] of points [P, 3]."""
+        """Image points [P, 2] without lens distortion, and depths [P], of points [P, 3]."""
         seen = (points - camera[:3, 3]) @ camera[:3, :3]
         depth = seen[:, 2]
         image = seen[:, :2] / depth[:, None]
@@ -84,12 +85,12 @@ class Photographs:
 
 
 @dataclass(frozen=True)
-class Thing:
+class PlacedObject:
     """The object in the capture's frame.
 
     Attributes:
-        foot: [3], the point on the surface that it stands on; height: its own, in the capture's unit.
-        axes: [3, 3], its sides, front and up (the surface's normal), a row each; half: [3] half extents along them.
+        foot: [3], the point on the surface on which it stands; height: in the capture's unit.
+        axes: [3, 3], its side, front and up (the surface's normal) in rows; half: [3] half extents along them.
         shape: "box" or "ellipsoid".
     """
 
@@ -109,7 +110,7 @@ class Thing:
 
 
 class Views(NamedTuple):
-    """Names of photographs by azimuth about the object: all, and those of them that are test views."""
+    """Names of photographs by azimuth about the object: all, and the test views among them."""
 
     all: list[str]
     test: list[str]
@@ -119,8 +120,8 @@ class Views(NamedTuple):
         return [name for name in self.all if name not in self.test]
 
 
-def load(folder: Path) -> Photographs:
-    """ValueError where transforms.json or the points are missing."""
+def load_photographs(folder: Path) -> Photographs:
+    """Load a capture. ValueError if transforms.json or the points are missing."""
     if not (folder / "transforms.json").exists():
         raise ValueError(f"{folder} holds no transforms.json: it is no nerfstudio capture")
     meta = load_json(folder / "transforms.json")
@@ -136,17 +137,17 @@ def load(folder: Path) -> Photographs:
     return Photographs(folder, meta, intrinsics, distortion, *size, frames, cameras, load_points(cloud)[0])
 
 
-def save_meta(capture: Photographs, names: list[str], path: Path) -> None:
-    """transforms.json of some views, whose pictures lie in images/<view>.png."""
+def save_transforms(capture: Photographs, names: list[str], path: Path) -> None:
+    """Save transforms.json for some views, whose pictures are images/<view>.png."""
     frames = [capture.frames[name] | {"file_path": f"images/{name}.png"} for name in names]
     path.write_text(json.dumps(capture.meta | {"frames": frames}, indent=1))
 
 
-def stand(capture: Photographs, place: Place) -> Thing:
+def place_object(capture: Photographs, place: Place) -> PlacedObject:
     """The object on the plane through the points around the place's pixel.
 
     Raises:
-        ValueError: no such view, or too few points near the pixel.
+        ValueError: unknown view, or too few points near the pixel.
     """
     if place.view not in capture.cameras:
         raise ValueError(f"{place.name}: {capture.folder} has no photograph {place.view}")
@@ -161,23 +162,23 @@ def stand(capture: Photographs, place: Place) -> Thing:
     across = np.cross(normal, ray)
     across /= np.linalg.norm(across)
     ahead = np.cross(across, normal)
-    c, s = np.cos(np.radians(TURN)), np.sin(np.radians(TURN))
+    c, s = np.cos(np.radians(YAW)), np.sin(np.radians(YAW))
     axes = np.stack([c * across + s * ahead, c * ahead - s * across, normal])
-    return Thing(foot, height, axes, np.array(HALF) * height, place.shape)
+    return PlacedObject(foot, height, axes, np.array(HALF_EXTENTS) * height, place.shape)
 
 
 def _surface(capture: Photographs, place: Place) -> np.ndarray:
-    """The points [P, 3] of the surface in front around the place's pixel."""
+    """Points [P, 3] of the front surface around the place's pixel."""
     image, depth = capture.project(capture.cameras[place.view], capture.points)
     close = (depth > 0) & (np.linalg.norm(image - place.pixel, axis=1) < place.near)
-    if close.sum() < FEWEST:
+    if close.sum() < MIN_POINTS:
         found = f"{close.sum()} points within {place.near:g} px of its pixel"
-        raise ValueError(f"{place.name}: {found}, {FEWEST} are needed")
-    return capture.points[close & (depth < SLACK * np.percentile(depth[close], 20))]
+        raise ValueError(f"{place.name}: {found}, {MIN_POINTS} are needed")
+    return capture.points[close & (depth < FRONT_TOLERANCE * np.percentile(depth[close], 20))]
 
 
 def _plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(a point [3] on it, normal [3]) of the plane through most of the points [P, 3]; the farthest are let go."""
+    """(a point [3] on it, normal [3]) of the plane through most of the points [P, 3], with the farthest trimmed."""
     for _ in range(5):
         normal = np.linalg.svd(points - points.mean(0))[2][2]
         off = np.abs((points - np.median(points, 0)) @ normal)
@@ -185,21 +186,21 @@ def _plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.median(points, 0), normal
 
 
-def azimuth(thing: Thing, base: np.ndarray, camera: np.ndarray) -> float:
-    """Degrees from camera `base` to another about the surface's normal."""
+def azimuth(thing: PlacedObject, base: np.ndarray, camera: np.ndarray) -> float:
+    """Degrees from camera `base` to another one about the surface's normal."""
     one, other = (_along(thing, at[:3, 3] - thing.foot) for at in (base, camera))
     return float(np.degrees(np.arctan2(np.cross(one, other) @ thing.normal, one @ other)))
 
 
-def _along(thing: Thing, vector: np.ndarray) -> np.ndarray:
+def _along(thing: PlacedObject, vector: np.ndarray) -> np.ndarray:
     return vector - thing.normal * (vector @ thing.normal)
 
 
-def views_around(capture: Photographs, place: Place, thing: Thing) -> Views:
-    """Photographs that show the object, evenly taken, test views evenly among them.
+def select_views(capture: Photographs, place: Place, thing: PlacedObject) -> Views:
+    """Evenly selected photographs that show the object, with test views evenly among them.
 
     Raises:
-        ValueError: too few to train on, or none to test with.
+        ValueError: too few photographs show the object.
     """
     axis = np.stack([thing.foot, thing.middle, thing.foot + 2 * thing.normal * thing.half[2]])
     base, angles = capture.cameras[place.view], {}
@@ -210,10 +211,10 @@ def views_around(capture: Photographs, place: Place, thing: Thing) -> Views:
         inside = (image > MARGIN).all() and (image < [capture.width - MARGIN, capture.height - MARGIN]).all()
         if depth.min() > 0 and abs(angle) <= place.arc and inside:
             angles[name] = angle
-    shown = sorted(angles, key=angles.__getitem__)
-    count = min(len(shown), place.train + place.test)
+    visible = sorted(angles, key=angles.__getitem__)
+    count = min(len(visible), place.train + place.test)
     if count < 4:
         raise ValueError(f"{place.name}: {count} photographs show the object, 4 are needed")
-    taken = [shown[k] for k in np.linspace(0, len(shown) - 1, count).round().astype(int)]
+    selected = [visible[k] for k in np.linspace(0, len(visible) - 1, count).round().astype(int)]
     every = max(2, round(count / max(1, place.test)))
-    return Views(taken, taken[every // 2 :: every])
+    return Views(selected, selected[every // 2 :: every])

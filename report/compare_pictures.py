@@ -11,20 +11,22 @@ from reffusion.io.arrays import load_json
 from reffusion.io.images import load_image, save_image
 from reffusion.io.scene import shows_object
 from report.results import FULL, Comparison, Run
-from report.sheet import GAP, enlarged, evenly
+from report.sheet import GAP, enlarge, pick_evenly
 
-WIDTH = 1920  # px of a sheet of crops, about
-CONTEXT = 0.15  # the crop is wider than the box by this share of it on each side
+WIDTH = 1920  # approximate width of a sheet, px
+CONTEXT = 0.15  # margin of the crop on each side, as a share of the box
 BOX = ("left", "top", "right", "bottom")
 
 
-def sheets(comparison: Comparison, out: Path, count: int = 3) -> dict[str, Path]:
-    """View -> a PNG with what every method made of it, and the truth; views of the only scene, spread evenly, or one
-    of each of so many scenes."""
+def save_sheets(comparison: Comparison, out: Path, count: int = 3) -> dict[str, Path]:
+    """View -> PNG with the result of every method and the truth.
+
+    With one scene, `count` evenly spread views; with several, one view each of `count` scenes.
+    """
     if len(comparison.scenes) == 1:
         return _sheets_of(comparison, comparison.scenes[0], out, "", count)
     made: dict[str, Path] = {}
-    for scene in evenly(list(comparison.scenes), count):
+    for scene in pick_evenly(list(comparison.scenes), count):
         made |= _sheets_of(comparison, scene, out, f"{scene}-", 1)
     return made
 
@@ -38,11 +40,11 @@ def _sheets_of(comparison: Comparison, scene: str, out: Path, prefix: str, count
     first = next((run for run in runs if run.method == FULL), runs[0])
     boxed = [view for view, row in first.views.items() if all(side in row for side in BOX)]
     made = {}
-    for view in evenly(boxed or list(first.views), count):
+    for view in pick_evenly(boxed or list(first.views), count):
         cells = _cells(runs, first, view)
         if cells:
             path = made[f"{prefix}{view}"] = out / f"{prefix}{view}.png"
-            save_image(path, wall([picture for _, picture in cells], [title for title, _ in cells]))
+            save_image(path, arrange_crops([picture for _, picture in cells], [title for title, _ in cells]))
     return made
 
 
@@ -58,7 +60,7 @@ def _cells(runs: list[Run], first: Run, view: str) -> list[tuple[str, np.ndarray
         path = run.folders["evaluate"] / "renders" / f"{view}.png"
         if path.exists():
             cells.append((_title(run, view), load_image(path)))
-    return [(title, crop(picture, first.views[view])) for title, picture in cells]
+    return [(title, crop_to_box(picture, first.views[view])) for title, picture in cells]
 
 
 def _title(run: Run, view: str) -> str:
@@ -68,8 +70,8 @@ def _title(run: Run, view: str) -> str:
     return "\n".join([run.method, *([", ".join(scores)] if scores else [])])
 
 
-def crop(picture: np.ndarray, row: dict[str, float]) -> np.ndarray:
-    """[H, W, 3] -> the box of a row of per_view.csv with `CONTEXT` around; the whole picture where it has no box."""
+def crop_to_box(picture: np.ndarray, row: dict[str, float]) -> np.ndarray:
+    """[H, W, 3]: the box of a row of per_view.csv with `CONTEXT` around it; the whole picture if the row has no box."""
     if not all(side in row for side in BOX):
         return picture
     left, top, right, bottom = (int(row[side]) for side in BOX)
@@ -77,8 +79,8 @@ def crop(picture: np.ndarray, row: dict[str, float]) -> np.ndarray:
     return picture[max(0, top - high) : bottom + high, max(0, left - wide) : right + wide]
 
 
-def wall(cells: list[np.ndarray], titles: list[str]) -> np.ndarray:
-    """uint8 [H, W, 3]: pictures of one size in rows, each enlarged by a whole factor, its title (two lines) above."""
+def arrange_crops(cells: list[np.ndarray], titles: list[str]) -> np.ndarray:
+    """uint8 [H, W, 3]: pictures of one size in rows, enlarged by a whole factor, with titles of one or two lines."""
     height, width = (max(cell.shape[axis] for cell in cells) for axis in (0, 1))
     columns = min(len(cells), 4)
     scale = max(1, round(WIDTH / columns / width))
@@ -94,5 +96,5 @@ def wall(cells: list[np.ndarray], titles: list[str]) -> np.ndarray:
         name, _, score = title.partition("\n")
         draw.text((left, top + head - size // 3), score, "#666", font, anchor="ls")
         draw.text((left, top + head - size // 3 - below), name, "black", font, anchor="ls")
-        canvas.paste(Image.fromarray(enlarged(cell, scale)), (left, top + head))
+        canvas.paste(Image.fromarray(enlarge(cell, scale)), (left, top + head))
     return np.asarray(canvas)

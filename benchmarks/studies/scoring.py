@@ -1,4 +1,4 @@
-"""What a composite's result is worth: its scores beside the ceiling's and Telea's, what stays uncovered, a sheet."""
+"""Scores of a composite's result beside its ceiling and Telea's method, uncovered pixels, and a sheet of pictures."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from reffusion.splat import rasterizer
 from reffusion.types import Camera, Gaussians, Scene
 from stages import evaluate
 
-THIN = 0.9  # alpha under which a pixel is uncovered
-BLACK, LIT = 0.06, 0.15  # brightest channel: of what looks uncovered, where the truth has more than that
-AROUND = 0.6  # of the box's extent that a sheet shows to each side
-ROW = 200  # px, height of a sheet's rows
-COLUMNS = {"lpips_vgg": 3, "psnr": 2, "ssim": 3, "flip": 3}  # and their digits
-WAYS = ("result", "initialize", "ceiling", "telea")
+MIN_ALPHA = 0.9  # a pixel is uncovered below this alpha
+BLACK, LIT = 0.06, 0.15  # or if its brightest channel is below BLACK where the truth's is above LIT
+SHEET_MARGIN = 0.6  # margin of a sheet's crop on each side, relative to the box
+ROW = 200  # height of a sheet's rows, px
+COLUMNS = {"lpips_vgg": 3, "psnr": 2, "ssim": 3, "flip": 3}  # column -> digits
+PICTURES = ("result", "initialize", "ceiling", "telea")
 
 
 @dataclass(frozen=True)
 class Run:
-    """A finished job: its folder, its scene, and what evaluate wrote down."""
+    """A finished job: its folder, its scene, and the metrics of evaluate."""
 
     folder: Path
     scene: Scene
@@ -39,39 +39,43 @@ class Run:
     base: Path | None = None
 
     @classmethod
-    def at(cls, folder: Path) -> Run:
+    def load(cls, folder: Path) -> Run:
         return cls(folder, load_scene(folder / "poses"), load_json(folder / "evaluate/metrics.json"))
 
     @classmethod
-    def of_variant(cls, base: Run, folder: Path) -> Run:
-        """A variant's, which shares with `base` the stages that it has no folder of."""
+    def load_variant(cls, base: Run, folder: Path) -> Run:
+        """Load a variant's run, which shares with `base` the stages for which it has no folder."""
         return cls(folder, base.scene, load_json(folder / "evaluate/metrics.json"), base.folder)
 
     def stage(self, name: str) -> Path:
+        """Folder of a stage; the base run's if a variant has none."""
         own = self.folder / name
         return own if own.exists() or self.base is None else self.base / name
 
     def picture(self, name: str, kind: str = "renders") -> np.ndarray:
-        """uint8 [H, W, 3], a test view as evaluate drew it."""
+        """uint8 [H, W, 3]: a test view as evaluate rendered it."""
         return load_image(self.folder / "evaluate" / kind / f"{name}.png")
 
     def truth(self, name: str) -> np.ndarray:
-        """uint8 [H, W, 3], a test view's photograph."""
+        """uint8 [H, W, 3]: a test view's photograph."""
         return load_image(self.stage("poses") / f"images/{name}.png")
 
     def mask(self, name: str) -> np.ndarray:
-        """bool [H, W]: where the object is: the test mask of a test view, else the consistent mask."""
+        """bool [H, W]: pixels of the object, from the test mask of a test view, else the consistent mask."""
         masks = self.stage("masks")
         return evaluate.mask_of(self.scene.cameras[name], self.stage("raw_masks"), masks if masks.exists() else None)
 
     def gaussians(self) -> Gaussians:
-        """The result."""
+        """The result's Gaussians."""
         return load_ply(self.stage(self.metrics["result"]) / "gaussians.ply")
 
 
-def scores(run: Run, ceiling: Run, variants: Mapping[str, Run]) -> dict[str, Any]:
-    """A place's row: for each of WAYS its means of COLUMNS over the test views' boxes (+ 10 %); "sharpness" of result
-    and ceiling; "uncovered", worst view, of "train" and "test"; "seconds" of the job; "variants", COLUMNS of each."""
+def score_place(run: Run, ceiling: Run, variants: Mapping[str, Run]) -> dict[str, Any]:
+    """A place's row of the table.
+
+    PICTURES -> means of COLUMNS over the test views' boxes (+ 10 %); "sharpness" of result and ceiling; "uncovered",
+    the worst view's share, of "train" and "test"; "seconds" of the job; "variants", COLUMNS of each.
+    """
     row: dict[str, Any] = {
         "result": _means(run.metrics["mean"]),
         "initialize": _means(run.metrics["initialize"]),
@@ -93,7 +97,7 @@ def _means(of: dict[str, float | None]) -> dict[str, float | None]:
 
 
 def _telea(run: Run) -> dict[str, float | None]:
-    """Telea's filling of the test masks in our own renders: our surroundings, but inside them no method at all."""
+    """Scores of Telea's filling of the test masks in our own renders: our surroundings, no method in the mask."""
     rows, (vgg, _) = [], lpips.load("vgg")
     models = {"vgg": vgg} if vgg else {}
     for name in run.scene.test:
@@ -107,7 +111,7 @@ def _telea(run: Run) -> dict[str, float | None]:
 
 
 def _sharpness(run: Run) -> float | None:
-    """Mean over the test views of the gradients' energy in the box over that of the truth; 1 is as sharp."""
+    """Mean over the test views of the gradient energy in the box over that of the truth; 1 is as sharp."""
     shares = []
     for name in run.scene.test:
         box = image_metrics.mask_box(run.mask(name))
@@ -119,40 +123,45 @@ def _sharpness(run: Run) -> float | None:
 
 
 def _untouched(run: Run, ceiling: Run, name: str) -> np.ndarray | None:
-    """A training view's photograph without the object, of which the ceiling's fit has the undistorted; None where that
-    came out at another size."""
+    """A training view's photograph without the object, from the ceiling's fit; None if its size differs."""
     picture, camera = ceiling.truth(name), run.scene.cameras[name]
     return picture if picture.shape[:2] == (camera.height, camera.width) else None
 
 
 def _worst(run: Run, truths: dict[str, np.ndarray | None]) -> float | None:
-    """The largest `uncovered` share of the named views."""
+    """Largest uncovered share over the named views."""
     gaussians = run.gaussians()
-    found = [uncovered(gaussians, run.scene.cameras[name], run.mask(name), truth) for name, truth in truths.items()]
+    found = [
+        uncovered_share(gaussians, run.scene.cameras[name], run.mask(name), truth) for name, truth in truths.items()
+    ]
     return max((share for share in found if share is not None), default=None)
 
 
-def uncovered(gaussians: Gaussians, camera: Camera, mask: np.ndarray, truth: np.ndarray | None) -> float | None:
-    """Share of the mask's pixels, bool [H, W], that nothing covers: alpha under THIN, or near black where the truth
-    (uint8 [H, W, 3]) is not. None for an empty mask."""
+def uncovered_share(gaussians: Gaussians, camera: Camera, mask: np.ndarray, truth: np.ndarray | None) -> float | None:
+    """Share of a mask's pixels, bool [H, W], that nothing covers; None for an empty mask.
+
+    A pixel is uncovered if alpha is below MIN_ALPHA, or if it is near black and the truth, uint8 [H, W, 3], is not.
+    """
     import torch
 
     if not mask.any():
         return None
     with torch.no_grad():
         drawing = rasterizer.render(gaussians, camera)
-    bare = drawing.alpha.cpu().numpy() < THIN
+    bare = drawing.alpha.cpu().numpy() < MIN_ALPHA
     if truth is not None:
         bare |= (drawing.color.cpu().numpy().max(2) < BLACK) & (truth.max(2) / 255.0 > LIT)
     return float(bare[mask].mean())
 
 
-def sheet(run: Run, ceiling: Run) -> np.ndarray:
-    """uint8 [H, W, 3], a row a test view around its box: truth, with the object (the fit's render), ours, the
-    ceiling, and the absolute difference between ours and the truth."""
+def comparison_sheet(run: Run, ceiling: Run) -> np.ndarray:
+    """uint8 [H, W, 3], a row per test view around its box.
+
+    Columns: truth, with the object (the fit's render), ours, ceiling, absolute difference between ours and the truth.
+    """
     rows = []
     for name in run.scene.test:
-        box, same = (image_metrics.mask_box(of.mask(name), AROUND) for of in (run, ceiling))
+        box, same = (image_metrics.mask_box(of.mask(name), SHEET_MARGIN) for of in (run, ceiling))
         if box is None or same is None:
             continue
         truth, ours = box.crop(run.truth(name)), box.crop(run.picture(name))
@@ -164,20 +173,23 @@ def sheet(run: Run, ceiling: Run) -> np.ndarray:
 
 
 def _row(panels: list[np.ndarray]) -> np.ndarray:
-    """Panels side by side, all of ROW px, 4 px of black between them."""
+    """Panels side by side, scaled to a height of ROW px, with 4 px of black between them."""
     scaled = [cv2.resize(p, (round(p.shape[1] * ROW / p.shape[0]), ROW), interpolation=cv2.INTER_AREA) for p in panels]
     return np.concatenate([np.pad(p, ((0, 0), (0, 4), (0, 0))) for p in scaled], 1)
 
 
 def table(rows: list[dict]) -> str:
-    """Markdown: a row a place; scores are LPIPS (vgg) / PSNR / SSIM / FLIP, shares in percent; of each variant its
-    scores, and the ratio of our LPIPS to its."""
+    """Markdown table with a row per place.
+
+    Scores are LPIPS (vgg) / PSNR / SSIM / FLIP, shares in percent; each variant has its scores and the ratio of our
+    LPIPS to its.
+    """
     variants = list(rows[0]["variants"]) if rows else []
-    heads = [*WAYS, "sharpness", "its ceiling", "uncovered, train %", "test %", "seconds"]
+    heads = [*PICTURES, "sharpness", "its ceiling", "uncovered, train %", "test %", "seconds"]
     heads += [head for name in variants for head in (name, f"LPIPS, ours / {name}")]
     lines = ["| place | " + " | ".join(heads) + " |", "|---" * (len(heads) + 1) + "|"]
     for row in rows:
-        cells = [_scores(row[way]) for way in WAYS]
+        cells = [_scores(row[way]) for way in PICTURES]
         cells += [_number(row["sharpness"][way], 2) for way in ("result", "ceiling")]
         cells += [_number(row["uncovered"][split], 2, 100) for split in ("train", "test")]
         cells.append(_number(row["seconds"], 0))

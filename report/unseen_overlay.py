@@ -1,4 +1,4 @@
-"""A note in a picture: here it shows what no photograph saw."""
+"""Hatching over the parts of a picture that no photograph shows."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from reffusion.io.scene import load_raw_masks
 from reffusion.types import Camera, Gaussians, Scene
 from report.sheet import stage_folder
 
-LEAST = 0.003  # of a picture, under which nothing is said
-EVERY, LINE = 14, 2  # px between the lines of the hatching, and their width
+MIN_SHARE = 0.003  # of a picture; smaller unseen parts are not marked
+LINE_PERIOD, LINE_WIDTH = 14, 2  # distance between the lines of the hatching, and their width, px
 WORDS = "hatched: no photograph shows it"
 
 
-def photographed(home: Path, scene: Scene) -> list[training_coverage.SeenView]:
-    """What the training views saw, by the fit of them; empty where there is none."""
+def load_seen_views(home: Path, scene: Scene) -> list[training_coverage.SeenView]:
+    """What the training views saw, according to the fit; empty if there is no fit."""
     fit = stage_folder(home, "fit") / "gaussians.ply"
     if not fit.exists():
         return []
@@ -31,27 +31,32 @@ def photographed(home: Path, scene: Scene) -> list[training_coverage.SeenView]:
     return training_coverage.seen_views(load_ply(fit), [scene.cameras[name] for name in scene.train], masks)
 
 
-def noted(
+def hatch_unseen(
     picture: np.ndarray, gaussians: Gaussians, camera: Camera, seen_by: list[training_coverage.SeenView]
 ) -> np.ndarray:
-    """uint8 [H, W, 3] with what none of the training views saw hatched, and words for it; as it is where that is next
-    to nothing.
+    """uint8 [H, W, 3]: the picture with everything that no training view saw hatched, and a label.
+
+    The picture is returned unchanged if less than `MIN_SHARE` is unseen.
 
     Args:
-        camera: of any size; a small one answers sooner.
+        camera: of any size; a small one is faster.
     """
-    found = resize_nearest(training_coverage.unseen(gaussians, camera, seen_by), picture.shape[:2])
-    if found.mean() < LEAST:
+    unseen = resize_nearest(training_coverage.unseen(gaussians, camera, seen_by), picture.shape[:2])
+    if unseen.mean() < MIN_SHARE:
         return picture
-    rows, columns = np.indices(found.shape)
-    place = (rows + columns) % EVERY
+    rows, columns = np.indices(unseen.shape)
+    place = (rows + columns) % LINE_PERIOD
     marked = picture.copy()
-    for offset, level in ((0, 255), (LINE, 0)):  # a bright line beside a dark one: one of them shows anywhere
-        line = found & (place >= offset) & (place < offset + LINE)
+    for offset, level in ((0, 255), (LINE_WIDTH, 0)):  # a bright line beside a dark one, visible on any background
+        line = unseen & (place >= offset) & (place < offset + LINE_WIDTH)
         marked[line] = (0.45 * marked[line] + 0.55 * level).astype(np.uint8)
     canvas = Image.fromarray(marked)
-    size = min(picture.shape[0] // 32, picture.shape[1] // 20)  # a phone held upright is narrow
-    draw, font, at = ImageDraw.Draw(canvas), ImageFont.load_default(max(11, size)), (8, 8)  # axes stand below
+    size = min(picture.shape[0] // 32, picture.shape[1] // 20)  # narrow on a phone held upright
+    draw, font, at = (
+        ImageDraw.Draw(canvas),
+        ImageFont.load_default(max(11, size)),
+        (8, 8),
+    )  # at the top: the viewer draws its axes at the bottom
     left, top, right, bottom = draw.textbbox(at, WORDS, font, anchor="la")
     draw.rectangle((left - 4, top - 4, right + 4, bottom + 4), "#222")
     draw.text(at, WORDS, "white", font, anchor="la")

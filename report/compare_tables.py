@@ -1,0 +1,88 @@
+"""Tables over several scenes: each method in each scene, and published figures beside ours."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+from report import page
+from report.results import BOX_SCORES, Comparison, Run
+
+PUBLISHED = "published.csv"  # file in the folder of the scenes
+COLUMNS = ("method", "metric", "value", "protocol")
+Table = tuple[list[str], list[list[str]]]
+
+
+def scene_table(comparison: Comparison, table: list[dict], metric: str, digits: int) -> Table | None:
+    """Header and rows: a method's score in each scene, then its mean as in `table`; None if there are no scores."""
+    means = {row["method"]: row[metric] for row in table}
+    methods = comparison.distinct_methods
+    if all(means[method] is None for method in methods):
+        return None
+    lines = []
+    for method in methods:
+        runs = [comparison.runs[method, scene] for scene in comparison.scenes]
+        values = [run.metrics.get("mean", {}).get(metric) if run.state == "done" else None for run in runs]
+        lines.append([method, *(page.format_number(value, digits) for value in [*values, means[method]])])
+    return ["method", *comparison.scenes, "mean"], lines
+
+
+def describe_protocol(done: list[Run]) -> list[str]:
+    """Which views of what size were rendered in which scenes, as one phrase; empty if unknown."""
+    scenes_by_size: dict[str, dict[str, None]] = {}
+    for run in done:
+        sizes = ", ".join(run.metrics.get("protocol", {}).get("resolution", ()))
+        if sizes:
+            scenes_by_size.setdefault(f"{run.metrics['rendered']} of {sizes} px", {})[run.scene] = None
+    groups = [f"{what} ({', '.join(scenes)})" for what, scenes in scenes_by_size.items()]
+    return ["; ".join(groups)] if groups else []
+
+
+def load_published(data: Path | None) -> list[dict[str, str]]:
+    """The rows of FOLDER/published.csv; empty if there is no such file.
+
+    Raises:
+        ValueError: it has other columns, a metric that is not compared, or a value that is not a number.
+    """
+    path = data / PUBLISHED if data else None
+    if path is None or not path.is_file():
+        return []
+    with open(path, newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    for number, row in enumerate(rows, 2):
+        if set(row) != set(COLUMNS):
+            raise ValueError(f"{path}: its columns are {', '.join(map(str, row))}; expected {', '.join(COLUMNS)}")
+        if row["metric"] not in BOX_SCORES:
+            raise ValueError(f"{path}: line {number}: metric {row['metric']!r} is none of {', '.join(BOX_SCORES)}")
+        try:
+            float(row["value"])
+        except (TypeError, ValueError):
+            raise ValueError(f"{path}: line {number}: {row['value']!r} is no number") from None
+    return rows
+
+
+def published_table(
+    rows: list[dict[str, str]], table: list[dict], short: dict[str, str], digits: dict[str, int], here: str
+) -> Table:
+    """Header and rows: per metric the published values, then ours with intervals over scenes.
+
+    `short` and `digits` give the name and the decimals of a metric; `here` is our protocol.
+    """
+    lines = []
+    for metric in dict.fromkeys(row["metric"] for row in rows):
+        lines += [
+            [row["method"], "published", short[metric], row["value"], row["protocol"]]
+            for row in rows
+            if row["metric"] == metric
+        ]
+        ours = [row for row in table if row[metric] is not None]
+        lines += [
+            [row["method"], "here", short[metric], format_spread(row, metric, digits[metric]), here] for row in ours
+        ]
+    return ["method", "from", "metric", "mean over scenes", "protocol"], lines
+
+
+def format_spread(row: dict, metric: str, digits: int) -> str:
+    """The mean and, if there are several scenes, half its interval over them."""
+    half = row[f"{metric}_interval"]
+    return page.format_number(row[metric], digits) + ("" if half is None else f" ± {half:.{digits}f}")

@@ -1,0 +1,53 @@
+"""Pictures embedded in a page as data URLs, small enough that a page with a hundred of them can be sent."""
+
+from __future__ import annotations
+
+import base64
+import io
+from html import escape
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from reffusion.io.images import resized
+
+QUALITY = 70  # WebP quality
+BYTES_PER_PIXEL = 0.2  # approximate size of a photograph at that quality
+COLOURS = 64  # palette size of a chart
+
+
+def photo_address(array: np.ndarray, longest: int) -> str:
+    """Data URL of a picture, uint8 [H, W, 3], reduced to at most `longest` px a side."""
+    factor = min(1.0, longest / max(array.shape[:2]))
+    small = resized(array, (max(1, round(array.shape[1] * factor)), max(1, round(array.shape[0] * factor))))
+    return _address(Image.fromarray(small), "webp", quality=QUALITY)
+
+
+def chart_element(path: Path, alt: str) -> str:
+    """Element of a chart's PNG, wide enough to scroll on a phone, so that its text stays readable."""
+    with Image.open(path) as image:
+        reduced = image.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+    source = _address(reduced, "png", optimize=True)
+    return f'<div class="wide"><img class="chart" src="{source}" alt="{escape(alt)}"></div>'
+
+
+def affordable_side(count: int, megabytes: float, least: int, most: int, aspect: float) -> int:
+    """Longer side in px, between `least` and `most`, at which `count` pictures take about `megabytes`."""
+    pixels = megabytes * 1e6 / max(count, 1) / BYTES_PER_PIXEL
+    return round(min(most, max(least, (pixels * max(aspect, 1 / aspect)) ** 0.5)))
+
+
+def picture_grid(cells: list[tuple[str, str]]) -> str:
+    """Pictures in a responsive grid; cells are (address, caption)."""
+    lines = [
+        f'<figure><img src="{address}" alt="{escape(words)}"><figcaption>{escape(words)}</figcaption></figure>'
+        for address, words in cells
+    ]
+    return '<div class="grid">' + "\n".join(lines) + "</div>"
+
+
+def _address(image: Image.Image, kind: str, **options: int | bool) -> str:
+    written = io.BytesIO()
+    image.save(written, kind, **options)
+    return f"data:image/{kind};base64,{base64.b64encode(written.getvalue()).decode()}"

@@ -1,0 +1,179 @@
+"""Picture sections of a job's page: masks, references, extra completed views, depth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from reffusion.io.arrays import load_json
+from reffusion.io.images import load_exr, load_image, load_mask
+from reffusion.io.ply import load_ply
+from reffusion.io.scene import load_scene
+from reffusion.splat import rasterizer
+from reffusion.types import Camera, Gaussians
+from report import before_after, inline_images, page
+from report.check import overlay_masks, view_role
+from report.job_data import Job
+from report.sheet import pick_evenly
+
+MAX_MASK_VIEWS, FIRST_MASK_VIEWS, MASK_SIDE = 60, 12, 240  # most views, views visible at once, longer side in px
+REFERENCE_SIDE, DEPTH_SIDE = 640, 480  # longer side, px
+DEPTH_VIEWS = 4  # number of views
+REMOVED, INVENTED = (255, 210, 0), (0, 230, 230)  # outline colours
+MIN_ALPHA = 0.5  # below this alpha there is no depth
+RESULTS = ("distill", "initialize", "fit")  # stages with Gaussians, latest first
+
+
+def masks_section(job: Job) -> list[str]:
+    """Masks over photographs: input masks tinted, the classes from the stage `masks` outlined."""
+    poses, raw_masks = (job.folders.get(stage, Path()) for stage in ("poses", "raw_masks"))
+    top = page.heading("Masks")
+    if not (poses / "views.json").is_file() or not any((raw_masks / "masks").rglob("*.png")):
+        return [top, page.paragraph("None: no photograph has a mask.")]
+    views = load_json(poses / "views.json")
+    names = pick_evenly(sorted(views["train"]), MAX_MASK_VIEWS)
+    cell = lambda name: (
+        inline_images.photo_address(draw_mask_classes(job, poses, name), MASK_SIDE),
+        f"{name}, {view_role(name, views)}",
+    )
+    first = pick_evenly(names, FIRST_MASK_VIEWS)
+    rest = [name for name in names if name not in first]
+    more = (
+        f"<details><summary>{len(rest)} more</summary>{inline_images.picture_grid(list(map(cell, rest)))}</details>"
+        if rest
+        else ""
+    )
+    words = "Magenta: the input mask. "
+    if "masks" in job.folders:
+        words += "Yellow line: the removed region, consistent over all views. Cyan line: what no photograph shows. "
+    else:
+        words += "Consistent masks come with the stage `masks`. "
+    words += f"{len(names)} of {len(views['train'])} training views."
+    return [top, page.paragraph(words, quiet=True), inline_images.picture_grid(list(map(cell, first))), more]
+
+
+def draw_mask_classes(job: Job, poses: Path, name: str) -> np.ndarray:
+    """uint8 [h, w, 3]: the reduced photograph with its mask tinted and its pixel classes outlined."""
+    small = np.ascontiguousarray(overlay_masks(poses, job.folders.get("raw_masks", Path()), name))
+    for kind, colour in (("consistent", REMOVED), ("invent", INVENTED)):
+        path = job.folders.get("masks", Path()) / kind / f"{name}.png"
+        if "masks" in job.folders and path.is_file():
+            draw_outline(small, load_mask(path), colour)
+    return small
+
+
+def draw_outline(picture: np.ndarray, mask: np.ndarray, colour: tuple[int, int, int]) -> None:
+    """Draw the outline of a mask of any size into a picture, uint8 [H, W, 3], in place."""
+    scale = picture.shape[1] / mask.shape[1]
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    moved = [((contour + 0.5) * scale - 0.5).round().astype(np.int32) for contour in contours]
+    cv2.polylines(picture, moved, True, colour, 1 if picture.shape[1] < 400 else 2)
+
+
+def references_section(job: Job) -> list[str]:
+    """Each reference beside its photograph, the hole outlined, with its origin and fit."""
+    folder, poses = job.folders.get("reference", Path()), job.folders.get("poses", Path())
+    top = page.heading("References")
+    if "reference" not in job.folders:
+        return [top, page.paragraph("None: the stage `reference` has not run, or was left out.")]
+    facts = _facts(folder)
+    parts = [top]
+    for path in sorted((folder / "references").glob("*.png")):
+        name, picture = path.stem, load_image(path)
+        draw_outline(picture, load_mask(folder / "masks" / path.name), INVENTED)
+        cells = [
+            (
+                inline_images.photo_address(picture, REFERENCE_SIDE),
+                f"{name}, the hole outlined: {_origin(facts, folder, name)}",
+            )
+        ]
+        photo = poses / "images" / path.name
+        if photo.is_file():
+            cells.insert(0, (inline_images.photo_address(load_image(photo), REFERENCE_SIDE), f"{name}, photograph"))
+        depth = job.folders.get("initialize", Path()) / "depth" / f"{name}.exr"
+        if "initialize" in job.folders and depth.is_file():
+            cells.append(
+                (
+                    inline_images.photo_address(color_disparity([load_exr(depth)])[0], REFERENCE_SIDE),
+                    "its depth behind the object",
+                )
+            )
+        parts.append(inline_images.picture_grid(cells))
+    return [*parts, *extra_views_section(job)]
+
+
+def _facts(folder: Path) -> dict:
+    return load_json(folder / "facts.json") if (folder / "facts.json").is_file() else {}
+
+
+def _origin(facts: dict, folder: Path, name: str) -> str:
+    """Where a reference comes from and how well it fits."""
+    if name in facts.get("given", ()):
+        return f"given; {facts.get('fits', {}).get(name, 'how well it fits was not recorded')}"
+    path = folder / "candidates.json"
+    record = load_json(path) if path.is_file() else {}
+    if "painter" in record:
+        return f"painted by {record['painter']}"
+    way = "composed of patches of the photographs" if "misfits" in record else "painted by the diffusion model"
+    scores = record.get("misfits") or record.get("seams") or []
+    return f"{way}, the best of {len(scores)} tries" if len(scores) > 1 else way
+
+
+def extra_views_section(job: Job) -> list[str]:
+    """Views that were completed in addition to the references, and why."""
+    folder = job.folders.get("initialize", Path())
+    shares = _facts(folder).get("extra_views", {}) if "initialize" in job.folders else {}
+    if not shares:
+        return []
+    reason = "No reference shows these places, so these views were completed from patches of the photographs."
+    cells = [
+        (
+            inline_images.photo_address(load_image(folder / "extra_views" / f"{view}.png"), DEPTH_SIDE),
+            f"{view}: {share:.1%} of its mask",
+        )
+        for view, share in shares.items()
+    ]
+    return [page.heading("Extra views", 3), page.paragraph(reason), inline_images.picture_grid(cells)]
+
+
+def depth_section(job: Job) -> list[str]:
+    """Depth of a few views before and after, in the same colours."""
+    stages = [s for s in RESULTS if s in job.folders and (job.folders[s] / "gaussians.ply").is_file()]
+    top = page.heading("Depth, before and after")
+    if not stages or "fit" not in stages or "poses" not in job.folders:
+        return [top, page.paragraph("None yet: the stage `fit` has not run.")]
+    scene = load_scene(job.folders["poses"])
+    names = pick_evenly(before_after.rendered_views(job) or list(scene.train), DEPTH_VIEWS)
+    states = {"with the object": "fit"} | ({f"after {stages[0]}": stages[0]} if len(stages) > 1 else {})
+    loaded = {words: load_ply(job.folders[stage] / "gaussians.ply") for words, stage in states.items()}
+    cells = []
+    for name in names:
+        pictures = color_disparity([render_depth(gaussians, scene.cameras[name]) for gaussians in loaded.values()])
+        for words, picture in zip(loaded, pictures, strict=True):
+            cells.append((inline_images.photo_address(picture, DEPTH_SIDE), f"{name}, {words}"))
+    legend = "Bright is near; pairs share a scale; grey is empty."
+    return [top, page.paragraph(legend, quiet=True), inline_images.picture_grid(cells)]
+
+
+def render_depth(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+    """[H, W]: camera z, 0 where alpha is below `MIN_ALPHA`."""
+    rendering = rasterizer.render(gaussians, camera, sh_degree=0)
+    return np.where(rendering.alpha.numpy() > MIN_ALPHA, rendering.depth.numpy(), 0.0)
+
+
+def color_disparity(depths: list[np.ndarray]) -> list[np.ndarray]:
+    """uint8 [H, W, 3] each: disparity in colours, on the scale of the first map."""
+    from matplotlib import colormaps
+
+    near = [np.where(depth > 0, 1 / np.where(depth > 0, depth, 1.0), np.nan) for depth in depths]
+    known = near[0][np.isfinite(near[0])]
+    low, high = np.percentile(known, (1, 99)) if len(known) else (0.0, 1.0)
+    made = []
+    for disparity in near:
+        level = np.clip((disparity - low) / max(high - low, 1e-9), 0, 1)
+        picture = (colormaps["inferno"](np.nan_to_num(level))[..., :3] * 255).round().astype(np.uint8)
+        picture[~np.isfinite(disparity)] = 128
+        made.append(picture)
+    return made
