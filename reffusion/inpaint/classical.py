@@ -58,14 +58,14 @@ def lama(module: torch.nn.Module, image: np.ndarray, hole: np.ndarray, device: s
     """
     height, width = hole.shape
     beyond = (0, -width % MULTIPLE, 0, -height % MULTIPLE)
-    shown = torch.from_numpy(blanked(image, hole)).to(device).permute(2, 0, 1)[None] / 255
+    shown = torch.from_numpy(blank_hole(image, hole)).to(device).permute(2, 0, 1)[None] / 255
     mask = torch.from_numpy(hole).to(device, torch.float32)[None, None]
     shown, mask = (F.pad(tensor, beyond, mode="replicate") for tensor in (shown, mask))
     answer = module(shown, mask)
     if answer.shape != shown.shape or not torch.isfinite(answer).all():
         raise ValueError(f"LaMa: the module's answer to {list(shown.shape)} is {list(answer.shape)}, or not finite")
     picture = (answer[0, :, :height, :width].clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy()
-    return inside(image, picture, hole)
+    return paste_hole(image, picture, hole)
 
 
 def fsr(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
@@ -76,19 +76,19 @@ def fsr(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
     size = tuple(max(1, round(side * factor)) for side in hole.shape[::-1])
     # Weights keep the blank inside of the hole from darkening the pixels around it.
     weight = cv2.resize((~hole).astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    small = cv2.resize(blanked(image, hole).astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(blank_hole(image, hole).astype(np.float32), size, interpolation=cv2.INTER_AREA)
     small = np.round(small / np.maximum(weight, 1e-3)[..., None]).clip(0, 255).astype(np.uint8)
     known = np.where(weight < 1 - 1e-4, 0, 255).astype(np.uint8)
     small[known == 0] = 0
     painted = np.zeros_like(small)
     cv2.xphoto.inpaint(small, known, painted, cv2.xphoto.INPAINT_FSR_FAST)
-    return inside(image, cv2.resize(painted, hole.shape[::-1], interpolation=cv2.INTER_CUBIC), hole)
+    return paste_hole(image, cv2.resize(painted, hole.shape[::-1], interpolation=cv2.INTER_CUBIC), hole)
 
 
 def telea(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
     """OpenCV's fast marching (Telea, 2004)."""
-    painted = cv2.inpaint(blanked(image, hole), hole.astype(np.uint8), TELEA_RADIUS, cv2.INPAINT_TELEA)
-    return inside(image, painted, hole)
+    painted = cv2.inpaint(blank_hole(image, hole), hole.astype(np.uint8), TELEA_RADIUS, cv2.INPAINT_TELEA)
+    return paste_hole(image, painted, hole)
 
 
 _TELEA = Painter(f"OpenCV Telea, radius {TELEA_RADIUS} px", telea)
@@ -103,11 +103,11 @@ def _fsr_works() -> bool:
         return False
 
 
-def blanked(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
+def blank_hole(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
     """The picture with zeros in the hole."""
     return np.where(hole[..., None], np.uint8(0), image)
 
 
-def inside(image: np.ndarray, painted: np.ndarray, hole: np.ndarray) -> np.ndarray:
+def paste_hole(image: np.ndarray, painted: np.ndarray, hole: np.ndarray) -> np.ndarray:
     """What was painted in the hole, the picture elsewhere."""
     return np.where(hole[..., None], painted, image)

@@ -56,7 +56,7 @@ def painted(network: Network, image: np.ndarray, hole: np.ndarray) -> np.ndarray
     answer = scaled(network.paint(scaled(shown, size), scaled_hole(mask, size)), whole)
     result = image.copy()
     result[place] = answer[:height, :width]
-    return classical.inside(image, result, hole)
+    return classical.paste_hole(image, result, hole)
 
 
 def around(hole: np.ndarray, side: int) -> tuple[slice, slice]:
