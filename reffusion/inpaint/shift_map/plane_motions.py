@@ -96,11 +96,16 @@ class PlanePhoto:
 
 @dataclass(frozen=True)
 class Motion:
-    """A photograph (index) and a motion of it along the plane: one of the symmetry's, and a small shift [2] after it
-    that refines it, in the plane's unit."""
+    """A motion of a photograph along the plane.
+
+    Attributes:
+        photo: index of the photograph.
+        base: one of the symmetry's motions, [2] or [1].
+        shift: [2], a small shift after it that refines it, in the plane's unit.
+    """
 
     photo: int
-    symmetry: np.ndarray
+    base: np.ndarray
     shift: np.ndarray
 
 
@@ -110,7 +115,7 @@ class PlaneMotions:
 
     Attributes:
         target: the view with the hole.
-        photos: the photographs, the view's own first.
+        photos: the photographs; from all but the first pixels cost more.
         symmetry: how the plane repeats itself.
         motions: one for each candidate.
     """
@@ -127,9 +132,7 @@ class PlaneMotions:
         return len(self.motions)
 
     def sample(self, k: int, pixels: HolePixels) -> Samples:
-        return self.sample_motion(self.motions[k], pixels)
-
-    def sample_motion(self, motion: Motion, pixels: HolePixels) -> Samples:
+        motion = self.motions[k]
         at, photo = self._source_pixels(motion, pixels), self.photos[motion.photo]
         return Samples(_sample(photo.colors, at), _sample(photo.detail, at), _is_set(photo.readable, at))
 
@@ -154,13 +157,10 @@ class PlaneMotions:
         valid = _is_set(self.photos[motion.photo].readable, at) & (low > MIN_SCALE) & (high < MAX_SCALE)
         return np.where(valid, cost, INVALID_COST)
 
-    def coordinates(self, pixels: HolePixels) -> np.ndarray:
-        """[N, 2], of the pixels on the plane."""
-        return self.target.plane_xy[pixels.rows, pixels.columns].astype(np.float64)
-
     def _moved(self, motion: Motion, pixels: HolePixels) -> np.ndarray:
         """[N, 2], coordinates on the plane from which the motion takes the pixels."""
-        return self.symmetry.move(self.coordinates(pixels), motion.symmetry) + motion.shift
+        coordinates = self.target.plane_xy[pixels.rows, pixels.columns].astype(np.float64)
+        return self.symmetry.move(coordinates, motion.base) + motion.shift
 
     def _source_pixels(self, motion: Motion, pixels: HolePixels) -> np.ndarray:
         """[N, 2] float32, pixels (x, y) of the photograph from which the motion takes the pixels."""
@@ -173,7 +173,7 @@ class PlaneMotions:
         moved, homography = self._moved(motion, pixels), self.photos[motion.photo].homography
         weight = moved @ homography[2, :2] + homography[2, 2]
         jacobian = (homography[None, :2, :2] - at[:, :, None] * homography[2, :2]) / weight[:, None, None]
-        change = jacobian @ self.symmetry.rotation(motion.symmetry) @ self.target.to_plane[pixels.rows, pixels.columns]
+        change = jacobian @ self.symmetry.rotation(motion.base) @ self.target.to_plane[pixels.rows, pixels.columns]
         area, square = np.abs(np.linalg.det(change)), (change**2).sum((1, 2))
         high = np.sqrt((square + np.sqrt(np.maximum(square**2 - 4 * area**2, 0))) / 2)
         return area / np.maximum(high, 1e-12), high
@@ -210,9 +210,9 @@ def _refine_motion(ring: HolePixels, motion: Motion, candidates: PlaneMotions) -
     for step in REFINE_STEPS:
         size = step * symmetry.resolution
         for _ in range(2):
-            tried = [Motion(motion.photo, motion.symmetry, motion.shift + size * np.array(to)) for to in SIDES]
+            tried = [Motion(motion.photo, motion.base, motion.shift + size * np.array(to)) for to in SIDES]
             if symmetry.centre is not None:
-                turned = [motion.symmetry + turn * size / radius for turn in (-1, 1)]
+                turned = [motion.base + turn * size / radius for turn in (-1, 1)]
                 tried += [Motion(motion.photo, each, motion.shift) for each in turned]
             misfits = [misfit(each) for each in tried]
             if min(misfits) < least:
