@@ -74,7 +74,7 @@ def inpaint_reference(params: Params, out: Path, space: Workspace) -> Reference:
     if kind in PAINTERS:
         source = "" if params.inpainter == painters.AUTO else params.prior
         painter = feedforward.load(kind, source, params.device)
-        image = painter.paint(base, exemplar.to_paint(masks.consistent, masks.invent))
+        image = painter.paint(base, exemplar.mask_to_paint(masks.consistent, masks.invent))
         save_candidates(out, [image], {"view": name, "painter": painter.name, "chosen": 0})
         return Reference(camera, image, masks.invent)
     return Reference(camera, inpaint_by_prior(params, out, base, name, masks), masks.invent)
@@ -83,9 +83,9 @@ def inpaint_reference(params: Params, out: Path, space: Workspace) -> Reference:
 def inpaint_by_patches(params: Params, out: Path, base: np.ndarray, name: str, space: Workspace) -> np.ndarray:
     """uint8 [H, W, 3]: the view with I put together from patches of the photographs."""
     camera, masks = space.scene.cameras[name], space.mask_sets[name]
-    hole = exemplar.to_paint(masks.consistent, masks.invent)
+    hole = exemplar.mask_to_paint(masks.consistent, masks.invent)
     seeds = [params.seed + index for index in range(params.candidates)]
-    found = exemplar.completions(base, hole, camera, masks.consistent, space.background, seeds)
+    found = exemplar.complete_view(base, hole, camera, masks.consistent, space.background, seeds)
     misfits = [each.misfit for each in found]
     chosen = int(np.argmin(misfits)) if params.choose is None else params.choose
     save_candidates(out, [each.image for each in found], {"view": name, "misfits": misfits, "chosen": chosen})

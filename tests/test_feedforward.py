@@ -110,7 +110,7 @@ def test_only_the_hole_changes_and_its_content_does_not_count(tmp_path, kind, si
     image, inner = picture(), hole()
     painted = painter.paint(image, inner)
     assert painted.dtype == np.uint8 and (painted[~inner] == image[~inner]).all()
-    place = feedforward.around(inner, side) if side else (slice(None), slice(None))
+    place = feedforward.crop_around(inner, side) if side else (slice(None), slice(None))
     known = image[place][~inner[place]].mean(0)
     middle = cv2.erode(inner.astype(np.uint8), np.ones((9, 9))) > 0  # of scaled answers the border mixes
     assert np.abs(painted[middle if side else inner] - known).max() < (1.01 if not side else 4)
@@ -134,21 +134,21 @@ def seen_by(side, inner):
         shown.append((image, mask))
         return image
 
-    feedforward.painted(Network(side, paint), np.full((*inner.shape, 3), 77, np.uint8), inner)
+    feedforward.run_network(Network(side, paint), np.full((*inner.shape, 3), 77, np.uint8), inner)
     return shown[0]
 
 
 def test_a_fixed_size_sees_a_square_around_the_hole_with_as_much_again():
     inner = np.zeros((300, 400), bool)
     inner[100:140, 200:260] = True
-    assert feedforward.around(inner, 64) == (slice(60, 180), slice(170, 290))  # twice the hole
-    assert feedforward.around(inner, 200) == (slice(20, 220), slice(130, 330))  # as large as the model
-    assert feedforward.around(inner, 512) == (slice(0, 300), slice(80, 380))  # as the picture has it
+    assert feedforward.crop_around(inner, 64) == (slice(60, 180), slice(170, 290))  # twice the hole
+    assert feedforward.crop_around(inner, 200) == (slice(20, 220), slice(130, 330))  # as large as the model
+    assert feedforward.crop_around(inner, 512) == (slice(0, 300), slice(80, 380))  # as the picture has it
     inner[:] = False
     inner[290:, :20] = True
-    assert feedforward.around(inner, 64) == (slice(236, 300), slice(0, 64)), "at the picture's border"
+    assert feedforward.crop_around(inner, 64) == (slice(236, 300), slice(0, 64)), "at the picture's border"
     inner[10, :] = True
-    assert feedforward.around(inner, 64) == (slice(0, 300), slice(0, 400)), "longer than the picture is high"
+    assert feedforward.crop_around(inner, 64) == (slice(0, 300), slice(0, 400)), "longer than the picture is high"
     for side in (64, 512):
         image, mask = seen_by(side, inner)
         assert image.shape == (side, side, 3) and mask.shape == (side, side) and (abs(image.astype(int) - 77) < 5).all()
@@ -298,7 +298,7 @@ def test_the_stage_paints_the_hole_in_one_pass(wall, tmp_path, kind):  # noqa: F
     reference.run(Params(inpainter=kind, prior=str(file)), out, **wall)
     (found,) = load_references(out, load_scene(wall["poses"]))
     pixels = load_mask_sets(wall["masks"], ["a2"])["a2"]
-    inner = exemplar.to_paint(pixels.consistent, pixels.invent)
+    inner = exemplar.mask_to_paint(pixels.consistent, pixels.invent)
     assert found.camera.name == "a2" and np.array_equal(found.mask, pixels.invent)
     assert np.ptp(found.image[inner].astype(int), axis=0).max() <= 1, "the stand-in's mean"
     outside = ~inner & ~pixels.consistent

@@ -41,7 +41,7 @@ def hole():
 def painters(folder):
     torch.jit.script(Mean()).save(folder / "any-name.pt")
     return [
-        classical.load(folder / "any-name.pt"),
+        classical.load_lama(folder / "any-name.pt"),
         classical.load_classical(),
         classical.Painter("telea", classical.telea),
     ]
@@ -89,10 +89,10 @@ def test_weights_that_are_none_are_refused(tmp_path):
     file = tmp_path / "a.pt"
     file.write_text("no module")
     with pytest.raises(ValueError, match=r"a.pt is no TorchScript module"):
-        classical.load(file)
+        classical.load_lama(file)
     torch.jit.script(Broken()).save(file)
     with pytest.raises(ValueError, match="the module's answer"):
-        classical.load(file).paint(picture(), hole())
+        classical.load_lama(file).paint(picture(), hole())
 
 
 def test_the_stand_in_for_lpips_is_named_as_such_and_measures_structure(tmp_path, monkeypatch):

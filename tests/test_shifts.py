@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from reffusion import geometry
-from reffusion.inpaint.normals import slopes
-from reffusion.inpaint.shift_map.offsets import frequent
-from reffusion.inpaint.shift_map.photo_shifts import shifted
-from reffusion.inpaint.source_image import alone
+from reffusion.inpaint.normals import mean_normals
+from reffusion.inpaint.shift_map.photo_offsets import fill_from_photo, frequent_offsets
+from reffusion.inpaint.source_image import without_geometry
 from reffusion.types import Camera
 
 HEIGHT, WIDTH = 120, 200
@@ -34,8 +33,8 @@ def hole() -> np.ndarray:
 
 
 def marked(image: np.ndarray, seed: int = 0, **fields) -> tuple[np.ndarray, np.ndarray]:
-    shown = replace(alone(image, hole()), **fields)  # type: ignore[arg-type]
-    found = shifted(shown, hole(), shown, seed=seed)
+    shown = replace(without_geometry(image, hole()), **fields)  # type: ignore[arg-type]
+    found = fill_from_photo(shown, hole(), shown, seed=seed)
     return found.image, found.filled
 
 
@@ -79,17 +78,19 @@ def test_what_lies_otherwise_or_stands_before_the_rest_is_not_taken():
 def test_nothing_is_said_where_there_is_nothing_to_take():
     image = lawn()
     nowhere = np.zeros((HEIGHT, WIDTH), bool)
-    none = shifted(alone(image, nowhere), nowhere, alone(image, nowhere))
+    none = fill_from_photo(without_geometry(image, nowhere), nowhere, without_geometry(image, nowhere))
     assert not none.filled.any() and (none.image == image).all()
     assert not marked(image, usable=nowhere)[1].any()
     everywhere = ~nowhere
-    assert not shifted(alone(image, everywhere), everywhere, alone(image, everywhere)).filled.any()
+    assert not fill_from_photo(
+        without_geometry(image, everywhere), everywhere, without_geometry(image, everywhere)
+    ).filled.any()
 
 
 def test_stripes_repeat_by_their_period():
     stripes = np.broadcast_to((np.arange(WIDTH) % 20 < 7)[None, :, None] * 100.0, (HEIGHT, WIDTH, 3))
     stripes = stripes + np.random.default_rng(0).normal(0, 1, stripes.shape)
-    found = frequent(stripes, np.ones((HEIGHT, WIDTH), bool), np.zeros((HEIGHT, WIDTH)), 64, seed=0)
+    found = frequent_offsets(stripes, np.ones((HEIGHT, WIDTH), bool), np.zeros((HEIGHT, WIDTH)), 64, seed=0)
     beside = np.abs(found[:20, 1] - 20 * np.round(found[:20, 1] / 20))
     assert beside.max() <= 1
 
@@ -102,13 +103,13 @@ def test_slopes_are_those_of_the_ground_and_short_among_leaves():
     rays = geometry.pixel_rays(view) @ pose[:3, :3]
     depth = np.where(rays[..., 2] < -0.05, 1.0 / np.maximum(-rays[..., 2], 0.05), 0.0)
     known = (depth > 0) & (depth < 3)
-    found = slopes(depth, known, view)
+    found = mean_normals(depth, known, view)
     middle = found[HEIGHT // 2 : -20, 40:-40].reshape(-1, 3)
     assert np.abs(middle - (0, 0, 1)).max() < 0.02
     rough = 1 + 2 * cv2.GaussianBlur(np.random.default_rng(0).normal(0, 1, depth.shape), (0, 0), 3)
-    leaves = slopes(depth * rough, known, view)[HEIGHT // 2 : -20, 40:-40]
+    leaves = mean_normals(depth * rough, known, view)[HEIGHT // 2 : -20, 40:-40]
     assert np.linalg.norm(leaves, axis=-1).mean() < 0.8
-    assert (slopes(depth, np.zeros_like(known), view) == 0).all()
+    assert (mean_normals(depth, np.zeros_like(known), view) == 0).all()
 
 
 def test_where_all_lies_otherwise_patches_are_left_to_do_it():
@@ -123,5 +124,5 @@ def test_a_plane_seen_edge_on_stops_nothing():
     surface, flat = np.ones((HEIGHT, WIDTH), np.int64), np.broadcast_to(np.eye(2), (HEIGHT, WIDTH, 2, 2)).copy()
     flat[:, :60], flat[:20] = 0.0, np.inf
     image = np.where(hole()[..., None], np.uint8((255, 0, 0)), lawn())
-    painted, filled = marked(image, surface=surface, to_plane=flat)
+    painted, filled = marked(image, plane=surface, to_plane=flat)
     assert filled[hole()].all() and energy(painted) > 0.8 * energy(lawn())

@@ -9,19 +9,18 @@ import pytest
 
 from reffusion import geometry
 from reffusion.background.mirrors import render_mirrors
-from reffusion.background.model import Background
 from reffusion.background.plane import CELLS, Plane
 from reffusion.background.visibility import DepthView, depth_range
 from reffusion.inpaint import exemplar, plane_frames
 from reffusion.inpaint.classical import telea
 from reffusion.inpaint.patchmatch import completion, search
 from reffusion.inpaint.patchmatch.completion import complete
-from reffusion.inpaint.patchmatch.matches import NONE, PATCH, Compared
-from reffusion.inpaint.poisson import blended
+from reffusion.inpaint.patchmatch.matches import NO_MATCH, PATCH_RADIUS, Level
+from reffusion.inpaint.poisson import blend
 from reffusion.inpaint.shift_map import plane_symmetry
-from reffusion.inpaint.shift_map.plane_montage import montage
-from reffusion.inpaint.shift_map.plane_symmetry import FEWEST, Seen, repeats
-from reffusion.inpaint.source_image import alone
+from reffusion.inpaint.shift_map.plane_motions import fill_plane
+from reffusion.inpaint.shift_map.plane_symmetry import MIN_CELLS, PlanePixels, find_symmetry
+from reffusion.inpaint.source_image import without_geometry
 from reffusion.types import Camera
 
 SIDE = 128
@@ -29,7 +28,7 @@ RED = (255, 0, 0)
 
 
 def alone_completed(image, mask, seed=0):
-    return complete(alone(image, mask), mask, [alone(image, mask)], seed=seed).image
+    return complete(without_geometry(image, mask), mask, [without_geometry(image, mask)], seed=seed).image
 
 
 def board():
@@ -83,7 +82,7 @@ def test_sources_may_have_other_sizes(shape):
     image, nothing = np.full((96, 128, 3), 128, np.uint8), np.zeros(shape, bool)
     beside = np.abs(np.arange(128) - 64) > 30
     image[:, beside] = np.where(np.arange(128) % 6 < 3, 40, 210)[None, beside, None]
-    painted = complete(alone(image, middle()), middle(), [alone(source, nothing)]).image
+    painted = complete(without_geometry(image, middle()), middle(), [without_geometry(source, nothing)]).image
     assert painted[middle()].std() > 50, "striped as the only source is"
 
 
@@ -91,8 +90,10 @@ def test_masked_pixels_of_a_source_never_show():
     image, mask, red = board(), middle(), np.zeros((96, 128), bool)
     red[::12, ::9] = True
     other = np.where(red[..., None], np.uint8(RED), board())
-    source = replace(alone(other, red), usable=np.ones_like(red))
-    painted = complete(alone(image, mask), mask, [source, alone(image, mask)]).image[mask].astype(int)
+    source = replace(without_geometry(other, red), usable=np.ones_like(red))
+    painted = (
+        complete(without_geometry(image, mask), mask, [source, without_geometry(image, mask)]).image[mask].astype(int)
+    )
     assert (painted[:, 0] - painted[:, 1]).max() < 30
 
 
@@ -131,20 +132,20 @@ def hidden() -> np.ndarray:
     return (rows - 70) ** 2 + (columns - 62) ** 2 < 24**2
 
 
-def floor() -> Background:
+def floor() -> exemplar.Around:
     views = []
     for view in CAMERAS:
         depth = FLOOR.depth(view)
         depth = np.where(np.isfinite(depth) & (depth < 5), depth, 0).astype(np.float32)
-        views.append(DepthView.from_range(view, depth, depth_range(depth), hidden()))
-    return Background(views, {view.name: planks(view) for view in CAMERAS}, planes=[FLOOR], radius=1.0)
+        views.append(DepthView.of(view, depth, depth_range(depth), hidden()))
+    return exemplar.Around(views, [FLOOR], {view.name: planks(view) for view in CAMERAS}, np.zeros(3), 1.0)
 
 
 def test_planks_run_on_in_their_own_perspective():
     image = np.where(hidden()[..., None], np.uint8(RED), planks(CAMERAS[0]))
 
     def off(around):
-        found = exemplar.completions(image, hidden(), CAMERAS[0], hidden(), around, range(3))
+        found = exemplar.complete_view(image, hidden(), CAMERAS[0], hidden(), around, range(3))
         return np.mean([np.abs(each.image.astype(int) - planks(CAMERAS[0]))[hidden()].mean() for each in found])
 
     plain = np.abs(telea(image, hidden()).astype(int) - planks(CAMERAS[0]))[hidden()].mean()
@@ -152,15 +153,15 @@ def test_planks_run_on_in_their_own_perspective():
     assert carried < 0.9 * shifted and carried < 0.6 * plain
 
 
-def seen_plane(picture: np.ndarray, view: Camera) -> Seen:
+def seen_plane(picture: np.ndarray, view: Camera) -> PlanePixels:
     """The floor within 1.2 of its middle, as a picture shows it."""
-    places = plane_frames.places_of(np.ones((SIDE, SIDE), np.int64), view, [FLOOR])
+    places = plane_frames.plane_coordinates(np.ones((SIDE, SIDE), np.int64), view, [FLOOR])
     rows, columns = np.nonzero((np.linalg.norm(places, axis=-1) < 1.2) & np.isfinite(FLOOR.depth(view)))
-    return Seen(np.stack([columns, rows], 1), places[rows, columns], picture)
+    return PlanePixels(np.stack([columns, rows], 1), places[rows, columns], picture)
 
 
 def test_a_floor_of_planks_repeats_itself_by_their_width():
-    found = repeats(seen_plane(planks(CAMERAS[0]), CAMERAS[0]))
+    found = find_symmetry(seen_plane(planks(CAMERAS[0]), CAMERAS[0]))
     across = (found.motions @ (1.0, 0.3)) / 0.12  # planks' widths that each shift goes across them
     assert found.centre is None and len(found.motions) > 5 and np.abs(across - across.round()).max() < 0.25
     assert np.abs(across).max() > 2
@@ -176,33 +177,33 @@ def tabletop(view: Camera) -> np.ndarray:
 
 
 def test_planks_that_meet_in_a_point_are_turned_about_it():
-    found = repeats(seen_plane(tabletop(CAMERAS[0]), CAMERAS[0]))
+    found = find_symmetry(seen_plane(tabletop(CAMERAS[0]), CAMERAS[0]))
     turns = found.motions[:, 0] / (np.pi / 10)
     assert np.linalg.norm(found.centre - (0.1, 0.4)) < 0.03
     assert np.abs(turns - turns.round()).max() < 0.15 and np.abs(turns).min() > 0.5 and np.abs(turns).max() > 4
     places = np.random.default_rng(0).normal(size=(50, 2))
-    moved, step = found.moved(places, found.motions[0]), 1e-4 * np.array([0.6, 0.8])
-    assert np.allclose(found.moved(moved, -found.motions[0]), places), "a turn and its opposite"
-    slope = (found.moved(places + step, found.motions[0]) - moved) @ found.turn(found.motions[0])
-    assert np.allclose(slope, step, atol=1e-9), "turn() is the derivative of moved()"
+    moved, step = found.move(places, found.motions[0]), 1e-4 * np.array([0.6, 0.8])
+    assert np.allclose(found.move(moved, -found.motions[0]), places), "a turn and its opposite"
+    slope = (found.move(places + step, found.motions[0]) - moved) @ found.rotation(found.motions[0])
+    assert np.allclose(slope, step, atol=1e-9), "rotation() is the derivative of move()"
 
 
 def test_the_centre_is_found_from_afar_though_a_part_of_the_top_is_seen():
     whole = seen_plane(tabletop(CAMERAS[0]), CAMERAS[0])
-    right = whole.places[:, 0] > -0.1
-    seen, cell = Seen(whole.pixels[right], whole.places[right], whole.image), 2.4 / plane_symmetry.SIDE
+    right = whole.coordinates[:, 0] > -0.1
+    seen, cell = PlanePixels(whole.pixels[right], whole.coordinates[right], whole.image), 2.4 / plane_symmetry.SIDE
     for away in ((6, -5), (-4, 6)):
-        centre, flat = plane_symmetry._put_right(seen, np.array([0.1, 0.4]) + cell * np.array(away), cell)
+        centre, flat = plane_symmetry._refine_centre(seen, np.array([0.1, 0.4]) + cell * np.array(away), cell)
         assert flat is not None and np.linalg.norm(centre - (0.1, 0.4)) < 2 * cell, away
 
 
 def test_what_does_not_repeat_itself_is_not_said_to():
     noise = np.random.default_rng(0).integers(0, 256, (SIDE, SIDE, 3), np.uint8)
     some = seen_plane(noise, CAMERAS[0])
-    assert repeats(some) is None
+    assert find_symmetry(some) is None
     smooth = np.repeat(np.linspace(0, 255, SIDE)[None, :, None], SIDE, 0).repeat(3, 2).astype(np.uint8)
-    assert repeats(seen_plane(smooth, CAMERAS[0])) is None
-    assert repeats(Seen(some.pixels[:FEWEST], some.places[:FEWEST], some.image)) is None
+    assert find_symmetry(seen_plane(smooth, CAMERAS[0])) is None
+    assert find_symmetry(PlanePixels(some.pixels[:MIN_CELLS], some.coordinates[:MIN_CELLS], some.image)) is None
 
 
 @pytest.mark.parametrize("shown", [planks, tabletop])
@@ -210,10 +211,11 @@ def test_joints_and_round_borders_go_on_where_a_floor_repeats_itself(shown):
     around = replace(floor(), photos={view.name: shown(view) for view in CAMERAS})
     truth = shown(CAMERAS[0]).astype(int)
     image = np.where(hidden()[..., None], np.uint8(RED), shown(CAMERAS[0]))
-    target, sources, smooth, how = exemplar._told(
+    target, sources, smooth, how = exemplar._find_surfaces(
         image, hidden(), CAMERAS[0], hidden(), around, render_mirrors([], CAMERAS[0], hidden(), [])
     )
-    picture, filled = montage(target, hidden(), sources, 1, how[1])
+    found = fill_plane(target, hidden(), sources, 1, how[1])
+    picture, filled = found.image, found.filled
     assert filled[hidden()].mean() > 0.9 and not filled[~hidden()].any() and (picture[~filled] == image[~filled]).all()
     dark = lambda done: done.mean(-1)[filled] < 90  # joints; and what is bright is the plate
     kind = lambda done: dark(done).astype(int) + 2 * (done.mean(-1)[filled] > 195)
@@ -224,25 +226,23 @@ def test_joints_and_round_borders_go_on_where_a_floor_repeats_itself(shown):
 
 def test_a_hole_without_anything_to_move_into_it_is_left():
     image = np.where(hidden()[..., None], np.uint8(RED), planks(CAMERAS[0]))
-    target, sources, _, how = exemplar._told(
+    target, sources, _, how = exemplar._find_surfaces(
         image, hidden(), CAMERAS[0], hidden(), floor(), render_mirrors([], CAMERAS[0], hidden(), [])
     )
-    picture, filled = montage(
-        target, hidden(), [replace(s, usable=np.zeros_like(hidden())) for s in sources], 1, how[1]
-    )
-    assert not filled.any() and picture is image
+    found = fill_plane(target, hidden(), [replace(s, usable=np.zeros_like(hidden())) for s in sources], 1, how[1])
+    assert not found.filled.any() and found.image is image
 
 
 def test_frames_are_the_derivative_of_a_planes_coordinates():
     view, h = CAMERAS[1], 1e-4
-    frames = plane_frames.frames_of(np.ones((SIDE, SIDE), np.int64), view, [FLOOR])
+    frames = plane_frames.plane_jacobians(np.ones((SIDE, SIDE), np.int64), view, [FLOOR])
     for row, column in ((80, 30), (100, 90)):
         for axis, (dx, dy) in enumerate(((h, 0), (0, h))):
             coordinates = []
             for sign in (-1, 1):
                 moved = replace(view, cx=view.cx - sign * dx, cy=view.cy - sign * dy)
                 point = geometry.unproject(FLOOR.depth(moved), moved)[row, column]
-                coordinates.append(FLOOR.axes @ (point - FLOOR.origin))
+                coordinates.append(FLOOR.along @ (point - FLOOR.origin))
             numeric = (coordinates[1] - coordinates[0]) / (2 * h)
             assert np.allclose(frames[row, column, :, axis], numeric, rtol=1e-6, atol=1e-9)
 
@@ -259,23 +259,27 @@ def test_a_floor_is_smooth_and_grass_is_not():
 def test_the_misfit_is_the_mean_square_by_weight():
     """Against NumPy, in float64, for a patch that is turned and carried along the floor."""
     around = floor()
-    own, other = (exemplar._source(view, around.photos[view.camera.name], around) for view in around.views[:2])
-    seen = [(completion._values(each.image, each.masked), each.masked) for each in (own, other)]
-    marked = [completion._marked(values, each, [1], 1) for (values, _), each in zip(seen, (own, other), strict=True)]
-    pictures = completion._pictures(marked, [masked for _, masked in seen], [own, other], 1)
+    own, other = (exemplar._source_image(view, around.photos[view.camera.name], around) for view in around.views[:2])
+    seen = [(completion._color_features(each.image, each.masked), each.masked) for each in (own, other)]
+    marked = [
+        completion._with_geometry(values, each, [1], 1) for (values, _), each in zip(seen, (own, other), strict=True)
+    ]
+    pictures = completion._stack_sources(marked, [masked for _, masked in seen], [own, other], 1)
     mask = np.zeros((SIDE, SIDE), bool)
     mask[70, 62] = True
-    target = replace(own, surface=np.ones((SIDE, SIDE), np.int64))
-    target = replace(target, to_plane=plane_frames.frames_of(target.surface, CAMERAS[0], [FLOOR]))
-    pixels = completion._pixels(target, mask, 1, [1], pictures)
+    target = replace(own, plane=np.ones((SIDE, SIDE), np.int64))
+    target = replace(target, to_plane=plane_frames.plane_jacobians(target.plane, CAMERAS[0], [FLOOR]))
+    pixels = completion._gather_hole(target, mask, 1, [1], pictures)
     now, weight = marked[0], np.random.default_rng(0).random((SIDE, SIDE)).astype(np.float32)
     row, column, angle = 100.0, 40.0, 0.2
-    of = Compared(pixels, pictures, now, weight)
-    found = search.misfit(0, True, 1, row, column, np.float32(angle), NONE, of)
-    assert search.misfit(0, False, 1, row, column, np.float32(0), NONE, of) == NONE, "along a plane nothing is shifted"
+    of = Level(pixels, pictures, now, weight)
+    found = search.misfit(0, True, 1, row, column, np.float32(angle), NO_MATCH, of)
+    assert search.misfit(0, False, 1, row, column, np.float32(0), NO_MATCH, of) == NO_MATCH, (
+        "along a plane nothing is shifted"
+    )
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     matrix = pictures.to_pixels[1, 100, 40].reshape(2, 2) @ turn @ target.to_plane[70, 62]
-    steps = np.arange(-PATCH, PATCH + 1)
+    steps = np.arange(-PATCH_RADIUS, PATCH_RADIUS + 1)
     total = mass = 0.0
     for dy in steps:
         for dx in steps:
@@ -296,8 +300,8 @@ def test_a_pictures_own_steps_give_it_back():
     picture = rng.normal(size=(96, 128, 3))
     right, below = np.zeros_like(picture), np.zeros_like(picture)
     right[:, :-1], below[:-1] = np.diff(picture, axis=1), np.diff(picture, axis=0)
-    assert np.allclose(blended(picture, hole, right, below, picture), picture[hole], atol=1e-9)
-    shifted = blended(picture, hole, right, below, picture + 5)
+    assert np.allclose(blend(picture, hole, right, below, picture), picture[hole], atol=1e-9)
+    shifted = blend(picture, hole, right, below, picture + 5)
     offset = np.zeros(hole.shape)
     offset[hole] = (shifted - picture[hole])[:, 0]
     assert offset[31, 46] < 1 < offset[45, 64], "a cast of the patches fades towards the hole's border"
@@ -307,7 +311,7 @@ def test_what_is_painted_reaches_over_the_rim_and_narrow_rests():
     mask, unknown = np.zeros((100, 200), bool), np.zeros((100, 200), bool)
     mask[20:80, 40:160] = True
     unknown[20:80, 40:80] = unknown[20:80, 84:100] = True  # a rest of 4 px is left between, and 60 px beside
-    hole = exemplar.to_paint(mask, unknown)
+    hole = exemplar.mask_to_paint(mask, unknown)
     assert hole[50, 82] and hole[50, 39] and not hole[50, 120] and not hole[50, 37] and not hole[10].any()
 
 
@@ -317,8 +321,8 @@ def test_a_nearer_surface_ends_at_the_prolongation_of_its_border():
     depth[60:] = 1.0
     hidden = np.zeros((120, 160), bool)
     hidden[30:90, 60:100] = True
-    found, layer = exemplar._drawn(depth, ~hidden, hidden)
+    found, layer = exemplar._interpolate_depth(depth, ~hidden, hidden)
     assert np.allclose(found[30:60, 60:100], 4, rtol=0.01) and np.allclose(found[61:90, 60:100], 1, rtol=0.01)
     assert (layer[61:90, 60:100] == 1).all() and (layer[30:60, 60:100] == 0).all() and layer[0, 0] == -1
-    alone, layer = exemplar._drawn(np.full((120, 160), 2.0), ~hidden, hidden)
+    alone, layer = exemplar._interpolate_depth(np.full((120, 160), 2.0), ~hidden, hidden)
     assert np.allclose(alone, 2, rtol=0.01) and layer.max() == 0

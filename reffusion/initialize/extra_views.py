@@ -73,10 +73,10 @@ def _complete_view(draft: Draft, camera, hole: np.ndarray, sources: Background, 
     mask = sources.masks[camera.name]
     # Just outside C a photograph may still show the object's rim, which would be repeated.
     photo = sources.photos[camera.name]
-    base = inpaint.background(draft.gaussians, camera, photo, morphology.dilate(mask, exemplar.RIM))
-    region = exemplar.with_rim(hole, mask)
+    base = inpaint.background(draft.gaussians, camera, photo, morphology.dilate(mask, exemplar.RIM_WIDTH))
+    region = exemplar.add_rim(hole, mask)
     if painter is not None:
         return painter.paint(base, region)
     if coverage.is_narrow(hole):  # a gap has no room for texture, only for what is beside it
         return classical.telea(base, region)
-    return exemplar.completions(base, region, camera, mask, sources, [SEED])[0].image
+    return exemplar.complete_view(base, region, camera, mask, sources, [SEED])[0].image

@@ -1,6 +1,6 @@
-"""Deterministic 2D inpainting: LaMa from weights that lie on this machine, else what OpenCV has.
+"""Deterministic 2D inpainting: LaMa from a TorchScript file on this machine, or OpenCV's methods.
 
-Nothing is downloaded, and what was used is named: a table of results must say whether LaMa or its stand-in painted.
+Nothing is downloaded. Each painter has a name, so that a table of results can say which one filled the holes.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-MULTIPLE = 8  # LaMa halves a picture three times
-FSR_SIDE = 160  # px: FSR's time grows with the hole's area, and what it adds on larger pictures is blurred alike
-TELEA_RADIUS = 5  # px
+SIZE_MULTIPLE = 8  # px: LaMa halves an image three times
+FSR_SIDE = 160  # px, the longer side FSR works at: its time grows with the hole's area, and larger is no sharper
+TELEA_RADIUS = 5  # px around each pixel from which Telea's method takes colours
 
 
 @dataclass(frozen=True)
 class Painter:
-    """Fills holes.
+    """An inpainter.
 
     Attributes:
-        name: what does it, for tables.
-        paint: (image [H, W, 3] uint8, hole [H, W] bool) -> uint8 [H, W, 3], equal to the image outside the hole and
-            independent of what the image holds inside.
+        name: of the method and its weights, for tables.
+        paint: (image uint8 [H, W, 3], hole bool [H, W]) -> uint8 [H, W, 3]. Outside the hole the result equals the
+            image; it does not depend on the image inside the hole.
     """
 
     name: str
@@ -34,12 +34,12 @@ class Painter:
 
 
 def load_classical() -> Painter:
-    """OpenCV's FSR, and Telea's method where this OpenCV has no FSR, or one that does not work."""
+    """Returns OpenCV's FSR, or Telea's method where this OpenCV has no FSR, or one that does not work."""
     return Painter(f"OpenCV FSR fast, {FSR_SIDE} px", fsr) if _fsr_works() else _TELEA
 
 
-def load(file: Path, device: str = "cpu") -> Painter:
-    """LaMa as a TorchScript file. ValueError where the file is no TorchScript module."""
+def load_lama(file: Path, device: str = "cpu") -> Painter:
+    """Loads LaMa from a TorchScript file. ValueError if the file is no TorchScript module."""
     try:
         module = torch.jit.load(file, map_location=device).eval()
     except (RuntimeError, ValueError) as error:
@@ -50,45 +50,47 @@ def load(file: Path, device: str = "cpu") -> Painter:
 
 @torch.no_grad()
 def lama(module: torch.nn.Module, image: np.ndarray, hole: np.ndarray, device: str = "cpu") -> np.ndarray:
-    """One forward pass. The module takes a picture [1, 3, H, W] in [0, 1] and a mask [1, 1, H, W], 1 = hole, both of
-    sides that are multiples of 8, and gives a picture of that size in [0, 1].
+    """uint8 [H, W, 3], the image with its hole filled by one forward pass of LaMa.
+
+    The module takes an image [1, 3, H, W] in [0, 1] and a mask [1, 1, H, W], 1 in the hole, both with sides that are
+    multiples of 8, and returns an image of that size in [0, 1].
 
     Raises:
         ValueError: its answer has another shape or is not finite.
     """
     height, width = hole.shape
-    beyond = (0, -width % MULTIPLE, 0, -height % MULTIPLE)
-    shown = torch.from_numpy(blanked(image, hole)).to(device).permute(2, 0, 1)[None] / 255
+    padding = (0, -width % SIZE_MULTIPLE, 0, -height % SIZE_MULTIPLE)
+    known = torch.from_numpy(blank_hole(image, hole)).to(device).permute(2, 0, 1)[None] / 255
     mask = torch.from_numpy(hole).to(device, torch.float32)[None, None]
-    shown, mask = (F.pad(tensor, beyond, mode="replicate") for tensor in (shown, mask))
-    answer = module(shown, mask)
-    if answer.shape != shown.shape or not torch.isfinite(answer).all():
-        raise ValueError(f"LaMa: the module's answer to {list(shown.shape)} is {list(answer.shape)}, or not finite")
+    known, mask = (F.pad(tensor, padding, mode="replicate") for tensor in (known, mask))
+    answer = module(known, mask)
+    if answer.shape != known.shape or not torch.isfinite(answer).all():
+        raise ValueError(f"LaMa: the module's answer to {list(known.shape)} is {list(answer.shape)}, or not finite")
     picture = (answer[0, :, :height, :width].clamp(0, 1) * 255).round().byte().permute(1, 2, 0).cpu().numpy()
-    return inside(image, picture, hole)
+    return paste_hole(image, picture, hole)
 
 
 def fsr(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    """OpenCV's frequency selective reconstruction, worked out at `FSR_SIDE` px and enlarged."""
+    """uint8 [H, W, 3], the hole filled by OpenCV's frequency selective reconstruction at `FSR_SIDE` px, enlarged."""
     if not hole.any():
         return image.copy()
     factor = min(1.0, FSR_SIDE / max(hole.shape))
     size = tuple(max(1, round(side * factor)) for side in hole.shape[::-1])
-    # Weights keep the blank inside of the hole from darkening the pixels around it.
+    # Without the weights the zeros in the hole would darken the pixels around it.
     weight = cv2.resize((~hole).astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    small = cv2.resize(blanked(image, hole).astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(blank_hole(image, hole).astype(np.float32), size, interpolation=cv2.INTER_AREA)
     small = np.round(small / np.maximum(weight, 1e-3)[..., None]).clip(0, 255).astype(np.uint8)
     known = np.where(weight < 1 - 1e-4, 0, 255).astype(np.uint8)
     small[known == 0] = 0
     painted = np.zeros_like(small)
     cv2.xphoto.inpaint(small, known, painted, cv2.xphoto.INPAINT_FSR_FAST)
-    return inside(image, cv2.resize(painted, hole.shape[::-1], interpolation=cv2.INTER_CUBIC), hole)
+    return paste_hole(image, cv2.resize(painted, hole.shape[::-1], interpolation=cv2.INTER_CUBIC), hole)
 
 
 def telea(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    """OpenCV's fast marching (Telea, 2004)."""
-    painted = cv2.inpaint(blanked(image, hole), hole.astype(np.uint8), TELEA_RADIUS, cv2.INPAINT_TELEA)
-    return inside(image, painted, hole)
+    """uint8 [H, W, 3], the hole filled by OpenCV's fast marching method (Telea, 2004)."""
+    painted = cv2.inpaint(blank_hole(image, hole), hole.astype(np.uint8), TELEA_RADIUS, cv2.INPAINT_TELEA)
+    return paste_hole(image, painted, hole)
 
 
 _TELEA = Painter(f"OpenCV Telea, radius {TELEA_RADIUS} px", telea)
@@ -99,15 +101,15 @@ def _fsr_works() -> bool:
     hole[6:10, 6:10] = True
     try:
         return bool((fsr(np.full((16, 16, 3), 90, np.uint8), hole) > 0).all())
-    except (AttributeError, cv2.error):  # no contrib modules; built without this one
+    except (AttributeError, cv2.error):  # OpenCV without contrib modules, or built without this one
         return False
 
 
-def blanked(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    """The picture with zeros in the hole."""
+def blank_hole(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
+    """uint8 [H, W, 3], the image with zeros in the hole, bool [H, W]."""
     return np.where(hole[..., None], np.uint8(0), image)
 
 
-def inside(image: np.ndarray, painted: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    """What was painted in the hole, the picture elsewhere."""
+def paste_hole(image: np.ndarray, painted: np.ndarray, hole: np.ndarray) -> np.ndarray:
+    """[H, W, 3], `painted` in the hole, bool [H, W], the image elsewhere."""
     return np.where(hole[..., None], painted, image)

@@ -1,4 +1,4 @@
-"""Inpainters as ONNX files, on the CPU. The only importer of onnxruntime, which is optional."""
+"""Runs inpainters from ONNX files on the CPU. The only module that imports onnxruntime, which is optional."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 import torch
 
-TYPES = {"float32": "tensor(float)", "uint8": "tensor(uint8)"}
+ONNX_TYPES = {"float32": "tensor(float)", "uint8": "tensor(uint8)"}
 
 
 @dataclass(frozen=True)
 class Network:
-    """One pass of an inpainter.
+    """An inpainting network.
 
     Attributes:
-        side: of the square pictures that it takes, px; None where it takes any size.
-        paint: (picture [H, W, 3] uint8, hole [H, W] bool) -> uint8 [H, W, 3], the whole picture as it answers.
-            ValueError where the answer is of another size, not finite or not in 0..255.
+        side: of the square images that it takes, px; None if it takes any size.
+        paint: (picture uint8 [H, W, 3], hole bool [H, W]) -> uint8 [H, W, 3], the network's whole output.
+            ValueError if the output has another size, is not finite or not in 0..255.
     """
 
     side: int | None
@@ -28,79 +28,82 @@ class Network:
 
 
 def load(file: Path, dtype: str) -> Network:
-    """An inpainter that takes `image` [1, 3, H, W] and `mask` [1, 1, H, W] and gives one picture [1, 3, H, W].
+    """Loads a network with inputs `image` [1, 3, H, W] and `mask` [1, 1, H, W] and one output [1, 3, H, W].
 
     Args:
-        dtype: "float32" (as LaMa's): image in [0, 1], mask 1 in the hole, answer in 0..255; "uint8" (as MI-GAN's):
-            image and answer in 0..255, mask 0 in the hole and 255 elsewhere.
+        dtype: "float32" (LaMa): image in [0, 1], mask 1 in the hole, output in 0..255; "uint8" (MI-GAN): image and
+            output in 0..255, mask 0 in the hole and 255 elsewhere.
     Raises:
-        ValueError: no onnxruntime, no ONNX model, or one of other inputs and outputs; one line that names the file.
+        ValueError: no onnxruntime, no ONNX model, or other inputs and outputs; one line that names the file.
     """
-    session = _session(file)
-    side = _side(session, file, dtype)
-    return Network(side, lambda picture, hole: _painted(session, file, dtype, picture, hole))
+    session = _open_session(file)
+    side = _read_side(session, file, dtype)
+    return Network(side, lambda picture, hole: _run(session, file, dtype, picture, hole))
 
 
-def _session(file: Path) -> Any:
+def _open_session(file: Path) -> Any:
     try:
         import onnxruntime
     except ImportError:
         raise ValueError(f"{file.name} needs onnxruntime: `pip install onnxruntime`") from None
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = torch.get_num_threads()  # it does not read OMP_NUM_THREADS itself
-    options.log_severity_level = 3  # errors: exporters name sizes that do not hold, which it would warn of
+    options.intra_op_num_threads = torch.get_num_threads()  # onnxruntime does not read OMP_NUM_THREADS
+    options.log_severity_level = 3  # errors only: it would warn of output sizes that exporters misname
     try:
         return onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # classes of its own, which share none
-        raise ValueError(f"{file} is no ONNX model that onnxruntime reads ({_line(error)})") from None
+    except Exception as error:  # onnxruntime's exceptions have no common base class
+        raise ValueError(f"{file} is no ONNX model that onnxruntime reads ({_one_line(error)})") from None
 
 
-def _side(session: Any, file: Path, dtype: str) -> int | None:
-    """Reads what the model says of itself. ValueError where it is not what `load` says."""
+def _read_side(session: Any, file: Path, dtype: str) -> int | None:
+    """The side of the square images that the model takes, px; None for any size. ValueError if its inputs and outputs
+    are not as `load` says."""
     inputs = {each.name: (each.type, list(each.shape)) for each in session.get_inputs()}
     outputs = [(each.type, list(each.shape)) for each in session.get_outputs()]
     sides = [side for _, shape in inputs.values() for side in shape[2:]]
     fixed = {side for side in sides if isinstance(side, int)}
-    # A size that is not fixed has a name, or none. Outputs' sizes are checked as they come: exporters misname them.
+    # A size that is not fixed is a name or None. Sizes of outputs are checked when it runs: exporters misname them.
     one_size = len(fixed) == 1 and all(isinstance(side, int) for side in sides)
     fits = (
-        {name: _kind(*each) for name, each in inputs.items()} == {"image": (dtype, 3), "mask": (dtype, 1)}
+        {name: _type_and_channels(*each) for name, each in inputs.items()} == {"image": (dtype, 3), "mask": (dtype, 1)}
         and len(outputs) == 1
-        and outputs[0][0] == TYPES[dtype]
+        and outputs[0][0] == ONNX_TYPES[dtype]
         and (one_size or not fixed)
     )
     if not fits:
-        says = ", ".join(f"{name} {_words(*each)}" for name, each in inputs.items())
+        described = ", ".join(f"{name} {_describe(*each)}" for name, each in inputs.items())
         raise ValueError(
             f"{file}: expected image {dtype} [1, 3, H, W], mask {dtype} [1, 1, H, W], of any or one square size, and "
-            f"one {dtype} picture; it takes {says} and gives {', '.join(_words(*each) for each in outputs)}"
+            f"one {dtype} picture; it takes {described} and gives {', '.join(_describe(*each) for each in outputs)}"
         )
     return fixed.pop() if fixed else None
 
 
-def _kind(kind: str, shape: list[Any]) -> tuple[str, int] | None:
-    """Its type and channels, of a batch that may be of one picture; None where it is no such batch."""
-    types = {theirs: ours for ours, theirs in TYPES.items()}
+def _type_and_channels(kind: str, shape: list[Any]) -> tuple[str, int] | None:
+    """Type and number of channels of an input that may be a batch of one image; None if it may not."""
+    types = {onnx_type: dtype for dtype, onnx_type in ONNX_TYPES.items()}
     batch = len(shape) == 4 and (shape[0] == 1 or not isinstance(shape[0], int))
     return (types[kind], shape[1]) if batch and kind in types else None
 
 
-def _words(kind: str, shape: list[Any]) -> str:
+def _describe(kind: str, shape: list[Any]) -> str:
+    """An input or output, for messages: its type and shape."""
     return f"{kind.removeprefix('tensor(').removesuffix(')')} [{', '.join(map(str, shape))}]"
 
 
-def _painted(session: Any, file: Path, dtype: str, picture: np.ndarray, hole: np.ndarray) -> np.ndarray:
+def _run(session: Any, file: Path, dtype: str, picture: np.ndarray, hole: np.ndarray) -> np.ndarray:
+    """See `Network.paint`."""
     if dtype == "uint8":
         image, mask = picture, np.where(hole, np.uint8(0), np.uint8(255))
     else:
         mask = hole.astype(np.float32)
         image = np.where(hole[..., None], np.float32(0), picture.astype(np.float32) / 255)
     try:
-        fed = {"image": np.ascontiguousarray(image.transpose(2, 0, 1)[None]), "mask": mask[None, None]}
-        (answer,) = session.run(None, fed)
-    except Exception as error:  # classes of its own, which share none
+        inputs = {"image": np.ascontiguousarray(image.transpose(2, 0, 1)[None]), "mask": mask[None, None]}
+        (answer,) = session.run(None, inputs)
+    except Exception as error:  # onnxruntime's exceptions have no common base class
         raise ValueError(
-            f"{file}: failed on a picture of {hole.shape[1]}x{hole.shape[0]} px ({_line(error)})"
+            f"{file}: failed on a picture of {hole.shape[1]}x{hole.shape[0]} px ({_one_line(error)})"
         ) from None
     if answer.shape != (1, 3, *hole.shape) or not np.isfinite(answer).all():
         raise ValueError(f"{file}: its answer to {[1, 3, *hole.shape]} is {list(answer.shape)}, or not finite")
@@ -109,6 +112,7 @@ def _painted(session: Any, file: Path, dtype: str, picture: np.ndarray, hole: np
     return answer[0].transpose(1, 2, 0).round().clip(0, 255).astype(np.uint8)
 
 
-def _line(error: BaseException) -> str:
+def _one_line(error: BaseException) -> str:
+    """The error's text on one line of at most 160 characters."""
     text = " ".join(str(error).split())
     return text if len(text) <= 160 else text[:157] + "..."

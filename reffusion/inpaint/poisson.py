@@ -1,4 +1,4 @@
-"""Patches blended without seams: the picture whose changes from pixel to pixel are nearest to theirs."""
+"""Blends pieces without seams: finds the picture whose gradients are nearest to theirs (screened Poisson equation)."""
 
 from __future__ import annotations
 
@@ -6,60 +6,62 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-ABSOLUTE = 0.02  # weight of the patches' own colours against their changes: far from the border they hold
-LEAST = 1e-9  # of them, so that a hole that nothing lies beside is 0
+COLOR_WEIGHT = 0.02  # of the pieces' own colours against their gradients: far from the border the colours win
+TINY_WEIGHT = 1e-9  # of them, so that a hole without known neighbours is zero, not singular
 
 
-def blended(
+def blend(
     known: np.ndarray,
     hole: np.ndarray,
     right: np.ndarray,
     below: np.ndarray,
     own: np.ndarray,
     beside: np.ndarray | None = None,
-    absolute: float = ABSOLUTE,
+    color_weight: float = COLOR_WEIGHT,
 ) -> np.ndarray:
-    """[N, 3], the colours of the hole's pixels in reading order (screened Poisson, as in Perez et al. 2003).
+    """[N, 3] float64, the blended colours of the hole's pixels in reading order (Perez et al. 2003).
 
     Args:
         known: [H, W, 3], read beside the hole. hole: bool [H, W].
-        right, below: [H, W, 3], wanted change to the next pixel. own: [H, W, 3], wanted colours.
-        beside: bool [H, W], which pixels outside the hole go on in it; None: all.
-        absolute: weight of the wanted colours against the wanted changes.
+        right, below: [H, W, 3], the gradients wanted, to the next pixel. own: [H, W, 3], the colours wanted.
+        beside: bool [H, W], the pixels outside the hole that it must join without a seam; None: all.
+        color_weight: of the colours against the gradients.
     """
     rows, columns = np.nonzero(hole)
     index = np.full(hole.shape, -1)
     index[rows, columns] = np.arange(len(rows))
-    total, wanted, links = np.full(len(rows), absolute), absolute * own[rows, columns].astype(np.float64), []
-    for down, along, change in ((0, 1, right), (0, -1, right), (1, 0, below), (-1, 0, below)):
+    diagonal, wanted = np.full(len(rows), color_weight), color_weight * own[rows, columns].astype(np.float64)
+    links = []
+    for down, along, gradient in ((0, 1, right), (0, -1, right), (1, 0, below), (-1, 0, below)):
         row, column = rows + down, columns + along
         here = np.flatnonzero((row >= 0) & (column >= 0) & (row < hole.shape[0]) & (column < hole.shape[1]))
         if beside is not None:
             here = here[(hole | beside)[row[here], column[here]]]
         row, column = row[here], column[here]
         first = np.minimum(rows[here], row), np.minimum(columns[here], column)
-        total[here] += 1
-        wanted[here] -= change[first] * (down + along)
+        diagonal[here] += 1
+        wanted[here] -= gradient[first] * (down + along)
         other = index[row, column]
         outside = other < 0
         wanted[here[outside]] += known[row[outside], column[outside]]
         links.append(np.stack([here[~outside], other[~outside]]))
-    here, there = np.concatenate(links, 1)
-    matrix = sparse.csc_matrix((-np.ones(len(here)), (here, there)), (len(rows),) * 2) + sparse.diags(total)
+    here, other = np.concatenate(links, 1)
+    matrix = sparse.csc_matrix((-np.ones(len(here)), (here, other)), (len(rows),) * 2) + sparse.diags(diagonal)
     return splu(matrix.tocsc()).solve(wanted)
 
 
-def laid_over(image: np.ndarray, picture: np.ndarray, there: np.ndarray, both: np.ndarray) -> np.ndarray:
-    """[H, W, 3] uint8, an image with what is `there`, bool [H, W], of a picture, in the tone that the image has beside
-    the picture's where `both` are known, bool [H, W]."""
-    apart = image[both].astype(np.float64) - picture[both]
-    tone = np.median(apart, 0) if len(apart) else np.zeros(3)
-    found = image.copy()
-    found[there] = (picture[there] + tone).clip(0, 255).round()
-    return found
+def paste(image: np.ndarray, picture: np.ndarray, mask: np.ndarray, both: np.ndarray) -> np.ndarray:
+    """uint8 [H, W, 3], the image with a picture pasted into a mask, bool [H, W], in the image's tone: the median
+    difference of the two is added, where `both` are known, bool [H, W]."""
+    difference = image[both].astype(np.float64) - picture[both]
+    tone = np.median(difference, 0) if len(difference) else np.zeros(3)
+    result = image.copy()
+    result[mask] = (picture[mask] + tone).clip(0, 255).round()
+    return result
 
 
-def evenly(values: np.ndarray, hole: np.ndarray, beside: np.ndarray) -> np.ndarray:
-    """[N, 3], what is known `beside` a hole, bool [H, W], drawn evenly across it: at its pixels in reading order."""
+def interpolate(values: np.ndarray, hole: np.ndarray, beside: np.ndarray) -> np.ndarray:
+    """[N, 3] float64, values [H, W, 3] of the pixels `beside` a hole, bool [H, W] both, interpolated smoothly (Laplace
+    equation) at the hole's pixels in reading order."""
     even = np.zeros(values.shape, np.float32)
-    return blended(values, hole, even, even, even, beside, LEAST)
+    return blend(values, hole, even, even, even, beside, TINY_WEIGHT)

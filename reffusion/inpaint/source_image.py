@@ -1,4 +1,4 @@
-"""A picture beside the surfaces that it shows."""
+"""An image and the geometry of the surfaces that it shows: what every exemplar-based method works on."""
 
 from __future__ import annotations
 
@@ -8,34 +8,36 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Shown:
-    """A picture and the surfaces that it shows.
+class SourceImage:
+    """An image and the surfaces that it shows.
 
     Attributes:
         image: [H, W, 3] uint8.
         masked: bool [H, W], pixels that must not be read.
         usable: bool [H, W], where a patch may have its middle.
-        surface: int [H, W], the plane shown, 1, 2, ...; 0: none.
-        to_plane: [H, W, 2, 2], change of the plane's coordinates with (x, y) in pixels; any regular matrix off planes.
-        size: [H, W], the world's length of a pixel.
-        place: [H, W, 2], where on its plane a pixel lies; anything off planes.
-        layer: int [H, W], of things that stand before what is around them, 1, 2, ..., the one shown; 0: none.
-        normal: [H, W, 3], how the surface shown lies in space, see `slopes`; zeros where nothing is known.
+        plane: int [H, W], index of the plane shown, 1, 2, ...; 0: none.
+        to_plane: [H, W, 2, 2], derivative of the coordinates on the plane by the pixel (x, y); off planes any regular
+            matrix.
+        pixel_size: [H, W], length of a pixel on the surface, in the world's unit.
+        plane_xy: [H, W, 2], coordinates on the pixel's plane; anything off planes.
+        layer: int [H, W], index of the foreground layer shown, 1, 2, ..., a thing in front of all that it meets beside
+            the hole; 0: none.
+        normal: [H, W, 3], the surface's mean normal, see `normals.mean_normals`; zeros where nothing is known.
     """
 
     image: np.ndarray
     masked: np.ndarray
     usable: np.ndarray
-    surface: np.ndarray
+    plane: np.ndarray
     to_plane: np.ndarray
-    size: np.ndarray
-    place: np.ndarray
+    pixel_size: np.ndarray
+    plane_xy: np.ndarray
     layer: np.ndarray
     normal: np.ndarray
 
 
-def alone(image: np.ndarray, hole: np.ndarray) -> Shown:
-    """A picture of which nothing else is known."""
-    unit, none = np.broadcast_to(np.eye(2), (*hole.shape, 2, 2)), np.zeros(hole.shape, np.int64)
-    place, normal = np.zeros((*hole.shape, 2)), np.zeros((*hole.shape, 3), np.float32)
-    return Shown(image, hole, ~hole, none, unit, np.ones(hole.shape), place, none, normal)
+def without_geometry(image: np.ndarray, hole: np.ndarray) -> SourceImage:
+    """An image with a hole, bool [H, W], that is masked, and nothing known of its surfaces."""
+    identity, none = np.broadcast_to(np.eye(2), (*hole.shape, 2, 2)), np.zeros(hole.shape, np.int64)
+    plane_xy, normal = np.zeros((*hole.shape, 2)), np.zeros((*hole.shape, 3), np.float32)
+    return SourceImage(image, hole, ~hole, none, identity, np.ones(hole.shape), plane_xy, none, normal)

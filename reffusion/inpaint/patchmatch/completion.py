@@ -1,7 +1,7 @@
-"""A hole completed from patches of photographs, coarse to fine.
+"""Fills a hole with patches of photographs, coarse to fine.
 
-PatchMatch with votes (after Wexler et al. 2007, Barnes et al. 2009, Newson et al. 2017), patches carried along planes
-(after Huang et al. 2014), blended by their gradients. Nothing new is invented, and nothing is downloaded.
+PatchMatch with voting (after Wexler et al. 2007, Barnes et al. 2009, Newson et al. 2017), with patches that follow the
+perspective of planes (after Huang et al. 2014), blended by their gradients. Nothing is invented or downloaded.
 
 PAPER leaves open: who inpaints the reference (it shows results of several tools, and of people).
 """
@@ -16,137 +16,149 @@ import numpy as np
 from scipy import ndimage
 
 from reffusion import seeding
-from reffusion.inpaint.classical import blanked, telea
+from reffusion.inpaint.classical import blank_hole, telea
 from reffusion.inpaint.patchmatch import search, voting
-from reffusion.inpaint.patchmatch.matches import NONE, PATCH, Choice, Compared, Hole, Match, Pictures
-from reffusion.inpaint.plane_frames import inverse
-from reffusion.inpaint.poisson import blended
-from reffusion.inpaint.source_image import Shown
+from reffusion.inpaint.patchmatch.matches import NO_MATCH, PATCH_RADIUS, Hole, Level, Matches, Positions, Sources
+from reffusion.inpaint.plane_frames import invert_2x2
+from reffusion.inpaint.poisson import blend
+from reffusion.inpaint.source_image import SourceImage
 
-COARSEST = 40.0  # px that the hole may be wide at the coarsest level: there its parts are laid out
-SMALL = 16.0  # px: a wider hole has two levels at least
-ROUGHNESS = 2.0  # weight of the local mean gradient beside the colours: what tells gravel from a wall of its colour
-APART = 50.0  # difference of two planes beside that of colours
-BEFORE = 75.0  # the same, of what stands before the rest
-LIES = 40.0  # the same, of normals, by their difference
-CHANNELS, VOTED = 9, 5  # of what is compared, and the first of them, which patches say; the others are known
-AROUND = 15  # px, a side of the window of that mean
-FADING = 1.2  # factor by which trust falls with each pixel from the hole's border
-LEAST_TRUST = 0.02
-CLEAR = 1.5  # times PATCH: how far from what is masked a patch's middle must lie
-FEWEST = 200  # places for patches: with fewer there is no coarser level, or Telea's method instead
-RINGS, TRIES = (3, 60), 20  # rounds and tries anywhere of the first layout, and tries of what follows
+COARSEST_WIDTH = 40.0  # px, width of the hole at the coarsest level, where its parts are laid out
+SINGLE_LEVEL_WIDTH = 16.0  # px: a wider hole has at least two levels
+ROUGHNESS_WEIGHT = 2.0  # of the local mean gradient beside the colours: it tells gravel from a wall of its colour
+PLANE_FEATURE = 50.0  # levels, the difference of two planes beside that of colours
+LAYER_FEATURE = 75.0  # levels, the difference of two foreground layers
+NORMAL_FEATURE = 40.0  # levels, by the difference of normals
+CHANNELS, VOTED = 9, 5  # features compared, and the first of them, on which patches vote; the others are known
+ROUGHNESS_WINDOW = 15  # px, a side of the window of the local mean gradient
+TRUST_FALLOFF = 1.2  # factor by which trust falls with each pixel from the hole's border
+MIN_TRUST = 0.02
+MASK_MARGIN = 1.5  # of PATCH_RADIUS: how far from masked pixels a patch's middle must lie
+MIN_PLACES = 200  # for patches: with fewer there is no coarser level, or Telea's method instead
+FIRST_ROUNDS, FIRST_TRIES = 3, 60  # rounds, and tries anywhere, of the first layout
+TRIES = 20  # tries anywhere at the coarsest level; a fifth at the others
 ROUNDS = (8, 5, 3)  # of search and vote: at the coarsest level, between, at the finest
+NO_SPREAD = 1e12  # spread of misfit at which all patches vote alike
 
 
 @dataclass(frozen=True)
-class Completed:
-    """A picture with its hole filled, uint8 [H, W, 3], and how badly its patches fit on the whole: of several, the one
-    with the least is the best to look at, mostly."""
+class Completion:
+    """An image with its hole filled.
+
+    Attributes:
+        image: uint8 [H, W, 3].
+        misfit: how badly its patches fit on the whole: of several completions, the one with the least mostly looks
+            best.
+    """
 
     image: np.ndarray
     misfit: float
 
 
 def complete(
-    target: Shown, hole: np.ndarray, sources: Sequence[Shown], smooth: Sequence[int] = (), seed: int = 0
-) -> Completed:
-    """The target with its hole filled by patches of the sources, which may be the target itself.
+    target: SourceImage, hole: np.ndarray, sources: Sequence[SourceImage], smooth: Sequence[int] = (), seed: int = 0
+) -> Completion:
+    """The target with its hole, bool [H, W], filled with patches of the sources, which may include the target itself.
 
     Args:
-        target: its image is read outside the hole only. hole: bool [H, W].
-        smooth: numbers of the planes along which patches are carried; on rough ground that would smear grass.
+        target: its image is read outside the hole only.
+        smooth: indices of the planes whose perspective patches follow; on rough ground that would smear grass.
         seed: of the search.
     """
     if not hole.any():
-        return Completed(target.image.copy(), 0.0)
-    target = replace(target, image=blanked(target.image, hole))
-    levels = _levels(target, hole, sources, smooth)
-    if not levels:
-        return Completed(telea(target.image, hole), float(NONE))
+        return Completion(target.image.copy(), 0.0)
+    target = replace(target, image=blank_hole(target.image, hole))
+    pyramid = _build_pyramid(target, hole, sources, smooth)
+    if not pyramid:
+        return Completion(telea(target.image, hole), float(NO_MATCH))
     state = np.array([seeding.seed_for(seed, "texture") | 1], np.uint64)
-    match = before = None
-    for k, (now, mask, pictures) in enumerate(levels):
-        first, last = k == 0, k == len(levels) - 1
-        pixels = _pixels(target, mask, 2 ** (len(levels) - 1 - k), smooth, pictures)
-        of = Compared(pixels, pictures, now, _trust(mask))
-        choice = _choice(pictures, int(pixels.surface.max()))
+    matches = coarser = None
+    for k, (current, mask, level_sources) in enumerate(pyramid):
+        first, last = k == 0, k == len(pyramid) - 1
+        hole_pixels = _gather_hole(target, mask, 2 ** (len(pyramid) - 1 - k), smooth, level_sources)
+        level = Level(hole_pixels, level_sources, current, _trust(mask))
+        positions = _patch_positions(level_sources, int(hole_pixels.plane.max()))
         if first:
-            match = _laid_out(of, mask, choice, state)
+            matches = _first_layout(level, mask, positions, state)
         else:
-            match = _from_coarser(match, before, of)
-            _voted(of, match, of.weight, 1e12)
-        rounds, todo = ROUNDS[0] if first else ROUNDS[2] if last else ROUNDS[1], np.arange(len(pixels.row))
+            matches = _from_coarser(matches, coarser, level)
+            _vote(level, matches, level.weight, NO_SPREAD)
+        rounds, todo = ROUNDS[0] if first else ROUNDS[2] if last else ROUNDS[1], np.arange(len(hole_pixels.row))
         for turn in range(rounds):
-            search.search(todo, 2, TRIES if first else TRIES // 5, match, of, choice, state)
+            search.search(todo, 2, TRIES if first else TRIES // 5, matches, level, positions, state)
             if not last or turn < rounds - 1:
-                _voted(of, match, of.weight, max(float(np.median(match.misfit)), 1.0))
-        before = pixels
-    weight = of.weight[pixels.row, pixels.column] * (match.misfit < NONE)
-    fitted = float((match.misfit * weight).sum() / max(weight.sum(), 1e-6))
-    return Completed(_finished(target.image, hole, of, match), fitted)
+                _vote(level, matches, level.weight, max(float(np.median(matches.misfit)), 1.0))
+        coarser = hole_pixels
+    weight = level.weight[hole_pixels.row, hole_pixels.column] * (matches.misfit < NO_MATCH)
+    misfit = float((matches.misfit * weight).sum() / max(weight.sum(), 1e-6))
+    return Completion(_blend_patches(target.image, hole, level, matches), misfit)
 
 
-def _finished(image: np.ndarray, hole: np.ndarray, of: Compared, match: Match) -> np.ndarray:
-    """uint8 [H, W, 3]: what the patches show at their middles, without seams, and no colour beyond theirs and those
-    outside the hole."""
-    own = of.now[..., :3].copy()
+def _blend_patches(image: np.ndarray, hole: np.ndarray, level: Level, matches: Matches) -> np.ndarray:
+    """uint8 [H, W, 3], the image with its hole filled from the middles of the patches, without seams. No colour lies
+    beyond theirs and those outside the hole."""
+    own = level.current[..., :3].copy()
     right, below = np.zeros_like(own), np.zeros_like(own)
-    beside, under = np.zeros(hole.shape, np.float32), np.zeros(hole.shape, np.float32)
-    voting.steps(match, of.hole, of.pictures, right, below, beside, under, own)
-    right, below = right / np.maximum(beside, 1)[..., None], below / np.maximum(under, 1)[..., None]
+    count_right, count_below = np.zeros(hole.shape, np.float32), np.zeros(hole.shape, np.float32)
+    voting.gather_gradients(matches, level.hole, level.sources, right, below, count_right, count_below, own)
+    right, below = right / np.maximum(count_right, 1)[..., None], below / np.maximum(count_below, 1)[..., None]
     low, high = own.min((0, 1)), own.max((0, 1))
     picture = image.copy()
-    picture[hole] = blended(of.now[..., :3], hole, right, below, own).clip(low, high).round().astype(np.uint8)
+    colors = blend(level.current[..., :3], hole, right, below, own)
+    picture[hole] = colors.clip(low, high).round().astype(np.uint8)
     return picture
 
 
-def _levels(target: Shown, hole: np.ndarray, sources: Sequence[Shown], smooth: Sequence[int]) -> list:
-    """Coarsest first: the target's values [h, w, C], its hole, and the sources; none where there is too little to take
-    patches from."""
-    width = 2 * _depth(hole).max()
-    count = 1 + int(np.ceil(np.log2(max(width / COARSEST, 2.0 if width > SMALL else 1.0))))
-    now, mask, scale = _values(target.image, hole), hole, 1
-    seen = [(_values(source.image, source.masked), source.masked) for source in sources]
-    levels = []
+def _build_pyramid(
+    target: SourceImage, hole: np.ndarray, sources: Sequence[SourceImage], smooth: Sequence[int]
+) -> list[tuple[np.ndarray, np.ndarray, Sources]]:
+    """The levels, coarsest first: the target's features [h, w, C], its hole, bool [h, w], and the sources. Empty where
+    there is too little to take patches from."""
+    width = 2 * _distance_inside(hole).max()
+    count = 1 + int(np.ceil(np.log2(max(width / COARSEST_WIDTH, 2.0 if width > SINGLE_LEVEL_WIDTH else 1.0))))
+    current, mask, scale = _color_features(target.image, hole), hole, 1
+    images = [(_color_features(source.image, source.masked), source.masked) for source in sources]
+    pyramid = []
     for _ in range(count):
-        marked = [_marked(values, each, smooth, scale) for (values, _), each in zip(seen, sources, strict=True)]
-        pictures = _pictures(marked, [masked for _, masked in seen], sources, scale)
-        if (pictures.surface >= 0).sum() < FEWEST:
+        values = [
+            _with_geometry(each, source, smooth, scale) for (each, _), source in zip(images, sources, strict=True)
+        ]
+        level_sources = _stack_sources(values, [masked for _, masked in images], sources, scale)
+        if (level_sources.plane >= 0).sum() < MIN_PLACES:
             break
-        levels.append((_marked(now, target, smooth, scale), mask, pictures))
-        now, mask = _halved(now, mask)
-        seen = [_halved(values, masked) for values, masked in seen]
+        pyramid.append((_with_geometry(current, target, smooth, scale), mask, level_sources))
+        current, mask = _halve(current, mask)
+        images = [_halve(values, masked) for values, masked in images]
         scale *= 2
-    return levels[::-1]
+    return pyramid[::-1]
 
 
-def _values(image: np.ndarray, masked: np.ndarray) -> np.ndarray:
-    """[H, W, 5] float32: colours, and the local mean of the grey picture's change along x and y. What is masked shows
-    what is next to it."""
+def _color_features(image: np.ndarray, masked: np.ndarray) -> np.ndarray:
+    """[H, W, 5] float32, colours, and the local mean of the grey image's absolute gradient along x and y. Masked pixels
+    take the colours of the nearest others."""
     if masked.any() and not masked.all():
         nearest = ndimage.distance_transform_edt(masked, return_distances=False, return_indices=True)
         image = image[tuple(nearest)]
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     known = cv2.erode((~masked).astype(np.float32), np.ones((3, 3)))
-    window = (AROUND, AROUND)
+    window = (ROUGHNESS_WINDOW, ROUGHNESS_WINDOW)
     mass = np.maximum(cv2.blur(known, window), 1e-3)
-    change = [cv2.blur(np.abs(cv2.Scharr(grey, -1, *way)) / 16 * known, window) / mass for way in ((1, 0), (0, 1))]
-    return np.concatenate([image.astype(np.float32), ROUGHNESS * np.stack(change, -1)], -1)
+    gradient = [cv2.blur(np.abs(cv2.Scharr(grey, -1, *way)) / 16 * known, window) / mass for way in ((1, 0), (0, 1))]
+    return np.concatenate([image.astype(np.float32), ROUGHNESS_WEIGHT * np.stack(gradient, -1)], -1)
 
 
-def _marked(values: np.ndarray, shown: Shown, smooth: Sequence[int], scale: int) -> np.ndarray:
-    """[H, W, 9], the plane, and what stands before the rest, in one channel more: where two meet, patches must show the
-    same edge. Then how the surface lies."""
-    of = np.zeros(max([*smooth, int(shown.surface.max())]) + 1, np.float32)
-    of[list(smooth)] = APART * np.arange(1, len(smooth) + 1)
-    marks = of[shown.surface] + BEFORE * shown.layer.astype(np.float32)
-    marks, lies = cv2.medianBlur(marks, 5)[..., None], LIES * shown.normal
-    return np.concatenate([values, *(each[::scale, ::scale] for each in (marks, lies))], -1)
+def _with_geometry(values: np.ndarray, source: SourceImage, smooth: Sequence[int], scale: int) -> np.ndarray:
+    """[h, w, 9], features [h, w, 5], then one channel for smooth plane and foreground layer (where two meet, patches
+    must show the same edge), and the normal. `scale`: of the source's size to that of the features."""
+    of_plane = np.zeros(max([*smooth, int(source.plane.max())]) + 1, np.float32)
+    of_plane[list(smooth)] = PLANE_FEATURE * np.arange(1, len(smooth) + 1)
+    marks = of_plane[source.plane] + LAYER_FEATURE * source.layer.astype(np.float32)
+    marks, normal = cv2.medianBlur(marks, 5)[..., None], NORMAL_FEATURE * source.normal
+    return np.concatenate([values, *(each[::scale, ::scale] for each in (marks, normal))], -1)
 
 
-def _halved(values: np.ndarray, masked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both at half the size, rounded up; a pixel is masked that holds any masked one."""
+def _halve(values: np.ndarray, masked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Both at half the size, rounded up; a pixel is masked if any part of it is."""
     even = lambda a: np.pad(a, [(0, a.shape[0] % 2), (0, a.shape[1] % 2)] + [(0, 0)] * (a.ndim - 2), mode="edge")
     values, known = even(values), even((~masked).astype(np.float32))
     size = (known.shape[1] // 2, known.shape[0] // 2)
@@ -155,90 +167,91 @@ def _halved(values: np.ndarray, masked: np.ndarray) -> tuple[np.ndarray, np.ndar
     return small / np.maximum(share, 1e-3)[..., None], share < 0.999
 
 
-def _pictures(
-    marked: Sequence[np.ndarray], masks: Sequence[np.ndarray], sources: Sequence[Shown], scale: int
-) -> Pictures:
-    """The sources at 1 / `scale` of their size; `marked` values [h, w, C] and `masks` [h, w] have it already."""
+def _stack_sources(
+    values: Sequence[np.ndarray], masks: Sequence[np.ndarray], sources: Sequence[SourceImage], scale: int
+) -> Sources:
+    """The sources at 1 / `scale` of their size; features `values` [h, w, C] and `masks` [h, w] have it already."""
     height, width = (max(masked.shape[axis] for masked in masks) for axis in (0, 1))
     shape = (len(masks), height, width)
-    found = Pictures(
+    stack = Sources(
         np.zeros((*shape, CHANNELS), np.float32), np.full(shape, -1, np.int32), np.zeros((*shape, 4), np.float32),
         np.ones(shape, np.float32),
     )  # fmt: skip
-    for k, (values, masked, source) in enumerate(zip(marked, masks, sources, strict=True)):
+    for k, (features, masked, source) in enumerate(zip(values, masks, sources, strict=True)):
         here = (k, slice(masked.shape[0]), slice(masked.shape[1]))
         every = (slice(None, None, scale),) * 2
-        clear = ndimage.distance_transform_edt(np.pad(~masked, 1))[1:-1, 1:-1] > CLEAR * PATCH
-        found.values[here] = values
-        found.surface[here] = np.where(clear & source.usable[every], source.surface[every], -1)
-        found.to_pixels[here] = inverse(scale * source.to_plane[every]).reshape(*masked.shape, 4)
-        found.size[here] = scale * source.size[every]
-    return found
+        clear = ndimage.distance_transform_edt(np.pad(~masked, 1))[1:-1, 1:-1] > MASK_MARGIN * PATCH_RADIUS
+        stack.values[here] = features
+        stack.plane[here] = np.where(clear & source.usable[every], source.plane[every], -1)
+        stack.to_pixels[here] = invert_2x2(scale * source.to_plane[every]).reshape(*masked.shape, 4)
+        stack.pixel_size[here] = scale * source.pixel_size[every]
+    return stack
 
 
-def _pixels(target: Shown, mask: np.ndarray, scale: int, smooth: Sequence[int], pictures: Pictures) -> Hole:
-    """The hole's pixels at 1 / `scale` of the target's size. Along planes that hardly any source shows nothing is
-    carried."""
+def _gather_hole(target: SourceImage, mask: np.ndarray, scale: int, smooth: Sequence[int], sources: Sources) -> Hole:
+    """The hole's pixels at 1 / `scale` of the target's size. Patches do not follow planes that hardly any source
+    shows."""
     rows, columns = np.nonzero(mask)
     index = np.full(mask.shape, -1)
     index[rows, columns] = np.arange(len(rows))
-    at = np.minimum(rows * scale, target.surface.shape[0] - 1), np.minimum(columns * scale, target.surface.shape[1] - 1)
-    surface = target.surface[at].astype(np.int32)
-    carried = [k for k in smooth if (pictures.surface == k).sum() >= FEWEST]
+    at = np.minimum(rows * scale, target.plane.shape[0] - 1), np.minimum(columns * scale, target.plane.shape[1] - 1)
+    plane = target.plane[at].astype(np.int32)
+    followed = [k for k in smooth if (sources.plane == k).sum() >= MIN_PLACES]
     to_plane = (scale * target.to_plane[at]).reshape(-1, 4).astype(np.float32)
-    size = (scale * target.size[at]).astype(np.float32)
-    return Hole(rows, columns, index, surface, np.isin(surface, carried), to_plane, size)
+    pixel_size = (scale * target.pixel_size[at]).astype(np.float32)
+    return Hole(rows, columns, index, plane, np.isin(plane, followed), to_plane, pixel_size)
 
 
-def _choice(pictures: Pictures, most: int) -> Choice:
-    """All places, then those of each plane up to number `most`."""
-    places = np.argwhere(pictures.surface >= 0).astype(np.int32)
-    surface = pictures.surface[tuple(places.T)]
-    parts = [places] + [places[surface == k] for k in range(1, most + 1)]
-    return Choice(np.concatenate(parts), np.cumsum([0] + [len(part) for part in parts]))
+def _patch_positions(sources: Sources, last_plane: int) -> Positions:
+    """All places, then those of each plane up to index `last_plane`."""
+    places = np.argwhere(sources.plane >= 0).astype(np.int32)
+    plane = sources.plane[tuple(places.T)]
+    parts = [places] + [places[plane == k] for k in range(1, last_plane + 1)]
+    return Positions(np.concatenate(parts), np.cumsum([0] + [len(part) for part in parts]))
 
 
 def _trust(mask: np.ndarray) -> np.ndarray:
     """[H, W] float32: 1 where known, falling from the hole's border inwards."""
-    return np.where(mask, np.maximum(FADING ** -_depth(mask), LEAST_TRUST), 1).astype(np.float32)
+    return np.where(mask, np.maximum(TRUST_FALLOFF ** -_distance_inside(mask), MIN_TRUST), 1).astype(np.float32)
 
 
-def _laid_out(of: Compared, mask: np.ndarray, choice: Choice, state: np.ndarray) -> Match:
-    """The first patches, from the hole's border inwards: each ring is compared with what is known outside it."""
-    row, column, trust = of.hole.row, of.hole.column, of.weight
+def _first_layout(level: Level, mask: np.ndarray, positions: Positions, state: np.ndarray) -> Matches:
+    """The first matches, ring by ring from the hole's border inwards: each ring is compared with what is known outside
+    it."""
+    row, column, trust = level.hole.row, level.hole.column, level.weight
     count = len(row)
     zeros = lambda kind: np.zeros(count, kind)
-    picture = np.full(count, -1, np.int32)
-    unfit = np.full(count, NONE, np.float32)
-    match = Match(picture, zeros(np.float32), zeros(np.float32), zeros(np.float32), zeros(bool), unfit)
-    of = of._replace(weight=np.where(mask, 0, 1).astype(np.float32))
-    ring = np.ceil(_depth(mask))[row, column]
+    source, misfit = np.full(count, -1, np.int32), np.full(count, NO_MATCH, np.float32)
+    matches = Matches(source, zeros(np.float32), zeros(np.float32), zeros(np.float32), zeros(bool), misfit)
+    level = level._replace(weight=np.where(mask, 0, 1).astype(np.float32))
+    ring = np.ceil(_distance_inside(mask))[row, column]
     for k in range(1, int(ring.max()) + 1):
         todo = np.flatnonzero(ring == k)
-        search.search(todo, *RINGS, match, of, choice, state)
-        _voted(of, match, trust, max(2 * float(np.percentile(match.misfit[todo], 75)), 1.0), todo)
-        of.weight[row[todo], column[todo]] = trust[row[todo], column[todo]]
-    return match
+        search.search(todo, FIRST_ROUNDS, FIRST_TRIES, matches, level, positions, state)
+        _vote(level, matches, trust, max(2 * float(np.percentile(matches.misfit[todo], 75)), 1.0), todo)
+        level.weight[row[todo], column[todo]] = trust[row[todo], column[todo]]
+    return matches
 
 
-def _from_coarser(match: Match, before: Hole, of: Compared) -> Match:
-    """The patches of a coarser level, `before`, for the pixels of this one."""
-    (height, width), pixels = before.index.shape, of.hole
-    row, column = np.minimum(pixels.row // 2, height - 1), np.minimum(pixels.column // 2, width - 1)
-    parent = before.index[row, column]
-    taken = Match(*(each[parent].copy() for each in match))
-    taken = taken._replace(planar=taken.planar & pixels.planar)
-    voting.carried_down(taken, before.row[parent], before.column[parent], pixels, of.pictures)
-    return taken
+def _from_coarser(matches: Matches, coarser: Hole, level: Level) -> Matches:
+    """The matches of the coarser level's hole, for the pixels of this level."""
+    (height, width), hole = coarser.index.shape, level.hole
+    row, column = np.minimum(hole.row // 2, height - 1), np.minimum(hole.column // 2, width - 1)
+    parent = coarser.index[row, column]
+    result = Matches(*(each[parent].copy() for each in matches))
+    result = result._replace(along_plane=result.along_plane & hole.along_plane)
+    voting.upsample_matches(result, coarser.row[parent], coarser.column[parent], hole, level.sources)
+    return result
 
 
-def _voted(of: Compared, match: Match, trust: np.ndarray, spread: float, todo: np.ndarray | None = None) -> None:
-    """`of.now` with its hole, or the pixels `todo` of it, as the patches say; but surfaces, which are known."""
-    todo, voted = np.arange(len(of.hole.row)) if todo is None else todo, of.now.copy()
-    voting.vote(todo, match, of.hole, trust, of.pictures, spread, voted)
-    of.now[..., :VOTED] = voted[..., :VOTED]
+def _vote(level: Level, matches: Matches, trust: np.ndarray, spread: float, todo: np.ndarray | None = None) -> None:
+    """Fills the hole of `level.current`, or its pixels `todo`, by the vote of the patches: the first `VOTED` features,
+    for the geometry is known."""
+    todo, voted = np.arange(len(level.hole.row)) if todo is None else todo, level.current.copy()
+    voting.vote(todo, matches, level.hole, trust, level.sources, spread, voted)
+    level.current[..., :VOTED] = voted[..., :VOTED]
 
 
-def _depth(mask: np.ndarray) -> np.ndarray:
-    """[H, W]: how far inside the mask, in pixels; the picture's border counts as one of it."""
+def _distance_inside(mask: np.ndarray) -> np.ndarray:
+    """[H, W], distance to the outside of the mask, in px; beyond the image's border counts as outside."""
     return ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]

@@ -1,4 +1,7 @@
-"""Ways to move photographs of a plane over a hole in it, by motions that map the plane onto itself."""
+"""Candidates for a hole in a plane that repeats itself: photographs of the plane, moved along it by its symmetries.
+
+So joints of planks continue straight, and what is round about the plane's centre stays round.
+"""
 
 from __future__ import annotations
 
@@ -7,182 +10,257 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy import ndimage
 
-from reffusion.inpaint.shift_map.plane_symmetry import Repeats
-from reffusion.inpaint.source_image import Shown
+from reffusion.inpaint.shift_map.assemble import (
+    INVALID_COST,
+    MAX_COMPARED,
+    MAX_DIFFERENCE,
+    MAX_PIXELS,
+    Assembly,
+    HolePixels,
+    Options,
+    Samples,
+    assemble,
+    erode_readable,
+    hole_pixels,
+    split_detail,
+)
+from reffusion.inpaint.shift_map.plane_symmetry import PlaneSymmetry
+from reffusion.inpaint.source_image import SourceImage
 
-CLEAR = 2  # px that a piece's source stays away from what is masked
-MOST = 15000  # pixels that pieces are laid out for: of a larger hole every second, third ...
-PIECES = 48  # ways of moving that are tried together
-COVERS = 0.1  # share of the hole that one must cover
-TOLD = 60  # pixels of the ring that it must be compared in
-COMPARED = 800  # of them at most
-AROUND = 25  # px, a side of the window in which ways compete for the ring
-STEPS = (1.0, 0.5, 0.25)  # cells by which a way is put right, step by step
-TONE = 0.015  # of the image's width: changes over more are tone, which blending evens out
-APART = 60.0  # difference in finer colour above which pixels do not fit at all
+MIN_PHOTO_PIXELS = MAX_PIXELS // 50  # pixels of the plane below which a photograph hardly shows it
+HOMOGRAPHY_PIXELS = 1000  # that a photograph's homography is fitted to
+MAX_CANDIDATES = 48  # motions that the cut chooses from; twice as many are refined
+MIN_COVERAGE = 0.1  # share of the hole that one must cover
+MIN_RING_PIXELS = 60  # pixels of the ring that a motion must be compared in
+RING_WINDOW = 25  # px, a side of the window in which motions compete for a part of the ring
+REFINE_STEPS = (1.0, 0.5, 0.25)  # steps of the refinement, of the symmetry's resolution
 SIDES = ((1, 0), (-1, 0), (0, 1), (0, -1))
+BLUR_COST = 12.0  # levels, of a pixel for each time that its photograph shows it at half the size
+FULL_SCALE = 0.8  # source pixels for a pixel of the hole below which it counts as blurred
+MIN_SCALE, MAX_SCALE = 0.35, 3.0  # bounds of these, along any direction
+OTHER_PHOTO_COST = 6.0  # levels, of a pixel from another photograph, whose light may differ
+OPTIONS = Options(color_weight=3e-4)  # what a plane reflects is known from around the hole better than from the pieces
+
+
+def fill_plane(
+    target: SourceImage, hole: np.ndarray, sources: Sequence[SourceImage], plane: int, symmetry: PlaneSymmetry
+) -> Assembly:
+    """The target with the plane's part of its hole, bool [H, W], filled from the sources, where one shows it, moved.
+
+    Args:
+        target: its image is read outside the hole only, its geometry everywhere.
+        sources: photographs, the view's own first.
+        plane: index of the plane in the sources and the target.
+        symmetry: how the plane repeats itself.
+    """
+    nothing = Assembly(target.image, np.zeros_like(hole), 0.0)
+    on_plane = _without_specks(target.plane == plane)
+    pixels = hole_pixels(target, hole, hole & on_plane, on_plane & (target.plane_xy != 0).any(-1))
+    photos = [photo for source in sources if (photo := PlanePhoto.of(source, plane)) is not None]
+    if not photos or not pixels.in_hole.any() or (~pixels.in_hole).sum() < MIN_RING_PIXELS:
+        return nothing
+    coarse, _ = pixels.subsample()
+    candidates = _select_motions(coarse, PlaneMotions(target, photos, symmetry, []))
+    return assemble(target, hole, pixels, candidates, [on_plane], OPTIONS) if len(candidates) else nothing
 
 
 @dataclass(frozen=True)
-class Source:
-    """A photograph of the plane: [H, W, 3] float32, colours and their finer part; bool [H, W], where it may be read;
-    [3, 3], from places on the plane to its pixels (x, y, 1)."""
+class PlanePhoto:
+    """A photograph of the plane.
+
+    Attributes:
+        colors, detail: [H, W, 3] float32, see `split_detail`.
+        readable: bool [H, W], pixels of the plane that may be taken.
+        homography: [3, 3], from coordinates on the plane to pixels (x, y).
+    """
 
     colors: np.ndarray
-    fine: np.ndarray
-    clear: np.ndarray
-    across: np.ndarray
+    detail: np.ndarray
+    readable: np.ndarray
+    homography: np.ndarray
+
+    @classmethod
+    def of(cls, source: SourceImage, plane: int) -> PlanePhoto | None:
+        """None where the source hardly shows the plane."""
+        on_plane = source.plane == plane
+        readable = erode_readable(source, source.masked) & _without_specks(on_plane)
+        rows, columns = np.nonzero(readable & on_plane)
+        if len(rows) < MIN_PHOTO_PIXELS:
+            return None
+        some = np.linspace(0, len(rows) - 1, min(len(rows), HOMOGRAPHY_PIXELS)).astype(int)
+        pixels = np.stack([columns[some], rows[some]], 1).astype(np.float64)
+        homography, _ = cv2.findHomography(source.plane_xy[rows[some], columns[some]].astype(np.float64), pixels, 0)
+        return None if homography is None else cls(*split_detail(source.image, source.masked), readable, homography)
 
 
 @dataclass(frozen=True)
-class Way:
-    """A way to move a source over the hole: its number, a motion of the plane, and a shift [2] that puts it right."""
+class Motion:
+    """A motion of a photograph along the plane.
 
-    source: int
-    motion: np.ndarray
+    Attributes:
+        photo: index of the photograph.
+        base: one of the symmetry's motions, [2] or [1].
+        shift: [2], a small shift after it that refines it, in the plane's unit.
+    """
+
+    photo: int
+    base: np.ndarray
     shift: np.ndarray
 
 
 @dataclass(frozen=True)
-class Laid:
-    """Pixels (rows, columns: [N]) to be filled or compared, their places [N, 2], the change of the place by a pixel
-    [N, 2, 2], which of them are in the hole, and of the others colours and their finer part, [N, 3] each."""
+class PlaneMotions:
+    """The candidates: photographs of the plane, moved.
 
-    rows: np.ndarray
-    columns: np.ndarray
-    places: np.ndarray
-    steps: np.ndarray
-    inside: np.ndarray
-    colors: np.ndarray
-    fine: np.ndarray
+    Attributes:
+        target: the view with the hole.
+        photos: the photographs; from all but the first pixels cost more.
+        symmetry: how the plane repeats itself.
+        motions: one for each candidate.
+    """
 
-    def of(self, which: np.ndarray) -> Laid:
-        return Laid(*(each[which] for each in vars(self).values()))
+    target: SourceImage
+    photos: Sequence[PlanePhoto]
+    symmetry: PlaneSymmetry
+    motions: Sequence[Motion]
+
+    def with_motions(self, motions: Sequence[Motion]) -> PlaneMotions:
+        return PlaneMotions(self.target, self.photos, self.symmetry, motions)
+
+    def __len__(self) -> int:
+        return len(self.motions)
+
+    def sample(self, k: int, pixels: HolePixels) -> Samples:
+        motion = self.motions[k]
+        at, photo = self._source_pixels(motion, pixels), self.photos[motion.photo]
+        return Samples(_sample(photo.colors, at), _sample(photo.detail, at), _is_set(photo.readable, at))
+
+    def covers(self, motion: Motion, pixels: HolePixels) -> np.ndarray:
+        """bool [N], which of the pixels the motion fills."""
+        return _is_set(self.photos[motion.photo].readable, self._source_pixels(motion, pixels))
+
+    def detail_difference(self, motion: Motion, pixels: HolePixels) -> tuple[np.ndarray, np.ndarray]:
+        """[N], difference of detail from the known picture, in levels; bool [N], where the motion shows something."""
+        at, photo = self._source_pixels(motion, pixels), self.photos[motion.photo]
+        difference = np.linalg.norm(_sample(photo.detail, at) - pixels.detail, axis=1)
+        return np.minimum(difference, MAX_DIFFERENCE), _is_set(photo.readable, at)
+
+    def costs(self, k: int, pixels: HolePixels) -> np.ndarray:
+        """[N], cost of each pixel for blur and other light; `INVALID_COST` where it is not shown, or far too small or
+        large."""
+        motion = self.motions[k]
+        at = self._source_pixels(motion, pixels)
+        low, high = self._scales(motion, pixels, at)
+        cost = BLUR_COST * np.maximum(np.log2(FULL_SCALE / np.maximum(low, 1e-6)), 0)
+        cost = cost + OTHER_PHOTO_COST * (motion.photo > 0)
+        valid = _is_set(self.photos[motion.photo].readable, at) & (low > MIN_SCALE) & (high < MAX_SCALE)
+        return np.where(valid, cost, INVALID_COST)
+
+    def _moved(self, motion: Motion, pixels: HolePixels) -> np.ndarray:
+        """[N, 2], coordinates on the plane from which the motion takes the pixels."""
+        coordinates = self.target.plane_xy[pixels.rows, pixels.columns].astype(np.float64)
+        return self.symmetry.move(coordinates, motion.base) + motion.shift
+
+    def _source_pixels(self, motion: Motion, pixels: HolePixels) -> np.ndarray:
+        """[N, 2] float32, pixels (x, y) of the photograph from which the motion takes the pixels."""
+        at = cv2.perspectiveTransform(self._moved(motion, pixels)[None], self.photos[motion.photo].homography)[0]
+        return at.clip(-1e6, 1e6).astype(np.float32)
+
+    def _scales(self, motion: Motion, pixels: HolePixels, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """[N] each: how many source pixels a pixel of the hole spans, along the direction of the fewest and
+        of the most. `at`: `_source_pixels`."""
+        moved, homography = self._moved(motion, pixels), self.photos[motion.photo].homography
+        weight = moved @ homography[2, :2] + homography[2, 2]
+        jacobian = (homography[None, :2, :2] - at[:, :, None] * homography[2, :2]) / weight[:, None, None]
+        change = jacobian @ self.symmetry.rotation(motion.base) @ self.target.to_plane[pixels.rows, pixels.columns]
+        area, square = np.abs(np.linalg.det(change)), (change**2).sum((1, 2))
+        high = np.sqrt((square + np.sqrt(np.maximum(square**2 - 4 * area**2, 0))) / 2)
+        return area / np.maximum(high, 1e-12), high
 
 
-def solid(mask: np.ndarray) -> np.ndarray:
-    """bool [H, W], without specks and without holes of a pixel or two."""
+def _select_motions(pixels: HolePixels, candidates: PlaneMotions) -> PlaneMotions:
+    """Candidates with the motions that match the known ring best, each some part of it, refined by it."""
+    ring = pixels.select(~pixels.in_hole).spread(MAX_COMPARED)
+    inside = pixels.select(pixels.in_hole).spread(MAX_COMPARED)
+    motions = [
+        Motion(number, motion, np.zeros(2))
+        for number in range(len(candidates.photos))
+        for motion in candidates.symmetry.motions
+    ]
+    motions = [motion for motion in motions if candidates.covers(motion, inside).mean() >= MIN_COVERAGE]
+    motions = _best_motions(ring, motions, candidates, 2 * MAX_CANDIDATES)
+    motions = [_refine_motion(ring, motion, candidates) for motion in motions]
+    return candidates.with_motions(_best_motions(ring, motions, candidates, MAX_CANDIDATES))
+
+
+def _refine_motion(ring: HolePixels, motion: Motion, candidates: PlaneMotions) -> Motion:
+    """The motion, shifted along the plane and turned a little, so that it matches the ring best."""
+    symmetry = candidates.symmetry
+
+    def misfit(motion: Motion) -> float:
+        difference, valid = candidates.detail_difference(motion, ring)
+        return float(difference[valid].mean()) if valid.sum() >= MIN_RING_PIXELS / 2 else np.inf
+
+    radius = 1.0
+    if symmetry.centre is not None:
+        from_centre = candidates.target.plane_xy[ring.rows, ring.columns] - symmetry.centre
+        radius = float(np.median(np.linalg.norm(from_centre, axis=1)))
+    least = misfit(motion)
+    for step in REFINE_STEPS:
+        size = step * symmetry.resolution
+        for _ in range(2):
+            tried = [Motion(motion.photo, motion.base, motion.shift + size * np.array(to)) for to in SIDES]
+            if symmetry.centre is not None:
+                turned = [motion.base + turn * size / radius for turn in (-1, 1)]
+                tried += [Motion(motion.photo, each, motion.shift) for each in turned]
+            misfits = [misfit(each) for each in tried]
+            if min(misfits) < least:
+                least, motion = min(misfits), tried[int(np.argmin(misfits))]
+    return motion
+
+
+def _best_motions(ring: HolePixels, motions: Sequence[Motion], candidates: PlaneMotions, most: int) -> list[Motion]:
+    """Up to `most` of the motions, chosen one after the other so that together they match the ring best."""
+    top, left = ring.rows.min(), ring.columns.min()
+    shape = (ring.rows.max() - top + 1, ring.columns.max() - left + 1)
+    at = ring.rows - top, ring.columns - left
+    blur = lambda a: cv2.blur(a, (RING_WINDOW, RING_WINDOW), borderType=cv2.BORDER_CONSTANT)[at]
+    means = []
+    for motion in motions:
+        difference, valid = candidates.detail_difference(motion, ring)
+        if valid.sum() < MIN_RING_PIXELS:
+            difference[:] = MAX_DIFFERENCE
+        total, count = np.zeros((2, *shape), np.float32)
+        total[at], count[at] = np.where(valid, difference, MAX_DIFFERENCE), 1
+        means.append(blur(total) / np.maximum(blur(count), 1e-6))
+    chosen: list[int] = []
+    local, least = np.array(means), np.full(len(ring), MAX_DIFFERENCE)
+    for _ in range(min(most, len(motions))):
+        gain = np.maximum(least - local, 0).sum(1) - 1e-3 * local.mean(1)
+        gain[chosen] = -np.inf
+        chosen.append(int(gain.argmax()))
+        least = np.minimum(least, local[chosen[-1]])
+    return [motions[k] for k in chosen]
+
+
+def _without_specks(mask: np.ndarray) -> np.ndarray:
+    """bool [H, W], the mask without specks and gaps of a pixel or two."""
     return cv2.medianBlur(mask.astype(np.uint8), 5) > 0
 
 
-def values_of(image: np.ndarray, masked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """[H, W, 3] float32: colours, and what differs in them from the mean around."""
-    known, colors = (~masked).astype(np.float32)[..., None], image.astype(np.float32)
-    blur = lambda a: cv2.GaussianBlur(a, (0, 0), TONE * image.shape[1]).reshape(*a.shape[:2], -1)
-    return colors, colors - blur(colors * known) / np.maximum(blur(known), 1e-3)
-
-
-def source_of(shown: Shown, plane: int) -> Source | None:
-    """None where the picture hardly shows the plane."""
-    clear = ndimage.binary_erosion(~shown.masked, iterations=CLEAR) & shown.usable & solid(shown.surface == plane)
-    rows, columns = np.nonzero(clear & (shown.surface == plane))
-    if len(rows) < MOST // 50:
-        return None
-    some = np.linspace(0, len(rows) - 1, min(len(rows), 1000)).astype(int)
-    pixels = np.stack([columns[some], rows[some]], 1).astype(np.float64)
-    across, _ = cv2.findHomography(shown.place[rows[some], columns[some]].astype(np.float64), pixels, 0)
-    return None if across is None else Source(*values_of(shown.image, shown.masked), clear, across)
-
-
-def _moved(laid: Laid, way: Way, how: Repeats) -> np.ndarray:
-    """[N, 2], where on the plane a way takes pixels from."""
-    return how.moved(laid.places.astype(np.float64), way.motion) + way.shift
-
-
-def taken_from(laid: Laid, way: Way, seen: Sequence[Source], how: Repeats) -> np.ndarray:
-    """[N, 2] float32, where (x, y) in its source a way takes pixels from."""
-    at = cv2.perspectiveTransform(_moved(laid, way, how)[None], seen[way.source].across)[0]
-    return at.clip(-1e6, 1e6).astype(np.float32)
-
-
-def shown_at(at: np.ndarray, clear: np.ndarray) -> np.ndarray:
-    """bool [N], which pixels [N, 2] of a picture may be read."""
-    height, width = clear.shape
+def _is_set(mask: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """bool [N], the mask, bool [H, W], at the pixels nearest to (x, y) [N, 2]; false outside and on its border."""
+    height, width = mask.shape
     column, row = np.round(at).astype(int).T
     inside = (row >= 1) & (column >= 1) & (row < height - 1) & (column < width - 1)
-    inside[inside] = clear[row[inside], column[inside]]
+    inside[inside] = mask[row[inside], column[inside]]
     return inside
 
 
-def values_at(at: np.ndarray, picture: np.ndarray) -> np.ndarray:
-    """A picture's values [N, 3] at pixels [N, 2]."""
+def _sample(picture: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """[N, 3], a picture at (x, y) [N, 2], bicubic."""
     grid = np.full((-(-len(at) // 1024) * 1024, 2), -1, np.float32)  # cv2.remap takes no side above 32767
     grid[: len(at)] = at
     x, y = (np.ascontiguousarray(grid[:, axis]).reshape(-1, 1024) for axis in (0, 1))
     return cv2.remap(picture, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).reshape(-1, 3)[: len(at)]
-
-
-def scales(laid: Laid, at: np.ndarray, way: Way, seen: Sequence[Source], how: Repeats) -> tuple[np.ndarray, ...]:
-    """[N] each: the fewest and the most source pixels along a pixel of the hole."""
-    places, across = _moved(laid, way, how), seen[way.source].across
-    weight = places @ across[2, :2] + across[2, 2]
-    slope = (across[None, :2, :2] - at[:, :, None] * across[2, :2]) / weight[:, None, None]
-    change = slope @ how.turn(way.motion) @ laid.steps
-    area, square = np.abs(np.linalg.det(change)), (change**2).sum((1, 2))
-    most = np.sqrt((square + np.sqrt(np.maximum(square**2 - 4 * area**2, 0))) / 2)
-    return area / np.maximum(most, 1e-12), most
-
-
-def ways_of(laid: Laid, seen: Sequence[Source], how: Repeats) -> list[Way]:
-    """Those that fit what is known around the hole, each somewhere, put right by it."""
-    ring, inside = laid.of(~laid.inside), laid.of(laid.inside)
-    ring = ring.of(np.linspace(0, len(ring.rows) - 1, min(len(ring.rows), COMPARED)).astype(int))
-    inside = inside.of(np.linspace(0, len(inside.rows) - 1, min(len(inside.rows), COMPARED)).astype(int))
-    ways = [Way(number, motion, np.zeros(2)) for number in range(len(seen)) for motion in how.motions]
-    covered = lambda way: shown_at(taken_from(inside, way, seen, how), seen[way.source].clear).mean()
-    ways = [way for way in ways if covered(way) >= COVERS]
-    ways = _best(ring, ways, seen, how, 2 * PIECES)
-    return _best(ring, [_put_right(ring, way, seen, how) for way in ways], seen, how, PIECES)
-
-
-def _off(ring: Laid, way: Way, seen: Sequence[Source], how: Repeats) -> tuple[np.ndarray, np.ndarray]:
-    """[N], by how much finer colours differ from what is known, and bool [N], where the way shows something."""
-    at, source = taken_from(ring, way, seen, how), seen[way.source]
-    return np.minimum(np.linalg.norm(values_at(at, source.fine) - ring.fine, axis=1), APART), shown_at(at, source.clear)
-
-
-def _put_right(ring: Laid, way: Way, seen: Sequence[Source], how: Repeats) -> Way:
-    """The way, shifted along the plane and turned a little so that it fits best."""
-
-    def misfit(asked: Way) -> float:
-        differs, told = _off(ring, asked, seen, how)
-        return float(differs[told].mean()) if told.sum() >= TOLD / 2 else np.inf
-
-    arm = 1.0 if how.centre is None else float(np.median(np.linalg.norm(ring.places - how.centre, axis=1)))
-    least = misfit(way)
-    for step in STEPS:
-        size = step * how.cell
-        for _ in range(2):
-            tried = [Way(way.source, way.motion, way.shift + size * np.array(to)) for to in SIDES]
-            if how.centre is not None:
-                tried += [Way(way.source, way.motion + turn * size / arm, way.shift) for turn in (-1, 1)]
-            found = [misfit(each) for each in tried]
-            if min(found) < least:
-                least, way = min(found), tried[int(np.argmin(found))]
-    return way
-
-
-def _best(ring: Laid, ways: Sequence[Way], seen: Sequence[Source], how: Repeats, most: int) -> list[Way]:
-    """Those that together fit what is known around the hole best, each somewhere in it."""
-    top, left = ring.rows.min(), ring.columns.min()
-    shape = (ring.rows.max() - top + 1, ring.columns.max() - left + 1)
-    at = ring.rows - top, ring.columns - left
-    blur = lambda a: cv2.blur(a, (AROUND, AROUND), borderType=cv2.BORDER_CONSTANT)[at]
-    near = []
-    for way in ways:
-        differs, told = _off(ring, way, seen, how)
-        if told.sum() < TOLD:
-            differs[:] = APART
-        total, count = np.zeros((2, *shape), np.float32)
-        total[at], count[at] = np.where(told, differs, APART), 1
-        near.append(blur(total) / np.maximum(blur(count), 1e-6))
-    chosen: list[int] = []
-    around, least = np.array(near), np.full(len(ring.rows), APART)
-    for _ in range(min(most, len(ways))):
-        gain = np.maximum(least - around, 0).sum(1) - 1e-3 * around.mean(1)
-        gain[chosen] = -np.inf
-        chosen.append(int(gain.argmax()))
-        least = np.minimum(least, around[chosen[-1]])
-    return [ways[k] for k in chosen]

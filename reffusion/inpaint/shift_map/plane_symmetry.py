@@ -1,8 +1,8 @@
-"""Motions along a plane that map what it shows onto itself: planks onto planks, tiles onto tiles.
+"""Finds how a plane's texture repeats itself: the motions along it that map planks onto planks, tiles onto tiles.
 
-What is seen of the plane is drawn in the plane's own metric coordinates and compared with itself, moved: the motions by
-which it looks most like itself repeat it, in every picture of it. Where the lines of a plane meet in a point, as the
-joints of a round table do, it is turned about that point instead of shifted.
+The plane is resampled from a photograph in its own metric coordinates and correlated with itself. Where correlation
+peaks, a shift maps the texture onto itself, in every photograph. Where the texture's lines meet in a point, as the
+joints of a round table do, the motions are turns about that point instead.
 """
 
 from __future__ import annotations
@@ -16,244 +16,260 @@ from scipy import ndimage
 
 from reffusion import seeding
 
-SIDE = 224  # cells at most a side of a plane's map
-FEWEST = 400  # cells that must be seen of the plane for anything to be said
-BOTH = 0.1  # of the cells seen, and as many at least, that must be seen of it moved, too
-EVEN = 6.0  # cells: what changes over more is shading, and is not compared
-AWAY = 3  # cells, at least: nearer everything is like itself
-ALIKE = 0.6  # correlation of the motion by which a plane looks most like itself; stone reaches 0.5, planks 0.7
-OF_BEST = 0.5  # of the highest correlation, which the others must reach
-FIRST = 0.75  # of it, from which the smallest turn is the one that the others are multiples of
-ASIDE = 0.2  # of that turn, by which a multiple may lie beside where it is expected
-MOST = 60  # motions
-DISTINCT = 9  # cells a side of a window in which one shift stands for all
-SEVERAL = 4  # shifts that a plane must have: both ways, and twice as far, say
-GAP = 9  # px: narrower gaps in what is shown of a plane, where its depth is uneven, close
-LINES, PAIRS = 3000, 400  # steepest cells that tell of lines, and pairs of them that tell where lines meet
-STRAIGHT = 0.035  # sine of the angle by which a line may miss that point
-MEETING = 1.25  # times as many lines that must go through a point as in one direction
-NEAR = 3.0  # map sides from the map's middle within which they meet
-LEAST = 16  # cells a side of a map
-REACH = 8.0  # cells to each side of it within which that point is looked for
-STEPS, LEAST_GAIN = (2.0, 1.0, 0.5), 1e-3  # cells by which it is put right, while likeness grows so much
-SEED = 0  # of what is drawn
+SIDE = 224  # cells, the longest side of a plane's map
+MIN_SIDE = 16  # cells, the shortest
+MIN_CELLS = 400  # cells of the plane that must be seen
+MIN_OVERLAP = 0.1  # of the cells seen: as many must overlap after a shift, and at least `MIN_CELLS`
+SHADING_SIGMA = 6.0  # cells: what changes over more is shading, and is not compared
+MIN_SHIFT = 3  # cells: nearer every texture is like itself
+MIN_CORRELATION = 0.6  # of the best motion; stone reaches 0.5, planks 0.7
+MIN_OF_BEST = 0.5  # share of `MIN_CORRELATION` that the other motions must reach
+MIN_OF_PEAK = 0.75  # share of the highest peak from which the smallest turn counts as the one that generates the others
+TURN_TOLERANCE = 0.2  # of that turn, by which a multiple may miss its expected place
+MAX_MOTIONS = 60
+PEAK_WINDOW = 9  # cells, a side of the window that has one peak
+MIN_SHIFTS = 4  # that a plane must have: both ways, and twice as far, say
+CLOSE_PX = 9  # px: narrower gaps in the pixels of a plane are closed, where its depth is uneven
+MAX_EDGES, LINE_PAIRS = 3000, 400  # steepest cells, whose edges are taken as lines, and pairs of them that are crossed
+SIN_TOLERANCE = 0.035  # sine of the angle by which a line may miss the centre
+MIN_CONVERGENCE = 1.25  # times as many lines must meet in the centre as run in one direction
+MAX_CENTRE_DISTANCE = 3.0  # map sides from the map's middle within which the centre is sought
+CENTRE_REACH = 8.0  # cells to each side of the lines' centre within which it is refined
+CENTRE_STEPS, MIN_GAIN = (2.0, 1.0, 0.5), 1e-3  # cells, steps of that, and the gain in correlation that continues it
+CENTRE_ITERATIONS = 5  # of the least squares fit of the centre to its lines
+HOMOGRAPHY_PIXELS = 2000  # that the homography is fitted to
+SEED = 0  # of the random pairs of lines
 
 
 @dataclass(frozen=True)
-class Repeats:
-    """How a plane repeats itself.
+class PlaneSymmetry:
+    """How a plane's texture repeats itself.
 
     Attributes:
-        centre: [2], the place about which it is turned; None: it is shifted.
+        centre: [2], the point on the plane about which it turns; None: it shifts.
         motions: [M, 2], shifts in the plane's unit; or [M, 1], turns in radians.
-        cell: length to which they are known, in the plane's unit, at most of what is seen of it.
+        resolution: to which the motions are known, in the plane's unit; of a turn, at most, at the points seen.
     """
 
     centre: np.ndarray | None
     motions: np.ndarray
-    cell: float
+    resolution: float
 
-    def moved(self, places: np.ndarray, motion: np.ndarray) -> np.ndarray:
-        """Places [N, 2] on the plane, moved."""
+    def move(self, points: np.ndarray, motion: np.ndarray) -> np.ndarray:
+        """Points [N, 2] on the plane, moved by a shift [2] or a turn [1]."""
         if self.centre is None:
-            return places + motion
+            return points + motion
         cosine, sine = np.cos(motion[0]), np.sin(motion[0])
-        return (places - self.centre) @ np.array([[cosine, sine], [-sine, cosine]]) + self.centre
+        return (points - self.centre) @ np.array([[cosine, sine], [-sine, cosine]]) + self.centre
 
-    def turn(self, motion: np.ndarray) -> np.ndarray:
-        """[2, 2], by which a motion turns a step on the plane."""
+    def rotation(self, motion: np.ndarray) -> np.ndarray:
+        """[2, 2], the derivative of `move`: the motion's rotation, the identity for a shift."""
         angle = 0.0 if self.centre is None else motion[0]
         return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
-class Seen(NamedTuple):
-    """What a picture shows of a plane: pixels [M, 2] (x, y), their places [M, 2] on the plane, the picture."""
+class PlanePixels(NamedTuple):
+    """What an image shows of a plane: pixels [M, 2] (x, y), their coordinates [M, 2] on the plane, and the image."""
 
     pixels: np.ndarray
-    places: np.ndarray
+    coordinates: np.ndarray
     image: np.ndarray
 
 
-class Map(NamedTuple):
-    """A plane as a picture shows it: [h, w, 3] float32, what is known of it, bool [h, w], and the sides of a cell."""
+class PlaneMap(NamedTuple):
+    """A plane's texture on a grid: values [h, w, 3] float32, where they are known, bool [h, w], and the two sides of a
+    cell, in the plane's unit (or radians, see `_polar_map`)."""
 
     values: np.ndarray
     known: np.ndarray
     pitch: np.ndarray
 
 
-def repeats(seen: Seen) -> Repeats | None:
-    """How the plane repeats itself, after what a picture shows of it; None: it does not."""
-    low, high = seen.places.min(0), seen.places.max(0)
-    flat = _map(seen, low, high)
-    if flat is None:
+def find_symmetry(seen: PlanePixels) -> PlaneSymmetry | None:
+    """How the plane's texture repeats itself, from what an image shows of it; None: it does not."""
+    low, high = seen.coordinates.min(0), seen.coordinates.max(0)
+    plane_map = _cartesian_map(seen, low, high)
+    if plane_map is None:
         return None
-    found = _centre(flat, np.random.default_rng(seeding.seed_for(SEED, "lines")))
-    if found is None:
-        motions = _shifts(_likeness(flat)) * flat.pitch
-        return Repeats(None, motions, flat.pitch[0]) if len(motions) else None
-    centre, unrolled = _put_right(seen, low + found * flat.pitch, flat.pitch[0])
-    if unrolled is None:
+    cell = _find_centre(plane_map, np.random.default_rng(seeding.seed_for(SEED, "lines")))
+    if cell is None:
+        motions = _find_shifts(_autocorrelation(plane_map)) * plane_map.pitch
+        return PlaneSymmetry(None, motions, plane_map.pitch[0]) if len(motions) else None
+    centre, polar = _refine_centre(seen, low + cell * plane_map.pitch, plane_map.pitch[0])
+    if polar is None:
         return None
-    motions = _turns(_likeness(unrolled)[:, 0], 2 * np.pi / unrolled.pitch[1]) * unrolled.pitch[1]
-    return Repeats(centre, motions[:, None], unrolled.pitch[0]) if len(motions) else None
+    motions = _find_turns(_autocorrelation(polar)[:, 0], 2 * np.pi / polar.pitch[1]) * polar.pitch[1]
+    return PlaneSymmetry(centre, motions[:, None], polar.pitch[0]) if len(motions) else None
 
 
-def _put_right(seen: Seen, centre: np.ndarray, cell: float) -> tuple[np.ndarray, Map | None]:
-    """The centre about which what is seen looks like itself at every turn, near one that lines tell; and the map
-    unrolled about it. About a wrong one it may look like itself once: a short arc fits many circles. Where no two turns
-    are seen, that of the lines stays."""
+def _refine_centre(seen: PlanePixels, centre: np.ndarray, cell: float) -> tuple[np.ndarray, PlaneMap | None]:
+    """The centre [2], near a first estimate, about which the texture is like itself at every turn; and the polar map
+    about it.
 
-    def judged(at: np.ndarray) -> tuple[float, Map | None]:
-        flat = _unrolled(seen, at)
-        return (-1.0 if flat is None else _steady(_likeness(flat)[:, 0], 2 * np.pi / flat.pitch[1]), flat)
+    About a wrong centre the texture may look like itself once: a short arc fits many circles. Where fewer than two
+    turns are seen, the estimate stays.
+    """
 
-    coarse = np.arange(-REACH, REACH + 1, STEPS[0])
+    def judge(at: np.ndarray) -> tuple[float, PlaneMap | None]:
+        polar = _polar_map(seen, at)
+        return (
+            -1.0 if polar is None else _mean_correlation(_autocorrelation(polar)[:, 0], 2 * np.pi / polar.pitch[1]),
+            polar,
+        )
+
+    coarse = np.arange(-CENTRE_REACH, CENTRE_REACH + 1, CENTRE_STEPS[0])
     starts = [centre + cell * np.array([x, y]) for y in coarse for x in coarse]
-    likely = [judged(start)[0] for start in starts]
-    if max(likely) > 0:
-        centre = starts[int(np.argmax(likely))]
-    best, flat = judged(centre)
-    for step in STEPS[1:]:
+    scores = [judge(start)[0] for start in starts]
+    if max(scores) > 0:
+        centre = starts[int(np.argmax(scores))]
+    best, polar = judge(centre)
+    for step in CENTRE_STEPS[1:]:
         for side in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-            while (found := judged(centre + step * cell * np.array(side)))[0] > best + LEAST_GAIN:
-                (best, flat), centre = found, centre + step * cell * np.array(side)
-    return centre, flat
+            while (score := judge(centre + step * cell * np.array(side)))[0] > best + MIN_GAIN:
+                (best, polar), centre = score, centre + step * cell * np.array(side)
+    return centre, polar
 
 
-def _steady(likeness: np.ndarray, whole: float) -> float:
-    """Mean likeness, [h] by turn, over all turns that repeat a map and of which enough is seen; 0 for fewer than 2."""
-    turns = _turns(likeness, whole)
-    told = np.interp(turns[turns > 0], np.arange(len(likeness)), likeness)
-    told = told[told != 0]
-    return float(told.mean()) if len(told) > 1 else 0.0
+def _mean_correlation(correlation: np.ndarray, full_turn: float) -> float:
+    """Mean of a correlation, [h] by turn, over all turns that map the texture onto itself and of which enough is seen;
+    0 for fewer than 2. `full_turn`: in rows."""
+    turns = _find_turns(correlation, full_turn)
+    values = np.interp(turns[turns > 0], np.arange(len(correlation)), correlation)
+    values = values[values != 0]
+    return float(values.mean()) if len(values) > 1 else 0.0
 
 
-def _likeness(flat: Map) -> np.ndarray:
-    """[h, w], correlation of a map with itself, moved by a row and a column (negative ones from the end); 0 where too
-    little of both is known."""
-    known = cv2.erode(flat.known.astype(np.uint8), np.ones((5, 5)), borderValue=0) > 0
-    grey = flat.values.mean(2)
-    fine = np.where(known, grey - cv2.GaussianBlur(grey, (0, 0), EVEN), 0.0).astype(np.float64)
-    size = [cv2.getOptimalDFTSize(2 * side) for side in fine.shape]
-    picture, mask, power = (np.fft.rfft2(each, size) for each in (fine, known.astype(float), fine**2))
+def _autocorrelation(plane_map: PlaneMap) -> np.ndarray:
+    """[h, w], normalised correlation of a map with itself, moved by a row and a column (negative ones from the end);
+    0 where too little overlaps."""
+    known = cv2.erode(plane_map.known.astype(np.uint8), np.ones((5, 5)), borderValue=0) > 0
+    grey = plane_map.values.mean(2)
+    detail = np.where(known, grey - cv2.GaussianBlur(grey, (0, 0), SHADING_SIGMA), 0.0).astype(np.float64)
+    size = [cv2.getOptimalDFTSize(2 * side) for side in detail.shape]
+    picture, mask, power = (np.fft.rfft2(each, size) for each in (detail, known.astype(float), detail**2))
     back = lambda spectrum: np.fft.irfft2(spectrum, size)
     both = np.sqrt(np.maximum(back(power * mask.conj()) * back(power.conj() * mask), 1e-6))
-    return np.where(back(np.abs(mask) ** 2) > max(FEWEST, BOTH * known.sum()), back(np.abs(picture) ** 2) / both, 0.0)
+    enough = back(np.abs(mask) ** 2) > max(MIN_CELLS, MIN_OVERLAP * known.sum())
+    return np.where(enough, back(np.abs(picture) ** 2) / both, 0.0)
 
 
-def _shifts(likeness: np.ndarray) -> np.ndarray:
-    """[M, 2], the shifts (x, y) in cells by which a map looks most like itself, the best first."""
-    height, width = (side // 2 for side in likeness.shape)
-    near = np.fft.fftshift(likeness)
-    peak = (near == ndimage.maximum_filter(near, DISTINCT)) & (near > OF_BEST * ALIKE)
-    peak[height - AWAY : height + AWAY + 1, width - AWAY : width + AWAY + 1] = False
+def _find_shifts(correlation: np.ndarray) -> np.ndarray:
+    """[M, 2], the shifts (x, y) in cells at which an autocorrelation [h, w] peaks, the highest first."""
+    height, width = (side // 2 for side in correlation.shape)
+    centred = np.fft.fftshift(correlation)
+    peak = (centred == ndimage.maximum_filter(centred, PEAK_WINDOW)) & (centred > MIN_OF_BEST * MIN_CORRELATION)
+    peak[height - MIN_SHIFT : height + MIN_SHIFT + 1, width - MIN_SHIFT : width + MIN_SHIFT + 1] = False
     rows, columns = np.nonzero(peak)
-    order = np.argsort(-near[rows, columns], kind="stable")[:MOST]
-    if len(order) < SEVERAL or near[rows, columns].max() < ALIKE:
+    order = np.argsort(-centred[rows, columns], kind="stable")[:MAX_MOTIONS]
+    if len(order) < MIN_SHIFTS or centred[rows, columns].max() < MIN_CORRELATION:
         return np.zeros((0, 2))
     return np.stack([columns[order] - width, rows[order] - height], 1).astype(np.float64)
 
 
-def _turns(likeness: np.ndarray, whole: float) -> np.ndarray:
-    """[M], the turns in rows by which a map of directions looks like itself: multiples, either way, of the smallest
-    that is about as good as any.
+def _find_turns(correlation: np.ndarray, full_turn: float) -> np.ndarray:
+    """[M], the turns, in rows, that map the texture onto itself: multiples, either way, of the smallest one that is
+    about as good as any.
 
     Args:
-        likeness: [h], by turn. whole: rows of a whole turn.
+        correlation: [h], of a polar map with itself, by turn in rows.
+        full_turn: in rows.
     """
-    some = likeness[: min(len(likeness) // 2, int(whole / 2) + 1)]
-    rows = np.arange(AWAY, len(some) - 1)
-    rows = rows[(some[rows] > some[rows - 1]) & (some[rows] >= some[rows + 1]) & (some[rows] > OF_BEST * ALIKE)]
-    if not len(rows) or some[rows].max() < ALIKE:
+    half = correlation[: min(len(correlation) // 2, int(full_turn / 2) + 1)]
+    rows = np.arange(MIN_SHIFT, len(half) - 1)
+    peak = (half[rows] > half[rows - 1]) & (half[rows] >= half[rows + 1]) & (half[rows] > MIN_OF_BEST * MIN_CORRELATION)
+    rows = rows[peak]
+    if not len(rows) or half[rows].max() < MIN_CORRELATION:
         return np.zeros(0)
-    before, at, after = (some[rows + step] for step in (-1, 0, 1))
+    before, at, after = (half[rows + step] for step in (-1, 0, 1))
     exact = rows + 0.5 * (before - after) / (before - 2 * at + after)
-    first = exact[some[rows] > FIRST * some[rows].max()].min()
-    found = []
-    for k in range(1, int(whole / 2 / first) + 1):
-        beside = np.abs(exact - k * first)
-        found.append(exact[beside.argmin()] if beside.min() < ASIDE * first else k * first)
-    return np.array([way * turn for turn in found[: MOST // 2] for way in (1, -1)])
+    first = exact[half[rows] > MIN_OF_PEAK * half[rows].max()].min()
+    turns = []
+    for k in range(1, int(full_turn / 2 / first) + 1):
+        off = np.abs(exact - k * first)
+        turns.append(exact[off.argmin()] if off.min() < TURN_TOLERANCE * first else k * first)
+    return np.array([way * turn for turn in turns[: MAX_MOTIONS // 2] for way in (1, -1)])
 
 
-def _map(seen: Seen, low: np.ndarray, high: np.ndarray) -> Map | None:
-    """Between two corners, along the plane's axes; None where it is no plane to the picture."""
-    pitch = np.full(2, _pitch(seen, float((high - low).max())))
+def _cartesian_map(seen: PlanePixels, low: np.ndarray, high: np.ndarray) -> PlaneMap | None:
+    """The map between two corners [2], along the plane's axes; None as in `_resample`."""
+    pitch = np.full(2, _cell_side(seen, float((high - low).max())))
     steps = [low[axis] + pitch[axis] * np.arange(int((high - low)[axis] / pitch[axis]) + 1) for axis in (0, 1)]
-    return _drawn(seen, np.stack(np.meshgrid(*steps), -1), pitch)
+    return _resample(seen, np.stack(np.meshgrid(*steps), -1), pitch)
 
 
-def _pitch(seen: Seen, length: float) -> float:
-    """Side of a cell of a map of a length: no finer than the picture's pixels on the whole."""
-    area = cv2.contourArea(cv2.convexHull(seen.places.astype(np.float32)))
-    return max(length / SIDE, (area / len(seen.places)) ** 0.5, 1e-9)
+def _cell_side(seen: PlanePixels, length: float) -> float:
+    """Side of a cell of a map of this length: on the whole no finer than the image's pixels."""
+    area = cv2.contourArea(cv2.convexHull(seen.coordinates.astype(np.float32)))
+    return max(length / SIDE, (area / len(seen.coordinates)) ** 0.5, 1e-9)
 
 
-def _unrolled(seen: Seen, centre: np.ndarray) -> Map | None:
-    """A column a distance from the centre, a row a direction, as wide in the middle as it is long."""
-    away = seen.places - centre
+def _polar_map(seen: PlanePixels, centre: np.ndarray) -> PlaneMap | None:
+    """The map about a centre: a column for each radius, a row for each angle (its pitch is in radians). At the median
+    radius cells are square. None as in `_resample`."""
+    away = seen.coordinates - centre
     distance = np.hypot(*away.T)
     direction = np.angle(np.exp(1j * np.arctan2(away[:, 1], away[:, 0])).mean())  # the seam lies opposite
     angle = np.angle(np.exp(1j * (np.arctan2(away[:, 1], away[:, 0]) - direction)))
     length = max(float(np.ptp(distance)), float(np.median(distance)) * float(np.ptp(angle)) / 2)
-    step = _pitch(seen, length)
+    step = _cell_side(seen, length)
     pitch = np.array([step, step / float(np.median(distance))])
     radii = np.arange(distance.min(), distance.max(), pitch[0])
     turns = direction + np.arange(angle.min(), angle.max(), pitch[1])
     radius, turn = np.meshgrid(radii, turns)
-    return _drawn(seen, centre + radius[..., None] * np.stack([np.cos(turn), np.sin(turn)], -1), pitch)
+    return _resample(seen, centre + radius[..., None] * np.stack([np.cos(turn), np.sin(turn)], -1), pitch)
 
 
-def _drawn(seen: Seen, places: np.ndarray, pitch: np.ndarray) -> Map | None:
-    """What the picture shows at places [h, w, 2]."""
-    some = np.linspace(0, len(seen.places) - 1, min(len(seen.places), 2000)).astype(int)
-    across, _ = cv2.findHomography(seen.places[some].astype(np.float64), seen.pixels[some].astype(np.float64), 0)
-    if across is None or min(places.shape[:2]) < LEAST:
+def _resample(seen: PlanePixels, coordinates: np.ndarray, pitch: np.ndarray) -> PlaneMap | None:
+    """The map at coordinates [h, w, 2] on the plane; None where it is too small, or the pixels fit no homography."""
+    some = np.linspace(0, len(seen.coordinates) - 1, min(len(seen.coordinates), HOMOGRAPHY_PIXELS)).astype(int)
+    points, pixels = (each[some].astype(np.float64) for each in (seen.coordinates, seen.pixels))
+    homography, _ = cv2.findHomography(points, pixels, 0)
+    if homography is None or min(coordinates.shape[:2]) < MIN_SIDE:
         return None
-    at = cv2.perspectiveTransform(places.reshape(1, -1, 2), across).reshape(places.shape).astype(np.float32)
-    shown = np.zeros(seen.image.shape[:2], np.uint8)
-    shown[seen.pixels[:, 1], seen.pixels[:, 0]] = 1
-    shown = cv2.morphologyEx(shown, cv2.MORPH_CLOSE, np.ones((GAP, GAP)))
-    values = cv2.remap(seen.image, at[..., 0], at[..., 1], cv2.INTER_LINEAR).astype(np.float32)
-    return Map(values, cv2.remap(shown, at[..., 0], at[..., 1], cv2.INTER_NEAREST) > 0, pitch)
+    at = cv2.perspectiveTransform(coordinates.reshape(1, -1, 2), homography).reshape(coordinates.shape)
+    x, y = at.astype(np.float32)[..., 0], at.astype(np.float32)[..., 1]
+    on_plane = np.zeros(seen.image.shape[:2], np.uint8)
+    on_plane[seen.pixels[:, 1], seen.pixels[:, 0]] = 1
+    on_plane = cv2.morphologyEx(on_plane, cv2.MORPH_CLOSE, np.ones((CLOSE_PX, CLOSE_PX)))
+    values = cv2.remap(seen.image, x, y, cv2.INTER_LINEAR).astype(np.float32)
+    return PlaneMap(values, cv2.remap(on_plane, x, y, cv2.INTER_NEAREST) > 0, pitch)
 
 
-def _centre(flat: Map, draws: np.random.Generator) -> np.ndarray | None:
-    """[2], the cell (x, y), perhaps outside the map, in which the lines meet; None where they are rather parallel."""
-    grey = cv2.GaussianBlur(flat.values.mean(2), (0, 0), 1.0)
-    slope = np.stack([cv2.Scharr(grey, cv2.CV_32F, *way) for way in ((1, 0), (0, 1))], -1)
-    length = np.linalg.norm(slope, axis=-1) * (
-        cv2.erode(flat.known.astype(np.uint8), np.ones((7, 7)), borderValue=0) > 0
-    )
-    steepest = np.argsort(-length, axis=None, kind="stable")[:LINES]
+def _find_centre(plane_map: PlaneMap, draws: np.random.Generator) -> np.ndarray | None:
+    """[2], the cell (x, y), perhaps outside the map, in which the texture's lines meet; None where they are rather
+    parallel."""
+    grey = cv2.GaussianBlur(plane_map.values.mean(2), (0, 0), 1.0)
+    gradient = np.stack([cv2.Scharr(grey, cv2.CV_32F, *way) for way in ((1, 0), (0, 1))], -1)
+    inner = cv2.erode(plane_map.known.astype(np.uint8), np.ones((7, 7)), borderValue=0) > 0
+    length = np.linalg.norm(gradient, axis=-1) * inner
+    steepest = np.argsort(-length, axis=None, kind="stable")[:MAX_EDGES]
     steepest = steepest[length.reshape(-1)[steepest] > 0]
-    if len(steepest) < FEWEST:
+    if len(steepest) < MIN_CELLS:
         return None
     rows, columns = np.unravel_index(steepest, length.shape)
     at = np.stack([columns, rows], 1).astype(np.float64)
-    across = slope[rows, columns] / length[rows, columns, None]
-    first, second = draws.integers(len(at), size=(2, PAIRS))
-    crossing = np.linalg.det(np.stack([across[first], across[second]], 1))
-    apart = np.abs(crossing) > STRAIGHT
-    heights = (across * at).sum(1)
-    a, b, p, q = across[first][apart], across[second][apart], heights[first][apart], heights[second][apart]
-    points = np.stack([p * b[:, 1] - q * a[:, 1], a[:, 0] * q - b[:, 0] * p], 1) / crossing[apart, None]
+    normals = gradient[rows, columns] / length[rows, columns, None]
+    first, second = draws.integers(len(at), size=(2, LINE_PAIRS))
+    crossing = np.linalg.det(np.stack([normals[first], normals[second]], 1))
+    crosses = np.abs(crossing) > SIN_TOLERANCE
+    heights = (normals * at).sum(1)
+    a, b, p, q = normals[first][crosses], normals[second][crosses], heights[first][crosses], heights[second][crosses]
+    points = np.stack([p * b[:, 1] - q * a[:, 1], a[:, 0] * q - b[:, 0] * p], 1) / crossing[crosses, None]
     middle = np.array(grey.shape[::-1]) / 2
-    points = points[np.linalg.norm(points - middle, axis=1) < NEAR * SIDE]
+    points = points[np.linalg.norm(points - middle, axis=1) < MAX_CENTRE_DISTANCE * SIDE]
     if not len(points):
         return None
-    through = [_through(point, at, across) for point in points]
-    parallel = max(int((np.abs(across @ (-each[1], each[0])) < STRAIGHT).sum()) for each in across[first])
-    best = points[int(np.argmax([mine.sum() for mine in through]))]
-    for _ in range(5):
-        mine = _through(best, at, across)
-        weight = 1 / np.maximum(np.linalg.norm(at[mine] - best, axis=1), LEAST / 2)[:, None]
-        best = np.linalg.lstsq(across[mine] * weight, heights[mine, None] * weight, rcond=None)[0][:, 0]
-    return best if _through(best, at, across).sum() > MEETING * parallel else None
+    counts = [_meets(point, at, normals).sum() for point in points]
+    parallel = max(int((np.abs(normals @ (-each[1], each[0])) < SIN_TOLERANCE).sum()) for each in normals[first])
+    best = points[int(np.argmax(counts))]
+    for _ in range(CENTRE_ITERATIONS):
+        mine = _meets(best, at, normals)
+        weight = 1 / np.maximum(np.linalg.norm(at[mine] - best, axis=1), MIN_SIDE / 2)[:, None]
+        best = np.linalg.lstsq(normals[mine] * weight, heights[mine, None] * weight, rcond=None)[0][:, 0]
+    return best if _meets(best, at, normals).sum() > MIN_CONVERGENCE * parallel else None
 
 
-def _through(point: np.ndarray, at: np.ndarray, across: np.ndarray) -> np.ndarray:
-    """bool [L]: lines at [L, 2], normal to `across` [L, 2], that go through the point."""
+def _meets(point: np.ndarray, at: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """bool [L], which lines, through points `at` [L, 2] with unit normals [L, 2], go through a point [2]."""
     away = point - at
-    return np.abs((across * away).sum(1)) < STRAIGHT * np.linalg.norm(away, axis=1)
+    return np.abs((normals * away).sum(1)) < SIN_TOLERANCE * np.linalg.norm(away, axis=1)
