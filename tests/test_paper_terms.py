@@ -14,8 +14,11 @@ from small_params import altered
 from small_prior import small_prior
 from test_distill import camera, train_view, wall
 
-from reffusion.distill import confinement, optimization
-from reffusion.distill.depth_term import _within
+from reffusion.distill import loop
+from reffusion.distill.adversary import Adversary
+from reffusion.distill.display_range import clamp_to_display
+from reffusion.distill.terms import adversarial, sds
+from reffusion.distill.terms.depth import _downscale
 from reffusion.fit import step
 from reffusion.gaussians.optimize import Rates
 from reffusion.geometry import cameras_extent
@@ -66,7 +69,7 @@ def test_photographs_do_not_supervise_where_an_object_is_drawn(views_of):
     views = made()
     assert torch.equal(views["a0"].supervises, ~(hidden | drawn)) and torch.equal(views["a3"].supervises, ~hidden)
     assert views["a4"].clean and views["a4"].supervises.all()
-    _, _, not_seen = _within(10_000, views["a0"])  # the depth term's
+    _, _, not_seen = _downscale(views["a0"], 10_000)  # the depth term's
     assert torch.equal(not_seen, hidden | drawn)
 
 
@@ -146,7 +149,7 @@ def test_guidance_of_the_empty_prompt_changes_nothing_and_costs_nothing(prior, m
 
 def test_colours_above_1_are_shown_as_1_and_may_only_come_back():
     color = torch.tensor([-0.2, 0.5, 1.5, 1.5], requires_grad=True)
-    shown = confinement.displayed(color)
+    shown = clamp_to_display(color)
     assert torch.equal(shown, torch.tensor([0.0, 0.5, 1.0, 1.0]))
     (shown * torch.tensor([1.0, 1.0, 1.0, -1.0])).sum().backward()  # a step goes against the gradient
     assert color.grad.tolist() == [0, 1, 1, 0]
@@ -156,17 +159,17 @@ def test_no_term_shows_a_prior_or_a_critic_colours_above_1(prior, monkeypatch):
     gaussians, masked = wall()
     bright = replace(gaussians, sh=gaussians.sh + 3)
     seen = []
-    encode, patches = diffusion.encode, confinement.patches_around
+    encode, patches = diffusion.encode, adversarial.draw_patches
     monkeypatch.setattr(diffusion, "encode", lambda p, images: seen.append(float(images.max())) or encode(p, images))
     watched = lambda image, *rest: seen.append(float(image.max()) * 2 - 1) or patches(image, *rest)
-    monkeypatch.setattr(confinement, "patches_around", watched)
+    monkeypatch.setattr(adversarial, "draw_patches", watched)
     with torch.no_grad():
         text = diffusion.embed_text(prior, list(crops.PROMPTS))
-    confinement.sds_term(bright, masked, train_view(), prior, text, Sds(guidance=0), generator(0, "bright"))
-    critic = optimization.Params(adversarial={"patches": 4, "size": 8, "width": 4}).adversarial
-    adversary = confinement.Adversary(critic, 0)
+    sds.evaluate_sds(bright, masked, train_view(), prior, text, Sds(guidance=0), generator(0, "bright"))
+    critic = Params(adversarial={"patches": 4, "size": 8, "width": 4}).adversarial
+    adversary = Adversary(critic, 0)
     view = train_view()
-    confinement.adversarial_term(bright, masked, view, view.photo, view.repaint, adversary, generator(0, "bright"))
+    adversarial.evaluate_adversarial(bright, masked, view, view.photo, view.repaint, adversary, generator(0, "bright"))
     assert len(seen) >= 4 and max(seen) <= 1 + 1e-5
 
 
@@ -200,7 +203,7 @@ def test_positions_step_by_the_cameras_extent_as_3dgs_has_it():
     assert cameras_extent(cameras) == pytest.approx(1.1 * 0.3)
     for unit, factor in (("distance", 1.0), ("cameras", 1.1 * 0.3)):
         rates = step.rates_of(LearningRates(means_unit=unit), cameras)
-        ours = optimization.rates_of(Params(lr={"means_unit": unit}).lr, cameras)
+        ours = loop.rates_of(Params(lr={"means_unit": unit}).lr, cameras)
         for each in (rates, ours):
             assert (each.means, each.means_last) == pytest.approx((1.6e-4 * factor, 1.6e-6 * factor))
             assert replace(each, means=Rates.means, means_last=Rates.means_last) == Rates()

@@ -20,8 +20,7 @@ import torch
 import yaml
 
 from reffusion import trace
-from reffusion.distill.optimization import average, masked_factors
-from reffusion.distill.steps import job_of, step_of
+from reffusion.distill.loop import average, build_objective, masked_factors, take_step
 from reffusion.gaussians.optimize import GaussianOptimizer
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.scene import load_scene
@@ -46,7 +45,7 @@ ATTEMPTS: dict[str, dict] = {
     "prior not personalized": {BASE: False},
     "a tenth of the weight": {"sds": {"weight": 0.03}},
     "ten times the weight": {"sds": {"weight": 3}},
-    "every view": {"sds": {"within": 180}},
+    "every view": {"sds": {"max_angle": 180}},
     "contrast not kept": {"sds": {"keep_contrast": False}},
     "two windows as well": {"sds": {"patches": 2}},
     "two windows, a tenth of the weight": {"sds": {"patches": 2, "weight": 0.03}},
@@ -104,7 +103,7 @@ def curve(overrides: dict, run: Path, start: Path, views: list[tuple]) -> list[d
     adapted = run / "personalize" if overrides.get(BASE, True) else None
     prior, text = stage.adapted_prior(params, adapted)
     seen = stage.train_views(params, scene, run / "poses", run / "fit", run / "masks")
-    job = job_of(seen, holes, prior, text, params, initial, masked)
+    objective = build_objective(initial, masked, seen, holes, prior, text, params)
     optimizer = GaussianOptimizer(initial, masked, None, masked_factors(params.lr), epsilon=params.lr.epsilon)
     rasterizer.render(optimizer.gaussians, holes[0][0]).color.sum().backward()  # compiles, before the clock starts
     optimizer.forget_gradients()
@@ -115,7 +114,7 @@ def curve(overrides: dict, run: Path, start: Path, views: list[tuple]) -> list[d
                 with log.paused():
                     log.log(step, **scored(optimizer.gaussians, views))
             if step < max(MOMENTS):
-                step_of(optimizer, step, job)
+                take_step(optimizer, step, objective)
                 average(optimizer, params, step + 1)
         return trace.read_trace(log.path)
 
