@@ -1,4 +1,4 @@
-"""distill: reconstruction, multi-scale score distillation and a critic, each confined (RefFusion section 4)."""
+"""distill: optimises the initialization by reconstruction, score distillation and a critic (RefFusion section 4)."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from torch import Tensor
 from reffusion import trace
 from reffusion.depth import monocular
 from reffusion.depth.background_depth import Completion
-from reffusion.distill import depth_term, perceptual
-from reffusion.distill.confinement import TrainView
-from reffusion.distill.optimization import distill
-from reffusion.distill.steps import near_a_reference
+from reffusion.distill import depth_estimator, perceptual
+from reffusion.distill.loop import distill
+from reffusion.distill.terms.sds import views_near_references
+from reffusion.distill.train_view import ReferenceHole, TrainView
 from reffusion.fit import exposure
 from reffusion.io.arrays import load_json, load_labels, save_json, save_labels
 from reffusion.io.images import load_mask
@@ -28,10 +28,9 @@ from reffusion.prior import diffusion, lora, memory
 from reffusion.prior.crops import PROMPTS
 from reffusion.prior.model import Prior, load_prior, recomputing, without_text
 from reffusion.splat import rasterizer
-from reffusion.types import Camera, Gaussians, Scene
+from reffusion.types import Gaussians, Scene
 
-MEMORY = "distill.memory_gb"  # what an error names
-Hole = tuple[Camera, Tensor, Tensor]  # of a reference: camera, image [H, W, 3] in [0, 1], hole [H, W] bool
+MEMORY_PARAM = "distill.memory_gb"  # the parameter that out-of-memory errors name
 
 
 def run(
@@ -48,57 +47,61 @@ def run(
 ) -> None:
     rasterizer.prepare(params.device)
     began = time.monotonic()
-    params, said = without_sds(params, initialize)
+    params, sds_decision = resolve_sds(params, initialize)
     scene = load_scene(poses)
-    initial, masked, holes = start(params, scene, reference, initialize)
-    prior, text = adapted_prior(params, personalize)
-    estimator = depth_estimator(params, scene.points) if params.depth.weight > 0 else None
-    views = train_views(params, scene, poses, fit, masks, lift, initialize)
-    named, distance = lift_distance(params)
-    if params.sds.weight > 0 and params.sds.within < 180:
-        print(within(params, initial.means[masked], views, holes), flush=True)
-    with memory.blamed(MEMORY, params.memory_gb):
+    initial, masked, references = load_initialization(params, scene, reference, initialize)
+    prior, text = load_adapted_prior(params, personalize)
+    estimator = build_depth_estimator(params, scene.points) if params.depth.weight > 0 else None
+    views = load_train_views(params, scene, poses, fit, masks, lift, initialize)
+    distance_name, distance = load_lift_distance(params)
+    if params.sds.is_on and params.sds.max_angle < 180:
+        print(describe_sds_views(params, initial.means[masked], views, references), flush=True)
+    with memory.blamed(MEMORY_PARAM, params.memory_gb):
         if prior is not None:
-            prior = memory.fitted(prior, params.memory_gb, MEMORY, memory.encoding)
-        given = initial, masked, views, holes, prior, text
+            prior = memory.fitted(prior, params.memory_gb, MEMORY_PARAM, memory.encoding)
+        inputs = initial, masked, views, references, prior, text
 
-        def made(folder: Path, steps: int) -> tuple[Gaussians, Tensor]:
-            return distill(*given, params.model_copy(update={"iterations": steps}), folder, estimator, distance)
+        def distill_for(folder: Path, steps: int) -> tuple[Gaussians, Tensor]:
+            return distill(*inputs, params.model_copy(update={"iterations": steps}), folder, estimator, distance)
 
-        steps = trace.affordable(out, params.iterations, params.seconds, lambda: time.monotonic() - began, made)
-        gaussians, masked = made(out, steps)
+        elapsed = lambda: time.monotonic() - began
+        steps = trace.affordable(out, params.iterations, params.seconds, elapsed, distill_for)
+        gaussians, masked = distill_for(out, steps)
     save_ply(out / "gaussians.ply", gaussians.map(lambda p: p.cpu()))
     save_labels(out / "labels.npy", masked.cpu())
-    painted = load_json(lift / "facts.json")["inpainter"] if lift else None
-    save_json(out / "facts.json", {"inpainter": painted, "perceptual": named, "sds": said})
+    inpainter = load_json(lift / "facts.json")["inpainter"] if lift else None
+    save_json(out / "facts.json", {"inpainter": inpainter, "perceptual": distance_name, "sds": sds_decision})
     trace.clear_checkpoint(out)
 
 
-def without_sds(params: Params, initialize: Path) -> tuple[Params, str]:
-    """The parameters, of SDS the weight 0 where it is not to run, and in words whether it runs."""
+def resolve_sds(params: Params, initialize: Path) -> tuple[Params, str]:
+    """Decides whether SDS runs: the parameters, with `sds.weight` 0 if it does not, and the decision in words."""
     if params.sds.weight == 0 or params.sds.run == "always":
         return params, "runs" if params.sds.weight else "weight 0"
     never = {"sds_reason": "distill.sds.run is never"}
-    told = load_json(initialize / "facts.json") if params.sds.run == "auto" else never
-    if told.get("sds_may_gain"):
-        return params, f"runs: {told['sds_reason']}"
-    said = f"left out: {told['sds_reason']}"
-    print(f"SDS {said}", flush=True)
-    return params.model_copy(update={"sds": params.sds.model_copy(update={"weight": 0.0})}), said
+    facts = load_json(initialize / "facts.json") if params.sds.run == "auto" else never
+    if facts.get("sds_may_gain"):
+        return params, f"runs: {facts['sds_reason']}"
+    decision = f"left out: {facts['sds_reason']}"
+    print(f"SDS {decision}", flush=True)
+    return params.model_copy(update={"sds": params.sds.model_copy(update={"weight": 0.0})}), decision
 
 
-def start(params: Params, scene: Scene, reference: Path, initialize: Path) -> tuple[Gaussians, Tensor, list[Hole]]:
-    """The initialization's Gaussians and labels, and the holes of the references, on the device."""
+def load_initialization(
+    params: Params, scene: Scene, reference: Path, initialize: Path
+) -> tuple[Gaussians, Tensor, list[ReferenceHole]]:
+    """The initialization's Gaussians and labels, and the references with their holes, on the device."""
     initial = load_ply(initialize / "gaussians.ply").map(lambda p: p.to(params.device))
     masked = load_labels(initialize / "labels.npy").to(params.device)
-    place = lambda array: torch.from_numpy(array).to(params.device)
-    holes = [(r.camera, place(r.image) / 255, place(r.mask)) for r in load_references(reference, scene)]
-    return initial, masked, holes
+    to_device = lambda array: torch.from_numpy(array).to(params.device)
+    found = load_references(reference, scene)
+    references = [ReferenceHole(each.camera, to_device(each.image) / 255, to_device(each.mask)) for each in found]
+    return initial, masked, references
 
 
-def adapted_prior(params: Params, personalize: Path | None) -> tuple[Prior | None, Tensor | None]:
-    """The prior with what it learnt, without its text encoder, and the prompts' embeddings; None, None if unused."""
-    if not (params.sds.weight > 0 or params.depth.weight > 0):
+def load_adapted_prior(params: Params, personalize: Path | None) -> tuple[Prior | None, Tensor | None]:
+    """The personalized prior without its text encoder, and the prompts' embeddings; (None, None) if no term uses it."""
+    if not params.needs_prior:
         return None, None
     prior = load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
     prior = prior if personalize is None else lora.merged(prior, personalize)
@@ -108,7 +111,7 @@ def adapted_prior(params: Params, personalize: Path | None) -> tuple[Prior | Non
     return recomputing(prior) if params.checkpointing else prior, text
 
 
-def train_views(
+def load_train_views(
     params: Params,
     scene: Scene,
     poses: Path,
@@ -117,42 +120,45 @@ def train_views(
     lift: Path | None = None,
     initialize: Path | None = None,
 ) -> list[TrainView]:
-    """The training views with the pixels that may supervise, those to repaint, and their pictures inpainted in 2D.
+    """The training views with the pixels that may supervise, those to repaint, and their images inpainted in 2D.
 
-    `initialize` may know of pixels that the object had shadowed, which may not supervise, and of fewer to repaint.
+    Where `initialize` found pixels that the object shadows, these do not supervise; where it reduced a view's invent
+    mask, the reduced one counts.
     """
     photos, sets = exposure.load_views(poses, fit, scene.train), load_mask_sets(masks, (*scene.train, *scene.blank))
-    place = lambda array: torch.from_numpy(array).to(params.device)
-    painted = load_views(lift, [n for n in scene.train if (lift / "images" / f"{n}.png").exists()]) if lift else {}
-    known = lambda folder: {path.stem: path for path in (initialize / folder).glob("*.png")} if initialize else {}
-    shadowed = known("shadows")
-    sets |= {name: replace(sets[name], invent=load_mask(path)) for name, path in known("invent").items()}
+    to_device = lambda array: torch.from_numpy(array).to(params.device)
+    inpainted = load_views(lift, [n for n in scene.train if (lift / "images" / f"{n}.png").exists()]) if lift else {}
+    find_masks = lambda folder: {path.stem: path for path in (initialize / folder).glob("*.png")} if initialize else {}
+    shadows = find_masks("shadows")
+    sets |= {name: replace(sets[name], invent=load_mask(path)) for name, path in find_masks("invent").items()}
     views = []
     for name in (*scene.train, *scene.blank):
         clean, pixels = name in scene.clean, sets[name]
-        drawn = pixels.consistent | pixels.invent  # a region that is filled is part of the paper's m
-        repaint = (pixels.invent if params.repaint == "invent" else drawn) & (not clean)
-        # C shows the object; I, where it reaches beyond C, the place of one that is to be drawn there.
-        supervises = (~drawn | clean) & (name not in scene.blank)
-        if name in shadowed:
-            supervises &= ~load_mask(shadowed[name])
-        lifted = place(painted[name]) / 255 if name in painted else None
-        photo = place(photos.get(name, np.zeros((*repaint.shape, 3), np.uint8)))
-        views.append(TrainView(scene.cameras[name], photo, place(supervises), place(repaint), clean, lifted))
+        hidden = pixels.consistent | pixels.invent  # a region to fill is part of the paper's mask m
+        repaint = (pixels.invent if params.repaint == "invent" else hidden) & (not clean)
+        # C shows the object. Where I reaches beyond C, it is the place of an object to be inserted.
+        supervises = (~hidden | clean) & (name not in scene.blank)
+        if name in shadows:
+            supervises &= ~load_mask(shadows[name])
+        lifted = to_device(inpainted[name]) / 255 if name in inpainted else None
+        photo = to_device(photos.get(name, np.zeros((*repaint.shape, 3), np.uint8)))
+        views.append(TrainView(scene.cameras[name], photo, to_device(supervises), to_device(repaint), clean, lifted))
     return views
 
 
-def within(params: Params, means: Tensor, views: list[TrainView], holes: list[Hole]) -> str:
-    """How many of the views that could be distilled are."""
-    painted = [view for view in views if view.repaint.any()]
-    near = near_a_reference(painted, [camera for camera, _, _ in holes], means, params.sds.within)
-    return f"SDS in {len(near)} of {len(painted)} views: those within {params.sds.within:g} degrees of a reference"
+def describe_sds_views(params: Params, means: Tensor, views: list[TrainView], references: list[ReferenceHole]) -> str:
+    """A sentence that says how many of the views with a hole are distilled. `means`: [M, 3] of masked Gaussians."""
+    with_hole = [view for view in views if view.repaint.any()]
+    near = views_near_references(with_hole, [each.camera for each in references], means, params.sds.max_angle)
+    degrees = f"{params.sds.max_angle:g} degrees"
+    return f"SDS in {len(near)} of {len(with_hole)} views: those within {degrees} of a reference"
 
 
-def lift_distance(params: Params) -> tuple[str | None, perceptual.Distance | None]:
-    """The perceptual distance of lifted pictures, its name first; None, None where none is used.
+def load_lift_distance(params: Params) -> tuple[str | None, perceptual.Distance | None]:
+    """The name of the perceptual distance for lifted images, and the distance; (None, None) if none is used.
 
-    Raises ValueError where LPIPS weights are there but broken.
+    Raises:
+        ValueError: LPIPS weights exist but are broken.
     """
     if not params.lift.weight or params.lift.loss == "mse":
         return None, None
@@ -161,11 +167,15 @@ def lift_distance(params: Params) -> tuple[str | None, perceptual.Distance | Non
     return name, distance
 
 
-def depth_estimator(params: Params, points: np.ndarray) -> depth_term.Estimator:
-    """The depth term's estimator: by a network where one is named, else the scene's own depth continued."""
-    # PAPER leaves open: whether an estimate is aligned plainly or robustly on known pixels; plainly, by squared error.
+def build_depth_estimator(params: Params, points: np.ndarray) -> depth_estimator.DepthEstimator:
+    """The depth term's estimator: by a network if one is named, else the scene's own depth continued.
+
+    Args:
+        points: [P, 3], the scene's sparse points.
+    """
+    # PAPER leaves open: whether an estimate is aligned by least squares or robustly on known pixels; least squares.
     how = Completion(robust=False, seed=params.seed)
     if not params.depth.model:
-        return depth_term.by_continuation(points, how)
+        return depth_estimator.continuation_estimator(points, how)
     network = monocular.load_network(params.depth.model, params.device)
-    return depth_term.by_network(partial(monocular.disparity, network), how)
+    return depth_estimator.network_estimator(partial(monocular.disparity, network), how)

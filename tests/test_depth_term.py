@@ -11,10 +11,11 @@ from reffusion import trace
 from reffusion.depth import background_depth, estimates
 from reffusion.depth.alignment import align
 from reffusion.depth.background_depth import Completion
-from reffusion.distill import depth_term
-from reffusion.distill import optimization as D
-from reffusion.distill.confinement import TrainView
-from reffusion.distill.depth_term import Estimator
+from reffusion.distill import depth_estimator
+from reffusion.distill import loop as D
+from reffusion.distill.depth_estimator import DepthEstimator
+from reffusion.distill.terms import depth as depth_term
+from reffusion.distill.train_view import TrainView
 from reffusion.gaussians.optimize import GaussianOptimizer, Rates
 from reffusion.gaussians.surfels import surface_gaussians
 from reffusion.geometry import Degenerate
@@ -60,7 +61,7 @@ def leaves(gaussians):
 
 def term(gaussians, masked, estimator, prior=None, text=None, view=None, **more):
     given = view or train_view(), prior, text, DEPTH, 7.5, generator(1), estimator
-    return depth_term.depth_term(gaussians, masked, *given, **more)
+    return depth_term.evaluate_depth(gaussians, masked, *given, **more)
 
 
 def shown(moved=1.0, how=HOW):
@@ -71,7 +72,7 @@ def shown(moved=1.0, how=HOW):
 
 def giving(estimate):
     """The paper's estimator with a network that says `estimate`, whatever it is shown."""
-    return depth_term.by_network(lambda image: torch.as_tensor(np.asarray(estimate)), HOW)
+    return depth_estimator.network_estimator(lambda image: torch.as_tensor(np.asarray(estimate)), HOW)
 
 
 # ------------------------------------------------------------------------------------------ alignment and target
@@ -132,7 +133,7 @@ def test_nothing_is_compared_where_depth_is_unknown():
 
 
 def test_a_surface_that_is_right_has_no_loss_and_one_that_is_not_is_pulled_the_right_way():
-    estimator = depth_term.by_continuation(NO_POINTS, HOW)
+    estimator = depth_estimator.continuation_estimator(NO_POINTS, HOW)
     right = float(term(*wall(), estimator)[0])
     for moved, sign in ((0.9, -1), (1.1, 1)):
         gaussians, masked = wall(moved)
@@ -147,7 +148,7 @@ def test_a_surface_that_is_right_has_no_loss_and_one_that_is_not_is_pulled_the_r
 
 def test_the_loss_is_in_units_of_the_extent():
     gaussians, masked = wall(0.9)
-    estimator = depth_term.by_continuation(NO_POINTS, HOW)
+    estimator = depth_estimator.continuation_estimator(NO_POINTS, HOW)
     once, thrice = (float(term(gaussians, masked, estimator, extent=e)[0]) for e in (1, 3))
     assert once == pytest.approx(9 * thrice)
 
@@ -155,7 +156,7 @@ def test_the_loss_is_in_units_of_the_extent():
 def test_a_displaced_surface_converges_to_the_wall():
     gaussians, masked = wall(0.92)
     optimizer = GaussianOptimizer(gaussians, masked, Rates(means=1.2e-2, means_last=1e-3))
-    estimator, losses = depth_term.by_continuation(NO_POINTS, HOW), []
+    estimator, losses = depth_estimator.continuation_estimator(NO_POINTS, HOW), []
     for step in range(36):
         loss, rendering = term(optimizer.gaussians, optimizer.masked, estimator)
         loss.backward()
@@ -194,7 +195,7 @@ def test_the_gradient_agrees_with_finite_differences_in_float64():
     )
     masked = torch.arange(count) % 3 > 0
     hole = (np.abs(COLUMNS + 0.5 - WIDTH / 2) < 4) & (np.abs(ROWS + 0.5 - HEIGHT / 2) < 4)
-    estimator = Estimator(replace(HOW, explained=0.2), lambda *_: WALL)
+    estimator = DepthEstimator(replace(HOW, explained=0.2), lambda *_: WALL)
     gaussians = leaves(few)
     loss, drawn = term(gaussians, masked, estimator, view=train_view(hole))
     loss.backward()
@@ -232,7 +233,10 @@ def test_estimates_that_fit_nothing_are_degenerate(estimate, reason, prior, text
 
 def test_views_without_known_or_drawn_pixels_are_degenerate(prior, text):
     everywhere = train_view(np.ones_like(HOLE))
-    for estimator, reason in ((giving(WALL), "few pixels"), (depth_term.by_continuation(NO_POINTS, HOW), "no plane")):
+    for estimator, reason in (
+        (giving(WALL), "few pixels"),
+        (depth_estimator.continuation_estimator(NO_POINTS, HOW), "no plane"),
+    ):
         with pytest.raises(Degenerate) as caught:
             term(*wall(), estimator, prior, text, view=everywhere)
         assert caught.value.reason == reason
@@ -240,12 +244,12 @@ def test_views_without_known_or_drawn_pixels_are_degenerate(prior, text):
     around = gaussians.map(lambda p: p[~masked])
     with pytest.raises(Degenerate) as caught:
         inner = train_view((np.abs(COLUMNS + 0.5 - WIDTH / 2) < 2) & (np.abs(ROWS + 0.5 - HEIGHT / 2) < 2))
-        term(around, masked[~masked], depth_term.by_continuation(NO_POINTS, HOW), view=inner)
+        term(around, masked[~masked], depth_estimator.continuation_estimator(NO_POINTS, HOW), view=inner)
     assert caught.value.reason == "nothing compared"
 
 
 def test_a_view_larger_than_asked_for_is_rendered_smaller():
-    _, drawn = term(*wall(), depth_term.by_continuation(NO_POINTS, HOW), longest=WIDTH // 2)
+    _, drawn = term(*wall(), depth_estimator.continuation_estimator(NO_POINTS, HOW), max_side=WIDTH // 2)
     assert drawn.depth.shape == (HEIGHT // 2, WIDTH // 2)
 
 
@@ -276,7 +280,7 @@ def test_the_picture_is_painted_only_where_planes_do_not_explain(prior, text):
         found, _ = background_depth.continued(view, guide, NO_POINTS, replace(HOW, planar_share=share))
         np.testing.assert_allclose(found[HOLE], WALL[HOLE], rtol=1e-3)
         assert len(asked) == times
-    smooth = depth_term.by_continuation(NO_POINTS, replace(HOW, planar_share=2.0))
+    smooth = depth_estimator.continuation_estimator(NO_POINTS, replace(HOW, planar_share=2.0))
     assert float(term(*wall(), smooth, prior, text)[0]) < 1e-3
 
 
@@ -287,7 +291,7 @@ def test_the_estimator_sees_the_repainted_view(prior, text):
         seen.append(image)
         return torch.from_numpy(WALL)
 
-    term(*wall(), depth_term.by_network(network, HOW), prior, text)
+    term(*wall(), depth_estimator.network_estimator(network, HOW), prior, text)
     with torch.no_grad():
         color = render(wall()[0], VIEW).color.clamp(0, 1).permute(2, 0, 1)
     hole = torch.from_numpy(HOLE)
@@ -320,18 +324,18 @@ def lines(folder):
 def test_interrupted_distillation_with_the_depth_term_resumes_bit_for_bit(prior, text, tmp_path, monkeypatch):
     monkeypatch.setattr(trace, "WORTH", 0)  # a checkpoint after every step
     whole, _ = distilled(tmp_path / "whole", prior, text, giving(WALL))
-    real = D.step_of
+    real = D.take_step
 
     def interrupted(optimizer, step, *others):
         if step == 3:
             raise KeyboardInterrupt
         return real(optimizer, step, *others)
 
-    monkeypatch.setattr(D, "step_of", interrupted)
+    monkeypatch.setattr(D, "take_step", interrupted)
     with pytest.raises(KeyboardInterrupt):
         distilled(tmp_path / "broken", prior, text, giving(WALL))
     assert load_checkpoint(tmp_path / "broken")["step"] == 3
-    monkeypatch.setattr(D, "step_of", real)
+    monkeypatch.setattr(D, "take_step", real)
     resumed, _ = distilled(tmp_path / "broken", prior, text, giving(WALL))
     for name in PARAMETERS:
         assert (getattr(whole, name) == getattr(resumed, name)).all(), name
@@ -347,7 +351,7 @@ def test_skipped_views_are_counted_by_reason_and_move_nothing(prior, text, tmp_p
 
 
 def test_an_estimate_that_is_not_finite_names_step_and_view(prior, text, tmp_path):
-    nowhere = Estimator(HOW, lambda view, picture: np.full(WALL.shape, np.nan))
+    nowhere = DepthEstimator(HOW, lambda view, picture: np.full(WALL.shape, np.nan))
     with pytest.raises(FloatingPointError, match="step 0, depth, view 'a'"):
         distilled(tmp_path, prior, text, nowhere)
     with pytest.raises(ValueError, match="estimator"):
@@ -357,4 +361,4 @@ def test_an_estimate_that_is_not_finite_names_step_and_view(prior, text, tmp_pat
 def test_both_stages_find_depth_alike():
     from stages import distill, initialize
 
-    assert initialize.HOW == Completion() == distill.depth_estimator(Params(), NO_POINTS).how
+    assert initialize.HOW == Completion() == distill.build_depth_estimator(Params(), NO_POINTS).how

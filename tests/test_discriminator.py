@@ -6,16 +6,16 @@ import torch
 from small_params import altered
 
 from reffusion.distill.adversary import Adversary
-from reffusion.distill.confinement import patches_around
 from reffusion.distill.discriminator import (
     Critic,
-    binomial,
+    append_minibatch_std,
+    binomial_filter,
     critic_loss,
-    gathered,
+    gather_patches,
     generator_loss,
     gradient_penalty,
-    with_deviation,
 )
+from reffusion.distill.terms.adversarial import draw_patches
 from reffusion.params.distill import Adversarial
 from reffusion.prior.windows import window_around, windows_around
 from reffusion.seeding import generator
@@ -119,28 +119,28 @@ def test_scores_at_the_start_are_of_one_size_whatever_the_width():
 
 def test_minibatch_deviation_against_numpy():
     features = noise(12, 5, 3, 3)
-    out = with_deviation(features, group=4)
+    out = append_minibatch_std(features, group=4)
     assert (out[:, :5] == features).all() and out.shape == (12, 6, 3, 3)
     for i in range(12):
         members = features.numpy()[i % 3 :: 3]  # three groups of four
         assert len(members) == 4
         assert out[i, 5].numpy() == pytest.approx(np.full((3, 3), members.std(0).mean()), rel=1e-5)
     same = torch.ones(4, 2, 3, 3, requires_grad=True)
-    with_deviation(same)[:, 2].sum().backward()
+    append_minibatch_std(same)[:, 2].sum().backward()
     assert torch.isfinite(same.grad).all(), "equal patches"
     with pytest.raises(ValueError, match="6 patches"):
-        with_deviation(noise(6, 2, 3, 3))
+        append_minibatch_std(noise(6, 2, 3, 3))
 
 
 def test_the_filter_keeps_constants_and_removes_what_halving_would_alias():
     line = torch.ones(16, dtype=torch.float32)
-    assert torch.allclose((binomial(16, 2) @ line)[2:-2], torch.ones(13))
-    assert torch.allclose((binomial(16, 1) @ line)[1:-1], torch.ones(13))
+    assert torch.allclose((binomial_filter(16, 2) @ line)[2:-2], torch.ones(13))
+    assert torch.allclose((binomial_filter(16, 1) @ line)[1:-1], torch.ones(13))
     fastest = torch.tensor([1.0, -1.0]).repeat(8)
-    assert (binomial(16, 2) @ fastest)[2:-2].abs().max() < 1e-6
+    assert (binomial_filter(16, 2) @ fastest)[2:-2].abs().max() < 1e-6
     values = noise(16)
     expected = np.convolve(values.numpy(), np.array([1, 3, 3, 1]) / 8)
-    assert np.allclose((binomial(16, 2) @ values).numpy(), expected[1:-1], atol=1e-6)
+    assert np.allclose((binomial_filter(16, 2) @ values).numpy(), expected[1:-1], atol=1e-6)
 
 
 @pytest.mark.parametrize("size", [8, 16, 32])
@@ -162,10 +162,10 @@ def test_sizes_that_cannot_be_halved_are_refused(size):
 def test_gathering_is_slicing_and_its_gradient_is_the_finite_differences():
     image = noise(3, 11, 13, dtype=torch.float64).requires_grad_()
     windows = torch.tensor([[0, 0], [3, 5], [3, 5], [7, 9], [4, 4]])
-    patches = gathered(image, windows, 4)
+    patches = gather_patches(image, windows, 4)
     for patch, (top, left) in zip(patches, windows.tolist(), strict=True):
         assert (patch == image[:, top : top + 4, left : left + 4]).all()
-    assert torch.autograd.gradcheck(lambda x: gathered(x, windows, 4).square(), image)
+    assert torch.autograd.gradcheck(lambda x: gather_patches(x, windows, 4).square(), image)
 
 
 def test_windows_show_a_masked_pixel_and_stay_inside():
@@ -186,7 +186,7 @@ def test_a_view_smaller_than_a_patch_is_enlarged_and_still_gets_its_gradient():
     image = torch.full((10, 12, 3), 0.75, requires_grad=True)
     mask = torch.zeros(10, 12, dtype=torch.bool)
     mask[4, 5] = True
-    patches = patches_around(image, mask, 4, 16, generator(0))
+    patches = draw_patches(image, mask, 4, 16, generator(0))
     assert patches.shape == (4, 3, 16, 16) and torch.allclose(patches, torch.tensor(0.5))
     patches.sum().backward()
     assert image.grad[4, 5].ne(0).all()
@@ -194,7 +194,7 @@ def test_a_view_smaller_than_a_patch_is_enlarged_and_still_gets_its_gradient():
 
 def test_patches_lie_between_black_at_minus_one_and_white_at_one():
     image = torch.tensor([0.0, 0.5, 1.0]).expand(9, 9, 3)
-    patches = patches_around(image, torch.ones(9, 9, dtype=torch.bool), 4, 8, generator(0))
+    patches = draw_patches(image, torch.ones(9, 9, dtype=torch.bool), 4, 8, generator(0))
     assert (patches == torch.tensor([-1.0, 0.0, 1.0])[:, None, None]).all()
 
 
@@ -214,18 +214,18 @@ def textures(count, fine, label):
 @pytest.mark.parametrize("form", ["non-saturating", "saturating"])
 def test_the_critic_separates_two_textures_and_its_slope_leads_to_the_real_one(penalized, form):
     adversary = Adversary(altered(SMALL, form=form, penalized=penalized), seed=0, rate=RATE)
-    said = [adversary.learn(textures(16, True, (step, 0)), textures(16, False, (step, 1))) for step in range(20)]
+    said = [adversary.train_step(textures(16, True, (step, 0)), textures(16, False, (step, 1))) for step in range(20)]
     assert said[-1]["critic_loss"] < 0.3 < 1 < said[0]["critic_loss"] and said[-1]["critic_slope"] > 0
     real, fake = textures(16, True, "r"), textures(16, False, "f")
     with torch.no_grad():
         assert (adversary.critic(real) > 0).all() and (adversary.critic(fake) < 0).all()
     fake.requires_grad_()
-    start = adversary.loss(fake)
+    start = adversary.generator_loss(fake)
     (slope,) = torch.autograd.grad(start, fake)
     assert all(weights.grad is None or weights.requires_grad for weights in adversary.critic.parameters())
     with torch.no_grad():
         nearer = fake - 0.5 * slope / slope.square().mean().sqrt()
-        assert adversary.loss(nearer) < start
+        assert adversary.generator_loss(nearer) < start
         assert adversary.critic(nearer).mean() > adversary.critic(fake).mean()
         assert ((nearer - fake) * fake.sign()).mean() < 0, "the coarse texture is not taken away"
 
@@ -235,7 +235,7 @@ def test_the_penalty_holds_the_critics_slope_down():
     for penalty in (0.0, 10.0):
         adversary = Adversary(altered(SMALL, penalty=penalty, penalized="real"), seed=0, rate=RATE)
         for step in range(15):
-            said = adversary.learn(textures(16, True, (step, 0)), textures(16, False, (step, 1)))
+            said = adversary.train_step(textures(16, True, (step, 0)), textures(16, False, (step, 1)))
         assert ("critic_slope" in said) == (penalty > 0)
         patches = textures(16, True, "r").requires_grad_()
         slopes[penalty] = gradient_penalty(adversary.critic(patches), patches).item()
@@ -245,17 +245,17 @@ def test_the_penalty_holds_the_critics_slope_down():
 def test_generator_loss_leaves_the_critics_weights_alone_and_learning_leaves_the_patches():
     adversary, fake = Adversary(SMALL, seed=0, rate=RATE), noise(16, 3, 8, 8).requires_grad_()
     before = [weights.detach().clone() for weights in adversary.critic.parameters()]
-    adversary.loss(fake).backward()
+    adversary.generator_loss(fake).backward()
     assert fake.grad.ne(0).any() and all(weights.grad is None for weights in adversary.critic.parameters())
     fake.grad = None
-    adversary.learn(noise(16, 3, 8, 8, label=1), fake)
+    adversary.train_step(noise(16, 3, 8, 8, label=1), fake)
     assert fake.grad is None
     assert all((a != b).any() for a, b in zip(before, adversary.critic.parameters(), strict=True))
 
 
 def test_an_adversary_continues_from_its_state_bit_for_bit():
     def trained(adversary, steps):
-        return [adversary.learn(textures(16, True, (s, 0)), textures(16, False, (s, 1))) for s in steps]
+        return [adversary.train_step(textures(16, True, (s, 0)), textures(16, False, (s, 1))) for s in steps]
 
     whole = Adversary(SMALL, seed=3, rate=RATE)
     said = trained(whole, range(6))
@@ -271,5 +271,5 @@ def test_a_patch_that_is_no_number_stops_the_critic_before_it_changes():
     adversary = Adversary(SMALL, seed=0, rate=RATE)
     before = [weights.detach().clone() for weights in adversary.critic.parameters()]
     with pytest.raises(FloatingPointError, match="critic's loss"):
-        adversary.learn(noise(16, 3, 8, 8), torch.full((16, 3, 8, 8), float("nan")))
+        adversary.train_step(noise(16, 3, 8, 8), torch.full((16, 3, 8, 8), float("nan")))
     assert all((a == b).all() for a, b in zip(before, adversary.critic.parameters(), strict=True))

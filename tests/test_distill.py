@@ -11,19 +11,15 @@ from small_prior import save_small_prior
 from small_scene import write_photos
 
 from reffusion import trace
-from reffusion.distill import optimization as D
-from reffusion.distill import steps
+from reffusion.distill import densification
+from reffusion.distill import loop as D
 from reffusion.distill.adversary import Adversary
-from reffusion.distill.confinement import (
-    TrainView,
-    adversarial_term,
-    changed_region,
-    reconstruction_term,
-    reference_term,
-    region_of,
-    sds_term,
-)
-from reffusion.distill.steps import near_a_reference
+from reffusion.distill.regions import build_region, has_changed_region
+from reffusion.distill.terms.adversarial import evaluate_adversarial
+from reffusion.distill.terms.reconstruction import evaluate_reconstruction
+from reffusion.distill.terms.reference import evaluate_reference
+from reffusion.distill.terms.sds import evaluate_sds, views_near_references
+from reffusion.distill.train_view import TrainView
 from reffusion.gaussians.optimize import Rates, reconstruction_loss
 from reffusion.io.arrays import load_labels, save_json, save_labels
 from reffusion.io.images import load_image, load_mask, save_image
@@ -90,11 +86,12 @@ def reached(gaussians):
 def gradients_of(term, gaussians, masked, prior, text, view=None):
     gaussians, view = leaves(gaussians), view or train_view()
     if term == "sds":
-        loss, rendering = sds_term(gaussians, masked, view, prior, text, SDS, generator(1))
+        loss, rendering = evaluate_sds(gaussians, masked, view, prior, text, SDS, generator(1))
     elif term == "reference":
-        loss, rendering = reference_term(gaussians, masked, view.camera, view.photo, hole())
+        loss, rendering = evaluate_reference(gaussians, masked, view.camera, view.photo, hole())
     else:
-        loss, rendering = reconstruction_term(gaussians, masked, view)
+        reached = torch.ones_like(masked) if view.clean else ~masked
+        loss, rendering = evaluate_reconstruction(gaussians, reached, view)
     loss.backward()
     return gaussians, rendering.radii > 0
 
@@ -131,7 +128,7 @@ def test_the_photo_where_it_is_not_trusted_changes_nothing(term, prior, text):
 def test_densification_probe_of_unmasked_gaussians_stays_zero(prior, text):
     gaussians, masked = wall()
     probe = torch.zeros(len(gaussians), 2, requires_grad=True)
-    sds_term(leaves(gaussians), masked, train_view(), prior, text, SDS, generator(1), probe)[0].backward()
+    evaluate_sds(leaves(gaussians), masked, train_view(), prior, text, SDS, generator(1), probe)[0].backward()
     assert (probe.grad[~masked] == 0).all() and (probe.grad[masked] != 0).any()
 
 
@@ -139,7 +136,7 @@ def test_sds_without_patches_and_with_guidance(prior, text):
     gaussians, masked = wall()
     for settings in ({"patches": 0}, {"guidance": 2.0}, {"hole_only": True}):
         moved = leaves(gaussians)
-        sds_term(moved, masked, train_view(), prior, text, altered(SDS, **settings), generator(1))[0].backward()
+        evaluate_sds(moved, masked, train_view(), prior, text, altered(SDS, **settings), generator(1))[0].backward()
         assert torch.isfinite(moved.means.grad).all() and moved.means.grad[masked].ne(0).any()
 
 
@@ -148,7 +145,7 @@ def test_the_critic_reaches_spherical_harmonics_only(reaches):
     gaussians, masked = wall()
     moved, view = leaves(gaussians), train_view()
     adversary, chosen = Adversary(ADVERSARIAL, seed=0), masked | (reaches == "all")
-    loss, rendering, said = adversarial_term(moved, chosen, view, view.photo, hole(), adversary, generator(1))
+    loss, rendering, said = evaluate_adversarial(moved, chosen, view, view.photo, hole(), adversary, generator(1))
     loss.backward()
     assert all(getattr(moved, name).grad is None for name in PARAMETERS if name != "sh")
     got, drawn = moved.sh.grad.flatten(1).ne(0).any(1), rendering.radii > 0
@@ -162,7 +159,7 @@ def test_the_adversarial_gradient_is_that_of_the_patches_by_finite_differences()
     gaussians, masked = wall()
     moved, view = leaves(gaussians), train_view()
     adversary = Adversary(ADVERSARIAL, seed=0, rate=1e-12)  # the critic stands still
-    term = lambda g: adversarial_term(g, masked, view, view.photo, hole(), adversary, generator(1))[0]
+    term = lambda g: evaluate_adversarial(g, masked, view, view.photo, hole(), adversary, generator(1))[0]
     term(moved).backward()
     direction = torch.randn(gaussians.sh.shape, generator=generator(8)) * masked[:, None, None]
     step = 2e-3
@@ -173,19 +170,19 @@ def test_the_adversarial_gradient_is_that_of_the_patches_by_finite_differences()
 
 def test_region_changers_are_found_and_no_one_else():
     gaussians, masked = wall(600)
-    region = region_of(gaussians.means, masked)
-    assert not changed_region(region, gaussians.means, masked).any(), "an initialization is in its regions"
+    region = build_region(gaussians.means, masked)
+    assert not has_changed_region(region, gaussians.means, masked).any(), "an initialization is in its regions"
     moved = gaussians.means.clone()
     a, b = torch.nonzero(masked)[0, 0], torch.nonzero(~masked)[0, 0]
     moved[a] = torch.tensor([0.55, 0.4, 0.05])  # a masked one far out on the wall
     middle = ((gaussians.means[:, :2].norm(dim=1)) + 10 * ~masked).argmin()
     moved[b] = gaussians.means[middle]  # an unmasked one in the middle of the invented part
-    assert set(torch.nonzero(changed_region(region, moved, masked))[:, 0].tolist()) == {int(a), int(b)}
+    assert set(torch.nonzero(has_changed_region(region, moved, masked))[:, 0].tolist()) == {int(a), int(b)}
     slightly = gaussians.means + region.voxel * 0.9
-    assert not changed_region(region, slightly, masked)[masked].any(), "there is room to move in"
-    assert changed_region(region, torch.full_like(moved, 1e6), masked).tolist() == masked.tolist()
-    single = region_of(gaussians.means[:1], torch.tensor([True]))
-    assert not changed_region(single, gaussians.means[:1], torch.tensor([True])).any()
+    assert not has_changed_region(region, slightly, masked)[masked].any(), "there is room to move in"
+    assert has_changed_region(region, torch.full_like(moved, 1e6), masked).tolist() == masked.tolist()
+    single = build_region(gaussians.means[:1], torch.tensor([True]))
+    assert not has_changed_region(single, gaussians.means[:1], torch.tensor([True])).any()
 
 
 SETTINGS = Params(
@@ -224,18 +221,18 @@ def test_interrupted_distillation_resumes_to_the_same_gaussians(prior, text, tmp
     monkeypatch.setattr(D, "REGION_EVERY", 2)
     whole, labels = run(tmp_path / "whole", prior, text)
     assert labels.sum() > wall()[1].sum(), "densification added no masked Gaussian"
-    real = D.step_of
+    real = D.take_step
 
     def interrupted(optimizer, step, *others):
         if step == 3:
             raise KeyboardInterrupt
         return real(optimizer, step, *others)
 
-    monkeypatch.setattr(D, "step_of", interrupted)
+    monkeypatch.setattr(D, "take_step", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "broken", prior, text)
     assert load_checkpoint(tmp_path / "broken")["step"] == 3
-    monkeypatch.setattr(D, "step_of", real)
+    monkeypatch.setattr(D, "take_step", real)
     resumed, resumed_labels = run(tmp_path / "broken", prior, text)
     assert (labels == resumed_labels).all()
     for name in PARAMETERS:
@@ -251,8 +248,8 @@ def test_interrupted_distillation_resumes_to_the_same_gaussians(prior, text, tmp
 
 def test_densification_takes_a_share_whatever_the_weight(prior, text, tmp_path, monkeypatch):
     """The SDS gradient has no scale of its own."""
-    monkeypatch.setattr(D, "PRUNE_OPA", 0.0)
-    monkeypatch.setattr(D, "DENSIFIED", 0.25)
+    monkeypatch.setattr(densification, "PRUNE_OPA", 0.0)
+    monkeypatch.setattr(densification, "DENSIFIED_SHARE", 0.25)
 
     def grown(name, weight, every):
         densify = {"every": every}
@@ -294,10 +291,10 @@ def test_distillation_may_reach_the_background_too_but_not_what_does_not_show(pr
 def test_views_far_from_every_reference_are_not_distilled(prior, text, tmp_path):
     start, masked = wall()
     near, far = train_view("a"), train_view("b", 0.5)  # 26 degrees aside
-    distilled = lambda degrees: near_a_reference([near, far], [camera()], start.means[masked], degrees)
+    distilled = lambda degrees: views_near_references([near, far], [camera()], start.means[masked], degrees)
     assert [distilled(x) for x in (1, 20, 35, 180)] == [{"a"}, {"a"}, {"a", "b"}, {"a", "b"}]
     for degrees in (20, 35):
-        settings = altered(PLAIN, iterations=3, reconstruction={"every": 0}, sds={"within": degrees})
+        settings = altered(PLAIN, iterations=3, reconstruction={"every": 0}, sds={"max_angle": degrees})
         ended, _ = run(tmp_path / str(degrees), prior, text, settings, [far])
         assert changed(start, ended).any() == (degrees == 35)
         logged = ["sds_gradient_mean" in line for line in read_trace(tmp_path / str(degrees) / "trace.jsonl")[1:]]
@@ -323,9 +320,8 @@ def changed(before, after):
     return torch.cat(rows, 1).any(1)
 
 
-def test_the_critic_waits_for_its_part_of_the_run(tmp_path, monkeypatch):
-    monkeypatch.setattr(steps, "ADVERSARIAL_FROM", 0.5)
-    run(tmp_path / "late", None, None, altered(SETTINGS, sds=OFF, iterations=8))
+def test_the_critic_waits_for_its_part_of_the_run(tmp_path):
+    run(tmp_path / "late", None, None, altered(SETTINGS, sds=OFF, iterations=8, adversarial={"start": 0.5}))
     judged = {r["iteration"]: "critic_loss" in r for r in read_trace(tmp_path / "late" / "trace.jsonl")}
     assert judged == {step: step > 4 for step in judged} and len(set(judged.values())) == 2
 
@@ -348,7 +344,7 @@ def test_the_reference_term_is_that_of_the_whole_view():
     start, masked = wall()
     image, chosen = torch.rand(HEIGHT, WIDTH, 3, generator=generator(3)), torch.ones_like(masked)
     part, whole = leaves(start), leaves(start)
-    loss, _ = reference_term(part, chosen, camera(), image, hole())
+    loss, _ = evaluate_reference(part, chosen, camera(), image, hole())
     expected = reconstruction_loss(render(whole, camera()).color, image, hole())
     loss.backward()
     expected.backward()
@@ -356,7 +352,7 @@ def test_the_reference_term_is_that_of_the_whole_view():
     for name in PARAMETERS:
         apart = (getattr(part, name).grad - getattr(whole, name).grad).norm()
         assert apart < 0.01 * getattr(whole, name).grad.norm(), name
-    nothing, _ = reference_term(part, chosen, camera(), image, torch.zeros_like(hole()))
+    nothing, _ = evaluate_reference(part, chosen, camera(), image, torch.zeros_like(hole()))
     assert float(nothing) == 0
 
 

@@ -47,7 +47,7 @@ PURE = (
     "gaussians/",
     "distill/sds",
     "distill/discriminator",
-    "distill/depth_term",
+    "distill/terms/",
     "prior/windows",
 )  # tensors and plain numbers only
 

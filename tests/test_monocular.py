@@ -144,5 +144,5 @@ def test_the_depth_term_asks_the_model_of_its_parameter(folder, network):
     true = 2.0 + 0.3 * monocular.disparity(network, image).double().numpy()
     hole = small.true_mask(view, 1.7)
     seen = Seen(view, np.where(hole, 0.0, 1 / true), ~hole, hole, hole, np.zeros_like(hole))
-    estimator = distill.depth_estimator(distill.Params(depth={"model": str(folder)}), np.zeros((0, 3)))
+    estimator = distill.build_depth_estimator(distill.Params(depth={"model": str(folder)}), np.zeros((0, 3)))
     np.testing.assert_allclose(estimator.disparity(seen, lambda: image.permute(1, 2, 0).numpy()), true, rtol=1e-6)

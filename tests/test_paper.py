@@ -94,7 +94,7 @@ ABSENT = {
     "initialize.extra_views": 0,
     "initialize.refit_steps": 0,
     "distill.sds.run": "always",
-    "distill.sds.within": 180,
+    "distill.sds.max_angle": 180,
     "distill.sds.keep_contrast": False,
     "distill.reference.weight": 0,
     "distill.reference.reaches": "masked",

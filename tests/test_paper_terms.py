@@ -14,8 +14,11 @@ from small_params import altered
 from small_prior import small_prior
 from test_distill import camera, train_view, wall
 
-from reffusion.distill import confinement, optimization
-from reffusion.distill.depth_term import _within
+from reffusion.distill import loop
+from reffusion.distill.adversary import Adversary
+from reffusion.distill.display_range import clamp_to_display
+from reffusion.distill.terms import adversarial, sds
+from reffusion.distill.terms.depth import _downscale
 from reffusion.fit import step
 from reffusion.gaussians.optimize import Rates
 from reffusion.geometry import cameras_extent
@@ -55,7 +58,7 @@ def views_of(tmp_path_factory):
     scene = load_scene(poses)
 
     def made(**changes):
-        views = distill.train_views(altered(Params(), **changes), scene, poses, fitted, home / "masks")
+        views = distill.load_train_views(altered(Params(), **changes), scene, poses, fitted, home / "masks")
         return {view.camera.name: view for view in views}
 
     return made, torch.from_numpy(hidden), torch.from_numpy(drawn)
@@ -66,7 +69,7 @@ def test_photographs_do_not_supervise_where_an_object_is_drawn(views_of):
     views = made()
     assert torch.equal(views["a0"].supervises, ~(hidden | drawn)) and torch.equal(views["a3"].supervises, ~hidden)
     assert views["a4"].clean and views["a4"].supervises.all()
-    _, _, not_seen = _within(10_000, views["a0"])  # the depth term's
+    _, _, not_seen = _downscale(views["a0"], 10_000)  # the depth term's
     assert torch.equal(not_seen, hidden | drawn)
 
 
@@ -125,8 +128,8 @@ def test_an_unadapted_prior_is_not_prompted_unless_asked():
 
 def test_what_the_prior_is_told(prior, monkeypatch):
     monkeypatch.setattr(distill, "load_prior", lambda *_, **__: prior)
-    _, told = distill.adapted_prior(Params(), None)
-    _, nothing = distill.adapted_prior(Params(prompts="empty"), None)
+    _, told = distill.load_adapted_prior(Params(), None)
+    _, nothing = distill.load_adapted_prior(Params(prompts="empty"), None)
     assert torch.equal(told, diffusion.embed_text(prior, list(crops.PROMPTS)))
     assert torch.equal(nothing, diffusion.embed_text(prior, [""] * 3)) and not torch.equal(told[0], nothing[0])
 
@@ -146,7 +149,7 @@ def test_guidance_of_the_empty_prompt_changes_nothing_and_costs_nothing(prior, m
 
 def test_colours_above_1_are_shown_as_1_and_may_only_come_back():
     color = torch.tensor([-0.2, 0.5, 1.5, 1.5], requires_grad=True)
-    shown = confinement.displayed(color)
+    shown = clamp_to_display(color)
     assert torch.equal(shown, torch.tensor([0.0, 0.5, 1.0, 1.0]))
     (shown * torch.tensor([1.0, 1.0, 1.0, -1.0])).sum().backward()  # a step goes against the gradient
     assert color.grad.tolist() == [0, 1, 1, 0]
@@ -156,17 +159,17 @@ def test_no_term_shows_a_prior_or_a_critic_colours_above_1(prior, monkeypatch):
     gaussians, masked = wall()
     bright = replace(gaussians, sh=gaussians.sh + 3)
     seen = []
-    encode, patches = diffusion.encode, confinement.patches_around
+    encode, patches = diffusion.encode, adversarial.draw_patches
     monkeypatch.setattr(diffusion, "encode", lambda p, images: seen.append(float(images.max())) or encode(p, images))
     watched = lambda image, *rest: seen.append(float(image.max()) * 2 - 1) or patches(image, *rest)
-    monkeypatch.setattr(confinement, "patches_around", watched)
+    monkeypatch.setattr(adversarial, "draw_patches", watched)
     with torch.no_grad():
         text = diffusion.embed_text(prior, list(crops.PROMPTS))
-    confinement.sds_term(bright, masked, train_view(), prior, text, Sds(guidance=0), generator(0, "bright"))
-    critic = optimization.Params(adversarial={"patches": 4, "size": 8, "width": 4}).adversarial
-    adversary = confinement.Adversary(critic, 0)
+    sds.evaluate_sds(bright, masked, train_view(), prior, text, Sds(guidance=0), generator(0, "bright"))
+    critic = Params(adversarial={"patches": 4, "size": 8, "width": 4}).adversarial
+    adversary = Adversary(critic, 0)
     view = train_view()
-    confinement.adversarial_term(bright, masked, view, view.photo, view.repaint, adversary, generator(0, "bright"))
+    adversarial.evaluate_adversarial(bright, masked, view, view.photo, view.repaint, adversary, generator(0, "bright"))
     assert len(seen) >= 4 and max(seen) <= 1 + 1e-5
 
 
@@ -200,14 +203,14 @@ def test_positions_step_by_the_cameras_extent_as_3dgs_has_it():
     assert cameras_extent(cameras) == pytest.approx(1.1 * 0.3)
     for unit, factor in (("distance", 1.0), ("cameras", 1.1 * 0.3)):
         rates = step.rates_of(LearningRates(means_unit=unit), cameras)
-        ours = optimization.rates_of(Params(lr={"means_unit": unit}).lr, cameras)
+        ours = loop.rates_of(Params(lr={"means_unit": unit}).lr, cameras)
         for each in (rates, ours):
             assert (each.means, each.means_last) == pytest.approx((1.6e-4 * factor, 1.6e-6 * factor))
             assert replace(each, means=Rates.means, means_last=Rates.means_last) == Rates()
 
 
 def test_what_the_paper_does_not_do_can_be_left_out(monkeypatch):
-    monkeypatch.setattr(fit.support, "harmonics", lambda *_: (0, 1.0))
+    monkeypatch.setattr(fit.image_detail, "harmonics", lambda *_: (0, 1.0))
     scene = type("Scene", (), {"points": None, "cameras": {}, "train": ()})
     degree = lambda few_views: fit.supported(fit.Params(few_views=few_views), scene).sh.degree
     assert [degree(each) for each in ("as_many", "fewer_harmonics", "surfaces")] == [3, 0, 0]

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from reffusion.distill.sds import draw_timesteps, sds_gradient, sds_loss, unfaded
+from reffusion.distill.sds import draw_timesteps, match_contrast, sds_gradient, sds_loss
 from reffusion.prior.windows import enlarged, two_scale_masks, two_scales, window_around
 from reffusion.seeding import generator
 
@@ -77,15 +77,15 @@ def faded(factor, shift=0.2):
 
 def test_a_faded_answer_gets_the_contrast_of_the_render_and_keeps_its_mean():
     x0, z, mask = faded(0.6)
-    clear = unfaded(x0, z, mask)
+    clear = match_contrast(x0, z, mask)
     torch.testing.assert_close(clear * mask, (z + 0.2) * mask)
-    torch.testing.assert_close(unfaded(clear, z, mask), clear)
+    torch.testing.assert_close(match_contrast(clear, z, mask), clear)
 
 
 def test_what_the_prior_has_more_of_it_may_add():
     for factor in (1.0, 1.5, -0.5):  # as strong, stronger, the opposite
         x0, z, mask = faded(factor)
-        torch.testing.assert_close(unfaded(x0, z, mask), x0)
+        torch.testing.assert_close(match_contrast(x0, z, mask), x0)
 
 
 def test_unfading_asks_for_no_more_contrast_and_blows_nothing_up():
@@ -94,14 +94,14 @@ def test_unfading_asks_for_no_more_contrast_and_blows_nothing_up():
     centred = lambda x: x - x.mean((2, 3), keepdim=True)
     for size in (0.0, 1e-200, 1e-160, 1e-6, 0.3):
         x0 = size * torch.randn(1, 4, 8, 8, generator=draw, dtype=torch.float64)
-        clear = unfaded(x0, z, mask)
+        clear = match_contrast(x0, z, mask)
         assert (centred(clear).norm(dim=(2, 3)) <= centred(z).norm(dim=(2, 3)) * (1 + 1e-12)).all()
         raised = centred(clear).norm(dim=(2, 3)) > centred(x0).norm(dim=(2, 3)) * (1 + 1e-9)
         along = ((z - clear) * centred(clear)).sum((2, 3))
         assert (along.abs() <= 1e-9)[raised].all(), "the gradient still changes the contrast"
     flat = torch.full_like(z, 0.4)
-    torch.testing.assert_close(unfaded(flat, z, mask), flat)
-    assert (unfaded(flat, z, torch.zeros_like(mask)) == flat).all()
+    torch.testing.assert_close(match_contrast(flat, z, mask), flat)
+    assert (match_contrast(flat, z, torch.zeros_like(mask)) == flat).all()
 
 
 def test_kept_contrast_means_the_same_in_every_weighting():

@@ -17,7 +17,7 @@ from benchmarks.bench import gate
 from benchmarks.bench.points import Diagram, Point, recommendation
 from reffusion import trace
 from reffusion.depth.background_depth import Completion
-from reffusion.distill import optimization as distilling
+from reffusion.distill import loop as distilling
 from reffusion.fit import reconstruction as fitting
 from reffusion.io.ply import load_ply
 from reffusion.io.scene import load_mask_sets, save_references
@@ -178,7 +178,7 @@ def test_moments_depend_on_the_iteration_only():
 KILLED = {
     "fit": (fitting, "step", 6),
     "personalize": (personalizing, "train_step", 4),
-    "distill": (distilling, "step_of", 1),
+    "distill": (distilling, "take_step", 1),
 }
 
 

@@ -17,9 +17,9 @@ from small_prior import save_small_prior
 from test_distill import OFF, PLAIN, hole, leaves, reached, train_view, wall
 
 from reffusion import seeding, trace
-from reffusion.distill import optimization as D
+from reffusion.distill import loop as D
 from reffusion.distill import perceptual
-from reffusion.distill.lift import lift_term
+from reffusion.distill.terms.lift import evaluate_lift
 from reffusion.initialize import random_init
 from reffusion.io.arrays import load_json, load_labels
 from reffusion.io.images import load_image, load_mask, save_image
@@ -157,7 +157,7 @@ def test_lifted_pictures_reach_the_gaussians_they_may_and_no_other(how):
     for allowed in (masked, torch.ones_like(masked)):
         gaussians = leaves(start)
         given = lifted(), how, perceptual.multi_scale_dssim, seeding.generator(1)
-        loss, rendering = lift_term(gaussians, allowed, *given)
+        loss, rendering = evaluate_lift(gaussians, allowed, *given)
         loss.backward()
         got = reached(gaussians)
         assert not got[~allowed].any() and (got & masked & (rendering.radii > 0)).any()
@@ -166,11 +166,11 @@ def test_lifted_pictures_reach_the_gaussians_they_may_and_no_other(how):
 
 def test_the_squared_error_is_that_of_the_holes_pixels():
     (gaussians, masked), view = wall(), lifted()
-    loss, rendering = lift_term(gaussians, masked, view, MSE, None, seeding.generator(1))
+    loss, rendering = evaluate_lift(gaussians, masked, view, MSE, None, seeding.generator(1))
     expected = ((rendering.color - view.lifted)[hole()] ** 2).mean()
     assert float(loss) == pytest.approx(float(expected))
     outside = torch.where(hole()[..., None], view.lifted, float("nan"))
-    again, _ = lift_term(gaussians, masked, replace(view, lifted=outside), MSE, None, seeding.generator(1))
+    again, _ = evaluate_lift(gaussians, masked, replace(view, lifted=outside), MSE, None, seeding.generator(1))
     assert float(again) == float(loss), "pixels outside the hole were looked at"
 
 

@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from reffusion.distill.confinement import TrainView, sds_term
+from reffusion.distill.terms.sds import evaluate_sds
+from reffusion.distill.train_view import TrainView
 from reffusion.params.distill import Sds
 from reffusion.params.personalize import Optimizer, Params
 from reffusion.prior import crops, denoising, diffusion, lora, memory
@@ -255,7 +256,7 @@ def sds_step(
 ) -> dict[str, float]:
     """One SDS term of the library, and its backward pass into the Gaussians."""
     masked = torch.ones(len(scene), dtype=torch.bool, device=scene.means.device)
-    loss, _ = sds_term(scene, masked, view, prior, text, sds, generator(0, "sds", step))
+    loss, _ = evaluate_sds(scene, masked, view, prior, text, sds, generator(0, "sds", step))
     (1e-3 * loss).backward()
     norm = float(scene.sh.grad.norm())
     if not (np.isfinite(norm) and norm > 0):

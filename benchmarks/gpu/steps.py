@@ -16,8 +16,11 @@ from reffusion import trace
 from reffusion.depth import monocular
 from reffusion.depth.background_depth import Completion, Seen
 from reffusion.distill.adversary import Adversary
-from reffusion.distill.confinement import adversarial_term, reconstruction_term, reference_term
-from reffusion.distill.depth_term import Estimator, by_network, depth_term
+from reffusion.distill.depth_estimator import DepthEstimator, network_estimator
+from reffusion.distill.terms.adversarial import evaluate_adversarial
+from reffusion.distill.terms.depth import evaluate_depth
+from reffusion.distill.terms.reconstruction import evaluate_reconstruction
+from reffusion.distill.terms.reference import evaluate_reference
 from reffusion.fit.reconstruction import fit
 from reffusion.geometry import Degenerate
 from reffusion.params.distill import Depth, Sds
@@ -40,13 +43,13 @@ def backpropagate(scene: Gaussians, loss: Tensor) -> None:
 
 def reconstruction(bench: Bench) -> dict[str, Any]:
     (scene, masked), view = bench.scene(), full_size.train_view(bench.sizes.rows, bench.device)
-    return bench.measure(lambda: backpropagate(scene, reconstruction_term(scene, masked, view)[0]))
+    return bench.measure(lambda: backpropagate(scene, evaluate_reconstruction(scene, ~masked, view)[0]))
 
 
 def reference(bench: Bench) -> dict[str, Any]:
     (scene, masked), view = bench.scene(), full_size.train_view(bench.sizes.rows, bench.device)
     return bench.measure(
-        lambda: backpropagate(scene, reference_term(scene, masked, view.camera, view.picture, view.repaint)[0])
+        lambda: backpropagate(scene, evaluate_reference(scene, masked, view.camera, view.picture, view.repaint)[0])
     )
 
 
@@ -89,7 +92,7 @@ def depth(bench: Bench) -> dict[str, Any]:
 
     def step() -> dict[str, float]:
         draw = generator(0, "depth")
-        loss, _ = depth_term(scene, masked, view, prior, text, Depth(), Sds().guidance, draw, estimator)
+        loss, _ = evaluate_depth(scene, masked, view, prior, text, Depth(), Sds().guidance, draw, estimator)
         backpropagate(scene, loss)
         return {"loss": float(loss.detach())}
 
@@ -103,14 +106,14 @@ def adversarial(bench: Bench) -> dict[str, Any]:
 
     def step() -> dict[str, float]:
         draw = generator(0, "patches")
-        loss, _, values = adversarial_term(scene, masked, view, view.picture, view.repaint, critic, draw)
+        loss, _, values = evaluate_adversarial(scene, masked, view, view.picture, view.repaint, critic, draw)
         backpropagate(scene, loss)
         return values
 
     return bench.measure(step)
 
 
-def depth_estimator(sizes: Sizes, device: str) -> tuple[Estimator, str]:
+def depth_estimator(sizes: Sizes, device: str) -> tuple[DepthEstimator, str]:
     """Depth Anything V2 Small, published or with random weights; the sign that fits the scene is taken."""
     from transformers import DepthAnythingConfig, DepthAnythingForDepthEstimation, Dinov2Config
 
@@ -128,7 +131,7 @@ def depth_estimator(sizes: Sizes, device: str) -> tuple[Estimator, str]:
         ))  # fmt: skip
         torch.nn.init.constant_(model.head.conv3.bias, 1e4)  # else the last ReLU would cut nearly all values to 0
         network, source = monocular.make_network(model, device), "random"
-    tries = [by_network(lambda image, sign=sign: sign * monocular.disparity(network, image), Completion())
+    tries = [network_estimator(lambda image, sign=sign: sign * monocular.disparity(network, image), Completion())
              for sign in (1, -1)]  # fmt: skip
 
     def disparity(view: Seen, picture: Callable[[], np.ndarray]) -> np.ndarray:
@@ -138,7 +141,7 @@ def depth_estimator(sizes: Sizes, device: str) -> tuple[Estimator, str]:
         except Degenerate:
             return tries[1].disparity(view, lambda: painted)
 
-    return Estimator(tries[0].how, disparity), source
+    return DepthEstimator(tries[0].how, disparity), source
 
 
 def fit_scene(bench: Bench) -> dict[str, Any]:

@@ -12,7 +12,8 @@ from benchmarks.stability.cases import EPS32, EXACT, UNCLEAR, Case, count_unclea
 from benchmarks.stability.splatting import camera, cloud
 from reffusion import seeding
 from reffusion.distill import discriminator, sds
-from reffusion.distill.confinement import TrainView, sds_term
+from reffusion.distill.terms.sds import evaluate_sds
+from reffusion.distill.train_view import TrainView
 from reffusion.params.distill import Sds
 from reffusion.prior import diffusion, windows
 from reffusion.prior.model import Prior, load_prior
@@ -159,7 +160,7 @@ def count_bad_gradients(low: float, high: float, guidance: float) -> float:
     whole = TrainView(view, torch.rand(18, 24, 3, generator=seeding.generator(0)), ~everything, everything, clean=False)
     chosen = Sds(patches=1, t_high=high, guidance=guidance)
     masked = torch.ones(len(gaussians), dtype=torch.bool)
-    loss, _ = sds_term(gaussians, masked, whole, model(), prompts(), chosen, seeding.generator(1), t_low=low)
+    loss, _ = evaluate_sds(gaussians, masked, whole, model(), prompts(), chosen, seeding.generator(1), t_low=low)
     loss.backward()
     return float(sum((~torch.isfinite(getattr(gaussians, name).grad)).sum() for name in PARAMETERS))
 

@@ -70,7 +70,7 @@ FAULTS = (
           change_result(lambda decibels: -10 * log10(10 ** (-decibels / 10))), "metrics of identical images"),
     Fault("an unsafe logarithm in the critic's loss", "reffusion.distill.discriminator", "critic_loss",
           lambda right: log_of_sigmoid, "discriminator logits +-1e4, critic"),
-    Fault("a mean over nothing where a mask is empty", "reffusion.distill.sds", "unfaded",
+    Fault("a mean over nothing where a mask is empty", "reffusion.distill.sds", "match_contrast",
           lambda right: lambda x0, latents, mask: right(x0, latents, mask) * (mask.sum() / mask.sum()),
           "mask empty, gradient"),
     Fault("1 - alpha bar in half precision", "reffusion.distill.sds", "sds_gradient",

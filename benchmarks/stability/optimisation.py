@@ -16,8 +16,8 @@ from benchmarks.stability import frames
 from benchmarks.stability.cases import EPS32, EXACT, Case, nan_safe_max
 from benchmarks.stability.splatting import camera, cloud
 from reffusion import seeding, trace
-from reffusion.distill.confinement import TrainView
-from reffusion.distill.optimization import distill
+from reffusion.distill.loop import distill
+from reffusion.distill.train_view import TrainView
 from reffusion.fit.reconstruction import fit
 from reffusion.fit.start import initial_gaussians
 from reffusion.gaussians.densify import densify, prune

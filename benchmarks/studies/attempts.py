@@ -20,8 +20,7 @@ import torch
 import yaml
 
 from reffusion import trace
-from reffusion.distill.optimization import average, masked_factors
-from reffusion.distill.steps import job_of, step_of
+from reffusion.distill.loop import average, build_objective, masked_factors, take_step
 from reffusion.gaussians.optimize import GaussianOptimizer
 from reffusion.io.arrays import load_json, save_json
 from reffusion.io.scene import load_scene
@@ -46,7 +45,7 @@ ATTEMPTS: dict[str, dict] = {
     "prior not personalized": {BASE: False},
     "a tenth of the weight": {"sds": {"weight": 0.03}},
     "ten times the weight": {"sds": {"weight": 3}},
-    "every view": {"sds": {"within": 180}},
+    "every view": {"sds": {"max_angle": 180}},
     "contrast not kept": {"sds": {"keep_contrast": False}},
     "two windows as well": {"sds": {"patches": 2}},
     "two windows, a tenth of the weight": {"sds": {"patches": 2, "weight": 0.03}},
@@ -100,11 +99,11 @@ def run_attempt(overrides: dict, run: Path, start: Path, views: list[tuple]) -> 
     """Lines {"seconds", "iteration", scores} of one setting."""
     params = profile_params(overrides)
     scene = load_scene(run / "poses")
-    initial, masked, holes = stage.start(params, scene, run / "reference", start)
+    initial, masked, holes = stage.load_initialization(params, scene, run / "reference", start)
     adapted = run / "personalize" if overrides.get(BASE, True) else None
-    prior, text = stage.adapted_prior(params, adapted)
-    seen = stage.train_views(params, scene, run / "poses", run / "fit", run / "masks")
-    job = job_of(seen, holes, prior, text, params, initial, masked)
+    prior, text = stage.load_adapted_prior(params, adapted)
+    seen = stage.load_train_views(params, scene, run / "poses", run / "fit", run / "masks")
+    objective = build_objective(initial, masked, seen, holes, prior, text, params)
     optimizer = GaussianOptimizer(initial, masked, None, masked_factors(params.lr), epsilon=params.lr.epsilon)
     rasterizer.render(
         optimizer.gaussians, holes[0][0]
@@ -117,7 +116,7 @@ def run_attempt(overrides: dict, run: Path, start: Path, views: list[tuple]) -> 
                 with log.paused():
                     log.log(step, **score_views(optimizer.gaussians, views))
             if step < max(MEASURED_STEPS):
-                step_of(optimizer, step, job)
+                take_step(optimizer, step, objective)
                 average(optimizer, params, step + 1)
         return trace.read_trace(log.path)
 

@@ -1,10 +1,12 @@
-"""The patch critic of the adversarial term (RefFusion section 4.3): a residual discriminator of StyleGAN2's kind.
+"""The patch critic of the adversarial term (RefFusion section 4.3): StyleGAN2's residual discriminator and its losses.
 
-The losses are written with f(x) = -log(1 + exp(-x)), the logarithm of the logistic function, and D the critic's score,
-large where it takes a patch for real. The critic raises f(D(real)) + f(-D(fake)); the fake patches' maker lowers it.
+The losses are written with f(x) = -log(1 + exp(-x)), the logarithm of the logistic function, and the critic's score D,
+which is large for patches that it takes for real. The critic maximises f(D(real)) + f(-D(fake)); the generator, here
+the Gaussians, minimises it.
 
-PAPER leaves open: the discriminator beyond its being StyleGAN2's. Taken: its residual form, equalised learning rates,
-the [1, 3, 3, 1] filter before each halving (anti-aliased), minibatch standard deviation over groups of 4.
+PAPER leaves open: details of the discriminator beyond StyleGAN2's name. We take its residual form, equalised learning
+rates, the anti-aliasing filter [1, 3, 3, 1] before each downsampling, and the minibatch standard deviation over groups
+of 4.
 """
 
 from __future__ import annotations
@@ -18,16 +20,17 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 Form = Literal["non-saturating", "saturating"]
-SLOPE, GAIN = 0.2, sqrt(2)  # leaky ReLU, and the factor after it that keeps the size of what passes
-LAST = 4  # px, the side at which halving ends
-MOST_CHANNELS = 512  # however often they are doubled
-GROUP = 4  # patches whose deviation is taken together
+SLOPE = 0.2  # of the leaky ReLU below 0
+GAIN = sqrt(2)  # factor after the leaky ReLU, which keeps the variance of activations
+LAST_SIZE = 4  # px, the side of the feature maps at which downsampling ends
+MAX_CHANNELS = 512
+GROUP = 4  # patches in a group of the minibatch standard deviation
 
 
 class Convolution(nn.Module):
     """A square convolution with equalised learning rate: unit normal weights, divided by sqrt(fan-in) when used.
 
-    So every layer's weights are of one size, and a step of the optimiser changes all layers alike.
+    All layers' weights then have the same scale, and an optimizer step changes all layers by the same proportion.
     """
 
     def __init__(self, inputs: int, outputs: int, side: int, generator: torch.Generator, stride=1, padding=0):
@@ -41,7 +44,7 @@ class Convolution(nn.Module):
 
 
 class Linear(nn.Module):
-    """A linear map with equalised learning rate, as `Convolution`."""
+    """A linear layer with equalised learning rate, as `Convolution`."""
 
     def __init__(self, inputs: int, outputs: int, generator: torch.Generator):
         super().__init__()
@@ -53,20 +56,20 @@ class Linear(nn.Module):
         return F.linear(x, self.weight * self.scale, self.bias)
 
 
-class Halving(nn.Module):
-    """A residual block: [B, C, size, size] -> [B, C', size / 2, size / 2], size even."""
+class DownBlock(nn.Module):
+    """A residual block that downsamples by 2: [B, C, size, size] -> [B, C', size / 2, size / 2], size even."""
 
     def __init__(self, size: int, inputs: int, outputs: int, generator: torch.Generator):
         super().__init__()
         self.first = Convolution(inputs, inputs, 3, generator, padding=1)
         self.second = Convolution(inputs, outputs, 3, generator, stride=2)
         self.skip = Convolution(inputs, outputs, 1, generator)
-        self.register_buffer("smooth", binomial(size, padding=2), persistent=False)
-        self.register_buffer("halve", binomial(size, padding=1)[::2].contiguous(), persistent=False)
+        self.register_buffer("smooth", binomial_filter(size, padding=2), persistent=False)
+        self.register_buffer("halve", binomial_filter(size, padding=1)[::2].contiguous(), persistent=False)
 
     def forward(self, x: Tensor) -> Tensor:
-        deep = self.smooth @ leaky(self.first(x)) @ self.smooth.T
-        return (leaky(self.second(deep)) + self.skip(self.halve @ x @ self.halve.T)) / sqrt(2)
+        deep = self.smooth @ scaled_leaky_relu(self.first(x)) @ self.smooth.T
+        return (scaled_leaky_relu(self.second(deep)) + self.skip(self.halve @ x @ self.halve.T)) / sqrt(2)
 
 
 class Critic(nn.Module):
@@ -74,42 +77,44 @@ class Critic(nn.Module):
 
     Args:
         size: side of a patch in pixels, 8, 16, 32, ...
-        width: channels at that size; doubled with each halving, 512 at most.
-        generator: on the CPU; of the first weights.
+        width: channels at that size; doubled with each downsampling, 512 at most.
+        generator: on the CPU; draws the initial weights.
     Raises:
-        ValueError: another size; a batch that is not a multiple of 4 patches (see `with_deviation`).
+        ValueError: another size; a batch that is not a multiple of 4 patches (see `append_minibatch_std`).
     """
 
     def __init__(self, size: int, width: int, generator: torch.Generator):
         super().__init__()
-        halvings = (size // LAST).bit_length() - 1
-        if halvings < 1 or size != LAST << halvings:
+        halvings = (size // LAST_SIZE).bit_length() - 1
+        if halvings < 1 or size != LAST_SIZE << halvings:
             raise ValueError(f"the side of a critic's patches must be 8, 16, 32, ... px, got {size}")
-        channels = [min(width << level, max(width, MOST_CHANNELS)) for level in range(halvings + 1)]
+        channels = [min(width << level, max(width, MAX_CHANNELS)) for level in range(halvings + 1)]
         self.colors = Convolution(3, channels[0], 1, generator)
         self.halvings = nn.ModuleList(
-            Halving(size >> level, channels[level], channels[level + 1], generator) for level in range(halvings)
+            DownBlock(size >> level, channels[level], channels[level + 1], generator) for level in range(halvings)
         )
         self.mixed = Convolution(channels[-1] + 1, channels[-1], 3, generator, padding=1)
-        self.dense = Linear(channels[-1] * LAST**2, channels[-1], generator)
+        self.dense = Linear(channels[-1] * LAST_SIZE**2, channels[-1], generator)
         self.score = Linear(channels[-1], 1, generator)
 
     def forward(self, patches: Tensor) -> Tensor:
-        x = leaky(self.colors(patches))
+        x = scaled_leaky_relu(self.colors(patches))
         for halving in self.halvings:
             x = halving(x)
-        x = leaky(self.mixed(with_deviation(x)))
-        return self.score(leaky(self.dense(x.flatten(1))))[:, 0]
+        x = scaled_leaky_relu(self.mixed(append_minibatch_std(x)))
+        return self.score(scaled_leaky_relu(self.dense(x.flatten(1))))[:, 0]
 
 
-def leaky(x: Tensor) -> Tensor:
+def scaled_leaky_relu(x: Tensor) -> Tensor:
+    """Leaky ReLU times `GAIN`."""
     return F.leaky_relu(x, SLOPE) * GAIN
 
 
-def binomial(size: int, padding: int) -> Tensor:
-    """[size + 2 padding - 3, size]: convolution of a line with [1, 3, 3, 1] / 8, zeros around it, as a matrix.
+def binomial_filter(size: int, padding: int) -> Tensor:
+    """[size + 2 padding - 3, size]: the convolution of a zero-padded row with [1, 3, 3, 1] / 8, as a matrix.
 
-    A product with it from either side filters images: on the CPU many times faster than a convolution of each channel.
+    Multiplying an image by it from both sides filters rows and columns, which on the CPU is many times faster than a
+    convolution per channel.
     """
     matrix = torch.zeros(size + 2 * padding - 3, size + 2 * padding)
     for tap, weight in enumerate((1, 3, 3, 1)):
@@ -117,11 +122,12 @@ def binomial(size: int, padding: int) -> Tensor:
     return matrix[:, padding:-padding].contiguous()
 
 
-def with_deviation(features: Tensor, group: int = GROUP) -> Tensor:
-    """Minibatch standard deviation: a channel more, [B, C, h, w] -> [B, C + 1, h, w], constant within each group.
+def append_minibatch_std(features: Tensor, group: int = GROUP) -> Tensor:
+    """Appends the minibatch standard deviation as a channel: [B, C, h, w] -> [B, C + 1, h, w].
 
-    Its value is the standard deviation over the group's patches, averaged over channels and pixels: fake patches that
-    are too much alike are seen to be. A group is every (B / group)-th patch, so that neighbours are in different ones.
+    The channel is constant within a group of patches. Its value is the standard deviation over the group, averaged over
+    channels and pixels, by which the critic recognises fake patches that are too similar. A group consists of every
+    (B / group)-th patch, so that consecutive patches are in different groups.
 
     Raises:
         ValueError: B is no multiple of `group`.
@@ -130,7 +136,7 @@ def with_deviation(features: Tensor, group: int = GROUP) -> Tensor:
     if batch % group:
         raise ValueError(f"{batch} patches cannot be split into groups of {group}")
     grouped = features.reshape(group, batch // group, *features.shape[1:])
-    # Under the root stands no zero: its slope there is infinite.
+    # The offset keeps the square root's derivative finite where all patches are equal.
     deviation = (grouped.var(0, unbiased=False) + 1e-8).sqrt().mean((1, 2, 3))
     return torch.cat([features, deviation.repeat(group)[:, None, None, None].expand_as(features[:, :1])], dim=1)
 
@@ -141,10 +147,11 @@ def critic_loss(real: Tensor, fake: Tensor) -> Tensor:
 
 
 def generator_loss(fake: Tensor, form: Form = "non-saturating") -> Tensor:
-    """What the maker of the fake patches minimises, from their scores.
+    """The loss that the generator minimises, from the scores of fake patches (any shape).
 
-    PAPER leaves open: which form. "saturating", mean f(-D(fake)), is the critic's own objective: its slope vanishes
-    where the critic is sure. "non-saturating", -mean f(D(fake)), has the same fixed point and pulls hardest there.
+    PAPER leaves open: which form. "saturating", mean f(-D(fake)), is the critic's own objective; its gradient vanishes
+    where the critic is certain. "non-saturating", -mean f(D(fake)), has the same fixed point, and its gradient is
+    largest there.
     """
     if form == "saturating":
         return F.logsigmoid(-fake).mean()
@@ -157,23 +164,24 @@ def gradient_penalty(scores: Tensor, patches: Tensor) -> Tensor:
     """R1: the mean over patches of ||dD / d patch||^2, differentiable in the critic's weights.
 
     Args:
-        scores: [B], the critic's at `patches`. patches: [B, 3, n, n], requiring a gradient.
+        scores: [B], the critic's scores of `patches`. patches: [B, 3, n, n], requiring a gradient.
     """
     (slope,) = torch.autograd.grad(scores.sum(), patches, create_graph=True)
     return slope.square().flatten(1).sum(1).mean()
 
 
-def gathered(image: Tensor, windows: Tensor, size: int) -> Tensor:
-    """Patches of an image in one indexing call: [C, H, W] -> [P, C, size, size], differentiable.
+def gather_patches(image: Tensor, windows: Tensor, size: int) -> Tensor:
+    """Crops patches from an image in one indexing call: [C, H, W] -> [P, C, size, size], differentiable.
 
     Args:
-        windows: [P, 2] long, (top, left) of each, all of them inside the image.
+        windows: [P, 2] long, (top, left) of each patch, which lies inside the image.
     """
     return _Gather.apply(image, windows, size)
 
 
 class _Gather(torch.autograd.Function):
-    """Indexing whose gradient is summed patch by patch: that of torch's indexing adds in the order threads arrive."""
+    """Indexing whose gradient is summed patch by patch, so that it is deterministic. The gradient of torch's own
+    indexing is summed in the order in which threads finish."""
 
     @staticmethod
     def forward(ctx, image: Tensor, windows: Tensor, size: int) -> Tensor:

@@ -1,4 +1,5 @@
-"""Two things at once: the prior's answer, whose maps are too small for threads to share, beside what only draws."""
+"""Runs two parts of a step at the same time: the prior, whose small tensors gain nothing from more threads, and
+rendering."""
 
 from __future__ import annotations
 
@@ -12,26 +13,35 @@ import torch
 T = TypeVar("T")
 
 
-class Crew:
-    """One thread for the small work, and the others for the rest. The same is computed with any number of threads."""
+class OverlapWorker:
+    """One thread for work in the background, the others for the foreground.
+
+    Results do not depend on the number of threads.
+
+    Args:
+        threads: in all; with 1 nothing overlaps.
+    """
 
     def __init__(self, threads: int):
-        self._all = threads
-        self._helper = ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(1,)) if threads > 1 else None
+        self._threads = threads
+        one_thread = {"initializer": torch.set_num_threads, "initargs": (1,)}
+        self._executor = ThreadPoolExecutor(1, **one_thread) if threads > 1 else None
 
     @contextmanager
-    def beside(self, work: Callable[[], T]) -> Iterator[Callable[[], T]]:
-        """Does the work while the body runs, before it where there is one thread only; what it gives by a call, after.
+    def overlap(self, work: Callable[[], T]) -> Iterator[Callable[[], T]]:
+        """Does `work` while the body of the `with` statement runs; before it if there is one thread only.
 
-        The body waits for it at its end, whatever happened."""
-        if self._helper is None:
-            done = work()
-            yield lambda: done
+        Gives a function that returns the result of `work` or raises its exception. The context waits for `work` at its
+        end, even if the body raises.
+        """
+        if self._executor is None:
+            result = work()
+            yield lambda: result
             return
-        torch.set_num_threads(max(1, self._all - 1))
-        doing = self._helper.submit(work)
+        torch.set_num_threads(max(1, self._threads - 1))
+        future = self._executor.submit(work)
         try:
-            yield doing.result
+            yield future.result
         finally:
-            wait([doing])
-            torch.set_num_threads(self._all)
+            wait([future])
+            torch.set_num_threads(self._threads)

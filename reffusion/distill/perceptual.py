@@ -1,4 +1,4 @@
-"""The perceptual distance that supervises patches: LPIPS where its weights lie on the machine, else a stand-in."""
+"""The perceptual distance between patches: LPIPS if its weights are installed, else the multi-scale D-SSIM."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from reffusion.metrics import lpips
 
 Distance = Callable[[Tensor, Tensor], Tensor]  # (render, target), [H, W, 3] in [0, 1] each -> scalar
 
-SCALES = 3
-SMALLEST = 11  # px a side, SSIM's window
+SCALES = 3  # full, half and quarter size
+MIN_SIDE = 11  # px, the side of SSIM's window
 
 
 def load(device: str = "cpu") -> tuple[str, Distance]:
-    """The name of the distance, and the distance: LPIPS (vgg), else the multi-scale D-SSIM.
+    """The name of the distance, and the distance: LPIPS (vgg) if its weights are installed, else multi-scale D-SSIM.
 
     Raises:
-        ValueError: LPIPS weights that are there but broken.
+        ValueError: LPIPS weights exist but are broken.
     """
     model, missing = lpips.load("vgg")
     if model is None:
@@ -35,25 +35,26 @@ def load(device: str = "cpu") -> tuple[str, Distance]:
 
 
 def multi_scale_dssim(render: Tensor, target: Tensor) -> Tensor:
-    """Mean of 1 - SSIM over the picture at full, half and quarter size, as far as a window fits.
+    """Mean of 1 - SSIM over an image at full, half and quarter size, as far as a window fits into these.
 
-    Not LPIPS: like it blind to a slight blur of what is coarse, unlike it without any knowledge of textures.
+    A substitute for LPIPS: both tolerate a slight blur of coarse structure, but this one knows nothing of textures.
 
     Args:
         render, target: [H, W, 3] in [0, 1]; the gradient reaches `render`.
     Raises:
-        ValueError: under 11 px a side.
+        ValueError: a side is shorter than 11 px.
     """
-    if min(target.shape[:2]) < SMALLEST:
-        raise ValueError(f"D-SSIM needs {SMALLEST} px a side; the patch has {target.shape[1]}x{target.shape[0]} px")
+    if min(target.shape[:2]) < MIN_SIDE:
+        raise ValueError(f"D-SSIM needs {MIN_SIDE} px a side; the patch has {target.shape[1]}x{target.shape[0]} px")
     values = []
     for _ in range(SCALES):
         values.append(dssim(render, target))
-        render, target = (_halved(image) for image in (render, target))
-        if min(target.shape[:2]) < SMALLEST:
+        render, target = (_downsample(image) for image in (render, target))
+        if min(target.shape[:2]) < MIN_SIDE:
             break
     return sum(values) / len(values)
 
 
-def _halved(image: Tensor) -> Tensor:
+def _downsample(image: Tensor) -> Tensor:
+    """An image of half the size, [H, W, C] -> [H // 2, W // 2, C]."""
     return F.avg_pool2d(image.permute(2, 0, 1)[None], 2)[0].permute(1, 2, 0)

@@ -1,7 +1,7 @@
-"""Multi-scale score distillation (RefFusion section 4.2): the whole view and patches of it, pulled towards the prior.
+"""The gradient of score distillation (RefFusion section 4.2), in latents.
 
-Every function takes tensors, plain numbers and one callable, the denoiser, so that the mathematics can be checked
-against a distribution whose score is known. Notation: z a clean latent, z_t = a z + s eps its noised form, with
+Every function takes tensors, plain numbers and one callable, the denoiser, so that tests can compare it with a
+distribution whose score is known. Notation: z is a clean latent and z_t = a z + s eps the noisy one, with
 a = sqrt(alpha_bar_t) and s = sqrt(1 - alpha_bar_t).
 """
 
@@ -25,13 +25,14 @@ def draw_timesteps(count: int, steps: int, low: float, high: float, generator: t
     return torch.randint(first, last + 1, (count,), generator=generator)
 
 
-def unfaded(x0: Tensor, latents: Tensor, mask: Tensor) -> Tensor:
-    """`x0` with its contrast inside the mask raised to that of the latents, as far as it shows the same.
+def match_contrast(x0: Tensor, latents: Tensor, mask: Tensor) -> Tensor:
+    """`x0` with its contrast inside the mask raised to that of the latents, as far as both show the same pattern.
 
-    A denoiser answers a mean over what it holds possible, which is paler than any of it; step by step that takes
-    contrast from a render that was right. So for each sample and channel, deviations from the mean are multiplied by
-    b = <z', x0'> / <x0', x0'>, the factor that brings them nearest to the latents' own. Never by less than 1: what x0
-    has more of, it may add. Where b counts, |b x0'| <= |z'|: nothing is blown up.
+    A denoiser predicts the mean of all plausible images, which has less contrast than any of them. Repeated steps
+    towards it remove contrast from a rendering that was correct. So for each sample and channel, deviations x0' from
+    the mean inside the mask are multiplied by b = <z', x0'> / <x0', x0'>, the factor that minimises their squared
+    difference from the latents' deviations z'. A factor below 1 is replaced by 1, so that x0 may add contrast. A larger
+    one gives |b x0'| <= |z'|, so that contrast is never amplified beyond the latents' own.
 
     Args:
         x0, latents: [B, C, h, w]. mask: [B, 1, h, w], 1 inside.
@@ -40,7 +41,7 @@ def unfaded(x0: Tensor, latents: Tensor, mask: Tensor) -> Tensor:
     mean = (x0 * mask).sum((2, 3), keepdim=True) / count
     deviation = (x0 - mean) * mask
     energy = deviation.square().sum((2, 3), keepdim=True)
-    shared = (latents * deviation).sum((2, 3), keepdim=True)  # the deviations sum to 0: the latents' mean drops out
+    shared = (latents * deviation).sum((2, 3), keepdim=True)  # deviations sum to 0, so the latents' mean cancels
     factor = torch.where(shared > energy, shared / energy.clamp(min=torch.finfo(x0.dtype).tiny), 1.0)
     return mean + factor * (x0 - mean)
 
@@ -56,34 +57,34 @@ def sds_gradient(
     keep_contrast: bool = False,
     mask: Tensor | None = None,
 ) -> Tensor:
-    """w(t) (eps_theta(z_t, t) - eps), one noise for each latent; the UNet's Jacobian left out (DreamFusion eq. 3).
+    """The SDS gradient w(t) (eps_theta(z_t, t) - eps), without the UNet's Jacobian (DreamFusion eq. 3).
 
-    PAPER leaves open: w(t), the factor a of dz_t/dz, which is taken into w, and any normalisation (none here). In
-    every case eps_theta - eps = (a / s) (z - x0_theta), so the weightings differ only by a function of t:
-      "sigma2"  s^2 (eps_theta - eps), DreamFusion's and threestudio's;
-      "x0"      z - x0_theta, i.e. w = s / a: bounded at both ends of the schedule;
+    PAPER leaves open: w(t), the factor a of dz_t/dz (part of w here), and any normalisation (none here). Since
+    eps_theta - eps = (a / s) (z - x0_theta), the weightings differ only by a function of t:
+      "sigma2"  s^2 (eps_theta - eps), as in DreamFusion and threestudio;
+      "x0"      z - x0_theta, i.e. w = s / a, bounded at both ends of the schedule;
       "one"     eps_theta - eps; with v-prediction, noise dominates it near t = 0.
 
     Args:
         latents: [B, C, h, w] clean latents z; no gradient flows here.
-        denoise: (z_t, t) -> (eps, x0), guidance and conditioning inside.
+        denoise: (z_t, t) -> (eps, x0), with guidance and conditioning applied.
         timesteps: [B] long.
-        noise: [B, C, h, w], standard normal.
+        noise: [B, C, h, w], standard normal, one for each latent.
         alphas_cumprod: [T], alpha_bar of every timestep.
-        keep_contrast: x0_theta is taken `unfaded`. Not in the paper.
-        mask: [B, 1, h, w], 1 where the gradient is kept; None keeps it everywhere.
-            PAPER leaves open: it distils the whole view; only masked Gaussians receive the gradient in any case.
+        keep_contrast: replaces x0_theta by `match_contrast` of it. Not in the paper.
+        mask: [B, 1, h, w], 1 where the gradient is kept; None keeps it everywhere. PAPER leaves open: whether it is
+            masked. The paper distils the whole view, and only masked Gaussians receive the gradient in any case.
     Returns:
         [B, C, h, w] without gradient.
     """
     with torch.no_grad():
         alpha_bar = alphas_cumprod[timesteps].reshape(-1, 1, 1, 1)
-        # 1 - alpha_bar before any rounding to the latents' type: in half precision it would have no digits near t = 0.
+        # 1 - alpha_bar is computed before rounding to the latents' type: half precision would cancel it near t = 0.
         signal, spread, variance = (x.to(latents) for x in (alpha_bar.sqrt(), (1 - alpha_bar).sqrt(), 1 - alpha_bar))
         eps, x0 = denoise(signal * latents + spread * noise, timesteps)
         if keep_contrast:
-            clear = unfaded(x0, latents, torch.ones_like(latents[:, :1]) if mask is None else mask)
-            eps, x0 = eps + signal / spread * (x0 - clear), clear
+            contrasted = match_contrast(x0, latents, torch.ones_like(latents[:, :1]) if mask is None else mask)
+            eps, x0 = eps + signal / spread * (x0 - contrasted), contrasted
         if weighting == "x0":
             gradient = latents - x0
         elif weighting == "sigma2":
@@ -98,13 +99,14 @@ def sds_gradient(
 
 
 def sds_loss(latents: Tensor, gradient: Tensor, reduction: Literal["sum", "mean"] = "sum") -> Tensor:
-    """A scalar whose gradient with respect to `latents` is the distillation gradient (its value means nothing).
+    """A scalar whose gradient with respect to `latents` is the SDS gradient. Its value has no meaning.
 
-    Sample 0 is the whole view and counts 1; the others are patches and count by their mean: L_global + mean(L_local).
+    Sample 0 is the whole view and has weight 1; the others are patches, which are averaged: L_global + mean(L_local).
+
     PAPER leaves open: "sum" (threestudio) or "mean" over a latent's elements.
 
     Args:
-        latents: [1 + P, C, h, w], with gradient back to the render.
+        latents: [1 + P, C, h, w], differentiable back to the rendering.
         gradient: [1 + P, C, h, w] from `sds_gradient`.
     """
     patches = latents.shape[0] - 1

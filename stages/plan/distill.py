@@ -1,4 +1,4 @@
-"""What can be told of `distill` before it runs."""
+"""What the plan says of the stage `distill` before it runs: weights, missing hardware, cost."""
 
 from __future__ import annotations
 
@@ -13,18 +13,22 @@ __all__ = ["Params", "cost", "lacks", "needed_weights"]
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
-    """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
-    asked = (params.sds.weight > 0 and params.sds.run != "never") or params.depth.weight > 0
-    found = [local.of_model(params.prior, params.dtype)] if asked else []
-    estimates = params.depth.weight > 0 and params.depth.model
-    return found + ([local.of_model(params.depth.model, "float32")] if estimates else [])
+    """The weights that the stage needs, each with what of it is missing on this machine.
+
+    Args:
+        brings: the keys of scene.yaml.
+    """
+    needs = [local.of_model(params.prior, params.dtype)] if params.needs_prior else []
+    if params.depth.weight > 0 and params.depth.model:
+        needs.append(local.of_model(params.depth.model, "float32"))
+    return needs
 
 
 def lacks(params: Params) -> list[str]:
-    """What this machine has not, and the stage needs on CUDA."""
+    """What the stage needs on CUDA and this machine lacks."""
     return machine.lacks(machine.machine(), params.memory_gb, splats=True, memory_param="distill.memory_gb")
 
 
 def cost(params: Params, card: str) -> Mapping[str, object] | None:
-    """What it takes on a card; "": this machine's. ValueError for one that is not in the table."""
+    """The estimated cost on a GPU, by name; "" is this machine's. ValueError if the name is not in the table."""
     return estimate.said(card, params.device, estimate.distill(params))

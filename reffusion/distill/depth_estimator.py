@@ -1,0 +1,51 @@
+"""How the depth term finds the depth of a view: with a depth network, or by continuing the scene's own depth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from reffusion.depth import background_depth, estimates
+from reffusion.depth.background_depth import Completion, Seen
+
+
+class DepthEstimator(NamedTuple):
+    """Estimates the depth of a view.
+
+    Attributes:
+        how: which rendered depth counts as known.
+        disparity: (what the view shows of the scene's depth, a function that returns the view with its hole repainted)
+            -> disparity [H, W] in the scene's units. The image, [H, W, 3] in [0, 1], is painted only if the function
+            is called. Raises Degenerate where the disparity is undetermined.
+    """
+
+    how: Completion
+    disparity: Callable[[Seen, Callable[[], np.ndarray]], np.ndarray]
+
+
+def continuation_estimator(points: np.ndarray, how: Completion) -> DepthEstimator:
+    """An estimator without a depth network: it continues the scene's own depth around the hole through it.
+
+    Args:
+        points: [P, 3] sparse points of the scene.
+    """
+    return DepthEstimator(how, lambda view, picture: background_depth.continued(view, picture, points, how)[0])
+
+
+def network_estimator(network: Callable[[Tensor], Tensor], how: Completion) -> DepthEstimator:
+    """The paper's estimator: a network's depth of the repainted view, aligned and passed through the bilateral solver.
+
+    Args:
+        network: [3, H, W] in [0, 1] -> [H, W] disparity up to scale and offset.
+    """
+
+    def disparity(view: Seen, picture: Callable[[], np.ndarray]) -> np.ndarray:
+        painted = picture()
+        estimate = network(torch.from_numpy(painted).float().permute(2, 0, 1)).double().cpu().numpy()
+        return estimates.estimated(view, painted, estimate, how)[0]
+
+    return DepthEstimator(how, disparity)

@@ -1,0 +1,31 @@
+"""Rendered colours as an 8-bit image can show them."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+
+def clamp_to_display(color: Tensor) -> Tensor:
+    """Clamps colours to [0, 1]; the gradient passes unless it would drive a colour further out of this range.
+
+    PAPER leaves open: colours above 1. Spherical harmonics can add up to them, and neither the prior nor the critic
+    was trained on any. A plain clamp has no gradient there, so such colours would never return; passing every gradient
+    would let white grow without limit.
+    """
+    return _ClampToDisplay.apply(color)
+
+
+class _ClampToDisplay(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, color: Tensor) -> Tensor:
+        ctx.save_for_backward(color)
+        return color.clamp(0, 1)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, gradient: Tensor) -> Tensor:
+        (color,) = ctx.saved_tensors
+        outwards = ((color > 1) & (gradient < 0)) | ((color < 0) & (gradient > 0))
+        return torch.where(outwards, 0.0, gradient)

@@ -1,0 +1,138 @@
+"""The SDS term: multi-scale score distillation pulls a view towards what the adapted prior expects (section 4.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from reffusion import seeding
+from reffusion.distill.display_range import clamp_to_display
+from reffusion.distill.sds import draw_timesteps, sds_gradient, sds_loss
+from reffusion.distill.terms.term import Term, TermInputs, TermValue, cycle_through, reach_hole
+from reffusion.distill.train_view import TrainView
+from reffusion.gaussians.optimize import confine
+from reffusion.geometry import angle_between_views
+from reffusion.params.distill import Params, Sds
+from reffusion.prior import diffusion
+from reffusion.prior.model import Prior
+from reffusion.prior.windows import enlarged, two_scale_masks, two_scales, window_around
+from reffusion.splat.rasterizer import render
+from reffusion.types import Camera, Gaussians, Rendering
+
+T_LOW = 0.02  # PAPER leaves open: the lowest timestep of SDS, as a fraction of the schedule; threestudio's
+
+
+def build(inputs: TermInputs, settings: Params) -> Term | None:
+    """The term; None if SDS is off, or no view has a hole and is near enough to a reference.
+
+    All views with a hole take their turn, and the turns of those that are too far from every reference are left out.
+    The gradient reaches the masked Gaussians, or all that show with `sds.reaches: all`.
+
+    Raises:
+        ValueError: there is no prior, or its prompts are not embedded.
+    """
+    sds, views = settings.sds, inputs.hole_views
+    if not sds.is_on or not views:
+        return None
+    if inputs.prior is None or inputs.text is None:
+        raise ValueError("distillation with sds.weight > 0 needs a prior and its prompts' embeddings")
+    cameras = [reference.camera for reference in inputs.references]
+    near = views_near_references(views, cameras, inputs.masked_means, sds.max_angle)
+    if not near:
+        return None
+    next_view = cycle_through(views, settings.seed, "sds")
+
+    def select_view(turn: int) -> TrainView | None:
+        view = next_view(turn)
+        return view if view.camera.name in near else None
+
+    def loss(gaussians: Gaussians, reached: Tensor, view: TrainView, step: int) -> TermValue:
+        probe = torch.zeros(len(reached), 2, device=reached.device, requires_grad=True)
+        draws = seeding.generator(settings.seed, "distill", "sds", step)
+        value, rendering = evaluate_sds(gaussians, reached, view, inputs.prior, inputs.text, sds, draws, probe)
+        return TermValue(value, rendering, probe=probe)
+
+    return Term(
+        "SDS",
+        weight=sds.weight,
+        select_view=select_view,
+        reaches=reach_hole(settings, everywhere=sds.reaches == "all"),
+        loss=loss,
+        is_background=True,
+    )
+
+
+def views_near_references(
+    views: Sequence[TrainView], references: Sequence[Camera], means: Tensor, max_angle: float
+) -> frozenset[str]:
+    """Names of the views that are at most `max_angle` degrees from a reference.
+
+    The angle is measured at the median of `means` [M, 3], the middle of the hole.
+    """
+    if max_angle >= 180 or len(means) == 0:
+        return frozenset(view.camera.name for view in views)
+    middle = means.detach().median(0).values.double().cpu().numpy()
+    angles = {view.camera.name: angle_between_views(middle, view.camera, references) for view in views}
+    return frozenset(name for name, angle in angles.items() if angle <= max_angle)
+
+
+def evaluate_sds(
+    gaussians: Gaussians,
+    reached: Tensor,
+    view: TrainView,
+    prior: Prior,
+    text: Tensor,
+    sds: Sds,
+    generator: torch.Generator,
+    probe: Tensor | None = None,
+    t_low: float = T_LOW,
+) -> tuple[Tensor, Rendering]:
+    """L_global + mean(L_local) of one view, all samples in one batch of the UNet, and the rendering.
+
+    PAPER leaves open: what conditions the UNet. The photo where it may supervise; elsewhere the rendering itself
+    (background that other views see behind the object), with the hole blanked. No gradient flows through it.
+
+    Args:
+        reached: [N] bool, the Gaussians that the gradient reaches.
+        view: with at least one pixel to repaint.
+        text: [3, L, D], the hidden states of the global, the local and the empty prompt.
+        generator: on the CPU; draws windows, timesteps and noise.
+        probe: [N, 2], see `splat.render`; its gradient is zero for Gaussians that are not reached, too.
+        t_low: lowest timestep, as a fraction of the schedule.
+    Raises:
+        FloatingPointError: the prior's prediction is not finite.
+    """
+    size = prior.native_size
+    probe = None if probe is None else probe * reached[:, None]
+    rendering = render(confine(gaussians, reached), view.camera, probe=probe)
+    color = clamp_to_display(rendering.color)
+    rendered = enlarged(color.permute(2, 0, 1) * 2 - 1, size)
+    known = torch.where(view.supervises[..., None], view.picture, color.detach())
+    known = enlarged(known.permute(2, 0, 1) * 2 - 1, size)
+    hole = enlarged(view.repaint.to(rendered)[None], size)[0] > 1e-4
+
+    windows = [window_around(hole.cpu(), size, generator) for _ in range(sds.patches)]
+    masks = two_scale_masks(hole, windows, size)
+    condition = diffusion.conditioning(prior, two_scales(known, windows, size), masks)
+    latents = diffusion.encode(prior, two_scales(rendered, windows, size))
+    prompts = torch.cat([text[:1], text[1:2].expand(sds.patches, -1, -1)])
+    empty = text[2:].expand(len(latents), -1, -1)
+
+    count = len(latents)
+    timesteps = draw_timesteps(count, prior.timesteps, t_low, sds.t_high, generator).to(latents.device)
+    noise = torch.randn(latents.shape, generator=generator).to(latents)
+    gradient = sds_gradient(
+        latents,
+        lambda noisy, t: diffusion.guided(prior, noisy, t, condition, prompts, empty, sds.guidance),
+        timesteps,
+        noise,
+        prior.alphas_cumprod,
+        weighting=sds.weighting,
+        keep_contrast=sds.keep_contrast,
+        mask=condition[:, :1] if sds.hole_only else None,
+    )
+    if not torch.isfinite(gradient).all():
+        raise FloatingPointError(f"the prior's answer at timesteps {timesteps.tolist()} is not finite")
+    return sds_loss(latents, gradient, sds.reduction), rendering
