@@ -10,16 +10,16 @@ from pathlib import Path
 
 from reffusion.command import workplace
 from runner import Failed, Refused
-from runner.child import INTERRUPTED
+from runner.worker import INTERRUPTED
 from runner.compare import By, batch, compare, show_results
-from runner.costs import costs
+from runner.card_costs import costs
 from runner.engine import ENGINES, chosen
 from runner.execute import Work, run_scene, weights
 from runner.files import told, write_json
 from runner.plan import as_record, plan, table
 from runner.resolve import Request, resolve
 from runner.sweep import sweep
-from runner.upkeep import clean, verify
+from runner.maintenance import clean, verify
 
 SOME_FAILED = 3  # compare: done, but for some variants
 

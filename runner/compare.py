@@ -14,7 +14,7 @@ from runner import Refused, say
 from runner.engine import Engine, Local
 from runner.files import RECEIPT, shown, write_json, write_text
 from runner.keys import HASHES, Hashes
-from runner.many import Outcome, Run, do_all
+from runner.parallel import Outcome, Run, do_all
 from runner.pipeline import Pipeline, find_scene, load_pipeline, scene_name, unknown
 from runner.resolve import Request, resolve_all
 

@@ -247,7 +247,7 @@ def chosen(name: str | None, address: str | None, root: Path, runs: Path) -> Eng
         raise Refused(f"engine={name}: unknown; known: local, {', '.join(ENGINES)}")
     kind, library = ENGINES[name]
     try:
-        module = importlib.import_module(f"runner.on_{name}")
+        module = importlib.import_module(f"runner.{name}_engine")
     except ImportError as error:
         if error.name != library:
             raise

@@ -33,7 +33,7 @@ from runner.files import (
     write_text,
 )
 from runner.keys import Hashes, Inputs
-from runner.lost import take_over
+from runner.retry import take_over
 from runner.pipeline import SCENE
 from runner.plan import Decision, amount, decide, expected_seconds, needs_in_use, partial_folder, plan, table
 from runner.resolve import Job, Request, ask, child, resolve

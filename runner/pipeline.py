@@ -12,7 +12,7 @@ from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_v
 
 from reffusion.command import workplace
 from runner import Refused
-from runner.handed import read_handed
+from runner.user_yaml import read_handed
 
 SCENE = "scene"  # the need that stands for the scene's own folder
 NAME = re.compile(r"[\w'][\w'\" .,()+\-]*")  # of a scene; none that patterns or variants could be made of

@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import shlex
 import subprocess
 import sys
@@ -13,7 +12,7 @@ from typing import Any
 from runner import Refused, say
 from runner.files import files_below, read_json, read_text, shown
 from runner.keys import HASHES, Hashes, code_of, digest, elsewhere, outside
-from runner.layers import Layers, layered, parse_set, seconds_of, shared_out
+from runner.parameters import Layers, layered, parse_set, seconds_of, shared_out
 from runner.pipeline import (
     SCENE,
     Pipeline,
@@ -21,16 +20,14 @@ from runner.pipeline import (
     find_scene,
     load_pipeline,
     load_scene_file,
-    read_yaml,
     scene_name,
     unknown,
 )
 
 AUTO = "auto"  # the profile that this machine can do
-CHILD = Path(__file__).with_name("child.py")
+WORKER = Path(__file__).with_name("worker.py")
 FRAMES, TAKEN = "frames", ("frames.json", "frames.csv")  # in runs/<video>/, and what is written there beside images/
 LASTING = "told "  # before the names of answers that are remembered
-RENAMED = Path("runner", "renamed.yaml")  # old dotted name of a parameter: the new one, or what became of it
 
 
 @dataclass(frozen=True)
@@ -218,10 +215,10 @@ def take_frames(video: Path, folder: Path, root: Path, hashes: Hashes) -> None:
 
 
 def child(root: Path, *arguments: str, **options: Any) -> subprocess.Popen[str]:
-    """A fresh process that may import stages: `python -m runner.child <arguments>` with `root` first on its path."""
+    """A fresh process that may import stages: `python -m runner.worker <arguments>` with `root` first on its path."""
     here = Path(__file__).resolve().parent.parent
     path = os.pathsep.join(filter(None, [str(root), str(here), os.environ.get("PYTHONPATH", "")]))
-    command, environment = [sys.executable, "-m", "runner.child", *arguments], {**os.environ, "PYTHONPATH": path}
+    command, environment = [sys.executable, "-m", "runner.worker", *arguments], {**os.environ, "PYTHONPATH": path}
     return subprocess.Popen(command, cwd=root, env=environment, stdin=subprocess.PIPE, text=True, **options)
 
 
@@ -260,7 +257,7 @@ def _name(job: Job, question: dict[str, Any]) -> str:
     if "scene" in question and any(outside(question["params"], job.folder)):  # its files may have a say
         return json.dumps(question)
     files = [(str(path), (stat := path.stat()).st_size, stat.st_mtime_ns) for path in listed]
-    return LASTING + digest(json.dumps([question, code, job.hashes.file(CHILD), files]))
+    return LASTING + digest(json.dumps([question, code, job.hashes.file(WORKER), files]))
 
 
 def _described(job: Job, questions: dict[str, dict[str, Any]], answers: dict[str, Any]) -> Job:
@@ -271,7 +268,7 @@ def _described(job: Job, questions: dict[str, dict[str, Any]], answers: dict[str
         stage, answer = question["stage"], answers[name]
         for error in answer.get("errors", ()):
             origin = job.layers.origin(stage, error["where"])
-            raise Refused(f"{origin}: {_refusal(job.root, stage, error, answer['known'])}")
+            raise Refused(f"{origin}: {_refusal(stage, error, answer['known'])}")
         if "broken" in answer:
             broken[stage] = answer["broken"]
         else:
@@ -280,15 +277,8 @@ def _described(job: Job, questions: dict[str, dict[str, Any]], answers: dict[str
     return replace(job, stages=stages, broken=broken)
 
 
-def _refusal(root: Path, stage: str, error: dict[str, Any], known: list[str]) -> str:
-    """What is wrong with a parameter; one that had this name once is told its new one."""
-    old = f"{stage}.{error['where']}"
-    if not error["unknown"]:
-        return f"{old} = {error['value']}: {error['message']}"
-    renamed = read_yaml(root / RENAMED) if (root / RENAMED).is_file() else {}
-    while old and old not in renamed:
-        old = old.rpartition(".")[0]
-    if not old:
+def _refusal(stage: str, error: dict[str, Any], known: list[str]) -> str:
+    """What is wrong with a parameter."""
+    if error["unknown"]:
         return f"stage {stage}: {unknown('parameter', error['where'], known)}"
-    new = renamed[old] or "it is gone"
-    return f"unknown parameter {old}; " + (f"it is {new} now" if re.fullmatch(r"\w+(\.\w+)+", new) else new)
+    return f"{stage}.{error['where']} = {error['value']}: {error['message']}"

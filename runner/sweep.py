@@ -13,7 +13,7 @@ from runner.keys import HASHES, Hashes
 from runner.pipeline import load_pipeline
 from runner.plan import amount, plan
 from runner.resolve import Request, resolve
-from runner.upkeep import is_home, made_of, remove_empty
+from runner.maintenance import is_home, made_of, remove_empty
 
 
 @dataclass(frozen=True)

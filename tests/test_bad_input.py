@@ -30,8 +30,9 @@ from reffusion.io.ply import save_ply
 from reffusion.references.files import load_given
 from reffusion.references.undistort import GivenReference
 from reffusion.types import Gaussians
-from runner import Refused, child
-from runner.layers import layered, parse_set, seconds_of
+from runner import Refused
+from runner import worker
+from runner.parameters import layered, parse_set, seconds_of
 from runner.pipeline import load_pipeline, load_scene_file
 from runner.resolve import choose_profile
 from stages import poses, raw_masks
@@ -68,7 +69,7 @@ def told(folder: Path, out: Path, set_: str = "") -> str | None:
         if "scene" in spec.takes and stage in ("poses", "raw_masks"):
             asked |= {"scene": str(folder), "needs": {"scene": str(folder)}}
         try:
-            answer = child._describe(asked)
+            answer = worker._describe(asked)
         except Refused as error:
             return str(error)
         assert "broken" not in answer, answer

@@ -152,7 +152,7 @@ def test_stopped_while_several_run(tmp_path):
     process.send_signal(signal.SIGINT)
     assert process.wait(30) != 0
     assert not (root / "runs/spans.txt").exists()
-    assert not subprocess.run(["pgrep", "-f", f"runner.child run.*{root}"], capture_output=True).stdout
+    assert not subprocess.run(["pgrep", "-f", f"runner.worker run.*{root}"], capture_output=True).stdout
     (root / "stages/distill.py").write_text(FILES["stages/distill.py"])
     assert batch(asked(root, ""), root / "many", By(machine(4))) == 1
     assert (root / "runs/ran.txt").read_text().count("poses") == 3

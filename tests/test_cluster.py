@@ -17,11 +17,11 @@ from test_batch import FILES, spans, toys, written
 from test_compare import request as asked
 from test_faults import assert_whole
 
-from runner.child import INTERRUPTED
+from runner.worker import INTERRUPTED
 from runner.compare import By, compare
 from runner.engine import Ended, Local, Needs, Task, chosen
 from runner.execute import Work, run_scene
-from runner.lost import attempt, take_over
+from runner.retry import attempt, take_over
 
 REPO = Path(__file__).resolve().parent.parent
 slow = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="takes minutes; set REFFUSION_SLOW=1")
@@ -90,7 +90,7 @@ def test_one_that_was_given_up_for_lost_writes_nowhere(tmp_path, monkeypatch):
             (mine / "trace.jsonl").write_text("late")
         return Ended({}, 0)
 
-    monkeypatch.setattr("runner.lost.carry_out", work)
+    monkeypatch.setattr("runner.retry.carry_out", work)
     attempt(stage_task(root))
     assert [path.name for path in out.iterdir()] == ["theirs.txt"]
 

@@ -15,7 +15,7 @@ from reffusion.cost import estimate
 from reffusion.cost.counts import COUNTS
 from reffusion.params import distill, fit, personalize, reference
 from runner import Refused
-from runner.costs import costs, span
+from runner.card_costs import costs, span
 from runner.plan import plan, table
 from runner.resolve import Request, resolve
 
@@ -93,6 +93,6 @@ def test_what_a_plan_prints(tmp_path, monkeypatch):
     assert re.fullmatch(r"    together +[\d.]+ (s|min|h)", lines[-1])
     with pytest.raises(Refused, match="card 'voodoo' is none of"):
         costs(job, decisions, "voodoo")
-    monkeypatch.setattr("runner.costs.has_cuda", lambda: False)
+    monkeypatch.setattr("runner.card_costs.has_cuda", lambda: False)
     assert costs(job, decisions, None) == "", "nothing is asked where there is no card"
     assert [span(s) for s in (12.3, 600, 7200)] == ["12 s", "10 min", "2.0 h"]

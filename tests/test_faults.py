@@ -22,7 +22,8 @@ from test_installed import write_capture
 from test_runner import FILES, REPO, finished, ran, request, result, root, start, wait_for, words, write
 
 from reffusion import trace
-from runner import Refused, compare, upkeep
+from runner import Refused, compare
+from runner import maintenance
 from runner.artifacts import wear
 from runner.execute import run_scene
 from runner.files import RECEIPT
@@ -197,20 +198,20 @@ def test_what_is_missing_or_changed_is_named_and_made_again(root, capsys):
 
 
 def test_verify_hashes_everything(root, capsys):
-    assert upkeep.verify(request(root)) == 0 and "runs/toy/fit: as it was made" in capsys.readouterr().out
+    assert maintenance.verify(request(root)) == 0 and "runs/toy/fit: as it was made" in capsys.readouterr().out
     files = [path for path in (root / "runs/toy").glob("*/*") if path.is_file() and path.suffix in (".ply", ".json")]
     files = sorted((path for path in files if path.name != RECEIPT), key=lambda path: path.name == "facts.json")
     for path in (root / "data/toy/number.txt", *files):
         flip(path, quietly=True)
         assert path.name == "facts.json" or set(words(root).values()) == {"cached"}  # by size and time
-    assert upkeep.verify(request(root)) == len(files) + 1
+    assert maintenance.verify(request(root)) == len(files) + 1
     said = capsys.readouterr().out
     assert all(f"toy/{path.parent.name}: {path.name} changed" in said for path in files)
     assert "data/toy/number.txt: its content changed, its size and time did not" in said and "keep=1" in said
     assert words(root)["poses"].startswith("run need scene changed") and "gaussians.ply changed" in words(root)["fit"]
     for spoiled in ("{", "[]", "{}"):
         (root / "runs/toy/masks" / RECEIPT).write_text(spoiled)
-        assert upkeep.verify(request(root)) and "masks: receipt.json cannot be read" in capsys.readouterr().out
+        assert maintenance.verify(request(root)) and "masks: receipt.json cannot be read" in capsys.readouterr().out
 
 
 def test_an_old_receipt_holds_as_a_whole(root):
@@ -385,5 +386,5 @@ def test_a_quote_in_a_scenes_name(fresh, capsys):
     (fresh / "data/toy").rename(fresh / "data" / name)
     assert ran(capsys, fresh, "fit", scene=name) == ["fit"]
     assert ran(capsys, fresh, "fit", scene=str(fresh / "data" / name), variant="strong") == ["fit"]
-    upkeep.clean(request(fresh, scene=name))
+    maintenance.clean(request(fresh, scene=name))
     assert not list((fresh / "runs").glob("[!.]*"))

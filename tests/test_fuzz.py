@@ -36,7 +36,7 @@ from reffusion.io.quantized import save_splat
 from reffusion.io.splats import load_splats
 from reffusion.types import Gaussians
 from runner import Refused
-from runner.handed import read_handed
+from runner.user_yaml import read_handed
 
 SLOW = os.environ.get("REFFUSION_SLOW") == "1"
 SECONDS = float(os.environ.get("REFFUSION_FUZZ_SECONDS", "600"))

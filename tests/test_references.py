@@ -33,7 +33,7 @@ from runner.keys import Hashes, code_of
 from runner.plan import plan
 from runner.resolve import Request
 from runner.resolve import resolve as prepare_job
-from runner.upkeep import clean
+from runner.maintenance import clean
 from stages import poses, reference
 from stages.plan import poses as plan_poses
 from stages.plan import reference as plan_reference

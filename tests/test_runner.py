@@ -14,7 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from runner import Refused, compare, upkeep
+from runner import Refused, compare
+from runner import maintenance
 from runner import resolve as resolving
 from runner.execute import Failed, run_scene
 from runner.keys import Hashes, code_of, fingerprint
@@ -526,7 +527,7 @@ def test_two_runners_on_one_scene(root):
     wait_for(lambda: list((root / "runs/toy").glob(".partial-fit-*")))
     first.send_signal(signal.SIGSTOP)  # until the second has had to wait
     with pytest.raises(Refused, match=f"toy is in use by process {first.pid}"):
-        upkeep.clean(request(root))
+        maintenance.clean(request(root))
     second = start(root, "--scene", "toy", "--set", "fit.pause=0.2 fit.iterations=8")
     output = second.stdout.readline()
     first.send_signal(signal.SIGCONT)
@@ -626,16 +627,16 @@ def test_two_folders_of_one_name(root, tmp_path):
 
 def test_clean(root, capsys):
     run_scene(request(root, variant="strong"), "distill")
-    upkeep.clean(request(root, variant="strong"))
+    maintenance.clean(request(root, variant="strong"))
     assert (root / "runs/toy").exists() and not (root / "runs/toy@strong").exists()
-    upkeep.clean(request(root, scene=str(root / "data/toy")))
+    maintenance.clean(request(root, scene=str(root / "data/toy")))
     assert not (root / "runs/toy").exists()
     assert "removing" in (said := capsys.readouterr().out) and "runs/toy: distill, evaluate, fit, masks, poses" in said
-    upkeep.clean(request(root))
+    maintenance.clean(request(root))
     assert "nothing was computed for toy" in capsys.readouterr().out
     run_scene(request(root), "fit")
     shutil.rmtree(root / "data/toy")
-    upkeep.clean(request(root))
+    maintenance.clean(request(root))
     assert not (root / "runs/toy").exists()
 
 
@@ -645,10 +646,10 @@ def test_clean_removes_only_what_it_was_asked_for_by_name(root):
     before = sorted(root.rglob("*"))
     for name in ("*", "to*", "[t]oy", ".locks", "..", ".", "/", "data/..", "toy@strong", "tyo", "toys", "mine"):
         with pytest.raises(Refused, match="toy"):
-            upkeep.clean(request(root, scene=name))
+            maintenance.clean(request(root, scene=name))
     for variant in ("*", "../toy", "string"):
         with pytest.raises(Refused, match=r"unknown variant .*strong"):
-            upkeep.clean(request(root, variant=variant))
+            maintenance.clean(request(root, variant=variant))
     assert sorted(root.rglob("*")) == before
 
 
@@ -662,7 +663,7 @@ def test_clean_and_a_rerun_leave_what_people_put_there(root, tmp_path, capsys):
     assert ran(capsys, root, "fit", set="fit.rate=3") == ["fit"]
     assert (root / "runs/toy/fit/notes.txt").read_text() == "2"
     (root / "runs/toy/poses/number.txt").write_text("9")
-    upkeep.clean(request(root))
+    maintenance.clean(request(root))
     assert "kept, as it was not made by the runner: " in capsys.readouterr().out
     home = root / "runs/toy"
     left = {path.relative_to(home).as_posix() for path in home.rglob("*") if path.is_file()}
@@ -833,24 +834,6 @@ def test_the_layer_that_asked_last_is_named(fresh):
         resolve(request(fresh, set="distill.sds.lora.rank=3"))
     with pytest.raises(Refused, match=r"set: distill.sds.weight = 'more'"):
         resolve(request(fresh, set="distill.sds.weight=more"))
-
-
-def test_an_old_name_is_told_its_new_one(fresh):
-    old = "distill.sds_weight: distill.sds.weight\ndistill.lora: distill.sds.lora\ndistill.gone: ''\nfit.was: no use\n"
-    write(fresh, {**NESTING, "runner/renamed.yaml": old})
-    for asked, message in {
-        "distill.sds_weight=1": "unknown parameter distill.sds_weight; it is distill.sds.weight now",
-        "distill.lora.rank=1": "unknown parameter distill.lora; it is distill.sds.lora now",
-        "distill.gone=1": "unknown parameter distill.gone; it is gone",
-        "fit.was=1": "unknown parameter fit.was; no use",
-        "fit.rat=1": "stage fit: unknown parameter 'rat'; did you mean 'rate'?",
-    }.items():
-        with pytest.raises(Refused) as caught:
-            resolve(request(fresh, set=asked))
-        assert str(caught.value) == f"set: {message}"
-    write(fresh, {"data/toy/scene.yaml": "stages: {distill: {sds_weight: 1}}"})
-    with pytest.raises(Refused, match=r"scene.yaml: stages: unknown parameter distill.sds_weight; it is distill.sds"):
-        resolve(request(fresh))
 
 
 # -------------------------------------------------------------------------------------------------------------- keys

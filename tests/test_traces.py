@@ -24,7 +24,7 @@ from reffusion.io.scene import load_mask_sets, save_references
 from reffusion.io.traces import MAIN, load_trace, main_quantity
 from reffusion.prior import personalize as personalizing
 from reffusion.types import PARAMETERS, Reference
-from runner.layers import layered, seconds_of, shared_out
+from runner.parameters import layered, seconds_of, shared_out
 from runner.pipeline import Refused, load_pipeline, load_scene_file
 from stages import distill, fit, initialize, masks, personalize
 

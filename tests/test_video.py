@@ -18,7 +18,7 @@ from reffusion.io.files import BadInput
 from reffusion.io.images import image_size, load_image
 from runner import Refused
 from runner.resolve import Request, resolve, take_frames
-from runner.upkeep import clean
+from runner.maintenance import clean
 
 ROOT = Path(__file__).resolve().parent.parent
 WIDTH, HEIGHT, STEP, SHOTS = 160, 120, 3, 60

@@ -15,7 +15,7 @@ from ray.exceptions import RayError, TaskCancelledError
 from runner import Failed, Refused
 from runner.engine import GRACE, Ended, Needs, Task
 from runner.files import told
-from runner.lost import attempt
+from runner.retry import attempt
 
 RETRIES = 3  # on other machines, of a stage whose machine was lost
 

@@ -16,7 +16,7 @@ import submitit
 from runner import Failed, Refused
 from runner.engine import GRACE, Ended, Needs, Task
 from runner.files import shown, told
-from runner.lost import attempt
+from runner.retry import attempt
 
 RETRIES = 3  # of a stage whose node was lost
 MINUTES = 24 * 60  # that a stage may take; what it has done by then is gone on with

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from runner import Refused
-from runner.handed import value_of
+from runner.user_yaml import value_of
 from runner.keys import leaves
 from runner.pipeline import Overrides, Pipeline, SceneFile, unknown
 
