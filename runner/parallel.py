@@ -1,4 +1,4 @@
-"""Many runs, several scenes at once where there are cores and memory for them."""
+"""Runs several scenes at once, as cores and memory allow."""
 
 import sys
 import threading
@@ -9,86 +9,98 @@ from functools import partial
 from itertools import count, groupby
 from pathlib import Path
 
-from runner import said_to, say
+from runner import redirect_output, say
 from runner.engine import GRACE, Engine
-from runner.execute import Work, run_scene
-from runner.files import told
+from runner.execute import Execution, run_scene
 from runner.keys import Hashes
 from runner.progress import Progress
 from runner.resolve import Request
+from runner.text import format_error
 
-OUTPUT = "output.log"  # in a run's folder: what it said while others ran beside it
-FAR = 256  # scenes at once, at most, where others do the work
+OUTPUT = "output.log"  # in a run's folder: what it printed while others ran at the same time
+MAX_SCENES = 256  # scenes at once, at most, on a cluster
 
 
 @dataclass(frozen=True)
 class Run:
-    """One to be done. `name`: what people read; runs of one `group`, which are neighbours, are done one after another,
-    since they share what is equal. `announced`: a line said first where nothing runs beside it."""
+    """One scene, or a variant of it, to be run.
+
+    Attributes:
+        name: for people.
+        group: runs of a group, which are neighbours, run one after another, as they share artifacts.
+        home: the folder in runs/.
+        request: what to run.
+        announcement: printed first where runs are not parallel.
+    """
 
     name: str
     group: str
     home: Path
     request: Request
-    announced: str = ""
+    announcement: str = ""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a run: each stage's artifact, what went wrong, seconds of wall clock."""
+    """The result of a run: stage -> artifact, the error if it failed, and seconds of wall clock."""
 
     stages: dict[str, Path | None]
     error: str | None
     seconds: float
 
 
-def do_all(
+def run_all(
     runs: Sequence[Run],
-    engine: Engine,
-    cores: int | None,
+    execution: Execution,
     hashes: Hashes,
     stages: list[str],
-    ended: Callable[[int, Outcome], None],
+    on_end: Callable[[int, Outcome], None],
 ) -> None:
-    """Bring each up to date; one that fails stops no other. `ended` is told each one's place among `runs` and its
-    outcome, one at a time.
+    """Bring each run up to date; one that fails stops no other.
 
-    cores: that each stage gets, None: an equal part of the engine's for every group, at least one. It stays the same to
-    the end, so that no result depends on which of them ended first."""
-    groups = [list(each) for _, each in groupby(range(len(runs)), key=lambda place: runs[place].group)]
-    each = min(cores or max(1, engine.cores // max(1, len(groups))), engine.cores)
-    at_once = min(len(groups), engine.cores // each, FAR)
-    if at_once == 1 and not engine.shares:
+    By default each group gets an equal part of the engine's cores, at least one. The number of cores of a stage stays
+    the same to the end, so that no result depends on which run ended first.
+
+    Args:
+        on_end: called with the place of a run among `runs` and its outcome, by one thread at a time.
+    """
+    engine, cores = execution.engine, execution.cores
+    groups = [list(places) for _, places in groupby(range(len(runs)), key=lambda place: runs[place].group)]
+    cores_each = min(cores or max(1, engine.cores // max(1, len(groups))), engine.cores)
+    at_once = min(len(groups), engine.cores // cores_each, MAX_SCENES)
+    if at_once == 1 and not engine.is_remote:
         for place, run in enumerate(runs):
-            if run.announced:
-                say(run.announced)
-            ended(place, _outcome(run, hashes, Work(engine, cores and each)))
+            if run.announcement:
+                say(run.announcement)
+            on_end(place, _run(run, hashes, Execution(engine, cores and cores_each)))
         return
-    said = f"{len(groups)} scenes, {at_once} at once, {each} core{'s' * (each > 1)} each"
+    header = f"{len(groups)} scenes, {at_once} at once, {cores_each} core{'s' * (cores_each > 1)} each"
     homes = [run.home for run in runs]
-    with Progress([run.name for run in runs], homes, stages, at_once, said) as progress:
-        _in_threads(runs, groups, at_once, partial(_watched, progress, hashes, Work(engine, each)), ended, engine)
+    with Progress([run.name for run in runs], homes, stages, at_once, header) as progress:
+        run_one = partial(_run_with_progress, progress, hashes, Execution(engine, cores_each))
+        _run_in_threads(runs, groups, at_once, run_one, on_end, engine)
 
 
-def _in_threads(
+def _run_in_threads(
     runs: Sequence[Run],
     groups: list[list[int]],
     at_once: int,
-    do: Callable[[int, Run], Outcome],
-    ended: Callable[[int, Outcome], None],
+    run_one: Callable[[int, Run], Outcome],
+    on_end: Callable[[int, Outcome], None],
     engine: Engine,
 ) -> None:
+    """Run the groups in `at_once` threads. An interrupt stops the engine; an error of `on_end` is raised at the end."""
     order, one_at_a_time = count(), threading.Lock()
 
-    def work() -> None:
+    def run_groups() -> None:
         while (number := next(order)) < len(groups):
             for place in groups[number]:
-                outcome = do(place, runs[place])
+                outcome = run_one(place, runs[place])
                 with one_at_a_time:
-                    ended(place, outcome)
+                    on_end(place, outcome)
 
-    wrong: list[BaseException] = []
-    threads = [threading.Thread(target=_kept, args=(work, wrong), daemon=True) for _ in range(at_once)]
+    errors: list[BaseException] = []
+    threads = [threading.Thread(target=_collect_errors, args=(run_groups, errors), daemon=True) for _ in range(at_once)]
     for thread in threads:
         thread.start()
     try:
@@ -102,33 +114,35 @@ def _in_threads(
         for thread in threads:
             thread.join(max(0, until - time.monotonic()))
         raise
-    if wrong:
-        raise wrong[0]
+    if errors:
+        raise errors[0]
 
 
-def _kept(work: Callable[[], None], wrong: list[BaseException]) -> None:
-    """Do it, and keep what goes wrong beside the stages, such as a table on a full disk."""
+def _collect_errors(function: Callable[[], None], errors: list[BaseException]) -> None:
+    """Call a function and append its error: not one of a stage, but such as a table on a full disk."""
     try:
-        work()
+        function()
     except BaseException as error:
-        wrong.append(error)
+        errors.append(error)
 
 
-def _watched(progress: Progress, hashes: Hashes, work: Work, place: int, run: Run) -> Outcome:
-    """Do one whose words go to a file, while its progress is watched."""
+def _run_with_progress(progress: Progress, hashes: Hashes, execution: Execution, place: int, run: Run) -> Outcome:
+    """Run one with its output in a file, and report its progress."""
     run.home.mkdir(parents=True, exist_ok=True)
     output = run.home / OUTPUT
-    with open(output, "w", encoding="utf-8") as file, said_to(lambda text: print(text, file=file, flush=True)):
-        outcome = _outcome(run, hashes, replace(work, output=output, watch=partial(progress.stage, place)))
-    progress.ended(place, outcome.error, outcome.seconds)
+    with open(output, "w", encoding="utf-8") as file, redirect_output(lambda text: print(text, file=file, flush=True)):
+        on_change = partial(progress.update, place)
+        outcome = _run(run, hashes, replace(execution, output=output, on_change=on_change))
+    progress.end(place, outcome.error, outcome.seconds)
     return outcome
 
 
-def _outcome(run: Run, hashes: Hashes, work: Work) -> Outcome:
-    began = time.monotonic()
+def _run(run: Run, hashes: Hashes, execution: Execution) -> Outcome:
+    """Run one; an error of any kind is part of the outcome, as other runs go on."""
+    started = time.monotonic()
     try:
-        return Outcome(run_scene(run.request, "all", hashes, work), None, time.monotonic() - began)
-    except Exception as error:  # of whatever kind: it must not keep others waiting
-        if work.output is None:
-            print(f"error: {told(error)}", file=sys.stderr, flush=True)
-        return Outcome({}, told(error), time.monotonic() - began)
+        return Outcome(run_scene(run.request, "all", hashes, execution), None, time.monotonic() - started)
+    except Exception as error:
+        if execution.output is None:
+            print(f"error: {format_error(error)}", file=sys.stderr, flush=True)
+        return Outcome({}, format_error(error), time.monotonic() - started)

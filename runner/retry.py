@@ -1,6 +1,7 @@
-"""Work in a shared folder by machines that may be lost: what one works in has a name of its own for each attempt, so
-that one which was given up and works on writes to a folder that is gone. Locks are held where the runner is, never by
-the machines that work."""
+"""Runs a task again after its machine was lost, in a folder shared by all machines.
+
+Each attempt works in a folder with a name of its own, so that a machine that was given up and still works writes to a
+folder that is gone. Only the runner holds locks, never the machines that work."""
 
 import shutil
 import uuid
@@ -8,27 +9,29 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from runner.engine import Ended, Task, carry_out
+from runner.engine import StageResult, Task, run_process
 
 
-def attempt(task: Task, told: Callable[[], bool] | None = None) -> Ended:
-    """Do a task on this machine in a folder that no other attempt writes to, and which is called as the task says again
-    when it ends; begins with what an earlier one left. told: see carry_out."""
+def run_attempt(task: Task, should_stop: Callable[[], bool] | None = None) -> StageResult:
+    """Run a task on this machine, in a folder that no other attempt writes to, from the state that an earlier one left.
+
+    The folder has the task's own name again at the end. `should_stop`: see `engine.run_process`."""
     out = Path(task.line["out"])
     mine = out.with_name(f"{out.name}.{uuid.uuid4().hex[:8]}")
     take_over(out)
     out.mkdir(parents=True, exist_ok=True)
     out.rename(mine)
     try:
-        return carry_out(replace(task, line=task.line | {"out": str(mine)}), told=told)
+        return run_process(replace(task, line=task.line | {"out": str(mine)}), should_stop=should_stop)
     finally:
-        if mine.exists() and not out.exists():  # else it was given up for lost, and another is at work
+        if mine.exists() and not out.exists():  # else it was given up, and another attempt works
             mine.rename(out)
 
 
 def take_over(folder: Path) -> None:
-    """Let `folder` be what the newest attempt at it left, where its runner or its machine was lost. Copied, so that
-    what may still be at work there writes to a folder that is gone."""
+    """Make `folder` what the newest attempt left, where its runner or machine was lost.
+
+    It is a copy, as the lost attempt may still write to its own folder, which is removed."""
     attempts = sorted(folder.parent.glob(f"{folder.name}.*"), key=lambda path: path.stat().st_mtime)
     for left in reversed(attempts):
         if not folder.exists():

@@ -22,13 +22,12 @@ from test_installed import write_capture
 from test_runner import FILES, REPO, finished, ran, request, result, root, start, wait_for, words, write
 
 from reffusion import trace
-from runner import Refused, compare
-from runner import maintenance
-from runner.artifacts import wear
+from runner import Refused, compare, maintenance
+from runner.artifacts import diff_artifact
 from runner.execute import run_scene
 from runner.files import RECEIPT
 from runner.keys import Hashes
-from runner.plan import decide, table
+from runner.plan import decide, plan_table
 from runner.resolve import Request, resolve
 
 SLOW = os.environ.get("REFFUSION_SLOW") == "1"
@@ -76,8 +75,8 @@ def assert_one_line(said: tuple[int, str, str]) -> str:
 def assert_whole(runs: Path) -> None:
     """Every artifact in place is one that a stage finished, and every table and record is whole."""
     for receipt in runs.glob("*/[a-z]*/" + RECEIPT):
-        worn = wear(receipt.parent, Hashes(runs / "none"))
-        assert json.loads(receipt.read_text())["files"] and not worn.words(), receipt
+        worn = diff_artifact(receipt.parent, Hashes(runs / "none"))
+        assert json.loads(receipt.read_text())["files"] and not worn.describe(), receipt
     for path in runs.glob("*/compare.json"):
         json.loads(path.read_text())
 
@@ -284,7 +283,7 @@ def test_pictures_outside_the_scene_count_and_are_listed(tmp_path):
     (scene / "transforms.json").write_text(json.dumps(record))
     job = lambda: resolve(Request(REPO, tmp_path / "runs", str(scene), "laptop"))
     before = decide(asked := job(), "poses", {})
-    assert f"read outside the scene's folder: {pictures} (4 files)" in table(asked, {"poses": before})
+    assert f"read outside the scene's folder: {pictures} (4 files)" in plan_table(asked, {"poses": before})
     shutil.copy(scene / "masks/v2.png", pictures / "v3.png")
     assert decide(job(), "poses", {}).inputs.key != before.inputs.key
 

@@ -14,12 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from runner import Refused, compare
-from runner import maintenance
-from runner import resolve as resolving
-from runner.execute import Failed, run_scene
-from runner.keys import Hashes, code_of, fingerprint
-from runner.plan import plan, table
+from runner import Failed, Refused, compare, maintenance, process, results
+from runner.execute import run_scene
+from runner.keys import Hashes, code_fingerprints, fingerprint
+from runner.plan import plan, plan_table
 from runner.resolve import Request, resolve
 
 REPO = Path(__file__).resolve().parent.parent
@@ -32,12 +30,12 @@ stages:
   fit: {needs: [poses], provided: {by: gaussians, artifact: poses}}
   masks:
     needs: [poses, fit]
-    left_out: [{empty: poses/masks, because: the scene has no masks}]
+    skip_if: [{empty: poses/masks, reason: the scene has no masks}]
   distill:
     needs: [fit, masks]
-    left_out:
-      - {fact: masks.invent, equals: 0, because: nothing to invent}
-      - {param: distill.gain, equals: 0, because: no gain}
+    skip_if:
+      - {fact: masks.invent, equals: 0, reason: nothing to invent}
+      - {param: distill.gain, equals: 0, reason: no gain}
   evaluate: {needs: [poses, fit], optional: [masks, distill]}
 profiles: {laptop: {fit: {rate: 2}}, paper: {}}
 variants: {strong: {distill: {gain: 5}}, same: {}}
@@ -164,7 +162,7 @@ def request(root: Path, scene: str = "toy", **options) -> Request:
 def words(root: Path, **options) -> dict[str, str]:
     """Stage -> "word reason" as planned."""
     job = resolve(request(root, **options))
-    return {s: f"{d.word} {d.reason}".strip() for s, d in plan(job, job.pipeline.closure("all")).items()}
+    return {s: f"{d.status} {d.reason}".strip() for s, d in plan(job, job.pipeline.closure("all")).items()}
 
 
 def ran(capsys, root: Path, target: str = "all", **options) -> list[str]:
@@ -243,10 +241,10 @@ def test_first_run_and_receipts(root):
 def test_fresh_plan(fresh):
     said = words(fresh)
     assert said["poses"] == said["fit"] == "run no artifact yet"
-    assert said["masks"].startswith("undecided left out if the scene has no masks")
-    assert said["distill"].startswith("undecided") and said["evaluate"].startswith("run")
+    assert said["masks"].startswith("pending left out if the scene has no masks")
+    assert said["distill"].startswith("pending") and said["evaluate"].startswith("run")
     job = resolve(request(fresh))
-    assert "reads one number" in table(job, plan(job, ["poses"]))
+    assert "reads one number" in plan_table(job, plan(job, ["poses"]))
     assert not (fresh / "runs").exists() or not (fresh / "runs/toy").exists()  # plan leaves nothing but hashes
 
 
@@ -339,7 +337,7 @@ def test_a_stage_that_reads_the_scene_refuses_before_its_other_needs_are_made(fr
 
 def run(params: Params, out: Path, *, scene: Path,""",
     )
-    assert words(fresh)["masks"].startswith("undecided")
+    assert words(fresh)["masks"].startswith("pending")
     write(fresh, {"data/toy/wrong": ""})
     assert "remove it" in words(fresh)["masks"]
     with pytest.raises(Refused, match=r"masks: .*wrong: remove it"):
@@ -348,7 +346,7 @@ def run(params: Params, out: Path, *, scene: Path,""",
 
 
 def test_what_is_handed_out_outlives_its_artifact_and_is_never_lost(root, capsys):
-    edit(root / "pipeline.yaml", "masks:\n    needs", "masks:\n    hands_out: [drafts]\n    needs")
+    edit(root / "pipeline.yaml", "masks:\n    needs", "masks:\n    export: [drafts]\n    needs")
     edit(
         root / "stages/masks.py",
         "    invent = ",
@@ -452,8 +450,8 @@ def test_a_condition_may_ask_for_two_parameters(root):
 
 
 def test_a_condition_may_hold_for_some_parameters_only_and_name_facts(root, capsys):
-    plain = "{fact: masks.invent, equals: 0, because: nothing to invent}"
-    named = '{fact: masks.invent, equals: 0, only: {distill.gain: 2}, because: "nothing to gain: {invent} of 9"}'
+    plain = "{fact: masks.invent, equals: 0, reason: nothing to invent}"
+    named = '{fact: masks.invent, equals: 0, only: {distill.gain: 2}, reason: "nothing to gain: {invent} of 9"}'
     write(root, {"pipeline.yaml": FILES["pipeline.yaml"].replace(plain, named)})
     nothing = "masks.threshold=1 "
     assert words(root, set=nothing + "distill.gain=2")["distill"].endswith("if nothing to gain: known after masks")
@@ -486,7 +484,7 @@ def test_variants_share_what_they_do_not_change(root, capsys):
     same = request(root, variant="same")
     folder = run_scene(same, "all")["evaluate"]
     (folder / "scene.ply").touch()
-    compare.show_results("evaluate", folder, same)
+    results.show_results("evaluate", folder, same)
     said = capsys.readouterr().out
     assert "runs/toy/evaluate/: metrics.json" in said
     assert "make scene=toy variant=same view    make scene=toy variant=same report" in said
@@ -719,7 +717,7 @@ class Need:
 
 
 def test_weights_that_are_missing_are_told_before_any_work_and_fetched(fresh, capsys):
-    from runner.execute import weights
+    from runner.weights import fetch_weights
 
     source = fresh / "stages" / "distill.py"
     source.write_text(source.read_text() + WEIGHTS)
@@ -733,14 +731,14 @@ def test_weights_that_are_missing_are_told_before_any_work_and_fetched(fresh, ca
     assert not (fresh / "runs" / "toy" / "poses").exists()
 
     asked = request(fresh, scene="")
-    assert weights(asked, offline=True) == 1
+    assert fetch_weights(asked, offline=True) == 1
     shown = capsys.readouterr().out
     assert "to fetch         2.6 GB  acme/net  (distill)" in shown and "5 kB  metric.pth" in shown
     (fresh / "unreachable").touch()
-    assert weights(asked, offline=False) == 2
+    assert fetch_weights(asked, offline=False) == 2
     (fresh / "unreachable").unlink()
-    assert weights(asked, offline=False) == 0 and (fresh / "fetched.txt").exists()
-    assert weights(asked, offline=False) == 0
+    assert fetch_weights(asked, offline=False) == 0 and (fresh / "fetched.txt").exists()
+    assert fetch_weights(asked, offline=False) == 0
     assert "to fetch: about 0 bytes" in capsys.readouterr().out
     assert not words(fresh)["distill"].startswith("missing")
 
@@ -896,7 +894,7 @@ def test_a_stage_is_described_in_its_plan_module_and_that_is_no_part_of_its_code
     write(fresh, PLANNED)
     run_scene(request(fresh), "poses")
     job = resolve(request(fresh))
-    assert "3 steps" in table(job, plan(job, ["poses", "fit"])) and not imported.exists()
+    assert "3 steps" in plan_table(job, plan(job, ["poses", "fit"])) and not imported.exists()
     assert "fit" in ran(capsys, fresh) and imported.read_text() == "x"  # by the process that does the work
     assert result(fresh) == 10.0
     code = json.loads((fresh / "runs/toy/fit/receipt.json").read_text())["code"]
@@ -906,7 +904,7 @@ def test_a_stage_is_described_in_its_plan_module_and_that_is_no_part_of_its_code
     edit(fresh / "stages/plan/fit.py", "rate: int = 1", "rate: int = 1\n    slope: int = 1")
     assert words(fresh)["fit"] == "run param slope is new"
     edit(fresh / "stages/fit.py", "import heavy", "import heavy\nfrom stages.plan import fit")
-    assert "stages/plan/fit.py" in code_of(fresh, "fit", Hashes(fresh / "hashes"))  # now it is imported
+    assert "stages/plan/fit.py" in code_fingerprints(fresh, "fit", Hashes(fresh / "hashes"))  # now it is imported
 
 
 def test_a_run_that_does_not_fit_its_needs_is_refused_without_importing_it(fresh, monkeypatch):
@@ -924,8 +922,8 @@ def test_a_run_that_does_not_fit_its_needs_is_refused_without_importing_it(fresh
 @pytest.fixture
 def started(monkeypatch) -> list[str]:
     """What each process is started for that imports stages."""
-    started, child = [], resolving.child
-    monkeypatch.setattr(resolving, "child", lambda *given, **how: started.append(given[1]) or child(*given, **how))
+    started, start = [], process.start_worker
+    monkeypatch.setattr(process, "start_worker", lambda *given, **how: started.append(given[1]) or start(*given, **how))
     return started
 
 
@@ -954,7 +952,7 @@ def test_what_a_stage_says_of_its_parameters_is_remembered_until_its_code_change
 def test_a_stage_that_was_described_and_cannot_be_imported_any_more_is_refused_before_any_work(fresh):
     edit(fresh / "stages/distill.py", "from pydantic", "import installed\nfrom pydantic")
     write(fresh, {"installed.py": ""})
-    assert words(fresh)["distill"].startswith("undecided")
+    assert words(fresh)["distill"].startswith("pending")
     (fresh / "installed.py").unlink()
     with pytest.raises(Refused, match=r"stages/distill.py: ModuleNotFoundError.*installed"):
         run_scene(request(fresh), "all")
