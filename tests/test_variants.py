@@ -27,6 +27,7 @@ from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_mask_sets, load_raw_masks, load_references, load_scene, save_references
 from reffusion.params.distill import Lift
 from reffusion.types import PARAMETERS, Reference
+from runner.artifacts import hash_contents
 from runner.pipeline import load_pipeline
 from runner.plan import Decision, decide
 from runner.resolve import Job, Request, resolve
@@ -82,7 +83,7 @@ def capture(tmp_path_factory):
             (place / "masks" / "v00.png").write_text(stage)
             (place / "facts.json").write_text(json.dumps({"invent_pixels": 7, "sds_may_gain": True}))
             inputs = said[stage].inputs
-            receipt = asdict(inputs) | {"key": inputs.key, "output": job.hashes.folder(place)}
+            receipt = asdict(inputs) | {"key": inputs.key} | hash_contents(place, job.hashes)
             (place / "receipt.json").write_text(json.dumps(receipt))
             said[stage] = decide(job, stage, said)
     assert [s for s, d in said.items() if d.status != "cached"] == ["lift"]
