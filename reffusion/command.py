@@ -35,19 +35,19 @@ COMMANDS = {
 
 
 def root() -> Path:
-    """The folder with pipeline.yaml, stages/, runner/ and report/: `app` in an installed package, the top of a checkout."""
+    """The folder with pipeline.yaml, stages/, runner/ and report/: `app` if installed, else the top of a checkout."""
     here = Path(__file__).resolve().parent
     return here / "app" if (here / "app").is_dir() else here.parent
 
 
-def installed(root: Path) -> bool:
+def is_installed(root: Path) -> bool:
     """Whether `root` is the folder `app` of an installed package, and not a checkout."""
     return root.parts[-2:] == ("reffusion", "app") and not (root / "reffusion").is_dir()
 
 
 def workplace(root: Path) -> Path:
     """The folder with data/ and runs/: the top of a checkout, or the current folder for an installed package."""
-    return Path.cwd() if installed(root) else root
+    return Path.cwd() if is_installed(root) else root
 
 
 def overview() -> str:

@@ -19,8 +19,8 @@ def cost_table(job: Job, decisions: dict[str, Decision], card: str | None) -> st
     on_card = [stage for stage in left if job.params.get(stage, {}).get("device") == "cuda"]
     if not (on_card and (card or has_cuda())):
         return f"  card={card}: no stage of this plan runs on CUDA" if card else ""
-    rows, asked = [], [job.question(stage) | {"card": card or ""} for stage in on_card]
-    for stage, answer in zip(on_card, ask_stages(job.root, asked), strict=True):
+    rows, questions = [], [job.question(stage) | {"card": card or ""} for stage in on_card]
+    for stage, answer in zip(on_card, ask_stages(job.root, questions), strict=True):
         if "unknown card" in answer:
             raise Refused(answer["unknown card"])
         if answer.get("cost"):

@@ -156,20 +156,20 @@ class LocalEngine:
         gpu_count = min(resources.gpus, self._gpu_count)
         with self._change:
             self._number += 1
-            mine = self._number
+            number = self._number
             while not (self._stopped or self._fits(core_count, gpu_count, resources.memory_mb)):
                 self._change.wait(1.0)  # free memory changes without a notification
             if self._stopped:
                 raise KeyboardInterrupt
             cores, self._cores = self._cores[:core_count], self._cores[core_count:]
             gpus, self._gpus = self._gpus[:gpu_count], self._gpus[gpu_count:]
-            self._reserved[mine] = resources.memory_mb
+            self._reserved[number] = resources.memory_mb
         try:
             yield cores, gpus
         finally:
             with self._change:
                 self._cores, self._gpus = sorted(self._cores + cores), sorted(self._gpus + gpus)
-                del self._reserved[mine]
+                del self._reserved[number]
                 self._change.notify_all()
 
     def _fits(self, cores: int, gpus: int, memory_mb: int) -> bool:

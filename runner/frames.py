@@ -25,11 +25,11 @@ def extract_frames(video: Path, folder: Path, root: Path, hashes: Hashes) -> Non
     if found.get("content") == content:
         return
     ours = [folder / name for name in FRAME_FILES]
-    theirs = [path for path in list_files(folder) if path not in ours and path.parent != folder / "images"]
-    if found and (theirs or found["video"] != str(video)):
+    others = [path for path in list_files(folder) if path not in ours and path.parent != folder / "images"]
+    if found and (others or found["video"] != str(video)):
         raise Refused(
             f"{display_path(folder)} holds frames of another video, {found['video']} as it was"
-            + (f", and {display_path(theirs[0])} for them" if theirs else "")
+            + (f", and {display_path(others[0])} for them" if others else "")
             + "; rename the video, or move that folder away"
         )
     process = start_worker(root, "frames", stdout=subprocess.PIPE)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from reffusion.command import installed
+from reffusion.command import is_installed
 from runner import Refused
 from runner.files import RECEIPT, list_files, read_json, write_text
 
@@ -103,8 +103,8 @@ class Hashes:
 
     def save(self) -> None:
         """Write the cache, unless nothing is new or the last save was slow and recent."""
-        began = time.monotonic()
-        if len(self.known) == self._saved or (self._took > self.SLOW and began - self._at < self.WAIT * self._took):
+        started = time.monotonic()
+        if len(self.known) == self._saved or (self._took > self.SLOW and started - self._at < self.WAIT * self._took):
             return
         kept = dict(list(self.known.copy().items())[-self.LIMIT :])  # other threads may add to it
         # A full or read-only disk: the hashes are computed again the next time.
@@ -113,7 +113,7 @@ class Hashes:
             write_text(partial, json.dumps(kept))
             os.replace(partial, self.path)
             self._saved, self._at = len(self.known), time.monotonic()
-            self._took = self._at - began
+            self._took = self._at - started
 
 
 def paths_outside(value: Any, folder: Path) -> Iterator[Path]:
@@ -181,7 +181,7 @@ def _imported_files(names: Iterable[str], path: Path, root: Path) -> Iterator[Pa
         package = _module_path(path, root).parts[:-level] if level else ()
         parts = (*package, *filter(None, name.lstrip(".").split(".")))
         if parts and parts[0] in CODE_PACKAGES:
-            base = root.parents[1] if parts[0] == "reffusion" and installed(root) else root
+            base = root.parents[1] if parts[0] == "reffusion" and is_installed(root) else root
             places |= {os.path.join(base, *parts[: n + 1]) for n in range(len(parts))}  # a.b.c runs a and a.b too
     yield from (Path(p) for place in places for p in (f"{place}.py", f"{place}/__init__.py") if os.path.isfile(p))
 

@@ -130,8 +130,8 @@ def _made_files(home: Path, pipeline: Pipeline, hashes: Hashes) -> Iterator[Path
 def artifact_files(folder: Path, hashes: Hashes) -> Iterator[Path]:
     """The files of an artifact that agree with its receipt, and then the receipt."""
     diff = diff_artifact(folder, hashes)
-    theirs = {*diff.changed, *diff.added, *diff.by_hand}
-    yield from (folder / name for name in hashes.listing(folder) if name not in theirs and name != RECEIPT)
+    by_people = {*diff.changed, *diff.added, *diff.by_hand}
+    yield from (folder / name for name in hashes.listing(folder) if name not in by_people and name != RECEIPT)
     yield folder / RECEIPT
 
 

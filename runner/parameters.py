@@ -31,13 +31,13 @@ def parse_set(text: str, pipeline: Pipeline) -> Overrides:
         match = re.fullmatch(r"(\w+)((?:\.\w+)+)=(.*)", word, flags=re.DOTALL)
         if not match:
             raise Refused(f"set: {word!r} is not of the form stage.parameter=value")
-        stage, names, given = match.groups()
+        stage, names, value_text = match.groups()
         if stage not in pipeline.stages:
             raise Refused(f"set: {unknown_name('stage', stage, pipeline.stages)}")
         try:
-            value = parse_value(given, is_text=names.split(".")[1] in pipeline.scene_keys.get(stage, ()))
+            value = parse_value(value_text, is_text=names.split(".")[1] in pipeline.scene_keys.get(stage, ()))
         except ValueError:
-            raise Refused(f"set: the value of {stage}{names} is not valid YAML: {given!r:.60}") from None
+            raise Refused(f"set: the value of {stage}{names} is not valid YAML: {value_text!r:.60}") from None
         for name in reversed(names[1:].split(".")):
             value = {name: value}
         overrides[stage] = merge_params(overrides.get(stage, {}), value)
@@ -114,8 +114,8 @@ def split_budget(pipeline: Pipeline, values: Overrides, seconds: float) -> Overr
     """stage -> {"seconds": its share}. The shares of stages that `values` lets skip go to the others."""
     if not pipeline.budget:
         raise Refused("pipeline.yaml: a budget is asked for, and there is no table `budget` that shares it out")
-    asked = {f"{stage}.{name}": value for stage in values for name, value in flatten_params(values[stage]).items()}
-    has_values = lambda wanted: all(asked.get(param, ...) == value for param, value in wanted.items())
+    set_params = {f"{stage}.{name}": value for stage in values for name, value in flatten_params(values[stage]).items()}
+    has_values = lambda wanted: all(set_params.get(param, ...) == value for param, value in wanted.items())
     is_true = lambda c: c.param and has_values(dict.fromkeys(c.param, c.equals) | c.only)
     remaining = [name for name in pipeline.budget if not any(is_true(c) for c in pipeline.stages[name].skip_if)]
     if not remaining:

@@ -183,20 +183,20 @@ def _compare_receipts(job: Job, stage: str, inputs: Inputs) -> Decision:
     Else run, with the differences as reason."""
     places = [home / stage for home in dict.fromkeys((job.home, job.base))]
     receipts = [(place, list_changes(found, inputs), found) for place in places if (found := read_receipt(place))]
-    whys = []
+    reasons = []
     for place, differs, found in sorted(receipts, key=lambda receipt: bool(receipt[1])):
         notes = [] if place.parent == job.home else [f"shared with {job.base.name}"]
         diff = diff_artifact(place, job.hashes)
         if differs and not (job.trust and differs == list_code_changes(found, inputs)):
-            whys.append(differs)
+            reasons.append(differs)
         elif harm := _damage(job, diff):
-            whys.append(harm)
+            reasons.append(harm)
         else:
             notes = [f"trusted although {join_names(differs)}"] if differs else notes
             return Decision("cached", "; ".join([*notes, *diff.describe()]), place, True, inputs)
-    begun = "; goes on where it stopped" if partial_folder(job, stage, inputs.key).exists() else ""
-    why = join_names(whys[0]) if whys else "no artifact yet"
-    return Decision("run", why + begun, receipts[0][0] if receipts else None, False, inputs)
+    resumes = "; goes on where it stopped" if partial_folder(job, stage, inputs.key).exists() else ""
+    why = join_names(reasons[0]) if reasons else "no artifact yet"
+    return Decision("run", why + resumes, receipts[0][0] if receipts else None, False, inputs)
 
 
 def _damage(job: Job, diff: ArtifactDiff) -> list[str]:
@@ -231,8 +231,8 @@ def plan(job: Job, stages: list[str], done: dict[str, Decision] | None = None) -
     for stage in stages:
         if stage not in decisions:
             decisions[stage] = _check_device(job, stage, decide(job, stage, decisions))
-    asked = [_stage_question(job, stage, decisions) for stage in stages if decisions[stage].status not in FINAL]
-    for question, answer in zip(asked, ask_stages(job.root, asked), strict=True):
+    questions = [_stage_question(job, stage, decisions) for stage in stages if decisions[stage].status not in FINAL]
+    for question, answer in zip(questions, ask_stages(job.root, questions), strict=True):
         if "broken" in answer and not done:  # while a job runs, it may be mended before its turn comes
             raise Refused(answer["broken"])
         decisions[question["stage"]] = _apply_answer(job, question, decisions[question["stage"]], answer)

@@ -89,8 +89,8 @@ class Job:
         """The question to a stage about its weights, see `worker.describe`. They depend on what the scene brings: keys
         of its scene.yaml and its folders. The answer is not cached, as weights come and go."""
         folders = [path.name for path in self.folder.iterdir() if path.is_dir()] if self.folder != self.root else ()
-        asked = {"stage": stage, "params": self.stages[stage].params, "takes": self.pipeline.stages[stage].all_needs}
-        return asked | {"brings": sorted({*self.brings, *folders})}
+        question = {"stage": stage, "params": self.stages[stage].params, "takes": self.pipeline.stages[stage].all_needs}
+        return question | {"brings": sorted({*self.brings, *folders})}
 
 
 def resolve(request: Request, hashes: Hashes | None = None, scene: bool = True) -> Job:
@@ -105,8 +105,8 @@ def resolve(request: Request, hashes: Hashes | None = None, scene: bool = True) 
 def resolve_all(requests: list[Request], hashes: Hashes, scene: bool = True) -> list[Job]:
     """Resolve several requests with one root. Asks all stages at once, and only what is not in the cache."""
     drafts = [_draft(request, hashes, scene) for request in requests]
-    asked = [_questions(job) for job in drafts]
-    new = {name: question for each in asked for name, question in each.items() if name not in hashes.known}
+    questions = [_questions(job) for job in drafts]
+    new = {name: question for each in questions for name, question in each.items() if name not in hashes.known}
     answers = dict(zip(new, ask_stages(requests[0].root, list(new.values())), strict=True))
     may_cache = lambda key, answer: (
         key.startswith(CACHED) and "params" in answer and not (answer.get("unavailable") or answer.get("machine"))
@@ -115,7 +115,7 @@ def resolve_all(requests: list[Request], hashes: Hashes, scene: bool = True) -> 
         not any(files_outside(answer.get("reads") or (), Path(question.get("scene", "."))))
     )
     hashes.known |= {k: answer for k, answer in answers.items() if may_cache(k, answer) and inside(new[k], answer)}
-    return [_add_descriptions(job, each, hashes.known | answers) for job, each in zip(drafts, asked, strict=True)]
+    return [_add_descriptions(job, each, hashes.known | answers) for job, each in zip(drafts, questions, strict=True)]
 
 
 def _draft(request: Request, hashes: Hashes, scene: bool) -> Job:

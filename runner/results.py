@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from reffusion.command import installed, workplace
+from reffusion.command import is_installed, workplace
 from runner import Failed, say
 from runner.files import RECEIPT, read_json
 from runner.process import PROJECT
@@ -45,7 +45,7 @@ def format_command(request: Request, command: str) -> str:
     the command needs, else `reffusion`."""
     runs = "" if request.runs == workplace(request.root) / "runs" else display_path(request.runs)
     options = {"scene": request.scene, "variant": request.variant, "runs": runs}
-    if installed(request.root):
+    if is_installed(request.root):
         return f"reffusion {command} " + " ".join(f"--{name} {value}" for name, value in options.items() if value)
     return "make " + " ".join(f"{name}={value}" for name, value in options.items() if value) + f" {command}"
 

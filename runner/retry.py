@@ -17,15 +17,15 @@ def run_attempt(task: Task, should_stop: Callable[[], bool] | None = None) -> St
 
     The folder has the task's own name again at the end. `should_stop`: see `engine.run_process`."""
     out = Path(task.line["out"])
-    mine = out.with_name(f"{out.name}.{uuid.uuid4().hex[:8]}")
+    own = out.with_name(f"{out.name}.{uuid.uuid4().hex[:8]}")
     take_over(out)
     out.mkdir(parents=True, exist_ok=True)
-    out.rename(mine)
+    out.rename(own)
     try:
-        return run_process(replace(task, line=task.line | {"out": str(mine)}), should_stop=should_stop)
+        return run_process(replace(task, line=task.line | {"out": str(own)}), should_stop=should_stop)
     finally:
-        if mine.exists() and not out.exists():  # else it was given up, and another attempt works
-            mine.rename(out)
+        if own.exists() and not out.exists():  # else it was given up, and another attempt works
+            own.rename(out)
 
 
 def take_over(folder: Path) -> None:

@@ -54,22 +54,22 @@ def describe() -> None:
     json.dump([_describe(question) for question in questions], output)
 
 
-def _describe(asked: dict[str, Any]) -> dict[str, Any]:
+def _describe(question: dict[str, Any]) -> dict[str, Any]:
     """The fields of `resolve.StageInfo`, or {"broken": why}, or {"errors": in params, "known": names of parameters}.
 
     A question with `scene` adds what the stage reads of it; with `brings` the weights that are "needed" and what this
     machine "lacks" for CUDA; with `card` its "cost" on that GPU; with `needs` the preview's "notes" or "refusal"."""
-    stage, needs, brings, scene = (asked.get(name) for name in ("stage", "needs", "brings", "scene"))
+    stage, needs, brings, scene = (question.get(name) for name in ("stage", "needs", "brings", "scene"))
     path = _description_file(stage)
     try:
         planned = _import_file(path)
         path = Path(f"stages/{stage}.py")
-        _check_run(path, asked["takes"])
+        _check_run(path, question["takes"])
     except Exception as error:
         return {"broken": f"{path}: {format_error(error)}"}
     fields = dict(_fields(planned.Params))
     try:
-        resolved = planned.Params(**asked["params"])
+        resolved = planned.Params(**question["params"])
     except ValidationError as error:
         return {"errors": [_error(e, planned.Params) for e in error.errors()], "known": list(fields)}
     marks = {name: extra for name, extra in fields.items() if isinstance(extra, dict)}
@@ -88,9 +88,9 @@ def _describe(asked: dict[str, Any]) -> dict[str, Any]:
         answer["needed"] = [asdict(need) for need in planned.needed_weights(resolved, frozenset(brings))]
     if brings is not None and hasattr(planned, "lacks") and answer["params"].get("device") == "cuda":
         answer["lacks"] = planned.lacks(resolved)
-    if "card" in asked and hasattr(planned, "cost"):
+    if "card" in question and hasattr(planned, "cost"):
         try:
-            answer["cost"] = planned.cost(resolved, asked["card"])
+            answer["cost"] = planned.cost(resolved, question["card"])
         except ValueError as error:
             answer["unknown card"] = format_error(error)
     if scene is not None and hasattr(planned, "scene_files"):
@@ -162,11 +162,11 @@ def fetch() -> int:
         How many could not be fetched; their errors go to standard error.
     """
     wanted = {}
-    for stage, asked in json.load(sys.stdin).items():
+    for stage, question in json.load(sys.stdin).items():
         planned = _import_file(_description_file(stage))
         if hasattr(planned, "needed_weights"):
-            params = planned.Params(**asked["params"])
-            needs = planned.needed_weights(params, frozenset(asked["brings"]))
+            params = planned.Params(**question["params"])
+            needs = planned.needed_weights(params, frozenset(question["brings"]))
             needs += planned.optional_weights(params) if hasattr(planned, "optional_weights") else []
             wanted |= {need.name: need for need in needs if need.problem and need.fetched}
     failed = 0
@@ -183,10 +183,10 @@ def fetch() -> int:
 def frames() -> int:
     """Extract the frames of a video. Standard input: {"video", "folder", "content": its hash}; standard output: a
     sentence on the result, or on the error."""
-    asked = json.load(sys.stdin)
+    question = json.load(sys.stdin)
     video = importlib.import_module("reffusion.capture.layouts.video")
     try:
-        print(video.take(Path(asked["video"]), Path(asked["folder"]), asked["content"]))
+        print(video.take(Path(question["video"]), Path(question["folder"]), question["content"]))
     except ValueError as error:
         print(format_error(error))
         return 1

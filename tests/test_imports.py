@@ -97,9 +97,8 @@ def test_runner_knows_nothing_of_3d(path):
     own = {name for name in imports(path) if name.split(".")[0] == "reffusion"}
     assert own <= {
         "reffusion.command",
-        "reffusion.command.installed",
+        "reffusion.command.is_installed",
         "reffusion.command.workplace",
-        "reffusion.command.command_line",
     }
 
 
