@@ -20,7 +20,7 @@ from runner.plan import plan, plan_record, plan_table
 from runner.resolve import Request, resolve
 from runner.results import call_report, show_results
 from runner.sweep import sweep
-from runner.text import format_error
+from runner.text import display_path, format_error
 from runner.weights import fetch_weights
 from runner.worker import INTERRUPTED
 
@@ -74,7 +74,7 @@ def _compare(request: Request, arguments: argparse.Namespace) -> int:
     request = replace(request, cuda=execution.engine.cuda)
     failed = compare(request, arguments.variants, arguments.seeds, data, execution)
     what = f"--data={data}" if data else f"--scene={request.scene}"
-    return call_report("compare", what, f"--runs={request.runs}") or (SOME_FAILED if failed else 0)
+    return call_report("compare", what, f"--runs={display_path(request.runs)}") or (SOME_FAILED if failed else 0)
 
 
 def _batch(request: Request, arguments: argparse.Namespace) -> int:
@@ -82,7 +82,8 @@ def _batch(request: Request, arguments: argparse.Namespace) -> int:
     execution = _execution(request, arguments)
     request = replace(request, cuda=execution.engine.cuda)
     failed = batch(request, arguments.data or Path("data"), execution)
-    return call_report("batch", f"--runs={request.runs}", f"--variant={request.variant or ''}") or int(failed > 0)
+    options = f"--runs={display_path(request.runs)}", f"--variant={request.variant or ''}"
+    return call_report("batch", *options) or int(failed > 0)
 
 
 def _sweep(request: Request, arguments: argparse.Namespace) -> int:

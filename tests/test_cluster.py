@@ -185,7 +185,7 @@ from test_cluster import *
 signal.signal(signal.SIGINT, signal.default_int_handler)
 from runner.compare import batch
 root = Path(sys.argv[1])
-engine = chosen("ray", sys.argv[2], root, root / "runs")
+engine = make_engine("ray", sys.argv[2], root, root / "runs")
 sys.exit(batch(asked(root, "", cuda=engine.cuda), root / "many", Execution(engine, 1)))
 """
 
