@@ -260,10 +260,8 @@ def _interrupt(process: "subprocess.Popen[str]") -> int:
         return process.wait()
 
 
-ENGINES = {
-    "ray": ("RayEngine", "ray"),
-    "slurm": ("SlurmEngine", "submitit"),
-}  # name -> class in <name>_engine.py, the package that it imports
+# name -> class in <name>_engine.py, the package that it imports
+ENGINES = {"ray": ("RayEngine", "ray"), "slurm": ("SlurmEngine", "submitit")}
 
 
 def make_engine(name: str | None, address: str | None, root: Path, runs: Path) -> Engine:

@@ -122,9 +122,8 @@ def _run_in_engine(
     how = f"ended by signal {-code} ({signal.Signals(-code).name})" if code < 0 else f"ended with code {code}"
     hint = "; out of memory?" if code == -signal.SIGKILL else ""
     error = answer.get("error", how + hint)
-    if (
-        shutil.disk_usage(job.home).free < FULL_DISK_BYTES and REMEDIES[errno.ENOSPC] not in error
-    ):  # libraries do not report it
+    is_full = shutil.disk_usage(job.home).free < FULL_DISK_BYTES
+    if is_full and REMEDIES[errno.ENOSPC] not in error:  # libraries do not report it
         error += f"; the disk is full: {REMEDIES[errno.ENOSPC]}"
     raise Failed(f"{stage}: {error} (all of it in {display_path(log)})")
 

@@ -57,10 +57,8 @@ class Layers:
     def origin(self, stage: str, name: str) -> str:
         """The last layer that sets a dotted name, a group that contains it, or a part of it."""
         near = lambda other: f"{other}.".startswith(f"{name}.") or f"{name}.".startswith(f"{other}.")
-        setting = (
-            label for label, layer in reversed(self.layers) if any(map(near, flatten_params(layer.get(stage, {}))))
-        )
-        return next(setting, "pipeline.yaml")
+        sets_it = lambda layer: any(map(near, flatten_params(layer.get(stage, {}))))
+        return next((label for label, layer in reversed(self.layers) if sets_it(layer)), "pipeline.yaml")
 
 
 def stack_layers(

@@ -54,14 +54,10 @@ def decide(job: Job, stage: str, earlier: dict[str, Decision]) -> Decision:
     spec = job.pipeline.stages[stage]
     if stage in job.broken:
         raise Refused(job.broken[stage])
-    provided = spec.provided
-    if (
-        provided
-        and provided.by in job.brings
-        and (not provided.param or _has_value(job, provided.param, provided.equals))
-    ):
-        source = earlier[provided.artifact]
-        return Decision("provided", f"the scene brings `{provided.by}`", source.path, source.is_final)
+    own = spec.provided
+    if own and own.by in job.brings and (not own.param or _has_value(job, own.param, own.equals)):
+        source = earlier[own.artifact]
+        return Decision("provided", f"the scene brings `{own.by}`", source.path, source.is_final)
     open_questions = []
     for condition in spec.skip_if:
         if holds := _is_true(job, condition, earlier):
@@ -86,12 +82,11 @@ def decide(job: Job, stage: str, earlier: dict[str, Decision]) -> Decision:
         found = path and read_receipt(path)
         if not path or not found:
             return Decision("run", "no artifact yet")
-        own = job.stages[stage]
-        as_then = Inputs(own.params, found["needs"], found["weights"], code, own.unkeyed, own.unavailable)
-        if known := ([] if job.trust else list_changes(found, as_then)) or _damage(
-            job, diff_artifact(path, job.hashes)
-        ):
-            return Decision("run", join_names(known), path)
+        info = job.stages[stage]
+        same_needs = Inputs(info.params, found["needs"], found["weights"], code, info.unkeyed, info.unavailable)
+        differences = [] if job.trust else list_changes(found, same_needs)
+        if differences or (differences := _damage(job, diff_artifact(path, job.hashes))):
+            return Decision("run", join_names(differences), path)
         return Decision("stale", f"waits for {', '.join(changing)}; kept if the new content is the same", path)
     return _compare_receipts(job, stage, _inputs(job, stage, {need: d.path for need, d in needs.items()}, code))
 
@@ -201,10 +196,9 @@ def _compare_receipts(job: Job, stage: str, inputs: Inputs) -> Decision:
 
 def _damage(job: Job, diff: ArtifactDiff) -> list[str]:
     """Why an artifact cannot be used, a phrase each: files are missing or changed."""
-    changed = f"{join_names(diff.changed)} changed since (keep=1 keeps it)"
-    return [f"{join_names(diff.missing)} missing"] * bool(diff.missing) + [changed] * bool(
-        diff.changed and not job.keep
-    )
+    missing = [f"{join_names(diff.missing)} missing"] if diff.missing else []
+    changed = [f"{join_names(diff.changed)} changed since (keep=1 keeps it)"] if diff.changed and not job.keep else []
+    return missing + changed
 
 
 def _check_device(job: Job, stage: str, decision: Decision) -> Decision:

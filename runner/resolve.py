@@ -213,9 +213,8 @@ def _answer_key(job: Job, question: dict[str, Any]) -> str:
     A process that imports stages takes half a second to start, and so may listing the files that a stage reads."""
     stage, plan, listed = question["stage"], "stages/plan", list_files(job.folder) if "scene" in question else ()
     try:
-        code = code_fingerprints(
-            job.root, stage, job.hashes, plan if (job.root / plan / f"{stage}.py").is_file() else "stages"
-        )
+        folder = plan if (job.root / plan / f"{stage}.py").is_file() else "stages"
+        code = code_fingerprints(job.root, stage, job.hashes, folder)
         code["run"] = job.hashes.module(job.root / "stages" / f"{stage}.py", job.root)[0]
     except Refused:  # not valid Python: reported as broken
         return json.dumps(question)

@@ -91,14 +91,12 @@ def _planned(request: Request, home: Path, reasons: dict[Path, str], hashes: Has
         if decision.status in ("cached", "provided", "stale", "pending", "missing"):
             used |= {decision.path} if decision.path else {home / stage, job.base / stage}
         else:
-            reasons[home / stage] = (
-                f"{'left out' if decision.status == 'skip' else 'to be made again'}: {decision.reason}"
-            )
+            what = "left out" if decision.status == "skip" else "to be made again"
+            reasons[home / stage] = f"{what}: {decision.reason}"
         if decision.path and decision.path != home / stage:
             reasons.setdefault(home / stage, f"{display_path(decision.path)} is the same")
-    reasons |= {
-        folder: f"there is no stage {folder.name} any more" for folder in receipts if folder.name not in decisions
-    }
+    unknown = [folder for folder in receipts if folder.name not in decisions]
+    reasons |= {folder: f"there is no stage {folder.name} any more" for folder in unknown}
     return used
 
 
