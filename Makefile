@@ -1,8 +1,51 @@
-# One run: make scene=demo all        What it would do: make scene=demo plan        Everything else: make help
+## make scene=demo all            the whole job; a second call finds everything cached
+## make scene=X STAGE             one stage and what it needs: the stages of pipeline.yaml
+## make scene=X plan              what would run, and why; card=rtx-4090: time and memory of each stage on that GPU
+## make scene=X mask              make masks from clicks, in a browser; port=8090
+## make scene=X check             look for problems of photographs, masks and poses; draw each mask over its photograph
+## make scene=X compare           the full method, ablations and baselines: runs/X/compare.html
+##                                variants=a,b: only these; seeds=5: on demo, demo-1 ... demo-4, with intervals
+## make data=FOLDER compare       the same on all its scenes, in one table: runs/compare/compare.html
+## make scene=X report            what was done, errors against time: runs/X/report.html
+## make data=FOLDER report        the same of all its scenes: runs/report/index.html
+## make scene=X view              walk through the finished scene in a browser; port=8080
+## make scene=X turntable         a video around the finished scene: runs/X/turntable.webm
+## make scene=X patch             fill what was deleted in an editor (scene.yaml: gaussians, cleaned): runs/X/patch/
+##                                with two files only: reffusion patch before.ply after.ply --out patched.ply
+## make scene=X export            the finished scene for other tools, .ply, cameras, LoRA: runs/X/export/
+## make scene=X verify            hash all its results: are they as they were made?
+## make scene=X clean             remove its results
+## make gc                        list results that no plan uses, with sizes; remove them if you say so, or with yes=1
+## make data=FOLDER batch         all scenes of a folder, in parallel: runs/results.html; cores=2: for each stage
+##                                engine=ray address=HOST:6379, engine=slurm address=PARTITION: on a cluster
+##                                (also for compare, all and stages)
+## make data=FOLDER spinnerf      list SPIn-NeRF's published scenes in a folder, then batch
+## make data=FOLDER study         after compare, or with scene=X: paired clips for people to judge
+## make weights [profile=paper]   fetch the weights of a profile; offline=1: only list what is missing
+## make demo [seed=N]             make the demo scene, or data/demo-N; others are made when they are named: demo-wide,
+##                                -360, -seen, -photos, -behind, -table, -corner, -grass, -insert, -outpaint, -pair,
+##                                -sparse, each also with -N
+## make scene=X adapted           views painted by the adapted prior and the unadapted one: runs/X/adapted/sheet.png
+## make scene=X sds-variance      variance of the SDS gradient before and after personalization
+##                                both: device=cuda dtype=float16
+## make scene=demo-sparse sparse  scores against the number of photographs (hours); seeds=3: on two more scenes
+## make gpu                       on a CUDA machine: install gsplat and build its extension (minutes, once)
+## make gpu-check                 values, time and memory at the paper's sizes on a CUDA machine (1 to 8 minutes)
+## make prior [steps=N]           train the embedded prior further (hours)
+## make prior-report              measure the embedded prior (minutes): runs/prior-report
+## make setup | test | lint       .venv; the tests, with slow=1 the slow ones too (make fuzz: hours); ruff and mypy
+## make bench                     work-precision diagrams of the kernels: runs/bench; gate=1: against the baselines
+## make stability                 stiff and extreme cases, each with its bound (minutes): runs/stability.json
+##
+## scene=  a name under data/, or a path
+## profile=auto|laptop|paper|best|paper-terms  variant=NAME  set="fit.iterations=500 distill.seed=3"  runs=FOLDER
+## budget=5m  time for the whole job: sets the number of steps of fit, personalize and distill
+## trust=1  accept results of older code; keep=1  accept results that you changed by hand
 
-# Given on the command line; set here so that a variable of the environment is not taken for one of them. Recipes read
-# them from their environment, in double quotes, as they were typed: there is no quote or $ that a shell or make obeys.
-given := scene profile variant budget set trust keep runs variants seeds seed name steps gate slow offline port card device dtype engine address cores yes
+# The options. They are set here so that variables of the environment are ignored. Recipes read them as shell variables
+# in double quotes, so that neither the shell nor make expands what was typed.
+given := scene profile variant budget set trust keep runs variants seeds seed name steps gate slow offline port card \
+	device dtype engine address cores yes
 $(foreach each,$(given),$(eval $(each) :=))
 data := data
 folder := $(findstring command,$(origin data))
@@ -17,70 +60,31 @@ PYTHON ?= python3
 VENV ?= .venv
 PY := $(VENV)/bin/python
 RUN := $(VENV)/bin/reffusion
-STAGES := poses raw_masks fit masks reference lift initialize personalize distill evaluate
+STAGES := $(shell sed -n '/^stages:/,/^[a-z]/s/^  \([a-z_]*\):.*/\1/p' pipeline.yaml)
 
-of = --scene="$$scene"
-where = $(if $(variant),--variant="$$variant") $(if $(runs),--runs="$$runs")
-by = $(if $(engine),--engine="$$engine") $(if $(address),--address="$$address") $(if $(cores),--cores="$$cores")
-options = $(where) $(if $(profile),--profile="$$profile") $(if $(budget),--budget="$$budget") \
-	$(if $(set),--set="$$set") $(if $(trust),--trust) $(if $(keep),--keep)
+# $(call flags,a b) is `--a="$a" --b="$b"`, without those that were not given. Their meaning is in `reffusion`.
+switches := trust keep yes offline
+flags = $(foreach each,$1,$(if $($(each)),--$(each)$(if $(filter $(each),$(switches)),,="$$$(each)")))
+where := scene variant runs
+options := $(where) profile budget set trust keep
+cluster := engine address cores
 
-.PHONY: help setup all $(STAGES) plan check verify clean batch spinnerf weights demo prior prior-report sds-variance \
-	adapted view turntable test fuzz bench stability gpu gpu-check lint
+.PHONY: help setup named ready all $(STAGES) plan check compare report study mask view turntable patch export verify \
+	clean gc spinnerf batch weights demo prior prior-report sds-variance adapted sparse test fuzz bench stability gpu \
+	gpu-check lint
 .DELETE_ON_ERROR:
 
 help:
-	@echo 'make scene=demo all            the whole job; a second call finds everything cached'
-	@echo 'make scene=X STAGE             one stage and what it needs: $(STAGES)'
-	@echo 'make scene=X plan              what would run, and why; card=rtx-4090: and what each stage takes on that card'
-	@echo 'make scene=X mask              masks from clicks, in a browser; port=8090'
-	@echo 'make scene=X check             what is odd about its photographs, masks and poses; each mask over its photograph'
-	@echo 'make scene=X compare           the full method, ablations and baselines side by side: runs/X/compare.html'
-	@echo '                               variants=a,b  only these; seeds=5  on demo, demo-1 ... demo-4, with intervals'
-	@echo 'make data=FOLDER compare       the same over all its scenes, in one table: runs/compare/compare.html'
-	@echo 'make data=FOLDER spinnerf      what it holds of SPIn-NeRF'"'"'s published scenes; then as batch'
-	@echo 'make data=FOLDER study         then, or with scene=X: paired clips for people to judge: runs/compare/study/index.html'
-	@echo 'make scene=X report            what was done, errors against seconds: runs/X/report.html'
-	@echo 'make scene=X view              walk through the finished scene in a browser; port=8080'
-	@echo 'make scene=X turntable         the finished scene on a way around the capture: runs/X/turntable.webm'
-	@echo 'make scene=X sds-variance      the SDS gradient over noise and timesteps, before and after personalization'
-	@echo '                               device=cuda dtype=float16  for this and the next'
-	@echo 'make scene=demo-sparse sparse  scores against the number of photographs; seeds=3  on two more scenes (hours)'
-	@echo 'make scene=X adapted           views painted by the adapted prior, beside the unadapted: runs/X/adapted/sheet.png'
-	@echo 'make data=FOLDER report        the same of all its scenes: runs/report/index.html'
-	@echo 'make scene=X patch             fill what was deleted in an editor (scene.yaml: gaussians, cleaned): runs/X/patch/'
-	@echo '                               two files are enough: reffusion patch before.ply after.ply --out patched.ply'
-	@echo 'make scene=X export            the finished scene for other tools, .ply, cameras, LoRA: runs/X/export/'
-	@echo 'make scene=X verify            hash all that was computed for it: is it as it was made?'
-	@echo 'make scene=X clean             remove what was computed for it'
-	@echo 'make gc                        what no plan uses any more, with sizes; then removes it, if you say so or yes=1'
-	@echo 'make data=FOLDER batch         every scene of a folder, several at once, and one table: runs/results.html; cores=2  each'
-	@echo '                               engine=ray address=HOST:6379  on a cluster; engine=slurm address=PARTITION; also for'
-	@echo '                               compare, all and stages'
-	@echo 'make demo [seed=N]             make the demo scene, or another: data/demo-N; others are made when named:'
-	@echo '                               demo-wide, -360, -seen, -photos, -behind, -table, -corner, -grass, -insert, -outpaint, -pair, -sparse,'
-	@echo '                               with -N too'
-	@echo 'make prior [steps=N]           train the embedded prior further (hours)'
-	@echo 'make weights [profile=paper]   fetch what a profile needs, sizes first; offline=1 only says what is missing'
-	@echo 'make gpu                       on a CUDA machine: gsplat, and its extension built and loaded (minutes, once)'
-	@echo 'make gpu-check                 values, time and memory at the paper'"'"'s sizes on a CUDA machine (1 to 8 minutes)'
-	@echo 'make prior-report              measure it, and draw what it paints (minutes): runs/prior-report'
-	@echo 'make setup | test | lint       .venv; the tests, slow=1 those that take minutes too (make fuzz: hours); ruff and mypy'
-	@echo 'make bench                     work-precision diagrams of the kernels: runs/bench; gate=1: against the baselines'
-	@echo 'make stability                 stiff and extreme cases, each with its bound (minutes): runs/stability.json'
-	@echo 'scene=  a name under data/, or the path of any folder'
-	@echo 'profile=auto|laptop|paper|best|paper-terms  variant=NAME  set="fit.iterations=500 distill.seed=3"  runs=FOLDER'
-	@echo 'budget=5m  time for the whole job: sets the number of steps of fit, personalize and distill'
-	@echo 'trust=1  keep results of older code; keep=1  and results that you changed by hand'
+	@sed -n 's/^## \{0,1\}//p' Makefile
 
 # ---------------------------------------------------------------------------------------------------- environment
 
 setup: $(VENV)/.ready
 
-# Bytecode is written by what is imported first; where Python is told not to, each stage would compile its libraries anew.
+# pip leaves bytecode to the first import. Where Python writes none, pip must: else each stage compiles its libraries.
 bytecode := $(if $(PYTHONDONTWRITEBYTECODE),,--no-compile)
 
-# Only where there is none: an environment that exists is never emptied.
+# An existing environment is never emptied.
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo 'error: $(PYTHON) is not Python 3.11 or later; name one: make PYTHON=python3.12 setup' >&2; exit 1; }
@@ -90,32 +94,21 @@ $(VENV)/.ready: pyproject.toml constraints.txt | $(VENV)/bin/python
 	$(PY) -m pip install --quiet $(bytecode) --constraint constraints.txt --editable .
 	@touch $@
 
-$(VENV)/.ready-view: $(VENV)/.ready
-	$(PY) -m pip install --quiet $(bytecode) --constraint constraints.txt --editable '.[view]'
+# With an extra of pyproject.toml: view, export, cluster, dev.
+$(VENV)/.ready-%: $(VENV)/.ready
+	$(PY) -m pip install --quiet $(bytecode) --constraint constraints.txt --editable '.[$*]'
 	@touch $@
 
-$(VENV)/.ready-export: $(VENV)/.ready
-	$(PY) -m pip install --quiet $(bytecode) --constraint constraints.txt --editable '.[export]'
-	@touch $@
-
-$(VENV)/.ready-cluster: $(VENV)/.ready
-	$(PY) -m pip install --quiet $(bytecode) --constraint constraints.txt --editable '.[cluster]'
-	@touch $@
-
-# Once, and a failure too: `make weights` tries again.
+# Once, whether it succeeds or not: `make weights` tries again.
 $(VENV)/.lpips: | $(VENV)/.ready
 	@$(PY) -m reffusion.weights
 	@touch $@
 
-$(VENV)/.ready-dev: $(VENV)/.ready
-	$(PY) -m pip install --quiet $(bytecode) --constraint constraints.txt --editable '.[dev]'
-	@touch $@
-
 # --------------------------------------------------------------------------------------------------------- scenes
 
-# The demo scenes are made by the project: `demo`, `demo-photos` (no poses) and demo-<one of the others>, each with `-<seed>` or not.
+# Generated scenes: `demo` and `demo-<kind>`, with or without `-<seed>`.
 kinds := photos wide 360 seen behind table corner grass insert outpaint pair sparse
-# Their names become part of a recipe, so there are none with other characters than these.
+# Their names are parts of recipes, so that they may have these characters only.
 plain := a b c d e f g h i j k l m n o p q r s t u v w x y z 0 1 2 3 4 5 6 7 8 9 -
 rest = $(if $1,$(call rest,$(wordlist 2,99,$1),$(subst $(firstword $1),,$2)),$2)
 made := $(if $(call rest,$(plain),$(scene)),,$(filter demo demo-%,$(scene)))
@@ -131,119 +124,99 @@ data/%/.generated: | $(VENV)/.ready
 
 # ----------------------------------------------------------------------------------------------------------- jobs
 
-.PHONY: named ready
 named:
 	@test -n "$$scene" || { echo "error: which scene? For example: make scene=demo $$goals" >&2; exit 2; }
 
 ready: named setup $(VENV)/.lpips $(if $(engine),$(VENV)/.ready-cluster) $(made:%=data/%/.generated)
 
 all $(STAGES): ready
-	@$(RUN) run $@ $(of) $(options) $(by)
+	@$(RUN) run $@ $(call flags,$(options) $(cluster))
 
 plan: ready
-	@$(RUN) plan $(of) $(options) $(if $(card),--card="$$card")
+	@$(RUN) plan $(call flags,$(options) card)
 
 check: ready
-	@$(RUN) run raw_masks $(of) $(options)
-	@$(RUN) check $(of) $(where)
+	@$(RUN) run raw_masks $(call flags,$(options))
+	@$(RUN) check $(call flags,$(where))
 
-.PHONY: compare report
-# On the demo scenes of other seeds too. A variant that fails (3) stops no other: the table is drawn, then make fails.
+# The demo scenes of other seeds, too.
 others := $(if $(call rest,0 1 2 3 4 5 6 7 8 9,$(seeds)),,$(if $(made),$(addsuffix /.generated,\
 	$(addprefix data/$(made)-,$(wordlist 2,$(or $(seeds),1),$(shell seq 0 99))))))
-# Of a folder of scenes where it is named on the command line and no scene is.
-these = $(if $(scene),$(of),--data="$$data")
+# A scene, or all scenes of a folder.
+these = $(if $(scene),--scene="$$scene",--data="$$data")
 compare: $(if $(scene),ready $(others),$(if $(folder),setup $(if $(engine),$(VENV)/.ready-cluster),named))
-	@$(RUN) compare $(these) $(options) $(by) $(if $(variants),--variants="$$variants") $(if $(seeds),--seeds="$$seeds"); \
-		status=$$?; test $$status = 0 || test $$status = 3 || exit $$status; \
-		$(RUN) compare-page $(these) $(if $(runs),--runs="$$runs") && exit $$status
+	@$(RUN) compare $(these) $(call flags,$(filter-out scene,$(options)) $(cluster) variants seeds)
 
 report: $(if $(scene),ready,setup)
-ifneq ($(scene),)
-	@$(RUN) plan --record $(of) $(options)
-	@$(RUN) report $(of) $(where)
-else
-	@$(RUN) report --data="$$data" $(where)
-endif
+	$(if $(scene),@$(RUN) plan --record $(call flags,$(options)))
+	@$(RUN) report $(these) $(call flags,variant runs)
 
-.PHONY: study
 study: setup
-	@$(RUN) study $(these) $(if $(runs),--runs="$$runs") $(if $(variants),--variants="$$variants") \
-		$(if $(seed),--seed="$$seed")
+	@$(RUN) study $(these) $(call flags,runs variants seed)
 
-.PHONY: mask
 mask: ready
-	@$(RUN) mask $(of) $(where) $(if $(profile),--profile="$$profile") $(if $(budget),--budget="$$budget") \
-		$(if $(set),--set="$$set") $(if $(port),--port="$$port")
+	@$(RUN) mask $(call flags,$(where) profile budget set port)
 
 view: named $(VENV)/.ready-view
-	@$(RUN) view $(of) $(where) $(if $(port),--port="$$port")
+	@$(RUN) view $(call flags,$(where) port)
 
 turntable: named setup
-	@$(RUN) turntable $(of) $(where)
+	@$(RUN) turntable $(call flags,$(where))
 
-# What was deleted is known once `poses` has run: before the work, not after it.
-.PHONY: patch export
+# What was deleted is known after `poses`: checked before the work.
 patch: ready $(VENV)/.ready-export
-	@$(RUN) run poses $(of) $(options)
-	@$(RUN) patch $(of) $(where) --only-check
-	@$(RUN) run all $(of) $(options)
-	@$(RUN) patch $(of) $(where)
+	@$(RUN) run poses $(call flags,$(options))
+	@$(RUN) patch --only-check $(call flags,$(where))
+	@$(RUN) run all $(call flags,$(options))
+	@$(RUN) patch $(call flags,$(where))
 
 export: ready $(VENV)/.ready-export
-	@$(RUN) run all $(of) $(options)
-	@$(RUN) export $(of) $(where)
+	@$(RUN) run all $(call flags,$(options))
+	@$(RUN) export $(call flags,$(where))
 
 verify clean: named setup
-	@$(RUN) $@ $(of) $(options)
+	@$(RUN) $@ $(call flags,$(options))
 
-.PHONY: gc
 gc: setup
-	@$(RUN) gc $(if $(scene),$(of)) $(options) $(if $(yes),--yes)
+	@$(RUN) gc $(call flags,$(options) yes)
 
-spinnerf: setup $(if $(engine),$(VENV)/.ready-cluster)
-	@$(PY) data/spinnerf.py --data="$$data"
-	@$(RUN) batch --data="$$data" $(options) $(by)
-
-# A scene that fails (1) stops no other: the page is drawn, then make fails.
-batch: setup $(if $(engine),$(VENV)/.ready-cluster)
-	@$(RUN) batch --data="$$data" $(options) $(by); status=$$?; test $$status = 0 || test $$status = 1 || exit $$status; \
-		$(RUN) batch-page $(where) && exit $$status
+spinnerf batch: setup $(if $(engine),$(VENV)/.ready-cluster)
+	$(if $(filter spinnerf,$@),@$(PY) data/spinnerf.py --data="$$data")
+	@$(RUN) batch --data="$$data" $(call flags,$(filter-out scene,$(options)) $(cluster))
 
 weights: setup
-	@$(RUN) weights $(if $(scene),$(of)) $(if $(offline),--offline) $(options)
+	@$(RUN) weights $(call flags,$(options) offline)
 
 prior: setup
-	$(PY) -m priors.tiny.train --start priors/tiny $(if $(steps),--steps="$$steps")
+	$(PY) -m priors.tiny.train --start priors/tiny $(call flags,steps)
 
-# Personalizes on the demo's reference, which is made first where it is missing.
+# Personalizes on the reference of the demo scene, which is made first where it is missing.
 prior-report: data/demo/.generated setup
 	@$(RUN) run reference --scene demo --profile laptop
 	$(PY) -m benchmarks.studies.prior --steps 1 4 12 --run runs/demo --out runs/prior-report
 	$(PY) -m report.prior runs/prior-report
 
-# On any scene; what it lacks of personalization and initialization is made first.
+# Runs personalization and initialization first, where they are missing.
 sds-variance: ready
-	@$(RUN) run personalize $(of) $(options) --set="distill.sds.run=always $$set"
-	@$(RUN) run initialize $(of) $(options)
-	$(PY) -m benchmarks.studies.sds_variance --run="$${runs:-runs}/$$(basename "$$scene")" $(on)
+	@$(RUN) run personalize $(call flags,$(options)) --set="distill.sds.run=always $$set"
+	@$(RUN) run initialize $(call flags,$(options))
+	$(PY) -m benchmarks.studies.sds_variance --run="$${runs:-runs}/$$(basename "$$scene")" $(call flags,device dtype)
 
-# Where a study computes; what is made first runs where the profile says.
-on = $(if $(device),--device="$$device") $(if $(dtype),--dtype="$$dtype")
 adapted: ready
-	@$(RUN) run personalize $(of) $(options) --set="distill.sds.run=always $$set"
-	$(PY) -m benchmarks.studies.adapted --run="$${runs:-runs}/$$(basename "$$scene")" $(on) $(if $(steps),--steps="$$steps")
+	@$(RUN) run personalize $(call flags,$(options)) --set="distill.sds.run=always $$set"
+	$(PY) -m benchmarks.studies.adapted --run="$${runs:-runs}/$$(basename "$$scene")" $(call flags,device dtype steps)
 
-# Of a made scene demo-sparse, with seeds=3 of two others too: scores against the number of photographs (hours).
-.PHONY: sparse
+# On the generated scene demo-sparse, with seeds=3 on two others, too (hours).
 sparse: ready $(others)
-	$(PY) -m benchmarks.studies.sparse --scenes data/$(made) $(patsubst %/.generated,%,$(others)) --out="$${runs:-runs}/sparse"
+	$(PY) -m benchmarks.studies.sparse --scenes data/$(made) $(patsubst %/.generated,%,$(others)) \
+		--out="$${runs:-runs}/sparse"
 
-# Two processes of one thread each, whole files to each: kernels that are compiled for one test serve the next.
+# Two processes with one thread each. Each gets whole files, so that tests of a file share compiled kernels.
 test: $(VENV)/.ready-dev
-	$(if $(slow),REFFUSION_SLOW=1) OMP_NUM_THREADS=1 $(PY) -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
+	$(if $(slow),REFFUSION_SLOW=1) OMP_NUM_THREADS=1 \
+		$(PY) -m pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
-# Every reader on spoilt files, ten minutes each.
+# Every reader on damaged files, ten minutes each.
 fuzz: $(VENV)/.ready-dev
 	$(PY) -m tests.test_fuzz
 
@@ -252,7 +225,7 @@ lint: $(VENV)/.ready-dev
 	$(PY) -m ruff format --check --quiet .
 	$(PY) -m mypy
 
-# slow=1 adds the splatting of 100,000 Gaussians and more, and personalization (an hour).
+# slow=1 adds the rendering of 100,000 Gaussians and more, and personalization (an hour).
 bench: $(VENV)/.ready
 	$(PY) -m benchmarks.bench --out="$${runs:-runs}/bench" $(if $(gate),--gate) $(if $(slow),--slow)
 	$(if $(slow),$(PY) -m benchmarks.bench.large)
@@ -260,7 +233,7 @@ bench: $(VENV)/.ready
 stability: $(VENV)/.ready-dev
 	$(PY) -m benchmarks.stability --out="$${runs:-runs}/stability.json"
 
-# First what cannot be mended by installing; MAX_JOBS bounds the compilers, each of which takes up to 1 GB.
+# Checks first what an installation cannot fix. MAX_JOBS limits the number of compilers, which take up to 1 GB each.
 gpu: $(VENV)/.ready
 	@$(PY) -m benchmarks.gpu.ready --before
 	$(PY) -m pip install --quiet $(bytecode) --constraint constraints.txt --editable '.[gpu]'

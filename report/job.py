@@ -28,7 +28,7 @@ from report.job_data import Job, load_job
 
 WORDS = {
     "skip": "left\u00a0out", "provided": "brought", "cached": "done", "run": "to\u00a0run", "stale": "to\u00a0run",
-    "missing": "cannot\u00a0run", "undecided": "undecided",
+    "missing": "cannot\u00a0run", "pending": "pending",
 }  # fmt: skip
 STYLE = """
 .grid { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(14rem, 46%), 1fr)); gap: .6rem }

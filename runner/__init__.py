@@ -1,19 +1,24 @@
-"""The tiny runner: it knows files, hashes and YAML, and nothing of 3D. Its way is resolve -> plan -> execute.
+"""The runner: resolves a request, plans what must run, and executes it. It knows files, hashes and YAML, not 3D.
 
-- resolve.py: a request becomes a job, in which all is settled: scene, profile, parameters of all stages, folders.
-  - pipeline.py: pipeline.yaml and scene.yaml: models, clear refusals.
-  - layers.py: parameters, layer over layer, and a time budget shared out over stages.
-- plan.py: one word and a reason for each stage, from what lies on the disk.
-  - keys.py: what an artifact depends on, as hashes: contents of folders, code, parameters.
-- execute.py: does it: a fresh process a stage, folders renamed into place, receipts.
-  - engine.py: where that process runs: here, or on a cluster (on_ray.py, on_slurm.py).
-  - artifacts.py: what of one is as its receipt says, and swaps that survive a kill.
-  - files.py: files written whole, locks, and copies that people work with.
-- upkeep.py: what was made is verified, or removed.
-- child.py: the other side: the process in which stages are imported.
-- compare.py: many runs: which, and their tables.
-  - many.py: several at once; progress.py: how far each is.
-- sweep.py: what no plan uses any more is listed, and removed.
+- resolve.py: turns a request into a job with its scene, profile, folders and the parameters of all stages.
+  - pipeline.py: the models of pipeline.yaml and scene.yaml, and their checks.
+  - user_yaml.py: a YAML reader for files that people write.
+  - parameters.py: merges the layers of parameters, and splits a time budget over stages.
+  - frames.py: a video as a scene.
+- plan.py: gives each stage a status and a reason, from what is on disk.
+  - keys.py: hashes of what an artifact depends on: contents of folders, code, parameters.
+  - card_costs.py: expected time and memory of stages on a GPU.
+- execute.py: runs stages, each in a fresh process; writes receipts; renames folders into place.
+  - engine.py: where that process runs: on this machine, or on a cluster (ray_engine.py, slurm_engine.py, retry.py).
+  - artifacts.py: compares artifacts with their receipts, and replaces them so that a kill loses nothing.
+  - files.py: atomic writes, locks, exported copies.
+- worker.py: the process that imports stages; process.py: starts it and asks it.
+- compare.py: many runs: `compare` and `batch`.
+  - parallel.py: several runs at once; progress.py: how far each one is.
+- results.py: prints scores; calls report/ for tables and pages.
+- maintenance.py: verifies artifacts or removes them; sweep.py: removes those that no plan uses.
+- weights.py: lists and fetches the weights that stages need.
+- text.py: errors, sizes, times and paths as text.
 """
 
 from collections.abc import Callable, Iterator
@@ -22,26 +27,27 @@ from contextvars import ContextVar
 
 
 class Refused(Exception):
-    """What the user can put right, told in one line before any work."""
+    """The user can fix this. One line, raised before any work."""
 
 
 class Failed(Exception):
-    """A stage could not do its work, told in one line."""
+    """A stage failed. One line."""
 
 
 def say(text: str) -> None:
-    hear = _hears.get()
-    print(text, flush=True) if hear is None else hear(text)
+    """Print a message, or pass it to the function set by `redirect_output`."""
+    redirect = _redirect.get()
+    print(text, flush=True) if redirect is None else redirect(text)
 
 
 @contextmanager
-def said_to(hear: Callable[[str], None]) -> Iterator[None]:
-    """While this runs, and in this thread, what is said goes to `hear`."""
-    before = _hears.set(hear)
+def redirect_output(redirect: Callable[[str], None]) -> Iterator[None]:
+    """Pass the messages of this thread to `redirect` inside the context."""
+    token = _redirect.set(redirect)
     try:
         yield
     finally:
-        _hears.reset(before)
+        _redirect.reset(token)
 
 
-_hears: ContextVar[Callable[[str], None] | None] = ContextVar("hears", default=None)
+_redirect: ContextVar[Callable[[str], None] | None] = ContextVar("redirect", default=None)

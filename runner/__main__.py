@@ -1,5 +1,5 @@
-"""reffusion plan|run|compare|batch|weights|verify|clean|gc --scene NAME: what the Makefile calls (or python -m runner).
-Pages of what was made: reffusion report|compare-page|view|turntable|sheet, each with --help."""
+"""reffusion plan|run|compare|batch|weights|verify|clean|gc --scene NAME: the commands of the runner.
+Other commands (report, check, view, turntable, sheet, export ...) have a --help of their own."""
 
 import argparse
 import os
@@ -10,18 +10,21 @@ from pathlib import Path
 
 from reffusion.command import workplace
 from runner import Failed, Refused
-from runner.child import INTERRUPTED
-from runner.compare import By, batch, compare, show_results
-from runner.costs import costs
-from runner.engine import ENGINES, chosen
-from runner.execute import Work, run_scene, weights
-from runner.files import told, write_json
-from runner.plan import as_record, plan, table
+from runner.card_costs import cost_table
+from runner.compare import batch, compare
+from runner.engine import ENGINES, make_engine
+from runner.execute import Execution, run_scene
+from runner.files import write_json
+from runner.maintenance import clean, verify
+from runner.plan import plan, plan_record, plan_table
 from runner.resolve import Request, resolve
+from runner.results import call_report, show_results
 from runner.sweep import sweep
-from runner.upkeep import clean, verify
+from runner.text import display_path, format_error
+from runner.weights import fetch_weights
+from runner.worker import INTERRUPTED
 
-SOME_FAILED = 3  # compare: done, but for some variants
+SOME_FAILED = 3  # exit code of compare: finished, but some runs failed
 
 
 def main() -> int:
@@ -31,78 +34,110 @@ def main() -> int:
     runs = (arguments.runs or workplace(root) / "runs").resolve()
     names = ("scene", "profile", "variant", "trust", "set", "budget", "keep")
     request = Request(root, runs, *(getattr(arguments, name) for name in names))
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # told to end: as Ctrl-C
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # handled as Ctrl-C
     try:
-        if arguments.command == "plan":
-            job = resolve(request)
-            decisions = plan(job, job.pipeline.closure(arguments.stage))
-            if arguments.record:
-                unset = resolve(replace(request, set="", budget=None), job.hashes)
-                write_json(job.home / "plan.json", as_record(job, decisions, unset))
-            else:
-                print("\n".join(filter(None, [table(job, decisions), costs(job, decisions, arguments.card)])))
-        elif arguments.command == "run":
-            by = _by(arguments, request)
-            request, work = replace(request, cuda=by.engine.cuda), Work(by.engine, by.cores)
-            stage, folder = list(run_scene(request, arguments.stage, None, work).items())[-1]
-            show_results(stage, folder, request)
-        elif arguments.command == "compare":
-            by = _by(arguments, request)
-            request = replace(request, cuda=by.engine.cuda)
-            return SOME_FAILED if compare(request, arguments.variants, arguments.seeds, arguments.data, by) else 0
-        elif arguments.command == "batch":
-            by = _by(arguments, request)
-            request = replace(request, cuda=by.engine.cuda)
-            return 1 if batch(request, arguments.data or Path("data"), by) else 0
-        elif arguments.command == "weights":
-            return 1 if weights(request, arguments.offline) else 0
-        elif arguments.command == "verify":
-            return 1 if verify(request) else 0
-        elif arguments.command == "gc":
-            sweep(request, arguments.yes)
-        else:
-            clean(request)
+        return _COMMANDS[arguments.command](request, arguments)
     except KeyboardInterrupt:
         print("\nstopped; the same command goes on from here", file=sys.stderr)
         return INTERRUPTED
-    except BrokenPipeError:  # as in `plan | head`: who read the output is gone
+    except BrokenPipeError:  # as in `plan | head`: the reader is gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except (Refused, Failed, OSError) as error:
-        print(f"error: {told(error)}", file=sys.stderr)
+        print(f"error: {format_error(error)}", file=sys.stderr)
         return 2
+
+
+def _plan(request: Request, arguments: argparse.Namespace) -> int:
+    job = resolve(request)
+    decisions = plan(job, job.pipeline.closure(arguments.stage))
+    if arguments.record:
+        unset = resolve(replace(request, set="", budget=None), job.hashes)
+        write_json(job.home / "plan.json", plan_record(job, decisions, unset))
+    else:
+        parts = [plan_table(job, decisions), cost_table(job, decisions, arguments.card)]
+        print("\n".join(filter(None, parts)))
     return 0
 
 
-def _by(arguments: argparse.Namespace, request: Request) -> By:
+def _run(request: Request, arguments: argparse.Namespace) -> int:
+    execution = _execution(request, arguments)
+    request = replace(request, cuda=execution.engine.cuda)
+    stage, folder = list(run_scene(request, arguments.stage, None, execution).items())[-1]
+    show_results(stage, folder, request)
+    return 0
+
+
+def _compare(request: Request, arguments: argparse.Namespace) -> int:
+    """Then draws the page, also where some runs failed."""
+    execution, data = _execution(request, arguments), arguments.data
+    request = replace(request, cuda=execution.engine.cuda)
+    failed = compare(request, arguments.variants, arguments.seeds, data, execution)
+    what = f"--data={data}" if data else f"--scene={request.scene}"
+    return call_report("compare", what, f"--runs={display_path(request.runs)}") or (SOME_FAILED if failed else 0)
+
+
+def _batch(request: Request, arguments: argparse.Namespace) -> int:
+    """Then draws the page, also where some scenes failed."""
+    execution = _execution(request, arguments)
+    request = replace(request, cuda=execution.engine.cuda)
+    failed = batch(request, arguments.data or Path("data"), execution)
+    options = f"--runs={display_path(request.runs)}", f"--variant={request.variant or ''}"
+    return call_report("batch", *options) or int(failed > 0)
+
+
+def _sweep(request: Request, arguments: argparse.Namespace) -> int:
+    sweep(request, arguments.yes)
+    return 0
+
+
+def _clean(request: Request, arguments: argparse.Namespace) -> int:
+    clean(request)
+    return 0
+
+
+_COMMANDS = {
+    "plan": _plan,
+    "run": _run,
+    "compare": _compare,
+    "batch": _batch,
+    "weights": lambda request, arguments: int(fetch_weights(request, arguments.offline) > 0),
+    "verify": lambda request, arguments: int(verify(request) > 0),
+    "clean": _clean,
+    "gc": _sweep,
+}
+
+
+def _execution(request: Request, arguments: argparse.Namespace) -> Execution:
     if arguments.cores is not None and arguments.cores < 1:
         raise Refused(f"cores={arguments.cores}: of each stage; 1 or more")
-    return By(chosen(arguments.engine, arguments.address, request.root, request.runs), arguments.cores)
+    engine = make_engine(arguments.engine, arguments.address, request.root, request.runs)
+    return Execution(engine, arguments.cores)
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="reffusion", description=__doc__)
-    parser.add_argument("command", choices=["plan", "run", "compare", "batch", "weights", "verify", "clean", "gc"])
-    parser.add_argument("stage", nargs="?", default="all", help="run this stage and what it needs; `all` (default)")
+    parser.add_argument("command", choices=list(_COMMANDS))
+    parser.add_argument("stage", nargs="?", default="all", help="run this stage and what it needs; default: all")
     parser.add_argument("--scene", default="", help="a name under data/, or a path")
-    parser.add_argument("--data", type=Path, help="batch, compare: a folder of scenes; batch takes data/")
+    parser.add_argument("--data", type=Path, help="batch, compare: a folder of scenes; default of batch: data/")
     parser.add_argument("--profile", help="auto, or a profile of pipeline.yaml: laptop, paper, best, paper-terms")
     parser.add_argument("--variant", help="a variant of pipeline.yaml")
-    parser.add_argument("--variants", default="", help="compare: these only, with commas between")
-    parser.add_argument("--seeds", type=int, default=1, help="compare: on so many scenes: X, X-1, X-2 ...")
+    parser.add_argument("--variants", default="", help="compare: only these, separated by commas")
+    parser.add_argument("--seeds", type=int, default=1, help="compare: number of scenes: X, X-1, X-2 ...")
     parser.add_argument("--record", action="store_true", help="plan: write it to runs/<scene>/plan.json")
-    parser.add_argument("--card", help="plan: seconds and GB of each stage on this card, like rtx-4090, a100, h100")
+    parser.add_argument("--card", help="plan: seconds and GB of each stage on this GPU, such as rtx-4090, a100, h100")
     parser.add_argument("--trust", action="store_true", help="accept artifacts made by older code")
-    parser.add_argument("--keep", action="store_true", help="go on with artifacts as people changed them, from now on")
-    parser.add_argument("--budget", help="time for the whole job, like 5m: sets the number of steps")
-    parser.add_argument("--cores", type=int, help="of each stage; all, for several scenes an equal part for each")
+    parser.add_argument("--keep", action="store_true", help="accept artifacts that people changed, from now on")
+    parser.add_argument("--budget", help="time for the whole job, such as 5m: sets the number of steps")
+    parser.add_argument("--cores", type=int, help="for each stage; default: all, or an equal part for each scene")
     parser.add_argument("--engine", help=f"where stages run: local (default), {', '.join(ENGINES)}")
     parser.add_argument("--address", help="of the engine: ray://HOST:10001 or HOST:6379; a partition of Slurm")
-    parser.add_argument("--offline", action="store_true", help="weights: only say what is missing")
+    parser.add_argument("--offline", action="store_true", help="weights: only list what is missing")
     parser.add_argument("--set", action="append", default=[], help="stage.parameter=value ...")
-    parser.add_argument("--yes", action="store_true", help="gc: remove what it lists, without asking")
+    parser.add_argument("--yes", action="store_true", help="gc: remove what it lists, without a question")
     parser.add_argument("--root", type=Path, default=Path(__file__).parent.parent, help="where pipeline.yaml is")
-    parser.add_argument("--runs", type=Path, help="where artifacts go; root/runs, installed ./runs")
+    parser.add_argument("--runs", type=Path, help="folder of artifacts; default: root/runs, installed ./runs")
     return parser
 
 

@@ -1,5 +1,5 @@
-"""Where a stage's process runs, with how many cores, how much memory, which card. An engine takes a stage's task and
-needs, and tells how it ended; the one here is this machine, on_ray.py and on_slurm.py are clusters."""
+"""Engines run the processes of stages with given cores, memory and GPUs: here on this machine, in ray_engine.py and
+slurm_engine.py on clusters."""
 
 import importlib
 import json
@@ -14,17 +14,17 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from runner import Refused, say
-from runner.resolve import child
+from runner.process import start_worker
 
-ALL = 2**40  # MB: more than any machine has
-GRACE = 20.0  # seconds an interrupted stage has to end by itself
+ALL_MEMORY_MB = 2**40  # more than any machine has: the stage runs alone
+GRACE = 20.0  # seconds that an interrupted stage has to end by itself
 CGROUPS = (("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
            ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"))  # fmt: skip
 
 
 @dataclass(frozen=True)
-class Needs:
-    """What a stage is to have: cores (None: all there are), cards, memory of the CPU in MB."""
+class Resources:
+    """What a stage gets: cores (None: all), GPUs, CPU memory in MB."""
 
     cores: int | None
     gpus: int
@@ -33,9 +33,13 @@ class Needs:
 
 @dataclass(frozen=True)
 class Task:
-    """One stage's work. `line`: what child.py reads, but for what the process is given here; paths as text.
+    """The work of one stage.
 
-    `output`: the file to which what the stage prints is added, None: where the runner's own output goes."""
+    Attributes:
+        root: the folder with pipeline.yaml and stages/.
+        line: what `worker.run` reads, without what `run_process` adds; paths are text.
+        output: the file to which the stage appends what it prints; None: the runner's own output.
+    """
 
     root: Path
     line: dict[str, Any]
@@ -43,9 +47,14 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Ended:
-    """What a stage's process told (see child.run), empty where it told nothing, and its exit code; negative: by a
-    signal. interrupted: who waited for it was."""
+class StageResult:
+    """How a stage's process ended.
+
+    Attributes:
+        answer: see `worker.run`; empty where the process gave none.
+        code: exit code; negative for a signal.
+        interrupted: the wait for it was interrupted.
+    """
 
     answer: dict[str, Any]
     code: int
@@ -53,62 +62,73 @@ class Ended:
 
 
 class Engine(Protocol):
-    """cuda: has it a card? None: what this machine has. cores: of which stages may get some. shares: do other machines
-    work in the folder of results?"""
+    """Where stages run.
+
+    Attributes:
+        cuda: whether it has a GPU; None: see `resolve.has_cuda`.
+        cores: in all.
+        is_remote: whether other machines work in the folder of results.
+    """
 
     cuda: bool | None
     cores: int
-    shares: bool
+    is_remote: bool
 
-    def run(self, task: Task, needs: Needs, lock: int, begun: Callable[[], None]) -> Ended:
-        """Do the work, `begun` called when it has what it needs. `lock`: the file that who works must hold open.
+    def run(self, task: Task, resources: Resources, lock: int, on_start: Callable[[], None]) -> StageResult:
+        """Run a task; calls `on_start` when it has its resources. The process holds the file descriptor `lock` open.
 
-        Raises KeyboardInterrupt where the engine was told to stop, Refused where it can never have what it needs."""
+        Raises:
+            KeyboardInterrupt: the engine was stopped.
+        """
         ...
 
     def stop(self) -> None:
-        """End what runs, and start nothing more; may be called from another thread."""
+        """Interrupt what runs, and start nothing more. May be called from another thread."""
         ...
 
 
-class Local:
-    """This machine. Any number of threads may ask it to run a stage; it lets in as many as there is room for."""
+class LocalEngine:
+    """Runs stages on this machine. Any number of threads may call `run`; each waits for its resources."""
 
     cuda: bool | None = None
-    shares = False
+    is_remote = False
 
-    def __init__(self, cores: list[int] | None = None, memory_mb: int | None = None, cards: list[str] | None = None):
-        """Numbers of cores, memory, numbers of cards; those that this process may use where they are not given."""
+    def __init__(self, cores: list[int] | None = None, memory_mb: int | None = None, gpus: list[str] | None = None):
+        """Numbers of the cores, memory, and numbers of the GPUs to use; by default all that this process may use."""
         self._cores = sorted(os.sched_getaffinity(0)) if cores is None else list(cores)
-        self._cards = visible_cards() if cards is None else list(cards)
-        self.cores, self._all_cards = len(self._cores), len(self._cards)
+        self._gpus = visible_gpus() if gpus is None else list(gpus)
+        self.cores, self._gpu_count = len(self._cores), len(self._gpus)
         self.memory_mb = memory_mb if memory_mb is not None else free_memory_mb()
         self._asks_system = memory_mb is None
-        self._given: dict[int, int] = {}  # running task -> memory promised to it
+        self._reserved: dict[int, int] = {}  # running task -> its memory, MB
         self._running: set[subprocess.Popen[str]] = set()
         self._change, self._stopped, self._number = threading.Condition(), False, 0
 
-    def run(self, task: Task, needs: Needs, lock: int, begun: Callable[[], None]) -> Ended:
-        ended, beside = self._once(task, needs, lock, begun)
-        if ended.code == -signal.SIGKILL and beside:  # memory ran out, it seems: it goes on alone
-            ended, _ = self._once(task, replace(needs, memory_mb=ALL), lock, begun)
-        return ended
+    def run(self, task: Task, resources: Resources, lock: int, on_start: Callable[[], None]) -> StageResult:
+        """See `Engine.run`."""
+        result, others = self._run_once(task, resources, lock, on_start)
+        if result.code == -signal.SIGKILL and others:  # probably out of memory: it resumes alone
+            result, _ = self._run_once(task, replace(resources, memory_mb=ALL_MEMORY_MB), lock, on_start)
+        return result
 
-    def _once(self, task: Task, needs: Needs, lock: int, begun: Callable[[], None]) -> tuple[Ended, int]:
-        """How it ended, and how many stages ran beside it then."""
-        with self._room(needs) as (cores, cards):
-            begun()
-            where = {"cores": len(cores), "on": cores} if needs.cores is not None else {}
-            where |= {"cards": ",".join(cards)} if cards and self._all_cards > 1 else {}
-            ended = carry_out(replace(task, line=task.line | where), lock, self._follow)
-            beside = len(self._given) - 1
-        if ended.interrupted:
-            self._stopped = True  # what had finished is put in place, and nothing begun after it
-        if self._stopped and ended.code != 0:
+    def _run_once(
+        self, task: Task, resources: Resources, lock: int, on_start: Callable[[], None]
+    ) -> tuple[StageResult, int]:
+        """The result, and how many other stages ran at its end."""
+        with self._reserve(resources) as (cores, gpus):
+            on_start()
+            where = {"cores": len(cores), "on": cores} if resources.cores is not None else {}
+            where |= {"gpus": ",".join(gpus)} if gpus and self._gpu_count > 1 else {}
+            result = run_process(replace(task, line=task.line | where), lock, self._follow)
+            others = len(self._reserved) - 1
+        if result.interrupted:
+            self._stopped = True  # a finished artifact is still moved into place; nothing starts after it
+        if self._stopped and result.code != 0:
             raise KeyboardInterrupt
-        return ended, beside
+        return result, others
 
     def stop(self) -> None:
+        """See `Engine.stop`."""
         with self._change:
             self._stopped = True
             self._change.notify_all()
@@ -129,39 +149,39 @@ class Local:
                 self._running.discard(process)
 
     @contextmanager
-    def _room(self, needs: Needs) -> Iterator[tuple[list[int], list[str]]]:
-        """Cores and cards for a stage, as soon as they and its memory are free. One that wants more than there is of
-        cores or memory gets it all, alone."""
-        wanted = min(needs.cores or self.cores, self.cores)
-        cards_wanted = min(needs.gpus, self._all_cards)
+    def _reserve(self, resources: Resources) -> Iterator[tuple[list[int], list[str]]]:
+        """Wait for a stage's cores, GPUs and memory, and hold them. A stage that asks for more memory than there is
+        runs alone."""
+        core_count = min(resources.cores or self.cores, self.cores)
+        gpu_count = min(resources.gpus, self._gpu_count)
         with self._change:
             self._number += 1
-            mine = self._number
-            while not (self._stopped or self._fits(wanted, cards_wanted, needs.memory_mb)):
-                self._change.wait(1.0)  # free memory changes without telling
+            number = self._number
+            while not (self._stopped or self._fits(core_count, gpu_count, resources.memory_mb)):
+                self._change.wait(1.0)  # free memory changes without a notification
             if self._stopped:
                 raise KeyboardInterrupt
-            cores, self._cores = self._cores[:wanted], self._cores[wanted:]
-            cards, self._cards = self._cards[:cards_wanted], self._cards[cards_wanted:]
-            self._given[mine] = needs.memory_mb
+            cores, self._cores = self._cores[:core_count], self._cores[core_count:]
+            gpus, self._gpus = self._gpus[:gpu_count], self._gpus[gpu_count:]
+            self._reserved[number] = resources.memory_mb
         try:
-            yield cores, cards
+            yield cores, gpus
         finally:
             with self._change:
-                self._cores, self._cards = sorted(self._cores + cores), sorted(self._cards + cards)
-                del self._given[mine]
+                self._cores, self._gpus = sorted(self._cores + cores), sorted(self._gpus + gpus)
+                del self._reserved[number]
                 self._change.notify_all()
 
-    def _fits(self, cores: int, cards: int, memory_mb: int) -> bool:
-        if not self._given:
+    def _fits(self, cores: int, gpus: int, memory_mb: int) -> bool:
+        if not self._reserved:
             return True
-        promised = sum(self._given.values()) + memory_mb
-        enough = promised <= self.memory_mb and (not self._asks_system or memory_mb <= free_memory_mb())
-        return cores <= len(self._cores) and cards <= len(self._cards) and enough
+        reserved = sum(self._reserved.values()) + memory_mb
+        enough = reserved <= self.memory_mb and (not self._asks_system or memory_mb <= free_memory_mb())
+        return cores <= len(self._cores) and gpus <= len(self._gpus) and enough
 
 
 def free_memory_mb() -> int:
-    """What this machine, or the group this process is held in, has left."""
+    """Free memory of this machine, or of the control group of this process if that is less."""
     found = []
     with suppress(OSError, ValueError, StopIteration):
         lines = Path("/proc/meminfo").read_text().splitlines()
@@ -172,60 +192,66 @@ def free_memory_mb() -> int:
     return min(found, default=2**50) // 2**20
 
 
-def visible_cards() -> list[str]:
-    """Numbers of the cards that this process may use."""
-    said = os.environ.get("CUDA_VISIBLE_DEVICES")
-    if said is not None:
-        return [number for number in said.split(",") if number not in ("", "-1")]
+def visible_gpus() -> list[str]:
+    """Numbers of the GPUs that this process may use."""
+    listed = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if listed is not None:
+        return [number for number in listed.split(",") if number not in ("", "-1")]
     return sorted((path.name.removeprefix("nvidia") for path in Path("/dev").glob("nvidia[0-9]*")), key=int)
 
 
-def carry_out(
+def run_process(
     task: Task,
     lock: int | None = None,
     follow: Callable[[Any], Any] = nullcontext,
-    told: Callable[[], bool] | None = None,
-) -> Ended:
-    """Do a task in a fresh process of this machine, and wait for its end. An interrupt is passed on to it, and not
-    raised: it may have finished.
+    should_stop: Callable[[], bool] | None = None,
+) -> StageResult:
+    """Run a task in a fresh process on this machine, and wait for its end.
 
-    lock: an open file that the process holds, too. follow: a context, given the process, while that runs. told: asked
-    every second whether to interrupt it, where no signal comes."""
-    heard, result = os.pipe()  # no file: that there is no room for one may be what must be told
-    line = json.dumps(task.line | {"result": result, "lock": lock})
+    Passes an interrupt on to the process and does not raise it, as the stage may have finished.
+
+    Args:
+        lock: an open file that the process holds, too.
+        follow: a context that gets the process, entered while it runs.
+        should_stop: called every second; where it returns True the process is interrupted.
+    """
+    reader, writer = os.pipe()  # not a file: the answer may be that the disk is full
+    line = json.dumps(task.line | {"result": writer, "lock": lock})
     answer: dict[str, Any] = {}
     interrupted = False
     with open(task.output, "a") if task.output else nullcontext() as output:
         # A process group of its own: Ctrl-C reaches it once, from here.
-        held = (result,) if lock is None else (lock, result)
-        process = child(task.root, "run", pass_fds=held, process_group=0, stdout=output, stderr=output)
+        held = (writer,) if lock is None else (lock, writer)
+        process = start_worker(task.root, "run", pass_fds=held, process_group=0, stdout=output, stderr=output)
     assert process.stdin
-    os.close(result)
+    os.close(writer)
     try:
         with follow(process):
-            with suppress(BrokenPipeError):  # a child that is gone already has its code below
+            with suppress(BrokenPipeError):  # a worker that is gone already has its code below
                 process.stdin.write(line + "\n")
-                process.stdin.flush()  # and left open: the child ends when this process does
-            code = _code_of(process, told) if told else process.wait()
+                process.stdin.flush()  # and stays open: the worker ends when this process does
+            code = _poll(process, should_stop) if should_stop else process.wait()
     except KeyboardInterrupt:
-        code, interrupted = _interrupted(process), True
+        code, interrupted = _interrupt(process), True
     finally:
         with suppress(BrokenPipeError):
             process.stdin.close()
-        os.set_blocking(heard, False)  # what a stage has started may live on, and hold its end open
-        with suppress(BlockingIOError), open(heard, "rb", buffering=0) as file:
+        os.set_blocking(reader, False)  # processes that the stage started may still hold the other end
+        with suppress(BlockingIOError), open(reader, "rb", buffering=0) as file:
             answer = json.loads(file.read(1 << 16) or "{}")
-    return Ended(answer, code, interrupted)
+    return StageResult(answer, code, interrupted)
 
 
-def _code_of(process: "subprocess.Popen[str]", told: Callable[[], bool]) -> int:
-    while not told():
+def _poll(process: "subprocess.Popen[str]", should_stop: Callable[[], bool]) -> int:
+    """Wait for a process, or interrupt it; its exit code."""
+    while not should_stop():
         with suppress(subprocess.TimeoutExpired):
             return process.wait(1.0)
-    return _interrupted(process)
+    return _interrupt(process)
 
 
-def _interrupted(process: "subprocess.Popen[str]") -> int:
+def _interrupt(process: "subprocess.Popen[str]") -> int:
+    """Interrupt a process, and kill it after GRACE seconds; its exit code."""
     process.send_signal(signal.SIGINT)
     try:
         return process.wait(GRACE)
@@ -234,20 +260,21 @@ def _interrupted(process: "subprocess.Popen[str]") -> int:
         return process.wait()
 
 
-ENGINES = {"ray": ("Ray", "ray"), "slurm": ("Slurm", "submitit")}  # name -> class in on_<name>.py, what it imports
+# name -> class in <name>_engine.py, the package that it imports
+ENGINES = {"ray": ("RayEngine", "ray"), "slurm": ("SlurmEngine", "submitit")}
 
 
-def chosen(name: str | None, address: str | None, root: Path, runs: Path) -> Engine:
-    """The engine that a command asks for, this machine where it asks for none. Refused where it cannot be had."""
+def make_engine(name: str | None, address: str | None, root: Path, runs: Path) -> Engine:
+    """The engine of this name, of this machine by default. Raises Refused where it is unknown or unreachable."""
     if name in (None, "", "local"):
         if address:
             raise Refused(f"address={address}: of which engine? For example engine=ray address={address}")
-        return Local()
+        return LocalEngine()
     if name not in ENGINES:
         raise Refused(f"engine={name}: unknown; known: local, {', '.join(ENGINES)}")
     kind, library = ENGINES[name]
     try:
-        module = importlib.import_module(f"runner.on_{name}")
+        module = importlib.import_module(f"runner.{name}_engine")
     except ImportError as error:
         if error.name != library:
             raise

@@ -1,4 +1,4 @@
-"""The third step: does what a plan asks for, in a fresh process a stage, and renames folders into place."""
+"""The third step: runs the stages of a plan, each in a fresh process, and renames their folders into place."""
 
 import errno
 import functools
@@ -7,7 +7,6 @@ import json
 import platform
 import shutil
 import signal
-import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
@@ -16,119 +15,130 @@ from pathlib import Path
 from typing import Any
 
 from runner import Failed, Refused, say
-from runner.artifacts import accept, contents, discard, put_in_place, recover, wear
-from runner.engine import Engine, Local, Needs, Task
+from runner.artifacts import accept_changes, delete_folder, diff_artifact, hash_contents, recover_swap, replace_artifact
+from runner.engine import Engine, LocalEngine, Resources, Task
 from runner.files import (
-    CURES,
     MACHINE,
     RECEIPT,
-    files_below,
-    hand_out,
-    locked,
+    check_lock,
+    export_folders,
+    hold_lock,
+    list_files,
     read_json,
     read_receipt,
-    refuse_lost,
-    shown,
     write_json,
     write_text,
 )
 from runner.keys import Hashes, Inputs
-from runner.lost import take_over
 from runner.pipeline import SCENE
-from runner.plan import Decision, amount, decide, expected_seconds, needs_in_use, partial_folder, plan, table
-from runner.resolve import Job, Request, ask, child, resolve
+from runner.plan import Decision, decide, expected_seconds, partial_folder, plan, plan_table, used_needs
+from runner.resolve import Job, Request, resolve
+from runner.retry import take_over
+from runner.text import REMEDIES, display_path
 
 PACKAGES = ("reffusion", "numpy", "torch", "numba", "diffusers", "transformers", "peft", "pycolmap", "gsplat")
-LITTLE = 2**20  # bytes: a disk with less is full
+FULL_DISK_BYTES = 2**20  # a disk with less free space counts as full
 
 
 @dataclass(frozen=True)
-class Work:
-    """How a job's stages are done. cores: of each of them, None: all there are. output: the file to which what they
-    print is added, None: where the runner's own goes. watch: told each stage and what becomes of it, waits, runs, done
-    (or it is cached, left out, or provided)."""
+class Execution:
+    """How stages are run.
+
+    Attributes:
+        engine: where.
+        cores: for each stage; None: all, or with several scenes an equal part for each.
+        output: the file to which stages append what they print; None: the runner's own output.
+        on_change: called with a stage and its new state: waits, runs or done (also where it need not run).
+    """
 
     engine: Engine
     cores: int | None = None
     output: Path | None = None
-    watch: Callable[[str, str], None] = lambda stage, word: None
+    on_change: Callable[[str, str], None] = lambda stage, state: None
 
 
-def run_stage(
-    job: Job, stage: str, decision: Decision, earlier: dict[str, Decision], lock: int, work: Work
+def _run_stage(
+    job: Job, stage: str, decision: Decision, earlier: dict[str, Decision], lock: int, execution: Execution
 ) -> Decision:
-    """Do the stage in `.partial-<stage>-<key>`, which may hold what an earlier try left, and put it in place."""
+    """Run a stage in `.partial-<stage>-<key>`, which may hold the state of an earlier try, and move it into place."""
     assert decision.inputs
     partial, place = partial_folder(job, stage, decision.inputs.key), job.home / stage
     take_over(partial)
-    if not partial.exists() and (other := copied_from_variant(job, stage, decision.inputs.key, partial)):
+    if not partial.exists() and (other := _copy_from_variant(job, stage, decision.inputs.key, partial)):
         say(f"{stage}: the same as in {other}: copied")
-    if not read_receipt(partial):  # it is there where the runner was killed just before the swap
+    if not read_receipt(partial):  # there is one if the runner was killed just before the renames
         resumed = partial.exists()
         partial.mkdir(parents=True, exist_ok=True)
         seconds = expected_seconds(job, stage)
         say(f"{stage}: {decision.reason}" + (f"; about {seconds:.0f} s" if seconds is not None else ""))
-        result = {"resumed": resumed} | _done_by(
-            work, job, stage, partial, earlier, lock
-        )  # the last try's seconds only
+        result = _run_in_engine(execution, job, stage, partial, earlier, lock)  # seconds of the last try only
         say(f"{stage}: done in {result['seconds']:.1f} s, {result['peak_memory_mb']} MB")
-        refuse_lost(lock)
-        write_json(partial / RECEIPT, _receipt(job, stage, decision.inputs, partial, result))
-    for line in hand_out(partial, place, job.home, job.pipeline.stages[stage].hands_out):
-        say(line)
-    put_in_place(partial, place, job.hashes)
+        check_lock(lock)
+        write_json(partial / RECEIPT, _receipt(job, stage, decision.inputs, partial, {"resumed": resumed} | result))
+    for message in export_folders(partial, place, job.home, job.pipeline.stages[stage].export):
+        say(message)
+    replace_artifact(partial, place, job.hashes)
     for other in job.home.glob(f".partial-{stage}-*"):
-        discard(other)
+        delete_folder(other)
     job.hashes.save()
-    return replace(decision, word="cached", reason="made now", path=place, settled=True)
+    return replace(decision, status="cached", reason="made now", path=place, is_final=True)
 
 
-def copied_from_variant(job: Job, stage: str, key: str, to: Path) -> str | None:
-    """Where another variant of the scene has done this very work, copy it; that variant's folder, or None."""
+def _copy_from_variant(job: Job, stage: str, key: str, to: Path) -> str | None:
+    """Copy the artifact with this key from another variant of the scene; returns that variant's folder, or None."""
     for home in sorted(job.runs.glob(f"{job.base.name}@*")):
         if home != job.home and (read_receipt(home / stage) or {}).get("key") == key:
-            with suppress(Refused), locked(job.runs, home.name, shared=True, wait=False):
+            with suppress(Refused), hold_lock(job.runs, home.name, shared=True, wait=False):
                 copy, found = job.home / f".copying-{stage}", read_receipt(home / stage)
-                discard(copy)
-                if found and found["key"] == key and not wear(home / stage, job.hashes).words():
+                delete_folder(copy)
+                if found and found["key"] == key and not diff_artifact(home / stage, job.hashes).describe():
                     shutil.copytree(home / stage, copy)
                     copy.rename(to)
                     return home.name
     return None
 
 
-def _done_by(
-    work: Work, job: Job, stage: str, partial: Path, earlier: dict[str, Decision], lock: int
+def _run_in_engine(
+    execution: Execution, job: Job, stage: str, partial: Path, earlier: dict[str, Decision], lock: int
 ) -> dict[str, Any]:
-    """The result the stage's process told. Raises Failed with its error, KeyboardInterrupt where it was interrupted."""
+    """Run the stage's process; returns its answer, see `worker.run`.
+
+    Raises:
+        Failed: with the stage's error.
+        KeyboardInterrupt: it was interrupted.
+    """
     log = job.home / f"{stage}.log"
-    needs = dict.fromkeys(job.pipeline.stages[stage].takes)
-    needs |= {need: job.folder if need == SCENE else earlier[need].path for need in needs_in_use(job, stage)}
+    needs = dict.fromkeys(job.pipeline.stages[stage].all_needs)
+    needs |= {need: job.folder if need == SCENE else earlier[need].path for need in used_needs(job, stage)}
     line = {"stage": stage, "params": job.params[stage], "out": partial, "log": log, "needs": needs}
-    task = Task(job.root, json.loads(json.dumps(line, default=str)), work.output)
-    wanted = Needs(work.cores, int(job.params[stage].get("device") == "cuda"), memory_of(job, stage, needs))
-    work.watch(stage, "waits")
-    ended = work.engine.run(task, wanted, lock, lambda: work.watch(stage, "runs"))
-    code, answer = ended.code, ended.answer
+    task = Task(job.root, json.loads(json.dumps(line, default=str)), execution.output)
+    gpus = int(job.params[stage].get("device") == "cuda")
+    resources = Resources(execution.cores, gpus, expected_memory_mb(job, stage, needs))
+    execution.on_change(stage, "waits")
+    result = execution.engine.run(task, resources, lock, lambda: execution.on_change(stage, "runs"))
+    code, answer = result.code, result.answer
     if code == 0 and answer:
         return answer
     how = f"ended by signal {-code} ({signal.Signals(-code).name})" if code < 0 else f"ended with code {code}"
     hint = "; out of memory?" if code == -signal.SIGKILL else ""
-    said = answer.get("error", how + hint)
-    if shutil.disk_usage(job.home).free < LITTLE and CURES[errno.ENOSPC] not in said:  # libraries do not tell
-        said += f"; the disk is full: {CURES[errno.ENOSPC]}"
-    raise Failed(f"{stage}: {said} (all of it in {shown(log)})")
+    error = answer.get("error", how + hint)
+    is_full = shutil.disk_usage(job.home).free < FULL_DISK_BYTES
+    if is_full and REMEDIES[errno.ENOSPC] not in error:  # libraries do not report it
+        error += f"; the disk is full: {REMEDIES[errno.ENOSPC]}"
+    raise Failed(f"{stage}: {error} (all of it in {display_path(log)})")
 
 
-def memory_of(job: Job, stage: str, needs: dict[str, Path | None]) -> int:
-    """MB of the CPU's that a stage may take: a tenth above what it last took for this scene, or a variant of it; where
-    it has not run yet by pipeline.yaml's `memory`, from the size of the files that it reads."""
+def expected_memory_mb(job: Job, stage: str, needs: dict[str, Path | None]) -> int:
+    """MB of CPU memory to reserve for a stage.
+
+    10% above its last peak on this scene or a variant of it; before its first run by `memory` of pipeline.yaml, from
+    the size of the files that it reads."""
     places = [job.runs / job.base.name, *job.runs.glob(f"{job.base.name}@*")]
-    took = [r["peak_memory_mb"] for place in places if (r := read_receipt(place / stage)) and r.get("peak_memory_mb")]
-    if took:
-        return round(1.1 * max(took))
+    peaks = [r["peak_memory_mb"] for place in places if (r := read_receipt(place / stage)) and r.get("peak_memory_mb")]
+    if peaks:
+        return round(1.1 * max(peaks))
     each = job.pipeline.memory.get(stage)
-    read = (path for folder in needs.values() if folder for path in files_below(folder))
+    read = (path for folder in needs.values() if folder for path in list_files(folder))
     return round(each.mb + each.each * sum(path.stat().st_size for path in read) / 2**20) if each else 0
 
 
@@ -139,7 +149,7 @@ def _receipt(job: Job, stage: str, inputs: Inputs, folder: Path, result: dict[st
         "key": inputs.key,
         **asdict(inputs),
         "profile": job.profile,
-        **contents(folder, job.hashes),
+        **hash_contents(folder, job.hashes),
         "versions": {"python": platform.python_version(), **_installed()},
         "platform": platform.platform(),
         "machine": MACHINE,
@@ -159,83 +169,53 @@ def _installed() -> dict[str, str]:
 
 
 def run_scene(
-    request: Request, target: str, hashes: Hashes | None = None, work: Work | None = None
+    request: Request, target: str, hashes: Hashes | None = None, execution: Execution | None = None
 ) -> dict[str, Path | None]:
-    """Bring `target` and what it needs up to date; stage -> its artifact's folder, None where it is left out.
+    """Bring `target` and what it needs up to date.
 
-    Raises Refused before any work, Failed where a stage fails."""
-    work = work or Work(Local())
+    Returns:
+        stage -> its artifact's folder, None where it is skipped.
+    Raises:
+        Refused: before any work.
+        Failed: a stage fails.
+    """
+    execution = execution or Execution(LocalEngine())
     job = resolve(request, hashes)
     stages = job.pipeline.closure(target)
-    with ExitStack() as held:
+    with ExitStack() as locks:
         if job.home != job.base:
-            held.enter_context(locked(job.runs, job.base.name, shared=True))
-        lock = held.enter_context(locked(job.runs, job.home.name))
+            locks.enter_context(hold_lock(job.runs, job.base.name, shared=True))
+        lock = locks.enter_context(hold_lock(job.runs, job.home.name))
         job.home.mkdir(parents=True, exist_ok=True)
-        recover(job.home, job.hashes)
+        recover_swap(job.home, job.hashes)
         planned = plan(job, stages)
-        say(table(job, planned))
-        refuse_missing(job, planned)
+        say(plan_table(job, planned))
+        _refuse_missing(job, planned)
         write_text(job.home / "profile", job.profile + "\n")
-        inside = job.folder.is_relative_to(job.root)  # then as seen from there
+        inside = job.folder.is_relative_to(job.root)  # then relative to it
         write_text(job.home / "source", f"{job.folder.relative_to(job.root) if inside else job.folder}\n")
         done: dict[str, Decision] = {}
         for position, stage in enumerate(stages):
             done[stage] = decide(job, stage, done)
-            if job.keep and done[stage].word == "cached" and done[stage].path == job.home / stage:
-                accept(job.home / stage, job.hashes)
-            if done[stage].word == "cached":  # one that runs says it itself
-                for line in read_json(done[stage].path / "warnings.json") or ():
-                    say(f"warning: {line}")
-            if done[stage].word == "run":
-                done[stage] = run_stage(job, stage, done[stage], done, lock, work)
-                if any(planned[later].word == "undecided" for later in stages[position + 1 :]):
+            if job.keep and done[stage].status == "cached" and done[stage].path == job.home / stage:
+                accept_changes(job.home / stage, job.hashes)
+            if done[stage].status == "cached":  # a stage that runs prints its warnings itself
+                for warning in read_json(done[stage].path / "warnings.json") or ():
+                    say(f"warning: {warning}")
+            if done[stage].status == "run":
+                done[stage] = _run_stage(job, stage, done[stage], done, lock, execution)
+                if any(planned[later].status == "pending" for later in stages[position + 1 :]):
                     planned = plan(job, stages, done)
-                    if not any(planned[later].word == "undecided" for later in stages[position + 1 :]):
-                        say(table(job, {later: planned[later] for later in stages[position + 1 :]}))
-                    refuse_missing(job, planned)
-            work.watch(stage, "done")
+                    if not any(planned[later].status == "pending" for later in stages[position + 1 :]):
+                        say(plan_table(job, {later: planned[later] for later in stages[position + 1 :]}))
+                    _refuse_missing(job, planned)
+            execution.on_change(stage, "done")
         job.hashes.save()
     return {stage: decision.path for stage, decision in done.items()}
 
 
-def refuse_missing(job: Job, planned: dict[str, Decision]) -> None:
+def _refuse_missing(job: Job, planned: dict[str, Decision]) -> None:
+    """Raise Refused where something is missing for a stage."""
     for stage, decision in planned.items():
-        if decision.word == "missing":
+        if decision.status == "missing":
             raise Refused(f"{job.home.name}: {stage}: {decision.reason}")
-
-
-def weights(request: Request, offline: bool) -> int:
-    """Show the weights of all stages, of a scene where one is named, and fetch what is missing unless `offline`; how
-    many that a stage cannot do without are missing in the end."""
-    job = resolve(request, scene=bool(request.scene))
-    answers = list(zip(job.stages, ask(job.root, list(map(job.question, job.stages))), strict=True))
-    all_needs = [(stage, need) for stage, answer in answers for need in answer.get("needed", ())]
-    all_needs += [
-        (f"{stage}, if asked for", need | {"optional": True})
-        for stage, answer in answers
-        for need in answer.get("optional", ())
-    ]
-    needs = {need["name"]: need for _, need in all_needs}
-    users = {name: ", ".join(stage for stage, need in all_needs if need["name"] == name) for name in needs}
-    missing = [need for need in needs.values() if need["problem"]]
-    to_fetch = [need for need in missing if need["fetched"]]
-    print(f"weights of profile {job.profile} ({job.why})")
-    for name, need in needs.items():
-        state = "here" if not need["problem"] else "to fetch" if need["fetched"] else "not usable"
-        print(f"  {state:<10} {amount(need['bytes']):>12}  {name}  ({users[name]})")
-    for need in missing:
-        if not need["fetched"]:
-            print(f"error: {need['problem']}", file=sys.stderr)
-    for places in dict.fromkeys(tuple(need.get("looked", ())) for need in missing):
-        names = [need["name"] for need in missing if tuple(need.get("looked", ())) == places]
-        if places:
-            print(f"looked for {', '.join(names)} in {', '.join(places)}")
-    unsized = " and what has no known size" if any(need["bytes"] is None for need in to_fetch) else ""
-    print(f"to fetch: about {amount(sum(need['bytes'] or 0 for need in to_fetch))}{unsized}", flush=True)
-    unusable = len(missing) - len(to_fetch)
-    if offline or not to_fetch:
-        return unusable + sum(not need["optional"] for need in to_fetch)
-    process = child(request.root, "fetch")
-    process.communicate(json.dumps({stage: job.question(stage) for stage in job.stages}))
-    return unusable + process.returncode

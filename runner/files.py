@@ -1,6 +1,5 @@
-"""Files on the disk: written whole or not at all, locks, and copies that people work with."""
+"""Files on disk: listing, atomic writes, receipts, locks, and exported copies that people work with."""
 
-import errno
 import fcntl
 import filecmp
 import json
@@ -13,17 +12,19 @@ from pathlib import Path
 from typing import Any
 
 from runner import Failed, Refused, say
+from runner.text import display_path
 
 RECEIPT = "receipt.json"
-WHOLE = {"key", "params", "needs", "weights", "code", "output"}  # what a receipt holds at least
+RECEIPT_KEYS = {"key", "params", "needs", "weights", "code", "output", "files"}  # what a receipt holds at least
 MACHINE = platform.node()
-CURES = dict.fromkeys(
-    (errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "make room, and the same command goes on from here"
-) | dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "runs=FOLDER puts results elsewhere")
 
 
-def files_below(folder: Path) -> Iterator[Path]:
-    """Files, sorted, links followed, hidden names left out."""
+def list_files(folder: Path) -> Iterator[Path]:
+    """All files below a folder, sorted. Follows links, and leaves out hidden names and __pycache__.
+
+    Raises:
+        Refused: a pipe or a device lies there.
+    """
     seen = set()
     for place, folders, names in os.walk(folder, followlinks=True):
         real = os.path.realpath(place)
@@ -38,7 +39,7 @@ def files_below(folder: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """At once or not at all."""
+    """Write a file atomically, and create its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.writing")
     try:
@@ -50,11 +51,12 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, content: Any) -> None:
+    """Write a JSON file atomically."""
     write_text(path, json.dumps(content, indent=1) + "\n")
 
 
 def read_text(path: Path) -> str:
-    """What a file says, stripped; nothing where it is none, or no text."""
+    """The stripped text of a file; "" where there is no file, or it is not text."""
     try:
         return path.read_text(encoding="utf-8").strip()
     except (OSError, ValueError):
@@ -62,7 +64,7 @@ def read_text(path: Path) -> str:
 
 
 def read_json(path: Path) -> Any:
-    """What a file holds; None where it is none, or not whole."""
+    """The content of a JSON file; None where there is no file, or it is not valid."""
     try:
         return json.loads(path.read_text())
     except (OSError, ValueError):
@@ -70,34 +72,29 @@ def read_json(path: Path) -> Any:
 
 
 def read_receipt(artifact: Path) -> dict[str, Any] | None:
-    """None where there is none, or not a whole one."""
+    """The receipt of an artifact; None where it is missing or not complete."""
     found = read_json(artifact / RECEIPT)
-    return found if isinstance(found, dict) and found.keys() >= WHOLE else None
-
-
-def shown(path: Path) -> str:
-    """A path as people type it: from the current folder where it lies below."""
-    return os.path.relpath(path) if path.is_relative_to(Path.cwd()) else str(path)
-
-
-def told(error: BaseException) -> str:
-    """What went wrong, in one line."""
-    text = " ".join(str(error).split())
-    if isinstance(error, OSError) and error.errno in CURES:
-        return f"{error.filename or 'a file'}: {error.strerror}; {CURES[error.errno]}"
-    return text if isinstance(error, ValueError | Refused | Failed) and text else f"{type(error).__name__}: {text}"
+    return found if isinstance(found, dict) and found.keys() >= RECEIPT_KEYS else None
 
 
 @contextmanager
-def locked(runs: Path, name: str, shared: bool = False, wait: bool = True) -> Iterator[int]:
-    """Hold `runs/.locks/<name>`; yields its file descriptor. The system frees it when all who hold it have ended."""
+def hold_lock(runs: Path, name: str, shared: bool = False, wait: bool = True) -> Iterator[int]:
+    """Hold the lock `runs/.locks/<name>`. The system releases it when all processes that hold it have ended.
+
+    Yields:
+        Its file descriptor.
+    Raises:
+        Refused: another process holds it and `wait` is False, or the file system has no locks.
+    """
     path = runs / ".locks" / name
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(path, "a+") as file:
         _lock(file.fileno(), name, fcntl.LOCK_SH if shared else fcntl.LOCK_EX, wait)
         _, host = _holder(file.fileno())
         if host not in ("", MACHINE):
-            say(f"{name} was last in use on {host}; is it still? One machine at a time may work in {shown(runs)}")
+            say(
+                f"{name} was last in use on {host}; is it still? One machine at a time may work in {display_path(runs)}"
+            )
         if not shared:
             _sign(file.fileno(), f"{os.getpid()} {MACHINE}\n")
         yield file.fileno()
@@ -120,36 +117,43 @@ def _lock(lock: int, name: str, mode: int, wait: bool) -> None:
 
 
 def _holder(lock: int) -> tuple[str, str]:
-    """Process and machine, as the one that holds a lock, or that was killed while it did, has written them into it."""
+    """Process and machine of the last holder of a lock, as it wrote them into the file; a killed one leaves them."""
     process, _, host = os.pread(lock, 999, 0).decode(errors="replace").strip().partition(" ")
     return process, host
 
 
 def _sign(lock: int, text: str) -> None:
-    with suppress(OSError):  # a full disk: who holds a lock is good to know, no more
+    with suppress(OSError):  # a full disk: the holder is for messages only
         os.ftruncate(lock, 0)
         os.write(lock, text.encode())
 
 
-def refuse_lost(lock: int) -> None:
-    """Failed where the file of a lock was removed: another process may hold a new one of the same name."""
+def check_lock(lock: int) -> None:
+    """Check that the file of a lock still exists: if not, another process may hold a new one of the same name.
+
+    Raises:
+        Failed: it was removed.
+    """
     if not os.fstat(lock).st_nlink:
         raise Failed("its lock in .locks was removed, so another process may be at work here; the same command goes on")
 
 
-def hand_out(made: Path, before: Path, home: Path, names: tuple[str, ...]) -> Iterator[str]:
-    """Copy the folders `names` of an artifact to `home`; yields what there is to say, a line each.
+def export_folders(new: Path, old: Path, home: Path, names: tuple[str, ...]) -> Iterator[str]:
+    """Copy the folders `names` of the artifact `new`, which replaces `old`, to `home`.
 
-    A file that was handed out `before`, of the artifact that is replaced, and is no longer `made` goes; one that a
-    person changed or added stays as it is."""
+    Removes exported files of `old` that `new` does not have. Files that a person changed or added stay.
+
+    Yields:
+        A message for each file that stays although `new` has another version.
+    """
     for name in names:
-        for path in list(files_below(home / name)):
-            twins = [artifact / path.relative_to(home) for artifact in (before, made)]
+        for path in list(list_files(home / name)):
+            twins = [artifact / path.relative_to(home) for artifact in (old, new)]
             if any(twin.is_file() and filecmp.cmp(path, twin, shallow=False) for twin in twins):
                 path.unlink()
-        kept = [path.relative_to(home) for path in files_below(home / name)]
-        for path in files_below(made / name):
-            relative = path.relative_to(made)
+        kept = [path.relative_to(home) for path in list_files(home / name)]
+        for path in list_files(new / name):
+            relative = path.relative_to(new)
             if relative not in kept:
                 (home / relative).parent.mkdir(parents=True, exist_ok=True)
                 partial = (home / relative).with_name(f".{relative.name}.writing")

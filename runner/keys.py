@@ -1,4 +1,4 @@
-"""What an artifact depends on, as hashes."""
+"""Hashes of what an artifact depends on: contents of folders, code, parameters, weights."""
 
 import ast
 import hashlib
@@ -12,18 +12,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from reffusion.command import installed
+from reffusion.command import is_installed
 from runner import Refused
-from runner.files import RECEIPT, files_below, read_json, write_text
+from runner.files import RECEIPT, list_files, read_json, write_text
 
-OWN = ("reffusion", "stages")  # the packages whose modules count as a stage's code where it imports them
-HASHES = ".hashes.json"  # in runs/: where they are remembered
+CODE_PACKAGES = ("reffusion", "stages")  # modules of these packages are part of a stage's code where it imports them
+HASHES = ".hashes.json"  # in runs/: the cache of hashes
 NOT_CONTENT = (RECEIPT, "trace.jsonl", "warnings.json", "checkpoint.pt", "checkpoint.pt.writing")
-NOT_WEIGHTS = (".md", ".py", ".png", ".jpg")  # a model's card, its pictures, the scripts that trained it
+NOT_WEIGHTS = (".md", ".py", ".png", ".jpg")  # a model's card, pictures and training scripts
 
 
 def digest(*parts: str) -> str:
-    """20 hexadecimal digits that depend on every part and on where one ends."""
+    """A hash of a sequence of texts, 20 hexadecimal digits."""
     state = hashlib.blake2b(digest_size=10)
     for part in parts:
         data = part.encode()
@@ -31,39 +31,43 @@ def digest(*parts: str) -> str:
     return state.hexdigest()
 
 
-def content(listing: dict[str, str], leave_out: tuple[str, ...] = NOT_CONTENT) -> str:
-    """One hash of names and hashes, but for the files and folders in `leave_out`."""
-    kept = {name: file for name, file in listing.items() if name.partition("/")[0] not in leave_out}
+def hash_listing(listing: dict[str, str], exclude: tuple[str, ...] = NOT_CONTENT) -> str:
+    """One hash of file names and their hashes, without the files and folders in `exclude`."""
+    kept = {name: file for name, file in listing.items() if name.partition("/")[0] not in exclude}
     return digest(*(part for item in kept.items() for part in item))
 
 
 class Hashes:
-    """Hashes of files, remembered in a JSON file for as long as inode, size and time of change stay the same; beside
-    them what stages say of themselves (`resolve`)."""
+    """Hashes of files, cached in a JSON file while inode, size and modification time stay the same.
 
-    LIMIT = 1_000_000  # entries kept, the latest; a demo scene and its results are 1,000
-    SLOW, SHARE = 0.1, 50  # a save that took so many seconds is not repeated before so many times that
+    The cache also holds the descriptions of stages (`resolve.resolve_all`)."""
 
-    def __init__(self, path: Path, afresh: bool = False):
-        """afresh: compute all that is asked for, once; `rotten` are files that changed though nothing else says so."""
-        self.path, self.afresh = path, afresh
-        self.rotten: list[Path] = []
+    LIMIT = 1_000_000  # the newest entries are kept; a demo scene and its results have 1,000
+    # A save that took more than SLOW seconds is not repeated before WAIT times its duration.
+    SLOW, WAIT = 0.1, 50
+
+    def __init__(self, path: Path, recompute: bool = False):
+        """With `recompute` ignores cached hashes; `corrupt` lists files whose content changed and nothing else."""
+        self.path, self.recompute = path, recompute
+        self.corrupt: list[Path] = []
         found = read_json(path)
         self.known: dict[str, Any] = found if isinstance(found, dict) else {}
-        self._saved, self._saving = 0 if afresh else len(self.known), threading.Lock()
-        self._took, self._at = 0.0, 0.0  # seconds of the last save, and when it was
-        self._runs: dict[tuple[Path, str], list[Path]] = {}  # a module with its fingerprint -> see `module`
+        self._saved, self._saving = 0 if recompute else len(self.known), threading.Lock()
+        self._took, self._at = 0.0, 0.0  # duration of the last save, and its time; seconds
+        self._imports: dict[tuple[Path, str], list[Path]] = {}  # (module, fingerprint) -> see `module`
 
     def _remember(self, kind: str, path: Path, compute: Any) -> Any:
         stat = os.stat(path)
         name = f"{kind} {stat.st_dev} {stat.st_ino} {stat.st_size} {stat.st_mtime_ns}"
-        if name not in self.known or self.afresh:
+        if name not in self.known or self.recompute:
             before, self.known[name] = self.known.get(name), compute(path)
             if before not in (None, self.known[name]):
-                self.rotten.append(path)
+                self.corrupt.append(path)
         return self.known[name]
 
     def file(self, path: Path) -> str:
+        """The hash of a file's content."""
+
         def content(path: Path) -> str:
             with open(path, "rb") as file:
                 return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=10)).hexdigest()
@@ -71,72 +75,73 @@ class Hashes:
         return self._remember("file", path, content)
 
     def module(self, path: Path, root: Path) -> tuple[str, list[Path]]:
-        """The fingerprint of a Python file, and those files below `root` that its imports run."""
+        """The fingerprint of a Python file, and the files below `root` that it imports."""
         names, fingerprint = self._remember("module", path, _read_module)
-        if (path, fingerprint) not in self._runs:
-            self._runs[path, fingerprint] = list(_run_by(names, path, root))
-        return fingerprint, self._runs[path, fingerprint]
+        if (path, fingerprint) not in self._imports:
+            self._imports[path, fingerprint] = list(_imported_files(names, path, root))
+        return fingerprint, self._imports[path, fingerprint]
 
-    def folder(self, folder: Path, leave_out: tuple[str, ...] = NOT_CONTENT) -> str:
-        """Names and contents of all files below `folder`, but hidden ones and those at its top in `leave_out`."""
-        return content(self.listing(folder), leave_out)
+    def folder(self, folder: Path, exclude: tuple[str, ...] = NOT_CONTENT) -> str:
+        """One hash of all files below `folder`, without hidden ones and those at its top in `exclude`."""
+        return hash_listing(self.listing(folder), exclude)
 
     def listing(self, folder: Path) -> dict[str, str]:
-        """Name, as seen from `folder`, and hash of all files below, but hidden ones."""
+        """Name, relative to `folder`, -> hash of all files below, without hidden ones."""
         top = os.path.join(folder, "")
-        return {str(path)[len(top) :]: self.file(path) for path in files_below(folder)}
+        return {str(path)[len(top) :]: self.file(path) for path in list_files(folder)}
 
     def files(self, folder: Path, files: Iterable[Path]) -> str:
-        """Names as seen from `folder` and contents of these files, in this order."""
+        """One hash of these files: names relative to `folder`, and contents, in this order."""
         top = os.path.join(folder, "")
         name = lambda path: path[len(top) :] if path.startswith(top) else os.path.relpath(path, folder)
         return digest(*(part for path in files for part in (name(str(path)), self.file(path))))
 
     def weights(self, folder: Path) -> str:
-        """Of a model's folder: what a library may read of it. Writing in its card reruns nothing. Or of a file."""
-        read = [path for path in files_below(folder) if path.suffix not in NOT_WEIGHTS]
+        """The hash of a file of weights, or of a model's folder without its card: an edit there reruns nothing."""
+        read = [path for path in list_files(folder) if path.suffix not in NOT_WEIGHTS]
         return self.file(folder) if folder.is_file() else self.files(folder, read)
 
     def save(self) -> None:
-        began = time.monotonic()
-        if len(self.known) == self._saved or (self._took > self.SLOW and began - self._at < self.SHARE * self._took):
+        """Write the cache, unless nothing is new or the last save was slow and recent."""
+        started = time.monotonic()
+        if len(self.known) == self._saved or (self._took > self.SLOW and started - self._at < self.WAIT * self._took):
             return
         kept = dict(list(self.known.copy().items())[-self.LIMIT :])  # other threads may add to it
-        # A full disk, or one that is only read: they are computed again the next time.
+        # A full or read-only disk: the hashes are computed again the next time.
         with suppress(OSError), self._saving:
-            partial = self.path.with_name(f"{self.path.name}.{os.getpid()}")  # runners of other scenes do the same
+            partial = self.path.with_name(f"{self.path.name}.{os.getpid()}")  # runners of other scenes write here too
             write_text(partial, json.dumps(kept))
             os.replace(partial, self.path)
             self._saved, self._at = len(self.known), time.monotonic()
-            self._took = self._at - began
+            self._took = self._at - started
 
 
-def outside(value: Any, folder: Path) -> Iterator[Path]:
-    """Files and folders named anywhere in `value`, relative to the scene, that the scene's folder does not hold."""
+def paths_outside(value: Any, folder: Path) -> Iterator[Path]:
+    """Existing files and folders that `value` names anywhere, relative to the scene, outside the scene's folder."""
     if isinstance(value, dict | list):
         for part in value.values() if isinstance(value, dict) else value:
-            yield from outside(part, folder)
+            yield from paths_outside(part, folder)
     elif isinstance(value, str) and value and "\0" not in value and len(value) < 1024:
         path = (folder / value).resolve()
         if ("/" in value or value == "..") and not path.is_relative_to(folder) and path.exists():
             yield path
 
 
-def elsewhere(files: Iterable[str], folder: Path) -> list[Path]:
-    """Those of these files that are not reached through the folder."""
+def files_outside(files: Iterable[str], folder: Path) -> list[Path]:
+    """Those of `files` that are not reached through the folder."""
     paths = (Path(os.path.normpath(os.path.join(folder, file))) for file in files)
     return [path for path in paths if not path.is_relative_to(folder)]
 
 
 def fingerprint(tree: ast.Module) -> str:
-    """A hash of Python code that comments, docstrings, layout and descriptions of fields do not change."""
+    """A hash of Python code that ignores comments, docstrings, layout and descriptions of fields."""
     for node in ast.walk(tree):
         body = getattr(node, "body", None)
         if isinstance(body, list):
             body[:] = [s for s in body if not (isinstance(s, ast.Expr) and isinstance(s.value, ast.Constant))]
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Field":
             node.keywords = [k for k in node.keywords if k.arg != "description"]
-    return digest(ast.unparse(tree))  # text, because the trees of two Python versions print differently
+    return digest(ast.unparse(tree))  # as text: syntax trees print differently in other Python versions
 
 
 def _read_module(path: Path) -> list[Any]:
@@ -144,12 +149,13 @@ def _read_module(path: Path) -> list[Any]:
         tree = ast.parse(path.read_text(encoding="utf-8"))
     except SyntaxError as error:
         raise Refused(f"{path}:{error.lineno}: not valid Python: {error.msg}") from None
-    return [sorted(set(_imported(tree))), fingerprint(tree)]  # which changes the tree
+    return [sorted(set(_imported(tree))), fingerprint(tree)]  # changes the tree, so it comes last
 
 
 def _imported(tree: ast.AST) -> Iterator[str]:
-    """Every imported name that may be a module (`.name`: relative), also those imported inside functions, but for
-    those under `if TYPE_CHECKING`, which are never run."""
+    """Every imported name that may be a module (`.name` if relative), also inside functions.
+
+    Leaves out imports under `if TYPE_CHECKING`, which never run."""
     for node in ast.iter_child_nodes(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -161,28 +167,29 @@ def _imported(tree: ast.AST) -> Iterator[str]:
             yield from _imported(node)
 
 
-def _named(path: Path, root: Path) -> Path:
-    """From the root; a module of the library from beside it where it is installed, for it then holds the root."""
+def _module_path(path: Path, root: Path) -> Path:
+    """The path of a module relative to the root. An installed library contains the root, so its modules are relative to
+    the library's parent."""
     return path.relative_to(root if path.is_relative_to(root) else root.parents[1])
 
 
-def _run_by(names: Iterable[str], path: Path, root: Path) -> Iterator[Path]:
-    """The files of our own packages that importing `names` in the file at `path` runs."""
+def _imported_files(names: Iterable[str], path: Path, root: Path) -> Iterator[Path]:
+    """Files of CODE_PACKAGES that run when the file at `path` imports `names`."""
     places = set()
     for name in names:
         level = len(name) - len(name.lstrip("."))
-        package = _named(path, root).parts[:-level] if level else ()
+        package = _module_path(path, root).parts[:-level] if level else ()
         parts = (*package, *filter(None, name.lstrip(".").split(".")))
-        if parts and parts[0] in OWN:
-            base = root.parents[1] if parts[0] == "reffusion" and installed(root) else root
+        if parts and parts[0] in CODE_PACKAGES:
+            base = root.parents[1] if parts[0] == "reffusion" and is_installed(root) else root
             places |= {os.path.join(base, *parts[: n + 1]) for n in range(len(parts))}  # a.b.c runs a and a.b too
     yield from (Path(p) for place in places for p in (f"{place}.py", f"{place}/__init__.py") if os.path.isfile(p))
 
 
-def code_of(root: Path, stage: str, hashes: Hashes, folder: str = "stages") -> dict[str, str]:
-    """File -> fingerprint, of stages/<stage>.py and of each module of ours that it imports, directly or not.
+def code_fingerprints(root: Path, stage: str, hashes: Hashes, folder: str = "stages") -> dict[str, str]:
+    """File -> fingerprint, of stages/<stage>.py and of all modules of CODE_PACKAGES that it imports, directly or not.
 
-    What describes a stage beforehand (stages/plan/<stage>.py) is not part of it, unless the stage itself imports it."""
+    The description of a stage (stages/plan/<stage>.py) counts only where the stage imports it."""
     found: dict[Path, str] = {}
     waiting = [root / folder / f"{stage}.py"]
     while waiting:
@@ -190,56 +197,57 @@ def code_of(root: Path, stage: str, hashes: Hashes, folder: str = "stages") -> d
         if path not in found:
             found[path], imported = hashes.module(path, root)
             waiting += imported
-    return {_named(path, root).as_posix(): found[path] for path in sorted(found)}
+    return {_module_path(path, root).as_posix(): found[path] for path in sorted(found)}
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """All that an artifact depends on; kept in its receipt, so that a rerun can say what changed."""
+    """All that an artifact depends on. The receipt stores it, so that a plan can say what changed."""
 
     params: dict[str, Any]  # every parameter of the stage, resolved
-    needs: dict[str, str | None]  # need -> hash of its content, None where it was left out
-    weights: dict[str, str]  # parameter -> hash of the folder or file it names, or the name itself where none is here
+    needs: dict[str, str | None]  # need -> hash of its content, None where the need was skipped
+    weights: dict[str, str]  # parameter -> hash of the folder or file that it names, or the name if it is not local
     code: dict[str, str]  # file -> fingerprint
-    unkeyed: tuple[str, ...] = ()  # parameters that nothing in the artifact depends on
-    unavailable: tuple[str, ...] = ()  # what the stage did without; where it is there, the artifact is made anew
+    unkeyed: tuple[str, ...] = ()  # parameters that do not change the artifact
+    unavailable: tuple[str, ...] = ()  # optional things that were missing; when they are there it is made again
 
     @property
     def key(self) -> str:
         return digest(json.dumps([self.keyed(self.params), self.needs, self.weights, self.code], sort_keys=True))
 
     def keyed(self, params: dict[str, Any]) -> dict[str, Any]:
-        """Dotted name -> value, of those parameters that count."""
+        """Dotted name -> value, of the parameters that are part of the key."""
         inside = tuple(f"{name}." for name in self.unkeyed)
-        return {n: v for n, v in leaves(params).items() if n not in self.unkeyed and not n.startswith(inside)}
+        return {n: v for n, v in flatten_params(params).items() if n not in self.unkeyed and not n.startswith(inside)}
 
 
-def leaves(params: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Dotted name -> value, of all that is no mapping itself."""
+def flatten_params(params: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested parameters as dotted name -> value."""
     found = {}
     for name, value in params.items():
         inner = isinstance(value, dict) and value
-        found |= leaves(value, f"{prefix}{name}.") if inner else {f"{prefix}{name}": value}
+        found |= flatten_params(value, f"{prefix}{name}.") if inner else {f"{prefix}{name}": value}
     return found
 
 
-def changes(old: dict[str, Any], new: Inputs) -> list[str]:
-    """What differs between a receipt and the inputs of today, in words; code comes last."""
-    said, before, after = [], new.keyed(old["params"]), new.keyed(new.params)
+def list_changes(old: dict[str, Any], new: Inputs) -> list[str]:
+    """The differences between a receipt and the current inputs, a phrase each; code comes last."""
+    found, before, after = [], new.keyed(old["params"]), new.keyed(new.params)
     for name in sorted({*before, *after}):
         if name not in after:
-            said.append(f"param {name} is gone")
+            found.append(f"param {name} is gone")
         elif name not in before:
-            said.append(f"param {name} is new")
+            found.append(f"param {name} is new")
         elif before[name] != after[name]:
-            said.append(f"param {name} {_short(before[name])} -> {_short(after[name])}")
+            found.append(f"param {name} {_short(before[name])} -> {_short(after[name])}")
     for kind, then, now in (("need", old["needs"], new.needs), ("weights", old["weights"], new.weights)):
-        said += [f"{kind} {name} changed" for name in sorted({*then, *now}) if then.get(name) != now.get(name)]
-    said += [f"{name} is on this machine now" for name in old.get("unavailable", ()) if name not in new.unavailable]
-    return said + code_changes(old, new)
+        found += [f"{kind} {name} changed" for name in sorted({*then, *now}) if then.get(name) != now.get(name)]
+    found += [f"{name} is on this machine now" for name in old.get("unavailable", ()) if name not in new.unavailable]
+    return found + list_code_changes(old, new)
 
 
-def code_changes(old: dict[str, Any], new: Inputs) -> list[str]:
+def list_code_changes(old: dict[str, Any], new: Inputs) -> list[str]:
+    """The files of code that differ between a receipt and the current inputs, a phrase each."""
     files = sorted({*old["code"], *new.code})
     return [f"code of {name} changed" for name in files if old["code"].get(name) != new.code.get(name)]
 

@@ -1,4 +1,4 @@
-"""`pipeline.yaml` and `scene.yaml`: what they say, checked."""
+"""Reads and checks `pipeline.yaml` and `scene.yaml`, and finds scenes."""
 
 import difflib
 import re
@@ -12,52 +12,53 @@ from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_v
 
 from reffusion.command import workplace
 from runner import Refused
-from runner.handed import read_handed
+from runner.user_yaml import read_user_yaml
 
 SCENE = "scene"  # the need that stands for the scene's own folder
-NAME = re.compile(r"[\w'][\w'\" .,()+\-]*")  # of a scene; none that patterns or variants could be made of
-LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the one in C takes a tenth of the time
+NAME = re.compile(r"[\w'][\w'\" .,()+\-]*")  # names of scenes, without the characters of patterns and variants
+LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the C one takes a tenth of the time
 
 Overrides = dict[str, dict[str, Any]]  # stage -> parameter, or group of parameters -> value
 
 
 class Strict(BaseModel, extra="forbid", frozen=True):
-    """As all of pipeline.yaml: a name that is not known is refused."""
+    """A part of pipeline.yaml; unknown keys are errors."""
 
 
 class Condition(Strict):
-    """A reason to leave a stage out: one question, by `fact`, `param` or `empty`, whose answer is yes."""
+    """A condition under which a stage is skipped: a test of one of `fact`, `param` and `empty`."""
 
-    because: str  # may name facts of that stage in braces
-    fact: str | None = None  # <stage>.<name>: of an earlier stage's facts.json, is `equals`
-    # <stage>.<name>, or a list of them: parameters of any stage, each `equals`
-    param: Annotated[tuple[str, ...], BeforeValidator(lambda said: (said,) if isinstance(said, str) else said)] = ()
+    reason: str  # may name facts of that stage in braces
+    fact: str | None = None  # <stage>.<name>: a value of an earlier stage's facts.json is `equals`
+    # <stage>.<name>, or a list of them: parameters of any stage are all `equals`
+    param: Annotated[tuple[str, ...], BeforeValidator(lambda value: (value,) if isinstance(value, str) else value)] = ()
     equals: Any = None
-    empty: str | None = None  # <stage>/<folder>: of an earlier artifact, is without a file
-    unless: tuple[str, ...] = ()  # ignored where the scene brings one of these keys
-    only: dict[str, Any] = {}  # ignored unless each <stage>.<name>, a parameter, has this value
+    empty: str | None = None  # <stage>/<folder>: a folder of an earlier artifact has no files
+    unless: tuple[str, ...] = ()  # never true where scene.yaml has one of these keys
+    only: dict[str, Any] = {}  # true only while each of these parameters, <stage>.<name>, has its value
 
     @model_validator(mode="after")
-    def _one_question(self) -> Self:
+    def _has_one_test(self) -> Self:
         if sum(map(bool, (self.fact, self.param, self.empty))) != 1:
             raise ValueError("a condition has one of `fact`, `param`, `empty`")
         return self
 
     @property
     def names(self) -> tuple[str, str]:
-        """The stage the question is about, and the name of the fact, parameter or folder."""
+        """The stage that the condition tests, and the name of the fact, parameter or folder."""
         stage, name = re.split(r"[./]", self.fact or self.empty or self.param[0], maxsplit=1)
         return stage, name
 
     @property
-    def waits_for(self) -> tuple[str, ...]:
-        """The stage that must be done before there is an answer, if any."""
+    def depends_on(self) -> tuple[str, ...]:
+        """The stage, if any, that must be done before the condition can be tested."""
         return () if self.param else self.names[:1]
 
 
-class Provided(Strict):
-    """The scene's own file stands for the stage: where scene.yaml has the key `by`, `artifact` is used in its place;
-    where `param: <stage>.<name>` is given, only while that parameter is `equals`."""
+class Substitute(Strict):
+    """The scene's own file replaces the stage: where scene.yaml has the key `by`, `artifact` is used instead.
+
+    With `param: <stage>.<name>` only while that parameter is `equals`."""
 
     by: str
     artifact: str
@@ -65,9 +66,10 @@ class Provided(Strict):
     equals: Any = None
 
 
-class Unread(Strict):
-    """An optional need that the stage does not read while `param: <stage>.<name>` is `equals`: it arrives as None, and
-    where it changes, the stage does not run again."""
+class IgnoredNeed(Strict):
+    """An optional need that the stage does not read while the parameter `param: <stage>.<name>` is `equals`.
+
+    The stage then gets None, and does not run again when the need changes."""
 
     need: str
     param: str
@@ -75,34 +77,50 @@ class Unread(Strict):
 
 
 class Stage(Strict):
-    """needs: earlier stages, or `scene`. optional: needs that may be left out, and then arrive as None. hands_out:
-    folders of its artifact that people work with, copied to runs/<scene>/ where they outlive it."""
+    """A stage of the pipeline.
+
+    Attributes:
+        needs: earlier stages, or `scene`.
+        optional: needs that may be skipped; the stage then gets None.
+        provided: the scene's own file that replaces the stage.
+        ignore: an optional need that the stage does not always read.
+        skip_if: conditions; the stage is skipped where one is true.
+        export: folders of the artifact that people work with, copied to runs/<scene>/, where they stay.
+        params: defaults of parameters.
+    """
 
     needs: tuple[str, ...]
     optional: tuple[str, ...] = ()
-    provided: Provided | None = None
-    unread: Unread | None = None
-    left_out: tuple[Condition, ...] = ()
-    hands_out: tuple[str, ...] = ()
+    provided: Substitute | None = None
+    ignore: IgnoredNeed | None = None
+    skip_if: tuple[Condition, ...] = ()
+    export: tuple[str, ...] = ()
     params: dict[str, Any] = {}
 
     @property
-    def takes(self) -> tuple[str, ...]:
-        """All that run() is handed."""
+    def all_needs(self) -> tuple[str, ...]:
+        """The keyword arguments of run()."""
         return (*self.needs, *self.optional)
 
 
 class Memory(Strict):
-    """What a stage takes of the CPU's: MB of itself, and MB for each MB of the files that it reads."""
+    """CPU memory of a stage: `mb`, and `each` MB more per MB of files that it reads."""
 
     mb: Annotated[float, Field(gt=0)]
     each: Annotated[float, Field(ge=0)] = 0
 
 
 class Pipeline(Strict):
-    """The stages in order; parameters by profile and by variant; the keys of scene.yaml and the stages they go to; the
-    profile in which a profile's methods are compared, where it is another; the parts of a time budget that stages get;
-    what memory they take, where no earlier run tells."""
+    """The content of pipeline.yaml.
+
+    Attributes:
+        stages: name -> stage, in order.
+        scene_keys: stage -> keys of scene.yaml that are parameters of it.
+        profiles, variants: name -> parameters.
+        comparisons: profile -> the profile in which `compare` runs its methods.
+        budget: stage -> its part of a time budget.
+        memory: stage -> expected memory, where no earlier run has measured it.
+    """
 
     stages: dict[str, Stage]
     scene_keys: dict[str, tuple[str, ...]]
@@ -116,10 +134,10 @@ class Pipeline(Strict):
     def _names_are_known(self) -> Self:
         earlier = [SCENE]
         for name, stage in self.stages.items():
-            named = [*stage.takes, *(need for c in stage.left_out for need in c.waits_for)]
-            named += [stage.provided.artifact] if stage.provided else []
-            named += [stage.unread.need] if stage.unread else []
-            for need in named:
+            referenced = [*stage.all_needs, *(need for c in stage.skip_if for need in c.depends_on)]
+            referenced += [stage.provided.artifact] if stage.provided else []
+            referenced += [stage.ignore.need] if stage.ignore else []
+            for need in referenced:
                 if need not in earlier:
                     raise ValueError(f"stage {name} names {need!r}, which is not a stage before it")
             earlier.append(name)
@@ -133,36 +151,36 @@ class Pipeline(Strict):
         for label, layer in tables.items():
             for stage in layer:
                 if stage not in self.stages:
-                    raise ValueError(f"{label} names {unknown('stage', stage, self.stages)}")
+                    raise ValueError(f"{label} names {unknown_name('stage', stage, self.stages)}")
         for name in (name for pair in self.comparisons.items() for name in pair if name not in self.profiles):
-            raise ValueError(f"comparisons names {unknown('profile', name, self.profiles)}")
+            raise ValueError(f"comparisons names {unknown_name('profile', name, self.profiles)}")
         if sum(self.budget.values()) > 1:
             raise ValueError(f"budget: the parts add up to {sum(self.budget.values()):g}, which is more than 1")
         return self
 
     def closure(self, target: str) -> list[str]:
-        """`target` and all it needs, in order; every stage for `all`."""
+        """`target` and the stages that it needs, in order; every stage for `all`."""
         if target == "all":
             return list(self.stages)
         if target not in self.stages:
-            raise Refused(f"pipeline.yaml: {unknown('stage', target, ['all', *self.stages])}")
+            raise Refused(f"pipeline.yaml: {unknown_name('stage', target, ['all', *self.stages])}")
         wanted = {target}
         for name in reversed(self.stages):
             if name in wanted:
                 stage = self.stages[name]
-                wanted |= {*stage.takes, *(need for c in stage.left_out for need in c.waits_for)}
+                wanted |= {*stage.all_needs, *(need for c in stage.skip_if for need in c.depends_on)}
         return [name for name in self.stages if name in wanted]
 
 
-def unknown(kind: str, name: object, known: Any) -> str:
-    """Words for a name that is not known: the one that was meant, or all there are."""
+def unknown_name(kind: str, name: object, known: Any) -> str:
+    """The message for an unknown name, with the nearest known one or all that are known."""
     known = [str(k) for k in known]
     near = difflib.get_close_matches(str(name), known, n=1)
     return f"unknown {kind} {name!r}; " + (f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}")
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Raises Refused where it is not valid, or holds no `key: value` lines."""
+    """The mapping in a YAML file of the project. Raises Refused where it is not valid or not a mapping."""
     try:
         content = yaml.load(path.read_text(encoding="utf-8"), LOADER)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
@@ -173,7 +191,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def load_pipeline(root: Path) -> Pipeline:
-    """Raises Refused where pipeline.yaml is missing, ill-formed, or names a stage that is not there."""
+    """Read pipeline.yaml. Raises Refused where it is missing, ill-formed, or names an unknown stage."""
     path = root / "pipeline.yaml"
     if not path.is_file():
         raise Refused(f"{path}: no such file; the runner's --root is the folder that holds it")
@@ -187,27 +205,28 @@ def load_pipeline(root: Path) -> Pipeline:
 
 @dataclass(frozen=True)
 class SceneFile:
-    """What a scene's optional scene.yaml says."""
+    """The content of a scene's optional scene.yaml."""
 
-    path: Path  # the file, present or not
+    path: Path  # of the file, whether it exists or not
     profile: str | None
-    brings: dict[str, Any]  # the keys, with values, that describe the scene
+    brings: dict[str, Any]  # key -> value, of the keys that describe the scene
     stages: Overrides
     budget: Any = None
 
 
 def load_scene_file(folder: Path, pipeline: Pipeline) -> SceneFile:
+    """Read the scene.yaml of a scene's folder. Raises Refused where a key, stage or type is wrong."""
     path = folder / "scene.yaml"
-    content = read_handed(path, typed=("stages",))
+    content = read_user_yaml(path, typed=("stages",))
     keys = [key for names in pipeline.scene_keys.values() for key in names]
     known = [*keys, "profile", "budget", "stages"]
     for key in (key for key in content if key not in known):
-        raise Refused(f"{path}: {unknown('key', key, known)}")
+        raise Refused(f"{path}: {unknown_name('key', key, known)}")
     stages = content.get("stages") or {}
     if not isinstance(stages, dict) or not all(isinstance(v, dict) for v in stages.values()):
         raise Refused(f"{path}: stages: expected {{stage: {{parameter: value}}}}")
     for stage in (stage for stage in stages if stage not in pipeline.stages):
-        raise Refused(f"{path}: stages: {unknown('stage', stage, pipeline.stages)}")
+        raise Refused(f"{path}: stages: {unknown_name('stage', stage, pipeline.stages)}")
     if not isinstance(content.get("profile"), str | None):
         raise Refused(f"{path}: profile: expected the name of one")
     brings = {key: value for key, value in content.items() if key in keys and value is not None}
@@ -215,12 +234,12 @@ def load_scene_file(folder: Path, pipeline: Pipeline) -> SceneFile:
 
 
 def scene_name(scene: Path) -> str:
-    """What the scene in a folder, or of a video, is called."""
+    """The name of a scene: of its folder, or of a video without the ending."""
     return scene.stem if scene.is_file() else scene.name
 
 
 def find_scene(text: str, root: Path) -> Path:
-    """What is meant by `scene=`, a name under data/ or a path: a folder, or a file that is taken for a video."""
+    """The folder or video that `scene=` means: a name under data/, or a path. Raises Refused where there is none."""
     data = workplace(root) / "data"
     for scene in (data / text, Path(text).expanduser()):
         if text and (scene.is_dir() or scene.is_file()):

@@ -1,4 +1,4 @@
-"""The second step: one word and a reason for each stage, from what lies on the disk; nothing heavy is imported."""
+"""The second step: gives each stage a status and a reason, from what is on disk. Imports nothing heavy."""
 
 import json
 import os
@@ -10,141 +10,161 @@ from pathlib import Path
 from typing import Any
 
 from runner import Refused
-from runner.artifacts import Wear, listed, wear
-from runner.files import MACHINE, RECEIPT, files_below, read_receipt
-from runner.keys import Inputs, changes, code_changes, code_of, digest, elsewhere, leaves, outside
+from runner.artifacts import ArtifactDiff, diff_artifact
+from runner.files import MACHINE, RECEIPT, list_files, read_receipt
+from runner.keys import (
+    Inputs,
+    code_fingerprints,
+    digest,
+    files_outside,
+    flatten_params,
+    list_changes,
+    list_code_changes,
+    paths_outside,
+)
 from runner.pipeline import SCENE, Condition
-from runner.resolve import Job, ask, has_cuda
+from runner.process import ask_stages
+from runner.resolve import Job, has_cuda
+from runner.text import format_bytes, join_names
 
-TO_DO, SETTLED = ("run", "stale", "undecided"), ("cached", "provided", "skip")
+TO_DO, FINAL = ("run", "stale", "pending"), ("cached", "provided", "skip")  # statuses
 
 
 @dataclass(frozen=True)
 class Decision:
-    """The word for a stage: run, cached, provided, skip, missing, stale or undecided."""
+    """What a plan says of a stage.
 
-    word: str
+    Statuses: `run`; `cached`: its artifact is up to date; `provided`: the scene's own file takes its place; `skip`: it
+    is not needed; `missing`: it cannot run, as something is not there; `stale`: it waits for needs that run first, and
+    runs if they come out different; `pending`: known only after an earlier stage has run.
+    """
+
+    status: str
     reason: str
-    path: Path | None = None  # the artifact as it stands; None where there is none or the stage is left out
-    settled: bool = False  # this artifact, or its absence, is final
-    inputs: Inputs | None = None  # what the artifact depends on, where that is known
-    notes: tuple[str, ...] = ()  # what the stage says of itself beforehand
-    needed: tuple[dict[str, Any], ...] = ()  # the weights it will work with: reffusion.weights.Need
-    lacks: tuple[str, ...] = ()  # what this machine has not, for a stage on CUDA: a line each, with what mends it
+    path: Path | None = None  # the artifact as it is now; None where there is none or the stage is skipped
+    is_final: bool = False  # this artifact, or its absence, will not change in this run
+    inputs: Inputs | None = None  # what the artifact depends on, where known
+    notes: tuple[str, ...] = ()  # what the stage reports before it runs
+    needed: tuple[dict[str, Any], ...] = ()  # the weights that it will use: reffusion.weights.Need
+    lacks: tuple[str, ...] = ()  # what this machine lacks for CUDA: a line each, with a remedy
 
 
 def decide(job: Job, stage: str, earlier: dict[str, Decision]) -> Decision:
-    """The word for `stage`, given those of the stages before it."""
+    """The decision for `stage`, given those of the stages before it."""
     spec = job.pipeline.stages[stage]
     if stage in job.broken:
         raise Refused(job.broken[stage])
-    provided = spec.provided
-    if provided and provided.by in job.brings and (not provided.param or _is(job, provided.param, provided.equals)):
-        source = earlier[provided.artifact]
-        return Decision("provided", f"the scene brings `{provided.by}`", source.path, source.settled)
-    unknown_yet = []
-    for condition in spec.left_out:
-        if holds := _holds(job, condition, earlier):
-            return Decision("skip", _because(condition, earlier), settled=True)
+    own = spec.provided
+    if own and own.by in job.brings and (not own.param or _has_value(job, own.param, own.equals)):
+        source = earlier[own.artifact]
+        return Decision("provided", f"the scene brings `{own.by}`", source.path, source.is_final)
+    open_questions = []
+    for condition in spec.skip_if:
+        if holds := _is_true(job, condition, earlier):
+            return Decision("skip", _format_reason(condition, earlier), is_final=True)
         if holds is None:
-            unknown_yet.append(f"left out if {condition.because.split(':')[0]}: known after {condition.names[0]}")
-    needs = {need: earlier[need] for need in needs_in_use(job, stage) if need != SCENE}
+            open_questions.append(f"left out if {condition.reason.split(':')[0]}: known after {condition.names[0]}")
+    needs = {need: earlier[need] for need in used_needs(job, stage) if need != SCENE}
     for need in (need for need in spec.needs if need != SCENE):
-        if needs[need].word == "skip":
-            return Decision("skip", f"needs {need}, which is left out", settled=True)
-        if needs[need].word == "undecided":
-            unknown_yet.append(f"waits for {need}")
+        if needs[need].status == "skip":
+            return Decision("skip", f"needs {need}, which is left out", is_final=True)
+        if needs[need].status == "pending":
+            open_questions.append(f"waits for {need}")
     for param, _, folder in _weights(job, stage):
         if folder and not folder.exists():
             return Decision("missing", f"{stage}.{param}: no weights at {folder}; name a folder, a file or owner/model")
-    code = code_of(job.root, stage, job.hashes)
-    if unknown_yet:
-        return Decision("undecided", unknown_yet[0], _there(job, stage))
-    moving = [need for need, decision in needs.items() if not decision.settled]
-    if moving:
-        path = _there(job, stage)
+    code = code_fingerprints(job.root, stage, job.hashes)
+    if open_questions:
+        return Decision("pending", open_questions[0], _existing_artifact(job, stage))
+    changing = [need for need, decision in needs.items() if not decision.is_final]
+    if changing:
+        path = _existing_artifact(job, stage)
         found = path and read_receipt(path)
         if not path or not found:
             return Decision("run", "no artifact yet")
-        own = job.stages[stage]
-        as_then = Inputs(own.params, found["needs"], found["weights"], code, own.unkeyed, own.unavailable)
-        if known := ([] if job.trust else changes(found, as_then)) or _harm(job, wear(path, job.hashes)):
-            return Decision("run", listed(known), path)
-        return Decision("stale", f"waits for {', '.join(moving)}; kept if the new content is the same", path)
-    return _compare(job, stage, _inputs(job, stage, {need: d.path for need, d in needs.items()}, code))
+        info = job.stages[stage]
+        same_needs = Inputs(info.params, found["needs"], found["weights"], code, info.unkeyed, info.unavailable)
+        differences = [] if job.trust else list_changes(found, same_needs)
+        if differences or (differences := _damage(job, diff_artifact(path, job.hashes))):
+            return Decision("run", join_names(differences), path)
+        return Decision("stale", f"waits for {', '.join(changing)}; kept if the new content is the same", path)
+    return _compare_receipts(job, stage, _inputs(job, stage, {need: d.path for need, d in needs.items()}, code))
 
 
-def needs_in_use(job: Job, stage: str) -> list[str]:
-    """The needs of a stage, without one that its parameters leave unread."""
+def used_needs(job: Job, stage: str) -> list[str]:
+    """The needs of a stage, without one that it ignores with these parameters."""
     spec = job.pipeline.stages[stage]
-    unread = spec.unread and _is(job, spec.unread.param, spec.unread.equals) and spec.unread.need
-    return [need for need in spec.takes if need != unread]
+    ignored = spec.ignore and _has_value(job, spec.ignore.param, spec.ignore.equals) and spec.ignore.need
+    return [need for need in spec.all_needs if need != ignored]
 
 
-def _holds(job: Job, condition: Condition, earlier: dict[str, Decision]) -> bool | None:
-    """Is the condition true? None: not known yet."""
+def _is_true(job: Job, condition: Condition, earlier: dict[str, Decision]) -> bool | None:
+    """Whether a condition holds; None where this is not known yet."""
     stage, name = condition.names
     if job.brings.intersection(condition.unless):
         return False
-    if not all(_is(job, param, value) for param, value in condition.only.items()):
+    if not all(_has_value(job, param, value) for param, value in condition.only.items()):
         return False
     if condition.param:
-        return all(_is(job, param, condition.equals) for param in condition.param)
+        return all(_has_value(job, param, condition.equals) for param in condition.param)
     source = earlier[stage]
-    if source.word == "skip":
+    if source.status == "skip":
         return False
-    if not source.settled or source.path is None:
+    if not source.is_final or source.path is None:
         return None
     if condition.empty:
-        return not any(files_below(source.path / name))
+        return not any(list_files(source.path / name))
     return _fact(source.path, name) == condition.equals
 
 
 def _fact(folder: Path, name: str) -> Any:
+    """A value of an artifact's facts.json."""
     try:
         return json.loads((folder / "facts.json").read_text())[name]
     except (OSError, ValueError, KeyError):
         raise Refused(f"{folder / 'facts.json'}: has no {name!r}, which pipeline.yaml asks for; `verify` it") from None
 
 
-def _because(condition: Condition, earlier: dict[str, Decision]) -> str:
-    """The reason, with the facts that it names."""
-    names = [name for _, name, _, _ in string.Formatter().parse(condition.because) if name]
+def _format_reason(condition: Condition, earlier: dict[str, Decision]) -> str:
+    """The reason of a condition, with the facts that it names."""
+    names = [name for _, name, _, _ in string.Formatter().parse(condition.reason) if name]
     folder = earlier[condition.names[0]].path if names else None
-    return condition.because.format(**{name: _fact(folder, name) for name in names}) if folder else condition.because
+    return condition.reason.format(**{name: _fact(folder, name) for name in names}) if folder else condition.reason
 
 
-def _is(job: Job, param: str, value: Any) -> bool:
-    """Has `<stage>.<name>` this value?"""
-    params = leaves(job.params)
+def _has_value(job: Job, param: str, value: Any) -> bool:
+    """Whether the parameter `<stage>.<name>` has this value."""
+    params = flatten_params(job.params)
     if param not in params:
         raise Refused(f"{job.root / 'pipeline.yaml'}: a condition asks for {param}, which is not there")
     return params[param] == value
 
 
-def _there(job: Job, stage: str) -> Path | None:
+def _existing_artifact(job: Job, stage: str) -> Path | None:
+    """The stage's artifact of this run, else of the scene's own run, up to date or not."""
     return next((home / stage for home in (job.home, job.base) if (home / stage / RECEIPT).is_file()), None)
 
 
 def _weights(job: Job, stage: str) -> Iterator[tuple[str, str, Path | None]]:
-    """Parameter that names weights, its value, and the local folder this is, or None for the id of published ones."""
+    """For each parameter that names weights: its name, its value, and the local path, None for a published id."""
     for param in job.stages[stage].weights:
-        if name := leaves(job.params[stage])[param]:
+        if name := flatten_params(job.params[stage])[param]:
             path = job.root / Path(name).expanduser()
             local = path.exists() or name.startswith(("/", ".", "~")) or name.count("/") != 1
             yield param, name, path if local or (job.root / name.split("/")[0]).is_dir() else None
 
 
 def _inputs(job: Job, stage: str, needs: dict[str, Path | None], code: dict[str, str]) -> Inputs:
+    """What the stage's artifact depends on, with its needs at these paths."""
     own = job.stages[stage]
     hashes = {need: path and job.hashes.folder(path) for need, path in needs.items()}
     hashes |= {f"{SCENE}: {name}": digest(json.dumps(fact)) for name, fact in own.facts.items()}
     hashes |= {f"machine: {name}": fact for name, fact in own.machine.items()}
     if own.reads is not None:
         hashes[SCENE] = job.hashes.files(job.folder, map(Path, own.reads))
-    elif SCENE in job.pipeline.stages[stage].takes:
-        hashes[SCENE] = job.hashes.folder(job.folder, leave_out=("scene.yaml",))
-        for path in outside(own.params, job.folder):
+    elif SCENE in job.pipeline.stages[stage].all_needs:
+        hashes[SCENE] = job.hashes.folder(job.folder, exclude=("scene.yaml",))
+        for path in paths_outside(own.params, job.folder):
             if job.folder.is_relative_to(path):
                 raise Refused(f"{stage}: {path} is named in scene.yaml, and holds the scene itself; name one beside it")
             hashes[str(path)] = job.hashes.folder(path) if path.is_dir() else job.hashes.file(path)
@@ -152,35 +172,38 @@ def _inputs(job: Job, stage: str, needs: dict[str, Path | None], code: dict[str,
     return Inputs(own.params, hashes, weights, code, own.unkeyed, own.unavailable)
 
 
-def _compare(job: Job, stage: str, inputs: Inputs) -> Decision:
-    """Cached where a receipt differs in nothing (the variant's own, else the base's), and the artifact not from it;
-    else run, and why."""
+def _compare_receipts(job: Job, stage: str, inputs: Inputs) -> Decision:
+    """Cached where a receipt (the variant's own, else the scene's) agrees with the inputs and with its artifact.
+
+    Else run, with the differences as reason."""
     places = [home / stage for home in dict.fromkeys((job.home, job.base))]
-    receipts = [(place, changes(found, inputs), found) for place in places if (found := read_receipt(place))]
-    whys = []
+    receipts = [(place, list_changes(found, inputs), found) for place in places if (found := read_receipt(place))]
+    reasons = []
     for place, differs, found in sorted(receipts, key=lambda receipt: bool(receipt[1])):
-        said, worn = [] if place.parent == job.home else [f"shared with {job.base.name}"], wear(place, job.hashes)
-        if differs and not (job.trust and differs == code_changes(found, inputs)):
-            whys.append(differs)
-        elif harm := _harm(job, worn):
-            whys.append(harm)
+        notes = [] if place.parent == job.home else [f"shared with {job.base.name}"]
+        diff = diff_artifact(place, job.hashes)
+        if differs and not (job.trust and differs == list_code_changes(found, inputs)):
+            reasons.append(differs)
+        elif harm := _damage(job, diff):
+            reasons.append(harm)
         else:
-            said = [f"trusted although {listed(differs)}"] if differs else said
-            return Decision("cached", "; ".join([*said, *worn.words()]), place, True, inputs)
-    begun = "; goes on where it stopped" if partial_folder(job, stage, inputs.key).exists() else ""
-    why = listed(whys[0]) if whys else "no artifact yet"
-    return Decision("run", why + begun, receipts[0][0] if receipts else None, False, inputs)
+            notes = [f"trusted although {join_names(differs)}"] if differs else notes
+            return Decision("cached", "; ".join([*notes, *diff.describe()]), place, True, inputs)
+    resumes = "; goes on where it stopped" if partial_folder(job, stage, inputs.key).exists() else ""
+    why = join_names(reasons[0]) if reasons else "no artifact yet"
+    return Decision("run", why + resumes, receipts[0][0] if receipts else None, False, inputs)
 
 
-def _harm(job: Job, worn: Wear) -> list[str]:
-    """What makes an artifact unfit, in words: files that are missing, or not as they were made."""
-    changed = f"{listed(worn.changed)} changed since (keep=1 keeps it)"
-    return [f"{listed(worn.missing)} missing"] * bool(worn.missing) + [changed] * bool(worn.changed and not job.keep)
+def _damage(job: Job, diff: ArtifactDiff) -> list[str]:
+    """Why an artifact cannot be used, a phrase each: files are missing or changed."""
+    missing = [f"{join_names(diff.missing)} missing"] if diff.missing else []
+    changed = [f"{join_names(diff.changed)} changed since (keep=1 keeps it)"] if diff.changed and not job.keep else []
+    return missing + changed
 
 
-def _with_device(job: Job, stage: str, decision: Decision) -> Decision:
-    """The decision, or `missing` for work on a GPU where there is none; what is cached holds on any machine."""
-    if decision.word not in TO_DO or job.params[stage].get("device") != "cuda":
+def _check_device(job: Job, stage: str, decision: Decision) -> Decision:
+    """The decision, or `missing` for a stage on CUDA without a GPU; cached artifacts are valid on any machine."""
+    if decision.status not in TO_DO or job.params[stage].get("device") != "cuda":
         return decision
     if has_cuda() if job.cuda is None else job.cuda:
         return decision
@@ -189,106 +212,105 @@ def _with_device(job: Job, stage: str, decision: Decision) -> Decision:
     return Decision("missing", f"{stage}.device is cuda, and {where}: {cure}")
 
 
-def amount(count: int | None) -> str:
-    """Bytes as people read them; "size unknown" for None."""
-    if count is None:
-        return "size unknown"
-    unit, size = next(((u, s) for u, s in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)) if count >= s), ("bytes", 1))
-    return f"{count / size:.1f} {unit}" if unit == "GB" else f"{count / size:.0f} {unit}"
-
-
 def partial_folder(job: Job, stage: str, key: str) -> Path:
+    """The folder in which the stage works; the same key resumes there."""
     return job.home / f".partial-{stage}-{key}"
 
 
 def plan(job: Job, stages: list[str], done: dict[str, Decision] | None = None) -> dict[str, Decision]:
-    """The words for `stages`, in order; `done` holds those already settled. Asks those that may run, each time anew,
-    for their notes and the weights they need."""
+    """The decisions for `stages`, in order; `done` has those already made.
+
+    Asks each stage that may run for its notes and the weights that it needs; these answers are not cached."""
     decisions = dict(done or {})
     for stage in stages:
         if stage not in decisions:
-            decisions[stage] = _with_device(job, stage, decide(job, stage, decisions))
-    asked = [_question(job, stage, decisions) for stage in stages if decisions[stage].word not in SETTLED]
-    for question, answer in zip(asked, ask(job.root, asked), strict=True):
+            decisions[stage] = _check_device(job, stage, decide(job, stage, decisions))
+    questions = [_stage_question(job, stage, decisions) for stage in stages if decisions[stage].status not in FINAL]
+    for question, answer in zip(questions, ask_stages(job.root, questions), strict=True):
         if "broken" in answer and not done:  # while a job runs, it may be mended before its turn comes
             raise Refused(answer["broken"])
-        decisions[question["stage"]] = _answered(job, question, decisions[question["stage"]], answer)
+        decisions[question["stage"]] = _apply_answer(job, question, decisions[question["stage"]], answer)
     job.hashes.save()
     return {stage: decisions[stage] for stage in stages}
 
 
-def _question(job: Job, stage: str, decisions: dict[str, Decision]) -> dict[str, Any]:
-    """See `child.describe`. What may run is shown its needs as they stand, for a preview. One that reads the scene is
-    asked, and may refuse, before its other needs are made; of these it is shown only what will not change any more."""
+def _stage_question(job: Job, stage: str, decisions: dict[str, Decision]) -> dict[str, Any]:
+    """The question to a stage, see `worker.describe`. A stage that may run gets the paths of its needs, for a preview.
+    One that reads the scene is asked, and may refuse, before its other needs are made; it gets only those of them that
+    are final."""
     spec, question = job.pipeline.stages[stage], job.question(stage)
-    others = {need: decisions[need] for need in spec.takes if need != SCENE}
-    needs = {need: each.path for need, each in others.items() if each.settled or SCENE not in spec.takes}
-    needs |= {SCENE: job.folder} if SCENE in spec.takes else {}
-    if decisions[stage].word in TO_DO and (SCENE in needs or all(map(needs.get, spec.needs))):
-        question["needs"] = {need: str(path) if (path := needs.get(need)) else None for need in spec.takes}
+    others = {need: decisions[need] for need in spec.all_needs if need != SCENE}
+    needs = {need: each.path for need, each in others.items() if each.is_final or SCENE not in spec.all_needs}
+    needs |= {SCENE: job.folder} if SCENE in spec.all_needs else {}
+    if decisions[stage].status in TO_DO and (SCENE in needs or all(map(needs.get, spec.needs))):
+        question["needs"] = {need: str(path) if (path := needs.get(need)) else None for need in spec.all_needs}
     return question
 
 
-def _answered(job: Job, question: dict[str, Any], decision: Decision, answer: dict[str, Any]) -> Decision:
-    """The decision with what the stage says of itself; `missing` where it refuses, or something is unavailable."""
+def _apply_answer(job: Job, question: dict[str, Any], decision: Decision, answer: dict[str, Any]) -> Decision:
+    """The decision with the stage's notes; `missing` where the stage refuses or something is not there."""
     needed, notes = (tuple(answer.get(name, ())) for name in ("needed", "notes"))
-    if decision.word not in TO_DO:
+    if decision.status not in TO_DO:
         return replace(decision, needed=needed)
-    if job.cuda is None and (absent := tuple(answer.get("lacks", ()))):  # of this machine
+    if job.cuda is None and (absent := tuple(answer.get("lacks", ()))):  # this machine runs the stages
         reason = f"{question['stage']}.device is cuda, and {absent[0]}"
         return Decision("missing", reason, needed=needed, lacks=absent)
     cure, lacks = f"`make weights profile={job.profile}` fetches it", [need for need in needed if need["problem"]]
     for need in (need for need in lacks if not need["optional"]):
-        fetch = f"; {cure} ({amount(need['bytes'])})" if need["fetched"] else ""
+        fetch = f"; {cure} ({format_bytes(need['bytes'])})" if need["fetched"] else ""
         return Decision("missing", need["problem"] + fetch, needed=needed)
     if lacks:
-        notes += (f"{lacks[0]['problem']}; {cure} ({amount(sum(need['bytes'] or 0 for need in lacks))})",)
-    if "refusal" in answer and (decision.inputs or SCENE in question["takes"]):  # it looked at what will be
-        decision = replace(decision, word="missing", reason=answer["refusal"])
+        notes += (f"{lacks[0]['problem']}; {cure} ({format_bytes(sum(need['bytes'] or 0 for need in lacks))})",)
+    if "refusal" in answer and (decision.inputs or SCENE in question["takes"]):  # its preview saw the final needs
+        decision = replace(decision, status="missing", reason=answer["refusal"])
     return replace(decision, notes=notes, needed=needed)
 
 
-def table(job: Job, decisions: dict[str, Decision]) -> str:
-    """The profile and why; a line a stage: word, stage, expected time, reason, notes; what there is to download."""
+def plan_table(job: Job, decisions: dict[str, Decision]) -> str:
+    """The plan as text: the profile and its reason; a line per stage with status, expected time, reason and notes; the
+    weights to fetch; files that are read outside the scene's folder."""
     lines = [f"{job.home.name} (profile {job.profile}: {job.why})"]
     for stage, decision in decisions.items():
-        seconds = expected_seconds(job, stage) if decision.word in TO_DO else None
+        seconds = expected_seconds(job, stage) if decision.status in TO_DO else None
         time = f"~{seconds:.0f} s" if seconds is not None else ""
-        lines.append(f"  {decision.word:<9} {stage:<12} {time:>7}  {decision.reason}".rstrip())
+        lines.append(f"  {decision.status:<9} {stage:<12} {time:>7}  {decision.reason}".rstrip())
         lines += [f"{'':33}{note}" for note in decision.notes]
     rest = dict.fromkeys(line for decision in decisions.values() for line in decision.lacks[1:])
     lines += [f"  besides, {line}" for line in rest]
     needs = {need["name"]: need for decision in decisions.values() for need in decision.needed if need["problem"]}
     if sizes := [need["bytes"] or 0 for need in needs.values() if need["fetched"] and not need["optional"]]:
-        lines.append(f"  weights to fetch: {amount(sum(sizes))}, by `make weights profile={job.profile}`")
-    if paths := _read_elsewhere(job, list(decisions)):
+        lines.append(f"  weights to fetch: {format_bytes(sum(sizes))}, by `make weights profile={job.profile}`")
+    if paths := _paths_outside_scene(job, list(decisions)):
         folders = Counter(str(path if path.is_dir() else path.parent) for path in paths)
         named = [f"{path} ({count} file{'s' * (count > 1)})" for path, count in folders.items()]
-        lines.append(f"  read outside the scene's folder: {listed(named)}")
+        lines.append(f"  read outside the scene's folder: {join_names(named)}")
     return "\n".join(lines)
 
 
-def _read_elsewhere(job: Job, stages: list[str]) -> list[Path]:
-    """What the stages read that scene.yaml or the capture's own files name, and the scene's folder does not hold."""
-    there = [stage for stage in stages if stage in job.stages and SCENE in job.pipeline.stages[stage].takes]
-    reads = [path for stage in there for path in elsewhere(job.stages[stage].reads or (), job.folder)]
+def _paths_outside_scene(job: Job, stages: list[str]) -> list[Path]:
+    """Paths outside the scene's folder that the stages read, as scene.yaml or the capture's own files name them."""
+    readers = [stage for stage in stages if stage in job.stages and SCENE in job.pipeline.stages[stage].all_needs]
+    reads = [path for stage in readers for path in files_outside(job.stages[stage].reads or (), job.folder)]
     named = [
-        path for stage in there if job.stages[stage].reads is None for path in outside(job.params[stage], job.folder)
+        path
+        for stage in readers
+        if job.stages[stage].reads is None
+        for path in paths_outside(job.params[stage], job.folder)
     ]
     return sorted({*reads, *named})
 
 
-def as_record(job: Job, decisions: dict[str, Decision], unset: Job) -> dict[str, Any]:
-    """The same for plan.json, which the report reads: stage -> word, reason, notes, artifact's folder below runs/; and
-    the parameters of the job as it is without `set=` and `budget=`."""
+def plan_record(job: Job, decisions: dict[str, Decision], unset: Job) -> dict[str, Any]:
+    """The plan for plan.json, which the report reads: for each stage its status, reason, notes and folder below runs/;
+    and the parameters of `unset`, the same job without `set=` and `budget=`."""
     folder = lambda path: path and os.path.relpath(path, job.runs)
-    words = lambda d: {"word": d.word, "reason": d.reason, "notes": list(d.notes), "folder": folder(d.path)}
-    stages = {stage: words(decision) for stage, decision in decisions.items()}
+    entry = lambda d: {"word": d.status, "reason": d.reason, "notes": list(d.notes), "folder": folder(d.path)}
+    stages = {stage: entry(decision) for stage, decision in decisions.items()}
     return {"profile": job.profile, "stages": stages, "params": unset.params}
 
 
 def expected_seconds(job: Job, stage: str) -> float | None:
-    """What the stage last took for this scene, or a variant of it, on this machine with this profile."""
+    """Seconds of the stage's last run on this scene or a variant of it, on this machine with this profile."""
     places = [job.runs / job.base.name, *job.runs.glob(f"{job.base.name}@*")]
     found = [r for place in places if (r := read_receipt(place / stage))]
     here = [r for r in found if r.get("machine") == MACHINE and r.get("profile") == job.profile]

@@ -1,4 +1,4 @@
-"""`gc`: artifacts that no plan of today uses any more are listed with their sizes, and removed."""
+"""The command `gc`: lists artifacts that no current plan uses, with their sizes, and removes them."""
 
 import sys
 from collections.abc import Iterator
@@ -7,18 +7,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from runner import Refused, say
-from runner.artifacts import discard, recover
-from runner.files import RECEIPT, files_below, locked, read_receipt, read_text, shown
+from runner.artifacts import delete_folder, recover_swap
+from runner.files import RECEIPT, hold_lock, list_files, read_receipt, read_text
 from runner.keys import HASHES, Hashes
+from runner.maintenance import artifact_files, is_home, remove_empty
 from runner.pipeline import load_pipeline
-from runner.plan import amount, plan
+from runner.plan import plan
 from runner.resolve import Request, resolve
-from runner.upkeep import is_home, made_of, remove_empty
+from runner.text import display_path, format_bytes
 
 
 @dataclass(frozen=True)
 class Unused:
-    """An artifact that no plan uses: its folder, bytes that its receipt vouches for, why."""
+    """An artifact that no plan uses: its folder, the bytes of the files in its receipt, and why."""
 
     folder: Path
     size: int
@@ -26,20 +27,20 @@ class Unused:
 
 
 def sweep(request: Request, yes: bool) -> None:
-    """Say what no plan of the scenes in runs/ uses (of one scene and its variants, where one is named), and remove it
-    where `yes`, or where who sits at the terminal says so.
+    """List artifacts that no plan of the scenes in runs/, or of one scene and its variants, uses.
 
-    Plans are those of today's scene.yaml, pipeline.yaml and options; what only older code made counts as used. Removed
-    are files as their receipts say. What has no receipt, what people changed, and what belongs to a scene that is not
-    there stay."""
+    Removes them with `yes`, or after a question on a terminal.
+
+    Plans follow the current scene.yaml, pipeline.yaml and options; artifacts of older code count as used. Only files in
+    receipts are removed. Files that people added or changed stay, and so do artifacts of a scene that is not there."""
     hashes = Hashes(request.runs / HASHES)
     found = list(_unused(request, hashes))
     for each in found:
-        say(f"{amount(each.size):>9}  {shown(each.folder)}: {each.why}")
+        say(f"{format_bytes(each.size):>9}  {display_path(each.folder)}: {each.why}")
     if not found:
         say("nothing that no plan uses")
         return
-    say(f"{amount(sum(each.size for each in found)):>9}  together, in {len(found)} artifacts")
+    say(f"{format_bytes(sum(each.size for each in found)):>9}  together, in {len(found)} artifacts")
     if not yes and not (sys.stdin.isatty() and input("remove them? [y/N] ").strip().lower() in ("y", "yes")):
         say("nothing was removed; yes=1 removes them")
         return
@@ -54,61 +55,66 @@ def _unused(request: Request, hashes: Hashes) -> Iterator[Unused]:
     scenes = dict.fromkeys(home.name.partition("@")[0] for home in homes)
     if name and name not in scenes:
         raise Refused(
-            f"{shown(request.runs)}: nothing was computed for {name}; there are {', '.join(scenes) or 'none'}"
+            f"{display_path(request.runs)}: nothing was computed for {name}; there are {', '.join(scenes) or 'none'}"
         )
     for scene in scenes if not name else [name]:
-        there = [home for home in homes if home.name.partition("@")[0] == scene]
+        scene_homes = [home for home in homes if home.name.partition("@")[0] == scene]
         used: set[Path] = set()
-        whys: dict[Path, str] = {}
+        reasons: dict[Path, str] = {}
         try:
-            for home in there:
-                used |= _planned(request, home, whys, hashes)
+            for home in scene_homes:
+                used |= _planned(request, home, reasons, hashes)
         except Refused as error:
             say(f"{scene}: kept, as it cannot be planned: {error}")
             continue
-        for folder in (path.parent for home in there for path in sorted(home.glob(f"*/{RECEIPT}"))):
+        for folder in (path.parent for home in scene_homes for path in sorted(home.glob(f"*/{RECEIPT}"))):
             if folder not in used and not folder.is_symlink() and read_receipt(folder):
-                size = sum(path.stat().st_size for path in made_of(folder, hashes) if path.exists())
-                yield Unused(folder, size, whys.get(folder, "no plan uses it"))
+                size = sum(path.stat().st_size for path in artifact_files(folder, hashes) if path.exists())
+                yield Unused(folder, size, reasons.get(folder, "no plan uses it"))
 
 
-def _planned(request: Request, home: Path, whys: dict[Path, str], hashes: Hashes) -> set[Path]:
-    """The artifacts that a run's plan uses, or may yet; `whys` gets why it does not use its own others."""
+def _planned(request: Request, home: Path, reasons: dict[Path, str], hashes: Hashes) -> set[Path]:
+    """The artifacts that the plan of a run uses or may use; adds to `reasons` why it does not use its others."""
     name, _, variant = home.name.partition("@")
     pipeline = load_pipeline(request.root)
     receipts = [path.parent for path in home.glob(f"*/{RECEIPT}")]
     if variant and variant not in pipeline.variants:
-        whys |= dict.fromkeys(receipts, f"there is no variant {variant} any more")
+        reasons |= dict.fromkeys(receipts, f"there is no variant {variant} any more")
         return set()
     source = request.root / (read_text(home / "source") or read_text(home.with_name(name) / "source"))
     if source == request.root or not source.exists():
         raise Refused("its scene is not there")
-    asked = replace(request, scene=str(source), variant=variant or None, trust=True)
-    job = resolve(asked, hashes)
+    planned = replace(request, scene=str(source), variant=variant or None, trust=True)
+    job = resolve(planned, hashes)
     decisions, used = plan(job, list(pipeline.stages)), set()
     for stage, decision in decisions.items():
-        if decision.word in ("cached", "provided", "stale", "undecided", "missing"):
+        if decision.status in ("cached", "provided", "stale", "pending", "missing"):
             used |= {decision.path} if decision.path else {home / stage, job.base / stage}
         else:
-            whys[home / stage] = f"{'left out' if decision.word == 'skip' else 'to be made again'}: {decision.reason}"
+            what = "left out" if decision.status == "skip" else "to be made again"
+            reasons[home / stage] = f"{what}: {decision.reason}"
         if decision.path and decision.path != home / stage:
-            whys.setdefault(home / stage, f"{shown(decision.path)} is the same")
-    whys |= {folder: f"there is no stage {folder.name} any more" for folder in receipts if folder.name not in decisions}
+            reasons.setdefault(home / stage, f"{display_path(decision.path)} is the same")
+    unknown = [folder for folder in receipts if folder.name not in decisions]
+    reasons |= {folder: f"there is no stage {folder.name} any more" for folder in unknown}
     return used
 
 
 def _remove(runs: Path, folder: Path, hashes: Hashes) -> None:
+    """Remove the files of an artifact that agree with its receipt, and its folder if it is then empty."""
     try:
-        with locked(runs, folder.parent.name, wait=False):
-            recover(folder.parent, hashes)
-            for path in list(made_of(folder, hashes)):
+        with hold_lock(runs, folder.parent.name, wait=False):
+            recover_swap(folder.parent, hashes)
+            for path in list(artifact_files(folder, hashes)):
                 path.unlink(missing_ok=True)
             remove_empty(folder)
             if folder.exists():
-                kept = next(files_below(folder), None)
-                say(f"{shown(folder)}: kept what was not made by the runner" + (f": {kept.name}" if kept else ""))
+                kept = next(list_files(folder), None)
+                say(
+                    f"{display_path(folder)}: kept what was not made by the runner" + (f": {kept.name}" if kept else "")
+                )
             with suppress(OSError):
                 if not any(folder.parent.iterdir()):
-                    discard(folder.parent)
+                    delete_folder(folder.parent)
     except Refused as error:
-        say(f"{shown(folder)}: kept: {error}")
+        say(f"{display_path(folder)}: kept: {error}")

@@ -30,8 +30,8 @@ from reffusion.io.ply import save_ply
 from reffusion.references.files import load_given
 from reffusion.references.undistort import GivenReference
 from reffusion.types import Gaussians
-from runner import Refused, child
-from runner.layers import layered, parse_set, seconds_of
+from runner import Refused, worker
+from runner.parameters import parse_duration, parse_set, stack_layers
 from runner.pipeline import load_pipeline, load_scene_file
 from runner.resolve import choose_profile
 from stages import poses, raw_masks
@@ -58,17 +58,17 @@ def told(folder: Path, out: Path, set_: str = "") -> str | None:
     try:
         scene = load_scene_file(folder, PIPELINE)
         profile, _ = choose_profile("laptop" if scene.profile is None else None, scene, [], PIPELINE)
-        layers = layered(PIPELINE, scene, profile, None, parse_set(set_, PIPELINE), {})
+        layers = stack_layers(PIPELINE, scene, profile, None, parse_set(set_, PIPELINE), {})
         if scene.budget is not None:
-            seconds_of(scene.budget, str(scene.path))
+            parse_duration(scene.budget, str(scene.path))
     except Refused as error:
         return str(error)
     for stage, spec in PIPELINE.stages.items():
-        asked = {"stage": stage, "params": layers.values[stage], "takes": spec.takes}
-        if "scene" in spec.takes and stage in ("poses", "raw_masks"):
+        asked = {"stage": stage, "params": layers.values[stage], "takes": spec.all_needs}
+        if "scene" in spec.all_needs and stage in ("poses", "raw_masks"):
             asked |= {"scene": str(folder), "needs": {"scene": str(folder)}}
         try:
-            answer = child._describe(asked)
+            answer = worker._describe(asked)
         except Refused as error:
             return str(error)
         assert "broken" not in answer, answer

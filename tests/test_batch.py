@@ -18,9 +18,9 @@ from test_compare import request as asked
 
 from report import batch as page
 from runner import Refused
-from runner.compare import By, batch, compare
-from runner.engine import Local, chosen
-from runner.execute import run_scene
+from runner.compare import batch, compare
+from runner.engine import LocalEngine, make_engine
+from runner.execute import Execution, run_scene
 from runner.progress import Progress
 from runner.resolve import Request
 
@@ -64,15 +64,15 @@ def most_at_once(found: list[list]) -> int:
     return max(sum(a <= begun < b for a, b, *_ in found) for begun, *_ in found)
 
 
-def machine(cores: int, memory_mb: int = 10_000) -> Local:
+def machine(cores: int, memory_mb: int = 10_000) -> LocalEngine:
     """One with so many cores, whatever this one has."""
     real = sorted(os.sched_getaffinity(0))
-    return Local([real[n % len(real)] for n in range(cores)], memory_mb, [])
+    return LocalEngine([real[n % len(real)] for n in range(cores)], memory_mb, [])
 
 
 def test_several_at_once_and_a_second_call_runs_what_failed(tmp_path, capsys):
     root = toys(tmp_path, meet=3)
-    assert batch(asked(root, ""), root / "many", By(machine(4))) == 1
+    assert batch(asked(root, ""), root / "many", Execution(machine(4))) == 1
     output = capsys.readouterr().out
     assert "4 scenes, 4 at once, 1 core each" in output
     assert re.search(r"^\d\d:\d\d:\d\d a: distill", output, re.MULTILINE)
@@ -86,7 +86,7 @@ def test_several_at_once_and_a_second_call_runs_what_failed(tmp_path, capsys):
     assert "c,failed," in (root / "runs/results.csv").read_text()
     assert "poses: done in" in (root / "runs/a/output.log").read_text()
     (root / "many/c/number.txt").write_text("20")
-    assert batch(asked(root, ""), root / "many", By(machine(4))) == 0
+    assert batch(asked(root, ""), root / "many", Execution(machine(4))) == 0
     assert len(spans(root)) == 4 and "failed" not in (root / "runs/results.md").read_text()
     (root / "alone").mkdir()
     for other in "ac":  # it waits for three
@@ -102,7 +102,7 @@ def test_several_at_once_and_a_second_call_runs_what_failed(tmp_path, capsys):
 def test_never_more_than_there_are_cores_or_memory(tmp_path, cores, memory_mb, most):
     """By pipeline.yaml 500 MB, and 100 for each MB of what poses wrote (next to nothing); then by what it last took."""
     root = toys(tmp_path, 0.5, "memory: {distill: {mb: 600, each: 100}}\n")
-    batch(asked(root, ""), root / "many", By(machine(cores, memory_mb), 1))
+    batch(asked(root, ""), root / "many", Execution(machine(cores, memory_mb), 1))
     assert len(spans(root)) == 3 and most_at_once(spans(root)) <= most
 
 
@@ -118,20 +118,22 @@ def test_what_is_killed_beside_others_goes_on_alone(tmp_path):
     time.sleep(params.pause)
 """
     (root / "stages/distill.py").write_text(stage.replace("    time.sleep(params.pause)\n", kill))
-    assert batch(asked(root, ""), root / "many", By(machine(4))) == 1
+    assert batch(asked(root, ""), root / "many", Execution(machine(4))) == 1
     assert len(spans(root)) == 3 and most_at_once(spans(root)[-1:]) == 1
 
 
 def test_cores_are_as_asked_for(tmp_path):
     root = toys(tmp_path, 0.0)
-    batch(asked(root, "", variant="better"), root / "many", By(machine(4), 2))
+    batch(asked(root, "", variant="better"), root / "many", Execution(machine(4), 2))
     assert {threads for _, _, threads, _ in spans(root)} == {"2"}
     assert (root / "runs/results@better.csv").is_file()
 
 
 def test_variants_of_several_scenes_at_once(tmp_path):
     root = toys(tmp_path, 0.1)
-    assert compare(asked(root, ""), "better,twin", data=root / "many", by=By(machine(4))) == 3  # of scene c
+    assert (
+        compare(asked(root, ""), "better,twin", data=root / "many", execution=Execution(machine(4))) == 3
+    )  # of scene c
     lines = (root / "runs/ran.txt").read_text().splitlines()
     assert sorted(lines) == sorted(set(lines)), "what is equal is done once"
     record = json.loads((root / "runs/compare/compare.json").read_text())
@@ -142,7 +144,7 @@ def test_stopped_while_several_run(tmp_path):
     root = toys(tmp_path, 60)
     code = "import sys; from test_batch import *; signal.signal(signal.SIGINT, signal.default_int_handler);"
     code = f"{code} batch(asked(Path(sys.argv[1]), ''), Path(sys.argv[1]) / 'many',"
-    code = f"{code} By(machine(4)))"
+    code = f"{code} Execution(machine(4)))"
     environment = {**os.environ, "PYTHONPATH": f"{REPO}:{REPO}/tests"}
     process = subprocess.Popen([sys.executable, "-c", code, str(root)], env=environment, stderr=subprocess.DEVNULL)
     until = time.monotonic() + 60
@@ -152,9 +154,9 @@ def test_stopped_while_several_run(tmp_path):
     process.send_signal(signal.SIGINT)
     assert process.wait(30) != 0
     assert not (root / "runs/spans.txt").exists()
-    assert not subprocess.run(["pgrep", "-f", f"runner.child run.*{root}"], capture_output=True).stdout
+    assert not subprocess.run(["pgrep", "-f", f"runner.worker run.*{root}"], capture_output=True).stdout
     (root / "stages/distill.py").write_text(FILES["stages/distill.py"])
-    assert batch(asked(root, ""), root / "many", By(machine(4))) == 1
+    assert batch(asked(root, ""), root / "many", Execution(machine(4))) == 1
     assert (root / "runs/ran.txt").read_text().count("poses") == 3
 
 
@@ -179,15 +181,15 @@ def test_what_ended_when_the_runner_was_interrupted_is_not_done_again(tmp_path):
 
 
 def test_the_live_table(tmp_path):
-    receipt = dict.fromkeys(("key", "params", "needs", "weights", "code", "output"), "") | {"seconds": 60.0}
+    receipt = dict.fromkeys(("key", "params", "needs", "weights", "code", "output", "files"), "") | {"seconds": 60.0}
     for stage in ("fit", "evaluate"):
         (tmp_path / "old" / stage).mkdir(parents=True)
         (tmp_path / "old" / stage / "receipt.json").write_text(json.dumps(receipt))
     names = ["garden", "bear", "statue", "fox"]
     progress = Progress(names, [tmp_path / "old"], ["fit", "evaluate"], 2, "4 scenes")
-    progress.stage(0, "fit", "runs")
-    progress.stage(1, "fit", "waits")
-    progress.ended(2, "fit: masks/x.png has another size", 3.0)
+    progress.update(0, "fit", "runs")
+    progress.update(1, "fit", "waits")
+    progress.end(2, "fit: masks/x.png has another size", 3.0)
     lines = progress.table(80, 24)
     assert lines[0].startswith("0 of 4 done, 1 failed, 180 s left") or lines[0].startswith(
         "0 of 4 done, 1 failed, 3 min"
@@ -201,7 +203,7 @@ def test_the_live_table(tmp_path):
 
 def test_the_page_of_a_batch(tmp_path, capsys):
     root = toys(tmp_path, 0.0)
-    batch(asked(root, ""), root / "many", By(machine(2)))
+    batch(asked(root, ""), root / "many", Execution(machine(2)))
     made = page.make(root / "runs/results.json")
     with visiting(made.as_uri()) as browser:
         assert "3 of 4 scenes done, 1 failed" in browser.inner_text("body")
@@ -218,4 +220,4 @@ def test_the_page_of_a_batch(tmp_path, capsys):
 )
 def test_engines_that_are_not_there(tmp_path, name, address, message):
     with pytest.raises(Refused, match=message):
-        chosen(name, address, tmp_path, tmp_path)
+        make_engine(name, address, tmp_path, tmp_path)

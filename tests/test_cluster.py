@@ -17,11 +17,11 @@ from test_batch import FILES, spans, toys, written
 from test_compare import request as asked
 from test_faults import assert_whole
 
-from runner.child import INTERRUPTED
-from runner.compare import By, compare
-from runner.engine import Ended, Local, Needs, Task, chosen
-from runner.execute import Work, run_scene
-from runner.lost import attempt, take_over
+from runner.compare import compare
+from runner.engine import LocalEngine, Resources, StageResult, Task, make_engine
+from runner.execute import Execution, run_scene
+from runner.retry import run_attempt, take_over
+from runner.worker import INTERRUPTED
 
 REPO = Path(__file__).resolve().parent.parent
 slow = pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="takes minutes; set REFFUSION_SLOW=1")
@@ -49,7 +49,7 @@ def cluster():
 def on_ray(cluster, tmp_path):
     import ray
 
-    yield chosen("ray", cluster.address, tmp_path, tmp_path / "runs")
+    yield make_engine("ray", cluster.address, tmp_path, tmp_path / "runs")
     ray.shutdown()
 
 
@@ -69,7 +69,7 @@ def test_an_attempt_works_in_a_folder_of_its_own_and_goes_on_from_the_one_before
     lost.mkdir(parents=True)
     (lost / "checkpoint.pt").write_text("half")
     (lost / "checkpoint.pt.writing").write_text("ha")
-    ended = attempt(stage_task(root))
+    ended = run_attempt(stage_task(root))
     assert ended.code == 0 and ended.answer["seconds"] >= 0
     assert (out / "checkpoint.pt").read_text() == "half" and (out / "gain.txt").exists()
     assert not (out / "checkpoint.pt.writing").exists() and not lost.exists()
@@ -81,17 +81,17 @@ def test_one_that_was_given_up_for_lost_writes_nowhere(tmp_path, monkeypatch):
     root = written(tmp_path)
     out = root / "runs/toy/.partial-distill-1"
 
-    def work(task: Task, told=None) -> Ended:
+    def work(task: Task, should_stop=None) -> StageResult:
         mine = Path(task.line["out"])
         assert mine != out and not out.exists()
         take_over(out)
         (out / "theirs.txt").touch()
         with pytest.raises(FileNotFoundError):
             (mine / "trace.jsonl").write_text("late")
-        return Ended({}, 0)
+        return StageResult({}, 0)
 
-    monkeypatch.setattr("runner.lost.carry_out", work)
-    attempt(stage_task(root))
+    monkeypatch.setattr("runner.retry.run_process", work)
+    run_attempt(stage_task(root))
     assert [path.name for path in out.iterdir()] == ["theirs.txt"]
 
 
@@ -108,7 +108,7 @@ def test_one_that_is_told_to_end_is_interrupted_and_one_that_had_finished_has(tm
 """
     stage = FILES["stages/distill.py"].replace("    time.sleep(params.pause)\n", wait.replace("HEEDS", str(heeds)))
     (root / "stages/distill.py").write_text(stage)
-    ended = attempt(stage_task(root), lambda: bool(list(out.parent.glob("*/checkpoint.pt"))))
+    ended = run_attempt(stage_task(root), lambda: bool(list(out.parent.glob("*/checkpoint.pt"))))
     assert ended.code == (INTERRUPTED if heeds else 0) and bool(ended.answer) != heeds
     assert (out / "checkpoint.pt").exists() and (out / "gain.txt").exists() != heeds
 
@@ -153,7 +153,10 @@ def test_twelve_scenes_with_three_variants_on_ray_are_those_of_one_machine(tmp_p
 
     killer = threading.Thread(target=kill, daemon=True)
     killer.start()
-    assert compare(asked(root, "", cuda=on_ray.cuda), "better,none", data=root / "many", by=By(on_ray, 1)) == 0
+    assert (
+        compare(asked(root, "", cuda=on_ray.cuda), "better,none", data=root / "many", execution=Execution(on_ray, 1))
+        == 0
+    )
     killer.join()
     cluster.others.append(cluster.add_node(num_cpus=1))
     equals_one_machine(root, "better,none", 300)
@@ -163,7 +166,7 @@ def equals_one_machine(root: Path, variants: str, least: int) -> None:
     """runs/ holds what one machine makes, file by file; and nothing of it is run again by that machine."""
     there = root / "runs"
     local = type(asked(root, ""))(root, root / "alone", "", "laptop")
-    assert compare(local, variants, data=root / "many", by=By(Local(), 1)) == 0
+    assert compare(local, variants, data=root / "many", execution=Execution(LocalEngine(), 1)) == 0
     here, away = results(root / "alone"), results(there)
     different = sorted(name for name in {*here, *away} if here.get(name) != away.get(name))
     assert len(here) >= least and not [name for name in different if not name.endswith("metrics.json")]
@@ -172,7 +175,7 @@ def equals_one_machine(root: Path, variants: str, least: int) -> None:
         assert one["mean"] == other["mean"] and one["gaussians"] == other["gaussians"]
     assert_whole(there)
     times = {path: path.stat().st_mtime_ns for path in there.glob("*/*/receipt.json")}
-    assert compare(asked(root, ""), variants, data=root / "many", by=By(Local(), 1)) == 0
+    assert compare(asked(root, ""), variants, data=root / "many", execution=Execution(LocalEngine(), 1)) == 0
     assert {path: path.stat().st_mtime_ns for path in there.glob("*/*/receipt.json")} == times
 
 
@@ -182,8 +185,8 @@ from test_cluster import *
 signal.signal(signal.SIGINT, signal.default_int_handler)
 from runner.compare import batch
 root = Path(sys.argv[1])
-engine = chosen("ray", sys.argv[2], root, root / "runs")
-sys.exit(batch(asked(root, "", cuda=engine.cuda), root / "many", By(engine, 1)))
+engine = make_engine("ray", sys.argv[2], root, root / "runs")
+sys.exit(batch(asked(root, "", cuda=engine.cuda), root / "many", Execution(engine, 1)))
 """
 
 
@@ -229,9 +232,9 @@ def test_what_ended_when_the_driver_was_interrupted_is_not_done_again(tmp_path, 
 @slow
 def test_ray_adds_little_and_a_stage_has_the_cores_it_was_given(tmp_path, on_ray, capsys):
     root = toys(tmp_path)
-    run_scene(asked(root, str(root / "many/a"), cuda=on_ray.cuda), "poses", None, Work(on_ray, 1))
+    run_scene(asked(root, str(root / "many/a"), cuda=on_ray.cuda), "poses", None, Execution(on_ray, 1))
     begun = time.monotonic()
-    run_scene(asked(root, str(root / "many/a"), cuda=on_ray.cuda), "distill", None, Work(on_ray, 1))
+    run_scene(asked(root, str(root / "many/a"), cuda=on_ray.cuda), "distill", None, Execution(on_ray, 1))
     took = time.monotonic() - begun
     print(f"one stage by Ray, planning and all: {took:.2f} s")
     assert [threads for _, _, threads, _ in spans(root)] == ["1"]
@@ -245,15 +248,15 @@ def test_ray_adds_little_and_a_stage_has_the_cores_it_was_given(tmp_path, on_ray
 def test_slurm_by_submitits_local_executor(tmp_path, capsys):
     pytest.importorskip("submitit", reason="submitit is not installed")
     root = written(tmp_path)
-    engine = chosen("slurm", "local", root, root / "runs")
-    folders = run_scene(asked(root), "distill", None, Work(engine, 1))
+    engine = make_engine("slurm", "local", root, root / "runs")
+    folders = run_scene(asked(root), "distill", None, Execution(engine, 1))
     assert (folders["distill"] / "gain.txt").read_text() == "1"
     (root / "stages/poses.py").write_text(FILES["stages/poses.py"].replace("    number =", "    boom\n    number ="))
     with pytest.raises(Exception, match="poses: NameError: name 'boom' is not defined"):
-        run_scene(asked(root), "poses", None, Work(engine, 1))
+        run_scene(asked(root), "poses", None, Execution(engine, 1))
     engine.stop()
     with pytest.raises(KeyboardInterrupt):
-        engine.run(stage_task(root), Needs(1, 0, 100), 0, lambda: None)
+        engine.run(stage_task(root), Resources(1, 0, 100), 0, lambda: None)
 
 
 def test_a_cluster_that_is_not_there_is_told_in_a_line(tmp_path):

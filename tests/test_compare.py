@@ -32,7 +32,7 @@ stages:
   poses: {needs: [scene]}
   distill:
     needs: [poses]
-    left_out: [{param: distill.gain, equals: 0, because: no gain}]
+    skip_if: [{param: distill.gain, equals: 0, reason: no gain}]
   evaluate: {needs: [poses], optional: [distill]}
 profiles: {laptop: {}}
 variants:

@@ -15,9 +15,10 @@ from reffusion.cost import estimate
 from reffusion.cost.counts import COUNTS
 from reffusion.params import distill, fit, personalize, reference
 from runner import Refused
-from runner.costs import costs, span
-from runner.plan import plan, table
+from runner.card_costs import cost_table
+from runner.plan import plan, plan_table
 from runner.resolve import Request, resolve
+from runner.text import format_seconds
 
 HALF = {"device": "cuda", "dtype": "float16"}
 WORK = {
@@ -80,19 +81,19 @@ def test_what_a_plan_prints(tmp_path, monkeypatch):
     monkeypatch.setattr("runner.plan.has_cuda", lambda: True)
     job = resolve(Request(ROOT, tmp_path / "runs", str(tmp_path / "row"), profile="paper"))
     decisions = plan(job, job.pipeline.closure("all"))
-    printed = table(job, decisions)
+    printed = plan_table(job, decisions)
     for stage, memory in (("personalize", 20), ("distill", 16)):
-        assert decisions[stage].word == "missing"
+        assert decisions[stage].status == "missing"
         assert any(f"{stage}.memory_gb is {memory}, and NVIDIA" in line for line in decisions[stage].lacks), stage
         assert f"{stage}.memory_gb is {memory}, and NVIDIA GeForce GTX 1080 has 9 GB" in printed
     assert "fit.device is cuda, and " in printed and printed.count("\n") < 40
-    head, *lines = costs(job, decisions, "rtx-4090").splitlines()
+    head, *lines = cost_table(job, decisions, "rtx-4090").splitlines()
     assert "on rtx-4090: counted operations" in head and "as timed on an H200" in head
     shape = r"    (fit|reference|personalize|distill) +[\d.]+ (s|min|h) +\d+\.\d GB"
     assert len(lines) == 5 and all(re.fullmatch(shape, line) for line in lines[:-1]), lines
     assert re.fullmatch(r"    together +[\d.]+ (s|min|h)", lines[-1])
     with pytest.raises(Refused, match="card 'voodoo' is none of"):
-        costs(job, decisions, "voodoo")
-    monkeypatch.setattr("runner.costs.has_cuda", lambda: False)
-    assert costs(job, decisions, None) == "", "nothing is asked where there is no card"
-    assert [span(s) for s in (12.3, 600, 7200)] == ["12 s", "10 min", "2.0 h"]
+        cost_table(job, decisions, "voodoo")
+    monkeypatch.setattr("runner.card_costs.has_cuda", lambda: False)
+    assert cost_table(job, decisions, None) == "", "nothing is asked where there is no card"
+    assert [format_seconds(s) for s in (12.3, 600, 7200)] == ["12 s", "10 min", "2.0 h"]

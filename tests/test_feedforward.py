@@ -276,7 +276,7 @@ def test_a_job_is_told_before_any_work_and_keyed_by_the_files_content(own_cache,
         job = prepare_job(Request(ROOT, tmp_path / "runs", str(scene), profile="laptop",
                                   set=f"reference.inpainter=lama reference.prior={prior}"))  # fmt: skip
         found = plan(job, job.pipeline.closure("reference"))["reference"]
-        return found.word, found.reason
+        return found.status, found.reason
 
     word, reason = planned(file)
     assert word == "missing" and f"reference.prior: no weights at {file}; name a folder, a file" in reason

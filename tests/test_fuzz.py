@@ -36,7 +36,7 @@ from reffusion.io.quantized import save_splat
 from reffusion.io.splats import load_splats
 from reffusion.types import Gaussians
 from runner import Refused
-from runner.handed import read_handed
+from runner.user_yaml import read_user_yaml
 
 SLOW = os.environ.get("REFFUSION_SLOW") == "1"
 SECONDS = float(os.environ.get("REFFUSION_FUZZ_SECONDS", "600"))
@@ -174,7 +174,7 @@ def readers() -> list[Reader]:
         Reader("points3D.txt", load_model_points, (POINTS_TXT,)),
         Reader("transforms.json", _capture("transforms", made), (TRANSFORMS,)),
         Reader("poses_bounds.npy", _capture("llff", made), of("poses_bounds.npy")),
-        Reader("scene.yaml", lambda path: read_handed(path, ("stages",)), (SCENE,)),
+        Reader("scene.yaml", lambda path: read_user_yaml(path, ("stages",)), (SCENE,)),
         Reader("g.ply", any_ply, (*of("g.ply", "points.ply"), _ascii(made["g.ply"]), _ascii(made["points.ply"]))),
         Reader("g.splat", any_splats, of("g.splat")),
         Reader("g.spz", any_splats, of("g.spz")),

@@ -22,8 +22,8 @@ DOORS = {
     "huggingface_hub": ("reffusion/weights/download.py",),
     "onnxruntime": ("reffusion/inpaint/onnx_model.py",),
     "gsply": ("reffusion/io/compressed.py",),
-    "ray": ("runner/on_ray.py",),
-    "submitit": ("runner/on_slurm.py",),
+    "ray": ("runner/ray_engine.py",),
+    "submitit": ("runner/slurm_engine.py",),
 }
 OPENERS = {"open", "read_text", "write_text", "read_bytes", "write_bytes", "imread", "imwrite", "imsave", "savez"}
 MAY_OPEN = ("reffusion/io/", "reffusion/capture/", "reffusion/trace.py")
@@ -97,9 +97,8 @@ def test_runner_knows_nothing_of_3d(path):
     own = {name for name in imports(path) if name.split(".")[0] == "reffusion"}
     assert own <= {
         "reffusion.command",
-        "reffusion.command.installed",
+        "reffusion.command.is_installed",
         "reffusion.command.workplace",
-        "reffusion.command.command_line",
     }
 
 

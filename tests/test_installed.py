@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from runner.keys import Hashes, code_of
+from runner.keys import Hashes, code_fingerprints
 from runner.pipeline import load_pipeline
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -83,9 +83,9 @@ def test_stages_depend_on_the_same_code(unpacked, tmp_path):
     app, hashes = unpacked / "reffusion" / "app", Hashes(tmp_path / "hashes.json")
     for stage in load_pipeline(ROOT).stages:
         for folder in ("stages", "stages/plan"):
-            code = code_of(ROOT, stage, hashes, folder)
+            code = code_fingerprints(ROOT, stage, hashes, folder)
             assert f"reffusion/params/{stage}.py" in code
-            assert code_of(app, stage, hashes, folder) == code
+            assert code_fingerprints(app, stage, hashes, folder) == code
 
 
 def test_plan_in_any_folder(unpacked, tmp_path):

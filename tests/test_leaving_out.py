@@ -51,14 +51,14 @@ def test_a_scene_whose_background_is_seen_imports_no_diffusion(tmp_path):
 def test_the_pipeline_leaves_diffusion_out_where_nothing_is_to_be_invented():
     stages = yaml.safe_load((ROOT / "pipeline.yaml").read_text())["stages"]
     for name in ("reference", "personalize", "distill"):
-        facts = [c.get("fact") for c in stages[name]["left_out"]]
+        facts = [c.get("fact") for c in stages[name]["skip_if"]]
         assert "masks.invent_pixels" in facts, name
 
 
 def test_personalization_is_left_out_where_sds_cannot_gain_and_the_profile_asks():
     pipeline = yaml.safe_load((ROOT / "pipeline.yaml").read_text())
-    (asked,) = (c for c in pipeline["stages"]["personalize"]["left_out"] if c.get("fact") == "initialize.sds_may_gain")
-    assert asked["equals"] is False and "{sds_reason}" in asked["because"]
+    (asked,) = (c for c in pipeline["stages"]["personalize"]["skip_if"] if c.get("fact") == "initialize.sds_may_gain")
+    assert asked["equals"] is False and "{sds_reason}" in asked["reason"]
     assert asked["only"] == {"distill.sds.run": "auto", "distill.depth.weight": 0}  # the depth term asks the prior too
     runs = {name: profile["distill"].get("sds", {}).get("run") for name, profile in pipeline["profiles"].items()}
     assert runs == {"paper": None, "best": None, "laptop": "auto", "laptop-terms": "always", "paper-terms": None}

@@ -15,7 +15,7 @@ import pytest
 from benchmarks.gpu import ready
 from reffusion.io import machine
 from reffusion.io.machine import Machine, lacks
-from runner import child
+from runner import worker
 
 ROOT = Path(__file__).resolve().parent.parent
 GOOD = Machine("NVIDIA GeForce RTX 4090", 25.3, 580, "13.0", gsplat=True, extension=True, nvcc="13.0")
@@ -95,11 +95,11 @@ def test_a_stage_says_what_it_lacks_at_once(tmp_path, monkeypatch):
     machine.machine.cache_clear()
     asked = lambda **params: {"stage": "distill", "params": params, "takes": TAKES, "brings": []}
     began = time.perf_counter()
-    said = child._describe(asked(device="cuda", memory_gb=16))["lacks"]
+    said = worker._describe(asked(device="cuda", memory_gb=16))["lacks"]
     assert time.perf_counter() - began < 1
     assert any("distill.memory_gb is 16, and NVIDIA GeForce GTX 1080 has 9 GB" in line for line in said)
     assert any("built without CUDA" in line or "needs 580" in line for line in said)
-    assert "lacks" not in child._describe(asked(device="cpu"))
+    assert "lacks" not in worker._describe(asked(device="cpu"))
     machine.machine.cache_clear()
 
 

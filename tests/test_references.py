@@ -29,11 +29,11 @@ from reffusion.references.files import GivenReference
 from reffusion.references.undistort import load_straight, load_straight_depth
 from reffusion.types import Reference
 from runner.execute import run_scene
-from runner.keys import Hashes, code_of
+from runner.keys import Hashes, code_fingerprints
+from runner.maintenance import clean
 from runner.plan import plan
 from runner.resolve import Request
 from runner.resolve import resolve as prepare_job
-from runner.upkeep import clean
 from stages import poses, reference
 from stages.plan import poses as plan_poses
 from stages.plan import reference as plan_reference
@@ -277,10 +277,10 @@ def test_references_are_refused_by_what_poses_wrote(tmp_path, name, params, pain
 
 def test_the_stage_reads_nothing_of_the_capture(tmp_path):
     """So mending a reader of captures reruns `poses` at most."""
-    code = code_of(ROOT, "reference", Hashes(tmp_path / "hashes.json"))
+    code = code_fingerprints(ROOT, "reference", Hashes(tmp_path / "hashes.json"))
     readers = ("reffusion/capture/layouts/", "reffusion/capture/load.py", "reffusion/capture/roles.py")
     assert "reffusion/references/files.py" in code and not [path for path in code if path.startswith(readers)]
-    assert any(path.startswith(readers) for path in code_of(ROOT, "poses", Hashes(tmp_path / "hashes.json")))
+    assert any(path.startswith(readers) for path in code_fingerprints(ROOT, "poses", Hashes(tmp_path / "hashes.json")))
 
 
 def test_paintings_stand_for_named_references_and_masks_beside_them_are_passed_over(tmp_path):
@@ -413,7 +413,7 @@ def test_a_new_reference_reruns_nothing_before_its_stage(tmp_path):
 
     def words() -> dict[str, str]:
         job = prepare_job(request)
-        return {stage: each.word for stage, each in plan(job, job.pipeline.closure("reference")).items()}
+        return {stage: each.status for stage, each in plan(job, job.pipeline.closure("reference")).items()}
 
     def only_the_reference_changed() -> bool:
         return words() == dict.fromkeys(("poses", "raw_masks", "fit", "masks"), "cached") | {"reference": "run"}
@@ -451,7 +451,7 @@ def test_saved_masks_rerun_neither_poses_nor_the_fit(tmp_path):
 
     def words() -> dict[str, str]:
         job = prepare_job(request)
-        return {stage: each.word for stage, each in plan(job, job.pipeline.closure("masks")).items()}
+        return {stage: each.status for stage, each in plan(job, job.pipeline.closure("masks")).items()}
 
     before = dict.fromkeys(("poses", "fit"), "cached")
     (folder / "scene.yaml").write_text("masks: none\n")

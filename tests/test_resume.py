@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from runner import upkeep
-from runner.files import RECEIPT, files_below, read_json
+from runner import maintenance
+from runner.files import RECEIPT, list_files, read_json
 from runner.keys import Hashes
 from runner.plan import decide
 from runner.resolve import Request, resolve
@@ -108,9 +108,9 @@ def test_one_byte_flipped_in_each_kind_of_file_is_noticed_and_named(scene, unbro
     """Of every stage; what then runs, tests of the runner tell."""
     shutil.copytree(unbroken[0].parent, tmp_path / "runs")
     request = Request(ROOT, tmp_path / "runs", str(scene), "laptop", set=SMALL)
-    assert upkeep.verify(request) == 0
+    assert maintenance.verify(request) == 0
     home = tmp_path / "runs" / "mini"
-    files = [path for stage in ("poses", *STAGES) for path in files_below(home / stage) if path.name != RECEIPT]
+    files = [path for stage in ("poses", *STAGES) for path in list_files(home / stage) if path.name != RECEIPT]
     kinds = {(path.relative_to(home).parts[0], path.suffix): path for path in files}
     for path in kinds.values():
         data, then = bytearray(path.read_bytes()), path.stat().st_mtime_ns
@@ -118,8 +118,8 @@ def test_one_byte_flipped_in_each_kind_of_file_is_noticed_and_named(scene, unbro
         path.write_bytes(data)
         os.utime(path, ns=(then, then))
     capsys.readouterr()
-    assert upkeep.verify(request) == len({stage for stage, _ in kinds}) == 8
+    assert maintenance.verify(request) == len({stage for stage, _ in kinds}) == 8
     said = {line.split(": ")[0].rpartition("/")[2]: line for line in capsys.readouterr().out.splitlines()}
     for (stage, _), path in kinds.items():
         assert path.relative_to(home / stage).as_posix() in said[stage] or " more changed" in said[stage]
-    assert decide(resolve(request), "poses", {}).word == "run"
+    assert decide(resolve(request), "poses", {}).status == "run"

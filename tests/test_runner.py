@@ -14,11 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from runner import Refused, compare, upkeep
-from runner import resolve as resolving
-from runner.execute import Failed, run_scene
-from runner.keys import Hashes, code_of, fingerprint
-from runner.plan import plan, table
+from runner import Failed, Refused, compare, maintenance, process, results
+from runner.execute import run_scene
+from runner.keys import Hashes, code_fingerprints, fingerprint
+from runner.plan import plan, plan_table
 from runner.resolve import Request, resolve
 
 REPO = Path(__file__).resolve().parent.parent
@@ -31,12 +30,12 @@ stages:
   fit: {needs: [poses], provided: {by: gaussians, artifact: poses}}
   masks:
     needs: [poses, fit]
-    left_out: [{empty: poses/masks, because: the scene has no masks}]
+    skip_if: [{empty: poses/masks, reason: the scene has no masks}]
   distill:
     needs: [fit, masks]
-    left_out:
-      - {fact: masks.invent, equals: 0, because: nothing to invent}
-      - {param: distill.gain, equals: 0, because: no gain}
+    skip_if:
+      - {fact: masks.invent, equals: 0, reason: nothing to invent}
+      - {param: distill.gain, equals: 0, reason: no gain}
   evaluate: {needs: [poses, fit], optional: [masks, distill]}
 profiles: {laptop: {fit: {rate: 2}}, paper: {}}
 variants: {strong: {distill: {gain: 5}}, same: {}}
@@ -163,7 +162,7 @@ def request(root: Path, scene: str = "toy", **options) -> Request:
 def words(root: Path, **options) -> dict[str, str]:
     """Stage -> "word reason" as planned."""
     job = resolve(request(root, **options))
-    return {s: f"{d.word} {d.reason}".strip() for s, d in plan(job, job.pipeline.closure("all")).items()}
+    return {s: f"{d.status} {d.reason}".strip() for s, d in plan(job, job.pipeline.closure("all")).items()}
 
 
 def ran(capsys, root: Path, target: str = "all", **options) -> list[str]:
@@ -242,10 +241,10 @@ def test_first_run_and_receipts(root):
 def test_fresh_plan(fresh):
     said = words(fresh)
     assert said["poses"] == said["fit"] == "run no artifact yet"
-    assert said["masks"].startswith("undecided left out if the scene has no masks")
-    assert said["distill"].startswith("undecided") and said["evaluate"].startswith("run")
+    assert said["masks"].startswith("pending left out if the scene has no masks")
+    assert said["distill"].startswith("pending") and said["evaluate"].startswith("run")
     job = resolve(request(fresh))
-    assert "reads one number" in table(job, plan(job, ["poses"]))
+    assert "reads one number" in plan_table(job, plan(job, ["poses"]))
     assert not (fresh / "runs").exists() or not (fresh / "runs/toy").exists()  # plan leaves nothing but hashes
 
 
@@ -338,7 +337,7 @@ def test_a_stage_that_reads_the_scene_refuses_before_its_other_needs_are_made(fr
 
 def run(params: Params, out: Path, *, scene: Path,""",
     )
-    assert words(fresh)["masks"].startswith("undecided")
+    assert words(fresh)["masks"].startswith("pending")
     write(fresh, {"data/toy/wrong": ""})
     assert "remove it" in words(fresh)["masks"]
     with pytest.raises(Refused, match=r"masks: .*wrong: remove it"):
@@ -347,7 +346,7 @@ def run(params: Params, out: Path, *, scene: Path,""",
 
 
 def test_what_is_handed_out_outlives_its_artifact_and_is_never_lost(root, capsys):
-    edit(root / "pipeline.yaml", "masks:\n    needs", "masks:\n    hands_out: [drafts]\n    needs")
+    edit(root / "pipeline.yaml", "masks:\n    needs", "masks:\n    export: [drafts]\n    needs")
     edit(
         root / "stages/masks.py",
         "    invent = ",
@@ -451,8 +450,8 @@ def test_a_condition_may_ask_for_two_parameters(root):
 
 
 def test_a_condition_may_hold_for_some_parameters_only_and_name_facts(root, capsys):
-    plain = "{fact: masks.invent, equals: 0, because: nothing to invent}"
-    named = '{fact: masks.invent, equals: 0, only: {distill.gain: 2}, because: "nothing to gain: {invent} of 9"}'
+    plain = "{fact: masks.invent, equals: 0, reason: nothing to invent}"
+    named = '{fact: masks.invent, equals: 0, only: {distill.gain: 2}, reason: "nothing to gain: {invent} of 9"}'
     write(root, {"pipeline.yaml": FILES["pipeline.yaml"].replace(plain, named)})
     nothing = "masks.threshold=1 "
     assert words(root, set=nothing + "distill.gain=2")["distill"].endswith("if nothing to gain: known after masks")
@@ -485,7 +484,7 @@ def test_variants_share_what_they_do_not_change(root, capsys):
     same = request(root, variant="same")
     folder = run_scene(same, "all")["evaluate"]
     (folder / "scene.ply").touch()
-    compare.show_results("evaluate", folder, same)
+    results.show_results("evaluate", folder, same)
     said = capsys.readouterr().out
     assert "runs/toy/evaluate/: metrics.json" in said
     assert "make scene=toy variant=same view    make scene=toy variant=same report" in said
@@ -526,7 +525,7 @@ def test_two_runners_on_one_scene(root):
     wait_for(lambda: list((root / "runs/toy").glob(".partial-fit-*")))
     first.send_signal(signal.SIGSTOP)  # until the second has had to wait
     with pytest.raises(Refused, match=f"toy is in use by process {first.pid}"):
-        upkeep.clean(request(root))
+        maintenance.clean(request(root))
     second = start(root, "--scene", "toy", "--set", "fit.pause=0.2 fit.iterations=8")
     output = second.stdout.readline()
     first.send_signal(signal.SIGCONT)
@@ -626,16 +625,16 @@ def test_two_folders_of_one_name(root, tmp_path):
 
 def test_clean(root, capsys):
     run_scene(request(root, variant="strong"), "distill")
-    upkeep.clean(request(root, variant="strong"))
+    maintenance.clean(request(root, variant="strong"))
     assert (root / "runs/toy").exists() and not (root / "runs/toy@strong").exists()
-    upkeep.clean(request(root, scene=str(root / "data/toy")))
+    maintenance.clean(request(root, scene=str(root / "data/toy")))
     assert not (root / "runs/toy").exists()
     assert "removing" in (said := capsys.readouterr().out) and "runs/toy: distill, evaluate, fit, masks, poses" in said
-    upkeep.clean(request(root))
+    maintenance.clean(request(root))
     assert "nothing was computed for toy" in capsys.readouterr().out
     run_scene(request(root), "fit")
     shutil.rmtree(root / "data/toy")
-    upkeep.clean(request(root))
+    maintenance.clean(request(root))
     assert not (root / "runs/toy").exists()
 
 
@@ -645,10 +644,10 @@ def test_clean_removes_only_what_it_was_asked_for_by_name(root):
     before = sorted(root.rglob("*"))
     for name in ("*", "to*", "[t]oy", ".locks", "..", ".", "/", "data/..", "toy@strong", "tyo", "toys", "mine"):
         with pytest.raises(Refused, match="toy"):
-            upkeep.clean(request(root, scene=name))
+            maintenance.clean(request(root, scene=name))
     for variant in ("*", "../toy", "string"):
         with pytest.raises(Refused, match=r"unknown variant .*strong"):
-            upkeep.clean(request(root, variant=variant))
+            maintenance.clean(request(root, variant=variant))
     assert sorted(root.rglob("*")) == before
 
 
@@ -662,7 +661,7 @@ def test_clean_and_a_rerun_leave_what_people_put_there(root, tmp_path, capsys):
     assert ran(capsys, root, "fit", set="fit.rate=3") == ["fit"]
     assert (root / "runs/toy/fit/notes.txt").read_text() == "2"
     (root / "runs/toy/poses/number.txt").write_text("9")
-    upkeep.clean(request(root))
+    maintenance.clean(request(root))
     assert "kept, as it was not made by the runner: " in capsys.readouterr().out
     home = root / "runs/toy"
     left = {path.relative_to(home).as_posix() for path in home.rglob("*") if path.is_file()}
@@ -718,7 +717,7 @@ class Need:
 
 
 def test_weights_that_are_missing_are_told_before_any_work_and_fetched(fresh, capsys):
-    from runner.execute import weights
+    from runner.weights import fetch_weights
 
     source = fresh / "stages" / "distill.py"
     source.write_text(source.read_text() + WEIGHTS)
@@ -732,14 +731,14 @@ def test_weights_that_are_missing_are_told_before_any_work_and_fetched(fresh, ca
     assert not (fresh / "runs" / "toy" / "poses").exists()
 
     asked = request(fresh, scene="")
-    assert weights(asked, offline=True) == 1
+    assert fetch_weights(asked, offline=True) == 1
     shown = capsys.readouterr().out
     assert "to fetch         2.6 GB  acme/net  (distill)" in shown and "5 kB  metric.pth" in shown
     (fresh / "unreachable").touch()
-    assert weights(asked, offline=False) == 2
+    assert fetch_weights(asked, offline=False) == 2
     (fresh / "unreachable").unlink()
-    assert weights(asked, offline=False) == 0 and (fresh / "fetched.txt").exists()
-    assert weights(asked, offline=False) == 0
+    assert fetch_weights(asked, offline=False) == 0 and (fresh / "fetched.txt").exists()
+    assert fetch_weights(asked, offline=False) == 0
     assert "to fetch: about 0 bytes" in capsys.readouterr().out
     assert not words(fresh)["distill"].startswith("missing")
 
@@ -835,24 +834,6 @@ def test_the_layer_that_asked_last_is_named(fresh):
         resolve(request(fresh, set="distill.sds.weight=more"))
 
 
-def test_an_old_name_is_told_its_new_one(fresh):
-    old = "distill.sds_weight: distill.sds.weight\ndistill.lora: distill.sds.lora\ndistill.gone: ''\nfit.was: no use\n"
-    write(fresh, {**NESTING, "runner/renamed.yaml": old})
-    for asked, message in {
-        "distill.sds_weight=1": "unknown parameter distill.sds_weight; it is distill.sds.weight now",
-        "distill.lora.rank=1": "unknown parameter distill.lora; it is distill.sds.lora now",
-        "distill.gone=1": "unknown parameter distill.gone; it is gone",
-        "fit.was=1": "unknown parameter fit.was; no use",
-        "fit.rat=1": "stage fit: unknown parameter 'rat'; did you mean 'rate'?",
-    }.items():
-        with pytest.raises(Refused) as caught:
-            resolve(request(fresh, set=asked))
-        assert str(caught.value) == f"set: {message}"
-    write(fresh, {"data/toy/scene.yaml": "stages: {distill: {sds_weight: 1}}"})
-    with pytest.raises(Refused, match=r"scene.yaml: stages: unknown parameter distill.sds_weight; it is distill.sds"):
-        resolve(request(fresh))
-
-
 # -------------------------------------------------------------------------------------------------------------- keys
 
 
@@ -913,7 +894,7 @@ def test_a_stage_is_described_in_its_plan_module_and_that_is_no_part_of_its_code
     write(fresh, PLANNED)
     run_scene(request(fresh), "poses")
     job = resolve(request(fresh))
-    assert "3 steps" in table(job, plan(job, ["poses", "fit"])) and not imported.exists()
+    assert "3 steps" in plan_table(job, plan(job, ["poses", "fit"])) and not imported.exists()
     assert "fit" in ran(capsys, fresh) and imported.read_text() == "x"  # by the process that does the work
     assert result(fresh) == 10.0
     code = json.loads((fresh / "runs/toy/fit/receipt.json").read_text())["code"]
@@ -923,7 +904,7 @@ def test_a_stage_is_described_in_its_plan_module_and_that_is_no_part_of_its_code
     edit(fresh / "stages/plan/fit.py", "rate: int = 1", "rate: int = 1\n    slope: int = 1")
     assert words(fresh)["fit"] == "run param slope is new"
     edit(fresh / "stages/fit.py", "import heavy", "import heavy\nfrom stages.plan import fit")
-    assert "stages/plan/fit.py" in code_of(fresh, "fit", Hashes(fresh / "hashes"))  # now it is imported
+    assert "stages/plan/fit.py" in code_fingerprints(fresh, "fit", Hashes(fresh / "hashes"))  # now it is imported
 
 
 def test_a_run_that_does_not_fit_its_needs_is_refused_without_importing_it(fresh, monkeypatch):
@@ -941,8 +922,8 @@ def test_a_run_that_does_not_fit_its_needs_is_refused_without_importing_it(fresh
 @pytest.fixture
 def started(monkeypatch) -> list[str]:
     """What each process is started for that imports stages."""
-    started, child = [], resolving.child
-    monkeypatch.setattr(resolving, "child", lambda *given, **how: started.append(given[1]) or child(*given, **how))
+    started, start = [], process.start_worker
+    monkeypatch.setattr(process, "start_worker", lambda *given, **how: started.append(given[1]) or start(*given, **how))
     return started
 
 
@@ -971,7 +952,7 @@ def test_what_a_stage_says_of_its_parameters_is_remembered_until_its_code_change
 def test_a_stage_that_was_described_and_cannot_be_imported_any_more_is_refused_before_any_work(fresh):
     edit(fresh / "stages/distill.py", "from pydantic", "import installed\nfrom pydantic")
     write(fresh, {"installed.py": ""})
-    assert words(fresh)["distill"].startswith("undecided")
+    assert words(fresh)["distill"].startswith("pending")
     (fresh / "installed.py").unlink()
     with pytest.raises(Refused, match=r"stages/distill.py: ModuleNotFoundError.*installed"):
         run_scene(request(fresh), "all")

@@ -24,8 +24,9 @@ from reffusion.io.scene import load_mask_sets, save_references
 from reffusion.io.traces import MAIN, load_trace, main_quantity
 from reffusion.prior import personalize as personalizing
 from reffusion.types import PARAMETERS, Reference
-from runner.layers import layered, seconds_of, shared_out
-from runner.pipeline import Refused, load_pipeline, load_scene_file
+from runner import Refused
+from runner.parameters import parse_duration, split_budget, stack_layers
+from runner.pipeline import load_pipeline, load_scene_file
 from stages import distill, fit, initialize, masks, personalize
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -253,30 +254,30 @@ def test_a_stage_gives_the_same_after_a_kill(ready, tmp_path, monkeypatch, stage
     [("5m", 300), ("90s", 90), ("1h30m", 5400), ("2.5m", 150), (120, 120), ("45", 45), ("1H", 3600)],
 )
 def test_times_are_read(text, seconds):
-    assert seconds_of(text, "x") == seconds
+    assert parse_duration(text, "x") == seconds
 
 
 @pytest.mark.parametrize("text", ["", "m", "5 minutes", "-5m", "0", "5x", None, "5m5", [5]])
 def test_what_is_no_time_is_refused(text):
     with pytest.raises(Refused, match=r"scene.yaml: budget .* like 5m"):
-        seconds_of(text, "scene.yaml")
+        parse_duration(text, "scene.yaml")
 
 
 def test_a_budget_is_shared_out_and_gives_way_to_what_is_said_by_name(tmp_path):
     pipeline = load_pipeline(ROOT)
-    shares = {name: share["seconds"] for name, share in shared_out(pipeline, {}, 1000.0).items()}
+    shares = {name: share["seconds"] for name, share in split_budget(pipeline, {}, 1000.0).items()}
     assert set(shares) == {"fit", "personalize", "distill"}
     assert shares == {name: pytest.approx(1000 * part) for name, part in pipeline.budget.items()}
-    less = shared_out(pipeline, {"distill": {"sds": {"weight": 0}, "depth": {"weight": 0}}}, 1000.0)
+    less = split_budget(pipeline, {"distill": {"sds": {"weight": 0}, "depth": {"weight": 0}}}, 1000.0)
     assert "personalize" not in less and sum(s["seconds"] for s in less.values()) == pytest.approx(sum(shares.values()))
     assert less["fit"]["seconds"] / less["distill"]["seconds"] == pytest.approx(shares["fit"] / shares["distill"])
     (tmp_path / "scene.yaml").write_text("budget: 5m\nstages: {fit: {seconds: 7}}\n")
     scene = load_scene_file(tmp_path, pipeline)
     assert scene.budget == "5m"
-    values = layered(pipeline, scene, "laptop", None, {}, shared_out(pipeline, {}, 300.0)).values
+    values = stack_layers(pipeline, scene, "laptop", None, {}, split_budget(pipeline, {}, 300.0)).values
     assert values["fit"]["seconds"] == 7 and values["distill"]["seconds"] == 300 * pipeline.budget["distill"]
     with pytest.raises(Refused, match="no table `budget`"):
-        shared_out(pipeline.model_copy(update={"budget": {}}), {}, 60.0)
+        split_budget(pipeline.model_copy(update={"budget": {}}), {}, 60.0)
 
 
 def test_steps_that_fit_are_counted_once(tmp_path):

@@ -27,6 +27,7 @@ from reffusion.io.ply import load_ply, save_ply
 from reffusion.io.scene import load_mask_sets, load_raw_masks, load_references, load_scene, save_references
 from reffusion.params.distill import Lift
 from reffusion.types import PARAMETERS, Reference
+from runner.artifacts import hash_contents
 from runner.pipeline import load_pipeline
 from runner.plan import Decision, decide
 from runner.resolve import Job, Request, resolve
@@ -76,16 +77,16 @@ def capture(tmp_path_factory):
     job, said = resolve(Request(ROOT, runs, str(scene), profile="laptop")), {}
     for stage in job.pipeline.stages:
         said[stage] = decide(job, stage, said)
-        if said[stage].word == "run":
+        if said[stage].status == "run":
             place = runs / "scene" / stage
             (place / "masks").mkdir(parents=True)
             (place / "masks" / "v00.png").write_text(stage)
             (place / "facts.json").write_text(json.dumps({"invent_pixels": 7, "sds_may_gain": True}))
             inputs = said[stage].inputs
-            receipt = asdict(inputs) | {"key": inputs.key, "output": job.hashes.folder(place)}
+            receipt = asdict(inputs) | {"key": inputs.key} | hash_contents(place, job.hashes)
             (place / "receipt.json").write_text(json.dumps(receipt))
             said[stage] = decide(job, stage, said)
-    assert [s for s, d in said.items() if d.word != "cached"] == ["lift"]
+    assert [s for s, d in said.items() if d.status != "cached"] == ["lift"]
     return scene, runs
 
 
@@ -101,9 +102,9 @@ def test_a_variant_runs_what_it_changes_and_shares_the_rest(capture, variant):
     scene, runs = capture
     said = decisions(resolve(Request(ROOT, runs, str(scene), profile="laptop", variant=variant)))
     runs_here, left_out = PLANS[variant]
-    assert {s for s, d in said.items() if d.word == "skip"} == {*left_out, *({"lift"} - set(runs_here))}
-    assert {s for s, d in said.items() if d.word in ("run", "stale", "undecided")} == set(runs_here)
-    shared = {s for s, d in said.items() if d.word == "cached"}
+    assert {s for s, d in said.items() if d.status == "skip"} == {*left_out, *({"lift"} - set(runs_here))}
+    assert {s for s, d in said.items() if d.status in ("run", "stale", "pending")} == set(runs_here)
+    shared = {s for s, d in said.items() if d.status == "cached"}
     assert shared == set(said) - set(runs_here) - set(left_out) - {"lift"}
     assert all(said[s].reason == "shared with scene" for s in shared)
 

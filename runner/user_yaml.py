@@ -1,4 +1,4 @@
-"""YAML that people write by hand, scene.yaml above all: names are text, and nothing in it can cost much."""
+"""Reads YAML that people write, above all scene.yaml: keeps names as text, and bounds size, depth and aliases."""
 
 from collections import Counter
 from pathlib import Path
@@ -8,14 +8,14 @@ import yaml
 
 from runner import Refused
 
-LONGEST = 1_000_000  # bytes of a file
-DEEPEST = 20  # lists and mappings inside each other
-MOST = 10_000  # values, those that aliases repeat included
+MAX_BYTES = 1_000_000  # size of a file
+MAX_DEPTH = 20  # nested lists and mappings
+MAX_VALUES = 10_000  # values, with those that aliases repeat
 TAGS = tuple(f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool", "null", "seq", "map"))
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """Without dates, which nothing here is."""
+    """Reads no dates: nothing in these files is one."""
 
 
 _Loader.yaml_implicit_resolvers = {
@@ -24,21 +24,21 @@ _Loader.yaml_implicit_resolvers = {
 }
 
 
-def read_handed(path: Path, typed: tuple[str, ...]) -> dict[str, Any]:
-    """The `key: value` lines of a file. What stands under keys other than `typed` is text as it is written, or None:
-    `view: 20220819_104425` and `test: [2022-08-19, 007, on]` name views, and YAML would make numbers and dates of them.
+def read_user_yaml(path: Path, typed: tuple[str, ...]) -> dict[str, Any]:
+    """The `key: value` lines of a file. Values of keys outside `typed` stay text as written, or None: in
+    `view: 20220819_104425` and `test: [2022-08-19, 007, on]` YAML would read names of views as numbers and dates.
 
     Raises:
-        Refused: naming the file and, where there is one, the line: it is no regular file, no text in UTF-8, no YAML, or
-            no mapping; a key comes twice; it is larger, deeper or more repetitive than any scene needs.
+        Refused: it is not a regular file, UTF-8 text, YAML or a mapping; a key comes twice; it exceeds a limit of this
+            module. The message names the file and, where known, the line.
     """
     if not path.is_file():
         if path.exists() or path.is_symlink():
             raise Refused(f"{path}: it must be a file")
         return {}
     try:
-        if path.stat().st_size > LONGEST:
-            raise Refused(f"{path}: larger than {LONGEST // 10**6} MB; a scene needs some lines")
+        if path.stat().st_size > MAX_BYTES:
+            raise Refused(f"{path}: larger than {MAX_BYTES // 10**6} MB; a scene needs some lines")
         node, loader = _tree(path.read_bytes().decode("utf-8-sig"))
         if node is None or _is_null(node):
             return {}
@@ -49,8 +49,12 @@ def read_handed(path: Path, typed: tuple[str, ...]) -> dict[str, Any]:
         raise Refused(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
 
 
-def value_of(text: str, is_text: bool) -> Any:
-    """A value that was typed; `is_text` as in `read_handed`. Raises ValueError where it is not valid YAML."""
+def parse_value(text: str, is_text: bool) -> Any:
+    """Parse a value of the command line; `is_text` keeps it as text, see `read_user_yaml`.
+
+    Raises:
+        ValueError: it is not valid YAML.
+    """
     try:
         node, loader = _tree(text)
     except yaml.YAMLError as error:
@@ -59,13 +63,13 @@ def value_of(text: str, is_text: bool) -> Any:
 
 
 def _tree(text: str) -> tuple[Any, Any]:
-    """The document as nodes, checked, and their loader."""
+    """The checked nodes of a document, and their loader."""
     depth = 0
-    for event in yaml.parse(text, _Loader):  # in steps: nothing is built before its depth is known
+    for event in yaml.parse(text, _Loader):  # event by event: checks the depth before nodes are built
         starts = isinstance(event, yaml.CollectionStartEvent)
         depth += starts - isinstance(event, yaml.CollectionEndEvent)
-        if depth > DEEPEST:
-            raise ValueError(f"line {event.start_mark.line + 1}: more than {DEEPEST} levels deep")
+        if depth > MAX_DEPTH:
+            raise ValueError(f"line {event.start_mark.line + 1}: more than {MAX_DEPTH} levels deep")
         tag = getattr(event, "tag", None)
         if tag not in (None, "!", *TAGS):
             raise ValueError(f"line {event.start_mark.line + 1}: the tag {tag!r:.60} is not understood; leave it out")
@@ -74,15 +78,15 @@ def _tree(text: str) -> tuple[Any, Any]:
     waiting, seen = [node] if node else [], 0
     while waiting:
         each, seen = waiting.pop(), seen + 1
-        if seen > MOST:
-            raise ValueError(f"more than {MOST} values, with those that aliases (*) repeat")
+        if seen > MAX_VALUES:
+            raise ValueError(f"more than {MAX_VALUES} values, with those that aliases (*) repeat")
         if isinstance(each, yaml.CollectionNode):
             waiting += [part for item in each.value for part in (item if isinstance(item, tuple) else (item,))]
     return node, loader
 
 
 def _pairs(loader: Any, node: yaml.MappingNode) -> list[tuple[str, Any]]:
-    """Keys, as text, and values of a mapping; what it merges by `<<` included."""
+    """Keys, as text, and values of a mapping, with those that it merges by `<<`."""
     keys = Counter(_key(key) for key, _ in node.value)
     if twice := [key for key, count in keys.items() if count > 1]:
         raise ValueError(f"line {node.start_mark.line + 1}: the key {twice[0]!r:.60} comes twice; keep one")

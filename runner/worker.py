@@ -1,9 +1,8 @@
-"""The process in which stages are imported: `describe` reads their parameters, `fetch` gets the weights they name,
-`run` does a stage's work, `frames` takes pictures from a video.
+"""The process that imports stages: `describe` reads their parameters, `fetch` downloads the weights that they name,
+`frames` extracts the frames of a video, `run` runs a stage.
 
-What can be told of a stage before it runs (Params, needed_weights, lacks, unavailable, optional_weights, cost, preview,
-scene_files, scene_facts, machine_facts) lies in stages/plan/<stage>.py where there is such a file, which imports
-nothing heavy, else in stages/<stage>.py itself.
+The description of a stage (Params, needed_weights, lacks, unavailable, optional_weights, cost, preview, scene_files,
+scene_facts, machine_facts) is in stages/plan/<stage>.py, which imports nothing heavy, or else in stages/<stage>.py.
 """
 
 import ast
@@ -28,46 +27,49 @@ from typing import Any, TextIO, get_args
 
 from pydantic import BaseModel, ValidationError
 
-from runner.files import files_below, told
+from runner.files import list_files
+from runner.text import format_error
 
 INTERRUPTED = 130
 THREADS = ("OMP", "MKL", "OPENBLAS", "NUMBA")  # <each>_NUM_THREADS
 
 
-def _described_in(stage: str) -> Path:
-    """The file that describes a stage, as seen from the root, in which this process is started."""
+def _description_file(stage: str) -> Path:
+    """The file that describes a stage, relative to the root, where this process starts."""
     path = Path(f"stages/plan/{stage}.py")
     return path if path.is_file() else Path(f"stages/{stage}.py")
 
 
-def _module(path: Path) -> Any:
+def _import_file(path: Path) -> Any:
     return importlib.import_module(".".join(path.with_suffix("").parts))
 
 
 def describe() -> None:
-    """Standard input: a list of {"stage", "params": asked for, "takes": names of needs, "needs": their paths (for a
-    preview), "brings": keys of scene.yaml and its folders, "scene": its folder}; standard output: `_describe` of each.
+    """Describe stages. Standard input: a list of {"stage", "params": asked for, "takes": names of needs, "needs": their
+    paths (for a preview), "brings": keys of scene.yaml and folders of the scene, "scene": its folder}; standard output:
+    the list of `_describe` of each.
     """
     questions = json.load(sys.stdin)
-    answer_to, sys.stdout = sys.stdout, sys.stderr  # whatever a module prints must not mix with the answer
-    json.dump([_describe(question) for question in questions], answer_to)
+    output, sys.stdout = sys.stdout, sys.stderr  # what a module prints must not mix with the answer
+    json.dump([_describe(question) for question in questions], output)
 
 
-def _describe(asked: dict[str, Any]) -> dict[str, Any]:
-    """What `resolve.Described` holds, where `scene` is given with what it reads of it; where `brings` is the weights
-    that are "needed", and what this machine "lacks" for CUDA; where `card` is its "cost" on that; where `needs`
-    is the preview's "notes" or "refusal"; or {"broken": why}; or {"errors": in the params, "known": names}."""
-    stage, needs, brings, scene = (asked.get(name) for name in ("stage", "needs", "brings", "scene"))
-    path = _described_in(stage)
+def _describe(question: dict[str, Any]) -> dict[str, Any]:
+    """The fields of `resolve.StageInfo`, or {"broken": why}, or {"errors": in params, "known": names of parameters}.
+
+    A question with `scene` adds what the stage reads of it; with `brings` the weights that are "needed" and what this
+    machine "lacks" for CUDA; with `card` its "cost" on that GPU; with `needs` the preview's "notes" or "refusal"."""
+    stage, needs, brings, scene = (question.get(name) for name in ("stage", "needs", "brings", "scene"))
+    path = _description_file(stage)
     try:
-        planned = _module(path)
+        planned = _import_file(path)
         path = Path(f"stages/{stage}.py")
-        _check_run(path, asked["takes"])
+        _check_run(path, question["takes"])
     except Exception as error:
-        return {"broken": f"{path}: {told(error)}"}
+        return {"broken": f"{path}: {format_error(error)}"}
     fields = dict(_fields(planned.Params))
     try:
-        resolved = planned.Params(**asked["params"])
+        resolved = planned.Params(**question["params"])
     except ValidationError as error:
         return {"errors": [_error(e, planned.Params) for e in error.errors()], "known": list(fields)}
     marks = {name: extra for name, extra in fields.items() if isinstance(extra, dict)}
@@ -86,31 +88,31 @@ def _describe(asked: dict[str, Any]) -> dict[str, Any]:
         answer["needed"] = [asdict(need) for need in planned.needed_weights(resolved, frozenset(brings))]
     if brings is not None and hasattr(planned, "lacks") and answer["params"].get("device") == "cuda":
         answer["lacks"] = planned.lacks(resolved)
-    if "card" in asked and hasattr(planned, "cost"):
+    if "card" in question and hasattr(planned, "cost"):
         try:
-            answer["cost"] = planned.cost(resolved, asked["card"])
+            answer["cost"] = planned.cost(resolved, question["card"])
         except ValueError as error:
-            answer["unknown card"] = told(error)
+            answer["unknown card"] = format_error(error)
     if scene is not None and hasattr(planned, "scene_files"):
-        files = planned.scene_files(resolved, Path(scene), list(files_below(Path(scene))))
+        files = planned.scene_files(resolved, Path(scene), list(list_files(Path(scene))))
         answer["reads"] = sorted(str(path) for path in files)
     if scene is not None and hasattr(planned, "scene_facts"):
         try:
             answer["facts"] = planned.scene_facts(resolved, Path(scene))
-        except ValueError:  # its preview refuses the scene
+        except ValueError:  # its preview reports this
             answer["facts"] = {}
     if needs is not None and hasattr(planned, "preview"):
         try:
             answer["notes"] = list(planned.preview(resolved, **{n: p and Path(p) for n, p in needs.items()}))
         except ValueError as error:
-            answer["refusal"] = told(error)
+            answer["refusal"] = format_error(error)
         except Exception as error:
-            answer["notes"] = [f"(its preview failed: {told(error)})"]
+            answer["notes"] = [f"(its preview failed: {format_error(error)})"]
     return answer
 
 
 def _check_run(path: Path, takes: list[str]) -> None:
-    """ValueError where `run` is not made for these needs; read from its source, for a stage may import much."""
+    """Raise ValueError where `run` does not take these needs; reads its source, as a stage may import much."""
     named = {n.name: n.args for n in ast.parse(path.read_text(encoding="utf-8")).body if isinstance(n, ast.FunctionDef)}
     run = named["run"]
     plain, needs = [a.arg for a in run.args][2:], [a.arg for a in run.kwonlyargs]
@@ -121,7 +123,7 @@ def _check_run(path: Path, takes: list[str]) -> None:
 
 
 def _fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Dotted name and extra of each parameter, those of groups after one another."""
+    """Dotted name and json_schema_extra of each parameter, with those in groups."""
     for name, info in model.model_fields.items():
         yield prefix + name, info.json_schema_extra
         if _is_group(info.annotation):
@@ -133,7 +135,7 @@ def _is_group(annotation: Any) -> bool:
 
 
 def _error(error: Any, model: type[BaseModel]) -> dict[str, Any]:
-    """`where` it is, dotted; `unknown`: it is a name that no group has, with what is in it where it is a mapping."""
+    """An error of pydantic as {where: dotted name, unknown: no parameter has this name, value, message}."""
     where, value, group = _place(error["loc"], model), error["input"], model
     for part in where[:-1]:
         group = _is_group(group) and part in group.model_fields and group.model_fields[part].annotation
@@ -146,7 +148,7 @@ def _error(error: Any, model: type[BaseModel]) -> dict[str, Any]:
 
 
 def _place(loc: tuple[Any, ...], model: type[BaseModel]) -> list[str]:
-    """The way to what is wrong, without the name of the alternative (of `str | list[str]`) that pydantic tried."""
+    """The path to what is wrong, without the alternative (of `str | list[str]`) that pydantic tried."""
     field = model.model_fields.get(loc[0]) if loc else None
     alternatives = [kind for kind in get_args(field.annotation) if kind is not NoneType] if field else []
     tried = isinstance(field and field.annotation, UnionType) and len(alternatives) > 1
@@ -154,14 +156,17 @@ def _place(loc: tuple[Any, ...], model: type[BaseModel]) -> list[str]:
 
 
 def fetch() -> int:
-    """Get the weights that stages need and that are not here, each once; how many could not be had, which are told on
-    standard error. Standard input: {stage: {"params", "brings"}}."""
+    """Download the missing weights that stages need, each once. Standard input: {stage: {"params", "brings"}}.
+
+    Returns:
+        How many could not be fetched; their errors go to standard error.
+    """
     wanted = {}
-    for stage, asked in json.load(sys.stdin).items():
-        planned = _module(_described_in(stage))
+    for stage, question in json.load(sys.stdin).items():
+        planned = _import_file(_description_file(stage))
         if hasattr(planned, "needed_weights"):
-            params = planned.Params(**asked["params"])
-            needs = planned.needed_weights(params, frozenset(asked["brings"]))
+            params = planned.Params(**question["params"])
+            needs = planned.needed_weights(params, frozenset(question["brings"]))
             needs += planned.optional_weights(params) if hasattr(planned, "optional_weights") else []
             wanted |= {need.name: need for need in needs if need.problem and need.fetched}
     failed = 0
@@ -171,37 +176,37 @@ def fetch() -> int:
             print(f"{need.name}: fetched", flush=True)
         except ValueError as error:
             failed += 1
-            print(f"error: {told(error)}", file=sys.stderr, flush=True)
+            print(f"error: {format_error(error)}", file=sys.stderr, flush=True)
     return failed
 
 
 def frames() -> int:
-    """Take a video's frames. Standard input: {"video", "folder", "content": its hash}; standard output: what was taken,
-    or what is wrong."""
-    asked = json.load(sys.stdin)
+    """Extract the frames of a video. Standard input: {"video", "folder", "content": its hash}; standard output: a
+    sentence on the result, or on the error."""
+    question = json.load(sys.stdin)
     video = importlib.import_module("reffusion.capture.layouts.video")
     try:
-        print(video.take(Path(asked["video"]), Path(asked["folder"]), asked["content"]))
+        print(video.take(Path(question["video"]), Path(question["folder"]), question["content"]))
     except ValueError as error:
-        print(told(error))
+        print(format_error(error))
         return 1
     return 0
 
 
 def run() -> int:
-    """Do one stage. Standard input: one line of JSON, then nothing until the runner is gone.
+    """Run a stage. Standard input: one line of JSON, then nothing; its end means that the runner is gone.
 
-    The line: {"stage", "params", "out", "needs": {need: path or null}, "log", "result", "lock" or null}, and see
-    `_confine`. Writes to `result`, an open file's number, {"seconds", "peak_memory_mb", "machine"} or {"error": one
-    line}, and to `log` the full traceback.
+    The line has "stage", "params", "out", "needs": {need: path or null}, "log", "result", "lock" or null, and the
+    arguments of `_limit_resources`. Writes {"seconds", "peak_memory_mb", "machine"} or {"error": one line} to the file
+    descriptor `result`, and the traceback to `log`.
     """
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])  # Ray's processes, and those started by them, block it
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])  # blocked in processes of Ray and their children
     signal.signal(signal.SIGINT, signal.default_int_handler)
     job = json.loads(sys.stdin.readline())
-    for number in (job["lock"], job["result"]):  # the lock is held until this process ends: no second runner before
+    for number in (job["lock"], job["result"]):  # not inherited: the lock is held until this very process ends
         if number is not None:
             os.set_inheritable(number, False)
-    _confine(job.get("cores"), job.get("on"), job.get("cards"))
+    _limit_resources(job.get("cores"), job.get("on"), job.get("gpus"))
     threading.Thread(target=_end_with_runner, args=(sys.stdin.fileno(),), daemon=True).start()
     warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
     result: dict[str, Any] = {}
@@ -209,53 +214,53 @@ def run() -> int:
         with open(job["log"], "w") as log:
             faulthandler.enable(log)
             log.write(f"{time.strftime('%F %T')} {job['stage']} {json.dumps(job['params'])}\n")
-            result = _done(job, log)
+            result = _run_stage(job, log)
             log.write(f"{time.strftime('%F %T')} {json.dumps(result)}\n")
             faulthandler.disable()
     except KeyboardInterrupt:
         return INTERRUPTED
-    except OSError as error:  # of the log
-        result = result or {"error": told(error)}
+    except OSError as error:  # of the log file
+        result = result or {"error": format_error(error)}
     os.write(job["result"], json.dumps(result).encode())
     return int("error" in result)
 
 
-def _confine(cores: int | None, on: list[int] | None, cards: str | None) -> None:
-    """Let what is imported from now on use so many threads, on these cores, and these cards; None: as it likes."""
+def _limit_resources(cores: int | None, on: list[int] | None, gpus: str | None) -> None:
+    """Limit the number of threads, the cores and the GPUs of libraries that are imported later; None: no limit."""
     if cores is not None:
         os.environ |= {f"{library}_NUM_THREADS": str(cores) for library in THREADS}
         os.environ["OPENCV_FOR_THREADS_NUM"] = str(cores)
-    if on and hasattr(os, "sched_setaffinity"):  # what asks the system for its cores, and reads no variable
+    if on and hasattr(os, "sched_setaffinity"):  # for libraries that ask the system and read no variable
         os.sched_setaffinity(0, on)
-    if cards is not None:
-        os.environ["CUDA_VISIBLE_DEVICES"] = cards
+    if gpus is not None:
+        os.environ["CUDA_VISIBLE_DEVICES"] = gpus
 
 
-def _done(job: dict[str, Any], log: TextIO) -> dict[str, Any]:
-    """What there is to tell of a stage, done here and now."""
-    began = time.perf_counter()
+def _run_stage(job: dict[str, Any], log: TextIO) -> dict[str, Any]:
+    """Run a stage in this process; its result, see `run`."""
+    started = time.perf_counter()
     try:
-        params = _module(_described_in(job["stage"])).Params(**job["params"])
+        params = _import_file(_description_file(job["stage"])).Params(**job["params"])
         stage = importlib.import_module(f"stages.{job['stage']}")
         needs = {name: path and Path(path) for name, path in job["needs"].items()}
         stage.run(params, Path(job["out"]), **needs)
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # it is done, and that will be told
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # it is done, and the result must be written
     except Exception as error:
         log.write(traceback.format_exc())
-        return {"error": told(error)[:9999]}  # what a pipe holds
-    seconds = round(time.perf_counter() - began, 2)
+        return {"error": format_error(error)[:9999]}  # less than a pipe holds
+    seconds = round(time.perf_counter() - started, 2)
     return {"seconds": seconds, "peak_memory_mb": _peak_memory_mb(), "machine": platform.node()}
 
 
 def _end_with_runner(fd: int) -> None:
-    """A runner that is killed must not leave a stage working on in a folder that the next runner takes over."""
+    """Kill this process when the runner is gone: the next runner takes over its folder."""
     while os.read(fd, 4096):
         pass
     os.kill(os.getpid(), signal.SIGKILL)
 
 
 def _peak_memory_mb() -> int:
-    unit = 1 if sys.platform == "darwin" else 1024  # bytes there, kilobytes elsewhere
+    unit = 1 if sys.platform == "darwin" else 1024  # ru_maxrss is in bytes there, in kB elsewhere
     largest = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return round(largest * unit / 2**20)
 
@@ -263,7 +268,7 @@ def _peak_memory_mb() -> int:
 if __name__ == "__main__":
     code = {"describe": describe, "fetch": fetch, "frames": frames, "run": run}[sys.argv[1]]()
     if sys.argv[1] == "run":
-        # Large libraries take most of a second to be taken apart, for nothing: what is to be kept lies in files by now.
+        # All results are in files: skip the teardown of large libraries, which takes most of a second.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)

@@ -1,0 +1,40 @@
+"""A video as a scene: keeps the folder of its frames up to date."""
+
+import json
+import subprocess
+from pathlib import Path
+
+from runner import Refused, say
+from runner.files import list_files, read_json
+from runner.keys import Hashes
+from runner.process import start_worker
+from runner.text import display_path
+
+FRAMES = "frames"  # folder in runs/<video>/
+FRAME_FILES = ("frames.json", "frames.csv")  # what extraction writes there beside images/
+
+
+def extract_frames(video: Path, folder: Path, root: Path, hashes: Hashes) -> None:
+    """Extract a video's frames into the folder of a scene, unless they are there.
+
+    Raises:
+        Refused: it is not a usable video, or the folder holds frames of another one, or files that people added for the
+            frames of an earlier version.
+    """
+    content, found = hashes.file(video), read_json(folder / FRAME_FILES[0]) or {}
+    if found.get("content") == content:
+        return
+    ours = [folder / name for name in FRAME_FILES]
+    others = [path for path in list_files(folder) if path not in ours and path.parent != folder / "images"]
+    if found and (others or found["video"] != str(video)):
+        raise Refused(
+            f"{display_path(folder)} holds frames of another video, {found['video']} as it was"
+            + (f", and {display_path(others[0])} for them" if others else "")
+            + "; rename the video, or move that folder away"
+        )
+    process = start_worker(root, "frames", stdout=subprocess.PIPE)
+    question = {"video": str(video), "folder": str(folder), "content": content}
+    message, _ = process.communicate(json.dumps(question))
+    if process.returncode:
+        raise Refused(message.strip() or f"{video}: its frames could not be taken (see above)")
+    say(message.strip())

@@ -1,0 +1,142 @@
+"""The commands `verify`, which hashes all artifacts of a scene, and `clean`, which removes them and nothing else."""
+
+import os
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+from runner import Refused, say
+from runner.artifacts import delete_folder, diff_artifact, recover_swap
+from runner.files import RECEIPT, hold_lock, list_files, read_receipt, read_text
+from runner.frames import FRAMES
+from runner.keys import HASHES, Hashes
+from runner.pipeline import NAME, Pipeline, find_scene, load_pipeline, scene_name, unknown_name
+from runner.resolve import Request, check_unique_name
+from runner.text import display_path, join_names
+
+# Files that the runner and report/ write to runs/<scene>/ besides artifacts.
+RECORDS = ("profile", "source", "plan.json", "output.log", "turntable.webm", "check.png")
+PAGES = (*(f"compare.{kind}" for kind in ("json", "csv", "md", "html")), "compare-runs.csv", "compare-runs.md",
+         "compare/*.png", "study/index.html", "study/clips/*.webm", "study/clips/*.png", "study-key.json",
+         "adapted/sheet.png", "adapted/*/*.png", "adapted/adapted.json",
+         "sds-variance/sds_variance.json", "report.html", "report/index.html", "report/*.png",
+         "frames/frames.json", "frames/frames.csv", "frames/images/frame_*.jpg",
+         "patch/patched.ply", "patch/new.ply",
+         "export/scene.ply", "export/scene.compressed.ply", "export/lora/pytorch_lora_weights.safetensors",
+         "export/cameras/transforms.json", "export/cameras/sparse_pc.ply", "export/cameras/sparse/0/*.bin",
+         "export/cameras/images/*.png", "**/.*.writing")  # fmt: skip
+# Folders that a kill may leave.
+TEMPORARY = (".partial-*", ".copying-*", ".gone-*")
+
+
+def verify(request: Request) -> int:
+    """Hash all files of a scene, and of its artifacts and its variants'.
+
+    The hashes are cached, so that the next run makes again what is missing or changed.
+
+    Returns:
+        How many artifacts and files are not as they were made.
+    """
+    hashes, homes, damaged = Hashes(request.runs / HASHES, recompute=True), _homes(request), 0
+    for home in homes:
+        with hold_lock(request.runs, home.name, shared=True, wait=False):
+            for folder in sorted(path.parent for path in home.glob(f"*/{RECEIPT}")):
+                diff = diff_artifact(folder, hashes) if read_receipt(folder) else None
+                damaged += not diff or bool(diff.missing or diff.changed)
+                message = ", ".join(diff.describe()) if diff else f"{RECEIPT} cannot be read"
+                say(f"{display_path(folder)}: {message or 'as it was made'}")
+    del hashes.corrupt[:]  # the comparison with receipts has reported them
+    for scene in {request.root / source for home in homes if (source := read_text(home / "source"))}:
+        hashes.folder(scene)
+    for path in hashes.corrupt:
+        say(f"{display_path(path)}: its content changed, its size and time did not")
+    hashes.save()
+    if damaged + len(hashes.corrupt):
+        say(f"`make scene={request.scene} all` makes again what is missing or changed; keep=1: what is missing")
+    return damaged + len(hashes.corrupt)
+
+
+def clean(request: Request) -> None:
+    """Remove what was computed for a scene and its variants, or for one variant, but no file that people put there."""
+    homes, pipeline, hashes = _homes(request), load_pipeline(request.root), Hashes(request.runs / HASHES)
+    with ExitStack() as locks:
+        for home in homes:
+            locks.enter_context(hold_lock(request.runs, home.name, wait=False))
+        for home in homes:
+            recover_swap(home, hashes)
+            say(f"removing {display_path(home)}: {', '.join(sorted(p.parent.name for p in home.glob(f'*/{RECEIPT}')))}")
+        for home in homes:
+            for path in list(_made_files(home, pipeline, hashes)):
+                path.unlink(missing_ok=True)
+            for folder in (path for pattern in TEMPORARY for path in home.glob(pattern)):
+                delete_folder(folder)
+            remove_empty(home)
+            if home.exists():
+                kept = join_names(display_path(path) for path in list_files(home))
+                say(f"kept, as it was not made by the runner: {kept}")
+    if not homes:
+        say(f"nothing was computed for {request.scene}")
+
+
+def _homes(request: Request) -> list[Path]:
+    """The folders in runs/ of a scene and its variants, or of one variant; none for a scene that was not run.
+
+    The scene itself may be gone. Raises Refused where there is neither a scene nor a folder of that name."""
+    name, runs = scene_name(Path(request.scene).expanduser()), request.runs
+    existing = sorted(path.name for path in (runs.iterdir() if runs.is_dir() else ()) if is_home(path))
+    scenes = list(dict.fromkeys(each.partition("@")[0] for each in existing))
+    if not NAME.fullmatch(name):
+        raise Refused(
+            f"scene={request.scene}: no scene has such a name; in {display_path(runs)}: {', '.join(scenes) or 'none'}"
+        )
+    try:
+        scene = find_scene(request.scene, request.root)
+    except Refused:
+        if name not in scenes:
+            raise Refused(f"{display_path(runs)}: {unknown_name('scene', name, scenes)}") from None
+    else:
+        base = runs / scene_name(scene)
+        check_unique_name(base, base / FRAMES if scene.is_file() else scene, request.root)
+    variants = [each for each in existing if each.startswith(f"{name}@")]
+    if request.variant and f"{name}@{request.variant}" not in variants:
+        known = [each.partition("@")[2] for each in variants]
+        raise Refused(f"{display_path(runs)}: {unknown_name('variant', request.variant, known)}")
+    names = [f"{name}@{request.variant}"] if request.variant else [each for each in existing if each == name] + variants
+    return [runs / each for each in names]
+
+
+def is_home(folder: Path) -> bool:
+    """Whether the runner made this folder in runs/: it has a receipt or a file `source`."""
+    own = folder.is_dir() and not folder.is_symlink() and folder.name[0] != "."
+    return own and ((folder / "source").is_file() or any(folder.glob(f"*/{RECEIPT}")))
+
+
+def _made_files(home: Path, pipeline: Pipeline, hashes: Hashes) -> Iterator[Path]:
+    """The files of a scene's results that the runner or report/ wrote and nobody changed; receipts come last."""
+    yield from (home / name for name in RECORDS)
+    yield from (home / f"{stage}.log" for stage in pipeline.stages)
+    yield from (path for pattern in PAGES for path in home.glob(pattern))
+    for folder in sorted(path.parent for path in home.glob(f"*/{RECEIPT}")):
+        if folder.is_symlink():  # made by a person: its target may belong to another scene
+            yield folder
+            continue
+        listing = hashes.listing(folder)
+        for name in pipeline.stages[folder.name].export if folder.name in pipeline.stages else ():
+            twins = {path.relative_to(home): hashes.file(path) for path in list_files(home / name)}
+            yield from (home / path for path, own in twins.items() if listing.get(str(path)) == own)
+        yield from artifact_files(folder, hashes)
+
+
+def artifact_files(folder: Path, hashes: Hashes) -> Iterator[Path]:
+    """The files of an artifact that agree with its receipt, and then the receipt."""
+    diff = diff_artifact(folder, hashes)
+    by_people = {*diff.changed, *diff.added, *diff.by_hand}
+    yield from (folder / name for name in hashes.listing(folder) if name not in by_people and name != RECEIPT)
+    yield folder / RECEIPT
+
+
+def remove_empty(home: Path) -> None:
+    """Remove all empty folders in `home`, and itself if it is empty."""
+    for place, _, _ in os.walk(home, topdown=False):
+        if not any(os.scandir(place)):
+            os.rmdir(place)

@@ -1,0 +1,148 @@
+"""Runs several scenes at once, as cores and memory allow."""
+
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import count, groupby
+from pathlib import Path
+
+from runner import redirect_output, say
+from runner.engine import GRACE, Engine
+from runner.execute import Execution, run_scene
+from runner.keys import Hashes
+from runner.progress import Progress
+from runner.resolve import Request
+from runner.text import format_error
+
+OUTPUT = "output.log"  # in a run's folder: what it printed while others ran at the same time
+MAX_SCENES = 256  # scenes at once, at most, on a cluster
+
+
+@dataclass(frozen=True)
+class Run:
+    """One scene, or a variant of it, to be run.
+
+    Attributes:
+        name: for people.
+        group: runs of a group, which are neighbours, run one after another, as they share artifacts.
+        home: the folder in runs/.
+        request: what to run.
+        announcement: printed first where runs are not parallel.
+    """
+
+    name: str
+    group: str
+    home: Path
+    request: Request
+    announcement: str = ""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The result of a run: stage -> artifact, the error if it failed, and seconds of wall clock."""
+
+    stages: dict[str, Path | None]
+    error: str | None
+    seconds: float
+
+
+def run_all(
+    runs: Sequence[Run],
+    execution: Execution,
+    hashes: Hashes,
+    stages: list[str],
+    on_end: Callable[[int, Outcome], None],
+) -> None:
+    """Bring each run up to date; one that fails stops no other.
+
+    By default each group gets an equal part of the engine's cores, at least one. The number of cores of a stage stays
+    the same to the end, so that no result depends on which run ended first.
+
+    Args:
+        on_end: called with the place of a run among `runs` and its outcome, by one thread at a time.
+    """
+    engine, cores = execution.engine, execution.cores
+    groups = [list(places) for _, places in groupby(range(len(runs)), key=lambda place: runs[place].group)]
+    cores_each = min(cores or max(1, engine.cores // max(1, len(groups))), engine.cores)
+    at_once = min(len(groups), engine.cores // cores_each, MAX_SCENES)
+    if at_once == 1 and not engine.is_remote:
+        for place, run in enumerate(runs):
+            if run.announcement:
+                say(run.announcement)
+            on_end(place, _run(run, hashes, Execution(engine, cores and cores_each)))
+        return
+    header = f"{len(groups)} scenes, {at_once} at once, {cores_each} core{'s' * (cores_each > 1)} each"
+    homes = [run.home for run in runs]
+    with Progress([run.name for run in runs], homes, stages, at_once, header) as progress:
+        run_one = partial(_run_with_progress, progress, hashes, Execution(engine, cores_each))
+        _run_in_threads(runs, groups, at_once, run_one, on_end, engine)
+
+
+def _run_in_threads(
+    runs: Sequence[Run],
+    groups: list[list[int]],
+    at_once: int,
+    run_one: Callable[[int, Run], Outcome],
+    on_end: Callable[[int, Outcome], None],
+    engine: Engine,
+) -> None:
+    """Run the groups in `at_once` threads. An interrupt stops the engine; an error of `on_end` is raised at the end."""
+    order, one_at_a_time = count(), threading.Lock()
+
+    def run_groups() -> None:
+        while (number := next(order)) < len(groups):
+            for place in groups[number]:
+                outcome = run_one(place, runs[place])
+                with one_at_a_time:
+                    on_end(place, outcome)
+
+    errors: list[BaseException] = []
+    threads = [threading.Thread(target=_collect_errors, args=(run_groups, errors), daemon=True) for _ in range(at_once)]
+    for thread in threads:
+        thread.start()
+    try:
+        for thread in threads:
+            while thread.is_alive():
+                thread.join(0.5)
+    except KeyboardInterrupt:
+        say("stopping")
+        engine.stop()
+        until = time.monotonic() + GRACE + 5  # a thread that waits for a lock is left behind
+        for thread in threads:
+            thread.join(max(0, until - time.monotonic()))
+        raise
+    if errors:
+        raise errors[0]
+
+
+def _collect_errors(function: Callable[[], None], errors: list[BaseException]) -> None:
+    """Call a function and append its error: not one of a stage, but such as a table on a full disk."""
+    try:
+        function()
+    except BaseException as error:
+        errors.append(error)
+
+
+def _run_with_progress(progress: Progress, hashes: Hashes, execution: Execution, place: int, run: Run) -> Outcome:
+    """Run one with its output in a file, and report its progress."""
+    run.home.mkdir(parents=True, exist_ok=True)
+    output = run.home / OUTPUT
+    with open(output, "w", encoding="utf-8") as file, redirect_output(lambda text: print(text, file=file, flush=True)):
+        on_change = partial(progress.update, place)
+        outcome = _run(run, hashes, replace(execution, output=output, on_change=on_change))
+    progress.end(place, outcome.error, outcome.seconds)
+    return outcome
+
+
+def _run(run: Run, hashes: Hashes, execution: Execution) -> Outcome:
+    """Run one; an error of any kind is part of the outcome, as other runs go on."""
+    started = time.monotonic()
+    try:
+        return Outcome(run_scene(run.request, "all", hashes, execution), None, time.monotonic() - started)
+    except Exception as error:
+        if execution.output is None:
+            print(f"error: {format_error(error)}", file=sys.stderr, flush=True)
+        return Outcome({}, format_error(error), time.monotonic() - started)

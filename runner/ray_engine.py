@@ -1,0 +1,109 @@
+"""Runs stages on a Ray cluster whose machines share results, scenes and this checkout at equal paths.
+
+Ray places each stage's process by its cores, GPUs and memory, and again where a machine is lost (retry.py)."""
+
+import logging
+import os
+import signal
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import ray
+from ray.exceptions import RayError, TaskCancelledError
+
+from runner import Failed, Refused
+from runner.engine import GRACE, Resources, StageResult, Task
+from runner.retry import run_attempt
+from runner.text import format_error
+
+RETRIES = 3  # times that a stage is started again after its machine was lost
+
+
+class RayEngine:
+    """See `engine.Engine`.
+
+    `address` is that of a running cluster, as ray.init takes it; None: $RAY_ADDRESS, or one on this machine."""
+
+    is_remote = True
+
+    def __init__(self, address: str | None, root: Path, runs: Path):
+        here = os.pathsep.join(dict.fromkeys([str(root), str(Path(__file__).resolve().parent.parent)]))
+        try:
+            ray.init(
+                address=address or "auto",
+                runtime_env={"env_vars": {"PYTHONPATH": here}},
+                log_to_driver=False,
+                logging_level=logging.ERROR,
+            )
+        except (RayError, ConnectionError, ValueError, OSError, RuntimeError) as error:
+            raise Refused(f"address={address or 'auto'}: no Ray cluster there: {format_error(error)}") from None
+        total = ray.cluster_resources()
+        self.cores, self._gpus = int(total.get("CPU", 0)), total.get("GPU", 0)
+        self.cuda = self._gpus > 0
+        self._memory_mb = max((node["Resources"].get("memory", 0) for node in ray.nodes()), default=0) / 2**20
+        if not self.cores:
+            raise Refused(f"address={address or 'auto'}: the cluster has no core")
+        self._refs: set[ray.ObjectRef] = set()
+        self._stopped = False
+
+    def run(self, task: Task, resources: Resources, lock: int, on_start: Callable[[], None]) -> StageResult:
+        """See `Engine.run`. The lock stays with the runner. A stage that asks for more memory than any machine has gets
+        all of one."""
+        if self._stopped:
+            raise KeyboardInterrupt
+        cores = resources.cores or 1
+        memory_mb = min(resources.memory_mb, 0.95 * self._memory_mb)
+        options = {"num_cpus": cores, "num_gpus": resources.gpus, "memory": int(memory_mb * 2**20)}
+        line = task.line | {"cores": cores}
+        ref = _remote_task.options(**options, name=str(line["stage"])).remote(Task(task.root, line, task.output))
+        self._refs.add(ref)
+        if self._stopped:  # meanwhile
+            ray.cancel(ref)
+        on_start()
+        try:
+            result = self._wait(ref)
+        except TaskCancelledError:  # before it started
+            raise KeyboardInterrupt from None
+        except RayError as error:
+            if self._stopped:
+                raise KeyboardInterrupt from None
+            raise Failed(
+                f"{line['stage']}: its machine was lost {RETRIES + 1} times: {format_error(error)[:400]}"
+            ) from None
+        finally:
+            self._refs.discard(ref)
+        if self._stopped and result.code != 0:
+            raise KeyboardInterrupt
+        return result
+
+    def _wait(self, ref: "ray.ObjectRef[StageResult]") -> StageResult:
+        """The result. Interrupted, waits for the end of the stage, as Ray kills it at once when this process ends."""
+        try:
+            return ray.get(ref)
+        except KeyboardInterrupt:
+            self.stop()
+            return ray.get(ref, timeout=GRACE + 5)
+
+    def stop(self) -> None:
+        """See `Engine.stop`."""
+        self._stopped = True
+        for ref in list(self._refs):
+            ray.cancel(ref)
+
+
+_stop = threading.Event()  # set in a process of Ray that works for a stopped runner
+
+
+def run_task(task: Task) -> StageResult:
+    """Run a task, on the machine that works.
+
+    Ray cancels by a KeyboardInterrupt at any point of this thread, which would discard a finished result. The signal
+    only sets a flag instead, which is read while there is a process to interrupt."""
+    signal.signal(signal.SIGINT, lambda *_: _stop.set())
+    if _stop.is_set():
+        return StageResult({}, -signal.SIGINT)
+    return run_attempt(task, _stop.is_set)
+
+
+_remote_task = ray.remote(max_retries=RETRIES)(run_task)

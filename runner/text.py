@@ -1,0 +1,48 @@
+"""Errors, sizes, times and paths as text for people."""
+
+import errno
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+from runner import Failed, Refused
+
+# errno -> what the user can do about it
+REMEDIES = dict.fromkeys(
+    (errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "make room, and the same command goes on from here"
+) | dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "runs=FOLDER puts results elsewhere")
+
+
+def format_error(error: BaseException) -> str:
+    """An error in one line, with a remedy where one is known."""
+    text = " ".join(str(error).split())
+    if isinstance(error, OSError) and error.errno in REMEDIES:
+        return f"{error.filename or 'a file'}: {error.strerror}; {REMEDIES[error.errno]}"
+    return text if isinstance(error, ValueError | Refused | Failed) and text else f"{type(error).__name__}: {text}"
+
+
+def format_bytes(count: int | None) -> str:
+    """A size in bytes, kB, MB or GB; "size unknown" for None."""
+    if count is None:
+        return "size unknown"
+    unit, size = next(((u, s) for u, s in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)) if count >= s), ("bytes", 1))
+    return f"{count / size:.1f} {unit}" if unit == "GB" else f"{count / size:.0f} {unit}"
+
+
+def format_seconds(seconds: float) -> str:
+    """A duration in seconds, minutes or hours."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def join_names(names: Iterable[str], limit: int = 3) -> str:
+    """The first names with commas between, and how many more there are."""
+    names = list(names)
+    rest = f" and {len(names) - limit} more" if len(names) > limit else ""
+    return ", ".join(names[:limit]) + rest
+
+
+def display_path(path: Path) -> str:
+    """A path relative to the current folder where it lies inside it, else as it is."""
+    return os.path.relpath(path) if path.is_relative_to(Path.cwd()) else str(path)

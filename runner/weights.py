@@ -1,0 +1,53 @@
+"""The command `weights`: lists the weights that stages need, and fetches what is missing."""
+
+import json
+import sys
+from typing import Any
+
+from runner.process import ask_stages, start_worker
+from runner.resolve import Request, resolve
+from runner.text import format_bytes
+
+
+def fetch_weights(request: Request, offline: bool) -> int:
+    """List the weights of all stages, of a scene where one is named, and fetch what is missing unless `offline`.
+
+    Returns:
+        How many weights that a stage cannot do without are still missing.
+    """
+    job = resolve(request, scene=bool(request.scene))
+    answers = list(zip(job.stages, ask_stages(job.root, list(map(job.question, job.stages))), strict=True))
+    all_needs = [(stage, need) for stage, answer in answers for need in answer.get("needed", ())]
+    all_needs += [
+        (f"{stage}, if asked for", need | {"optional": True})
+        for stage, answer in answers
+        for need in answer.get("optional", ())
+    ]
+    needs = {need["name"]: need for _, need in all_needs}
+    users = {name: ", ".join(stage for stage, need in all_needs if need["name"] == name) for name in needs}
+    missing = [need for need in needs.values() if need["problem"]]
+    to_fetch = [need for need in missing if need["fetched"]]
+    print(f"weights of profile {job.profile} ({job.why})")
+    for name, need in needs.items():
+        state = "here" if not need["problem"] else "to fetch" if need["fetched"] else "not usable"
+        print(f"  {state:<10} {format_bytes(need['bytes']):>12}  {name}  ({users[name]})")
+    _print_problems(missing)
+    unsized = " and what has no known size" if any(need["bytes"] is None for need in to_fetch) else ""
+    print(f"to fetch: about {format_bytes(sum(need['bytes'] or 0 for need in to_fetch))}{unsized}", flush=True)
+    unusable = len(missing) - len(to_fetch)
+    if offline or not to_fetch:
+        return unusable + sum(not need["optional"] for need in to_fetch)
+    process = start_worker(request.root, "fetch")
+    process.communicate(json.dumps({stage: job.question(stage) for stage in job.stages}))
+    return unusable + process.returncode
+
+
+def _print_problems(missing: list[dict[str, Any]]) -> None:
+    """Print why weights cannot be fetched, and where each one was looked for."""
+    for need in missing:
+        if not need["fetched"]:
+            print(f"error: {need['problem']}", file=sys.stderr)
+    for places in dict.fromkeys(tuple(need.get("looked", ())) for need in missing):
+        names = [need["name"] for need in missing if tuple(need.get("looked", ())) == places]
+        if places:
+            print(f"looked for {', '.join(names)} in {', '.join(places)}")
