@@ -199,7 +199,7 @@ def test_positions_step_by_the_cameras_extent_as_3dgs_has_it():
     cameras = [camera("a", -0.3), camera("b", 0.3), camera("c", 0.0)]
     assert cameras_extent(cameras) == pytest.approx(1.1 * 0.3)
     for unit, factor in (("distance", 1.0), ("cameras", 1.1 * 0.3)):
-        rates = step.rates_of(LearningRates(means_unit=unit), cameras)
+        rates = step.learning_rates(LearningRates(means_unit=unit), cameras)
         ours = optimization.rates_of(Params(lr={"means_unit": unit}).lr, cameras)
         for each in (rates, ours):
             assert (each.means, each.means_last) == pytest.approx((1.6e-4 * factor, 1.6e-6 * factor))
