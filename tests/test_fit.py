@@ -106,11 +106,11 @@ def test_a_resumed_fit_is_the_unbroken_one_bit_for_bit(tmp_path, monkeypatch, ga
             if done == moment:
                 raise Killed
 
-        monkeypatch.setattr(fitting, "adapt", killing)
+        monkeypatch.setattr(fitting, "control_density", killing)
         with pytest.raises(Killed):
             run(folder, settings=SETTINGS.changed({"checkpoint_seconds": 1e-9}), gains=gains)
         assert trace.load_checkpoint(folder)["iteration"] == moment - 1
-    monkeypatch.setattr(fitting, "adapt", adapt)
+    monkeypatch.setattr(fitting, "control_density", adapt)
     resumed = run(folder, initial=start(truth().means.numpy()[:5].astype(np.float64)), gains=gains)
     for name in PARAMETERS:
         assert torch.equal(getattr(unbroken, name), getattr(resumed, name)), name
@@ -383,7 +383,7 @@ def test_sparse_steps_look_at_every_pixel_in_four_turns(monkeypatch):
     assert all(
         look[0] == camera for look in view_loader.iterate_views(*given, sparse=range(4))
     )  # too small to do without
-    monkeypatch.setattr(view_loader, "SPARED", 35)
+    monkeypatch.setattr(view_loader, "MIN_SPARSE_PIXELS", 35)
     looks = list(view_loader.iterate_views(*given, sparse=range(4)))
     assert sorted(np.concatenate([weights.flatten() for _, _, weights in looks[:4]])) == list(range(35))
     for seen, target, weights in looks[:4]:

@@ -52,7 +52,7 @@ def test_the_hidden_wall_is_rebuilt_where_it_was(scene, tmp_path, monkeypatch, h
     before, removed = load_ply(scene["fit"] / "gaussians.ply"), load_labels(scene["masks"] / "labels.npy")
     haze = load_json(tmp_path / "facts.json")["haze"]
     assert len(gaussians) == len(new) and int((~new).sum()) == len(before) - int(removed.sum()) - haze
-    sheet = small.WALL / small.FOCAL * SHEETS.sunk  # the second one lies so far behind the wall
+    sheet = small.WALL / small.FOCAL * SHEETS.offset_px  # the second one lies so far behind the wall
     distance = gaussians.means[new][:, 2] - small.WALL
     assert (torch.minimum(distance.abs(), (distance - sheet).abs()) < 0.03).all() and (distance.abs() < 0.03).any()
     depth = load_exr(tmp_path / "depth" / "a2.exr")
@@ -178,7 +178,7 @@ def test_what_is_painted_on_the_new_surface_stays_in_place_from_the_other_side()
     reference = Reference(view, (picture * 255).round().astype(np.uint8), np.ones(depth.shape, bool))
     nothing = surface_gaussians(picture, depth, np.zeros(depth.shape, bool), view, sh_count=1)
     around, errors = rules.Surroundings([], {}, {}, [], [], np.zeros((0, 3)), np.zeros(3), 1.0, [], {}, frozenset()), []
-    for how in (replace(SHEETS, opacity=0.95, sunk=0.0, spread=0.4), SHEETS):
+    for how in (replace(SHEETS, opacity=0.95, offset_px=0.0, spread=0.4), SHEETS):
         drawn, _ = rules.placed(
             nothing, torch.zeros(0, dtype=torch.bool), reference, depth, reference.mask, around, how
         )
