@@ -56,7 +56,7 @@ def test_global_samples_lose_a_thin_border_only():
     ramp = torch.arange(200.0).expand(3, 100, 200)
     source = crops.Picture(ramp, ramp[0] > 100)
     for seed in range(20):
-        cut = crops.without_border(source, 0.1, generator(seed))
+        cut = crops.crop_border(source, 0.1, generator(seed))
         height, width = cut.region.shape
         assert 80 <= height <= 100 and 160 <= width <= 200
         assert torch.equal(cut.image[0] > 100, cut.region)
@@ -151,7 +151,7 @@ def test_photographs_are_measured_by_and_not_learnt_from(tiny, tmp_path):
     thing = torch.zeros(70, 90, dtype=torch.bool)
     thing[:, :45] = True
     photograph = reference.image.flip(2)
-    held = validation.held_out([reference], [(photograph, thing)], NATIVE, 0)
+    held = validation.make_held_out([reference], [(photograph, thing)], NATIVE, 0)
     assert len(held.pictures) == 2 and not (held.holes[1] * two_scale_masks(thing, [], NATIVE)[0]).any()
     assert held.holes[1].any() and (held.repaint[1] >= held.holes[1]).all()
 

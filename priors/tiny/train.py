@@ -106,7 +106,7 @@ def loss(model: Model, alphas: Tensor, batch: tuple[Tensor, Tensor, list[str]], 
     """Mean squared error of v = sqrt(a) eps - sqrt(1 - a) z, weighted by OUTSIDE (hole pixels 1) and LATENTS."""
     pixels, masks, captions = batch
     filled = torch.rand(len(pixels), 1, 1, 1, generator=random) < FILLED
-    shown = torch.where(filled, harmonic_fill.extended(pixels, masks), pixels * (masks < 0.5))
+    shown = torch.where(filled, harmonic_fill.harmonic_extension(pixels, masks), pixels * (masks < 0.5))
     clean, given = build.latents(pixels), build.latents(shown)
     t = noisy_quarter(spread_timesteps(len(pixels), len(alphas), random), len(alphas))
     noise = torch.randn(clean.shape, generator=random)
