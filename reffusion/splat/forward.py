@@ -96,7 +96,7 @@ def allocate_vectors(vectors):
 
 @kernel
 def load_constants():
-    """_NUMBERS where the compiler does not know them."""
+    """A copy of _CONSTANTS whose values the compiler does not know."""
     constants = allocate_vectors(len(_CONSTANTS) // LANES)
     constants[:] = _CONSTANTS
     return constants
