@@ -131,7 +131,7 @@ def system_of(
     return system.tocsr(), cell
 
 
-def condition(confidence: np.ndarray, guide: np.ndarray, solver: Solver = DEFAULT_SOLVER) -> tuple[float, float]:
+def condition(confidence: np.ndarray, guide: np.ndarray) -> tuple[float, float]:
     """Condition numbers (largest over smallest eigenvalue) of the system: plain, and with the Jacobi preconditioner.
 
     `solve` uses the preconditioner. The square root of the number is about the number of steps that conjugate
@@ -139,7 +139,7 @@ def condition(confidence: np.ndarray, guide: np.ndarray, solver: Solver = DEFAUL
 
     Args: as `solve`.
     """
-    system, _ = system_of(np.asarray(confidence, np.float64), guide, solver)
+    system, _ = system_of(np.asarray(confidence, np.float64), guide)
     root = sparse.diags(1.0 / np.sqrt(system.diagonal()))
     return extremes_ratio(system), extremes_ratio((root @ system @ root).tocsr())
 

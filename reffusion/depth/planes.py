@@ -11,6 +11,9 @@ from reffusion.geometry import Degenerate
 
 MIN_SAMPLES = 12  # four for each coefficient of a plane
 MIN_SHARE = 0.03  # of the samples: with fewer unexplained samples no further plane is searched
+MIN_GAIN = 0.03  # minimum increase of the explained share for which a plane joins
+TRIALS = 500  # random triples of samples for each plane
+MAX_PLANES = 6  # candidates
 
 
 def fit_plane(disparity: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -53,9 +56,6 @@ def planar_model(
     generator: torch.Generator,
     *,
     tolerance: float = 0.01,
-    gain: float = 0.03,
-    trials: int = 500,
-    most_planes: int = 6,
 ) -> PlanarModel:
     """Fit planes to the surroundings of a hole, and continue them until they intersect.
 
@@ -72,9 +72,6 @@ def planar_model(
         shape: (H, W) of the result.
         generator: on the CPU.
         tolerance: relative disparity within which a sample is explained.
-        gain: minimum increase of the explained share for which a plane joins.
-        trials: random triples of samples for each plane.
-        most_planes: maximum number of candidate planes.
 
     Raises:
         Degenerate: fewer than 12 samples, or all of them on one line.
@@ -85,7 +82,7 @@ def planar_model(
             "no plane", f"{len(pixels)} samples around the hole fix no plane: {MIN_SAMPLES} off one line are needed"
         )
     tolerances = tolerance * disparity
-    planes = _find_planes(scaled, disparity, tolerances, generator, trials, most_planes)
+    planes = _find_planes(scaled, disparity, tolerances, generator)
     candidates = [scaled @ plane for plane in planes]
     explained_share = lambda values: np.mean(np.abs(values - disparity) < tolerances)
     start = max(range(len(planes)), key=lambda k: explained_share(candidates[k]))
@@ -94,7 +91,7 @@ def planar_model(
         joins = [(join, k) for k in range(len(planes)) for join in (np.maximum, np.minimum)]
         join, k = max(joins, key=lambda option: explained_share(option[0](at_samples, candidates[option[1]])))
         joined = join(at_samples, candidates[k])
-        if explained_share(joined) < explained_share(at_samples) + gain:
+        if explained_share(joined) < explained_share(at_samples) + MIN_GAIN:
             return PlanarModel(model, float(explained_share(at_samples)), count)
         at_samples, model, count = joined, join(model, _at_pixel_centers(planes[k], shape)), count + 1
 
@@ -105,11 +102,11 @@ def _at_pixel_centers(plane: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     return plane_values((a, b, c + 0.5 * (a + b) / shape[1]), shape)
 
 
-def _find_planes(points, values, tolerances, generator, trials, most_planes) -> list[np.ndarray]:
+def _find_planes(points, values, tolerances, generator) -> list[np.ndarray]:
     """Coefficients [3] of planes, at least one: values [S] ~ points [S, 3] @ plane within `tolerances` [S]."""
     unexplained, planes = np.ones(len(values), bool), []
-    while unexplained.sum() >= max(MIN_SAMPLES, MIN_SHARE * len(values)) and len(planes) < most_planes:
-        candidate = _best_supported_plane(points, values, tolerances, np.flatnonzero(unexplained), generator, trials)
+    while unexplained.sum() >= max(MIN_SAMPLES, MIN_SHARE * len(values)) and len(planes) < MAX_PLANES:
+        candidate = _best_supported_plane(points, values, tolerances, np.flatnonzero(unexplained), generator)
         if candidate is None:
             break
         planes.append(_refit_plane(candidate, points, values, tolerances, unexplained))
@@ -117,9 +114,9 @@ def _find_planes(points, values, tolerances, generator, trials, most_planes) -> 
     return planes or [np.linalg.lstsq(points, values, rcond=None)[0]]
 
 
-def _best_supported_plane(points, values, tolerances, index, generator, trials) -> np.ndarray | None:
+def _best_supported_plane(points, values, tolerances, index, generator) -> np.ndarray | None:
     """The plane through three of the samples `index` with the most inliers; None if no three form a triangle."""
-    triples = index[torch.randint(len(index), (trials, 3), generator=generator).numpy()]
+    triples = index[torch.randint(len(index), (TRIALS, 3), generator=generator).numpy()]
     is_triangle = np.abs(np.linalg.det(points[triples])) > 1e-4  # sides of about 1% of the width
     if not is_triangle.any():
         return None

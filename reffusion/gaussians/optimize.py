@@ -17,9 +17,11 @@ from reffusion.gaussians import adam
 from reffusion.gaussians.ssim import dssim
 from reffusion.types import PARAMETERS, Gaussians
 
+DSSIM_SHARE = 0.2  # of the reconstruction loss, as in 3DGS
 
-def reconstruction_loss(image: Tensor, target: Tensor, weights: Tensor | None = None, share: float = 0.2) -> Tensor:
-    """(1 - share) L1 + share D-SSIM, 3DGS's photometric loss with share 0.2 (D-SSIM = 1 - SSIM).
+
+def reconstruction_loss(image: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
+    """The photometric loss of 3DGS: 0.8 L1 + 0.2 D-SSIM, where D-SSIM = 1 - SSIM.
 
     Args:
         image, target: [H, W, C] in [0, 1]; the gradient reaches `image` only.
@@ -28,7 +30,7 @@ def reconstruction_loss(image: Tensor, target: Tensor, weights: Tensor | None = 
             PAPER leaves open: what a masked loss is divided by. It is divided by the number of all pixels, so that a
             pixel has the same influence in every view; the loss of a completely masked view is 0.
     """
-    return (1 - share) * _l1(image, target.detach(), weights) + share * dssim(image, target, weights)
+    return (1 - DSSIM_SHARE) * _l1(image, target.detach(), weights) + DSSIM_SHARE * dssim(image, target, weights)
 
 
 def _l1(image: Tensor, target: Tensor, weights: Tensor | None) -> Tensor:

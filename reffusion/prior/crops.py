@@ -64,22 +64,15 @@ def _uniform(low: float, high: float, generator: torch.Generator) -> float:
     return low + (high - low) * float(torch.rand((), generator=generator))
 
 
-def rectangle_mask(
-    size: int,
-    generator: torch.Generator,
-    *,
-    rectangles: tuple[int, int] = RECTANGLE_COUNT,
-    side: tuple[float, float] = RECTANGLE_SIDE,
-    inverted_share: float = INVERTED_SHARE,
-) -> Tensor:
+def rectangle_mask(size: int, generator: torch.Generator) -> Tensor:
     """[1, size, size] float, 1 = repaint: a union of random rectangles, or its complement."""
-    fewest, most = rectangles
+    fewest, most = RECTANGLE_COUNT
     mask = torch.zeros(1, size, size)
     for _ in range(int(torch.randint(fewest, most + 1, (), generator=generator))):
-        height, width = (max(1, round(_uniform(*side, generator) * size)) for _ in range(2))
+        height, width = (max(1, round(_uniform(*RECTANGLE_SIDE, generator) * size)) for _ in range(2))
         top, left = (int(torch.randint(size - extent + 1, (), generator=generator)) for extent in (height, width))
         mask[:, top : top + height, left : left + width] = 1
-    return 1 - mask if _uniform(0, 1, generator) < inverted_share else mask
+    return 1 - mask if _uniform(0, 1, generator) < INVERTED_SHARE else mask
 
 
 def random_mask(samples: Samples, size: int, generator: torch.Generator) -> Tensor:
@@ -105,7 +98,6 @@ def draw_samples(
     count: int,
     samples: Samples,
     generator: torch.Generator,
-    empty_share: float = EMPTY_SHARE,
 ) -> Batch:
     """`count` random training samples of side `size`, determined by `generator`.
 
@@ -121,7 +113,7 @@ def draw_samples(
         images.append(image)
         use_hole = hole.any() and _uniform(0, 1, generator) < samples.hole_share
         masks.append(hole if use_hole else random_mask(samples, size, generator))
-        prompts.append(EMPTY if _uniform(0, 1, generator) < empty_share else prompt)
+        prompts.append(EMPTY if _uniform(0, 1, generator) < EMPTY_SHARE else prompt)
     return Batch(torch.stack(images), torch.stack(masks), torch.tensor(prompts))
 
 
