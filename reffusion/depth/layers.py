@@ -178,12 +178,12 @@ def pieces(
     piece = np.unique(piece, return_inverse=True)[1]
     counts = np.bincount(piece, minlength=1)
     order = np.argsort(-counts, kind="stable")
-    number = np.zeros(len(counts), np.int64)
+    label = np.zeros(len(counts), np.int64)
     large = order[counts[order] >= MIN_SHARE * max(len(plane_index), 1)]
-    number[large] = np.arange(1, len(large) + 1)
-    found = np.zeros(known.shape, np.int64)
-    found[known] = number[piece]
-    return found
+    label[large] = np.arange(1, len(large) + 1)
+    result = np.zeros(known.shape, np.int64)
+    result[known] = label[piece]
+    return result
 
 
 def standing(disparity: np.ndarray, known: np.ndarray, hole: np.ndarray) -> np.ndarray:

@@ -146,8 +146,8 @@ def _visible_points(
     point_colors, differences = points.colors[index].astype(int), []
     for shift in np.ndindex(3, 3):
         columns, rows = (uv + np.array(shift) - 1).astype(int).T
-        shown = image[rows.clip(0, camera.height - 1), columns.clip(0, camera.width - 1)]
-        differences.append(np.abs(shown - point_colors).max(1))
+        image_colors = image[rows.clip(0, camera.height - 1), columns.clip(0, camera.width - 1)]
+        differences.append(np.abs(image_colors - point_colors).max(1))
     is_visible = ~is_occluded & (np.min(differences, axis=0) <= MAX_COLOR_DIFFERENCE)
     return uv[is_visible], disparity[is_visible], index[is_visible]
 

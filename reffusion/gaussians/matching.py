@@ -54,10 +54,10 @@ def matched(whole: np.ndarray, cleaned: np.ndarray) -> Match:
         flip = max(TURNS, key=near_share.__getitem__)
         if near_share[flip] < SAME:
             return Match(np.zeros(len(whole), bool), near_share[flip], flip)
-    found = index.find(cleaned * flip)
-    unmatched = np.flatnonzero(found < 0)
+    exact_matches = index.find(cleaned * flip)
+    unmatched = np.flatnonzero(exact_matches < 0)
     is_kept = np.zeros(len(whole), bool)
-    is_kept[found[found >= 0]] = True
+    is_kept[exact_matches[exact_matches >= 0]] = True
     if len(unmatched):
         is_kept |= _match_one_to_one(near_index or _NearIndex(whole), cleaned[unmatched] * flip, is_kept)
     return Match(~is_kept, float(is_kept.sum() / len(cleaned)), flip)

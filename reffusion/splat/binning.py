@@ -177,7 +177,7 @@ def _columns(mean_x, half_width, tiles_x):
 
 
 @kernel
-def _find_pairs(tickets, footprints, order, width, height, places, first_slots, pairs, needed):
+def _find_pairs(tickets, footprints, order, width, height, counts_by_chunk, first_slots, pairs, needed):
     """Find tile and rows of each pair, in chunks of the order, and count them by tile and by Gaussian.
 
     Args:
@@ -190,11 +190,11 @@ def _find_pairs(tickets, footprints, order, width, height, places, first_slots, 
         ticket = take_ticket(tickets)
         if ticket >= CHUNKS:
             return
-        counts, found, at = places[ticket], pairs[ticket], 0
+        counts, chunk_pairs, position = counts_by_chunk[ticket], pairs[ticket], 0
         stop = (ticket + 1) * len(order) // CHUNKS
         for m in range(ticket * len(order) // CHUNKS, stop):
             prefetch(footprints, order[min(m + AHEAD, stop - 1)] * FOOTPRINT)
-            base, begin = order[m] * FOOTPRINT, at
+            base, begin = order[m] * FOOTPRINT, position
             first, last = _columns(_mean(footprints, base)[0], footprints[base + HALF_WIDTH], tiles_x)
             for start in range(first, last, LANES):
                 _column_rows(footprints, base, start, width, height, tops, bottoms)
@@ -204,46 +204,48 @@ def _find_pairs(tickets, footprints, order, width, height, places, first_slots, 
                         continue
                     for tile_row in range(top // TILE_HEIGHT, (bottom - 1) // TILE_HEIGHT + 1):
                         tile, tile_top = tile_row * tiles_x + start + k, tile_row * TILE_HEIGHT
-                        if at < found.shape[0]:
+                        if position < chunk_pairs.shape[0]:
                             counts[tile] += 1
-                            found[at, 0] = tile
-                            found[at, 1] = max(top - tile_top, 0) + 256 * min(bottom - tile_top, TILE_HEIGHT)
-                        at += 1
-            first_slots[order[m] + 1] = at - begin
-        needed[ticket] = at
+                            chunk_pairs[position, 0] = tile
+                            chunk_pairs[position, 1] = max(top - tile_top, 0) + 256 * min(
+                                bottom - tile_top, TILE_HEIGHT
+                            )
+                        position += 1
+            first_slots[order[m] + 1] = position - begin
+        needed[ticket] = position
 
 
 @kernel
-def _cumulate_counts(first_slots, places):
+def _cumulate_counts(first_slots, counts):
     """Turn counts into offsets by running sums in place: by Gaussian, and by tile then chunk. Returns their total."""
     for m in range(first_slots.shape[0] - 1):
         first_slots[m + 1] += first_slots[m]
     total = 0
-    for tile in range(places.shape[1]):
-        for chunk in range(places.shape[0]):
-            here = places[chunk, tile]
-            places[chunk, tile] = total
-            total += here
+    for tile in range(counts.shape[1]):
+        for chunk in range(counts.shape[0]):
+            count = counts[chunk, tile]
+            counts[chunk, tile] = total
+            total += count
     return total
 
 
 @kernel
-def _fill_lists(tickets, order, all_places, first_slots, pairs, entries):
+def _fill_lists(tickets, order, all_offsets, first_slots, pairs, entries):
     """Write the pairs into the tile lists."""
     while True:
         ticket = take_ticket(tickets)
         if ticket >= CHUNKS:
             return
-        places, found, at = all_places[ticket], pairs[ticket], 0
+        offsets, chunk_pairs, position = all_offsets[ticket], pairs[ticket], 0
         stop = (ticket + 1) * len(order) // CHUNKS
         for m in range(ticket * len(order) // CHUNKS, stop):
             prefetch(first_slots, order[min(m + AHEAD, stop - 1)])
             member = order[m]
             for slot in range(first_slots[member], first_slots[member + 1]):
-                tile = found[at, 0]
-                place = places[tile]
-                places[tile] = place + 1
-                entries[place, MEMBER] = member
-                entries[place, ROWS] = found[at, 1]
-                entries[place, SLOT] = slot
-                at += 1
+                tile = chunk_pairs[position, 0]
+                target = offsets[tile]
+                offsets[tile] = target + 1
+                entries[target, MEMBER] = member
+                entries[target, ROWS] = chunk_pairs[position, 1]
+                entries[target, SLOT] = slot
+                position += 1

@@ -71,10 +71,10 @@ def render(
         backgrounds=behind_all[None],
     )
     image, alpha = image[0], alpha[0, ..., 0]
-    drawn = alpha > 0
+    covered = alpha > 0
     return Rendering(
         color=image[..., :3],
-        depth=torch.where(drawn, image[..., 3], 0) / torch.where(drawn, alpha, 1),
+        depth=torch.where(covered, image[..., 3], 0) / torch.where(covered, alpha, 1),
         alpha=alpha,
         features=None if features is None else image[..., 4:],
         radii=(footprints.radii[0].amax(1) * visible).to(torch.int32),

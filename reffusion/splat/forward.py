@@ -195,9 +195,9 @@ def blend_pixels(power, is_above_cut, before, constants):
     raw = exp2(power, constants)
     alpha = select(is_above_cut, minimum(raw, load(constants, AT_MAX_ALPHA * LANES)), np.float32(0.0))
     after = fnma(before, alpha, before)
-    kept = after >= load(constants, _AT_MIN_TRANSMITTANCE * LANES)
-    weight = select(kept, before * alpha, np.float32(0.0))
-    return raw, alpha, weight, select(kept, after, minimum(before, splat(0.0) - before))
+    is_blended = after >= load(constants, _AT_MIN_TRANSMITTANCE * LANES)
+    weight = select(is_blended, before * alpha, np.float32(0.0))
+    return raw, alpha, weight, select(is_blended, after, minimum(before, splat(0.0) - before))
 
 
 @kernel

@@ -176,17 +176,17 @@ def project(view, mean, quaternions, log_scales, opacity_logits, row, last):
     z_inverse = 1.0 / z
     _, _, _, _, a, b = _frame(view, x, y, z_inverse, quaternions, log_scales, row, last)
     xx, xy, yy, sharp, determinant = _covariance(a, b, view[23])
-    kept = (z >= NEAR) & (xx < MAX_VARIANCE) & (yy < MAX_VARIANCE)
+    is_kept = (z >= NEAR) & (xx < MAX_VARIANCE) & (yy < MAX_VARIANCE)
     xx, yy = xx + view[23], yy + view[23]
     mean_x, mean_y = view[12] * x * z_inverse + view[14], view[13] * y * z_inverse + view[15]
     opacity = 1.0 / (1.0 + exponential(0.0 - widen(load_column(opacity_logits, 1, 0, row, last))))
     opacity = opacity * root(maximum(1.0 - view[22] * (1.0 - sharp / determinant), 0.0))
-    kept = kept & (opacity >= MIN_ALPHA)
+    is_kept = is_kept & (opacity >= MIN_ALPHA)
     level = log2(opacity)
     cut = root(maximum((level - _LEAST_LEVEL) * (2.0 / _LOG2_E), 0.0))
     whiten_x, whiten_y = _HALF_LOG2_E * root(yy / determinant), _HALF_LOG2_E / root(yy)
     reach_x, reach_y = ceiling(cut * root(xx)), ceiling(cut * root(yy))
-    return kept, mean_x, mean_y, xy / yy, whiten_x, whiten_y, level, z, reach_x, reach_y
+    return is_kept, mean_x, mean_y, xy / yy, whiten_x, whiten_y, level, z, reach_x, reach_y
 
 
 @inlined

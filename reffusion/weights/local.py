@@ -264,10 +264,10 @@ def misfit(configs: Mapping[str, Mapping[str, Any]]) -> str | None:
         configs: part -> configuration, for "unet", "vae", "text_encoder", "scheduler"; "text_encoder_2" of SDXL.
     """
     unet, vae, scheduler = (configs[part] for part in ("unet", "vae", "scheduler"))
-    channels, given = vae.get("latent_channels", 4), unet.get("in_channels", 4)
-    if given != 2 * channels + 1:
+    channels, actual = vae.get("latent_channels", 4), unet.get("in_channels", 4)
+    if actual != 2 * channels + 1:
         return (
-            f"the UNet takes {given} channels; an inpainting UNet for {channels} latent channels takes "
+            f"the UNet takes {actual} channels; an inpainting UNet for {channels} latent channels takes "
             f"{2 * channels + 1} (latents, mask, masked latents): take an inpainting model"
         )
     kind = scheduler.get("prediction_type", "epsilon")
@@ -277,8 +277,8 @@ def misfit(configs: Mapping[str, Mapping[str, Any]]) -> str | None:
     widths = [text.get("hidden_size", 512) for text in texts]
     wanted = unet.get("cross_attention_dim", 1280)
     if wanted != sum(widths):
-        given = " + ".join(map(str, widths))
-        return f"the UNet reads text of width {wanted}, the text encoder gives {given}: the parts are of two models"
+        actual = " + ".join(map(str, widths))
+        return f"the UNet reads text of width {wanted}, the text encoder gives {actual}: the parts are of two models"
     return _find_added_mismatch(unet, texts)
 
 

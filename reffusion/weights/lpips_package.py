@@ -103,9 +103,9 @@ def _read_network(archive: tarfile.TarFile, known: LpipsNet) -> dict[str, np.nda
 
 def digest(state: Mapping[str, np.ndarray]) -> str:
     """16 hexadecimal digits of a hash over all names, shapes and values."""
-    found = hashlib.sha256()
+    checksum = hashlib.sha256()
     for name in sorted(state):
         array = np.ascontiguousarray(state[name], dtype="<f4")
-        found.update(f"{name} {array.shape} ".encode())
-        found.update(array.data)
-    return found.hexdigest()[:16]
+        checksum.update(f"{name} {array.shape} ".encode())
+        checksum.update(array.data)
+    return checksum.hexdigest()[:16]
