@@ -1,4 +1,4 @@
-"""The parts of the tiny prior before training: ordinary diffusers and transformers objects.
+"""The parts of the embedded prior before training: ordinary diffusers and transformers objects.
 
 The VAE works at full resolution (factor 1) and is exact by construction, not trained: see `linear_vae`.
 """

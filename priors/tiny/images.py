@@ -1,4 +1,4 @@
-"""Training images of the tiny prior: procedural surfaces, corners of rooms and bundled photographs; and their masks.
+"""Training images of the embedded prior: procedural surfaces, corners of rooms, bundled photographs; and their masks.
 
 Image number k of a seed is a pure function of (seed, k), so training resumes to the same pictures without a
 data set on disk. Nothing is downloaded: patterns are made here, photographs come with scikit-image (the model

@@ -1,4 +1,4 @@
-"""Train the tiny prior: `python -m priors.tiny.train --steps 20000` (or `make prior`).
+"""Train the embedded prior: `python -m priors.tiny.train --steps 20000` (or `make prior`).
 
 Resumable and seeded: step k draws its images, masks, noise and timesteps from (seed, k) alone, so an interrupted run
 continues as the unbroken one would. The folder this file stands in receives an ordinary diffusers inpainting pipeline

@@ -3,8 +3,8 @@
 This is the only module that imports peft.
 
 W' = W + alpha / rank * B A. Without dropout the product is added to the weights once per forward pass, instead of
-passing every input through A and B as well. Function and gradients are the same, and a training step of the tiny prior
-is a fifth cheaper. In half precision this is not done: most of a small product would be lost in the sum, while A and B
+passing every input through A and B as well. Function and gradients are the same, and a step of the embedded prior is a
+fifth cheaper. In half precision this is not done: most of a small product would be lost in the sum, while A and B
 themselves are float32.
 """
 

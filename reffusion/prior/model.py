@@ -2,7 +2,7 @@
 
 This is the only module that imports diffusers. It works with any inpainting folder of the Stable Diffusion type, SDXL
 included (channels: latents C | mask 1 | masked latents C). Sizes, factor and prediction type are read from the
-configuration, so that the tiny prior and SD2-inpainting take the same path. `reffusion.prior.diffusion` holds the
+configuration, so that the embedded prior and SD2-inpainting take the same path. `reffusion.prior.diffusion` holds the
 operations.
 
 Half precision applies to UNet and text encoders. Always float32 are:
