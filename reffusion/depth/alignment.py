@@ -17,18 +17,15 @@ MIN_PIXELS = 4  # two unknowns, and two more pixels so that a residual can show
 MIN_RELATIVE_SPREAD = 1e-6  # of the largest value; below it float32 input determines no slope
 MAX_REWEIGHTINGS = 30
 TRIALS = 1000  # lines through two pixels: with 10% inliers 1 in 100 has two; that none has happens once in 20,000 runs
-VOTERS = (
-    500  # pixels on which a line is judged: of 10% inliers 50 agree with the right line, a handful with a wrong one
-)
+# Pixels on which a line is judged: of 10% inliers 50 agree with the right line, a handful with a wrong one.
+VOTERS = 500
 SUPPORT_LEVELS = 32  # numbers of agreeing pixels that are compared
 MAX_ERROR_RATIO = 0.7  # median error / spread of the known disparity, above which a map does not fit the scene
-SAME_UNIT_RATIO = (
-    1.5  # a map without alignment counts as being in the scene's unit up to this many times the best fit's error
-)
+# A map without alignment counts as being in the scene's unit up to this many times the best fit's error.
+SAME_UNIT_RATIO = 1.5
 SAME_UNIT_ERROR = 0.03  # or up to this relative error, which a map in another unit would hardly reach by chance
-MIN_DISPARITY_SPREAD = (
-    0.02  # relative; a scene whose disparity varies less counts as flat, and any map within this error fits
-)
+# Relative; a scene whose disparity varies less counts as flat, and any map within this error fits.
+MIN_DISPARITY_SPREAD = 0.02
 
 
 @dataclass(frozen=True)

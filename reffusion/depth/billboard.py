@@ -11,9 +11,8 @@ from reffusion.types import Camera
 
 FOOT_SHARE = 0.05  # of the height: the lowest pixels, which stand on the surface below
 BULGE = 0.5  # of the half width: how far the middle bulges towards the camera
-MIN_SINE = (
-    0.3  # between viewing direction and surface, below which the billboard faces the camera instead of standing upright
-)
+# Between viewing direction and surface, below which the billboard faces the camera instead of standing upright.
+MIN_SINE = 0.3
 GOOD_WITHIN = 30  # degrees from the reference's view; beyond this the missing back becomes visible
 
 

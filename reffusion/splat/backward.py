@@ -43,9 +43,8 @@ from reffusion.splat.layout import (
     TILE_WIDTH,
 )
 
-_UPSTREAM = (
-    6  # vectors per step before those of features: transmittance, remainder, upstream gradients of r, g, b, depth
-)
+# Vectors per step before those of features: transmittance, remainder, upstream gradients of r, g, b, depth.
+_UPSTREAM = 6
 
 
 def blend_backward(footprints, features, bins, used, images, transmittance, gradients):
