@@ -1,5 +1,7 @@
-"""lift: the hole of every training view inpainted in 2D, each by itself, as NeRF-In and SPIn-NeRF do; a baseline's
-stage, left out of the method."""
+"""lift: inpaint the hole of each training view in 2D, independently, as NeRF-In and SPIn-NeRF do.
+
+A stage of baselines, not part of the method.
+"""
 
 from __future__ import annotations
 
@@ -22,36 +24,36 @@ from reffusion.prior import inpaint
 from reffusion.prior.model import load_prior
 from reffusion.types import Reference
 
-GUIDANCE, SEED = 0.0, 0  # the paper's a
+GUIDANCE, SEED = 0.0, 0  # GUIDANCE is a of the paper
 DTYPE = torch.float32
 
 
 def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path) -> None:
-    """Write images/<view>.png, inpainted in the invent mask; the best view as a reference too; and facts.json.
+    """Write images/<view>.png, inpainted in the invent mask; the best view as a reference; and facts.json.
 
-    Views that an earlier try finished are not painted again.
+    Views finished by an earlier run are not painted again.
     """
     scene, facts = load_scene(poses), load_json(masks / "facts.json")
-    best = facts["best_reference"]
-    names = sorted({best, *facts["invent_views"]} - scene.clean)
+    best_view = facts["best_reference"]
+    names = sorted({best_view, *facts["invent_views"]} - scene.clean)
     gaussians, labels = load_ply(fit / "gaussians.ply"), load_labels(masks / "labels.npy")
     remaining = gaussians.map(lambda p: p[~labels])
-    painter, paint = painter_of(params)
+    painter, paint = load_painter(params)
     print(f"2D inpainter: {painter}", flush=True)
     for k in trace.progress(len(names), "lift"):
         name, path = names[k], out / "images" / f"{names[k]}.png"
         if path.exists():
             continue
-        photo, pixels = exposure.load_views(poses, fit, [name])[name], load_mask_sets(masks, [name])[name]
-        base = inpaint.background(remaining, scene.cameras[name], photo, pixels.consistent)
-        replace_image(path, paint(base, pixels.invent, name))
-    image, mask = load_image(out / "images" / f"{best}.png"), load_mask_sets(masks, [best])[best].invent
-    save_references(out, [Reference(scene.cameras[best], image, mask)])
+        photo, masks_of_view = exposure.load_views(poses, fit, [name])[name], load_mask_sets(masks, [name])[name]
+        picture = inpaint.background(remaining, scene.cameras[name], photo, masks_of_view.consistent)
+        replace_image(path, paint(picture, masks_of_view.invent, name))
+    image, mask = load_image(out / "images" / f"{best_view}.png"), load_mask_sets(masks, [best_view])[best_view].invent
+    save_references(out, [Reference(scene.cameras[best_view], image, mask)])
     save_json(out / "facts.json", {"inpainter": painter, "views": len(names)})
 
 
-def painter_of(params: Params) -> tuple[str, Callable[[np.ndarray, np.ndarray, str], np.ndarray]]:
-    """The inpainter's name, and (image [H, W, 3] uint8, hole [H, W] bool, name of the view) -> uint8 [H, W, 3]."""
+def load_painter(params: Params) -> tuple[str, Callable[[np.ndarray, np.ndarray, str], np.ndarray]]:
+    """The inpainter's name, and a function (image uint8 [H, W, 3], hole bool [H, W], view name) -> uint8 [H, W, 3]."""
     if params.inpainter != "diffusion":
         painter = feedforward.load_by_name(params.inpainter, params.device)
         return painter.name, lambda image, hole, _: painter.paint(image, hole)

@@ -1,4 +1,4 @@
-"""personalize: the prior learns the reference by LoRA (RefFusion section 4.1)."""
+"""personalize: fine-tune the prior on the reference by LoRA (RefFusion section 4.1)."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from reffusion.prior.model import load_prior, recomputing
 from reffusion.prior.personalize import personalize
 from reffusion.types import Scene
 
-MEMORY = "personalize.memory_gb"  # what an error names
-HELD_OUT = 4  # photographs by which it is measured
+MEMORY_PARAM = "personalize.memory_gb"  # named in errors
+VALIDATION_PHOTOS = 4  # number of photographs used for validation
 
 
 def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, reference: Path) -> None:
-    began = time.monotonic()
+    start = time.monotonic()
     if not params.steps:
         raise ValueError("personalize.steps is 0: there is nothing to learn, leave the stage out")
     scene = load_scene(poses)
@@ -30,30 +30,34 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, reference: P
         crops.picture(torch.from_numpy(r.image), torch.from_numpy(r.mask), prior.native_size)
         for r in load_references(reference, scene)
     ]
-    photographs = others(scene, poses, raw_masks, [r.camera.name for r in load_references(reference, scene)])
-    chosen = params.lora
-    trained = lora.add(prior, chosen.rank, chosen.alpha, chosen.dropout, chosen.layers, params.seed)
+    photographs = load_validation_photos(
+        scene, poses, raw_masks, [r.camera.name for r in load_references(reference, scene)]
+    )
+    lora_params = params.lora
+    trained = lora.add(prior, lora_params.rank, lora_params.alpha, lora_params.dropout, lora_params.layers, params.seed)
 
-    def learn(folder: Path, steps: int) -> None:
+    def train(folder: Path, steps: int) -> None:
         personalize(prior, trained, references, params.model_copy(update={"steps": steps}), folder, photographs)
 
-    def tried(folder: Path, steps: int) -> None:
-        before = lora.state(prior)
-        learn(folder, steps)
-        lora.load_state(prior, before)
+    def try_training(folder: Path, steps: int) -> None:
+        state = lora.state(prior)
+        train(folder, steps)
+        lora.load_state(prior, state)
 
-    row = lambda prior: denoising.one_sample(prior, references, params.seed)
-    with memory.blamed(MEMORY, params.memory_gb):
-        prior = memory.fitted(prior, params.memory_gb, MEMORY, row)
-        learn(out, trace.affordable(out, params.steps, params.seconds, lambda: time.monotonic() - began, tried))
+    backward = lambda prior: denoising.one_sample(prior, references, params.seed)
+    with memory.blamed(MEMORY_PARAM, params.memory_gb):
+        prior = memory.fitted(prior, params.memory_gb, MEMORY_PARAM, backward)
+        train(out, trace.affordable(out, params.steps, params.seconds, lambda: time.monotonic() - start, try_training))
     lora.save(prior, out)
     trace.clear_checkpoint(out)
 
 
-def others(scene: Scene, poses: Path, raw_masks: Path, learnt: list[str]) -> list[tuple[torch.Tensor, torch.Tensor]]:
-    """`HELD_OUT` photographs of views that are not references, [3, H, W] in [-1, 1], and the object in them [H, W]."""
+def load_validation_photos(
+    scene: Scene, poses: Path, raw_masks: Path, references: list[str]
+) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """Photographs [3, H, W] in [-1, 1] of views that are not references, and the object's masks, bool [H, W]."""
     masks = load_raw_masks(raw_masks, scene.train)
-    names = [name for name in scene.train if name in masks and name not in learnt]
-    photos = load_views(poses, names[:: max(1, len(names) // HELD_OUT)][:HELD_OUT])
-    picture = lambda image: torch.from_numpy(image).permute(2, 0, 1).float() / 127.5 - 1
-    return [(picture(image), torch.from_numpy(masks[name])) for name, image in photos.items()]
+    names = [name for name in scene.train if name in masks and name not in references]
+    photos = load_views(poses, names[:: max(1, len(names) // VALIDATION_PHOTOS)][:VALIDATION_PHOTOS])
+    to_tensor = lambda image: torch.from_numpy(image).permute(2, 0, 1).float() / 127.5 - 1
+    return [(to_tensor(image), torch.from_numpy(masks[name])) for name, image in photos.items()]

@@ -9,8 +9,8 @@ from small_scene import camera
 
 from reffusion import geometry
 from reffusion.depth import patchmatch, sparse_to_dense
-from reffusion.depth.multiview_depth import agreed
-from reffusion.depth.sparse_to_dense import SparsePoints, known
+from reffusion.depth.multiview_depth import estimate_multiview_depth
+from reffusion.depth.sparse_to_dense import SparsePoints, visible_samples
 from reffusion.fit import few_views
 from reffusion.io.images import save_image
 from reffusion.io.ply import load_ply
@@ -25,7 +25,7 @@ NONE: dict[str, np.ndarray] = {}
 
 
 def depth_between(points, view, picture):
-    return sparse_to_dense.depth_between(known(points, view, picture), view, picture)
+    return sparse_to_dense.interpolate_depth(visible_samples(points, view, picture), view, picture)
 
 
 def shown(view):
@@ -76,9 +76,12 @@ def test_too_few_points_tell_nothing():
     view = camera("a", 0.0)
     assert depth_between(SparsePoints.of(positions[:20], colors[:20]), view, shown(view)[1]) is None
     params = Params(sh={"degree": 0})
-    assert few_views.surfaces([view], {"a": shown(view)[1]}, positions[:10], colors[:10], NONE, params) is None
+    assert (
+        few_views.gaussians_on_surfaces([view], {"a": shown(view)[1]}, positions[:10], colors[:10], NONE, params)
+        is None
+    )
     behind = positions * (1, 1, -1)
-    assert few_views.surfaces([view], {"a": shown(view)[1]}, behind, colors, NONE, params) is None
+    assert few_views.gaussians_on_surfaces([view], {"a": shown(view)[1]}, behind, colors, NONE, params) is None
 
 
 def rough(points):
@@ -101,7 +104,7 @@ def test_photographs_tell_a_slanted_plane_within_a_thousandth():
     (true, picture), *others = map(slanted, views)
     seen = [(view, image) for view, (_, image) in zip(views[1:], others, strict=True)]
     rays, draw = geometry.pixel_rays(views[0]), np.random.default_rng(0)
-    planes = patchmatch.fitted(views[0], picture, seen, 1.06 * true, draw)
+    planes = patchmatch.estimate_planes(views[0], picture, seen, 1.06 * true, draw)
     error = np.abs(1 / (planes * rays).sum(-1) / true - 1)[8:-8, 8:-8]
     assert np.median(error) < 1e-3 and (error < 5e-3).mean() > 0.97, (np.median(error), (error < 5e-3).mean())
 
@@ -109,11 +112,11 @@ def test_photographs_tell_a_slanted_plane_within_a_thousandth():
 def test_where_photographs_show_nothing_what_is_believed_stays():
     views, grey = [camera("a", 0.0), camera("b", 0.2)], np.full((72, 96, 3), 90, np.uint8)
     believed = np.full((72, 96), 2.0)
-    planes = patchmatch.fitted(views[0], grey, [(views[1], grey)], believed, np.random.default_rng(0))
+    planes = patchmatch.estimate_planes(views[0], grey, [(views[1], grey)], believed, np.random.default_rng(0))
     depth = 1 / (planes * geometry.pixel_rays(views[0])).sum(-1)
     assert np.abs(depth / believed - 1).max() < 1e-6
     away = camera("away", 50.0)  # shows nothing of it
-    planes = patchmatch.fitted(views[0], grey, [(away, grey)], believed, np.random.default_rng(0))
+    planes = patchmatch.estimate_planes(views[0], grey, [(away, grey)], believed, np.random.default_rng(0))
     assert np.abs((planes * geometry.pixel_rays(views[0])).sum(-1) - 0.5).max() < 1e-6
 
 
@@ -124,7 +127,7 @@ def test_other_photographs_may_be_of_another_size_and_threads_do_not_matter():
     found, before = [], torch.get_num_threads()
     for count in (1, 2):
         torch.set_num_threads(count)
-        found.append(patchmatch.fitted(views[0], picture, seen, 1.06 * true, np.random.default_rng(3)))
+        found.append(patchmatch.estimate_planes(views[0], picture, seen, 1.06 * true, np.random.default_rng(3)))
     torch.set_num_threads(before)
     assert np.array_equal(*found)
     depth = 1 / (found[0] * geometry.pixel_rays(views[0])).sum(-1)
@@ -152,27 +155,27 @@ def test_points_that_lie_behind_what_is_seen_are_refuted_by_the_photographs():
     behind = (np.abs(wall[:, :2]) < HALF * WALL / NEAR).all(1)
     colors[: len(wall)][behind] = geometry.sample_nearest(pictures["a"], uv)[0][behind]
     points = SparsePoints.of(positions, colors)
-    told = agreed(points, views, pictures, NONE, seed=0)
+    told = estimate_multiview_depth(points, views, pictures, NONE, seed=0)
     true, inner = before_wall(views[0])[0], (slice(22, 50), slice(34, 62))
     wrong = lambda depth: (np.abs(depth / true - 1) > 0.02)[inner].mean()
     assert wrong(told["a"].depth) < 0.2 < 0.4 < wrong(depth_between(points, views[0], pictures["a"]))
-    assert (np.abs(told["a"].depth / true - 1) < 0.01)[told["a"].sure].mean() > 0.97
-    alone = agreed(points, views[:1], pictures, NONE, seed=0)["a"]
-    assert not alone.sure.any() and not alone.wrong.any(), "one photograph alone is sure of nothing"
+    assert (np.abs(told["a"].depth / true - 1) < 0.01)[told["a"].confirmed].mean() > 0.97
+    alone = estimate_multiview_depth(points, views[:1], pictures, NONE, seed=0)["a"]
+    assert not alone.confirmed.any() and not alone.refuted.any(), "one photograph alone is sure of nothing"
     hidden = {"a": np.ones(true.shape, bool)}
-    assert not agreed(points, views, pictures, hidden, seed=0)["a"].sure.any()
+    assert not estimate_multiview_depth(points, views, pictures, hidden, seed=0)["a"].confirmed.any()
 
 
 def test_a_further_view_adds_what_those_before_do_not_show():
     views = [camera("a", 0.0), camera("b", 0.1)]
     images = {view.name: shown(view)[1] for view in views}
     params = Params(sh={"degree": 0})
-    one, both = (few_views.surfaces(views[:k], images, *sparse(), NONE, params) for k in (1, 2))
+    one, both = (few_views.gaussians_on_surfaces(views[:k], images, *sparse(), NONE, params) for k in (1, 2))
     pixels = views[0].width * views[0].height
     assert 1.9 * pixels < len(one) < 2 * pixels, "but for what is beside the square"
     assert len(one) < len(both) < 2.4 * pixels
     hidden = {"a": np.ones((views[0].height, views[0].width), bool)}
-    assert len(few_views.surfaces(views[:1], images, *sparse(), hidden, params)) == 0
+    assert len(few_views.gaussians_on_surfaces(views[:1], images, *sparse(), hidden, params)) == 0
 
 
 def written(folder, train):

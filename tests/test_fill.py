@@ -6,7 +6,7 @@ import torch
 from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import spsolve
 
-from reffusion.prior.harmonic_fill import extended
+from reffusion.prior.harmonic_fill import harmonic_extension
 
 
 def disc(height, width, radius):
@@ -48,7 +48,7 @@ def exact(image, hole):
 def test_what_is_given_stays_and_the_hole_lies_within_its_range(size):
     images, hidden = pictures(3, 3, *size), (pictures(3, 1, *size, seed=1) > 0).double()
     hidden[..., 0, 0] = 0
-    filled = extended(images, hidden)
+    filled = harmonic_extension(images, hidden)
     given = (hidden == 0).expand_as(images)
     assert torch.equal(filled[given], images[given])
     low = images.where(given, torch.inf).amin((2, 3), keepdim=True)
@@ -58,7 +58,7 @@ def test_what_is_given_stays_and_the_hole_lies_within_its_range(size):
 
 def test_a_constant_is_continued_exactly():
     images = torch.full((1, 3, 40, 40), 0.3, dtype=torch.float64)
-    assert (extended(images, disc(40, 40, 15)) - 0.3).abs().max() < 1e-14
+    assert (harmonic_extension(images, disc(40, 40, 15)) - 0.3).abs().max() < 1e-14
 
 
 @pytest.mark.parametrize("radius", [3, 8, 16])
@@ -66,7 +66,7 @@ def test_it_is_close_to_the_solution_of_laplaces_equation(radius):
     images, hidden = smooth(48, 48), disc(48, 48, radius)
     hole = hidden[0, 0].numpy() > 0
     solution = exact(images[0].permute(1, 2, 0).numpy(), hole)
-    ours = extended(images, hidden)[0].permute(1, 2, 0).numpy()
+    ours = harmonic_extension(images, hidden)[0].permute(1, 2, 0).numpy()
     assert np.abs(ours - solution)[hole].max() < 0.12  # of a range of 2
     assert np.square(ours - solution)[hole].mean() < 0.01 * np.square(solution)[hole].mean() + 2e-4
 
@@ -74,17 +74,17 @@ def test_it_is_close_to_the_solution_of_laplaces_equation(radius):
 def test_what_lies_in_the_hole_does_not_matter():
     images, hidden = pictures(1, 3, 32, 32), disc(32, 32, 9)
     other = torch.where(hidden > 0, torch.nan, images)
-    assert torch.equal(extended(images, hidden), extended(other, hidden))
+    assert torch.equal(harmonic_extension(images, hidden), harmonic_extension(other, hidden))
 
 
 def test_nothing_given_gives_grey_and_leaves_its_neighbours_in_the_batch_alone():
     images, hidden = pictures(2, 3, 32, 32), disc(32, 32, 9).repeat(2, 1, 1, 1)
     hidden[0] = 1
-    both = extended(images, hidden)
+    both = harmonic_extension(images, hidden)
     assert torch.equal(both[0], torch.zeros_like(both[0]))
-    assert torch.equal(both[1], extended(images[1:], hidden[1:])[0])
+    assert torch.equal(both[1], harmonic_extension(images[1:], hidden[1:])[0])
 
 
 def test_no_hole_changes_nothing():
     images = pictures(1, 3, 20, 30)
-    assert torch.equal(extended(images, torch.zeros(1, 1, 20, 30, dtype=torch.float64)), images)
+    assert torch.equal(harmonic_extension(images, torch.zeros(1, 1, 20, 30, dtype=torch.float64)), images)

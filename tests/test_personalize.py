@@ -41,10 +41,13 @@ def test_pictures_are_enlarged_until_a_crop_fits():
     assert float(small.image.min()) == -1
 
 
-def test_rectangle_masks_repaint_something_and_keep_within_their_sides():
-    once = {"rectangles": (1, 1), "side": (0.25, 0.5), "inverted_share": 0.0}
+def test_rectangle_masks_repaint_something_and_keep_within_their_sides(monkeypatch):
+    once = {"RECTANGLE_COUNT": (1, 1), "RECTANGLE_SIDE": (0.25, 0.5), "INVERTED_SHARE": 0.0}
     for seed in range(50):
-        mask = crops.rectangle_mask(64, generator(seed), **once)[0]
+        with monkeypatch.context() as patched:
+            for name, value in once.items():
+                patched.setattr(crops, name, value)
+            mask = crops.rectangle_mask(64, generator(seed))[0]
         rows, columns = mask.any(1).sum(), mask.any(0).sum()
         assert set(mask.unique().tolist()) == {0.0, 1.0} and mask.sum() == rows * columns
         assert 16 <= rows <= 32 and 16 <= columns <= 32
@@ -56,7 +59,7 @@ def test_global_samples_lose_a_thin_border_only():
     ramp = torch.arange(200.0).expand(3, 100, 200)
     source = crops.Picture(ramp, ramp[0] > 100)
     for seed in range(20):
-        cut = crops.without_border(source, 0.1, generator(seed))
+        cut = crops.crop_border(source, 0.1, generator(seed))
         height, width = cut.region.shape
         assert 80 <= height <= 100 and 160 <= width <= 200
         assert torch.equal(cut.image[0] > 100, cut.region)
@@ -64,12 +67,13 @@ def test_global_samples_lose_a_thin_border_only():
 
 @pytest.mark.parametrize("local_share", [0.0, 1.0])
 @pytest.mark.parametrize("size", [SIZE, NATIVE])
-def test_samples_masked_by_the_hole_show_it_where_it_is(local_share, size):
+def test_samples_masked_by_the_hole_show_it_where_it_is(local_share, size, monkeypatch):
     """The striped picture with its hole painted white: mask and white pixels must be the same."""
     source = striped()
     source = crops.Picture(torch.where(source.region, 1.0, source.image.clamp(max=0)), source.region)
     chosen = Samples(local_share=local_share, hole_share=1.0)
-    samples = crops.draw_samples([source], NATIVE, size, 40, chosen, generator(5), empty_share=0.0)
+    monkeypatch.setattr(crops, "EMPTY_SHARE", 0.0)
+    samples = crops.draw_samples([source], NATIVE, size, 40, chosen, generator(5))
     white = samples.images[:, :1]
     assert (samples.masks.flatten(1).sum(1) > 0).all()
     assert (white[samples.masks == 0] <= 1e-5).all()
@@ -77,11 +81,13 @@ def test_samples_masked_by_the_hole_show_it_where_it_is(local_share, size):
         assert torch.equal(white == 1, samples.masks == 1)
 
 
-def test_local_samples_show_the_hole_in_full_resolution_and_prompts_follow():
+def test_local_samples_show_the_hole_in_full_resolution_and_prompts_follow(monkeypatch):
     view = striped()
-    drawn = lambda count, size, share, empty: crops.draw_samples(
-        [view], NATIVE, size, count, Samples(local_share=share), generator(3), empty_share=empty
-    )
+
+    def drawn(count, size, share, empty):
+        monkeypatch.setattr(crops, "EMPTY_SHARE", empty)
+        return crops.draw_samples([view], NATIVE, size, count, Samples(local_share=share), generator(3))
+
     local = drawn(10, SIZE, 1.0, 0.0)
     windows = view.image.unfold(1, SIZE, 1).unfold(2, SIZE, 1).permute(1, 2, 0, 3, 4).flatten(0, 1)
     for image in local.images:
@@ -151,7 +157,7 @@ def test_photographs_are_measured_by_and_not_learnt_from(tiny, tmp_path):
     thing = torch.zeros(70, 90, dtype=torch.bool)
     thing[:, :45] = True
     photograph = reference.image.flip(2)
-    held = validation.held_out([reference], [(photograph, thing)], NATIVE, 0)
+    held = validation.make_held_out([reference], [(photograph, thing)], NATIVE, 0)
     assert len(held.pictures) == 2 and not (held.holes[1] * two_scale_masks(thing, [], NATIVE)[0]).any()
     assert held.holes[1].any() and (held.repaint[1] >= held.holes[1]).all()
 

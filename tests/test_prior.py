@@ -60,7 +60,7 @@ def test_predictions_reproduce_the_noisy_latents(tiny, kind):
     eps, x0 = diffusion.predict(prior, noisy, t, condition, text)
     assert torch.allclose(diffusion.add_noise(prior, x0, eps, t), noisy, atol=1e-4)
     target = diffusion.training_target(prior, clean, noise, t)
-    a = diffusion.abar(prior, t)
+    a = diffusion.alpha_bar(prior, t)
     recovered = (
         (noisy - (1 - a).sqrt() * target) / a.sqrt()
         if kind == "epsilon"
@@ -79,7 +79,7 @@ def test_conditioning_hides_what_lies_under_the_mask(tiny):
 
 def test_a_folder_says_what_the_hole_shows(tiny, tmp_path):
     images, masks = pictures(), half_masks()
-    filled = harmonic_fill.extended(images, masks)
+    filled = harmonic_fill.harmonic_extension(images, masks)
     assert tiny.fills
     expected = torch.cat([masks, diffusion.encode(tiny, filled)], 1)
     assert torch.equal(diffusion.conditioning(tiny, images, masks), expected)

@@ -97,7 +97,13 @@ def weights_of(folder):
 @pytest.fixture
 def command(monkeypatch, tmp_path):
     """`train.py` with small batches; gives back the exported weights."""
-    for name, value in (("POOL", 6), ("SMALL", (16, 2)), ("LARGE", (16, 2)), ("VALIDATION", 2), ("KEEP", 3)):
+    for name, value in (
+        ("POOL", 6),
+        ("SMALL", (16, 2)),
+        ("LARGE", (16, 2)),
+        ("VALIDATION_CROPS", 2),
+        ("CHECKPOINT_STEPS", 3),
+    ):
         monkeypatch.setattr(train, name, value)
 
     def run(work, count, *more):

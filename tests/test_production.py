@@ -128,7 +128,7 @@ def test_half_precision_stays_near_and_leaves_the_vae_alone(sd2):
     error = (eps_half - eps).abs().max()
     assert 0 < error < 0.1
     # x0 = (z - s eps) / a itself loses nothing: its error is that of eps, times s / a.
-    a = diffusion.abar(sd2, at)
+    a = diffusion.alpha_bar(sd2, at)
     assert torch.allclose(clean_half - clean, -((1 - a) / a).sqrt() * (eps_half - eps), atol=1e-4)
 
 
@@ -215,7 +215,7 @@ def test_living_tensors_are_counted():
 def test_a_budget_chooses_the_parts(sd2):
     assert memory.fitted(sd2, 0.0, "distill.memory_gb", memory.encoding) is sd2
     one, answer = (memory.peak_bytes(lambda w=w: w(sd2), "cpu") for w in (memory.encoding, memory.answering))
-    budget = (sd2.bytes + 3.5 * one) / memory.SPARE / 1e9
+    budget = (sd2.bytes + 3.5 * one) / memory.USABLE_SHARE / 1e9
     chosen = memory.fitted(sd2, budget, "distill.memory_gb", memory.encoding)
     assert chosen.rows_graded == 3 and chosen.rows == int(3.5 * one // answer)
     with pytest.raises(ValueError, match=r"distill.memory_gb is 0.001, but the prior takes .* raise it to"):

@@ -5,12 +5,12 @@ import time
 import torch
 
 from reffusion.io.machine import idle_seconds
-from reffusion.prior.threads import MEASURED, RECENT, WORTH, Threads
+from reffusion.prior.threads import CALIBRATION_STEPS, MIN_STEPS, RECENT_STEPS, Threads
 
 STEPS = 12
 
 
-def used(seconds, steps=WORTH, device="cpu", idle=time.perf_counter):
+def used(seconds, steps=MIN_STEPS, device="cpu", idle=time.perf_counter):
     """The parts at once of each of `STEPS` steps, which take `seconds[parts]`; a core is idle, or as `idle` says."""
     before, found = torch.get_num_threads(), []
     torch.set_num_threads(2)
@@ -20,7 +20,7 @@ def used(seconds, steps=WORTH, device="cpu", idle=time.perf_counter):
                 with threads.step():
                     found.append(threads.now)
                     of_torch = set(threads.map(lambda _: torch.get_num_threads(), range(4)))
-                    assert of_torch == ({1} if steps >= WORTH and device == "cpu" else {2})
+                    assert of_torch == ({1} if steps >= MIN_STEPS and device == "cpu" else {2})
                     time.sleep(seconds[found[-1]])
         assert torch.get_num_threads() == 2
     finally:
@@ -29,11 +29,13 @@ def used(seconds, steps=WORTH, device="cpu", idle=time.perf_counter):
 
 
 def test_all_threads_are_used_while_they_pay():
-    assert used({1: 0.1, 2: 0.0}) == [1] * MEASURED + [2] * (STEPS - MEASURED)
+    assert used({1: 0.1, 2: 0.0}) == [1] * CALIBRATION_STEPS + [2] * (STEPS - CALIBRATION_STEPS)
 
 
 def test_one_thread_is_used_where_the_others_hold_it_up():
-    assert used({1: 0.0, 2: 0.1}) == [1] * MEASURED + [2] * RECENT + [1] * (STEPS - MEASURED - RECENT)
+    assert used({1: 0.0, 2: 0.1}) == [1] * CALIBRATION_STEPS + [2] * RECENT_STEPS + [1] * (
+        STEPS - CALIBRATION_STEPS - RECENT_STEPS
+    )
 
 
 def test_a_core_that_others_use_is_left_to_them():
@@ -43,4 +45,4 @@ def test_a_core_that_others_use_is_left_to_them():
 
 
 def test_little_work_and_gpus_are_left_to_torch():
-    assert used({1: 0.0, 2: 0.0}, steps=WORTH - 1) == [1] * STEPS == used({1: 0.0, 2: 0.0}, device="meta")
+    assert used({1: 0.0, 2: 0.0}, steps=MIN_STEPS - 1) == [1] * STEPS == used({1: 0.0, 2: 0.0}, device="meta")

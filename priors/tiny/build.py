@@ -21,14 +21,14 @@ TEXT_LENGTH = 24
 # Opponent colours of (r, g, b) in [-1, 1], scaled to deviation about 1 over the training images, so that one noise
 # schedule serves light and colour alike. Diffusers' inpainting pipeline wants four latents; the fourth is empty.
 LIGHT, WARM, GREEN = 1.9, 5.0, 9.0
-# At full resolution what a hole holds is decided where the noise is strong: neighbours average weak noise away. So the
+# At full resolution the content of a hole is decided at strong noise, since neighbours average weak noise away. So the
 # schedule spends most timesteps between a log signal-to-noise ratio of 0 and -7, and ends where even a hole's mean
 # colour is hidden (with SD's schedule, which ends at -5.4, 1.1 dB of a hole's PSNR came from what showed through).
 TIMESTEPS, SHIFT, LOWEST = 1000, -2.2, -12.0
 
 
 def analysis() -> Tensor:
-    """[4, 3, 3, 3], the convolution that the VAE's encoder amounts to: pixels in [-1, 1] to latents."""
+    """[4, 3, 3, 3], the convolution that equals the VAE's encoder: pixels in [-1, 1] to latents."""
     light = torch.tensor([1, 1, 1]) / 3
     kernel = torch.zeros(4, 3, 3, 3)
     kernel[0, :, 1, 1] = LIGHT * light
@@ -38,7 +38,7 @@ def analysis() -> Tensor:
 
 
 def latents(pixels: Tensor) -> Tensor:
-    """[B, 3, H, W] in [-1, 1] -> [B, 4, H, W]: what the VAE's encoder gives, up to 1e-3, at a tenth of its cost."""
+    """[B, 3, H, W] in [-1, 1] -> [B, 4, H, W]: the output of the VAE's encoder up to 1e-3, at a tenth of the cost."""
     return conv2d(pixels, analysis(), padding=1)
 
 
@@ -67,7 +67,7 @@ def linear_vae() -> AutoencoderKL:
     kernel = analysis()
     back = torch.zeros(3, 4, 3, 3)
     back[:, :3, 1, 1] = torch.linalg.inv(kernel[:3, :, 1, 1])
-    gain = constant * (2 / channels) ** 0.5  # what the group norm divides by
+    gain = constant * (2 / channels) ** 0.5  # divisor of the group norm
     with torch.no_grad():
         for module in vae.modules():
             if type(module).__name__ == "ResnetBlock2D":
@@ -102,7 +102,7 @@ def _gather(conv: torch.nn.Conv2d, gain: float, kernel: torch.Tensor | None = No
 
 
 def tokenizer() -> CLIPTokenizer:
-    """A CLIP tokenizer of bytes and the prompts' own words."""
+    """A CLIP tokenizer for bytes and the words of the prompts."""
     letters = _byte_letters()
     vocabulary, merges = [*letters, *(c + "</w>" for c in letters)], []
     for word in WORDS:
@@ -148,7 +148,7 @@ def text_encoder(tokens: CLIPTokenizer) -> CLIPTextModel:
 
 
 def unet(channels: tuple[int, ...] = (32, 64, 96), layers: int = 1) -> UNet2DConditionModel:
-    """Mostly convolutional; attention (to the text and within the view) at the coarsest level only."""
+    """A mostly convolutional UNet; attention (to the text and within the view) only at the coarsest level."""
     levels = len(channels)
     return UNet2DConditionModel(
         sample_size=NATIVE,

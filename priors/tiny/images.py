@@ -1,4 +1,4 @@
-"""The images that train the embedded prior: procedural surfaces, corners of rooms and bundled photographs; their masks.
+"""Training images of the embedded prior: procedural surfaces, corners of rooms, bundled photographs; and their masks.
 
 Image number k of a seed is a pure function of (seed, k), so training resumes to the same pictures without a
 data set on disk. Nothing is downloaded: patterns are made here, photographs come with scikit-image (the model
@@ -44,7 +44,7 @@ def pixels() -> tuple[Field, Field]:
 
 
 def surface(rng: np.random.Generator) -> tuple[np.ndarray, str]:
-    """One textured plane seen from in front or aslant, under a shading gradient."""
+    """One textured plane, frontal or slanted, under a shading gradient."""
     texture, name = random_texture(rng)
     x, y = pixels()
     tilt = rng.normal(0, 0.002, 2) if rng.random() < 0.7 else np.zeros(2)
@@ -66,7 +66,7 @@ def corner(rng: np.random.Generator) -> tuple[np.ndarray, str]:
     dx, dz = dx * np.cos(yaw) + dz * np.sin(yaw), dz * np.cos(yaw) - dx * np.sin(yaw)
     height, back, side = rng.uniform(0.7, 1.6), rng.uniform(1.2, 3.5), rng.choice([-1, 1]) * rng.uniform(0.8, 3)
     if rng.random() < 0.35:
-        side *= 100  # no side wall in sight
+        side *= 100  # no visible side wall
     with np.errstate(divide="ignore"):
         reach = np.stack([height / dy, back / dz, side / dx])
     reach = np.where(reach > 1e-3, reach, np.inf)
@@ -86,7 +86,7 @@ def corner(rng: np.random.Generator) -> tuple[np.ndarray, str]:
 
 
 def with_props(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
-    """Up to three textured blobs or boxes before the picture: edges that end and shapes that occlude."""
+    """Up to three textured blobs or boxes in the foreground: edges that end, and shapes that occlude."""
     x, y = pixels()
     for _ in range(rng.integers(1, 4)):
         texture, _ = random_texture(rng)
@@ -108,7 +108,7 @@ def with_props(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
 
 @lru_cache
 def photographs(names: tuple[str, ...]) -> tuple[tuple[str, np.ndarray], ...]:
-    """The named photographs of scikit-image that lie on disk, as [H, W, 3] uint8."""
+    """The named photographs of scikit-image that are on disk, as uint8 [H, W, 3]."""
     from pathlib import Path
 
     import skimage
@@ -138,7 +138,7 @@ def photo_crop(rng: np.random.Generator, held_out: bool) -> tuple[np.ndarray, st
 
 
 def mask(rng: np.random.Generator, size: int) -> np.ndarray:
-    """A mask like the job's, in a crop: a silhouette, a half plane, rectangles or everything; bool [size, size]."""
+    """bool [size, size]: a mask as in the method: a silhouette, a half plane, rectangles or everything."""
     kind = rng.choice(["silhouette", "halfplane", "rectangles", "all"], p=[0.55, 0.2, 0.17, 0.08])
     canvas = np.zeros((size, size), np.uint8)
     if kind == "all":

@@ -31,22 +31,22 @@ from reffusion.trace import load_checkpoint, save_checkpoint
 HERE = Path(__file__).resolve().parent
 
 POOL = 500  # images held in memory
-FRESH = 2  # steps for each new image, which takes the place of the oldest; making one costs a twentieth of a step
+STEPS_PER_IMAGE = 2  # steps per new image, which replaces the oldest; making one costs 1/20 of a step
 SMALL, LARGE = (
     (32, 24),
     (64, 8),
 )  # (crop side in px, batch): small crops three steps of four, whole native ones the fourth
-PEAK_RATE, WARMUP, FALL, EMA = 1e-3, 200, 0.5, 0.999  # FALL: share of the run, at its end, over which the rate falls
-OUTSIDE = 0.2  # weight of the loss on pixels the network is given anyway
-FILLED = 0.8  # share of samples that show the hole filled from its surroundings, as conditioning.json says; else grey
-NOISIEST = 0.15  # part of the schedule, its noisy end, that every fourth sample is drawn from
-LATENTS = (1.0, 1.0, 1.0, 0.02)  # weight of each latent; the fourth is empty, and need only stay near that
-VALIDATION = 32  # held-out crops
-KEEP = 100  # steps between checkpoints
+PEAK_RATE, WARMUP, DECAY_SHARE, EMA = 1e-3, 200, 0.5, 0.999  # DECAY_SHARE: last part of the run, with a falling rate
+OUTSIDE_WEIGHT = 0.2  # weight of the loss outside the mask
+FILLED_SHARE = 0.8  # of samples have the hole filled as in conditioning.json; the others a grey hole
+NOISY_SHARE = 0.15  # noisy end of the schedule, from which every fourth timestep is sampled
+LATENT_WEIGHTS = (1.0, 1.0, 1.0, 0.02)  # of each latent; the fourth is empty, and only has to stay close to 0
+VALIDATION_CROPS = 32  # held-out crops
+CHECKPOINT_STEPS = 100  # steps between checkpoints
 
 
 class Pool:
-    """The last `size` images of a seed; `advance` puts image number `index` in the place of the oldest."""
+    """The last `size` images of a seed; `advance` replaces the oldest by image number `index`."""
 
     def __init__(self, seed: int, step: int, size: int, held_out: bool = False):
         self.seed, self.held_out = seed, held_out
@@ -77,7 +77,7 @@ class Pool:
 
 
 class Model(nn.Module):
-    """What is trained: UNet and text encoder; the VAE is exact by construction."""
+    """The trained parts: UNet and text encoder; the VAE is constructed and exact."""
 
     def __init__(self, seed: int):
         super().__init__()
@@ -92,28 +92,28 @@ class Model(nn.Module):
 
 
 def noisy_quarter(t: Tensor, steps: int) -> Tensor:
-    """Timesteps of which every fourth is moved into the last `NOISIEST` of the schedule.
+    """Timesteps of which every fourth is moved into the last `NOISY_SHARE` of the schedule.
 
     There the network can only answer the mean of all fillings, and must forget the noise: what the sampler's first
     step, which decides colours and layout, is made of.
     """
     last = steps - 1
-    moved = last - ((last - t) * NOISIEST).long()
+    moved = last - ((last - t) * NOISY_SHARE).long()
     return torch.where(torch.arange(len(t)) % 4 == 0, moved, t)
 
 
 def loss(model: Model, alphas: Tensor, batch: tuple[Tensor, Tensor, list[str]], random: torch.Generator) -> Tensor:
-    """Mean squared error of v = sqrt(a) eps - sqrt(1 - a) z, weighted by OUTSIDE (hole pixels 1) and LATENTS."""
+    """Mean squared error of v = sqrt(a) eps - sqrt(1 - a) z, with OUTSIDE_WEIGHT (1 in holes) and LATENT_WEIGHTS."""
     pixels, masks, captions = batch
-    filled = torch.rand(len(pixels), 1, 1, 1, generator=random) < FILLED
-    shown = torch.where(filled, harmonic_fill.extended(pixels, masks), pixels * (masks < 0.5))
+    filled = torch.rand(len(pixels), 1, 1, 1, generator=random) < FILLED_SHARE
+    shown = torch.where(filled, harmonic_fill.harmonic_extension(pixels, masks), pixels * (masks < 0.5))
     clean, given = build.latents(pixels), build.latents(shown)
     t = noisy_quarter(spread_timesteps(len(pixels), len(alphas), random), len(alphas))
     noise = torch.randn(clean.shape, generator=random)
     a = alphas[t].view(-1, 1, 1, 1)
     noisy, target = a.sqrt() * clean + (1 - a).sqrt() * noise, a.sqrt() * noise - (1 - a).sqrt() * clean
     predicted = model(noisy, t, torch.cat([masks, given], 1), captions)
-    weight = (OUTSIDE + (1 - OUTSIDE) * masks) * torch.tensor(LATENTS).view(-1, 1, 1)
+    weight = (OUTSIDE_WEIGHT + (1 - OUTSIDE_WEIGHT) * masks) * torch.tensor(LATENT_WEIGHTS).view(-1, 1, 1)
     return (weight * (predicted - target) ** 2).sum() / weight.sum()
 
 
@@ -122,8 +122,8 @@ def make_optimiser(model: Model) -> torch.optim.Optimizer:
 
 
 def rate(step: int, steps: int) -> float:
-    """Warm-up, constant, and half a cosine over the last `FALL` of the steps: until then it does not depend on them."""
-    ending = max((step / steps - 1) / FALL + 1, 0.0)
+    """Warm-up, constant, then a cosine decay over the last `DECAY_SHARE` of the steps."""
+    ending = max((step / steps - 1) / DECAY_SHARE + 1, 0.0)
     return PEAK_RATE * min((step + 1) / WARMUP, 1.0) * (0.5 + 0.5 * math.cos(math.pi * ending)) + 1e-6
 
 
@@ -131,7 +131,7 @@ def validation(model: Model, alphas: Tensor, pool: Pool) -> float:
     """The loss on fixed held-out crops, masks, noise and timesteps."""
     rng = np.random.default_rng(seed_for(pool.seed, "validation"))
     with torch.no_grad():
-        batch = pool.batch(rng, build.NATIVE, VALIDATION)
+        batch = pool.batch(rng, build.NATIVE, VALIDATION_CROPS)
         return float(loss(model, alphas, batch, generator(pool.seed, "validation noise")))
 
 
@@ -155,7 +155,7 @@ def step_once(
 
 @torch.no_grad()
 def follow(average: dict[str, Tensor], model: Model, step: int) -> None:
-    """Move the running average of the weights towards the model's; short at first, EMA later."""
+    """Update the exponential moving average of the weights; its memory is short at first, EMA later."""
     keep = min(EMA, (step + 1) / (step + 10))
     for name, value in model.state_dict().items():
         average[name].lerp_(value, 1 - keep) if value.is_floating_point() else average[name].copy_(value)
@@ -228,15 +228,15 @@ def main() -> None:
         model.load_state_dict(state["model"])
         optimiser.load_state_dict(state["optimiser"])
         average, start = state["average"], state["step"]
-    pool, held_out = Pool(options.seed, start // FRESH, POOL), Pool(0, 0, VALIDATION, held_out=True)
+    pool, held_out = Pool(options.seed, start // STEPS_PER_IMAGE, POOL), Pool(0, 0, VALIDATION_CROPS, held_out=True)
     began = time.time()
     for step in range(start, options.steps):
         error = step_once(model, alphas, optimiser, pool, step, options.steps)
         follow(average, model, step)
         done = step + 1
-        if done % FRESH == 0:
-            pool.advance(done // FRESH + POOL - 1)
-        if done % KEEP == 0 or done == options.steps:
+        if done % STEPS_PER_IMAGE == 0:
+            pool.advance(done // STEPS_PER_IMAGE + POOL - 1)
+        if done % CHECKPOINT_STEPS == 0 or done == options.steps:
             averaged.load_state_dict(average)
             held = validation(averaged, alphas, held_out)
             print(f"{done} loss {error:.4f} held-out {held:.4f} {time.time() - began:.0f} s", flush=True)

@@ -1,8 +1,8 @@
-"""What a stage takes on a card: operations and bytes counted at full size (counts.py), over the card's peaks.
+"""Estimates the cost of a stage on a GPU: operations and bytes counted at full size (counts.py), over its peak rates.
 
-Of each peak two fifths are reached, and computing and moving do not overlap: so it was on the one kind of card that was
-timed, an H200, to a tenth to a fifth (docs/production.md). What the numbers stand for otherwise, where a plan cannot
-know it yet: `BASIS`. The CPU's part of a stage is left out.
+Two fifths of each peak are assumed, without overlap of computation and memory traffic. On the only kind of GPU that was
+timed, an H200, this is within a tenth to a fifth (docs/production.md). `BASIS` states the assumed scene, which a plan
+cannot know yet. The CPU time of a stage is not included.
 """
 
 from __future__ import annotations
@@ -19,30 +19,36 @@ from reffusion.params.fit import Params as Fit
 from reffusion.params.personalize import Params as Personalize
 from reffusion.params.reference import Params as Reference
 
-REACHED = 0.4  # of a card's peaks
+PEAK_SHARE = 0.4  # of the peak rates of a GPU
 VIEWS, WIDTH, HEIGHT, GAUSSIANS = 60, 1600, 1200, 1_000_000
-GROWING = 0.6  # of the Gaussians that a fit ends with, that it has on the mean
-HOLE = 0.2  # of a view
+MEAN_SHARE = 0.6  # mean number of Gaussians during a fit / final number
+HOLE_SHARE = 0.2  # of a view is inpainted
 BASIS = (
-    f"counted operations, {REACHED:.0%} of the card's peak as timed on an H200; {VIEWS} views of {WIDTH} x "
+    f"counted operations, {PEAK_SHARE:.0%} of the card's peak as timed on an H200; {VIEWS} views of {WIDTH} x "
     f"{HEIGHT} px, {GAUSSIANS:,} Gaussians"
 )
-# Floats of a Gaussian of degree 3; of these it, its gradient and Adam's two moments are kept.
-FLOATS, KEPT = 59, 4
-# Bytes that gsplat moves for a Gaussian there and back (its own, its footprint, 10 tiles' lists), and for a pixel.
-# Operations of a Gaussian in a pixel, of which the demo's views blend 36, and three times as many are looked at.
+# Floats of a Gaussian of degree 3; and copies in memory: parameters, gradient, two moments of Adam.
+FLOATS, COPIES = 59, 4
+# Bytes that gsplat moves per Gaussian, forward and backward (parameters, footprint, 10 list entries), and per pixel.
+# Operations per pixel: 100 per Gaussian; views of the demo blend 36, and three times as many are evaluated.
 SPLAT_BYTES, PIXEL_BYTES, SPLAT_FLOPS = 3000, 200, 3 * 36 * 100
 # GB: `python -m benchmarks.gpu.full_size --count`, SD2 in half precision at 512 px
 WEIGHTS, PAINTED, DISTILLED, TRAINED = 2.7, 0.8, 3.3, 3.9
 SDXL = "diffusers/stable-diffusion-xl-1.0-inpainting-0.1"
-PRIORS = {PRIOR: ("SD2", 512), SDXL: ("SDXL", 1024)}  # name: that of the counts, native size in pixels
+PRIORS = {PRIOR: ("SD2", 512), SDXL: ("SDXL", 1024)}  # hub id: name in the counts, native size in pixels
 
 
 @dataclass(frozen=True)
 class Card:
-    """Peaks as its maker states them: half, single: 1e12 operations a second of products in half precision and in
-    float32 (TF32 where it has it, which torch's convolutions take); plain: of float32 elsewhere; memory moves
-    `bandwidth` 1e12 bytes a second, and holds `gigabytes`."""
+    """Peak rates of a GPU, as stated by its manufacturer.
+
+    Attributes:
+        half, single: 1e12 operations per second of matrix products in half precision and in float32 (TF32 if
+            available, which torch's convolutions use).
+        plain: 1e12 operations per second of other float32 arithmetic.
+        bandwidth: 1e12 bytes per second.
+        gigabytes: of memory.
+    """
 
     half: float
     single: float
@@ -61,20 +67,22 @@ CARDS = {
 
 
 def card_of(name: str) -> str | None:
-    """The card that is named; of this machine where none is. None: it has none, or one that is not in the table.
+    """The GPU called `name`, or that of this machine if `name` is empty; None if there is none in the table.
 
-    Raises ValueError for a name that is not in the table."""
-    plain = lambda text: re.sub(r"[^a-z0-9]", "", text.lower())
-    asked = name or machine().card or ""
-    found = next((card for card in CARDS if asked and plain(card) in plain(asked)), None)
-    if name and not found:
+    Raises:
+        ValueError: `name` is not in the table.
+    """
+    normalize = lambda text: re.sub(r"[^a-z0-9]", "", text.lower())
+    requested = name or machine().card or ""
+    match = next((card for card in CARDS if requested and normalize(card) in normalize(requested)), None)
+    if name and not match:
         raise ValueError(f"card {name!r} is none of {', '.join(CARDS)}")
-    return found
+    return match
 
 
 @dataclass(frozen=True)
 class Work:
-    """Operations in half precision, in float32 and beside products, and bytes, 1e12 each."""
+    """Operations in half precision, in float32 and outside products, and bytes moved; 1e12 each."""
 
     half: float = 0.0
     single: float = 0.0
@@ -89,38 +97,38 @@ class Work:
 
     def seconds(self, card: Card) -> float:
         computing = self.half / card.half + self.single / card.single + self.plain / card.plain
-        return (computing + self.moved / card.bandwidth) / REACHED
+        return (computing + self.moved / card.bandwidth) / PEAK_SHARE
 
 
 def network(name: str, half: bool = False) -> Work:
-    """A part of the table, once."""
+    """One pass of a network of the table."""
     tera = COUNTS[name]["tflop"]
     return Work(tera * half, tera * (not half), 0.0, COUNTS[name]["gb"] / 1e3)
 
 
-def drawing(pixels: float, gaussians: float) -> Work:
-    """A view drawn, and the way back."""
+def rendering(pixels: float, gaussians: float) -> Work:
+    """Rendering of a view, forward and backward."""
     return Work(plain=SPLAT_FLOPS * pixels / 1e12, moved=(SPLAT_BYTES * gaussians + PIXEL_BYTES * pixels) / 1e12)
 
 
 def reconstruction(gaussians: float) -> Work:
-    """A view drawn and compared with its photograph, without Adam."""
-    return drawing(WIDTH * HEIGHT, gaussians) + network("loss, a million pixels").times(WIDTH * HEIGHT / 1e6)
+    """Rendering of a view and the loss, without Adam."""
+    return rendering(WIDTH * HEIGHT, gaussians) + network("loss, a million pixels").times(WIDTH * HEIGHT / 1e6)
 
 
 def adam(gaussians: float) -> Work:
     return network("Adam, a million Gaussians").times(gaussians / 1e6)
 
 
-def answering(prior: str, half: bool, steps: float, guided: bool) -> Work:
-    """A picture of the native size painted from `steps` answers: its latents and the picture again."""
+def inpainting(prior: str, half: bool, steps: float, guided: bool) -> Work:
+    """Inpainting of a picture at native size with `steps` evaluations of the UNet, with encoding and decoding."""
     known = network(f"{prior} encode").times(2) + network(f"{prior} decode")
     return known + network(f"{prior} unet", half).times(steps * (1 + guided))
 
 
 def fit(params: Fit) -> tuple[Work, float]:
     number = min(GAUSSIANS, params.densify.cap_max)
-    step = reconstruction(GROWING * number) + adam(GROWING * number)
+    step = reconstruction(MEAN_SHARE * number) + adam(MEAN_SHARE * number)
     return step.times(params.iterations), _scene(number)
 
 
@@ -129,14 +137,14 @@ def reference(params: Reference) -> tuple[Work, float] | None:
         return None
     prior, size = PRIORS[params.prior]
     finer, side = 0.0, 2 * size
-    while side < 2 * HEIGHT:  # windows of three quarters of the native size over the hole, at sizes up to the view's
+    while side < 2 * HEIGHT:  # windows of 3/4 of the native size over the hole, at sizes up to that of the view
         shorter = min(side, HEIGHT)
-        finer += max(1.0, HOLE * shorter * shorter * WIDTH / HEIGHT / (0.75 * size) ** 2)
+        finer += max(1.0, HOLE_SHARE * shorter * shorter * WIDTH / HEIGHT / (0.75 * size) ** 2)
         side *= 2
     sampler, half = params.sampler, params.dtype != "float32"
     guided = sampler.guidance > 0
-    whole = answering(prior, half, sampler.steps, guided)
-    window = answering(prior, half, REFINED_FROM * sampler.steps, guided)
+    whole = inpainting(prior, half, sampler.steps, guided)
+    window = inpainting(prior, half, REFINED_FROM * sampler.steps, guided)
     return (whole + window.times(finer)).times(params.candidates), WEIGHTS * (2.6 if prior == "SDXL" else 1) + PAINTED
 
 
@@ -145,16 +153,18 @@ def personalize(params: Personalize) -> tuple[Work, float] | None:
         return None
     rate = (params.samples.size or 512) / 512
     sample = network("SD2 personalize a sample", params.dtype != "float32").times(rate**2)
-    samples = _at_once(params.memory_gb, TRAINED * rate**2, params.optimizer.batch)
-    again = 4 / 3 if samples < params.optimizer.batch or params.checkpointing else 1  # activations twice
-    return sample.times(params.steps * params.optimizer.batch * again), WEIGHTS + samples * TRAINED * rate**2
+    samples = _samples_per_pass(params.memory_gb, TRAINED * rate**2, params.optimizer.batch)
+    recompute = (
+        4 / 3 if samples < params.optimizer.batch or params.checkpointing else 1
+    )  # activations are computed twice
+    return sample.times(params.steps * params.optimizer.batch * recompute), WEIGHTS + samples * TRAINED * rate**2
 
 
 def distill(params: Distill) -> tuple[Work, float] | None:
     if params.prior != PRIOR:
         return None
     half, samples = params.dtype != "float32", 1 + params.sds.patches
-    view, sds = drawing(WIDTH * HEIGHT, GAUSSIANS), Work()
+    view, sds = rendering(WIDTH * HEIGHT, GAUSSIANS), Work()
     step = adam(GAUSSIANS)
     if params.reconstruction.every:
         step += reconstruction(GAUSSIANS).times(1 / params.reconstruction.every)
@@ -162,36 +172,36 @@ def distill(params: Distill) -> tuple[Work, float] | None:
         unet = network("SD2 unet", half).times(1 + (params.sds.guidance > 0))
         sds = (network("SD2 encode and back") + network("SD2 encode") + unet).times(samples) + view
     if params.depth.weight:
-        painted = answering("SD2", half, params.depth.steps / 2, params.sds.guidance > 0)
+        painted = inpainting("SD2", half, params.depth.steps / 2, params.sds.guidance > 0)
         sds += (painted + view + network("depth network")).times(1 / params.depth.every)
     if params.adversarial.weight:
         sds += view + _critic(params.adversarial.width, params.adversarial.patches * params.adversarial.size**2)
-    taken = WEIGHTS + _at_once(params.memory_gb, DISTILLED, samples) * DISTILLED + _scene(GAUSSIANS)
+    gigabytes = WEIGHTS + _samples_per_pass(params.memory_gb, DISTILLED, samples) * DISTILLED + _scene(GAUSSIANS)
     photos = VIEWS * WIDTH * HEIGHT * 3 * 4 / 1e9
-    return (step + sds).times(params.iterations), taken + photos
+    return (step + sds).times(params.iterations), gigabytes + photos
 
 
 def _critic(width: int, pixels: int) -> Work:
-    """Counted at two widths; between and beyond them in proportion."""
+    """Counted at two widths; interpolated and extrapolated linearly."""
     low, high = network("critic 256"), network("critic 512")
     share = (width - 256) / 256
-    there = max(share, -0.95)
-    return (low + (high + low.times(-1)).times(there)).times(pixels / (64 * 64**2))
+    extrapolation = max(share, -0.95)
+    return (low + (high + low.times(-1)).times(extrapolation)).times(pixels / (64 * 64**2))
 
 
 def _scene(gaussians: float) -> float:
-    """GB of the Gaussians, their gradients and moments, and of a view on its way back."""
-    return gaussians * FLOATS * KEPT * 4 / 1e9 + WIDTH * HEIGHT * PIXEL_BYTES / 1e9
+    """GB of the Gaussians, their gradients and moments, and of the backward pass of a view."""
+    return gaussians * FLOATS * COPIES * 4 / 1e9 + WIDTH * HEIGHT * PIXEL_BYTES / 1e9
 
 
-def _at_once(memory_gb: float, sample: float, most: int) -> int:
+def _samples_per_pass(memory_gb: float, sample: float, most: int) -> int:
     if not memory_gb:
         return most
     return max(1, min(most, int((0.9 * memory_gb - WEIGHTS) / sample)))
 
 
 def said(name: str, device: str, found: tuple[Work, float] | None) -> Mapping[str, object] | None:
-    """What a plan prints of it: seconds, gigabytes, the card and what the figures stand for; None: not on a card."""
+    """What a plan prints: seconds, gigabytes, the GPU and the assumptions; None if the stage does not run on a GPU."""
     card = card_of(name)
     if card is None or device != "cuda" or found is None:
         return None

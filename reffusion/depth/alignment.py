@@ -1,4 +1,4 @@
-"""The alignment of depth maps by a scale and an offset: pure functions on float64 arrays."""
+"""Alignment of depth maps by a scale and an offset: pure functions on float64 arrays."""
 
 from __future__ import annotations
 
@@ -13,16 +13,19 @@ from reffusion.geometry import Degenerate
 
 Space = Literal["depth", "disparity"]
 
-LEAST_PIXELS = 4  # two unknowns, and as many pixels again to notice a misfit
-LEAST_SPREAD = 1e-6  # relative; below it float32 input carries no slope
-REWEIGHTINGS = 30
-TRIALS = 1000  # of two pixels: of 10% inliers both are in one of a hundred; all miss them once in 20,000 times
-JURY = 500  # pixels that judge a trial: of 10% inliers 50 agree with the right line, with a wrong one a handful
-SUPPORTS = 32  # numbers of agreeing pixels that are looked at
-DISAGREES = 0.7  # of the spread of what is known: half the pixels missing by more, and a map says nothing of the scene
-AS_IT_IS = 1.5  # times the best fit's error, up to which a map counts as being in the scene's unit
-BY_CHANCE = 0.03  # relative error of a map as it is: one in another unit would hardly come as near by chance
-LEAST_DISPARITY = 0.02  # relative; a scene that varies less is flat, and any map that is right to this fits
+MIN_PIXELS = 4  # two unknowns, and two more pixels so that a residual can show
+MIN_RELATIVE_SPREAD = 1e-6  # of the largest value; below it float32 input determines no slope
+MAX_REWEIGHTINGS = 30
+TRIALS = 1000  # lines through two pixels: with 10% inliers 1 in 100 has two; that none has happens once in 20,000 runs
+# Pixels on which a line is judged: of 10% inliers 50 agree with the right line, a handful with a wrong one.
+VOTERS = 500
+SUPPORT_LEVELS = 32  # numbers of agreeing pixels that are compared
+MAX_ERROR_RATIO = 0.7  # median error / spread of the known disparity, above which a map does not fit the scene
+# A map without alignment counts as being in the scene's unit up to this many times the best fit's error.
+SAME_UNIT_RATIO = 1.5
+SAME_UNIT_ERROR = 0.03  # or up to this relative error, which a map in another unit would hardly reach by chance
+# Relative; a scene whose disparity varies less counts as flat, and any map within this error fits.
+MIN_DISPARITY_SPREAD = 0.02
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,7 @@ class Alignment:
 
     Attributes:
         scale, offset: the fitted coefficients.
-        residual: weighted root mean square of target - fit, in the target's unit.
+        residual: weighted root mean square of target - fit, in the unit of the target.
     """
 
     scale: float
@@ -39,6 +42,7 @@ class Alignment:
     residual: float
 
     def apply(self, estimate: np.ndarray) -> np.ndarray:
+        """scale * estimate + offset, float64."""
         return self.scale * np.asarray(estimate, np.float64) + self.offset
 
 
@@ -50,31 +54,32 @@ def align(
     robust: bool = False,
     seed: int = 0,
 ) -> Alignment:
-    """Scale and offset by L2 on the pixels of positive weight (paper, depth supervision).
+    """Fit scale and offset by least squares on the pixels of positive weight (paper, depth supervision).
 
     The normal equations are solved about the weighted means and in units of the weighted spread, so that neither a
-    large offset nor a large unit costs digits.
+    large offset nor a large unit loses digits.
 
     Args:
         estimate, target: arrays of one shape, any unit.
-        weights: same shape, >= 0 (bool for a choice of pixels); None: all ones.
-        robust: let go of outliers, up to 90% of a few hundred pixels or more where these form no line themselves: from
-            the line that chance explains least, iteratively reweighted least squares with Geman-McClure weights.
-        seed: of the robust start's draws.
+        weights: same shape, >= 0, or bool to select pixels; None: all ones.
+        robust: reject outliers, up to 90% of a few hundred pixels or more if these form no line themselves. Starts
+            from the line that chance explains least, then iteratively reweighted least squares with Geman-McClure
+            weights.
+        seed: of the random samples of the robust fit.
 
     Raises:
-        Degenerate: fewer than 4 pixels of positive weight, or an estimate whose spread there is under 1e-6 of its
-            magnitude (a constant fixes no scale).
-        ValueError: shapes that differ, or values that are not finite.
+        Degenerate: fewer than 4 pixels of positive weight, or an estimate whose spread there is below 1e-6 of its
+            magnitude (a constant determines no scale).
+        ValueError: shapes differ, or values are not finite.
     """
     estimate, target = np.asarray(estimate, np.float64), np.asarray(target, np.float64)
     weights = np.ones(estimate.shape) if weights is None else np.asarray(weights, np.float64)
     if not estimate.shape == target.shape == weights.shape:
         raise ValueError(f"alignment of arrays of different shapes: {estimate.shape}, {target.shape}, {weights.shape}")
-    chosen = weights > 0
-    x, y, w = estimate[chosen], target[chosen], weights[chosen]
-    if x.size < LEAST_PIXELS:
-        raise Degenerate("few pixels", f"alignment needs at least {LEAST_PIXELS} known pixels, got {x.size}")
+    used = weights > 0
+    x, y, w = estimate[used], target[used], weights[used]
+    if x.size < MIN_PIXELS:
+        raise Degenerate("few pixels", f"alignment needs at least {MIN_PIXELS} known pixels, got {x.size}")
     if not (np.isfinite(x).all() and np.isfinite(y).all() and np.isfinite(w).all()):
         raise ValueError("alignment got values that are not finite: leave those pixels out by weight 0")
     plain = _weighted_line(x, y, w)
@@ -82,12 +87,12 @@ def align(
 
 
 def condition(estimate: np.ndarray, weights: np.ndarray | None = None) -> tuple[float, float]:
-    """Condition numbers of the alignment's normal equations: plain (scale and offset), and as `align` solves them.
+    """Condition numbers of the normal equations: in plain form, and in the form that `align` solves.
 
-    Those of `align` are about the weighted mean and in units of the weighted spread: two equations that do not know of
-    each other. What remains is the rounding of the mean, relative to the spread.
+    `align` works about the weighted mean and in units of the weighted spread, which decouples the two equations. Only
+    the rounding of the mean relative to the spread remains.
 
-    Args: as `align`, the estimate not constant.
+    Args: as `align`; the estimate is not constant.
     """
     estimate = np.asarray(estimate, np.float64)
     weights = np.ones(estimate.shape) if weights is None else np.asarray(weights, np.float64)
@@ -98,52 +103,57 @@ def condition(estimate: np.ndarray, weights: np.ndarray | None = None) -> tuple[
     return squared(x), squared((x - center) / spread)
 
 
-def _robust_line(x: np.ndarray, y: np.ndarray, w: np.ndarray, plain: Alignment, draws: torch.Generator) -> Alignment:
-    """M-estimation from a consensus; `plain` where the sample has none."""
-    result, share = _consensus(x, y, w, draws) or (plain, 1.0)
-    for _ in range(REWEIGHTINGS):
+def _robust_line(
+    x: np.ndarray, y: np.ndarray, w: np.ndarray, plain: Alignment, generator: torch.Generator
+) -> Alignment:
+    """M-estimation starting from a consensus line, or from `plain` where there is none."""
+    result, share = _consensus(x, y, w, generator) or (plain, 1.0)
+    for _ in range(MAX_REWEIGHTINGS):
         error = np.abs(y - result.apply(x))
-        spread = 1.4826 * np.quantile(error, 0.5 * share)  # the median of those that agree
+        spread = 1.4826 * np.quantile(error, 0.5 * share)  # the median error of the inliers
         if spread <= 1e-12 * np.abs(y).max():
-            agree = error <= 1e-9 * np.abs(y).max()  # to rounding: nothing to weigh
-            fixes = np.ptp(x[agree]) > LEAST_SPREAD * np.abs(x[agree]).max()
-            return _weighted_line(x[agree], y[agree], w[agree]) if fixes else result
-        updated = _weighted_line(x, y, w * trusted(error, spread))
-        moved = np.abs(updated.apply(x) - result.apply(x)).max()
+            inlier = error <= 1e-9 * np.abs(y).max()  # an exact fit up to rounding: no weighting needed
+            has_spread = np.ptp(x[inlier]) > MIN_RELATIVE_SPREAD * np.abs(x[inlier]).max()
+            return _weighted_line(x[inlier], y[inlier], w[inlier]) if has_spread else result
+        updated = _weighted_line(x, y, w * geman_mcclure_weights(error, spread))
+        change = np.abs(updated.apply(x) - result.apply(x)).max()
         result = updated
-        if moved < 1e-9 * np.abs(y).max():
+        if change < 1e-9 * np.abs(y).max():
             break
     return result
 
 
-def trusted(error: np.ndarray, spread: float) -> np.ndarray:
-    """Geman-McClure weights in (0, 1] of absolute residuals whose standard deviation is `spread` > 0."""
+def geman_mcclure_weights(error: np.ndarray, spread: float) -> np.ndarray:
+    """Geman-McClure weights in (0, 1] of absolute residuals with standard deviation `spread` > 0."""
     return (1.0 + (error / (2.0 * spread)) ** 2) ** -2
 
 
-def _consensus(x: np.ndarray, y: np.ndarray, w: np.ndarray, draws: torch.Generator) -> tuple[Alignment, float] | None:
-    """The line through two pixels, of many drawn, whose support chance explains least, and its share of the pixels.
+def _consensus(
+    x: np.ndarray, y: np.ndarray, w: np.ndarray, generator: torch.Generator
+) -> tuple[Alignment, float] | None:
+    """The line through two random pixels whose support is least likely by chance, and its share of the pixels.
 
-    A contrario, so that no noise level need be known: if x said nothing of y, and a share q of the residuals to
-    shuffled targets is within r, h of n would be with probability exp(-n KL(h/n || q)) (Chernoff). The line and the r
-    of the largest exponent win; None where no line says more than chance.
+    A contrario, so that no noise level has to be known: suppose x carried no information about y, and a share q of
+    the residuals to shuffled targets is within r. Then h of n residuals are within r with probability
+    exp(-n KL(h/n || q)) (Chernoff). The line and the r of the largest exponent win. None where no line does better
+    than chance.
     """
-    uniform = lambda count: torch.rand(count, generator=draws, dtype=torch.float64).numpy()
+    uniform = lambda count: torch.rand(count, generator=generator, dtype=torch.float64).numpy()
     edges = np.cumsum(w) / w.sum()
     first, second = (np.minimum(np.searchsorted(edges, uniform(TRIALS)), x.size - 1) for _ in range(2))
-    jury = np.argsort(-np.log1p(-uniform(x.size)) / w)[:JURY]  # by weight, no pixel twice
-    run = x[second] - x[first]
-    apart = np.abs(run) > LEAST_SPREAD * np.abs(x).max()
-    if not apart.any():
+    voters = np.argsort(-np.log1p(-uniform(x.size)) / w)[:VOTERS]  # weighted sampling without replacement
+    distance = x[second] - x[first]
+    distinct = np.abs(distance) > MIN_RELATIVE_SPREAD * np.abs(x).max()
+    if not distinct.any():
         return None
-    first, slope = first[apart], (y[second] - y[first])[apart] / run[apart]
-    along = y[first, None] + slope[:, None] * (x[jury] - x[first, None])
-    error = np.sort(np.abs(y[jury] - along), 1)
-    shuffled = np.abs(y[jury][np.argsort(uniform(len(jury)))] - along)
-    support = np.unique(np.geomspace(3, len(jury), SUPPORTS).round().astype(int))
-    share = (support - 2) / (len(jury) - 2)  # two agree by construction
-    within = np.stack([(shuffled <= error[:, s - 1, None]).sum(1) for s in support], 1)
-    chance = (within + 1) / (len(jury) + 1)
+    first, slope = first[distinct], (y[second] - y[first])[distinct] / distance[distinct]
+    predicted = y[first, None] + slope[:, None] * (x[voters] - x[first, None])
+    error = np.sort(np.abs(y[voters] - predicted), 1)
+    shuffled = np.abs(y[voters][np.argsort(uniform(len(voters)))] - predicted)
+    support = np.unique(np.geomspace(3, len(voters), SUPPORT_LEVELS).round().astype(int))
+    share = (support - 2) / (len(voters) - 2)  # the two pixels of the line agree by construction
+    within_chance = np.stack([(shuffled <= error[:, s - 1, None]).sum(1) for s in support], 1)
+    chance = (within_chance + 1) / (len(voters) + 1)
     rest = np.log(np.maximum(1.0 - share, 1e-12) / np.maximum(1.0 - chance, 1e-12))
     surprise = np.where(share > chance, share * np.log(share / chance) + (1.0 - share) * rest, 0.0)
     if not surprise.any():
@@ -151,7 +161,7 @@ def _consensus(x: np.ndarray, y: np.ndarray, w: np.ndarray, draws: torch.Generat
     trial, level = np.unravel_index(surprise.argmax(), surprise.shape)
     offset = y[first[trial]] - slope[trial] * x[first[trial]]
     line = Alignment(float(slope[trial]), float(offset), float(error[trial, support[level] - 1]))
-    return line, float(support[level] / len(jury))
+    return line, float(support[level] / len(voters))
 
 
 def _weighted_line(x: np.ndarray, y: np.ndarray, w: np.ndarray) -> Alignment:
@@ -159,14 +169,14 @@ def _weighted_line(x: np.ndarray, y: np.ndarray, w: np.ndarray) -> Alignment:
     x_mean, y_mean = (w @ x) / total, (w @ y) / total
     dx, dy = x - x_mean, y - y_mean
     spread = np.sqrt((w @ dx**2) / total)
-    _refuse_constant(x, x_mean, spread)
+    _check_not_constant(x, x_mean, spread)
     scale = (w @ (dx / spread * dy)) / total / spread
     residual = np.sqrt((w @ (dy - scale * dx) ** 2) / total)
     return Alignment(float(scale), float(y_mean - scale * x_mean), float(residual))
 
 
-def _refuse_constant(x: np.ndarray, mean: float, spread: float) -> None:
-    if spread <= LEAST_SPREAD * np.abs(x).max():
+def _check_not_constant(x: np.ndarray, mean: float, spread: float) -> None:
+    if spread <= MIN_RELATIVE_SPREAD * np.abs(x).max():
         raise Degenerate(
             "constant",
             f"alignment is degenerate: the estimate is constant ({mean:.6g}) on its {x.size} known pixels, "
@@ -177,20 +187,20 @@ def _refuse_constant(x: np.ndarray, mean: float, spread: float) -> None:
 def align_depth(
     estimate: np.ndarray, depth: np.ndarray, known: np.ndarray, *, space: Space = "disparity", robust: bool = False
 ) -> np.ndarray:
-    """A monocular estimate brought to the scene's depth, [H, W] float64 camera z.
+    """A monocular estimate aligned to the scene's depth, [H, W] float64 camera z.
 
-    PAPER leaves open: whether scale and offset act on depth or on its inverse. Both are here: it must be the space of
-    the estimator's output (Depth Anything gives disparity), since an offset in one is no offset in the other.
+    PAPER leaves open: whether scale and offset act on depth or on its inverse. Both are offered; it must be the space
+    of the estimator's output (Depth Anything returns disparity), since an offset in one is no offset in the other.
 
     Args:
-        estimate: [H, W], affine in the scene's depth or in its disparity, as `space` says.
+        estimate: [H, W], affine in the scene's depth or disparity, according to `space`.
         depth: [H, W] the scene's depth, read where `known`.
         known: bool or weights [H, W]; pixels of depth <= 0 do not count.
         space: what the estimate is affine in.
         robust: see `align`.
 
     Returns:
-        depth; where the aligned disparity is not positive (beyond infinity), the largest depth among known pixels.
+        depth; the largest known depth where the aligned disparity is not positive (beyond infinity).
 
     Raises:
         ValueError: as `align`; or the fitted scale is not positive, i.e. the estimate is of the other space.
@@ -198,13 +208,13 @@ def align_depth(
     depth = np.asarray(depth, np.float64)
     weights = np.asarray(known, np.float64) * (depth > 0)
     target = depth if space == "depth" else geometry.reciprocal(depth)
-    fitted = align(estimate, target, weights, robust=robust)
+    fit = align(estimate, target, weights, robust=robust)
     known_values = np.asarray(estimate, np.float64)[weights > 0]
-    rise = fitted.scale * np.ptp(known_values)  # none, to rounding, where the scene's depth is constant: it stays so
+    rise = fit.scale * np.ptp(known_values)  # zero up to rounding where the scene's depth is constant, which is allowed
     if rise < -1e-12 * target.max():
         other = "depth" if space == "disparity" else "disparity"
         raise ValueError(f"the estimate falls where the scene's {space} grows: is it {other}?")
-    aligned, farthest = fitted.apply(estimate), depth[weights > 0].max()
+    aligned, farthest = fit.apply(estimate), depth[weights > 0].max()
     if space == "depth":
         nearest = depth[weights > 0].min()
         return np.where(aligned > 0, aligned, nearest)
@@ -212,30 +222,30 @@ def align_depth(
 
 
 def align_either(estimate: np.ndarray, depth: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, Space]:
-    """A depth map of unknown kind brought to the scene's: (depth [H, W] float64 camera z, what the map is affine in).
+    """A map of unknown kind, aligned to the scene: (depth [H, W] float64 camera z, what the map is affine in).
 
-    It is taken as depth and as disparity, each with a scale and an offset, robustly; of the two that rise with the
-    scene's the one that comes nearer in disparity is kept. One that is in the scene's unit stays as it is, if it fits
-    hardly worse, or within `BY_CHANCE`: two such maps agree with each other, while each fitted by itself would be off
-    by its own noise.
+    The map is aligned robustly both as depth and as disparity. Of the alignments with a positive scale, the one with
+    the smaller error in disparity is kept. A map that is already in the scene's unit stays unchanged if its error is
+    hardly larger, or within `SAME_UNIT_ERROR`: two such maps agree with each other, while separate alignments would
+    add noise to each.
 
     Args:
-        estimate: [H, W], depth or disparity of any scale and offset; NaN where it says nothing.
+        estimate: [H, W], depth or disparity of any scale and offset; NaN where it is missing.
         depth: [H, W] the scene's depth, read where `known`.
         known: bool or weights [H, W]; pixels of depth <= 0 do not count.
 
     Returns:
-        depth, NaN where the estimate is; beyond infinity the largest, before the camera the smallest known depth.
+        depth, NaN where the estimate is NaN; the largest known depth beyond infinity, the smallest behind the camera.
 
     Raises:
-        Degenerate: too few known pixels, or a map that is constant there.
-        ValueError: the map falls where the scene's depth and disparity grow, or agrees with neither.
+        Degenerate: too few known pixels, or the map is constant there.
+        ValueError: the map falls where the scene's depth and disparity grow, or fits neither.
     """
-    said = np.isfinite(estimate)
-    estimate, depth = np.where(said, estimate, 0.0).astype(np.float64), np.asarray(depth, np.float64)
-    weights = np.asarray(known, np.float64) * (depth > 0) * said
-    shown = weights > 0
-    found: dict[Space, tuple[float, np.ndarray]] = {}
+    valid = np.isfinite(estimate)
+    estimate, depth = np.where(valid, estimate, 0.0).astype(np.float64), np.asarray(depth, np.float64)
+    weights = np.asarray(known, np.float64) * (depth > 0) * valid
+    used = weights > 0
+    candidates: dict[Space, tuple[float, np.ndarray]] = {}
     for space in ("disparity", "depth"):
         try:
             aligned = align_depth(estimate, depth, weights, space=space, robust=True)
@@ -243,20 +253,21 @@ def align_either(estimate: np.ndarray, depth: np.ndarray, known: np.ndarray) -> 
             raise
         except ValueError:
             continue
-        found[space] = (float(np.median(np.abs(1 / aligned[shown] - 1 / depth[shown]))), aligned)
-    if not found:
+        candidates[space] = (float(np.median(np.abs(1 / aligned[used] - 1 / depth[used]))), aligned)
+    if not candidates:
         raise ValueError("the depth map falls where the scene's depth grows, and where its disparity does; invert it")
-    space = min(found, key=lambda each: found[each][0])
-    error, aligned = found[space]
-    disparity = 1 / depth[shown]
+    space = min(candidates, key=lambda each: candidates[each][0])
+    error, aligned = candidates[space]
+    disparity = 1 / depth[used]
     spread = float(np.median(np.abs(disparity - np.median(disparity))))
-    if error > DISAGREES * max(spread, LEAST_DISPARITY * float(np.median(disparity))):
+    if error > MAX_ERROR_RATIO * max(spread, MIN_DISPARITY_SPREAD * float(np.median(disparity))):
         raise ValueError(
             f"the depth map does not fit what is seen: half of it misses by {error / np.median(disparity):.0%} of the "
             f"disparity or more, and the scene's own varies by {spread / np.median(disparity):.0%}"
         )
-    given = estimate[shown]
-    off = float(np.median(np.abs(geometry.reciprocal(given) - disparity)))
-    if (estimate[said] > 0).all() and off <= max(AS_IT_IS * error, BY_CHANCE * float(np.median(disparity))):
-        return np.where(said, estimate, np.nan), "depth"
-    return np.where(said, aligned, np.nan), space
+    in_unit = estimate[used]
+    in_unit_error = float(np.median(np.abs(geometry.reciprocal(in_unit) - disparity)))
+    tolerance = max(SAME_UNIT_RATIO * error, SAME_UNIT_ERROR * float(np.median(disparity)))
+    if (estimate[valid] > 0).all() and in_unit_error <= tolerance:
+        return np.where(valid, estimate, np.nan), "depth"
+    return np.where(valid, aligned, np.nan), space

@@ -1,4 +1,7 @@
-"""Depth where a view shows nothing yet: the surroundings continued through the hole, or a picture's estimate fitted."""
+"""Depth inside a hole, where a view shows nothing yet: the surroundings are continued through it.
+
+`reffusion.depth.estimates` fits the depth map of a network or of a reference instead.
+"""
 
 from __future__ import annotations
 
@@ -12,37 +15,38 @@ from scipy import ndimage
 from reffusion import geometry, seeding
 from reffusion.depth import bilateral, planes
 from reffusion.depth.completion import Plate, complete
-from reffusion.depth.layers import of_planes, shared_out
-from reffusion.depth.solverlog import SILENT, SolverLog
+from reffusion.depth.layers import label_surfaces, plane_labels
+from reffusion.depth.solverlog import NO_LOG, SolverLog
 from reffusion.types import Camera, Rendering
 
-ENOUGH_POINTS = 50  # fewer sparse points around the hole, and the rendered depth is asked instead
-SURE = 0.8  # share of the sparse points that planes explain, from which nothing else is asked
-SWEPT = 3  # times as many pixels whose depth was swept take part in the search for planes
-BEHIND = 1.03  # relative depth from which a sparse point is hidden by what is rendered
-STRETCH = 1.15  # a surface continued beyond the disparities that are seen of it, by so much at most
-REFUTED = 0.05  # share of the hole in which planes that meet are wrong, from which they are not taken
-NEARER = 1.03  # relative disparity by which they are, before a plane that goes on
-FARTHEST = 2.0  # times the farthest known depth: beyond it lies infinity, of which nothing is known
+MIN_POINTS = 50  # with fewer sparse points around the hole, the rendered depth is used instead
+CONCLUSIVE_SHARE = 0.8  # share of the sparse points explained by planes, above which no further samples are added
+SWEPT_RATIO = 3  # pixels of swept depth that join the search for planes, for each sparse point
+OCCLUSION_RATIO = 1.03  # a sparse point this many times as deep as the rendering is occluded
+MAX_EXTRAPOLATION = 1.15  # a continued surface exceeds the range of its known disparities by this factor at most
+MAX_REFUTED_SHARE = 0.05  # share of the hole in which intersecting planes are refuted, above which they are rejected
+IN_FRONT_RATIO = 1.03  # they are refuted where their disparity exceeds that of a continued plane by this factor
+FARTHEST_RATIO = 2.0  # depth is limited to this many times the farthest known depth
 
 
 @dataclass(frozen=True)
 class Completion:
-    """How depth is found behind the object.
+    """Settings for finding the depth behind the object.
 
-    PAPER leaves open: the depth model. Without one the surroundings are continued, by two hypotheses: planes that meet
-    (rooms), taken where they explain the surroundings, else the smooth completion.
+    PAPER leaves open: the depth model. Without one the surroundings are continued under one of two hypotheses:
+    intersecting planes (rooms), where these explain the surroundings, else a smooth completion.
 
     Attributes:
-        explained: alpha from which the rendered depth is known.
-        margin: known pixels nearer to the hole are left out, / image width: their depth is half the object's.
-        ring: surroundings that are continued, / image width.
-        planar_share: share of the surroundings that planes must explain to be taken; above 1 they never are.
-        planar_tolerance: relative disparity within which they do.
-        stiffness, edge, unknowns: see `depth.Plate`.
+        explained: alpha above which the rendered depth counts as known.
+        margin: pixels within this distance of the hole do not count as known, / image width: the object's depth is
+            blended into theirs.
+        ring: width of the surroundings that are continued, / image width.
+        planar_share: share of the surroundings that planes must explain to be used; above 1 they never are.
+        planar_tolerance: relative disparity within which planes explain a sample.
+        stiffness, edge, unknowns: see `completion.Plate`.
         solver_smoothness, solver_spatial, solver_luma, solver_chroma: see `bilateral.Solver`.
-        robust: an estimate is aligned with outliers let go, see `alignment.align`.
-        seed: of the draws that find planes.
+        robust: reject outliers when an estimate is aligned, see `alignment.align`.
+        seed: of the random samples that find planes.
     """
 
     explained: float = 0.5
@@ -67,23 +71,24 @@ class Completion:
 
 @dataclass(frozen=True)
 class Hints:
-    """What else is known of a view's depth; None where it was not asked.
+    """Further knowledge of a view's depth; None where it was not computed.
 
     Attributes:
-        continued: [H, W] depth of planes that go on in the hole, inf where none does (`unobserved.Uncovered`).
-        planes: depth [H, W] of each of these planes, everywhere. witnessed: bool [H, W], pixels of the hole whose
-            rendered depth other views show.
-        outer: [H, W] depth that is better known than the rendering's, above 0 where there is one.
-        told: bool [H, W], pixels of `outer` that other photographs agree on (`reffusion.initialize.sweep`).
-        looked_past: depth [H, W] -> bool [H, W], where other views look past such a surface.
+        plane_depth: [H, W] depth of planes that continue into the hole, inf where none does
+            (`reffusion.background.continuation`).
+        planes: depth [H, W] of each of these planes, at every pixel.
+        observed: bool [H, W], pixels of the hole whose rendered depth other views confirm.
+        outer: [H, W] depth that replaces the rendered one where it is above 0, because it is more accurate.
+        confirmed: bool [H, W], pixels of `outer` on which other photographs agree (`reffusion.initialize.sweep`).
+        free_space: depth [H, W] -> bool [H, W], pixels in which other views see past a surface of this depth.
     """
 
-    continued: np.ndarray | None = None
+    plane_depth: np.ndarray | None = None
     planes: Sequence[np.ndarray] = ()
-    witnessed: np.ndarray | None = None
+    observed: np.ndarray | None = None
     outer: np.ndarray | None = None
-    told: np.ndarray | None = None
-    looked_past: Callable[[np.ndarray], np.ndarray] | None = None
+    confirmed: np.ndarray | None = None
+    free_space: Callable[[np.ndarray], np.ndarray] | None = None
 
 
 NO_HINTS = Hints()
@@ -91,15 +96,17 @@ NO_HINTS = Hints()
 
 @dataclass(frozen=True)
 class Seen:
-    """What one view shows of the scene's depth.
+    """The scene's depth in one view, and where it is known.
 
     Attributes:
         camera: the view.
         depth: [H, W] float64 camera z as rendered.
-        known: bool [H, W], the pixels whose depth is the scene's: covered, and not beside the hole; or witnessed in it.
-        hole: bool [H, W], the pixels to be filled. hidden: bool [H, W], C: where the object stood.
-        anchored: bool [H, W], pixels of the hole whose `depth` is that of a plane which goes on there.
-        hints: what else is known.
+        known: bool [H, W], the pixels whose depth is that of the scene: covered by Gaussians and not beside the hole,
+            or inside it and confirmed by other views.
+        hole: bool [H, W], the pixels to be filled.
+        hidden: bool [H, W], C: the pixels of the removed object.
+        anchored: bool [H, W], pixels of the hole whose `depth` is that of a plane which continues there.
+        hints: further knowledge of the depth.
     """
 
     camera: Camera
@@ -117,30 +124,30 @@ class Seen:
 
     @property
     def least_disparity(self) -> float:
-        """Of what is farther nothing is known. Degenerate where nothing is known at all."""
+        """The disparity of the farthest depth that is allowed. Raises Degenerate where no depth is known."""
         if not self.known.any():
             raise geometry.Degenerate("few pixels", "no depth is known around the hole")
-        return 1.0 / (FARTHEST * self.depth[self.known].max())
+        return 1.0 / (FARTHEST_RATIO * self.depth[self.known].max())
 
 
 def seen(
-    drawn: Rendering,
+    rendering: Rendering,
     camera: Camera,
     hole: np.ndarray,
     hidden: np.ndarray,
-    how: Completion,
+    settings: Completion,
     hints: Hints = NO_HINTS,
 ) -> Seen:
-    """The depth of a rendering, known where it is covered, but for the hole and a margin around it."""
-    depth, alpha = (t.detach().double().cpu().numpy() for t in (drawn.depth, drawn.alpha))
-    continued, outer = hints.continued, hints.outer
+    """The depth of a rendering: known where alpha is high, except in the hole and a margin around it."""
+    depth, alpha = (t.detach().double().cpu().numpy() for t in (rendering.depth, rendering.alpha))
+    plane_depth, outer = hints.plane_depth, hints.outer
     if outer is not None:
         depth, alpha = np.where(outer > 0, outer, depth), np.where(outer > 0, 1.0, alpha)
-    known = (alpha > how.explained) & (depth > 0) & ~grown(hole, how.margin)
-    if hints.witnessed is not None:
-        known |= hole & hints.witnessed
-    anchored = hole & ~known & np.isfinite(continued) if continued is not None else np.zeros_like(hole)
-    depth = np.where(anchored, continued, depth) if anchored.any() else depth
+    known = (alpha > settings.explained) & (depth > 0) & ~grown(hole, settings.margin)
+    if hints.observed is not None:
+        known |= hole & hints.observed
+    anchored = hole & ~known & np.isfinite(plane_depth) if plane_depth is not None else np.zeros_like(hole)
+    depth = np.where(anchored, plane_depth, depth) if anchored.any() else depth
     return Seen(camera, depth, known, hole, hidden, anchored, hints)
 
 
@@ -148,152 +155,169 @@ def continued(
     view: Seen,
     guide: np.ndarray | Callable[[], np.ndarray],
     points: np.ndarray,
-    how: Completion,
-    solvers: SolverLog = SILENT,
+    settings: Completion,
+    log: SolverLog = NO_LOG,
     farthest: bool = False,
 ) -> tuple[np.ndarray, str]:
-    """The scene's own disparity, [H, W] float64, continued through the hole; and how in words.
+    """The scene's disparity continued through the hole, [H, W] float64, and a description of the method used.
 
-    Planes are found among the sparse points where there are enough (they are unbiased, while the expected depth of
-    splats lies too near wherever haze hangs before a plain surface), else among the rendered depths. Where planes do
-    not explain the surroundings, they are continued smoothly but for creases at edges of the guide.
+    Planes are fitted to the sparse points where there are enough of them, else to the rendered depth. (Sparse points
+    are unbiased, while the expected depth of splats is too small wherever haze floats in front of a plain surface.)
+    Where planes do not explain the surroundings, these are continued smoothly, with creases at edges of the guide.
 
     Args:
-        guide: [H, W, 3] uint8 or [0, 1], or what gives it when it is needed; the view's picture without the object.
-        points: [P, 3] sparse points of the scene; P = 0 allowed.
-        solvers: are told of what each solver finds.
-        farthest: of several surfaces around the hole only the farthest goes on: for a hole through which one looks.
+        guide: [H, W, 3] uint8 or [0, 1], the view's picture without the object; or a function that returns it, called
+            only if it is needed.
+        points: [P, 3] sparse points of the scene; P = 0 is allowed.
+        log: records the result of each solver.
+        farthest: continue only the farthest of several surfaces around the hole, for a hole one looks through.
+
     Raises:
-        Degenerate: too little is known around the hole.
+        Degenerate: too few known pixels around the hole.
     """
-    planar, said = _planar(view, points, how)
-    solvers.solved("planes", planar.disparity)
-    if planar.explained >= how.planar_share:
-        wrong = _refuted(view, planar.disparity)
-        if wrong <= REFUTED:
-            return planar.disparity, said
-        said = f"{said}, but would hide what is known of the space in {wrong:.0%} of the hole"
+    planar, description = _fit_planar_model(view, points, settings)
+    log.log_result("planes", planar.disparity)
+    if planar.explained >= settings.planar_share:
+        refuted = _refuted_share(view, planar.disparity)
+        if refuted <= MAX_REFUTED_SHARE:
+            return planar.disparity, description
+        description = f"{description}, but occlude known free space in {refuted:.0%} of the hole"
     guide = guide() if callable(guide) else guide
-    plate = Plate(how.ring, how.stiffness, how.edge, how.unknowns)
-    given = view.known | view.anchored
-    around, hole = given & grown(view.hole, how.ring), grown(view.hole, how.margin)
+    plate = Plate(settings.ring, settings.stiffness, settings.edge, settings.unknowns)
+    usable = view.known | view.anchored
+    surroundings, hole = usable & grown(view.hole, settings.ring), grown(view.hole, settings.margin)
     planes = () if farthest else view.hints.planes
-    share = partial(shared_out, view.disparity, around, hole, guide, planes, view.anchored)
-    surfaces = share()
+    label = partial(label_surfaces, view.disparity, surroundings, hole, guide, planes, view.anchored)
+    surfaces = label()
     if surfaces.max() > 1 and farthest:
-        far = complete(view.disparity, given & (surfaces == _farthest(view, surfaces, given)), guide, plate)
-        return np.where(view.anchored, view.disparity, far), f"{said}: the farthest of {surfaces.max()} surfaces"
+        far_disparity = complete(
+            view.disparity, usable & (surfaces == _farthest_surface(view, surfaces, usable)), guide, plate
+        )
+        return np.where(
+            view.anchored, view.disparity, far_disparity
+        ), f"{description}: the farthest of {surfaces.max()} surfaces"
     if surfaces.max() > 1:
-        layered, said = _layered(view, surfaces, planes, guide, plate), f"{said}: {surfaces.max()} surfaces continued"
-        # Of planes that go on their maps tell; and views look into a mirror that is a part of one.
-        wrong = _looked_past(view, layered) & ~view.anchored & (surfaces != _farthest(view, surfaces, given))
-        if wrong.any():
-            layered = _layered(view, share(np.where(wrong, surfaces, 0)), planes, guide, plate)
-        solvers.solved("completion", layered)
-        return layered, said
-    fitted = complete(view.disparity, given, guide, plate, keep=False)
-    solvers.solved("completion", fitted)
-    # Its misfit on known pixels is spread by the bilateral solver, so that rims meet.
-    refined = bilateral.refine(fitted, view.disparity, given.astype(np.float64), guide, how.solver, solvers.iterated)
-    solvers.solved("bilateral", refined, solvers.iterations)
+        layered, description = (
+            _complete_layers(view, surfaces, planes, guide, plate),
+            f"{description}: {surfaces.max()} surfaces continued",
+        )
+        # Planes that continue have depth maps of their own; and views do see "past" a mirror that is part of one.
+        refuted = (
+            _in_free_space(view, layered) & ~view.anchored & (surfaces != _farthest_surface(view, surfaces, usable))
+        )
+        if refuted.any():
+            layered = _complete_layers(view, label(np.where(refuted, surfaces, 0)), planes, guide, plate)
+        log.log_result("completion", layered)
+        return layered, description
+    smooth = complete(view.disparity, usable, guide, plate, keep=False)
+    log.log_result("completion", smooth)
+    # The bilateral solver spreads the residuals of known pixels into the hole, so that there is no step at its rim.
+    refined = bilateral.refine(
+        smooth, view.disparity, usable.astype(np.float64), guide, settings.solver, log.log_iteration
+    )
+    log.log_result("bilateral", refined, log.iterations)
     share = view.anchored.sum() / max(view.hole.sum(), 1)
-    onward = f", planes that go on in {share:.0%} of the hole" if share else ""
-    return np.where(view.anchored, view.disparity, refined), f"{said}: continued smoothly instead{onward}"
+    onward = f", planes that continue in {share:.0%} of the hole" if share else ""
+    return np.where(view.anchored, view.disparity, refined), f"{description}: continued smoothly instead{onward}"
 
 
-def _farthest(view: Seen, surfaces: np.ndarray, given: np.ndarray) -> int:
+def _farthest_surface(view: Seen, surfaces: np.ndarray, usable: np.ndarray) -> int:
     """The surface of the smallest median disparity."""
-    median = lambda surface: float(np.median(view.disparity[given & ~view.anchored & (surfaces == surface)]))
-    present = [k for k in range(1, surfaces.max() + 1) if (given & ~view.anchored & (surfaces == k)).any()]
-    return min(present, key=median)
+    median_disparity = lambda surface: float(np.median(view.disparity[usable & ~view.anchored & (surfaces == surface)]))
+    present = [k for k in range(1, surfaces.max() + 1) if (usable & ~view.anchored & (surfaces == k)).any()]
+    return min(present, key=median_disparity)
 
 
-def _layered(
+def _complete_layers(
     view: Seen, surfaces: np.ndarray, planes: Sequence[np.ndarray], guide: np.ndarray, plate: Plate
 ) -> np.ndarray:
-    """[H, W] disparity: each surface continued smoothly by itself, with a step where two meet. One that has taken what
-    was supposed to be a plane's stands before the plane."""
-    taken = view.anchored & (of_planes(view.disparity, view.anchored, surfaces, planes) != surfaces)
-    given = view.known | (view.anchored & ~taken)
-    found = np.where(given, view.disparity, 0.0)
-    for surface in range(1, surfaces.max() + 1):
-        own, part = surfaces == surface, view.hole & (surfaces == surface) & ~given
-        if not part.any():
-            continue
-        # Unknown for this surface is what is to be filled; what belongs to others takes no part.
-        done = complete(view.disparity, given & own, guide, plate)
-        low, high = np.percentile(view.disparity[given & own], [1, 99])
-        found[part] = done[part].clip(low / STRETCH, high * STRETCH)
-    found = np.where(taken, np.maximum(found, view.disparity), found)
-    rest = ~given & (found <= 0)
-    return np.where(rest, complete(found, found > 0, guide, plate), found) if rest.any() else found
+    """[H, W] disparity: each surface is continued smoothly by itself, with a step between two surfaces.
 
-
-def _refuted(view: Seen, disparity: np.ndarray) -> float:
-    """The share of the hole in which a surface of this disparity hides a plane that goes on, or other views look past
-    it: the planes of a post and of the ground meet in front of the ground behind the post."""
-    wrong = (view.anchored & (disparity > view.disparity * NEARER)) | _looked_past(view, disparity)
-    return float(wrong[view.hole].mean()) if view.hole.any() else 0.0
-
-
-def _looked_past(view: Seen, disparity: np.ndarray) -> np.ndarray:
-    """bool [H, W]: pixels of the hole in which other views look past a surface of this disparity."""
-    if view.hints.looked_past is None:
-        return np.zeros_like(view.hole)
-    return view.hole & view.hints.looked_past(1 / np.maximum(disparity, view.least_disparity))
-
-
-def points_around(view: Seen, points: np.ndarray, how: Completion) -> tuple[np.ndarray, np.ndarray]:
-    """Image points [S, 2] and disparities [S] of the scene's points that are seen around the hole."""
-    return visible_points(points, view.camera, _around(view, how), view.disparity)
-
-
-def _around(view: Seen, how: Completion) -> np.ndarray:
-    taken = view.hidden | view.hole
-    return grown(taken, how.ring) & ~taken
-
-
-def _planar(view: Seen, points: np.ndarray, how: Completion) -> tuple[planes.PlanarModel, str]:
-    """Planes through the surroundings; and how many explain how much.
-
-    Sparse points where they are enough; where planes explain most of them, but not all, so that it is their noise that
-    decides, also the pixels whose depth was swept.
+    A surface that was given pixels of a continued plane lies in front of that plane.
     """
-    (pixels, values), source = points_around(view, points, how), "sparse points"
-    sparse = len(values) >= ENOUGH_POINTS
+    reassigned = view.anchored & (plane_labels(view.disparity, view.anchored, surfaces, planes) != surfaces)
+    usable = view.known | (view.anchored & ~reassigned)
+    result = np.where(usable, view.disparity, 0.0)
+    for surface in range(1, surfaces.max() + 1):
+        is_surface, missing = surfaces == surface, view.hole & (surfaces == surface) & ~usable
+        if not missing.any():
+            continue
+        # For this surface, only the missing pixels are unknown; pixels of other surfaces take no part.
+        filled = complete(view.disparity, usable & is_surface, guide, plate)
+        low, high = np.percentile(view.disparity[usable & is_surface], [1, 99])
+        result[missing] = filled[missing].clip(low / MAX_EXTRAPOLATION, high * MAX_EXTRAPOLATION)
+    result = np.where(reassigned, np.maximum(result, view.disparity), result)
+    rest = ~usable & (result <= 0)
+    return np.where(rest, complete(result, result > 0, guide, plate), result) if rest.any() else result
+
+
+def _refuted_share(view: Seen, disparity: np.ndarray) -> float:
+    """The share of the hole in which a surface of this disparity occludes a continued plane or fills free space.
+
+    This rejects, for example, the planes of a post and of the ground, which meet before the ground behind the post.
+    """
+    refuted = (view.anchored & (disparity > view.disparity * IN_FRONT_RATIO)) | _in_free_space(view, disparity)
+    return float(refuted[view.hole].mean()) if view.hole.any() else 0.0
+
+
+def _in_free_space(view: Seen, disparity: np.ndarray) -> np.ndarray:
+    """bool [H, W]: pixels of the hole in which other views see past a surface of this disparity."""
+    if view.hints.free_space is None:
+        return np.zeros_like(view.hole)
+    return view.hole & view.hints.free_space(1 / np.maximum(disparity, view.least_disparity))
+
+
+def points_around(view: Seen, points: np.ndarray, settings: Completion) -> tuple[np.ndarray, np.ndarray]:
+    """Image points [S, 2] and disparities [S] of the sparse points that are visible around the hole."""
+    return visible_points(points, view.camera, _surroundings(view, settings), view.disparity)
+
+
+def _surroundings(view: Seen, settings: Completion) -> np.ndarray:
+    excluded = view.hidden | view.hole
+    return grown(excluded, settings.ring) & ~excluded
+
+
+def _fit_planar_model(view: Seen, points: np.ndarray, settings: Completion) -> tuple[planes.PlanarModel, str]:
+    """The planes fitted to the surroundings, and a description: how many explain what share of the samples.
+
+    The samples are the sparse points where there are enough. Where planes explain most of these but not all, so that
+    their noise decides, pixels of swept depth are added.
+    """
+    (pixels, values), source = points_around(view, points, settings), "sparse points"
+    sparse = len(values) >= MIN_POINTS
     if not sparse:
-        rows, columns = np.nonzero(_around(view, how) & view.known)
+        rows, columns = np.nonzero(_surroundings(view, settings) & view.known)
         values, source = view.disparity[rows, columns], "rendered depth"
         pixels = np.stack([columns, rows], 1) + 0.5
-    planar = _planes_through(view, pixels, values, how)
-    if sparse and view.hints.told is not None and planar.explained < SURE:
-        rows, columns = np.nonzero(_around(view, how) & view.known & view.hints.told)
-        kept = slice(None, None, max(1, len(rows) // (SWEPT * len(values))))
-        rows, columns, source = rows[kept], columns[kept], "sparse points and photographs compared"
+    model = _fit_planes(view, pixels, values, settings)
+    if sparse and view.hints.confirmed is not None and model.explained < CONCLUSIVE_SHARE:
+        rows, columns = np.nonzero(_surroundings(view, settings) & view.known & view.hints.confirmed)
+        every = slice(None, None, max(1, len(rows) // (SWEPT_RATIO * len(values))))
+        rows, columns, source = rows[every], columns[every], "sparse points and photographs compared"
         values = np.concatenate([values, view.disparity[rows, columns]])
         pixels = np.concatenate([pixels, np.stack([columns, rows], 1) + 0.5])
-        planar = _planes_through(view, pixels, values, how)
-    return planar, f"{planar.planes} planes explain {planar.explained:.0%} of {len(values)} {source}"
+        model = _fit_planes(view, pixels, values, settings)
+    return model, f"{model.planes} planes explain {model.explained:.0%} of {len(values)} {source}"
 
 
-def _planes_through(view: Seen, pixels: np.ndarray, values: np.ndarray, how: Completion) -> planes.PlanarModel:
-    draws = seeding.generator(how.seed, "planes", view.camera.name)
-    return planes.planar_model(pixels, values, view.hole.shape, draws, tolerance=how.planar_tolerance)
+def _fit_planes(view: Seen, pixels: np.ndarray, values: np.ndarray, settings: Completion) -> planes.PlanarModel:
+    generator = seeding.generator(settings.seed, "planes", view.camera.name)
+    return planes.planar_model(pixels, values, view.hole.shape, generator, tolerance=settings.planar_tolerance)
 
 
 def visible_points(
     points: np.ndarray, camera: Camera, pixels: np.ndarray, disparity: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Image points [S, 2] and disparities [S] of the points that fall on `pixels`, not behind what is rendered."""
+    """Image points [S, 2] and disparities [S] of the points that project to `pixels`, bool [H, W], and are visible."""
     uv, z = geometry.project(points, camera)
-    chosen, inside = geometry.sample_nearest(pixels, uv)
-    shown, _ = geometry.sample_nearest(disparity, uv)
-    visible = chosen & inside & (z > 0) & (z * shown < BEHIND)
+    on_pixels, inside = geometry.sample_nearest(pixels, uv)
+    rendered, _ = geometry.sample_nearest(disparity, uv)
+    visible = on_pixels & inside & (z > 0) & (z * rendered < OCCLUSION_RATIO)
     return uv[visible], 1.0 / z[visible]
 
 
 def grown(mask: np.ndarray, fraction: float) -> np.ndarray:
-    """`mask` and all pixels within `fraction` of the image's width of it."""
+    """bool [H, W]: the mask and all pixels within `fraction` of the image's width of it, by Euclidean distance."""
     if not mask.any():
         return mask
     return ndimage.distance_transform_edt(~mask) <= fraction * mask.shape[1]

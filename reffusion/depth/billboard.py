@@ -1,4 +1,4 @@
-"""Depth of what a picture draws in front of a scene, where nothing tells it: a billboard with thickness."""
+"""Depth for an object that a reference draws in front of the scene, when it is unknown: a billboard with thickness."""
 
 from __future__ import annotations
 
@@ -9,62 +9,66 @@ from reffusion import geometry
 from reffusion.gaussians.surfels import surface_normals
 from reffusion.types import Camera
 
-FOOT = 0.05  # of its height: the lowest pixels, that stand on the surface beneath
-BULGE = 0.5  # of its half width: how far its middle comes towards the camera
-FACING = 0.3  # least sine between the view and a surface's normal for something to stand upright on it
-GOOD_WITHIN = 30  # degrees from the reference's view: further round its back is missing
+FOOT_SHARE = 0.05  # of the height: the lowest pixels, which stand on the surface below
+BULGE = 0.5  # of the half width: how far the middle bulges towards the camera
+# Between viewing direction and surface, below which the billboard faces the camera instead of standing upright.
+MIN_SINE = 0.3
+GOOD_WITHIN = 30  # degrees from the reference's view; beyond this the missing back becomes visible
 
 
-def standing(drawn: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """[H, W] camera z: `depth`, and on `drawn` that of a standing shape.
+def standing(object_pixels: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
+    """[H, W] camera z: `depth`, and at `object_pixels` that of upright billboards.
 
-    Each piece stands upright where its lowest pixels meet the surface that is there, and bulges towards the camera
-    away from its outline. Its sides and its back are not known.
+    Each connected component stands upright where its lowest pixels meet the surface below, and bulges towards the
+    camera inside its outline. Its sides and its back are not known.
 
     Args:
-        drawn: bool [H, W], pixels of what was drawn in. depth: [H, W] float64, above 0, of the scene without it.
+        object_pixels: bool [H, W], pixels of the object.
+        depth: [H, W] float64 > 0, of the scene without it.
     """
-    pieces, count = ndimage.label(drawn, np.ones((3, 3)))
+    components, count = ndimage.label(object_pixels, np.ones((3, 3)))
     normals, rays = surface_normals(depth, camera), geometry.pixel_rays(camera)
-    found = depth.copy()
-    for piece in (pieces == k for k in range(1, count + 1)):
-        foot, normal = _foot(piece, depth, normals, camera)
-        sight = foot - camera.center
-        scale = camera.world_to_camera[2, :3] @ sight
-        facing = _upright(sight / np.linalg.norm(sight), normal)
-        towards = facing @ camera.world_to_camera[:3, :3].T  # the same in camera axes
-        flat = (facing @ sight) / np.minimum(rays @ towards, -1e-3)
-        bulge = _profile(piece) * BULGE * _half_width(piece) * scale / camera.fx
-        nearer = np.clip(flat, 0.5 * scale, 2 * scale) - bulge
-        found[piece] = np.minimum(nearer, depth)[piece]
-    return found
+    result = depth.copy()
+    for component in (components == k for k in range(1, count + 1)):
+        foot_point, normal = _foot(component, depth, normals, camera)
+        view_direction = foot_point - camera.center
+        foot_depth = camera.world_to_camera[2, :3] @ view_direction
+        facing_normal = _billboard_normal(view_direction / np.linalg.norm(view_direction), normal)
+        camera_normal = facing_normal @ camera.world_to_camera[:3, :3].T  # in camera axes
+        plane_depth = (facing_normal @ view_direction) / np.minimum(rays @ camera_normal, -1e-3)
+        bulge_depth = _profile(component) * BULGE * _half_width_px(component) * foot_depth / camera.fx
+        object_depth = np.clip(plane_depth, 0.5 * foot_depth, 2 * foot_depth) - bulge_depth
+        result[component] = np.minimum(object_depth, depth)[component]
+    return result
 
 
-def _foot(piece: np.ndarray, depth: np.ndarray, normals: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Where it stands: the middle of the surface points [3] under its lowest pixels, and their normal [3]."""
-    rows, columns = np.nonzero(piece)
-    lowest = np.full(piece.shape[1], -1)
+def _foot(
+    component: np.ndarray, depth: np.ndarray, normals: np.ndarray, camera: Camera
+) -> tuple[np.ndarray, np.ndarray]:
+    """The median surface point [3] under the lowest pixels of a component, and the unit normal [3] there."""
+    rows, columns = np.nonzero(component)
+    lowest = np.full(component.shape[1], -1)
     np.maximum.at(lowest, columns, rows)
-    feet = np.flatnonzero(lowest >= rows.max() - FOOT * (np.ptp(rows) + 1))
-    beneath = np.minimum(lowest[feet] + 1, piece.shape[0] - 1), feet
-    normal = np.median(normals[beneath], 0)
-    return np.median(geometry.unproject(depth, camera)[beneath], 0), normal / np.linalg.norm(normal)
+    foot_columns = np.flatnonzero(lowest >= rows.max() - FOOT_SHARE * (np.ptp(rows) + 1))
+    below = np.minimum(lowest[foot_columns] + 1, component.shape[0] - 1), foot_columns
+    normal = np.median(normals[below], 0)
+    return np.median(geometry.unproject(depth, camera)[below], 0), normal / np.linalg.norm(normal)
 
 
-def _upright(sight: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """[3] unit normal, towards the camera, of a plane that stands on a surface; on a wall it faces the camera."""
-    across = sight - (sight @ normal) * normal
+def _billboard_normal(view_direction: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """[3] unit normal, towards the camera, of a plane upright on a surface; on a wall the plane faces the camera."""
+    across = view_direction - (view_direction @ normal) * normal
     length = np.linalg.norm(across)
-    return -sight if length < FACING else -across / length
+    return -view_direction if length < MIN_SINE else -across / length
 
 
-def _profile(piece: np.ndarray) -> np.ndarray:
-    """[H, W] in [0, 1]: 0 at the outline, 1 in the middle, round between."""
-    inward = np.maximum(ndimage.distance_transform_edt(np.pad(piece, 1))[1:-1, 1:-1] - 1, 0)
-    share = inward / max(inward.max(), 1.0)
-    return np.sqrt(1 - (1 - share) ** 2)
+def _profile(component: np.ndarray) -> np.ndarray:
+    """[H, W] in [0, 1]: a rounded profile, 0 at the outline and 1 in the middle."""
+    distance = np.maximum(ndimage.distance_transform_edt(np.pad(component, 1))[1:-1, 1:-1] - 1, 0)
+    normalized = distance / max(distance.max(), 1.0)
+    return np.sqrt(1 - (1 - normalized) ** 2)
 
 
-def _half_width(piece: np.ndarray) -> float:
-    """Pixels: half the width of its widest row."""
-    return piece.sum(1).max() / 2
+def _half_width_px(component: np.ndarray) -> float:
+    """Half the width of the widest row, in pixels."""
+    return component.sum(1).max() / 2

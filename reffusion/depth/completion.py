@@ -1,6 +1,6 @@
-"""Completing depth behind what was removed, smoothly but for creases where an image has edges.
+"""Smooth completion of depth behind a removed object, with creases where an image has edges.
 
-Everything happens in disparity (1/z): the disparity of a plane is an affine function of the pixel, so that penalising
+All computation is in disparity (1/z): the disparity of a plane is an affine function of the pixel, so that penalising
 second differences continues floors and walls exactly.
 """
 
@@ -25,13 +25,13 @@ STENCILS = (  # (row, column, factor) of the second differences along x, along y
 
 @dataclass(frozen=True)
 class Plate:
-    """The thin plate that is laid through a hole.
+    """Settings of the thin plate that is fitted through a hole.
 
     Attributes:
         ring: width of the surroundings that take part, as a fraction of the image's width.
         stiffness: weight of bending against the data, px^4; about 3 px are averaged at 100.
         edge: guide step (in [0, 1]) at which the weight of a second difference has fallen to 1/e.
-        most_unknowns: above so many pixels a coarser grid is solved, and its correction interpolated.
+        most_unknowns: above this number of pixels a coarser grid is solved, and its solution interpolated.
     """
 
     ring: float = 0.05
@@ -40,27 +40,27 @@ class Plate:
     most_unknowns: float = 60_000
 
     def coarser(self, factor: int) -> Plate:
-        """The same plate on blocks of `factor` x `factor` pixels, solved there whatever their number."""
+        """The same plate on blocks of `factor` x `factor` pixels, solved directly whatever their number."""
         # A second difference over blocks is factor^2 larger, and there are factor^2 fewer.
         return replace(self, stiffness=self.stiffness / factor**2, most_unknowns=np.inf)
 
 
-USUAL = Plate()
+DEFAULT_PLATE = Plate()
 
 
 def complete(
     disparity: np.ndarray,
     confidence: np.ndarray,
     guide: np.ndarray | None = None,
-    plate: Plate = USUAL,
+    plate: Plate = DEFAULT_PLATE,
     *,
     keep: bool = True,
 ) -> np.ndarray:
     """Fill the pixels of zero confidence by second-order, edge-aware completion in disparity.
 
     Minimises  sum_p c_p (d_p - D_p)^2 + stiffness * sum w (d_xx^2 + 2 d_xy^2 + d_yy^2)  over the hole and a ring
-    of known pixels around it; w falls across edges of the guide, so that a crease may lie there. An affine D makes both
-    sums zero: planes are continued to rounding, whatever the guide's texture.
+    of known pixels around it. w is small across edges of the guide, so that a crease may lie there. An affine D makes
+    both sums zero: planes are continued exactly (up to rounding), whatever the guide's texture.
 
     PAPER leaves open: how the depth of a hole is found without a monocular estimator. Second order in disparity,
     because first-order filling bends every plane.
@@ -70,14 +70,14 @@ def complete(
         confidence: [H, W] >= 0, or bool; 0 = unknown.
         guide: [H, W, 3] or [H, W] image, uint8 or [0, 1], or None.
         plate: parameters.
-        keep: known pixels keep their values; else those of the ring take the minimiser's, which is smooth at the rim.
+        keep: known pixels keep their values; else those of the ring take the minimiser's, which has no step at the rim.
 
     Returns:
         [H, W] float64: the completion where confidence is 0, elsewhere the input (see `keep`).
 
     Raises:
-        Degenerate: fewer than 3 known pixels next to some hole, or these on one line (no plane is fixed).
-        ValueError: known values that are not finite; shapes that differ.
+        Degenerate: fewer than 3 known pixels next to some hole, or all on one line (they determine no plane).
+        ValueError: known values are not finite, or shapes differ.
     """
     disparity, confidence = np.asarray(disparity, np.float64), np.asarray(confidence, np.float64)
     check_maps(disparity, confidence, guide)
@@ -86,19 +86,19 @@ def complete(
     if not hole.any():
         return completed
     colors = None if guide is None else unit_range(guide)
-    reach = max(2, round(plate.ring * disparity.shape[1]))
-    regions, count = ndimage.label(ndimage.distance_transform_edt(~hole) <= reach)
+    ring_px = max(2, round(plate.ring * disparity.shape[1]))
+    regions, count = ndimage.label(ndimage.distance_transform_edt(~hole) <= ring_px)
     for window, region in zip(ndimage.find_objects(regions), range(1, count + 1), strict=True):
         domain = regions[window] == region
-        shown = None if colors is None else colors[window]
-        part = _complete_region(disparity[window], confidence[window], shown, domain, plate)
-        inside = domain & hole[window] if keep else domain
-        completed[window][inside] = part[inside]
+        window_colors = None if colors is None else colors[window]
+        filled = _complete_region(disparity[window], confidence[window], window_colors, domain, plate)
+        updated = domain & hole[window] if keep else domain
+        completed[window][updated] = filled[updated]
     return completed
 
 
 def check_maps(disparity: np.ndarray, confidence: np.ndarray, guide: np.ndarray | None) -> None:
-    """ValueError unless the maps are [H, W], the guide has their size, and what will be read of them is finite."""
+    """Raise ValueError unless the maps are [H, W], the guide has their size, and the values to be read are finite."""
     if disparity.ndim != 2 or disparity.shape != confidence.shape:
         raise ValueError(f"disparity {disparity.shape} and confidence {confidence.shape} must both be [H, W]")
     if guide is not None and guide.shape[:2] != disparity.shape:
@@ -110,38 +110,43 @@ def check_maps(disparity: np.ndarray, confidence: np.ndarray, guide: np.ndarray 
 
 
 def _complete_region(disparity, confidence, guide, domain, plate: Plate) -> np.ndarray:
-    """[H, W] of one hole and its ring, both in `domain` (bool); the plane that fits best outside them."""
+    """[H, W]: disparity of one hole and its ring, both in `domain` (bool [H, W]); elsewhere the best fitting plane."""
     known = domain & (confidence > 0)
-    _fixes_a_plane(known)
-    # Solved as a correction to the best plane, in units of the data's spread: few digits are lost to the offset.
+    _check_determines_plane(known)
+    # Solve for a correction to the best plane, in units of the data's spread: few digits are lost to the offset.
     plane = fit_plane(disparity, known * confidence)
-    rest = np.where(known, disparity - plane, 0.0)
+    residual = np.where(known, disparity - plane, 0.0)
     data = np.where(known, confidence, 0.0)
     if domain.sum() > plate.most_unknowns:
-        return plane + _corrected_coarsely(rest, data, guide, domain, plate)
-    unit = np.abs(rest).max()
-    if unit <= 1e-13 * np.abs(disparity[known]).max():
+        return plane + _solve_coarsely(residual, data, guide, domain, plate)
+    scale = np.abs(residual).max()
+    if scale <= 1e-13 * np.abs(disparity[known]).max():
         return plane
     filled = plane.copy()
-    filled[domain] += unit * factored(system_of(data, guide, domain, plate)).solve(data[domain] * rest[domain] / unit)
+    filled[domain] += scale * factored(system_of(data, guide, domain, plate)).solve(
+        data[domain] * residual[domain] / scale
+    )
     return filled
 
 
-def system_of(confidence: np.ndarray, guide: np.ndarray | None, domain: np.ndarray, plate: Plate = USUAL):
-    """The completion's matrix over the pixels of `domain` (bool [H, W]), symmetric and positive definite, sparse."""
+def system_of(confidence: np.ndarray, guide: np.ndarray | None, domain: np.ndarray, plate: Plate = DEFAULT_PLATE):
+    """The completion's sparse matrix over the pixels of `domain`, bool [H, W]; symmetric and positive definite."""
     bend = _bending(domain, guide, plate.edge)
     return (sparse.diags(confidence[domain]) + plate.stiffness * bend.T @ bend).tocsc()
 
 
 def factored(system: sparse.csc_matrix):
+    """Sparse LU factors of a symmetric matrix."""
     return splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
-def condition(confidence: np.ndarray, guide: np.ndarray | None = None, plate: Plate = USUAL) -> float:
+def condition(confidence: np.ndarray, guide: np.ndarray | None = None, plate: Plate = DEFAULT_PLATE) -> float:
     """Condition number (largest over smallest eigenvalue) of the completion's system over a whole map [H, W].
 
-    So many roundings of the right hand side's largest value may be in the answer: why `complete` solves for the
-    correction to a plane. Args: as `complete`.
+    Rounding errors of the right hand side's largest value are amplified by up to this factor, which is why `complete`
+    solves for the correction to a plane.
+
+    Args: as `complete`.
     """
     confidence = np.asarray(confidence, np.float64)
     colors = None if guide is None else unit_range(guide)
@@ -153,25 +158,29 @@ def extremes_ratio(matrix: sparse.spmatrix) -> float:
     if matrix.shape[0] < 16:
         values = np.linalg.eigvalsh(matrix.toarray())
         return float(values[-1] / values[0])
-    start = np.ones(matrix.shape[0]) + 0.1 * np.arange(matrix.shape[0]) % 0.7  # the same answer each time
+    start = (
+        np.ones(matrix.shape[0]) + 0.1 * np.arange(matrix.shape[0]) % 0.7
+    )  # fixed start vector, for reproducible results
     largest = eigsh(matrix, k=1, which="LA", v0=start, return_eigenvectors=False)[0]
     smallest = eigsh(matrix.tocsc(), k=1, sigma=0.0, which="LM", v0=start, return_eigenvectors=False)[0]
     return float(largest / smallest)
 
 
-def _corrected_coarsely(rest, data, guide, domain, plate: Plate) -> np.ndarray:
-    """[H, W] correction to the plane, solved over blocks and interpolated; blocks may be averaged off-centre because
-    the plane is taken off `rest`."""
+def _solve_coarsely(residual, data, guide, domain, plate: Plate) -> np.ndarray:
+    """[H, W]: correction to the plane, solved over blocks and interpolated.
+
+    Blocks may be averaged off-centre because `residual` is the difference from the plane.
+    """
     factor = int(np.ceil(np.sqrt(domain.sum() / plate.most_unknowns)))
     blocks = lambda array: _block_sum(array, factor)
     weights = blocks(data)
-    means = np.divide(blocks(rest * data), weights, where=weights > 0, out=np.zeros_like(weights))
+    means = np.divide(blocks(residual * data), weights, where=weights > 0, out=np.zeros_like(weights))
     if guide is not None:
         pixels = blocks(np.ones(domain.shape))
         guide = np.stack([blocks(channel) / pixels for channel in np.moveaxis(guide, -1, 0)], -1)
     coarse = _complete_region(means, weights, guide, blocks(domain) > 0, plate.coarser(factor))
-    at = [(np.arange(n) + 0.5) / factor - 0.5 for n in domain.shape]
-    return ndimage.map_coordinates(coarse, np.meshgrid(*at, indexing="ij"), order=1, mode="nearest")
+    coordinates = [(np.arange(n) + 0.5) / factor - 0.5 for n in domain.shape]
+    return ndimage.map_coordinates(coarse, np.meshgrid(*coordinates, indexing="ij"), order=1, mode="nearest")
 
 
 def _block_sum(array: np.ndarray, factor: int) -> np.ndarray:
@@ -181,7 +190,7 @@ def _block_sum(array: np.ndarray, factor: int) -> np.ndarray:
     return padded.reshape(height // factor, factor, width // factor, factor).sum((1, 3))
 
 
-def _fixes_a_plane(known: np.ndarray) -> None:
+def _check_determines_plane(known: np.ndarray) -> None:
     rows, columns = np.nonzero(known)
     if len(rows) < 3 or np.linalg.matrix_rank(np.stack([rows - rows[0], columns - columns[0]])) < 2:
         raise Degenerate(
@@ -199,15 +208,15 @@ def _bending(domain: np.ndarray, guide: np.ndarray | None, edge: float) -> spars
 
 
 def _stencil_rows(index: np.ndarray, guide: np.ndarray | None, stencil, edge: float) -> sparse.csr_matrix:
-    tall, wide = (1 + max(s[axis] for s in stencil) for axis in (0, 1))
+    stencil_height, stencil_width = (1 + max(s[axis] for s in stencil) for axis in (0, 1))
     height, width = index.shape
-    view = lambda array, dr, dc: array[dr : height - tall + 1 + dr, dc : width - wide + 1 + dc]
-    cells = np.stack([view(index, dr, dc) for dr, dc, _ in stencil], -1)
+    shifted = lambda array, dr, dc: array[dr : height - stencil_height + 1 + dr, dc : width - stencil_width + 1 + dc]
+    cells = np.stack([shifted(index, dr, dc) for dr, dc, _ in stencil], -1)
     valid = (cells >= 0).all(-1)
     cells = cells[valid]
     weight = np.full(len(cells), 2.0 if len(stencil) == 4 else 1.0)
     if guide is not None:
-        colors = np.stack([view(guide, dr, dc)[valid] for dr, dc, _ in stencil], -1)
+        colors = np.stack([shifted(guide, dr, dc)[valid] for dr, dc, _ in stencil], -1)
         step = colors.max(-1) - colors.min(-1)  # [M, channels]
         weight *= CREASE_FLOOR + (1 - CREASE_FLOOR) * np.exp(-((step**2).sum(-1) / edge**2))
     values = np.sqrt(weight)[:, None] * np.array([s[2] for s in stencil], np.float64)
@@ -217,6 +226,6 @@ def _stencil_rows(index: np.ndarray, guide: np.ndarray | None, stencil, edge: fl
 
 
 def unit_range(guide: np.ndarray) -> np.ndarray:
-    """[H, W, channels] float64 in [0, 1] of a guide, uint8 or in [0, 1], with channels or without."""
+    """A guide [H, W] or [H, W, C], uint8 or in [0, 1], as float64 [H, W, C] in [0, 1]."""
     guide = guide / 255.0 if guide.dtype == np.uint8 else np.asarray(guide, np.float64)
     return guide[..., None] if guide.ndim == 2 else guide

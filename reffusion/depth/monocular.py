@@ -1,6 +1,6 @@
-"""Depth of a single picture by a network of the Depth Anything kind, loaded through transformers.
+"""Monocular depth by a Depth Anything network, loaded through transformers.
 
-Its own processor would ask for torchvision; the few lines that it takes are here in plain torch.
+Preprocessing is written here in plain torch because the image processor of transformers requires torchvision.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ from torch.nn.functional import interpolate
 
 from reffusion.weights import local
 
-MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet's pixels, which the backbone was fed
-KIND = "depth_anything"
-FARTHEST = 1e6  # metres: what a metric network puts beyond has no disparity to speak of
+# Of the pixels of ImageNet, on which the backbone was trained.
+MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+MODEL_TYPE = "depth_anything"
+MAX_DEPTH_M = 1e6  # metres: the depth of a metric network is clamped here before it is inverted
 
 
 @dataclass(frozen=True)
@@ -28,9 +29,9 @@ class DepthNetwork:
 
     Attributes:
         model: transformers' DepthAnythingForDepthEstimation.
-        patch: pixels per token, a side; it takes pictures of whole patches.
-        side: pixels of the square pictures it was trained on.
-        metric: it answers depth in metres, not disparity up to scale and offset.
+        patch: side of a patch in pixels; the input is a whole number of patches.
+        side: side of the square training pictures in pixels.
+        metric: the output is depth in metres, not disparity up to scale and offset.
     """
 
     model: nn.Module
@@ -40,15 +41,15 @@ class DepthNetwork:
 
 
 def load_network(source: str | Path, device: str = "cpu") -> DepthNetwork:
-    """The model in a local folder, or a hub id such as depth-anything/Depth-Anything-V2-Small-hf; float32.
+    """Load the model, in float32, from a local folder or by a hub id (depth-anything/Depth-Anything-V2-Small-hf).
 
     Raises:
-        ValueError: not on this machine, a folder without a model, or a model of another kind.
+        ValueError: the model is not on this machine, the folder has no model, or the model is of another type.
     """
     from transformers import AutoConfig, AutoModelForDepthEstimation
     from transformers.utils import logging as transformers_logging
 
-    cure = "Name a local folder, or leave `depth.model` empty: depth is then continued from the surroundings"
+    advice = "Name a local folder, or leave `depth.model` empty: depth is then continued from the surroundings"
     try:
         folder = local.locate(source)
         if folder is None:
@@ -56,33 +57,35 @@ def load_network(source: str | Path, device: str = "cpu") -> DepthNetwork:
         if not (folder / "config.json").is_file():
             raise ValueError(f"{folder} lacks config.json; it must be a transformers model folder")
     except ValueError as error:
-        raise ValueError(f"depth model {error}. {cure}") from None
+        raise ValueError(f"depth model {error}. {advice}") from None
     transformers_logging.disable_progress_bar()
-    _check_kind(_loaded(folder, cure, lambda: AutoConfig.from_pretrained(folder)), str(source))
-    model = _loaded(folder, cure, lambda: AutoModelForDepthEstimation.from_pretrained(folder, dtype=torch.float32))
+    _check_kind(_load_or_explain(folder, advice, lambda: AutoConfig.from_pretrained(folder)), str(source))
+    model = _load_or_explain(
+        folder, advice, lambda: AutoModelForDepthEstimation.from_pretrained(folder, dtype=torch.float32)
+    )
     return make_network(model, device)
 
 
-def _loaded(folder: Path, cure: str, load: Callable[[], Any]) -> Any:
-    """What transformers loads; its complaint in one line, with what can be done."""
+def _load_or_explain(folder: Path, advice: str, load: Callable[[], Any]) -> Any:
+    """Call a loader of transformers; its errors become one line with advice."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return load()
     except (OSError, ValueError) as error:
-        raise ValueError(f"depth model {folder}: {str(error).splitlines()[0]} {cure}") from error
+        raise ValueError(f"depth model {folder}: {str(error).splitlines()[0]} {advice}") from error
 
 
 def _check_kind(config, name: str) -> None:
-    if config.model_type != KIND:
+    if config.model_type != MODEL_TYPE:
         raise ValueError(
-            f"depth model {name}: a model of type {config.model_type!r}; those of type {KIND!r} are understood "
+            f"depth model {name}: a model of type {config.model_type!r}; those of type {MODEL_TYPE!r} are understood "
             "(Depth Anything, Depth Anything V2)"
         )
 
 
 def make_network(model: nn.Module, device: str = "cpu") -> DepthNetwork:
-    """A DepthNetwork from a model in memory."""
+    """Build a DepthNetwork from a model in memory."""
     _check_kind(model.config, model.config.name_or_path)
     backbone = model.config.backbone_config
     model.requires_grad_(False).eval().to(device)
@@ -92,37 +95,38 @@ def make_network(model: nn.Module, device: str = "cpu") -> DepthNetwork:
 
 @torch.no_grad()
 def disparity(network: DepthNetwork, image: Tensor) -> Tensor:
-    """What the network says of a picture, near high: [H, W] float32, on the picture's device.
+    """[H, W] float32 disparity of a picture, up to scale and offset, on the picture's device.
 
-    Up to scale and offset; a metric network's depth is inverted.
+    The depth of a metric network is inverted.
 
     Args:
         image: [3, H, W] in [0, 1].
+
     Raises:
-        ValueError: not a picture of three channels.
-        FloatingPointError: the answer is not finite.
+        ValueError: the picture does not have three channels.
+        FloatingPointError: the output is not finite.
     """
     if image.ndim != 3 or image.shape[0] != 3:
         raise ValueError(f"the depth model takes one picture [3, H, W], not {list(image.shape)}")
     device = next(network.model.parameters()).device
-    answer = network.model(pixel_values=prepared(network, image).to(device)).predicted_depth[None]
+    output = network.model(pixel_values=preprocess(network, image).to(device)).predicted_depth[None]
     if network.metric:
-        answer = 1 / answer.clamp(1 / FARTHEST, FARTHEST)
-    if not torch.isfinite(answer).all():
+        output = 1 / output.clamp(1 / MAX_DEPTH_M, MAX_DEPTH_M)
+    if not torch.isfinite(output).all():
         raise FloatingPointError("the depth model's answer is not finite")
     size = tuple(image.shape[1:])
-    return interpolate(answer, size=size, mode="bilinear", align_corners=False)[0, 0].to(image.device)
+    return interpolate(output, size=size, mode="bilinear", align_corners=False)[0, 0].to(image.device)
 
 
-def prepared(network: DepthNetwork, image: Tensor) -> Tensor:
-    """[1, 3, h, w] of a picture [3, H, W] in [0, 1]: sides near the network's own in whole patches, normalised.
+def preprocess(network: DepthNetwork, image: Tensor) -> Tensor:
+    """The network's input [1, 3, h, w] for a picture [3, H, W] in [0, 1]: resized to whole patches and normalised.
 
-    The proportions stay but for that rounding; of the two sides the one that asks for less resizing is made to fit.
+    The aspect ratio is kept up to this rounding. The side that needs less resizing is scaled to the training size.
     """
     height, width = image.shape[1:]
     scale = min((network.side / height, network.side / width), key=lambda s: abs(1 - s))
-    whole = lambda length: max(1, round(scale * length / network.patch)) * network.patch
-    size = whole(height), whole(width)
+    to_patches = lambda length: max(1, round(scale * length / network.patch)) * network.patch
+    size = to_patches(height), to_patches(width)
     resized = interpolate(image.float()[None], size=size, mode="bicubic", align_corners=False, antialias=True)
     mean, deviation = (resized.new_tensor(values).view(1, 3, 1, 1) for values in (MEAN, DEVIATION))
     return (resized.clamp(0, 1) - mean) / deviation

@@ -1,8 +1,9 @@
-"""The depth of a few photographs, where they agree on it: sparse points begin, the photographs correct them.
+"""Multi-view stereo for a few photographs: depth from sparse points, refined and cross-checked between views.
 
-Sparse points are few on what is smooth, and some lie on what a photograph does not show: the far side of a thing, seen
-in others. Each photograph's depth between them is corrected by PatchMatch stereo; where another one finds the same
-surface, both are right; what they are right about speaks for the pixels beside it, and against sparse points.
+Smooth surfaces have few sparse points, and some points lie on surfaces that a photograph does not show (the far side of
+an object, seen in others). So the depth interpolated between the points is refined by PatchMatch stereo. Pixels for
+which another view finds the same surface are confirmed. Confirmed pixels replace the sparse points they contradict, and
+the rest is interpolated anew.
 """
 
 from __future__ import annotations
@@ -14,116 +15,142 @@ import numpy as np
 
 from reffusion import geometry, seeding
 from reffusion.depth import patchmatch
-from reffusion.depth.sparse_to_dense import UNIT, Known, SparsePoints, depth_between, known
+from reffusion.depth.sparse_to_dense import (
+    REFERENCE_WIDTH,
+    DepthSamples,
+    SparsePoints,
+    interpolate_depth,
+    visible_samples,
+)
 from reffusion.kernels.compiled import side_by_side
 from reffusion.types import Camera
 
-COMPARED, APART = 3, 70.0  # so many others, whose axes differ by less than so many degrees
-CONFIRMED = 0.01  # relative depth within which two photographs' surfaces are the same
-CONTRADICTED = 0.05  # relative depth by which another photograph sees farther
-SPACING = 3  # px of a picture `UNIT` wide: the grid of what photographs agree on that others ask
+MAX_NEIGHBORS, MAX_ANGLE_DEG = (
+    3,
+    70.0,
+)  # other views that a view is compared with, and how far their axes may turn from its own
+SAME_SURFACE = 0.01  # relative depth within which the surfaces of two views are the same
+SEEN_PAST = 0.05  # relative depth by which another view must see farther to refute a surface
+GRID_SPACING = 3  # px of a picture `REFERENCE_WIDTH` wide: grid of the confirmed pixels that become samples
 
 
 @dataclass(frozen=True)
-class Agreed:
-    """What is known of a view's depth.
+class MultiviewDepth:
+    """The depth of a view, checked against other views.
 
     Attributes:
-        depth: [H, W] float64 camera z. sure: bool [H, W], another photograph shows the same surface there.
-        wrong: bool [H, W], not sure, and another photograph that is sees past it.
+        depth: [H, W] float64 camera z.
+        confirmed: bool [H, W], another view finds the same surface.
+        refuted: bool [H, W], not confirmed, and a confirmed pixel of another view sees past the surface.
     """
 
     depth: np.ndarray
-    sure: np.ndarray
-    wrong: np.ndarray
+    confirmed: np.ndarray
+    refuted: np.ndarray
 
 
-def agreed(
+def estimate_multiview_depth(
     points: SparsePoints,
     cameras: Sequence[Camera],
     images: Mapping[str, np.ndarray],
     hidden: Mapping[str, np.ndarray],
     seed: int,
-) -> dict[str, Agreed]:
-    """View name -> its depth, of the views that show enough points.
+) -> dict[str, MultiviewDepth]:
+    """View name -> its depth, for the views that show enough points.
 
     Args:
-        images: view name -> uint8 [H, W, 3], as bright as each other.
-        hidden: view name -> bool [H, W], pixels of which nothing is sure.
+        images: view name -> uint8 [H, W, 3], with equal exposure.
+        hidden: view name -> bool [H, W], pixels that are never confirmed.
     """
-    said = {camera.name: known(points, camera, images[camera.name]) for camera in cameras}
-    between = lambda camera: depth_between(said[camera.name], camera, images[camera.name])
-    believed = dict(zip(said, side_by_side(between, cameras), strict=True))
-    views = [camera for camera in cameras if believed[camera.name] is not None]
-    planes = {view.name: _planes(view, views, images, believed[view.name], seed) for view in views}
-    depth = {view.name: _depth(planes[view.name], view) for view in views}
-    sure = {view.name: _confirmed(view, depth, views) & np.logical_not(hidden.get(view.name, False)) for view in views}
-    rest = lambda view: _beside(
-        view, images[view.name], said[view.name], planes[view.name], depth[view.name], sure[view.name]
+    samples = {camera.name: visible_samples(points, camera, images[camera.name]) for camera in cameras}
+    interpolate = lambda camera: interpolate_depth(samples[camera.name], camera, images[camera.name])
+    initial = dict(zip(samples, side_by_side(interpolate, cameras), strict=True))
+    views = [camera for camera in cameras if initial[camera.name] is not None]
+    planes = {view.name: _refine_planes(view, views, images, initial[view.name], seed) for view in views}
+    depth = {view.name: _depth_of_planes(planes[view.name], view) for view in views}
+    confirmed = {
+        view.name: _confirmed_pixels(view, depth, views) & np.logical_not(hidden.get(view.name, False))
+        for view in views
+    }
+    complete = lambda view: _complete_depth(
+        view, images[view.name], samples[view.name], planes[view.name], depth[view.name], confirmed[view.name]
     )
-    depth = dict(zip(depth, side_by_side(rest, views), strict=True))
+    depth = dict(zip(depth, side_by_side(complete, views), strict=True))
     return {
-        view.name: Agreed(depth[view.name], sure[view.name], _contradicted(view, depth, sure, views)) for view in views
+        view.name: MultiviewDepth(
+            depth[view.name], confirmed[view.name], _refuted_pixels(view, depth, confirmed, views)
+        )
+        for view in views
     }
 
 
-def _planes(
-    view: Camera, views: Sequence[Camera], images: Mapping[str, np.ndarray], believed: np.ndarray, seed: int
+def _refine_planes(
+    view: Camera, views: Sequence[Camera], images: Mapping[str, np.ndarray], initial: np.ndarray, seed: int
 ) -> np.ndarray:
-    alike = lambda other: float(view.world_to_camera[2, :3] @ other.world_to_camera[2, :3])
-    near = [other for other in views if other.name != view.name and alike(other) > np.cos(np.radians(APART))]
-    others = [(other, images[other.name]) for other in sorted(near, key=alike, reverse=True)[:COMPARED]]
+    """[H, W, 3] planes of a view, from its initial depth refined by stereo with the most similar views."""
+    axis_cosine = lambda other: float(view.world_to_camera[2, :3] @ other.world_to_camera[2, :3])
+    near = [
+        other for other in views if other.name != view.name and axis_cosine(other) > np.cos(np.radians(MAX_ANGLE_DEG))
+    ]
+    others = [(other, images[other.name]) for other in sorted(near, key=axis_cosine, reverse=True)[:MAX_NEIGHBORS]]
     if not others:
-        return patchmatch.tangents(1 / believed, geometry.pixel_rays(view))
-    noise = np.random.default_rng(seeding.seed_for(seed, "agreed", view.name))
-    return patchmatch.fitted(view, images[view.name], others, believed, noise)
+        return patchmatch.tangent_planes(1 / initial, geometry.pixel_rays(view))
+    generator = np.random.default_rng(seeding.seed_for(seed, "agreed", view.name))
+    return patchmatch.estimate_planes(view, images[view.name], others, initial, generator)
 
 
-def _depth(planes: np.ndarray, view: Camera) -> np.ndarray:
+def _depth_of_planes(planes: np.ndarray, view: Camera) -> np.ndarray:
     return 1 / (planes * geometry.pixel_rays(view)).sum(-1)
 
 
-def _confirmed(view: Camera, depth: Mapping[str, np.ndarray], views: Sequence[Camera]) -> np.ndarray:
-    """bool [H, W]: pixels whose surface another view shows, too."""
+def _confirmed_pixels(view: Camera, depth: Mapping[str, np.ndarray], views: Sequence[Camera]) -> np.ndarray:
+    """bool [H, W]: pixels for which another view finds the same surface."""
     result = np.zeros(depth[view.name].shape, bool)
-    for there, z, inside, _ in _elsewhere(view, depth, depth, views):
-        result |= inside & (np.abs(there - z) < CONFIRMED * z)
+    for other_depth, z, inside, _ in _compare_views(view, depth, depth, views):
+        result |= inside & (np.abs(other_depth - z) < SAME_SURFACE * z)
     return result
 
 
-def _contradicted(
-    view: Camera, depth: Mapping[str, np.ndarray], sure: Mapping[str, np.ndarray], views: Sequence[Camera]
+def _refuted_pixels(
+    view: Camera, depth: Mapping[str, np.ndarray], confirmed: Mapping[str, np.ndarray], views: Sequence[Camera]
 ) -> np.ndarray:
-    """bool [H, W]: pixels not sure of themselves, which another view is sure to see past."""
+    """bool [H, W]: pixels that are not confirmed and that a confirmed pixel of another view sees past."""
     result = np.zeros(depth[view.name].shape, bool)
-    for there, z, inside, certain in _elsewhere(view, depth, sure, views):
-        result |= inside & certain & (there > z * (1 + CONTRADICTED))
-    return result & ~sure[view.name]
+    for other_depth, z, inside, other_confirmed in _compare_views(view, depth, confirmed, views):
+        result |= inside & other_confirmed & (other_depth > z * (1 + SEEN_PAST))
+    return result & ~confirmed[view.name]
 
 
-def _elsewhere(view: Camera, depth: Mapping[str, np.ndarray], told: Mapping[str, np.ndarray], views: Sequence[Camera]):
-    """Of each other view, for all pixels of this one [H, W]: its depth where they lie in it, theirs, whether they do,
-    and what it tells there."""
+def _compare_views(
+    view: Camera, depth: Mapping[str, np.ndarray], values: Mapping[str, np.ndarray], views: Sequence[Camera]
+):
+    """Project the pixels [H, W] of a view into each other view.
+
+    Yields:
+        for each other view: its depth there, the point's depth in it, whether the point is in its frame, and its
+        `values` there.
+    """
     points = geometry.unproject(depth[view.name], view)
     for other in views:
         if other.name != view.name:
             uv, z = geometry.project(points, other)
-            there, inside = geometry.sample_nearest(depth[other.name], uv)
-            yield there, z, inside & (z > 0), geometry.sample_nearest(told[other.name], uv)[0]
+            other_depth, inside = geometry.sample_nearest(depth[other.name], uv)
+            yield other_depth, z, inside & (z > 0), geometry.sample_nearest(values[other.name], uv)[0]
 
 
-def _beside(
-    view: Camera, image: np.ndarray, said: Known, planes: np.ndarray, depth: np.ndarray, sure: np.ndarray
+def _complete_depth(
+    view: Camera, image: np.ndarray, samples: DepthSamples, planes: np.ndarray, depth: np.ndarray, confirmed: np.ndarray
 ) -> np.ndarray:
-    """[H, W]: the depth where it is sure, and elsewhere what lies between that and the points it does not refute."""
-    if not sure.any():
+    """[H, W]: the depth where it is confirmed; elsewhere it is interpolated from confirmed pixels and from the sparse
+    points that these do not refute."""
+    if not confirmed.any():
         return depth
-    columns, rows = said.pixels.astype(int).T
-    refuted = sure[rows, columns]  # or as good as told by the pixel itself
-    spacing = max(1, round(SPACING * view.width / UNIT))
-    grid = np.zeros(sure.shape, bool)
+    columns, rows = samples.pixels.astype(int).T
+    refuted = confirmed[rows, columns]  # or redundant beside the confirmed pixel itself
+    spacing = max(1, round(GRID_SPACING * view.width / REFERENCE_WIDTH))
+    grid = np.zeros(confirmed.shape, bool)
     grid[::spacing, ::spacing] = True
-    at = np.argwhere(sure & grid)
-    found = Known(at[:, ::-1] + 0.5, planes[tuple(at.T)], 1 / depth[tuple(at.T)])
-    between = depth_between(said.taken(~refuted).joined(found), view, image)
-    return depth if between is None else np.where(sure, depth, between)
+    grid_pixels = np.argwhere(confirmed & grid)
+    dense = DepthSamples(grid_pixels[:, ::-1] + 0.5, planes[tuple(grid_pixels.T)], 1 / depth[tuple(grid_pixels.T)])
+    completed = interpolate_depth(samples.select(~refuted).concatenate(dense), view, image)
+    return depth if completed is None else np.where(confirmed, depth, completed)

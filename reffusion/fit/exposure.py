@@ -1,8 +1,8 @@
-"""Exposure compensation: each view's own affine map of colours, fitted with the scene (as 3DGS's code does).
+"""Exposure compensation: an affine colour map for each view, optimised with the scene (as in the code of 3DGS).
 
-A phone re-exposes while it walks round. Without compensation Gaussians take the mean, or colours that change with the
-direction; with it they have one exposure, and the photographs are brought to that one wherever they are used later.
-Views that were not photographed are drawn as the nearest photographs are exposed.
+A phone changes its exposure while it moves around a scene. Without compensation Gaussians learn the mean, or colours
+that change with the direction. With it they have one exposure, and later stages use photographs normalised to it.
+Views without a photograph take the exposure of the nearest photographs.
 """
 
 from __future__ import annotations
@@ -21,14 +21,16 @@ from reffusion.splat import rasterizer
 from reffusion.types import Camera
 
 FILE = "exposures.json"
-RATE, RATE_LAST = 1e-2, 1e-3  # Adam's step size at the start and at the end
-SINGULAR = 1e-5  # determinant of an exposure under which it is a black picture
-UNEVEN = 0.05  # deviation of the log of the photographs' brightness from which their exposures are fitted, too
-REACHES = (0.5, 1.0, 2.0, 4.0, 16.0)  # of the mean way to the nearest photograph: how far exposures tell
-BLUR = 0.01  # of the width, under which a view is compared with its photograph
-WITHIN, ENOUGH = 0.5, 100  # share of a pixel's surroundings that must be compared, and how many such pixels
-OFF, ROUNDS = 0.03, 8  # difference from which a pixel counts less, and rounds of reweighting
-GAINS, LEAST_SPREAD = (0.4, 2.5), 0.02  # bounds of a gain, and deviation of the colours that tell one beside an offset
+LEARNING_RATE, FINAL_LEARNING_RATE = 1e-2, 1e-3  # Adam's step size at the start and at the end
+MIN_DETERMINANT = 1e-5  # determinant of an exposure below which the picture is practically black
+BRIGHTNESS_DEVIATION = 0.05  # standard deviation of the photographs' log brightness, from which exposures are fitted
+# Of the kernel that interpolates exposures, in mean distances to the nearest photograph.
+BANDWIDTHS = (0.5, 1.0, 2.0, 4.0, 16.0)
+BLUR = 0.01  # of the width: blur under which a view is compared with its photograph
+MIN_COVERAGE, MIN_PIXELS = 0.5, 100  # share of usable pixels around a compared pixel, and number of such pixels
+ERROR_SCALE, REWEIGHTINGS = 0.03, 8  # difference above which a pixel gets a lower weight, and number of reweightings
+# Of a gain; and deviation of colours above which gain and offset can be separated.
+GAIN_BOUNDS, MIN_SPREAD = (0.4, 2.5), 0.02
 PROTOCOL = (
     "the photographs differ in brightness: each channel of a test view is as bright as its photograph is outside the "
     "mask (gain and offset, by the fit, blurred); of one without a photograph, as those next to it are"
@@ -39,31 +41,31 @@ _IDENTITY = torch.eye(3, 4)
 class Exposures:
     """A [3, 4] matrix for each view: photo = matrix[:, :3] @ colour + matrix[:, 3].
 
-    All matrices times one, and all colours times its inverse, would be the same pictures; so their mean is kept at the
-    identity. PAPER leaves open: any exposure.
+    Multiplying all matrices by one matrix, and all colours by its inverse, leaves the pictures unchanged. So the mean
+    of the matrices is kept at the identity. PAPER leaves open: any exposure.
     """
 
     def __init__(self, names: Iterable[str], device: torch.device | str = "cpu", gains: np.ndarray | None = None):
-        """Args: gains: [V, 3], how bright each view's red, green and blue are, to start from; None: all alike."""
+        """Args: gains: [V, 3], initial brightness of each view's red, green and blue; None: all equal."""
         names = list(names)
         first = np.ones((len(names), 3)) if gains is None else gains / gains.mean(0)
-        start = lambda gain: torch.diag(torch.from_numpy(gain).float()) @ _IDENTITY
+        initial = lambda gain: torch.diag(torch.from_numpy(gain).float()) @ _IDENTITY
         self._matrices = {
-            name: start(gain).to(device).requires_grad_() for name, gain in zip(names, first, strict=True)
+            name: initial(gain).to(device).requires_grad_() for name, gain in zip(names, first, strict=True)
         }
-        # a parameter for each view: Adam leaves those alone that got no gradient, and counts each one's steps
-        self._adam = torch.optim.Adam(list(self._matrices.values()), lr=RATE, eps=1e-15)
+        # One parameter per view: Adam skips those without a gradient, and counts the steps of each.
+        self._adam = torch.optim.Adam(list(self._matrices.values()), lr=LEARNING_RATE, eps=1e-15)
 
     def apply(self, color: Tensor, name: str) -> Tensor:
-        """[H, W, 3] as the view's camera exposed it; differentiable in the colours and in the exposure."""
+        """[H, W, 3] with the exposure of the view; differentiable in the colours and in the exposure."""
         matrix = self._matrices[name]
         return color @ matrix[:, :3].T + matrix[:, 3]
 
     @torch.no_grad()
     def step(self, progress: float) -> None:
-        """Move the exposures that got a gradient; `progress` in [0, 1] of the run sets the step size."""
+        """Update the exposures that have a gradient; `progress` of the run in [0, 1] sets the learning rate."""
         for group in self._adam.param_groups:
-            group["lr"] = RATE ** (1 - progress) * RATE_LAST**progress
+            group["lr"] = LEARNING_RATE ** (1 - progress) * FINAL_LEARNING_RATE**progress
         self._adam.step()
         self._adam.zero_grad(set_to_none=True)
         shift = torch.stack(list(self._matrices.values())).mean(0)
@@ -72,7 +74,7 @@ class Exposures:
             matrix -= shift
 
     def state_dict(self) -> dict:
-        """What `load_state_dict` continues from, bit for bit."""
+        """State from which `load_state_dict` continues bit for bit."""
         return {"matrices": {n: m.detach().clone() for n, m in self._matrices.items()}, "adam": self._adam.state_dict()}
 
     def load_state_dict(self, state: dict) -> None:
@@ -88,103 +90,113 @@ class Exposures:
 
 
 def of_views(fit: Path, cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
-    """View name -> [3, 4], how a view is exposed: as was fitted, and other views as the photographs next to them; none
-    where no exposures were fitted.
+    """View name -> exposure [3, 4]: as fitted, or interpolated from nearby photographs for other views.
+
+    Empty where no exposures were fitted.
 
     Args:
-        cameras: of all views, the fitted ones among them.
+        cameras: of all views, including the fitted ones.
     """
     from reffusion.io.arrays import load_json
 
     path = Path(fit) / FILE
     fitted = {name: np.array(matrix) for name, matrix in load_json(path).items()} if path.exists() else {}
-    known = [camera for camera in cameras if camera.name in fitted]
-    if not known:
+    fitted_cameras = [camera for camera in cameras if camera.name in fitted]
+    if not fitted_cameras:
         return {}
-    away, matrices = _apart(known, known), np.stack([fitted[camera.name] for camera in known])
-    np.fill_diagonal(away, np.inf)
-    unit = float(np.mean(away.min(1))) if len(known) > 1 else 1.0
-    blended = lambda away, reach: np.einsum("vk,kij->vij", _shares(away / (reach * unit)), matrices)
-    # How far photographs tell of each other is what tells each of them best by the others.
-    misses = lambda reach: float(np.square(blended(away, reach) - matrices).sum())
-    reach = min(REACHES, key=misses) if len(known) > 2 else REACHES[0]
-    others = [camera for camera in cameras if camera.name not in fitted]
-    told = blended(_apart(others, known), reach) if others else []
-    return fitted | {camera.name: matrix for camera, matrix in zip(others, told, strict=True)}
+    distances, matrices = (
+        _pose_distances(fitted_cameras, fitted_cameras),
+        np.stack([fitted[camera.name] for camera in fitted_cameras]),
+    )
+    np.fill_diagonal(distances, np.inf)
+    mean_spacing = float(np.mean(distances.min(1))) if len(fitted_cameras) > 1 else 1.0
+    interpolate = lambda distances, bandwidth: np.einsum(
+        "vk,kij->vij", _kernel_weights(distances / (bandwidth * mean_spacing)), matrices
+    )
+    # Choose the bandwidth that predicts each photograph's exposure best from the others.
+    leave_one_out_error = lambda bandwidth: float(np.square(interpolate(distances, bandwidth) - matrices).sum())
+    bandwidth = min(BANDWIDTHS, key=leave_one_out_error) if len(fitted_cameras) > 2 else BANDWIDTHS[0]
+    other_cameras = [camera for camera in cameras if camera.name not in fitted]
+    interpolated = interpolate(_pose_distances(other_cameras, fitted_cameras), bandwidth) if other_cameras else []
+    return fitted | {camera.name: matrix for camera, matrix in zip(other_cameras, interpolated, strict=True)}
 
 
-def _apart(views: Sequence[Camera], known: Sequence[Camera]) -> np.ndarray:
-    """[V, K]: how far views stand from others, and, in the same unit of the normalised frame, how unlike they look."""
-    placed = lambda cameras: np.array([[*camera.center, *camera.world_to_camera[2, :3]] for camera in cameras])
-    return np.linalg.norm(placed(views)[:, None] - placed(known)[None], axis=-1)
+def _pose_distances(views: Sequence[Camera], fitted_cameras: Sequence[Camera]) -> np.ndarray:
+    """[V, K]: distances between poses, where a difference of viewing directions counts like one of the centres."""
+    features = lambda cameras: np.array([[*camera.center, *camera.world_to_camera[2, :3]] for camera in cameras])
+    return np.linalg.norm(features(views)[:, None] - features(fitted_cameras)[None], axis=-1)
 
 
-def _shares(away: np.ndarray) -> np.ndarray:
-    """[V, K]: what each of K has to say, falling with its distance [V, K]; sums to 1."""
-    weight = np.exp(-(away**2 - np.square(away.min(1, keepdims=True))) / 2)
-    return weight / weight.sum(1, keepdims=True)
+def _kernel_weights(distances: np.ndarray) -> np.ndarray:
+    """[V, K]: Gaussian kernel weights for distances [V, K]; they sum to 1 over K."""
+    weights = np.exp(-(distances**2 - np.square(distances.min(1, keepdims=True))) / 2)
+    return weights / weights.sum(1, keepdims=True)
 
 
 def exposed(color: Tensor, matrix: np.ndarray | None) -> Tensor:
-    """[H, W, 3], colours of the Gaussians as a view of this exposure, [3, 4], shows them."""
+    """[H, W, 3]: colours of the Gaussians with an exposure [3, 4] applied."""
     if matrix is None:
         return color
-    of = torch.from_numpy(matrix).to(color)
-    return color @ of[:, :3].T + of[:, 3]
+    exposure = torch.from_numpy(matrix).to(color)
+    return color @ exposure[:, :3].T + exposure[:, 3]
 
 
 def matched(matrix: np.ndarray, color: np.ndarray, photo: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """[3, 4], an exposure brought to that of a photograph, each channel by a factor and an offset; as it is where too
-    little can be compared.
+    """[3, 4]: an exposure adjusted to a photograph by a gain and an offset per channel.
 
-    Both are blurred first: what one of them does not show sharply would make the other's contrast seem higher.
+    It is returned unchanged where too few pixels can be compared. Both pictures are blurred first: where one is less
+    sharp, the other's contrast would seem higher.
 
     Args:
-        color: [H, W, 3] in [0, 1], the view so exposed. photo: uint8 [H, W, 3]. pixels: bool [H, W], those compared.
+        color: [H, W, 3] in [0, 1], the rendering with this exposure.
+        photo: uint8 [H, W, 3].
+        pixels: bool [H, W], the pixels to compare.
     """
-    found = np.array(matrix, np.float64)
-    told = pixels & (photo > DARK).all(-1) & (photo < BRIGHT).all(-1)
-    soft = lambda image: cv2.GaussianBlur(image.astype(np.float64), (0, 0), max(1.0, BLUR * told.shape[1]))
-    mass = soft(told)
-    rows, columns = np.nonzero(told & (mass > WITHIN))
-    if len(rows) < ENOUGH:
-        return found
-    at = lambda image: (soft(image * told) / np.maximum(mass, 1e-6))[rows, columns]
+    result = np.array(matrix, np.float64)
+    usable = pixels & (photo > DARK).all(-1) & (photo < BRIGHT).all(-1)
+    blur = lambda image: cv2.GaussianBlur(image.astype(np.float64), (0, 0), max(1.0, BLUR * usable.shape[1]))
+    coverage = blur(usable)
+    rows, columns = np.nonzero(usable & (coverage > MIN_COVERAGE))
+    if len(rows) < MIN_PIXELS:
+        return result
+    compared = lambda image: (blur(image * usable) / np.maximum(coverage, 1e-6))[rows, columns]
     for channel in range(3):
-        gain, offset = _line(at(color[..., channel]), at(photo[..., channel] / 255.0))
-        found[channel] *= gain
-        found[channel, 3] += offset
-    return found
+        gain, offset = _fit_line(compared(color[..., channel]), compared(photo[..., channel] / 255.0))
+        result[channel] *= gain
+        result[channel, 3] += offset
+    return result
 
 
-def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Gain and offset of y by x, robust; the gain within what an exposure may be."""
+def _fit_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
+    """Gain and offset of the robust line y = gain * x + offset, with the gain bounded."""
     weight, gain, offset = np.ones_like(x), 1.0, 0.0
-    for _ in range(ROUNDS):
+    for _ in range(REWEIGHTINGS):
         mean_x, mean_y = np.average(x, weights=weight), np.average(y, weights=weight)
         spread = np.average((x - mean_x) ** 2, weights=weight)
         gain = np.average((x - mean_x) * (y - mean_y), weights=weight) / max(spread, 1e-9)
-        gain = float(np.clip(gain, *GAINS)) if spread > LEAST_SPREAD**2 else mean_y / max(mean_x, 1e-3)
+        gain = float(np.clip(gain, *GAIN_BOUNDS)) if spread > MIN_SPREAD**2 else mean_y / max(mean_x, 1e-3)
         offset = mean_y - gain * mean_x
-        weight = 1 / np.maximum(np.abs(y - gain * x - offset) / OFF, 1.0)
+        weight = 1 / np.maximum(np.abs(y - gain * x - offset) / ERROR_SCALE, 1.0)
     return float(gain), float(offset)
 
 
 def load_views(poses: Path, fit: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
-    """View name -> uint8 [H, W, 3], `normalised`; of a scene without photographs what the Gaussians of the folder `fit`
-    show, the object too."""
+    """View name -> uint8 [H, W, 3]: the photographs, `normalised`.
+
+    Views without a photograph are rendered from the Gaussians in the folder `fit`, object included.
+    """
     from reffusion.io import scene
 
     names = list(names)
-    there = [name for name in names if scene.has_photograph(poses, name)]
-    photos = {name: normalised(image, fit, name) for name, image in scene.load_views(poses, there).items()}
-    drawn = rendered(poses, fit, [name for name in names if name not in photos])
-    return {name: (photos | drawn)[name] for name in names}
+    photographed = [name for name in names if scene.has_photograph(poses, name)]
+    photos = {name: normalised(image, fit, name) for name, image in scene.load_views(poses, photographed).items()}
+    renderings = render_views(poses, fit, [name for name in names if name not in photos])
+    return {name: (photos | renderings)[name] for name in names}
 
 
 @torch.no_grad()
-def rendered(poses: Path, fit: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """View name -> uint8 [H, W, 3], as the Gaussians of the folder `fit` show it."""
+def render_views(poses: Path, fit: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """View name -> uint8 [H, W, 3], rendered from the Gaussians in the folder `fit`."""
     from reffusion.io.ply import load_ply
     from reffusion.io.scene import load_scene
 
@@ -195,8 +207,9 @@ def rendered(poses: Path, fit: Path, names: Sequence[str]) -> dict[str, np.ndarr
 
 
 def normalised(image: np.ndarray, fit: Path, name: str) -> np.ndarray:
-    """uint8 [H, W, 3] as the Gaussians of the folder `fit` are exposed: with the exposure that was fitted to the view
-    `name` taken out, and clipped to [0, 255]; as it is where none was fitted (always so for test views).
+    """uint8 [H, W, 3] in the exposure of the Gaussians in the folder `fit`: the view's fitted exposure is undone.
+
+    Values are clipped to [0, 255]. The image is returned unchanged where no exposure was fitted, as for test views.
 
     Raises:
         ValueError: the exposure cannot be inverted.
@@ -208,7 +221,7 @@ def normalised(image: np.ndarray, fit: Path, name: str) -> np.ndarray:
     if name not in matrices:
         return image
     matrix = np.array(matrices[name])
-    if abs(np.linalg.det(matrix[:, :3])) < SINGULAR:
+    if abs(np.linalg.det(matrix[:, :3])) < MIN_DETERMINANT:
         raise ValueError(f"{path}: view '{name}' is too dark to undo its exposure; leave it out, or fit.exposure=never")
     return to_uint8(undone(image / 255.0, matrix))
 

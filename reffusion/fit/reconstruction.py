@@ -1,4 +1,4 @@
-"""3DGS optimisation of a whole scene from its training views: what `fit` runs, and any baseline that masks pixels."""
+"""3DGS optimisation of a whole scene from its training views, with masked pixels if asked for."""
 
 from __future__ import annotations
 
@@ -13,15 +13,24 @@ from torch import Tensor
 
 from reffusion import trace
 from reffusion.fit.exposure import Exposures
-from reffusion.fit.step import adapt, average, coarse_steps, degree_at, rates_of, sparse_steps, squared_error, step
-from reffusion.fit.view_loader import check_sizes, sample, samples
+from reffusion.fit.step import (
+    average,
+    coarse_steps,
+    control_density,
+    degree_at,
+    learning_rates,
+    sparse_steps,
+    squared_error,
+    step,
+)
+from reffusion.fit.view_loader import check_sizes, iterate_views, to_tensors
 from reffusion.gaussians.optimize import GaussianOptimizer, Rates
 from reffusion.params.fit import Params
 from reffusion.splat.rasterizer import render
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
-KNOWN_PLACE = 0.1  # of a step's length, by which Gaussians move whose places are known
-FIRST_MOMENT = 16  # of the trace, after the start: measuring held-out views takes as long as several steps
+PLACED_RATE_FACTOR = 0.1  # on the learning rate of positions, for Gaussians whose positions are known
+FIRST_MOMENT = 16  # first traced step after the start: measuring held-out views takes as long as several steps
 
 
 def fit(
@@ -39,54 +48,62 @@ def fit(
     spent: float = 0.0,
     impl: str = "auto",
 ) -> Gaussians:
-    """Optimise `initial` until its renders look like the views; resumes from `folder`'s checkpoint, bit for bit.
+    """Optimise `initial` so that its renderings match the views; resumes bit for bit from the checkpoint in `folder`.
 
     Args:
         images: view name -> uint8 [H, W, 3], for `cameras` and `held_out`.
-        initial: the Gaussians to start from; the work is done on their device. Where there is a checkpoint, only their
-            degree, device and way of being drawn still matter.
-        folder: gets trace.jsonl (loss, psnr since the last, gaussians, psnr_held_out), checkpoints, exposures.json.
-        weights: view name -> [H, W], how much each pixel counts; pixels of weight 0, and they alone, influence nothing.
-            A view without an entry counts as a whole.
-        held_out: views that are only measured. rates: Adam's step sizes where they are not those of `settings.lr`.
-        gains: [V, 3], of `cameras`: exposures are fitted, and start from these; None: they are not.
-        placed: [N] bool, of `initial`: Gaussians whose places are known. They move `KNOWN_PLACE` as far as the others.
-        spent: seconds that making `initial` took; the trace counts from there.
+        initial: the initial Gaussians; computation runs on their device. With a checkpoint, only their degree, device
+            and antialiasing matter.
+        folder: receives trace.jsonl (loss, psnr since the last line, gaussians, psnr_held_out), checkpoints and
+            exposures.json.
+        weights: view name -> [H, W], weight of each pixel; pixels of weight 0, and only these, influence nothing. A
+            view without an entry has weight 1 everywhere.
+        held_out: views that are only evaluated.
+        rates: Adam's learning rates, if they are not those of `settings.lr`.
+        gains: [V, 3] of `cameras`: exposures are fitted, starting from these; None: they are not.
+        placed: [N] bool, of `initial`: Gaussians whose positions are known; their positions move at
+            `PLACED_RATE_FACTOR` of the learning rate.
+        spent: seconds that making `initial` took; the trace starts from there.
 
     Raises:
-        ValueError: no view, or an image or mask of another size than its camera; before any work.
-        FloatingPointError: a loss, gradient or parameter became infinite or NaN; names the step and the view.
+        ValueError: before any computation: there is no view, or an image or mask differs in size from its camera.
+        FloatingPointError: a loss, gradient or parameter is infinite or NaN; names the step and the view.
     """
     weights = weights or {}
-    _refuse_misfits(cameras, held_out, images, weights)
+    _check_views(cameras, held_out, images, weights)
     state = trace.load_checkpoint(folder)
-    run = _Run.begun(initial, placed, cameras, gains, settings, rates or rates_of(settings.lr, cameras), state, spent)
+    run = _Run.create(
+        initial, placed, cameras, gains, settings, rates or learning_rates(settings.lr, cameras), state, spent
+    )
     optimizer = run.optimizer
     log = trace.Trace(folder, run.seconds, run.iteration + 1 if run.iteration else 0)
     centers = torch.tensor(np.stack([camera.center for camera in cameras]), dtype=torch.float32)
-    checkpoints, measured = trace.Checkpoints(folder, settings.checkpoint_seconds), (held_out, images, settings, impl)
+    checkpoints, trace_inputs = (
+        trace.Checkpoints(folder, settings.checkpoint_seconds),
+        (held_out, images, settings, impl),
+    )
     if run.iteration == 0:
-        _write_line(log, run, *measured)
-    steps, until = range(run.iteration, settings.iterations), (coarse_steps(settings), sparse_steps(settings))
+        _write_line(log, run, *trace_inputs)
+    steps, view_schedule = range(run.iteration, settings.iterations), (coarse_steps(settings), sparse_steps(settings))
     for i, (camera, target, counts) in zip(
         trace.progress(settings.iterations, "fit", run.iteration),
-        samples(cameras, images, weights, steps, settings.seed, *until, optimizer.masked.device),
+        iterate_views(cameras, images, weights, steps, settings.seed, *view_schedule, optimizer.masked.device),
         strict=True,
     ):
         run.count(*step(optimizer, run.exposures, camera, target, counts, settings, i, impl))
-        adapt(optimizer, centers, run.started_with, settings, run.iteration)
+        control_density(optimizer, centers, run.started_with, settings, run.iteration)
         average(optimizer, settings, run.iteration)
-        line_due = trace.log_spaced(run.iteration, settings.iterations, first=FIRST_MOMENT)
-        save_due = checkpoints.due and run.iteration < settings.iterations
-        _check(optimizer.gaussians, i, camera, values=line_due or save_due)
-        if line_due:
-            _write_line(log, run, *measured)
-        if save_due:
+        is_line_due = trace.log_spaced(run.iteration, settings.iterations, first=FIRST_MOMENT)
+        is_checkpoint_due = checkpoints.due and run.iteration < settings.iterations
+        _check_gaussians(optimizer.gaussians, i, camera, check_values=is_line_due or is_checkpoint_due)
+        if is_line_due:
+            _write_line(log, run, *trace_inputs)
+        if is_checkpoint_due:
             checkpoints.save(lambda: run.state_dict() | {"seconds": log.seconds})
-    return run.finished(folder)
+    return run.finish(folder)
 
 
-def _refuse_misfits(
+def _check_views(
     cameras: Sequence[Camera],
     held_out: Sequence[Camera],
     images: Mapping[str, np.ndarray],
@@ -100,10 +117,11 @@ def _refuse_misfits(
 
 @dataclass
 class _Run:
-    """What a fit continues from.
+    """State of a fit, from which it can resume.
 
     Attributes:
-        started_with: Gaussians at the start. iteration, seconds: done and spent so far.
+        started_with: number of Gaussians at the start.
+        iteration, seconds: steps done and time spent so far.
         loss, error, steps: sums over the steps since the last line of the trace, and their number.
     """
 
@@ -119,7 +137,7 @@ class _Run:
     _NUMBERS = ("started_with", "seconds", "iteration", "loss", "error", "steps")
 
     @classmethod
-    def begun(
+    def create(
         cls,
         initial: Gaussians,
         placed: Tensor | None,
@@ -130,10 +148,10 @@ class _Run:
         state: dict[str, Any] | None,
         spent: float,
     ) -> _Run:
-        """From the start, or from a checkpoint's state."""
+        """A new run, or one restored from the state of a checkpoint."""
         names, device = [camera.name for camera in cameras], initial.means.device
         exposures = None if gains is None else Exposures(names, device, gains)
-        optimizer = GaussianOptimizer(initial, placed, rates, {"means": KNOWN_PLACE}, settings.lr.betas)
+        optimizer = GaussianOptimizer(initial, placed, rates, {"means": PLACED_RATE_FACTOR}, settings.lr.betas)
         run = cls(optimizer, exposures, len(initial), spent)
         if state is not None:
             optimizer.load_state_dict(state["optimizer"])
@@ -144,12 +162,12 @@ class _Run:
         return run
 
     def count(self, loss: float, error: float) -> None:
-        """One step more, of this loss and mean squared error."""
+        """Count a step with this loss and mean squared error."""
         self.iteration, self.steps = self.iteration + 1, self.steps + 1
         self.loss, self.error = self.loss + loss, self.error + error
 
-    def finished(self, folder: Path) -> Gaussians:
-        """What was fitted; exposures are saved."""
+    def finish(self, folder: Path) -> Gaussians:
+        """Save the exposures and return the Gaussians."""
         if self.exposures is not None:
             self.exposures.save(folder)
         return self.optimizer.gaussians.map(Tensor.detach)
@@ -167,17 +185,17 @@ def _write_line(
     settings: Params,
     impl: str,
 ) -> None:
-    """A line of the trace, written with the clock stopped."""
+    """Write a line of the trace, with the clock stopped."""
     with log.paused():
         end = {"reason": "finished"} if run.iteration == settings.iterations else {}
-        log.log(run.iteration, **_summary(run, held_out, images, settings, impl), **end)
+        log.log(run.iteration, **_trace_values(run, held_out, images, settings, impl), **end)
     run.loss, run.error, run.steps = 0.0, 0.0, 0
 
 
-def _summary(
+def _trace_values(
     run: _Run, held_out: Sequence[Camera], images: Mapping[str, np.ndarray], settings: Params, impl: str
 ) -> dict[str, Any]:
-    """A line of the trace; without steps since the last line there is no loss and no training PSNR."""
+    """Values of a line of the trace; loss and training PSNR only if there were steps since the last line."""
     line: dict[str, Any] = {"gaussians": len(run.optimizer.gaussians)}
     if run.steps:
         line = {"loss": run.loss / run.steps, "psnr": trace.decibels(run.error / run.steps)} | line
@@ -187,16 +205,16 @@ def _summary(
     psnr = []
     for camera in held_out:
         image = render(gaussians, camera, impl=impl, sh_degree=degree).color.clamp(0, 1)
-        _, target, _ = sample(camera, images[camera.name], None, gaussians.means.device)
+        _, target, _ = to_tensors(camera, images[camera.name], None, gaussians.means.device)
         psnr.append(trace.decibels(squared_error(image, target, None)))
     return line | {"psnr_held_out": sum(psnr) / len(psnr)}
 
 
-def _check(gaussians: Gaussians, step: int, camera: Camera, values: bool) -> None:
-    """Refuse to go on without Gaussians, or, where `values` are looked at, with some that are not finite."""
+def _check_gaussians(gaussians: Gaussians, step: int, camera: Camera, check_values: bool) -> None:
+    """Raise if no Gaussian is left, or, with `check_values`, if a parameter is not finite."""
     if not len(gaussians):
         remedy = "raise densify.prune_scale3d"
         raise ValueError(f"fit, step {step}: pruning left no Gaussian: {remedy}")
-    for name in PARAMETERS if values else ():
+    for name in PARAMETERS if check_values else ():
         if not torch.isfinite(getattr(gaussians, name).detach()).all():
             raise FloatingPointError(f"fit, step {step}, view '{camera.name}': the Gaussians' {name} are not finite")

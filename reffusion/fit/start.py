@@ -1,4 +1,4 @@
-"""The Gaussians a fit starts from: one at each point."""
+"""The initial Gaussians of a fit: one at each point."""
 
 from __future__ import annotations
 
@@ -21,14 +21,15 @@ def initial_gaussians(
     opacity: float = 0.1,
     size: float = 1.0,
 ) -> Gaussians:
-    """3DGS's start: a round Gaussian at each point, sized by the way to its 3 nearest neighbours.
+    """Initialization of 3DGS: an isotropic Gaussian at each point, scaled by the distance to its 3 nearest neighbours.
 
     Args:
         points: [P, 3] in the normalised frame, P >= 4.
         colors: [P, 3] uint8.
-        budget: no more Gaussians than this; a random subset of the points then.
+        budget: maximum number of Gaussians; above it a random subset of the points is used.
         generator: of that subset.
-        opacity: of each, in (0, 1). size: standard deviations over that way (root mean square).
+        opacity: of each Gaussian, in (0, 1).
+        size: standard deviation divided by the root mean square of the distances to the neighbours.
 
     Raises:
         ValueError: fewer than 4 points.
@@ -36,17 +37,17 @@ def initial_gaussians(
     if len(points) < 4:
         raise ValueError(f"a fit starts from sparse points, at least 4; the scene has {len(points)}")
     if len(points) > budget:
-        kept = torch.randperm(len(points), generator=generator)[:budget].numpy()
-        points, colors = points[kept], colors[kept]
+        subset = torch.randperm(len(points), generator=generator)[:budget].numpy()
+        points, colors = points[subset], colors[subset]
     distance = cKDTree(points).query(points, k=4)[0][:, 1:]
-    spread = size * np.sqrt((distance**2).mean(1)).clip(min=1e-4)
+    deviation = size * np.sqrt((distance**2).mean(1)).clip(min=1e-4)
     count = len(points)
     sh = torch.zeros(count, (sh_degree + 1) ** 2, 3)
     sh[:, 0] = (torch.from_numpy(colors.astype(np.float32)) / 255 - 0.5) / SH0
     return Gaussians(
         means=torch.from_numpy(points.astype(np.float32)),
         quaternions=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
-        log_scales=torch.from_numpy(np.log(spread).astype(np.float32))[:, None].repeat(1, 3),
+        log_scales=torch.from_numpy(np.log(deviation).astype(np.float32))[:, None].repeat(1, 3),
         opacity_logits=torch.full((count,), math.log(opacity / (1 - opacity))),
         sh=sh,
     )

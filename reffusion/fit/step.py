@@ -1,4 +1,4 @@
-"""One step of a fit: render, compare, move; and where the schedule says so, add, prune and fade Gaussians."""
+"""One step of a fit: render, compute the loss, update; and the schedules of densification, resolution and averaging."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ from reffusion.params.fit import LearningRates, Params
 from reffusion.splat.rasterizer import render
 from reffusion.types import Camera
 
-PRUNE_OPA = 0.005  # 3DGS's: fainter Gaussians are pruned
-# Between those of a fit's start and end, for a scene that is there, in which what does not agree must move.
+PRUNE_OPA = 0.005  # opacity below which Gaussians are pruned, as in 3DGS
+# For refining an existing scene: between the rates at the start and at the end of a fit, so that Gaussians which
+# contradict the views can still move.
 GENTLE = Rates(
     means=4e-4,
     means_last=2e-5,
@@ -29,14 +30,14 @@ GENTLE = Rates(
     sh_dc=5e-3,
     sh_rest=5e-4,
 )
-COARSE = 0.3  # of the steps, that look at half the size
-SPARSE = 0.9  # of the steps, up to which they look at every second pixel
-AVERAGED = 0.9  # of the steps, from which on the Gaussians' mean is what a fit ends with
-GROW_SCALE3D = 0.01  # deviation / distance from which on a Gaussian is split, not cloned
+COARSE_SHARE = 0.3  # of the steps, at the start, that use views of half the size
+SPARSE_UNTIL = 0.9  # of the steps, up to which every second pixel is used
+AVERAGED_FROM = 0.9  # of the steps, from which on Gaussians are averaged into the result
+GROW_SCALE3D = 0.01  # standard deviation / distance to the camera above which a Gaussian is split, not cloned
 
 
-def rates_of(lr: LearningRates, cameras: Sequence[Camera]) -> Rates:
-    """Adam's step sizes of a fit to these views; that of positions falls to a hundredth."""
+def learning_rates(lr: LearningRates, cameras: Sequence[Camera]) -> Rates:
+    """Adam's learning rates for a fit to these views; that of positions decays to a hundredth."""
     rates = Rates(
         means=lr.means,
         means_last=lr.means / 100,
@@ -59,8 +60,8 @@ def step(
     i: int,
     impl: str,
 ) -> tuple[float, float]:
-    """Render, compare, move; returns the loss and the mean squared error over the pixels that count."""
-    where = f"step {i}, view '{camera.name}'"
+    """Render a view, compute the loss and update; returns the loss and the mean squared error of weighted pixels."""
+    location = f"step {i}, view '{camera.name}'"
     probe = None
     if i < settings.densify.stop * settings.iterations:
         probe = torch.zeros(len(optimizer.gaussians), 2, device=target.device, requires_grad=True)
@@ -71,23 +72,23 @@ def step(
     rendering = render(optimizer.gaussians, camera, background=background, impl=impl, sh_degree=degree, probe=probe)
     image = rendering.color if exposures is None else exposures.apply(rendering.color, camera.name)
     loss = reconstruction_loss(image, target, counts)
-    value = float(loss.detach())
-    if not math.isfinite(value):
-        raise FloatingPointError(f"fit, {where}: the reconstruction loss is {value}")
+    loss_value = float(loss.detach())
+    if not math.isfinite(loss_value):
+        raise FloatingPointError(f"fit, {location}: the reconstruction loss is {loss_value}")
     loss.backward()
     if probe is not None:
         optimizer.observe(probe.grad, rendering.radii, camera.width, camera.height)
     try:
         optimizer.step(i / settings.iterations, visible=rendering.radii > 0, sh_degree=degree)
     except FloatingPointError as error:
-        raise FloatingPointError(f"fit, {where}, reconstruction: {error}") from None
+        raise FloatingPointError(f"fit, {location}, reconstruction: {error}") from None
     if exposures is not None:
         exposures.step(i / settings.iterations)
-    return value, squared_error(image.detach(), target, counts)
+    return loss_value, squared_error(image.detach(), target, counts)
 
 
 def squared_error(image: Tensor, target: Tensor, counts: Tensor | None) -> float:
-    """Mean over the channels of the pixels that count."""
+    """Mean squared error over the channels of the pixels with positive weight `counts` [H, W]."""
     if counts is None:
         error = (image - target).flatten()
         return float(error @ error) / error.numel()
@@ -97,60 +98,73 @@ def squared_error(image: Tensor, target: Tensor, counts: Tensor | None) -> float
 
 
 def coarse_steps(settings: Params) -> int:
-    """How many of the first steps look at views of half the size. A start with a point every few pixels has its places:
-    it is sizes and colours that are learnt first, and those a small view tells as well."""
-    return round(COARSE * settings.iterations) if settings.init.flow_cell else 0
+    """Number of initial steps that use views of half the size.
+
+    With a dense start (a point every few pixels) positions are known. Sizes and colours are learnt first, and small
+    views are enough for these. 0 without such a start, as in 3DGS.
+    """
+    return round(COARSE_SHARE * settings.iterations) if settings.init.flow_cell else 0
 
 
 def sparse_steps(settings: Params) -> range:
-    """Which of the steps look at every second pixel each way: of those after the coarse ones, once no Gaussian is added
-    any more, all but the last. None without such a start, as in 3DGS."""
+    """The steps that use every second pixel each way: from the end of densification up to `SPARSE_UNTIL`.
+
+    None without a dense start, as in 3DGS.
+    """
     if not settings.init.flow_cell:
         return range(0)
-    return range(round(settings.densify.stop * settings.iterations), round(SPARSE * settings.iterations))
+    return range(round(settings.densify.stop * settings.iterations), round(SPARSE_UNTIL * settings.iterations))
 
 
 def average(optimizer: GaussianOptimizer, settings: Params, done: int) -> None:
-    """Remember the Gaussians after `done` steps where they count, and put the mean in their place after the last."""
-    if remembered(settings, done):
+    """Accumulate the Gaussians after `done` steps into the mean, and replace them by it after the last step."""
+    if is_averaged(settings, done):
         optimizer.remember()
     if done == settings.iterations:
         optimizer.take_mean()
 
 
-def remembered(settings: Params, done: int) -> bool:
-    """Do the Gaussians after so many steps count in the mean that a fit ends with? In the last steps every second, once
-    none is added any more; in runs as 3DGS's own, which begins with few, never."""
-    many = settings.init.flow_cell or settings.densify.stop == 0
-    begin = max(AVERAGED, settings.densify.stop) * settings.iterations
-    return bool(many) and done > begin and (settings.iterations - done) % 2 == 0
+def is_averaged(settings: Params, done: int) -> bool:
+    """Do the Gaussians after `done` steps count in the final mean?
+
+    Every second of the last steps, after densification, does. In runs like those of 3DGS, which start with few
+    Gaussians, none does.
+    """
+    has_dense_start = settings.init.flow_cell or settings.densify.stop == 0
+    first = max(AVERAGED_FROM, settings.densify.stop) * settings.iterations
+    return bool(has_dense_start) and done > first and (settings.iterations - done) % 2 == 0
 
 
 def degree_at(settings: Params, i: int) -> int:
-    """Of the spherical harmonics in step `i`."""
+    """Degree of the spherical harmonics in step `i`."""
     if settings.sh.every == 0:
         return settings.sh.degree
     return min(settings.sh.degree, int(i / (settings.sh.every * settings.iterations)))
 
 
-def adapt(optimizer: GaussianOptimizer, centers: Tensor, started_with: int, settings: Params, done: int) -> None:
-    """Add, prune and fade Gaussians where the schedule says so after `done` steps."""
+def control_density(
+    optimizer: GaussianOptimizer, centers: Tensor, started_with: int, settings: Params, done: int
+) -> None:
+    """Densify, prune and reset opacities where the schedule asks for it after `done` steps."""
     schedule, progress = settings.densify, done / settings.iterations
     if not schedule.start <= progress < schedule.stop:
         return
     if done % schedule.every == 0:
-        noise, allowed = seeding.generator(settings.seed, "densify", done), _allowed(started_with, settings, done)
-        away = viewing_distance(optimizer.gaussians.means, centers)
-        densify(optimizer, schedule.grow_grad2d, GROW_SCALE3D * away, allowed, noise)
-        away = viewing_distance(optimizer.gaussians.means, centers)
-        prune(optimizer, PRUNE_OPA, schedule.prune_scale3d * away)
+        generator, max_gaussians = (
+            seeding.generator(settings.seed, "densify", done),
+            _max_gaussians(started_with, settings, done),
+        )
+        distance = viewing_distance(optimizer.gaussians.means, centers)
+        densify(optimizer, schedule.grow_grad2d, GROW_SCALE3D * distance, max_gaussians, generator)
+        distance = viewing_distance(optimizer.gaussians.means, centers)
+        prune(optimizer, PRUNE_OPA, schedule.prune_scale3d * distance)
     period = round(schedule.reset_every * settings.iterations)
     if period and done % period == 0:
         optimizer.cap_opacity(0.01)
 
 
-def _allowed(started_with: int, settings: Params, done: int) -> int:
-    """The number of Gaussians after `done` steps may be this."""
+def _max_gaussians(started_with: int, settings: Params, done: int) -> int:
+    """Maximum number of Gaussians after `done` steps; it grows linearly during densification."""
     first, last = settings.densify.start * settings.iterations, settings.densify.stop * settings.iterations
-    passed = (done + settings.densify.every - first) / (last - first)
-    return round(started_with + (settings.densify.cap_max - started_with) * min(1.0, passed))
+    progress = (done + settings.densify.every - first) / (last - first)
+    return round(started_with + (settings.densify.cap_max - started_with) * min(1.0, progress))

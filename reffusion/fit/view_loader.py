@@ -1,4 +1,4 @@
-"""The views in the order in which a fit takes them, each prepared while the step before it runs."""
+"""Feeds views to a fit in random order, each prepared in a thread while the previous step runs."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from torch import Tensor
 from reffusion import seeding
 from reffusion.types import Camera
 
-SPARED = 200_000  # pixels of a view from which on a step can do without most of them
+MIN_SPARSE_PIXELS = 200_000  # views with fewer pixels are never subsampled
 
 
-def samples(
+def iterate_views(
     cameras: Sequence[Camera],
     images: Mapping[str, np.ndarray],
     weights: Mapping[str, np.ndarray],
@@ -26,40 +26,42 @@ def samples(
     sparse: range = range(0),
     device: torch.device | str = "cpu",
 ) -> Iterator[tuple[Camera, Tensor, Tensor | None]]:
-    """What each of the steps sees, on `device`, prepared by a thread of its own while the step before it runs: before
-    step `coarse` at half the size; in the steps `sparse` every second pixel each way, where there are enough, in four
-    turns all."""
+    """Yields for each step (camera, image, weights), on `device`, prepared by a thread while the previous step runs.
 
-    def prepared(i: int) -> tuple[Camera, Tensor, Tensor | None]:
+    Steps before `coarse` get views of half the size. The steps `sparse` get every second pixel each way of views that
+    are large enough, so that four visits cover all pixels.
+    """
+
+    def prepare(i: int) -> tuple[Camera, Tensor, Tensor | None]:
         camera = cameras[seeding.in_epochs(i, len(cameras), seed, "views")]
         view = camera, images[camera.name], weights.get(camera.name)
         if i < coarse:
-            return sample(*halved(*view), device)
-        if i in sparse and camera.width * camera.height >= SPARED:
-            turn = seeding.in_epochs(i // len(cameras), 4, seed, "pixels", camera.name)
-            return sample(*every_second(*view, turn % 2, turn // 2), device)
-        return sample(*view, device)
+            return to_tensors(*downsample(*view), device)
+        if i in sparse and camera.width * camera.height >= MIN_SPARSE_PIXELS:
+            phase = seeding.in_epochs(i // len(cameras), 4, seed, "pixels", camera.name)
+            return to_tensors(*subsample(*view, phase % 2, phase // 2), device)
+        return to_tensors(*view, device)
 
-    with ThreadPoolExecutor(1, thread_name_prefix="fit") as ahead:
-        coming = ahead.submit(prepared, steps.start)
+    with ThreadPoolExecutor(1, thread_name_prefix="fit") as executor:
+        pending = executor.submit(prepare, steps.start)
         for i in steps:
-            ready = coming.result()
-            coming = ahead.submit(prepared, min(i + 1, steps.stop - 1))
+            ready = pending.result()
+            pending = executor.submit(prepare, min(i + 1, steps.stop - 1))
             yield ready
 
 
-def sample(
+def to_tensors(
     camera: Camera, image: np.ndarray, weights: np.ndarray | None, device: torch.device | str
 ) -> tuple[Camera, Tensor, Tensor | None]:
-    """The view as the step sees it: camera, image in [0, 1], weights. Bytes go to a card, a quarter of the floats."""
+    """Camera, image [H, W, 3] in [0, 1] and weights on the device. Images are copied to a GPU as bytes."""
     counts = None if weights is None else torch.from_numpy(np.asarray(weights, np.float32)).to(device)
     return camera, torch.from_numpy(image).to(device).float() / 255, counts
 
 
-def halved(
+def downsample(
     camera: Camera, image: np.ndarray, weights: np.ndarray | None
 ) -> tuple[Camera, np.ndarray, np.ndarray | None]:
-    """The view at half its size, rounded up; a pixel counts as the least that it holds."""
+    """The view at half its size, rounded up; a pixel's weight is the lowest of those it covers."""
     size = (camera.width + 1) // 2, (camera.height + 1) // 2
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     if weights is not None:
@@ -68,16 +70,16 @@ def halved(
     return camera.resized(*size), small, weights
 
 
-def every_second(
+def subsample(
     camera: Camera, image: np.ndarray, weights: np.ndarray | None, left: int, top: int
 ) -> tuple[Camera, np.ndarray, np.ndarray | None]:
-    """Every second pixel of the view each way, from (left, top) on: a quarter of the work, all of the sharpness."""
+    """Every second pixel of the view each way, from (left, top) on: a quarter of the work at full sharpness."""
     weights = None if weights is None else weights[top::2, left::2]
     return camera.sampled(2, left, top), np.ascontiguousarray(image[top::2, left::2]), weights
 
 
 def check_sizes(cameras: Sequence[Camera], images: Mapping[str, np.ndarray], weights: Mapping[str, np.ndarray]) -> None:
-    """ValueError naming a view without an image, or whose image or mask is not of its camera's size."""
+    """Raise ValueError naming a view without an image, or whose image or mask differs in size from its camera."""
     for camera in cameras:
         for kind, array in (("image", images.get(camera.name)), ("mask", weights.get(camera.name))):
             if array is None and kind == "image":

@@ -1,4 +1,4 @@
-"""One step of Adam over rows of parameters, each with its own count of steps: plain torch, and two that are faster."""
+"""One step of Adam over rows of parameters, each with its own step count: in plain torch and in two faster ways."""
 
 from __future__ import annotations
 
@@ -14,23 +14,25 @@ from reffusion.gaussians.ssim import triton_works
 from reffusion.kernels.compiled import FREE_ROUNDING, kernel, parallel_for
 from reffusion.kernels.vectors import take_ticket
 
-_CHUNK = 512  # rows that a thread takes at once
+_CHUNK = 512  # rows per ticket of a thread
 _jit = partial(kernel, fastmath=FREE_ROUNDING)
 
 
 @lru_cache(maxsize=4)
 def unbiasing(betas: tuple[float, float], kilo: int, device: torch.device) -> list[Tensor]:
-    """1 / (1 - beta^t) for t = 0 (which is never used) to 1024 `kilo` - 1, for each beta."""
+    """Bias corrections 1 / (1 - beta^t) of each beta, for t = 0 (never used) to 1024 * `kilo` - 1."""
     t = torch.arange(1024 * kilo, dtype=torch.float64).clamp(min=1)
     return [(1 / (1 - beta**t)).float().to(device) for beta in betas]
 
 
 class Update(NamedTuple):
-    """What a step of Adam needs for one parameter.
+    """Inputs of an Adam step for one parameter.
 
     Attributes:
-        parameter, first, second: it and its two moments [N, D], changed in place; gradient: [N, D].
-        rates: step sizes [d] of the first d columns; the others stay. masked_factor: the factor on them in masked rows.
+        parameter, first, second: the parameter and its two moments [N, D], updated in place.
+        gradient: [N, D].
+        rates: learning rates [d] of the first d columns; the other columns stay.
+        masked_factor: factor on the rates in masked rows.
     """
 
     parameter: Tensor
@@ -42,7 +44,7 @@ class Update(NamedTuple):
 
 
 def fastest(device: torch.device) -> Callable[..., None]:
-    """The fastest that works there; all are the same formula."""
+    """The fastest implementation for the device; all compute the same formula."""
     if device.type == "cpu":
         return adam_cpu
     if device.type == "cuda" and triton_works():
@@ -54,7 +56,10 @@ def fastest(device: torch.device) -> Callable[..., None]:
 
 @torch.no_grad()
 def adam(updates: list[Update], steps, visible, masked, unbias1, unbias2, beta1, beta2, epsilon) -> None:
-    """One Adam step on the visible rows; `unbias` [T] is 1 / (1 - beta^t), `steps` [N] each row's t."""
+    """One Adam step on the visible rows.
+
+    `unbias1` and `unbias2` [T] are the bias corrections 1 / (1 - beta^t); `steps` [N] is t of each row.
+    """
     rows = visible.nonzero()[:, 0]
     first_unbias, second_unbias = unbias1[steps[rows], None], unbias2[steps[rows], None]
     for *tables, rates, masked_factor in updates:
@@ -68,7 +73,7 @@ def adam(updates: list[Update], steps, visible, masked, unbias1, unbias2, beta1,
 
 
 def adam_cpu(updates: list[Update], steps, visible, masked, unbias1, unbias2, beta1, beta2, epsilon) -> None:
-    """`adam` in one pass over memory, for float32."""
+    """`adam` in one pass over memory, for float32 on the CPU."""
     if not updates:
         return
     columns = [tuple(t.numpy() for t in kind) for kind in list(zip(*updates, strict=True))[:5]]
@@ -96,15 +101,15 @@ def _adam_rows(begin, end, tables, rates, masked_factor, rows, numbers):
     steps, visible, masked, unbias1, unbias2 = rows
     beta1, beta2, epsilon = numbers
     new1, new2 = np.float32(1) - beta1, np.float32(1) - beta2
-    least = np.float32(1e-30)  # below it a first moment would soon be denormal, on which processors are slow
+    min_moment = np.float32(1e-30)  # smaller first moments would become denormal, which is slow
     for i in range(begin, end):
         if not visible[i]:
             continue
-        factor, over = unbias1[steps[i]] * (masked_factor if masked[i] else np.float32(1)), unbias2[steps[i]]
+        factor, correction2 = unbias1[steps[i]] * (masked_factor if masked[i] else np.float32(1)), unbias2[steps[i]]
         for j in range(len(rates)):
             g = gradient[i, j]
-            a = beta1 * first[i, j] + new1 * g
-            a = np.float32(0) if abs(a) < least else a
-            b = beta2 * second[i, j] + new2 * g * g
-            first[i, j], second[i, j] = a, b
-            parameter[i, j] -= factor * rates[j] * a / (np.sqrt(b * over) + epsilon)
+            new_first = beta1 * first[i, j] + new1 * g
+            new_first = np.float32(0) if abs(new_first) < min_moment else new_first
+            new_second = beta2 * second[i, j] + new2 * g * g
+            first[i, j], second[i, j] = new_first, new_second
+            parameter[i, j] -= factor * rates[j] * new_first / (np.sqrt(new_second * correction2) + epsilon)

@@ -1,7 +1,7 @@
-"""D-SSIM and Adam on a CUDA card, each in a few passes over memory: Triton kernels (it comes with torch's CUDA builds).
+"""D-SSIM and Adam on CUDA as Triton kernels, each in a few passes over memory (Triton comes with torch's CUDA builds).
 
-In plain torch the windows of SSIM and its products, and the gathering of the visible rows for Adam, are three quarters
-of a fit's step on a card (docs/production.md). The formulas are those of `gaussians.ssim` and `gaussians.adam`.
+In plain torch the windows of SSIM and the gathering of visible rows for Adam take three quarters of a step of `fit` on
+a GPU (docs/production.md). The formulas are those of `gaussians.ssim` and `gaussians.adam`.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-_BLOCK = 1024  # numbers that a program of a kernel works on
+_BLOCK = 1024  # elements per program of a kernel
 
 
 def works() -> bool:
-    """Can the kernels be compiled for this machine's card? Said once where not."""
+    """Can the kernels be compiled for the GPU of this machine? Prints the reason if not."""
     try:
         probe = torch.zeros(4, 4, 1, device="cuda")
         dssim_and_gradient(probe, probe, None, np.ones(1), (1.0, 1.0))
-    except Exception as error:  # of Triton's compiler or of the driver, of many kinds
+    except Exception as error:  # the compiler of Triton and the driver raise many types
         reason = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
         print(f"Triton does not work here ({reason}): SSIM and Adam take plain torch, slower", file=sys.stderr)
         return False
@@ -30,7 +30,7 @@ def works() -> bool:
 
 
 class Dssim(torch.autograd.Function):
-    """See `gaussians.ssim.dssim`; float32 on the card. The other arguments are those of `dssim_and_gradient`."""
+    """`gaussians.ssim.dssim` for float32 on CUDA; arguments as `dssim_and_gradient`."""
 
     @staticmethod
     def forward(ctx, image: Tensor, target: Tensor, weights: Tensor | None, taps: np.ndarray, constants) -> Tensor:
@@ -46,23 +46,27 @@ class Dssim(torch.autograd.Function):
 def dssim_and_gradient(
     image: Tensor, target: Tensor, weights: Tensor | None, window: np.ndarray, constants: tuple[float, float]
 ) -> tuple[Tensor, Tensor]:
-    """(mean of weights * (1 - SSIM), its gradient by the image [H, W, C]), float32.
+    """Mean of weights * (1 - SSIM), and its gradient by the image [H, W, C]; float32.
 
     Args:
-        weights: [H, W], or None. window: [2 R + 1], the taps along one axis. constants: SSIM's C1 and C2.
+        weights: [H, W], or None.
+        window: [2 R + 1], the taps along one axis.
+        constants: C1 and C2 of SSIM.
     """
     channels, count, row = image.shape[2], image.numel(), image.shape[1] * image.shape[2]
     x, y = image.contiguous(), target.contiguous()
-    counts = x if weights is None else weights.contiguous()  # not read where there are none
+    weights_or_dummy = x if weights is None else weights.contiguous()  # a dummy that is not read without weights
     taps = torch.as_tensor(window, dtype=torch.float32).to(x.device)
     fields, slopes = x.new_empty(5, count), x.new_empty(3, count)
     programs = triton.cdiv(count, _BLOCK)
     sums, gradient = x.new_empty(programs), torch.empty_like(x)
-    given = {"BLOCK": _BLOCK, "RADIUS": len(window) // 2, "WEIGHTED": weights is not None}
-    _products_along_rows[(programs,)](x, y, counts, taps, fields, count, row, channels, **given)
-    _compared_down_columns[(programs,)](counts, taps, fields, slopes, sums, count, row, channels, *constants, **given)
+    options = {"BLOCK": _BLOCK, "RADIUS": len(window) // 2, "WEIGHTED": weights is not None}
+    _products_along_rows[(programs,)](x, y, weights_or_dummy, taps, fields, count, row, channels, **options)
+    _compared_down_columns[(programs,)](
+        weights_or_dummy, taps, fields, slopes, sums, count, row, channels, *constants, **options
+    )
     _slopes_along_rows[(programs,)](taps, slopes, fields, count, row, channels, _BLOCK, len(window) // 2)
-    _gathered_down_columns[(programs,)](x, y, counts, taps, fields, gradient, count, row, channels, **given)
+    _gathered_down_columns[(programs,)](x, y, weights_or_dummy, taps, fields, gradient, count, row, channels, **options)
     return (sums.double().sum() / count).to(x.dtype), gradient.div_(count)
 
 
@@ -100,7 +104,7 @@ def _products_along_rows(
 
 @triton.jit
 def _filtered(field, taps, at, step, low, high, BLOCK: tl.constexpr, RADIUS: tl.constexpr):
-    """The window's sum around `at`, its pixels `step` numbers apart; outside `low` to `high` they count as 0."""
+    """Window sum around `at` with pixels `step` elements apart; outside `low` to `high` they count as 0."""
     total = tl.zeros((BLOCK,), tl.float32)
     for k in tl.static_range(2 * RADIUS + 1):
         to = at + (k - RADIUS) * step
@@ -113,7 +117,7 @@ def _compared_down_columns(
     weights, taps, fields, slopes, sums, count, row, channels, c1, c2,
     BLOCK: tl.constexpr, RADIUS: tl.constexpr, WEIGHTED: tl.constexpr,
 ):  # fmt: skip
-    """Each program's sum of weights * (1 - SSIM), and slopes [3, H, W * C]: by the windows of x, x^2 + y^2 and x y."""
+    """Sum of weights * (1 - SSIM) of each program; slopes [3, H, W * C] by the means of x, x^2 + y^2 and x y."""
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     mean_x = _filtered(fields, taps, at, row, 0, count, BLOCK, RADIUS)
     mean_y = _filtered(fields + count, taps, at, row, 0, count, BLOCK, RADIUS)

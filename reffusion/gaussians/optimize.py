@@ -1,6 +1,6 @@
-"""The reconstruction loss, the paper's confinement, and Adam over a set of Gaussians whose number changes.
+"""The reconstruction loss, the paper's confinement of gradients, and Adam over a varying number of Gaussians.
 
-Shared by `fit` and `distill`. Everything here takes tensors and plain numbers.
+Shared by `fit` and `distill`. All functions take tensors and plain numbers.
 """
 
 from __future__ import annotations
@@ -17,18 +17,20 @@ from reffusion.gaussians import adam
 from reffusion.gaussians.ssim import dssim
 from reffusion.types import PARAMETERS, Gaussians
 
+DSSIM_SHARE = 0.2  # of the reconstruction loss, as in 3DGS
 
-def reconstruction_loss(image: Tensor, target: Tensor, weights: Tensor | None = None, share: float = 0.2) -> Tensor:
-    """(1 - share) L1 + share D-SSIM, 3DGS's photometric loss with share 0.2 (D-SSIM = 1 - SSIM).
+
+def reconstruction_loss(image: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
+    """The photometric loss of 3DGS: 0.8 L1 + 0.2 D-SSIM, where D-SSIM = 1 - SSIM.
 
     Args:
         image, target: [H, W, C] in [0, 1]; the gradient reaches `image` only.
-        weights: [H, W], bool or in [0, 1]: how much a pixel counts; None: all alike. A pixel of weight 0 influences
-            neither the value nor any other pixel's gradient, and its own gradient is 0 (see `gaussians.ssim`).
-            PAPER leaves open: what a masked loss is divided by. All pixels of the image, so that a pixel pulls
-            equally hard in every view; a view masked as a whole gives 0.
+        weights: [H, W], bool or in [0, 1]; None: all 1. A pixel of weight 0 influences neither the value nor the
+            gradient of any other pixel, and its own gradient is 0 (see `gaussians.ssim`).
+            PAPER leaves open: what a masked loss is divided by. It is divided by the number of all pixels, so that a
+            pixel has the same influence in every view; the loss of a completely masked view is 0.
     """
-    return (1 - share) * _l1(image, target.detach(), weights) + share * dssim(image, target, weights)
+    return (1 - DSSIM_SHARE) * _l1(image, target.detach(), weights) + DSSIM_SHARE * dssim(image, target, weights)
 
 
 def _l1(image: Tensor, target: Tensor, weights: Tensor | None) -> Tensor:
@@ -40,7 +42,7 @@ def _l1(image: Tensor, target: Tensor, weights: Tensor | None) -> Tensor:
 
 
 def confine(gaussians: Gaussians, select: Tensor) -> Gaussians:
-    """The same Gaussians, but a gradient reaches only the rows where `select` [N] bool is True: elsewhere exactly 0."""
+    """The same Gaussians, with gradients only in the rows selected by `select`, bool [N]; exactly 0 elsewhere."""
 
     def confined(parameter: Tensor) -> Tensor:
         return torch.where(select.view(-1, *[1] * (parameter.ndim - 1)), parameter, parameter.detach())
@@ -50,12 +52,12 @@ def confine(gaussians: Gaussians, select: Tensor) -> Gaussians:
 
 @dataclass(frozen=True)
 class Rates:
-    """Adam's step sizes: 3DGS's values, for the normalised frame, in which cameras stand about 1 from the scene.
+    """Adam's learning rates: those of 3DGS, for the normalised frame, in which cameras are about 1 from the scene.
 
     Attributes:
-        means: for positions at the start, in units of the frame; it falls exponentially to `means_last`.
+        means: for positions at the start, in units of the frame; decays exponentially to `means_last`.
         means_last: for positions at the end.
-        quaternions, log_scales, opacity_logits: of the like-named parameters.
+        quaternions, log_scales, opacity_logits: for the parameters of these names.
         sh_dc: for the constant spherical harmonic.
         sh_rest: for the others.
     """
@@ -69,11 +71,11 @@ class Rates:
     sh_rest: float = 2.5e-3 / 20
 
     def in_units_of(self, unit: float) -> Rates:
-        """The same with positions measured in `unit` units of the frame."""
+        """The same rates with those of positions multiplied by `unit`."""
         return replace(self, means=unit * self.means, means_last=unit * self.means_last)
 
     def at(self, progress: float, gaussians: Gaussians) -> dict[str, Tensor]:
-        """Step size per parameter and column, at `progress` in [0, 1] of the run."""
+        """Learning rate per parameter and column, at `progress` in [0, 1] of the run."""
         constant = lambda value, count: torch.full((count,), value)
         sh = constant(self.sh_rest, gaussians.sh.shape[1] * 3)
         sh[:3] = self.sh_dc
@@ -89,15 +91,15 @@ class Rates:
 class GaussianOptimizer:
     """Adam over Gaussians that can be added, removed and relabelled.
 
-    Each Gaussian counts its own steps, so one born late starts Adam afresh, bias correction included. In a
-    step only the Gaussians said to be visible move: moments of the others wait (as in Taming 3DGS), for a Gaussian that
-    no pixel sees has no gradient to average.
+    Each Gaussian counts its own steps, so that one added later starts Adam anew, bias correction included. A step
+    updates only visible Gaussians and their moments (as in Taming 3DGS), because a Gaussian that no pixel sees has no
+    gradient to average.
 
     Attributes:
-        gaussians: the parameters, leaves that require a gradient. A new object after each change of number.
-        masked: [N] bool, the Gaussians' labels; they follow through `select` and `append`.
-        masked_factors: parameter -> factor on the step sizes of masked Gaussians; 1 where it names none.
-        grad2d_sum, grad2d_count: [N], what `observe` has gathered since `forget_grad2d`; they follow likewise.
+        gaussians: the parameters, leaves that require gradients. A new object after each change of their number.
+        masked: [N] bool, labels of the Gaussians; `select` and `append` keep them aligned.
+        masked_factors: parameter -> factor on the learning rates of masked Gaussians; 1 if it has no entry.
+        grad2d_sum, grad2d_count: [N], accumulated by `observe` since `forget_grad2d`; kept aligned likewise.
     """
 
     _COUNTERS = ("masked", "_steps", "grad2d_sum", "grad2d_count")
@@ -123,36 +125,37 @@ class GaussianOptimizer:
         self.forget_grad2d()
 
     def observe(self, probe_gradient: Tensor, radii: Tensor, width: int, height: int) -> None:
-        """Gather one view's screen-space gradients, by which `densify` chooses.
+        """Accumulate one view's screen-space gradients, which `densify` uses.
 
-        3DGS measures in normalised device coordinates, where the image spans [-1, 1]: one unit is half the image. A
-        gradient by pixels therefore counts `width / 2` and `height / 2` times, and since the loss is a mean over
-        pixels the result depends neither on the image's size nor on the scene's.
+        3DGS measures in normalised device coordinates, where the image spans [-1, 1]: one unit is half the image. So
+        gradients by pixels are multiplied by `width / 2` and `height / 2`. Since the loss is a mean over pixels, the
+        result depends neither on the size of the image nor on that of the scene.
 
         Args:
-            probe_gradient: [N, 2], d loss / d (2D mean in pixels), as `splat.render`'s probe receives it.
-            radii: [N], 0 where the Gaussian was not drawn.
+            probe_gradient: [N, 2], d loss / d (2D mean in pixels), the gradient of the probe of `splat.render`.
+            radii: [N], 0 where the Gaussian was not rendered.
             width, height: of the rendered image, in pixels.
         """
-        seen = radii > 0
+        visible = radii > 0
         grad2d = torch.hypot(probe_gradient[:, 0] * (width / 2), probe_gradient[:, 1] * (height / 2))
-        self.grad2d_sum += torch.where(seen, grad2d, 0.0)
-        self.grad2d_count += seen
+        self.grad2d_sum += torch.where(visible, grad2d, 0.0)
+        self.grad2d_count += visible
 
     def forget_grad2d(self) -> None:
+        """Reset the accumulated screen-space gradients."""
         self.grad2d_sum = torch.zeros_like(self._steps, dtype=torch.float32)
         self.grad2d_count = torch.zeros_like(self._steps)
 
     def step(self, progress: float, visible: Tensor | None = None, sh_degree: int | None = None) -> None:
-        """One Adam step along the gradients gathered since the last, which are then forgotten.
+        """One Adam step along the accumulated gradients, which are then cleared.
 
         Args:
-            progress: in [0, 1], the part of the run that is done; it sets the step size of the means.
-            visible: [N] bool, the Gaussians to move, e.g. `rendering.radii > 0`; None moves all.
-            sh_degree: the highest degree that was drawn up to now, where that is not all; the others lie still.
+            progress: in [0, 1] of the run; sets the learning rate of the means.
+            visible: [N] bool, the Gaussians to update, e.g. `rendering.radii > 0`; None updates all.
+            sh_degree: the highest degree rendered so far; higher coefficients are not updated. None: all are.
 
         Raises:
-            FloatingPointError: a gradient is not finite; says of which parameter. Nothing has been changed then.
+            FloatingPointError: a gradient is not finite; names the parameter. Nothing has been changed then.
         """
         gradients = {name: getattr(self.gaussians, name).grad for name in PARAMETERS}
         refuse_not_finite(gradients)
@@ -176,12 +179,13 @@ class GaussianOptimizer:
         return self.gaussians, self._first, self._second
 
     def forget_gradients(self) -> None:
+        """Clear the gradients of all parameters."""
         for name in PARAMETERS:
             getattr(self.gaussians, name).grad = None
 
     @torch.no_grad()
     def remember(self) -> None:
-        """Take the present Gaussians into the mean that `take_mean` puts in their place."""
+        """Add the current Gaussians to the running mean that `take_mean` applies."""
         self._meant += 1
         if self._mean is None:
             self._mean = self.gaussians.map(lambda p: p.detach().clone())
@@ -191,23 +195,24 @@ class GaussianOptimizer:
 
     @torch.no_grad()
     def take_mean(self) -> None:
-        """The mean of all that was remembered, where anything was, becomes the Gaussians. One view a step, and at
-        Adam's step sizes, Gaussians wander about the place where they settle: their mean lies nearer to it than the
-        last of them (Polyak, Ruppert)."""
+        """Replace the Gaussians by their running mean, if `remember` was called.
+
+        With one view per step Gaussians fluctuate around their optimum, and the mean of the iterates is closer to it
+        than the last one (Polyak, Ruppert).
+        """
         if self._mean is not None:
             for name in PARAMETERS:
                 getattr(self.gaussians, name).copy_(getattr(self._mean, name))
 
     def select(self, keep: Tensor) -> None:
-        """Keep the rows that `keep` ([N] bool, or indices [M]) names; labels, moments and the mean with them."""
+        """Keep the rows chosen by `keep` ([N] bool, or indices [M]), with their labels, moments and mean."""
         self._replace(lambda p: p[keep])
         self._mean = self._mean and self._mean.map(lambda p: p[keep])
         for name in self._COUNTERS:
             setattr(self, name, getattr(self, name)[keep])
 
     def append(self, gaussians: Gaussians, masked: Tensor) -> None:
-        """Add Gaussians after the present ones, with labels `masked` [M] bool and empty moments; what was remembered is
-        forgotten."""
+        """Append Gaussians with labels `masked` [M] bool and zero moments; the running mean is discarded."""
         self._mean, self._meant = None, 0
         self.gaussians = self.gaussians.zipped(gaussians, lambda a, b: _leaf(torch.cat([a, b])))
         empty = gaussians.map(_zeros)
@@ -218,9 +223,9 @@ class GaussianOptimizer:
             setattr(self, name, torch.cat([old, masked if name == "masked" else old.new_zeros(len(gaussians))]))
 
     def cap_opacity(self, limit: float) -> None:
-        """3DGS's opacity reset: no Gaussian is more opaque than `limit` in (0, 1); what is needed grows back.
+        """Opacity reset of 3DGS: clamp opacities to `limit` in (0, 1); needed Gaussians recover.
 
-        Adam's moments of the opacity are emptied: they tell of a slope that is no longer there.
+        Adam's moments of the opacity are set to zero, because they belong to the former values.
         """
         with torch.no_grad():
             self.gaussians.opacity_logits.clamp_(max=float(np.log(limit / (1 - limit))))
@@ -228,7 +233,7 @@ class GaussianOptimizer:
             self._second.opacity_logits.zero_()
 
     def state_dict(self) -> dict[str, Any]:
-        """Tensors from which `load_state_dict` continues bit for bit."""
+        """State from which `load_state_dict` continues bit for bit."""
         parts = {"parameters": self.gaussians, "first": self._first, "second": self._second}
         parts |= {"mean": self._mean} if self._mean is not None else {}
         state: dict[str, Any] = {
@@ -237,7 +242,7 @@ class GaussianOptimizer:
         return state | {name: getattr(self, name).clone() for name in self._COUNTERS} | {"meant": self._meant}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a `state_dict`, of any number of Gaussians."""
+        """Restore a `state_dict`, with any number of Gaussians."""
         self.gaussians = Gaussians(**state["parameters"], antialiased=self.gaussians.antialiased).map(_leaf)
         self._first = Gaussians(**state["first"]).map(torch.clone)
         self._second = Gaussians(**state["second"]).map(torch.clone)
@@ -252,8 +257,8 @@ class GaussianOptimizer:
 
 
 def refuse_not_finite(gradients: Mapping[str, Tensor | None]) -> None:
-    """FloatingPointError that names the parameter where a gradient is NaN or infinite."""
-    # A sum is finite only if every term is, and costs no array of flags; all are asked for at once.
+    """Raise FloatingPointError naming the parameter if a gradient is NaN or infinite."""
+    # A sum is finite only if every term is, and needs no array of flags; all sums are checked at once.
     sums = {name: gradient.sum() for name, gradient in gradients.items() if gradient is not None}
     for name, finite in zip(sums, torch.isfinite(torch.stack([*sums.values()])).tolist() if sums else (), strict=True):
         if not finite:

@@ -1,4 +1,4 @@
-"""A surface that shows one picture, as Gaussians: two sheets of disks, one for each pixel."""
+"""A textured surface as Gaussians: two sheets of disks, with one disk per pixel in each."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from reffusion.types import Camera, Gaussians
 
 @dataclass(frozen=True)
 class Sheets:
-    """How Gaussians lie on a surface: a sheet of thin ones, and a second, opaque one behind it.
+    """Settings of the Gaussians on a surface: a sheet of faint ones, and a second, more opaque sheet behind it.
 
-    Opaque Gaussians next to each other cannot show a sharp picture from all sides: the nearer one hides part of the
-    next, so that each is seen on its far side only. What is painted on them seems to slide away from the camera by a
-    third of their distance, and so twice that between opposite views. The fainter they are, the less; the second sheet
-    keeps the surface closed. docs/initialization.md has figures.
+    Opaque neighbouring Gaussians cannot show a sharp picture from all sides: each occludes part of the next one, so
+    that only its far side is visible. The texture appears shifted away from the camera by a third of their spacing, and
+    by twice that between opposite views. Fainter Gaussians reduce the shift; the second sheet keeps the surface closed.
+    Figures are in docs/initialization.md.
 
     PAPER leaves open: scale and opacity of the initial Gaussians.
 
     Attributes:
-        spread: standard deviation of new Gaussians, pixels of the reference.
-        thickness: their deviation along the normal over that within the surface.
-        grazing: least cosine to the view at which they are stretched.
+        spread: standard deviation of the first sheet's Gaussians, in pixels of the reference.
+        thickness: standard deviation along the normal, relative to that within the surface.
+        grazing: cosine of the viewing angle below which Gaussians are not stretched further.
         opacity: of the first sheet.
-        sunk: how far behind it the second lies, in pixels (0: there is none).
-        under_spread, under_opacity: the second's. Wider Gaussians than the first's leave no gaps between them, which a
-            nearer view would show as a grid; what that blurs the colours of the first make up for.
-        color_steps: corrections of the colours, see `filling.match_colors`.
-        gloss: whether they change with the direction as what is around them does, see
+        offset_px: distance of the second sheet behind the first, in pixels (0: no second sheet).
+        under_spread, under_opacity: of the second sheet. Its Gaussians are wider so that they leave no gaps, which a
+            nearer view would show as a grid; the colours of the first sheet compensate for the blur.
+        color_steps: corrections of the colours, see `reffusion.initialize.unprojection.match_colors`.
+        gloss: make colours depend on the direction as those around them do, see
             `reffusion.initialize.view_dependent_color`.
     """
 
@@ -39,7 +39,7 @@ class Sheets:
     thickness: float = 0.1
     grazing: float = 0.15
     opacity: float = 0.4
-    sunk: float = 1.0
+    offset_px: float = 1.0
     under_spread: float = 0.6
     under_opacity: float = 0.8
     color_steps: int = 5
@@ -47,13 +47,15 @@ class Sheets:
 
 
 def surface(
-    image: np.ndarray, depth: np.ndarray, pixels: np.ndarray, camera: Camera, sh_count: int, how: Sheets
+    image: np.ndarray, depth: np.ndarray, pixels: np.ndarray, camera: Camera, sh_count: int, settings: Sheets
 ) -> Gaussians:
-    """Both sheets, see `surface_gaussians`."""
-    shown = (image, depth, pixels, camera)
-    shape = {"sh_count": sh_count, "thickness": how.thickness, "grazing": how.grazing}
-    sheet = surface_gaussians(*shown, **shape, spread=how.spread, opacity=how.opacity)
-    if not how.sunk:
-        return sheet
-    under = surface_gaussians(*shown, **shape, spread=how.under_spread, opacity=how.under_opacity, sunk=how.sunk)
-    return sheet.zipped(under, lambda a, b: torch.cat([a, b]))
+    """Gaussians of both sheets for the chosen `pixels`; arguments as `surface_gaussians`."""
+    source = (image, depth, pixels, camera)
+    shape = {"sh_count": sh_count, "thickness": settings.thickness, "grazing": settings.grazing}
+    front = surface_gaussians(*source, **shape, spread=settings.spread, opacity=settings.opacity)
+    if not settings.offset_px:
+        return front
+    back = surface_gaussians(
+        *source, **shape, spread=settings.under_spread, opacity=settings.under_opacity, offset_px=settings.offset_px
+    )
+    return front.zipped(back, lambda a, b: torch.cat([a, b]))

@@ -1,12 +1,12 @@
-"""Structural similarity over windows from which masked pixels are left out, differentiable in the first image.
+"""Structural similarity over windows that leave out masked pixels, differentiable in the first image.
 
-Windows as in 3DGS: Gaussian, 11 x 11, sigma 1.5. The local statistics are *normalised convolutions*: sums run over
-the pixels that count and are divided by the window's weight there. A pixel of weight 0 is thus in no window, and
-neither are the pixels outside the image (3DGS counts those as black). The other way, setting both images equal where
-masked, would paint an edge that both share into the windows around a mask and so flatter them.
+Windows are those of 3DGS: Gaussian, 11 x 11, sigma 1.5. Local statistics are *normalised convolutions*: weighted sums
+divided by the sum of the weights in the window. So a pixel of weight 0 is in no window, and neither are pixels outside
+the image (3DGS counts those as black). The alternative, making both images equal where masked, would put a common edge
+into the windows around a mask and raise their similarity.
 
-`dssim` runs a numba kernel on float32 CPU tensors, one of Triton's on a card, and plain torch everywhere else; all are
-the same formula.
+`dssim` runs a numba kernel on float32 CPU tensors, a Triton kernel on CUDA, and plain torch elsewhere; all compute the
+same formula.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ C1, C2 = 0.01**2, 0.03**2
 
 
 def window() -> np.ndarray:
-    """The taps along one axis, of sum 1."""
+    """[11]: taps of the window along one axis, with sum 1."""
     taps = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2)
     return taps / taps.sum()
 
@@ -39,10 +39,10 @@ def dssim(image: Tensor, target: Tensor, weights: Tensor | None = None) -> Tenso
 
     Args:
         image, target: [H, W, C] in [0, 1].
-        weights: [H, W], bool or in [0, 1]; where it is 0 the pixel influences nothing, whatever it holds. None: all 1.
+        weights: [H, W], bool or in [0, 1]; a pixel of weight 0 influences nothing, whatever its value. None: all 1.
 
     Returns:
-        A scalar in [0, 2], the sum divided by H * W * C: a pixel weighs the same in every view, however large its mask.
+        A scalar in [0, 2]: the sum divided by H * W * C, so that a pixel counts the same however large the mask is.
     """
     if weights is not None:
         weights = weights.to(image.dtype)
@@ -59,7 +59,7 @@ def dssim(image: Tensor, target: Tensor, weights: Tensor | None = None) -> Tenso
 
 @cache
 def triton_works() -> bool:
-    """Are there a card and Triton, which comes with torch's CUDA builds, for `gaussians.card`?"""
+    """Are a CUDA device and Triton available for `gaussians.cuda_kernels`? Triton comes with torch's CUDA builds."""
     if not torch.cuda.is_available() or find_spec("triton") is None:
         return False
     from reffusion.gaussians import cuda_kernels
@@ -68,7 +68,7 @@ def triton_works() -> bool:
 
 
 def dssim_torch(image: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
-    """`dssim` in plain torch, any device and type, for finite inputs; the formula to read, and the kernel's oracle."""
+    """`dssim` in plain torch, for any device and dtype and finite inputs; the reference for the kernels."""
     if weights is None:
         weights = torch.ones_like(image[..., 0])
     weights = weights[..., None]
@@ -83,8 +83,11 @@ def dssim_torch(image: Tensor, target: Tensor, weights: Tensor | None = None) ->
 
 
 class _Windowed(torch.autograd.Function):
-    """[H, W, F] -> [H, W, F], each field's window sums, zeros around the image. The window is symmetric: its own
-    adjoint. A function of its own, so that the way back is as exact as the way there."""
+    """[H, W, F] -> [H, W, F]: window sums of each field, with zeros around the image.
+
+    The window is symmetric, so the operation is its own adjoint. An autograd function of its own makes the backward
+    pass as exact as the forward pass.
+    """
 
     @staticmethod
     def forward(ctx, fields: Tensor) -> Tensor:
@@ -102,8 +105,11 @@ class _Windowed(torch.autograd.Function):
 
 @contextmanager
 def no_tf32() -> Iterator[None]:
-    """Convolutions on CUDA keep float32's digits inside. SSIM subtracts E[x]^2 from E[x^2]: of TF32's 10 bits hardly
-    any would be left, and gradients would be wrong by a tenth to a third."""
+    """Disable TF32 in CUDA convolutions inside the context.
+
+    SSIM subtracts E[x]^2 from E[x^2]: of the 10 bits of TF32 hardly any would remain, and gradients would be wrong by a
+    tenth to a third.
+    """
     before = torch.backends.cudnn.allow_tf32
     torch.backends.cudnn.allow_tf32 = False
     try:
@@ -118,11 +124,11 @@ class _FastDssim(torch.autograd.Function):
         height, width, channels = image.shape
         flat = lambda t: t.detach().contiguous().numpy().reshape(height, width * channels)
         if weights is None:
-            weight_rows, norm_rows = _unmasked_rows(height, width, channels)
+            weight_rows, norm_rows = _unmasked_weight_rows(height, width, channels)
         else:
-            weight_rows, norm_rows = _rows(weights.contiguous().numpy(), channels)
+            weight_rows, norm_rows = _weight_rows(weights.contiguous().numpy(), channels)
         images = flat(image), flat(target), weight_rows
-        fields, partials, sums = _padded(4, images[0]), _padded(3, images[0]), np.empty(height)
+        fields, partials, sums = _allocate_fields(4, images[0]), _allocate_fields(3, images[0]), np.empty(height)
         parallel_for(_filter_products, *images, channels, fields)
         parallel_for(_compare, fields, weight_rows, norm_rows, channels, sums, partials)
         if ctx.needs_input_grad[0]:
@@ -136,35 +142,37 @@ class _FastDssim(torch.autograd.Function):
         return ctx.gradient * (upstream / ctx.gradient.numel()), None, None
 
 
-def _padded(count: int, image: np.ndarray) -> np.ndarray:
-    """`count` fields like `image`, to be written, with 5 rows of zeros above and below."""
+def _allocate_fields(count: int, image: np.ndarray) -> np.ndarray:
+    """`count` uninitialised fields of the size of `image`, with 5 rows of zeros above and below."""
     fields = empty_aligned(count, image.shape[0] + 2 * RADIUS, image.shape[1])
     fields[:, :RADIUS], fields[:, -RADIUS:] = 0, 0
     return fields
 
 
-def _rows(weights: np.ndarray, channels: int) -> tuple[np.ndarray, np.ndarray]:
-    """The weights [H, W], and their window sums (1 where a pixel does not count, so that nothing divides by 0), each
-    `channels` times over: [H, W * C]."""
+def _weight_rows(weights: np.ndarray, channels: int) -> tuple[np.ndarray, np.ndarray]:
+    """The weights [H, W] and their window sums, each repeated for every channel: [H, W * C].
+
+    The sum of a pixel of weight 0 is set to 1, so that nothing is divided by 0.
+    """
     norm = np.where(weights > 0, _filtered(weights, 1), np.float32(1))
     return np.repeat(weights, channels, 1), np.repeat(norm, channels, 1)
 
 
 @lru_cache(maxsize=8)
-def _unmasked_rows(height: int, width: int, channels: int) -> tuple[np.ndarray, np.ndarray]:
-    return _rows(np.ones((height, width), np.float32), channels)
+def _unmasked_weight_rows(height: int, width: int, channels: int) -> tuple[np.ndarray, np.ndarray]:
+    return _weight_rows(np.ones((height, width), np.float32), channels)
 
 
-# The kernels hold an image as H rows of W * C numbers, so that each inner loop runs along memory. Rows of a field are
-# filtered along the row first, then columns; both are symmetric, so each is its own adjoint (borders count as 0).
-# Threads share out rows.
+# The kernels hold an image as H rows of W * C numbers, so that inner loops run along memory. Fields are filtered along
+# rows, then along columns; both filters are symmetric, hence their own adjoints (pixels outside count as 0). Threads
+# take rows in turn.
 _K0, _K1, _K2, _K3, _K4, _K5 = (np.float32(k) for k in window()[RADIUS:])
 _jit = partial(kernel, fastmath=FREE_ROUNDING)
 
 
 @_jit
 def _along_row(padded, out, n, step):
-    """out[j] = the window's sum around padded[5 * step + j]."""
+    """out[j] = window sum around padded[5 * step + j]."""
     a0, a1, a2, a3 = padded[:n], padded[step:], padded[2 * step :], padded[3 * step :]
     a4, a5, a6, a7 = padded[4 * step :], padded[5 * step :], padded[6 * step :], padded[7 * step :]
     a8, a9, a10 = padded[8 * step :], padded[9 * step :], padded[10 * step :]
@@ -181,7 +189,7 @@ def _along_row(padded, out, n, step):
 
 @_jit
 def _down_column(rows, i, out, n):
-    """out[j] = the window's sum around rows[i + 5, j]; `rows` has 5 empty rows above and below."""
+    """out[j] = window sum around rows[i + 5, j]; `rows` has 5 rows of zeros above and below."""
     r0, r1, r2, r3 = rows[i], rows[i + 1], rows[i + 2], rows[i + 3]
     r4, r5, r6, r7 = rows[i + 4], rows[i + 5], rows[i + 6], rows[i + 7]
     r8, r9, r10 = rows[i + 8], rows[i + 9], rows[i + 10]
@@ -234,9 +242,9 @@ def _filter_products(tickets, x, y, weights, channels, fields):
 
 @_jit
 def _compare(tickets, fields, weights, norm, channels, sums, partials):
-    """Sum of weights * (1 - SSIM) of each row, and its partials by the windowed fields, filtered along the row.
+    """Sum of weights * (1 - SSIM) of each row, and its derivatives by the windowed fields, filtered along the row.
 
-    Writes sums [H] float64 and partials [3, H + 10, W * C]: by the means of x, of x^2 + y^2 and of x y.
+    Writes sums [H] float64 and partials [3, H + 10, W * C]: derivatives by the means of x, of x^2 + y^2 and of x y.
     """
     height, n = weights.shape
     lead = RADIUS * channels

@@ -1,4 +1,4 @@
-"""How kernels are compiled, kept, and shared out among threads."""
+"""Compiles kernels, caches machine code, and runs kernels on several threads."""
 
 from __future__ import annotations
 
@@ -22,27 +22,29 @@ import torch
 
 T = TypeVar("T")
 R = TypeVar("R")
-_LARGE, _BLOCKS = 2**16, 24  # numbers of an array worth keeping; how many are kept, some two steps' worth
-FEW = 8000  # Gaussians for which waking another thread takes longer than it saves
-# Rounding may vary, but NaN and infinity stay what they are: `fit` looks for them.
+_MIN_KEPT, _MAX_BLOCKS = 2**16, 24  # numbers of an array that is reused; arrays kept, about those of two steps
+MIN_PARALLEL = 8000  # Gaussians below which another thread costs more time than it saves
+# Rounding may vary, but NaN and infinity are preserved, because `fit` checks for them.
 FREE_ROUNDING = "contract", "reassoc", "nsz", "arcp"
-_ROOMS = "kernels", "splat", "gaussians", "depth", "texture", "masks"  # the packages that have kernels
-_OUTSIDE = threading.local()  # `threads`: torch's number outside of `torch_on_one_thread`, by thread as torch's is
-_CACHE = "splat-"  # folders of machine code in __pycache__, one per state of these sources
+_PACKAGES = "kernels", "splat", "gaussians", "depth", "background", "inpaint/patchmatch"  # packages with kernels
+_torch_threads = threading.local()  # thread-local, like the number itself: torch's number outside `torch_on_one_thread`
+_CACHE = "splat-"  # prefix of folders of machine code in __pycache__, one per state of the sources
 
 
 @functools.cache
 def _cache_folder() -> Path:
-    """Machine code is kept by the content of all files of `_ROOMS`: numba itself looks only at the one file of a
-    function, and would go on using a constant or a callee that has changed elsewhere."""
+    """The folder of machine code for the present content of `_PACKAGES`.
+
+    numba itself checks only the file of a function, and would keep using a constant or a callee that changed elsewhere.
+    """
     library = Path(__file__).parents[1]
-    sources = [path for room in _ROOMS for path in sorted((library / room).glob("*.py"))]
+    sources = [path for package in _PACKAGES for path in sorted((library / package).glob("*.py"))]
     digest = hashlib.blake2b(b"".join(path.read_bytes() for path in sources), digest_size=8).hexdigest()
     return Path(__file__).parent / "__pycache__" / (_CACHE + digest)
 
 
 def kernel(function: Callable, fastmath: tuple[str, ...] = ()) -> Callable:
-    """Compile `function` at its first call, without the interpreter's lock; later processes load it from disk."""
+    """Compile `function` at its first call, to run without the GIL; later processes load it from disk."""
     folder, before = _cache_folder(), numba.config.CACHE_DIR
     try:
         if not folder.exists():
@@ -51,7 +53,7 @@ def kernel(function: Callable, fastmath: tuple[str, ...] = ()) -> Callable:
             folder.mkdir(parents=True, exist_ok=True)
         numba.config.CACHE_DIR = str(folder)
     except OSError:
-        pass  # an installation that cannot be written to: numba falls back to the user's cache folder
+        pass  # not writable: numba falls back to the user's cache folder
     try:
         return numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=set(fastmath))(function)
     finally:
@@ -59,25 +61,25 @@ def kernel(function: Callable, fastmath: tuple[str, ...] = ()) -> Callable:
 
 
 def inlined(function: Callable) -> Callable:
-    """Compile `function` as a part of every kernel that calls it."""
+    """Inline `function` into every kernel that calls it."""
     return numba.njit(forceinline=True, error_model="numpy")(function)
 
 
 def empty_aligned(*shape: int) -> np.ndarray:
-    """Uninitialised float32 from a cache line's border on, where possible in memory given out before that nobody holds.
+    """Uninitialised float32 array, aligned to cache lines; large ones reuse memory of arrays that no longer exist.
 
-    Arrays of megabytes are otherwise made of fresh pages each time, and clearing those costs a good part of a step.
+    Otherwise the system provides new pages for large arrays each time, and clearing these takes much of a step.
     """
     size = math.prod(shape)
-    if size < _LARGE:
+    if size < _MIN_KEPT:
         return _cache_aligned(size).reshape(shape)
     blocks, lock = _blocks()
     with lock:
         fits = (block for block in blocks if size <= block.memory.size <= 2 * size and block.tenant() is None)
         block = next(fits, None) or _Block(_cache_aligned(size))
         others = [other for other in blocks if other is not block]
-        blocks[:] = [*others[1 - _BLOCKS :], block]
-        # through a memoryview, so that this array, not the block, is what its views refer to
+        blocks[:] = [*others[1 - _MAX_BLOCKS :], block]
+        # through a memoryview, so that views refer to this array and not to the block
         array = np.frombuffer(memoryview(block.memory), np.float32, size)
         block.tenant = weakref.ref(array)
         return array.reshape(shape)
@@ -91,7 +93,7 @@ def _cache_aligned(size: int) -> np.ndarray:
 
 @dataclass
 class _Block:
-    """Memory, and who has it."""
+    """Memory, and a reference to the array that uses it."""
 
     memory: np.ndarray
     tenant: Callable[[], np.ndarray | None] = lambda: None
@@ -99,56 +101,62 @@ class _Block:
 
 @functools.cache
 def _blocks() -> tuple[list[_Block], threading.Lock]:
-    """Given out by `room`, the latest last."""
+    """Blocks given out by `empty_aligned`, the latest last, and their lock."""
     return [], threading.Lock()
 
 
 def threads() -> int:
-    """How many threads kernels use: torch's number, so one setting (or OMP_NUM_THREADS) rules both; inside
-    `torch_on_one_thread` what that was before."""
-    return getattr(_OUTSIDE, "threads", None) or torch.get_num_threads()
+    """Number of threads for kernels: that of torch, so that one setting (or OMP_NUM_THREADS) controls both.
+
+    Inside `torch_on_one_thread` it is torch's number outside of it.
+    """
+    return getattr(_torch_threads, "threads", None) or torch.get_num_threads()
 
 
 @contextmanager
 def torch_on_one_thread() -> Iterator[None]:
-    """For work that mostly draws; a decorator, too. What torch itself does between kernels is little: its threads wait
-    for each other in each operation, which takes longer than it saves, and far longer where another process has one of
-    their cores. Besides, the same is computed with any number of threads."""
-    given, of_torch = getattr(_OUTSIDE, "threads", None), torch.get_num_threads()
-    _OUTSIDE.threads = given or of_torch
+    """Let torch use one thread, for work that mostly renders; context manager and decorator.
+
+    The operations of torch between kernels are small: synchronising threads in each takes longer than it saves, and far
+    longer if another process occupies a core. Besides, results do not depend on the number of threads.
+    """
+    outer, torch_threads = getattr(_torch_threads, "threads", None), torch.get_num_threads()
+    _torch_threads.threads = outer or torch_threads
     torch.set_num_threads(1)
     try:
         yield
     finally:
-        _OUTSIDE.threads = given
-        torch.set_num_threads(of_torch)
+        _torch_threads.threads = outer
+        torch.set_num_threads(torch_threads)
 
 
-def parallel_for(function: Callable, *arguments, gaussians: int = FEW) -> None:
-    """Call `function(tickets, *arguments)` on every thread at once; they draw tickets until the work is gone.
+def parallel_for(function: Callable, *arguments, gaussians: int = MIN_PARALLEL) -> None:
+    """Call `function(tickets, *arguments)` on every thread at once; they take tickets until all work is done.
 
-    `tickets` [2] int64: a counter to draw from with `vectors.take_ticket`, and the number of threads. What a piece of
-    work writes must depend on its number only, so that results are the same for any number of threads.
+    `tickets` [2] int64: a counter for `vectors.take_ticket`, and the number of threads. What a piece of work writes
+    must depend only on its number, so that results are the same for any number of threads.
 
     Args:
-        gaussians: how many there are to look at, where that is all the work; fewer than FEW are left to this thread.
+        gaussians: number of Gaussians, where it determines the work; below MIN_PARALLEL only this thread is used.
     """
-    helpers = threads() - 1 if gaussians >= FEW else 0
+    helpers = threads() - 1 if gaussians >= MIN_PARALLEL else 0
     tickets = np.array([0, helpers + 1])
     pending = [_pool(os.getpid(), helpers).submit(function, tickets, *arguments) for _ in range(helpers)]
     function(tickets, *arguments)
     for future in pending:
-        if not future.cancel():  # a helper that never woke up has nothing left to do
+        if not future.cancel():  # a thread that did not start has nothing left to do
             future.result()
 
 
 def side_by_side(function: Callable[[T], R], items: Iterable[T], most: int = 8) -> Iterator[R]:
-    """`function` of each item in their order, as many at once as there are threads, `most` at most: for work whose
-    array operations let other threads run; these share out the threads that there are. Where it is left early, what
-    has not begun is not done."""
+    """`function` of each item, in order, with up to `most` items at once, one per thread.
+
+    For work whose array operations release the GIL; torch's threads are divided among the items. If the iteration is
+    left early, items that have not begun are cancelled.
+    """
     workers = max(1, min(threads(), most))
-    own = max(1, threads() // workers)
-    with ThreadPoolExecutor(workers, "beside", initializer=torch.set_num_threads, initargs=(own,)) as pool:
+    threads_each = max(1, threads() // workers)
+    with ThreadPoolExecutor(workers, "beside", initializer=torch.set_num_threads, initargs=(threads_each,)) as pool:
         try:
             yield from pool.map(function, items)
         finally:
@@ -157,5 +165,5 @@ def side_by_side(function: Callable[[T], R], items: Iterable[T], most: int = 8) 
 
 @functools.lru_cache(maxsize=1)
 def _pool(process: int, helpers: int) -> ThreadPoolExecutor:
-    """Waiting threads; a forked process makes its own."""
+    """A pool of waiting threads; a forked process makes its own."""
     return ThreadPoolExecutor(helpers, thread_name_prefix="splat")

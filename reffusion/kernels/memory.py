@@ -1,6 +1,6 @@
-"""Vectors to and from arrays: consecutive elements, columns of consecutive rows, sums over the lanes.
+"""Loads and stores vectors: consecutive elements, columns of consecutive rows, sums over lanes.
 
-Arrays are contiguous, one-dimensional and unchecked.
+Arrays are contiguous and one-dimensional; bounds are not checked.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def _pointer(context, builder, array, place, kind=None):
 
 @intrinsic
 def splat_at(typing, array, place):
-    """An element of a contiguous one-dimensional float32 array in every lane (no bounds check, here and below)."""
+    """One element of a float32 array in every lane."""
 
     def emit(context, builder, sig, args):
         return copies(builder, FLOATS, builder.load(_pointer(context, builder, *zip(sig.args, args, strict=True))))
@@ -66,7 +66,7 @@ def _element(context, builder, kinds, values, lane: int):
 
 @intrinsic
 def load_column(typing, array, width, column, row, last):
-    """One column of LANES consecutive rows of a float32 array [R, width] (flat), row `last` standing for later ones."""
+    """One column of LANES consecutive rows of a float32 array [R, width] (flat); rows after `last` repeat it."""
 
     def emit(context, builder, sig, args):
         value = ir.Constant(FLOATS, ir.Undefined)
@@ -93,7 +93,7 @@ def store_column(typing, array, width, column, row, value):
 
 @intrinsic
 def load_mask(typing, array, place):
-    """Which of LANES consecutive elements of an int32 array are not 0."""
+    """A mask of the nonzero ones among LANES consecutive elements of an int32 array."""
 
     def emit(context, builder, sig, args):
         value = builder.load(_pointer(context, builder, *zip(sig.args, args, strict=True), INTS), align=4)
@@ -104,7 +104,7 @@ def load_mask(typing, array, place):
 
 @intrinsic
 def store_whole(typing, array, place, value):
-    """Write LANES consecutive elements of an int32 array, the values cut off at the point."""
+    """Write LANES consecutive elements of an int32 array; values are truncated."""
 
     def emit(context, builder, sig, args):
         at = _pointer(context, builder, (sig.args[0], args[0]), (sig.args[1], args[1]), INTS)
@@ -116,7 +116,7 @@ def store_whole(typing, array, place, value):
 
 @intrinsic
 def prefetch(typing, array, place):
-    """Ask for the cache line of an element that will be needed soon (any place will do, it is only a hint)."""
+    """Prefetch the cache line of an element that is needed soon; only a hint, so any index is allowed."""
 
     def emit(context, builder, sig, args):
         pointer = _pointer(context, builder, *zip(sig.args, args, strict=True), ir.IntType(8))
@@ -133,7 +133,7 @@ def _indices(places) -> ir.Constant:
 
 
 def _fold(builder, x, y, unit: int, span: int):
-    """In each span of lanes, the sums of neighbouring units of x, then those of y."""
+    """For each span of lanes: the sums of neighbouring units of x, then those of y."""
     even = [
         source + start + at
         for start in range(0, LANES, span)
@@ -156,7 +156,7 @@ def _totals(builder, vectors: list):
 
 @intrinsic
 def store_totals(typing, array, place, vectors):
-    """Write the sums over the lanes of the vectors of a tuple; zeros up to the next multiple of LANES."""
+    """Write the sums over lanes of each vector of a tuple; zeros up to the next multiple of LANES."""
 
     def emit(context, builder, sig, args):
         rows = [builder.extract_value(args[2], i) for i in range(len(sig.args[2]))]
@@ -170,11 +170,11 @@ def store_totals(typing, array, place, vectors):
 
 
 def _transposed(builder, rows: list) -> list:
-    """LANES vectors, lane k of vector i becoming lane i of vector k."""
+    """Transpose LANES vectors: lane k of vector i becomes lane i of vector k."""
     fours = range(0, LANES, 4)
     take = lambda x, y, places: builder.shuffle_vector(x, y, _indices(places))
     pick = lambda x, y, a, b, c, d: take(x, y, [g + i for g in fours for i in (a, b, c, d)])
-    blocks = []  # of each four rows, vectors that hold column 0, 4, ... of them; then column 1, 5, ...; and so on
+    blocks = []  # for each four rows, vectors with columns 0, 4, ... of them; then 1, 5, ...; and so on
     for k in fours:
         low = [pick(rows[i], rows[i + 1], 0, LANES, 1, LANES + 1) for i in (k, k + 2)]
         high = [pick(rows[i], rows[i + 1], 2, LANES + 2, 3, LANES + 3) for i in (k, k + 2)]
@@ -195,7 +195,7 @@ def _transposed(builder, rows: list) -> list:
 def load_columns(typing, array, width, column, row, last, columns, place):
     """Copy LANES columns of LANES rows of a float32 array [R, width] (flat), one after the other, into `columns`.
 
-    Row `last` stands for later ones.
+    Rows after `last` repeat it.
     """
 
     def emit(context, builder, sig, args):
@@ -214,7 +214,7 @@ def load_columns(typing, array, width, column, row, last, columns, place):
 
 @intrinsic
 def store_columns(typing, array, width, column, row, columns, place):
-    """The way back: write LANES columns of LANES rows from `columns`."""
+    """The inverse of `load_columns`: write LANES columns of LANES rows from `columns`."""
 
     def emit(context, builder, sig, args):
         source = _pointer(context, builder, (sig.args[4], args[4]), (sig.args[5], args[5]))

@@ -22,7 +22,7 @@ from numba.extending import intrinsic, lower_builtin, models, register_model
 
 
 def _has_avx512() -> bool:
-    """Whether numba will compile for AVX-512 (NUMBA_CPU_FEATURES overrules the processor)."""
+    """Does numba compile for AVX-512? NUMBA_CPU_FEATURES overrides the processor."""
     if config.CPU_FEATURES is not None:
         return "+avx512f" in config.CPU_FEATURES.split(",")
     return llvmlite.binding.get_host_cpu_features().get("avx512f", False)
@@ -37,7 +37,7 @@ LONGS = ir.VectorType(ir.IntType(64), LANES)
 _BITS = ir.VectorType(ir.IntType(1), LANES)
 INT = ir.IntType(32)
 
-ROUND = 1.5 * 2.0**23  # added to a small float32, it leaves the nearest whole number in the low bits
+ROUND = 1.5 * 2.0**23  # added to a small float32, leaves the nearest integer in the low bits
 # Minimax polynomial of degree 5 for 2^f on [-0.5, 0.5]: relative error 7.5e-8, 2.1e-7 with float32 rounding.
 EXP2 = (1.0000000717, 0.6931469671, 0.2402211972, 0.0555071327, 0.0096755413, 0.0013276472)
 _EXP2_DOUBLE = tuple(math.log(2) ** k / math.factorial(k) for k in range(13))  # series: 2e-16 on [-0.5, 0.5]
@@ -72,7 +72,7 @@ def _call(builder, name: str, *arguments):
 
 
 def _fma(builder, x, y, z):
-    """Fused where the processor can."""
+    """Multiply-add, fused if the processor supports it."""
     return _call(builder, "fmuladd", x, y, z)
 
 
@@ -82,15 +82,15 @@ def copies(builder, kind: ir.VectorType, number):
 
 
 def _as_vector(context, builder, value, have, want):
-    """A vector as it is, a number copied to all lanes."""
+    """A vector unchanged, or a number copied to all lanes."""
     if have == want:
         return value
     number = types.float32 if want == lanes else types.float64
     return copies(builder, _IR[want], context.cast(builder, value, have, number))
 
 
-def _teach(symbol, emit, kind, result):
-    """Teach numba `left symbol right` on vectors of a kind, either of them a number perhaps."""
+def _register_operator(symbol, emit, kind, result):
+    """Register the operator `left symbol right` in numba for vectors of a kind; either side may be a number."""
     pairs = [(kind, kind)]
     if kind != lane_mask:
         pairs += [pair for number in (types.float32, types.float64) for pair in ((kind, number), (number, kind))]
@@ -108,15 +108,15 @@ def _teach(symbol, emit, kind, result):
 
 
 for _kind in (lanes, wide):
-    _teach(operator.add, lambda b, x, y: b.fadd(x, y), _kind, _kind)
-    _teach(operator.sub, lambda b, x, y: b.fsub(x, y), _kind, _kind)
-    _teach(operator.mul, lambda b, x, y: b.fmul(x, y), _kind, _kind)
-    _teach(operator.truediv, lambda b, x, y: b.fdiv(x, y), _kind, _kind)
-    _teach(operator.lt, lambda b, x, y: b.fcmp_ordered("<", x, y), _kind, lane_mask)
-    _teach(operator.gt, lambda b, x, y: b.fcmp_ordered(">", x, y), _kind, lane_mask)
-    _teach(operator.le, lambda b, x, y: b.fcmp_ordered("<=", x, y), _kind, lane_mask)
-    _teach(operator.ge, lambda b, x, y: b.fcmp_ordered(">=", x, y), _kind, lane_mask)
-_teach(operator.and_, lambda b, x, y: b.and_(x, y), lane_mask, lane_mask)
+    _register_operator(operator.add, lambda b, x, y: b.fadd(x, y), _kind, _kind)
+    _register_operator(operator.sub, lambda b, x, y: b.fsub(x, y), _kind, _kind)
+    _register_operator(operator.mul, lambda b, x, y: b.fmul(x, y), _kind, _kind)
+    _register_operator(operator.truediv, lambda b, x, y: b.fdiv(x, y), _kind, _kind)
+    _register_operator(operator.lt, lambda b, x, y: b.fcmp_ordered("<", x, y), _kind, lane_mask)
+    _register_operator(operator.gt, lambda b, x, y: b.fcmp_ordered(">", x, y), _kind, lane_mask)
+    _register_operator(operator.le, lambda b, x, y: b.fcmp_ordered("<=", x, y), _kind, lane_mask)
+    _register_operator(operator.ge, lambda b, x, y: b.fcmp_ordered(">=", x, y), _kind, lane_mask)
+_register_operator(operator.and_, lambda b, x, y: b.and_(x, y), lane_mask, lane_mask)
 
 
 @intrinsic
@@ -141,7 +141,7 @@ def ramp(typing):
 
 @intrinsic
 def fma(typing, x, y, z):
-    """x y + z, rounded once where the processor can."""
+    """x y + z, rounded once if the processor supports it."""
 
     def emit(context, builder, sig, args):
         return _fma(builder, *args)
@@ -151,7 +151,7 @@ def fma(typing, x, y, z):
 
 @intrinsic
 def fnma(typing, x, y, z):
-    """z - x y, rounded once where the processor can."""
+    """z - x y, rounded once if the processor supports it."""
 
     def emit(context, builder, sig, args):
         return _fma(builder, builder.fneg(args[0]), args[1], args[2])
@@ -161,7 +161,7 @@ def fnma(typing, x, y, z):
 
 @intrinsic
 def minimum(typing, x, y):
-    """The smaller; y where x is not a number."""
+    """The smaller value; y where x is NaN."""
 
     def emit(context, builder, sig, args):
         both = [_as_vector(context, builder, value, have, x) for value, have in zip(args, sig.args, strict=True)]
@@ -172,7 +172,7 @@ def minimum(typing, x, y):
 
 @intrinsic
 def maximum(typing, x, y):
-    """The larger; y where x is not a number."""
+    """The larger value; y where x is NaN."""
 
     def emit(context, builder, sig, args):
         both = [_as_vector(context, builder, value, have, x) for value, have in zip(args, sig.args, strict=True)]
@@ -193,7 +193,7 @@ def root(typing, x):
 
 @intrinsic
 def ceiling(typing, x):
-    """The next whole number."""
+    """The value rounded up."""
 
     def emit(context, builder, sig, args):
         return _call(builder, "ceil", args[0])
@@ -203,7 +203,7 @@ def ceiling(typing, x):
 
 @intrinsic
 def select(typing, mask, x, y):
-    """x where the mask is set, else y; one of them may be a number."""
+    """x where the mask is set, else y; one of both may be a number."""
     kind = x if isinstance(x, _Vector) else y
 
     def emit(context, builder, sig, args):
@@ -217,7 +217,7 @@ def select(typing, mask, x, y):
 
 @intrinsic
 def some(typing, mask):
-    """Whether any lane of the mask is set."""
+    """Is any lane of the mask set?"""
 
     def emit(context, builder, sig, args):
         bits = builder.bitcast(args[0], ir.IntType(LANES))
@@ -228,7 +228,7 @@ def some(typing, mask):
 
 @intrinsic
 def widen(typing, x):
-    """float32 lanes as float64."""
+    """float32 lanes converted to float64."""
 
     def emit(context, builder, sig, args):
         return builder.fpext(args[0], DOUBLES)
@@ -248,7 +248,7 @@ def narrow(typing, x):
 
 @intrinsic
 def times_power(typing, x, rounded):
-    """x 2^n of float32 lanes, `rounded` being n + ROUND."""
+    """x 2^n of float32 lanes, where `rounded` is n + ROUND."""
 
     def emit(context, builder, sig, args):
         exponent = builder.shl(builder.bitcast(args[1], INTS), ir.Constant(INTS, [23] * LANES))
@@ -259,7 +259,7 @@ def times_power(typing, x, rounded):
 
 @intrinsic
 def exp2(typing, x):
-    """2^x of float64 lanes in [-1022, 1023]; anything (not a trap) outside."""
+    """2^x of float64 lanes in [-1022, 1023]; undefined (without a trap) outside."""
 
     def emit(context, builder, sig, args):
         magic, value = _constant(DOUBLES, 1.5 * 2.0**52), _constant(DOUBLES, _EXP2_DOUBLE[-1])
@@ -275,7 +275,7 @@ def exp2(typing, x):
 
 @intrinsic
 def log2(typing, x):
-    """log2 of positive normal float64 lanes; anything (not a trap) elsewhere."""
+    """log2 of positive normal float64 lanes; undefined (without a trap) elsewhere."""
 
     def emit(context, builder, sig, args):
         number = lambda value: ir.Constant(LONGS, [int(np.float64(value).view(np.int64))] * LANES)
@@ -296,7 +296,7 @@ def log2(typing, x):
 
 @intrinsic
 def take_ticket(typing, counter):
-    """Add 1 to counter[0] (int64) atomically and return what it was."""
+    """Add 1 to counter[0] (int64) atomically and return its former value."""
 
     def emit(context, builder, sig, args):
         data = context.make_array(sig.args[0])(context, builder, args[0]).data

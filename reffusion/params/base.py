@@ -1,4 +1,4 @@
-"""What all parameters have in common: no unknown names, no changes, and what two stages are both told."""
+"""Base class of all parameters (frozen, unknown names are errors), and fields that several stages share."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
-Decay = Annotated[float, Field(ge=0, lt=1)]  # part of a running mean that the next step keeps
+Decay = Annotated[float, Field(ge=0, lt=1)]  # decay rate of a running mean
 Device = Literal["cpu", "cuda"]
 Dtype = Literal["float32", "bfloat16", "float16"]
 MeansUnit = Literal["distance", "cameras"]
 
-# Of a Field's json_schema_extra. WEIGHTS: names a folder of weights, whose content is part of the artifact's key.
-# UNKEYED: changes nothing of the result, and is no part of the key.
+# For json_schema_extra of a Field. WEIGHTS: names a folder of weights, whose content is part of the artifact's key.
+# UNKEYED: does not change the result, and is not part of the key.
 WEIGHTS: dict[str, Any] = {"weights": True}
 UNKEYED: dict[str, Any] = {"keyed": False}
 
@@ -22,43 +22,43 @@ PRIOR = "sd2-community/stable-diffusion-2-inpainting"
 
 
 def _kinds(annotation: Any) -> set[Any]:
-    """The types of which one is allowed."""
+    """The types that an annotation allows."""
     return set(get_args(annotation)) if isinstance(annotation, UnionType) else {annotation}
 
 
 class Settings(BaseModel):
-    """A frozen set of parameters. Unknown names are refused."""
+    """A frozen set of parameters. Unknown names are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     @field_validator("*", mode="before")
     @classmethod
     def _as_meant(cls, value: Any, field: ValidationInfo) -> Any:
-        """YAML reads `true` and `on` as truth values, and pydantic would make 1 of them."""
+        """Refuse booleans and numbers where others are meant: YAML reads `on` as true, which pydantic turns into 1."""
         info = cls.model_fields[field.field_name]
         if isinstance(value, bool) and bool not in _kinds(info.annotation):
-            cure = "write it in quotes" if str in _kinds(info.annotation) else "give a number"
-            raise ValueError(f"yes, no, on, off, true and false are truth values; {cure}")
+            advice = "write it in quotes" if str in _kinds(info.annotation) else "give a number"
+            raise ValueError(f"yes, no, on, off, true and false are truth values; {advice}")
         if isinstance(value, int | float) and _kinds(info.annotation) <= {str, type(None)}:
             raise ValueError(f"read as the number {value}; write it in quotes")
         return value
 
     def changed(self, values: Mapping[str, Any]) -> Self:
-        """These settings with other values at dotted names, `{"sh.degree": 2}`; all checked anew."""
+        """A copy with other values at dotted names, such as `{"sh.degree": 2}`; all values are validated again."""
         nested = self.model_dump()
         for name, value in values.items():
-            *way, last = name.split(".")
-            place = nested
-            for step in way:
-                place = place[step]
-            place[last] = value
+            *parents, key = name.split(".")
+            node = nested
+            for step in parents:
+                node = node[step]
+            node[key] = value
         return type(self).model_validate(nested)
 
 
 def prior_field() -> Any:
     return Field(
         PRIOR,
-        description="inpainting prior: a diffusers folder, or the name of one on the hub",
+        description="inpainting prior: a diffusers folder or a hub id",
         json_schema_extra=WEIGHTS,
     )
 
@@ -66,38 +66,37 @@ def prior_field() -> Any:
 def depth_model_field() -> Any:
     return Field(
         None,
-        description="depth model: a transformers folder, or the name of one on the hub; none: the surroundings' own "
-        "depth is continued",
+        description="depth model: a transformers folder or a hub id; none: depth is continued from the surroundings",
         json_schema_extra=WEIGHTS,
     )
 
 
 def memory_field() -> Any:
-    return Field(0.0, ge=0, description="GB that the prior may take; batches are split to fit; 0: no limit")
+    return Field(0.0, ge=0, description="memory limit of the prior in GB; batches are split to fit; 0: no limit")
 
 
 def means_unit_field() -> Any:
     return Field(
         "distance",
-        description="unit of that step size: the cameras' distance from the scene, or, as in 3DGS's code, 1.1 times "
-        "the radius of the cameras around their middle",
+        description="unit of that learning rate: the cameras' distance from the scene, or, as in the code of 3DGS, 1.1 "
+        "times the radius of the cameras around their mean",
     )
 
 
 def seconds_field() -> Any:
-    return Field(0.0, ge=0, description="the stage's share of a time budget: as many steps as fit; 0: all")
+    return Field(0.0, ge=0, description="time budget of the stage in seconds: as many steps as fit; 0: all steps")
 
 
 def checkpoint_field() -> Any:
     return Field(10.0, gt=0, description="seconds of work between checkpoints", json_schema_extra=UNKEYED)
 
 
-# PAPER leaves open: where in the schedule the refinement of each finer level starts; 1 = pure noise.
+# PAPER leaves open: the noise level at which the refinement of a finer level starts; 1 = pure noise.
 REFINED_FROM = 0.6
 
 
 class Sampler(Settings):
-    """How a picture is painted by the prior (`reffusion.prior.inpaint`)."""
+    """Sampling of pictures by the prior (`reffusion.prior.inpaint`)."""
 
     steps: int = Field(50, ge=1, description="sampler steps from pure noise")
-    guidance: float = Field(0.0, ge=0, description="the paper's a; libraries' guidance scale is 1 + a")
+    guidance: float = Field(0.0, ge=0, description="a of the paper; the guidance scale of libraries is 1 + a")

@@ -1,7 +1,7 @@
-"""Parameters of the stage `fit`. Moments are parts of the run in [0, 1]; 3DGS's values unless said otherwise.
+"""Parameters of the stage `fit`. Times are fractions of the run in [0, 1]; values are those of 3DGS unless noted.
 
-PAPER leaves open: 3DGS measures Gaussians by the extent of the cameras, and so, in a street, prunes what is far away
-and large. Here sizes are standard deviations divided by the distance to the nearest camera.
+PAPER leaves open: 3DGS measures Gaussians by the extent of the cameras, and so prunes large distant Gaussians, for
+example in a street. Here sizes are standard deviations divided by the distance to the nearest camera.
 """
 
 from __future__ import annotations
@@ -23,44 +23,48 @@ from reffusion.params.base import (
 
 class SphericalHarmonics(Settings):
     degree: int = Field(3, ge=0, le=3, description="highest degree")
-    every: float = Field(1 / 30, ge=0, le=1, description="part of the run after which one more degree joins")
+    every: float = Field(1 / 30, ge=0, le=1, description="fraction of the run after which the degree increases by one")
 
 
 class Init(Settings):
-    """The Gaussians a fit starts from: one at each point."""
+    """Initial Gaussians: one at each point."""
 
-    flow_cell: int = Field(0, ge=0, description="start also from a flow point per cell of so many px a side; 0: none")
-    opacity: float = Field(0.1, gt=0, lt=1, description="of the Gaussians at the points")
-    scale: float = Field(1.0, gt=0, description="their deviation over the way to the next points (3DGS: 1)")
+    flow_cell: int = Field(0, ge=0, description="cell size in px; adds a point from optical flow per cell; 0: none")
+    opacity: float = Field(0.1, gt=0, lt=1, description="opacity of the initial Gaussians")
+    scale: float = Field(1.0, gt=0, description="their standard deviation / distance to the nearest points (3DGS: 1)")
 
 
 class Densify(Settings):
-    start: float = Field(1 / 60, ge=0, le=1, description="part of the run before the first densification")
-    stop: float = Field(0.5, ge=0, le=1, description="part of the run after which no Gaussian is added")
+    start: float = Field(1 / 60, ge=0, le=1, description="fraction of the run before the first densification")
+    stop: float = Field(0.5, ge=0, le=1, description="fraction of the run after which no Gaussian is added")
     every: int = Field(100, ge=1, description="steps from one densification to the next")
-    grow_grad2d: float = Field(2e-4, gt=0, description="screen-space gradient that clones or splits; images: [-1, 1]")
+    grow_grad2d: float = Field(
+        2e-4, gt=0, description="screen-space gradient for cloning or splitting, image in [-1, 1]"
+    )
     cap_max: int = Field(
         1_000_000,
         ge=4,
-        description="most Gaussians, reached at `stop`: the number allowed grows evenly from that of the start, so "
-        "that some are left for where late views still pull",
+        description="maximum number of Gaussians, reached at `stop`: the limit grows linearly from the initial number, "
+        "so that some are left for late densifications",
     )
-    per_pixel: float = Field(0.0, ge=0, description="most Gaussians for each pixel of a view; 0: `cap_max` alone")
-    prune_scale3d: float = Field(0.5, gt=0, description="Gaussians of a larger size are pruned; deviation / distance")
-    reset_every: float = Field(0.1, ge=0, le=1, description="part of the run between opacity resets; 0 = none")
+    per_pixel: float = Field(
+        0.0, ge=0, description="maximum number of Gaussians per pixel of a view; 0: `cap_max` only"
+    )
+    prune_scale3d: float = Field(0.5, gt=0, description="size (deviation / distance) above which Gaussians are pruned")
+    reset_every: float = Field(0.1, ge=0, le=1, description="fraction of the run between opacity resets; 0 = none")
 
 
 class LearningRates(Settings):
-    """Adam's step sizes, for the normalised frame, in which cameras stand about 1 from the scene."""
+    """Adam's learning rates, for the normalised frame, in which cameras are about 1 from the scene."""
 
-    means: float = Field(1.6e-4, gt=0, description="first step size of positions; the last is a hundredth of it")
+    means: float = Field(1.6e-4, gt=0, description="initial learning rate of positions; the final one is 1/100 of it")
     means_unit: MeansUnit = means_unit_field()
-    scales: float = Field(5e-3, gt=0, description="of log scales")
-    quats: float = Field(1e-3, gt=0, description="of quaternions")
-    sh0: float = Field(2.5e-3, gt=0, description="of the constant spherical harmonic")
-    shN: float = Field(2.5e-3 / 20, gt=0, description="of the others")
+    scales: float = Field(5e-3, gt=0, description="learning rate of log scales")
+    quats: float = Field(1e-3, gt=0, description="learning rate of quaternions")
+    sh0: float = Field(2.5e-3, gt=0, description="learning rate of the constant spherical harmonic")
+    shN: float = Field(2.5e-3 / 20, gt=0, description="learning rate of the other harmonics")
     betas: tuple[Decay, Decay] = Field(
-        (0.9, 0.999), description="Adam's memory of gradients and of their squares; a short run is better off with less"
+        (0.9, 0.999), description="Adam's decay rates of the gradient and of its square; short runs need smaller ones"
     )
 
 
@@ -70,25 +74,25 @@ class Params(Settings):
     init: Init = Init()
     densify: Densify = Densify()
     lr: LearningRates = LearningRates()
-    # PAPER leaves open: 3DGS takes black by default. Dark texture is then drawn by leaving holes, which the stages
-    # after this one would read as places that no Gaussian explains.
-    random_background: bool = Field(True, description="a new background colour each step, instead of black")
-    antialiased: bool = Field(False, description="a Gaussian adds up to the same from any distance (Mip-Splatting)")
+    # PAPER leaves open: the default of 3DGS is black. Dark texture can then be represented by holes, which later stages
+    # would take for places without Gaussians.
+    random_background: bool = Field(True, description="a random background colour in each step instead of black")
+    antialiased: bool = Field(False, description="2D filter of Mip-Splatting: same total opacity at any distance")
     exposure: Literal["never", "auto", "always"] = Field(
         "never",
-        description="fit each view's exposure too; later stages see the views without it; auto: where the photographs "
-        "of the same points differ in brightness",
+        description="fit the exposure of each view; later stages use the views without it; auto: if the brightness of "
+        "the same points differs between photographs",
     )
     few_views: Literal["as_many", "fewer_harmonics", "surfaces"] = Field(
         "fewer_harmonics",
-        description="what views too few for it change: nothing; no degree of spherical harmonics that they do not "
-        "determine; that, and, of at most 8 views, a start on surfaces between the sparse points",
+        description="adaptation to few views: none; limit the degree of spherical harmonics to what they determine; or "
+        "also, with at most 8 views, start on surfaces between the sparse points",
     )
     pixels: Literal["all", "unmasked"] = Field(
-        "all", description="those that supervise; unmasked, a baseline: masked pixels are never looked at (Masked NeRF)"
+        "all", description="pixels that supervise; unmasked is a baseline that ignores masked pixels (Masked NeRF)"
     )
-    holdout: int = Field(0, ge=0, description="every so manieth training view is only measured; 0 = none")
-    seed: int = Field(0, description="of the order of views, backgrounds and splits")
+    holdout: int = Field(0, ge=0, description="use every n-th training view only for evaluation; 0 = none")
+    seed: int = Field(0, description="seed of the order of views, backgrounds and splits")
     device: Device = Field("cpu", description="where to compute")
     seconds: float = seconds_field()
     checkpoint_seconds: float = checkpoint_field()

@@ -10,36 +10,34 @@ from reffusion.params.base import Device, Settings, depth_model_field
 
 
 class Depth(Settings):
-    """How the depth of a reference's hole is found."""
+    """Depth in the hole of a reference."""
 
     # PAPER leaves open: the depth model, and whether its alignment is plain or robust.
     model: str | None = depth_model_field()
-    sweep: bool = Field(False, description="depth around the hole is found anew by comparing the photographs")
+    sweep: bool = Field(False, description="recompute depth around the hole by plane sweep stereo")
 
 
 class Params(Settings):
     start: Literal["reference", "lift", "random", "nothing"] = Field(
         "reference",
-        description="what fills the hole: the reference on its depth; instead (baselines) the picture that the stage "
-        "lift painted of the best view, Gaussians at random (initialize.scatter), or nothing: it only removes",
+        description="content of the hole: the reference on its depth; or (baselines) the picture of the best view "
+        "painted by the stage lift, random Gaussians, or nothing: the object is only removed",
     )
     depth: Depth = Depth()
     tidy: bool = Field(
         True,
-        description="haze goes that shows mostly where nobody saw; where other views see past the new surface into "
-        "nothing, there is a second",
+        description="remove haze that mostly covers unobserved pixels; add a second surface where other views see past "
+        "the new one into nothing",
     )
     # PAPER leaves open: the new Gaussians' view-dependent colour. The reference shows one side only.
     view_dependent_color: bool = Field(
-        False, description="they change with the direction as the surfaces around them do"
+        False, description="view-dependent colours like those of the surfaces around the hole"
     )
     # PAPER leaves open: what the reference's camera does not see of the hole.
-    extra_views: int = Field(
-        0, ge=0, description="most views completed beside the references, until nothing is uncovered"
-    )
+    extra_views: int = Field(0, ge=0, description="maximum number of views completed besides the references")
     inpainter: Literal["exemplar", "diffusion", "lama", "migan", "auto"] = Field(
         "exemplar",
-        description="what completes them, as `reference.inpainter`; diffusion: patches of the photographs too",
+        description="inpainter for these, as `reference.inpainter`; diffusion: also patches of photographs",
     )
-    refit_steps: int = Field(0, ge=0, description="steps of reconstruction after filling; 0: none")
-    device: Device = Field("cpu", description="where Gaussians are drawn and the depth model is asked")
+    refit_steps: int = Field(0, ge=0, description="reconstruction steps after filling; 0: none")
+    device: Device = Field("cpu", description="device for rendering and the depth model")

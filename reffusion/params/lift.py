@@ -1,4 +1,4 @@
-"""Parameters of the stage `lift`, a baseline's."""
+"""Parameters of the stage `lift`, a baseline."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from reffusion.params.base import Device, Settings, prior_field
 
 
 def inpainter_field() -> str:
-    return Field("fsr", description="OpenCV's FSR, else Telea; LaMa or MI-GAN, as `make weights` fetched them")
+    return Field("fsr", description="OpenCV's FSR, else Telea; or LaMa or MI-GAN fetched by `make weights`")
 
 
 class Params(Settings):
     inpainter: Literal["fsr", "lama", "migan", "diffusion"] = inpainter_field()
     prior: str = prior_field()
-    prompt: str = Field("", description="what the invented region shows, for a prior that reads")
+    prompt: str = Field("", description="prompt for the inpainted region, for text-conditioned priors")
     steps: int = Field(50, ge=1, description="sampler steps from pure noise")
     device: Device = "cpu"

@@ -24,53 +24,53 @@ class Lora(Settings):
     dropout: float = Field(0.1, ge=0, lt=1, description="LoRA dropout")
     layers: Literal["attention", "qkv", "attention+conv"] = Field(
         "attention",
-        description="what carries LoRA: attention layers; without their output projections (RealFill's code); or "
-        "convolutions and feed-forward layers of the UNet too",
+        description="layers with LoRA: attention; qkv, without output projections (code of RealFill); or also "
+        "convolutions and feed-forward layers of the UNet",
     )
 
 
 class Optimizer(Settings):
-    """AdamW. PAPER leaves open: batch, accumulation, weight decay, clipping, schedule. RealFill's batch 16 here; decay
-    and clip in `reffusion.prior.personalize`."""
+    """AdamW. PAPER leaves open: batch, accumulation, weight decay, clipping, schedule. Batch 16 is RealFill's; weight
+    decay and clipping are in `reffusion.prior.personalize`."""
 
     lr_unet: float = Field(2e-4, gt=0, description="learning rate of the UNet's LoRA")
     lr_text: float = Field(4e-5, gt=0, description="learning rate of the text encoder's LoRA")
     batch: int = Field(16, ge=1, description="samples in a batch")
-    betas: tuple[Decay, Decay] = Field((0.9, 0.999), description="memory of gradients and of their squares")
+    betas: tuple[Decay, Decay] = Field((0.9, 0.999), description="decay rates of the gradient and of its square")
     warm_up: int = Field(0, ge=0, description="steps of linear warm-up")
     schedule: Literal["constant", "cosine"] = Field("constant", description="learning rate after the warm-up")
 
 
 class Samples(Settings):
-    """How samples are drawn from the reference.
+    """Sampling of training images from the reference.
 
-    PAPER leaves open: all of it but that there are local and global ones; the rest is in `reffusion.prior.crops`.
+    PAPER leaves open: everything except that there are local and global samples; see `reffusion.prior.crops`.
     """
 
     size: int = Field(0, ge=0, description="side of a sample in pixels; 0: the prior's native size (paper)")
     local_share: float = Field(0.5, ge=0, le=1, description="share of the samples that are local crops")
-    # PAPER leaves open: the rectangles' number and sides, RealFill's in either case; the paper has nothing but them.
+    # PAPER leaves open: number and sides of the rectangles; RealFill's in both cases. The paper uses only rectangles.
     masks: Literal["rectangles", "realfill"] = Field(
-        "rectangles", description="random rectangles; RealFill's code: a tenth of the masks repaints all"
+        "rectangles", description="random rectangles; code of RealFill: a tenth of the masks covers everything"
     )
-    # The hole is the mask of the job; rectangles leave most of it to be seen, and a short training does not get beyond.
+    # The hole is the mask to be inpainted later; rectangles leave most of it visible, which a short training exploits.
     hole_share: float = Field(
         0.0, ge=0, le=1, description="share of the samples whose mask is the reference's hole (paper: 0)"
     )
-    # What is given is soon denoised well; at weight 1 the hole, a small part of a sample, learns from what is left.
-    outside_weight: float = Field(1.0, gt=0, le=1, description="weight in the loss of what a mask leaves to be seen")
+    # Visible pixels are soon denoised well; a lower weight gives the hole, a small part of a sample, more influence.
+    outside_weight: float = Field(1.0, gt=0, le=1, description="weight of pixels outside the mask in the loss")
 
 
 class Params(Settings):
     prior: str = prior_field()
-    steps: int = Field(2000, ge=0, description="optimiser steps; 0 leaves the stage out: the prior stays as it is")
+    steps: int = Field(2000, ge=0, description="optimiser steps; 0 skips the stage: the prior is not adapted")
     lora: Lora = Lora()
     optimizer: Optimizer = Optimizer()
     samples: Samples = Samples()
     seed: int = 0
     device: Device = "cpu"
-    dtype: Dtype = Field("float32", description="of the frozen weights")
+    dtype: Dtype = Field("float32", description="precision of the frozen weights")
     memory_gb: float = memory_field()
-    checkpointing: bool = Field(False, description="compute activations again on the way back: less memory, more time")
+    checkpointing: bool = Field(False, description="gradient checkpointing: less memory, more time")
     seconds: float = seconds_field()
     checkpoint_seconds: float = checkpoint_field()

@@ -1,6 +1,6 @@
-"""What personalization shows the prior (RefFusion section 4.1): the reference, as a whole and in crops.
+"""Training samples for personalization (RefFusion section 4.1): the reference, as a whole and in crops.
 
-A sample is an image, a mask to repaint and a prompt.
+A sample consists of an image, a mask of pixels to repaint and a prompt.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from reffusion.prior.windows import enlarged, two_scale_masks, two_scales, windo
 PROMPTS = ("A photo of sks", "A photo of sks, cropped", "")
 GLOBAL, LOCAL, EMPTY = 0, 1, 2
 
-# PAPER leaves open: all of these figures. Those of the rectangles and the share of empty prompts are RealFill's.
-EMPTY_SHARE = 0.1  # of samples whose prompt is replaced by the empty one, so that guidance stays meaningful
-BORDER = 0.1  # the largest share of height or width that a global sample loses at each side
-RECTANGLES = (1, 29)  # the fewest and the most of a mask
-SIDE = (0.03, 0.25)  # the shortest and the longest side of one, in sides of the sample
-WHOLE_SHARE = 0.1  # of the masks `realfill` that repaint all
-INVERTED_SHARE = 0.5  # of masks that repaint everything but their rectangles
+# PAPER leaves open: all of these values. Those of rectangles and empty prompts are RealFill's.
+EMPTY_SHARE = 0.1  # of samples get the empty prompt, so that classifier-free guidance stays meaningful
+MAX_BORDER = 0.1  # maximum share of height or width that is cropped at each side of a global sample
+RECTANGLE_COUNT = (1, 29)  # minimum and maximum number per mask
+RECTANGLE_SIDE = (0.03, 0.25)  # minimum and maximum side of a rectangle / side of the sample
+WHOLE_SHARE = 0.1  # of masks of the kind `realfill` cover the whole image
+INVERTED_SHARE = 0.5  # of masks cover everything except their rectangles
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Picture:
 
     Attributes:
         image: [3, H, W] float32 in [-1, 1], no side shorter than the prior's native size.
-        region: [H, W] bool, the pixels that a reference stands for.
+        region: [H, W] bool, the inpainted pixels of the reference.
     """
 
     image: Tensor
@@ -41,7 +41,13 @@ class Picture:
 
 
 class Batch(NamedTuple):
-    """images [B, 3, n, n] in [-1, 1]; masks [B, 1, n, n], 1 = repaint; prompts [B] long, indices into PROMPTS."""
+    """Training samples.
+
+    Attributes:
+        images: [B, 3, n, n] in [-1, 1].
+        masks: [B, 1, n, n], 1 = repaint.
+        prompts: [B] long, indices into PROMPTS.
+    """
 
     images: Tensor
     masks: Tensor
@@ -49,7 +55,7 @@ class Batch(NamedTuple):
 
 
 def picture(image: Tensor, region: Tensor, size: int) -> Picture:
-    """A `Picture` from a uint8 [H, W, 3] image and a bool [H, W] region, enlarged where shorter than `size` pixels."""
+    """A `Picture` from a uint8 [H, W, 3] image and a bool [H, W] region, enlarged to at least `size` pixels a side."""
     floats = enlarged(image.permute(2, 0, 1).to(torch.float32) / 127.5 - 1, size)
     return Picture(floats, enlarged(region.to(torch.float32)[None], size)[0] > 1e-4)
 
@@ -58,36 +64,29 @@ def _uniform(low: float, high: float, generator: torch.Generator) -> float:
     return low + (high - low) * float(torch.rand((), generator=generator))
 
 
-def rectangle_mask(
-    size: int,
-    generator: torch.Generator,
-    *,
-    rectangles: tuple[int, int] = RECTANGLES,
-    side: tuple[float, float] = SIDE,
-    inverted_share: float = INVERTED_SHARE,
-) -> Tensor:
-    """[1, size, size] float, 1 = repaint: a union of random rectangles, or everything but them."""
-    fewest, most = rectangles
+def rectangle_mask(size: int, generator: torch.Generator) -> Tensor:
+    """[1, size, size] float, 1 = repaint: a union of random rectangles, or its complement."""
+    fewest, most = RECTANGLE_COUNT
     mask = torch.zeros(1, size, size)
     for _ in range(int(torch.randint(fewest, most + 1, (), generator=generator))):
-        height, width = (max(1, round(_uniform(*side, generator) * size)) for _ in range(2))
+        height, width = (max(1, round(_uniform(*RECTANGLE_SIDE, generator) * size)) for _ in range(2))
         top, left = (int(torch.randint(size - extent + 1, (), generator=generator)) for extent in (height, width))
         mask[:, top : top + height, left : left + width] = 1
-    return 1 - mask if _uniform(0, 1, generator) < inverted_share else mask
+    return 1 - mask if _uniform(0, 1, generator) < INVERTED_SHARE else mask
 
 
 def random_mask(samples: Samples, size: int, generator: torch.Generator) -> Tensor:
-    """[1, size, size] float, 1 = repaint, by `samples.masks`."""
+    """[1, size, size] float, 1 = repaint: a random mask of the kind `samples.masks`."""
     if samples.masks == "realfill" and _uniform(0, 1, generator) < WHOLE_SHARE:
         return torch.ones(1, size, size)
     return rectangle_mask(size, generator)
 
 
-def without_border(source: Picture, border: float, generator: torch.Generator) -> Picture:
-    """The picture less a thin strip, drawn for each of its four sides: at most `border` of its height or width."""
+def crop_border(source: Picture, max_border: float, generator: torch.Generator) -> Picture:
+    """The picture without a strip of random width at each side: at most `max_border` of its height or width."""
     height, width = source.region.shape
-    top, bottom = (int(_uniform(0, border, generator) * height) for _ in range(2))
-    left, right = (int(_uniform(0, border, generator) * width) for _ in range(2))
+    top, bottom = (int(_uniform(0, max_border, generator) * height) for _ in range(2))
+    left, right = (int(_uniform(0, max_border, generator) * width) for _ in range(2))
     rows, columns = slice(top, height - bottom), slice(left, width - right)
     return Picture(source.image[:, rows, columns], source.region[rows, columns])
 
@@ -99,40 +98,38 @@ def draw_samples(
     count: int,
     samples: Samples,
     generator: torch.Generator,
-    empty_share: float = EMPTY_SHARE,
 ) -> Batch:
-    """`count` training samples of side `size`. All the randomness comes from `generator`.
+    """`count` random training samples of side `size`, determined by `generator`.
 
     Args:
-        references: what is to be learned; every pixel of them may be used.
-        native: the side that distillation reduces a whole view to. A global sample is reduced to it as well, and,
-            where `size` is smaller, a window of it that shows some of the hole, so that the model learns it in the
-            scale it will see.
+        references: the pictures to learn; all of their pixels may be used.
+        native: side to which distillation resizes a whole view. Global samples are resized to it, too. If `size` is
+            smaller, a window of them that shows part of the hole is used, so that the scale is that of distillation.
     """
     images, masks, prompts = [], [], []
     for _ in range(count):
         source = references[int(torch.randint(len(references), (), generator=generator))]
-        image, hole, prompt = _of_reference(source, native, size, samples.local_share, generator)
+        image, hole, prompt = _sample_of_reference(source, native, size, samples.local_share, generator)
         images.append(image)
-        as_asked = hole.any() and _uniform(0, 1, generator) < samples.hole_share
-        masks.append(hole if as_asked else random_mask(samples, size, generator))
-        prompts.append(EMPTY if _uniform(0, 1, generator) < empty_share else prompt)
+        use_hole = hole.any() and _uniform(0, 1, generator) < samples.hole_share
+        masks.append(hole if use_hole else random_mask(samples, size, generator))
+        prompts.append(EMPTY if _uniform(0, 1, generator) < EMPTY_SHARE else prompt)
     return Batch(torch.stack(images), torch.stack(masks), torch.tensor(prompts))
 
 
-def _of_reference(
+def _sample_of_reference(
     source: Picture, native: int, size: int, local_share: float, generator: torch.Generator
 ) -> tuple[Tensor, Tensor, int]:
-    """A local or global sample of a reference: image [3, size, size], its hole there [1, size, size], prompt."""
+    """A local or global sample of a reference: image [3, size, size], its hole [1, size, size], index of the prompt."""
     if _uniform(0, 1, generator) < local_share:
         image, hole, prompt = source.image, source.region[None].to(torch.float32), LOCAL
     else:
-        whole = without_border(source, BORDER, generator)
+        whole = crop_border(source, MAX_BORDER, generator)
         image, hole = two_scales(whole.image, [], native)[0], two_scale_masks(whole.region, [], native)[0]
         prompt = GLOBAL
     if hole.shape[-2:] == (size, size):
         return image, hole, prompt
-    window = window_around if hole.any() else _window_anywhere  # a border may have been all of the hole
+    window = window_around if hole.any() else _window_anywhere  # cropping may have removed the hole
     top, left = window(hole[0] > 0, size, generator)
     return image[:, top : top + size, left : left + size], hole[:, top : top + size, left : left + size], prompt
 

@@ -1,4 +1,4 @@
-"""What personalization lowers: the prior's own denoising loss, over the whole image of a sample."""
+"""The loss of personalization: the prior's own denoising loss, over the whole image of a sample."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from reffusion.seeding import generator as seeded
 
 
 def spread_timesteps(count: int, steps: int, generator: torch.Generator) -> Tensor:
-    """[count] long, each uniform in [0, steps), one in each of `count` equal parts: batches differ less."""
-    places = torch.randperm(count, generator=generator) + torch.rand(1, generator=generator)
-    return (places * (steps / count)).long().clamp(max=steps - 1)
+    """[count] long: stratified timesteps, one in each of `count` equal parts of [0, steps); batches vary less."""
+    positions = torch.randperm(count, generator=generator) + torch.rand(1, generator=generator)
+    return (positions * (steps / count)).long().clamp(max=steps - 1)
 
 
 def latent_shape(prior: Prior, size: int) -> tuple[int, int, int]:
@@ -29,16 +29,16 @@ def latent_shape(prior: Prior, size: int) -> tuple[int, int, int]:
 def denoising_error(
     prior: Prior, samples: Batch, text: Tensor, timesteps: Tensor, noise: Tensor, outside_weight: float = 1.0
 ) -> tuple[Tensor, Tensor]:
-    """([B], [B]): mean squared error of the prior's own target over the whole image, and of the clean latent.
+    """([B], [B]): mean squared errors over the whole image, of the prior's own target and of the clean latent.
 
     The target is what the network was trained to predict: eps, or v = a eps - s z. PAPER leaves open: the target
-    (its prior predicts eps) and whether the loss covers the whole image or the mask; as in RealFill it covers all.
+    (its prior predicts eps) and whether the loss covers the whole image or the mask; as in RealFill, it covers all.
 
     Args:
-        text: [3, L, D], PROMPTS embedded.
+        text: [3, L, D], embeddings of PROMPTS.
         timesteps: [B] long.
-        noise: [B, C, h, w] standard normal, shaped as the latents.
-        outside_weight: of latents that are given anyway; those to repaint have weight 1. The mean is over the weights.
+        noise: [B, C, h, w] standard normal, in the shape of the latents.
+        outside_weight: weight of latents outside the mask; those to repaint have weight 1. The mean is weighted.
     """
     images, masks = samples.images.to(prior.device), samples.masks.to(prior.device)
     timesteps, noise = timesteps.to(prior.device), noise.to(prior.device)
@@ -48,26 +48,26 @@ def denoising_error(
         noisy = diffusion.add_noise(prior, latents, noise, timesteps)
         target = diffusion.training_target(prior, latents, noise, timesteps)
     output = diffusion.raw_prediction(prior, noisy, timesteps, condition, text[samples.prompts.to(prior.device)])
-    weight = torch.where(condition[:, :1] > 0.5, 1.0, outside_weight)  # the mask comes first
+    weight = torch.where(condition[:, :1] > 0.5, 1.0, outside_weight)  # channel 0 is the mask
     error = (weight * (output - target).square()).mean((1, 2, 3)) / weight.mean((1, 2, 3))
-    # z_t is given, so both targets are linear in the clean latent: an error of 1 in it is one of a/s in eps, 1/s in v.
-    alpha_bar = diffusion.abar(prior, timesteps).flatten()
-    odds = alpha_bar if prior.prediction_type == "epsilon" else 1.0
-    return error, (1 - alpha_bar) * error / odds
+    # With z_t fixed both targets are linear in the clean latent: an error of 1 in it is a/s in eps and 1/s in v.
+    alpha_bar = diffusion.alpha_bar(prior, timesteps).flatten()
+    scale = alpha_bar if prior.prediction_type == "epsilon" else 1.0
+    return error, (1 - alpha_bar) * error / scale
 
 
 def held_out_samples(references: Sequence[Picture], size: int, seed: int) -> Batch:
-    """The reference's own hole, all of it where it has none: the whole view and a crop. Same for equal seeds."""
-    draw = seeded(seed, "personalize", "held out")
-    first = references[0]
-    region = first.region if first.region.any() else torch.ones_like(first.region)
-    windows = [window_around(region, size, draw)]
+    """The reference with its own hole (all of it if it has none): the whole view and a crop. Fixed by the seed."""
+    generator = seeded(seed, "personalize", "held out")
+    reference = references[0]
+    region = reference.region if reference.region.any() else torch.ones_like(reference.region)
+    windows = [window_around(region, size, generator)]
     masks = two_scale_masks(region, windows, size)
-    return Batch(two_scales(first.image, windows, size), masks, torch.tensor([GLOBAL, LOCAL]))
+    return Batch(two_scales(reference.image, windows, size), masks, torch.tensor([GLOBAL, LOCAL]))
 
 
 def one_sample(prior: Prior, references: Sequence[Picture], seed: int) -> None:
-    """Loss and gradient of one sample: what `memory.fitted` measures."""
+    """Compute loss and gradient of one sample; `memory.fitted` measures the memory of this."""
     sample = Batch(*(tensor[:1] for tensor in held_out_samples(references, prior.native_size, seed)))
     noise = torch.zeros(1, *latent_shape(prior, prior.native_size))
     text = diffusion.embed_text(prior, list(PROMPTS))

@@ -1,7 +1,7 @@
-"""The maps of the inpainting diffusion model: embed, encode, decode, add noise, predict, sample. In masks 1 = repaint.
+"""Operations of the inpainting diffusion model: embed, encode, decode, add noise, predict, sample. Masks: 1 = repaint.
 
-Schedule, noise and x0 = (z_t - s eps) / a are float32 whatever the UNet's precision: at the last timestep 1 / a is 15,
-and a rounding is multiplied by it.
+Schedule, noise and x0 = (z_t - s eps) / a are float32 whatever the precision of the UNet: at the last timestep 1 / a is
+15, and rounding errors are multiplied by it.
 """
 
 from __future__ import annotations
@@ -21,89 +21,91 @@ from reffusion.prior.model import Prior
 
 
 def embed_text(prior: Prior, prompts: list[str]) -> Tensor:
-    """[B, L, D] hidden states of the prompts; differentiable in the text encoder's LoRA.
+    """[B, L, D] hidden states of the prompts; differentiable in the LoRA of the text encoder.
 
-    Of SDXL: the last hidden layer but one of both encoders side by side, and as one row more, filled up with zeros,
-    the pooled embedding that its UNet takes besides. So a prompt is one tensor for either kind.
+    For SDXL these are the penultimate hidden layers of both encoders, concatenated. One more row, padded with zeros,
+    holds the pooled embedding that its UNet also takes. So a prompt is one tensor for both kinds of model.
     """
     if prior.text_encoder is None:
         raise ValueError("this prior's text encoder was dropped; embed every prompt before `without_text`")
     if prior.text_encoder_2 is None:
-        return prior.text_encoder(_ids(prior.tokenizer, prior.text_encoder, prompts, prior.device)).last_hidden_state
+        return prior.text_encoder(
+            _token_ids(prior.tokenizer, prior.text_encoder, prompts, prior.device)
+        ).last_hidden_state
     pairs = ((prior.tokenizer, prior.text_encoder), (prior.tokenizer_2, prior.text_encoder_2))
-    outputs = [net(_ids(tokens, net, prompts, prior.device), output_hidden_states=True) for tokens, net in pairs]
+    outputs = [net(_token_ids(tokens, net, prompts, prior.device), output_hidden_states=True) for tokens, net in pairs]
     states = torch.cat([output.hidden_states[-2] for output in outputs], -1)
     pooled = outputs[1].text_embeds
     packed = torch.cat([states, F.pad(pooled, (0, states.shape[-1] - pooled.shape[-1]))[:, None]], 1)
-    said = torch.tensor([prompt != "" or not prior.zero_empty for prompt in prompts], device=prior.device)
-    return packed * said[:, None, None]
+    is_kept = torch.tensor([prompt != "" or not prior.zero_empty for prompt in prompts], device=prior.device)
+    return packed * is_kept[:, None, None]
 
 
-def _ids(tokenizer: Any, encoder: nn.Module, prompts: list[str], device: torch.device) -> Tensor:
+def _token_ids(tokenizer: Any, encoder: nn.Module, prompts: list[str], device: torch.device) -> Tensor:
     length = min(tokenizer.model_max_length, encoder.config.max_position_embeddings)
     tokens = tokenizer(prompts, padding="max_length", max_length=length, truncation=True, return_tensors="pt")
     return tokens.input_ids.to(device)
 
 
-def _in_parts(prior: Prior, function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
-    """`function` of the rows, at most as many of them in one pass as the prior says."""
-    most = (prior.rows_graded if torch.is_grad_enabled() else prior.rows) or len(rows[0])
-    if len(rows[0]) <= most:
+def _in_batches(prior: Prior, function: Callable[..., Tensor], *rows: Tensor) -> Tensor:
+    """`function` of the rows, in passes of at most the number of rows set in the prior."""
+    max_rows = (prior.rows_graded if torch.is_grad_enabled() else prior.rows) or len(rows[0])
+    if len(rows[0]) <= max_rows:
         return function(*rows)
-    parts = zip(*(tensor.split(most) for tensor in rows), strict=True)
+    parts = zip(*(tensor.split(max_rows) for tensor in rows), strict=True)
     if not torch.is_grad_enabled():
         return torch.cat([function(*part) for part in parts])
     return torch.cat([checkpoint(function, *part, use_reentrant=False) for part in parts])
 
 
 def encode(prior: Prior, images: Tensor) -> Tensor:
-    """Images [B, 3, H, W] in [-1, 1] -> latents [B, C, H/f, W/f], the posterior's mean, scaled; differentiable."""
+    """Images [B, 3, H, W] in [-1, 1] -> latents [B, C, H/f, W/f], the scaled mean of the posterior; differentiable."""
     dtype = next(prior.vae.parameters()).dtype
-    mean = _in_parts(prior, lambda part: prior.vae.encode(part.to(dtype)).latent_dist.mean, images)
+    mean = _in_batches(prior, lambda part: prior.vae.encode(part.to(dtype)).latent_dist.mean, images)
     return (mean * prior.vae.config.scaling_factor).float()
 
 
 def decode(prior: Prior, latents: Tensor) -> Tensor:
-    """Latents [B, C, h, w] -> images [B, 3, H, W], about [-1, 1]; differentiable."""
+    """Latents [B, C, h, w] -> images [B, 3, H, W], roughly in [-1, 1]; differentiable."""
     dtype = next(prior.vae.parameters()).dtype
     scaled = latents / prior.vae.config.scaling_factor
-    return _in_parts(prior, lambda part: prior.vae.decode(part.to(dtype)).sample, scaled).float()
+    return _in_batches(prior, lambda part: prior.vae.decode(part.to(dtype)).sample, scaled).float()
 
 
 @torch.no_grad()
 def conditioning(prior: Prior, images: Tensor, masks: Tensor) -> Tensor:
-    """What the UNet sees beside the noisy latents: [mask | latents of the image outside the mask], [B, 1 + C, h, w].
+    """Conditioning of the UNet: [mask | latents of the image outside the mask], [B, 1 + C, h, w].
 
-    Carries no gradient. `images` [B, 3, H, W] in [-1, 1], `masks` [B, 1, H, W], 1 = repaint; the hole is grey, or
-    filled from its surroundings, by `prior.fills`.
+    Carries no gradient. `images` [B, 3, H, W] in [-1, 1], `masks` [B, 1, H, W], 1 = repaint. The hole is grey, or
+    filled from its surroundings if `prior.fills`.
     """
     hidden = (masks > 0.5).to(images.dtype)
-    latents = encode(prior, harmonic_fill.extended(images, hidden) if prior.fills else images * (1 - hidden))
-    small = interpolate(hidden, size=latents.shape[-2:], mode="nearest") if prior.factor > 1 else hidden
-    return torch.cat([small.float(), latents], 1)
+    latents = encode(prior, harmonic_fill.harmonic_extension(images, hidden) if prior.fills else images * (1 - hidden))
+    small_mask = interpolate(hidden, size=latents.shape[-2:], mode="nearest") if prior.factor > 1 else hidden
+    return torch.cat([small_mask.float(), latents], 1)
 
 
-def abar(prior: Prior, t: Tensor) -> Tensor:
-    """alpha-bar at timesteps `t` [B], shaped [B, 1, 1, 1]."""
+def alpha_bar(prior: Prior, t: Tensor) -> Tensor:
+    """alpha-bar at timesteps `t` [B], in the shape [B, 1, 1, 1]."""
     return prior.alphas_cumprod[t].view(-1, 1, 1, 1)
 
 
 def add_noise(prior: Prior, latents: Tensor, noise: Tensor, t: Tensor) -> Tensor:
     """z_t = sqrt(abar_t) z_0 + sqrt(1 - abar_t) eps."""
-    a = abar(prior, t)
+    a = alpha_bar(prior, t)
     return a.sqrt() * latents + (1 - a).sqrt() * noise
 
 
 def raw_prediction(prior: Prior, noisy: Tensor, t: Tensor, condition: Tensor, text: Tensor) -> Tensor:
-    """The UNet's own output, eps or v, float32 [B, C, h, w]; for training."""
+    """The raw output of the UNet, eps or v, float32 [B, C, h, w]; for training."""
     inputs = torch.cat([noisy, condition], 1).to(prior.dtype)
-    return _in_parts(prior, lambda *rows: _unet(prior, *rows), inputs, t, text.to(prior.dtype)).float()
+    return _in_batches(prior, lambda *rows: _unet(prior, *rows), inputs, t, text.to(prior.dtype)).float()
 
 
 def _unet(prior: Prior, inputs: Tensor, t: Tensor, text: Tensor) -> Tensor:
     if prior.unet.config.addition_embed_type is None:
         return prior.unet(inputs, t, encoder_hidden_states=text).sample
-    # SDXL: size of the original, top left corner of the crop, size asked for; a window is a picture of its own here.
+    # SDXL: original size, top left corner of the crop, target size; here a window is a picture of its own.
     height, width = (extent * prior.factor for extent in inputs.shape[-2:])
     sizes = inputs.new_tensor([height, width, 0, 0, height, width]).expand(len(inputs), -1)
     pooled = prior.unet.config.projection_class_embeddings_input_dim - 6 * prior.unet.config.addition_time_embed_dim
@@ -112,16 +114,16 @@ def _unet(prior: Prior, inputs: Tensor, t: Tensor, text: Tensor) -> Tensor:
 
 
 def training_target(prior: Prior, latents: Tensor, noise: Tensor, t: Tensor) -> Tensor:
-    """What `raw_prediction` should equal: eps, or v = sqrt(abar) eps - sqrt(1 - abar) z_0."""
+    """The target of `raw_prediction`: eps, or v = sqrt(abar) eps - sqrt(1 - abar) z_0."""
     if prior.prediction_type == "epsilon":
         return noise
-    a = abar(prior, t)
+    a = alpha_bar(prior, t)
     return a.sqrt() * noise - (1 - a).sqrt() * latents
 
 
 def predict(prior: Prior, noisy: Tensor, t: Tensor, condition: Tensor, text: Tensor) -> tuple[Tensor, Tensor]:
     """(eps, z_0) predicted from z_t; both float32 [B, C, h, w]."""
-    output, a = raw_prediction(prior, noisy, t, condition, text), abar(prior, t)
+    output, a = raw_prediction(prior, noisy, t, condition, text), alpha_bar(prior, t)
     if prior.prediction_type == "epsilon":
         return output, (noisy - (1 - a).sqrt() * output) / a.sqrt()
     return a.sqrt() * output + (1 - a).sqrt() * noisy, a.sqrt() * noisy - (1 - a).sqrt() * output
@@ -142,38 +144,38 @@ def sample(
     """Inpaint by deterministic DDIM.
 
     Args:
-        images: [B, 3, H, W] in [-1, 1]; what lies under the mask matters only when `start` < 1.
+        images: [B, 3, H, W] in [-1, 1]; pixels under the mask matter only if `start` < 1.
         masks: [B, 1, H, W], 1 = repaint.
         text, empty: [B, L, D] hidden states; `empty` is needed when `guidance` > 0.
         steps: denoising steps, >= 1.
         random: a CPU generator for the noise.
-        guidance: the paper's a: (1 + a) eps(cond) - a eps(empty); libraries' scale is 1 + a.
-        start: noise level to begin from as a fraction of the schedule; 1 begins from pure noise.
+        guidance: a of the paper: (1 + a) eps(cond) - a eps(empty); the guidance scale of libraries is 1 + a.
+        start: initial noise level as a fraction of the schedule; 1 starts from pure noise.
 
     Returns:
-        [B, 3, H, W] in [-1, 1], the model's whole picture (the caller keeps the pixels it knows).
+        [B, 3, H, W] in [-1, 1], the whole picture of the model; the caller restores known pixels.
     """
     if not 0 < start <= 1:
         raise ValueError(f"start must lie in (0, 1], not {start}")
     condition = conditioning(prior, images, masks)
     shape = (len(images), condition.shape[1] - 1, *condition.shape[-2:])
     noise = torch.randn(shape, generator=random).to(images.device)
-    first = start * prior.timesteps - 1
-    times = torch.linspace(first, 0, steps + 1).round().long().clamp(min=0).tolist()
+    start_t = start * prior.timesteps - 1
+    times = torch.linspace(start_t, 0, steps + 1).round().long().clamp(min=0).tolist()
     batch = torch.full((len(images),), times[0], device=images.device)
     noisy = noise if start == 1 else add_noise(prior, encode(prior, images), noise, batch)
-    for now, then in itertools.pairwise(times):
-        eps, clean = guided(prior, noisy, torch.full_like(batch, now), condition, text, empty, guidance)
-        noisy = clean if then == times[-1] else add_noise(prior, clean, eps, torch.full_like(batch, then))
+    for t, next_t in itertools.pairwise(times):
+        eps, clean = guided(prior, noisy, torch.full_like(batch, t), condition, text, empty, guidance)
+        noisy = clean if next_t == times[-1] else add_noise(prior, clean, eps, torch.full_like(batch, next_t))
     return decode(prior, noisy).clamp(-1, 1)
 
 
 def guided(
     prior: Prior, noisy: Tensor, t: Tensor, condition: Tensor, text: Tensor, empty: Tensor | None, guidance: float
 ) -> tuple[Tensor, Tensor]:
-    """(eps, z_0) under classifier-free guidance (1 + a) eps(cond) - a eps(empty); one UNet batch for both.
+    """(eps, z_0) with classifier-free guidance (1 + a) eps(cond) - a eps(empty), both in one UNet batch.
 
-    Of the empty prompt itself that is eps(empty), whatever a, and one pass.
+    For the empty prompt itself this is eps(empty), whatever a is, and takes one pass.
     """
     if guidance and empty is None:
         raise ValueError("guidance needs the empty prompt's embedding")

@@ -1,4 +1,4 @@
-"""A view completed in 2D by the prior, at the view's own resolution: coarse to fine, several candidates."""
+"""2D inpainting of a view by the prior at the view's full resolution: coarse to fine, several candidates."""
 
 from __future__ import annotations
 
@@ -20,19 +20,22 @@ from reffusion.types import Camera, Gaussians
 
 @torch.no_grad()
 def background(remaining: Gaussians, camera: Camera, photo: np.ndarray, consistent: np.ndarray) -> np.ndarray:
-    """A view as far as it is known without the object, uint8 [H, W, 3]: the photo outside C, in C the remaining
-    Gaussians' render, which shows what other views saw and nothing sensible where none did.
+    """A view without the object, as far as it is known, uint8 [H, W, 3].
+
+    Outside C this is the photo, inside C a rendering of the remaining Gaussians. The rendering shows what other views
+    observed, and is meaningless where none did.
 
     Args:
-        remaining: the Gaussians without the object's.
-        photo: uint8 [H, W, 3]. consistent: C, bool [H, W].
+        remaining: the Gaussians without those of the object.
+        photo: uint8 [H, W, 3].
+        consistent: C, bool [H, W].
     """
-    drawn = rasterizer.render(remaining, camera).color.cpu().numpy()
-    return np.where(consistent[..., None], to_uint8(drawn), photo)
+    rendering = rasterizer.render(remaining, camera).color.cpu().numpy()
+    return np.where(consistent[..., None], to_uint8(rendering), photo)
 
 
 def as_input(picture: np.ndarray) -> Tensor:
-    """uint8 [H, W, 3] as `paint` takes it: float32 [3, H, W] in [-1, 1]."""
+    """uint8 [H, W, 3] -> float32 [3, H, W] in [-1, 1], the input of `paint`."""
     return torch.from_numpy(picture).permute(2, 0, 1) / 127.5 - 1
 
 
@@ -41,15 +44,15 @@ def as_picture(painted: Tensor) -> np.ndarray:
     return to_uint8((painted.permute(1, 2, 0).cpu().numpy() + 1) / 2)
 
 
-def resized(image: Tensor, height: int, width: int) -> Tensor:
-    """[B, C, H, W] -> [B, C, height, width], bilinear, antialiased where it shrinks."""
+def resize(image: Tensor, height: int, width: int) -> Tensor:
+    """[B, C, H, W] -> [B, C, height, width], bilinear, antialiased when shrinking."""
     return F.interpolate(image, size=(height, width), mode="bilinear", align_corners=False, antialias=True)
 
 
 def level_sizes(height: int, width: int, size: int) -> list[tuple[int, int]]:
-    """(height, width) of each refinement level: the shorter side doubles from 2 x `size` until the view is full.
+    """(height, width) of each refinement level: the shorter side doubles from 2 x `size` up to the full view.
 
-    A view whose shorter side is at most `size` is refined once, at the scale where that side is `size`.
+    A view whose shorter side is at most `size` is refined once, scaled so that this side is `size`.
     """
     shorter = min(height, width)
     sizes, side = [], 2 * size
@@ -63,21 +66,21 @@ def level_sizes(height: int, width: int, size: int) -> list[tuple[int, int]]:
 def windows_over(hole: Tensor, size: int) -> Iterator[tuple[int, int]]:
     """(top, left) of size x size windows, half overlapping, that cover the True pixels of a [H, W] bool hole."""
     height, width = hole.shape
-    left_to_cover = hole.clone()
-    while left_to_cover.any():
-        rows, columns = torch.nonzero(left_to_cover, as_tuple=True)
+    uncovered = hole.clone()
+    while uncovered.any():
+        rows, columns = torch.nonzero(uncovered, as_tuple=True)
         row = int(rows[0])
         column = int(columns[rows < row + size // 2].min())
         top = min(max(row - size // 4, 0), height - size)
         left = min(max(column - size // 4, 0), width - size)
         yield top, left
-        left_to_cover[top : top + 3 * size // 4, left : left + 3 * size // 4] = False
+        uncovered[top : top + 3 * size // 4, left : left + 3 * size // 4] = False
         if top == height - size:
-            left_to_cover[top:, left : left + 3 * size // 4] = False
+            uncovered[top:, left : left + 3 * size // 4] = False
         if left == width - size:
-            left_to_cover[top : top + 3 * size // 4, left:] = False
+            uncovered[top : top + 3 * size // 4, left:] = False
         if top == height - size and left == width - size:
-            left_to_cover[top:, left:] = False
+            uncovered[top:, left:] = False
 
 
 @torch.no_grad()
@@ -92,19 +95,20 @@ def paint(
     start: float,
     guidance: float,
 ) -> Tensor:
-    """Candidates for the pixels of `hole`; all others stay as they are.
+    """Candidates for the pixels of `hole`; other pixels are unchanged.
 
     The whole view is painted at the prior's native size from pure noise. Each finer level (`level_sizes`) starts from
-    the enlarged coarser one and is repainted window by window from the timestep `start`, every window seeing what
-    its neighbours have become. Fully determined by the seeds.
+    the enlarged coarser one and is repainted window by window from the timestep `start`; a window sees the results of
+    its neighbours. The result is determined by the seeds.
 
     Args:
-        image: [3, H, W] float32 in [-1, 1]; what lies inside the hole is not looked at.
+        image: [3, H, W] float32 in [-1, 1]; pixels inside the hole are ignored.
         hole: [H, W] bool, with at least one True pixel.
-        seeds: one for each candidate.
-        steps: sampler steps from pure noise; a later start takes its share of them.
-        start: in (0, 1], where each refinement starts in the schedule (1 = pure noise).
-        guidance: the paper's a.
+        seeds: one per candidate.
+        steps: sampler steps from pure noise; a later start takes a proportional part of them.
+        start: in (0, 1], initial noise level of refinements as a fraction of the schedule (1 = pure noise).
+        guidance: a of the paper.
+
     Returns:
         [len(seeds), 3, H, W] in [-1, 1].
     """
@@ -115,7 +119,7 @@ def paint(
     whole_hole = hole.to(device, torch.float32)[None, None]
 
     def sample(images: Tensor, mask: Tensor, *place: int, start: float, level: int | str) -> Tensor:
-        # Each candidate has a generator of its own: its picture does not depend on how many others are asked for.
+        # Each candidate has its own generator, so that it does not depend on the number of candidates.
         share = max(1, round(steps * start))
         rows = []
         for image, seed in zip(images, seeds, strict=True):
@@ -124,34 +128,35 @@ def paint(
         return torch.cat(rows)
 
     def scaled(shape: tuple[int, int]) -> tuple[Tensor, Tensor]:
-        # Weights keep the blank inside of the hole from darkening the pixels around it.
-        weight = resized(1 - whole_hole, *shape)
-        return resized(known, *shape) / weight.clamp_min(1e-3), (weight < 1 - 1e-4).to(torch.float32)
+        # Dividing by weights keeps the empty hole from darkening the pixels around it.
+        weight = resize(1 - whole_hole, *shape)
+        return resize(known, *shape) / weight.clamp_min(1e-3), (weight < 1 - 1e-4).to(torch.float32)
 
     view, mask = scaled((size, size))
     painted = sample((view * (1 - mask)).expand(count, -1, -1, -1), mask, start=1.0, level="whole")
     for level, shape in enumerate(level_sizes(height, width, size)):
         view, mask = scaled(shape)
-        painted = view * (1 - mask) + resized(painted, *shape) * mask
+        painted = view * (1 - mask) + resize(painted, *shape) * mask
         _paint_windows(painted, mask, size, partial(sample, start=start, level=level))
-    painted = resized(painted, height, width)
+    painted = resize(painted, height, width)
     return image.to(device) * (1 - whole_hole) + painted * whole_hole
 
 
 def _paint_windows(painted: Tensor, mask: Tensor, size: int, sample: Callable[..., Tensor]) -> None:
-    """Paint `mask` [1, 1, h, w] of `painted` [B, 3, h, w] in place, each window seeing what its neighbours have become.
+    """Repaint `mask` [1, 1, h, w] of `painted` [B, 3, h, w] in place, window by window.
 
-    `sample(images, part, top, left)` gives the new picture of a window and what of it is to be painted.
+    A window sees the results of its neighbours. `sample(images, part, top, left)` returns the new picture of a window,
+    of which the pixels `part` are used.
     """
-    todo = mask[0, 0] > 0
-    for top, left in windows_over(todo.cpu(), size):
-        here = (..., slice(top, top + size), slice(left, left + size))
-        if not todo[here].any():
+    remaining = mask[0, 0] > 0
+    for top, left in windows_over(remaining.cpu(), size):
+        window = (..., slice(top, top + size), slice(left, left + size))
+        if not remaining[window].any():
             continue
-        part = todo[here].to(torch.float32)[None, None]
-        fresh = sample(painted[here], part, top, left)
-        painted[here] = painted[here] * (1 - part) + fresh * part
-        todo[here] = False
+        part = remaining[window].to(torch.float32)[None, None]
+        repainted = sample(painted[window], part, top, left)
+        painted[window] = painted[window] * (1 - part) + repainted * part
+        remaining[window] = False
 
 
 @torch.no_grad()
@@ -168,22 +173,23 @@ def repaint(
     steps: int,
     guidance: float,
 ) -> Tensor:
-    """A view whose hole is painted anew, beginning with what it shows: the nearer `start` is to 0 the less changes.
+    """A view with its hole repainted, starting from its present content: the smaller `start`, the less changes.
 
-    The whole view at the prior's native size, then `levels` of the finer sizes of `paint`. What a level changes is
-    enlarged and added to the view at the next, so that the view's own detail is not lost with its size.
+    The whole view is repainted at the prior's native size, then at `levels` of the finer sizes of `paint`. The change
+    of a level is enlarged and added to the view at the next one, so that the view keeps its own detail.
 
     Args:
         image: [3, H, W] in [-1, 1].
         hole: [H, W] bool, with at least one True pixel.
-        text: [3, L, D], hidden states of the prompts for the whole view and for windows, and of the empty one.
+        text: [3, L, D], hidden states of the prompts for the whole view and for windows, and of the empty prompt.
         random: a CPU generator.
-        start: in (0, 1], the timestep from which the whole view is painted, as a part of the schedule.
-        finest: the finer levels start no higher; from pure noise a window would forget the whole.
-        steps: sampler steps from pure noise; a later start takes its share of them.
-        guidance: the paper's a.
+        start: in (0, 1], initial noise level of the whole view as a fraction of the schedule.
+        finest: upper limit of this level for finer sizes; from pure noise a window would ignore the whole view.
+        steps: sampler steps from pure noise; a later start takes a proportional part of them.
+        guidance: a of the paper.
+
     Returns:
-        [3, H, W] in [-1, 1]; pixels outside the hole as they were.
+        [3, H, W] in [-1, 1]; pixels outside the hole are unchanged.
     """
     size, (height, width), device = prior.native_size, hole.shape, prior.device
     view, whole_hole = image.to(device)[None], hole.to(device, torch.float32)[None, None]
@@ -197,20 +203,20 @@ def repaint(
 
     change = view.new_zeros(1, 3, 1, 1)
     for level, shape in enumerate([(size, size), *level_sizes(height, width, size)[:levels]]):
-        small, mask = resized(view, *shape), (resized(whole_hole, *shape) > 1e-4).to(torch.float32)
-        painted = (small + resized(change, *shape) * mask).clamp(-1, 1)
+        small, mask = resize(view, *shape), (resize(whole_hole, *shape) > 1e-4).to(torch.float32)
+        painted = (small + resize(change, *shape) * mask).clamp(-1, 1)
         if level == 0:
             painted = painted * (1 - mask) + sample(text[:1], start)(painted, mask) * mask
         else:
             _paint_windows(painted, mask, size, sample(text[1:2], min(start, finest)))
         change = painted - small
-    return (view + resized(change, height, width) * whole_hole).clamp(-1, 1)[0]
+    return (view + resize(change, height, width) * whole_hole).clamp(-1, 1)[0]
 
 
 def seam(candidates: Tensor, hole: Tensor) -> Tensor:
-    """[B]: mean absolute colour step between each pixel of the hole and its neighbours outside; low is seamless.
+    """[B]: mean absolute colour step across the boundary of the hole; low values are seamless.
 
-    PAPER leaves open: how its reference is chosen (by eye). The default choice is the candidate of the lowest seam.
+    PAPER leaves open: how its reference is chosen (by eye). By default the candidate with the lowest value is chosen.
 
     Args:
         candidates: [B, 3, H, W].
@@ -220,8 +226,8 @@ def seam(candidates: Tensor, hole: Tensor) -> Tensor:
     total, count = candidates.new_zeros(candidates.shape[0]), 0
     for axis in (0, 1):
         length = hole.shape[axis]
-        before, after = hole.narrow(axis, 0, length - 1), hole.narrow(axis, 1, length - 1)
-        border = before ^ after
+        first, second = hole.narrow(axis, 0, length - 1), hole.narrow(axis, 1, length - 1)
+        border = first ^ second
         step = candidates.narrow(axis + 2, 1, length - 1) - candidates.narrow(axis + 2, 0, length - 1)
         total = total + (step.abs().mean(1) * border).sum((1, 2))
         count += int(border.sum())

@@ -1,4 +1,4 @@
-"""What personalization is for, measured while it learns: the reference's hole, and holes in other photographs."""
+"""Errors measured during personalization: in the hole of the reference, and in holes of other photographs."""
 
 from __future__ import annotations
 
@@ -17,16 +17,19 @@ from reffusion.prior.windows import two_scale_masks, two_scales
 from reffusion.seeding import generator as seeded
 from reffusion.trace import decibels
 
-LEVELS = (0.2, 0.55, 0.9)  # of the noise, as parts of the schedule, at which the clean latent is asked for
-SHIFTS = 4  # places along a side where the reference's hole is tried in a photograph
+NOISE_LEVELS = (0.2, 0.55, 0.9)  # timesteps, as fractions of the schedule, at which errors are measured
+SHIFTS_PER_SIDE = 4  # positions per side at which the hole of the reference is tried in a photograph
 
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Attributes:
-    reference: its own hole, in the whole view and in a crop.
-    pictures, repaint, holes: [1 + B, ...] the whole reference and B photographs, what is to be repainted of them
-        [1 + B, 1, n, n], and where the truth is known.
+    """Fixed samples for validation.
+
+    Attributes:
+        reference: the reference with its own hole, as a whole view and as a crop.
+        pictures: [1 + B, 3, n, n], the whole reference and B photographs.
+        repaint: [1 + B, 1, n, n], the pixels to repaint.
+        holes: [1 + B, 1, n, n], those of them whose true colours are known.
     """
 
     reference: Batch
@@ -35,64 +38,73 @@ class HeldOut:
     holes: Tensor
 
 
-def held_out(
+def make_held_out(
     references: Sequence[Picture], photographs: Sequence[tuple[Tensor, Tensor]], size: int, seed: int
 ) -> HeldOut:
-    """What `measured` looks at; same for equal seeds.
+    """Samples for `measure_errors`; the same for equal seeds.
 
     Args:
-        photographs: of other views, [3, H, W] in [-1, 1], and the object in them, bool [H, W]. The reference's hole is
-            put where least of the object is.
+        photographs: other views [3, H, W] in [-1, 1] with the object's mask, bool [H, W]. The hole of the reference is
+            placed where it overlaps least with the object.
     """
-    own = held_out_samples(references, size, seed)
-    hole = own.masks[0]
-    pictures, repaint, holes = [own.images[0]], [hole], [hole]
+    reference = held_out_samples(references, size, seed)
+    hole = reference.masks[0]
+    pictures, repaint, holes = [reference.images[0]], [hole], [hole]
     for image, hidden in photographs:
-        thing = two_scale_masks(hidden, [], size)[0]
-        steps = [round(k * size / SHIFTS) for k in range(SHIFTS)]
-        places = [hole.roll((down, right), (1, 2)) for down in steps for right in steps]
-        place = min(places, key=lambda each: float((each * thing).sum()))
-        if (known := place * (1 - thing)).any():
+        object_mask = two_scale_masks(hidden, [], size)[0]
+        steps = [round(k * size / SHIFTS_PER_SIDE) for k in range(SHIFTS_PER_SIDE)]
+        shifted_holes = [hole.roll((down, right), (1, 2)) for down in steps for right in steps]
+        shifted_hole = min(shifted_holes, key=lambda each: float((each * object_mask).sum()))
+        if (known := shifted_hole * (1 - object_mask)).any():
             pictures.append(two_scales(image, [], size)[0])
-            repaint.append(torch.maximum(place, thing))
+            repaint.append(torch.maximum(shifted_hole, object_mask))
             holes.append(known)
-    return HeldOut(own, *(torch.stack(each) for each in (pictures, repaint, holes)))
+    return HeldOut(reference, *(torch.stack(each) for each in (pictures, repaint, holes)))
 
 
-def measured(prior: Prior, held: HeldOut, seed: int, each: Callable[..., Iterable] = map) -> dict[str, float]:
-    """The errors of docs/traces.md, with fixed noise: comparable through the training. A small model takes about the
-    time of a step of training.
+def measure_errors(
+    prior: Prior, held: HeldOut, seed: int, map_parts: Callable[..., Iterable] = map
+) -> dict[str, float]:
+    """The errors listed in docs/traces.md, with fixed noise, so that they are comparable during training.
+
+    With a small model this takes about as long as one training step.
 
     Args:
-        each: like `map`; may do several at once.
+        map_parts: like `map`; may run several calls at once.
     """
     lora.set_dropout(prior, False)
-    parts = [partial(_errors, prior, held, seed, level) for level in LEVELS] + [partial(_expected, prior, held, seed)]
-    *errors, expected = each(lambda part: part(), parts)
+    parts = [partial(_hole_errors, prior, held, seed, level) for level in NOISE_LEVELS] + [
+        partial(_one_step_psnr, prior, held, seed)
+    ]
+    *errors, psnr = map_parts(lambda part: part(), parts)
     target, clean = torch.stack(errors).mean(0)
-    said = {"target_mse": float(target[0]), "clean_latent_mse": float(clean[0]), "crop_latent_mse": float(clean[1])}
-    return said | expected
+    result = {"target_mse": float(target[0]), "clean_latent_mse": float(clean[0]), "crop_latent_mse": float(clean[1])}
+    return result | psnr
 
 
 @torch.no_grad()
-def _errors(prior: Prior, held: HeldOut, seed: int, level: float) -> Tensor:
-    """[2, B]: those of the reference's own hole, at a level of the noise; see `denoising_error`."""
+def _hole_errors(prior: Prior, held: HeldOut, seed: int, level: float) -> Tensor:
+    """[2, B]: both errors of `denoising_error` in the hole of the reference, at one noise level."""
     samples = held.reference
     timesteps = torch.full((len(samples.prompts),), round(level * (prior.timesteps - 1)))
-    draw = seeded(seed, "personalize", "held out", level)
-    noise = torch.randn(len(samples.prompts), *latent_shape(prior, samples.images.shape[-1]), generator=draw)
+    generator = seeded(seed, "personalize", "held out", level)
+    noise = torch.randn(len(samples.prompts), *latent_shape(prior, samples.images.shape[-1]), generator=generator)
     text = diffusion.embed_text(prior, list(PROMPTS))
     return torch.stack(denoising_error(prior, samples, text, timesteps, noise, outside_weight=0))
 
 
 @torch.no_grad()
-def _expected(prior: Prior, held: HeldOut, seed: int) -> dict[str, float]:
-    """PSNR of the reference's hole, and of those in photographs, as the prior expects them from pure noise, in a step:
-    the mean of what it would paint."""
+def _one_step_psnr(prior: Prior, held: HeldOut, seed: int) -> dict[str, float]:
+    """PSNR of the hole in the reference and of those in photographs, for one denoising step from pure noise.
+
+    One step predicts the mean of what the prior would paint.
+    """
     text = diffusion.embed_text(prior, [PROMPTS[GLOBAL]]).expand(len(held.pictures), -1, -1)
     images, repaint, holes = (each.to(prior.device) for each in (held.pictures, held.repaint, held.holes))
-    draw = seeded(seed, "personalize", "expected")
-    made = diffusion.sample(prior, images, repaint, text, steps=1, random=draw)
-    squared = (((made - images) / 2).square().mean(1, keepdim=True) * holes).sum((1, 2, 3)) / holes.sum((1, 2, 3))
-    found = {"hole_psnr": decibels(float(squared[0]))}
-    return found | ({"photo_psnr": decibels(float(squared[1:].mean()))} if len(squared) > 1 else {})
+    generator = seeded(seed, "personalize", "expected")
+    sampled = diffusion.sample(prior, images, repaint, text, steps=1, random=generator)
+    squared_error = (((sampled - images) / 2).square().mean(1, keepdim=True) * holes).sum((1, 2, 3)) / holes.sum(
+        (1, 2, 3)
+    )
+    result = {"hole_psnr": decibels(float(squared_error[0]))}
+    return result | ({"photo_psnr": decibels(float(squared_error[1:].mean()))} if len(squared_error) > 1 else {})

@@ -1,4 +1,4 @@
-"""Windows of a view around its masked pixels, and a view at two scales: what SDS and personalization are shown."""
+"""Windows around masked pixels, and views at two scales: the inputs of SDS and personalization."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from torch import Tensor
 
 
 def window_around(mask: Tensor, size: int, generator: torch.Generator) -> tuple[int, int]:
-    """(top, left) of a size x size window inside the view that shows a randomly drawn masked pixel.
+    """(top, left) of a random size x size window inside the view that contains a masked pixel.
 
-    PAPER leaves open: how a patch is drawn from the mask's box. A box may be mostly unmasked (a ring, two objects),
-    so a masked pixel is drawn first, then its place in the window; the window is pushed back inside the view.
+    PAPER leaves open: how a patch is sampled from the bounding box of the mask. A box may be mostly unmasked (a ring,
+    two objects), so a masked pixel is sampled first, then its position in the window. The window is moved inside the
+    view.
 
     Args:
         mask: [H, W] bool with at least one True pixel.
@@ -21,7 +22,7 @@ def window_around(mask: Tensor, size: int, generator: torch.Generator) -> tuple[
 
 
 def windows_around(mask: Tensor, size: int, count: int, generator: torch.Generator) -> Tensor:
-    """[count, 2] long: (top, left) of each of `count` windows, drawn independently as by `window_around`."""
+    """[count, 2] long: (top, left) of `count` independent windows as of `window_around`."""
     height, width = mask.shape
     if size > min(height, width):
         raise ValueError(f"a window of {size} px does not fit into a view of {width} x {height} px; enlarge it first")
@@ -35,7 +36,7 @@ def windows_around(mask: Tensor, size: int, count: int, generator: torch.Generat
 
 
 def enlarged(image: Tensor, size: int) -> Tensor:
-    """[C, H, W] -> the same image, bilinearly enlarged where needed so that a window of `size` px fits into it."""
+    """[C, H, W] -> the same image, enlarged bilinearly if needed so that a window of `size` px fits into it."""
     height, width = image.shape[-2:]
     factor = size / min(height, width)
     if factor <= 1:
@@ -45,14 +46,15 @@ def enlarged(image: Tensor, size: int) -> Tensor:
 
 
 def two_scales(image: Tensor, windows: list[tuple[int, int]], size: int) -> Tensor:
-    """The whole view resized to size x size, then its patches in full resolution (section 4.2).
+    """The whole view resized to size x size, and patches in full resolution (section 4.2).
 
-    PAPER leaves open: whether the bilinear reduction is antialiased. It is: each rendered pixel then receives a
-    share of the global gradient, where plain bilinear sampling of a large view would skip most of them.
+    PAPER leaves open: whether the bilinear reduction is antialiased. It is, so that each rendered pixel receives a part
+    of the global gradient; plain bilinear sampling of a large view would skip most pixels.
 
     Args:
         image: [C, H, W].
         windows: (top, left) of each patch.
+
     Returns:
         [1 + len(windows), C, size, size], differentiable in `image`.
     """
@@ -64,6 +66,6 @@ def two_scales(image: Tensor, windows: list[tuple[int, int]], size: int) -> Tens
 def two_scale_masks(mask: Tensor, windows: list[tuple[int, int]], size: int) -> Tensor:
     """`two_scales` of a bool [H, W] mask -> [1 + len(windows), 1, size, size] float, 1 = repaint.
 
-    A reduced pixel is repainted as soon as any part of it was masked: what is masked must not reach the UNet.
+    A reduced pixel is repainted if any part of it is masked, because masked content must not reach the UNet.
     """
     return (two_scales(mask.to(torch.float32)[None], windows, size) > 1e-4).to(torch.float32)

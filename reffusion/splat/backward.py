@@ -1,7 +1,7 @@
-"""Gradients of blending, tile by tile, front to back with the arithmetic of `forward` (docs/splatting.md).
+"""Gradients of blending, per tile, front to back with the arithmetic of `forward` (docs/splatting.md).
 
-Each footprint-tile pair leaves one record; the records of a footprint are then added in a fixed order, so the result
-does not depend on the number of threads.
+Each footprint-tile pair writes one record. The records of a footprint are then added in a fixed order, so that results
+do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from reffusion.splat.forward import (
     AT_ROW,
     STEP_ROWS,
     STEPS,
-    aligned,
-    corner,
-    finished,
+    allocate_vectors,
+    blend_pixels,
+    footprint_in_tile,
+    init_transmittance,
+    is_finished,
+    load_constants,
     log_alpha,
-    meet,
     next_tile,
-    open_tile,
     or_none,
-    shape,
-    working_numbers,
+    tile_corner,
 )
 from reffusion.splat.layout import (
     AHEAD,
@@ -43,23 +43,22 @@ from reffusion.splat.layout import (
     TILE_WIDTH,
 )
 
-_UPSTREAM = (
-    6  # vectors of a step before those of features: transmittance, remainder, upstream gradients of r, g, b, depth
-)
+# Vectors per step before those of features: transmittance, remainder, upstream gradients of r, g, b, depth.
+_UPSTREAM = 6
 
 
 def blend_backward(footprints, features, bins, used, images, transmittance, gradients):
-    """One gradient record per footprint-tile pair.
+    """Compute one gradient record per footprint-tile pair.
 
     Args:
         footprints: [>= N, FOOTPRINT] flat; features: [N, C]; bins: see `binning`.
-        images: color [H, W, 3], depth [H, W], alpha [H, W], features [H, W, C] as `blend` returned them.
+        images: color [H, W, 3], depth [H, W], alpha [H, W], features [H, W, C] from `blend`.
         used, transmittance: from `blend`.
-        gradients: dLoss/d(color, depth, alpha, features), shaped like them.
+        gradients: dLoss/d(color, depth, alpha, features), of the same shapes.
 
     Returns:
-        records [I, columns] float32 ordered by Gaussian, its first GRAD_FEATURES + C columns those of `layout`; written
-        [I] bool, which of them mean anything: a pair that no pixel takes has none.
+        records [I, columns] float32 ordered by Gaussian, with the first GRAD_FEATURES + C columns as in `layout`; and
+        written [I] bool, which of them are valid: a pair that no pixel blends has none.
     """
     columns = record_columns(features.shape[1])
     records, written = empty_aligned(len(bins.entries), columns), np.zeros(len(bins.entries), np.bool_)
@@ -69,7 +68,7 @@ def blend_backward(footprints, features, bins, used, images, transmittance, grad
 
 
 def record_columns(channels: int) -> int:
-    """Floats of a gradient record, whole cache lines."""
+    """Floats per gradient record, rounded up to whole cache lines."""
     return -(-(GRAD_FEATURES + channels) // 16) * 16
 
 
@@ -93,7 +92,11 @@ def _blend_backward(
     written,
 ):
     channels = blended.shape[2]
-    state, sums, numbers = aligned(STEPS * (_UPSTREAM + channels)), aligned(channels), working_numbers()
+    state, sums, constants = (
+        allocate_vectors(STEPS * (_UPSTREAM + channels)),
+        allocate_vectors(channels),
+        load_constants(),
+    )
     flat = records.reshape(-1)
     images = color, depth, alpha, blended, transmittance
     gradients = grad_color, grad_depth, grad_alpha, grad_blended
@@ -101,25 +104,26 @@ def _blend_backward(
         tile = next_tile(tickets, used.shape[0])
         if tile < 0:
             return
-        left, top = corner(tile, depth.shape[1])
+        left, top = tile_corner(tile, depth.shape[1])
         _load_tile(left, top, state, (_UPSTREAM + channels) * LANES, images, gradients)
         start = bins.starts[tile]
         _tile_backward(
-            left, top, start, start + used[tile], footprints, features, bins, state, sums, numbers, flat, written
+            left, top, start, start + used[tile], footprints, features, bins, state, sums, constants, flat, written
         )
 
 
 @kernel
 def _load_tile(left, top, state, stride, images, gradients):
-    """Upstream gradients of the blended sums, and the remainder: upstream dotted with all that was blended.
+    """Load upstream gradients of the blended sums, and the remainder: their dot product with the rendered pixel.
 
-    depth = D / alpha and alpha = 1 - transmittance: D receives grad_depth / alpha, alpha loses depth times that.
+    With depth = D / alpha and alpha = 1 - transmittance, D receives grad_depth / alpha, and alpha minus depth times
+    that.
     """
     color, depth, alpha, blended, transmittance = images
     grad_color, grad_depth, grad_alpha, grad_blended = gradients
     height, width = depth.shape
     state[:] = np.float32(0.0)
-    open_tile(state, stride, height - top, width - left)
+    init_transmittance(state, stride, height - top, width - left)
     for row in range(min(TILE_HEIGHT, height - top)):
         y = top + row
         for lane in range(min(TILE_WIDTH, width - left)):
@@ -139,22 +143,24 @@ def _load_tile(left, top, state, stride, images, gradients):
 
 
 @kernel
-def _tile_backward(left, top, start, stop, footprints, features, bins, state, sums, numbers, records, written):
+def _tile_backward(left, top, start, stop, footprints, features, bins, state, sums, constants, records, written):
     """Write the records of one tile's list."""
     columns = records.shape[0] // max(1, written.shape[0])
     stride = _UPSTREAM * LANES
     if features is not None:
         stride += features.shape[1] * LANES
     for at in range(start, stop):
-        soon = min(at + AHEAD, stop - 1)
-        prefetch(footprints, bins.entries[soon, MEMBER] * FOOTPRINT)
-        prefetch(records, bins.entries[soon, SLOT] * columns)
+        upcoming = min(at + AHEAD, stop - 1)
+        prefetch(footprints, bins.entries[upcoming, MEMBER] * FOOTPRINT)
+        prefetch(records, bins.entries[upcoming, SLOT] * columns)
         member, rows, slot = bins.entries[at, MEMBER], bins.entries[at, ROWS], bins.entries[at, SLOT]
         if features is not None:
             sums[:] = np.float32(0.0)
-        touched, to_all = _rows_backward(member, rows, left, top, footprints, features, state, stride, sums, numbers)
-        written[slot] = touched
-        if not touched:
+        is_touched, to_all = _rows_backward(
+            member, rows, left, top, footprints, features, state, stride, sums, constants
+        )
+        written[slot] = is_touched
+        if not is_touched:
             continue
         store_totals(records, slot * columns, to_all)
         if features is not None:
@@ -163,38 +169,38 @@ def _tile_backward(left, top, start, stop, footprints, features, bins, state, su
 
 
 @inlined
-def _rows_backward(member, rows, left, top, footprints, features, state, stride, sums, numbers):
-    """One footprint in the rows of a tile.
+def _rows_backward(member, rows, left, top, footprints, features, state, stride, sums, constants):
+    """Backward pass of one footprint in the rows of a tile.
 
     Returns:
-        Whether any pixel takes it; by lane, the first ten columns of its record.
+        Whether any pixel blends it; and per lane the first ten columns of its record.
     """
     zero = splat(0.0)
     base, first_row, end_row = member * FOOTPRINT, rows & 255, rows >> 8
     middle = np.float32((first_row + end_row) // 2)
-    # The same bits as forward decide what is blended; the sums are about the middle row, where they lose least.
-    seen = shape(footprints, base, left, top, np.float32(0.0))
-    about = shape(footprints, base, left, top, middle)
+    # Blending is decided with the same bits as in forward; sums are about the middle row, where they lose least.
+    footprint = footprint_in_tile(footprints, base, left, top, np.float32(0.0))
+    centered_footprint = footprint_in_tile(footprints, base, left, top, middle)
     red, green = splat_at(footprints, base + RED), splat_at(footprints, base + GREEN)
-    blue, far = splat_at(footprints, base + BLUE), splat_at(footprints, base + DEPTH)
-    g_0 = g_1 = g_2 = to_red = to_green = to_blue = to_far = zero
-    touched = False
+    blue, depth = splat_at(footprints, base + BLUE), splat_at(footprints, base + DEPTH)
+    g_0 = g_1 = g_2 = to_red = to_green = to_blue = to_depth = zero
+    is_touched = False
     for step in range(first_row // STEP_ROWS, (end_row + STEP_ROWS - 1) // STEP_ROWS):
         place = step * stride
         before = load(state, place)
-        row = load(numbers, (AT_ROW + step) * LANES)
-        power = log_alpha(seen, row)
-        above = power >= load(numbers, AT_CUT * LANES)
-        if not some(above & (before > zero)):
+        row = load(constants, (AT_ROW + step) * LANES)
+        power = log_alpha(footprint, row)
+        is_above_cut = power >= load(constants, AT_CUT * LANES)
+        if not some(is_above_cut & (before > zero)):
             continue
-        touched = True
-        raw, alpha, weight, after = meet(power, above, before, numbers)
+        is_touched = True
+        raw, alpha, weight, after = blend_pixels(power, is_above_cut, before, constants)
         store(state, place, after)
         up_red, up_green = load(state, place + 2 * LANES), load(state, place + 3 * LANES)
-        up_blue, up_far = load(state, place + 4 * LANES), load(state, place + 5 * LANES)
-        shade = fma(far, up_far, fma(blue, up_blue, fma(green, up_green, red * up_red)))
+        up_blue, up_depth = load(state, place + 4 * LANES), load(state, place + 5 * LANES)
+        shade = fma(depth, up_depth, fma(blue, up_blue, fma(green, up_green, red * up_red)))
         to_red, to_green = fma(weight, up_red, to_red), fma(weight, up_green, to_green)
-        to_blue, to_far = fma(weight, up_blue, to_blue), fma(weight, up_far, to_far)
+        to_blue, to_depth = fma(weight, up_blue, to_blue), fma(weight, up_depth, to_depth)
         if features is not None:
             for c in range(features.shape[1]):
                 up = load(state, place + (_UPSTREAM + c) * LANES)
@@ -204,17 +210,17 @@ def _rows_backward(member, rows, left, top, footprints, features, state, stride,
         store(state, place + LANES, behind)
         # g = dLoss/d(ln alpha) = alpha (transmittance shade - behind / (1 - alpha)), 0 where clamped or not blended
         g = fnma(behind, alpha / (splat(1.0) - alpha), weight * shade)
-        g = select((after > zero) & (raw < load(numbers, AT_MAX_ALPHA * LANES)), g, zero)
+        g = select((after > zero) & (raw < load(constants, AT_MAX_ALPHA * LANES)), g, zero)
         j = row - splat(middle)
         gj = g * j
         g_0, g_1, g_2 = g_0 + g, g_1 + gj, fma(gj, j, g_2)
-    return touched, (*_moments(about, g_0, g_1, g_2), to_far, to_red, to_green, to_blue)
+    return is_touched, (*_moments(centered_footprint, g_0, g_1, g_2), to_depth, to_red, to_green, to_blue)
 
 
 @inlined
-def _moments(seen, g_0, g_1, g_2):
-    """From sums of g, g j, g j^2 in each lane to those of g, g u, g v, g u^2, g u v, g v^2 (`forward.shape`)."""
-    u_middle, lean, v_middle, whiten_y, _ = seen
+def _moments(footprint, g_0, g_1, g_2):
+    """From sums of g, g j, g j^2 per lane to those of g, g u, g v, g u^2, g u v, g v^2 (`footprint_in_tile`)."""
+    u_middle, lean, v_middle, whiten_y, _ = footprint
     g_u, g_uj = fnma(lean, g_1, u_middle * g_0), fnma(lean, g_2, u_middle * g_1)
     g_v, g_vj = fma(whiten_y, g_1, v_middle * g_0), fma(whiten_y, g_2, v_middle * g_1)
     g_uu, g_uv = fnma(lean, g_uj, u_middle * g_u), fnma(lean, g_vj, u_middle * g_v)
@@ -222,10 +228,10 @@ def _moments(seen, g_0, g_1, g_2):
 
 
 def gather_values(footprints, bins, values, count):
-    """Per footprint-tile pair, ordered by Gaussian: pixel sums of weight x value (`count`: of value).
+    """Sums over pixels of weight x value (`count`: of value) per footprint-tile pair, ordered by Gaussian.
 
     Returns:
-        records [I, columns], written [I]: as `blend_backward` does.
+        records [I, columns] and written [I], as of `blend_backward`.
     """
     columns = -(-values.shape[2] // 16) * 16
     records, written = np.zeros((len(bins.entries), columns), np.float32), np.zeros(len(bins.entries), np.bool_)
@@ -237,51 +243,51 @@ def gather_values(footprints, bins, values, count):
 def _gather_values(tickets, footprints, bins, values, count, records, written):
     height, width, channels = values.shape
     stride = (1 + channels) * LANES
-    state = aligned(STEPS * (1 + channels))
-    sums, numbers = aligned(channels), working_numbers()
+    state = allocate_vectors(STEPS * (1 + channels))
+    sums, constants = allocate_vectors(channels), load_constants()
     while True:
         tile = next_tile(tickets, bins.starts.shape[0] - 1)
         if tile < 0:
             return
-        left, top = corner(tile, width)
+        left, top = tile_corner(tile, width)
         state[:] = np.float32(0.0)
-        open_tile(state, stride, height - top, width - left)
+        init_transmittance(state, stride, height - top, width - left)
         for row in range(min(TILE_HEIGHT, height - top)):
             for lane in range(min(TILE_WIDTH, width - left)):
                 place = row // STEP_ROWS * stride + row % STEP_ROWS * TILE_WIDTH + lane
                 for c in range(channels):
                     state[place + (1 + c) * LANES] = values[top + row, left + lane, c]
-        _gather_tile(left, top, tile, footprints, bins, count, channels, state, sums, numbers, records, written)
+        _gather_tile(left, top, tile, footprints, bins, count, channels, state, sums, constants, records, written)
 
 
 @kernel
-def _gather_tile(left, top, tile, footprints, bins, count, channels, state, sums, numbers, records, written):
-    """Write the records of one tile's list, its values being in `state`."""
+def _gather_tile(left, top, tile, footprints, bins, count, channels, state, sums, constants, records, written):
+    """Write the records of one tile's list, whose values are in `state`."""
     start, stop, stride = bins.starts[tile], bins.starts[tile + 1], (1 + channels) * LANES
     zero = splat(0.0)
     for at in range(start, stop):
-        if (at - start) % 32 == 31 and finished(state, stride):
+        if (at - start) % 32 == 31 and is_finished(state, stride):
             return
         member, rows, slot = bins.entries[at, MEMBER], bins.entries[at, ROWS], bins.entries[at, SLOT]
-        seen = shape(footprints, member * FOOTPRINT, left, top, np.float32(0.0))
+        footprint = footprint_in_tile(footprints, member * FOOTPRINT, left, top, np.float32(0.0))
         for c in range(channels):
             store(sums, c * LANES, zero)
-        touched = False
+        is_touched = False
         for step in range((rows & 255) // STEP_ROWS, ((rows >> 8) + STEP_ROWS - 1) // STEP_ROWS):
             place = step * stride
             before = load(state, place)
-            power = log_alpha(seen, load(numbers, (AT_ROW + step) * LANES))
-            above = power >= load(numbers, AT_CUT * LANES)
-            if not some(above & (before > zero)):
+            power = log_alpha(footprint, load(constants, (AT_ROW + step) * LANES))
+            is_above_cut = power >= load(constants, AT_CUT * LANES)
+            if not some(is_above_cut & (before > zero)):
                 continue
-            touched = True
-            _, _, weight, after = meet(power, above, before, numbers)
+            is_touched = True
+            _, _, weight, after = blend_pixels(power, is_above_cut, before, constants)
             store(state, place, after)
             if count:
                 weight = select(weight > zero, splat(1.0), zero)
             for c in range(channels):
                 store(sums, c * LANES, fma(weight, load(state, place + (1 + c) * LANES), load(sums, c * LANES)))
-        written[slot] = touched
-        if touched:
+        written[slot] = is_touched
+        if is_touched:
             for c in range(channels):
                 records[slot, c] = total(load(sums, c * LANES))

@@ -1,6 +1,6 @@
-"""Which footprints touch which tiles: one sort by depth, then tile lists filled in that order.
+"""Lists of footprints per tile: one sort by depth, then lists filled in that order.
 
-The lists do not depend on how the work is shared among threads.
+The lists do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ from reffusion.splat.layout import (
 )
 
 _F = np.float32
-_ROOM = 16  # pairs to a footprint that room is made for at first; untouched room costs nothing
+_PAIRS_PER_FOOTPRINT = 16  # pairs per footprint for which memory is allocated first; unused memory costs nothing
 
 
 class Bins(NamedTuple):
     """Tile lists, front to back.
 
     Attributes:
-        starts: [tiles + 1] int64, where each tile's list begins; tiles in reading order.
-        entries: [I, ENTRY] int32, the lists one after the other, front to back (`layout`).
-        first_slots: [N + 1] int64, where each Gaussian's records begin: they are ordered by Gaussian.
+        starts: [tiles + 1] int64, start of each tile's list; tiles are in row-major order.
+        entries: [I, ENTRY] int32, the concatenated lists, each front to back (`layout`).
+        first_slots: [N + 1] int64, start of each Gaussian's records, which are ordered by Gaussian.
     """
 
     starts: np.ndarray
@@ -57,13 +57,13 @@ class Bins(NamedTuple):
 
 @kernel
 def depth_order(radii, footprints):
-    """Sort the Gaussians that have a radius by depth, equal depths by index (radix sort, stable).
+    """Sort the Gaussians with a positive radius by depth, equal depths by index (stable radix sort).
 
     Args:
         radii: [N] int32; footprints: [>= N, FOOTPRINT] flat.
 
     Returns:
-        [M] int32, their indices front to back.
+        [M] int32: indices front to back.
     """
     count = radii.shape[0]
     visible = 0
@@ -96,33 +96,35 @@ def depth_order(radii, footprints):
 
 
 def bin_footprints(footprints, order, count: int, width: int, height: int) -> Bins:
-    """Make the tile lists of an image.
+    """Build the tile lists of an image.
 
     Args:
         footprints: [>= N, FOOTPRINT] flat; order: [M] int32 front to back; count: N.
     """
     tiles = -(-width // TILE_WIDTH) * -(-height // TILE_HEIGHT)
-    part = -(-len(order) // CHUNKS) * _ROOM
+    capacity = -(-len(order) // CHUNKS) * _PAIRS_PER_FOOTPRINT
     while True:
-        first_slots, places = np.zeros(count + 1, np.int64), np.zeros((CHUNKS, tiles), np.int64)
-        pairs, needed = empty_aligned(CHUNKS, part, 2).view(np.int32), np.zeros(CHUNKS, np.int64)
-        parallel_for(_find_pairs, footprints, order, width, height, places, first_slots, pairs, needed, gaussians=count)
-        if needed.max() <= part:
+        first_slots, offsets = np.zeros(count + 1, np.int64), np.zeros((CHUNKS, tiles), np.int64)
+        pairs, needed = empty_aligned(CHUNKS, capacity, 2).view(np.int32), np.zeros(CHUNKS, np.int64)
+        parallel_for(
+            _find_pairs, footprints, order, width, height, offsets, first_slots, pairs, needed, gaussians=count
+        )
+        if needed.max() <= capacity:
             break
-        part = needed.max()
-    total = _counts_to_places(first_slots, places)
-    starts = np.append(places[0], total)
+        capacity = needed.max()
+    total = _cumulate_counts(first_slots, offsets)
+    starts = np.append(offsets[0], total)
     entries = empty_aligned(total, ENTRY).view(np.int32)
-    parallel_for(_fill_lists, order, places, first_slots, pairs, entries, gaussians=count)
+    parallel_for(_fill_lists, order, offsets, first_slots, pairs, entries, gaussians=count)
     return Bins(starts, entries, first_slots)
 
 
 @inlined
 def ellipse(slant, whiten_x, whiten_y, level):
-    """The alpha >= 1/255 ellipse of footprints, a little enlarged against rounding; all in float32 lanes.
+    """The ellipse alpha >= 1/255 of footprints, slightly enlarged against rounding; all as float32 vectors.
 
     Returns:
-        half width, half height, slope of the middle line y(dx), squared half-height of a column at dx = 0.
+        half width, half height, slope of the centre line y(dx), squared half-height of the column at dx = 0.
     """
     level = (level - CUT) * 1.00002 + 1e-4
     across = 1.0 / (whiten_x * whiten_x)  # variance of x at fixed y, x log2(e) / 2
@@ -133,7 +135,7 @@ def ellipse(slant, whiten_x, whiten_y, level):
 
 @inlined
 def _mean(footprints, base):
-    """The 2D mean, from the anchor and what is whitened there."""
+    """The 2D mean, from the anchor and the whitened coordinates there."""
     dy = footprints[base + ANCHOR_V] / footprints[base + WHITEN_Y]
     dx = footprints[base + ANCHOR_U] / footprints[base + WHITEN_X] + footprints[base + SLANT] * dy
     return footprints[base + ANCHOR_X] - dx, footprints[base + ANCHOR_Y] - dy
@@ -175,11 +177,12 @@ def _columns(mean_x, half_width, tiles_x):
 
 
 @kernel
-def _find_pairs(tickets, footprints, order, width, height, places, first_slots, pairs, needed):
-    """Tile and rows of each pair, in chunks of the order; how many there are, by tile and by Gaussian.
+def _find_pairs(tickets, footprints, order, width, height, counts_by_chunk, first_slots, pairs, needed):
+    """Find tile and rows of each pair, in chunks of the order, and count them by tile and by Gaussian.
 
     Args:
-        pairs: [CHUNKS, room, 2] int32, written as far as there is room; needed: [CHUNKS], how much it takes.
+        pairs: [CHUNKS, capacity, 2] int32, output up to the capacity.
+        needed: [CHUNKS], output, the number of pairs.
     """
     tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
     tops, bottoms = np.empty(LANES, np.int32), np.empty(LANES, np.int32)
@@ -187,11 +190,11 @@ def _find_pairs(tickets, footprints, order, width, height, places, first_slots, 
         ticket = take_ticket(tickets)
         if ticket >= CHUNKS:
             return
-        counts, found, at = places[ticket], pairs[ticket], 0
+        counts, chunk_pairs, position = counts_by_chunk[ticket], pairs[ticket], 0
         stop = (ticket + 1) * len(order) // CHUNKS
         for m in range(ticket * len(order) // CHUNKS, stop):
             prefetch(footprints, order[min(m + AHEAD, stop - 1)] * FOOTPRINT)
-            base, begin = order[m] * FOOTPRINT, at
+            base, begin = order[m] * FOOTPRINT, position
             first, last = _columns(_mean(footprints, base)[0], footprints[base + HALF_WIDTH], tiles_x)
             for start in range(first, last, LANES):
                 _column_rows(footprints, base, start, width, height, tops, bottoms)
@@ -201,46 +204,48 @@ def _find_pairs(tickets, footprints, order, width, height, places, first_slots, 
                         continue
                     for tile_row in range(top // TILE_HEIGHT, (bottom - 1) // TILE_HEIGHT + 1):
                         tile, tile_top = tile_row * tiles_x + start + k, tile_row * TILE_HEIGHT
-                        if at < found.shape[0]:
+                        if position < chunk_pairs.shape[0]:
                             counts[tile] += 1
-                            found[at, 0] = tile
-                            found[at, 1] = max(top - tile_top, 0) + 256 * min(bottom - tile_top, TILE_HEIGHT)
-                        at += 1
-            first_slots[order[m] + 1] = at - begin
-        needed[ticket] = at
+                            chunk_pairs[position, 0] = tile
+                            chunk_pairs[position, 1] = max(top - tile_top, 0) + 256 * min(
+                                bottom - tile_top, TILE_HEIGHT
+                            )
+                        position += 1
+            first_slots[order[m] + 1] = position - begin
+        needed[ticket] = position
 
 
 @kernel
-def _counts_to_places(first_slots, places):
-    """Running sums in place: by Gaussian, and by tile then chunk. Returns the number of pairs."""
+def _cumulate_counts(first_slots, counts):
+    """Turn counts into offsets by running sums in place: by Gaussian, and by tile then chunk. Returns their total."""
     for m in range(first_slots.shape[0] - 1):
         first_slots[m + 1] += first_slots[m]
     total = 0
-    for tile in range(places.shape[1]):
-        for chunk in range(places.shape[0]):
-            here = places[chunk, tile]
-            places[chunk, tile] = total
-            total += here
+    for tile in range(counts.shape[1]):
+        for chunk in range(counts.shape[0]):
+            count = counts[chunk, tile]
+            counts[chunk, tile] = total
+            total += count
     return total
 
 
 @kernel
-def _fill_lists(tickets, order, all_places, first_slots, pairs, entries):
-    """Write the pairs to their places."""
+def _fill_lists(tickets, order, all_offsets, first_slots, pairs, entries):
+    """Write the pairs into the tile lists."""
     while True:
         ticket = take_ticket(tickets)
         if ticket >= CHUNKS:
             return
-        places, found, at = all_places[ticket], pairs[ticket], 0
+        offsets, chunk_pairs, position = all_offsets[ticket], pairs[ticket], 0
         stop = (ticket + 1) * len(order) // CHUNKS
         for m in range(ticket * len(order) // CHUNKS, stop):
             prefetch(first_slots, order[min(m + AHEAD, stop - 1)])
             member = order[m]
             for slot in range(first_slots[member], first_slots[member + 1]):
-                tile = found[at, 0]
-                place = places[tile]
-                places[tile] = place + 1
-                entries[place, MEMBER] = member
-                entries[place, ROWS] = found[at, 1]
-                entries[place, SLOT] = slot
-                at += 1
+                tile = chunk_pairs[position, 0]
+                target = offsets[tile]
+                offsets[tile] = target + 1
+                entries[target, MEMBER] = member
+                entries[target, ROWS] = chunk_pairs[position, 1]
+                entries[target, SLOT] = slot
+                position += 1

@@ -1,13 +1,13 @@
 """The constants of the splatting model, shared by its implementations (docs/splatting.md)."""
 
-NEAR = 0.01  # camera z below which a Gaussian is left out, in units of the normalised frame
-LOW_PASS = 0.3  # px^2 added to the diagonal of the 2D covariance; of a sampled view, px of the view it is of
+NEAR = 0.01  # camera z below which a Gaussian is culled, in units of the normalised frame
+LOW_PASS = 0.3  # px^2 added to the diagonal of the 2D covariance; in a subsampled view, px of the full view
 MIN_ALPHA = 1.0 / 255.0  # fainter contributions are skipped
-MAX_ALPHA = 0.999  # stronger ones are cut; their gradient is then zero. gsplat has this value compiled in
-MIN_TRANSMITTANCE = 1e-4  # the Gaussian that would go below is not blended, and the pixel is finished
-JACOBIAN_MARGIN = 0.3  # x/z is clamped at the image border + this share of half the image, in the Jacobian only
-MAX_PIXELS = 1e7  # Gaussians whose 2D mean lies farther than this from the image are left out
-MAX_VARIANCE = 1e30  # px^2: those with a larger 2D variance are left out, too
+MAX_ALPHA = 0.999  # larger values are clamped, with zero gradient; compiled into gsplat
+MIN_TRANSMITTANCE = 1e-4  # a Gaussian that would go below is not blended, and the pixel is finished
+JACOBIAN_MARGIN = 0.3  # in the Jacobian, x/z is clamped at the image border + this share of half the image
+MAX_PIXELS = 1e7  # Gaussians whose 2D mean is farther than this from the image are culled
+MAX_VARIANCE = 1e30  # px^2; Gaussians with a larger 2D variance are culled
 
 # Real spherical harmonics in the order and with the signs of 3DGS.
 SH0 = 0.28209479177387814

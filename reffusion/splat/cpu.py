@@ -1,4 +1,4 @@
-"""Splatting on the CPU, compiled by numba: float32, all cores, the same bits for any number of threads."""
+"""Splatting on the CPU, compiled by numba: float32, all cores, bit for bit the same for any number of threads."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from reffusion.types import Camera, Gaussians, Rendering
 
 
 class View(NamedTuple):
-    """The Gaussians as they reach one view.
+    """The Gaussians projected into one view.
 
     Attributes:
         footprints: [padded(N), FOOTPRINT] float32 flat, see `layout`.
         radii: [padded(N)] int32.
-        bins: the tile lists.
+        bins: lists of Gaussians per tile.
     """
 
     footprints: np.ndarray
@@ -68,15 +68,23 @@ def _array(tensor: Tensor) -> np.ndarray:
 def project_and_bin(
     parameters: list[np.ndarray], antialiased: bool, probe: np.ndarray, camera: Camera, degree: int
 ) -> View:
-    """Project, sort and bin; `parameters` in the order of `types.PARAMETERS`."""
+    """Project, sort and bin the Gaussians; `parameters` are in the order of `types.PARAMETERS`."""
     count, rows = len(parameters[0]), footprints.padded(len(parameters[0]))
-    drawn, radii = empty_aligned(rows * FOOTPRINT), np.zeros(rows, np.int32)
-    seen_from = view_numbers(camera, antialiased), camera.center
+    footprint_array, radii = empty_aligned(rows * FOOTPRINT), np.zeros(rows, np.int32)
+    view_arguments = view_numbers(camera, antialiased), camera.center
     parallel_for(
-        footprints.draw, _flat(parameters, degree), probe.reshape(-1), *seen_from, drawn, radii, gaussians=count
+        footprints.project_gaussians,
+        _flat(parameters, degree),
+        probe.reshape(-1),
+        *view_arguments,
+        footprint_array,
+        radii,
+        gaussians=count,
     )
-    order = binning.depth_order(radii[:count], drawn)
-    return View(drawn, radii, binning.bin_footprints(drawn, order, count, camera.width, camera.height))
+    order = binning.depth_order(radii[:count], footprint_array)
+    return View(
+        footprint_array, radii, binning.bin_footprints(footprint_array, order, count, camera.width, camera.height)
+    )
 
 
 def _flat(parameters: list[np.ndarray], degree: int) -> footprints.Parameters:
@@ -126,13 +134,13 @@ class _Splat(torch.autograd.Function):
 def _to_parameters(
     view, records, written, parameters, channels, numbers, center, degree, want_probe
 ) -> list[np.ndarray]:
-    """Gradients of the parameters, in the order of `types.PARAMETERS`, of the features and of the probe."""
+    """Gradients of the parameters (in the order of `types.PARAMETERS`), of the features and of the probe."""
     count, rows = len(parameters[0]), footprints.padded(len(parameters[0]))
     shapes = [(rows, *array.shape[1:]) for array in parameters] + [(rows, channels), (rows if want_probe else 0, 2)]
     out = [empty_aligned(*shape) for shape in shapes]
     flat = [array.reshape(-1) for array in out]
     parallel_for(
-        footprints.draw_backward,
+        footprints.project_gaussians_backward,
         records.reshape(-1),
         written,
         view.bins.first_slots,

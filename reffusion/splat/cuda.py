@@ -1,8 +1,8 @@
 """Splatting on a CUDA GPU by gsplat 1.5, with the conventions of the other implementations.
 
-gsplat's `rasterization` in its parts, because the probe is added to the 2D means between two of them. What differs
-from `reference` and cannot be set: the transmittance stop is <= 1e-4 instead of <, and the conic is inverted from a
-float32 determinant (long needles lose digits).
+Calls the steps of gsplat's `rasterization` separately, because the probe is added to the 2D means between two of them.
+Two differences from `reference` cannot be configured: the transmittance limit is <= 1e-4 instead of <, and the conic is
+inverted from a float32 determinant (long needles lose digits).
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ _TILE = 16
 
 
 class _Footprints(NamedTuple):
-    """One view's footprints as gsplat passes them on, with a leading dimension of one view."""
+    """Footprints of one view as gsplat represents them, with a leading dimension for the view."""
 
     means: Tensor  # [1, N, 2]
     radii: Tensor  # [1, N, 2] int32
     depths: Tensor  # [1, N]
     conics: Tensor  # [1, N, 3]
     opacities: Tensor  # [1, N]
-    tiles: tuple[Tensor, Tensor]  # where each tile's list begins, and the lists
+    tiles: tuple[Tensor, Tensor]  # start of each tile's list, and the lists
 
 
 def require_gpu(means: Tensor) -> None:
-    """Raise ValueError unless there are a GPU, gsplat and tensors on that GPU."""
+    """Raise ValueError unless a GPU and gsplat are available and the tensors are on that GPU."""
     if not torch.cuda.is_available():
         raise ValueError("impl='cuda' needs a CUDA GPU and there is none here; take impl='cpu' or 'auto'")
     if not means.is_cuda or means.dtype != torch.float32:
@@ -39,7 +39,7 @@ def require_gpu(means: Tensor) -> None:
         from gsplat.cuda import _backend
     except ImportError as error:
         raise ValueError("impl='cuda' needs gsplat: `make gpu` installs it") from error
-    if _backend._C is None:  # it can be imported all the same
+    if _backend._C is None:  # it can be imported without its extension
         raise ValueError("impl='cuda' needs gsplat's compiled extension, and there is no nvcc to build it: `make gpu`")
 
 
@@ -71,10 +71,10 @@ def render(
         backgrounds=behind_all[None],
     )
     image, alpha = image[0], alpha[0, ..., 0]
-    drawn = alpha > 0
+    covered = alpha > 0
     return Rendering(
         color=image[..., :3],
-        depth=torch.where(drawn, image[..., 3], 0) / torch.where(drawn, alpha, 1),
+        depth=torch.where(covered, image[..., 3], 0) / torch.where(covered, alpha, 1),
         alpha=alpha,
         features=None if features is None else image[..., 4:],
         radii=(footprints.radii[0].amax(1) * visible).to(torch.int32),
@@ -115,11 +115,11 @@ def _project(gaussians: Gaussians, camera: Camera) -> _Footprints:
     like = gaussians.means
     pose = torch.as_tensor(camera.world_to_camera, dtype=like.dtype, device=like.device)
     intrinsics = torch.as_tensor(camera.intrinsics, dtype=like.dtype, device=like.device)
-    # gsplat divides by the length: the zero quaternion has to become the identity here
+    # gsplat divides by the length, so the zero quaternion is replaced by the identity here.
     zero = (gaussians.quaternions == 0).all(1, keepdim=True)
     quaternions = torch.where(zero, like.new_tensor([1.0, 0.0, 0.0, 0.0]), gaussians.quaternions)
     opacities = torch.sigmoid(gaussians.opacity_logits)
-    radii, means, depths, conics, kept = gsplat.fully_fused_projection(
+    radii, means, depths, conics, compensations = gsplat.fully_fused_projection(
         like,
         None,
         quaternions,
@@ -133,7 +133,7 @@ def _project(gaussians: Gaussians, camera: Camera) -> _Footprints:
         calc_compensations=gaussians.antialiased,
         opacities=opacities,
     )
-    opacities = opacities[None] if kept is None else opacities[None] * kept
+    opacities = opacities[None] if compensations is None else opacities[None] * compensations
     across, down = -(-camera.width // _TILE), -(-camera.height // _TILE)
     with torch.no_grad():
         _, pairs, lists = gsplat.isect_tiles(means, radii, depths, _TILE, across, down, n_images=1)

@@ -1,6 +1,6 @@
-"""View-dependent colour of one group of LANES Gaussians: spherical harmonics, and their gradients.
+"""View-dependent colours of LANES Gaussians by spherical harmonics, and their gradients.
 
-The direction is that from the camera to the Gaussian.
+Directions are from the camera to the Gaussian.
 """
 
 from __future__ import annotations
@@ -62,10 +62,10 @@ def colors(degree, basis, coefficients):
 
 @inlined
 def colors_backward(degree, basis, coefficients, red, green, blue, along):
-    """Replace the coefficients by their gradients, given those of the colours (0 where clamped).
+    """Overwrite the coefficients by their gradients, given those of the colours (0 where clamped).
 
     Args:
-        along: written, dLoss/dY_k, LANES values each.
+        along: output, dLoss/dY_k, LANES values each.
     """
     for k in range((degree + 1) * (degree + 1)):
         y, place = load(basis, k * LANES), 3 * k * LANES
@@ -80,7 +80,7 @@ def colors_backward(degree, basis, coefficients, red, green, blue, along):
 
 @inlined
 def direction_backward(degree, x, y, z, inverse, along):
-    """Gradient of the mean through the direction, given dLoss/dY_k."""
+    """Gradient of the mean through the viewing direction, given dLoss/dY_k."""
     gx = gy = gz = splat(0.0)
     if degree >= 1:
         gx, gy, gz = -SH1 * _at(along, 3), -SH1 * _at(along, 1), SH1 * _at(along, 2)

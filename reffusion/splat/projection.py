@@ -1,7 +1,7 @@
-"""Geometry of one group of LANES Gaussians: from their parameters to footprints, and back.
+"""Geometry of LANES Gaussians: from parameters to footprints, and the backward pass.
 
-Computed in float64: scales of any size stay finite and needles keep their gradients. What the pixels see is rounded to
-float32. Derivation of the backward pass: docs/splatting.md.
+Computed in float64, so that scales of any size stay finite and needles keep their gradients. Results for pixels are
+rounded to float32. Derivation of the backward pass: docs/splatting.md.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from reffusion.types import Camera
 
 _LOG2_E = 1.4426950408889634
 _HALF_LOG2_E = math.sqrt(0.5 * _LOG2_E)
-_UNSCALE = 1.0 / _HALF_LOG2_E  # a footprint's u and v are scaled by sqrt(log2(e) / 2)
+_UNSCALE = 1.0 / _HALF_LOG2_E  # u and v of a footprint are scaled by sqrt(log2(e) / 2)
 _LEAST_LEVEL = math.log2(MIN_ALPHA)
 
 
@@ -77,10 +77,10 @@ def _unit_quaternion(quaternions, row, last):
     y = widen(load_column(quaternions, 4, 2, row, last))
     z = widen(load_column(quaternions, 4, 3, row, last))
     square = w * w + x * x + y * y + z * z
-    some_length = square > 0.0
-    inverse = 1.0 / root(select(some_length, square, 1.0))
-    inverse = select(some_length, inverse, select(square <= 0.0, 0.0, square))  # not a number stays so
-    return select(some_length, w * inverse, 1.0), x * inverse, y * inverse, z * inverse, inverse
+    is_nonzero = square > 0.0
+    inverse = 1.0 / root(select(is_nonzero, square, 1.0))
+    inverse = select(is_nonzero, inverse, select(square <= 0.0, 0.0, square))  # NaN stays NaN
+    return select(is_nonzero, w * inverse, 1.0), x * inverse, y * inverse, z * inverse, inverse
 
 
 @inlined
@@ -134,9 +134,9 @@ def _cross(a, b):
 
 @inlined
 def _covariance(a, b, low):
-    """Of root [2, 3] with rows a and b: xx, xy, yy and determinant of root rootᵀ, and the determinant with low-pass.
+    """xx, xy, yy and determinant of root rootᵀ, for rows a and b of root [2, 3], and the determinant with low-pass.
 
-    Cauchy-Binet: the sum of the squared 2x2 minors has no cancellation where xx yy - xy^2 loses everything.
+    By Cauchy-Binet the determinant is the sum of squared 2x2 minors, without the cancellation of xx yy - xy^2.
     """
     xx, xy, yy = _dot(a, a), _dot(a, b), _dot(b, b)
     m0, m1, m2 = _cross(a, b)
@@ -146,7 +146,7 @@ def _covariance(a, b, low):
 
 @inlined
 def _frame(view, x, y, z_inverse, quaternions, log_scales, row, last):
-    """What forward and backward both start from: unit quaternion, rotation, projector, scales, rows of root [2, 3]."""
+    """Shared by forward and backward pass: unit quaternion, rotation, projector, scales, rows of root [2, 3]."""
     quaternion = _unit_quaternion(quaternions, row, last)
     rotation = _rotation(quaternion[0], quaternion[1], quaternion[2], quaternion[3])
     projector = _projector(view, x, y, z_inverse)
@@ -163,11 +163,12 @@ def project(view, mean, quaternions, log_scales, opacity_logits, row, last):
 
     Args:
         view: see `view_numbers`.
-        mean: their means, three float64 lanes.
-        quaternions, log_scales, opacity_logits: of all Gaussians, flat; row: the first of the group; last: of all.
+        mean: their means, three float64 vectors.
+        quaternions, log_scales, opacity_logits: of all Gaussians, flat.
+        row, last: the first Gaussian of the group, and the last of all.
 
     Returns:
-        Which are in front of the camera, opaque and small enough (a mask), and in float64 lanes: 2D mean x, y; slant,
+        A mask of those in front of the camera, opaque and small enough; and as float64 vectors: 2D mean x, y; slant,
         the two whitening factors and the level of a footprint; camera z; half width and height of the box around
         alpha >= 1/255.
     """
@@ -175,22 +176,22 @@ def project(view, mean, quaternions, log_scales, opacity_logits, row, last):
     z_inverse = 1.0 / z
     _, _, _, _, a, b = _frame(view, x, y, z_inverse, quaternions, log_scales, row, last)
     xx, xy, yy, sharp, determinant = _covariance(a, b, view[23])
-    kept = (z >= NEAR) & (xx < MAX_VARIANCE) & (yy < MAX_VARIANCE)
+    is_kept = (z >= NEAR) & (xx < MAX_VARIANCE) & (yy < MAX_VARIANCE)
     xx, yy = xx + view[23], yy + view[23]
     mean_x, mean_y = view[12] * x * z_inverse + view[14], view[13] * y * z_inverse + view[15]
     opacity = 1.0 / (1.0 + exponential(0.0 - widen(load_column(opacity_logits, 1, 0, row, last))))
     opacity = opacity * root(maximum(1.0 - view[22] * (1.0 - sharp / determinant), 0.0))
-    kept = kept & (opacity >= MIN_ALPHA)
+    is_kept = is_kept & (opacity >= MIN_ALPHA)
     level = log2(opacity)
     cut = root(maximum((level - _LEAST_LEVEL) * (2.0 / _LOG2_E), 0.0))
     whiten_x, whiten_y = _HALF_LOG2_E * root(yy / determinant), _HALF_LOG2_E / root(yy)
     reach_x, reach_y = ceiling(cut * root(xx)), ceiling(cut * root(yy))
-    return kept, mean_x, mean_y, xy / yy, whiten_x, whiten_y, level, z, reach_x, reach_y
+    return is_kept, mean_x, mean_y, xy / yy, whiten_x, whiten_y, level, z, reach_x, reach_y
 
 
 @inlined
 def in_image(view, mean_x, mean_y, reach_x, reach_y):
-    """Which boxes touch the image (a mask)."""
+    """A mask of the boxes that touch the image."""
     near_enough = (mean_x > -MAX_PIXELS) & (mean_x < MAX_PIXELS) & (mean_y > -MAX_PIXELS) & (mean_y < MAX_PIXELS)
     inside_x = (mean_x + reach_x > 0.0) & (mean_x - reach_x < view[20])
     inside_y = (mean_y + reach_y > 0.0) & (mean_y - reach_y < view[21])
@@ -199,7 +200,7 @@ def in_image(view, mean_x, mean_y, reach_x, reach_y):
 
 @inlined
 def anchor(view, mean_x, mean_y, slant, whiten_x, whiten_y):
-    """The point of the image nearest the 2D mean, and the whitened coordinates u and v there."""
+    """The point of the image nearest to the 2D mean, and the whitened coordinates u and v there."""
     x, y = minimum(maximum(mean_x, 0.0), view[20]), minimum(maximum(mean_y, 0.0), view[21])
     dx, dy = x - mean_x, y - mean_y
     return x, y, whiten_x * (dx - slant * dy), whiten_y * dy
@@ -207,14 +208,14 @@ def anchor(view, mean_x, mean_y, slant, whiten_x, whiten_y):
 
 @inlined
 def project_backward(view, mean, quaternions, log_scales, opacity_logits, row, last, moments):
-    """Gradients of LANES Gaussians' geometry.
+    """Gradients of the geometry of LANES Gaussians.
 
     Args:
         view, ..., last: as in `project`.
         moments: the columns of their gradient records (`layout`), LANES values each.
 
     Returns:
-        Gradients of the mean (3), quaternion (4), log-scales (3), opacity logit and 2D mean (2), float64 lanes.
+        Gradients of the mean (3), quaternion (4), log-scales (3), opacity logit and 2D mean (2), as float64 vectors.
     """
     x, y, z = camera_point(view, mean)
     z_inverse = 1.0 / z
@@ -274,9 +275,10 @@ def _root_backward(a, b, slant, lx, ly, moments):
 
 @inlined
 def _compensation_backward(a, b, sharp, determinant, low, grad, grad_a, grad_b):
-    """Add what ln sqrt(sharp / determinant) owes to root: `grad` times half the gradients of the two logarithms.
+    """Add the gradient of ln sqrt(sharp / determinant) by root: `grad` times half the gradients of the two logarithms.
 
-    The minors' gradient is a cross product, again without cancellation. Where sharp is 0, nothing is drawn: grad is 0.
+    The gradient of the minors is a cross product, again without cancellation. Where sharp is 0, nothing is rendered and
+    grad is 0.
     """
     m = _cross(a, b)
     sharpness = grad * (1.0 / maximum(sharp, 1e-300) - 1.0 / determinant)
@@ -299,10 +301,11 @@ def _moved_row(grad, by, sharpness, row, width):
 
 @inlined
 def _quaternion_backward(quaternion, p, ga, gb):
-    """Through the rotation matrix; tangential to the unit sphere, divided by the length; zero stays zero.
+    """Gradient through the rotation matrix: tangential to the unit sphere, divided by the length; zero stays zero.
 
     Args:
-        p: the projector's rows; ga, gb: dLoss/d(root) diag(scales), its rows.
+        p: rows of the projector.
+        ga, gb: rows of dLoss/d(root) diag(scales).
     """
     w, x, y, z, inverse = quaternion
     p0, p1 = p
@@ -324,9 +327,9 @@ def _quaternion_backward(quaternion, p, ga, gb):
 
 @inlined
 def _projector_backward(view, x, y, z_inverse, r, p, ga, gb):
-    """Through the projector's rows fx/z (R0 - slope_x R2) and fy/z (R1 - slope_y R2) to camera coordinates.
+    """Gradient through the projector's rows fx/z (R0 - slope_x R2) and fy/z (R1 - slope_y R2) to camera coordinates.
 
-    What the slopes x/z and y/z owe to z is left to the caller, who has the same term for the 2D mean.
+    The caller adds the dependence of the slopes x/z and y/z on z, which has the same form for the 2D mean.
     """
     gp0 = _dot(ga, r[0]), _dot(ga, r[1]), _dot(ga, r[2])
     gp1 = _dot(gb, r[0]), _dot(gb, r[1]), _dot(gb, r[2])

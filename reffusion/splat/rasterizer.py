@@ -1,7 +1,7 @@
-"""3D Gaussian splatting: one call, three implementations of the same conventions (docs/splatting.md).
+"""3D Gaussian splatting: one interface, three implementations of the same conventions (docs/splatting.md).
 
-`reference` is plain torch in the dtype it is given (the oracle of the tests), `cpu` is compiled by numba,
-`cuda` is gsplat. Each is imported when it is first asked for.
+`reference` is plain torch in any dtype (the oracle of the tests), `cpu` is compiled by numba, and `cuda` is gsplat.
+Each is imported at its first use.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ def render(
     sh_degree: int | None = None,
     probe: Tensor | None = None,
 ) -> Rendering:
-    """Draw the Gaussians: colour, depth, alpha and blended features in one pass, differentiable in all of them.
+    """Render Gaussians: colour, depth, alpha and blended features in one pass, all differentiable.
 
     Args:
-        gaussians: N of them, N = 0 allowed. Those the conventions leave out (docs/splatting.md) get zero gradients.
-        camera: the view; any size from 1 x 1.
+        gaussians: N Gaussians, N = 0 allowed. Culled ones (docs/splatting.md) get zero gradients.
+        camera: the view, of size 1 x 1 or larger.
         features: [N, C] values to blend like colours, over a background of zeros; differentiable.
         background: [3] colour behind everything, black if None; differentiable.
-        impl: "auto" takes "cuda" for tensors on a GPU, else "cpu". "reference" also takes float64 and any device.
+        impl: "auto" selects "cuda" for tensors on a GPU, else "cpu". "reference" supports float64 and any device.
         sh_degree: highest degree of spherical harmonics used, 0 to the stored one (the default).
-        probe: [N, 2] added to the 2D means, in pixels; give zeros that require a gradient to read
-            dLoss/d(2D mean) from them after the backward pass.
+        probe: [N, 2] added to the 2D means, in pixels. Pass zeros that require a gradient; after the backward pass
+            their gradient is dLoss/d(2D mean).
 
     Returns:
-        A Rendering on the Gaussians' device, of their dtype.
+        A Rendering on the device and of the dtype of the Gaussians.
 
     Raises:
-        ValueError: shapes, dtypes or devices that do not fit together, or "cuda" without a GPU.
+        ValueError: shapes, dtypes or devices do not match, or "cuda" is not available.
     """
     _check_gaussians(gaussians, camera)
     count, means = len(gaussians), gaussians.means
@@ -61,7 +61,7 @@ def render(
 
 
 def prepare(device: str) -> None:
-    """Load what draws on this device, before a clock runs: gsplat compiles its extension when it is first loaded."""
+    """Load the implementation for a device before time is measured: gsplat compiles its extension when first loaded."""
     if torch.device(device).type == "cuda":
         _implementation("cuda", torch.zeros(1, device=device))
 
@@ -70,13 +70,13 @@ def prepare(device: str) -> None:
 def accumulate(
     gaussians: Gaussians, camera: Camera, values: Tensor, *, impl: Implementation = "auto", count: bool = False
 ) -> Tensor:
-    """What each Gaussian gathers from the pixels: sum over pixels of blending weight x value. Not differentiable.
+    """Sum of blending weight x value over the pixels, for each Gaussian. Not differentiable.
 
-    With `values` = 1 - mask and mask side by side, the two columns are the votes of the paper's mask lifting.
+    With 1 - mask and mask as two channels of `values`, the columns are the votes of the paper's mask lifting.
 
     Args:
-        values: [H, W, C] of the Gaussians' dtype.
-        count: add the value itself wherever the Gaussian is blended, instead of its share by weight.
+        values: [H, W, C] of the dtype of the Gaussians.
+        count: use weight 1 wherever the Gaussian is blended.
 
     Returns:
         [N, C].

@@ -1,6 +1,6 @@
-"""Splatting in plain torch: slow, obviously right, in the dtype it is given; gradients come from autograd.
+"""Splatting in plain torch: slow and simple, in any dtype, with gradients from autograd.
 
-Every pixel looks at every Gaussian. In float64 this is the oracle that the fast implementations are held to.
+Every pixel evaluates every Gaussian. In float64 this is the oracle for the fast implementations.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from reffusion.splat.conventions import (
 )
 from reffusion.types import Camera, Gaussians, Rendering
 
-_CHUNK = 2**22  # pixel-Gaussian pairs held at once
+_CHUNK = 2**22  # pixel-Gaussian pairs in memory at once
 
 
 class Projected(NamedTuple):
     """The M Gaussians that reach the image, front to back.
 
     Attributes:
-        order: [M] their indices.
+        order: [M] indices of the Gaussians.
         means: [M, 2] pixels.
-        covariances: [M, 3] px^2: xx, xy, yy, low-pass included.
-        determinants: [M] px^4, of those.
+        covariances: [M, 3] px^2: xx, xy, yy, with low-pass.
+        determinants: [M] px^4, of these covariances.
         depths: [M] camera z.
         opacities: [M].
     """
@@ -66,10 +66,10 @@ def render(
     image = torch.cat(blended).reshape(camera.height, camera.width, -1)
     behind = torch.cat(transmittance).reshape(camera.height, camera.width)
     alpha = 1 - behind
-    drawn = alpha > 0
+    covered = alpha > 0
     return Rendering(
         color=image[..., :3] + behind[..., None] * background,
-        depth=torch.where(drawn, image[..., 3], 0) / torch.where(drawn, alpha, 1),
+        depth=torch.where(covered, image[..., 3], 0) / torch.where(covered, alpha, 1),
         alpha=alpha,
         features=None if features is None else image[..., 4:],
         radii=radii,
@@ -94,10 +94,10 @@ def accumulate(gaussians: Gaussians, camera: Camera, values: Tensor, count: bool
 
 
 def project(gaussians: Gaussians, camera: Camera, probe: Tensor | None) -> tuple[Projected, Tensor]:
-    """The Gaussians' footprints in the image (EWA splatting), sorted by depth, equal depths by index.
+    """Footprints of the Gaussians in the image (EWA splatting), sorted by depth, equal depths by index.
 
     Returns:
-        The footprints that reach the image, and radii [N] int32 of all (0 = left out).
+        The footprints that reach the image, and radii [N] int32 of all Gaussians (0 = culled).
     """
     like = gaussians.means
     pose = torch.as_tensor(camera.world_to_camera, dtype=like.dtype, device=like.device)
@@ -110,7 +110,7 @@ def project(gaussians: Gaussians, camera: Camera, probe: Tensor | None) -> tuple
     if probe is not None:
         means = means + probe[index]
 
-    # Jacobian of the projection, taken where x/z and y/z are clamped a little outside the image.
+    # Jacobian of the projection, with x/z and y/z clamped slightly outside the image.
     half_x, half_y = camera.width / 2 / camera.fx, camera.height / 2 / camera.fy
     right, left = (camera.width - camera.cx) / camera.fx, -camera.cx / camera.fx
     bottom, top = (camera.height - camera.cy) / camera.fy, -camera.cy / camera.fy
@@ -144,14 +144,14 @@ def project(gaussians: Gaussians, camera: Camera, probe: Tensor | None) -> tuple
         reach = torch.ceil(cut[:, None] * covariances[:, [0, 2]].sqrt())
         size = torch.tensor([camera.width, camera.height], dtype=like.dtype, device=like.device)
         near_enough = (means.abs() < MAX_PIXELS).all(1) & (xx < MAX_VARIANCE) & (yy < MAX_VARIANCE)
-        kept = (opacities >= MIN_ALPHA) & near_enough
-        kept &= ((means + reach > 0) & (means - reach < size)).all(1)
+        visible = (opacities >= MIN_ALPHA) & near_enough
+        visible &= ((means + reach > 0) & (means - reach < size)).all(1)
         radii = torch.zeros(len(gaussians), dtype=torch.int32, device=like.device)
-        radii[index[kept]] = reach[kept].amax(1).clamp(1, 2**30).to(torch.int32)
-        chosen = torch.nonzero(kept)[:, 0]
-        chosen = chosen[torch.sort(z[chosen], stable=True).indices]
-    every = (index, means, covariances, determinants, z, opacities)
-    return Projected(*(array[chosen] for array in every)), radii
+        radii[index[visible]] = reach[visible].amax(1).clamp(1, 2**30).to(torch.int32)
+        indices = torch.nonzero(visible)[:, 0]
+        indices = indices[torch.sort(z[indices], stable=True).indices]
+    columns = (index, means, covariances, determinants, z, opacities)
+    return Projected(*(array[indices] for array in columns)), radii
 
 
 def rotations(quaternions: Tensor) -> Tensor:
@@ -169,15 +169,15 @@ def rotations(quaternions: Tensor) -> Tensor:
 
 
 def colors(gaussians: Gaussians, camera: Camera, degree: int) -> Tensor:
-    """[N, 3] colours seen from the camera, max(0, 0.5 + sum_k Y_k(direction) sh_k)."""
+    """[N, 3]: colours in the direction from the camera, max(0, 0.5 + sum_k Y_k(direction) sh_k)."""
     center = torch.as_tensor(camera.center, dtype=gaussians.means.dtype, device=gaussians.means.device)
     weights = harmonics(gaussians.means - center, degree)
     return torch.clamp_min(0.5 + (weights[:, :, None] * gaussians.sh[:, : weights.shape[1]]).sum(1), 0)
 
 
-def harmonics(ways: Tensor, degree: int) -> Tensor:
-    """[..., (degree + 1)^2], the spherical harmonics of 3DGS in the directions [..., 3], of any length."""
-    x, y, z = (ways / ways.norm(dim=-1, keepdim=True).clamp_min(1e-30)).unbind(-1)
+def harmonics(directions: Tensor, degree: int) -> Tensor:
+    """[..., (degree + 1)^2]: the spherical harmonics of 3DGS in directions [..., 3] of any length."""
+    x, y, z = (directions / directions.norm(dim=-1, keepdim=True).clamp_min(1e-30)).unbind(-1)
     basis = [torch.full_like(x, SH0)]
     if degree >= 1:
         basis += [-SH1 * y, SH1 * z, -SH1 * x]
@@ -195,7 +195,7 @@ def blending_weights(projected: Projected, pixels: Tensor) -> tuple[Tensor, Tens
     """Front-to-back blending at pixel centres [P, 2].
 
     Returns:
-        weights [P, M] alpha_k prod_{j<k} (1 - alpha_j), and what is left behind all of them [P].
+        weights [P, M] alpha_k prod_{j<k} (1 - alpha_j), and the remaining transmittance [P].
     """
     dx, dy = (pixels[:, None, :] - projected.means).unbind(2)
     _, xy, yy = projected.covariances.unbind(1)
@@ -213,7 +213,7 @@ def blending_weights(projected: Projected, pixels: Tensor) -> tuple[Tensor, Tens
 
 
 def _pixel_chunks(camera: Camera, projected: Projected) -> tuple[Tensor, ...]:
-    """Pixel centres [P, 2] of the image in reading order, in pieces that fit in memory."""
+    """Pixel centres [P, 2] of the image in row-major order, in chunks that fit in memory."""
     like = projected.means
     x = torch.arange(camera.width, dtype=like.dtype, device=like.device) + 0.5
     y = torch.arange(camera.height, dtype=like.dtype, device=like.device) + 0.5

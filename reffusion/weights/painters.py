@@ -1,6 +1,6 @@
-"""The files of feed-forward 2D inpainters on this machine: which one a parameter names, and what to say where none is.
+"""Files of feed-forward 2D inpainters on this machine: finds the one a parameter names, or explains that it is missing.
 
-Nothing heavy is imported, so that `plan` can ask.
+Imports nothing heavy, so that `plan` can use it.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ AUTO, EXEMPLAR = "auto", "exemplar"
 
 
 def resolve_inpainter(inpainter: str) -> str:
-    """The inpainter; for "auto" the best feed-forward one whose published file is on this machine and can be run, else
-    "exemplar"."""
+    """The inpainter; for "auto" the best feed-forward one that is on this machine and can run, else "exemplar"."""
     if inpainter != AUTO:
         return inpainter
     can_run = lambda kind: (file := published_file(kind)) and not _lacks_runtime(file)
@@ -25,7 +24,7 @@ def resolve_inpainter(inpainter: str) -> str:
 
 
 def published_file(inpainter: str) -> Path | None:
-    """The file that `make weights` fetches, or another of its kind in that place; None where it is not here."""
+    """The file downloaded by `make weights`, or another of its kind in that folder; None if there is none."""
     folder = locate(PAINTERS[inpainter].repo)
     try:
         return find_file(inpainter, folder) if folder else None
@@ -34,16 +33,16 @@ def published_file(inpainter: str) -> Path | None:
 
 
 def file_of(inpainter: str, source: str | Path = "") -> Path:
-    """The file that `source` is, or the only one of its kind in the folder that it is; the published one where it is
-    empty or a diffusion prior.
+    """The file named by `source`, or the published one if `source` is empty or a diffusion prior.
 
     Args:
         inpainter: "lama" or "migan".
-        source: a file, or a folder of one; read from the working directory where relative.
+        source: a file, or a folder with exactly one of its kind; relative to the working directory.
+
     Raises:
-        ValueError: there is none or there are several, of a kind that this inpainter has.
+        ValueError: there is no such file, or there are several.
     """
-    if not _is_none(source):
+    if not _names_no_file(source):
         return find_file(inpainter, Path(source).expanduser())
     if file := published_file(inpainter):
         return file
@@ -51,33 +50,33 @@ def file_of(inpainter: str, source: str | Path = "") -> Path:
 
 
 def find_file(inpainter: str, path: Path) -> Path:
-    """`path`, or the only file of the inpainter's kind in it. ValueError as of `file_of`."""
-    known = PAINTERS[inpainter]
-    kinds = " or ".join(known.endings)
+    """`path`, or the only file of the inpainter's kind in it. Raises ValueError as `file_of`."""
+    published = PAINTERS[inpainter]
+    endings = " or ".join(published.endings)
     candidates = sorted(path.iterdir()) if path.is_dir() else [path]
-    files = [each for each in candidates if each.is_file() and each.suffix in known.endings]
+    files = [each for each in candidates if each.is_file() and each.suffix in published.endings]
     if len(files) > 1:
-        named = ", ".join(each.name for each in files)
-        raise ValueError(f"{known.name}: {path} holds {len(files)} {kinds} files ({named}); name one of them")
+        names = ", ".join(each.name for each in files)
+        raise ValueError(f"{published.name}: {path} holds {len(files)} {endings} files ({names}); name one of them")
     if not files:
-        wrong = f"holds no {kinds} file" if path.is_dir() else f"is no {kinds} file"
-        lacks = f"{path} {wrong if path.exists() else 'is not on this machine'}"
-        raise ValueError(f"{known.name}: {lacks}; get {known.where}, and name the file or its folder")
+        detail = f"holds no {endings} file" if path.is_dir() else f"is no {endings} file"
+        reason = f"{path} {detail if path.exists() else 'is not on this machine'}"
+        raise ValueError(f"{published.name}: {reason}; get {published.where}, and name the file or its folder")
     return files[0]
 
 
 def of_painter(inpainter: str, source: str | Path = "", param: str = "inpainter") -> Need:
-    """The file that an inpainter works with, and onnxruntime where it needs that.
+    """The need for the file of an inpainter, and for onnxruntime if it is an ONNX file.
 
     Args:
         inpainter, source: as in `file_of`.
-        param: what names the file, for the message.
+        param: the parameter that names the file, for messages.
     """
     known = PAINTERS[inpainter]
     try:
         file = file_of(inpainter, source)
     except ValueError as error:
-        if _is_none(source):
+        if _names_no_file(source):
             return Need(known.repo, f"{param}: {error}", known.bytes, file=known.file)
         return Need(known.name, f"{param}: {error}", fetched=False)
     problem = f"{param}: {file.name} needs onnxruntime: `pip install onnxruntime`" if _lacks_runtime(file) else None
@@ -85,7 +84,7 @@ def of_painter(inpainter: str, source: str | Path = "", param: str = "inpainter"
 
 
 def inpainter_facts(inpainter: str, source: str | Path = "") -> dict[str, str]:
-    """What its result depends on: which inpainter, and its file's content; nothing for one without a file."""
+    """What results depend on: the inpainter, and the hash of its file; empty for one without a file."""
     kind = resolve_inpainter(inpainter)
     if kind not in PAINTERS:
         return {"inpainter": kind} if inpainter == AUTO else {}
@@ -96,8 +95,8 @@ def inpainter_facts(inpainter: str, source: str | Path = "") -> dict[str, str]:
         return {"inpainter": kind}
 
 
-def _is_none(source: str | Path) -> bool:
-    """Is this no source of a feed-forward inpainter: empty, or a diffusion prior?"""
+def _names_no_file(source: str | Path) -> bool:
+    """Is `source` empty or a diffusion prior, and so names no file of a feed-forward inpainter?"""
     return not str(source) or str(source) in PUBLISHED or (Path(source).expanduser() / "unet").is_dir()
 
 

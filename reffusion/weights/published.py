@@ -1,4 +1,4 @@
-"""Weights that can be fetched: where they are published, how large they are, what does the same work."""
+"""Published weights that can be downloaded: where they are, their sizes, and alternatives."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ class Published:
     """A model of the hub.
 
     Attributes:
-        parameters: how many numbers it has in all: counted on its configuration (benchmarks/gpu/full_size.py).
-        instead: other models that do the same work.
+        parameters: total number of parameters, counted from the configuration (benchmarks/gpu/full_size.py).
+        instead: alternative models.
     """
 
     parameters: int
@@ -56,7 +56,7 @@ class LpipsNet:
 
 @dataclass(frozen=True)
 class LpipsPackage:
-    """A source package of the Python index that holds LPIPS 0.1: torchvision's convolutions and the linear weights."""
+    """A source package of the Python index with LPIPS 0.1: the convolutions of torchvision and the linear weights."""
 
     name: str
     version: str
@@ -84,20 +84,20 @@ LPIPS = LpipsPackage(
 )
 
 
-# Packages that bring the linear weights of version 0.1 along, under the same names, and the folder inside them.
+# Packages that contain the linear weights of version 0.1 under the same names, and the folder inside them.
 LPIPS_PACKAGES = {"lpips": "weights/v0.1", "torchmetrics": "functional/image/lpips_models"}
 
 
 @dataclass(frozen=True)
 class PublishedPainter:
-    """A feed-forward inpainter, one file of a model of the hub.
+    """A feed-forward inpainter: one file of a hub model.
 
     Attributes:
         name: for tables and messages.
-        endings: of the files that are read.
-        repo, file: where `make weights` gets it. The hub tells its sha256, by which it is checked.
-        bytes: about, as its page says.
-        where: which files can be taken, their sizes and licences, and who publishes them. From public sources.
+        endings: of files that can be read.
+        repo, file: source of `make weights`; checked by the sha256 that the hub reports.
+        bytes: approximate size according to its page.
+        where: files that can be used, with sizes, licences and publishers, from public sources.
     """
 
     name: str
@@ -108,7 +108,7 @@ class PublishedPainter:
     where: str
 
 
-PAINTERS = {  # the better first
+PAINTERS = {  # best first
     "lama": PublishedPainter(
         "LaMa",
         (".pt", ".onnx"),

@@ -1,4 +1,4 @@
-"""What can be told of `fit` before it runs."""
+"""What `plan` reports of the stage `fit` before it runs."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ __all__ = ["Params", "cost", "lacks", "preview"]
 
 
 def preview(params: Params, *, poses: Path | None) -> list[str]:
-    given = poses is not None and (poses / "gaussians.ply").exists() and params.pixels == "all"
-    return ["takes over the scene's gaussians.ply: no optimisation"] if given else []
+    has_gaussians = poses is not None and (poses / "gaussians.ply").exists() and params.pixels == "all"
+    return ["takes over the scene's gaussians.ply: no optimisation"] if has_gaussians else []
 
 
 def lacks(params: Params) -> list[str]:
-    """What this machine has not, and the stage needs on CUDA."""
+    """What the stage needs on CUDA and this machine lacks."""
     return machine.lacks(machine.machine())
 
 
 def cost(params: Params, card: str) -> Mapping[str, object] | None:
-    """What it takes on a card; "": this machine's. ValueError for one that is not in the table."""
+    """Estimated cost on a GPU ("": that of this machine). Raises ValueError for a GPU that is not in the table."""
     return estimate.said(card, params.device, estimate.fit(params))

@@ -1,4 +1,4 @@
-"""What can be told of `initialize` before it runs."""
+"""What `plan` reports of the stage `initialize` before it runs."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ __all__ = ["Params", "lacks", "needed_weights", "preview"]
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
-    """What must be on this machine, and what of it is not; `brings`: the keys of scene.yaml."""
-    found = [local.of_model(params.depth.model, "float32")] if params.depth.model else []
-    painted = params.extra_views and params.inpainter in PAINTERS
-    return found + ([painters.of_painter(params.inpainter, param="initialize.inpainter")] if painted else [])
+    """Weights that the stage needs, and whether they are here; `brings`: the keys of scene.yaml."""
+    needs = [local.of_model(params.depth.model, "float32")] if params.depth.model else []
+    uses_inpainter = params.extra_views and params.inpainter in PAINTERS
+    return needs + ([painters.of_painter(params.inpainter, param="initialize.inpainter")] if uses_inpainter else [])
 
 
 def optional_weights(params: Params) -> list[local.Need]:
-    """What the stage could work with instead."""
+    """Weights that the stage could use instead."""
     return [] if params.depth.model else [local.of_model(DEPTH_ANYTHING, "float32")]
 
 
 def machine_facts(params: Params) -> dict[str, str]:
-    """What the result depends on beside the parameters: which inpainter, and the content of its file."""
+    """What the result depends on besides the parameters: the inpainter, and the content of its file."""
     return painters.inpainter_facts(params.inpainter) if params.extra_views else {}
 
 
 def preview(params: Params, **_: Path | None) -> list[str]:
-    """What the stage will do, as far as that is known before it looks."""
+    """What the stage will do, as far as it is known in advance."""
     if not (params.extra_views and params.start == "reference"):
         return []
     kind = painters.resolve_inpainter(params.inpainter)
@@ -39,5 +39,5 @@ def preview(params: Params, **_: Path | None) -> list[str]:
 
 
 def lacks(params: Params) -> list[str]:
-    """What this machine has not, and the stage needs on CUDA."""
+    """What the stage needs on CUDA and this machine lacks."""
     return machine.lacks(machine.machine())

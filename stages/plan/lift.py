@@ -1,4 +1,4 @@
-"""What `lift` says before it runs."""
+"""What `plan` reports of the stage `lift` before it runs."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from reffusion.weights.published import PAINTERS
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
-    """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
+    """Weights that the stage needs, and whether they are here; `brings`: the keys of scene.yaml."""
     if params.inpainter == "diffusion":
         return [local.of_model(params.prior, "float32")]
     return [painters.of_painter(params.inpainter, param="lift.inpainter")] if params.inpainter in PAINTERS else []
 
 
 def machine_facts(params: Params) -> dict[str, str]:
-    """What the result depends on beside the parameters: the content of the inpainter's file."""
+    """What the result depends on besides the parameters: the content of the inpainter's file."""
     return painters.inpainter_facts(params.inpainter)
 
 
 def lacks(params: Params) -> list[str]:
-    """What this machine has not, and the stage needs on CUDA."""
+    """What the stage needs on CUDA and this machine lacks."""
     return machine.lacks(machine.machine(), splats=False)

@@ -1,4 +1,4 @@
-"""What can be told of `masks` before it runs."""
+"""What `plan` reports of the stage `masks` before it runs."""
 
 from reffusion.io import machine
 from reffusion.params.masks import Params
@@ -7,5 +7,5 @@ __all__ = ["Params", "lacks"]
 
 
 def lacks(params: Params) -> list[str]:
-    """What this machine has not, and the stage needs on CUDA."""
+    """What the stage needs on CUDA and this machine lacks."""
     return machine.lacks(machine.machine())

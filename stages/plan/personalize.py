@@ -1,4 +1,4 @@
-"""What can be told of `personalize` before it runs."""
+"""What `plan` reports of the stage `personalize` before it runs."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ __all__ = ["Params", "cost", "lacks", "needed_weights"]
 
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
-    """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
+    """Weights that the stage needs, and whether they are here; `brings`: the keys of scene.yaml."""
     return [local.of_model(params.prior, params.dtype)]
 
 
 def lacks(params: Params) -> list[str]:
-    """What this machine has not, and the stage needs on CUDA."""
+    """What the stage needs on CUDA and this machine lacks."""
     return machine.lacks(machine.machine(), params.memory_gb, splats=False, memory_param="personalize.memory_gb")
 
 
 def cost(params: Params, card: str) -> Mapping[str, object] | None:
-    """What it takes on a card; "": this machine's. ValueError for one that is not in the table."""
+    """Estimated cost on a GPU ("": that of this machine). Raises ValueError for a GPU that is not in the table."""
     return estimate.said(card, params.device, estimate.personalize(params))
