@@ -86,7 +86,9 @@ class Workspace:
     def remove_object(self, name: str) -> np.ndarray:
         """uint8 [H, W, 3]: the photograph outside C, the remaining Gaussians' render in it."""
         photo = self.load_photos([name])[name]
-        return inpaint.background(self.remaining, self.scene.cameras[name], photo, self.mask_sets[name].consistent)
+        return inpaint.composite_background(
+            self.remaining, self.scene.cameras[name], photo, self.mask_sets[name].consistent
+        )
 
     @cached_property
     def background(self) -> Background:
@@ -99,7 +101,7 @@ class Workspace:
         for name in scene.blank:
             everything = np.ones_like(hidden[name])
             nothing = np.zeros((1, 1, 3), np.uint8)
-            photos[name] = inpaint.background(self.gaussians, scene.cameras[name], nothing, everything)
+            photos[name] = inpaint.composite_background(self.gaussians, scene.cameras[name], nothing, everything)
         background = Background(
             render_depth_views(self.gaussians, [scene.cameras[name] for name in names], hidden),
             photos,

@@ -26,7 +26,7 @@ from reffusion.io.scene import load_mask_sets, load_references, load_scene, load
 from reffusion.params.distill import Params
 from reffusion.prior import diffusion, lora, memory
 from reffusion.prior.crops import PROMPTS
-from reffusion.prior.model import Prior, load_prior, recomputing, without_text
+from reffusion.prior.model import Prior, drop_text_encoders, enable_checkpointing, load_prior
 from reffusion.splat import rasterizer
 from reffusion.types import Gaussians, Scene
 
@@ -56,9 +56,9 @@ def run(
     distance_name, distance = load_lift_distance(params)
     if params.sds.is_on and params.sds.max_angle < 180:
         print(describe_sds_views(params, initial.means[masked], views, references), flush=True)
-    with memory.blamed(MEMORY_PARAM, params.memory_gb):
+    with memory.explain_oom(MEMORY_PARAM, params.memory_gb):
         if prior is not None:
-            prior = memory.fitted(prior, params.memory_gb, MEMORY_PARAM, memory.encoding)
+            prior = memory.fit_to_memory(prior, params.memory_gb, MEMORY_PARAM, memory.encode_one_sample)
         inputs = initial, masked, views, references, prior, text
 
         def distill_for(folder: Path, steps: int) -> tuple[Gaussians, Tensor]:
@@ -104,11 +104,11 @@ def load_adapted_prior(params: Params, personalize: Path | None) -> tuple[Prior 
     if not params.needs_prior:
         return None, None
     prior = load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
-    prior = prior if personalize is None else lora.merged(prior, personalize)
+    prior = prior if personalize is None else lora.merge(prior, personalize)
     with torch.no_grad():
         text = diffusion.embed_text(prior, list(PROMPTS) if params.prompts == "sks" else [""] * len(PROMPTS))
-    prior = without_text(prior)
-    return recomputing(prior) if params.checkpointing else prior, text
+    prior = drop_text_encoders(prior)
+    return enable_checkpointing(prior) if params.checkpointing else prior, text
 
 
 def load_train_views(
@@ -178,4 +178,4 @@ def build_depth_estimator(params: Params, points: np.ndarray) -> depth_estimator
     if not params.depth.model:
         return depth_estimator.continuation_estimator(points, how)
     network = monocular.load_network(params.depth.model, params.device)
-    return depth_estimator.network_estimator(partial(monocular.disparity, network), how)
+    return depth_estimator.network_estimator(partial(monocular.predict_disparity, network), how)

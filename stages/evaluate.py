@@ -132,7 +132,7 @@ def prepared(
         views = (*scene.train, *scene.blank) if needs["reference"] else scene.train
         gaussians |= finished([scene.cameras[name] for name in views], gaussians, result)
     painter = feedforward.load_by_name(params.inpainter, params.device) if params.inpaint else None
-    exposures = exposure.of_views(needs["fit"], list(scene.cameras.values()))
+    exposures = exposure.view_exposures(needs["fit"], list(scene.cameras.values()))
     return Work(out, poses, raw_masks, masks, gaussians, result, painter, tested, unseen, exposures), counts
 
 
@@ -151,9 +151,9 @@ def exposure_of(work: Work, camera: Camera, photo: np.ndarray | None) -> np.ndar
     if told is None or photo is None:
         return told
     drawn = rasterizer.render(work.gaussians["fit"], camera)
-    color, there = exposure.exposed(drawn.color, told).cpu().numpy(), drawn.alpha.cpu().numpy() > OPAQUE
+    color, there = exposure.apply_exposure(drawn.color, told).cpu().numpy(), drawn.alpha.cpu().numpy() > OPAQUE
     outside = ~dilate(mask_of(camera, work.raw_masks, work.masks), rows.OUTSIDE_MARGIN)
-    return exposure.matched(told, color, photo, outside & there)
+    return exposure.match_exposure(told, color, photo, outside & there)
 
 
 def rendered(work: Work, camera: Camera, how: np.ndarray | None) -> tuple[Shown, dict[str, np.ndarray]]:
@@ -238,7 +238,7 @@ def drawn(
     the depth, [H, W] float64, 0 where hardly anything is, for the comparison with a view's neighbour."""
     with torch.no_grad():
         drawing = rasterizer.render(gaussians, camera)
-    save_image(path, exposure.exposed(drawing.color, exposed).clamp(0, 1).cpu().numpy())
+    save_image(path, exposure.apply_exposure(drawing.color, exposed).clamp(0, 1).cpu().numpy())
     depth, alpha = drawing.depth.double().cpu().numpy(), drawing.alpha.cpu().numpy()
     return load_image(path), np.where(alpha > consistency.SOLID, depth, 0.0)
 

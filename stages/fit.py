@@ -17,7 +17,7 @@ from reffusion.fit.exposure import BRIGHTNESS_DEVIATION
 from reffusion.fit.gains import brightness_deviation, estimate_gains
 from reffusion.fit.reconstruction import fit
 from reffusion.fit.start import initial_gaussians
-from reffusion.fit.step import GENTLE
+from reffusion.fit.step import REFIT_RATES
 from reffusion.inpaint import classical
 from reffusion.io.images import to_uint8
 from reffusion.io.ply import load_ply, save_ply
@@ -47,7 +47,7 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path | None = None
     params, initial = limit_gaussians(params, cameras), start_on_surfaces(params, scene, cameras, equalized, hidden)
     rates = None
     if initial is not None:
-        params, rates = few_views.shorten_schedule(params), GENTLE
+        params, rates = few_views.shorten_schedule(params), REFIT_RATES
     elif (out / trace.CHECKPOINT).exists():  # only degree and device of the initial Gaussians matter then
         initial = make_gaussians(params, scene.points, scene.point_colors)
     else:

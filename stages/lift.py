@@ -45,7 +45,7 @@ def run(params: Params, out: Path, *, poses: Path, fit: Path, masks: Path) -> No
         if path.exists():
             continue
         photo, masks_of_view = exposure.load_views(poses, fit, [name])[name], load_mask_sets(masks, [name])[name]
-        picture = inpaint.background(remaining, scene.cameras[name], photo, masks_of_view.consistent)
+        picture = inpaint.composite_background(remaining, scene.cameras[name], photo, masks_of_view.consistent)
         replace_image(path, paint(picture, masks_of_view.invent, name))
     image, mask = load_image(out / "images" / f"{best_view}.png"), load_mask_sets(masks, [best_view])[best_view].invent
     save_references(out, [Reference(scene.cameras[best_view], image, mask)])
@@ -62,7 +62,7 @@ def load_painter(params: Params) -> tuple[str, Callable[[np.ndarray, np.ndarray,
     def paint(image: np.ndarray, hole: np.ndarray, name: str) -> np.ndarray:
         (picture,) = inpaint.paint(
             prior,
-            inpaint.as_input(image),
+            inpaint.to_input(image),
             torch.from_numpy(hole),
             prompt=params.prompt,
             seeds=[seeding.seed_for(SEED, "lift", name)],
@@ -70,6 +70,6 @@ def load_painter(params: Params) -> tuple[str, Callable[[np.ndarray, np.ndarray,
             start=REFINED_FROM,
             guidance=GUIDANCE,
         )
-        return inpaint.as_picture(picture)
+        return inpaint.to_picture(picture)
 
     return f"diffusion by {params.prior}, {params.steps} steps", paint

@@ -11,7 +11,7 @@ from reffusion import trace
 from reffusion.io.scene import load_raw_masks, load_references, load_scene, load_views
 from reffusion.params.personalize import Params
 from reffusion.prior import crops, denoising, lora, memory
-from reffusion.prior.model import load_prior, recomputing
+from reffusion.prior.model import enable_checkpointing, load_prior
 from reffusion.prior.personalize import personalize
 from reffusion.types import Scene
 
@@ -25,16 +25,18 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, reference: P
         raise ValueError("personalize.steps is 0: there is nothing to learn, leave the stage out")
     scene = load_scene(poses)
     prior = load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
-    prior = recomputing(prior) if params.checkpointing else prior
+    prior = enable_checkpointing(prior) if params.checkpointing else prior
     references = [
-        crops.picture(torch.from_numpy(r.image), torch.from_numpy(r.mask), prior.native_size)
+        crops.make_picture(torch.from_numpy(r.image), torch.from_numpy(r.mask), prior.native_size)
         for r in load_references(reference, scene)
     ]
     photographs = load_validation_photos(
         scene, poses, raw_masks, [r.camera.name for r in load_references(reference, scene)]
     )
     lora_params = params.lora
-    trained = lora.add(prior, lora_params.rank, lora_params.alpha, lora_params.dropout, lora_params.layers, params.seed)
+    trained = lora.attach(
+        prior, lora_params.rank, lora_params.alpha, lora_params.dropout, lora_params.layers, params.seed
+    )
 
     def train(folder: Path, steps: int) -> None:
         personalize(prior, trained, references, params.model_copy(update={"steps": steps}), folder, photographs)
@@ -44,9 +46,9 @@ def run(params: Params, out: Path, *, poses: Path, raw_masks: Path, reference: P
         train(folder, steps)
         lora.load_state(prior, state)
 
-    backward = lambda prior: denoising.one_sample(prior, references, params.seed)
-    with memory.blamed(MEMORY_PARAM, params.memory_gb):
-        prior = memory.fitted(prior, params.memory_gb, MEMORY_PARAM, backward)
+    backward = lambda prior: denoising.backward_one_sample(prior, references, params.seed)
+    with memory.explain_oom(MEMORY_PARAM, params.memory_gb):
+        prior = memory.fit_to_memory(prior, params.memory_gb, MEMORY_PARAM, backward)
         train(out, trace.affordable(out, params.steps, params.seconds, lambda: time.monotonic() - start, try_training))
     lora.save(prior, out)
     trace.clear_checkpoint(out)

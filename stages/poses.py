@@ -117,8 +117,8 @@ def _load_positions(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
 
 def _deleted(files: tuple[Path, Path], whole: np.ndarray, cleaned: np.ndarray) -> np.ndarray:
     """bool [N], those of the whole scene's positions [N, 3] that the cleaned scene's [M, 3] lack."""
-    match = matching.matched(whole, cleaned)
-    if match.found < matching.SAME:
+    match = matching.match_gaussians(whole, cleaned)
+    if match.found < matching.MIN_MATCHED_SHARE:
         raise BadInput(
             f"{files[1]}: of its splats {match.found:.0%} are where {files[0].name} has one: it is another scene, or "
             "was moved, turned or scaled; only delete, and save it where it was"

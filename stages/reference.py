@@ -95,21 +95,21 @@ def inpaint_by_patches(params: Params, out: Path, base: np.ndarray, name: str, s
 def inpaint_by_prior(params: Params, out: Path, base: np.ndarray, name: str, masks: MaskSet) -> np.ndarray:
     """uint8 [H, W, 3]: the view with I inpainted by the diffusion prior."""
     prior = load_prior(params.prior, device=params.device, dtype=getattr(torch, params.dtype))
-    prior = memory.fitted(prior, params.memory_gb, "reference.memory_gb")
+    prior = memory.fit_to_memory(prior, params.memory_gb, "reference.memory_gb")
     hole = torch.from_numpy(masks.invent)
-    with memory.blamed("reference.memory_gb", params.memory_gb):
+    with memory.explain_oom("reference.memory_gb", params.memory_gb):
         candidates = inpaint.paint(
             prior,
-            inpaint.as_input(base),
+            inpaint.to_input(base),
             hole,
             prompt=params.prompt,
             seeds=[params.seed + index for index in range(params.candidates)],
             start=REFINED_FROM,
             **params.sampler.model_dump(),
         ).cpu()
-    seams = inpaint.seam(candidates, hole)
+    seams = inpaint.seam_score(candidates, hole)
     chosen = int(seams.argmin()) if params.choose is None else params.choose
-    images = [inpaint.as_picture(each) for each in candidates]
+    images = [inpaint.to_picture(each) for each in candidates]
     save_candidates(out, images, {"view": name, "seams": seams.tolist(), "chosen": chosen})
     return images[chosen]
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from reffusion import geometry
-from reffusion.depth.billboard import standing
+from reffusion.depth.billboard import billboard_depth
 from reffusion.types import Camera
 
 TILT = np.radians(25)  # the camera looks down on a floor 1 below it
@@ -25,7 +25,7 @@ def test_it_stands_upright_where_its_lowest_pixels_meet_the_floor():
     camera, depth = floor_view()
     drawn = np.zeros(depth.shape, bool)
     drawn[20:50, 38:58] = True
-    found = standing(drawn, depth, camera)
+    found = billboard_depth(drawn, depth, camera)
     assert (found[~drawn] == depth[~drawn]).all() and (found[drawn] <= depth[drawn]).all()
     points = geometry.unproject(found, camera)
     foot, rim = points[49, 48], points[20:50, 38]
@@ -40,5 +40,5 @@ def test_on_a_wall_it_hangs_facing_the_camera():
     camera = Camera("v", 96, 72, 80.0, 80.0, 48.0, 36.0, np.eye(4))
     depth, drawn = np.full((72, 96), 2.0), np.zeros((72, 96), bool)
     drawn[30:40, 40:50] = True
-    found = standing(drawn, depth, camera)
+    found = billboard_depth(drawn, depth, camera)
     assert np.isfinite(found).all() and (found[drawn] <= 2.0).all() and found[drawn].min() > 1.8

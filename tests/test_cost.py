@@ -55,7 +55,7 @@ def test_each_term_of_distillation_costs():
 
 def test_another_prior_was_not_counted():
     assert estimate.distill(distill.Params(prior="priors/tiny", **HALF)) is None
-    assert estimate.said("a100", "cpu", estimate.fit(fit.Params())) is None
+    assert estimate.format_estimate("a100", "cpu", estimate.fit(fit.Params())) is None
 
 
 @pytest.mark.skipif(os.environ.get("REFFUSION_SLOW") != "1", reason="slow: a minute")
@@ -69,9 +69,9 @@ def test_the_table_is_what_is_counted_today():
 
 
 def test_cards_by_any_name():
-    assert estimate.card_of("NVIDIA GeForce RTX 4090") == "rtx-4090" and estimate.card_of("A100") == "a100"
+    assert estimate.find_gpu("NVIDIA GeForce RTX 4090") == "rtx-4090" and estimate.find_gpu("A100") == "a100"
     with pytest.raises(ValueError, match=r"card 'voodoo' is none of rtx-3090, .*h100"):
-        estimate.card_of("voodoo")
+        estimate.find_gpu("voodoo")
 
 
 def test_what_a_plan_prints(tmp_path, monkeypatch):

@@ -67,7 +67,7 @@ def term(gaussians, masked, estimator, prior=None, text=None, view=None, **more)
 def shown(moved=1.0, how=HOW):
     """What the view shows of the wall's depth."""
     with torch.no_grad():
-        return background_depth.seen(render(wall(moved)[0], VIEW), VIEW, HOLE, HOLE, how)
+        return background_depth.extract_depth(render(wall(moved)[0], VIEW), VIEW, HOLE, HOLE, how)
 
 
 def giving(estimate):
@@ -97,7 +97,7 @@ def test_the_target_does_not_depend_on_the_estimates_unit(unit):
     """An estimate that is right but for scale and offset gives the wall, in whatever unit it comes."""
     view = replace(shown(), depth=1 / WALL)
     guide = np.full((HEIGHT, WIDTH, 3), 0.5)
-    disparity, _ = estimates.estimated(view, guide, unit * (40 * WALL - 7), HOW)
+    disparity, _ = estimates.align_estimate(view, guide, unit * (40 * WALL - 7), HOW)
     target, compared = depth_term.depth_target(view, disparity, np.ones_like(HOLE))
     assert (compared == HOLE).all()
     np.testing.assert_allclose(target[HOLE], 1 / WALL[HOLE], rtol=1e-9)
@@ -110,7 +110,7 @@ def test_a_robust_alignment_lets_go_of_what_is_wrong():
     estimate[:, :4] += 3.0
     errors = []
     for robust in (False, True):
-        disparity, _ = estimates.estimated(view, guide, estimate, replace(HOW, robust=robust))
+        disparity, _ = estimates.align_estimate(view, guide, estimate, replace(HOW, robust=robust))
         errors.append(np.abs(disparity / WALL - 1)[HOLE].mean())
     assert errors[1] < 0.3 * errors[0]
 
@@ -277,7 +277,7 @@ def test_the_picture_is_painted_only_where_planes_do_not_explain(prior, text):
 
     view = replace(shown(), depth=1 / WALL)
     for share, times in ((0.7, 0), (2.0, 1)):
-        found, _ = background_depth.continued(view, guide, NO_POINTS, replace(HOW, planar_share=share))
+        found, _ = background_depth.continue_depth(view, guide, NO_POINTS, replace(HOW, planar_share=share))
         np.testing.assert_allclose(found[HOLE], WALL[HOLE], rtol=1e-3)
         assert len(asked) == times
     smooth = depth_estimator.continuation_estimator(NO_POINTS, replace(HOW, planar_share=2.0))

@@ -422,7 +422,7 @@ def test_levels_double_up_to_the_view():
 def test_the_seam_prefers_the_candidate_that_continues_its_surroundings():
     ramp = torch.linspace(-1, 1, WIDTH).expand(3, HEIGHT, WIDTH)
     wrong = torch.where(hole(), torch.tensor(0.9), ramp)
-    assert int(inpaint.seam(torch.stack([wrong, ramp, wrong]), hole()).argmin()) == 1
+    assert int(inpaint.seam_score(torch.stack([wrong, ramp, wrong]), hole()).argmin()) == 1
 
 
 # ------------------------------------------------------------------------------------------ the stages

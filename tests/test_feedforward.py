@@ -227,7 +227,7 @@ def test_auto_takes_the_best_that_is_here(own_cache):
     before = painters.inpainter_facts("auto")
     file = publish(own_cache, "lama")
     assert painters.resolve_inpainter("auto") == "lama" and painters.inpainter_facts("auto") != before
-    assert feedforward.load("lama").name == "LaMa (lama_fp32.onnx)" and painters.file_of("lama") == file
+    assert feedforward.load("lama").name == "LaMa (lama_fp32.onnx)" and painters.inpainter_file("lama") == file
     assert painters.inpainter_facts("exemplar") == painters.inpainter_facts("diffusion") == {}, (
         "the default depends on no cache"
     )
@@ -259,7 +259,7 @@ def test_the_file_is_found_or_the_plan_says_where_people_get_it(own_cache, tmp_p
     assert "is no .onnx file; get migan_pipeline_v2.onnx" in need.problem
     (need,) = needs(inpainter="lama", prior=str(tmp_path))
     assert need.problem is None and need.name == str(tmp_path / "big.pt") and need.bytes > 0
-    assert painters.file_of("lama", tmp_path) == tmp_path / "big.pt"
+    assert painters.inpainter_file("lama", tmp_path) == tmp_path / "big.pt"
     shutil.copy(tmp_path / "big.pt", tmp_path / "other.pt")
     (need,) = needs(inpainter="lama", prior=str(tmp_path))
     assert r"holds 2 .pt or .onnx files (big.pt, other.pt); name one" in need.problem

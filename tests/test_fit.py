@@ -146,7 +146,7 @@ def test_exposures_are_found_and_taken_out_again(tmp_path):
     assert away(exposure.load_views(poses, tmp_path / "True", names)) < 0.3 * away(load_views(poses, names))
     for view, image in exposure.load_views(poses, tmp_path / "False", names).items():
         assert np.array_equal(image, shown[view])
-    assert exposure.normalised(pictures[held.name], tmp_path / "True", held.name) is pictures[held.name]
+    assert exposure.normalize_exposure(pictures[held.name], tmp_path / "True", held.name) is pictures[held.name]
 
 
 def test_a_view_is_exposed_as_the_photographs_next_to_it(tmp_path):
@@ -157,9 +157,9 @@ def test_a_view_is_exposed_as_the_photographs_next_to_it(tmp_path):
     def told(gain_of) -> dict[str, float]:
         bright = np.array([[gain_of(cameras.index(camera))] * 3 for camera in seen])
         exposure.Exposures([camera.name for camera in seen], gains=bright).save(tmp_path)
-        return {name: matrix[0, 0] for name, matrix in exposure.of_views(tmp_path, cameras).items()}
+        return {name: matrix[0, 0] for name, matrix in exposure.view_exposures(tmp_path, cameras).items()}
 
-    assert exposure.of_views(tmp_path, cameras) == {}
+    assert exposure.view_exposures(tmp_path, cameras) == {}
     steps = told(lambda k: 0.7 if k < 6 else 1.3)
     assert steps["view0"] == pytest.approx(0.7) and steps["view11"] == pytest.approx(1.3)
     assert steps["view1"] == pytest.approx(0.7, abs=0.05) and steps["view10"] == pytest.approx(1.3, abs=0.05)
@@ -167,10 +167,10 @@ def test_a_view_is_exposed_as_the_photographs_next_to_it(tmp_path):
     mixed = told(lambda k: draws[k])
     assert all(0.85 < mixed[f"view{k}"] < 1.15 for k in (4, 7))
     color = torch.rand(2, 3, 3)
-    matrix = exposure.of_views(tmp_path, cameras)["view4"]
-    shown = exposure.exposed(color, matrix)
-    np.testing.assert_allclose(exposure.undone(shown.numpy(), matrix), color, atol=1e-6)
-    assert exposure.exposed(color, None) is color
+    matrix = exposure.view_exposures(tmp_path, cameras)["view4"]
+    shown = exposure.apply_exposure(color, matrix)
+    np.testing.assert_allclose(exposure.undo_exposure(shown.numpy(), matrix), color, atol=1e-6)
+    assert exposure.apply_exposure(color, None) is color
 
 
 def test_a_photograph_tells_how_its_view_is_exposed_though_it_is_sharper_and_shows_something_else():
@@ -182,10 +182,10 @@ def test_a_photograph_tells_how_its_view_is_exposed_though_it_is_sharper_and_sho
     photo[50:, 60:] = 0.5  # and somebody has walked into the picture
     pixels = np.ones((60, 80), bool)
     pixels[:20, :30] = False
-    found = exposure.matched(np.eye(3, 4), smooth, (photo.clip(0, 1) * 255).astype(np.uint8), pixels)
+    found = exposure.match_exposure(np.eye(3, 4), smooth, (photo.clip(0, 1) * 255).astype(np.uint8), pixels)
     assert np.abs(np.diag(found[:, :3]) - [0.7, 0.9, 1.1]).max() < 0.08
     assert np.abs(found[:, 3] - [0.1, 0.05, 0.0]).max() < 0.04
-    nothing = exposure.matched(np.eye(3, 4), smooth, np.zeros((60, 80, 3), np.uint8), pixels)
+    nothing = exposure.match_exposure(np.eye(3, 4), smooth, np.zeros((60, 80, 3), np.uint8), pixels)
     assert np.array_equal(nothing, np.eye(3, 4))
 
 

@@ -5,8 +5,8 @@ import itertools
 import numpy as np
 
 from reffusion.background.continuation import _surrounded
-from reffusion.depth.background_depth import Completion, Hints, Seen, continued, grown
-from reffusion.depth.layers import label_surfaces, pieces
+from reffusion.depth.background_depth import Completion, Hints, ViewDepth, continue_depth, dilate
+from reffusion.depth.layers import label_surfaces, segment_surfaces
 from reffusion.graph_cut import least_labels
 from reffusion.types import Camera
 
@@ -49,16 +49,16 @@ def test_where_other_views_look_past_a_surface_its_colours_are_another_ones():
     how = Completion(planar_share=2.0, ring=0.2, margin=0.01)
     wrong = []
     for looked_past in (None, past):
-        seen = Seen(
+        seen = ViewDepth(
             view,
             1 / disparity,
-            ~grown(hole, how.margin),
+            ~dilate(hole, how.margin),
             hole,
             hole,
             np.zeros_like(hole),
             Hints(free_space=looked_past),
         )
-        found, said = continued(seen, picture, np.zeros((0, 3)), how)
+        found, said = continue_depth(seen, picture, np.zeros((0, 3)), how)
         assert "2 surfaces" in said
         wrong.append((np.abs(found / disparity - 1)[leaves & hole] > 0.1).mean())
     assert wrong[0] > 0.8 and wrong[1] < 0.2
@@ -83,9 +83,9 @@ def test_what_stands_on_a_plane_that_goes_on_keeps_its_hidden_rim():
     table, depth, vase, picture, hole = vase_on_a_table()
     view = Camera("v", 120, 100, 100.0, 100.0, 60.0, 50.0, np.eye(4))
     how = Completion(planar_share=2.0, ring=0.2, margin=0.03)
-    known, hints = ~grown(hole, how.margin), Hints(np.where(hole, table, np.inf), (table,))
-    seen = Seen(view, np.where(hole, table, depth), known, hole, hole, hole, hints)
-    found, said = continued(seen, picture, np.zeros((0, 3)), how)
+    known, hints = ~dilate(hole, how.margin), Hints(np.where(hole, table, np.inf), (table,))
+    seen = ViewDepth(view, np.where(hole, table, depth), known, hole, hole, hole, hints)
+    found, said = continue_depth(seen, picture, np.zeros((0, 3)), how)
     assert "2 surfaces" in said
     error = np.abs(found * depth - 1)[hole]
     assert (hole & vase).sum() > 200 and np.quantile(error, 0.97) < 0.01, said
@@ -94,8 +94,8 @@ def test_what_stands_on_a_plane_that_goes_on_keeps_its_hidden_rim():
 def test_a_tuft_of_the_grounds_own_colours_takes_nothing_of_the_ground():
     table, depth, vase, _, hole = vase_on_a_table()
     grass = np.random.default_rng(0).uniform(0.2, 0.6, (100, 120, 3))
-    known = ~grown(hole, 0.03)
-    surfaces = label_surfaces(1 / depth, known, grown(hole, 0.03), grass, (table,), np.zeros_like(hole))
+    known = ~dilate(hole, 0.03)
+    surfaces = label_surfaces(1 / depth, known, dilate(hole, 0.03), grass, (table,), np.zeros_like(hole))
     assert (surfaces[hole & ~vase] == surfaces[95, 5]).mean() > 0.95
 
 
@@ -107,13 +107,13 @@ def test_a_plinth_that_touches_the_lawn_at_its_foot_is_a_piece_of_its_own():
     disparity = np.where(plinth, lawn[130, 0], lawn)
     hole = (np.abs(columns - 80) < 25) & (rows >= 40) & (rows < 100)
     around = ~hole & (rows > 15)
-    assert pieces(disparity, around).max() == 1
-    found = pieces(disparity, around, hole=hole)
+    assert segment_surfaces(disparity, around).max() == 1
+    found = segment_surfaces(disparity, around, hole=hole)
     assert found.max() == 2
     own = np.bincount(found[plinth & around]).argmax()
     assert (found[plinth & around] == own).mean() > 0.99
     assert (found[around & (rows < 90)] != own).all()
-    left_out = pieces(lawn, around, hole=hole)  # the lawn alone stands before nothing
+    left_out = segment_surfaces(lawn, around, hole=hole)  # the lawn alone stands before nothing
     assert left_out.max() == 1
 
 
@@ -136,8 +136,8 @@ def test_labels_of_the_least_cost_are_found():
 def test_depth_steps_where_the_picture_has_an_edge():
     disparity, picture, hole = step_scene()
     view = Camera("v", 120, 100, 100.0, 100.0, 60.0, 50.0, np.eye(4))
-    seen = Seen(view, 1 / disparity, ~hole, hole, hole, np.zeros_like(hole))
-    found, said = continued(seen, picture, np.zeros((0, 3)), Completion(planar_share=2.0, ring=0.2))
+    seen = ViewDepth(view, 1 / disparity, ~hole, hole, hole, np.zeros_like(hole))
+    found, said = continue_depth(seen, picture, np.zeros((0, 3)), Completion(planar_share=2.0, ring=0.2))
     assert "2 surfaces" in said
     error = np.abs(found / disparity - 1)[hole]
     assert np.quantile(error, 0.95) < 0.01

@@ -10,7 +10,7 @@ import small_scene as small
 import torch
 
 from reffusion.depth import monocular
-from reffusion.depth.background_depth import Completion, Seen
+from reffusion.depth.background_depth import Completion, ViewDepth
 from reffusion.initialize import unprojection
 from reffusion.seeding import generator
 from reffusion.types import Reference
@@ -69,19 +69,19 @@ def test_a_picture_is_prepared_as_the_models_own_processor_does(network, size):
 
 def test_disparity_has_the_pictures_size_and_repeats(network, folder):
     image = picture(48, 64)
-    first = monocular.disparity(network, image)
+    first = monocular.predict_disparity(network, image)
     assert first.shape == (48, 64) and torch.isfinite(first).all() and first.std() > 0
-    assert (first == monocular.disparity(monocular.load_network(folder), image)).all()
-    assert (first != monocular.disparity(network, picture(48, 64, 1))).any()
+    assert (first == monocular.predict_disparity(monocular.load_network(folder), image)).all()
+    assert (first != monocular.predict_disparity(network, picture(48, 64, 1))).any()
     with pytest.raises(ValueError, match=r"\[3, H, W\]"):
-        monocular.disparity(network, image[None])
+        monocular.predict_disparity(network, image[None])
 
 
 def test_a_metric_model_is_inverted(network):
     model = small_model("metric")
     image = picture(48, 64)
     answer = model(pixel_values=monocular.preprocess(network, image)).predicted_depth
-    found = monocular.disparity(monocular.make_network(model), image)
+    found = monocular.predict_disparity(monocular.make_network(model), image)
     inverse = 1 / answer[None].clamp(1e-6, 1e6)
     wanted = torch.nn.functional.interpolate(inverse, (48, 64), mode="bilinear")[0, 0].detach()
     torch.testing.assert_close(found, wanted)
@@ -132,7 +132,7 @@ def test_the_stage_shows_the_model_the_reference(network):
     view = small.CAMERAS["a2"]
     reference = Reference(view, small.photo(view), np.zeros((small.HEIGHT, small.WIDTH), bool))
     image = torch.from_numpy(reference.image).permute(2, 0, 1) / 255
-    assert (estimate_of(network, reference) == monocular.disparity(network, image).numpy()).all()
+    assert (estimate_of(network, reference) == monocular.predict_disparity(network, image).numpy()).all()
     assert estimate_of(None, reference) is None
 
 
@@ -141,8 +141,8 @@ def test_the_depth_term_asks_the_model_of_its_parameter(folder, network):
     from stages import distill
 
     view, image = small.CAMERAS["a2"], picture(small.HEIGHT, small.WIDTH)
-    true = 2.0 + 0.3 * monocular.disparity(network, image).double().numpy()
+    true = 2.0 + 0.3 * monocular.predict_disparity(network, image).double().numpy()
     hole = small.true_mask(view, 1.7)
-    seen = Seen(view, np.where(hole, 0.0, 1 / true), ~hole, hole, hole, np.zeros_like(hole))
+    seen = ViewDepth(view, np.where(hole, 0.0, 1 / true), ~hole, hole, hole, np.zeros_like(hole))
     estimator = distill.build_depth_estimator(distill.Params(depth={"model": str(folder)}), np.zeros((0, 3)))
     np.testing.assert_allclose(estimator.disparity(seen, lambda: image.permute(1, 2, 0).numpy()), true, rtol=1e-6)

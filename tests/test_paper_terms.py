@@ -189,7 +189,7 @@ def test_a_tenth_of_realfills_masks_repaints_all():
 @pytest.mark.parametrize("layers", ["attention", "qkv"])
 def test_output_projections_are_adapted_or_not(layers):
     fresh = small_prior()
-    lora.add(fresh, 2, 2.0, 0.0, layers, 0)
+    lora.attach(fresh, 2, 2.0, 0.0, layers, 0)
     names = list(lora.state(fresh))
     assert any("to_out" in name for name in names) == any("out_proj" in name for name in names) == (layers != "qkv")
     assert all(any(part in name for name in names) for part in ("to_q", "to_k", "to_v", "q_proj", "k_proj", "v_proj"))

@@ -39,27 +39,27 @@ def cloud(count=4000):
     return points, np.linalg.norm(points - (0.2, 0.1, 0.5), axis=1) < 0.3
 
 
-@pytest.mark.parametrize("turn", matching.TURNS)
+@pytest.mark.parametrize("turn", matching.AXIS_FLIPS)
 def test_deleted_splats_are_found_in_any_order_quantised_and_turned(turn):
     points, deleted = cloud()
     draws = np.random.default_rng(1)
     left = points[~deleted][draws.permutation(np.count_nonzero(~deleted))] * turn
-    found = matching.matched(points, left.astype(np.float16).astype(np.float64))
+    found = matching.match_gaussians(points, left.astype(np.float16).astype(np.float64))
     assert found.turn == turn and found.found == 1
     assert np.count_nonzero(found.deleted != deleted) <= 0.002 * len(points)
-    exact = matching.matched(points, left)
+    exact = matching.match_gaussians(points, left)
     np.testing.assert_array_equal(exact.deleted, deleted)
 
 
 def test_splats_on_each_other_are_matched_one_to_one():
     points = np.repeat(cloud(500)[0], 2, axis=0)
-    assert matching.matched(points, np.delete(points, 7, axis=0)).deleted.nonzero()[0].tolist() in ([6], [7])
+    assert matching.match_gaussians(points, np.delete(points, 7, axis=0)).deleted.nonzero()[0].tolist() in ([6], [7])
 
 
 @pytest.mark.parametrize("moved", [lambda p: p + 0.3, lambda p: 1.3 * p, lambda p: p[:, [1, 2, 0]]])
 def test_what_was_moved_scaled_or_turned_otherwise_is_not_matched(moved):
     points, deleted = cloud()
-    assert matching.matched(points, moved(points[~deleted])).found < matching.SAME
+    assert matching.match_gaussians(points, moved(points[~deleted])).found < matching.MIN_MATCHED_SHARE
 
 
 # ---------------------------------------------------------------------------------------------- the stage `poses`

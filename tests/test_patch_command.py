@@ -165,7 +165,7 @@ def test_many_splats_are_matched_by_their_exact_places():
     deleted = draws.random(len(points)) < 0.1
     deleted[[5, *range(1000, 1010)]], deleted[2000:2010] = False, True
     left = points[~deleted][draws.permutation(np.count_nonzero(~deleted))] * (-1, -1, 1)
-    found = matching.matched(points, left)
+    found = matching.match_gaussians(points, left)
     assert found.found == 1 and found.turn == (-1, -1, 1)
     twins = [*range(1000, 1010), *range(2000, 2010)]
     np.testing.assert_array_equal(np.delete(found.deleted, twins), np.delete(deleted, twins))
@@ -178,7 +178,7 @@ def test_some_splats_that_moved_a_little_are_still_found():
     deleted = np.arange(len(points)) < 100
     left = points[~deleted].copy()
     left[:40] += 1e-5
-    found = matching.matched(points, left)
+    found = matching.match_gaussians(points, left)
     assert found.found == 1
     np.testing.assert_array_equal(found.deleted, deleted)
 

@@ -32,11 +32,11 @@ def striped(height=70, width=90):
     image = torch.stack([128 + 100 * torch.sin((rows + k * columns) / 4) for k in (1, 2, 3)], 2)
     hole = torch.zeros(height, width, dtype=torch.bool)
     hole[20:50, 30:60] = True
-    return crops.picture(image.to(torch.uint8), hole, NATIVE)
+    return crops.make_picture(image.to(torch.uint8), hole, NATIVE)
 
 
 def test_pictures_are_enlarged_until_a_crop_fits():
-    small = crops.picture(torch.zeros(30, 50, 3, dtype=torch.uint8), torch.ones(30, 50, dtype=torch.bool), 64)
+    small = crops.make_picture(torch.zeros(30, 50, 3, dtype=torch.uint8), torch.ones(30, 50, dtype=torch.bool), 64)
     assert small.image.shape == (3, 64, 107) and small.region.shape == (64, 107) and small.region.all()
     assert float(small.image.min()) == -1
 
@@ -141,7 +141,7 @@ def test_learning_rate_warms_up_and_falls():
 
 
 def test_training_learns_the_reference_and_logs_it(tiny, tmp_path):
-    trained = lora.add(tiny, 8, 16, 0.1, "attention+conv", 0)
+    trained = lora.attach(tiny, 8, 16, 0.1, "attention+conv", 0)
     training = altered(TRAINING, steps=60, optimizer={"batch": 4, "lr_unet": 4e-3})
     P.personalize(tiny, trained, [striped()], training, tmp_path)
     records = read_trace(tmp_path / "trace.jsonl")
@@ -164,7 +164,7 @@ def test_photographs_are_measured_by_and_not_learnt_from(tiny, tmp_path):
     def learnt(folder, photographs):
         folder.mkdir()
         prior = small_prior()
-        trained = lora.add(prior, 4, 8, 0.0, "attention", 0)
+        trained = lora.attach(prior, 4, 8, 0.0, "attention", 0)
         P.personalize(prior, trained, [reference], TRAINING, folder, photographs)
         return lora.state(prior), read_trace(folder / "trace.jsonl")[-1]
 
@@ -179,7 +179,7 @@ def test_interrupted_training_resumes_to_the_same_weights(tmp_path, monkeypatch)
 
     def trained(folder):
         prior = small_prior()
-        trained = lora.add(prior, 4, 8, 0.1, "attention", 0)
+        trained = lora.attach(prior, 4, 8, 0.1, "attention", 0)
         training = altered(TRAINING, optimizer={"schedule": "cosine", "warm_up": 2}, checkpoint_seconds=1e-9)
         P.personalize(prior, trained, [striped()], training, folder)
         return lora.state(prior)
@@ -207,7 +207,7 @@ def test_interrupted_training_resumes_to_the_same_weights(tmp_path, monkeypatch)
 
 
 def test_a_number_that_is_none_stops_the_training_and_names_the_step(tiny, tmp_path):
-    trained = lora.add(tiny, 4, 8, 0.0, "attention", 0)
+    trained = lora.attach(tiny, 4, 8, 0.0, "attention", 0)
     broken = replace(striped(), image=torch.full((3, 70, 90), float("nan")))
     with pytest.raises(FloatingPointError, match="step 0"):
         P.personalize(tiny, trained, [broken], TRAINING, tmp_path)

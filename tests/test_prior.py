@@ -119,7 +119,7 @@ def test_guidance_zero_is_the_conditional_prediction(tiny):
 @pytest.mark.parametrize("dropout", [0.1, 0.0], ids=["beside the weights", "added to them"])
 @pytest.mark.parametrize("layers", ["attention", "attention+conv"])
 def test_saved_lora_gives_the_trained_epsilon_in_a_fresh_diffusers_pipeline(tiny, tmp_path, layers, dropout):
-    found = lora.add(tiny, rank=4, alpha=12.0, dropout=dropout, layers=layers, seed=0)
+    found = lora.attach(tiny, rank=4, alpha=12.0, dropout=dropout, layers=layers, seed=0)
     noise = generator(0, "lora")
     for parameter in found["unet"] + found["text"]:
         parameter.data += 0.1 * torch.randn(parameter.shape, generator=noise)
@@ -157,7 +157,7 @@ def test_saved_lora_gives_the_trained_epsilon_in_a_fresh_diffusers_pipeline(tiny
         loaded = diffusion.raw_prediction(fresh, noisy, t, condition, diffusion.embed_text(fresh, ["A photo of sks"]))
         assert (loaded - trained).abs().max() < 1e-5
 
-    merged = lora.merged(plain, tmp_path)
+    merged = lora.merge(plain, tmp_path)
     again = diffusion.raw_prediction(merged, noisy, t, condition, diffusion.embed_text(merged, ["A photo of sks"]))
     assert (again - trained).abs().max() < 2e-5
 
@@ -166,7 +166,7 @@ def test_lora_added_to_the_weights_has_the_gradients_of_lora_beside_them():
     gradients = []
     for dropout in (0.1, 0.0):  # in evaluation mode dropout does nothing
         prior = load_prior(TINY)
-        found = lora.add(prior, 4, 8.0, dropout, "attention+conv", 0)
+        found = lora.attach(prior, 4, 8.0, dropout, "attention+conv", 0)
         noise = generator(0, "lora")
         for parameter in found["unet"]:
             parameter.data += 0.02 * torch.randn(parameter.shape, generator=noise)
@@ -183,7 +183,7 @@ def test_lora_added_to_the_weights_has_the_gradients_of_lora_beside_them():
 
 
 def test_lora_state_round_trip(tiny):
-    found = lora.add(tiny, 2, 4.0, 0.0, "attention", 0)
+    found = lora.attach(tiny, 2, 4.0, 0.0, "attention", 0)
     state = lora.state(tiny)
     for parameter in found["unet"] + found["text"]:
         parameter.data += 1

@@ -16,7 +16,7 @@ from benchmarks.gpu import exact as gpu_exact
 from benchmarks.gpu import full_size as F
 from benchmarks.gpu import steps as gpu_steps
 from reffusion.prior import crops, denoising, diffusion, inpaint, lora, memory
-from reffusion.prior.model import load_prior, pipeline, recomputing, without_text
+from reffusion.prior.model import drop_text_encoders, enable_checkpointing, load_prior, pipeline
 from reffusion.prior.personalize import train_step
 from reffusion.seeding import generator
 from reffusion.weights import published
@@ -76,7 +76,7 @@ def test_sdxl_paints_a_reference(sdxl):
 
 def test_sdxl_is_refused_where_it_cannot_work(sdxl):
     with pytest.raises(ValueError, match=r"reference.prior"):
-        lora.add(sdxl, 4, 4.0, 0.0, "attention", 0)
+        lora.attach(sdxl, 4, 4.0, 0.0, "attention", 0)
 
 
 # ----------------------------------------------------------------------------------------------------- parts of a batch
@@ -87,7 +87,7 @@ def test_a_batch_in_parts_gives_the_same_values_and_gradients(sd2):
     noisy, condition, at = draw(3, 4, 16, 16), draw(3, 5, 16, 16), torch.tensor([10, 500, 900])
     text = diffusion.embed_text(sd2, list(crops.PROMPTS)).detach()
     found = []
-    for prior in (sd2, replace(sd2, rows=1, rows_graded=2), recomputing(sd2)):
+    for prior in (sd2, replace(sd2, rows=1, rows_graded=2), enable_checkpointing(sd2)):
         latents = diffusion.encode(prior, images)
         (gradient,) = torch.autograd.grad((latents * draw(*latents.shape)).sum(), images)
         with torch.no_grad():
@@ -140,7 +140,7 @@ def test_a_small_lora_is_not_lost_in_half_precision(sd2, dropout):
     noisy, condition, at, text = draw(1, 4, 16, 16), draw(1, 5, 16, 16), torch.tensor([500]), draw(1, 24, 64)
     changes = []
     for prior in (sd2, half):
-        found = lora.add(prior, 4, 4.0, dropout, "attention", 0)
+        found = lora.attach(prior, 4, 4.0, dropout, "attention", 0)
         before = diffusion.raw_prediction(prior, noisy, at, condition, text).detach()
         noise = generator(0, "lora")
         for parameter in found["unet"]:
@@ -156,7 +156,7 @@ def test_a_small_lora_is_not_lost_in_half_precision(sd2, dropout):
 def test_a_lora_loads_into_diffusers_own_pipeline_of_sd2(sd2, tmp_path):
     """Its UNet's and its text encoder's part, by `load_lora_weights`, into models of the same weights."""
     before = F.epsilon(sd2)
-    found = lora.add(sd2, 4, 8.0, 0.1, "attention", 0)
+    found = lora.attach(sd2, 4, 8.0, 0.1, "attention", 0)
     noise = generator(0, "lora")
     for parameter in found["unet"] + found["text"]:
         parameter.data += 0.1 * torch.randn(parameter.shape, generator=noise)
@@ -172,22 +172,22 @@ def test_a_lora_loads_into_diffusers_own_pipeline_of_sd2(sd2, tmp_path):
 
 def test_the_order_of_weights_in_memory_changes_nothing(sd2, tmp_path):
     """What a UNet on CUDA is laid out like: the same answer, with LoRA that is trained, saved and merged."""
-    lora.add(sd2, 4, 8.0, 0.0, "attention+conv", 0)
+    lora.attach(sd2, 4, 8.0, 0.0, "attention+conv", 0)
     before = F.epsilon(sd2)
     sd2.unet.to(memory_format=torch.channels_last)
     assert (F.epsilon(sd2) - before).abs().max() < 1e-5
     F.personalization_step(F.build_prior(F.shrink(F.SD2), torch.float32), F.reference(32), 1, tmp_path)
     fresh = F.build_prior(F.shrink(F.SD2), torch.float32)
     fresh.unet.to(memory_format=torch.channels_last)
-    plain = lora.merged(F.build_prior(F.shrink(F.SD2), torch.float32), tmp_path)
-    assert (F.epsilon(lora.merged(fresh, tmp_path)) - F.epsilon(plain)).abs().max() < 1e-5
+    plain = lora.merge(F.build_prior(F.shrink(F.SD2), torch.float32), tmp_path)
+    assert (F.epsilon(lora.merge(fresh, tmp_path)) - F.epsilon(plain)).abs().max() < 1e-5
 
 
 def test_the_text_encoder_is_let_go():
     prior = F.build_prior(F.shrink(F.SD2), torch.float32)
     whole, encoder = prior.bytes, weakref.ref(prior.text_encoder)
     text = diffusion.embed_text(prior, list(crops.PROMPTS)).detach()
-    prior = without_text(prior)
+    prior = drop_text_encoders(prior)
     gc.collect()
     assert encoder() is None and prior.bytes < whole
     with pytest.raises(ValueError, match="text encoder was dropped"):
@@ -213,32 +213,34 @@ def test_living_tensors_are_counted():
 
 
 def test_a_budget_chooses_the_parts(sd2):
-    assert memory.fitted(sd2, 0.0, "distill.memory_gb", memory.encoding) is sd2
-    one, answer = (memory.peak_bytes(lambda w=w: w(sd2), "cpu") for w in (memory.encoding, memory.answering))
+    assert memory.fit_to_memory(sd2, 0.0, "distill.memory_gb", memory.encode_one_sample) is sd2
+    one, answer = (
+        memory.peak_bytes(lambda w=w: w(sd2), "cpu") for w in (memory.encode_one_sample, memory.inpaint_one_sample)
+    )
     budget = (sd2.bytes + 3.5 * one) / memory.USABLE_SHARE / 1e9
-    chosen = memory.fitted(sd2, budget, "distill.memory_gb", memory.encoding)
+    chosen = memory.fit_to_memory(sd2, budget, "distill.memory_gb", memory.encode_one_sample)
     assert chosen.rows_graded == 3 and chosen.rows == int(3.5 * one // answer)
     with pytest.raises(ValueError, match=r"distill.memory_gb is 0.001, but the prior takes .* raise it to"):
-        memory.fitted(sd2, 1e-3, "distill.memory_gb", memory.encoding)
-    assert memory.peak_bytes(lambda: memory.encoding(recomputing(sd2)), "cpu") < one
+        memory.fit_to_memory(sd2, 1e-3, "distill.memory_gb", memory.encode_one_sample)
+    assert memory.peak_bytes(lambda: memory.encode_one_sample(enable_checkpointing(sd2)), "cpu") < one
 
 
 def test_measuring_a_training_sample_leaves_no_gradient(sd2):
     trained, _, _ = F.trainer(sd2, 1)
-    row = lambda prior: denoising.one_sample(prior, [F.reference(32)], 0)
-    assert memory.fitted(sd2, 1.0, "personalize.memory_gb", row).rows_graded > 1
+    row = lambda prior: denoising.backward_one_sample(prior, [F.reference(32)], 0)
+    assert memory.fit_to_memory(sd2, 1.0, "personalize.memory_gb", row).rows_graded > 1
     assert all(p.grad is None and p.requires_grad for part in trained.values() for p in part)
 
 
 def test_running_out_of_memory_names_the_param():
     with pytest.raises(ValueError, match=r"out of memory: lower distill.memory_gb \(now 20\)"):
-        with memory.blamed("distill.memory_gb", 20.0):
+        with memory.explain_oom("distill.memory_gb", 20.0):
             torch.empty(2**60, dtype=torch.uint8)
     with pytest.raises(ValueError, match=r"personalize.memory_gb \(now 0: no limit\)"):
-        with memory.blamed("personalize.memory_gb", 0.0):
+        with memory.explain_oom("personalize.memory_gb", 0.0):
             raise torch.OutOfMemoryError("CUDA out of memory")
     with pytest.raises(RuntimeError, match="other"):
-        with memory.blamed("distill.memory_gb", 20.0):
+        with memory.explain_oom("distill.memory_gb", 20.0):
             raise RuntimeError("other")
 
 
@@ -255,7 +257,7 @@ def test_memory_is_counted_without_computing():
     counted = F.peak_memory(shape, torch.float32)
     made = F.build_prior(shape, torch.float32)
     assert counted["weights"] == pytest.approx(made.bytes / 1e9, abs=1e-6)
-    real = memory.peak_bytes(lambda: memory.encoding(made), "cpu") / 1e9
+    real = memory.peak_bytes(lambda: memory.encode_one_sample(made), "cpu") / 1e9
     assert real <= counted["SDS"] < 2 * real  # attention is taken apart there
     assert counted["personalization, checkpointing"] < counted["personalization"]
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from reffusion.distill.sds import draw_timesteps, match_contrast, sds_gradient, sds_loss
-from reffusion.prior.windows import enlarged, two_scale_masks, two_scales, window_around
+from reffusion.prior.windows import enlarge_to_fit, two_scale_masks, two_scales, window_around
 from reffusion.seeding import generator
 
 ABAR = torch.cos(torch.linspace(0.05, 1.5, 100, dtype=torch.float64)) ** 2
@@ -192,9 +192,9 @@ def test_windows_show_the_mask_and_stay_inside():
 
 
 def test_small_views_are_enlarged_until_a_window_fits():
-    assert enlarged(torch.rand(3, 24, 40), 16).shape == (3, 24, 40)
-    assert enlarged(torch.rand(3, 24, 40), 48).shape == (3, 48, 80)
-    assert min(enlarged(torch.rand(3, 33, 47), 64).shape[1:]) == 64
+    assert enlarge_to_fit(torch.rand(3, 24, 40), 16).shape == (3, 24, 40)
+    assert enlarge_to_fit(torch.rand(3, 24, 40), 48).shape == (3, 48, 80)
+    assert min(enlarge_to_fit(torch.rand(3, 33, 47), 64).shape[1:]) == 64
 
 
 def test_timesteps_reach_both_ends_of_their_range():

@@ -179,21 +179,21 @@ def test_a_lost_shard_is_named(caches):
 
 
 def test_what_a_stage_needs(caches):
-    need = local.of_model(published.SD2, "float16")
+    need = local.model_need(published.SD2, "float16")
     assert "not on this machine" in need.problem and need.fetched and 2.5e9 < need.bytes < 2.7e9
     folder = copied(caches / "good")
-    assert local.of_model(str(folder), "float32").problem is None
+    assert local.model_need(str(folder), "float32").problem is None
     shutil.rmtree(folder / "unet")
-    broken = local.of_model(str(folder), "float32")
+    broken = local.model_need(str(folder), "float32")
     assert "lacks unet" in broken.problem and not broken.fetched
-    assert "no weights of alex and vgg" in local.of_lpips().problem and local.of_lpips().optional
+    assert "no weights of alex and vgg" in local.lpips_need().problem and local.lpips_need().optional
     own = caches / "cache" / "reffusion" / "lpips"
     own.mkdir(parents=True)
     for name in ("alex.safetensors", "vgg.pth"):  # whole, and half of a pair
         (own / name).write_bytes(b"x")
-    assert "no weights of vgg on" in local.of_lpips().problem
+    assert "no weights of vgg on" in local.lpips_need().problem
     (own / "vgg16-own.pth").write_bytes(b"x")
-    assert local.of_lpips().problem is None
+    assert local.lpips_need().problem is None
 
 
 # ------------------------------------------------------------------------------------------------------------- fetching
@@ -206,18 +206,18 @@ def test_one_set_of_weights_a_part_is_chosen():
              "vae/diffusion_pytorch_model.safetensors", "text_encoder/config.json",
              "text_encoder/model.fp16.safetensors", "tokenizer/vocab.json", "tokenizer/merges.txt",
              "scheduler/scheduler_config.json", "safety_checker/model.safetensors"]  # fmt: skip
-    half, full = set(download.chosen_files(names, True)), set(download.chosen_files(names, False))
+    half, full = set(download.select_files(names, True)), set(download.select_files(names, False))
     assert half - full == {"unet/diffusion_pytorch_model.fp16.safetensors"}
     assert full - half == {"unet/diffusion_pytorch_model.safetensors"}
     assert half & full == {"model_index.json", "unet/config.json", "vae/config.json", "text_encoder/config.json",
                            "vae/diffusion_pytorch_model.safetensors", "text_encoder/model.fp16.safetensors",
                            "tokenizer/vocab.json", "tokenizer/merges.txt",
                            "scheduler/scheduler_config.json"}  # fmt: skip
-    assert download.chosen_files(["config.json", "model.safetensors", "a.bin"], True) == [
+    assert download.select_files(["config.json", "model.safetensors", "a.bin"], True) == [
         "config.json",
         "model.safetensors",
     ]
-    assert download.chosen_files(["config.json", "pytorch_model.bin"], True) == []
+    assert download.select_files(["config.json", "pytorch_model.bin"], True) == []
 
 
 class Hub(http.server.BaseHTTPRequestHandler):
@@ -302,7 +302,7 @@ import sys
 from reffusion.weights import download
 for name in sys.argv[1:]:
     try:
-        print(download.model(name, True))
+        print(download.download_model(name, True))
     except ValueError as error:
         print(error)
 """

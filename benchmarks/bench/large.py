@@ -139,7 +139,7 @@ def _fma_chains(rounds):
     for _ in range(rounds):
         a, b, c, d, e = v.fma(a, x, y), v.fma(b, x, y), v.fma(c, x, y), v.fma(d, x, y), v.fma(e, x, y)
         f, g, h, i, j = v.fma(f, x, y), v.fma(g, x, y), v.fma(h, x, y), v.fma(i, x, y), v.fma(j, x, y)
-    return v.some(a + b + c + d + e + f + g + h + i + j > v.splat(0.0))
+    return v.any_lane(a + b + c + d + e + f + g + h + i + j > v.splat(0.0))
 
 
 def fma_peak(rounds: int = 3_000_000, tries: int = 10) -> float:

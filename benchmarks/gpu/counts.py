@@ -81,7 +81,7 @@ def count_prior(shape: full_size.Shape, name: str) -> dict[str, dict[str, float]
         found["encode and back"] = count_work(lambda: diffusion.encode(prior, graded).sum().backward())
         full_size.trainer(prior, 1)
         picture = full_size.reference(size)
-        found["personalize a sample"] = count_work(lambda: denoising.one_sample(prior, [picture], 0))
+        found["personalize a sample"] = count_work(lambda: denoising.backward_one_sample(prior, [picture], 0))
     return {f"{name} {part}": each for part, each in found.items()}
 
 

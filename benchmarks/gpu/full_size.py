@@ -25,7 +25,7 @@ from reffusion.distill.train_view import TrainView
 from reffusion.params.distill import Sds
 from reffusion.params.personalize import Optimizer, Params
 from reffusion.prior import crops, denoising, diffusion, lora, memory
-from reffusion.prior.model import Prior, make_prior, recomputing, without_text
+from reffusion.prior.model import Prior, drop_text_encoders, enable_checkpointing, make_prior
 from reffusion.prior.personalize import WEIGHT_DECAY, train_step
 from reffusion.seeding import generator
 from reffusion.types import Camera, Gaussians
@@ -152,14 +152,14 @@ def peak_memory(shape: Shape, dtype: torch.dtype) -> dict[str, float]:
         made = networks(shape, dtype)
     prior = assemble_prior(shape, made, "meta")
     picture = reference(prior.native_size)
-    steps = {"inpainting": memory.answering, "SDS": memory.encoding}
+    steps = {"inpainting": memory.inpaint_one_sample, "SDS": memory.encode_one_sample}
     sizes = {"weights": prior.bytes}
     sizes |= {name: memory.peak_bytes(lambda s=step: s(prior), "meta") for name, step in steps.items()}
     trainer(prior, 1)
-    training = lambda: denoising.one_sample(prior, [picture], 0)
+    training = lambda: denoising.backward_one_sample(prior, [picture], 0)
     sizes["personalization"] = memory.peak_bytes(training, "meta")
-    recomputing(prior)
-    sizes["SDS, checkpointing"] = memory.peak_bytes(lambda: memory.encoding(prior), "meta")
+    enable_checkpointing(prior)
+    sizes["SDS, checkpointing"] = memory.peak_bytes(lambda: memory.encode_one_sample(prior), "meta")
     sizes["personalization, checkpointing"] = memory.peak_bytes(training, "meta")
     return {name: round(count / 1e9, 6) for name, count in sizes.items()}
 
@@ -197,14 +197,14 @@ def reference(size: int) -> crops.Picture:
     image = torch.stack([128 + 100 * torch.sin((rows + k * columns) / 9) for k in (1, 2, 3)], 2)
     hole = torch.zeros(rows.shape, dtype=torch.bool)
     hole[size // 3 : 2 * size // 3, size // 2 : size] = True
-    return crops.picture(image.to(torch.uint8), hole, size)
+    return crops.make_picture(image.to(torch.uint8), hole, size)
 
 
 def trainer(prior: Prior, batch: int) -> tuple[dict[str, list], torch.optim.Optimizer, Params]:
     """The paper's LoRA on a prior (rank 8, alpha 16, dropout 0.1, attention layers), with AdamW."""
     training = Params(optimizer=Optimizer(batch=batch))
     chosen, rates = training.lora, training.optimizer
-    trained = lora.add(prior, chosen.rank, chosen.alpha, chosen.dropout, chosen.layers, training.seed)
+    trained = lora.attach(prior, chosen.rank, chosen.alpha, chosen.dropout, chosen.layers, training.seed)
     groups = [{"params": trained["unet"], "lr": rates.lr_unet}, {"params": trained["text"], "lr": rates.lr_text}]
     return trained, torch.optim.AdamW(groups, betas=rates.betas, weight_decay=WEIGHT_DECAY), training
 
@@ -290,7 +290,7 @@ def run(shape: Shape, dtype: torch.dtype, options: argparse.Namespace) -> dict[s
 
     def made() -> Prior:
         prior = build_prior(shape, dtype)
-        return recomputing(prior) if options.checkpointing else prior
+        return enable_checkpointing(prior) if options.checkpointing else prior
 
     prior = record_time(report, "build", made)
     report["size"] = size = prior.native_size
@@ -301,13 +301,13 @@ def run(shape: Shape, dtype: torch.dtype, options: argparse.Namespace) -> dict[s
     before = record_time(report, "epsilon of the trained", lambda: epsilon(prior))
     del prior
     gc.collect()
-    prior = lora.merged(record_time(report, "build again", made), options.out)
+    prior = lora.merge(record_time(report, "build again", made), options.out)
     after = record_time(report, "epsilon of the loaded", lambda: epsilon(prior))
     report["epsilon difference"] = float((after - before).abs().max())
     report["epsilon size"] = float(before.abs().max())
     with torch.no_grad():
         text = record_time(report, "embed prompts", lambda: diffusion.embed_text(prior, list(crops.PROMPTS)))
-    prior = without_text(prior)
+    prior = drop_text_encoders(prior)
     gc.collect()
     sds, scene = Sds(patches=options.patches), gaussians(options.gaussians, "cpu")
     record_time(report, "SDS step", lambda: sds_step(prior, text, train_view(size, "cpu"), scene, sds))
@@ -337,7 +337,7 @@ def main() -> None:
     need = 1.2 * count_parameters(shape) * (4 if options.dtype == "float32" else 2) / 1e9
     if need > options.memory_gb:
         parser.error(f"the weights alone take {need:.0f} GB, more than --memory-gb {options.memory_gb:g}")
-    with memory.blamed("--size", options.size):
+    with memory.explain_oom("--size", options.size):
         report = run(shape, getattr(torch, options.dtype), options)
     (options.out / "full_size.json").write_text(json.dumps(report, indent=1) + "\n")
     if not options.toy and report["parameters"] != published.PUBLISHED[published.SD2].parameters:

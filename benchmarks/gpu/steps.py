@@ -14,7 +14,7 @@ from benchmarks.gpu import full_size
 from benchmarks.gpu.bench import PAPER, Bench, Sizes
 from reffusion import trace
 from reffusion.depth import monocular
-from reffusion.depth.background_depth import Completion, Seen
+from reffusion.depth.background_depth import Completion, ViewDepth
 from reffusion.distill.adversary import Adversary
 from reffusion.distill.depth_estimator import DepthEstimator, network_estimator
 from reffusion.distill.terms.adversarial import evaluate_adversarial
@@ -26,7 +26,7 @@ from reffusion.geometry import Degenerate
 from reffusion.params.distill import Depth, Sds
 from reffusion.params.fit import Densify, Params, SphericalHarmonics
 from reffusion.prior import crops, denoising, diffusion, memory
-from reffusion.prior.model import Prior, without_text
+from reffusion.prior.model import Prior, drop_text_encoders
 from reffusion.prior.personalize import train_step
 from reffusion.seeding import generator
 from reffusion.splat import rasterizer
@@ -58,7 +58,9 @@ def personalization(bench: Bench) -> dict[str, Any]:
     prior, source = bench.prior("bfloat16")
     picture = full_size.reference(prior.native_size)
     trained, optimizer, training = full_size.trainer(prior, bench.sizes.batch)
-    prior = memory.fitted(prior, 20.0, "personalize.memory_gb", lambda p: denoising.one_sample(p, [picture], 0))
+    prior = memory.fit_to_memory(
+        prior, 20.0, "personalize.memory_gb", lambda p: denoising.backward_one_sample(p, [picture], 0)
+    )
     values = bench.measure(lambda: {"loss": train_step(prior, optimizer, [picture], training, 0)})
     moved = sum(float(p.detach().abs().sum()) for p in trained["text"])
     bench.forget_prior()  # it has LoRA layers now
@@ -69,7 +71,7 @@ def prior_and_prompts(bench: Bench) -> tuple[Prior, Tensor, str]:
     """The prior without its text encoder, the embedded prompts, and the source of the weights."""
     prior, source = bench.prior("float16")
     with torch.no_grad():
-        return without_text(prior), diffusion.embed_text(prior, list(crops.PROMPTS)), source
+        return drop_text_encoders(prior), diffusion.embed_text(prior, list(crops.PROMPTS)), source
 
 
 def distillation(bench: Bench) -> dict[str, Any]:
@@ -131,10 +133,10 @@ def depth_estimator(sizes: Sizes, device: str) -> tuple[DepthEstimator, str]:
         ))  # fmt: skip
         torch.nn.init.constant_(model.head.conv3.bias, 1e4)  # else the last ReLU would cut nearly all values to 0
         network, source = monocular.make_network(model, device), "random"
-    tries = [network_estimator(lambda image, sign=sign: sign * monocular.disparity(network, image), Completion())
+    tries = [network_estimator(lambda image, sign=sign: sign * monocular.predict_disparity(network, image), Completion())
              for sign in (1, -1)]  # fmt: skip
 
-    def disparity(view: Seen, picture: Callable[[], np.ndarray]) -> np.ndarray:
+    def disparity(view: ViewDepth, picture: Callable[[], np.ndarray]) -> np.ndarray:
         painted = picture()
         try:
             return tries[0].disparity(view, lambda: painted)

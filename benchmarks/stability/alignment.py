@@ -120,7 +120,7 @@ def count_invalid_depths() -> float:
 
 def plain_condition() -> float:
     """Condition number of the system that `align` solves if the estimate is 1e4 spreads from zero."""
-    return alignment.condition(1e4 + np.random.default_rng(0).normal(size=1000))[1]
+    return alignment.condition_numbers(1e4 + np.random.default_rng(0).normal(size=1000))[1]
 
 
 # A float64 sum over n pixels rounds by about sqrt(n) 2^-53 of its terms; data and slopes are of order one.

@@ -108,13 +108,13 @@ def condition_of_completion() -> float:
 
     It is the stiffness times the fourth power of the free width.
     """
-    return completion.condition((~HOLE).astype(float))
+    return completion.condition_number((~HOLE).astype(float))
 
 
 def condition_of_solver() -> float:
     """Condition number with Jacobi's preconditioning, relative to the one without."""
     confidence = 10 ** np.random.default_rng(0).uniform(-2, 2, PLANE.shape)
-    plain, scaled = bilateral.condition(confidence, noise_guide())
+    plain, scaled = bilateral.condition_numbers(confidence, noise_guide())
     return scaled / plain
 
 

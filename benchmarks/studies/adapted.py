@@ -60,7 +60,7 @@ def load_holes(run: Path, count: int) -> dict[str, tuple[np.ndarray, np.ndarray]
     remaining = load_ply(run / "fit" / "gaussians.ply").map(lambda p: p[keep])
     chosen = pick_evenly(names, count)
     photos = exposure.load_views(run / "poses", run / "fit", chosen)
-    known = lambda n: inpaint.background(remaining, scene.cameras[n], photos[n], sets[n].consistent)
+    known = lambda n: inpaint.composite_background(remaining, scene.cameras[n], photos[n], sets[n].consistent)
     return {name: (known(name), sets[name].invent) for name in chosen}
 
 
@@ -70,7 +70,7 @@ def paint_hole(prior: Prior, picture: np.ndarray, hole: np.ndarray, prompt: str,
     inside = torch.from_numpy(hole)
     made = inpaint.repaint(
         prior,
-        inpaint.as_input(picture) * ~inside,
+        inpaint.to_input(picture) * ~inside,
         inside,
         diffusion.embed_text(prior, [prompt, prompt, ""]),
         seeding.generator(SEED, "adapted"),
@@ -80,7 +80,7 @@ def paint_hole(prior: Prior, picture: np.ndarray, hole: np.ndarray, prompt: str,
         steps=steps,
         guidance=0.0,
     )
-    return inpaint.as_picture(made)
+    return inpaint.to_picture(made)
 
 
 def save_sheet(models: dict[str, Prior], run: Path, count: int, steps: int, out: Path) -> list[str]:

@@ -35,7 +35,7 @@ def alignment_errors() -> list[tuple[float, float, float, float]]:
         plain = np.linalg.solve([[x @ x, x.sum()], [x.sum(), float(x.size)]], [x @ truth, truth.sum()])
         ours = alignment.align(x, truth)
         error = lambda line, truth=truth: float(np.abs(line - truth).max() / np.ptp(truth))
-        rows.append((offset, alignment.condition(x)[0], error(plain[0] * x + plain[1]), error(ours.apply(x))))
+        rows.append((offset, alignment.condition_numbers(x)[0], error(plain[0] * x + plain[1]), error(ours.apply(x))))
     return rows
 
 
@@ -53,11 +53,11 @@ def make_maps() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def solver_errors() -> dict[str, tuple[float, list[tuple[float, float]]]]:
     """Form -> (condition number, [seconds, relative L2 error after each step of conjugate gradients])."""
     misfit, confidence, guide = make_maps()
-    system, cell = bilateral.system_of(confidence, guide)
+    system, cell = bilateral.build_system(confidence, guide)
     right = np.bincount(cell, (confidence * misfit).ravel(), minlength=system.shape[0])
     exact = spsolve(system.tocsc(), right)
     jacobi = sparse.diags(1.0 / system.diagonal())
-    conditions = bilateral.condition(confidence, guide)
+    conditions = bilateral.condition_numbers(confidence, guide)
     found = {}
     for name, form, number in (("none", None, conditions[0]), ("Jacobi", jacobi, conditions[1])):
         iterates, began = [], time.perf_counter()
@@ -79,14 +79,16 @@ def completion_errors() -> tuple[float, list[tuple[float, float, float]]]:
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] / WIDTH
     tilted, found = columns - 0.6 * rows, []
     plate = completion.Plate(ring=2.0)  # the whole map takes part, as in the absolute form
-    factors = completion.factored(completion.system_of(known.astype(float), None, np.ones(known.shape, bool), plate))
+    factors = completion.factorize(
+        completion.build_system(known.astype(float), None, np.ones(known.shape, bool), plate)
+    )
     for offset in SPREADS:
         truth = tilted + offset * np.ptp(tilted)
         absolute = factors.solve(np.where(known, truth, 0.0).ravel()).reshape(truth.shape)
         ours = completion.complete(truth, known, plate=plate)
         error = lambda x, truth=truth: float(np.abs(x - truth)[~known].max() / np.ptp(tilted))
         found.append((offset, error(absolute), error(ours)))
-    return completion.condition(known.astype(float), plate=plate), found
+    return completion.condition_number(known.astype(float), plate=plate), found
 
 
 def measure(say: Callable[[str], None]) -> tuple:

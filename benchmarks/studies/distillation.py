@@ -149,7 +149,7 @@ def main() -> None:
     given.out.mkdir(parents=True, exist_ok=True)
     models = {
         "unadapted": load_prior(given.prior),
-        "personalized": lora.merged(load_prior(given.prior), given.run / "personalize"),
+        "personalized": lora.merge(load_prior(given.prior), given.run / "personalize"),
     }
     rows = measure(models, given.run)
     save_json(given.out / "distillation.json", rows)

@@ -203,13 +203,13 @@ def personalize_prior(params: stage.Params, needs: dict[str, Path], folder: Path
         save_json(made, settings)
     if not (folder / lora.LORA_FILE).exists():
         stage.run(params, folder, **needs)
-    return lora.merged(load_prior(params.prior), folder), trace.read_trace(folder / "trace.jsonl")
+    return lora.merge(load_prior(params.prior), folder), trace.read_trace(folder / "trace.jsonl")
 
 
 def personalize_wrongly(params: stage.Params, needs: dict[str, Path], wrong: Path, folder: Path) -> Prior:
     """The prior personalized on a wrong reference: a picture, or another scene's finished run."""
     if wrong.is_dir():
-        return lora.merged(load_prior(params.prior), wrong / "personalize")
+        return lora.merge(load_prior(params.prior), wrong / "personalize")
     other = replace_references(needs["reference"], wrong, folder / "other")
     model, _ = personalize_prior(params, needs | {"reference": other}, folder / f"{params.seed}-wrong")
     shutil.rmtree(other)

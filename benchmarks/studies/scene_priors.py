@@ -59,7 +59,7 @@ def load_priors(given: argparse.Namespace) -> tuple[dict[str, Prior], str]:
         raise ValueError("dtype=float16 is for device=cuda; on the CPU float32 or bfloat16")
     base = given.prior or load_json(adapted / "receipt.json")["params"]["prior"]
     fresh = lambda: load_prior(base, given.device, getattr(torch, given.dtype))
-    return {"before": fresh(), "after": lora.merged(fresh(), adapted)}, base
+    return {"before": fresh(), "after": lora.merge(fresh(), adapted)}, base
 
 
 def peak_mb(device: str) -> int:

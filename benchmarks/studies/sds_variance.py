@@ -60,8 +60,8 @@ def load_inputs(run: Path, prior: Prior) -> dict[str, tuple[Tensor, Tensor]]:
     size, pictures, holes = prior.native_size, [], []
     for name in (names[place] for place in places):
         view = rasterizer.render(gaussians, scene.cameras[name]).color.clamp(0, 1).permute(2, 0, 1) * 2 - 1
-        view = windows.enlarged(view, size)
-        hole = windows.enlarged(torch.from_numpy(sets[name].invent).to(view)[None], size)[0] > 1e-4
+        view = windows.enlarge_to_fit(view, size)
+        hole = windows.enlarge_to_fit(torch.from_numpy(sets[name].invent).to(view)[None], size)[0] > 1e-4
         picked = [windows.window_around(hole, size, seeding.generator(SEED, "sds variance", name))]
         pictures.append(windows.two_scales(view, picked, size))
         holes.append(windows.two_scale_masks(hole, picked, size))

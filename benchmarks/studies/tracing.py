@@ -18,13 +18,13 @@ from types import ModuleType
 import yaml
 
 from reffusion import trace
-from reffusion.fit.reconstruction import FIRST_MOMENT
+from reffusion.fit.reconstruction import FIRST_TRACED_STEP
 from stages import distill, fit, personalize
 
 ROOT = Path(__file__).resolve().parents[2]
 
 STAGES = {
-    "fit": (fit, "iterations", ("poses",), (2, FIRST_MOMENT)),
+    "fit": (fit, "iterations", ("poses",), (2, FIRST_TRACED_STEP)),
     "personalize": (personalize, "steps", ("poses", "raw_masks", "reference"), (1, 1)),
     "distill": (distill, "iterations", ("poses", "fit", "masks", "reference", "personalize", "initialize"), (4, 1)),
 }

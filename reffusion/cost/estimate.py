@@ -66,7 +66,7 @@ CARDS = {
 }
 
 
-def card_of(name: str) -> str | None:
+def find_gpu(name: str) -> str | None:
     """The GPU called `name`, or that of this machine if `name` is empty; None if there is none in the table.
 
     Raises:
@@ -200,9 +200,9 @@ def _samples_per_pass(memory_gb: float, sample: float, most: int) -> int:
     return max(1, min(most, int((0.9 * memory_gb - WEIGHTS) / sample)))
 
 
-def said(name: str, device: str, found: tuple[Work, float] | None) -> Mapping[str, object] | None:
+def format_estimate(name: str, device: str, found: tuple[Work, float] | None) -> Mapping[str, object] | None:
     """What a plan prints: seconds, gigabytes, the GPU and the assumptions; None if the stage does not run on a GPU."""
-    card = card_of(name)
+    card = find_gpu(name)
     if card is None or device != "cuda" or found is None:
         return None
     work, gigabytes = found

@@ -86,7 +86,7 @@ def align(
     return _robust_line(x, y, w, plain, seeding.generator(seed, "align")) if robust else plain
 
 
-def condition(estimate: np.ndarray, weights: np.ndarray | None = None) -> tuple[float, float]:
+def condition_numbers(estimate: np.ndarray, weights: np.ndarray | None = None) -> tuple[float, float]:
     """Condition numbers of the normal equations: in plain form, and in the form that `align` solves.
 
     `align` works about the weighted mean and in units of the weighted spread, which decouples the two equations. Only

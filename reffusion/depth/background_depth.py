@@ -95,7 +95,7 @@ NO_HINTS = Hints()
 
 
 @dataclass(frozen=True)
-class Seen:
+class ViewDepth:
     """The scene's depth in one view, and where it is known.
 
     Attributes:
@@ -130,29 +130,29 @@ class Seen:
         return 1.0 / (FARTHEST_RATIO * self.depth[self.known].max())
 
 
-def seen(
+def extract_depth(
     rendering: Rendering,
     camera: Camera,
     hole: np.ndarray,
     hidden: np.ndarray,
     settings: Completion,
     hints: Hints = NO_HINTS,
-) -> Seen:
+) -> ViewDepth:
     """The depth of a rendering: known where alpha is high, except in the hole and a margin around it."""
     depth, alpha = (t.detach().double().cpu().numpy() for t in (rendering.depth, rendering.alpha))
     plane_depth, outer = hints.plane_depth, hints.outer
     if outer is not None:
         depth, alpha = np.where(outer > 0, outer, depth), np.where(outer > 0, 1.0, alpha)
-    known = (alpha > settings.explained) & (depth > 0) & ~grown(hole, settings.margin)
+    known = (alpha > settings.explained) & (depth > 0) & ~dilate(hole, settings.margin)
     if hints.observed is not None:
         known |= hole & hints.observed
     anchored = hole & ~known & np.isfinite(plane_depth) if plane_depth is not None else np.zeros_like(hole)
     depth = np.where(anchored, plane_depth, depth) if anchored.any() else depth
-    return Seen(camera, depth, known, hole, hidden, anchored, hints)
+    return ViewDepth(camera, depth, known, hole, hidden, anchored, hints)
 
 
-def continued(
-    view: Seen,
+def continue_depth(
+    view: ViewDepth,
     guide: np.ndarray | Callable[[], np.ndarray],
     points: np.ndarray,
     settings: Completion,
@@ -185,7 +185,7 @@ def continued(
     guide = guide() if callable(guide) else guide
     plate = Plate(settings.ring, settings.stiffness, settings.edge, settings.unknowns)
     usable = view.known | view.anchored
-    surroundings, hole = usable & grown(view.hole, settings.ring), grown(view.hole, settings.margin)
+    surroundings, hole = usable & dilate(view.hole, settings.ring), dilate(view.hole, settings.margin)
     planes = () if farthest else view.hints.planes
     label = partial(label_surfaces, view.disparity, surroundings, hole, guide, planes, view.anchored)
     surfaces = label()
@@ -221,7 +221,7 @@ def continued(
     return np.where(view.anchored, view.disparity, refined), f"{description}: continued smoothly instead{onward}"
 
 
-def _farthest_surface(view: Seen, surfaces: np.ndarray, usable: np.ndarray) -> int:
+def _farthest_surface(view: ViewDepth, surfaces: np.ndarray, usable: np.ndarray) -> int:
     """The surface of the smallest median disparity."""
     median_disparity = lambda surface: float(np.median(view.disparity[usable & ~view.anchored & (surfaces == surface)]))
     present = [k for k in range(1, surfaces.max() + 1) if (usable & ~view.anchored & (surfaces == k)).any()]
@@ -229,7 +229,7 @@ def _farthest_surface(view: Seen, surfaces: np.ndarray, usable: np.ndarray) -> i
 
 
 def _complete_layers(
-    view: Seen, surfaces: np.ndarray, planes: Sequence[np.ndarray], guide: np.ndarray, plate: Plate
+    view: ViewDepth, surfaces: np.ndarray, planes: Sequence[np.ndarray], guide: np.ndarray, plate: Plate
 ) -> np.ndarray:
     """[H, W] disparity: each surface is continued smoothly by itself, with a step between two surfaces.
 
@@ -251,7 +251,7 @@ def _complete_layers(
     return np.where(rest, complete(result, result > 0, guide, plate), result) if rest.any() else result
 
 
-def _refuted_share(view: Seen, disparity: np.ndarray) -> float:
+def _refuted_share(view: ViewDepth, disparity: np.ndarray) -> float:
     """The share of the hole in which a surface of this disparity occludes a continued plane or fills free space.
 
     This rejects, for example, the planes of a post and of the ground, which meet before the ground behind the post.
@@ -260,24 +260,24 @@ def _refuted_share(view: Seen, disparity: np.ndarray) -> float:
     return float(refuted[view.hole].mean()) if view.hole.any() else 0.0
 
 
-def _in_free_space(view: Seen, disparity: np.ndarray) -> np.ndarray:
+def _in_free_space(view: ViewDepth, disparity: np.ndarray) -> np.ndarray:
     """bool [H, W]: pixels of the hole in which other views see past a surface of this disparity."""
     if view.hints.free_space is None:
         return np.zeros_like(view.hole)
     return view.hole & view.hints.free_space(1 / np.maximum(disparity, view.least_disparity))
 
 
-def points_around(view: Seen, points: np.ndarray, settings: Completion) -> tuple[np.ndarray, np.ndarray]:
+def points_around(view: ViewDepth, points: np.ndarray, settings: Completion) -> tuple[np.ndarray, np.ndarray]:
     """Image points [S, 2] and disparities [S] of the sparse points that are visible around the hole."""
     return visible_points(points, view.camera, _surroundings(view, settings), view.disparity)
 
 
-def _surroundings(view: Seen, settings: Completion) -> np.ndarray:
+def _surroundings(view: ViewDepth, settings: Completion) -> np.ndarray:
     excluded = view.hidden | view.hole
-    return grown(excluded, settings.ring) & ~excluded
+    return dilate(excluded, settings.ring) & ~excluded
 
 
-def _fit_planar_model(view: Seen, points: np.ndarray, settings: Completion) -> tuple[planes.PlanarModel, str]:
+def _fit_planar_model(view: ViewDepth, points: np.ndarray, settings: Completion) -> tuple[planes.PlanarModel, str]:
     """The planes fitted to the surroundings, and a description: how many explain what share of the samples.
 
     The samples are the sparse points where there are enough. Where planes explain most of these but not all, so that
@@ -300,7 +300,7 @@ def _fit_planar_model(view: Seen, points: np.ndarray, settings: Completion) -> t
     return model, f"{model.planes} planes explain {model.explained:.0%} of {len(values)} {source}"
 
 
-def _fit_planes(view: Seen, pixels: np.ndarray, values: np.ndarray, settings: Completion) -> planes.PlanarModel:
+def _fit_planes(view: ViewDepth, pixels: np.ndarray, values: np.ndarray, settings: Completion) -> planes.PlanarModel:
     generator = seeding.generator(settings.seed, "planes", view.camera.name)
     return planes.planar_model(pixels, values, view.hole.shape, generator, tolerance=settings.planar_tolerance)
 
@@ -316,7 +316,7 @@ def visible_points(
     return uv[visible], 1.0 / z[visible]
 
 
-def grown(mask: np.ndarray, fraction: float) -> np.ndarray:
+def dilate(mask: np.ndarray, fraction: float) -> np.ndarray:
     """bool [H, W]: the mask and all pixels within `fraction` of the image's width of it, by Euclidean distance."""
     if not mask.any():
         return mask

@@ -98,7 +98,7 @@ def solve(
     scale = np.abs(offset).max()  # scaled to 1, so that very small values lose no precision
     if scale == 0:
         return np.full(target.shape, mean)
-    system, cell = system_of(confidence, guide, solver)
+    system, cell = build_system(confidence, guide, solver)
     right = np.bincount(cell, (confidence * (offset / scale)).ravel(), minlength=system.shape[0])
     to_pixels, steps = lambda cells: mean + scale * cells[cell].reshape(target.shape), 0
 
@@ -119,7 +119,7 @@ def solve(
     return to_pixels(solution)
 
 
-def system_of(
+def build_system(
     confidence: np.ndarray, guide: np.ndarray, solver: Solver = DEFAULT_SOLVER
 ) -> tuple[sparse.csr_matrix, np.ndarray]:
     """The solver's matrix [V, V], symmetric and positive definite, and the vertex of each pixel [H * W]."""
@@ -131,7 +131,7 @@ def system_of(
     return system.tocsr(), cell
 
 
-def condition(confidence: np.ndarray, guide: np.ndarray) -> tuple[float, float]:
+def condition_numbers(confidence: np.ndarray, guide: np.ndarray) -> tuple[float, float]:
     """Condition numbers (largest over smallest eigenvalue) of the system: plain, and with the Jacobi preconditioner.
 
     `solve` uses the preconditioner. The square root of the number is about the number of steps that conjugate
@@ -139,7 +139,7 @@ def condition(confidence: np.ndarray, guide: np.ndarray) -> tuple[float, float]:
 
     Args: as `solve`.
     """
-    system, _ = system_of(np.asarray(confidence, np.float64), guide)
+    system, _ = build_system(np.asarray(confidence, np.float64), guide)
     root = sparse.diags(1.0 / np.sqrt(system.diagonal()))
     return extremes_ratio(system), extremes_ratio((root @ system @ root).tocsr())
 

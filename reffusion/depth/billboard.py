@@ -13,10 +13,10 @@ FOOT_SHARE = 0.05  # of the height: the lowest pixels, which stand on the surfac
 BULGE = 0.5  # of the half width: how far the middle bulges towards the camera
 # Between viewing direction and surface, below which the billboard faces the camera instead of standing upright.
 MIN_SINE = 0.3
-GOOD_WITHIN = 30  # degrees from the reference's view; beyond this the missing back becomes visible
+MAX_ANGLE_DEG = 30  # degrees from the reference's view; beyond this the missing back becomes visible
 
 
-def standing(object_pixels: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
+def billboard_depth(object_pixels: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
     """[H, W] camera z: `depth`, and at `object_pixels` that of upright billboards.
 
     Each connected component stands upright where its lowest pixels meet the surface below, and bulges towards the

@@ -123,24 +123,24 @@ def _complete_region(disparity, confidence, guide, domain, plate: Plate) -> np.n
     if scale <= 1e-13 * np.abs(disparity[known]).max():
         return plane
     filled = plane.copy()
-    filled[domain] += scale * factored(system_of(data, guide, domain, plate)).solve(
+    filled[domain] += scale * factorize(build_system(data, guide, domain, plate)).solve(
         data[domain] * residual[domain] / scale
     )
     return filled
 
 
-def system_of(confidence: np.ndarray, guide: np.ndarray | None, domain: np.ndarray, plate: Plate = DEFAULT_PLATE):
+def build_system(confidence: np.ndarray, guide: np.ndarray | None, domain: np.ndarray, plate: Plate = DEFAULT_PLATE):
     """The completion's sparse matrix over the pixels of `domain`, bool [H, W]; symmetric and positive definite."""
     bend = _bending(domain, guide, plate.edge)
     return (sparse.diags(confidence[domain]) + plate.stiffness * bend.T @ bend).tocsc()
 
 
-def factored(system: sparse.csc_matrix):
+def factorize(system: sparse.csc_matrix):
     """Sparse LU factors of a symmetric matrix."""
     return splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
 
-def condition(confidence: np.ndarray, guide: np.ndarray | None = None, plate: Plate = DEFAULT_PLATE) -> float:
+def condition_number(confidence: np.ndarray, guide: np.ndarray | None = None, plate: Plate = DEFAULT_PLATE) -> float:
     """Condition number (largest over smallest eigenvalue) of the completion's system over a whole map [H, W].
 
     Rounding errors of the right hand side's largest value are amplified by up to this factor, which is why `complete`
@@ -150,7 +150,7 @@ def condition(confidence: np.ndarray, guide: np.ndarray | None = None, plate: Pl
     """
     confidence = np.asarray(confidence, np.float64)
     colors = None if guide is None else unit_range(guide)
-    return extremes_ratio(system_of(confidence, colors, np.ones(confidence.shape, bool), plate))
+    return extremes_ratio(build_system(confidence, colors, np.ones(confidence.shape, bool), plate))
 
 
 def extremes_ratio(matrix: sparse.spmatrix) -> float:

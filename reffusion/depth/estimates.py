@@ -6,12 +6,12 @@ import numpy as np
 
 from reffusion import geometry
 from reffusion.depth import alignment, bilateral
-from reffusion.depth.background_depth import Completion, Seen, continued
+from reffusion.depth.background_depth import Completion, ViewDepth, continue_depth
 from reffusion.depth.solverlog import NO_LOG, SolverLog
 
 
-def estimated(
-    view: Seen, guide: np.ndarray, estimate: np.ndarray, settings: Completion, log: SolverLog = NO_LOG
+def align_estimate(
+    view: ViewDepth, guide: np.ndarray, estimate: np.ndarray, settings: Completion, log: SolverLog = NO_LOG
 ) -> tuple[np.ndarray, str]:
     """A monocular estimate aligned to the scene, [H, W] float64 disparity, and a description of how well it fits.
 
@@ -42,8 +42,8 @@ def estimated(
     return refined, f"estimated, and aligned to {misfit:.1%} of the known disparity"
 
 
-def brought(
-    view: Seen,
+def align_depth_map(
+    view: ViewDepth,
     guide: np.ndarray,
     depth: np.ndarray,
     points: np.ndarray,
@@ -66,7 +66,7 @@ def brought(
     )
     missing = ~np.isfinite(aligned)
     if (missing & view.hole).any():
-        rest, rest_description = continued(view, guide, points, settings, log)
+        rest, rest_description = continue_depth(view, guide, points, settings, log)
         result, description = (
             np.where(missing, rest, result),
             f"{description}; where it says nothing, {rest_description}",

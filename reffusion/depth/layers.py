@@ -50,7 +50,7 @@ def label_surfaces(
         forbidden: int [H, W], a surface that a pixel must not belong to, numbered as in a call without it; 0: none.
     """
     assumed = np.zeros_like(hole) if assumed is None else assumed & known
-    surfaces = pieces(disparity, known & ~assumed, planes, hole)
+    surfaces = segment_surfaces(disparity, known & ~assumed, planes, hole)
     count = int(surfaces.max())
     missing = hole & ~(known & ~assumed)
     if count < 2 or not missing.any():
@@ -145,7 +145,7 @@ def _neighbor_pairs(index: np.ndarray, offset: tuple[int, int]) -> tuple[np.ndar
     return first[valid], second[valid]
 
 
-def pieces(
+def segment_surfaces(
     disparity: np.ndarray, known: np.ndarray, planes: Sequence[np.ndarray] = (), hole: np.ndarray | None = None
 ) -> np.ndarray:
     """int [H, W]: segments of the known pixels, numbered 1, 2, ... by decreasing size; 0: too small.
@@ -186,8 +186,8 @@ def pieces(
     return result
 
 
-def standing(disparity: np.ndarray, known: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    """int [H, W]: foreground objects, 1, 2, ..., nearer than everything they touch around the hole (see `pieces`).
+def segment_foreground(disparity: np.ndarray, known: np.ndarray, hole: np.ndarray) -> np.ndarray:
+    """int [H, W]: foreground objects, 1, 2, ..., nearer than everything they touch around the hole (see `segment_surfaces`).
 
     0 for the remaining pixels and where the depth is not known.
     """

@@ -53,7 +53,7 @@ def load_network(source: str | Path, device: str = "cpu") -> DepthNetwork:
     try:
         folder = local.locate(source)
         if folder is None:
-            raise ValueError(local.absent(source))
+            raise ValueError(local.explain_missing(source))
         if not (folder / "config.json").is_file():
             raise ValueError(f"{folder} lacks config.json; it must be a transformers model folder")
     except ValueError as error:
@@ -94,7 +94,7 @@ def make_network(model: nn.Module, device: str = "cpu") -> DepthNetwork:
 
 
 @torch.no_grad()
-def disparity(network: DepthNetwork, image: Tensor) -> Tensor:
+def predict_disparity(network: DepthNetwork, image: Tensor) -> Tensor:
     """[H, W] float32 disparity of a picture, up to scale and offset, on the picture's device.
 
     The depth of a metric network is inverted.

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from reffusion.depth import background_depth, estimates
-from reffusion.depth.background_depth import Completion, Seen
+from reffusion.depth.background_depth import Completion, ViewDepth
 
 
 class DepthEstimator(NamedTuple):
@@ -24,7 +24,7 @@ class DepthEstimator(NamedTuple):
     """
 
     how: Completion
-    disparity: Callable[[Seen, Callable[[], np.ndarray]], np.ndarray]
+    disparity: Callable[[ViewDepth, Callable[[], np.ndarray]], np.ndarray]
 
 
 def continuation_estimator(points: np.ndarray, how: Completion) -> DepthEstimator:
@@ -33,7 +33,7 @@ def continuation_estimator(points: np.ndarray, how: Completion) -> DepthEstimato
     Args:
         points: [P, 3] sparse points of the scene.
     """
-    return DepthEstimator(how, lambda view, picture: background_depth.continued(view, picture, points, how)[0])
+    return DepthEstimator(how, lambda view, picture: background_depth.continue_depth(view, picture, points, how)[0])
 
 
 def network_estimator(network: Callable[[Tensor], Tensor], how: Completion) -> DepthEstimator:
@@ -43,9 +43,9 @@ def network_estimator(network: Callable[[Tensor], Tensor], how: Completion) -> D
         network: [3, H, W] in [0, 1] -> [H, W] disparity up to scale and offset.
     """
 
-    def disparity(view: Seen, picture: Callable[[], np.ndarray]) -> np.ndarray:
+    def disparity(view: ViewDepth, picture: Callable[[], np.ndarray]) -> np.ndarray:
         painted = picture()
         estimate = network(torch.from_numpy(painted).float().permute(2, 0, 1)).double().cpu().numpy()
-        return estimates.estimated(view, painted, estimate, how)[0]
+        return estimates.align_estimate(view, painted, estimate, how)[0]
 
     return DepthEstimator(how, disparity)

@@ -89,7 +89,7 @@ class Exposures:
         save_json(folder / FILE, {name: matrix.detach().cpu().tolist() for name, matrix in self._matrices.items()})
 
 
-def of_views(fit: Path, cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
+def view_exposures(fit: Path, cameras: Sequence[Camera]) -> dict[str, np.ndarray]:
     """View name -> exposure [3, 4]: as fitted, or interpolated from nearby photographs for other views.
 
     Empty where no exposures were fitted.
@@ -133,7 +133,7 @@ def _kernel_weights(distances: np.ndarray) -> np.ndarray:
     return weights / weights.sum(1, keepdims=True)
 
 
-def exposed(color: Tensor, matrix: np.ndarray | None) -> Tensor:
+def apply_exposure(color: Tensor, matrix: np.ndarray | None) -> Tensor:
     """[H, W, 3]: colours of the Gaussians with an exposure [3, 4] applied."""
     if matrix is None:
         return color
@@ -141,7 +141,7 @@ def exposed(color: Tensor, matrix: np.ndarray | None) -> Tensor:
     return color @ exposure[:, :3].T + exposure[:, 3]
 
 
-def matched(matrix: np.ndarray, color: np.ndarray, photo: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+def match_exposure(matrix: np.ndarray, color: np.ndarray, photo: np.ndarray, pixels: np.ndarray) -> np.ndarray:
     """[3, 4]: an exposure adjusted to a photograph by a gain and an offset per channel.
 
     It is returned unchanged where too few pixels can be compared. Both pictures are blurred first: where one is less
@@ -181,7 +181,7 @@ def _fit_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
 
 
 def load_views(poses: Path, fit: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
-    """View name -> uint8 [H, W, 3]: the photographs, `normalised`.
+    """View name -> uint8 [H, W, 3]: the photographs, `normalize_exposure`.
 
     Views without a photograph are rendered from the Gaussians in the folder `fit`, object included.
     """
@@ -189,7 +189,9 @@ def load_views(poses: Path, fit: Path, names: Iterable[str]) -> dict[str, np.nda
 
     names = list(names)
     photographed = [name for name in names if scene.has_photograph(poses, name)]
-    photos = {name: normalised(image, fit, name) for name, image in scene.load_views(poses, photographed).items()}
+    photos = {
+        name: normalize_exposure(image, fit, name) for name, image in scene.load_views(poses, photographed).items()
+    }
     renderings = render_views(poses, fit, [name for name in names if name not in photos])
     return {name: (photos | renderings)[name] for name in names}
 
@@ -206,7 +208,7 @@ def render_views(poses: Path, fit: Path, names: Sequence[str]) -> dict[str, np.n
     return {name: to_uint8(rasterizer.render(gaussians, cameras[name]).color.numpy()) for name in names}
 
 
-def normalised(image: np.ndarray, fit: Path, name: str) -> np.ndarray:
+def normalize_exposure(image: np.ndarray, fit: Path, name: str) -> np.ndarray:
     """uint8 [H, W, 3] in the exposure of the Gaussians in the folder `fit`: the view's fitted exposure is undone.
 
     Values are clipped to [0, 255]. The image is returned unchanged where no exposure was fitted, as for test views.
@@ -223,9 +225,9 @@ def normalised(image: np.ndarray, fit: Path, name: str) -> np.ndarray:
     matrix = np.array(matrices[name])
     if abs(np.linalg.det(matrix[:, :3])) < MIN_DETERMINANT:
         raise ValueError(f"{path}: view '{name}' is too dark to undo its exposure; leave it out, or fit.exposure=never")
-    return to_uint8(undone(image / 255.0, matrix))
+    return to_uint8(undo_exposure(image / 255.0, matrix))
 
 
-def undone(color: np.ndarray, matrix: np.ndarray | None) -> np.ndarray:
-    """[H, W, 3], the inverse of `exposed`."""
+def undo_exposure(color: np.ndarray, matrix: np.ndarray | None) -> np.ndarray:
+    """[H, W, 3], the inverse of `apply_exposure`."""
     return color if matrix is None else (color - matrix[:, 3]) @ np.linalg.inv(matrix[:, :3]).T

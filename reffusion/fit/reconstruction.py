@@ -30,7 +30,7 @@ from reffusion.splat.rasterizer import render
 from reffusion.types import PARAMETERS, Camera, Gaussians
 
 PLACED_RATE_FACTOR = 0.1  # on the learning rate of positions, for Gaussians whose positions are known
-FIRST_MOMENT = 16  # first traced step after the start: measuring held-out views takes as long as several steps
+FIRST_TRACED_STEP = 16  # first traced step after the start: measuring held-out views takes as long as several steps
 
 
 def fit(
@@ -93,7 +93,7 @@ def fit(
         run.count(*step(optimizer, run.exposures, camera, target, counts, settings, i, impl))
         control_density(optimizer, centers, run.started_with, settings, run.iteration)
         average(optimizer, settings, run.iteration)
-        is_line_due = trace.log_spaced(run.iteration, settings.iterations, first=FIRST_MOMENT)
+        is_line_due = trace.log_spaced(run.iteration, settings.iterations, first=FIRST_TRACED_STEP)
         is_checkpoint_due = checkpoints.due and run.iteration < settings.iterations
         _check_gaussians(optimizer.gaussians, i, camera, check_values=is_line_due or is_checkpoint_due)
         if is_line_due:

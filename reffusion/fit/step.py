@@ -21,7 +21,7 @@ from reffusion.types import Camera
 PRUNE_OPA = 0.005  # opacity below which Gaussians are pruned, as in 3DGS
 # For refining an existing scene: between the rates at the start and at the end of a fit, so that Gaussians which
 # contradict the views can still move.
-GENTLE = Rates(
+REFIT_RATES = Rates(
     means=4e-4,
     means_last=2e-5,
     quaternions=2e-3,

@@ -12,9 +12,9 @@ MAX_DISTANCE = 0.5  # of the distance to its nearest neighbour, within which a p
 MIN_SPACING = 0.1  # of the median distance, used for Gaussians at the same position
 SAMPLE_SIZE = 5000  # kept Gaussians by which axis flips and different scenes are detected
 QUERY_SIZE = 100_000  # points per query of neighbours
-SAME = 0.95  # share of the kept Gaussians that must be matched for both files to be one scene
+MIN_MATCHED_SHARE = 0.95  # share of the kept Gaussians that must be matched for both files to be one scene
 # Signs of the axes: unchanged, or rotated by 180 degrees about x, y or z, as editors do with scenes that have y down.
-TURNS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
+AXIS_FLIPS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Match:
 
     Attributes:
         deleted: bool [N], Gaussians of the whole scene that are not in the cleaned one; all False where `found` is
-            less than `SAME`.
+            less than `MIN_MATCHED_SHARE`.
         found: share of the cleaned scene's Gaussians that are matched.
         turn: signs of the axes by which the cleaned scene was rotated.
     """
@@ -33,7 +33,7 @@ class Match:
     turn: tuple[int, int, int]
 
 
-def matched(whole: np.ndarray, cleaned: np.ndarray) -> Match:
+def match_gaussians(whole: np.ndarray, cleaned: np.ndarray) -> Match:
     """Match the Gaussians of a cleaned scene to those of the whole scene: one to one, nearest pairs first.
 
     Most editors keep positions to the last bit; these are matched by sorting. Quantisation moves a Gaussian by far less
@@ -46,13 +46,13 @@ def matched(whole: np.ndarray, cleaned: np.ndarray) -> Match:
     """
     sample = cleaned[:: max(1, len(cleaned) // SAMPLE_SIZE)]
     index = _ExactIndex(whole)
-    exact_share = {flip: float((index.find(sample * flip) >= 0).mean()) for flip in TURNS}
-    flip, near_index = max(TURNS, key=exact_share.__getitem__), None
-    if exact_share[flip] < SAME:
+    exact_share = {flip: float((index.find(sample * flip) >= 0).mean()) for flip in AXIS_FLIPS}
+    flip, near_index = max(AXIS_FLIPS, key=exact_share.__getitem__), None
+    if exact_share[flip] < MIN_MATCHED_SHARE:
         near_index = _NearIndex(whole)
-        near_share = {flip: near_index.share(sample * flip) for flip in TURNS}
-        flip = max(TURNS, key=near_share.__getitem__)
-        if near_share[flip] < SAME:
+        near_share = {flip: near_index.share(sample * flip) for flip in AXIS_FLIPS}
+        flip = max(AXIS_FLIPS, key=near_share.__getitem__)
+        if near_share[flip] < MIN_MATCHED_SHARE:
             return Match(np.zeros(len(whole), bool), near_share[flip], flip)
     exact_matches = index.find(cleaned * flip)
     unmatched = np.flatnonzero(exact_matches < 0)

@@ -46,7 +46,7 @@ class Sheets:
     gloss: bool = False
 
 
-def surface(
+def sheet_gaussians(
     image: np.ndarray, depth: np.ndarray, pixels: np.ndarray, camera: Camera, sh_count: int, settings: Sheets
 ) -> Gaussians:
     """Gaussians of both sheets for the chosen `pixels`; arguments as `surface_gaussians`."""

@@ -73,7 +73,7 @@ def _complete_view(draft: Draft, camera, hole: np.ndarray, sources: Background, 
     mask = sources.masks[camera.name]
     # Just outside C a photograph may still show the object's rim, which would be repeated.
     photo = sources.photos[camera.name]
-    base = inpaint.background(draft.gaussians, camera, photo, morphology.dilate(mask, exemplar.RIM_WIDTH))
+    base = inpaint.composite_background(draft.gaussians, camera, photo, morphology.dilate(mask, exemplar.RIM_WIDTH))
     region = exemplar.add_rim(hole, mask)
     if painter is not None:
         return painter.paint(base, region)

@@ -112,9 +112,9 @@ def fill_reference(
         visible = rasterizer.render(remaining, camera, sh_degree=0).depth.double().cpu().numpy()
         behind, inserted = np.where(visible > 0, visible, depth), hole & over
         if reference.depth is None and disparity is None:
-            upright = billboard.standing(inserted, behind, camera)
+            upright = billboard.billboard_depth(inserted, behind, camera)
             depth, estimate = (np.where(inserted, upright, each) for each in (depth, estimate))
-            words += f"; a billboard, good within {billboard.GOOD_WITHIN} degrees, stands where the scene goes on"
+            words += f"; a billboard, good within {billboard.MAX_ANGLE_DEG} degrees, stands where the scene goes on"
         else:
             back = (
                 share.drawn if share else coverage.pixels_in_front(draft.gaussians, estimate, reference, mask) & ~hole
@@ -122,7 +122,7 @@ def fill_reference(
             inserted, depth = inserted & ~ceded | back, np.where(back, estimate, depth)
         drawn_over = inserted & ~coverage.beside_depth_edges(depth, behind)
     print(f"depth of reference {camera.name}: {words}")
-    pixels = background_depth.grown(hole & ~inserted & ~ceded, OVERLAP) & ~ceded | drawn_over
+    pixels = background_depth.dilate(hole & ~inserted & ~ceded, OVERLAP) & ~ceded | drawn_over
     draft = unprojection.add_surface(draft, reference, depth, pixels, background, sheets)
     if farthest or not params.tidy:  # what is still open is completed view by view, or left
         return Filled(draft, depth)
@@ -138,4 +138,4 @@ def _predict_disparity(network: DepthNetwork | None, reference: Reference) -> np
     if network is None:
         return None
     image = torch.from_numpy(reference.image).permute(2, 0, 1) / 255
-    return monocular.disparity(network, image).numpy()
+    return monocular.predict_disparity(network, image).numpy()

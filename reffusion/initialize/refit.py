@@ -10,7 +10,7 @@ import numpy as np
 from torch import Tensor
 
 from reffusion.fit.reconstruction import fit
-from reffusion.fit.step import GENTLE
+from reffusion.fit.step import REFIT_RATES
 from reffusion.metrics.image_metrics import mask_box
 from reffusion.params.fit import Densify, LearningRates, Params, SphericalHarmonics
 from reffusion.types import Camera, Gaussians, Reference
@@ -68,7 +68,9 @@ def refit(
         densify=Densify(stop=0.0, reset_every=0.0),
         lr=LearningRates(betas=BETAS),
     )
-    return fit(views, images, gaussians, settings, folder=folder, weights=weights, rates=GENTLE, placed=has_exact_depth)
+    return fit(
+        views, images, gaussians, settings, folder=folder, weights=weights, rates=REFIT_RATES, placed=has_exact_depth
+    )
 
 
 def crop_to_mask(reference: Reference) -> tuple[Camera, np.ndarray, np.ndarray]:

@@ -31,7 +31,7 @@ def remove_shadows(
     for each in references:
         name = each.camera.name
         mask = background.masks[name]
-        view = inpaint.background(gaussians, each.camera, photos[name], mask)
+        view = inpaint.composite_background(gaussians, each.camera, photos[name], mask)
         shadow = shadows.detect_shadows(each.image, view, mask)
         if (each.mask & ~mask).any():  # it draws over what remains, which is no shadow, and neither is its rim
             shadow &= mask

@@ -104,7 +104,7 @@ def align_reference_depth(
     camera, rendering = reference.camera, rasterizer.render(remaining, reference.camera, sh_degree=0)
     hints = Hints(outer=background.photographed_depth(camera))
     mask = background.masks[camera.name]
-    view = background_depth.seen(rendering, camera, reference.mask, mask, completion, hints)
+    view = background_depth.extract_depth(rendering, camera, reference.mask, mask, completion, hints)
     depth, _ = alignment.align_either(reference.depth, view.depth, view.known)
     return np.where(np.isfinite(depth), depth, 0.0)
 

@@ -14,7 +14,7 @@ from reffusion.background.model import Background
 from reffusion.depth import background_depth, estimates
 from reffusion.depth.background_depth import NO_HINTS, Completion, Hints
 from reffusion.depth.solverlog import SolverLog
-from reffusion.gaussians.sheets import Sheets, surface
+from reffusion.gaussians.sheets import Sheets, sheet_gaussians
 from reffusion.initialize.draft import Draft
 from reffusion.initialize.view_dependent_color import measure_change, transfer_sh
 from reffusion.morphology import square
@@ -53,7 +53,7 @@ def estimate_depth(
         completion: settings.
         disparity: [H, W], a depth model's answer to the reference, up to scale and offset; None without a model.
         log: receives a series for each solver (docs/traces.md).
-        hints: what else is known of the depth. farthest: see `background_depth.continued`.
+        hints: what else is known of the depth. farthest: see `background_depth.continue_depth`.
 
     Returns:
         Depth [H, W] float64, as rendered where that is known, else estimated; the estimate at all pixels; and the way
@@ -63,15 +63,19 @@ def estimate_depth(
         ValueError: naming the view, where too little is known around the hole, or the estimate does not fit.
     """
     rendering = rasterizer.render(remaining, reference.camera, sh_degree=0)
-    view = background_depth.seen(rendering, reference.camera, hole, mask, completion, hints)
+    view = background_depth.extract_depth(rendering, reference.camera, hole, mask, completion, hints)
     solvers = SolverLog(log, reference.camera.name, *background_depth.points_around(view, points, completion))
     try:
         if reference.depth is not None:
-            solved, words = estimates.brought(view, reference.image, reference.depth, points, completion, solvers)
+            solved, words = estimates.align_depth_map(
+                view, reference.image, reference.depth, points, completion, solvers
+            )
         elif disparity is None:
-            solved, words = background_depth.continued(view, reference.image, points, completion, solvers, farthest)
+            solved, words = background_depth.continue_depth(
+                view, reference.image, points, completion, solvers, farthest
+            )
         else:
-            solved, words = estimates.estimated(view, reference.image, disparity, completion, solvers)
+            solved, words = estimates.align_estimate(view, reference.image, disparity, completion, solvers)
         # Nothing is beyond infinity: the farthest depth that can be told stands in for it.
         estimate = 1.0 / np.maximum(solved, view.least_disparity)
     except ValueError as error:
@@ -133,7 +137,7 @@ def add_surface(
 ) -> Draft:
     """The draft with a surface at `depth`, [H, W], that shows these pixels of the reference, bool [H, W]."""
     camera = reference.camera
-    added = surface(reference.image, depth, pixels, camera, draft.gaussians.sh.shape[1], sheets)
+    added = sheet_gaussians(reference.image, depth, pixels, camera, draft.gaussians.sh.shape[1], sheets)
     old_count, draft = len(draft.gaussians), draft.add(added.map(lambda p: p.to(draft.gaussians.means)))
     gaussians = draft.gaussians
     is_added = torch.arange(len(gaussians), device=draft.is_new.device) >= old_count

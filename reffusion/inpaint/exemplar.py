@@ -20,7 +20,7 @@ from reffusion.background.model import Background
 from reffusion.background.plane import Plane, remove_reflected_depth
 from reffusion.background.visibility import DepthView
 from reffusion.depth.inpaint_depth import inpaint_depth
-from reffusion.depth.layers import pieces, standing
+from reffusion.depth.layers import segment_foreground, segment_surfaces
 from reffusion.inpaint.normals import mean_normals
 from reffusion.inpaint.patchmatch.completion import Completion, complete
 from reffusion.inpaint.plane_frames import MAX_DISTANCE, label_planes, plane_coordinates, plane_jacobians
@@ -199,7 +199,7 @@ def _interpolate_depth(depth: np.ndarray, known: np.ndarray, hidden: np.ndarray)
     result = np.where(across > 0, across, np.median(depth[known]))
     ring = known & dilate(hidden, RING)
     disparity = geometry.reciprocal(depth)
-    piece, foreground = pieces(disparity, ring, hole=hidden), standing(disparity, ring, hidden)
+    piece, foreground = segment_surfaces(disparity, ring, hole=hidden), segment_foreground(disparity, ring, hidden)
     layer = np.where(ring, foreground, np.where(hidden, 0, -1))
     far_first = lambda k: -float(np.median(depth[piece == k]))
     for position, k in enumerate(sorted(range(1, piece.max() + 1), key=far_first)):

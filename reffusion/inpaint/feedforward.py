@@ -29,7 +29,7 @@ def load(inpainter: str, source: str | Path = "", device: str = "cpu") -> Painte
     Raises:
         ValueError: no such file or several, no onnxruntime, or a file of another kind.
     """
-    file = painters.file_of(inpainter, source)
+    file = painters.inpainter_file(inpainter, source)
     if file.suffix == ".pt":
         return classical.load_lama(file, device)
     network = onnx_model.load(file, DTYPES[inpainter])

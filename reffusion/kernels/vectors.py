@@ -216,7 +216,7 @@ def select(typing, mask, x, y):
 
 
 @intrinsic
-def some(typing, mask):
+def any_lane(typing, mask):
     """Is any lane of the mask set?"""
 
     def emit(context, builder, sig, args):

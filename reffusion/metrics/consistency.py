@@ -9,7 +9,7 @@ from scipy.ndimage import map_coordinates
 
 from reffusion import geometry
 from reffusion.depth.completion import complete
-from reffusion.fit.exposure import undone
+from reffusion.fit.exposure import undo_exposure
 from reffusion.types import Camera
 
 TOLERANCE = 0.02  # relative depth by which a point may lie behind the neighbour's surface and still be visible
@@ -44,7 +44,7 @@ class Shown(NamedTuple):
     @property
     def color(self) -> np.ndarray:
         """[H, W, 3] in [0, 1] as the Gaussians are exposed, so that views of other exposures can be compared."""
-        return undone(self.picture / 255.0, self.exposed)
+        return undo_exposure(self.picture / 255.0, self.exposed)
 
 
 def difference(first: Shown, second: Shown, tolerance: float = TOLERANCE) -> tuple[float | None, float | None]:

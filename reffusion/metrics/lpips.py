@@ -14,7 +14,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from reffusion.weights.local import at_home, lpips_files, lpips_folders
+from reffusion.weights.local import abbreviate_home, lpips_files, lpips_folders
 from reffusion.weights.lpips_package import digest
 from reffusion.weights.published import LPIPS
 
@@ -138,7 +138,7 @@ def load(net: Net, folder: str | Path | None = None) -> tuple[Lpips | None, str 
     """
     files = lpips_files(net, folder)
     if not files:
-        looked = ", ".join(at_home(place) for place in lpips_folders(folder))
+        looked = ", ".join(abbreviate_home(place) for place in lpips_folders(folder))
         return None, f"no weights of LPIPS ({net}): run `make weights`, or put {net}.safetensors into one of {looked}"
     try:
         if len(files) == 1:

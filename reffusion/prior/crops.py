@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from reffusion.params.personalize import Samples
-from reffusion.prior.windows import enlarged, two_scale_masks, two_scales, window_around
+from reffusion.prior.windows import enlarge_to_fit, two_scale_masks, two_scales, window_around
 
 PROMPTS = ("A photo of sks", "A photo of sks, cropped", "")
 GLOBAL, LOCAL, EMPTY = 0, 1, 2
@@ -54,10 +54,10 @@ class Batch(NamedTuple):
     prompts: Tensor
 
 
-def picture(image: Tensor, region: Tensor, size: int) -> Picture:
+def make_picture(image: Tensor, region: Tensor, size: int) -> Picture:
     """A `Picture` from a uint8 [H, W, 3] image and a bool [H, W] region, enlarged to at least `size` pixels a side."""
-    floats = enlarged(image.permute(2, 0, 1).to(torch.float32) / 127.5 - 1, size)
-    return Picture(floats, enlarged(region.to(torch.float32)[None], size)[0] > 1e-4)
+    floats = enlarge_to_fit(image.permute(2, 0, 1).to(torch.float32) / 127.5 - 1, size)
+    return Picture(floats, enlarge_to_fit(region.to(torch.float32)[None], size)[0] > 1e-4)
 
 
 def _uniform(low: float, high: float, generator: torch.Generator) -> float:

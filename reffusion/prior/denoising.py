@@ -66,8 +66,8 @@ def held_out_samples(references: Sequence[Picture], size: int, seed: int) -> Bat
     return Batch(two_scales(reference.image, windows, size), masks, torch.tensor([GLOBAL, LOCAL]))
 
 
-def one_sample(prior: Prior, references: Sequence[Picture], seed: int) -> None:
-    """Compute loss and gradient of one sample; `memory.fitted` measures the memory of this."""
+def backward_one_sample(prior: Prior, references: Sequence[Picture], seed: int) -> None:
+    """Compute loss and gradient of one sample; `memory.fit_to_memory` measures the memory of this."""
     sample = Batch(*(tensor[:1] for tensor in held_out_samples(references, prior.native_size, seed)))
     noise = torch.zeros(1, *latent_shape(prior, prior.native_size))
     text = diffusion.embed_text(prior, list(PROMPTS))

@@ -19,7 +19,7 @@ from reffusion.types import Camera, Gaussians
 
 
 @torch.no_grad()
-def background(remaining: Gaussians, camera: Camera, photo: np.ndarray, consistent: np.ndarray) -> np.ndarray:
+def composite_background(remaining: Gaussians, camera: Camera, photo: np.ndarray, consistent: np.ndarray) -> np.ndarray:
     """A view without the object, as far as it is known, uint8 [H, W, 3].
 
     Outside C this is the photo, inside C a rendering of the remaining Gaussians. The rendering shows what other views
@@ -34,12 +34,12 @@ def background(remaining: Gaussians, camera: Camera, photo: np.ndarray, consiste
     return np.where(consistent[..., None], to_uint8(rendering), photo)
 
 
-def as_input(picture: np.ndarray) -> Tensor:
+def to_input(picture: np.ndarray) -> Tensor:
     """uint8 [H, W, 3] -> float32 [3, H, W] in [-1, 1], the input of `paint`."""
     return torch.from_numpy(picture).permute(2, 0, 1) / 127.5 - 1
 
 
-def as_picture(painted: Tensor) -> np.ndarray:
+def to_picture(painted: Tensor) -> np.ndarray:
     """[3, H, W] in [-1, 1] -> uint8 [H, W, 3]."""
     return to_uint8((painted.permute(1, 2, 0).cpu().numpy() + 1) / 2)
 
@@ -213,7 +213,7 @@ def repaint(
     return (view + resize(change, height, width) * whole_hole).clamp(-1, 1)[0]
 
 
-def seam(candidates: Tensor, hole: Tensor) -> Tensor:
+def seam_score(candidates: Tensor, hole: Tensor) -> Tensor:
     """[B]: mean absolute colour step across the boundary of the hole; low values are seamless.
 
     PAPER leaves open: how its reference is chosen (by eye). By default the candidate with the lowest value is chosen.

@@ -39,7 +39,9 @@ CONVOLUTIONS = (
 )
 
 
-def add(prior: Prior, rank: int, alpha: float, dropout: float, layers: str, seed: int) -> dict[str, list[nn.Parameter]]:
+def attach(
+    prior: Prior, rank: int, alpha: float, dropout: float, layers: str, seed: int
+) -> dict[str, list[nn.Parameter]]:
     """Attach fresh LoRA layers to UNet and text encoder, in place.
 
     Args:
@@ -125,7 +127,7 @@ def state(prior: Prior) -> dict[str, Tensor]:
 
 
 def load_state(prior: Prior, state: dict[str, Tensor]) -> None:
-    """Restore the weights returned by `state`, into layers attached by `add`."""
+    """Restore the weights returned by `state`, into layers attached by `attach`."""
     for label, part in (("unet", prior.unet), ("text", prior.text_encoder)):
         for name, parameter in part.named_parameters():
             if "lora_" in name:
@@ -184,7 +186,7 @@ def _adapter_config(part: nn.Module) -> dict[str, Any]:
     return plain | {"base_model_name_or_path": None}
 
 
-def merged(prior: Prior, folder: Path) -> Prior:
+def merge(prior: Prior, folder: Path) -> Prior:
     """The prior with the LoRA in `folder`, merged into the UNet (the text encoder keeps separate layers)."""
     if not (folder / LORA_FILE).exists():
         raise ValueError(f"{folder / LORA_FILE} does not exist; run the personalize stage first")

@@ -82,7 +82,9 @@ def rows_within(budget_gb: float, fixed: int, row: int, param: str) -> int:
     return count
 
 
-def fitted(prior: Prior, budget_gb: float, param: str, backward: Callable[[Prior], object] | None = None) -> Prior:
+def fit_to_memory(
+    prior: Prior, budget_gb: float, param: str, backward: Callable[[Prior], object] | None = None
+) -> Prior:
     """The prior with the number of samples per pass set to what fits into the budget; unchanged for a budget of 0.
 
     Args:
@@ -93,7 +95,7 @@ def fitted(prior: Prior, budget_gb: float, param: str, backward: Callable[[Prior
     """
     if not budget_gb:
         return prior
-    rows = rows_within(budget_gb, prior.bytes, peak_bytes(lambda: answering(prior), prior.device), param)
+    rows = rows_within(budget_gb, prior.bytes, peak_bytes(lambda: inpaint_one_sample(prior), prior.device), param)
     if backward is None:
         return replace(prior, rows=rows)
     sample_bytes = peak_bytes(lambda: backward(prior), prior.device)
@@ -104,7 +106,7 @@ def fitted(prior: Prior, budget_gb: float, param: str, backward: Callable[[Prior
 
 
 @torch.no_grad()
-def answering(prior: Prior) -> None:
+def inpaint_one_sample(prior: Prior) -> None:
     """Run the passes of inpainting for one sample: encode, UNet, decode."""
     size, text_width = prior.native_size, prior.unet.config.cross_attention_dim
     latents = diffusion.encode(prior, torch.zeros(1, 3, size, size, device=prior.device))
@@ -114,7 +116,7 @@ def answering(prior: Prior) -> None:
     diffusion.decode(prior, latents)
 
 
-def encoding(prior: Prior) -> None:
+def encode_one_sample(prior: Prior) -> None:
     """Run the pass of score distillation that needs a gradient, for one sample: encode it, and back."""
     size = prior.native_size
     image = torch.zeros(1, 3, size, size, device=prior.device, requires_grad=True)
@@ -122,7 +124,7 @@ def encoding(prior: Prior) -> None:
 
 
 @contextmanager
-def blamed(param: str, value: float) -> Iterator[None]:
+def explain_oom(param: str, value: float) -> Iterator[None]:
     """Turn an out-of-memory error inside the context into a ValueError that names the parameter to lower."""
     try:
         yield

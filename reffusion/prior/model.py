@@ -36,7 +36,7 @@ class Prior:
 
     Attributes:
         unet, vae, text_encoder, tokenizer: diffusers and transformers objects, frozen, in evaluation mode;
-            text_encoder is None after `without_text`.
+            text_encoder is None after `drop_text_encoders`.
         alphas_cumprod: [T] float32, abar_t of the noise schedule.
         prediction_type: "epsilon" or "v_prediction".
         scheduler: the scheduler of the folder; only passed on when a pipeline is built.
@@ -109,7 +109,7 @@ def load_prior(source: str | Path, device: str = "cpu", dtype: torch.dtype = tor
     try:
         folder = local.locate(source)
         if folder is None:
-            raise ValueError(local.absent(source))
+            raise ValueError(local.explain_missing(source))
         local.check(folder)
     except ValueError as error:
         raise ValueError(f"prior {error}") from None
@@ -198,7 +198,7 @@ def make_prior(
     configs["text_encoder"] = text.config.to_dict()
     if text_2 is not None:
         configs["text_encoder_2"] = text_2.config.to_dict()
-    if problem := local.misfit(configs):
+    if problem := local.find_mismatch(configs):
         raise ValueError(f"prior {name}: {problem}")
     kind, alphas = scheduler.config.prediction_type, scheduler.alphas_cumprod.float()
     if kind == "epsilon" and float(alphas.min()) <= 0:
@@ -211,12 +211,12 @@ def make_prior(
     return Prior(unet, vae, text, tokenizer, alphas.to(device), kind, scheduler, text_2, tokenizer_2)
 
 
-def without_text(prior: Prior) -> Prior:
+def drop_text_encoders(prior: Prior) -> Prior:
     """The prior without text encoders, to free their memory once all prompts are embedded."""
     return replace(prior, text_encoder=None, text_encoder_2=None)
 
 
-def recomputing(prior: Prior) -> Prior:
+def enable_checkpointing(prior: Prior) -> Prior:
     """Enable gradient checkpointing in UNet and VAE: blocks are recomputed in the backward pass; returns the prior."""
     prior.unet.enable_gradient_checkpointing()
     prior.vae.enable_gradient_checkpointing()

@@ -48,7 +48,7 @@ def personalize(
     """Train the prior's LoRA in place; resumes from the checkpoint in `folder`, bit for bit on one CPU thread.
 
     Args:
-        trained: the parameters returned by `lora.add`.
+        trained: the parameters returned by `lora.attach`.
         references: see `draw_samples`.
         folder: receives trace.jsonl (`validation.measure_errors`, with the clock stopped) and checkpoints.
         photographs: see `validation.make_held_out`; nothing is learnt from them.

@@ -35,7 +35,7 @@ def windows_around(mask: Tensor, size: int, count: int, generator: torch.Generat
     return torch.minimum(corners.clamp(min=0), torch.tensor([height - size, width - size]))
 
 
-def enlarged(image: Tensor, size: int) -> Tensor:
+def enlarge_to_fit(image: Tensor, size: int) -> Tensor:
     """[C, H, W] -> the same image, enlarged bilinearly if needed so that a window of `size` px fits into it."""
     height, width = image.shape[-2:]
     factor = size / min(height, width)

@@ -97,7 +97,7 @@ def adopt_reference(file: GivenReference, masks: MaskSet, space: Workspace) -> t
     if masks.invent.any() and (share := inside[masks.invent].mean()) < LEAST_HOLE_SHARE:
         raise ValueError(f"{file.path}: shows only {share:.0%} of the hole in '{file.view}'; crop less")
     differs = masks.consistent | shadows.changed_pixels(image, photo, masks.invent, usual)
-    image = image if file.painted else exposure.normalised(image, space.fit, file.view)
+    image = image if file.painted else exposure.normalize_exposure(image, space.fit, file.view)
     depth = load_straight_depth(file, lens, upright, found.moved)
     if depth is not None:  # a depth map in the scene's own unit is now in that of the normalised frame
         depth = depth * space.scene.similarity.scale

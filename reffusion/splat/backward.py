@@ -10,7 +10,7 @@ import numpy as np
 
 from reffusion.kernels.compiled import empty_aligned, inlined, kernel, parallel_for
 from reffusion.kernels.memory import load, prefetch, splat_at, store, store_totals, total
-from reffusion.kernels.vectors import LANES, fma, fnma, select, some, splat
+from reffusion.kernels.vectors import LANES, any_lane, fma, fnma, select, splat
 from reffusion.splat.forward import (
     AT_CUT,
     AT_MAX_ALPHA,
@@ -191,7 +191,7 @@ def _rows_backward(member, rows, left, top, footprints, features, state, stride,
         row = load(constants, (AT_ROW + step) * LANES)
         power = log_alpha(footprint, row)
         is_above_cut = power >= load(constants, AT_CUT * LANES)
-        if not some(is_above_cut & (before > zero)):
+        if not any_lane(is_above_cut & (before > zero)):
             continue
         is_touched = True
         raw, alpha, weight, after = blend_pixels(power, is_above_cut, before, constants)
@@ -278,7 +278,7 @@ def _gather_tile(left, top, tile, footprints, bins, count, channels, state, sums
             before = load(state, place)
             power = log_alpha(footprint, load(constants, (AT_ROW + step) * LANES))
             is_above_cut = power >= load(constants, AT_CUT * LANES)
-            if not some(is_above_cut & (before > zero)):
+            if not any_lane(is_above_cut & (before > zero)):
                 continue
             is_touched = True
             _, _, weight, after = blend_pixels(power, is_above_cut, before, constants)

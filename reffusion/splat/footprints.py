@@ -17,7 +17,7 @@ from reffusion.kernels.memory import (
     store_columns,
     store_whole,
 )
-from reffusion.kernels.vectors import LANES, maximum, minimum, narrow, select, some, splat, take_ticket, widen
+from reffusion.kernels.vectors import LANES, any_lane, maximum, minimum, narrow, select, splat, take_ticket, widen
 from reffusion.splat import harmonics, projection
 from reffusion.splat.binning import ellipse
 from reffusion.splat.layout import (
@@ -137,7 +137,7 @@ def project_gaussians(tickets, parameters, probe, view, center, footprints, radi
                 mean_x = mean_x + widen(load_column(probe, 2, 0, row, last))
                 mean_y = mean_y + widen(load_column(probe, 2, 1, row, last))
             is_visible = is_visible & projection.in_image(view, mean_x, mean_y, reach_x, reach_y)
-            if not some(is_visible):
+            if not any_lane(is_visible):
                 continue
             radius = minimum(maximum(maximum(reach_x, reach_y), 1.0), 1073741824.0)
             store_whole(radii, row, select(is_visible, radius, 0.0))
@@ -262,7 +262,7 @@ def project_gaussians_backward(
                 for c in range(gradients.features.shape[1]):
                     gradients.features[row + lane, c] = workspace.sums[lane * columns + GRAD_FEATURES + c]
             is_visible = load_mask(radii, row)
-            if some(is_visible):
+            if any_lane(is_visible):
                 _read_rows(workspace.sums, columns, 0, LANES - 1, workspace.moments)
                 _rows_backward(row, is_visible, footprints, parameters, view, center, workspace, gradients)
             else:

@@ -10,11 +10,11 @@ from reffusion.kernels.vectors import (
     EXP2,
     LANES,
     ROUND,
+    any_lane,
     fma,
     fnma,
     minimum,
     select,
-    some,
     splat,
     take_ticket,
     times_power,
@@ -139,7 +139,7 @@ def init_transmittance(state, stride, rows, columns):
 def is_finished(state, stride):
     """Are all pixels of the tile finished?"""
     for step in range(STEPS):
-        if some(load(state, step * stride) > splat(0.0)):
+        if any_lane(load(state, step * stride) > splat(0.0)):
             return False
     return True
 
@@ -236,7 +236,7 @@ def _blend_tile(tile, footprints, features, bins, size, state, constants):
             before = load(state, place)
             power = log_alpha(footprint, load(constants, (AT_ROW + step) * LANES))
             is_above_cut = power >= load(constants, AT_CUT * LANES)
-            if not some(is_above_cut & (before > splat(0.0))):
+            if not any_lane(is_above_cut & (before > splat(0.0))):
                 continue
             _, _, weight, after = blend_pixels(power, is_above_cut, before, constants)
             store(state, place, after)

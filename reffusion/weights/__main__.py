@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import sys
 
-from reffusion.weights.local import of_lpips
+from reffusion.weights.local import lpips_need
 
 
 def main() -> None:
     """Download and report it in one line; a failure is only a warning."""
-    need = of_lpips()
+    need = lpips_need()
     if need.problem is None:
         return
     print(f"fetching the weights of LPIPS, a score ({need.bytes / 1e6:.0f} MB, once)", flush=True)

@@ -17,7 +17,7 @@ from reffusion.weights.published import NETWORKS, PUBLISHED
 _OFFLINE_ADVICE = "run `make weights` on a machine with a network and copy its cache, or name a folder of weights"
 
 
-def model(name: str, half: bool, only: str | None = None) -> Path:
+def download_model(name: str, half: bool, only: str | None = None) -> Path:
     """Download a hub model into the cache of the hub, and return its folder there.
 
     Args:
@@ -39,7 +39,7 @@ def model(name: str, half: bool, only: str | None = None) -> Path:
     try:
         info = HfApi().model_info(name, files_metadata=True)
         names = [entry.rfilename for entry in info.siblings]
-        chosen = [each for each in names if each == only] if only else chosen_files(names, half)
+        chosen = [each for each in names if each == only] if only else select_files(names, half)
         if not chosen:
             missing = f"file {only}" if only else ".safetensors weights, and others are not read"
             raise ValueError(f"{name} has no {missing}; {remedy}")
@@ -65,7 +65,7 @@ def model(name: str, half: bool, only: str | None = None) -> Path:
     return folder
 
 
-def chosen_files(names: Sequence[str], half: bool) -> list[str]:
+def select_files(names: Sequence[str], half: bool) -> list[str]:
     """The files of a model that are needed: configurations, vocabularies, and one set of weights per part.
 
     Weights are .safetensors: those marked fp16 if `half` and the part has them, else the plain ones. Checkpoints of the

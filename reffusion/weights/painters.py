@@ -9,7 +9,7 @@ import hashlib
 import importlib.util
 from pathlib import Path
 
-from reffusion.weights.local import Need, absent, locate
+from reffusion.weights.local import Need, explain_missing, locate
 from reffusion.weights.published import PAINTERS, PUBLISHED
 
 AUTO, EXEMPLAR = "auto", "exemplar"
@@ -32,7 +32,7 @@ def published_file(inpainter: str) -> Path | None:
         return None
 
 
-def file_of(inpainter: str, source: str | Path = "") -> Path:
+def inpainter_file(inpainter: str, source: str | Path = "") -> Path:
     """The file named by `source`, or the published one if `source` is empty or a diffusion prior.
 
     Args:
@@ -46,11 +46,11 @@ def file_of(inpainter: str, source: str | Path = "") -> Path:
         return find_file(inpainter, Path(source).expanduser())
     if file := published_file(inpainter):
         return file
-    raise ValueError(f"{PAINTERS[inpainter].name}: {absent(PAINTERS[inpainter].repo)}")
+    raise ValueError(f"{PAINTERS[inpainter].name}: {explain_missing(PAINTERS[inpainter].repo)}")
 
 
 def find_file(inpainter: str, path: Path) -> Path:
-    """`path`, or the only file of the inpainter's kind in it. Raises ValueError as `file_of`."""
+    """`path`, or the only file of the inpainter's kind in it. Raises ValueError as `inpainter_file`."""
     published = PAINTERS[inpainter]
     endings = " or ".join(published.endings)
     candidates = sorted(path.iterdir()) if path.is_dir() else [path]
@@ -65,16 +65,16 @@ def find_file(inpainter: str, path: Path) -> Path:
     return files[0]
 
 
-def of_painter(inpainter: str, source: str | Path = "", param: str = "inpainter") -> Need:
+def inpainter_need(inpainter: str, source: str | Path = "", param: str = "inpainter") -> Need:
     """The need for the file of an inpainter, and for onnxruntime if it is an ONNX file.
 
     Args:
-        inpainter, source: as in `file_of`.
+        inpainter, source: as in `inpainter_file`.
         param: the parameter that names the file, for messages.
     """
     known = PAINTERS[inpainter]
     try:
-        file = file_of(inpainter, source)
+        file = inpainter_file(inpainter, source)
     except ValueError as error:
         if _names_no_file(source):
             return Need(known.repo, f"{param}: {error}", known.bytes, file=known.file)
@@ -89,7 +89,7 @@ def inpainter_facts(inpainter: str, source: str | Path = "") -> dict[str, str]:
     if kind not in PAINTERS:
         return {"inpainter": kind} if inpainter == AUTO else {}
     try:
-        with open(file_of(kind, source), "rb") as file:
+        with open(inpainter_file(kind, source), "rb") as file:
             return {"inpainter": f"{kind} {hashlib.file_digest(file, 'sha256').hexdigest()[:16]}"}
     except (OSError, ValueError):
         return {"inpainter": kind}

@@ -18,9 +18,9 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
     Args:
         brings: the keys of scene.yaml.
     """
-    needs = [local.of_model(params.prior, params.dtype)] if params.needs_prior else []
+    needs = [local.model_need(params.prior, params.dtype)] if params.needs_prior else []
     if params.depth.weight > 0 and params.depth.model:
-        needs.append(local.of_model(params.depth.model, "float32"))
+        needs.append(local.model_need(params.depth.model, "float32"))
     return needs
 
 
@@ -31,4 +31,4 @@ def lacks(params: Params) -> list[str]:
 
 def cost(params: Params, card: str) -> Mapping[str, object] | None:
     """The estimated cost on a GPU, by name; "" is this machine's. ValueError if the name is not in the table."""
-    return estimate.said(card, params.device, estimate.distill(params))
+    return estimate.format_estimate(card, params.device, estimate.distill(params))

@@ -11,7 +11,10 @@ from reffusion.weights.published import PAINTERS
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
     """What must lie on this machine, and what of it does not; `brings`: the keys of scene.yaml."""
     painted = params.inpaint and params.inpainter in PAINTERS
-    return [local.of_lpips(), *([painters.of_painter(params.inpainter, param="evaluate.inpainter")] if painted else [])]
+    return [
+        local.lpips_need(),
+        *([painters.inpainter_need(params.inpainter, param="evaluate.inpainter")] if painted else []),
+    ]
 
 
 def machine_facts(params: Params) -> dict[str, str]:
@@ -21,7 +24,7 @@ def machine_facts(params: Params) -> dict[str, str]:
 
 def unavailable(params: Params) -> list[str]:
     """What scores are missing here; where it comes later, they are made anew."""
-    return ["LPIPS"] if local.of_lpips().problem else []
+    return ["LPIPS"] if local.lpips_need().problem else []
 
 
 def lacks(params: Params) -> list[str]:

@@ -24,4 +24,4 @@ def lacks(params: Params) -> list[str]:
 
 def cost(params: Params, card: str) -> Mapping[str, object] | None:
     """Estimated cost on a GPU ("": that of this machine). Raises ValueError for a GPU that is not in the table."""
-    return estimate.said(card, params.device, estimate.fit(params))
+    return estimate.format_estimate(card, params.device, estimate.fit(params))

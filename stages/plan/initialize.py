@@ -14,14 +14,14 @@ __all__ = ["Params", "lacks", "needed_weights", "preview"]
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
     """Weights that the stage needs, and whether they are here; `brings`: the keys of scene.yaml."""
-    needs = [local.of_model(params.depth.model, "float32")] if params.depth.model else []
+    needs = [local.model_need(params.depth.model, "float32")] if params.depth.model else []
     uses_inpainter = params.extra_views and params.inpainter in PAINTERS
-    return needs + ([painters.of_painter(params.inpainter, param="initialize.inpainter")] if uses_inpainter else [])
+    return needs + ([painters.inpainter_need(params.inpainter, param="initialize.inpainter")] if uses_inpainter else [])
 
 
 def optional_weights(params: Params) -> list[local.Need]:
     """Weights that the stage could use instead."""
-    return [] if params.depth.model else [local.of_model(DEPTH_ANYTHING, "float32")]
+    return [] if params.depth.model else [local.model_need(DEPTH_ANYTHING, "float32")]
 
 
 def machine_facts(params: Params) -> dict[str, str]:

@@ -11,8 +11,8 @@ from reffusion.weights.published import PAINTERS
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
     """Weights that the stage needs, and whether they are here; `brings`: the keys of scene.yaml."""
     if params.inpainter == "diffusion":
-        return [local.of_model(params.prior, "float32")]
-    return [painters.of_painter(params.inpainter, param="lift.inpainter")] if params.inpainter in PAINTERS else []
+        return [local.model_need(params.prior, "float32")]
+    return [painters.inpainter_need(params.inpainter, param="lift.inpainter")] if params.inpainter in PAINTERS else []
 
 
 def machine_facts(params: Params) -> dict[str, str]:

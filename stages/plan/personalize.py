@@ -14,7 +14,7 @@ __all__ = ["Params", "cost", "lacks", "needed_weights"]
 
 def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
     """Weights that the stage needs, and whether they are here; `brings`: the keys of scene.yaml."""
-    return [local.of_model(params.prior, params.dtype)]
+    return [local.model_need(params.prior, params.dtype)]
 
 
 def lacks(params: Params) -> list[str]:
@@ -24,4 +24,4 @@ def lacks(params: Params) -> list[str]:
 
 def cost(params: Params, card: str) -> Mapping[str, object] | None:
     """Estimated cost on a GPU ("": that of this machine). Raises ValueError for a GPU that is not in the table."""
-    return estimate.said(card, params.device, estimate.personalize(params))
+    return estimate.format_estimate(card, params.device, estimate.personalize(params))

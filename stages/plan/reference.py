@@ -20,13 +20,13 @@ def needed_weights(params: Params, brings: frozenset[str]) -> list[local.Need]:
     if given or params.inpainter in (painters.EXEMPLAR, painters.AUTO):
         return []
     if params.inpainter in PAINTERS:
-        return [painters.of_painter(params.inpainter, params.prior, "reference.prior")]
-    return [local.of_model(params.prior, params.dtype)]
+        return [painters.inpainter_need(params.inpainter, params.prior, "reference.prior")]
+    return [local.model_need(params.prior, params.dtype)]
 
 
 def optional_weights(params: Params) -> list[local.Need]:
     """What `inpainter: auto` would take."""
-    return [painters.of_painter(kind) for kind in PAINTERS]
+    return [painters.inpainter_need(kind) for kind in PAINTERS]
 
 
 def machine_facts(params: Params) -> dict[str, str]:
@@ -62,4 +62,4 @@ def lacks(params: Params) -> list[str]:
 
 def cost(params: Params, card: str) -> Mapping[str, object] | None:
     """What it takes on a card; "": this machine's. ValueError for one that is not in the table."""
-    return estimate.said(card, params.device, estimate.reference(params))
+    return estimate.format_estimate(card, params.device, estimate.reference(params))

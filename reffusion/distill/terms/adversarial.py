@@ -15,7 +15,7 @@ from reffusion.distill.terms.term import Term, TermInputs, TermValue, cycle_thro
 from reffusion.distill.train_view import TrainView
 from reffusion.gaussians.optimize import confine
 from reffusion.params.distill import Params
-from reffusion.prior.windows import enlarged, windows_around
+from reffusion.prior.windows import enlarge_to_fit, windows_around
 from reffusion.splat.rasterizer import render
 from reffusion.types import Gaussians, Rendering
 
@@ -96,6 +96,6 @@ def draw_patches(image: Tensor, mask: Tensor, count: int, size: int, generator: 
     Args:
         image: [H, W, 3] in [0, 1]. mask: [H, W] bool.
     """
-    view = enlarged(image.permute(2, 0, 1) * 2 - 1, size)
-    mask = enlarged(mask.to(view)[None], size)[0] > 1e-4
+    view = enlarge_to_fit(image.permute(2, 0, 1) * 2 - 1, size)
+    mask = enlarge_to_fit(mask.to(view)[None], size)[0] > 1e-4
     return gather_patches(view, windows_around(mask.cpu(), size, count, generator), size)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from reffusion import seeding
 from reffusion.depth import background_depth
-from reffusion.depth.background_depth import Seen
+from reffusion.depth.background_depth import ViewDepth
 from reffusion.distill.depth_estimator import DepthEstimator
 from reffusion.distill.terms.term import Term, TermInputs, TermValue, cycle_through, reach_hole
 from reffusion.distill.train_view import TrainView
@@ -99,7 +99,7 @@ def evaluate_depth(
     camera, hole, hidden = _downscale(view, max_side)
     geometry_only = confine(replace(gaussians, sh=gaussians.sh.detach()), reached)
     rendering = render(geometry_only, camera)
-    seen = background_depth.seen(rendering, camera, hole.cpu().numpy(), hidden.cpu().numpy(), estimator.how)
+    seen = background_depth.extract_depth(rendering, camera, hole.cpu().numpy(), hidden.cpu().numpy(), estimator.how)
     alpha = rendering.alpha.detach().cpu().numpy()
 
     def repaint_hole() -> np.ndarray:
@@ -117,7 +117,7 @@ def evaluate_depth(
     return depth_loss(rendering.depth, to_device(target), to_device(compared), extent), rendering
 
 
-def depth_target(view: Seen, disparity: np.ndarray, covered: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def depth_target(view: ViewDepth, disparity: np.ndarray, covered: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The depth that the hole should have, [H, W] float64, and the pixels to compare it in, [H, W] bool.
 
     Left out are pixels that no Gaussian covers, and those whose estimate is farther than everything known of the scene

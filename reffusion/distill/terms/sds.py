@@ -17,7 +17,7 @@ from reffusion.geometry import angle_between_views
 from reffusion.params.distill import Params, Sds
 from reffusion.prior import diffusion
 from reffusion.prior.model import Prior
-from reffusion.prior.windows import enlarged, two_scale_masks, two_scales, window_around
+from reffusion.prior.windows import enlarge_to_fit, two_scale_masks, two_scales, window_around
 from reffusion.splat.rasterizer import render
 from reffusion.types import Camera, Gaussians, Rendering
 
@@ -108,10 +108,10 @@ def evaluate_sds(
     probe = None if probe is None else probe * reached[:, None]
     rendering = render(confine(gaussians, reached), view.camera, probe=probe)
     color = clamp_to_display(rendering.color)
-    rendered = enlarged(color.permute(2, 0, 1) * 2 - 1, size)
+    rendered = enlarge_to_fit(color.permute(2, 0, 1) * 2 - 1, size)
     known = torch.where(view.supervises[..., None], view.picture, color.detach())
-    known = enlarged(known.permute(2, 0, 1) * 2 - 1, size)
-    hole = enlarged(view.repaint.to(rendered)[None], size)[0] > 1e-4
+    known = enlarge_to_fit(known.permute(2, 0, 1) * 2 - 1, size)
+    hole = enlarge_to_fit(view.repaint.to(rendered)[None], size)[0] > 1e-4
 
     windows = [window_around(hole.cpu(), size, generator) for _ in range(sds.patches)]
     masks = two_scale_masks(hole, windows, size)
