@@ -15,12 +15,12 @@ from reffusion.capture.checks import sanity
 from reffusion.capture.checks.pose_check import check_poses, judge
 from reffusion.capture.layouts import cameras, ring
 from reffusion.capture.layouts.capture import Capture
-from reffusion.capture.lens import undoing
+from reffusion.capture.lens import undistortion_map
 from reffusion.capture.lenses import save_lenses
-from reffusion.capture.refine import refined
+from reffusion.capture.refine import refine_cameras
 from reffusion.capture.roles import Roles
-from reffusion.capture.scene_folder import check_brought, read_scene, unphotographed
-from reffusion.capture.undistort import fitting_size, lens_of, load_at, save_undistorted
+from reffusion.capture.scene_folder import check_gaussian_files, is_gaussians_only, read_scene
+from reffusion.capture.undistort import fitting_size, load_resized, resized_lens, save_undistorted_view
 from reffusion.capture.views import check_outliers
 from reffusion.gaussians import matching
 from reffusion.io.arrays import save_json, save_labels
@@ -37,14 +37,14 @@ from reffusion.types import Scene
 LEAST_POINTS = 100  # with fewer sparse points, some of optical flow are added to them
 MORE_POINTS = 10_000  # how many at most; random ones, where flow finds too few
 SEED = 0
-SOLVED = "sfm.json"  # `sfm.Solution.facts`
+SFM_FACTS = "sfm.json"  # `sfm.Reconstruction.facts`
 
 
 def run(params: Params, out: Path, *, scene: Path) -> None:
     """Write images/, sparse/0/, lenses.json, transform.json, views.json; refine.json where cameras were adjusted;
     gaussians.ply and deleted.npy where the scene brings them; warnings.json where something is odd."""
     own = _load_own_splats(params, scene)  # before the work, not after it
-    if unphotographed(params, scene):
+    if is_gaussians_only(params, scene):
         _save_unphotographed(params, out, scene, own)
         return
     capture, roles = read_scene(params, scene, params.longest)
@@ -54,24 +54,26 @@ def run(params: Params, out: Path, *, scene: Path) -> None:
         everyone, capture = sorted(capture.pictures), _place(params, out, capture)
         if lost := [name for name in everyone if name not in capture.pictures]:
             said.append(f"{len(lost)} views were not placed and are left out: {', '.join(lost)}")
-        roles = roles.among(set(capture.pictures))
+        roles = roles.restrict(set(capture.pictures))
     views, longest = sorted({*roles.train, *roles.test}), _supported_size(params, capture, roles)
     lenses, pinholes = {}, {}
     for k in trace.progress(len(views), "poses"):
-        lenses[views[k]], pinholes[views[k]] = save_undistorted(out, views[k], capture, longest)
+        lenses[views[k]], pinholes[views[k]] = save_undistorted_view(out, views[k], capture, longest)
     for name in roles.blank:
-        lenses[name], pinholes[name] = lens_of(name, capture, longest)
-    normalised = frame.normalised(capture.poses, pinholes, roles.train, roles.test, roles.clean)
+        lenses[name], pinholes[name] = resized_lens(name, capture, longest)
+    normalised = frame.normalize_scene(capture.poses, pinholes, roles.train, roles.test, roles.clean)
     normalised, contradictions = _drop_outliers(params, roles, replace(normalised, blank=roles.blank), out)
     views = [name for name in views if name in normalised.cameras]
     lenses, pinholes = ({n: each[n] for n in each if n in normalised.cameras} for each in (lenses, pinholes))
     save_lenses(out, lenses, capture.upright, {name: sizes[name] for name in lenses})
     _save_warnings(out, [*said, *contradictions, *_oddities(normalised, out)])
     if len(normalised.points) < LEAST_POINTS:
-        ranges = frame.ranges_of(capture.poses, pinholes) * normalised.similarity.scale
+        ranges = frame.view_depth_ranges(capture.poses, pinholes) * normalised.similarity.scale
         draws = seeding.generator(SEED, "poses", "random points")
         shown = replace(normalised, cameras={name: normalised.cameras[name] for name in views})
-        filled = frame.filled_up(shown, ranges[: len(views)], MORE_POINTS, draws, lambda v: load_views(out, [v])[v])
+        filled = frame.add_random_points(
+            shown, ranges[: len(views)], MORE_POINTS, draws, lambda v: load_views(out, [v])[v]
+        )
         normalised = replace(filled, cameras=normalised.cameras)
     save_scene(out, normalised)
     if own is not None:
@@ -96,7 +98,7 @@ class OwnSplats:
 
 def _load_own_splats(params: Params, scene: Path) -> OwnSplats | None:
     """BadInput where `gaussians` or `cleaned` cannot be used. None where the scene has neither."""
-    check_brought(params, scene)
+    check_gaussian_files(params, scene)
     if params.gaussians is None:
         return None
     path = scene / params.gaussians
@@ -143,15 +145,15 @@ def _save_unphotographed(params: Params, out: Path, scene: Path, own: OwnSplats)
     """The same without photographs: cameras that a capture left, or some around the hole; nothing in images/."""
     rows, found = own.splats.rows, cameras.read(scene)
     means, opaque, sizes = rows.means, rows.opacity_logits > 0, np.exp(np.median(rows.log_scales, axis=1))
-    poses, source = found or (ring.cameras_around(means, sizes, opaque, own.deleted, params.longest), None)
+    poses, source = found or (ring.place_cameras(means, sizes, opaque, own.deleted, params.longest), None)
     some = np.flatnonzero(opaque)
     draws = seeding.generator(SEED, "poses", "points of Gaussians")
     some = some[torch.randperm(len(some), generator=draws)[:MORE_POINTS].numpy()]
     colors = (255 * (0.5 + SH0 * rows.sh[some, 0]).clip(0, 1)).round().astype(np.uint8)
     poses = replace(poses, points=means[some], colors=colors)
     at = {n: each.resized(*fitting_size(each.width, each.height, params.longest)) for n, each in poses.lenses.items()}
-    pinholes = {name: undoing(lens)[0] for name, lens in at.items()}
-    placed = frame.normalised(poses, pinholes, sorted(pinholes), (), frozenset())
+    pinholes = {name: undistortion_map(lens)[0] for name, lens in at.items()}
+    placed = frame.normalize_scene(poses, pinholes, sorted(pinholes), (), frozenset())
     save_lenses(out, pinholes, False, {n: (each.width, each.height) for n, each in pinholes.items()})
     where = f"the {len(pinholes)} cameras of {source}" if source else f"{len(pinholes)} cameras around the hole"
     _save_warnings(out, [
@@ -176,7 +178,7 @@ def _drop_outliers(params: Params, roles: Roles, scene: Scene, out: Path) -> tup
     if params.region is not None and params.region.view is not None:
         check_outliers("region", [params.region.view], verdict.outliers)
     if verdict.outliers or tied is scene:
-        tied = _adjust_cameras(params, verdict.applied_to(scene), out)
+        tied = _adjust_cameras(params, verdict.apply(scene), out)
     return replace(tied, suspects=verdict.suspects), list(verdict.sentences)
 
 
@@ -204,8 +206,8 @@ def _supported_size(params: Params, capture: Capture, roles: Roles) -> int:
     if params.detail == 0:
         return params.longest
     chosen = roles.train[:: max(1, len(roles.train) // 8)]
-    images = [load_at(capture.pictures[name], params.longest, capture.upright) for name in chosen]
-    if not image_detail.enlarged(images, params.detail):
+    images = [load_resized(capture.pictures[name], params.longest, capture.upright) for name in chosen]
+    if not image_detail.is_enlarged(images, params.detail):
         return params.longest
     side = max(max(image.shape[:2]) for image in images)
     print(f"pictures of {side} px show no more than {side // 2} px would: taken at that size", flush=True)
@@ -215,7 +217,7 @@ def _supported_size(params: Params, capture: Capture, roles: Roles) -> int:
 def _refined(scene: Scene, out: Path) -> Scene:
     """The scene with cameras that agree with optical flow; test views too, as they are in structure from motion."""
     shown = {name: camera for name, camera in scene.cameras.items() if name not in scene.blank}
-    found = refined(list(shown.values()), load_views(out, shown))
+    found = refine_cameras(list(shown.values()), load_views(out, shown))
     if np.isnan(found.before):
         print("cameras as given: optical flow matches nothing between the views", flush=True)
     elif found.after is None:
@@ -246,8 +248,8 @@ def _with_flow_points(scene: Scene, out: Path) -> Scene:
 
 def _place(params: Params, out: Path, capture: Capture) -> Capture:
     """The capture with poses by structure from motion, of the views that it places."""
-    found = sfm.solve(capture.pictures, params.longest, out / "sfm", SEED)
+    found = sfm.reconstruct(capture.pictures, params.longest, out / "sfm", SEED)
     facts = found.facts()
     print(facts["summary"], flush=True)
-    save_json(out / SOLVED, facts)
+    save_json(out / SFM_FACTS, facts)
     return replace(capture, pictures={name: capture.pictures[name] for name in found.poses.lenses}, poses=found.poses)

@@ -11,9 +11,9 @@ from pathlib import Path
 from reffusion import trace
 from reffusion.capture.checks.sanity import find_odd_masks
 from reffusion.capture.lenses import load_lenses
-from reffusion.capture.scene_folder import read_scene, unphotographed
+from reffusion.capture.scene_folder import is_gaussians_only, read_scene
 from reffusion.capture.undistort import save_undistorted_masks
-from reffusion.capture.views import check_outliers, known
+from reffusion.capture.views import check_outliers, resolve_view
 from reffusion.io.arrays import save_json
 from reffusion.io.images import image_size, save_mask
 from reffusion.io.scene import WARNINGS, load_raw_masks, load_scene
@@ -30,7 +30,7 @@ def run(params: Params, out: Path, *, scene: Path, poses: Path) -> None:
     masks are odd."""
     placed, lenses = load_scene(poses), load_lenses(poses)[0]
     notes: tuple[str, ...] = ()
-    if not unphotographed(params, scene):
+    if not is_gaussians_only(params, scene):
         _, roles = read_scene(params, scene)
         names = sorted(lenses)
         for k in trace.progress(len(names), "masks"):
@@ -52,7 +52,9 @@ def _save_region(params: Params, out: Path, scene: Scene) -> None:
     region, scale = params.region, scene.similarity.scale
     if region.view is not None:
         check_outliers("region", [region.view], scene.outliers)
-        center = regions.on_axis(scene.cameras[known(region.view, scene.cameras, "region")], region.distance * scale)
+        center = regions.on_axis(
+            scene.cameras[resolve_view(region.view, scene.cameras, "region")], region.distance * scale
+        )
     else:
         center = scene.similarity.apply(region.center)
     if region.outside:

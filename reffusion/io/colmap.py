@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from reffusion.io.files import BadInput, Cursor, reading, shortened, there
-from reffusion.io.rotations import pose_matrix, quaternion_of
+from reffusion.io.files import BadInput, Cursor, is_file, reading, shorten
+from reffusion.io.rotations import quaternion_to_pose, rotation_to_quaternion
 
 # Order is COLMAP's numbering in binary files.
 MODELS = {
@@ -74,7 +74,7 @@ class ModelPoints:
 
 def model_file(folder: Path, stem: str) -> Path | None:
     """`<folder>/<stem>.bin` or, failing that, `.txt`; None where neither is there."""
-    return next((p for p in (Path(folder) / f"{stem}{end}" for end in (".bin", ".txt")) if there(p)), None)
+    return next((p for p in (Path(folder) / f"{stem}{end}" for end in (".bin", ".txt")) if is_file(p)), None)
 
 
 def is_model(folder: Path) -> bool:
@@ -160,7 +160,7 @@ def _line(path: Path, what: str, line: str) -> Iterator[None]:
     except BadInput:
         raise
     except (ValueError, KeyError, OverflowError) as error:
-        raise BadInput(f"{path}: cannot read the {what} '{shortened(line)}' ({shortened(str(error))})") from None
+        raise BadInput(f"{path}: cannot read the {what} '{shorten(line)}' ({shorten(str(error))})") from None
 
 
 def load_images(path: Path) -> dict[int, ModelImage]:
@@ -170,7 +170,7 @@ def load_images(path: Path) -> dict[int, ModelImage]:
     for image in found.values():
         if not np.isfinite(image.world_to_camera).all():
             raise BadInput(
-                f"{path}: the pose of {shortened(image.name)} is not finite; remove the view or solve it again"
+                f"{path}: the pose of {shorten(image.name)} is not finite; remove the view or solve it again"
             )
     return found
 
@@ -182,7 +182,7 @@ def _images_binary(path: Path) -> dict[int, ModelImage]:
         name = file.text()
         seen = file.count(24)
         file.at += 24 * seen
-        _add(images, identity, ModelImage(_named(name, path), camera_id, pose_matrix(pose[:4], pose[4:])), path)
+        _add(images, identity, ModelImage(_named(name, path), camera_id, quaternion_to_pose(pose[:4], pose[4:])), path)
     file.end()
     return images
 
@@ -199,7 +199,7 @@ def _images_text(path: Path) -> dict[int, ModelImage]:
             if len(fields) != 10:
                 raise ValueError("10 fields are expected")
             pose = [float(f) for f in fields[1:8]]
-            image = ModelImage(_named(fields[9], path), int(fields[8]), pose_matrix(pose[:4], pose[4:]))
+            image = ModelImage(_named(fields[9], path), int(fields[8]), quaternion_to_pose(pose[:4], pose[4:]))
             _add(images, int(fields[0]), image, path)
     return images
 
@@ -282,7 +282,7 @@ def save_model(
     with open(folder / "images.bin", "wb") as file:
         file.write(struct.pack("<Q", len(images)))
         for identity, image in images.items():
-            pose = (*quaternion_of(image.world_to_camera[:3, :3]), *image.world_to_camera[:3, 3])
+            pose = (*rotation_to_quaternion(image.world_to_camera[:3, :3]), *image.world_to_camera[:3, 3])
             file.write(struct.pack("<I7dI", identity, *pose, image.camera_id))
             file.write(image.name.encode() + b"\0" + struct.pack("<Q", 0))
     records = np.zeros(len(positions), POINT)

@@ -114,14 +114,14 @@ def _turn_about_x(rows: Rows) -> Rows:
     return Rows(means, quaternions, rows.log_scales, rows.opacity_logits, rows.sh * TURNED_SH[: rows.sh.shape[1], None])
 
 
-def require_library(path: Path) -> None:
+def check_gsply(path: Path) -> None:
     """BadInput where gsply is not installed, without importing it."""
     if importlib.util.find_spec("gsply") is None:
         raise BadInput(f"{path}: a quantised file takes gsply: `pip install gsply`, or save it as plain .ply")
 
 
 def _library(path: Path):
-    require_library(path)
+    check_gsply(path)
     import gsply
 
     return gsply

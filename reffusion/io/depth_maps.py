@@ -8,7 +8,7 @@ import numpy as np
 
 from reffusion.io.arrays import load_array
 from reffusion.io.files import BadInput
-from reffusion.io.images import load_exr, opened
+from reffusion.io.images import load_exr, open_image
 
 
 def load_depth(path: Path) -> np.ndarray:
@@ -41,7 +41,7 @@ def _values(path: Path) -> np.ndarray:
         return load_exr(path)
     if path.suffix.lower() == ".npy":
         return load_array(path, "a readable depth map")
-    with opened(path, "a readable depth map") as image:
+    with open_image(path, "a readable depth map") as image:
         mode, values = image.mode, np.array(image)
     if mode[0] not in "IF":
         raise BadInput(f"{path}: {mode} pixels of 8 bits are too coarse for depth; write 16-bit grey, .npy or .exr")

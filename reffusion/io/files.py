@@ -18,11 +18,11 @@ class BadInput(ValueError):
 
     def __init__(self, message: str):
         # A number of two thousand digits is told by its beginning; a path is hardly ever so long.
-        super().__init__(" ".join(shortened(word, LONGEST_WORD) for word in " ".join(message.splitlines()).split(" ")))
+        super().__init__(" ".join(shorten(word, LONGEST_WORD) for word in " ".join(message.splitlines()).split(" ")))
 
 
 @contextmanager
-def understood(path: Path, what: str) -> Iterator[None]:
+def as_bad_input(path: Path, what: str) -> Iterator[None]:
     """Whatever is raised inside comes out as BadInput: libraries raise dozens of kinds of errors for what they do not
     understand, so all are caught.
 
@@ -34,14 +34,14 @@ def understood(path: Path, what: str) -> Iterator[None]:
     except BadInput:
         raise
     except Exception as error:
-        said = shortened(" ".join(str(error).split()), 200) or "cut off"
+        said = shorten(" ".join(str(error).split()), 200) or "cut off"
         raise BadInput(f"{path}: not {what} ({type(error).__name__}: {said})") from error
 
 
 @contextmanager
 def reading(path: Path, what: str) -> Iterator[None]:
-    """`understood`, of a file that is opened inside: BadInput too where it is absent, a folder, a pipe or a device."""
-    with understood(path, what):
+    """`as_bad_input` for a file that is opened inside: BadInput too where it is missing, a folder, a pipe or a device."""
+    with as_bad_input(path, what):
         _check_regular(path)
         yield
 
@@ -64,7 +64,7 @@ def check_pixels(path: Path, width: int, height: int) -> None:
         raise BadInput(f"{path}: {width}x{height} px are more than {MOST_PIXELS // 10**6} megapixels; make it smaller")
 
 
-def there(path: Path) -> bool:
+def is_file(path: Path) -> bool:
     """Is a file of this name there? BadInput where it is something else: it would be passed over without a word."""
     if path.is_file():
         return True
@@ -73,7 +73,7 @@ def there(path: Path) -> bool:
     return False
 
 
-def shortened(value: object, most: int = 60) -> str:
+def shorten(value: object, most: int = 60) -> str:
     """What was found, for a message; long texts and whole objects are cut."""
     text = value if isinstance(value, str) else reprlib.repr(value)
     return text if len(text) <= most else text[: most - 3] + "..."

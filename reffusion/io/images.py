@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageOps
 
-from reffusion.io.files import BadInput, check_pixels, reading, shortened
+from reffusion.io.files import BadInput, check_pixels, reading, shorten
 
 HEIC = (".heic", ".heif")  # of phones
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", *HEIC)  # of pictures, in small letters
@@ -25,11 +25,11 @@ _HEIC_BRANDS = tuple(
     b"ftyp" + brand for brand in (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1", b"hevc", b"hevx")
 )
 logging.getLogger("PIL").addHandler(logging.NullHandler())  # what it says on standard error is in our line too
-Image.MAX_IMAGE_PIXELS = None  # `opened` looks at the size itself: with one limit, and without a warning below it
+Image.MAX_IMAGE_PIXELS = None  # `open_image` looks at the size itself: with one limit, and without a warning below it
 
 
 @contextmanager
-def opened(path: Path, what: str = "a readable image") -> Iterator[Image.Image]:
+def open_image(path: Path, what: str = "a readable image") -> Iterator[Image.Image]:
     """A picture of which the header was read; BadInput naming the file for all that is wrong with it, here or inside
     the block, and for more than `MOST_PIXELS`."""
     with reading(path, what):
@@ -53,7 +53,7 @@ def _learn_heic(path: Path) -> None:
 
 def image_size(path: Path, upright: bool = False) -> tuple[int, int]:
     """(width, height) in pixels, from the file's header alone. `upright` as in `load_image`."""
-    with opened(path) as image:
+    with open_image(path) as image:
         width, height = image.size
         turned = upright and image.getexif().get(0x0112, 1) in (5, 6, 7, 8)
         return (height, width) if turned else (width, height)
@@ -68,7 +68,7 @@ def load_image(path: Path, upright: bool = False) -> np.ndarray:
     Raises:
         BadInput: naming the file, where it is absent, cut off, or has pixels of more than 16 bits or of floats.
     """
-    with opened(path) as image:
+    with open_image(path) as image:
         turned = ImageOps.exif_transpose(image) if upright else image
         if image.mode[0] not in "IF":
             return np.array(turned.convert("RGB"))
@@ -80,7 +80,7 @@ def load_image(path: Path, upright: bool = False) -> np.ndarray:
 
 def load_thumbnail(path: Path, side: int) -> np.ndarray:
     """The picture as uint8 [h, w, 3], its longer side at most `side` px; of the stored pixels. Imports no OpenCV."""
-    with opened(path) as image:
+    with open_image(path) as image:
         if image.mode[0] not in "IF":
             image.draft("RGB", (2 * side, 2 * side))  # JPEGs are decoded at a fraction of their size
             image = image.convert("RGB")
@@ -156,7 +156,7 @@ def load_mask(path: Path, size: tuple[int, int] | None = None, values: MaskValue
     Raises:
         BadInput: naming the file, where it is unreadable, in its alpha, or a map of object numbers without `ids`.
     """
-    with opened(path, "a readable mask") as image:
+    with open_image(path, "a readable mask") as image:
         if values.ids:
             mask = np.isin(_numbers(path, image), values.ids)
         else:
@@ -278,11 +278,11 @@ def load_exr(path: Path) -> np.ndarray:
                 raise BadInput(f"{path}: not an EXR file; give it the ending of what it is")
         file = oiio.ImageInput.open(str(path))
         if file is None:
-            raise BadInput(f"{path}: not a readable EXR file ({shortened(oiio.geterror(), 200)})")
+            raise BadInput(f"{path}: not a readable EXR file ({shorten(oiio.geterror(), 200)})")
         spec = file.spec()
         check_pixels(path, spec.width, spec.height * max(spec.depth, 1))
         pixels = file.read_image(0, 0, 0, 1, oiio.FLOAT)
         file.close()
         if pixels is None:
-            raise BadInput(f"{path}: cut off ({shortened(file.geterror(), 200)})")
+            raise BadInput(f"{path}: cut off ({shorten(file.geterror(), 200)})")
         return np.ascontiguousarray(pixels.reshape(pixels.shape[0], pixels.shape[1], -1)[..., 0])

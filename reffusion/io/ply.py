@@ -83,7 +83,7 @@ def can_save(path: Path) -> None:
     if not name.endswith(FORMATS):
         raise BadInput(f"{path}: {Path(path).suffix or 'no ending'} is not written; one of {', '.join(FORMATS)} is")
     if name.endswith((".compressed.ply", ".spz")):
-        compressed.require_library(path)
+        compressed.check_gsply(path)
     if Path(path).is_dir() or not (parent := Path(path).absolute().parent).is_dir():
         raise BadInput(f"{path}: a folder; name a file" if Path(path).is_dir() else f"{parent}: no such folder")
 
@@ -157,7 +157,7 @@ def _points(path: Path, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return points, np.full((len(points), 3), 128, np.uint8)
 
 
-def check_gaussians(path: Path) -> int:
+def count_gaussians(path: Path) -> int:
     """How many there are, by the header alone: BadInput where the file is cut off, or its properties are others."""
     return summarize(path).count
 

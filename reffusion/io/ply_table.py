@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from reffusion.io.files import BadInput, reading, shortened
+from reffusion.io.files import BadInput, reading, shorten
 
 TYPES: dict[str, np.dtype] = {
     **dict.fromkeys(("char", "int8"), np.dtype("i1")),
@@ -39,7 +39,7 @@ class Header:
     comments: tuple[str, ...]
     at: int
 
-    def least(self) -> int:
+    def least_bytes(self) -> int:
         """Bytes that the data takes at least: a digit and a blank for each number of a text, one for a list's length.
 
         An element without properties takes none, however many it is said to have: it counts as a byte each."""
@@ -76,10 +76,10 @@ def load_header(path: Path) -> Header:
         held = tuple((name, count, tuple(properties)) for name, count, properties in elements)
         header = Header(form == "ascii", held, tuple(comments), file.tell())
         if form not in ("ascii", "binary_little_endian", "binary_big_endian"):
-            raise BadInput(f"{path}: not a readable PLY file with vertices: its format is '{shortened(form)}'")
+            raise BadInput(f"{path}: not a readable PLY file with vertices: its format is '{shorten(form)}'")
         if any(count < 0 for _, count, _ in held) or not any(name == "vertex" for name, _, _ in held):
             raise BadInput(f"{path}: not a readable PLY file with vertices")
-        if header.at + header.least() > Path(path).stat().st_size:
+        if header.at + header.least_bytes() > Path(path).stat().st_size:
             raise BadInput(f"{path}: cut off: it is too short for what its header declares")
         return header
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 
-def pose_matrix(quaternion: np.ndarray, translation: np.ndarray) -> np.ndarray:
+def quaternion_to_pose(quaternion: np.ndarray, translation: np.ndarray) -> np.ndarray:
     """[4, 4] float64 from wxyz (any length; not finite where it is zero) and a translation."""
     with np.errstate(all="ignore"):
         w, x, y, z = np.asarray(quaternion, np.float64) / np.linalg.norm(quaternion)
@@ -19,7 +19,7 @@ def pose_matrix(quaternion: np.ndarray, translation: np.ndarray) -> np.ndarray:
     return matrix
 
 
-def quaternion_of(rotation: np.ndarray) -> np.ndarray:
+def rotation_to_quaternion(rotation: np.ndarray) -> np.ndarray:
     """[4] wxyz of a [3, 3] rotation, w >= 0, without loss where the angle nears pi."""
     r = np.asarray(rotation, np.float64)
     # The largest of the four components is found first, so that none is divided by a small number.

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from reffusion.io import compressed, quantized
-from reffusion.io.files import BadInput, reading, there
+from reffusion.io.files import BadInput, is_file, reading
 from reffusion.io.ply_table import load_header, load_vertices
 from reffusion.io.splat_rows import BAD_SHARE, DEGREE, FLAT, Repairs, Rows, drop_invalid, fold_filter
 from reffusion.splat.conventions import SH0
@@ -91,13 +91,13 @@ def summarize(path: Path) -> Summary:
     if ending == ".splat":
         return Summary(quantized.count_splat(path))
     if ending == ".spz":
-        compressed.require_library(path)
+        compressed.check_gsply(path)
         count, _, antialiased = compressed.load_spz_header(path)
         return Summary(count, antialiased=antialiased)
     header = load_header(path)
     count, names = header.vertices()
     if compressed.PACKED in names:
-        compressed.require_library(path)
+        compressed.check_gsply(path)
         return Summary(count)
     notes = _check_properties(path, names)
     smoothed = ANTIALIASED in header.comments or FILTER in names
@@ -111,7 +111,7 @@ def load_splats(path: Path) -> Splats:
         BadInput: naming the file, where it is none of Gaussians, or more than half of its rows are invalid.
     """
     path = Path(path)
-    there(path)
+    is_file(path)
     summary, ending = summarize(path), path.suffix.lower()
     with reading(path, "a file of Gaussians"):
         if ending == ".splat":

@@ -8,12 +8,12 @@ from pydantic import Field, model_validator
 
 from reffusion.params.base import UNKEYED, Settings
 from reffusion.params.clicks import Clicked
-from reffusion.params.reference import Given
+from reffusion.params.reference import ReferenceSpec
 
 Side = Annotated[float, Field(gt=0)]
 
 
-class Region(Settings):
+class RegionSpec(Settings):
     """A place in the scene's own frame and units: a box along its axes, or a sphere."""
 
     center: tuple[float, float, float] | None = Field(None, description="its middle")
@@ -34,7 +34,7 @@ class Region(Settings):
         return self
 
 
-class Masks(Settings):
+class MaskSpec(Settings):
     """Where masks lie, and which numbers in them are the object."""
 
     folder: str | None = Field(None, description="relative to the scene; None: the usual ones")
@@ -53,7 +53,7 @@ class SceneKeys(Settings):
 
     layout: Literal["llff", "colmap", "transforms", "photos"] | None = Field(None, description="None: recognised")
     images: str | None = Field(None, description="folder of pictures, relative to the scene; None: the usual ones")
-    masks: str | Masks | None = Field(
+    masks: str | MaskSpec | None = Field(
         None,
         description='folder of masks, or {folder, id}; "none": the scene has none; None: the usual ones',
         json_schema_extra=UNKEYED,
@@ -71,7 +71,7 @@ class SceneKeys(Settings):
     keep: list[str] = Field([], description="views that stay, even where their photographs contradict their poses")
     gaussians: str | None = Field(None, description="splats the scene brings in its own frame: .ply, .spz or .splat")
     cleaned: str | None = Field(None, description="the same file after someone deleted splats: these are the object")
-    region: Region | None = Field(
+    region: RegionSpec | None = Field(
         None, description="box or sphere that holds the object, or is to be filled", json_schema_extra=UNKEYED
     )
     fill: str | None = Field(
@@ -83,7 +83,7 @@ class SceneKeys(Settings):
     remove: list[str] | None = Field(
         None, description="read by the stage `masks`; here only checked", json_schema_extra=UNKEYED
     )
-    reference: Given | list[Given] | None = Field(
+    reference: ReferenceSpec | list[ReferenceSpec] | None = Field(
         None,
         description="read by the stage `reference`; here only checked against the views",
         json_schema_extra=UNKEYED,
@@ -96,4 +96,4 @@ class SceneKeys(Settings):
 
     @property
     def mask_folder(self) -> str | None:
-        return self.masks.folder if isinstance(self.masks, Masks) else self.masks
+        return self.masks.folder if isinstance(self.masks, MaskSpec) else self.masks

@@ -10,7 +10,7 @@ from pydantic import Field
 from reffusion.params.base import Device, Dtype, Sampler, Settings, memory_field, prior_field
 
 
-class Given(Settings):
+class ReferenceSpec(Settings):
     """A completed view that the scene brings."""
 
     view: str = Field(description="name of the view it completes")
@@ -20,13 +20,15 @@ class Given(Settings):
     trust: bool = Field(False, description="take it though it does not seem to show its view")
 
 
-def reference_list(given: Given | Sequence[Given] | None) -> list[Given]:
+def reference_list(given: ReferenceSpec | Sequence[ReferenceSpec] | None) -> list[ReferenceSpec]:
     """The values of the key `reference` as a list."""
-    return [] if given is None else [given] if isinstance(given, Given) else list(given)
+    return [] if given is None else [given] if isinstance(given, ReferenceSpec) else list(given)
 
 
 class Params(Settings):
-    reference: Given | list[Given] | None = Field(None, description="completed views that the scene brings")
+    reference: ReferenceSpec | list[ReferenceSpec] | None = Field(
+        None, description="completed views that the scene brings"
+    )
     inpainter: Literal["diffusion", "exemplar", "lama", "migan", "auto"] = Field(
         "diffusion",
         description="the prior; patches of the photographs, along surfaces: sharp, with nothing new; LaMa or MI-GAN: "

@@ -9,7 +9,7 @@ from reffusion.capture.views import placed_views
 from reffusion.cost import estimate
 from reffusion.io import machine
 from reffusion.params.reference import Params, reference_list
-from reffusion.references.files import PAINTED, load_given, paintings_in, words
+from reffusion.references.files import PAINTED, describe_references, list_paintings, load_given
 from reffusion.weights import local, painters
 from reffusion.weights.published import PAINTERS
 
@@ -43,8 +43,8 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
 def preview(params: Params, *, scene: Path, poses: Path | None = None, **_: Path | None) -> list[str]:
     """What the stage will do. ValueError where it would refuse a reference for its name, its file or its view, as far
     as that can be told: against the views that `poses` placed (before it has run, `poses` checks the capture's)."""
-    if reference_list(params.reference) or paintings_in(scene):
-        views = words(load_given(scene, placed_views(poses), params.reference)) if poses else ""
+    if reference_list(params.reference) or list_paintings(scene):
+        views = describe_references(load_given(scene, placed_views(poses), params.reference)) if poses else ""
         return [f"takes over the scene's reference{views and ' ' + views}: no diffusion here"]
     if params.inpainter == "diffusion":
         return []
