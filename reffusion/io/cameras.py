@@ -1,4 +1,4 @@
-"""Cameras in the scene's own frame for other tools: a COLMAP model and nerfstudio's transforms.json."""
+"""Exports cameras in the scene's own frame for other tools: as a COLMAP model and as nerfstudio's transforms.json."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ GL = np.diag([1.0, -1.0, -1.0, 1.0])  # nerfstudio's cameras look along -z, y up
 
 
 def save_cameras(folder: Path, scene: Scene, images: str) -> None:
-    """Write sparse/0/*.bin, transforms.json and sparse_pc.ply: undistorted pinholes and sparse points.
+    """Write undistorted pinholes and sparse points as sparse/0/*.bin, transforms.json and sparse_pc.ply.
 
     Args:
-        images: where the views' pictures <view>.png are, relative to `folder`.
+        images: folder of the views' pictures <view>.png, relative to `folder`.
     """
     folder = Path(folder)
     points = scene.similarity.invert(scene.points)

@@ -1,4 +1,4 @@
-"""Depth maps in files that other tools write: 16-bit pictures, .npy, .exr."""
+"""Reads depth maps from other tools: 16-bit pictures, .npy, .exr."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from reffusion.io.images import load_exr, open_image
 
 
 def load_depth(path: Path) -> np.ndarray:
-    """float32 [h, w], a map of depth or disparity in any unit; NaN where it says nothing (not finite; 0 in a picture).
+    """float32 [h, w], a map of depth or disparity in any unit; NaN where unknown (not finite, or 0 in a picture).
 
     Raises:
         BadInput: naming the file, where it is unreadable, not of one channel, 8-bit, empty or constant.

@@ -1,4 +1,4 @@
-"""Rotations as quaternions, as COLMAP's files have them."""
+"""Converts between rotations and quaternions, as in COLMAP's files."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ def quaternion_to_pose(quaternion: np.ndarray, translation: np.ndarray) -> np.nd
 
 
 def rotation_to_quaternion(rotation: np.ndarray) -> np.ndarray:
-    """[4] wxyz of a [3, 3] rotation, w >= 0, without loss where the angle nears pi."""
+    """[4] wxyz of a [3, 3] rotation, w >= 0; accurate near an angle of pi too."""
     r = np.asarray(rotation, np.float64)
-    # The largest of the four components is found first, so that none is divided by a small number.
+    # The largest of the four components is computed first, to avoid a division by a small number.
     squares = np.array(
         [
             1 + r[0, 0] + r[1, 1] + r[2, 2],
