@@ -1,4 +1,4 @@
-"""What of SPIn-NeRF's published scenes a folder holds, a line a scene: `python data/spinnerf.py --data FOLDER`."""
+"""Lists which of SPIn-NeRF's published scenes a folder holds, one per line: `python data/spinnerf.py --data FOLDER`."""
 
 from __future__ import annotations
 

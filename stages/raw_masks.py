@@ -1,6 +1,6 @@
-"""raw_masks: the masks that a scene brings, as its undistorted views lie; the region to change.
+"""raw_masks: the masks that a scene brings, undistorted like its views; and the region to change.
 
-They are no part of `poses`, so new masks move no camera and run no structure from motion again.
+They are not part of `poses`, so new masks rerun neither cameras nor structure from motion.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ FACTS = "facts.json"
 
 def run(params: Params, out: Path, *, scene: Path, poses: Path) -> None:
     """Write masks/ (with masks of several objects, masks/<object>/), test_masks/ and fill/, <view>.png each;
-    region.json where the scene names a region; facts.json, the size of the test masks' files; warnings.json where
-    masks are odd."""
+    region.json where the scene names a region; facts.json, the size of the test masks' files; warnings.json where masks
+    are odd."""
     placed, lenses = load_scene(poses), load_lenses(poses)[0]
     notes: tuple[str, ...] = ()
     if not is_gaussians_only(params, scene):
@@ -48,7 +48,7 @@ def run(params: Params, out: Path, *, scene: Path, poses: Path) -> None:
 
 
 def _save_region(params: Params, out: Path, scene: Scene) -> None:
-    """Write the region as region.json, or masks of what lies outside it."""
+    """Write the region as region.json, or as masks of what lies outside it."""
     region, scale = params.region, scene.similarity.scale
     if region.view is not None:
         check_outliers("region", [region.view], scene.outliers)

@@ -16,8 +16,8 @@ class ReferenceSpec(Settings):
     view: str = Field(description="name of the view it completes")
     image: str = Field(description="picture, relative to the scene; of another size or cropped a little is fine")
     depth: str | None = Field(None, description="its depth or disparity, any scale: 16-bit .png, .npy or .exr")
-    undistorted: bool = Field(False, description="painted over `poses`' own undistorted image, not over the photo")
-    trust: bool = Field(False, description="take it though it does not seem to show its view")
+    undistorted: bool = Field(False, description="painted over the undistorted image of `poses`, not over the photo")
+    trust: bool = Field(False, description="use it even though it does not seem to show its view")
 
 
 def reference_list(given: ReferenceSpec | Sequence[ReferenceSpec] | None) -> list[ReferenceSpec]:
@@ -36,11 +36,11 @@ class Params(Settings):
         "LaMa, MI-GAN that is here, else patches",
     )
     prior: str = prior_field()
-    prompt: str = Field("", description="what the invented region shows, for a prior that reads")
+    prompt: str = Field("", description="what the invented region shows, for a prior with a text encoder")
     candidates: int = Field(4, ge=1, description="pictures to choose from")
-    choose: int | None = Field(None, ge=0, description="the candidate to take; None takes the one of the lowest seam")
+    choose: int | None = Field(None, ge=0, description="the candidate to take; None takes the one with the lowest seam")
     sampler: Sampler = Sampler()
-    seed: int = Field(0, description="of the first candidate; the others count up")
+    seed: int = Field(0, description="seed of the first candidate; the others count up")
     device: Device = "cpu"
     dtype: Dtype = "float32"
     memory_gb: float = memory_field()

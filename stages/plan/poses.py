@@ -1,4 +1,4 @@
-"""What `poses` says before it runs."""
+"""What `poses` reads, checks and announces before it runs."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from reffusion.params.clicks import CLICKS
 from reffusion.params.poses import Params
 from reffusion.references.files import PAINTED, describe_references, load_given
 
-# pictures count where they are photographs; depth maps belong to references
+# Endings of files that this stage reads only as photographs or depth maps of the capture; others belong to references.
 NOT_READ = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".npy", ".exr")
 
 
 def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
-    """Of the scene's files those that this stage reads, and what it reads elsewhere: the photographs, and all that is
-    neither a picture nor a depth map. So new masks and references, wherever they lie, rerun nothing here."""
+    """The scene's files that this stage reads: the photographs, and everything that is neither a picture nor a depth
+    map. So new masks and references, wherever they lie, rerun nothing here."""
     others = [path for path in files if path.parent != scene or path.name not in ("scene.yaml", CLICKS)]
     brought = {scene / name for name in (params.gaussians, params.cleaned) if name is not None}
     try:
@@ -35,7 +35,7 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
 
 
 def scene_facts(params: Params, scene: Path) -> dict[str, object]:
-    """What each view is for, which may follow from the names of masks."""
+    """The role of each view, which may depend on the names of masks."""
     if is_gaussians_only(params, scene):
         return {}
     roles = read_scene(params, scene, params.longest)[1]
@@ -43,8 +43,8 @@ def scene_facts(params: Params, scene: Path) -> dict[str, object]:
 
 
 def preview(params: Params, scene: Path) -> list[str]:
-    """What the stage will do, from headers. ValueError where it would refuse, or where a reference that the scene
-    brings, read by a later stage, belongs to none of its views."""
+    """What the stage will do, from headers. ValueError where it would fail, or where a reference of the scene, which a
+    later stage reads, belongs to none of its views."""
     if is_gaussians_only(params, scene):
         brought = check_gaussian_files(params, scene)
         found = cameras.read(scene)
@@ -54,13 +54,13 @@ def preview(params: Params, scene: Path) -> list[str]:
     given = load_given(scene, capture_views(capture, roles), params.reference)
     notes = [f"{len(roles.train)} training and {len(roles.test)} test views"]
     notes += [f"{len(roles.blank)} views are cameras only"] if roles.blank else []
-    notes += _of_poses(capture, scene)
+    notes += _describe_poses(capture, scene)
     notes += [f"the scene brings a reference of {describe_references(given)}"] if given else []
     return [*notes, *capture.warnings, *check_gaussian_files(params, scene)]
 
 
-def _of_poses(capture: Capture, scene: Path) -> list[str]:
-    """Where the poses come from, and what their lenses take."""
+def _describe_poses(capture: Capture, scene: Path) -> list[str]:
+    """Where the poses come from, and what their lenses need."""
     if capture.poses is None:
         return [f"SfM: {len(capture.pictures)} photos bring no poses"]
     shifts = {each: lens.largest_shift(each) for each in set(capture.poses.lenses.values())}

@@ -1,4 +1,4 @@
-"""What `raw_masks` says before it runs."""
+"""What `raw_masks` reads, checks and announces before it runs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def scene_files(params: Params, scene: Path, files: list[Path]) -> list[Path]:
 
 
 def scene_facts(params: Params, scene: Path) -> dict[str, object]:
-    """Which file is which view's mask, and the region."""
+    """Which file is the mask of which view, and the region."""
     region = {"region": params.region.model_dump() | {"holds": params.has_masks}} if params.region else {}
     if is_gaussians_only(params, scene):
         return region
