@@ -93,24 +93,25 @@ def drawn_across(depth: np.ndarray, known: np.ndarray) -> np.ndarray:
     return np.divide(1.0, filled, out=np.zeros_like(filled), where=filled > 1e-3 * top)
 
 
-def ranked(holes: Mapping[str, Hole], chosen: Sequence[str], most: int) -> list[RankedView]:
+def ranked(view_holes: Mapping[str, Hole], chosen: Sequence[str], most: int) -> list[RankedView]:
     """Rank views greedily: those of `chosen`, then up to `most` others, each the one that covers most of what is not
     covered yet.
 
     Of the others, views whose hole does not touch the picture's border come first: a hole that is cut off hides a part.
 
     Args:
+        view_holes: view name -> its hole.
         chosen: views that have their picture already.
         most: how many further ones.
     """
-    covers, total = _coverage(holes)
+    covers, total = _coverage(view_holes)
     if not total:
         return []
     left, result = np.ones(total, bool), []
-    named = [name for name in chosen if name in holes]
-    at_border = {name for name in holes if _touches_border(holes[name])}
+    named = [name for name in chosen if name in view_holes]
+    at_border = {name for name in view_holes if _touches_border(view_holes[name])}
     groups = [([name], 1, 0.0) for name in named] + [
-        (set(holes) - at_border, most, LEAST_GAIN),
+        (set(view_holes) - at_border, most, LEAST_GAIN),
         (at_border, most, LEAST_GAIN),
     ]
     for group, count, least in groups:
@@ -130,12 +131,12 @@ def _touches_border(hole: Hole) -> bool:
     return bool(hole.pixels[[0, -1]].any() or hole.pixels[:, [0, -1]].any())
 
 
-def _coverage(holes: Mapping[str, Hole]) -> tuple[dict[str, np.ndarray], int]:
+def _coverage(view_holes: Mapping[str, Hole]) -> tuple[dict[str, np.ndarray], int]:
     """View -> bool [P]: which of the pixels to be invented, of all views together, its own hole covers; and P."""
-    points = [geometry.unproject(hole.depth, hole.camera)[hole.pixels & (hole.depth > 0)] for hole in holes.values()]
+    points = [geometry.unproject(hole.depth, hole.camera)[hole.pixels & (hole.depth > 0)] for hole in view_holes.values()]
     everything = np.concatenate(points) if points else np.zeros((0, 3))
     covers = {}
-    for name, hole in holes.items():
+    for name, hole in view_holes.items():
         uv, z = geometry.project(everything, hole.camera)
         inside, framed = geometry.sample_nearest(hole.pixels, uv)
         depth, _ = geometry.sample_nearest(hole.depth, uv)

@@ -39,13 +39,13 @@ class Frame:
 
     Attributes:
         values: its keys over the file's.
-        listed: its file_path.
+        file_path: its key of that name, the path of the picture.
         source: the file.
         split: "", or for Blender's files "train", "test" or "val".
     """
 
     values: dict[str, Any]
-    listed: str
+    file_path: str
     source: Path
     split: str
 
@@ -71,7 +71,7 @@ def read(folder: Path, images: str | None) -> Capture:
     files = _find_pictures(folder, images, frames)
     if not files:
         raise BadInput(f"{source}: none of its {len(frames)} frames has a picture; name their folder as `images`")
-    missing = [frame.listed for k, frame in enumerate(frames) if k not in files]
+    missing = [frame.file_path for k, frame in enumerate(frames) if k not in files]
     root = Path(os.path.commonpath([path.parent for path in files.values()]))
     of_path = {path.relative_to(root).as_posix(): frames[k] for k, path in files.items()}
     if len(of_path) < len(files):
@@ -92,7 +92,7 @@ def read(folder: Path, images: str | None) -> Capture:
     return Capture(
         "transforms",
         pictures,
-        {view: (*paths[view], each.listed) for view, each in placed.items()} | {path: (path,) for path in missing},
+        {view: (*paths[view], each.file_path) for view, each in placed.items()} | {path: (path,) for path in missing},
         replace(found, points=points[0], colors=points[1]),
         source,
         next(iter(pictures.values())).parent if len({path.parent for path in pictures.values()}) == 1 else root,
@@ -106,9 +106,9 @@ def read(folder: Path, images: str | None) -> Capture:
 def read_cameras(folder: Path) -> Poses:
     """Lenses and poses alone, of a capture whose pictures are missing; sizes are the file's w and h."""
     frames = [each for split, source in split_files(folder).items() for each in _load_frames(source, split)]
-    listed = {normalize_path(each.listed): each for each in frames}
+    listed = {normalize_path(each.file_path): each for each in frames}
     if len(listed) < len(frames):
-        twice = next(path for path in listed if sum(normalize_path(each.listed) == path for each in frames) > 1)
+        twice = next(path for path in listed if sum(normalize_path(each.file_path) == path for each in frames) > 1)
         raise BadInput(f"{frames[0].source}: two frames are called '{Path(twice).stem}'; rename one")
     lenses, poses = {}, {}
     for view, path in name_views(list(listed)).items():
@@ -155,13 +155,13 @@ def _find_pictures(folder: Path, images: str | None, frames: list[Frame]) -> dic
     machine, or name the folder of another size.
     """
     listed = {
-        k: path for k, frame in enumerate(frames) if (path := _existing_picture(folder, frame.listed)) is not None
+        k: path for k, frame in enumerate(frames) if (path := _existing_picture(folder, frame.file_path)) is not None
     }
     if images is None and listed:
         return listed
     for place in [images] if images is not None else USUAL:
         names = list_pictures(folder / place, nested=True)
-        pairs = pair_pictures({k: frame.listed for k, frame in enumerate(frames)}, names)
+        pairs = pair_pictures({k: frame.file_path for k, frame in enumerate(frames)}, names)
         if pairs:
             return {k: folder / place / name for k, name in sorted(pairs.items())}
     return {}
