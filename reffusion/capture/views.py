@@ -16,14 +16,14 @@ from reffusion.io.images import image_size
 
 @dataclass(frozen=True)
 class ViewTable:
-    """The views of a capture (`reffusion.capture.roles.capture_views`), or those that `poses` placed (`placed_views`).
+    """The views of a capture (`reffusion.capture.roles.capture_views`), or those that `poses` placed.
 
     Attributes:
         names: all views.
         train, test: training and test views.
         size_of: name -> (width, height) of its picture.
         upright: the orientation tag of pictures is obeyed.
-        placed: the views are those that `poses` wrote, so the capture may have others.
+        placed: the views are those that `poses` wrote (`placed_views`), so the capture may have others.
         outliers: views that `poses` left out because their photographs contradict their poses.
     """
 

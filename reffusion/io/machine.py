@@ -53,7 +53,8 @@ def lacks(here: Machine, memory_gb: float = 0.0, splats: bool = True, memory_par
     """What keeps this machine from running a stage on CUDA, a line each with the remedy; a driver is present.
 
     Args:
-        memory_gb: limit of the stage's memory by its parameters, 0: no limit. memory_param: the name of that parameter.
+        memory_gb: limit of the stage's memory by its parameters, 0: no limit.
+        memory_param: the name of that parameter.
         splats: does the stage render Gaussians?
     """
     found = []

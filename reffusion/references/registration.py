@@ -77,8 +77,8 @@ class Registration:
             else f"the median displacement is {self.median_displacement:.1f} px"
         )
         return (
-            f"{moved}, it shows {self.in_place:.0%} of {self.point_count} places around the hole where the photograph "
-            f"has them (at least {LEAST_INLIER_RATIO:.0%} must; {displaced})"
+            f"{moved}, it shows {self.in_place:.0%} of {self.point_count} places around the hole where the "
+            f"photograph has them (at least {LEAST_INLIER_RATIO:.0%} must; {displaced})"
         )
 
     def __str__(self) -> str:

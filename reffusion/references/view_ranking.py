@@ -133,7 +133,9 @@ def _touches_border(hole: Hole) -> bool:
 
 def _coverage(view_holes: Mapping[str, Hole]) -> tuple[dict[str, np.ndarray], int]:
     """View -> bool [P]: which of the pixels to be invented, of all views together, its own hole covers; and P."""
-    points = [geometry.unproject(hole.depth, hole.camera)[hole.pixels & (hole.depth > 0)] for hole in view_holes.values()]
+    points = [
+        geometry.unproject(hole.depth, hole.camera)[hole.pixels & (hole.depth > 0)] for hole in view_holes.values()
+    ]
     everything = np.concatenate(points) if points else np.zeros((0, 3))
     covers = {}
     for name, hole in view_holes.items():
